@@ -1,0 +1,50 @@
+"""Angles and planar transforms in REP-103 (yaw 0 along +x, counter-clockwise)."""
+
+import math
+
+import numpy as np
+
+from fgtrack.core.types import FloatArray
+
+TWO_PI = 2.0 * math.pi
+
+
+def wrap_angle(angle_rad: float) -> float:
+    """Angle in (-pi, pi]; exact (unchanged to the bit) where it lies there already."""
+    if -math.pi < angle_rad <= math.pi:
+        return angle_rad
+    wrapped = math.fmod(angle_rad + math.pi, TWO_PI)
+    return wrapped + math.pi if wrapped <= 0.0 else wrapped - math.pi
+
+
+def wrap_angles(angles_rad: FloatArray) -> FloatArray:
+    """Angles in (-pi, pi], any shape; exact (unchanged to the bit) where they lie there already."""
+    inside = (angles_rad > -np.pi) & (angles_rad <= np.pi)
+    if inside.all():
+        return angles_rad
+    wrapped = np.pi - np.mod(np.pi - angles_rad, TWO_PI)
+    return np.asarray(np.where(inside, angles_rad, wrapped))
+
+
+def rotation(yaw_rad: float) -> FloatArray:
+    """Rotation matrix parent_from_child, shape (2, 2), of a child frame turned by `yaw_rad`."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.array([[c, -s], [s, c]])
+
+
+def rotations(yaws_rad: FloatArray) -> FloatArray:
+    """Rotation matrices, shape (..., 2, 2), of child frames turned by `yaws_rad`, shape (...)."""
+    c, s = np.cos(yaws_rad), np.sin(yaws_rad)
+    return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+
+
+def parent_from_child(
+    points_m: FloatArray, origin_m: tuple[float, float], yaw_rad: float
+) -> FloatArray:
+    """Points, shape (n, 2), of a child frame at `origin_m`, `yaw_rad`, expressed in its parent."""
+    return np.asarray(points_m @ rotation(yaw_rad).T + np.asarray(origin_m))
+
+
+def circular_mean(angles_rad: FloatArray) -> float:
+    """Mean direction of `angles_rad`, shape (n,), in (-pi, pi]."""
+    return math.atan2(float(np.sin(angles_rad).sum()), float(np.cos(angles_rad).sum()))

@@ -1,0 +1,186 @@
+"""The values that flow through fgtrack: messages in, track states and update records out.
+
+Every message carries two times: `stamp_ns` (the world was sensed) and `receipt_ns` (the tracker got it).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+Frame = Literal["map", "ego", "sensor"]
+
+#: What a detection may measure, in the order of its covariance and of the residual columns of updates.csv.
+MEASURABLE = (
+    "x_m",
+    "y_m",
+    "yaw_rad",
+    "speed_mps",
+    "range_m",
+    "bearing_rad",
+    "range_rate_mps",
+)
+
+#: State columns of tracks.csv; a motion model's state is a leading part of them.
+STATE_NAMES = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2")
+X, Y, YAW, SPEED, YAW_RATE, ACCEL = range(6)
+
+
+@dataclass(frozen=True, slots=True)
+class EgoState:
+    """Pose and motion of the ego vehicle in the map frame."""
+
+    stamp_ns: int
+    receipt_ns: int
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    speed_mps: float
+    yaw_rate_radps: float = 0.0
+    accel_mps2: float = 0.0
+    in_pit: bool | None = None
+    """True while the ego drives in the pit lane; None when the source does not say."""
+
+
+@dataclass(frozen=True, slots=True)
+class Detection:
+    """One detected object; a component that was not measured is None."""
+
+    x_m: float | None = None
+    y_m: float | None = None
+    yaw_rad: float | None = None
+    speed_mps: float | None = None
+    range_m: float | None = None
+    bearing_rad: float | None = None
+    range_rate_mps: float | None = None
+    covariance: tuple[float, ...] | None = None
+    """Row-major, of the measured components in the order of `MEASURABLE`."""
+    stamp_ns: int | None = None
+    """The object's own stamp, where the sensor gives one per object."""
+    object_id: int | None = None
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Names of the measured components, in the order of `MEASURABLE`."""
+        return tuple(name for name in MEASURABLE if getattr(self, name) is not None)
+
+
+@dataclass(frozen=True, slots=True)
+class DetectionList:
+    """The object list of one sensor at one stamp; an empty list says "saw nothing"."""
+
+    sensor: str
+    stamp_ns: int
+    receipt_ns: int
+    objects: tuple[Detection, ...]
+    frame: Frame = "ego"
+
+
+@dataclass(frozen=True, slots=True)
+class TruthState:
+    """True state of an object in the map frame; object_id -1 is the ego."""
+
+    stamp_ns: int
+    receipt_ns: int
+    object_id: int
+    x_m: float
+    y_m: float
+    yaw_rad: float | None = None
+    speed_mps: float | None = None
+    yaw_rate_radps: float | None = None
+    accel_mps2: float | None = None
+
+
+Message = EgoState | DetectionList | TruthState
+
+
+class Disposition(StrEnum):
+    """What became of a detection: exactly one for each detection received."""
+
+    BIRTH = "birth"
+    IN_SEQUENCE = "in_sequence"
+    OUT_OF_SEQUENCE = "out_of_sequence"
+    BEYOND_WINDOW = "beyond_window"
+    TOO_OLD = "too_old"
+    GATED = "gated"
+    MERGED = "merged"
+    OUT_OF_BOUNDS = "out_of_bounds"
+    DUPLICATE = "duplicate"
+    SUPERSEDED = "superseded"
+    INVALID = "invalid"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class TrackState:
+    """Gaussian state of one object at one stamp."""
+
+    stamp_ns: int
+    mean: FloatArray
+    """State, shape (n,): x, y, yaw, speed, yaw rate and, if the model has it, acceleration."""
+    covariance: FloatArray
+    """Covariance, shape (n, n)."""
+
+
+class TrackStatus(StrEnum):
+    """How far a track can be trusted."""
+
+    TENTATIVE = "tentative"
+    """Measured less often than the confirmation threshold."""
+    CONFIRMED = "confirmed"
+    COASTING = "coasting"
+    """Not matched by the newest batch that expected to see it."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackReport:
+    """One row of tracks.csv: a track as the tracker publishes it at a tick."""
+
+    track_id: int
+    status: TrackStatus
+    state: TrackState
+    num_measured: int
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateRecord:
+    """One row of updates.csv: what became of one received detection."""
+
+    sensor: str
+    stamp_ns: int
+    receipt_ns: int
+    index: int
+    """Position of the detection in its message."""
+    disposition: Disposition
+    track_id: int | None = None
+    nis: float | None = None
+    innovation: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    """Measured minus predicted, by name of `MEASURABLE`."""
+
+
+@dataclass(frozen=True, slots=True)
+class SmoothedReport:
+    """One row of smoothed.csv: a state that later measurements have improved."""
+
+    track_id: int
+    kind: Literal["lagged", "final"]
+    state: TrackState
+
+
+@dataclass(frozen=True, slots=True)
+class TickReport:
+    """All that one tracker tick gives."""
+
+    tick: int
+    now_ns: int
+    tracks: tuple[TrackReport, ...]
+    updates: tuple[UpdateRecord, ...]
+    smoothed: tuple[SmoothedReport, ...] = ()
