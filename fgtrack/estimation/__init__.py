@@ -1,0 +1,1 @@
+"""Estimators: one object's state from measurements that may arrive late."""

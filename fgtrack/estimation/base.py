@@ -1,0 +1,122 @@
+"""What the tracker asks of an estimator."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Protocol
+
+import numpy as np
+
+from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.models.measurement import MeasurementModel, SensorPose
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """One detection, ready to be fused: z = h(x at stamp, pose) + N(0, R)."""
+
+    stamp_ns: int
+    model: MeasurementModel
+    z: FloatArray
+    """Measured components, shape (k,)."""
+    R: FloatArray
+    """Covariance, shape (k, k)."""
+    pose: SensorPose = field(default_factory=SensorPose)
+
+
+class UpdateStatus(StrEnum):
+    """How an estimator took a measurement; the values are dispositions."""
+
+    IN_SEQUENCE = "in_sequence"
+    OUT_OF_SEQUENCE = "out_of_sequence"
+    BEYOND_WINDOW = "beyond_window"
+    TOO_OLD = "too_old"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateResult:
+    """Outcome of one measurement."""
+
+    status: UpdateStatus
+    innovation: FloatArray | None = None
+    """Measured minus predicted at the measurement's own stamp, shape (k,)."""
+    nis: float | None = None
+    """Normalised innovation squared against the prior at that stamp."""
+
+
+@dataclass(frozen=True, slots=True)
+class BirthPrior:
+    """What is known of a new object at its first stamp; standard deviations beside the values.
+
+    `yaw_rad` None means that the direction of travel is unknown.
+    """
+
+    stamp_ns: int
+    position_m: FloatArray
+    """Shape (2,)."""
+    position_covariance: FloatArray
+    """Shape (2, 2)."""
+    yaw_rad: float | None
+    yaw_std_rad: float
+    speed_mps: float
+    speed_std_mps: float
+    yaw_rate_radps: float
+    yaw_rate_std_radps: float
+    accel_mps2: float
+    accel_std_mps2: float
+
+
+@dataclass(frozen=True, slots=True)
+class StatesAt:
+    """States of those tracks that existed at one stamp, in order of birth."""
+
+    track_ids: tuple[int, ...]
+    means: FloatArray
+    """Shape (m, n), in the motion model's own state."""
+    covariances: FloatArray
+    """Shape (m, n, n)."""
+
+
+class TrackBank(Protocol):
+    """The estimators of all objects; a bank may work on them together.
+
+    The tracker asks for states at a stamp, associates, and gives measurements of one stamp back.
+    """
+
+    @property
+    def present_ns(self) -> int:
+        """Stamp of the present states."""
+
+    @property
+    def window_start_ns(self) -> int:
+        """Measurements with an older stamp cannot be fused by any track."""
+
+    @property
+    def track_ids(self) -> tuple[int, ...]:
+        """All tracks in order of birth."""
+
+    def advance(self, now_ns: int) -> None:
+        """The clock moved: bring every track to the present."""
+
+    def states_at(self, stamp_ns: int) -> StatesAt:
+        """States at `stamp_ns`, in the past or the present."""
+
+    def update(
+        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+    ) -> list[UpdateResult]:
+        """Fuse one measurement for each of `track_ids`, all of the same stamp."""
+
+    def birth(self, track_id: int, prior: BirthPrior) -> None:
+        """Start a track at the prior's stamp."""
+
+    def remove(self, track_id: int) -> None:
+        """Forget a track."""
+
+    def present(self) -> list[TrackState]:
+        """Kinematic states (x, y, yaw, speed, yaw rate[, acceleration]) now, in the order of `track_ids`."""
+
+
+def no_states(dim: int) -> StatesAt:
+    """The states of no track at all."""
+    return StatesAt((), np.empty((0, dim)), np.empty((0, dim, dim)))

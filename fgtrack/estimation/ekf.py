@@ -1,0 +1,70 @@
+"""The extended Kalman filter's two steps, on stacks of independent states."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.linalg import psd_solve, symmetrise
+from fgtrack.core.types import FloatArray
+from fgtrack.models.measurement import MeasurementModel, SensorPose
+from fgtrack.models.motion import MotionModel
+
+
+class Correction(NamedTuple):
+    """Result of `correct` for m independent states."""
+
+    mean: FloatArray
+    """Posterior means, shape (m, n); angles are not wrapped."""
+    covariance: FloatArray
+    """Posterior covariances, shape (m, n, n)."""
+    innovation: FloatArray
+    """Shape (m, k)."""
+    nis: FloatArray
+    """Normalised innovation squared, shape (m,)."""
+
+
+def predict(mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: FloatArray | float) -> tuple[
+    FloatArray, FloatArray
+]:
+    """Mean and covariance after `dt_s`: x' = f(x), P' = F P F' + Q (Karle et al. 2023, eqs. 3 and 4).
+
+    Shapes (..., n) and (..., n, n); `dt_s` a number or of shape (...).
+    """
+    F = motion.jacobian(mean, dt_s)
+    spread = F @ covariance @ np.swapaxes(F, -1, -2) + motion.process_noise(mean, dt_s)
+    return motion.predict(mean, dt_s), symmetrise(spread)
+
+
+def correct(
+    mean: FloatArray,
+    covariance: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    model: MeasurementModel,
+    pose: SensorPose,
+) -> Correction:
+    """Fuse z (m, k) with covariance R (m, k, k) into m states (Karle et al. 2023, eqs. 5 to 9).
+
+    The posterior covariance is in Joseph form. Raises `numpy.linalg.LinAlgError` for a singular S.
+    """
+    y = model.residual(z, model.predict(mean, pose))
+    return correct_with_innovation(mean, covariance, y, R, model.jacobian(mean, pose))
+
+
+def correct_with_innovation(
+    mean: FloatArray, covariance: FloatArray, y: FloatArray, R: FloatArray, H: FloatArray
+) -> Correction:
+    """Fuse the innovations y (m, k) of measurements with Jacobians H (m, k, n) or (k, n)."""
+    HP = H @ covariance
+    S = HP @ np.swapaxes(H, -1, -2) + R
+    solved = psd_solve(S, np.concatenate([HP, y[..., None]], axis=-1))
+    K = np.swapaxes(solved[..., :-1], -1, -2)
+    weighted = solved[..., -1]
+    A = np.eye(mean.shape[-1]) - K @ H
+    posterior = A @ covariance @ np.swapaxes(A, -1, -2) + K @ R @ np.swapaxes(K, -1, -2)
+    return Correction(
+        mean + (K @ y[..., None])[..., 0],
+        symmetrise(posterior),
+        y,
+        np.asarray(np.sum(y * weighted, axis=-1)),
+    )

@@ -1,0 +1,75 @@
+"""Where the published implementation of Karle et al. 2023 departs from the clean filter, each departure by itself.
+
+Its yaw is 0 along +y and jumps at +-pi there, which in REP-103 is at 3 pi / 2 (the branch used here).
+"""
+
+import numpy as np
+
+from fgtrack.core.geometry import wrap_angles
+from fgtrack.core.types import ACCEL, SPEED, YAW, FloatArray, IntArray
+from fgtrack.estimation.backward_forward import BackwardForwardBank
+from fgtrack.estimation.propagation import EulerCtrv
+
+#: The published yaw range in REP-103 is (YAW_LIMIT - 2 pi, YAW_LIMIT].
+YAW_LIMIT_RAD = 1.5 * np.pi
+
+
+def published_yaw(yaw_rad: FloatArray) -> FloatArray:
+    """Yaw in the published range: in (-pi, pi] from +y, hence in (-pi/2, 3 pi/2] from +x."""
+    return np.asarray(wrap_angles(yaw_rad - 0.5 * np.pi) + 0.5 * np.pi)
+
+
+class AcceleratedEulerCtrv(EulerCtrv):
+    """The acceleration is a state that drives the speed but is absent from the transition matrix (defect Q5)."""
+
+    def speeds(self, mean: FloatArray, elapsed_s: FloatArray) -> FloatArray:
+        """See `EulerCtrv.speeds`."""
+        return np.asarray(mean[:, SPEED] + elapsed_s * mean[:, ACCEL])
+
+
+class SaturatedYaw:
+    """Mix-in: the predicted yaw sticks at the upper end of its range instead of wrapping (defect Q2)."""
+
+    def yaws(self, mean: FloatArray, elapsed_s: FloatArray) -> FloatArray:
+        """See `EulerCtrv.yaws`."""
+        free = super().yaws(mean, elapsed_s)  # type: ignore[misc]  # the mix-in's other base has it
+        return np.asarray(np.minimum(free, YAW_LIMIT_RAD))
+
+    def settle(self, mean: FloatArray) -> FloatArray:
+        """Means with the yaw in the published range."""
+        settled = mean.copy()
+        settled[..., YAW] = published_yaw(mean[..., YAW])
+        return settled
+
+
+class SaturatedEulerCtrv(SaturatedYaw, EulerCtrv):
+    """CTRV in Euler steps with a yaw that sticks (defect Q2)."""
+
+
+class SaturatedAcceleratedEulerCtrv(SaturatedYaw, AcceleratedEulerCtrv):
+    """The published motion: defects Q2 and Q5 together."""
+
+
+class LeadingClock(BackwardForwardBank):
+    """The tracking time leads the clock by up to one step, and never waits (defect Q14)."""
+
+    def advance(self, now_ns: int) -> None:
+        """Advance by at least one step, and as far as it takes to reach `now_ns`."""
+        if self._now_ns is None:
+            self._grid_ns = now_ns
+        else:
+            elapsed_ns = now_ns - self._grid_ns
+            self._advance_steps(max(-(-elapsed_ns // self._step_ns), 1))
+        self._now_ns = self._grid_ns
+
+
+class StalePresent(BackwardForwardBank):
+    """An update that is not delayed does not reach the stored present state (defect Q8)."""
+
+    def _store(self, back: int, slot: int, rows: IntArray) -> None:
+        if back:
+            super()._store(back, slot, rows)
+
+
+class LeadingClockStalePresent(LeadingClock, StalePresent):
+    """The published object storage: defects Q8 and Q14 together."""

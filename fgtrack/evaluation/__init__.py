@@ -1,0 +1,1 @@
+"""Judges runs: truth matching, metrics, tables and figures. Reads run folders, never a tracker."""

@@ -1,0 +1,117 @@
+"""How figures look, and how they are saved: the same bytes every time, whatever the user's own settings."""
+
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from fgtrack.core.errors import CallError
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import FloatArray, IntArray
+
+#: Colours of Okabe and Ito, told apart by the colour-blind as well; vermilion is kept for what is wrong.
+PALETTE = ("#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#000000", "#E69F00")
+WRONG = "#D55E00"
+GREY = "#555555"
+
+_BREAK_NS = NS_PER_S // 2  # a line is not drawn across a longer pause
+
+_LINES = ("-", "--", ":", "-.")
+
+# The defaults of matplotlib, not those of a file in the home folder; backends are not a matter of style.
+_STYLE = {
+    **{key: value for key, value in mpl.rcParamsDefault.items() if "backend" not in key},
+    "axes.grid": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 10,
+    "axes.labelsize": 9,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "legend.fontsize": 8,
+    "legend.framealpha": 0.9,
+    "figure.titlesize": 11,
+    "figure.constrained_layout.use": True,
+    "figure.dpi": 100,
+    "savefig.dpi": 150,
+    "path.simplify": True,
+    "agg.path.chunksize": 20_000,
+}
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def styled(function: Callable[P, T]) -> Callable[P, T]:
+    """`function` run with the style of fgtrack; settings are as before afterwards."""
+
+    @wraps(function)
+    def run(*args: P.args, **kwargs: P.kwargs) -> T:
+        with mpl.rc_context(_STYLE):
+            return function(*args, **kwargs)
+
+    return run
+
+
+def colour(index: int) -> str:
+    """Colour of the entry `index` of a legend."""
+    return PALETTE[index % len(PALETTE)]
+
+
+def line_style(index: int) -> str:
+    """Line style of the entry `index`: it changes when the colours repeat."""
+    return _LINES[index // len(PALETTE) % len(_LINES)]
+
+
+def legend_above(axes: Axes, width: int) -> None:
+    """Legend above a plot that is about `width` characters wide, where it hides nothing."""
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        axes.legend(
+            loc="lower left",
+            bbox_to_anchor=(0.0, 1.0),
+            ncols=max(1, width // (6 + max(map(len, labels)))),
+            frameon=False,
+            borderaxespad=0.2,
+            markerscale=3.0,
+        )
+
+
+def log_axis(axis: Axis) -> None:
+    """Plain numbers at 1, 2 and 5 of every decade of a logarithmic `axis`."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
+def broken_line(stamps_ns: IntArray, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Points in order of time, with a NaN where the time jumps, so that no line is drawn there."""
+    order = np.argsort(stamps_ns, kind="stable")
+    jumps = np.flatnonzero(np.diff(stamps_ns[order]) > _BREAK_NS) + 1
+    return np.insert(x[order], jumps, np.nan), np.insert(y[order], jumps, np.nan)
+
+
+@styled
+def save(figure: Figure, path: Path) -> Path:
+    """Write `figure` as PNG without date and version, so that equal figures are equal files.
+
+    Raises
+    ------
+    CallError
+        The file cannot be written.
+    """
+    try:
+        figure.savefig(path, format="png", metadata={"Software": None})
+    except OSError as error:
+        raise CallError(f"{path}: cannot be written ({error.strerror}), choose another folder") from error
+    return path

@@ -1,0 +1,75 @@
+"""The figure of tracks and truth on the map."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from fgtrack.evaluation.figure_style import GREY, WRONG, broken_line, colour, legend_above, styled
+from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, Matching
+from fgtrack.evaluation.truth import true_paths
+from fgtrack.io.run_folder import Run, Table
+from fgtrack.models.track_map import TrackMap
+
+_NAMED_OBJECTS = 8  # more objects than these share two entries of the legend
+
+
+@styled
+def figure_map(run: Run, matching: Matching | None, title: str = "") -> Figure:
+    """Tracks and truth on the map whose file `meta.json` names as `map`.
+
+    Truth is a broad pale line, so a stretch that nothing tracked stays visible; a track has the colour of the
+    object that it is paired to, and vermilion where it is paired to none. Without truth every track with
+    enough measurements has a colour.
+    """
+    figure = Figure(figsize=(8.0, 7.0))
+    axes = figure.add_subplot()
+    file = run.meta.get("map")
+    if file is not None:
+        if Path(str(file)).exists():
+            _draw_bounds(axes, TrackMap.read(Path(str(file))))
+        else:
+            title += "\n(the map file is not there any more)"
+    if matching is None:
+        tracks = run.tracks.where(run.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS)
+        for k, track_id in enumerate(np.unique(tracks["track_id"]).tolist()):
+            _draw_tracks(axes, tracks.where(tracks["track_id"] == track_id), colour(k), "")
+        count = len(np.unique(tracks["track_id"]))
+        title += f"\n{count} tracks with at least {CONFIRMED_MEASUREMENTS} measurements, no truth"
+    else:
+        _draw_matched(axes, run, matching)
+        legend_above(axes, width=100)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    figure.suptitle(title.strip())
+    return figure
+
+
+def _draw_bounds(axes: Axes, track_map: TrackMap) -> None:
+    s_m = np.linspace(0.0, track_map.length_m, 2000)
+    left_m, right_m = track_map.bounds(s_m)
+    for lateral_m in (left_m, -right_m):
+        axes.plot(*track_map.position(s_m, lateral_m).T, color=GREY, lw=0.7, zorder=3)
+
+
+def _draw_matched(axes: Axes, run: Run, matching: Matching) -> None:
+    paths = true_paths(run.truth)
+    few = len(paths) <= _NAMED_OBJECTS
+    for index, path in enumerate(paths):
+        name = f"object {path.object_id}" if few else "objects"
+        label = f"{name}, truth" if few or not index else ""
+        line = broken_line(path.stamps_ns, *path.states[:, :2].T)
+        axes.plot(*line, color=colour(index), lw=4.0, alpha=0.3, label=label)
+        label = f"{name}, track" if few or not index else ""
+        _draw_tracks(axes, matching.tracks.where(matching.object_index == index), colour(index), label)
+    _draw_tracks(axes, matching.tracks.where(~matching.paired), WRONG, "paired to no object")
+
+
+def _draw_tracks(axes: Axes, tracks: Table, color: str, label: str) -> None:
+    for track_id in np.unique(tracks["track_id"]).tolist():
+        rows = tracks.where(tracks["track_id"] == track_id)
+        line = broken_line(rows["stamp_ns"], rows["x_m"], rows["y_m"])
+        axes.plot(*line, color=color, lw=1.2, label=label, zorder=4)
+        label = ""

@@ -1,0 +1,165 @@
+"""Which track follows which true object, tick by tick, and how far off it is."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from fgtrack.core.geometry import wrap_angles
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.evaluation.truth import TRUE_STATE, TruePath, true_paths
+from fgtrack.io.run_folder import NO_TRACK, Run, Table
+
+CONFIRMED_MEASUREMENTS = 3
+"""Measurements from which on a track counts: the "valid" tracks of Karle et al. 2023."""
+
+NO_OBJECT = -1
+"""Object index of a track row that is paired to no true object."""
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """How tracks are paired to true objects."""
+
+    gate_m: float = 10.0
+    """Largest distance of a pair. Twice the default association distance of the tracker: a track that drifts
+    off its object is still charged with its error for a while before the object counts as lost."""
+    confirmed_only: bool = True
+    """Judge only rows with at least `CONFIRMED_MEASUREMENTS` measurements."""
+
+
+@dataclass(frozen=True)
+class Matching:
+    """Pairs of track rows and true objects. Objects are numbered by rising id; the ego is none of them."""
+
+    object_ids: tuple[int, ...]
+    tracks: Table
+    """The judged rows of tracks.csv: r rows with truth being recorded at their stamp."""
+    object_index: IntArray
+    """Object that each row is paired to, shape (r,); `NO_OBJECT` where none."""
+    true_states: FloatArray
+    """x, y, yaw, speed of that object at the row's stamp, shape (r, 4); NaN where none."""
+    present: BoolArray
+    """Whether there is truth at the tick's `now_ns`, shape (ticks, objects)."""
+    track_ids: IntArray
+    """Track paired to each object, shape (ticks, objects); `NO_TRACK` where none."""
+
+    @property
+    def paired(self) -> BoolArray:
+        """Whether each row is paired, shape (r,)."""
+        return np.asarray(self.object_index != NO_OBJECT)
+
+
+@dataclass(frozen=True)
+class TrackErrors:
+    """Track minus truth of every paired row, each of shape (p,); NaN where the truth does not say."""
+
+    stamps_ns: IntArray
+    object_index: IntArray
+    track_ids: IntArray
+    values: Mapping[str, FloatArray]
+    """By name of `ERROR_NAMES`."""
+
+
+#: Distance; along and across the true heading (left positive); yaw in (-pi, pi]; speed.
+ERROR_NAMES = ("position_m", "along_m", "across_m", "yaw_rad", "speed_mps")
+
+
+def match(run: Run, options: MatchOptions | None = None) -> Matching | None:
+    """Pair the tracks of `run` to its true objects at every tick; None for a run without truth.
+
+    As CLEAR does (Bernardin and Stiefelhagen 2008): a pair of the tick before stays while it lies inside the
+    gate, the rest is assigned by the Hungarian method, first as many pairs as possible, then the least sum of
+    distances. Ticks are those of timing.csv, so ticks without any track count as well.
+    """
+    options = options or MatchOptions()
+    paths = true_paths(run.truth)
+    if not paths:
+        return None
+    ticks, now_ns = run.timing["tick"], run.timing["now_ns"]
+    tracks = run.tracks.where(_judged(run, options))
+    candidates = np.stack([path.at(tracks["stamp_ns"]) for path in paths], axis=1)
+    xy = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
+    distances_m = np.linalg.norm(candidates[..., :2] - xy[:, None], axis=-1)
+    distances_m[~(distances_m <= options.gate_m)] = np.inf  # NaN, too: no truth or no finite state
+    object_index = np.full(len(tracks), NO_OBJECT)
+    track_ids = np.full((len(ticks), len(paths)), NO_TRACK)
+    order = np.argsort(tracks["tick"], kind="stable")
+    edges = np.searchsorted(tracks["tick"][order], ticks, side="left")
+    ends = np.searchsorted(tracks["tick"][order], ticks, side="right")
+    previous = np.full(len(paths), NO_TRACK)
+    for k, (start, end) in enumerate(zip(edges.tolist(), ends.tolist(), strict=True)):
+        rows = order[start:end]
+        ids = tracks["track_id"][rows]
+        for row, column in _assign(distances_m[rows], ids, previous):
+            object_index[rows[row]] = column
+            track_ids[k, column] = ids[row]
+        previous = track_ids[k]
+    true_states = np.full((len(tracks), len(TRUE_STATE)), np.nan)
+    paired = np.flatnonzero(object_index != NO_OBJECT)
+    true_states[paired] = candidates[paired, object_index[paired]]
+    return Matching(
+        object_ids=tuple(path.object_id for path in paths),
+        tracks=tracks,
+        object_index=object_index,
+        true_states=true_states,
+        present=_present(paths, now_ns),
+        track_ids=track_ids,
+    )
+
+
+def track_errors(matching: Matching) -> TrackErrors:
+    """Errors of the paired rows against the truth at their own stamps."""
+    tracks, truth = matching.tracks.where(matching.paired), matching.true_states[matching.paired]
+    dx_m, dy_m = tracks["x_m"] - truth[:, 0], tracks["y_m"] - truth[:, 1]
+    c, s = np.cos(truth[:, 2]), np.sin(truth[:, 2])
+    errors = (
+        np.hypot(dx_m, dy_m),
+        c * dx_m + s * dy_m,
+        c * dy_m - s * dx_m,
+        wrap_angles(tracks["yaw_rad"] - truth[:, 2]),
+        tracks["speed_mps"] - truth[:, 3],
+    )
+    return TrackErrors(
+        stamps_ns=tracks["stamp_ns"],
+        object_index=matching.object_index[matching.paired],
+        track_ids=tracks["track_id"],
+        values=dict(zip(ERROR_NAMES, errors, strict=True)),
+    )
+
+
+def _judged(run: Run, options: MatchOptions) -> BoolArray:
+    """Rows of tracks.csv to judge: stamped while truth was recorded, of a finished tick, confirmed if asked.
+
+    Only a run that was killed has rows of a tick that timing.csv does not know.
+    """
+    tracks, truth_ns = run.tracks, run.truth["stamp_ns"]
+    judged = (tracks["stamp_ns"] >= truth_ns.min()) & (tracks["stamp_ns"] <= truth_ns.max())
+    judged &= np.isin(tracks["tick"], run.timing["tick"])
+    if options.confirmed_only:
+        judged &= tracks["num_measured"] >= CONFIRMED_MEASUREMENTS
+    return np.asarray(judged)
+
+
+def _present(paths: list[TruePath], now_ns: IntArray) -> BoolArray:
+    return np.stack([np.isfinite(path.at(now_ns)[:, 0]) for path in paths], axis=-1)
+
+
+def _assign(distances_m: FloatArray, ids: IntArray, previous: IntArray) -> list[tuple[int, int]]:
+    """Pairs (row, object) of one tick; `distances_m`, shape (rows, objects), is infinite outside the gate."""
+    keep = (ids[:, None] == previous) & np.isfinite(distances_m)
+    kept_rows, kept_columns = np.nonzero(keep)
+    free_rows = np.flatnonzero(~keep.any(axis=1))
+    free_columns = np.flatnonzero(~keep.any(axis=0))
+    pairs = list(zip(kept_rows.tolist(), kept_columns.tolist(), strict=True))
+    cost = distances_m[np.ix_(free_rows, free_columns)]
+    inside = np.isfinite(cost)
+    if inside.any():
+        # A forbidden pair costs more than all allowed ones together, so the number of pairs is the largest.
+        forbidden = 1.0 + 2.0 * float(cost[inside].max()) * min(cost.shape)
+        rows, columns = linear_sum_assignment(np.where(inside, cost, forbidden))
+        allowed = inside[rows, columns]
+        chosen = zip(free_rows[rows[allowed]].tolist(), free_columns[columns[allowed]].tolist(), strict=True)
+        pairs.extend(chosen)
+    return pairs

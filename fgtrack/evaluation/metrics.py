@@ -1,0 +1,239 @@
+"""What a run achieved, in numbers."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any
+
+import numpy as np
+
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import BoolArray, Disposition, FloatArray, IntArray
+from fgtrack.evaluation.matching import (
+    CONFIRMED_MEASUREMENTS,
+    ERROR_NAMES,
+    Matching,
+    MatchOptions,
+    match,
+    track_errors,
+)
+from fgtrack.evaluation.residuals import ANGULAR, RESIDUAL_NAMES, residuals
+from fgtrack.evaluation.statistics import Distribution, Moments
+from fgtrack.io.run_folder import NO_TRACK, Run, Table
+
+FALSE_TRACK_SHARE = 0.5
+"""A track that is paired to a true object in less than this share of its judged life is false."""
+
+
+@dataclass(frozen=True)
+class ObjectMetrics:
+    """How one true object, or all of them together, was tracked."""
+
+    errors: Mapping[str, Moments]
+    """Track minus truth by name of `ERROR_NAMES`; `position_m` is the distance."""
+    ticks_present: int
+    """Ticks at which there is truth."""
+    ticks_tracked: int
+    """Ticks among them at which a track was paired."""
+    breaks: int
+    """How often tracking went on after a loss, or with another track."""
+    id_switches: int
+    """How often it went on with another track than the last one."""
+
+    @property
+    def tracked_share(self) -> float:
+        """Share of the ticks at which the object was tracked."""
+        return self.ticks_tracked / self.ticks_present if self.ticks_present else math.nan
+
+    def __add__(self, other: "ObjectMetrics") -> "ObjectMetrics":
+        return ObjectMetrics(
+            {name: self.errors[name] + other.errors[name] for name in ERROR_NAMES},
+            self.ticks_present + other.ticks_present,
+            self.ticks_tracked + other.ticks_tracked,
+            self.breaks + other.breaks,
+            self.id_switches + other.id_switches,
+        )
+
+
+NOTHING_TRACKED = ObjectMetrics({name: Moments() for name in ERROR_NAMES}, 0, 0, 0, 0)
+
+
+@dataclass(frozen=True)
+class TruthMetrics:
+    """The part of the metrics that needs truth."""
+
+    objects: Mapping[int, ObjectMetrics]
+    """By object id."""
+    judged_tracks: int
+    """Tracks with a judged row."""
+    false_tracks: int
+    """Those of them paired in less than `FALSE_TRACK_SHARE` of their judged rows."""
+    tracked_objects: int
+    """True objects that a confirmed track was ever paired to: the trackable ones, TP of the precision."""
+
+    @property
+    def overall(self) -> ObjectMetrics:
+        """All objects together."""
+        return sum(self.objects.values(), start=NOTHING_TRACKED)
+
+
+@dataclass(frozen=True)
+class SensorMetrics:
+    """What became of the detections of one sensor."""
+
+    dispositions: Mapping[str, int]
+    """Detections by disposition; every disposition is there."""
+    delay_s: Distribution
+    """Receipt minus stamp of the messages that held a detection."""
+    residuals: Mapping[str, Moments]
+    """Innovations by name of `RESIDUAL_NAMES`, those that occur."""
+    nis: Moments
+    """Normalised innovation squared."""
+    nis_dof: Moments
+    """Number of measured components of the updates with a NIS: a consistent filter has this mean NIS."""
+
+    @property
+    def detections(self) -> int:
+        """All detections received."""
+        return sum(self.dispositions.values())
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """All metrics of one run."""
+
+    name: str
+    """Name of the run folder."""
+    estimator: str
+    options: MatchOptions
+    num_tracks: int
+    """Distinct ids in tracks.csv."""
+    num_confirmed: int
+    """Ids with at least `CONFIRMED_MEASUREMENTS` measurements."""
+    sensors: Mapping[str, SensorMetrics]
+    time_per_tick_s: Distribution
+    """Wall time of the ticks with a detection."""
+    truth: TruthMetrics | None = field(default=None)
+    """None for a run without truth."""
+
+    @property
+    def precision(self) -> float:
+        """TP / (TP + FP) of Karle et al. 2023, section IV-A: trackable true objects / confirmed ids."""
+        if self.truth is None or not self.num_confirmed:
+            return math.nan
+        return self.truth.tracked_objects / self.num_confirmed
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values by name, derived ones included; None for what does not exist."""
+        values: dict[str, Any] = _plain(self)
+        values["precision"] = _plain(self.precision)
+        for name, sensor in self.sensors.items():
+            values["sensors"][name]["detections"] = sensor.detections
+        if self.truth is not None:
+            values["truth"]["overall"] = _plain(self.truth.overall)
+        return values
+
+
+def evaluate(run: Run, options: MatchOptions | None = None) -> Metrics:
+    """Metrics of `run`; without truth, those that need none."""
+    options = options or MatchOptions()
+    matching = match(run, options)
+    ids = run.tracks["track_id"]
+    confirmed = run.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS
+    busy = run.timing["num_detections"] > 0
+    return Metrics(
+        name=run.path.resolve().name,
+        estimator=str(run.meta.get("estimator", "")),
+        options=options,
+        num_tracks=len(np.unique(ids)),
+        num_confirmed=len(np.unique(ids[confirmed])),
+        sensors=_sensor_metrics(run),
+        time_per_tick_s=Distribution.of(run.timing["process_ns"][busy] / NS_PER_S),
+        truth=None if matching is None else _truth_metrics(matching),
+    )
+
+
+def _truth_metrics(matching: Matching) -> TruthMetrics:
+    errors = track_errors(matching)
+    objects = {}
+    for index, object_id in enumerate(matching.object_ids):
+        mine = errors.object_index == index
+        objects[object_id] = _object_metrics(
+            {name: Moments.of(values[mine]) for name, values in errors.values.items()},
+            matching.present[:, index],
+            matching.track_ids[:, index],
+        )
+    tracks, paired = matching.tracks, matching.paired
+    ids, inverse = np.unique(tracks["track_id"], return_inverse=True)
+    life = np.bincount(inverse, minlength=len(ids))
+    paired_life = np.bincount(inverse[paired], minlength=len(ids))
+    confirmed = tracks["num_measured"] >= CONFIRMED_MEASUREMENTS
+    return TruthMetrics(
+        objects=objects,
+        judged_tracks=len(ids),
+        false_tracks=int((paired_life < FALSE_TRACK_SHARE * life).sum()),
+        tracked_objects=len(np.unique(matching.object_index[paired & confirmed])),
+    )
+
+
+def _object_metrics(errors: Mapping[str, Moments], present: BoolArray, track_ids: IntArray) -> ObjectMetrics:
+    """Counts from the track paired to one object at every tick, shape (ticks,)."""
+    track_ids = track_ids[present]
+    tracked = track_ids != NO_TRACK
+    before = np.concatenate([[NO_TRACK], track_ids])[:-1]
+    stretches = int((tracked & (track_ids != before)).sum())
+    sequence = track_ids[tracked]
+    return ObjectMetrics(
+        errors=errors,
+        ticks_present=len(track_ids),
+        ticks_tracked=len(sequence),
+        breaks=max(stretches - 1, 0),
+        id_switches=int((sequence[1:] != sequence[:-1]).sum()),
+    )
+
+
+def _sensor_metrics(run: Run) -> dict[str, SensorMetrics]:
+    updates, values = run.updates, residuals(run)
+    measured = np.sum([np.isfinite(updates[name]) for name in updates if name.startswith("res_")], axis=0)
+    sensors = {}
+    for sensor in np.unique(updates["sensor"]).tolist():
+        mine = updates["sensor"] == sensor
+        with_nis = mine & np.isfinite(updates["nis"])
+        moments = {
+            name: (Moments.of_angles if name in ANGULAR else Moments.of)(values[name][mine])
+            for name in RESIDUAL_NAMES
+        }
+        dispositions = updates["disposition"][mine].tolist()
+        sensors[sensor] = SensorMetrics(
+            dispositions={name.value: dispositions.count(name.value) for name in Disposition},
+            delay_s=Distribution.of(message_delays(updates.where(mine))[1]),
+            residuals={name: value for name, value in moments.items() if value.count},
+            nis=Moments.of(updates["nis"][with_nis]),
+            nis_dof=Moments.of(measured[with_nis].astype(np.float64)),
+        )
+    return sensors
+
+
+def message_delays(updates: Table) -> tuple[IntArray, FloatArray]:
+    """Receipt in ns and delay in s of every message behind `updates` of one sensor, in order of receipt.
+
+    A message counts once, however many detections it holds; one without any does not appear in updates.csv.
+    """
+    messages = np.unique(np.stack([updates["receipt_ns"], updates["stamp_ns"]], axis=-1), axis=0)
+    return messages[:, 0], (messages[:, 0] - messages[:, 1]) / NS_PER_S
+
+
+def _plain(value: Any) -> Any:
+    """`value` as JSON: derived properties beside the fields, NaN as None, keys as text."""
+    if isinstance(value, Moments):
+        return {name: _plain(number) for name, number in value.as_dict().items()}
+    if is_dataclass(value):
+        plain = {entry.name: _plain(getattr(value, entry.name)) for entry in fields(value)}
+        if isinstance(value, ObjectMetrics):
+            plain["tracked_share"] = _plain(value.tracked_share)
+        return plain
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,84 @@
+"""Summaries of samples: moments that add up over runs, and quantiles."""
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from fgtrack.core.geometry import circular_mean, wrap_angle, wrap_angles
+from fgtrack.core.types import FloatArray
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Count, mean and spread of a sample; the moments of two samples add up to those of both together."""
+
+    count: int = 0
+    mean: float = math.nan
+    squares: float = 0.0
+    """Sum of squared deviations from the mean."""
+
+    @classmethod
+    def of(cls, values: FloatArray) -> Self:
+        """Moments of `values`, shape (n,), without the NaN among them."""
+        values = values[~np.isnan(values)]
+        if not len(values):
+            return cls()
+        mean = float(values.mean())
+        return cls(len(values), mean, float(np.square(values - mean).sum()))
+
+    @classmethod
+    def of_angles(cls, values_rad: FloatArray) -> Self:
+        """Moments of directions: deviations are the shorter way round from the circular mean.
+
+        For a sample that does not reach around to pi these are the ordinary moments.
+        """
+        values_rad = values_rad[~np.isnan(values_rad)]
+        if not len(values_rad):
+            return cls()
+        middle_rad = circular_mean(values_rad)
+        around = cls.of(wrap_angles(values_rad - middle_rad))
+        return cls(around.count, wrap_angle(middle_rad + around.mean), around.squares)
+
+    def __add__(self, other: "Moments") -> "Moments":
+        if not self.count or not other.count:
+            return self if self.count else other
+        count = self.count + other.count
+        step = other.mean - self.mean
+        squares = self.squares + other.squares + step**2 * self.count * other.count / count
+        return Moments(count, self.mean + step * other.count / count, squares)
+
+    @property
+    def std(self) -> float:
+        """Standard deviation of the sample (divided by n); NaN of an empty one."""
+        return math.sqrt(self.squares / self.count) if self.count else math.nan
+
+    @property
+    def rmse(self) -> float:
+        """Root of the mean square; NaN of an empty sample."""
+        return math.sqrt(self.mean**2 + self.squares / self.count) if self.count else math.nan
+
+    def as_dict(self) -> dict[str, float]:
+        """Values by name."""
+        return {"count": self.count, "mean": self.mean, "std": self.std, "rmse": self.rmse}
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """Mean and quantiles of a sample; NaN of an empty one."""
+
+    count: int = 0
+    mean: float = math.nan
+    p50: float = math.nan
+    p90: float = math.nan
+    p99: float = math.nan
+    max: float = math.nan
+
+    @classmethod
+    def of(cls, values: FloatArray) -> Self:
+        """Distribution of `values`, shape (n,); quantiles are linear between neighbours."""
+        if not len(values):
+            return cls()
+        quantiles = np.quantile(values, (0.5, 0.9, 0.99, 1.0)).tolist()
+        return cls(len(values), float(values.mean()), *quantiles)

@@ -1,0 +1,1 @@
+"""Recordings, streams and data sets in; streams, bags and run folders out."""

@@ -1,0 +1,110 @@
+"""What the adapters share: headers, quaternions, speeds and covariances of ROS messages."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import MEASURABLE, Detection, FloatArray, Frame
+
+# A message is known by its attributes only: its class is made when a recording is read.
+RosMessage = Any
+
+MAP_FRAMES = frozenset({"map", "world", "odom"})
+"""Header frames that are taken as the map frame where the configuration names none."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectList:
+    """What an adapter reads from one message."""
+
+    stamp_ns: int | None
+    """None where the message has no stamp; then it is the receipt."""
+    frame: Frame | None
+    """None where the message does not say."""
+    objects: tuple[Detection, ...]
+
+
+Adapter = Callable[[RosMessage], ObjectList]
+
+
+def stamp_ns(time: RosMessage) -> int:
+    """Integer nanoseconds of a `builtin_interfaces/Time`."""
+    return int(time.sec) * NS_PER_S + int(time.nanosec)
+
+
+def object_stamp_ns(header: RosMessage) -> int | None:
+    """Stamp of a nested header; None where it was not filled in."""
+    return stamp_ns(header.stamp) or None
+
+
+def frame_of(header: RosMessage) -> Frame:
+    """Frame that a header names: `map` for the usual names of a fixed frame, else `ego`."""
+    return "map" if header.frame_id.lstrip("/") in MAP_FRAMES else "ego"
+
+
+def object_list(header: RosMessage, objects: Sequence[Detection]) -> ObjectList:
+    """An object list with the stamp and the frame of `header`."""
+    return ObjectList(stamp_ns(header.stamp), frame_of(header), tuple(objects))
+
+
+def yaw_rad(orientation: RosMessage) -> float | None:
+    """Yaw of a quaternion of any norm; None where it is all zero, which says "not known"."""
+    x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
+    if x == y == z == w == 0.0:
+        return None
+    return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
+def signed_speed_mps(vx_mps: float, vy_mps: float, heading_rad: float | None) -> float:
+    """Length of the velocity, negative where it points against the heading (of the same frame)."""
+    speed = math.hypot(vx_mps, vy_mps)
+    if heading_rad is None:
+        return speed
+    forward = vx_mps * math.cos(heading_rad) + vy_mps * math.sin(heading_rad)
+    return -speed if forward < 0.0 else speed
+
+
+def speed_variance(vx_mps: float, vy_mps: float, covariance: FloatArray) -> float:
+    """Variance of the length of the velocity, from its covariance, shape (2, 2), to first order."""
+    speed = math.hypot(vx_mps, vy_mps)
+    if not speed > 0.0:
+        return float(covariance[0, 0])
+    direction = np.array([vx_mps, vy_mps]) / speed
+    return float(direction @ covariance @ direction)
+
+
+def covariance(
+    components: Sequence[str], pose: FloatArray | None, speed: float | None = None
+) -> tuple[float, ...] | None:
+    """Covariance of the measured `components`, row-major; None where it does not cover them all.
+
+    Parameters
+    ----------
+    components
+        Measured components in the order of `MEASURABLE`: positions, yaw and speed.
+    pose
+        Covariance, shape (3, 3), of x, y and yaw; None or all zero says "not known".
+    speed
+        Variance of the speed; None says "not known".
+    """
+    if pose is None or not np.any(pose) or ("speed_mps" in components and not speed):
+        return None
+    full = np.zeros((4, 4))
+    full[:3, :3] = pose
+    full[3, 3] = speed or 0.0
+    index = [MEASURABLE.index(name) for name in components]
+    return tuple(full[np.ix_(index, index)].ravel().tolist())
+
+
+def planar(covariance36: Sequence[float]) -> FloatArray:
+    """Covariance of x, y and yaw, shape (3, 3), from the 36 values of a `PoseWithCovariance`."""
+    return np.asarray(covariance36, dtype=float).reshape(6, 6)[np.ix_([0, 1, 5], [0, 1, 5])]
+
+
+def measured(values: Mapping[str, float | None]) -> tuple[str, ...]:
+    """Names of `values` that are given, in the order of `MEASURABLE`."""
+    return tuple(name for name in MEASURABLE if values.get(name) is not None)

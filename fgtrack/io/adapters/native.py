@@ -1,0 +1,71 @@
+"""fgtrack's own messages in a recording: every field of the core types, to the bit."""
+
+from collections.abc import Callable
+
+from fgtrack.core.types import (
+    MEASURABLE,
+    STATE_NAMES,
+    Detection,
+    DetectionList,
+    EgoState,
+    Message,
+    TruthState,
+)
+from fgtrack.io.adapters.common import RosMessage, stamp_ns
+
+EGO, DETECTIONS, TRUTH = (f"fgtrack_msgs/msg/{name}" for name in ("Ego", "DetectionList", "Truth"))
+
+#: Optional fields in the order of the bits of `present`.
+DETECTION_OPTIONAL = (*MEASURABLE, "covariance", "stamp_ns", "object_id")
+TRUTH_OPTIONAL = STATE_NAMES[2:]
+
+
+def presence(value: Detection | TruthState, names: tuple[str, ...]) -> int:
+    """Bits of those of the fields `names` that `value` has."""
+    return sum(1 << bit for bit, name in enumerate(names) if getattr(value, name) is not None)
+
+
+def _given(message: RosMessage, names: tuple[str, ...]) -> dict[str, RosMessage]:
+    return {name: getattr(message, name) for bit, name in enumerate(names) if message.present >> bit & 1}
+
+
+def ego(message: RosMessage, receipt_ns: int) -> EgoState:
+    """The ego's state of a `fgtrack_msgs/Ego`."""
+    return EgoState(
+        stamp_ns(message.header.stamp),
+        receipt_ns,
+        **{name: getattr(message, name) for name in STATE_NAMES},
+        in_pit=message.in_pit if message.has_in_pit else None,
+    )
+
+
+def detections(message: RosMessage, receipt_ns: int) -> DetectionList:
+    """The object list of a `fgtrack_msgs/DetectionList`."""
+    objects = []
+    for item in message.objects:
+        given = _given(item, DETECTION_OPTIONAL)
+        if "covariance" in given:
+            given["covariance"] = tuple(given["covariance"].tolist())
+        objects.append(Detection(**given))
+    stamp = stamp_ns(message.header.stamp)
+    return DetectionList(message.sensor, stamp, receipt_ns, tuple(objects), message.header.frame_id)
+
+
+def truth(message: RosMessage, receipt_ns: int) -> TruthState:
+    """The true state of a `fgtrack_msgs/Truth`."""
+    return TruthState(
+        stamp_ns(message.header.stamp),
+        receipt_ns,
+        message.object_id,
+        message.x_m,
+        message.y_m,
+        **_given(message, TRUTH_OPTIONAL),
+    )
+
+
+#: What reads fgtrack's own message types, by type name.
+NATIVE_ADAPTERS: dict[str, Callable[[RosMessage, int], Message]] = {
+    EGO: ego,
+    DETECTIONS: detections,
+    TRUTH: truth,
+}

@@ -1,0 +1,176 @@
+"""Object lists of the message types in use; each adapter gives all that the message measures.
+
+Which of it a tracker uses is the sensor model's choice. A speed is negative where an object moves backwards.
+No object is left out: what is not a number stays so and is counted by the tracker.
+"""
+
+import numpy as np
+
+from fgtrack.core.types import Detection
+from fgtrack.io.adapters.common import (
+    Adapter,
+    ObjectList,
+    RosMessage,
+    covariance,
+    measured,
+    object_list,
+    object_stamp_ns,
+    planar,
+    signed_speed_mps,
+    speed_variance,
+    yaw_rad,
+)
+
+_ORIENTATION_AVAILABLE = 2  # in autoware's DetectedObjectKinematics
+_ID_MASK = (1 << 63) - 1
+
+
+def detection3d_array(message: RosMessage) -> ObjectList:
+    """`vision_msgs/Detection3DArray`, versions 2 to 4: position and yaw.
+
+    The pose is that of the box, or where the box has no size that of the first hypothesis; the covariance is
+    that of the first hypothesis.
+    """
+    return object_list(message.header, [_detection3d(item) for item in message.detections])
+
+
+def _detection3d(item: RosMessage) -> Detection:
+    pose, size = item.bbox.center, item.bbox.size
+    hypothesis = item.results[0].pose if len(item.results) else None
+    if hypothesis is not None and size.x == size.y == size.z == 0.0:
+        pose = hypothesis.pose
+    text = str(getattr(item, "id", "") or getattr(item, "tracking_id", ""))
+    values = {"x_m": pose.position.x, "y_m": pose.position.y, "yaw_rad": yaw_rad(pose.orientation)}
+    return Detection(
+        **values,
+        covariance=None
+        if hypothesis is None
+        else covariance(measured(values), planar(hypothesis.covariance)),
+        stamp_ns=object_stamp_ns(item.header),
+        object_id=int(text) if text.isascii() and text.isdigit() and int(text) <= _ID_MASK else None,
+    )
+
+
+def detected_objects(message: RosMessage) -> ObjectList:
+    """`DetectedObjects` of autoware_perception_msgs and of autoware_auto_perception_msgs.
+
+    Position, yaw where the orientation is available without a doubt about its sign, speed where there is a
+    twist, which is in the object's own frame.
+    """
+    return object_list(message.header, [_detected_object(item.kinematics) for item in message.objects])
+
+
+def _detected_object(kinematics: RosMessage) -> Detection:
+    pose = kinematics.pose_with_covariance.pose
+    twist = kinematics.twist_with_covariance
+    velocity = twist.twist.linear
+    available = kinematics.orientation_availability == _ORIENTATION_AVAILABLE
+    values = {
+        "x_m": pose.position.x,
+        "y_m": pose.position.y,
+        "yaw_rad": yaw_rad(pose.orientation) if available else None,
+        "speed_mps": signed_speed_mps(velocity.x, velocity.y, 0.0 if available else None)
+        if kinematics.has_twist
+        else None,
+    }
+    variance = None
+    if kinematics.has_twist_covariance:
+        planar_twist = np.asarray(twist.covariance, dtype=float).reshape(6, 6)[:2, :2]
+        variance = speed_variance(velocity.x, velocity.y, planar_twist)
+    pose_covariance = kinematics.pose_with_covariance.covariance
+    return Detection(
+        **values,
+        covariance=covariance(
+            measured(values),
+            planar(pose_covariance) if kinematics.has_position_covariance else None,
+            variance,
+        ),
+    )
+
+
+def object_array(message: RosMessage) -> ObjectList:
+    """`derived_object_msgs/ObjectArray`: position, yaw, speed; the twist is in the frame of the header."""
+    return object_list(message.header, [_derived_object(item) for item in message.objects])
+
+
+def _derived_object(item: RosMessage) -> Detection:
+    yaw = yaw_rad(item.pose.orientation)
+    return Detection(
+        x_m=item.pose.position.x,
+        y_m=item.pose.position.y,
+        yaw_rad=yaw,
+        speed_mps=signed_speed_mps(item.twist.linear.x, item.twist.linear.y, yaw),
+        stamp_ns=object_stamp_ns(item.header),
+        object_id=int(item.id),
+    )
+
+
+def radar_tracks(message: RosMessage) -> ObjectList:
+    """`radar_msgs/RadarTracks`: position and speed; the radar does not say where an object heads."""
+    return object_list(message.header, [_radar_track(item) for item in message.tracks])
+
+
+def _radar_track(item: RosMessage) -> Detection:
+    position, velocity = item.position, item.velocity
+    pose = np.zeros((3, 3))
+    pose[:2, :2] = _planar_triangle(item.position_covariance)
+    values = {
+        "x_m": position.x,
+        "y_m": position.y,
+        "speed_mps": signed_speed_mps(velocity.x, velocity.y, None),
+    }
+    variance = speed_variance(velocity.x, velocity.y, _planar_triangle(item.velocity_covariance))
+    uuid = int.from_bytes(bytes(item.uuid.uuid), "little") & _ID_MASK
+    return Detection(
+        **values, covariance=covariance(measured(values), pose, variance), object_id=uuid or None
+    )
+
+
+def _planar_triangle(triangle: RosMessage) -> np.ndarray:
+    """Covariance of x and y, shape (2, 2), from the upper triangle xx, xy, xz, yy, yz, zz."""
+    xx, xy, _, yy, _, _ = (float(value) for value in triangle)
+    return np.array([[xx, xy], [xy, yy]])
+
+
+def pose_array(message: RosMessage) -> ObjectList:
+    """`geometry_msgs/PoseArray`: position and yaw."""
+    poses = message.poses
+    objects = [
+        Detection(x_m=pose.position.x, y_m=pose.position.y, yaw_rad=yaw_rad(pose.orientation))
+        for pose in poses
+    ]
+    return object_list(message.header, objects)
+
+
+def odometry(message: RosMessage) -> ObjectList:
+    """`nav_msgs/Odometry` of one object: position, yaw, speed; the twist is in the object's own frame."""
+    pose, velocity = message.pose.pose, message.twist.twist.linear
+    values = {
+        "x_m": pose.position.x,
+        "y_m": pose.position.y,
+        "yaw_rad": yaw_rad(pose.orientation),
+        "speed_mps": signed_speed_mps(velocity.x, velocity.y, 0.0),
+    }
+    planar_twist = np.asarray(message.twist.covariance, dtype=float).reshape(6, 6)[:2, :2]
+    variance = speed_variance(velocity.x, velocity.y, planar_twist)
+    item = Detection(
+        **values, covariance=covariance(measured(values), planar(message.pose.covariance), variance)
+    )
+    return object_list(message.header, [item])
+
+
+#: Adapters of object lists by type name; `register_adapter` adds to it.
+OBJECT_ADAPTERS: dict[str, Adapter] = {
+    "autoware_auto_perception_msgs/msg/DetectedObjects": detected_objects,
+    "autoware_perception_msgs/msg/DetectedObjects": detected_objects,
+    "derived_object_msgs/msg/ObjectArray": object_array,
+    "geometry_msgs/msg/PoseArray": pose_array,
+    "nav_msgs/msg/Odometry": odometry,
+    "radar_msgs/msg/RadarTracks": radar_tracks,
+    "vision_msgs/msg/Detection3DArray": detection3d_array,
+}
+
+
+def register_adapter(type_name: str, adapter: Adapter) -> None:
+    """Read messages of `type_name` (`package/msg/Type`) with `adapter` from now on."""
+    OBJECT_ADAPTERS[type_name] = adapter

@@ -1,0 +1,224 @@
+"""Reads recordings: rosbag2 folders, single MCAP and SQLite files, ROS 1 bags; without ROS.
+
+This module and those behind it (`bag_files`, `typestore`, `bag_writer`) are the only importers of rosbags.
+"""
+
+import re
+import struct
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+from rosbags.interfaces import Connection, ConnectionExtRosbag2
+from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
+from rosbags.typesys.store import Typestore
+
+from fgtrack.core.errors import DataError, FgtrackError
+from fgtrack.core.time import NS_PER_S
+from fgtrack.io.bag_files import BagFile, BagFolder, Rosbag1File, merged, storage_of
+from fgtrack.io.errors import TruncatedInput
+from fgtrack.io.typestore import build_typestore, missing_type, one_line, type_name
+
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_BAG_SUFFIXES = (".mcap", ".db3")
+
+
+@dataclass(frozen=True)
+class BagTopic:
+    """A topic of a recording."""
+
+    name: str
+    type: str
+    count: int
+    problem: str | None
+    """Why its messages cannot be decoded; None when they can."""
+
+
+@dataclass(frozen=True)
+class BagMessage:
+    """A decoded message."""
+
+    topic: str
+    type: str
+    log_ns: int
+    """When the recorder received it."""
+    # A message has the attributes of its type, which is known only when the recording is read.
+    data: Any
+
+
+class Bag:
+    """A recording, which can be read any number of times.
+
+    Parameters
+    ----------
+    path
+        rosbag2 folder (with or without metadata.yaml), `.mcap`, `.db3` or ROS 1 `.bag` file.
+    message_definitions
+        `.msg` files, or folders of them, for types that the recording does not define. The package is the
+        name of the folder (or of the one above a folder `msg`).
+
+    Raises
+    ------
+    DataError
+        The recording cannot be read at all.
+    """
+
+    def __init__(self, path: Path | str, message_definitions: Collection[str] = ()) -> None:
+        self.path = Path(path)
+        with _as_data_error(self.path), _opened(self.path) as files:
+            connections = [item for file in files for item in file.connections]
+            _check_serialization(self.path, connections)
+            self._ros1 = any(isinstance(file, Rosbag1File) for file in files)
+            self._store, unreadable = build_typestore(connections, self._ros1, message_definitions)
+            self.break_off = _break_off(files)
+        self.topics = _topics(connections, self._store, unreadable)
+        """Topics by name; a topic with two types is listed twice."""
+
+    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
+        """Decoded messages on `topics` in log-time order; equal times keep the order of the recording.
+
+        Raises
+        ------
+        TruncatedInput
+            The recording breaks off; raised after every message before the break.
+        DataError
+            A topic's type is not known or a message of it cannot be decoded.
+        """
+        for topic in self.topics:
+            if topic.name in topics and topic.problem:
+                raise DataError(f"{self.path}: topic {topic.name} cannot be read: {topic.problem}")
+        decode = self._store.deserialize_ros1 if self._ros1 else self._store.deserialize_cdr
+        for connection, log_ns, data in self._records(topics):
+            try:
+                message = decode(data, connection.msgtype)
+            except Exception as error:  # whatever foreign bytes make the decoder raise
+                raise DataError(
+                    f"{self.path}: the message on {connection.topic} at {log_ns} ns is not a "
+                    f"{connection.msgtype} ({one_line(error)})"
+                ) from error
+            yield BagMessage(connection.topic, connection.msgtype, log_ns, message)
+
+    def stamps(self) -> Iterator[tuple[BagTopic, int, int | None]]:
+        """Topic, log time and header stamp of every message, without decoding it.
+
+        The stamp is None where the type does not start with a header or is not known.
+        """
+        by_key = {(topic.name, topic.type): topic for topic in self.topics}
+        stamped = {topic: self._starts_with_header(topic) for topic in self.topics}
+        offset = 4  # behind the CDR header, or in ROS 1 behind the sequence number
+        for connection, log_ns, data in self._records({topic.name for topic in self.topics}):
+            topic = by_key[connection.topic, connection.msgtype]
+            stamp_ns = None
+            if stamped[topic] and len(data) >= offset + 8:
+                layout = ">iI" if not self._ros1 and data[1] == 0 else "<iI"
+                sec, nanosec = struct.unpack_from(layout, data, offset)
+                stamp_ns = sec * NS_PER_S + nanosec
+            yield topic, log_ns, stamp_ns
+
+    def _starts_with_header(self, topic: BagTopic) -> bool:
+        if topic.problem:
+            return False
+        fields = self._store.fielddefs[topic.type][1]
+        return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
+
+    def _records(self, topics: Collection[str]) -> Iterator[tuple[Connection, int, bytes]]:
+        count = 0
+        with _as_data_error(self.path), _opened(self.path) as files:
+            try:
+                for connection, log_ns, data in merged(files, topics):
+                    if data[:4] == _ZSTD_MAGIC and not self._ros1:
+                        data = DECOMPRESSORS["zstd"](data, 0)
+                    yield connection, log_ns, data
+                    count += 1
+            except FgtrackError:
+                raise
+            except Exception as error:  # whatever damaged bytes make rosbags or its decompressors raise
+                raise TruncatedInput(
+                    f"{self.path}: breaks off after {count} messages ({one_line(error)})"
+                ) from error
+            if broken := _break_off(files):
+                raise TruncatedInput(f"{broken}, after {count} messages")
+
+
+def is_bag_folder(path: Path) -> bool:
+    """Whether the folder `path` holds a rosbag2 recording."""
+    return (path / "metadata.yaml").is_file() or bool(_bag_files(path))
+
+
+def _topics(
+    connections: list[Connection], store: Typestore, unreadable: Mapping[str, str]
+) -> tuple[BagTopic, ...]:
+    counts: Counter[tuple[str, str]] = Counter()
+    for item in connections:
+        counts[item.topic, item.msgtype] += item.msgcount
+    topics = []
+    for (name, msgtype), count in sorted(counts.items()):
+        problem = unreadable.get(msgtype)
+        if problem is None and (missing := missing_type(store, msgtype)):
+            problem = (
+                f"the definition of {missing} is neither in the recording nor known, "
+                "name its .msg file in message_definitions"
+            )
+        topics.append(BagTopic(name, msgtype, count, problem))
+    return tuple(topics)
+
+
+def _check_serialization(path: Path, connections: list[Connection]) -> None:
+    for item in connections:
+        if isinstance(item.ext, ConnectionExtRosbag2) and item.ext.serialization_format != "cdr":
+            raise DataError(
+                f"{path}: topic {item.topic} is serialized as {item.ext.serialization_format!r}, "
+                "only 'cdr' can be read"
+            )
+
+
+def _break_off(files: list[BagFile]) -> str | None:
+    return next((f"{file.path} {file.break_off}" for file in files if file.break_off), None)
+
+
+def _bag_files(path: Path) -> list[Path]:
+    """Storage files of a folder without metadata.yaml, `x_2` before `x_10`."""
+
+    def natural(file: Path) -> list[tuple[int, str]]:
+        return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", file.name)]
+
+    return sorted((file for file in path.iterdir() if file.suffix in _BAG_SUFFIXES), key=natural)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[list[BagFile]]:
+    with ExitStack() as stack:
+        files: list[BagFile] = []
+        if (path / "metadata.yaml").is_file():
+            folder = BagFolder(path)
+            folder.open()
+            stack.callback(folder.close)
+            # Its storages are made from STORAGE_PLUGINS, which are BagFiles.
+            files += cast("list[BagFile]", folder.storages)
+        else:
+            for part in _bag_files(path) if path.is_dir() else [path]:
+                kind = storage_of(part)
+                if kind is None:
+                    empty = part.stat().st_size == 0
+                    raise DataError(f"{part}: {'is empty' if empty else 'is not a bag file'}")
+                file = kind(part)
+                file.open()
+                stack.callback(file.close)
+                files.append(file)
+        yield files
+
+
+@contextmanager
+def _as_data_error(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except FgtrackError:
+        raise
+    except Exception as error:  # rosbags raises its own, assertions, struct, SQLite, YAML, Unicode errors
+        raise DataError(f"{path}: cannot be read as a recording ({one_line(error)})") from error
+
+
+__all__ = ["Bag", "BagMessage", "BagTopic", "is_bag_folder", "type_name"]

@@ -1,0 +1,155 @@
+"""Writes rosbag2 recordings: fgtrack's own messages, exact to the bit, and twins that other tools show."""
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Literal
+
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2.storage_mcap import McapWriter
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
+
+from fgtrack.core.errors import DataError, FgtrackError
+from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
+from fgtrack.io.adapters.common import RosMessage
+from fgtrack.io.ros_messages import DETECTED_OBJECTS, DETECTION3D_ARRAY, MessageFactory
+from fgtrack.io.typestore import one_line
+
+_CHECKPOINT = 1000  # messages; a killed writer loses no more than that
+_PLUGINS = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
+_INT64_LIMIT = 1 << 63
+
+
+def write_bag(
+    path: Path | str,
+    messages: Iterable[Message],
+    storage: Literal["mcap", "sqlite3"] = "mcap",
+    standard_topics: bool = True,
+) -> int:
+    """Write `messages` to the new rosbag2 folder `path`; gives their number.
+
+    `/fgtrack/ego`, `/fgtrack/detections/SENSOR` and `/fgtrack/truth` hold every field to the bit and carry
+    their definitions; the log time is the receipt, the header stamp the stamp. The twins for other tools are
+    `/ego/odometry` (nav_msgs/Odometry), `/detections/SENSOR` (vision_msgs/Detection3DArray, or with speeds
+    autoware_perception_msgs/DetectedObjects) and `/truth/poses` (geometry_msgs/PoseArray); an object without a
+    position is not in them. What is written reaches the disk every thousand messages: a killed writer leaves a
+    recording that `Bag` reads up to there.
+
+    Raises
+    ------
+    DataError
+        `path` exists or cannot be written, or a time lies outside what ROS messages hold.
+    """
+    path = Path(path)
+    if path.exists():
+        raise DataError(f"{path}: exists already, choose another name or remove it")
+    try:
+        with Writer(path, version=Writer.VERSION_LATEST, storage_plugin=_PLUGINS[storage]) as bag:
+            writer = _MessageWriter(bag, standard_topics)
+            for message in messages:
+                writer.write(message)
+            writer.flush()
+    except FgtrackError as error:
+        raise type(error)(f"{path}: not written whole, {error}") from error
+    except Exception as error:  # rosbags lets SQLite, struct and operating system errors through
+        raise DataError(f"{path}: cannot be written ({one_line(error)})") from error
+    return writer.count
+
+
+class _MessageWriter:
+    """Puts messages on their topics."""
+
+    def __init__(self, bag: Writer, standard_topics: bool) -> None:
+        self._bag = bag
+        self._standard_topics = standard_topics
+        self._factory = MessageFactory()
+        self._connections: dict[str, Connection] = {}
+        self._twin_types: dict[str, str] = {}
+        self._undecided: dict[str, list[DetectionList]] = {}
+        self._truth: list[TruthState] = []
+        self.count = 0
+
+    def write(self, message: Message) -> None:
+        match message:
+            case EgoState():
+                self._put("/fgtrack/ego", self._factory.ego(message), message.receipt_ns)
+            case DetectionList():
+                topic = f"/fgtrack/detections/{_token(message.sensor)}"
+                self._put(topic, self._factory.detections(message), message.receipt_ns)
+            case TruthState():
+                self._put("/fgtrack/truth", self._factory.truth(message), message.receipt_ns)
+        if self._standard_topics:
+            self._write_twin(message)
+        self.count += 1
+        if self.count % _CHECKPOINT == 0:
+            self._checkpoint()
+
+    def flush(self) -> None:
+        """Write the twins that wait for later messages."""
+        self._write_truth_twin()
+        for messages in list(self._undecided.values()):
+            for message in messages:
+                self._write_list_twin(message, DETECTION3D_ARRAY)
+        self._undecided.clear()
+
+    def _write_twin(self, message: Message) -> None:
+        match message:
+            case EgoState():
+                self._put("/ego/odometry", self._factory.odometry(message), message.receipt_ns)
+            case TruthState():
+                times = (message.stamp_ns, message.receipt_ns)
+                if self._truth and (self._truth[0].stamp_ns, self._truth[0].receipt_ns) != times:
+                    self._write_truth_twin()
+                self._truth.append(message)
+            case DetectionList():
+                self._decide_list_twin(message)
+
+    def _decide_list_twin(self, message: DetectionList) -> None:
+        """A sensor's first object says whether it measures speed; empty lists before it wait."""
+        sensor = message.sensor
+        if sensor not in self._twin_types:
+            waiting = self._undecided.setdefault(sensor, [])
+            if not message.objects:
+                waiting.append(message)
+                return
+            fast = any(item.speed_mps is not None for item in message.objects)
+            self._twin_types[sensor] = DETECTED_OBJECTS if fast else DETECTION3D_ARRAY
+            for earlier in self._undecided.pop(sensor):
+                self._write_list_twin(earlier, self._twin_types[sensor])
+        self._write_list_twin(message, self._twin_types[sensor])
+
+    def _write_list_twin(self, message: DetectionList, msgtype: str) -> None:
+        make = (
+            self._factory.detected_objects if msgtype == DETECTED_OBJECTS else self._factory.detection3d_array
+        )
+        self._put(f"/detections/{_token(message.sensor)}", make(message), message.receipt_ns)
+
+    def _write_truth_twin(self) -> None:
+        if self._truth:
+            self._put("/truth/poses", self._factory.pose_array(self._truth), self._truth[0].receipt_ns)
+            self._truth = []
+
+    def _put(self, topic: str, message: RosMessage, log_ns: int) -> None:
+        if not 0 <= log_ns < _INT64_LIMIT:
+            raise DataError(f"receipt {log_ns} ns lies outside what a recording holds")
+        msgtype = message.__msgtype__
+        key = f"{topic} {msgtype}"
+        connection = self._connections.get(key)
+        if connection is None:
+            connection = self._bag.add_connection(topic, msgtype, typestore=self._factory.typestore)
+            self._connections[key] = connection
+        self._bag.write(connection, log_ns, self._factory.serialize(message))
+
+    def _checkpoint(self) -> None:
+        match self._bag.storage:
+            case McapWriter() as storage:
+                storage.close_chunk()
+                storage.bio.flush()
+            case Sqlite3Writer() as storage:
+                storage.conn.commit()
+
+
+def _token(name: str) -> str:
+    """`name` as a part of a topic name."""
+    return re.sub(r"\W", "_", name, flags=re.ASCII)

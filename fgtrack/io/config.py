@@ -1,0 +1,42 @@
+"""Which topics of a recording are what."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from fgtrack.core.types import Frame
+
+
+@dataclass(frozen=True)
+class TopicInput:
+    """One topic of a recording."""
+
+    topic: str
+    type: str | None = None
+    """Message type, where the topic has several or must have this one."""
+    frame: Frame | None = None
+    """Frame of the positions; by default `map` where the header names a fixed frame, else `ego`."""
+    fields: Mapping[str, str | Sequence[str]] | None = None
+    """Paths of the fields, for a type that fgtrack does not know.
+
+    `objects` is the list in the message, `stamp` its time (default `header.stamp`), `object_stamp`,
+    `object_id` and the measured components are paths in one object; several paths for one component are a
+    vector, whose length is meant: `speed_mps: [velocity.x, velocity.y]`. A quaternion gives its yaw.
+    """
+
+
+@dataclass(frozen=True)
+class InputConfig:
+    """The topics that a replay reads; a recording that fgtrack wrote needs none of it."""
+
+    ego: TopicInput | None = None
+    detections: Mapping[str, TopicInput] = field(default_factory=lambda: MappingProxyType({}))
+    """Topic of every sensor."""
+    truth: TopicInput | None = None
+    message_definitions: tuple[str, ...] = ()
+    """`.msg` files, or folders of them, of types that neither the recording nor fgtrack defines."""
+
+    @property
+    def names_topics(self) -> bool:
+        """Whether any topic is named."""
+        return bool(self.ego or self.detections or self.truth)

@@ -1,0 +1,126 @@
+"""Message definitions of the types that rosbags does not ship: fields in the order in which CDR stores them.
+
+A definition that a recording carries, and one that the user names, goes before these.
+"""
+
+# Versions of the layouts below: vision_msgs 4, radar_msgs 0.2, tier4's autoware_auto_msgs, autoware_msgs 1.
+_AUTOWARE_CLASSIFICATION = "uint8 label\nfloat32 probability\n"
+_AUTOWARE_SHAPE = "uint8 type\ngeometry_msgs/Polygon footprint\ngeometry_msgs/Vector3 dimensions\n"
+_AUTOWARE_KINEMATICS = """\
+uint8 UNAVAILABLE=0
+uint8 SIGN_UNKNOWN=1
+uint8 AVAILABLE=2
+geometry_msgs/PoseWithCovariance pose_with_covariance
+bool has_position_covariance
+uint8 orientation_availability
+geometry_msgs/TwistWithCovariance twist_with_covariance
+bool has_twist
+bool has_twist_covariance
+"""
+_AUTOWARE_OBJECT = """\
+float32 existence_probability
+ObjectClassification[] classification
+DetectedObjectKinematics kinematics
+Shape shape
+"""
+_AUTOWARE = {
+    "ObjectClassification": _AUTOWARE_CLASSIFICATION,
+    "Shape": _AUTOWARE_SHAPE,
+    "DetectedObjectKinematics": _AUTOWARE_KINEMATICS,
+    "DetectedObject": _AUTOWARE_OBJECT,
+    "DetectedObjects": "std_msgs/Header header\nDetectedObject[] objects\n",
+}
+
+FGTRACK_DEFINITIONS = {
+    "fgtrack_msgs/msg/Ego": """\
+std_msgs/Header header
+float64 x_m
+float64 y_m
+float64 yaw_rad
+float64 speed_mps
+float64 yaw_rate_radps
+float64 accel_mps2
+bool has_in_pit
+bool in_pit
+""",
+    "fgtrack_msgs/msg/Detection": """\
+# Bit i of `present` says that the i-th field below was given.
+uint16 present
+float64 x_m
+float64 y_m
+float64 yaw_rad
+float64 speed_mps
+float64 range_m
+float64 bearing_rad
+float64 range_rate_mps
+float64[] covariance
+int64 stamp_ns
+int64 object_id
+""",
+    "fgtrack_msgs/msg/DetectionList": """\
+# header.frame_id is map, ego or sensor.
+std_msgs/Header header
+string sensor
+Detection[] objects
+""",
+    "fgtrack_msgs/msg/Truth": """\
+# Bit i of `present` says that the i-th field after it was given.
+std_msgs/Header header
+int64 object_id
+float64 x_m
+float64 y_m
+uint16 present
+float64 yaw_rad
+float64 speed_mps
+float64 yaw_rate_radps
+float64 accel_mps2
+""",
+}
+
+#: Text of every definition by type name.
+DEFINITIONS: dict[str, str] = {
+    **FGTRACK_DEFINITIONS,
+    **{f"autoware_perception_msgs/msg/{name}": text for name, text in _AUTOWARE.items()},
+    **{f"autoware_auto_perception_msgs/msg/{name}": text for name, text in _AUTOWARE.items()},
+    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
+    "vision_msgs/msg/ObjectHypothesisWithPose": """\
+ObjectHypothesis hypothesis
+geometry_msgs/PoseWithCovariance pose
+""",
+    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
+    "vision_msgs/msg/Detection3D": """\
+std_msgs/Header header
+ObjectHypothesisWithPose[] results
+BoundingBox3D bbox
+string id
+""",
+    "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nDetection3D[] detections\n",
+    "radar_msgs/msg/RadarTrack": """\
+unique_identifier_msgs/UUID uuid
+geometry_msgs/Point position
+geometry_msgs/Vector3 velocity
+geometry_msgs/Vector3 acceleration
+geometry_msgs/Vector3 size
+uint16 classification
+float32[6] position_covariance
+float32[6] velocity_covariance
+float32[6] acceleration_covariance
+float32[6] size_covariance
+""",
+    "radar_msgs/msg/RadarTracks": "std_msgs/Header header\nRadarTrack[] tracks\n",
+    "derived_object_msgs/msg/Object": """\
+std_msgs/Header header
+uint32 id
+uint8 detection_level
+bool object_classified
+geometry_msgs/Pose pose
+geometry_msgs/Twist twist
+geometry_msgs/Accel accel
+geometry_msgs/Polygon polygon
+shape_msgs/SolidPrimitive shape
+uint8 classification
+uint8 classification_certainty
+uint32 classification_age
+""",
+    "derived_object_msgs/msg/ObjectArray": "std_msgs/Header header\nObject[] objects\n",
+}

@@ -1,0 +1,204 @@
+"""Makes ROS messages: fgtrack's own, and the standard ones that other tools show."""
+
+import math
+
+import numpy as np
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import STATE_NAMES, Detection, DetectionList, EgoState, FloatArray, Frame, TruthState
+from fgtrack.io.adapters.common import RosMessage
+from fgtrack.io.adapters.native import DETECTION_OPTIONAL, DETECTIONS, EGO, TRUTH, TRUTH_OPTIONAL, presence
+from fgtrack.io.typestore import build_typestore
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+DETECTION3D_ARRAY = "vision_msgs/msg/Detection3DArray"
+DETECTED_OBJECTS = "autoware_perception_msgs/msg/DetectedObjects"
+POSE_ARRAY = "geometry_msgs/msg/PoseArray"
+
+_FRAME_IDS: dict[Frame, str] = {"map": "map", "ego": "base_link"}
+_SECONDS_LIMIT = 1 << 31  # builtin_interfaces/Time holds 32 bits
+
+
+class MessageFactory:
+    """Makes and serializes messages of the types that fgtrack writes."""
+
+    def __init__(self) -> None:
+        self.typestore, _ = build_typestore((), ros1=False)
+
+    def serialize(self, message: RosMessage) -> memoryview:
+        """CDR bytes of `message`."""
+        return self.typestore.serialize_cdr(message, message.__msgtype__)
+
+    def ego(self, state: EgoState) -> RosMessage:
+        """`fgtrack_msgs/Ego`."""
+        return self._make(
+            EGO,
+            header=self._header(state.stamp_ns, "map"),
+            **{name: getattr(state, name) for name in STATE_NAMES},
+            has_in_pit=state.in_pit is not None,
+            in_pit=bool(state.in_pit),
+        )
+
+    def detections(self, message: DetectionList) -> RosMessage:
+        """`fgtrack_msgs/DetectionList`; its header's frame is fgtrack's own name of it."""
+        return self._make(
+            DETECTIONS,
+            header=self._header(message.stamp_ns, message.frame),
+            sensor=message.sensor,
+            objects=[self._detection(item) for item in message.objects],
+        )
+
+    def truth(self, state: TruthState) -> RosMessage:
+        """`fgtrack_msgs/Truth`."""
+        return self._make(
+            TRUTH,
+            header=self._header(state.stamp_ns, "map"),
+            object_id=state.object_id,
+            x_m=state.x_m,
+            y_m=state.y_m,
+            present=presence(state, TRUTH_OPTIONAL),
+            **{name: getattr(state, name) or 0.0 for name in TRUTH_OPTIONAL},
+        )
+
+    def odometry(self, state: EgoState) -> RosMessage:
+        """`nav_msgs/Odometry` in the frame `map`."""
+        return self._make(
+            ODOMETRY,
+            header=self._header(state.stamp_ns, "map"),
+            child_frame_id=_FRAME_IDS["ego"],
+            pose=self._with_covariance("Pose", self._pose(state.x_m, state.y_m, state.yaw_rad), None),
+            twist=self._with_covariance("Twist", self._twist(state.speed_mps, state.yaw_rate_radps), None),
+        )
+
+    def detection3d_array(self, message: DetectionList) -> RosMessage:
+        """`vision_msgs/Detection3DArray` of the objects that have a position."""
+        return self._make(
+            DETECTION3D_ARRAY,
+            header=self._list_header(message),
+            detections=[self._detection3d(item) for item in message.objects if _has_position(item)],
+        )
+
+    def detected_objects(self, message: DetectionList) -> RosMessage:
+        """`autoware_perception_msgs/DetectedObjects` of the objects that have a position."""
+        return self._make(
+            DETECTED_OBJECTS,
+            header=self._list_header(message),
+            objects=[self._detected_object(item) for item in message.objects if _has_position(item)],
+        )
+
+    def pose_array(self, states: list[TruthState]) -> RosMessage:
+        """`geometry_msgs/PoseArray` in the frame `map`, of states of one stamp."""
+        return self._make(
+            POSE_ARRAY,
+            header=self._header(states[0].stamp_ns, "map"),
+            poses=[self._pose(state.x_m, state.y_m, state.yaw_rad) for state in states],
+        )
+
+    def _make(self, name: str, **fields: RosMessage) -> RosMessage:
+        return self.typestore.types[name](**fields)
+
+    def _header(self, stamp_ns: int, frame_id: str) -> RosMessage:
+        sec, nanosec = divmod(stamp_ns, NS_PER_S)
+        if not -_SECONDS_LIMIT <= sec < _SECONDS_LIMIT:
+            raise DataError(f"stamp {stamp_ns} ns lies outside what a ROS header holds (1901 to 2038)")
+        stamp = self._make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+
+    def _list_header(self, message: DetectionList) -> RosMessage:
+        return self._header(message.stamp_ns, _FRAME_IDS.get(message.frame, message.sensor))
+
+    def _detection(self, item: Detection) -> RosMessage:
+        given = {name: getattr(item, name) or 0 for name in DETECTION_OPTIONAL}
+        given["covariance"] = np.array(item.covariance or (), dtype=np.float64)
+        return self._make("fgtrack_msgs/msg/Detection", present=presence(item, DETECTION_OPTIONAL), **given)
+
+    def _detection3d(self, item: Detection) -> RosMessage:
+        pose = self._pose(item.x_m, item.y_m, item.yaw_rad)
+        results = []
+        if (covariance := _full_covariance(item)) is not None:
+            hypothesis = self._make("vision_msgs/msg/ObjectHypothesis", class_id="", score=1.0)
+            result = "vision_msgs/msg/ObjectHypothesisWithPose"
+            results.append(
+                self._make(
+                    result, hypothesis=hypothesis, pose=self._with_covariance("Pose", pose, covariance[0])
+                )
+            )
+        return self._make(
+            "vision_msgs/msg/Detection3D",
+            header=self._header(item.stamp_ns or 0, ""),
+            results=results,
+            bbox=self._make("vision_msgs/msg/BoundingBox3D", center=pose, size=self._vector(0.0, 0.0)),
+            id="" if item.object_id is None else str(item.object_id),
+        )
+
+    def _detected_object(self, item: Detection) -> RosMessage:
+        package = "autoware_perception_msgs/msg"
+        covariance = _full_covariance(item)
+        pose, twist = (None, None) if covariance is None else covariance
+        kinematics = self._make(
+            f"{package}/DetectedObjectKinematics",
+            pose_with_covariance=self._with_covariance(
+                "Pose", self._pose(item.x_m, item.y_m, item.yaw_rad), pose
+            ),
+            has_position_covariance=pose is not None,
+            orientation_availability=0 if item.yaw_rad is None else 2,
+            twist_with_covariance=self._with_covariance("Twist", self._twist(item.speed_mps, 0.0), twist),
+            has_twist=item.speed_mps is not None,
+            has_twist_covariance=twist is not None and item.speed_mps is not None,
+        )
+        footprint = self._make("geometry_msgs/msg/Polygon", points=[])
+        shape = self._make(f"{package}/Shape", type=0, footprint=footprint, dimensions=self._vector(0.0, 0.0))
+        return self._make(
+            f"{package}/DetectedObject",
+            existence_probability=1.0,
+            classification=[],
+            kinematics=kinematics,
+            shape=shape,
+        )
+
+    def _vector(self, x: float, y: float, z: float = 0.0) -> RosMessage:
+        return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+    def _pose(self, x_m: float | None, y_m: float | None, yaw_rad: float | None) -> RosMessage:
+        """A pose; an unknown yaw is the quaternion of norm 0."""
+        half = 0.0 if yaw_rad is None else 0.5 * yaw_rad
+        w = 0.0 if yaw_rad is None else math.cos(half)
+        return self._make(
+            "geometry_msgs/msg/Pose",
+            position=self._make("geometry_msgs/msg/Point", x=x_m, y=y_m, z=0.0),
+            orientation=self._make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(half), w=w),
+        )
+
+    def _twist(self, speed_mps: float | None, yaw_rate_radps: float) -> RosMessage:
+        return self._make(
+            "geometry_msgs/msg/Twist",
+            linear=self._vector(speed_mps or 0.0, 0.0),
+            angular=self._vector(0.0, 0.0, yaw_rate_radps),
+        )
+
+    def _with_covariance(self, kind: str, value: RosMessage, covariance: FloatArray | None) -> RosMessage:
+        flat = np.zeros(36) if covariance is None else covariance.ravel()
+        fields = {kind.lower(): value, "covariance": flat}
+        return self._make(f"geometry_msgs/msg/{kind}WithCovariance", **fields)
+
+
+def _has_position(item: Detection) -> bool:
+    return item.x_m is not None and item.y_m is not None
+
+
+def _full_covariance(item: Detection) -> tuple[FloatArray, FloatArray] | None:
+    """Covariances, shape (6, 6), of pose and twist; None where the detection has none."""
+    if item.covariance is None:
+        return None
+    given = np.asarray(item.covariance).reshape(len(item.measured), -1)
+    pose, twist = np.zeros((6, 6)), np.zeros((6, 6))
+    place = {"x_m": 0, "y_m": 1, "yaw_rad": 5}
+    kept = [(place[name], index) for index, name in enumerate(item.measured) if name in place]
+    for row, i in kept:
+        for column, j in kept:
+            pose[row, column] = given[i, j]
+    if "speed_mps" in item.measured:
+        index = item.measured.index("speed_mps")
+        twist[0, 0] = given[index, index]
+    return pose, twist

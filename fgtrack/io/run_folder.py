@@ -1,0 +1,19 @@
+"""The run folder `fgtrack-run/1`, the interface of tracking and evaluation: writer, reader, layout."""
+
+from fgtrack.io.run_layout import COLUMNS, COVARIANCE_COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
+from fgtrack.io.run_reader import NO_TRACK, Run, Table, read_run
+from fgtrack.io.run_writer import RunWriter, digest, is_run_folder
+
+__all__ = [
+    "COLUMNS",
+    "COVARIANCE_COLUMNS",
+    "NO_TRACK",
+    "OPTIONAL_TABLES",
+    "RUN_FORMAT",
+    "Run",
+    "RunWriter",
+    "Table",
+    "digest",
+    "is_run_folder",
+    "read_run",
+]

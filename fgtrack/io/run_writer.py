@@ -1,0 +1,243 @@
+"""Writes a run folder as the run goes."""
+
+import hashlib
+import json
+import os
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
+from operator import itemgetter
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, Self
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.types import (
+    MEASURABLE,
+    STATE_NAMES,
+    Disposition,
+    SmoothedReport,
+    TickReport,
+    TrackReport,
+    TrackState,
+    TruthState,
+    UpdateRecord,
+)
+from fgtrack.io.run_layout import COLUMNS, COVARIANCE_STATES, OPTIONAL_TABLES, RUN_FORMAT
+
+_FILES = ("meta.json", "config.yaml", "metrics.json", *(f"{table}.csv" for table in COLUMNS))
+
+
+class RunWriter:
+    """Writes a run folder as the run goes; a context manager.
+
+    Every tick reaches the files before `write_tick` returns, so a killed run leaves readable files and a
+    `meta.json` with `"complete": false`. An older run folder at `path` is replaced, file by file.
+
+    Parameters
+    ----------
+    path
+        Folder of the run; made if need be.
+    config_text
+        Text of `config.yaml`, the resolved configuration.
+    meta
+        What `meta.json` says from the start on.
+
+    Raises
+    ------
+    CallError
+        `path` is a file, or a folder that holds something else than a run.
+    """
+
+    def __init__(
+        self, path: Path | str, config_text: str = "", meta: Mapping[str, object] | None = None
+    ) -> None:
+        self.path = Path(path)
+        self._files: dict[str, BinaryIO] = {}
+        self._counts: dict[str, Counter[Disposition]] = {}
+        self._meta: dict[str, object] = {"format": RUN_FORMAT, **(meta or {})}
+        _prepare_folder(self.path)
+        try:
+            (self.path / "config.yaml").write_text(config_text, encoding="utf-8")
+            self._write_meta(complete=False)
+        except OSError as error:
+            raise CallError(f"{self.path}: cannot be written to ({error.strerror})") from error
+        for table in COLUMNS:
+            if table not in OPTIONAL_TABLES:
+                self._append(table, "")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the tables; without `finish` before, the run stays marked as incomplete."""
+        while self._files:
+            self._files.popitem()[1].close()
+
+    def write_tick(self, report: TickReport, process_ns: int, num_detections: int) -> None:
+        """Append all rows of one tick.
+
+        Parameters
+        ----------
+        report
+            What the tracker gave.
+        process_ns
+            Wall time of the tick.
+        num_detections
+            Detections that the tick received.
+        """
+        if report.tracks:
+            prefix = f"{report.tick},{report.now_ns},"
+            self._append("tracks", "".join([prefix + _track_row(track) for track in report.tracks]))
+        if report.updates:
+            self._append("updates", "".join([f"{report.tick},{_update_row(row)}" for row in report.updates]))
+            for record in report.updates:
+                self._counts.setdefault(record.sensor, Counter())[record.disposition] += 1
+        if report.smoothed:
+            self._append("smoothed", "".join([_smoothed_row(row) for row in report.smoothed]))
+        counts = f"{len(report.tracks)},{num_detections}"
+        self._append("timing", f"{report.tick},{report.now_ns},{process_ns},{counts}\n")
+
+    def write_truth(self, truth: TruthState) -> None:
+        """Append one row to truth.csv."""
+        state = ",".join([_cell(getattr(truth, name)) for name in STATE_NAMES])
+        self._append("truth", f"{truth.stamp_ns},{truth.object_id},{state}\n")
+
+    def finish(self, meta: Mapping[str, object]) -> dict[str, object]:
+        """Close the tables and rewrite `meta.json` with `meta`, the counts and the digest; gives its content.
+
+        `counts` holds, per sensor, the number of detections of every disposition.
+        """
+        self.close()
+        self._meta |= {
+            **meta,
+            "counts": {
+                sensor: {disposition.value: counts[disposition] for disposition in Disposition}
+                for sensor, counts in sorted(self._counts.items())
+            },
+            "digest": digest(self.path),
+        }
+        self._write_meta(complete=True)
+        return dict(self._meta)
+
+    def _append(self, table: str, rows: str) -> None:
+        file = self._files.get(table)
+        path = self.path / f"{table}.csv"
+        try:
+            if file is None:
+                file = self._files[table] = path.open("wb", buffering=0)
+                rows = ",".join(COLUMNS[table]) + "\n" + rows
+            file.write(rows.encode())
+        except OSError as error:
+            raise DataError(f"{path}: cannot be written ({error.strerror}), free some space") from error
+
+    def _write_meta(self, complete: bool) -> None:
+        self._meta["complete"] = complete
+        part = self.path / "meta.json.part"
+        part.write_text(json.dumps(self._meta, indent=2) + "\n", encoding="utf-8")
+        os.replace(part, self.path / "meta.json")
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of the bytes of tracks.csv and then updates.csv of the run folder `path`, in hex."""
+    sha = hashlib.sha256()
+    for name in ("tracks.csv", "updates.csv"):
+        with (path / name).open("rb") as file:
+            while block := file.read(1 << 20):
+                sha.update(block)
+    return sha.hexdigest()
+
+
+def is_run_folder(path: Path) -> bool:
+    """Whether `path` holds a run: its `meta.json` names the format."""
+    try:
+        meta = json.loads((path / "meta.json").read_bytes())
+    except (OSError, ValueError):
+        return False
+    return isinstance(meta, dict) and meta.get("format") == RUN_FORMAT
+
+
+def _prepare_folder(path: Path) -> None:
+    if path.exists() and not path.is_dir():
+        raise CallError(f"{path}: is a file, a run needs a folder")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        if any(path.iterdir()) and not is_run_folder(path):
+            raise CallError(f"{path}: is not empty and not a run folder, choose another one")
+        for name in _FILES:
+            (path / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise CallError(f"{path}: cannot be made a run folder ({error.strerror})") from error
+
+
+def _cell(value: float | None) -> str:
+    return "" if value is None else f"{value:.17g}"
+
+
+@lru_cache
+def _text(name: str) -> str:
+    """`name` as a CSV cell."""
+    return '"' + name.replace('"', '""') + '"' if set(name) & set(',"\r\n') else name
+
+
+@lru_cache
+def _state_layout(size: int) -> tuple[str, str, Callable[[list[float]], tuple[float, ...]]]:
+    """Format of the mean and of the covariance of `size` states, and what picks its upper triangle."""
+    kept = range(len(COVARIANCE_STATES))
+    cells = [(i, j) for i in kept for j in kept[i:]]
+    mean = ",".join("%.17g" if i < size else "" for i in range(len(STATE_NAMES)))
+    covariance = ",".join("%.17g" if j < size else "" for _, j in cells)
+    # itemgetter's result type depends on the number of its arguments, which is 3 or more here.
+    pick: Any = itemgetter(*[i * size + j for i, j in cells if j < size])
+    return mean, covariance, pick
+
+
+@lru_cache
+def _track_format(size: int) -> str:
+    mean, covariance, _ = _state_layout(size)
+    return f"%d,%d,%s,{mean},%d,{covariance}\n"
+
+
+@lru_cache
+def _smoothed_format(size: int) -> str:
+    mean, covariance, _ = _state_layout(size)
+    return f"%d,%d,%s,{mean},{covariance}\n"
+
+
+def _upper_triangle(state: TrackState) -> Iterable[float]:
+    pick = _state_layout(len(state.mean))[2]
+    return pick(state.covariance.ravel().tolist())
+
+
+def _track_row(track: TrackReport) -> str:
+    state = track.state
+    mean = state.mean.tolist()
+    return _track_format(len(mean)) % (
+        *(state.stamp_ns, track.track_id, track.status),
+        *mean,
+        track.num_measured,
+        *_upper_triangle(state),
+    )
+
+
+def _smoothed_row(row: SmoothedReport) -> str:
+    mean = row.state.mean.tolist()
+    ids = (row.track_id, row.state.stamp_ns, row.kind)
+    return _smoothed_format(len(mean)) % (*ids, *mean, *_upper_triangle(row.state))
+
+
+def _update_row(row: UpdateRecord) -> str:
+    track = "" if row.track_id is None else row.track_id
+    innovation = ",".join([_cell(row.innovation.get(name)) for name in MEASURABLE])
+    return (
+        f"{_text(row.sensor)},{row.stamp_ns},{row.receipt_ns},{row.index},{row.disposition},{track},"
+        f"{_cell(row.nis)},{innovation}\n"
+    )

@@ -1,0 +1,208 @@
+"""From the topics of a recording to fgtrack's messages, as the configuration says."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.types import DetectionList, Message, TruthState
+from fgtrack.io.adapters.common import ObjectList, RosMessage
+from fgtrack.io.adapters.ego import ODOMETRY, ego_from_odometry
+from fgtrack.io.adapters.fields import (
+    EGO_FIELDS,
+    OBJECT_FIELDS,
+    FieldError,
+    ego_by_fields,
+    objects_by_fields,
+)
+from fgtrack.io.adapters.native import NATIVE_ADAPTERS
+from fgtrack.io.adapters.objects import OBJECT_ADAPTERS
+from fgtrack.io.bag import Bag, BagTopic, type_name
+from fgtrack.io.config import InputConfig, TopicInput
+from fgtrack.io.errors import TruncatedInput
+
+Convert = Callable[[RosMessage, int], Iterator[Message]]
+
+
+@dataclass(frozen=True)
+class TopicUse:
+    """What a replay makes of one topic."""
+
+    topic: BagTopic
+    role: str
+    """`ego`, `detections SENSOR`, `truth`, or `messages` for what fgtrack itself has written."""
+    convert: Convert
+    """Gives the messages of a ROS message and its receipt."""
+
+
+def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
+    """What the topics of `bag` are, as `config` names them.
+
+    A recording of fgtrack's own is known by its message types; `config` goes before where it names a topic of
+    the recording.
+
+    Raises
+    ------
+    DataError
+        The recording lacks a named topic, or nothing says what its topics are.
+    CallError
+        The configuration of a topic does not fit its type.
+    """
+    names = {topic.name for topic in bag.topics}
+    named = [item.topic for item in (config.ego, *config.detections.values(), config.truth) if item]
+    native = tuple(
+        TopicUse(topic, "messages", _native(topic.type))
+        for topic in bag.topics
+        if topic.type in NATIVE_ADAPTERS
+    )
+    if native and names.isdisjoint(named):
+        return native
+    if not named:
+        if bag.break_off:
+            raise TruncatedInput(f"{bag.break_off}, and holds no topic that fgtrack has written")
+        raise DataError(
+            f"{bag.path}: not written by fgtrack, so the configuration must name its topics "
+            f"(input.ego, input.detections); it has {_listed(bag.topics)}"
+        )
+    uses = []
+    if config.ego:
+        topic = _find(bag, config.ego)
+        uses.append(TopicUse(topic, "ego", _ego(topic, config.ego)))
+    for sensor, item in config.detections.items():
+        topic = _find(bag, item)
+        uses.append(TopicUse(topic, f"detections {sensor}", _detections(topic, item, sensor)))
+    if config.truth:
+        topic = _find(bag, config.truth)
+        uses.append(TopicUse(topic, "truth", _truth(topic, config.truth)))
+    return tuple(uses)
+
+
+def bag_messages(bag: Bag, uses: tuple[TopicUse, ...]) -> Iterator[Message]:
+    """Messages of `bag` in receipt order, which is the order of the recorder's log times.
+
+    Raises
+    ------
+    TruncatedInput
+        The recording breaks off; raised after everything before the break.
+    DataError
+        A message is not what its topic's use asks for.
+    """
+    by_topic: dict[tuple[str, str], list[TopicUse]] = {}
+    for use in uses:
+        by_topic.setdefault((use.topic.name, use.topic.type), []).append(use)
+    for message in bag.messages({use.topic.name for use in uses}):
+        for use in by_topic.get((message.topic, message.type), ()):
+            try:
+                yield from use.convert(message.data, message.log_ns)
+            except (FieldError, AttributeError, TypeError, ValueError, OverflowError) as error:
+                raise DataError(
+                    f"{bag.path}: topic {message.topic} ({message.type}) at {message.log_ns} ns: {error}"
+                ) from error
+
+
+def _find(bag: Bag, item: TopicInput) -> BagTopic:
+    wanted = type_name(item.type) if item.type else None
+    here = [topic for topic in bag.topics if topic.name == item.topic]
+    found = [topic for topic in here if wanted in (None, topic.type)]
+    if len(found) == 1:
+        return found[0]
+    if not here and bag.break_off:
+        raise TruncatedInput(f"{bag.break_off}, before topic {item.topic}")
+    if len(found) > 1:
+        types = ", ".join(topic.type for topic in found)
+        raise DataError(f"{bag.path}: topic {item.topic} has several types ({types}), name one as its type")
+    if here:
+        raise DataError(f"{bag.path}: topic {item.topic} is a {here[0].type}, not a {wanted}")
+    alike = [topic for topic in bag.topics if topic.type == wanted]
+    has = f"of that type it has {_listed(alike)}" if alike else f"it has {_listed(bag.topics)}"
+    raise DataError(f"{bag.path}: has no topic {item.topic}; {has}")
+
+
+def _listed(topics: tuple[BagTopic, ...] | list[BagTopic]) -> str:
+    return ", ".join(f"{topic.name} ({topic.type})" for topic in topics) or "no topic"
+
+
+def _check_fields(item: TopicInput, known: frozenset[str], needed: tuple[str, ...] = ()) -> None:
+    fields = item.fields or {}
+    for name in sorted(set(fields) - known):
+        raise CallError(f"topic {item.topic}: unknown field {name!r}, known are {', '.join(sorted(known))}")
+    for name in needed:
+        if name not in fields:
+            raise CallError(f"topic {item.topic}: fields must name {name}")
+
+
+def _native(msgtype: str) -> Convert:
+    adapter = NATIVE_ADAPTERS[msgtype]
+
+    def convert(message: RosMessage, receipt_ns: int) -> Iterator[Message]:
+        yield adapter(message, receipt_ns)
+
+    return convert
+
+
+def _ego(topic: BagTopic, item: TopicInput) -> Convert:
+    fields = item.fields
+    if fields is not None:
+        _check_fields(item, EGO_FIELDS, ("x_m", "y_m", "yaw_rad", "speed_mps"))
+    elif topic.type in NATIVE_ADAPTERS:
+        return _native(topic.type)
+    elif topic.type != ODOMETRY:
+        raise CallError(f"topic {topic.name}: an ego of type {topic.type} needs fields, known is {ODOMETRY}")
+
+    def convert(message: RosMessage, receipt_ns: int) -> Iterator[Message]:
+        if fields is None:
+            yield ego_from_odometry(message, receipt_ns)
+        else:
+            yield ego_by_fields(message, fields, receipt_ns)
+
+    return convert
+
+
+def _object_list(topic: BagTopic, item: TopicInput) -> Callable[[RosMessage], ObjectList]:
+    if item.fields is not None:
+        fields = item.fields
+        _check_fields(item, OBJECT_FIELDS)
+        return lambda message: objects_by_fields(message, fields)
+    adapter = OBJECT_ADAPTERS.get(topic.type)
+    if adapter is None:
+        known = ", ".join(sorted(OBJECT_ADAPTERS))
+        raise CallError(f"topic {topic.name}: objects of type {topic.type} need fields, known are {known}")
+    return adapter
+
+
+def _detections(topic: BagTopic, item: TopicInput, sensor: str) -> Convert:
+    if topic.type in NATIVE_ADAPTERS:
+        return _native(topic.type)
+    read = _object_list(topic, item)
+
+    def convert(message: RosMessage, receipt_ns: int) -> Iterator[Message]:
+        objects = read(message)
+        stamp = receipt_ns if objects.stamp_ns is None else objects.stamp_ns
+        frame = item.frame or objects.frame or "ego"
+        yield DetectionList(sensor, stamp, receipt_ns, objects.objects, frame)
+
+    return convert
+
+
+def _truth(topic: BagTopic, item: TopicInput) -> Convert:
+    """One state per object; an object without an id is known by its place in the list."""
+    if topic.type in NATIVE_ADAPTERS:
+        return _native(topic.type)
+    read = _object_list(topic, item)
+
+    def convert(message: RosMessage, receipt_ns: int) -> Iterator[Message]:
+        objects = read(message)
+        stamp = receipt_ns if objects.stamp_ns is None else objects.stamp_ns
+        for index, state in enumerate(objects.objects):
+            if state.x_m is None or state.y_m is None:
+                raise FieldError("truth needs x_m and y_m")
+            yield TruthState(
+                stamp if state.stamp_ns is None else state.stamp_ns,
+                receipt_ns,
+                index if state.object_id is None else state.object_id,
+                state.x_m,
+                state.y_m,
+                state.yaw_rad,
+                state.speed_mps,
+            )
+
+    return convert

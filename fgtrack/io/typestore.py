@@ -1,0 +1,115 @@
+"""The message types of a recording: rosbags' own, ours, the user's and those that the recording carries."""
+
+from collections.abc import Iterable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import cast
+
+from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat, Nodetype
+from rosbags.interfaces.typing import FieldDesc, Typesdict
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from fgtrack.core.errors import CallError
+from fgtrack.io.definitions import DEFINITIONS
+
+_IDL_SEPARATOR = "=" * 80 + "\n"
+
+
+def type_name(name: str) -> str:
+    """Full name of a message type: `pkg/Type` becomes `pkg/msg/Type`."""
+    package, _, base = name.partition("/")
+    return name if "/" in base else f"{package}/msg/{base}"
+
+
+def build_typestore(
+    connections: Iterable[Connection], ros1: bool, message_definitions: Iterable[str] = ()
+) -> tuple[Typestore, Mapping[str, str]]:
+    """Types for the messages of `connections`; by type name, why a definition of theirs cannot be read.
+
+    A definition that the recording carries goes before the user's, that before ours, that before rosbags'.
+
+    Raises
+    ------
+    CallError
+        One of the user's `message_definitions` cannot be read.
+    """
+    types: Typesdict = dict(_shipped_types(ros1))
+    for path in message_definitions:
+        types |= _user_types(Path(path))
+    unreadable: dict[str, str] = {}
+    for connection in connections:
+        try:
+            types |= _embedded_types(connection.msgtype, connection.msgdef)
+        except Exception as error:  # whatever a foreign definition makes the parser raise
+            unreadable[connection.msgtype] = f"its embedded definition cannot be read ({one_line(error)})"
+    store = get_typestore(Stores.EMPTY)
+    store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
+    return store, unreadable
+
+
+def one_line(error: BaseException) -> str:
+    """What `error` says, in one line of at most 200 characters."""
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def missing_type(store: Typestore, name: str) -> str | None:
+    """Name of the first type that is not in `store` and that `name` needs, itself included."""
+    pending, seen = [name], {name}
+    while pending:
+        current = pending.pop()
+        if current not in store.fielddefs:
+            return current
+        for _, description in store.fielddefs[current][1]:
+            for needed in _named_types(description):
+                if needed not in seen:
+                    seen.add(needed)
+                    pending.append(needed)
+    return None
+
+
+def _named_types(description: FieldDesc) -> list[str]:
+    kind, value = description
+    if kind == Nodetype.NAME:
+        return [cast("str", value)]
+    if kind == Nodetype.BASE:
+        return []
+    return _named_types(cast("tuple[FieldDesc, int]", value)[0])  # an array or a sequence, with its size
+
+
+@cache
+def _shipped_types(ros1: bool) -> Typesdict:
+    # Recordings without definitions are from Humble or older.
+    types = dict(get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE).fielddefs)
+    for name, text in DEFINITIONS.items():
+        types |= get_types_from_msg(text, name)
+    return types
+
+
+def _user_types(path: Path) -> Typesdict:
+    files = sorted(path.rglob("*.msg")) if path.is_dir() else [path]
+    if not files:
+        raise CallError(f"{path}: holds no .msg file")
+    types: Typesdict = {}
+    for file in files:
+        package = file.parent.parent.name if file.parent.name == "msg" else file.parent.name
+        try:
+            types |= get_types_from_msg(file.read_text(encoding="utf-8"), f"{package}/msg/{file.stem}")
+        except Exception as error:  # whatever a foreign definition makes the parser raise
+            raise CallError(f"{file}: is not a message definition ({one_line(error)})") from error
+    return types
+
+
+def _embedded_types(name: str, definition: MessageDefinition) -> Typesdict:
+    match definition.format:
+        case MessageDefinitionFormat.MSG if definition.data.strip():
+            return get_types_from_msg(definition.data, name)
+        case MessageDefinitionFormat.IDL if definition.data.startswith(f"{_IDL_SEPARATOR}IDL: "):
+            types: Typesdict = {}
+            for part in definition.data.split(_IDL_SEPARATOR)[1:]:
+                types |= get_types_from_idl(part.partition("\n")[2])
+            return types
+        case MessageDefinitionFormat.IDL:
+            return get_types_from_idl(definition.data)
+        case _:
+            return {}

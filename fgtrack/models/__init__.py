@@ -1,0 +1,1 @@
+"""Motion, measurement, sensor and map models: every equation once."""

@@ -1,0 +1,226 @@
+"""Measurement models: any subset of the measurable components, seen from a sensor pose.
+
+x_m, y_m and yaw_rad are in the map frame and speed_mps is over ground along the heading. range_m, bearing_rad
+(0 along the sensor's x axis, counter-clockwise) and range_rate_mps are relative to the sensor.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.errors import CallError
+from fgtrack.core.geometry import wrap_angles
+from fgtrack.core.types import MEASURABLE, STATE_NAMES, FloatArray, IntArray
+from fgtrack.models.motion import (
+    CV,
+    MIN_SPEED_MPS,
+    MotionModel,
+    cartesian,
+    cartesian_gradient,
+    polar,
+    polar_gradient,
+)
+
+#: The gradient of a bearing by the position grows as 1 / range; below this range it stays as it is there.
+MIN_RANGE_M = 1e-6
+
+_ANGULAR = ("yaw_rad", "bearing_rad")
+_NONE = np.zeros(2)
+
+
+@dataclass(frozen=True, slots=True)
+class SensorPose:
+    """Pose and velocity of a sensor in the map at the stamp of the measurement."""
+
+    x_m: float = 0.0
+    y_m: float = 0.0
+    yaw_rad: float = 0.0
+    vx_mps: float = 0.0
+    vy_mps: float = 0.0
+
+
+@dataclass(frozen=True)
+class MeasurementModel:
+    """What is measured of a state, z = h(x, pose) + noise; `measurement_model` gives a shared one.
+
+    A state may have more entries than `state_names`; the Jacobian is as wide as the state that it is given.
+    Raises `CallError` when a component is unknown, repeated or out of order, or the state is of another kind.
+    """
+
+    components: tuple[str, ...]
+    """Measured components, a non-empty subset of `MEASURABLE` in that order."""
+    state_names: tuple[str, ...]
+    """Names of the entries of the state: x, y and either yaw, speed or vx, vy, and what follows."""
+
+    def __post_init__(self) -> None:
+        if not self.components or self.components != tuple(
+            name for name in MEASURABLE if name in self.components
+        ):
+            raise CallError(
+                f"measurement of {', '.join(self.components) or 'nothing'}: give one or more of "
+                f"{', '.join(MEASURABLE)}, each once and in this order"
+            )
+        if self.state_names[:4] not in (STATE_NAMES[:4], CV.state_names):
+            raise CallError(
+                f"state of {', '.join(self.state_names)}: must begin with {', '.join(STATE_NAMES[:4])} "
+                f"or {', '.join(CV.state_names)}"
+            )
+
+    @cached_property
+    def angular(self) -> tuple[bool, ...]:
+        """For each component, whether it is an angle."""
+        return tuple(name in _ANGULAR for name in self.components)
+
+    @cached_property
+    def linear(self) -> bool:
+        """Whether the measurement selects entries of the state, whatever the sensor pose."""
+        return set(self.components) <= set(self.state_names)
+
+    def predict(self, x: FloatArray, pose: SensorPose = SensorPose()) -> FloatArray:
+        """Measurement expected of the states `x`, shape (..., n) -> (..., k). Angles are not wrapped."""
+        if self.linear:
+            return x[..., self._selected]
+        scene = _Scene(x, pose, self._cartesian)
+        return np.stack([_COMPONENTS[name].value(scene) for name in self.components], axis=-1)
+
+    def jacobian(self, x: FloatArray, pose: SensorPose = SensorPose()) -> FloatArray:
+        """Derivative H of `predict` by `x`, shape (..., k, n); read-only where the model is linear.
+
+        Finite everywhere: the gradient of an angle grows up to `MIN_RANGE_M` and `MIN_SPEED_MPS` and no
+        further.
+        """
+        shape = (*x.shape[:-1], len(self.components), x.shape[-1])
+        if self.linear:
+            H = _selection_matrix(self, x.shape[-1])
+            return H if x.ndim == 1 else np.broadcast_to(H, shape)
+        scene = _Scene(x, pose, self._cartesian)
+        H = np.zeros(shape)
+        for row, name in enumerate(self.components):
+            H[..., row, :2], H[..., row, 2:4] = _COMPONENTS[name].gradient(scene)
+        return H
+
+    def residual(self, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
+        """Measured minus predicted, shape (..., k), with angles in (-pi, pi]; the only place that wraps."""
+        y = np.asarray(z - z_predicted)
+        for index in self._angular_indices:
+            y[..., index] = wrap_angles(y[..., index])
+        return y
+
+    @cached_property
+    def _cartesian(self) -> bool:
+        return "vx_mps" in self.state_names
+
+    @cached_property
+    def _selected(self) -> IntArray:
+        return np.array([self.state_names.index(name) for name in self.components])
+
+    @cached_property
+    def _angular_indices(self) -> tuple[int, ...]:
+        return tuple(index for index, angular in enumerate(self.angular) if angular)
+
+
+def measurement_model(components: tuple[str, ...], motion_model: MotionModel) -> MeasurementModel:
+    """The measurement of `components` for the state of `motion_model`: one shared object for each."""
+    return _shared_model(components, motion_model.state_names)
+
+
+@cache
+def _shared_model(components: tuple[str, ...], state_names: tuple[str, ...]) -> MeasurementModel:
+    return MeasurementModel(components, state_names)
+
+
+@cache
+def _selection_matrix(model: MeasurementModel, n: int) -> FloatArray:
+    """Jacobian of a linear model for states of `n` entries, shape (k, n), read-only."""
+    H = np.eye(n)[model._selected]
+    H.flags.writeable = False
+    return H
+
+
+class _Scene:
+    """States and a sensor pose, and what several components derive from them.
+
+    `motion` is the third and fourth entry of the state: (yaw, speed), or (vx, vy) where `cartesian_motion` is
+    set.
+    """
+
+    def __init__(self, x: FloatArray, pose: SensorPose, cartesian_motion: bool) -> None:
+        self.position: FloatArray = x[..., :2]
+        self.motion: FloatArray = x[..., 2:4]
+        self.pose = pose
+        self.cartesian_motion = cartesian_motion
+
+    @cached_property
+    def offset(self) -> FloatArray:
+        """From the sensor to the object in the map, shape (..., 2)."""
+        return np.asarray(self.position - np.array([self.pose.x_m, self.pose.y_m]))
+
+    @cached_property
+    def offset_gradient(self) -> FloatArray:
+        """Derivative of direction and range by the position, shape (..., 2, 2)."""
+        return polar_gradient(self.offset, MIN_RANGE_M)
+
+    @property
+    def line_of_sight(self) -> FloatArray:
+        """Unit vector from the sensor to the object in the map, shape (..., 2)."""
+        return np.asarray(self.offset_gradient[..., 1, :])
+
+    @property
+    def yaw_speed(self) -> FloatArray:
+        """Heading and speed along it, shape (..., 2)."""
+        return polar(self.motion) if self.cartesian_motion else self.motion
+
+    @property
+    def yaw_speed_gradient(self) -> FloatArray:
+        """Derivative of heading and speed by `motion`, shape (..., 2, 2)."""
+        return polar_gradient(self.motion, MIN_SPEED_MPS) if self.cartesian_motion else np.eye(2)
+
+    @property
+    def relative_velocity(self) -> FloatArray:
+        """Velocity of the object minus that of the sensor in the map, shape (..., 2)."""
+        velocity = self.motion if self.cartesian_motion else cartesian(self.motion)
+        return np.asarray(velocity - np.array([self.pose.vx_mps, self.pose.vy_mps]))
+
+    @property
+    def velocity_gradient(self) -> FloatArray:
+        """Derivative of the velocity by `motion`, shape (..., 2, 2)."""
+        return np.eye(2) if self.cartesian_motion else cartesian_gradient(self.motion)
+
+
+class _Component(NamedTuple):
+    """One measurable quantity: its value and its gradients by position and `motion`, shape (..., 2) each."""
+
+    value: Callable[[_Scene], FloatArray]
+    gradient: Callable[[_Scene], tuple[FloatArray, FloatArray]]
+
+
+def _range_rate(scene: _Scene) -> FloatArray:
+    """Relative velocity along the line of sight."""
+    return np.asarray(np.sum(scene.relative_velocity * scene.line_of_sight, axis=-1))
+
+
+def _range_rate_gradient(scene: _Scene) -> tuple[FloatArray, FloatArray]:
+    """A moved object turns the line of sight towards its normal; the velocity counts along it."""
+    along = scene.line_of_sight
+    normal = np.stack([-along[..., 1], along[..., 0]], axis=-1)
+    across_mps = np.sum(scene.relative_velocity * normal, axis=-1, keepdims=True)
+    by_motion = (along[..., None, :] @ scene.velocity_gradient)[..., 0, :]
+    return across_mps * scene.offset_gradient[..., 0, :], by_motion
+
+
+_COMPONENTS = {
+    "x_m": _Component(lambda s: s.position[..., 0], lambda s: (np.array([1.0, 0.0]), _NONE)),
+    "y_m": _Component(lambda s: s.position[..., 1], lambda s: (np.array([0.0, 1.0]), _NONE)),
+    "yaw_rad": _Component(lambda s: s.yaw_speed[..., 0], lambda s: (_NONE, s.yaw_speed_gradient[..., 0, :])),
+    "speed_mps": _Component(
+        lambda s: s.yaw_speed[..., 1], lambda s: (_NONE, s.yaw_speed_gradient[..., 1, :])
+    ),
+    "range_m": _Component(lambda s: polar(s.offset)[..., 1], lambda s: (s.line_of_sight, _NONE)),
+    "bearing_rad": _Component(
+        lambda s: polar(s.offset)[..., 0] - s.pose.yaw_rad, lambda s: (s.offset_gradient[..., 0, :], _NONE)
+    ),
+    "range_rate_mps": _Component(_range_rate, _range_rate_gradient),
+}

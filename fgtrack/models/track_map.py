@@ -1,0 +1,298 @@
+"""The closed line of a race track or pit lane with its bounds, and the road coordinates along it."""
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.geometry import wrap_angles
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
+
+#: Columns of a map file, in order. The normal points to the right of the driving direction.
+COLUMNS = (
+    "x_ref_m",
+    "y_ref_m",
+    "width_right_m",
+    "width_left_m",
+    "x_normvec_m",
+    "y_normvec_m",
+    "alpha_m",
+    "s_racetraj_m",
+    "psi_racetraj_rad",
+    "kappa_racetraj_radpm",
+    "vx_racetraj_mps",
+    "ax_racetraj_mps2",
+    "banking_rad",
+    "s_ref_m",
+    "psi_ref_rad",
+    "kappa_ref_radpm",
+    "dkappa_ref_radpm2",
+)
+_COLUMN = {name: index for index, name in enumerate(COLUMNS)}
+_HEADINGS = (_COLUMN["psi_racetraj_rad"], _COLUMN["psi_ref_rad"])
+_ARCS = (_COLUMN["s_racetraj_m"], _COLUMN["s_ref_m"])
+
+_FILE_HEADING_OFFSET_RAD = math.pi / 2  # a file's heading is 0 along +y, REP-103 is 0 along +x
+_SAME_POINT_M = 1e-3
+_MAX_GAP = 10.0  # closing segment, in lengths of the longest other segment
+_MAX_HEADING_ERROR_RAD = 1.0  # coarse maps turn much in a row; a wrong convention is off by pi / 2
+
+# Quantities of a segment row: the values where it starts; `_CHANGE` further on, the change to its end.
+_X, _Y, _NORMAL_X, _NORMAL_Y, _HEADING, _CURVATURE, _LEFT, _RIGHT, _ARC = range(9)
+_CHANGE = 9
+_FRAME, _FRAME_CHANGE = slice(_X, _HEADING), slice(_CHANGE + _X, _CHANGE + _HEADING)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackMap:
+    """A closed reference line with widths to both bounds.
+
+    The line runs straight from row to row. Its normals turn evenly within a segment, from the heading of one
+    row to that of the next, so road coordinates (arc length s, lateral offset) are continuous and one-to-one
+    as far as the centre of curvature. s is measured along the segments from the first row; lateral is
+    positive to the left of the driving direction. Angles are REP-103. Points must be finite.
+
+    Raises
+    ------
+    DataError
+        If `table` is no closed line in driving direction.
+    """
+
+    table: FloatArray
+    """Rows of `COLUMNS`, shape (n + 1, 17), headings in REP-103; the last row closes the line."""
+    length_m: float = field(init=False)
+    """Length of one lap."""
+    counter_clockwise: bool = field(init=False)
+    """Whether the line is driven counter-clockwise, so that the inner bound is the left one."""
+    _points: FloatArray = field(init=False, repr=False)
+    _arc: FloatArray = field(init=False, repr=False)
+    _segments: FloatArray = field(init=False, repr=False)
+    _tree: "cKDTree[None]" = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        table = np.asarray(self.table, dtype=np.float64)
+        fault = _fault(table)
+        if fault is not None:
+            raise DataError(f"no map: row {fault[0] + 1}: {fault[1]}")
+        table = _closed(table)
+        table[:, _HEADINGS] = wrap_angles(table[:, _HEADINGS])
+        x, y = points = np.ascontiguousarray(table[:, :2].T)
+        lengths = np.hypot(np.diff(x), np.diff(y))
+        arc = np.concatenate([[0.0], np.cumsum(lengths)])
+        heading = np.unwrap(table[:, _COLUMN["psi_ref_rad"]])
+        knots = [  # in the order of a segment row
+            x,
+            y,
+            -np.sin(heading),
+            np.cos(heading),
+            heading,
+            table[:, _COLUMN["kappa_ref_radpm"]],
+            table[:, _COLUMN["width_left_m"]],
+            table[:, _COLUMN["width_right_m"]],
+            arc,
+        ]
+        segments = np.concatenate([np.stack(knots)[:, :-1], np.diff(np.stack(knots))]).T.copy()
+        for array in (table, points, arc, segments):
+            array.flags.writeable = False
+        for name, value in (
+            ("table", table),
+            ("length_m", float(arc[-1])),
+            ("counter_clockwise", bool(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]) > 0.0)),
+            ("_points", points.T[:-1]),
+            ("_arc", arc),
+            ("_segments", segments),
+            ("_tree", cKDTree(points.T[:-1])),
+        ):
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """Map of a semicolon-separated file with the 17 `COLUMNS`; `#` starts a comment line.
+
+        The last row may repeat the first. The file's headings (0 along +y) become REP-103 here.
+
+        Raises
+        ------
+        DataError
+            If the file cannot be read or is no map, with its line.
+        """
+        rows: list[list[float]] = []
+        lines: list[int] = []
+        try:
+            text = Path(path).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise DataError(f"{path}: cannot read the map: {error}") from error
+        for number, line in enumerate(text.splitlines(), start=1):
+            if not line.strip() or line.lstrip().startswith("#"):
+                continue
+            cells = line.split(";")
+            if len(cells) != len(COLUMNS):
+                raise DataError(
+                    f"{path}:{number}: no map: {len(cells)} columns, expected {len(COLUMNS)} separated by ';'"
+                )
+            try:
+                rows.append([float(cell) for cell in cells])
+            except ValueError as error:
+                raise DataError(f"{path}:{number}: no map: {error}") from error
+            lines.append(number)
+        table = np.array(rows, dtype=np.float64).reshape(-1, len(COLUMNS))
+        table[:, _HEADINGS] += _FILE_HEADING_OFFSET_RAD
+        fault = _fault(table)
+        if fault is not None:
+            place = f"{path}:{lines[fault[0]]}" if lines else f"{path}"
+            raise DataError(f"{place}: no map: {fault[1]}")
+        return cls(table)
+
+    def write(self, path: str | Path) -> None:
+        """Write the layout that `read` reads, with nine decimals."""
+        table = self.table.copy()
+        table[:, _HEADINGS] = wrap_angles(table[:, _HEADINGS] - _FILE_HEADING_OFFSET_RAD)
+        table = np.round(table, 9) + 0.0  # no negative zeros
+        np.savetxt(path, table, fmt="%.9f", delimiter="; ", header="; ".join(COLUMNS), encoding="utf-8")
+
+    def frenet(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Arc length s in [0, length) and lateral offset (left positive) of `points_m`, shape (n, 2)."""
+        at, part, lateral = self._locate(points_m)
+        s = _value(at, part, _ARC)
+        return np.where(s < self.length_m, s, 0.0), lateral
+
+    def position(self, s_m: FloatArray, lateral_m: FloatArray) -> FloatArray:
+        """Points, shape (n, 2), at arc length `s_m` (any lap) and `lateral_m`; the inverse of `frenet`."""
+        at, part = self._at(s_m)
+        frame = at[:, _FRAME] + part[:, None] * at[:, _FRAME_CHANGE]
+        foot, normal = frame[:, :2], frame[:, 2:]
+        return np.asarray(foot + (lateral_m / np.hypot(normal[:, 0], normal[:, 1]))[:, None] * normal)
+
+    def heading(self, points_m: FloatArray) -> FloatArray:
+        """Driving direction of the line beside `points_m`, shape (n,), interpolated along the circle."""
+        at, part, _ = self._locate(points_m)
+        return wrap_angles(_value(at, part, _HEADING))
+
+    def curvature(self, points_m: FloatArray) -> FloatArray:
+        """Curvature of the line beside `points_m` in rad/m, shape (n,), positive in a left turn."""
+        at, part, _ = self._locate(points_m)
+        return _value(at, part, _CURVATURE)
+
+    def bounds(self, s_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Widths (left, right) from the line to the bounds at arc length `s_m`, shapes (n,)."""
+        at, part = self._at(s_m)
+        return _value(at, part, _LEFT), _value(at, part, _RIGHT)
+
+    def outside(self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float) -> BoolArray:
+        """Which of `points_m` lie outside the bounds, shape (n,).
+
+        A positive buffer lets points in that lie up to that far beyond the bound; a negative one shrinks the
+        track. The inner bound is the one that the lap encloses: the left one if driven counter-clockwise.
+        """
+        return self._outside(*self._locate(points_m), inner_buffer_m, outer_buffer_m)
+
+    def view(
+        self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """`heading`, `curvature` and `outside` of `points_m` at the price of one look-up."""
+        at, part, lateral = self._locate(points_m)
+        return (
+            wrap_angles(_value(at, part, _HEADING)),
+            _value(at, part, _CURVATURE),
+            self._outside(at, part, lateral, inner_buffer_m, outer_buffer_m),
+        )
+
+    def _outside(
+        self,
+        at: FloatArray,
+        part: FloatArray,
+        lateral_m: FloatArray,
+        inner_buffer_m: float,
+        outer_buffer_m: float,
+    ) -> BoolArray:
+        """`outside` of what `_locate` gave."""
+        left_m, right_m = (
+            (inner_buffer_m, outer_buffer_m) if self.counter_clockwise else (outer_buffer_m, inner_buffer_m)
+        )
+        too_left = lateral_m > _value(at, part, _LEFT) + left_m
+        too_right = -lateral_m > _value(at, part, _RIGHT) + right_m
+        return np.asarray(too_left | too_right)
+
+    def _at(self, s_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Segment rows (n, 18) at arc length `s_m` and how far into them, 0 to 1."""
+        s = np.mod(np.asarray(s_m, dtype=np.float64), self.length_m)
+        index: IntArray = np.minimum(np.searchsorted(self._arc, s, side="right") - 1, len(self._segments) - 1)
+        at = self._segments[index]
+        return at, (s - at[:, _ARC]) / at[:, _CHANGE + _ARC]
+
+    def _locate(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Segment rows (n, 18) that `points_m` lie beside, how far into them (0 to 1), and lateral offsets.
+
+        The foot at the part t of a segment has the point on its normal: cross(q - t e, n + t dn) = 0 with q
+        from the start of the segment to the point, e the segment, n and dn the normal and its change.
+        """
+        _, nearest = self._tree.query(points_m)
+        offset = points_m - self._points[nearest]
+        at = self._segments[nearest]
+        behind = offset[:, 0] * at[:, _NORMAL_Y] < offset[:, 1] * at[:, _NORMAL_X]
+        if behind.any():
+            at = self._segments[nearest - behind]
+        ax, ay, nx, ny = at[:, _FRAME].T
+        ex, ey, mx, my = at[:, _FRAME_CHANGE].T
+        qx, qy = points_m[:, 0] - ax, points_m[:, 1] - ay
+        c = qx * ny - qy * nx
+        # Negative as far as the centre of curvature; beyond it the nearer end of the segment is the foot.
+        b = np.minimum((qx * my - qy * mx) - (ex * ny - ey * nx), -1e-12)
+        a = ey * mx - ex * my
+        root = np.sqrt(np.maximum(b * b - 4.0 * a * c, 0.0))
+        part = np.minimum(np.maximum(-2.0 * c / (b - root), 0.0), 1.0)
+        nx, ny = nx + part * mx, ny + part * my
+        lateral = ((qx - part * ex) * nx + (qy - part * ey) * ny) / np.sqrt(nx * nx + ny * ny)
+        return at, part, lateral
+
+
+def _value(at: FloatArray, part: FloatArray, quantity: int) -> FloatArray:
+    """One quantity of the segment rows `at`, shape (n, 18), at `part` of the segments, shape (n,)."""
+    return np.asarray(at[:, quantity] + part * at[:, _CHANGE + quantity])
+
+
+def _closed(table: FloatArray) -> FloatArray:
+    """Copy of `table` that ends with its first point, arc lengths carried on over the closing segment."""
+    gap = float(np.hypot(*(table[0, :2] - table[-1, :2])))
+    if gap < _SAME_POINT_M:
+        closed = table.copy()
+        closed[-1, :2] = table[0, :2]
+        return closed
+    last = table[0].copy()
+    for column in _ARCS:
+        last[column] = table[-1, column] + gap
+    return np.vstack([table, last])
+
+
+def _fault(table: FloatArray) -> tuple[int, str] | None:
+    """Row and reason why `table`, headings in REP-103, is no closed line in driving direction, or None."""
+    if table.ndim != 2 or table.shape[1] != len(COLUMNS) or len(table) < 4:
+        return max(len(table) - 1, 0), f"at least 4 rows of {len(COLUMNS)} columns are needed"
+    bad = np.argwhere(~np.isfinite(table))
+    if len(bad):
+        return int(bad[0, 0]), f"{COLUMNS[bad[0, 1]]} is not finite"
+    closed = _closed(table)
+    if len(closed) < 5:
+        return len(table) - 1, "at least 4 rows beside the one that repeats the first are needed"
+    steps = np.diff(closed[:, :2], axis=0)
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    if lengths.min() < _SAME_POINT_M:
+        return int(lengths.argmin()), "the next row holds the same point"
+    if lengths[-1] > _MAX_GAP * lengths[:-1].max():
+        return len(
+            table
+        ) - 1, f"the line does not close: {lengths[-1]:.1f} m from its last point to its first"
+    widths = closed[:, [_COLUMN["width_left_m"], _COLUMN["width_right_m"]]].sum(axis=1)
+    if widths.min() <= 0.0:
+        return int(widths[: len(table)].argmin()), "the widths do not add up to a positive one"
+    heading = closed[:-1, _COLUMN["psi_ref_rad"]]
+    error = np.abs(wrap_angles(np.arctan2(steps[:, 1], steps[:, 0]) - heading))
+    if error.max() > _MAX_HEADING_ERROR_RAD:
+        return int(error.argmax()), (
+            f"psi_ref_rad is {error.max():.2f} rad off the direction to the next row; 0 must be along +y"
+        )
+    return None

@@ -1,0 +1,1 @@
+"""From a configuration and an input to run folders."""

@@ -1,0 +1,134 @@
+"""From a configuration to a tracker."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from fgtrack.core.errors import CallError
+from fgtrack.core.time import period_ns, seconds
+from fgtrack.estimation.backward_forward import BackwardForwardBank
+from fgtrack.estimation.base import TrackBank
+from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator, Propagator
+from fgtrack.estimation.published import (
+    AcceleratedEulerCtrv,
+    LeadingClock,
+    LeadingClockStalePresent,
+    SaturatedAcceleratedEulerCtrv,
+    SaturatedEulerCtrv,
+    StalePresent,
+)
+from fgtrack.models.published_map import CircularHeadingMap, PublishedMap, PublishedRoad
+from fgtrack.models.road import FrenetRoad, OpenSpace, Road
+from fgtrack.models.track_map import TrackMap
+from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
+from fgtrack.sim.oval import make_oval, make_pit_lane
+from fgtrack.tracking.ego import EgoSource, EgoTrajectory
+from fgtrack.tracking.inbox import Inbox, QueueInbox
+from fgtrack.tracking.lifecycle import CountingLifecycle, Lifecycle
+from fgtrack.tracking.preprocess import Preprocess
+from fgtrack.tracking.published_input import PublishedEgo, SlotInbox
+from fgtrack.tracking.published_objects import PublishedLifecycle
+from fgtrack.tracking.tracker import PublishedTracker, Tracker, TrackerParts
+
+_EULER = {
+    ("free", "none"): EulerCtrv,
+    ("free", "driving"): AcceleratedEulerCtrv,
+    ("saturated", "none"): SaturatedEulerCtrv,
+    ("saturated", "driving"): SaturatedAcceleratedEulerCtrv,
+}
+_STORAGE = {
+    ("grid", "stored"): BackwardForwardBank,
+    ("grid", "stale"): StalePresent,
+    ("leading", "stored"): LeadingClock,
+    ("leading", "stale"): LeadingClockStalePresent,
+}
+
+
+def build_tracker(config: Config) -> Tracker:
+    """The tracker that `config` describes. Raises `CallError` for an estimator that does not exist."""
+    road = build_road(config.map)
+    motion = config.motion.model()
+    origin_m = (config.ego.detection_origin_x_m, config.ego.detection_origin_y_m)
+    published_order = config.lifecycle.kind == "published"
+    lifecycle: Lifecycle = (PublishedLifecycle if published_order else CountingLifecycle)(
+        config.lifecycle, config.sensors
+    )
+    parts = TrackerParts(
+        sensors=config.sensors,
+        ego=_build_ego(config),
+        inbox=_build_inbox(config),
+        preprocess=Preprocess(road, config.merge, motion, origin_m),
+        association=config.association,
+        bank=build_bank(config),
+        lifecycle=lifecycle,
+        birth=config.birth,
+        road=road,
+        confirm_count=config.lifecycle.confirm_count,
+    )
+    return (PublishedTracker if published_order else Tracker)(parts)
+
+
+def build_road(config: MapConfig) -> Road:
+    """The map that `config` names."""
+    if config.track is None:
+        return OpenSpace()
+    track = _read_map(config.track, make_oval)
+    pit = None if config.pit is None else _read_map(config.pit, make_pit_lane)
+    buffers = (config.inner_buffer_m, config.outer_buffer_m, config.pit_buffer_m)
+    if config.lookup == "frenet":
+        return FrenetRoad(track, pit, *buffers)
+    lookup = PublishedMap if config.lookup == "published" else CircularHeadingMap
+    return PublishedRoad(lookup(track), None if pit is None else lookup(pit), *buffers)
+
+
+def _read_map(name: str, built_in: Callable[[], TrackMap]) -> TrackMap:
+    return built_in() if name == "oval" else TrackMap.read(Path(name))
+
+
+def _build_backward_forward(config: Config) -> TrackBank:
+    step_ns = period_ns(config.filter.frequency_hz)
+    storage = _STORAGE[config.filter.clock, config.filter.present]
+    steps = round(config.filter.storage_s * config.filter.frequency_hz)
+    return storage(build_propagator(config.motion, seconds(step_ns)), step_ns, steps)
+
+
+#: Estimators by name.
+ESTIMATORS: Mapping[str, Callable[[Config], TrackBank]] = {"ekf-backward-forward": _build_backward_forward}
+
+
+def build_bank(config: Config) -> TrackBank:
+    """The estimators of all objects."""
+    if config.estimator not in ESTIMATORS:
+        raise CallError(f"estimator {config.estimator!r} is unknown: there are {', '.join(ESTIMATORS)}")
+    return ESTIMATORS[config.estimator](config)
+
+
+def build_propagator(config: MotionConfig, step_s: float) -> Propagator:
+    """The motion model in steps of `step_s`."""
+    motion = config.model()
+    if config.kind != "ctrv_euler":
+        return ExactPropagator(motion)
+    density = np.array([config.std_per_s[name] ** 2 / config.noise_hz for name in _noise_names(config)])
+    if config.noise == "per_step":
+        density *= config.noise_hz * step_s
+    return _EULER[config.yaw, config.acceleration](motion, density)
+
+
+def _noise_names(config: MotionConfig) -> list[str]:
+    names = ["position", "position", "yaw", "speed", "yaw_rate"]
+    return [*names, "accel"] if config.acceleration == "driving" else names
+
+
+def _build_ego(config: Config) -> EgoSource:
+    ego = config.ego
+    if ego.kind == "published":
+        step_ns = period_ns(config.filter.frequency_hz)
+        return PublishedEgo(ego.yaw_weight, ego.yaw_rate_weight, step_ns, ego.storage_ticks)
+    return EgoTrajectory(ego.yaw_weight, ego.yaw_rate_weight, ego.memory_s, ego.max_extrapolation_s)
+
+
+def _build_inbox(config: Config) -> Inbox:
+    if config.inbox.kind == "slot":
+        return SlotInbox(config.sensors)
+    return QueueInbox(config.sensors, config.inbox.max_future_s)

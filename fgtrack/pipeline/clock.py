@@ -1,0 +1,94 @@
+"""The replay clock: which messages have arrived at which tick."""
+
+import gzip
+import json
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.time import first_multiple, period_ns, seconds
+from fgtrack.core.types import DetectionList, EgoState
+
+Delivered = EgoState | DetectionList
+
+
+class Tick(NamedTuple):
+    """A tick and what arrived since the one before."""
+
+    now_ns: int
+    messages: list[Delivered]
+
+
+_LONGEST_GAP_S = 3600.0
+
+
+def node_ticks(messages: Iterable[Delivered], node_hz: float) -> Iterator[Tick]:
+    """Ticks on multiples of the node period, from the first at or after the first receipt until all is delivered.
+
+    What was received at or before a tick is delivered with it. Raises `DataError` for a gap of more than an hour.
+    """
+    step_ns = period_ns(node_hz)
+    waiting: list[Delivered] = []
+    now_ns: int | None = None
+    for message in messages:
+        if now_ns is None:
+            now_ns = first_multiple(message.receipt_ns, step_ns)
+        gap_s = seconds(message.receipt_ns - now_ns)
+        if gap_s > _LONGEST_GAP_S:
+            raise DataError(
+                f"nothing was received for {gap_s:.0f} s before {message.receipt_ns} ns: cut the recording there"
+            )
+        while message.receipt_ns > now_ns:
+            yield Tick(now_ns, waiting)
+            waiting = []
+            now_ns += step_ns
+        waiting.append(message)
+    if now_ns is not None:
+        yield Tick(now_ns, waiting)
+
+
+def message_ticks(messages: Iterable[Delivered]) -> Iterator[Tick]:
+    """A tick at every receipt; what was received at the same nanosecond shares one."""
+    waiting: list[Delivered] = []
+    for message in messages:
+        if waiting and message.receipt_ns > waiting[-1].receipt_ns:
+            yield Tick(waiting[-1].receipt_ns, waiting)
+            waiting = []
+        waiting.append(message)
+    if waiting:
+        yield Tick(waiting[-1].receipt_ns, waiting)
+
+
+def listed_ticks(messages: Iterable[Delivered], ticks_ns: Iterable[int]) -> Iterator[Tick]:
+    """The given ticks, and one more at the last receipt if something is left for it."""
+    source = iter(messages)
+    pending = next(source, None)
+    for now_ns in ticks_ns:
+        waiting = []
+        while pending is not None and pending.receipt_ns <= now_ns:
+            waiting.append(pending)
+            pending = next(source, None)
+        yield Tick(now_ns, waiting)
+    rest = [] if pending is None else [pending, *source]
+    if rest:
+        yield Tick(rest[-1].receipt_ns, rest)
+
+
+def read_ticks(path: Path) -> list[int]:
+    """The `now_ns` of every line of a JSON-lines file, plain or gzip, ascending.
+
+    Raises `CallError` where the file is missing or says something else.
+    """
+    try:
+        raw = path.read_bytes()
+        text = (gzip.decompress(raw) if raw[:2] == b"\x1f\x8b" else raw).decode("utf-8")
+        ticks = [int(json.loads(line)["now_ns"]) for line in text.splitlines()]
+    except OSError as error:
+        raise CallError(f"{path}: ticks cannot be read ({error.strerror or error})") from error
+    except (ValueError, KeyError, TypeError, EOFError) as error:
+        raise CallError(f"{path}: no list of ticks, every line must be an object with now_ns") from error
+    if not all(before < after for before, after in pairwise(ticks)):
+        raise CallError(f"{path}: the ticks are not ascending")
+    return ticks

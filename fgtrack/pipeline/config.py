@@ -1,0 +1,187 @@
+"""The configuration of a run. The defaults are the clean method of Karle et al. 2023; a YAML file overrides them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Annotated, Literal
+
+from pydantic import Discriminator
+
+from fgtrack.io.config import InputConfig
+from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
+from fgtrack.models.sensors import SensorModel
+from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
+from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
+from fgtrack.tracking.lifecycle import LifecycleRules
+from fgtrack.tracking.preprocess import ConnectedMerge, NoMerge
+from fgtrack.tracking.published_objects import NeighbourhoodMerge, UngatedEuclidean
+
+MergeConfig = Annotated[ConnectedMerge | NoMerge | NeighbourhoodMerge, Discriminator("kind")]
+AssociationConfig = Annotated[GatedEuclidean | GatedMahalanobis | UngatedEuclidean, Discriminator("kind")]
+BirthConfig = Annotated[MeasuredBirth | FixedBirth, Discriminator("kind")]
+
+#: The sensors of the paper, table II; LiDAR clusters and RADAR detections measure no yaw, the map gives it.
+PAPER_SENSORS: Mapping[str, SensorModel] = MappingProxyType(
+    {
+        "lidar": SensorModel(
+            std={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.4},
+            max_delay_s=0.3,
+            counter_init=5,
+            counter_add=2,
+            ages="short_range",
+        ),
+        "lidar_cluster": SensorModel(
+            std={"x_m": 0.3, "y_m": 0.3}, yaw_from_map_std_rad=0.35, max_delay_s=0.4, ages="short_range"
+        ),
+        "radar": SensorModel(
+            std={"x_m": 3.0, "y_m": 3.0, "speed_mps": 0.2},
+            yaw_from_map_std_rad=0.35,
+            max_delay_s=0.2,
+            counter_init=5,
+            counter_add=2,
+            ages="long_range",
+            stamp_from="objects_mean",
+        ),
+    }
+)
+
+
+@dataclass(frozen=True)
+class ClockConfig:
+    """When the tracker ticks."""
+
+    node_hz: float | None = 50.0
+    """Ticks lie on multiples of the node period; null ticks at every message instead."""
+    ticks_file: str | None = None
+    """Tick at the `now_ns` of the lines of this JSON-lines file instead (.jsonl or .jsonl.gz)."""
+
+    def __post_init__(self) -> None:
+        if self.node_hz is not None and not 0.1 <= self.node_hz <= 10_000.0:
+            raise ValueError(f"node_hz: must lie between 0.1 and 10000, is {self.node_hz}")
+
+
+@dataclass(frozen=True)
+class MapConfig:
+    """The map, and how far from it an object may be. A negative buffer keeps away from the wall."""
+
+    track: str | None = None
+    """CSV file of the track, `oval` for the built-in one, or null for open space."""
+    pit: str | None = None
+    """CSV file of the pit lane, `oval` for the built-in one, or null."""
+    lookup: Literal["frenet", "published", "published_circular_heading"] = "frenet"
+    inner_buffer_m: float = -0.5
+    outer_buffer_m: float = -1.5
+    pit_buffer_m: float = -1.5
+
+
+@dataclass(frozen=True)
+class EgoConfig:
+    """What is done to the ego state, and where detections in the ego frame have their origin."""
+
+    kind: Literal["low_pass", "published"] = "low_pass"
+    yaw_weight: float = 0.9
+    """Weight of the new yaw in the low-pass."""
+    yaw_rate_weight: float = 0.4
+    detection_origin_x_m: float = -1.74
+    """Origin of the detections' ego frame, ahead of the ego reference point (the paper's: the rear axle)."""
+    detection_origin_y_m: float = 0.0
+    memory_s: float = 5.0
+    max_extrapolation_s: float = 1.0
+    """A detection whose stamp is further than this from any ego state cannot be placed."""
+    storage_ticks: int = 350
+    """Length of the ego storage of the published implementation."""
+
+    def __post_init__(self) -> None:
+        for name in ("yaw_weight", "yaw_rate_weight"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise ValueError(f"{name}: must lie in (0, 1], is {getattr(self, name)}")
+        for name in ("memory_s", "max_extrapolation_s", "storage_ticks"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: must be positive, is {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class InboxConfig:
+    """How detections wait for the tick."""
+
+    kind: Literal["queue", "slot"] = "queue"
+    max_future_s: float = 1.0
+    """A detection stamped further than this ahead of its receipt is invalid."""
+
+
+@dataclass(frozen=True)
+class LifecycleConfig(LifecycleRules):
+    """When a track ends."""
+
+    kind: Literal["counting", "published"] = "counting"
+
+
+@dataclass(frozen=True)
+class FilterConfig:
+    """Time grid of the backward-forward EKF."""
+
+    frequency_hz: float = 100.0
+    storage_s: float = 3.5
+    """How far back states are kept."""
+    clock: Literal["grid", "leading"] = "grid"
+    present: Literal["stored", "stale"] = "stored"
+    """Whether an update without delay reaches the stored present state."""
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.frequency_hz <= 10_000.0:
+            raise ValueError(f"frequency_hz: must lie between 1 and 10000, is {self.frequency_hz}")
+        if not 1.0 / self.frequency_hz <= self.storage_s <= 60.0:
+            raise ValueError(f"storage_s: must lie between one step and 60 s, is {self.storage_s}")
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Motion model and its process noise."""
+
+    kind: Literal["ctrv_euler", "ctrv", "ctra", "cv"] = "ctrv_euler"
+    std_per_s: Mapping[str, float] = field(
+        default_factory=lambda: MappingProxyType({"position": 0.2, "yaw": 0.3, "speed": 1.0, "yaw_rate": 0.5})
+    )
+    """The paper's process noise: each step of 1 / noise_hz adds (std_per_s / noise_hz)^2, hence the density
+    std_per_s^2 / noise_hz. `ctra` takes `accel` as well, `cv` takes `velocity` alone."""
+    noise_hz: float = 100.0
+    noise: Literal["density", "per_step"] = "density"
+    """`per_step`: (std_per_s dt)^2 in every step dt of the filter, whatever its frequency (`ctrv_euler`)."""
+    yaw: Literal["free", "saturated"] = "free"
+    acceleration: Literal["none", "driving"] = "none"
+    """`driving`: an acceleration that drives the speed but is never estimated (`ctrv_euler`, takes `accel`)."""
+
+    def __post_init__(self) -> None:
+        departures = (self.noise, self.yaw, self.acceleration) != ("density", "free", "none")
+        if departures and self.kind != "ctrv_euler":
+            raise ValueError("noise, yaw and acceleration may be changed for kind ctrv_euler only")
+        self.model()
+
+    def model(self) -> MotionModel:
+        """The motion model, with the densities; raises `ValueError` where `std_per_s` does not fit it."""
+        if self.kind == "cv":
+            return CV.from_std_per_step(self.std_per_s, self.noise_hz)
+        if self.kind == "ctra" or self.acceleration == "driving":
+            return CTRA.from_std_per_step(self.std_per_s, self.noise_hz)
+        return CTRV.from_std_per_step(self.std_per_s, self.noise_hz)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that decides a run besides its input."""
+
+    estimator: str = "ekf-backward-forward"
+    sensors: Mapping[str, SensorModel] = field(default_factory=lambda: PAPER_SENSORS)
+    ignore_sensors: tuple[str, ...] = ()
+    """Sensors of the input that are left out on purpose."""
+    input: InputConfig = field(default_factory=InputConfig)
+    clock: ClockConfig = field(default_factory=ClockConfig)
+    map: MapConfig = field(default_factory=MapConfig)
+    ego: EgoConfig = field(default_factory=EgoConfig)
+    inbox: InboxConfig = field(default_factory=InboxConfig)
+    merge: MergeConfig = field(default_factory=ConnectedMerge)
+    association: AssociationConfig = field(default_factory=GatedEuclidean)
+    lifecycle: LifecycleConfig = field(default_factory=LifecycleConfig)
+    birth: BirthConfig = field(default_factory=MeasuredBirth)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    filter: FilterConfig = field(default_factory=FilterConfig)

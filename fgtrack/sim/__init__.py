@@ -1,0 +1,1 @@
+"""The simulator: vehicles on a track or in the open, what sensors see of them, and how late it arrives."""

@@ -1,0 +1,191 @@
+"""How late the messages of a sensor arrive: delay = receipt - stamp.
+
+A model draws the delays of all messages of one sensor at once, given their stamps in order, so that a model
+may have a memory (bursts) and still be an immutable value.
+"""
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal, Protocol
+
+import numpy as np
+from scipy import optimize, special
+
+from fgtrack.core.types import FloatArray
+from fgtrack.sim.require import require
+
+
+class DelayModel(Protocol):
+    """A distribution of delays."""
+
+    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
+        """Delays in seconds of the messages stamped `stamps_s` (ascending), shape (n,); NaN is a lost one."""
+
+
+@dataclass(frozen=True)
+class NoDelay:
+    """Everything arrives at once."""
+
+    kind: Literal["none"] = "none"
+
+    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
+        """See `DelayModel`."""
+        return np.zeros(len(stamps_s))
+
+
+@dataclass(frozen=True)
+class ConstantDelay:
+    """Everything arrives equally late."""
+
+    delay_s: float
+    kind: Literal["constant"] = "constant"
+
+    def __post_init__(self) -> None:
+        require(self.delay_s >= 0.0, "delay_s", "must not be negative", self.delay_s)
+
+    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
+        """See `DelayModel`."""
+        return np.full(len(stamps_s), self.delay_s)
+
+
+@dataclass(frozen=True)
+class UniformDelay:
+    """Uniform between two delays."""
+
+    min_s: float
+    max_s: float
+    kind: Literal["uniform"] = "uniform"
+
+    def __post_init__(self) -> None:
+        require(self.min_s >= 0.0, "min_s", "must not be negative", self.min_s)
+        require(self.max_s >= self.min_s, "max_s", "must not be below min_s", self.max_s)
+
+    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
+        """See `DelayModel`."""
+        return rng.uniform(self.min_s, self.max_s, len(stamps_s))
+
+
+@dataclass(frozen=True)
+class NormalDelay:
+    """Normal, given that it is not negative; so its mean lies above `mean_s`."""
+
+    mean_s: float
+    std_s: float
+    kind: Literal["normal"] = "normal"
+
+    def __post_init__(self) -> None:
+        require(self.mean_s >= 0.0, "mean_s", "must not be negative", self.mean_s)
+        require(self.std_s > 0.0, "std_s", "must be positive", self.std_s)
+
+    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
+        """See `DelayModel`. Inverts the distribution function."""
+        # 1 - u is uniform on (ndtr(-mean / std), 1]; the upper tail keeps its digits that way.
+        tail = rng.uniform(0.0, special.ndtr(self.mean_s / self.std_s), len(stamps_s))
+        return np.maximum(self.mean_s - self.std_s * special.ndtri(tail), 0.0)
+
+
+@dataclass(frozen=True)
+class GammaDelay:
+    """`min_s` plus a gamma variable, with the mean and the 90 % quantile that were measured.
+
+    Shape k solves quantile(k, 0.9) / k = (q90_s - min_s) / (mean_s - min_s). The left side falls from 2.71 at
+    k = 1/2 to 1; a shape below 1/2 is not offered.
+    """
+
+    min_s: float
+    mean_s: float
+    q90_s: float
+    kind: Literal["gamma"] = "gamma"
+
+    def __post_init__(self) -> None:
+        require(self.min_s >= 0.0, "min_s", "must not be negative", self.min_s)
+        require(self.mean_s > self.min_s, "mean_s", "must be above min_s", self.mean_s)
+        low, high = (_relative_q90(math.log(k)) for k in (_MAX_SHAPE, _MIN_SHAPE))
+        ratio = (self.q90_s - self.min_s) / (self.mean_s - self.min_s)
+        require(
+            low <= ratio <= high,
+            "q90_s",
+            f"no gamma fits; (q90_s - min_s) / (mean_s - min_s) must lie in [{low:.3f}, {high:.3f}]",
+            self.q90_s,
+        )
+
+    @cached_property
+    def shape(self) -> float:
+        """Shape k of the gamma part."""
+        ratio = (self.q90_s - self.min_s) / (self.mean_s - self.min_s)
+        log_shape = optimize.brentq(
+            lambda x: _relative_q90(x) - ratio, math.log(_MIN_SHAPE), math.log(_MAX_SHAPE), xtol=1e-13
+        )
+        return math.exp(log_shape)
+
+    @property
+    def scale_s(self) -> float:
+        """Scale of the gamma part."""
+        return (self.mean_s - self.min_s) / self.shape
+
+    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
+        """See `DelayModel`."""
+        return self.min_s + rng.gamma(self.shape, self.scale_s, len(stamps_s))
+
+
+@dataclass(frozen=True)
+class BurstDelay:
+    """Another model, and bursts in which everything takes longer.
+
+    Outside a burst, each message starts one with `probability`; all messages stamped less than `duration_s`
+    after it are `extra_s` later, itself included.
+    """
+
+    probability: float
+    duration_s: float
+    extra_s: float
+    base: "AnyDelay" = field(default_factory=NoDelay)
+    kind: Literal["burst"] = "burst"
+
+    def __post_init__(self) -> None:
+        require(0.0 <= self.probability <= 1.0, "probability", "must lie in [0, 1]", self.probability)
+        require(self.duration_s > 0.0, "duration_s", "must be positive", self.duration_s)
+        require(self.extra_s >= 0.0, "extra_s", "must not be negative", self.extra_s)
+
+    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
+        """See `DelayModel`."""
+        delays = self.base.draw(rng, stamps_s)
+        starts = rng.random(len(stamps_s)) < self.probability
+        burst_end_s = -math.inf
+        for index, stamp_s in enumerate(stamps_s):
+            if stamp_s >= burst_end_s and starts[index]:
+                burst_end_s = stamp_s + self.duration_s
+            if stamp_s < burst_end_s:
+                delays[index] += self.extra_s
+        return delays
+
+
+@dataclass(frozen=True)
+class LossyDelay:
+    """Another model, and messages that never arrive, each with `probability`."""
+
+    probability: float
+    base: "AnyDelay" = field(default_factory=NoDelay)
+    kind: Literal["loss"] = "loss"
+
+    def __post_init__(self) -> None:
+        require(0.0 <= self.probability <= 1.0, "probability", "must lie in [0, 1]", self.probability)
+
+    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
+        """See `DelayModel`."""
+        delays = self.base.draw(rng, stamps_s)
+        delays[rng.random(len(stamps_s)) < self.probability] = math.nan
+        return delays
+
+
+#: Every delay model, told apart by `kind`.
+AnyDelay = NoDelay | ConstantDelay | UniformDelay | NormalDelay | GammaDelay | BurstDelay | LossyDelay
+
+_MIN_SHAPE, _MAX_SHAPE = 0.5, 1e6
+
+
+def _relative_q90(log_shape: float) -> float:
+    """90 % quantile of a gamma distribution over its mean."""
+    shape = math.exp(log_shape)
+    return float(special.gammaincinv(shape, 0.9)) / shape

@@ -1,0 +1,162 @@
+"""Scans: what a simulated sensor sees of the objects, and what it only believes to see."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from fgtrack.core.geometry import rotations, wrap_angles
+from fgtrack.core.types import SPEED, YAW, YAW_RATE, BoolArray, Detection, FloatArray, IntArray, X, Y
+from fgtrack.models.measurement import measurement_model
+from fgtrack.models.motion import CV, cartesian
+from fgtrack.models.sensors import Mount
+from fgtrack.models.track_map import TrackMap
+from fgtrack.sim.sensor import POLAR, SimulatedSensor
+
+
+@dataclass(frozen=True, eq=False)
+class _Sightings:
+    """m detections of one sensor: the scan of each, its values, and a random key that shuffles a scan."""
+
+    scan: IntArray
+    z: FloatArray
+    key: FloatArray
+
+
+def _joined(parts: Sequence[_Sightings]) -> _Sightings:
+    """All sightings of `parts`."""
+    return _Sightings(
+        scan=np.concatenate([part.scan for part in parts]),
+        z=np.concatenate([part.z for part in parts]),
+        key=np.concatenate([part.key for part in parts]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Scanner:
+    """One sensor riding on the ego: `ego`, shape (n, 6), are the ego's states at its n scans."""
+
+    sensor: SimulatedSensor
+    ego: FloatArray
+    detection_origin_x_m: float
+    """Origin of the detection frame in the ego frame."""
+
+    def scans(
+        self, rng: np.random.Generator, objects: Sequence[FloatArray], track: TrackMap | None
+    ) -> list[tuple[Detection, ...]]:
+        """Detections of the n scans; `objects` holds the states of each object at the scans, shape (n, 6).
+
+        Every object and the clutter have a generator of their own.
+        """
+        clutter_rng, objects_rng = rng.spawn(2)
+        children = objects_rng.spawn(len(objects))
+        seen = [self._see(child, states) for child, states in zip(children, objects, strict=True)]
+        sightings = _joined([self._clutter(clutter_rng, track), *seen])
+        order = np.lexsort((sightings.key, sightings.scan))
+        components = self.sensor.components
+        detections = [
+            Detection(**dict(zip(components, row, strict=True))) for row in sightings.z[order].tolist()
+        ]
+        bounds = np.searchsorted(sightings.scan[order], np.arange(len(self.ego) + 1)).tolist()
+        return [tuple(detections[a:b]) for a, b in pairwise(bounds)]
+
+    def _see(self, rng: np.random.Generator, states: FloatArray) -> _Sightings:
+        """Sightings of one object: none, one or two (a split) in every scan."""
+        sensor, n = self.sensor, len(states)
+        everything = np.arange(n)
+        seen = self._visible(everything, states) & (rng.random(n) < sensor.detection_probability)
+        split = rng.random(n) < sensor.split_probability
+        shift_m = np.where(split, rng.uniform(*sensor.split_distance_m, n) / 2.0, 0.0)
+        parts = []
+        for sign, present in ((1.0, seen), (-1.0, seen & split)):
+            moved = states.copy()
+            moved[:, X] += sign * shift_m * np.cos(states[:, YAW])
+            moved[:, Y] += sign * shift_m * np.sin(states[:, YAW])
+            z = self._add_noise(rng, everything, moved)
+            parts.append(_Sightings(everything[present], z[present], rng.random(n)[present]))
+        return _joined(parts)
+
+    def _clutter(self, rng: np.random.Generator, track: TrackMap | None) -> _Sightings:
+        """Sightings of ghosts, measured without noise."""
+        sensor, clutter = self.sensor, self.sensor.clutter
+        scan = np.repeat(np.arange(len(self.ego)), rng.poisson(clutter.mean_per_scan, len(self.ego)))
+        m = len(scan)
+        ghosts = np.zeros((m, self.ego.shape[1]))
+        if clutter.region == "track" and track is not None:
+            s = track.frenet(self.ego[scan, :2])[0] + rng.uniform(-1.0, 1.0, m) * sensor.max_range_m
+            left_m, right_m = track.bounds(s)
+            ghosts[:, :2] = track.position(s, rng.uniform(-right_m, left_m))
+            ghosts[:, YAW] = track.heading(ghosts[:, :2])
+        else:
+            # Uniform over the area of a ring: the square of the range is uniform.
+            distance = np.sqrt(rng.uniform(sensor.min_range_m**2, sensor.max_range_m**2, m))
+            half = sensor.field_of_view_rad / 2.0
+            origin, yaw = self._pose(scan, sensor.mount)
+            direction = yaw + rng.uniform(-half, half, m)
+            ghosts[:, X] = origin[:, X] + distance * np.cos(direction)
+            ghosts[:, Y] = origin[:, Y] + distance * np.sin(direction)
+            ghosts[:, YAW] = rng.uniform(-math.pi, math.pi, m)
+        ghosts[:, SPEED] = rng.uniform(*clutter.speed_mps, m)
+        visible = self._visible(scan, ghosts)
+        return _Sightings(scan[visible], self._measure(scan, ghosts)[visible], rng.random(m)[visible])
+
+    def _add_noise(self, rng: np.random.Generator, scan: IntArray, states: FloatArray) -> FloatArray:
+        """Noisy measurements of `states`, shape (m, k)."""
+        sensor, components = self.sensor, self.sensor.components
+        noise = rng.standard_normal((len(scan), len(components)))
+        outlier = rng.random(len(scan)) < sensor.outlier_probability
+        noise *= np.where(outlier, sensor.outlier_factor, 1.0)[:, None]
+        noise *= [sensor.std[name] for name in components]
+        if sensor.frame == "ego":  # x_m and y_m come first: along and across the line of sight
+            line_of_sight = self._relative(scan, states)[:, 1] + sensor.mount.yaw_rad
+            noise[:, :2] = _rotated(noise[:, :2], line_of_sight)
+        z = self._measure(scan, states) + noise
+        for column, name in enumerate(components):
+            if name in ("yaw_rad", "bearing_rad"):
+                z[:, column] = wrap_angles(z[:, column])
+        return z
+
+    def _measure(self, scan: IntArray, states: FloatArray) -> FloatArray:
+        """Measurements without noise, shape (m, k), of `states`, shape (m, 6), in the scans `scan`."""
+        mount = Mount() if self.sensor.frame == "ego" else self.sensor.mount
+        origin, yaw = self._pose(scan, mount)
+        values = {"yaw_rad": states[:, YAW] - yaw, "speed_mps": states[:, SPEED]}
+        values["x_m"], values["y_m"] = _rotated(states[:, :2] - origin, -yaw).T
+        values.update(zip(POLAR, self._relative(scan, states).T, strict=True))
+        return np.stack([values[name] for name in self.sensor.components], axis=1)
+
+    def _visible(self, scan: IntArray, states: FloatArray) -> BoolArray:
+        """Which of `states` lie in the field of view, shape (m,)."""
+        sensor = self.sensor
+        distance, bearing, _ = self._relative(scan, states).T
+        in_range = (distance >= sensor.min_range_m) & (distance <= sensor.max_range_m)
+        return np.asarray(in_range & (np.abs(bearing) <= sensor.field_of_view_rad / 2.0))
+
+    def _relative(self, scan: IntArray, states: FloatArray) -> FloatArray:
+        """Range, bearing and range rate of `states` from the sensor, shape (m, 3), with its own motion."""
+        mount, ego = self.sensor.mount, self.ego[scan]
+        origin, yaw = self._pose(scan, mount)
+        lever = origin - ego[:, :2]
+        velocity = cartesian(ego[:, [YAW, SPEED]])
+        velocity += ego[:, YAW_RATE, None] * np.stack([-lever[:, 1], lever[:, 0]], axis=1)
+        relative = np.concatenate(
+            [
+                _rotated(states[:, :2] - origin, -yaw),
+                _rotated(cartesian(states[:, [YAW, SPEED]]) - velocity, -yaw),
+            ],
+            axis=1,
+        )
+        return measurement_model(POLAR, CV()).predict(relative)
+
+    def _pose(self, scan: IntArray, mount: Mount) -> tuple[FloatArray, FloatArray]:
+        """Origin, shape (m, 2), and yaw, shape (m,), in the map of a frame mounted in the detection frame."""
+        ego = self.ego[scan]
+        offset = np.broadcast_to([self.detection_origin_x_m + mount.x_m, mount.y_m], (len(scan), 2))
+        return ego[:, :2] + _rotated(offset, ego[:, YAW]), ego[:, YAW] + mount.yaw_rad
+
+
+def _rotated(vectors: FloatArray, angles_rad: FloatArray) -> FloatArray:
+    """Vectors, shape (m, 2), each turned by its angle, shape (m,)."""
+    return np.asarray((rotations(angles_rad) @ vectors[:, :, None])[:, :, 0])

@@ -1,0 +1,127 @@
+"""Settings of a simulated sensor: when it scans, what it measures, and what goes wrong."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from fgtrack.core.types import MEASURABLE, BoolArray, FloatArray, Frame
+from fgtrack.models.sensors import Mount
+from fgtrack.sim.delays import AnyDelay, NoDelay
+from fgtrack.sim.require import require
+
+#: Components in the frame of the sensor, relative to it.
+POLAR = ("range_m", "bearing_rad", "range_rate_mps")
+
+
+@dataclass(frozen=True)
+class Clutter:
+    """Detections of nothing: each scan has a Poisson number of them, uniform over a region."""
+
+    mean_per_scan: float = 0.0
+    """In the field of view or, for `track`, on the stretch of track no further off than the maximum range; of
+    these a sensor reports the ones in its field of view."""
+    region: Literal["field_of_view", "track"] = "field_of_view"
+    speed_mps: tuple[float, float] = (0.0, 0.0)
+    """Range of the speed that clutter seems to have, along the track or in any direction."""
+
+    def __post_init__(self) -> None:
+        require(self.mean_per_scan >= 0.0, "mean_per_scan", "must not be negative", self.mean_per_scan)
+        low, high = self.speed_mps
+        require(low <= high, "speed_mps", "must be a range (low, high), high", high)
+
+
+@dataclass(frozen=True)
+class SimulatedSensor:
+    """One sensor on the ego vehicle.
+
+    It measures positions and yaw in the ego's detection frame, or range, bearing and range rate in its own.
+    Speed is over ground.
+    """
+
+    name: str
+    std: Mapping[str, float]
+    """Standard deviation of each measured component; x_m along, y_m across the line of sight."""
+    rate_hz: float = 20.0
+    phase_s: float = 0.0
+    """Time of the first scan."""
+    jitter_s: float = 0.0
+    """Each scan is up to this much late, uniformly."""
+    delay: AnyDelay = field(default_factory=NoDelay)
+    mount: Mount = field(default_factory=Mount)
+    field_of_view_rad: float = math.tau
+    """Full angle, centred on the axis of the sensor."""
+    min_range_m: float = 0.0
+    max_range_m: float = 100.0
+    detection_probability: float = 1.0
+    clutter: Clutter = field(default_factory=Clutter)
+    split_probability: float = 0.0
+    """That a detected object gives two detections, one behind the other."""
+    split_distance_m: tuple[float, float] = (2.0, 4.0)
+    outlier_probability: float = 0.0
+    outlier_factor: float = 10.0
+    """How many times larger the standard deviations of an outlier are."""
+    drop_outs: tuple[tuple[float, float], ...] = ()
+    """Intervals [start, end) in seconds in which the sensor is silent."""
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise ValueError("name: must not be empty")
+        unknown = set(self.std) - set(MEASURABLE)
+        if unknown or not self.std:
+            raise ValueError(f"std: name components out of {', '.join(MEASURABLE)}, not {sorted(unknown)}")
+        if ("x_m" in self.std) != ("y_m" in self.std):
+            raise ValueError("std: x_m and y_m are measured together")
+        if "x_m" in self.std and not set(POLAR).isdisjoint(self.std):
+            raise ValueError("std: measure x_m and y_m or range and bearing, not both")
+        for name, value in self.std.items():
+            require(value >= 0.0, f"std.{name}", "must not be negative", value)
+        require(self.rate_hz > 0.0, "rate_hz", "must be positive", self.rate_hz)
+        require(self.phase_s >= 0.0, "phase_s", "must not be negative", self.phase_s)
+        require(
+            0.0 <= self.jitter_s < 1.0 / self.rate_hz, "jitter_s", "must be below a period", self.jitter_s
+        )
+        require(
+            0.0 < self.field_of_view_rad <= math.tau,
+            "field_of_view_rad",
+            "must lie in (0, 2 pi]",
+            self.field_of_view_rad,
+        )
+        require(self.min_range_m >= 0.0, "min_range_m", "must not be negative", self.min_range_m)
+        require(
+            self.max_range_m > self.min_range_m, "max_range_m", "must exceed min_range_m", self.max_range_m
+        )
+        for name in ("detection_probability", "split_probability", "outlier_probability"):
+            value = getattr(self, name)
+            require(0.0 <= value <= 1.0, name, "must lie in [0, 1]", value)
+        low, high = self.split_distance_m
+        require(0.0 <= low <= high, "split_distance_m", "must be a range (low, high), high", high)
+        require(self.outlier_factor >= 1.0, "outlier_factor", "must be at least 1", self.outlier_factor)
+        for start_s, end_s in self.drop_outs:
+            require(start_s < end_s, "drop_outs", "must be intervals (start, end), end", end_s)
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Measured components in the order of `MEASURABLE`."""
+        return tuple(name for name in MEASURABLE if name in self.std)
+
+    @property
+    def frame(self) -> Frame:
+        """Frame of its detections."""
+        return "ego" if "x_m" in self.std else "sensor"
+
+    def scan_times(self, rng: np.random.Generator, duration_s: float) -> FloatArray:
+        """Times of all scans from 0 to `duration_s`, ascending, drop-outs included."""
+        num_scans = max(math.floor((duration_s - self.phase_s) * self.rate_hz + 1e-9) + 1, 0)
+        times = self.phase_s + np.arange(num_scans) / self.rate_hz
+        times += rng.uniform(0.0, self.jitter_s, num_scans)
+        return times[times <= duration_s]
+
+    def silent(self, times_s: FloatArray) -> BoolArray:
+        """Which of `times_s` lie in a drop-out."""
+        result = np.zeros(len(times_s), dtype=bool)
+        for start_s, end_s in self.drop_outs:
+            result |= (times_s >= start_s) & (times_s < end_s)
+        return result

@@ -1,0 +1,148 @@
+"""From a scenario to the messages that a tracker would have received."""
+
+import math
+
+import numpy as np
+
+from fgtrack.core.geometry import wrap_angles
+from fgtrack.core.time import nanoseconds, seconds
+from fgtrack.core.types import (
+    ACCEL,
+    SPEED,
+    STATE_NAMES,
+    YAW,
+    YAW_RATE,
+    DetectionList,
+    EgoState,
+    FloatArray,
+    Message,
+    TruthState,
+    X,
+    Y,
+)
+from fgtrack.models.track_map import TrackMap
+from fgtrack.sim.delays import DelayModel
+from fgtrack.sim.oval import make_oval
+from fgtrack.sim.path import Path
+from fgtrack.sim.scanner import Scanner
+from fgtrack.sim.scenario import OVAL, Scenario
+from fgtrack.sim.sensor import SimulatedSensor
+from fgtrack.sim.vehicles import AnyVehicle, DrawnVehicle, Trajectory
+
+EGO_ID = -1
+
+
+def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
+    """Messages of `scenario` in order of receipt; at the same receipt truth, ego, sensors in their order.
+
+    Same scenario and same state of `rng`, same messages. Every vehicle and every sensor, and in it the
+    delays, the clutter and the detections of each object, draw from a generator of their own: another sensor
+    or another delay model leaves everything else as it was. A message that its delay model loses is not in
+    the list.
+
+    Raises
+    ------
+    DataError
+        If the map cannot be read.
+    """
+    return _Simulation(scenario, rng).messages()
+
+
+class _Simulation:
+    """One run: the generators of everything and the true trajectories."""
+
+    def __init__(self, scenario: Scenario, rng: np.random.Generator) -> None:
+        self.scenario = scenario
+        vehicles_rng, self.ego_rng, self.sensors_rng = rng.spawn(3)
+        self.track = _track(scenario)
+        path = None if self.track is None else Path.along(self.track)
+        vehicles = (scenario.ego, *scenario.opponents)
+        self.ego, *self.opponents = (
+            self._trajectory(vehicle, path, child)
+            for vehicle, child in zip(vehicles, vehicles_rng.spawn(len(vehicles)), strict=True)
+        )
+
+    def messages(self) -> list[Message]:
+        """All messages in order of receipt."""
+        sensors = self.scenario.sensors
+        messages: list[Message] = [*self._truth(), *self._ego_messages()]
+        for sensor, rng in zip(sensors, self.sensors_rng.spawn(len(sensors)), strict=True):
+            messages += self._scans(sensor, rng)
+        messages.sort(key=lambda message: message.receipt_ns)
+        return messages
+
+    def _trajectory(self, vehicle: AnyVehicle, path: Path | None, rng: np.random.Generator) -> Trajectory:
+        if isinstance(vehicle, DrawnVehicle):
+            return vehicle.trajectory(rng, self.scenario.duration_s)
+        assert path is not None, "a scenario without a map has no vehicle on a track"
+        return vehicle.trajectory(path)
+
+    def _truth(self) -> list[Message]:
+        stamps = self._stamps(self._times(self.scenario.truth_rate_hz))
+        times = self._seconds(stamps)
+        rows = [trajectory.states(times).tolist() for trajectory in (self.ego, *self.opponents)]
+        return [
+            TruthState(stamp, stamp, object_id, *states[index])
+            for index, stamp in enumerate(stamps)
+            for object_id, states in enumerate(rows, start=EGO_ID)
+        ]
+
+    def _ego_messages(self) -> list[Message]:
+        settings = self.scenario.ego_messages
+        noise_rng, delay_rng = self.ego_rng.spawn(2)
+        stamps = self._stamps(self._times(settings.rate_hz))
+        times = self._seconds(stamps)
+        std = np.empty(len(STATE_NAMES))
+        std[[X, Y]] = settings.position_std_m
+        std[[YAW, SPEED]] = settings.yaw_std_rad, settings.speed_std_mps
+        std[[YAW_RATE, ACCEL]] = settings.yaw_rate_std_radps, settings.accel_std_mps2
+        states = self.ego.states(times)
+        states += std * noise_rng.standard_normal(states.shape)
+        states[:, YAW] = wrap_angles(states[:, YAW])
+        receipts = _receipts(settings.delay, delay_rng, stamps, times)
+        return [
+            EgoState(stamp, receipt, *row)
+            for stamp, receipt, row in zip(stamps, receipts, states.tolist(), strict=True)
+            if receipt is not None
+        ]
+
+    def _scans(self, sensor: SimulatedSensor, rng: np.random.Generator) -> list[Message]:
+        times_rng, delay_rng, scanner_rng = rng.spawn(3)
+        stamps = self._stamps(sensor.scan_times(times_rng, self.scenario.duration_s))
+        times = self._seconds(stamps)
+        scanner = Scanner(sensor, self.ego.states(times), self.scenario.detection_origin_x_m)
+        objects = [trajectory.states(times) for trajectory in self.opponents]
+        scans = scanner.scans(scanner_rng, objects, self.track)
+        receipts = _receipts(sensor.delay, delay_rng, stamps, times)
+        silent = sensor.silent(times)
+        return [
+            DetectionList(sensor.name, stamp, receipt, detections, sensor.frame)
+            for stamp, receipt, detections, quiet in zip(stamps, receipts, scans, silent, strict=True)
+            if receipt is not None and not quiet
+        ]
+
+    def _times(self, rate_hz: float) -> FloatArray:
+        return np.arange(math.floor(self.scenario.duration_s * rate_hz + 1e-9) + 1) / rate_hz
+
+    def _stamps(self, times_s: FloatArray) -> list[int]:
+        return [self.scenario.start_ns + nanoseconds(time_s) for time_s in times_s.tolist()]
+
+    def _seconds(self, stamps: list[int]) -> FloatArray:
+        return np.array([seconds(stamp - self.scenario.start_ns) for stamp in stamps])
+
+
+def _track(scenario: Scenario) -> TrackMap | None:
+    if scenario.map is None:
+        return None
+    return make_oval() if scenario.map == OVAL else TrackMap.read(scenario.map)
+
+
+def _receipts(
+    delay: DelayModel, rng: np.random.Generator, stamps: list[int], times_s: FloatArray
+) -> list[int | None]:
+    """Receipt of each stamp, None where the message is lost."""
+    delays = delay.draw(rng, times_s).tolist()
+    return [
+        None if math.isnan(delay_s) else stamp + nanoseconds(delay_s)
+        for stamp, delay_s in zip(stamps, delays, strict=True)
+    ]

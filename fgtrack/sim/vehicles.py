@@ -1,0 +1,190 @@
+"""Where the vehicles are: driving along a track as told, or drawn from the motion model itself."""
+
+import math
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Literal, Protocol
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+
+from fgtrack.core.geometry import wrap_angles
+from fgtrack.core.types import STATE_NAMES, YAW, FloatArray
+from fgtrack.models.motion import CTRV
+from fgtrack.sim.path import Path
+from fgtrack.sim.require import require
+
+
+class Trajectory(Protocol):
+    """The true motion of one vehicle."""
+
+    def states(self, times_s: FloatArray) -> FloatArray:
+        """States at `times_s`, shape (n,), from the start of the scenario: shape (n, 6), `STATE_NAMES`."""
+
+
+@dataclass(frozen=True)
+class LaneChange:
+    """A move to another lateral offset: a quintic, at rest across the track at both ends."""
+
+    start_s: float
+    """Time at which it starts."""
+    duration_s: float
+    lateral_m: float
+    """Lateral offset that it ends at, positive to the left of the reference line."""
+
+    def __post_init__(self) -> None:
+        require(self.start_s >= 0.0, "start_s", "must not be negative", self.start_s)
+        require(self.duration_s > 0.0, "duration_s", "must be positive", self.duration_s)
+        require(True, "lateral_m", "must be finite", self.lateral_m)
+
+
+@dataclass(frozen=True)
+class TrackVehicle:
+    """A vehicle that follows the track. Overtaking comes from speeds and lane changes."""
+
+    arc_m: float
+    """Arc length along the reference line at the start."""
+    speed: tuple[tuple[float, float], ...]
+    """Knots (time [s], speed along the reference line [m/s]); smooth between them, constant outside."""
+    lateral_m: float = 0.0
+    """Lateral offset at the start, positive to the left."""
+    lane_changes: tuple[LaneChange, ...] = ()
+    """In order of time, one after the other."""
+    kind: Literal["track"] = "track"
+
+    def __post_init__(self) -> None:
+        require(True, "arc_m", "must be finite", self.arc_m)
+        require(True, "lateral_m", "must be finite", self.lateral_m)
+        require(len(self.speed) > 0, "speed", "must have at least one knot, number", len(self.speed))
+        for _, speed_mps in self.speed:
+            require(speed_mps > 0.0, "speed", "must be positive in every knot", speed_mps)
+        for (before_s, _), (time_s, _) in pairwise(self.speed):
+            require(time_s > before_s, "speed", "times of the knots must increase", time_s)
+        for before, change in pairwise(self.lane_changes):
+            end_s = before.start_s + before.duration_s
+            require(change.start_s >= end_s, "lane_changes", "one must end before the next", change.start_s)
+
+    def trajectory(self, path: Path) -> "TrackTrajectory":
+        """Motion of this vehicle along `path`."""
+        return TrackTrajectory(self, path)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackTrajectory:
+    """Motion along a path with a lateral offset; yaw is the direction of travel.
+
+    With path parameter u(t), lateral offset d(t), tangent direction psi(u) and scale g(u) (metres of path per
+    unit of u), a dot by time and a prime by u: the velocity is w along the tangent and d' across it, with
+    w = u' (g - d psi'), and yaw = psi + atan2(d', w). Yaw rate and acceleration are its exact derivatives.
+    """
+
+    vehicle: TrackVehicle
+    path: Path
+
+    def states(self, times_s: FloatArray) -> FloatArray:
+        """See `Trajectory`. The acceleration is that along the heading."""
+        u, u1, u2 = self._along(times_s)
+        d, d1, d2 = self._across(times_s)
+        frame = self.path.frame(u)
+        stretch = frame.scale - d * frame.turn
+        w = u1 * stretch
+        w1 = u2 * stretch + u1 * (u1 * (frame.scale_rate - d * frame.turn_rate) - d1 * frame.turn)
+        speed = np.hypot(w, d1)
+        return np.stack(
+            [
+                frame.x_m - d * np.sin(frame.heading_rad),
+                frame.y_m + d * np.cos(frame.heading_rad),
+                wrap_angles(frame.heading_rad + np.arctan2(d1, w)),
+                speed,
+                frame.turn * u1 + (d2 * w - d1 * w1) / speed**2,
+                (w * w1 + d1 * d2) / speed,
+            ],
+            axis=1,
+        )
+
+    def _along(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Path parameter and its first two derivatives by time."""
+        knots = np.array(self.vehicle.speed, dtype=np.float64)
+        if len(knots) == 1:
+            knots = np.vstack([knots, knots + np.array([1.0, 0.0])])
+        # Level at every knot, so that the acceleration has no jump where the speed becomes constant.
+        speed = CubicHermiteSpline(knots[:, 0], knots[:, 1], np.zeros(len(knots)))
+        times = np.append(times_s, 0.0)
+        inside = np.clip(times, knots[0, 0], knots[-1, 0])
+        distance = speed.antiderivative()(inside) + speed(inside) * (times - inside)
+        u = self.vehicle.arc_m + distance[:-1] - distance[-1]
+        return u, speed(inside[:-1]), speed(inside[:-1], 1)
+
+    def _across(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Lateral offset and its first two derivatives by time."""
+        d = np.full(len(times_s), self.vehicle.lateral_m)
+        d1, d2 = np.zeros((2, len(times_s)))
+        lateral_m = self.vehicle.lateral_m
+        for change in self.vehicle.lane_changes:
+            x = np.clip((times_s - change.start_s) / change.duration_s, 0.0, 1.0)
+            step = change.lateral_m - lateral_m
+            d += step * x**3 * (10.0 + x * (6.0 * x - 15.0))
+            d1 += step / change.duration_s * 30.0 * (x * (1.0 - x)) ** 2
+            d2 += step / change.duration_s**2 * 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x)
+            lateral_m = change.lateral_m
+        return d, d1, d2
+
+
+@dataclass(frozen=True)
+class DrawnVehicle:
+    """A vehicle whose motion is a draw from the CTRV model: a filter with this model is consistent."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    speed_mps: float
+    yaw_rate_radps: float = 0.0
+    motion: CTRV = field(default_factory=CTRV)
+    step_s: float = 0.01
+    """Time between two draws of the process noise; within a step it comes in evenly."""
+    kind: Literal["drawn"] = "drawn"
+
+    def __post_init__(self) -> None:
+        for name in STATE_NAMES[: self.motion.dim]:
+            require(True, name, "must be finite", getattr(self, name))
+        require(self.step_s > 0.0, "step_s", "must be positive", self.step_s)
+
+    def trajectory(self, rng: np.random.Generator, duration_s: float) -> "DrawnTrajectory":
+        """One draw of the motion of this vehicle over `duration_s`."""
+        num_steps = math.ceil(duration_s / self.step_s) + 1
+        normals = rng.standard_normal((num_steps, self.motion.dim))
+        states = np.empty((num_steps + 1, self.motion.dim))
+        noise = np.empty_like(normals)
+        states[0] = [getattr(self, name) for name in STATE_NAMES[: self.motion.dim]]
+        for k in range(num_steps):
+            # The covariance is singular where a density is zero: eigenvectors, not Cholesky.
+            variances, axes = np.linalg.eigh(self.motion.process_noise(states[k], self.step_s))
+            noise[k] = axes @ (np.sqrt(np.maximum(variances, 0.0)) * normals[k])
+            states[k + 1] = self.motion.predict(states[k], self.step_s) + noise[k]
+        return DrawnTrajectory(self, states, noise)
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnTrajectory:
+    """States at the steps of a drawn motion and the noise within each step."""
+
+    vehicle: DrawnVehicle
+    step_states: FloatArray
+    noise: FloatArray
+
+    def states(self, times_s: FloatArray) -> FloatArray:
+        """See `Trajectory`. The acceleration is 0, as the model has none."""
+        step_s = self.vehicle.step_s
+        k = np.clip((times_s / step_s).astype(np.int64), 0, len(self.noise) - 1)
+        within_s = times_s - k * step_s
+        states = np.zeros((len(times_s), len(STATE_NAMES)))
+        states[:, : self.noise.shape[1]] = (
+            self.vehicle.motion.predict(self.step_states[k], within_s)
+            + (within_s / step_s)[:, None] * self.noise[k]
+        )
+        states[:, YAW] = wrap_angles(states[:, YAW])
+        return states
+
+
+#: Every kind of vehicle, told apart by `kind`.
+AnyVehicle = TrackVehicle | DrawnVehicle

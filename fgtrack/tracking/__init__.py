@@ -1,0 +1,1 @@
+"""Tracking several objects: input processing, association, life cycle."""

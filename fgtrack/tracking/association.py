@@ -1,0 +1,135 @@
+"""Which candidate belongs to which track (Karle et al. 2023, section III-D)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal, NamedTuple, Protocol
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.stats import chi2
+
+from fgtrack.core.linalg import mahalanobis_squared
+from fgtrack.core.types import BoolArray, FloatArray
+from fgtrack.estimation.base import StatesAt
+from fgtrack.tracking.preprocess import Candidate
+
+_REFUSED = 1e9  # cost of a pair outside its gate: any number of good pairs is cheaper
+
+
+class Assignment(NamedTuple):
+    """Outcome of an association."""
+
+    pairs: list[tuple[int, int]]
+    """(candidate, track) as positions in the lists that were associated, candidates ascending."""
+    new: list[int]
+    """Candidates without a track, in the order of their birth."""
+    missed: list[int]
+    """Tracks without a candidate, ascending."""
+
+
+class Association(Protocol):
+    """Assigns candidates to tracks."""
+
+    def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
+        """Assignment of least cost; `states` are the tracks at the candidates' stamp."""
+
+
+def euclidean_distances(candidates: Sequence[Candidate], means: FloatArray) -> FloatArray:
+    """Distances, shape (candidates, tracks), in the map; of a bearing, from the track to the line of sight."""
+    positions = [candidate.position_m for candidate in candidates]
+    placed = [i for i, position in enumerate(positions) if position is not None]
+    distances = np.empty((len(candidates), len(means)))
+    if placed:
+        points = np.array([positions[i] for i in placed])
+        offsets = points[:, None, :] - means[None, :, :2]
+        distances[placed] = np.sqrt(np.sum(offsets * offsets, axis=-1))
+    for i, position in enumerate(positions):
+        if position is None:
+            distances[i] = _distances_to_ray(candidates[i], means)
+    return distances
+
+
+def _distances_to_ray(candidate: Candidate, means: FloatArray) -> FloatArray:
+    pose = candidate.measurement.pose
+    offsets = means[:, :2] - np.array([pose.x_m, pose.y_m])
+    ranges = np.hypot(offsets[:, 0], offsets[:, 1])
+    angle = np.arctan2(offsets[:, 1], offsets[:, 0]) - pose.yaw_rad - candidate.values["bearing_rad"]
+    across = np.abs(ranges * np.sin(angle))
+    return np.asarray(np.where(np.cos(angle) > 0.0, across, ranges))
+
+
+@dataclass(frozen=True)
+class GatedEuclidean:
+    """Hungarian assignment on distances; pairs further apart than the gate are out before the assignment."""
+
+    kind: Literal["euclidean"] = "euclidean"
+    gate_m: float = 5.0
+
+    def __post_init__(self) -> None:
+        if not self.gate_m > 0.0:
+            raise ValueError(f"gate_m: must be positive, is {self.gate_m}")
+
+    def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
+        """See `Association`."""
+        if not candidates or not states.track_ids:
+            return _unpaired(len(candidates), len(states.track_ids))
+        cost = euclidean_distances(candidates, states.means)
+        return _assigned(cost, cost <= self.gate_m)
+
+
+@dataclass(frozen=True)
+class GatedMahalanobis:
+    """Hungarian assignment on squared Mahalanobis distances of the innovation, gated by the chi-square quantile.
+
+    `max_distance_m` keeps a track of wide covariance from taking every detection.
+    """
+
+    kind: Literal["mahalanobis"] = "mahalanobis"
+    gate_probability: float = 0.99
+    max_distance_m: float = 50.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.gate_probability < 1.0:
+            raise ValueError(f"gate_probability: must lie between 0 and 1, is {self.gate_probability}")
+        if not self.max_distance_m > 0.0:
+            raise ValueError(f"max_distance_m: must be positive, is {self.max_distance_m}")
+
+    def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
+        """See `Association`; the cost adds log det S, so that a vague track does not win by being vague."""
+        if not candidates or not states.track_ids:
+            return _unpaired(len(candidates), len(states.track_ids))
+        cost = np.empty((len(candidates), len(states.track_ids)))
+        inside = euclidean_distances(candidates, states.means) <= self.max_distance_m
+        for row, candidate in enumerate(candidates):
+            measurement = candidate.measurement
+            model = measurement.model
+            y = model.residual(measurement.z, model.predict(states.means, measurement.pose))
+            H = model.jacobian(states.means, measurement.pose)
+            S = H @ states.covariances @ np.swapaxes(H, -1, -2) + measurement.R
+            squared = mahalanobis_squared(y, S)
+            cost[row] = squared + np.linalg.slogdet(S)[1]
+            inside[row] &= squared <= chi_square_quantile(self.gate_probability, len(measurement.z))
+        return _assigned(cost, inside)
+
+
+@cache
+def chi_square_quantile(probability: float, freedom: int) -> float:
+    """Quantile of the chi-square distribution."""
+    return float(chi2.ppf(probability, freedom))
+
+
+def _unpaired(candidates: int, tracks: int) -> Assignment:
+    return Assignment([], list(range(candidates)), list(range(tracks)))
+
+
+def _assigned(cost: FloatArray, inside: BoolArray) -> Assignment:
+    rows, columns = linear_sum_assignment(np.where(inside, cost, _REFUSED))
+    pairs = [(i, j) for i, j in zip(rows.tolist(), columns.tolist(), strict=True) if inside[i, j]]
+    paired = {i for i, _ in pairs}
+    seen = {j for _, j in pairs}
+    return Assignment(
+        pairs,
+        [i for i in range(cost.shape[0]) if i not in paired],
+        [j for j in range(cost.shape[1]) if j not in seen],
+    )

@@ -1,0 +1,129 @@
+"""Detections on their way from receipt to the tick that processes them."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from fgtrack.core.time import nanoseconds
+from fgtrack.core.types import Detection, DetectionList, Disposition, Frame, UpdateRecord
+from fgtrack.models.sensors import SensorModel
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """The usable detections of one message, at the stamp that they are processed at."""
+
+    message: DetectionList
+    stamp_ns: int
+    indices: tuple[int, ...]
+    """Positions, in the message, of the detections to process."""
+
+    @property
+    def sensor(self) -> str:
+        """Name of the sensor."""
+        return self.message.sensor
+
+    @property
+    def frame(self) -> Frame:
+        """Frame that the detections are given in."""
+        return self.message.frame
+
+    def record(self, index: int, disposition: Disposition) -> UpdateRecord:
+        """Say what became of detection `index`, where nothing was fused."""
+        return record(self.message, index, disposition)
+
+
+def record(message: DetectionList, index: int, disposition: Disposition) -> UpdateRecord:
+    """What became of detection `index` of `message`."""
+    stamp_ns = message.objects[index].stamp_ns
+    return UpdateRecord(
+        message.sensor,
+        message.stamp_ns if stamp_ns is None else stamp_ns,
+        message.receipt_ns,
+        index,
+        disposition,
+    )
+
+
+def records(message: DetectionList, disposition: Disposition) -> list[UpdateRecord]:
+    """The same disposition for every detection of `message`."""
+    return [record(message, index, disposition) for index in range(len(message.objects))]
+
+
+class Inbox(Protocol):
+    """Receives messages, and gives them out at the tick."""
+
+    def put(self, message: DetectionList) -> list[UpdateRecord]:
+        """Receive a message; the records of detections that end here."""
+
+    def collect(self) -> list[Batch]:
+        """Everything received since the last call, oldest stamp first."""
+
+
+def is_usable(detection: Detection, sensor: SensorModel) -> bool:
+    """Whether `detection` has finite values, says where it is, and is no empty slot (x = y = 0) of a fixed list."""
+    measured = [name for name in sensor.components if getattr(detection, name) is not None]
+    if not all(math.isfinite(getattr(detection, name)) for name in measured):
+        return False
+    if detection.covariance is not None and not all(map(math.isfinite, detection.covariance)):
+        return False
+    if detection.x_m == 0.0 and detection.y_m == 0.0:
+        return False
+    return ("x_m" in measured and "y_m" in measured) or "bearing_rad" in measured
+
+
+def stamps(message: DetectionList, sensor: SensorModel) -> list[int]:
+    """Stamp of every detection of `message`: the list's, its own, or the mean of those that have one."""
+    own = [detection.stamp_ns for detection in message.objects]
+    known = [stamp_ns for stamp_ns in own if stamp_ns is not None]
+    if sensor.stamp_from == "objects_mean" and known:
+        return [sum(known) // len(known)] * len(own)
+    if sensor.stamp_from == "object":
+        return [message.stamp_ns if stamp_ns is None else stamp_ns for stamp_ns in own]
+    return [message.stamp_ns] * len(own)
+
+
+class QueueInbox:
+    """Keeps every message. Refuses repeated, too late and future ones, and single detections that are no detections."""
+
+    def __init__(self, sensors: Mapping[str, SensorModel], max_future_s: float) -> None:
+        self._sensors = sensors
+        self._max_future_ns = nanoseconds(max_future_s)
+        self._pending: list[Batch] = []
+        self._last: dict[str, DetectionList] = {}
+
+    def put(self, message: DetectionList) -> list[UpdateRecord]:
+        """See `Inbox.put`; a message is repeated if stamp and contents equal the sensor's last one."""
+        sensor = self._sensors[message.sensor]
+        last = self._last.get(message.sensor)
+        if last is not None and last.stamp_ns == message.stamp_ns and last.objects == message.objects:
+            return records(message, Disposition.DUPLICATE)
+        self._last[message.sensor] = message
+        ended: list[UpdateRecord] = []
+        kept: dict[int, list[int]] = {} if message.objects else {message.stamp_ns: []}
+        for index, stamp_ns in enumerate(stamps(message, sensor)):
+            refusal = self._refusal(message, index, stamp_ns)
+            if refusal is None:
+                kept.setdefault(stamp_ns, []).append(index)
+            else:
+                ended.append(record(message, index, refusal))
+        self._pending += [Batch(message, stamp_ns, tuple(indices)) for stamp_ns, indices in kept.items()]
+        return ended
+
+    def _refusal(self, message: DetectionList, index: int, stamp_ns: int) -> Disposition | None:
+        sensor = self._sensors[message.sensor]
+        if not is_usable(message.objects[index], sensor):
+            return Disposition.INVALID
+        if stamp_ns - message.receipt_ns > self._max_future_ns:
+            return Disposition.INVALID
+        limit_s = sensor.max_delay_s
+        if limit_s is not None and message.receipt_ns - stamp_ns > nanoseconds(limit_s):
+            return Disposition.TOO_OLD
+        return None
+
+    def collect(self) -> list[Batch]:
+        """See `Inbox.collect`."""
+        batches = sorted(self._pending, key=lambda batch: batch.stamp_ns)
+        self._pending = []
+        return batches

@@ -1,0 +1,128 @@
+"""How long a track lives: the status counter of Karle et al. 2023, section III-D."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+from fgtrack.core.time import nanoseconds
+from fgtrack.core.types import FloatArray, TrackStatus
+from fgtrack.models.sensors import SensorModel
+
+
+@dataclass(slots=True)
+class Life:
+    """What is counted of one track."""
+
+    counter: int
+    last_seen_ns: int
+    num_measured: int = 1
+    missed: bool = False
+
+    def status(self, confirm_count: int) -> TrackStatus:
+        """How far the track can be trusted."""
+        if self.num_measured < confirm_count:
+            return TrackStatus.TENTATIVE
+        return TrackStatus.COASTING if self.missed else TrackStatus.CONFIRMED
+
+
+@dataclass(frozen=True)
+class LifecycleRules:
+    """When a track counts up, counts down, and ends."""
+
+    counter_cap: int = 25
+    forget_s: float = 2.0
+    """A track not measured for so long ends."""
+    short_range_m: float = 60.0
+    """Up to here short-range sensors age a track, beyond it long-range sensors do."""
+    confirm_count: int = 3
+    """Measurements after which a track is confirmed."""
+
+    def __post_init__(self) -> None:
+        if self.counter_cap < 1 or self.confirm_count < 1:
+            raise ValueError("counter_cap and confirm_count must be at least 1")
+        if not self.forget_s > 0.0 or not self.short_range_m >= 0.0:
+            raise ValueError("forget_s must be positive and short_range_m not negative")
+
+
+class Lifecycle(Protocol):
+    """Counts matches and misses, and says which tracks end."""
+
+    lives: Mapping[int, Life]
+
+    def born(self, track_id: int, sensor: str, stamp_ns: int, present_ns: int) -> None:
+        """A detection of `sensor` started a track."""
+
+    def matched(self, track_id: int, sensor: str, stamp_ns: int) -> None:
+        """A detection of `sensor` at `stamp_ns` was associated."""
+
+    def fused(self, track_id: int) -> None:
+        """The associated detection changed the state."""
+
+    def missed(
+        self, track_ids: Sequence[int], sensor: str, ranges_m: FloatArray, present_ns: int
+    ) -> list[int]:
+        """These tracks, at these distances from the ego, were not seen; the ids of those that end."""
+
+    def expired(self, present_ns: int) -> list[int]:
+        """The ids of tracks that end because time has passed."""
+
+    def forget(self, track_id: int) -> None:
+        """The track has ended."""
+
+
+class CountingLifecycle:
+    """The status counter, aged by every sensor at the range it is responsible for, and by time alone as well."""
+
+    def __init__(self, rules: LifecycleRules, sensors: Mapping[str, SensorModel]) -> None:
+        self._rules = rules
+        self._sensors = sensors
+        self._forget_ns = nanoseconds(rules.forget_s)
+        self.lives: dict[int, Life] = {}
+
+    def born(self, track_id: int, sensor: str, stamp_ns: int, present_ns: int) -> None:
+        """See `Lifecycle.born`."""
+        self.lives[track_id] = Life(self._sensors[sensor].counter_init, stamp_ns)
+
+    def matched(self, track_id: int, sensor: str, stamp_ns: int) -> None:
+        """See `Lifecycle.matched`."""
+        life = self.lives[track_id]
+        life.counter = min(life.counter + self._sensors[sensor].counter_add, self._rules.counter_cap)
+        life.last_seen_ns = max(life.last_seen_ns, stamp_ns)
+        life.missed = False
+
+    def fused(self, track_id: int) -> None:
+        """See `Lifecycle.fused`."""
+        self.lives[track_id].num_measured += 1
+
+    def missed(
+        self, track_ids: Sequence[int], sensor: str, ranges_m: FloatArray, present_ns: int
+    ) -> list[int]:
+        """See `Lifecycle.missed`."""
+        ended = []
+        for track_id, range_m in zip(track_ids, ranges_m.tolist(), strict=True):
+            if ages_at(self._sensors[sensor].ages, range_m, self._rules.short_range_m):
+                life = self.lives[track_id]
+                life.counter -= 1
+                life.missed = True
+                if life.counter <= 0:
+                    ended.append(track_id)
+        return ended
+
+    def expired(self, present_ns: int) -> list[int]:
+        """See `Lifecycle.expired`."""
+        return [i for i, life in self.lives.items() if present_ns - life.last_seen_ns > self._forget_ns]
+
+    def forget(self, track_id: int) -> None:
+        """See `Lifecycle.forget`."""
+        del self.lives[track_id]
+
+
+def ages_at(
+    ages: Literal["always", "short_range", "long_range", "never"], range_m: float, short_range_m: float
+) -> bool:
+    """Whether a sensor that `ages` so counts down a track at `range_m` that it did not see."""
+    if ages == "short_range":
+        return range_m <= short_range_m
+    if ages == "long_range":
+        return range_m > short_range_m
+    return ages == "always"

@@ -1,0 +1,230 @@
+"""The tracker: what happens at a tick, in the order of the paper's algorithm (Karle et al. 2023, figure 2)."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.types import (
+    DetectionList,
+    Disposition,
+    EgoState,
+    FloatArray,
+    TickReport,
+    TrackReport,
+    UpdateRecord,
+)
+from fgtrack.estimation.base import StatesAt, TrackBank, UpdateResult
+from fgtrack.models.road import Road
+from fgtrack.models.sensors import SensorModel
+from fgtrack.tracking.association import Association, Assignment
+from fgtrack.tracking.birth import Birth
+from fgtrack.tracking.ego import EgoPose, EgoSource
+from fgtrack.tracking.inbox import Batch, Inbox
+from fgtrack.tracking.lifecycle import Lifecycle
+from fgtrack.tracking.preprocess import Candidate, Preprocess
+
+
+@dataclass(frozen=True)
+class TrackerParts:
+    """The components that a tracker is made of."""
+
+    sensors: Mapping[str, SensorModel]
+    ego: EgoSource
+    inbox: Inbox
+    preprocess: Preprocess
+    association: Association
+    bank: TrackBank
+    lifecycle: Lifecycle
+    birth: Birth
+    road: Road
+    confirm_count: int
+
+
+class Tracker:
+    """Tracks objects from object lists that arrive late.
+
+    Messages come in through `receive` in receipt order; `tick` processes what came in since the last one.
+    Every detection received ends in exactly one record of exactly one tick.
+    """
+
+    def __init__(self, parts: TrackerParts) -> None:
+        self._parts = parts
+        self._tick = -1
+        self._next_id = 0
+        self._records: list[UpdateRecord] = []
+        self.refused_ego: Counter[str] = Counter()
+        """Ego messages that were not used, by reason."""
+
+    def receive(self, message: EgoState | DetectionList) -> None:
+        """Take a message. Raises `DataError` for a sensor that has no model."""
+        if isinstance(message, EgoState):
+            reason = self._parts.ego.receive(message)
+            if reason is not None:
+                self.refused_ego[reason] += 1
+            return
+        if message.sensor not in self._parts.sensors:
+            known = ", ".join(self._parts.sensors) or "none"
+            raise DataError(
+                f"sensor {message.sensor!r} has no model (the configuration has {known}): "
+                f"add it under `sensors`, or to `ignore_sensors`"
+            )
+        self._records += self._parts.inbox.put(message)
+
+    def tick(self, now_ns: int) -> TickReport:
+        """Process everything received up to `now_ns`."""
+        self._tick += 1
+        batches = self._parts.inbox.collect()
+        self._end(self._parts.lifecycle.expired(now_ns))
+        self._parts.bank.advance(now_ns)
+        self._parts.ego.start_tick()
+        for batch in batches:
+            self._process(batch)
+        updates, self._records = tuple(self._records), []
+        return TickReport(self._tick, now_ns, self._reports(), updates)
+
+    def _process(self, batch: Batch) -> None:
+        """One object list, at its own stamp: transform, filter, merge, associate, age, estimate, give birth."""
+        parts = self._parts
+        sensor = parts.sensors[batch.sensor]
+        ego = parts.ego.pose_at(batch.stamp_ns, parts.bank.present_ns)
+        if ego is None and batch.frame != "map":
+            self._records += [batch.record(index, Disposition.FAILED) for index in batch.indices]
+            return
+        candidates, out_of_bounds = parts.preprocess(batch, sensor, ego)
+        self._records += out_of_bounds
+        if batch.stamp_ns < parts.bank.window_start_ns:
+            for candidate in candidates:
+                self._conclude(batch, candidate, Disposition.TOO_OLD)
+            return
+        states = self._offered(batch)
+        assignment = parts.association(candidates, states)
+        self._count(batch, assignment, states, ego)
+        self._estimate(batch, candidates, assignment, states)
+        for position in assignment.new:
+            self._give_birth(batch, candidates[position], sensor)
+
+    def _offered(self, batch: Batch) -> StatesAt:
+        """The tracks that `batch` may be associated with, at its stamp."""
+        return self._parts.bank.states_at(batch.stamp_ns)
+
+    def _ranges_m(self, track_ids: Sequence[int], positions_m: FloatArray, ego: EgoPose | None) -> FloatArray:
+        """Distances from the ego to tracks at `positions_m` (n, 2), both at the stamp of the batch."""
+        if ego is None:
+            return np.zeros(len(track_ids))
+        return np.asarray(np.hypot(positions_m[:, 0] - ego.x_m, positions_m[:, 1] - ego.y_m))
+
+    def _count(self, batch: Batch, assignment: Assignment, states: StatesAt, ego: EgoPose | None) -> None:
+        """Status counters of matched and missed tracks; tracks that run out end here."""
+        lifecycle = self._parts.lifecycle
+        for _, track in assignment.pairs:
+            lifecycle.matched(states.track_ids[track], batch.sensor, batch.stamp_ns)
+        if not assignment.missed:
+            return
+        missed = [states.track_ids[track] for track in assignment.missed]
+        ranges_m = self._ranges_m(missed, states.means[assignment.missed, :2], ego)
+        self._end(lifecycle.missed(missed, batch.sensor, ranges_m, self._parts.bank.present_ns))
+
+    def _estimate(
+        self, batch: Batch, candidates: Sequence[Candidate], assignment: Assignment, states: StatesAt
+    ) -> None:
+        if not assignment.pairs:
+            return
+        matched = [candidates[position] for position, _ in assignment.pairs]
+        track_ids = [states.track_ids[track] for _, track in assignment.pairs]
+        results = self._parts.bank.update(
+            batch.stamp_ns, track_ids, [candidate.measurement for candidate in matched]
+        )
+        for candidate, track_id, result in zip(matched, track_ids, results, strict=True):
+            if result.innovation is not None:
+                self._parts.lifecycle.fused(track_id)
+            self._conclude(batch, candidate, Disposition(result.status.value), track_id, result)
+
+    def _give_birth(self, batch: Batch, candidate: Candidate, sensor: SensorModel) -> None:
+        parts = self._parts
+        prior = None
+        if sensor.births:
+            prior = parts.birth.prior(candidate, parts.road, parts.ego.current, parts.ego.in_pit)
+        if prior is None:
+            self._conclude(batch, candidate, Disposition.GATED)
+            return
+        track_id = self._next_id
+        self._next_id += 1
+        parts.bank.birth(track_id, prior)
+        parts.lifecycle.born(track_id, batch.sensor, batch.stamp_ns, parts.bank.present_ns)
+        self._conclude(batch, candidate, Disposition.BIRTH, track_id)
+
+    def _conclude(
+        self,
+        batch: Batch,
+        candidate: Candidate,
+        disposition: Disposition,
+        track_id: int | None = None,
+        result: UpdateResult | None = None,
+    ) -> None:
+        """Record the outcome of a candidate, and of the detections that were merged into it."""
+        outcome = replace(batch.record(candidate.index, disposition), track_id=track_id)
+        if result is not None and result.innovation is not None:
+            names = candidate.measurement.model.components
+            innovation = dict(zip(names, result.innovation.tolist(), strict=True))
+            outcome = replace(outcome, nis=result.nis, innovation=MappingProxyType(innovation))
+        self._records.append(outcome)
+        for index in candidate.merged:
+            merged = batch.record(index, Disposition.MERGED)
+            self._records.append(replace(merged, track_id=track_id))
+
+    def _end(self, track_ids: Sequence[int]) -> None:
+        for track_id in track_ids:
+            self._parts.bank.remove(track_id)
+            self._parts.lifecycle.forget(track_id)
+
+    def _reports(self) -> tuple[TrackReport, ...]:
+        lives = self._parts.lifecycle.lives
+        bank = self._parts.bank
+        return tuple(
+            TrackReport(
+                track_id, lives[track_id].status(self._parts.confirm_count), state, lives[track_id].num_measured
+            )
+            for track_id, state in zip(bank.track_ids, bank.present(), strict=True)
+        )
+
+
+class PublishedTracker(Tracker):
+    """The published implementation's order of things, where it differs (defects Q9 and Q22).
+
+    An empty list ages every track. The range that ages a track is measured from the present ego to where the
+    track was after the batch before, or at the end of the tick before.
+    """
+
+    def __init__(self, parts: TrackerParts) -> None:
+        super().__init__(parts)
+        self._last_known: dict[int, FloatArray] = {}
+
+    def tick(self, now_ns: int) -> TickReport:
+        """See `Tracker.tick`."""
+        report = super().tick(now_ns)
+        self._remember()
+        return report
+
+    def _process(self, batch: Batch) -> None:
+        super()._process(batch)
+        self._remember()
+
+    def _remember(self) -> None:
+        states = self._parts.bank.states_at(self._parts.bank.present_ns)
+        self._last_known = dict(zip(states.track_ids, states.means[:, :2], strict=True))
+
+    def _offered(self, batch: Batch) -> StatesAt:
+        if batch.indices:
+            return super()._offered(batch)
+        return self._parts.bank.states_at(self._parts.bank.present_ns)
+
+    def _ranges_m(self, track_ids: Sequence[int], positions_m: FloatArray, ego: EgoPose | None) -> FloatArray:
+        current = self._parts.ego.current
+        if current is None:
+            return np.zeros(len(track_ids))
+        known = np.array([self._last_known[track_id] for track_id in track_ids])
+        return np.asarray(np.hypot(known[:, 0] - current.x_m, known[:, 1] - current.y_m))

@@ -1,0 +1,244 @@
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluation_runs import ROUND, WEST, update, write_run
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from fgtrack.core.types import Disposition
+from fgtrack.evaluation.matching import MatchOptions
+from fgtrack.evaluation.metrics import Metrics, ObjectMetrics, evaluate
+from fgtrack.evaluation.statistics import Distribution, Moments
+from fgtrack.io.run_folder import Run
+
+samples = hnp.arrays(np.float64, st.integers(0, 20), elements=st.floats(-1e3, 1e3))
+
+
+@settings(deadline=None)
+@given(samples, samples)
+def test_moments_of_two_samples_add_up(a: np.ndarray, b: np.ndarray) -> None:
+    total, together = Moments.of(a) + Moments.of(b), Moments.of(np.concatenate([a, b]))
+    assert total.count == together.count
+    expected = (together.mean, together.std, together.rmse)
+    assert (total.mean, total.std, total.rmse) == pytest.approx(expected, abs=1e-6, nan_ok=True)
+
+
+def test_moments_leave_out_what_is_not_there() -> None:
+    moments = Moments.of(np.array([1.0, np.nan, 3.0]))
+    assert (moments.count, moments.mean, moments.std) == (2, 2.0, 1.0)
+    assert moments.rmse == pytest.approx(math.sqrt(5.0))
+
+
+@settings(deadline=None)
+@given(hnp.arrays(np.float64, st.integers(1, 20), elements=st.floats(-1.0, 1.0)), st.floats(-3.0, 3.0))
+def test_the_spread_of_angles_does_not_depend_on_where_they_point(angles: np.ndarray, turn: float) -> None:
+    here = Moments.of(angles)
+    there = Moments.of_angles(np.array([math.remainder(a + turn, 2 * math.pi) for a in angles]))
+    assert there.std == pytest.approx(here.std, abs=1e-7)
+    assert math.remainder(there.mean - here.mean - turn, 2 * math.pi) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_quantiles_of_a_known_sample() -> None:
+    distribution = Distribution.of(np.arange(101.0))
+    assert distribution == Distribution(101, 50.0, 50.0, 90.0, 99.0, 100.0)
+
+
+@pytest.fixture
+def story(tmp_path: Path) -> Run:
+    """Ten ticks. WEST: track 1, lost at 3 and 4, track 1 again at 5, track 2 from 7. ROUND: track 3, all but
+    the last two ticks. Track 4 follows nothing, track 5 was measured once. Truth of ROUND ends at tick 8.
+    """
+    tracks = []
+    for k in range(10):
+        rows = []
+        if k < 3 or 5 <= k < 7:
+            rows.append(WEST.track(k, 1, along_m=3.0, across_m=4.0, yaw_rad=-0.2, speed_mps=-1.0))
+        if k >= 7:
+            rows.append(WEST.track(k, 2, along_m=-3.0, across_m=4.0, yaw_rad=0.2, speed_mps=1.0))
+        if k < 8:
+            rows.append(ROUND.track(k, 3, along_m=1.0))
+        rows.append(WEST.track(k, 4, across_m=60.0))
+        if k == 4:
+            rows.append(WEST.track(k, 5, num_measured=1))
+        tracks.append(rows)
+    truth = [*WEST.truth(range(10)), *ROUND.truth(range(9))]
+    return write_run(tmp_path / "story", tracks, truth=truth)
+
+
+def objects_of(metrics: Metrics) -> dict[int, ObjectMetrics]:
+    assert metrics.truth is not None
+    return dict(metrics.truth.objects)
+
+
+def test_time_tracked_breaks_and_switches_are_counted(story: Run) -> None:
+    objects = objects_of(evaluate(story))
+    west, round_ = objects[7], objects[8]
+    assert (west.ticks_present, west.ticks_tracked, west.breaks, west.id_switches) == (10, 8, 2, 1)
+    assert (round_.ticks_present, round_.ticks_tracked, round_.breaks, round_.id_switches) == (9, 8, 0, 0)
+    assert west.tracked_share == pytest.approx(0.8)
+
+
+def test_errors_have_their_known_moments(story: Run) -> None:
+    errors = objects_of(evaluate(story))[7].errors
+    assert errors["position_m"].rmse == pytest.approx(5.0)
+    assert errors["position_m"].std == pytest.approx(0.0, abs=1e-9)
+    assert errors["across_m"].mean == pytest.approx(4.0)
+    # 5 of 8 rows at +3 m, 3 at -3 m; yaw and speed the other way round
+    assert errors["along_m"].mean == pytest.approx(3.0 / 4.0)
+    assert errors["along_m"].std == pytest.approx(3.0 * math.sqrt(1 - 1 / 16))
+    assert errors["along_m"].rmse == pytest.approx(3.0)
+    assert errors["yaw_rad"].mean == pytest.approx(-0.05)
+    assert errors["yaw_rad"].rmse == pytest.approx(0.2)
+    assert errors["speed_mps"].mean == pytest.approx(-0.25)
+
+
+def test_overall_is_all_objects_together(story: Run) -> None:
+    metrics = evaluate(story)
+    assert metrics.truth is not None
+    overall = metrics.truth.overall
+    assert (overall.ticks_present, overall.ticks_tracked, overall.breaks) == (19, 16, 2)
+    assert overall.errors["position_m"].rmse == pytest.approx(math.sqrt((8 * 25.0 + 8 * 1.0) / 16))
+
+
+def test_false_tracks_and_precision(story: Run) -> None:
+    metrics = evaluate(story)
+    assert metrics.truth is not None
+    assert (metrics.num_tracks, metrics.num_confirmed) == (5, 4)
+    assert (metrics.truth.judged_tracks, metrics.truth.false_tracks) == (4, 1)
+    assert metrics.truth.tracked_objects == 2
+    assert metrics.precision == pytest.approx(2 / 4)
+
+
+def test_precision_counts_confirmed_tracks_whatever_is_judged(story: Run) -> None:
+    metrics = evaluate(story, MatchOptions(confirmed_only=False))
+    assert metrics.truth is not None
+    assert metrics.truth.judged_tracks == 5
+    assert metrics.precision == pytest.approx(2 / 4)
+
+
+def test_an_object_that_no_confirmed_track_followed_is_no_true_positive(tmp_path: Path) -> None:
+    tracks = [[WEST.track(k, 1), ROUND.track(k, 2, num_measured=2)] for k in range(3)]
+    run = write_run(tmp_path / "run", tracks, truth=[*WEST.truth(range(3)), *ROUND.truth(range(3))])
+    metrics = evaluate(run, MatchOptions(confirmed_only=False))
+    assert metrics.truth is not None
+    assert metrics.truth.tracked_objects == 1
+    assert metrics.truth.overall.ticks_tracked == 6
+
+
+@pytest.mark.parametrize(("paired", "false"), [(4, 1), (5, 0)])
+def test_a_track_is_false_when_paired_for_less_than_half_of_its_life(
+    tmp_path: Path, paired: int, false: int
+) -> None:
+    tracks = [[WEST.track(k, 1, across_m=0.0 if k < paired else 20.0)] for k in range(10)]
+    metrics = evaluate(write_run(tmp_path / "run", tracks, truth=WEST.truth(range(10))))
+    assert metrics.truth is not None
+    assert metrics.truth.false_tracks == false
+
+
+def test_an_object_that_was_never_tracked_has_no_errors(tmp_path: Path) -> None:
+    metrics = evaluate(write_run(tmp_path / "run", [[], []], truth=WEST.truth(range(2))))
+    west = objects_of(metrics)[7]
+    assert (west.ticks_present, west.ticks_tracked, west.breaks, west.id_switches) == (2, 0, 0, 0)
+    assert math.isnan(west.errors["position_m"].rmse)
+    assert math.isnan(metrics.precision)
+
+
+def test_truth_without_heading_gives_position_errors_only(tmp_path: Path) -> None:
+    tracks = [[WEST.track(k, 1, along_m=0.3, across_m=0.4)] for k in range(3)]
+    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(3), pose=False))
+    errors = objects_of(evaluate(run))[7].errors
+    assert errors["position_m"].rmse == pytest.approx(0.5)
+    assert [errors[name].count for name in ("along_m", "across_m", "yaw_rad", "speed_mps")] == [0] * 4
+
+
+def test_residuals_turn_into_the_direction_of_the_track(tmp_path: Path) -> None:
+    tracks = [[ROUND.track(k, 1)] for k in range(3)]
+    yaw_rad = ROUND.state(0.01)[2]  # half a tick after the first
+    forward = {"x_m": 2.0 * math.cos(yaw_rad), "y_m": 2.0 * math.sin(yaw_rad)}
+    record = update(nis=1.5, **forward)
+    between = type(record)(
+        record.sensor, record.stamp_ns + 10_000_000, *(getattr(record, n) for n in record.__slots__[2:])
+    )
+    metrics = evaluate(write_run(tmp_path / "run", tracks, updates={1: [between]}))
+    residuals = metrics.sensors["lidar"].residuals
+    assert residuals["along_m"].mean == pytest.approx(2.0)
+    assert residuals["across_m"].mean == pytest.approx(0.0, abs=1e-9)
+    assert residuals["x_m"].mean == pytest.approx(forward["x_m"])
+
+
+def test_residuals_and_nis_are_summed_by_sensor(tmp_path: Path) -> None:
+    updates = {
+        0: [update(disposition=Disposition.BIRTH)],
+        1: [
+            update(tick=1, nis=1.0, x_m=1.0, y_m=0.0, yaw_rad=math.pi - 0.1),
+            update(tick=1, nis=3.0, x_m=3.0, y_m=0.0, yaw_rad=-math.pi + 0.1, index=1),
+            update("radar", tick=1, nis=4.0, speed_mps=-2.0),
+        ],
+    }
+    sensors = evaluate(write_run(tmp_path / "run", updates=updates)).sensors
+    lidar = sensors["lidar"]
+    assert (lidar.residuals["x_m"].mean, lidar.residuals["x_m"].std) == (2.0, 1.0)
+    assert abs(lidar.residuals["yaw_rad"].mean) == pytest.approx(math.pi)
+    assert lidar.residuals["yaw_rad"].std == pytest.approx(0.1)
+    assert (lidar.nis.mean, lidar.nis_dof.mean, lidar.nis.count) == (2.0, 3.0, 2)
+    assert set(sensors["radar"].residuals) == {"speed_mps"}
+    assert "along_m" not in lidar.residuals  # track 1 was never published
+
+
+def test_dispositions_sum_to_the_detections_received(tmp_path: Path) -> None:
+    updates = {k: [update(index=k, disposition=name)] for k, name in enumerate(Disposition)}
+    updates[0].append(update("radar", disposition=Disposition.GATED))
+    metrics = evaluate(write_run(tmp_path / "run", updates=updates))
+    assert dict(metrics.sensors["lidar"].dispositions) == {name.value: 1 for name in Disposition}
+    assert metrics.sensors["lidar"].detections == len(Disposition)
+    assert metrics.sensors["radar"].dispositions["gated"] == 1
+    assert sum(sensor.detections for sensor in metrics.sensors.values()) == 13
+
+
+def test_the_delay_of_a_message_counts_once(tmp_path: Path) -> None:
+    late, soon = 200_000_000, 100_000_000
+    updates = {
+        0: [update(index=k, delay_ns=late) for k in range(8)],
+        5: [update(tick=5, delay_ns=soon)],
+    }
+    delay_s = evaluate(write_run(tmp_path / "run", updates=updates)).sensors["lidar"].delay_s
+    assert (delay_s.count, delay_s.max) == (2, 0.2)
+    assert delay_s.mean == pytest.approx(0.15)
+    assert delay_s.p90 == pytest.approx(0.19)
+
+
+def test_time_is_that_of_ticks_with_detections(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", process_ns=[1_000, 4_000, 9_000, 6_000], num_detections=[0, 2, 0, 1])
+    time_s = evaluate(run).time_per_tick_s
+    assert (time_s.count, time_s.max) == (2, 6e-6)
+    assert time_s.p50 == pytest.approx(5e-6)
+
+
+def test_a_run_without_truth_has_the_rest(tmp_path: Path) -> None:
+    metrics = evaluate(write_run(tmp_path / "run", [[WEST.track(0, 1)]], updates={0: [update(nis=2.0)]}))
+    assert metrics.truth is None
+    assert metrics.num_tracks == 1
+    assert metrics.sensors["lidar"].nis.mean == 2.0
+    assert math.isnan(metrics.precision)
+
+
+def test_an_empty_run_can_be_judged(tmp_path: Path) -> None:
+    metrics = evaluate(write_run(tmp_path / "run"))
+    assert (metrics.num_tracks, dict(metrics.sensors), metrics.truth) == (0, {}, None)
+
+
+def test_metrics_are_strict_json(story: Run) -> None:
+    plain = evaluate(story).as_dict()
+    again = json.loads(json.dumps(plain, allow_nan=False))
+    assert again == plain
+    assert again["truth"]["objects"]["7"]["errors"]["position_m"]["rmse"] == pytest.approx(5.0)
+    assert again["truth"]["overall"]["tracked_share"] == pytest.approx(16 / 19)
+    assert again["precision"] == 0.5
+
+
+def test_metrics_are_the_same_every_time(story: Run) -> None:
+    assert json.dumps(evaluate(story).as_dict()) == json.dumps(evaluate(story).as_dict())

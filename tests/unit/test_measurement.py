@@ -1,0 +1,243 @@
+import math
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from fgtrack.core.errors import CallError
+from fgtrack.core.types import MEASURABLE, FloatArray
+from fgtrack.models.measurement import MIN_RANGE_M, MeasurementModel, SensorPose, measurement_model
+from fgtrack.models.motion import CTRA, CTRV, CV, MIN_SPEED_MPS, MotionModel
+
+MODELS: tuple[MotionModel, ...] = (CTRV(), CTRA(), CV())
+every_model = pytest.mark.parametrize("motion", MODELS, ids=lambda model: type(model).__name__)
+SELECTION = ("x_m", "y_m", "yaw_rad", "speed_mps")
+DOPPLER = ("range_m", "bearing_rad", "range_rate_mps")
+
+
+@st.composite
+def poses(draw: st.DrawFn) -> SensorPose:
+    position, yaw, velocity = st.floats(-100.0, 100.0), st.floats(-4.0, 4.0), st.floats(-50.0, 50.0)
+    return SensorPose(*(draw(s) for s in (position, position, yaw, velocity, velocity)))
+
+
+@st.composite
+def kinematics(draw: st.DrawFn) -> FloatArray:
+    """x, y, yaw, speed, yaw rate, acceleration of an object that is not far away and not quite at rest."""
+    position, yaw, speed = st.floats(-200.0, 200.0), st.floats(-3.0, 3.0), st.floats(0.5, 90.0)
+    return np.array([draw(s) for s in (position, position, yaw, speed)] + [0.1, 1.0])
+
+
+def state_of(motion: MotionModel, kinematic: FloatArray) -> FloatArray:
+    return motion.from_kinematic(kinematic, np.eye(6))[0]
+
+
+def one_by_hand(name: str, kinematic: FloatArray, pose: SensorPose) -> float:
+    """The component in words: the object in the frame of the sensor, by plain trigonometry."""
+    x, y, yaw, speed = kinematic[:4]
+    east, north = x - pose.x_m, y - pose.y_m
+    distance = math.sqrt(east**2 + north**2)
+    ahead = east * math.cos(pose.yaw_rad) + north * math.sin(pose.yaw_rad)
+    left = north * math.cos(pose.yaw_rad) - east * math.sin(pose.yaw_rad)
+    opening = east * (speed * math.cos(yaw) - pose.vx_mps) + north * (speed * math.sin(yaw) - pose.vy_mps)
+    values = {"x_m": x, "y_m": y, "yaw_rad": yaw, "speed_mps": speed, "range_m": distance}
+    return float(
+        {**values, "bearing_rad": math.atan2(left, ahead), "range_rate_mps": opening / distance}[name]
+    )
+
+
+def far_from(pose: SensorPose, kinematic: FloatArray) -> FloatArray:
+    """The object, moved away where it stands on the sensor."""
+    if math.hypot(kinematic[0] - pose.x_m, kinematic[1] - pose.y_m) < 1.0:
+        kinematic[0] = pose.x_m + 2.0
+    return kinematic
+
+
+@every_model
+@given(kinematic=kinematics(), pose=poses())
+@settings(deadline=None)
+def test_every_component_is_what_the_sensor_sees(
+    motion: MotionModel, kinematic: FloatArray, pose: SensorPose
+) -> None:
+    kinematic = far_from(pose, kinematic)
+    model = measurement_model(MEASURABLE, motion)
+    by_hand = np.array([one_by_hand(name, kinematic, pose) for name in MEASURABLE])
+    predicted = model.predict(state_of(motion, kinematic), pose)
+    assert_allclose(model.residual(predicted, by_hand), np.zeros(7), atol=1e-9)
+
+
+@every_model
+@given(kinematic=kinematics(), pose=poses())
+@settings(deadline=None)
+def test_the_jacobian_is_the_numeric_derivative(
+    motion: MotionModel, kinematic: FloatArray, pose: SensorPose
+) -> None:
+    x = state_of(motion, far_from(pose, kinematic))
+    model = measurement_model(MEASURABLE, motion)
+    step = 1e-5 * np.eye(motion.dim)
+    numeric = model.residual(model.predict(x + step, pose), model.predict(x - step, pose)).T / 2e-5
+    assert_allclose(model.jacobian(x, pose), numeric, rtol=1e-5, atol=1e-6)
+
+
+@every_model
+def test_every_subset_is_the_rows_of_the_whole(motion: MotionModel) -> None:
+    x = state_of(motion, np.array([30.0, -20.0, 2.0, 25.0, 0.1, 1.0]))
+    pose = SensorPose(4.0, 5.0, 0.3, 10.0, -2.0)
+    whole = measurement_model(MEASURABLE, motion)
+    subsets = [names for k in range(1, 8) for names in combinations(MEASURABLE, k)]
+    assert len(subsets) == 127
+    for names in subsets:
+        rows = [MEASURABLE.index(name) for name in names]
+        model = measurement_model(names, motion)
+        assert_array_equal(model.predict(x, pose), whole.predict(x, pose)[rows])
+        assert_array_equal(model.jacobian(x, pose), whole.jacobian(x, pose)[rows])
+        assert model.angular == tuple(name in ("yaw_rad", "bearing_rad") for name in names)
+
+
+@every_model
+@pytest.mark.parametrize("components", [SELECTION, ("x_m", "y_m"), DOPPLER, ("bearing_rad",), MEASURABLE])
+def test_many_states_at_once_equal_one_by_one(motion: MotionModel, components: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(5)
+    model, pose = measurement_model(components, motion), SensorPose(1.0, 2.0, 0.4, 5.0, -3.0)
+    x = rng.normal(size=(3, 4, motion.dim)) * 10.0
+    predicted, H = model.predict(x, pose), model.jacobian(x, pose)
+    assert predicted.shape == (3, 4, len(components))
+    assert H.shape == (3, 4, len(components), motion.dim)
+    for index in np.ndindex(3, 4):
+        assert_allclose(predicted[index], model.predict(x[index], pose), rtol=1e-14)
+        assert_allclose(H[index], model.jacobian(x[index], pose), rtol=1e-14, atol=1e-16)
+
+
+@every_model
+def test_a_state_with_further_entries_widens_the_jacobian_by_zeros(motion: MotionModel) -> None:
+    x = state_of(motion, np.array([30.0, -20.0, 2.0, 25.0, 0.1, 1.0]))
+    wider = np.concatenate([x, [7.0, 8.0]])
+    for components in (("x_m", "y_m"), SELECTION, DOPPLER):
+        model = measurement_model(components, motion)
+        assert_array_equal(model.predict(wider), model.predict(x))
+        H = model.jacobian(wider)
+        assert H.shape == (len(components), motion.dim + 2)
+        assert_array_equal(H[:, : motion.dim], model.jacobian(x))
+        assert_array_equal(H[:, motion.dim :], 0.0)
+
+
+@every_model
+def test_a_model_is_linear_where_it_selects_entries_of_the_state(motion: MotionModel) -> None:
+    cartesian = isinstance(motion, CV)
+    assert measurement_model(("x_m", "y_m"), motion).linear
+    assert measurement_model(SELECTION, motion).linear == (not cartesian)
+    assert not measurement_model(("x_m", "y_m", "range_m"), motion).linear
+    assert not measurement_model(("bearing_rad",), motion).linear
+
+
+def test_a_selection_is_a_copy_and_its_matrix_is_read_only() -> None:
+    model = measurement_model(("x_m", "y_m"), CTRV())
+    x = np.arange(5.0)
+    assert not np.shares_memory(model.predict(x), x)
+    assert_array_equal(model.jacobian(x), np.eye(5)[:2])
+    with pytest.raises(ValueError, match="read-only"):
+        model.jacobian(x)[0, 0] = 2.0
+
+
+def test_equal_questions_share_one_model_whatever_the_noise() -> None:
+    noisy = CTRV(yaw_density_rad2ps=1.0)
+    assert measurement_model(DOPPLER, CTRV()) is measurement_model(DOPPLER, noisy)
+    assert measurement_model(DOPPLER, CTRV()) is not measurement_model(DOPPLER, CV())
+
+
+@given(angle=st.floats(-50.0, 50.0), turns=st.integers(-5, 5), other=st.floats(-4.0, 4.0))
+@settings(deadline=None)
+def test_residuals_wrap_angles_and_nothing_else(angle: float, turns: int, other: float) -> None:
+    model = measurement_model(MEASURABLE, CTRV())
+    z = np.full(7, angle + 2.0 * math.pi * turns)
+    y = model.residual(z, np.full(7, other))
+    for name, entry, plain in zip(MEASURABLE, y, z - other, strict=True):
+        if name in ("yaw_rad", "bearing_rad"):
+            assert -math.pi < entry <= math.pi
+            assert_allclose(
+                [math.cos(entry), math.sin(entry)], [math.cos(plain), math.sin(plain)], atol=1e-12
+            )
+        else:
+            assert entry == plain
+
+
+def test_residuals_across_the_seam_are_small_and_half_a_turn_is_positive() -> None:
+    model = measurement_model(("x_m", "yaw_rad"), CTRV())
+    z = np.array([[1.0, math.pi - 0.01], [1.0, -math.pi + 0.01], [1.0, math.pi], [1.0, -math.pi], [1.0, 0.5]])
+    predicted = np.array([[0.0, -math.pi + 0.01], [0.0, math.pi - 0.01], [0.0, 0.0], [0.0, 0.0], [0.0, 0.25]])
+    y = model.residual(z, predicted)
+    assert_allclose(y[:, 1], [-0.02, 0.02, math.pi, math.pi, 0.25], atol=1e-14)
+    assert_array_equal(y[:, 0], 1.0)
+
+
+@every_model
+def test_a_static_object_seen_from_a_moving_sensor_closes_at_the_sensor_speed(motion: MotionModel) -> None:
+    model = measurement_model(("range_rate_mps",), motion)
+    x = np.zeros(motion.dim)
+    x[:2] = 30.0, 40.0
+    assert_allclose(model.predict(x, SensorPose(vx_mps=15.0, vy_mps=20.0)), [-25.0])
+    assert_allclose(model.predict(x, SensorPose(vx_mps=-20.0, vy_mps=15.0)), [0.0], atol=1e-14)
+    assert_allclose(model.predict(x, SensorPose(yaw_rad=1.0, vx_mps=15.0, vy_mps=20.0)), [-25.0])
+
+
+@every_model
+def test_an_object_that_drives_like_the_sensor_has_no_range_rate(motion: MotionModel) -> None:
+    x = state_of(motion, np.array([30.0, 40.0, 0.3, 20.0, 0.0, 0.0]))
+    pose = SensorPose(vx_mps=20.0 * math.cos(0.3), vy_mps=20.0 * math.sin(0.3))
+    assert_allclose(measurement_model(("range_rate_mps",), motion).predict(x, pose), [0.0], atol=1e-13)
+
+
+@every_model
+@pytest.mark.parametrize("side_m", [1e-3, -1e-3])
+def test_the_bearing_of_an_object_behind_crosses_the_seam_smoothly(
+    motion: MotionModel, side_m: float
+) -> None:
+    model = measurement_model(("bearing_rad",), motion)
+    pose = SensorPose(2.0, 1.0, yaw_rad=0.5 * math.pi)
+    x = np.zeros(motion.dim)
+    x[:2] = 2.0 + side_m, 1.0 - 10.0
+    behind = np.array([math.pi])
+    y = model.residual(model.predict(x, pose), behind)
+    assert_allclose(y, [side_m / 10.0], rtol=1e-6)  # east of the sensor is left of behind: further round
+    assert_allclose(model.jacobian(x, pose)[0, :2], [0.1, side_m / 100.0], rtol=1e-6)
+
+
+@every_model
+def test_an_object_at_the_sensor_or_at_rest_gives_finite_numbers(motion: MotionModel) -> None:
+    model = measurement_model(MEASURABLE, motion)
+    x = np.zeros(motion.dim)
+    pose = SensorPose(yaw_rad=0.25, vx_mps=3.0, vy_mps=-2.0)
+    assert_allclose(model.predict(x, pose), [0.0, 0.0, 0.0, 0.0, 0.0, -0.25, -3.0])
+    H = model.jacobian(x, pose)
+    assert np.isfinite(H).all()
+    assert_allclose(H[4:6, :2], [[1.0, 0.0], [0.0, 1.0 / MIN_RANGE_M]])
+    heading_row = [0.0, 1.0 / MIN_SPEED_MPS] if isinstance(motion, CV) else [1.0, 0.0]
+    assert_allclose(H[2, 2:4], heading_row)
+
+
+@pytest.mark.parametrize(
+    "components",
+    [(), ("y_m", "x_m"), ("x_m", "x_m"), ("x_m", "height_m"), ("vx_mps",)],
+)
+def test_components_that_cannot_be_measured_are_refused(components: tuple[str, ...]) -> None:
+    with pytest.raises(CallError, match="give one or more of x_m, y_m, yaw_rad"):
+        measurement_model(components, CTRV())
+
+
+def test_a_state_of_another_kind_is_refused() -> None:
+    with pytest.raises(CallError, match="state of x_m, y_m, z_m: must begin with"):
+        MeasurementModel(("x_m",), ("x_m", "y_m", "z_m"))
+
+
+@every_model
+def test_inputs_stay_as_they_are(motion: MotionModel) -> None:
+    x = np.ones((2, motion.dim))
+    x.flags.writeable = False
+    z = np.full((2, 7), 4.0)
+    z.flags.writeable = False
+    model = measurement_model(MEASURABLE, motion)
+    model.residual(z, model.predict(x, SensorPose(9.0, 9.0)))
+    model.jacobian(x, SensorPose(9.0, 9.0))
