@@ -16,10 +16,10 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 
-#: Colours of Okabe and Ito, told apart by the colour-blind as well; vermilion is kept for what is wrong.
-PALETTE = ("#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#000000", "#E69F00")
-WRONG = "#D55E00"
-GREY = "#555555"
+#: Colours of Okabe and Ito, which the colour-blind tell apart as well.
+PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
+WRONG = "#000000"
+GREY = "#777777"
 
 _BREAK_NS = NS_PER_S // 2  # a line is not drawn across a longer pause
 

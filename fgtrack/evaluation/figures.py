@@ -112,7 +112,7 @@ def figure_residuals(run: Run, title: str = "") -> Figure:
     for (over_time, histogram), name in zip(rows, names, strict=True):
         known = np.isfinite(values[name])
         low, high = _core(values[name][known])
-        bins = np.linspace(low, high, 61)
+        bins = np.linspace(low, high, 41)
         for k, sensor in enumerate(sensors):
             mine = known & (updates["sensor"] == sensor)
             sample = values[name][mine]
@@ -120,14 +120,15 @@ def figure_residuals(run: Run, title: str = "") -> Figure:
                 continue
             moments = (Moments.of_angles if name in ANGULAR else Moments.of)(sample)
             outside = int(((sample < low) | (sample > high)).sum())
-            label = f"{sensor}: mean {moments.mean:.3f}, std {moments.std:.3f}, n {moments.count}"
+            mean = round(moments.mean, 3) + 0.0  # no negative zero
+            label = f"{sensor}: mean {mean:.3f}, std {moments.std:.3f}, n {moments.count}"
             label += f" ({outside} outside)" if outside else ""
             over_time.plot(time_s[mine], sample, ".", ms=3.0, alpha=0.6, mew=0, color=colour(k), label=label)
             density = np.histogram(sample, bins)[0] / (len(sample) * np.diff(bins))
             histogram.stairs(density, bins, orientation="horizontal", color=colour(k), lw=1.4)
         over_time.set_ylim(low, high)
         over_time.set_ylabel(_RESIDUALS[name])
-        histogram.set_xlabel(f"density [1/({_RESIDUALS[name].rpartition('[')[2][:-1]})]")
+        histogram.set_xlabel(f"density, in 1 / {_RESIDUALS[name].rpartition(' ')[2]}")
         over_time.set_xlabel("time [s]")
         over_time.sharex(rows[0][0])
         legend_above(over_time, width=80)

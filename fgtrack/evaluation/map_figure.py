@@ -20,7 +20,7 @@ def figure_map(run: Run, matching: Matching | None, title: str = "") -> Figure:
     """Tracks and truth on the map whose file `meta.json` names as `map`.
 
     Truth is a broad pale line, so a stretch that nothing tracked stays visible; a track has the colour of the
-    object that it is paired to, and vermilion where it is paired to none. Without truth every track with
+    object that it is paired to, and is black where it is paired to none. Without truth every track with
     enough measurements has a colour.
     """
     figure = Figure(figsize=(8.0, 7.0))
@@ -39,7 +39,7 @@ def figure_map(run: Run, matching: Matching | None, title: str = "") -> Figure:
         title += f"\n{count} tracks with at least {CONFIRMED_MEASUREMENTS} measurements, no truth"
     else:
         _draw_matched(axes, run, matching)
-        legend_above(axes, width=100)
+        legend_above(axes, width=75)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")

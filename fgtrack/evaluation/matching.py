@@ -114,11 +114,14 @@ def track_errors(matching: Matching) -> TrackErrors:
     tracks, truth = matching.tracks.where(matching.paired), matching.true_states[matching.paired]
     dx_m, dy_m = tracks["x_m"] - truth[:, 0], tracks["y_m"] - truth[:, 1]
     c, s = np.cos(truth[:, 2]), np.sin(truth[:, 2])
+    yaw_rad = tracks["yaw_rad"] - truth[:, 2]
+    known = np.isfinite(yaw_rad)
+    yaw_rad[known] = wrap_angles(yaw_rad[known])
     errors = (
         np.hypot(dx_m, dy_m),
         c * dx_m + s * dy_m,
         c * dy_m - s * dx_m,
-        wrap_angles(tracks["yaw_rad"] - truth[:, 2]),
+        yaw_rad,
         tracks["speed_mps"] - truth[:, 3],
     )
     return TrackErrors(

@@ -45,7 +45,9 @@ class TruePath:
         u = (stamps_ns - self.stamps_ns[left]) / h_ns
         a, b = self.states[left], self.states[left + 1]
         states = a + u[:, None] * (b - a)
-        states[:, 2] = wrap_angles(a[:, 2] + u * wrap_angles(b[:, 2] - a[:, 2]))
+        both = np.isfinite(states[:, 2])
+        turned_rad = u[both] * wrap_angles(b[both, 2] - a[both, 2])
+        states[both, 2] = wrap_angles(a[both, 2] + turned_rad)
         curve = _hermite(a, b, u, h_ns / NS_PER_S)
         states[:, :2] = np.where(np.isfinite(curve), curve, states[:, :2])
         away = h_ns > max(_SHORTEST_GAP_NS, _GAP_PERIODS * float(np.median(periods_ns)))

@@ -148,6 +148,11 @@ def is_bag_folder(path: Path) -> bool:
     return (path / "metadata.yaml").is_file() or bool(_bag_files(path))
 
 
+def is_bag_file(path: Path) -> bool:
+    """Whether the file `path` starts as a recording does."""
+    return storage_of(path) is not None
+
+
 def _topics(
     connections: list[Connection], store: Typestore, unreadable: Mapping[str, str]
 ) -> tuple[BagTopic, ...]:
@@ -221,4 +226,4 @@ def _as_data_error(path: Path) -> Iterator[None]:
         raise DataError(f"{path}: cannot be read as a recording ({one_line(error)})") from error
 
 
-__all__ = ["Bag", "BagMessage", "BagTopic", "is_bag_folder", "type_name"]
+__all__ = ["Bag", "BagMessage", "BagTopic", "is_bag_file", "is_bag_folder", "type_name"]

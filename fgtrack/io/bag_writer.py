@@ -13,6 +13,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.io.adapters.common import RosMessage
+from fgtrack.io.errors import UntilBreak
 from fgtrack.io.ros_messages import DETECTED_OBJECTS, DETECTION3D_ARRAY, MessageFactory
 from fgtrack.io.typestore import one_line
 
@@ -32,12 +33,14 @@ def write_bag(
     `/fgtrack/ego`, `/fgtrack/detections/SENSOR` and `/fgtrack/truth` hold every field to the bit and carry
     their definitions; the log time is the receipt, the header stamp the stamp. The twins for other tools are
     `/ego/odometry` (nav_msgs/Odometry), `/detections/SENSOR` (vision_msgs/Detection3DArray, or with speeds
-    autoware_perception_msgs/DetectedObjects) and `/truth/poses` (geometry_msgs/PoseArray); an object without a
-    position is not in them. What is written reaches the disk every thousand messages: a killed writer leaves a
-    recording that `Bag` reads up to there.
+    autoware_perception_msgs/DetectedObjects) and `/truth/poses` (geometry_msgs/PoseArray); an object
+    without a position is not in them. What is written reaches the disk every thousand messages: a killed
+    writer leaves a recording that `Bag` reads up to there.
 
     Raises
     ------
+    TruncatedInput
+        `messages` broke off; what came before is written.
     DataError
         `path` exists or cannot be written, or a time lies outside what ROS messages hold.
     """
@@ -47,13 +50,15 @@ def write_bag(
     try:
         with Writer(path, version=Writer.VERSION_LATEST, storage_plugin=_PLUGINS[storage]) as bag:
             writer = _MessageWriter(bag, standard_topics)
-            for message in messages:
+            readable = UntilBreak(messages)
+            for message in readable:
                 writer.write(message)
             writer.flush()
-    except FgtrackError as error:
-        raise type(error)(f"{path}: not written whole, {error}") from error
+    except FgtrackError:
+        raise
     except Exception as error:  # rosbags lets SQLite, struct and operating system errors through
         raise DataError(f"{path}: cannot be written ({one_line(error)})") from error
+    readable.raise_error()
     return writer.count
 
 

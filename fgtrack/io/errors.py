@@ -1,10 +1,32 @@
-"""The error of an input that breaks off in the middle."""
+"""The error of an input that breaks off in the middle, and how to work with what comes before the break."""
+
+from collections.abc import Iterable, Iterator
 
 from fgtrack.core.errors import DataError
+from fgtrack.core.types import Message
 
 
-class TruncatedInput(DataError):  # noqa: N818 - it names what the input is, the readers have already given all before it
+class TruncatedInput(DataError):  # noqa: N818 - it names what the input is; the readers have given all before it
     """An input broke off; everything before the break has been yielded.
 
-    A replay catches it, finishes the run with what there is, reports the break and exits with 1.
+    A replay finishes the run with what there is, reports the break and exits with 1.
     """
+
+
+class UntilBreak:
+    """Iterates over messages up to the end or the break, and keeps the error of the break for later."""
+
+    def __init__(self, messages: Iterable[Message]) -> None:
+        self._messages = messages
+        self.error: TruncatedInput | None = None
+
+    def __iter__(self) -> Iterator[Message]:
+        try:
+            yield from self._messages
+        except TruncatedInput as error:
+            self.error = error
+
+    def raise_error(self) -> None:
+        """Raise the error of the break, if there was one."""
+        if self.error:
+            raise self.error

@@ -22,7 +22,7 @@ from fgtrack.core.types import (
     Message,
     TruthState,
 )
-from fgtrack.io.errors import TruncatedInput
+from fgtrack.io.errors import TruncatedInput, UntilBreak
 
 STREAM_FORMAT = "fgtrack-stream/1"
 GZIP_MAGIC = b"\x1f\x8b"
@@ -100,6 +100,13 @@ def write_stream(
     ----------
     header
         Entries of the header record beside `type` and `format`.
+
+    Raises
+    ------
+    TruncatedInput
+        `messages` broke off; what came before is written.
+    DataError
+        The file cannot be written.
     """
     path = Path(path)
     part = path.with_name(path.name + ".part")
@@ -108,12 +115,14 @@ def write_stream(
         path.parent.mkdir(parents=True, exist_ok=True)
         with _opened_for_writing(part, gzipped=path.name.endswith(".gz")) as file:
             file.write(_line({"type": "header", "format": STREAM_FORMAT, **(header or {})}))
-            for message in messages:
+            readable = UntilBreak(messages)
+            for message in readable:
                 file.write(_line(_record(message)))
                 count += 1
         os.replace(part, path)
     except OSError as error:
         raise DataError(f"{path}: cannot be written ({error.strerror})") from error
+    readable.raise_error()
     return count
 
 

@@ -185,3 +185,13 @@ class Config:
     birth: BirthConfig = field(default_factory=MeasuredBirth)
     motion: MotionConfig = field(default_factory=MotionConfig)
     filter: FilterConfig = field(default_factory=FilterConfig)
+
+    def __post_init__(self) -> None:
+        if not self.sensors:
+            raise ValueError("sensors: name at least one")
+        both = set(self.sensors) & set(self.ignore_sensors)
+        if both:
+            raise ValueError(f"ignore_sensors: {sorted(both)[0]!r} stands under sensors as well")
+        strangers = set(self.input.detections) - set(self.sensors) - set(self.ignore_sensors)
+        if strangers:
+            raise ValueError(f"input.detections: {sorted(strangers)[0]!r} has no model under sensors")

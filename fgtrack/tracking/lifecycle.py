@@ -47,7 +47,9 @@ class LifecycleRules:
 class Lifecycle(Protocol):
     """Counts matches and misses, and says which tracks end."""
 
-    lives: Mapping[int, Life]
+    @property
+    def lives(self) -> Mapping[int, Life]:
+        """What is counted, by track."""
 
     def born(self, track_id: int, sensor: str, stamp_ns: int, present_ns: int) -> None:
         """A detection of `sensor` started a track."""

@@ -1,0 +1,132 @@
+"""The Autoferry data set: object lists and bearings of a ferry, with the GNSS truth of two vessels.
+
+Helgesen, Vasstein, Brekke, Stahl, "Heterogeneous multi-sensor tracking for an autonomous surface vehicle in a
+littoral environment", 2022; github.com/Autoferry/sensor_fusion_dataset, a folder per scenario.
+
+Choices that the data leave open:
+
+- The receipt of a record is the newest stamp up to it in the file. In scenario 6 the records are not in the
+  order of their times, each sensor alone is; that fits a file in the order of arrival. This is an inference:
+  the publishers do not say so, and the true delay is at least the one that this gives.
+- Every scan is aligned to the north, so the ego frame is: its yaw is 0 and it only shifts. Its speed is given
+  as 0 because a speed along yaw 0 would be a motion to the east. An own-ship position older than one already
+  delivered is not delivered again.
+- LiDAR and RADAR points get the own ship's position of their record and are in the map frame. The bearings of
+  the cameras stay relative to the ego.
+"""
+
+import json
+import math
+from collections.abc import Iterator
+from decimal import Decimal
+from heapq import merge
+from pathlib import Path
+from typing import Any
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
+
+SENSORS = {1: "lidar", 2: "radar", 3: "infrared", 4: "daylight"}
+_CAMERAS = {3, 4}
+
+# Parsed JSON, checked while it is read.
+Json = Any
+
+
+def detections_file(folder: Path) -> Path | None:
+    """The file of detections of a scenario folder; None where `folder` is not one."""
+    return next(iter(sorted(folder.glob("*_detections.json"))), None)
+
+
+def read_scenario(folder: Path) -> Iterator[Message]:
+    """Messages of the scenario in `folder` in receipt order; truth only where the folder has it.
+
+    At equal receipts the truth comes first and the ego before the detections.
+
+    Raises
+    ------
+    DataError
+        A file is missing or not what the data set holds; the message names file and record.
+    """
+    file = detections_file(folder)
+    if file is None:
+        raise DataError(f"{folder}: holds no *_detections.json, so it is not an Autoferry scenario")
+    truth = file.with_name(file.name.replace("_detections", "_groundTruth"))
+    states = _truth(truth) if truth.exists() else []
+    return merge(states, _sensed(file), key=lambda message: message.receipt_ns)
+
+
+def _sensed(file: Path) -> Iterator[EgoState | DetectionList]:
+    newest_ns: int | None = None
+    for index, record in enumerate(_records(file)):
+        try:
+            stamp_ns = _nanoseconds(record["time"])
+            north_m, east_m = map(float, record["ownshipPosition"])
+            sensor = record["sensorID"]
+            name = SENSORS[sensor]
+            objects = (
+                _bearings(record["measurement"])
+                if sensor in _CAMERAS
+                else _points(record["measurement"], north_m, east_m)
+            )
+        except (KeyError, TypeError, ValueError, ArithmeticError) as error:
+            raise DataError(f"{file}: record {index} is not one of the data set ({error!r})") from error
+        newer = newest_ns is None or stamp_ns > newest_ns
+        receipt_ns = stamp_ns if newest_ns is None else max(stamp_ns, newest_ns)
+        if newer:
+            yield EgoState(stamp_ns, receipt_ns, x_m=east_m, y_m=north_m, yaw_rad=0.0, speed_mps=0.0)
+        yield DetectionList(name, stamp_ns, receipt_ns, objects, "ego" if sensor in _CAMERAS else "map")
+        newest_ns = receipt_ns
+
+
+def _points(measurement: Json, north_m: float, east_m: float) -> tuple[Detection, ...]:
+    """Points around the own ship: `[[north...], [east...]]`, `[north, east]` of one point, or `[]`."""
+    if not measurement:
+        return ()
+    norths, easts = measurement
+    if not isinstance(norths, list):
+        norths, easts = [norths], [easts]
+    return tuple(
+        Detection(x_m=east_m + float(east), y_m=north_m + float(north))
+        for north, east in zip(norths, easts, strict=True)
+    )
+
+
+def _bearings(measurement: Json) -> tuple[Detection, ...]:
+    """Bearings from the north, clockwise: a list, or a bare number for one."""
+    bearings = measurement if isinstance(measurement, list) else [measurement]
+    return tuple(Detection(bearing_rad=wrap_angle(0.5 * math.pi - float(item))) for item in bearings)
+
+
+def _truth(file: Path) -> list[TruthState]:
+    """GNSS fixes, each once: the file repeats the nearest fix for every record."""
+    states: dict[tuple[int, int], TruthState] = {}
+    for index, fixes in enumerate(_records(file)):
+        try:
+            for fix in fixes if isinstance(fixes, list) else [fixes]:
+                stamp_ns, target = _nanoseconds(fix["time"]), int(fix["targetID"])
+                north_m, east_m = map(float, fix["position"][:2])
+                state = TruthState(stamp_ns, stamp_ns, target, x_m=east_m, y_m=north_m)
+                states.setdefault((stamp_ns, target), state)
+        except (KeyError, TypeError, ValueError, ArithmeticError) as error:
+            raise DataError(f"{file}: record {index} is not one of the data set ({error!r})") from error
+    return [states[key] for key in sorted(states)]
+
+
+def _records(file: Path) -> list[Json]:
+    try:
+        records = json.loads(file.read_bytes(), parse_float=Decimal)
+    except OSError as error:
+        raise DataError(f"{file}: cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{file}: is not JSON ({error}), fetch it again") from error
+    if not isinstance(records, list):
+        raise DataError(f"{file}: is not a list of records")
+    return records
+
+
+def _nanoseconds(time_s: Decimal | int) -> int:
+    """Integer nanoseconds of the decimal text; a float would lose the last hundred of them."""
+    return round(Decimal(time_s) * NS_PER_S)

@@ -1,0 +1,102 @@
+"""The logs of the published tracker, TUMFTM/FusionTracking: what its node received, tick by tick.
+
+`data_logs.csv` holds a row per tick with a JSON value in every cell: the clock `time_ns`, the raw
+`detection_input` (by sensor, a list of objects and its stamp) and the `ego_state`. Choices that the logs
+leave open:
+
+- A row is written at the end of its tick: `time_ns` is the receipt of what is in it, an upper bound.
+- Objects are in the ego frame (as all sensors of the published configuration are) where the configuration
+  names no other.
+- The published yaw is 0 along +y: the ego's, and that of objects in the map frame, get pi/2 added. A yaw in
+  the ego frame is relative to the ego and stays.
+"""
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.types import Detection, DetectionList, EgoState, Frame, Message
+from fgtrack.io.errors import TruncatedInput
+
+LOG_NAME = "data_logs.csv"
+
+_COLUMNS = ("time_ns", "detection_input", "ego_state")
+_NAMES = {"x": "x_m", "y": "y_m", "yaw": "yaw_rad", "v": "speed_mps"}
+
+# Parsed JSON, checked while it is read.
+Json = Any
+
+
+def read_log(folder: Path, frames: Mapping[str, Frame]) -> Iterator[Message]:
+    """Messages of the log in `folder` in receipt order, the ego before the detections of its tick.
+
+    Parameters
+    ----------
+    frames
+        Frame of the sensors whose objects are not in the ego frame.
+
+    Raises
+    ------
+    TruncatedInput
+        The log ends in the middle of a row; raised after all rows before it.
+    DataError
+        The file is missing or not such a log; the message names the line.
+    """
+    file = folder / LOG_NAME
+    try:
+        with file.open(encoding="utf-8") as lines:
+            header = next(lines, "").rstrip("\n").split(";")
+            if missing := [name for name in _COLUMNS if name not in header]:
+                raise DataError(f"{file}:1: has no column {missing[0]}, so it is not a log of FusionTracking")
+            last_ego_ns: int | None = None
+            for number, line in enumerate(lines, 2):
+                cells = line.rstrip("\n").split(";")
+                if len(cells) < len(header) and not line.endswith("\n"):
+                    raise TruncatedInput(f"{file}:{number}: breaks off in the middle of a row")
+                try:
+                    row = dict(zip(header, cells, strict=True))
+                    receipt_ns, detections, ego = (json.loads(row[name]) for name in _COLUMNS)
+                    if "state" in ego and ego["t"] != last_ego_ns:
+                        last_ego_ns = ego["t"]
+                        yield _ego(ego, receipt_ns)
+                    yield from _lists(detections or {}, receipt_ns, frames)
+                except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+                    raise DataError(f"{file}:{number}: is not a row of such a log ({error!r})") from error
+    except OSError as error:
+        raise DataError(f"{file}: cannot be read ({error.strerror})") from error
+
+
+def _ego(ego: Json, receipt_ns: int) -> EgoState:
+    x, y, yaw, speed, yaw_rate, accel = map(float, ego["state"])
+    return EgoState(
+        int(ego["t"]),
+        receipt_ns,
+        x_m=x,
+        y_m=y,
+        yaw_rad=wrap_angle(yaw + 0.5 * math.pi),
+        speed_mps=speed,
+        yaw_rate_radps=yaw_rate,
+        accel_mps2=accel,
+        in_pit=ego.get("in_pit"),
+    )
+
+
+def _lists(detections: Json, receipt_ns: int, frames: Mapping[str, Frame]) -> Iterator[DetectionList]:
+    for sensor, (objects, stamp_ns) in sorted(detections.items(), key=lambda item: item[1][1]):
+        frame = frames.get(sensor, "ego")
+        found = tuple(_object(item, frame) for item in objects)
+        yield DetectionList(sensor, int(stamp_ns), receipt_ns, found, frame)
+
+
+def _object(item: Json, frame: Frame) -> Detection:
+    keys, state = item["keys"], item["state"]
+    if len(state) == len(keys) - 1:  # a yaw that the tracker adds from the map only after logging
+        keys = [key for key in keys if key != "yaw"]
+    values = {_NAMES[key]: float(value) for key, value in zip(keys, state, strict=True) if key in _NAMES}
+    if frame == "map" and "yaw_rad" in values:
+        values["yaw_rad"] = wrap_angle(values["yaw_rad"] + 0.5 * math.pi)
+    return Detection(**values, covariance=None, stamp_ns=None, object_id=None)

@@ -1,0 +1,186 @@
+"""What is in an input: its topics or sensors with counts, rates and delays."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.time import seconds
+from fgtrack.core.types import DetectionList, EgoState, Message
+from fgtrack.io.adapters.ego import ODOMETRY
+from fgtrack.io.adapters.native import NATIVE_ADAPTERS
+from fgtrack.io.adapters.objects import OBJECT_ADAPTERS
+from fgtrack.io.bag import Bag, BagTopic
+from fgtrack.io.config import InputConfig
+from fgtrack.io.errors import TruncatedInput
+from fgtrack.io.source import Kind, input_kind, open_input
+from fgtrack.io.topics import topic_uses
+
+_OTHER_CLOCK_S = 3600.0
+
+
+@dataclass(frozen=True)
+class DelayInfo:
+    """Delay of the receipts behind the stamps."""
+
+    mean_s: float
+    p50_s: float
+    p90_s: float
+    max_s: float
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """A topic of a recording, or the messages of one kind in another input."""
+
+    name: str
+    type: str
+    count: int
+    rate_hz: float | None
+    """None of fewer than two messages, or of messages all at one time."""
+    delay: DelayInfo | None
+    """None where the type has no header."""
+    used_as: str | None
+    """What a replay with the configuration takes it as."""
+    note: str | None
+    """Why it cannot be decoded, what is odd, or what a configuration could name it as."""
+
+
+@dataclass(frozen=True)
+class InputInfo:
+    """What `fgtrack info` shows."""
+
+    path: Path
+    kind: Kind
+    start_ns: int | None
+    """First receipt; None of an empty input."""
+    duration_s: float
+    """From the first receipt to the last."""
+    topics: tuple[TopicInfo, ...]
+    problem: str | None
+    """Where the input breaks off, or why a replay with the configuration would refuse it."""
+
+
+def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
+    """What is in the input at `path`, and what a replay with `config` would make of it.
+
+    Raises
+    ------
+    CallError
+        Nothing is there.
+    DataError
+        It is nothing that fgtrack reads, or damaged from the start.
+    """
+    path = Path(path)
+    kind = input_kind(path)
+    return _describe_bag(path, config) if kind == "recording" else _describe_messages(path, kind, config)
+
+
+class _Times:
+    """Receipts and delays of one topic."""
+
+    def __init__(self) -> None:
+        self.receipts_ns: list[int] = []
+        self.delays_ns: list[int] = []
+
+    def add(self, receipt_ns: int, stamp_ns: int | None) -> None:
+        self.receipts_ns.append(receipt_ns)
+        if stamp_ns is not None:
+            self.delays_ns.append(receipt_ns - stamp_ns)
+
+    def rate_hz(self) -> float | None:
+        if not self.receipts_ns:
+            return None
+        span_s = seconds(max(self.receipts_ns) - min(self.receipts_ns))
+        return (len(self.receipts_ns) - 1) / span_s if span_s > 0.0 else None
+
+    def delay(self) -> DelayInfo | None:
+        if not self.delays_ns:
+            return None
+        delays_s = np.array(self.delays_ns) * 1e-9
+        p50, p90 = np.quantile(delays_s, [0.5, 0.9]).tolist()
+        return DelayInfo(float(delays_s.mean()), p50, p90, float(delays_s.max()))
+
+    def clock_note(self) -> str | None:
+        delay = self.delay()
+        if delay and abs(delay.p50_s) > _OTHER_CLOCK_S:
+            return "its stamps are of another clock than the recorder's (simulated time?)"
+        return None
+
+
+def _describe_bag(path: Path, config: InputConfig | None) -> InputInfo:
+    bag = Bag(path, config.message_definitions if config else ())
+    problem: str | None = None
+    used: dict[tuple[str, str], str] = {}
+    try:
+        for use in topic_uses(bag, config or InputConfig()):
+            used[use.topic.name, use.topic.type] = use.role
+    except DataError as error:
+        problem = str(error) if config else None
+    times = {(topic.name, topic.type): _Times() for topic in bag.topics}
+    try:
+        for topic, log_ns, stamp_ns in bag.stamps():
+            times[topic.name, topic.type].add(log_ns, stamp_ns)
+    except TruncatedInput as error:
+        problem = str(error)
+    topics = tuple(
+        TopicInfo(
+            topic.name,
+            topic.type,
+            len(of_topic.receipts_ns),
+            of_topic.rate_hz(),
+            of_topic.delay(),
+            used.get((topic.name, topic.type)),
+            topic.problem or of_topic.clock_note() or _possible_use(topic),
+        )
+        for topic in bag.topics
+        for of_topic in [times[topic.name, topic.type]]
+    )
+    return _info(path, "recording", topics, list(times.values()), problem)
+
+
+def _possible_use(topic: BagTopic) -> str | None:
+    if topic.type in NATIVE_ADAPTERS:
+        return None
+    if topic.type == ODOMETRY:
+        return "could be the ego"
+    return "could be detections or truth" if topic.type in OBJECT_ADAPTERS else None
+
+
+def _describe_messages(path: Path, kind: Kind, config: InputConfig | None) -> InputInfo:
+    problem: str | None = None
+    times: dict[tuple[str, str], _Times] = {}
+    try:
+        for message in open_input(path, config).messages():
+            times.setdefault(_name_and_type(message), _Times()).add(message.receipt_ns, message.stamp_ns)
+    except TruncatedInput as error:
+        problem = str(error)
+    topics = tuple(
+        TopicInfo(
+            name,
+            msgtype,
+            len(of_topic.receipts_ns),
+            of_topic.rate_hz(),
+            of_topic.delay(),
+            f"detections {name}" if msgtype == "detections" else name,
+            None,
+        )
+        for (name, msgtype), of_topic in sorted(times.items())
+    )
+    return _info(path, kind, topics, list(times.values()), problem)
+
+
+def _name_and_type(message: Message) -> tuple[str, str]:
+    if isinstance(message, DetectionList):
+        return message.sensor, "detections"
+    return ("ego", "ego") if isinstance(message, EgoState) else ("truth", "truth")
+
+
+def _info(
+    path: Path, kind: Kind, topics: tuple[TopicInfo, ...], times: list[_Times], problem: str | None
+) -> InputInfo:
+    receipts_ns = [receipt for item in times for receipt in item.receipts_ns]
+    start_ns = min(receipts_ns, default=None)
+    duration_s = 0.0 if start_ns is None else seconds(max(receipts_ns) - start_ns)
+    return InputInfo(path, kind, start_ns, duration_s, topics, problem)

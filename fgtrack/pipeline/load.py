@@ -1,0 +1,157 @@
+"""YAML files to validated dataclasses and back; every error names the file and the key."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
+from fgtrack.core.errors import CallError
+
+T = TypeVar("T")
+
+
+def load(kind: type[T], path: Path | None, settings: Sequence[str] = ()) -> T:
+    """An instance of the dataclass `kind` from the YAML file `path`, with `settings` of the form a.b=value on top.
+
+    Without a file, from the defaults. Raises `CallError` for a missing file, wrong YAML, an unknown or repeated key,
+    and a value of the wrong type or range.
+    """
+    raw = {} if path is None else read_yaml(path)
+    origin = "defaults" if path is None else str(path)
+    for setting in settings:
+        raw = _with_setting(raw, setting)
+        origin = f"{origin.removesuffix(' with --set')} with --set"
+    return validate(kind, raw, origin)
+
+
+def read_yaml(path: Path) -> dict[str, Any]:  # Any: what YAML says is only known after validation
+    """The mapping that the YAML 1.2 file `path` holds; empty for an empty file."""
+    try:
+        return _mapping(path.read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "is no text file"
+        raise CallError(f"{path}: configuration cannot be read ({reason})") from error
+
+
+def _mapping(text: str, origin: str) -> dict[str, Any]:
+    value = _parse(text, origin)
+    if value is None:
+        return {}
+    if not isinstance(value, dict):
+        raise CallError(f"{origin}: a mapping of keys to values is needed, this is {_name(value)}")
+    return value
+
+
+def _parse(text: str, origin: str) -> Any:
+    try:
+        return YAML(typ="safe", pure=True).load(text)
+    except MarkedYAMLError as error:
+        line = "" if error.problem_mark is None else f":{error.problem_mark.line + 1}"
+        problem = " ".join(str(error.problem or error.context).split())
+        raise CallError(f"{origin}{line}: no valid YAML, {problem.split(' To suppress')[0]}") from error
+    except YAMLError as error:
+        raise CallError(f"{origin}: no valid YAML, {' '.join(str(error).split())}") from error
+
+
+def _with_setting(raw: dict[str, Any], setting: str) -> dict[str, Any]:
+    key, equals, text = setting.partition("=")
+    names = key.strip().split(".")
+    if not equals or not all(names):
+        raise CallError(f"--set {setting}: write key=value, with dots between the keys of a path")
+    changed = dict(raw)
+    inner = changed
+    for name in names[:-1]:
+        below = inner.get(name)
+        if below is not None and not isinstance(below, dict):
+            raise CallError(f"--set {setting}: {name} is a single value and has no keys below it")
+        inner[name] = dict(below or {})
+        inner = inner[name]
+    inner[names[-1]] = _parse(text, f"--set {setting}")
+    return changed
+
+
+def validate(kind: type[T], raw: Mapping[str, Any], origin: str) -> T:
+    """`raw` as an instance of the dataclass `kind`; `origin` stands in the errors."""
+    try:
+        text = json.dumps(raw)
+    except (TypeError, ValueError) as error:
+        raise CallError(f"{origin}: only plain YAML values and text keys are allowed ({error})") from error
+    try:
+        value = TypeAdapter(kind).validate_json(text, strict=True)
+    except ValidationError as error:
+        raise CallError(f"{origin}: {_first(error)}") from error
+    for where, name, known in _unknown(raw, value, ""):
+        raise CallError(f"{origin}: {where}{name}: unknown key, known here: {', '.join(known)}")
+    for where in _not_finite(raw, ""):
+        raise CallError(f"{origin}: {where}: must be a finite number")
+    return value
+
+
+def _first(error: ValidationError) -> str:
+    """The first of pydantic's complaints in a line."""
+    details = error.errors(include_url=False)
+    first = details[0]
+    where = ".".join(str(part) for part in first["loc"])
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "union_tag_not_found":
+        message = "needs the key `kind`, which says which of its forms is meant"
+    more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+    given = "" if first["type"] in ("value_error", "missing") else f", not {_name(first.get('input'))}"
+    return f"{where + ': ' if where else ''}{message}{given}{more}"
+
+
+def _name(value: object) -> str:
+    text = json.dumps(value, default=str)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _unknown(raw: object, value: object, where: str) -> list[tuple[str, str, list[str]]]:
+    """Keys of `raw` that the dataclasses in `value` do not have."""
+    found = []
+    if is_dataclass(value) and isinstance(raw, Mapping):
+        known = [field.name for field in fields(value)]
+        found = [(where, name, known) for name in raw if name not in known]
+        for name in known:
+            if name in raw:
+                found += _unknown(raw[name], getattr(value, name), f"{where}{name}.")
+    elif isinstance(value, Mapping) and isinstance(raw, Mapping):
+        for name in raw:
+            found += _unknown(raw[name], value.get(name), f"{where}{name}.")
+    elif isinstance(raw, list) and isinstance(value, Sequence):
+        for index, (item, inner) in enumerate(zip(raw, value, strict=False)):
+            found += _unknown(item, inner, f"{where}{index}.")
+    return found
+
+
+def _not_finite(raw: object, where: str) -> list[str]:
+    if isinstance(raw, float) and not math.isfinite(raw):
+        return [where.removesuffix(".")]
+    inner = raw.items() if isinstance(raw, Mapping) else enumerate(raw) if isinstance(raw, list) else ()
+    return [found for name, item in inner for found in _not_finite(item, f"{where}{name}.")]
+
+
+def _plain(value: object) -> object:
+    if is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {name: _plain(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return value
+
+
+def dump(value: object) -> str:
+    """YAML text of a dataclass, every key written out; `validate` reads it back to an equal value."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = False
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]  # ruamel declares it as None
+    text = StringIO()
+    yaml.dump(_plain(value), text)
+    return text.getvalue()

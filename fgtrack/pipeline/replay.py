@@ -1,0 +1,178 @@
+"""Replay: messages in receipt order through a tracker into a run folder."""
+
+import importlib.metadata
+import platform
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.time import seconds
+from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
+from fgtrack.io.run_folder import RunWriter
+from fgtrack.pipeline.build import build_tracker
+from fgtrack.pipeline.clock import Delivered, Tick, listed_ticks, message_ticks, node_ticks, read_ticks
+from fgtrack.pipeline.config import ClockConfig, Config
+from fgtrack.pipeline.load import dump
+
+_LARGEST_STEP_BACK_S = 1.0
+_PACKAGES = ("fgtrack", "numpy", "scipy", "rosbags")
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """A finished run."""
+
+    path: Path
+    meta: dict[str, object]
+    broken: str | None
+    """Why the input broke off, where it did; the run holds everything before."""
+
+
+@dataclass
+class _Feed:
+    """The input on its way to the tracker: sets truth and ignored sensors apart, and ends where the input breaks."""
+
+    messages: Iterable[Message]
+    ignored_sensors: frozenset[str]
+    on_truth: Callable[[TruthState], None]
+    broken: str | None = None
+    ignored_detections: int = 0
+    received_detections: int = 0
+    _newest_ego_ns: int | None = field(default=None, init=False)
+    _last_receipt_ns: int | None = field(default=None, init=False)
+
+    def __iter__(self) -> Iterator[Delivered]:
+        try:
+            for message in self.messages:
+                if isinstance(message, TruthState):
+                    self.on_truth(message)
+                elif isinstance(message, DetectionList) and message.sensor in self.ignored_sensors:
+                    self.ignored_detections += len(message.objects)
+                else:
+                    self._check_time(message)
+                    if isinstance(message, DetectionList):
+                        self.received_detections += len(message.objects)
+                    yield message
+        except DataError as error:
+            self.broken = str(error)
+
+    def _check_time(self, message: Delivered) -> None:
+        """Receipts never go back; ego stamps do a little, but not as they do where a recording starts over."""
+        last_ns = self._last_receipt_ns
+        if last_ns is not None and message.receipt_ns < last_ns:
+            back_s = seconds(last_ns - message.receipt_ns)
+            raise DataError(
+                f"receipt time goes back by {back_s:g} s at {message.receipt_ns} ns: sort the input by receipt"
+            )
+        self._last_receipt_ns = message.receipt_ns
+        if isinstance(message, EgoState):
+            newest_ns = self._newest_ego_ns
+            if newest_ns is not None and seconds(newest_ns - message.stamp_ns) > _LARGEST_STEP_BACK_S:
+                back_s = seconds(newest_ns - message.stamp_ns)
+                raise DataError(
+                    f"ego stamps jump back by {back_s:g} s at receipt {message.receipt_ns} ns, "
+                    "as in a looping recording: cut it there"
+                )
+            self._newest_ego_ns = max(message.stamp_ns, newest_ns or message.stamp_ns)
+
+
+def replay(
+    messages: Iterable[Message],
+    config: Config,
+    out: Path,
+    *,
+    origin: str = "",
+    kind: str = "",
+    on_tick: Callable[[int, int], None] | None = None,
+) -> ReplayResult:
+    """Run the tracker that `config` describes over `messages` and write the run folder `out`.
+
+    Parameters
+    ----------
+    messages
+        In receipt order. Where they end in a `DataError`, the run ends there in good order and says so.
+    origin, kind
+        What the input is, for meta.json.
+    on_tick
+        Called after each tick with its time in ns and its number of tracks.
+
+    Raises
+    ------
+    CallError
+        The configuration cannot be built, or `out` cannot be written to.
+    DataError
+        A sensor of the input has no model.
+    """
+    tracker = build_tracker(config)
+    started = time.perf_counter()
+    meta: dict[str, object] = {
+        "input": {"path": origin, "kind": kind},
+        "estimator": config.estimator,
+        "versions": _versions(),
+        "seed": None,
+    }
+    with RunWriter(out, dump(config), meta) as writer:
+        feed = _Feed(messages, frozenset(config.ignore_sensors), writer.write_truth)
+        for tick in _ticks(feed, config.clock):
+            before_ns = time.perf_counter_ns()
+            for message in tick.messages:
+                tracker.receive(message)
+            report = tracker.tick(tick.now_ns)
+            process_ns = time.perf_counter_ns() - before_ns
+            writer.write_tick(report, process_ns, _count(tick))
+            if on_tick is not None:
+                on_tick(tick.now_ns, len(report.tracks))
+        finished = writer.finish(
+            {
+                "wall_s": time.perf_counter() - started,
+                "detections_received": feed.received_detections,
+                "detections_ignored": feed.ignored_detections,
+                "ego_refused": dict(tracker.refused_ego),
+                "broken_off": feed.broken,
+            }
+        )
+    return ReplayResult(out, finished, feed.broken)
+
+
+def replay_each(
+    messages: Callable[[], Iterable[Message]],
+    config: Config,
+    estimators: tuple[str, ...],
+    out: Path,
+    *,
+    origin: str = "",
+    kind: str = "",
+    on_tick: Callable[[int, int], None] | None = None,
+) -> list[ReplayResult]:
+    """One replay for each of `estimators`: into `out`, or into a folder of its name there for several."""
+    folders = [out / name for name in estimators] if len(estimators) > 1 else [out]
+    return [
+        replay(
+            messages(),
+            replace(config, estimator=estimator),
+            folder,
+            origin=origin,
+            kind=kind,
+            on_tick=on_tick,
+        )
+        for estimator, folder in zip(estimators, folders, strict=True)
+    ]
+
+
+def _ticks(messages: Iterable[Delivered], clock: ClockConfig) -> Iterator[Tick]:
+    if clock.ticks_file is not None:
+        return listed_ticks(messages, read_ticks(Path(clock.ticks_file)))
+    if clock.node_hz is None:
+        return message_ticks(messages)
+    return node_ticks(messages, clock.node_hz)
+
+
+def _count(tick: Tick) -> int:
+    return sum(len(message.objects) for message in tick.messages if isinstance(message, DetectionList))
+
+
+def _versions() -> dict[str, str]:
+    found = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    return {"python": platform.python_version(), **found}

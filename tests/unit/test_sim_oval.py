@@ -1,0 +1,72 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fgtrack.core.geometry import wrap_angles
+from fgtrack.models.track_map import COLUMNS, TrackMap
+from fgtrack.sim.oval import make_oval, make_pit_lane
+from fgtrack.sim.path import Path as DrivenPath
+
+MAPS = Path(__file__).resolve().parents[2] / "configs/maps"
+OVAL, PIT_LANE = make_oval(), make_pit_lane()
+COLUMN = {name: index for index, name in enumerate(COLUMNS)}
+
+
+@pytest.mark.parametrize(("name", "track"), [("oval_track", OVAL), ("oval_pitlane", PIT_LANE)])
+def test_the_committed_maps_are_what_the_functions_make(name: str, track: TrackMap) -> None:
+    np.testing.assert_allclose(TrackMap.read(MAPS / f"{name}.csv").table, track.table, atol=1e-7)
+
+
+def test_the_oval_has_the_proportions_of_a_speedway() -> None:
+    curvature = OVAL.table[:, COLUMN["kappa_ref_radpm"]]
+    banking = np.degrees(-OVAL.table[:, COLUMN["banking_rad"]])
+    assert OVAL.length_m == pytest.approx(2400.0, abs=0.01)
+    assert OVAL.counter_clockwise
+    assert 1.0 / curvature.max() == pytest.approx(220.0, abs=0.1)
+    assert curvature.min() > -1e-6
+    assert np.count_nonzero(curvature < 1e-6) * 2.0 > 500.0  # metres of straight
+    assert (banking.min(), banking.max()) == pytest.approx((9.0, 20.0), abs=0.1)
+    left, right = OVAL.bounds(np.linspace(0.0, 2400.0, 100))
+    np.testing.assert_allclose(left + right, 15.0)
+
+
+@pytest.mark.parametrize("track", [OVAL, PIT_LANE])
+def test_the_columns_of_a_made_map_agree_with_each_other(track: TrackMap) -> None:
+    table = track.table
+    s, heading, curvature = (table[:, COLUMN[n]] for n in ("s_ref_m", "psi_ref_rad", "kappa_ref_radpm"))
+    chord = np.arctan2(*np.diff(table[:, :2], axis=0).T[::-1])
+    middle = heading[:-1] + wrap_angles(np.diff(heading)) / 2.0
+    assert np.abs(wrap_angles(chord - middle)).max() < 1e-4
+    # Where the pit lane leaves its straights, the curvature has kinks: differences are off there.
+    for of, rate in ((np.unwrap(heading), curvature), (curvature, table[:, COLUMN["dkappa_ref_radpm2"]])):
+        assert np.quantile(np.abs(np.gradient(of, s) - rate)[1:-1], 0.99) < 2e-5
+    normal = table[:, [COLUMN["x_normvec_m"], COLUMN["y_normvec_m"]]]
+    np.testing.assert_allclose(normal, np.stack([np.sin(heading), -np.cos(heading)], axis=1), atol=1e-12)
+    np.testing.assert_allclose(table[0, :2], table[-1, :2], atol=1e-9)
+
+
+def test_the_curvature_of_the_oval_has_no_jump() -> None:
+    curvature = OVAL.table[:, COLUMN["kappa_ref_radpm"]]
+    assert np.abs(np.diff(curvature)).max() < 2.0 * 7e-5  # rows are 2 m apart
+    assert curvature[0] == pytest.approx(curvature[-1], abs=1e-9)
+
+
+def test_the_pit_road_lies_left_of_the_front_straight_and_beside_the_track() -> None:
+    s = np.linspace(-200.0, 200.0, 101)
+    points = OVAL.position(s, np.full(101, 24.0))
+    assert not PIT_LANE.outside(points, 0.0, 0.0).any()
+    assert OVAL.outside(points, 0.0, 0.0).all()
+
+
+def test_a_path_frame_holds_the_exact_derivatives() -> None:
+    path = DrivenPath.along(OVAL)
+    u, h = np.linspace(-50.0, 2500.0, 997), 1e-4
+    frame, ahead, behind = path.frame(u), path.frame(u + h), path.frame(u - h)
+    tangent = np.stack([ahead.x_m - behind.x_m, ahead.y_m - behind.y_m]) / (2.0 * h)
+    np.testing.assert_allclose(frame.scale * np.cos(frame.heading_rad), tangent[0], atol=1e-7)
+    np.testing.assert_allclose(frame.scale * np.sin(frame.heading_rad), tangent[1], atol=1e-7)
+    turn = wrap_angles(ahead.heading_rad - behind.heading_rad) / (2.0 * h)
+    np.testing.assert_allclose(frame.turn, turn, atol=1e-8)
+    np.testing.assert_allclose(frame.turn_rate, (ahead.turn - behind.turn) / (2.0 * h), atol=2e-6)
+    np.testing.assert_allclose(frame.scale_rate, (ahead.scale - behind.scale) / (2.0 * h), atol=2e-6)
