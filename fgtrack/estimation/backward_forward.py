@@ -93,9 +93,7 @@ class BackwardForwardBank:
 
     def _integrate(self, rows: IntArray, steps: int) -> None:
         """Predict `rows` by `steps` that end at the newest grid stamp, and store every state on the way."""
-        means, covariances = self._propagator.propagate(
-            self._mean[rows], self._covariance[rows], steps, self._step_s
-        )
+        means, covariances = self._propagator.propagate(self._mean[rows], self._covariance[rows], steps, self._step_s)
         slots = np.arange(self._grid - steps + 1, self._grid + 1) % self._length
         self._stored_mean[slots[:, None], rows] = means
         self._stored_covariance[slots[:, None], rows] = covariances
@@ -135,9 +133,7 @@ class BackwardForwardBank:
             groups.setdefault(id(measurement.model), []).append(position)
         results: dict[int, UpdateResult] = {}
         for positions in groups.values():
-            part = self._update_alike(
-                stamp_ns, [track_ids[i] for i in positions], [measurements[i] for i in positions]
-            )
+            part = self._update_alike(stamp_ns, [track_ids[i] for i in positions], [measurements[i] for i in positions])
             results.update(zip(positions, part, strict=True))
         return [results[position] for position in range(len(measurements))]
 
@@ -171,9 +167,7 @@ class BackwardForwardBank:
             for i in range(len(measurements))
         ]
 
-    def _correct(
-        self, mean: FloatArray, covariance: FloatArray, measurements: Sequence[Measurement]
-    ) -> Correction:
+    def _correct(self, mean: FloatArray, covariance: FloatArray, measurements: Sequence[Measurement]) -> Correction:
         z = np.array([measurement.z for measurement in measurements])
         R = np.array([measurement.R for measurement in measurements])
         return correct(mean, covariance, z, R, measurements[0].model, measurements[0].pose)

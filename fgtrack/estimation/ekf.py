@@ -23,9 +23,9 @@ class Correction(NamedTuple):
     """Normalised innovation squared, shape (m,)."""
 
 
-def predict(mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: FloatArray | float) -> tuple[
-    FloatArray, FloatArray
-]:
+def predict(
+    mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: FloatArray | float
+) -> tuple[FloatArray, FloatArray]:
     """Mean and covariance after `dt_s`: x' = f(x), P' = F P F' + Q (Karle et al. 2023, eqs. 3 and 4).
 
     Shapes (..., n) and (..., n, n); `dt_s` a number or of shape (...).

@@ -22,9 +22,9 @@ NO_OBJECT = -1
 class MatchOptions:
     """How tracks are paired to true objects."""
 
-    gate_m: float = 10.0
-    """Largest distance of a pair. Twice the default association distance of the tracker: a track that drifts
-    off its object is still charged with its error for a while before the object counts as lost."""
+    gate_m: float = 5.0
+    """Largest distance of a pair. The default is the tracker's own association distance, a car's length: a track
+    farther off cannot be updated by its object any more. It bounds the errors, so compare runs with one gate."""
     confirmed_only: bool = True
     """Judge only rows with at least `CONFIRMED_MEASUREMENTS` measurements."""
 

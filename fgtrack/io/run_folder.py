@@ -2,7 +2,7 @@
 
 from fgtrack.io.run_layout import COLUMNS, COVARIANCE_COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
 from fgtrack.io.run_reader import NO_TRACK, Run, Table, read_run
-from fgtrack.io.run_writer import RunWriter, digest, is_run_folder
+from fgtrack.io.run_writer import RunWriter, digest, is_run_folder, write_metrics
 
 __all__ = [
     "COLUMNS",
@@ -16,4 +16,5 @@ __all__ = [
     "digest",
     "is_run_folder",
     "read_run",
+    "write_metrics",
 ]

@@ -146,6 +146,16 @@ class RunWriter:
         os.replace(part, self.path / "meta.json")
 
 
+def write_metrics(path: Path, metrics: Mapping[str, object]) -> None:
+    """Write `metrics` as metrics.json into the run folder `path`, whole or not at all."""
+    part = path / "metrics.json.part"
+    try:
+        part.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        os.replace(part, path / "metrics.json")
+    except OSError as error:
+        raise DataError(f"{path / 'metrics.json'}: cannot be written ({error.strerror})") from error
+
+
 def digest(path: Path) -> str:
     """SHA-256 of the bytes of tracks.csv and then updates.csv of the run folder `path`, in hex."""
     sha = hashlib.sha256()

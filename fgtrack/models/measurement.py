@@ -56,9 +56,7 @@ class MeasurementModel:
     """Names of the entries of the state: x, y and either yaw, speed or vx, vy, and what follows."""
 
     def __post_init__(self) -> None:
-        if not self.components or self.components != tuple(
-            name for name in MEASURABLE if name in self.components
-        ):
+        if not self.components or self.components != tuple(name for name in MEASURABLE if name in self.components):
             raise CallError(
                 f"measurement of {', '.join(self.components) or 'nothing'}: give one or more of "
                 f"{', '.join(MEASURABLE)}, each once and in this order"
@@ -215,9 +213,7 @@ _COMPONENTS = {
     "x_m": _Component(lambda s: s.position[..., 0], lambda s: (np.array([1.0, 0.0]), _NONE)),
     "y_m": _Component(lambda s: s.position[..., 1], lambda s: (np.array([0.0, 1.0]), _NONE)),
     "yaw_rad": _Component(lambda s: s.yaw_speed[..., 0], lambda s: (_NONE, s.yaw_speed_gradient[..., 0, :])),
-    "speed_mps": _Component(
-        lambda s: s.yaw_speed[..., 1], lambda s: (_NONE, s.yaw_speed_gradient[..., 1, :])
-    ),
+    "speed_mps": _Component(lambda s: s.yaw_speed[..., 1], lambda s: (_NONE, s.yaw_speed_gradient[..., 1, :])),
     "range_m": _Component(lambda s: polar(s.offset)[..., 1], lambda s: (s.line_of_sight, _NONE)),
     "bearing_rad": _Component(
         lambda s: polar(s.offset)[..., 0] - s.pose.yaw_rad, lambda s: (s.offset_gradient[..., 0, :], _NONE)

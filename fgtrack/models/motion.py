@@ -88,9 +88,7 @@ class _WhiteNoise:
         """
         names = {name.partition("_density_")[0]: name for name in cls._density_names()}
         if set(std) != set(names):
-            raise ValueError(
-                f"std of {cls.__name__}: give {', '.join(names)}, not {', '.join(std) or 'nothing'}"
-            )
+            raise ValueError(f"std of {cls.__name__}: give {', '.join(names)}, not {', '.join(std) or 'nothing'}")
         if not frequency_hz > 0.0:
             raise ValueError(f"frequency_hz: must be positive, is {frequency_hz}")
         return cls(**{names[key]: value * value / frequency_hz for key, value in std.items()})

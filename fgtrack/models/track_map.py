@@ -283,9 +283,7 @@ def _fault(table: FloatArray) -> tuple[int, str] | None:
     if lengths.min() < _SAME_POINT_M:
         return int(np.argmax(lengths < _SAME_POINT_M)), "the next row holds the same point"
     if lengths[-1] > _MAX_GAP * lengths[:-1].max():
-        return len(
-            table
-        ) - 1, f"the line does not close: {lengths[-1]:.1f} m from its last point to its first"
+        return len(table) - 1, f"the line does not close: {lengths[-1]:.1f} m from its last point to its first"
     widths = table[:, [_COLUMN["width_left_m"], _COLUMN["width_right_m"]]].sum(axis=1)
     if widths.min() <= 0.0:
         return int(np.argmax(widths <= 0.0)), "the widths do not add up to a positive one"
@@ -293,7 +291,5 @@ def _fault(table: FloatArray) -> tuple[int, str] | None:
     error = np.abs(wrap_angles(np.arctan2(steps[:, 1], steps[:, 0]) - heading))
     if error.max() > _MAX_HEADING_ERROR_RAD:
         row = int(np.argmax(error > _MAX_HEADING_ERROR_RAD))
-        return row, (
-            f"psi_ref_rad is {error[row]:.2f} rad off the way to the next row; a file counts it from +y"
-        )
+        return row, (f"psi_ref_rad is {error[row]:.2f} rad off the way to the next row; a file counts it from +y")
     return None

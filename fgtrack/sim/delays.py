@@ -7,9 +7,10 @@ may have a memory (bursts) and still be an immutable value.
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, Protocol
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
+from pydantic import Discriminator
 from scipy import optimize, special
 
 from fgtrack.core.types import FloatArray
@@ -180,7 +181,10 @@ class LossyDelay:
 
 
 #: Every delay model, told apart by `kind`.
-AnyDelay = NoDelay | ConstantDelay | UniformDelay | NormalDelay | GammaDelay | BurstDelay | LossyDelay
+AnyDelay = Annotated[
+    NoDelay | ConstantDelay | UniformDelay | NormalDelay | GammaDelay | BurstDelay | LossyDelay,
+    Discriminator("kind"),
+]
 
 _MIN_SHAPE, _MAX_SHAPE = 0.5, 1e6
 

@@ -3,9 +3,10 @@
 import math
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal, Protocol
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
+from pydantic import Discriminator
 from scipy.interpolate import CubicHermiteSpline
 
 from fgtrack.core.geometry import wrap_angles
@@ -141,7 +142,8 @@ class DrawnVehicle:
     yaw_rate_radps: float = 0.0
     motion: CTRV = field(default_factory=CTRV)
     step_s: float = 0.01
-    """Time between two draws of the process noise; within a step it comes in evenly."""
+    """Time between two draws of the process noise. Within a step, the noise of one instant is a Brownian
+    bridge; it is exact as long as all sensors together look at most once in a step."""
     kind: Literal["drawn"] = "drawn"
 
     def __post_init__(self) -> None:
@@ -152,39 +154,46 @@ class DrawnVehicle:
     def trajectory(self, rng: np.random.Generator, duration_s: float) -> "DrawnTrajectory":
         """One draw of the motion of this vehicle over `duration_s`."""
         num_steps = math.ceil(duration_s / self.step_s) + 1
-        normals = rng.standard_normal((num_steps, self.motion.dim))
+        normals = rng.standard_normal((num_steps, self.motion.dim, 2))
         states = np.empty((num_steps + 1, self.motion.dim))
         noise = np.empty_like(normals)
         states[0] = [getattr(self, name) for name in STATE_NAMES[: self.motion.dim]]
         for k in range(num_steps):
             # The covariance is singular where a density is zero: eigenvectors, not Cholesky.
             variances, axes = np.linalg.eigh(self.motion.process_noise(states[k], self.step_s))
-            noise[k] = axes @ (np.sqrt(np.maximum(variances, 0.0)) * normals[k])
-            states[k + 1] = self.motion.predict(states[k], self.step_s) + noise[k]
-        return DrawnTrajectory(self, states, noise)
+            noise[k] = (axes * np.sqrt(np.maximum(variances, 0.0))) @ normals[k]
+            states[k + 1] = self.motion.predict(states[k], self.step_s) + noise[k, :, 0]
+        return DrawnTrajectory(self, states, noise[:, :, 0], noise[:, :, 1])
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnTrajectory:
-    """States at the steps of a drawn motion and the noise within each step."""
+    """A drawn motion: x(t) = prediction from the step before + f noise + sqrt(f (1 - f)) bridge.
+
+    f is the part of the step that has passed. So the noise up to t and the noise after it are independent and
+    each as large as its share of the step.
+    """
 
     vehicle: DrawnVehicle
     step_states: FloatArray
+    """States where the m steps begin and where the last one ends, shape (m + 1, 5)."""
     noise: FloatArray
+    """Process noise of each step, shape (m, 5)."""
+    bridge: FloatArray
+    """Independent noise of the same covariance, shape (m, 5)."""
 
     def states(self, times_s: FloatArray) -> FloatArray:
         """See `Trajectory`. The acceleration is 0, as the model has none."""
-        step_s = self.vehicle.step_s
+        step_s, motion = self.vehicle.step_s, self.vehicle.motion
         k = np.clip((times_s / step_s).astype(np.int64), 0, len(self.noise) - 1)
         within_s = times_s - k * step_s
+        part = np.clip(within_s / step_s, 0.0, 1.0)[:, None]
+        noise = part * self.noise[k] + np.sqrt(part * (1.0 - part)) * self.bridge[k]
         states = np.zeros((len(times_s), len(STATE_NAMES)))
-        states[:, : self.noise.shape[1]] = (
-            self.vehicle.motion.predict(self.step_states[k], within_s)
-            + (within_s / step_s)[:, None] * self.noise[k]
-        )
+        states[:, : motion.dim] = motion.predict(self.step_states[k], within_s) + noise
         states[:, YAW] = wrap_angles(states[:, YAW])
         return states
 
 
 #: Every kind of vehicle, told apart by `kind`.
-AnyVehicle = TrackVehicle | DrawnVehicle
+AnyVehicle = Annotated[TrackVehicle | DrawnVehicle, Discriminator("kind")]

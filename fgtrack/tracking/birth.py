@@ -17,9 +17,7 @@ from fgtrack.tracking.preprocess import Candidate
 class Birth(Protocol):
     """Makes the first state of a track."""
 
-    def prior(
-        self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool
-    ) -> BirthPrior | None:
+    def prior(self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool) -> BirthPrior | None:
         """Prior at the candidate's stamp; None where it has no position to start from."""
 
 
@@ -49,9 +47,7 @@ class Assumptions:
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name}: must be positive, is {getattr(self, name)}")
 
-    def prior(
-        self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool
-    ) -> BirthPrior | None:
+    def prior(self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool) -> BirthPrior | None:
         """See `Birth.prior`: what was measured, then map heading, road curvature and a share of the ego speed."""
         if candidate.position_m is None:
             return None

@@ -43,9 +43,7 @@ class EgoSource(Protocol):
 
 def is_finite(ego: EgoState) -> bool:
     """Whether every number of `ego` is one."""
-    return all(
-        map(math.isfinite, (ego.x_m, ego.y_m, ego.yaw_rad, ego.speed_mps, ego.yaw_rate_radps, ego.accel_mps2))
-    )
+    return all(map(math.isfinite, (ego.x_m, ego.y_m, ego.yaw_rad, ego.speed_mps, ego.yaw_rate_radps, ego.accel_mps2)))
 
 
 def extrapolated(ego: EgoState, stamp_ns: int) -> EgoPose:
@@ -75,9 +73,7 @@ class EgoTrajectory:
     The low-pass pulls towards the previous state *turned on to the new stamp*, so a steady turn is not delayed.
     """
 
-    def __init__(
-        self, yaw_weight: float, yaw_rate_weight: float, memory_s: float, max_extrapolation_s: float
-    ) -> None:
+    def __init__(self, yaw_weight: float, yaw_rate_weight: float, memory_s: float, max_extrapolation_s: float) -> None:
         self._yaw_weight = yaw_weight
         self._yaw_rate_weight = yaw_rate_weight
         self._memory_ns = nanoseconds(memory_s)

@@ -60,9 +60,7 @@ class Lifecycle(Protocol):
     def fused(self, track_id: int) -> None:
         """The associated detection changed the state."""
 
-    def missed(
-        self, track_ids: Sequence[int], sensor: str, ranges_m: FloatArray, present_ns: int
-    ) -> list[int]:
+    def missed(self, track_ids: Sequence[int], sensor: str, ranges_m: FloatArray, present_ns: int) -> list[int]:
         """These tracks, at these distances from the ego, were not seen; the ids of those that end."""
 
     def expired(self, present_ns: int) -> list[int]:
@@ -96,9 +94,7 @@ class CountingLifecycle:
         """See `Lifecycle.fused`."""
         self.lives[track_id].num_measured += 1
 
-    def missed(
-        self, track_ids: Sequence[int], sensor: str, ranges_m: FloatArray, present_ns: int
-    ) -> list[int]:
+    def missed(self, track_ids: Sequence[int], sensor: str, ranges_m: FloatArray, present_ns: int) -> list[int]:
         """See `Lifecycle.missed`."""
         ended = []
         for track_id, range_m in zip(track_ids, ranges_m.tolist(), strict=True):

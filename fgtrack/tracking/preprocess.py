@@ -114,9 +114,7 @@ class Located:
 class Preprocess:
     """Transformation to the map, false-positive filter and merge (Karle et al. 2023, sections III-B and III-C)."""
 
-    def __init__(
-        self, road: Road, merge: Merge, motion: MotionModel, detection_origin_m: tuple[float, float]
-    ) -> None:
+    def __init__(self, road: Road, merge: Merge, motion: MotionModel, detection_origin_m: tuple[float, float]) -> None:
         """`detection_origin_m`: origin of the ego frame of detections, seen from the ego reference point."""
         self._road = road
         self._merge = merge
@@ -150,9 +148,7 @@ class Preprocess:
             yaw_rad += mount.yaw_rad
         return SensorPose(float(origin[0, 0]), float(origin[0, 1]), yaw_rad, vx, vy)
 
-    def _locate(
-        self, index: int, detection: Detection, sensor: SensorModel, pose: SensorPose, in_map: bool
-    ) -> Located:
+    def _locate(self, index: int, detection: Detection, sensor: SensorModel, pose: SensorPose, in_map: bool) -> Located:
         names = tuple(name for name in sensor.components if getattr(detection, name) is not None)
         values = {name: float(getattr(detection, name)) for name in names}
         R = _noise(detection, sensor, names)
@@ -208,9 +204,7 @@ class Preprocess:
             values, R, position_m = parts[0].values, parts[0].R, parts[0].position_m
             position_covariance = parts[0].position_covariance
         else:
-            values = {
-                name: self._merge.mean(name, np.array([part.values[name] for part in parts])) for name in names
-            }
+            values = {name: self._merge.mean(name, np.array([part.values[name] for part in parts])) for name in names}
             R = np.mean([_select(part, names) for part in parts], axis=0)
             position_m = _average([part.position_m for part in parts])
             position_covariance = _average([part.position_covariance for part in parts])
@@ -234,9 +228,7 @@ def _noise(detection: Detection, sensor: SensorModel, names: tuple[str, ...]) ->
     return np.ascontiguousarray(own[np.ix_(used, used)])
 
 
-def _axes_yaw(
-    detection: Detection, sensor: SensorModel, point_m: FloatArray, pose: SensorPose, in_map: bool
-) -> float:
+def _axes_yaw(detection: Detection, sensor: SensorModel, point_m: FloatArray, pose: SensorPose, in_map: bool) -> float:
     """Direction, in the map, of the axes that R's position block is given in; 0 where it does not matter."""
     if detection.covariance is not None and sensor.message_covariance:
         return 0.0 if in_map else pose.yaw_rad

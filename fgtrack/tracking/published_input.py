@@ -123,4 +123,3 @@ def _float_stamp(message: DetectionList) -> int:
         return message.stamp_ns
     stamps = [message.stamp_ns if item.stamp_ns is None else item.stamp_ns for item in message.objects]
     return int(np.mean(np.array(stamps, dtype=np.int64)))
-

@@ -98,9 +98,7 @@ class PublishedLifecycle:
         """See `Lifecycle.fused`."""
         self.lives[track_id].num_measured += 1
 
-    def missed(
-        self, track_ids: Sequence[int], sensor: str, ranges_m: FloatArray, present_ns: int
-    ) -> list[int]:
+    def missed(self, track_ids: Sequence[int], sensor: str, ranges_m: FloatArray, present_ns: int) -> list[int]:
         """See `Lifecycle.missed`."""
         ages = self._sensors[sensor].ages
         ended = []

@@ -20,7 +20,7 @@ from fgtrack.core.types import (
 from fgtrack.estimation.base import StatesAt, TrackBank, UpdateResult
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.association import Association, Assignment
+from fgtrack.tracking.association import Assignment, Association
 from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.ego import EgoPose, EgoSource
 from fgtrack.tracking.inbox import Batch, Inbox
@@ -135,9 +135,7 @@ class Tracker:
             return
         matched = [candidates[position] for position, _ in assignment.pairs]
         track_ids = [states.track_ids[track] for _, track in assignment.pairs]
-        results = self._parts.bank.update(
-            batch.stamp_ns, track_ids, [candidate.measurement for candidate in matched]
-        )
+        results = self._parts.bank.update(batch.stamp_ns, track_ids, [candidate.measurement for candidate in matched])
         for candidate, track_id, result in zip(matched, track_ids, results, strict=True):
             if result.innovation is not None:
                 self._parts.lifecycle.fused(track_id)
@@ -186,7 +184,10 @@ class Tracker:
         bank = self._parts.bank
         return tuple(
             TrackReport(
-                track_id, lives[track_id].status(self._parts.confirm_count), state, lives[track_id].num_measured
+                track_id,
+                lives[track_id].status(self._parts.confirm_count),
+                state,
+                lives[track_id].num_measured,
             )
             for track_id, state in zip(bank.track_ids, bank.present(), strict=True)
         )

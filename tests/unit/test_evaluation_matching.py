@@ -106,7 +106,7 @@ def test_a_pair_inside_the_gate_stays_though_another_track_is_nearer(tmp_path: P
     tracks = [
         [WEST.track(0, 1, along_m=0.1), WEST.track(0, 2, along_m=3.0)],
         [WEST.track(1, 1, along_m=4.0), WEST.track(1, 2, along_m=0.0)],
-        [WEST.track(2, 1, along_m=10.1), WEST.track(2, 2, along_m=1.0)],
+        [WEST.track(2, 1, along_m=5.1), WEST.track(2, 2, along_m=1.0)],
     ]
     matching = match(write_run(tmp_path / "run", tracks, truth=WEST.truth(range(3))))
     assert matching is not None

@@ -56,9 +56,9 @@ def story(tmp_path: Path) -> Run:
     for k in range(10):
         rows = []
         if k < 3 or 5 <= k < 7:
-            rows.append(WEST.track(k, 1, along_m=3.0, across_m=4.0, yaw_rad=-0.2, speed_mps=-1.0))
+            rows.append(WEST.track(k, 1, along_m=1.5, across_m=2.0, yaw_rad=-0.2, speed_mps=-1.0))
         if k >= 7:
-            rows.append(WEST.track(k, 2, along_m=-3.0, across_m=4.0, yaw_rad=0.2, speed_mps=1.0))
+            rows.append(WEST.track(k, 2, along_m=-1.5, across_m=2.0, yaw_rad=0.2, speed_mps=1.0))
         if k < 8:
             rows.append(ROUND.track(k, 3, along_m=1.0))
         rows.append(WEST.track(k, 4, across_m=60.0))
@@ -84,13 +84,13 @@ def test_time_tracked_breaks_and_switches_are_counted(story: Run) -> None:
 
 def test_errors_have_their_known_moments(story: Run) -> None:
     errors = objects_of(evaluate(story))[7].errors
-    assert errors["position_m"].rmse == pytest.approx(5.0)
+    assert errors["position_m"].rmse == pytest.approx(2.5)
     assert errors["position_m"].std == pytest.approx(0.0, abs=1e-9)
-    assert errors["across_m"].mean == pytest.approx(4.0)
-    # 5 of 8 rows at +3 m, 3 at -3 m; yaw and speed the other way round
-    assert errors["along_m"].mean == pytest.approx(3.0 / 4.0)
-    assert errors["along_m"].std == pytest.approx(3.0 * math.sqrt(1 - 1 / 16))
-    assert errors["along_m"].rmse == pytest.approx(3.0)
+    assert errors["across_m"].mean == pytest.approx(2.0)
+    # 5 of 8 rows at +1.5 m, 3 at -1.5 m; yaw and speed the other way round
+    assert errors["along_m"].mean == pytest.approx(1.5 / 4.0)
+    assert errors["along_m"].std == pytest.approx(1.5 * math.sqrt(1 - 1 / 16))
+    assert errors["along_m"].rmse == pytest.approx(1.5)
     assert errors["yaw_rad"].mean == pytest.approx(-0.05)
     assert errors["yaw_rad"].rmse == pytest.approx(0.2)
     assert errors["speed_mps"].mean == pytest.approx(-0.25)
@@ -101,7 +101,7 @@ def test_overall_is_all_objects_together(story: Run) -> None:
     assert metrics.truth is not None
     overall = metrics.truth.overall
     assert (overall.ticks_present, overall.ticks_tracked, overall.breaks) == (19, 16, 2)
-    assert overall.errors["position_m"].rmse == pytest.approx(math.sqrt((8 * 25.0 + 8 * 1.0) / 16))
+    assert overall.errors["position_m"].rmse == pytest.approx(math.sqrt((8 * 6.25 + 8 * 1.0) / 16))
 
 
 def test_false_tracks_and_precision(story: Run) -> None:
@@ -235,7 +235,7 @@ def test_metrics_are_strict_json(story: Run) -> None:
     plain = evaluate(story).as_dict()
     again = json.loads(json.dumps(plain, allow_nan=False))
     assert again == plain
-    assert again["truth"]["objects"]["7"]["errors"]["position_m"]["rmse"] == pytest.approx(5.0)
+    assert again["truth"]["objects"]["7"]["errors"]["position_m"]["rmse"] == pytest.approx(2.5)
     assert again["truth"]["overall"]["tracked_share"] == pytest.approx(16 / 19)
     assert again["precision"] == 0.5
 

@@ -1,0 +1,20 @@
+"""Arguments that several commands share."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Input = Annotated[
+    Path,
+    typer.Argument(help="Recording: rosbag2 folder, .mcap, .db3, .bag, fgtrack stream or Autoferry folder."),
+]
+ConfigFile = Annotated[
+    Path | None, typer.Option("-c", "--config", help="Configuration (YAML); without it the defaults.")
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override one key of the configuration; may be repeated."),
+]
+Runs = Annotated[list[Path], typer.Argument(help="Run folders, or folders that hold run folders.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]

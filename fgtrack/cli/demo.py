@@ -1,0 +1,63 @@
+"""`fgtrack demo`: the whole chain in a minute."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from fgtrack.cli.compare import evaluated
+from fgtrack.cli.show import TickProgress, console, progress
+from fgtrack.core.errors import CallError
+from fgtrack.evaluation.figures import save_figures
+from fgtrack.evaluation.tables import comparison_tables
+from fgtrack.io.bag_writer import write_bag
+from fgtrack.io.run_folder import read_run
+from fgtrack.io.source import open_input
+from fgtrack.pipeline.build import ESTIMATORS
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.replay import replay_each
+from fgtrack.sim.paper import paper_scenario
+from fgtrack.sim.scenario import OVAL
+from fgtrack.sim.simulate import simulate
+
+_SEED = 1
+
+
+def demo(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for recording, runs and figures.")] = Path(
+        "fgtrack-demo"
+    ),
+) -> None:
+    """Simulate the paper's scenario, record it as a rosbag2, replay the recording, compare and draw."""
+    bag = out / "recording"
+    if bag.exists():
+        if not (bag / "metadata.yaml").exists():
+            raise CallError(f"{bag}: is in the way and no recording, choose another folder with -o")
+        shutil.rmtree(bag)
+    out.mkdir(parents=True, exist_ok=True)
+    with progress("simulate"):
+        write_bag(bag, simulate(paper_scenario(), np.random.default_rng(_SEED)))
+    config = Config()
+    config = replace(config, map=replace(config.map, track=OVAL, pit=OVAL))
+    source = open_input(bag, config.input)
+    with progress("replay") as show:
+        results = replay_each(
+            source.messages,
+            config,
+            tuple(ESTIMATORS),
+            out / "runs",
+            origin=str(bag),
+            kind=source.kind,
+            on_tick=TickProgress(show),
+        )
+    runs = [read_run(result.path) for result in results]
+    for table in comparison_tables(evaluated(runs)):
+        console().print(table)
+    with progress("draw"):
+        files = save_figures(runs, out / "figures")
+    console().print(f"recording: {bag}\nruns: {out / 'runs'}", highlight=False, soft_wrap=True)
+    for file in files:
+        console().print(f"figure: {file}", highlight=False, soft_wrap=True)

@@ -1,0 +1,56 @@
+"""`fgtrack info`: what is in a recording."""
+
+import sys
+from datetime import UTC, datetime
+
+from rich import box
+from rich.table import Table
+
+from fgtrack.cli.arguments import ConfigFile, Input
+from fgtrack.cli.show import console
+from fgtrack.io.info import DelayInfo, InputInfo, describe
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.load import load
+
+
+def info(recording: Input, config_file: ConfigFile = None) -> int:
+    """List topics, types, rates and delays, and what a configuration would take."""
+    config = None if config_file is None else load(Config, config_file).input
+    found = describe(recording, config)
+    console().print(_heading(found), highlight=False, soft_wrap=True)
+    console().print(_table(found))
+    for topic in found.topics:
+        if topic.note is not None:
+            console().print(f"{topic.name}: {topic.note}", highlight=False, soft_wrap=True, markup=False)
+    if found.problem is None:
+        return 0
+    print(f"fgtrack: error: {' '.join(found.problem.split())}", file=sys.stderr)
+    return 1
+
+
+def _heading(found: InputInfo) -> str:
+    text = f"{found.path}: {found.kind}"
+    if found.start_ns is None:
+        return f"{text}, empty"
+    start = datetime.fromtimestamp(found.start_ns // 1_000_000_000, UTC)
+    return f"{text}, {found.duration_s:.3f} s from {start:%Y-%m-%d %H:%M:%S} UTC ({found.start_ns} ns)"
+
+
+def _table(found: InputInfo) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False)
+    table.add_column("topic", overflow="fold")
+    table.add_column("type", overflow="fold")
+    table.add_column("taken as")
+    table.add_column("messages", justify="right")
+    table.add_column("rate [Hz]", justify="right")
+    table.add_column("delay [ms] mean/p50/p90/max", justify="right")
+    for topic in found.topics:
+        rate = "–" if topic.rate_hz is None else f"{topic.rate_hz:.1f}"
+        table.add_row(topic.name, topic.type, topic.used_as or "–", str(topic.count), rate, _delay(topic.delay))
+    return table
+
+
+def _delay(delay: DelayInfo | None) -> str:
+    if delay is None:
+        return "–"
+    return "/".join(f"{1e3 * value:.0f}" for value in (delay.mean_s, delay.p50_s, delay.p90_s, delay.max_s))

@@ -1,0 +1,89 @@
+"""Entry point: runs a command and turns what went wrong into one line and an exit code."""
+
+import logging
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import Annotated
+
+import click
+import typer
+
+import fgtrack
+from fgtrack.cli import compare, config, convert, demo, figure, info, replay, simulate
+from fgtrack.core.errors import CallError, FgtrackError
+
+DONE, BAD_DATA, BAD_CALL = 0, 1, 2
+
+app = typer.Typer(
+    name="fgtrack",
+    help="Track objects from delayed object lists, and compare how delays are dealt with.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"fgtrack {fgtrack.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Options before the command; `main` reads --debug itself."""
+
+
+app.command()(demo.demo)
+app.command()(simulate.simulate)
+app.command()(replay.replay)
+app.command()(compare.compare)
+app.command()(figure.figure)
+app.command()(info.info)
+app.command()(convert.convert)
+app.command()(config.config)
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command; gives the exit code. Errors are one line on stderr."""
+    debug = "--debug" in arguments
+    words = [word for word in arguments if word != "--debug"]
+    logging.basicConfig(level=logging.WARNING, format="fgtrack: %(message)s", force=True)
+    try:
+        outcome = typer.main.get_command(app).main(words, prog_name="fgtrack", standalone_mode=False)
+        return outcome if isinstance(outcome, int) else DONE
+    except click.exceptions.NoArgsIsHelpError as error:
+        print(error.format_message())
+        return BAD_CALL
+    except click.ClickException as error:
+        return _failed(error.format_message(), BAD_CALL, debug)
+    except CallError as error:
+        return _failed(str(error), BAD_CALL, debug)
+    except FgtrackError as error:
+        return _failed(str(error), BAD_DATA, debug)
+    except (KeyboardInterrupt, click.Abort):
+        return _failed("interrupted; what was computed so far is in the output folder", 130, debug)
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader of a pipe has left: not an error worth a line
+        return DONE
+    except Exception as error:  # the last line of defence: a bug must not look like bad data
+        return _failed(f"internal error: {type(error).__name__}: {error} (run with --debug)", BAD_DATA, debug)
+
+
+def _failed(message: str, code: int, debug: bool) -> int:
+    if debug:
+        traceback.print_exc()
+    print("fgtrack: error: " + " ".join(message.split()), file=sys.stderr)
+    return code
+
+
+def main() -> None:
+    """Run the command line and exit."""
+    sys.exit(run(sys.argv[1:]))

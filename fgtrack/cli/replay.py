@@ -1,0 +1,67 @@
+"""`fgtrack replay`: a recording through the tracker into a run folder."""
+
+import sys
+from dataclasses import replace as changed
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fgtrack.cli.arguments import ConfigFile, Input, Settings
+from fgtrack.cli.show import TickProgress, console, progress
+from fgtrack.core.errors import CallError
+from fgtrack.io.source import open_input
+from fgtrack.pipeline.build import ESTIMATORS
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.load import load
+from fgtrack.pipeline.replay import ReplayResult, replay_each
+
+
+def replay(
+    recording: Input,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Run folder; for several estimators one below it each.")],
+    config_file: ConfigFile = None,
+    estimators: Annotated[
+        str | None, typer.Option("-e", "--estimator", help="Estimator, or several with commas between them.")
+    ] = None,
+    track_map: Annotated[
+        str | None, typer.Option("--map", help="Map of the track (CSV), or `oval` for the built-in one.")
+    ] = None,
+    pit_map: Annotated[str | None, typer.Option("--pit-map", help="Map of the pit lane (CSV), or `oval`.")] = None,
+    settings: Settings = None,
+) -> int:
+    """Replay a recording through the tracker."""
+    config = load(Config, config_file, settings or [])
+    config = changed(
+        config, map=changed(config.map, track=track_map or config.map.track, pit=pit_map or config.map.pit)
+    )
+    names = tuple(name.strip() for name in (estimators or config.estimator).split(","))
+    for name in names:
+        if name not in ESTIMATORS:
+            raise CallError(f"estimator {name!r} is unknown: there are {', '.join(ESTIMATORS)}")
+    source = open_input(recording, config.input)
+    with progress("replay") as show:
+        results = replay_each(
+            source.messages,
+            config,
+            names,
+            out,
+            origin=str(recording),
+            kind=source.kind,
+            on_tick=TickProgress(show),
+        )
+    for result in results:
+        console().print(_summary(result), highlight=False, soft_wrap=True)
+    broken = next((result.broken for result in results if result.broken is not None), None)
+    if broken is None:
+        return 0
+    print(f"fgtrack: error: {' '.join(broken.split())}; replayed up to there", file=sys.stderr)
+    return 1
+
+
+def _summary(result: ReplayResult) -> str:
+    meta = result.meta
+    return (
+        f"{result.path}: {meta['estimator']}, {meta['detections_received']} detections, "
+        f"{meta['wall_s']:.1f} s, digest {str(meta['digest'])[:12]}"
+    )

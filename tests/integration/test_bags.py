@@ -1,0 +1,431 @@
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+from itertools import islice
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from support.messages import START_NS, drive, exact, message_lists, shared
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.types import Detection, DetectionList, EgoState, TruthState
+from fgtrack.io.bag import Bag
+from fgtrack.io.bag_writer import write_bag
+from fgtrack.io.config import InputConfig, TopicInput
+from fgtrack.io.errors import TruncatedInput, UntilBreak
+from fgtrack.io.source import open_input
+from fgtrack.io.stream import read_stream
+
+STORAGES = ("mcap", "sqlite3")
+
+
+def storage_file(bag: Path) -> Path:
+    return next(file for file in bag.iterdir() if file.suffix in (".mcap", ".db3"))
+
+
+def read(path: Path, config: InputConfig | None = None) -> list:
+    return list(open_input(path, config).messages())
+
+
+# --- what fgtrack writes
+
+
+@settings(deadline=None, max_examples=40)
+@given(messages=message_lists(), storage=st.sampled_from(STORAGES), standard=st.booleans())
+def test_every_field_survives_the_bag_to_the_bit_and_in_order(tmp_path_factory, messages, storage, standard):
+    path = tmp_path_factory.mktemp("bag") / "bag"
+    assert write_bag(path, messages, storage, standard) == len(messages)
+    if messages:
+        assert exact(read(path)) == exact(messages)
+
+
+def test_both_storages_read_back_the_same_as_the_stream(tmp_path):
+    messages = list(islice(read_stream(shared("reference/lidar3_10/stream.jsonl.gz")), 2500))
+    for storage in STORAGES:
+        write_bag(tmp_path / storage, messages, storage)
+        assert read(tmp_path / storage) == messages
+
+
+def test_an_input_can_be_read_again(tmp_path):
+    write_bag(tmp_path / "bag", drive())
+    source = open_input(tmp_path / "bag")
+    assert list(source.messages()) == list(source.messages()) == drive()
+
+
+def test_the_storage_file_alone_is_enough(tmp_path):
+    for storage in STORAGES:
+        write_bag(tmp_path / storage, drive(), storage)
+        assert read(storage_file(tmp_path / storage)) == drive()
+
+
+def test_a_folder_without_metadata_is_read(tmp_path):
+    write_bag(tmp_path / "bag", drive())
+    (tmp_path / "bag/metadata.yaml").unlink()
+    assert read(tmp_path / "bag") == drive()
+
+
+def test_an_existing_path_is_not_overwritten(tmp_path):
+    (tmp_path / "bag").mkdir()
+    with pytest.raises(DataError, match="exists already"):
+        write_bag(tmp_path / "bag", drive())
+
+
+def test_a_stamp_that_ros_cannot_hold_is_one_line(tmp_path):
+    with pytest.raises(DataError, match="1901 to 2038"):
+        write_bag(tmp_path / "bag", [EgoState(1 << 62, 0, 0.0, 0.0, 0.0, 0.0)])
+
+
+def test_the_twins_say_what_other_tools_can_show(tmp_path):
+    write_bag(tmp_path / "bag", drive())
+    types = {topic.name: (topic.type, topic.count) for topic in Bag(tmp_path / "bag").topics}
+    assert types["/ego/odometry"] == ("nav_msgs/msg/Odometry", 50)
+    assert types["/detections/lidar"] == ("vision_msgs/msg/Detection3DArray", 10)
+    assert types["/detections/radar"] == ("autoware_perception_msgs/msg/DetectedObjects", 10)
+    assert types["/truth/poses"] == ("geometry_msgs/msg/PoseArray", 50)
+    config = InputConfig(
+        ego=TopicInput("/ego/odometry"),
+        detections={"lidar": TopicInput("/detections/lidar"), "radar": TopicInput("/detections/radar")},
+        truth=TopicInput("/truth/poses"),
+    )
+    found = read(tmp_path / "bag", config)
+    lists = [message for message in drive() if isinstance(message, DetectionList)]
+    read_lists = [message for message in found if isinstance(message, DetectionList)]
+    assert [(m.sensor, m.stamp_ns, m.receipt_ns, len(m.objects)) for m in read_lists] == [
+        (m.sensor, m.stamp_ns, m.receipt_ns, len(m.objects)) for m in lists
+    ]
+    for mine, theirs in zip(lists, read_lists, strict=True):
+        for a, b in zip(mine.objects, theirs.objects, strict=True):
+            assert (a.x_m, a.y_m, a.speed_mps, a.object_id) == (b.x_m, b.y_m, b.speed_mps, b.object_id)
+            assert b.yaw_rad == (None if a.yaw_rad is None else pytest.approx(a.yaw_rad, abs=1e-15))
+    ego = next(message for message in found if isinstance(message, EgoState))
+    assert ego == EgoState(START_NS, START_NS, 0.0, 0.0, pytest.approx(0.25), 50.0, 0.1)
+    truth = [message for message in found if isinstance(message, TruthState)]
+    assert len(truth) == 100
+    assert truth[0] == TruthState(START_NS, START_NS, 0, 30.0, 1.0, pytest.approx(0.1))
+
+
+def test_a_detection_in_the_twin_keeps_its_covariance(tmp_path):
+    covariance = tuple(float(value) for value in range(1, 10))
+    item = Detection(x_m=1.0, y_m=2.0, yaw_rad=0.5, covariance=covariance)
+    write_bag(tmp_path / "bag", [DetectionList("lidar", 1, 2, (item,), "map")])
+    config = InputConfig(detections={"lidar": TopicInput("/detections/lidar")})
+    (message,) = read(tmp_path / "bag", config)
+    assert message.objects[0].covariance == covariance
+    assert message.frame == "map"
+
+
+# --- what breaks off
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize("kept", [0.5, 0.9, 0.999])
+def test_a_truncated_recording_gives_all_before_the_break_and_then_says_so(tmp_path, storage, kept):
+    messages = drive(1500)
+    write_bag(tmp_path / "bag", messages, storage, standard_topics=False)
+    file = storage_file(tmp_path / "bag")
+    data = file.read_bytes()
+    file.write_bytes(data[: int(len(data) * kept)])
+    for path in (tmp_path / "bag", file):
+        readable = UntilBreak(open_input(path).messages())
+        found = list(readable)
+        with pytest.raises(TruncatedInput, match=f"after {len(found)} messages") as caught:
+            readable.raise_error()
+        assert "\n" not in str(caught.value)
+        assert found == messages[: len(found)]
+        assert len(found) > (kept - 0.3) * len(messages)
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize("kept", [0, 3, 20, 100, 700])
+def test_hardly_any_recording_is_one_line(tmp_path, storage, kept):
+    write_bag(tmp_path / "bag", drive(), storage)
+    file = storage_file(tmp_path / "bag")
+    file.write_bytes(file.read_bytes()[:kept])
+    for path in (tmp_path / "bag", file):
+        with pytest.raises(DataError) as caught:
+            read(path)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_damaged_bytes_are_always_one_line(tmp_path, storage):
+    write_bag(tmp_path / "bag", drive(), storage, standard_topics=False)
+    file = storage_file(tmp_path / "bag")
+    data = file.read_bytes()
+    for start in range(0, len(data), len(data) // 40):
+        file.write_bytes(data[:start] + b"\xff" * 50 + data[start + 50 :])
+        try:
+            read(file)
+        except DataError as error:
+            assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_killed_writer_leaves_a_recording_that_is_read(tmp_path, storage):
+    script = f"""
+import os, signal, sys
+sys.path[:0] = {[str(Path(__file__).resolve().parents[1])]!r}
+from support.messages import drive
+from fgtrack.io.bag_writer import write_bag
+def messages():
+    yield from drive(1200)
+    os.kill(os.getpid(), signal.SIGKILL)
+write_bag(sys.argv[1], messages(), {storage!r})
+"""
+    done = subprocess.run([sys.executable, "-c", script, str(tmp_path / "bag")], check=False)
+    assert done.returncode == -signal.SIGKILL
+    messages = drive(1200)
+    readable = UntilBreak(open_input(tmp_path / "bag").messages())
+    found = list(readable)
+    assert found == messages[: len(found)]
+    assert len(found) >= len(messages) - 1000
+    assert readable.error or storage == "sqlite3"
+
+
+def test_a_sqlite_recording_with_a_write_ahead_log_is_read_whole_and_left_alone(tmp_path):
+    write_bag(tmp_path / "bag", drive(), "sqlite3")
+    file = storage_file(tmp_path / "bag")
+    (tmp_path / "bag/metadata.yaml").unlink()
+    connection = sqlite3.connect(file)
+    connection.execute("PRAGMA journal_mode=WAL")
+    connection.execute("PRAGMA wal_autocheckpoint=0")
+    connection.execute("UPDATE messages SET timestamp = timestamp + 1")
+    connection.commit()
+    before = file.read_bytes()
+    readable = UntilBreak(open_input(file).messages())
+    found = list(readable)
+    assert [m.receipt_ns for m in found] == [m.receipt_ns + 1 for m in drive()]
+    assert readable.error is not None
+    assert "not closed" in str(readable.error)
+    assert file.read_bytes() == before
+    connection.close()
+
+
+def test_of_a_broken_input_all_before_the_break_is_written(tmp_path):
+    write_bag(tmp_path / "a", drive(1200), standard_topics=False)
+    file = storage_file(tmp_path / "a")
+    file.write_bytes(file.read_bytes()[:-3000])
+    with pytest.raises(TruncatedInput):
+        write_bag(tmp_path / "b", open_input(tmp_path / "a").messages())
+    assert read(tmp_path / "b") == list(UntilBreak(open_input(tmp_path / "a").messages()))
+
+
+# --- foreign recordings
+
+
+@pytest.fixture(scope="module")
+def humble():
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def make_odometry(store, stamp_ns, ros1=False):
+    types = store.types
+    import numpy as np
+
+    vector = types["geometry_msgs/msg/Vector3"]
+    stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    sequence = {"seq": 4} if ros1 else {}
+    pose = types["geometry_msgs/msg/Pose"](
+        position=types["geometry_msgs/msg/Point"](x=1.0, y=2.0, z=0.0),
+        orientation=types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=1.0, w=1.0),
+    )
+    twist = types["geometry_msgs/msg/Twist"](
+        linear=vector(x=-3.0, y=0.0, z=0.0), angular=vector(0.0, 0.0, 0.5)
+    )
+    return types["nav_msgs/msg/Odometry"](
+        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="odom", **sequence),
+        child_frame_id="base_link",
+        pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
+        twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
+    )
+
+
+ODOMETRY_STATE = EgoState(5, 9, 1.0, 2.0, pytest.approx(1.5707963267948966), -3.0, 0.5)
+
+
+@pytest.mark.parametrize("mode", list(CompressionMode))
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
+def test_compressed_recordings_are_read(tmp_path, humble, mode, plugin):
+    if mode == CompressionMode.STORAGE and plugin == StoragePlugin.SQLITE3:
+        pytest.skip("SQLite has no compression of its own")
+    writer = Writer(tmp_path / "bag", version=9, storage_plugin=plugin)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=humble)
+        data = humble.serialize_cdr(make_odometry(humble, 5), "nav_msgs/msg/Odometry")
+        writer.write(connection, 9, bytes(data))
+    assert read(tmp_path / "bag", InputConfig(ego=TopicInput("/odom"))) == [ODOMETRY_STATE]
+
+
+def test_a_ros1_bag_is_read(tmp_path):
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Rosbag1Writer(tmp_path / "a.bag") as writer:
+        connection = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=store)
+        data = store.serialize_ros1(make_odometry(store, 5, ros1=True), "nav_msgs/msg/Odometry")
+        writer.write(connection, 9, bytes(data))
+    assert read(tmp_path / "a.bag", InputConfig(ego=TopicInput("/odom"))) == [ODOMETRY_STATE]
+
+
+def test_messages_of_split_files_come_in_log_time_order(tmp_path, humble):
+    for part, times in (("b_10", (2, 5)), ("b_2", (1, 5, 7))):
+        with Writer(tmp_path / part, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            connection = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=humble)
+            for time_ns in times:
+                state = make_odometry(humble, 10 * len(part) + time_ns)
+                writer.write(connection, time_ns, bytes(humble.serialize_cdr(state, connection.msgtype)))
+    folder = tmp_path / "split"
+    folder.mkdir()
+    for part in ("b_10", "b_2"):
+        (tmp_path / part / f"{part}.mcap").rename(folder / f"{part}.mcap")
+    found = read(folder, InputConfig(ego=TopicInput("/odom")))
+    assert [message.receipt_ns for message in found] == [1, 2, 5, 5, 7]
+    assert [message.stamp_ns for message in found] == [31, 42, 35, 45, 37]
+
+
+def test_an_unordered_mcap_file_is_read_in_log_time_order_with_and_without_its_end(tmp_path, humble):
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=humble)
+        data = bytes(humble.serialize_cdr(make_odometry(humble, 5), connection.msgtype))
+        for time_ns in (7, 3, 9):
+            writer.write(connection, time_ns, data)
+        writer.storage.close_chunk()
+        for time_ns in (8, 1):
+            writer.write(connection, time_ns, data)
+    config = InputConfig(ego=TopicInput("/odom"))
+    assert [message.receipt_ns for message in read(tmp_path / "bag", config)] == [1, 3, 7, 8, 9]
+    file = storage_file(tmp_path / "bag")
+    file.write_bytes(file.read_bytes()[:-10])
+    found = list(UntilBreak(open_input(file, config).messages()))
+    assert [message.receipt_ns for message in found] == [1, 3, 7, 8, 9]
+
+
+# --- the recordings of other people
+
+
+def test_the_same_recording_in_both_storages_gives_the_same_messages():
+    folder = shared("data/bags/rosbag2_py_resources")
+    for name in ("wbag", "reindex_test_bags/multiple_files"):
+        read_both = []
+        for storage in STORAGES:
+            bag = Bag(folder / storage / name)
+            names = {topic.name for topic in bag.topics}
+            read_both.append([(m.topic, m.log_ns, m.data.data) for m in bag.messages(names)])
+        assert sorted(read_both[0]) == sorted(read_both[1])
+        assert [m[1] for m in read_both[0]] == [m[1] for m in read_both[1]]
+
+
+def test_a_real_odometry_recording_is_an_ego():
+    path = shared("data/bags/nav2_turtlebot.mcap")
+    found = read(path, InputConfig(ego=TopicInput("/odom")))
+    assert len(found) == 2639
+    assert all(a.receipt_ns <= b.receipt_ns for a, b in zip(found, found[1:], strict=False))
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_wrong_serialization_is_refused_in_one_line(storage):
+    with pytest.raises(DataError, match="wrong_format"):
+        open_input(shared(f"data/bags/rosbag2_tests_resources/{storage}/wrong_rmw_test"))
+
+
+def test_a_needed_type_without_definition_is_one_line_and_a_given_one_is_read(tmp_path):
+    path = shared("data/bags/rosbag2_py_resources/sqlite3/convert_a")
+    fields = {"x_m": "float64_value", "y_m": "float32_value", "object_id": "int32_value"}
+    item = TopicInput("b_basictypes", fields=fields)
+    with pytest.raises(DataError, match=r"test_msgs/msg/BasicTypes .* message_definitions"):
+        read(path, InputConfig(detections={"x": item}))
+    definition = tmp_path / "test_msgs/msg/BasicTypes.msg"
+    definition.parent.mkdir(parents=True)
+    names = ["bool", "byte", "char", "float32", "float64"]
+    names += [f"{sign}int{bits}" for bits in (8, 16, 32, 64) for sign in ("", "u")]
+    definition.write_text("".join(f"{name} {name}_value\n" for name in [*names, "string"]))
+    for given in (definition, definition.parent):
+        config = InputConfig(detections={"x": item}, message_definitions=(str(given),))
+        found = read(path, config)
+        assert len(found) == 50
+        assert found[3].objects[0].object_id == 3
+        assert found[3].stamp_ns == found[3].receipt_ns
+
+
+# --- configurations
+
+
+def test_a_topic_that_the_recording_lacks_is_named_with_what_there_is(tmp_path):
+    write_bag(tmp_path / "bag", drive())
+    config = InputConfig(
+        ego=TopicInput("/ego/odometry"),
+        detections={"lidar": TopicInput("/lidar", type="vision_msgs/Detection3DArray")},
+    )
+    with pytest.raises(DataError, match=r"no topic /lidar; .* /detections/lidar \(vision_msgs") as caught:
+        open_input(tmp_path / "bag", config)
+    assert "odometry" not in str(caught.value)
+
+
+def test_a_foreign_recording_without_a_configuration_is_one_line():
+    with pytest.raises(DataError, match=r"must name its topics .* /odom \(nav_msgs"):
+        open_input(shared("data/bags/nav2_turtlebot.mcap"))
+
+
+@pytest.mark.parametrize(
+    ("item", "error", "complaint"),
+    [
+        (TopicInput("/ego/odometry", type="nav_msgs/Path"), DataError, "is a nav_msgs/msg/Odometry, not"),
+        (TopicInput("/detections/lidar"), CallError, "needs fields"),
+        (TopicInput("/ego/odometry", fields={"x": "a"}), CallError, "unknown field 'x'"),
+        (TopicInput("/ego/odometry", fields={"x_m": "a"}), CallError, "must name y_m"),
+    ],
+)
+def test_an_ego_that_does_not_fit_is_one_line(tmp_path, item, error, complaint):
+    write_bag(tmp_path / "bag", drive())
+    with pytest.raises(error, match=complaint):
+        open_input(tmp_path / "bag", InputConfig(ego=item))
+
+
+def test_a_path_that_leads_nowhere_is_named(tmp_path):
+    write_bag(tmp_path / "bag", drive())
+    item = TopicInput("/detections/lidar", fields={"objects": "detections", "x_m": "bbox.centre.x"})
+    with pytest.raises(DataError, match=r"/detections/lidar .*bbox\.centre\.x: leads nowhere"):
+        read(tmp_path / "bag", InputConfig(detections={"lidar": item}))
+
+
+def test_any_type_is_read_by_its_paths(tmp_path):
+    write_bag(tmp_path / "bag", drive())
+    pose = "kinematics.pose_with_covariance.pose"
+    twist = "kinematics.twist_with_covariance.twist.linear"
+    fields = {
+        "objects": "objects",
+        "stamp": "header.stamp",
+        "x_m": f"{pose}.position.x",
+        "y_m": f"{pose}.position.y",
+        "yaw_rad": f"{pose}.orientation",
+        "speed_mps": [f"{twist}.x", f"{twist}.y"],
+    }
+    item = TopicInput("/detections/radar", frame="sensor", fields=fields)
+    found = [m for m in read(tmp_path / "bag", InputConfig(detections={"front": item})) if m.objects]
+    assert (found[0].sensor, found[0].frame) == ("front", "sensor")
+    assert found[0].stamp_ns == found[0].receipt_ns - 60_000_007
+    assert found[0].objects[0].speed_mps == 4.0
+    assert found[0].objects[0].yaw_rad != found[0].objects[0].yaw_rad  # the twin's yaw is not known
+
+
+def test_an_empty_file_and_a_text_are_no_inputs(tmp_path):
+    (tmp_path / "a.mcap").touch()
+    (tmp_path / "b.csv").write_text("x;y\n")
+    for name, complaint in (
+        ("a.mcap", "is empty"),
+        ("b.csv", "none of the inputs"),
+        ("", "none of the inputs"),
+    ):
+        with pytest.raises(DataError, match=complaint) as caught:
+            open_input(tmp_path / name)
+        assert "\n" not in str(caught.value)
+        (tmp_path / "a.mcap").unlink(missing_ok=True)
+    with pytest.raises(CallError, match="no such file"):
+        open_input(tmp_path / "nothing")
+    assert os.listdir(tmp_path) == ["b.csv"]

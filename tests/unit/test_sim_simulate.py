@@ -1,0 +1,221 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import BaseModel, ConfigDict, ValidationError
+from ruamel.yaml import YAML
+from scipy import stats
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
+from fgtrack.sim.delays import ConstantDelay, GammaDelay, LossyDelay, NoDelay
+from fgtrack.sim.scenario import EgoMessages, Scenario
+from fgtrack.sim.sensor import Clutter, SimulatedSensor
+from fgtrack.sim.simulate import simulate
+from fgtrack.sim.vehicles import DrawnVehicle, TrackVehicle
+
+ROOT = Path(__file__).resolve().parents[2]
+SCENARIOS = sorted((ROOT / "configs/scenarios").glob("*.yaml"))
+
+
+class Document(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    scenario: Scenario
+
+
+def load(text: str) -> Scenario:
+    return Document(scenario=YAML(typ="safe").load(text)).scenario
+
+
+def named(name: str) -> Scenario:
+    return load((ROOT / f"configs/scenarios/{name}.yaml").read_text(encoding="utf-8"))
+
+
+DEFAULT = named("default")
+SHORT = replace(DEFAULT, duration_s=5.0)
+
+
+def run(scenario: Scenario, seed: int = 0) -> list[Message]:
+    return simulate(scenario, np.random.default_rng(seed))
+
+
+def scans_of(messages: list[Message], sensor: str) -> list[DetectionList]:
+    scans = [m for m in messages if isinstance(m, DetectionList) and m.sensor == sensor]
+    return sorted(scans, key=lambda scan: scan.stamp_ns)
+
+
+# Scenarios
+
+
+@pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)
+def test_every_scenario_of_the_project_loads_and_runs(path: Path) -> None:
+    scenario = load(path.read_text(encoding="utf-8"))
+    messages = run(replace(scenario, duration_s=1.0))
+    assert {type(message) for message in messages} == {EgoState, DetectionList, TruthState}
+    for sensor in scenario.sensors:
+        assert any(scan.objects for scan in scans_of(messages, sensor.name))
+
+
+def test_the_scenarios_are_the_ones_the_documents_name() -> None:
+    names = {path.stem for path in SCENARIOS}
+    assert names >= {"default", "single_opponent", "drawn_ctrv", "dense", "no_delay"}
+    assert len(named("dense").opponents) == 10
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("duration: 3", "duration"),
+        ("sensors: [{name: a, std: {x_m: 1.0, y_m: 1.0}, colour: 3}]", "colour"),
+        ("ego_messages: {delay: {kind: gamma, min_s: 0.0}}", "mean_s"),
+        ("opponents: [{kind: boat}]", "boat"),
+        ("duration_s: -1.0", "duration_s: must be positive"),
+    ],
+)
+def test_a_scenario_with_a_wrong_key_is_refused_with_its_name(text: str, key: str) -> None:
+    ego = "ego: {kind: track, arc_m: 0.0, speed: [[0.0, 60.0]]}\n"
+    assert load(ego).ego == TrackVehicle(0.0, speed=((0.0, 60.0),))
+    with pytest.raises(ValidationError, match=key):
+        load(ego + text)
+
+
+def test_settings_of_a_scenario_that_make_no_sense_are_named() -> None:
+    drawn, driven = DrawnVehicle(0.0, 0.0, 0.0, 9.0), TrackVehicle(0.0, speed=((0.0, 9.0),))
+    lidar = SimulatedSensor("lidar", {"x_m": 1.0, "y_m": 1.0})
+    on_track = replace(lidar, clutter=Clutter(1.0, region="track"))
+    for make, message in (
+        (lambda: Scenario(drawn, truth_rate_hz=0.0), "truth_rate_hz"),
+        (lambda: Scenario(drawn, start_ns=-1), "start_ns"),
+        (lambda: Scenario(drawn, detection_origin_x_m=float("nan")), "detection_origin_x_m"),
+        (lambda: Scenario(drawn, sensors=(lidar, lidar)), "sensors: names must differ"),
+        (lambda: Scenario(driven, map=None), "map: a vehicle"),
+        (lambda: Scenario(drawn, opponents=(driven,), map=None), "map: a vehicle"),
+        (lambda: Scenario(drawn, sensors=(on_track,), map=None), "map: clutter"),
+        (lambda: EgoMessages(rate_hz=0.0), "rate_hz"),
+        (lambda: EgoMessages(speed_std_mps=-1.0), "speed_std_mps"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make()
+
+
+# Messages
+
+
+def test_the_same_seed_gives_the_same_messages_and_another_seed_others() -> None:
+    assert run(SHORT) == run(SHORT)
+    assert run(SHORT) != run(SHORT, seed=1)
+
+
+def test_messages_come_in_order_of_receipt_and_scans_overtake_each_other() -> None:
+    messages = run(SHORT)
+    receipts = [message.receipt_ns for message in messages]
+    assert receipts == sorted(receipts)
+    detection_stamps = [m.stamp_ns for m in messages if isinstance(m, DetectionList)]
+    assert detection_stamps != sorted(detection_stamps)
+    assert all(message.receipt_ns >= message.stamp_ns >= SHORT.start_ns for message in messages)
+    assert all(type(message.stamp_ns) is int and type(message.receipt_ns) is int for message in messages)
+
+
+def test_truth_holds_every_object_at_every_stamp() -> None:
+    truth = [message for message in run(SHORT) if isinstance(message, TruthState)]
+    stamps = [SHORT.start_ns + k * NS_PER_S // 100 for k in range(501)]
+    for object_id in (-1, 0, 1):
+        assert [state.stamp_ns for state in truth if state.object_id == object_id] == stamps
+    assert len(truth) == 3 * len(stamps)
+    assert all(state.receipt_ns == state.stamp_ns for state in truth)
+
+
+def test_ego_messages_are_truth_with_noise_and_delay() -> None:
+    messages = run(DEFAULT)
+    ego = [m for m in messages if isinstance(m, EgoState)]
+    truth = {m.stamp_ns: m for m in messages if isinstance(m, TruthState) and m.object_id == -1}
+    settings = DEFAULT.ego_messages
+    for name, std in (
+        ("x_m", settings.position_std_m),
+        ("y_m", settings.position_std_m),
+        ("speed_mps", settings.speed_std_mps),
+        ("yaw_rate_radps", settings.yaw_rate_std_radps),
+        ("accel_mps2", settings.accel_std_mps2),
+    ):
+        error = np.array([getattr(m, name) - getattr(truth[m.stamp_ns], name) for m in ego])
+        chi2 = stats.chi2(len(error))
+        assert chi2.ppf(1e-4) < np.sum(error**2) / std**2 < chi2.ppf(1.0 - 1e-4)
+    assert {m.receipt_ns - m.stamp_ns for m in ego} == {2_000_000}
+
+
+def test_delays_of_the_default_scenario_are_those_of_the_paper() -> None:
+    messages = run(replace(DEFAULT, duration_s=300.0, truth_rate_hz=0.1, opponents=()))
+    for name, mean_s, q90_s in (("lidar_cluster", 0.151, 0.191), ("radar", 0.062, 0.089)):
+        delays = np.array([(s.receipt_ns - s.stamp_ns) / NS_PER_S for s in scans_of(messages, name)])
+        assert abs(delays.mean() - mean_s) < 4.0 * delays.std() / np.sqrt(len(delays))
+        assert stats.binomtest(int(np.count_nonzero(delays <= q90_s)), len(delays), 0.9).pvalue > 1e-4
+
+
+def test_a_scan_that_saw_nothing_is_sent_and_a_silent_sensor_sends_nothing() -> None:
+    lidar = SimulatedSensor("lidar", {"x_m": 1.0, "y_m": 1.0}, rate_hz=10.0, drop_outs=((1.0, 2.0),))
+    scans = scans_of(run(replace(SHORT, opponents=(), sensors=(lidar,))), "lidar")
+    assert all(scan.objects == () for scan in scans)
+    times = [(scan.stamp_ns - SHORT.start_ns) / NS_PER_S for scan in scans]
+    assert times == [k / 10 for k in range(51) if not 10 <= k < 20]
+
+
+def test_a_lost_message_is_not_in_the_list_and_the_others_stay() -> None:
+    def scans(delay: NoDelay | LossyDelay) -> list[DetectionList]:
+        sensors = tuple(replace(sensor, delay=delay) for sensor in SHORT.sensors)
+        return scans_of(run(replace(SHORT, sensors=sensors)), "radar")
+
+    all_scans, some_scans = scans(NoDelay()), scans(LossyDelay(0.5))
+    assert 20 < len(some_scans) < 80
+    assert all(scan in all_scans for scan in some_scans)
+    assert scans(LossyDelay(1.0)) == []
+
+
+def test_another_sensor_leaves_everything_else_as_it_was() -> None:
+    extra = SimulatedSensor("extra", {"x_m": 1.0, "y_m": 1.0}, clutter=Clutter(2.0))
+    messages = run(replace(SHORT, sensors=(*SHORT.sensors, extra)))
+    assert scans_of(messages, "extra")
+    others = [m for m in messages if not (isinstance(m, DetectionList) and m.sensor == "extra")]
+    assert others == run(SHORT)
+
+
+def test_another_delay_leaves_stamps_and_detections_as_they_were() -> None:
+    def without_receipts(scenario: Scenario) -> list[tuple[object, ...]]:
+        messages = [m for m in run(scenario) if isinstance(m, DetectionList)]
+        return sorted((m.sensor, m.stamp_ns, m.objects) for m in messages)
+
+    late = tuple(replace(sensor, delay=ConstantDelay(0.5)) for sensor in SHORT.sensors)
+    gone = {"duration_s": 5.0}
+    assert without_receipts(replace(SHORT, sensors=late)) == without_receipts(SHORT)
+    assert without_receipts(replace(named("no_delay"), **gone)) == without_receipts(SHORT)  # type: ignore[arg-type]
+    assert all(isinstance(sensor.delay, GammaDelay) for sensor in SHORT.sensors)
+
+
+def test_equal_receipts_are_ordered_truth_ego_sensors() -> None:
+    lidar = SimulatedSensor("lidar", {"x_m": 1.0, "y_m": 1.0}, rate_hz=10.0)
+    radar = replace(lidar, name="radar")
+    scenario = replace(
+        SHORT,
+        sensors=(radar, lidar),
+        opponents=SHORT.opponents[:1],
+        ego_messages=EgoMessages(delay=NoDelay()),
+    )
+    first = [m for m in run(scenario) if m.receipt_ns == SHORT.start_ns]
+    assert [getattr(m, "sensor", type(m)) for m in first] == [
+        TruthState,
+        TruthState,
+        EgoState,
+        "radar",
+        "lidar",
+    ]
+
+
+def test_a_map_file_may_stand_for_the_oval() -> None:
+    path = str(ROOT / "configs/maps/oval_track.csv")
+    from_file = [m for m in run(replace(SHORT, map=path)) if isinstance(m, TruthState)]
+    built_in = [m for m in run(SHORT) if isinstance(m, TruthState)]
+    for a, b in zip(from_file[::50], built_in[::50], strict=True):
+        assert (a.x_m, a.y_m) == pytest.approx((b.x_m, b.y_m), abs=1e-5)
+    with pytest.raises(DataError, match="cannot read the map"):
+        run(replace(SHORT, map="missing.csv"))

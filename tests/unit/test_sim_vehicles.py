@@ -1,0 +1,125 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from fgtrack.core.geometry import wrap_angles
+from fgtrack.core.types import ACCEL, SPEED, YAW, YAW_RATE
+from fgtrack.models.motion import CTRV
+from fgtrack.sim.oval import make_oval
+from fgtrack.sim.path import Path
+from fgtrack.sim.vehicles import DrawnVehicle, LaneChange, TrackTrajectory, TrackVehicle
+
+OVAL = make_oval()
+PATH = Path.along(OVAL)
+BUSY = TrackVehicle(
+    arc_m=2350.0,
+    lateral_m=-4.0,
+    speed=((0.0, 60.0), (10.0, 75.0), (30.0, 50.0), (35.0, 70.0)),
+    lane_changes=(LaneChange(1.0, 3.0, 4.0), LaneChange(4.0, 2.0, 0.0), LaneChange(25.0, 6.0, -5.0)),
+)
+STILL = CTRV(0.0, 0.0, 0.0, 0.0)
+
+
+@given(st.lists(st.floats(0.01, 60.0), min_size=1, max_size=50))
+@settings(deadline=None)
+def test_yaw_is_the_direction_of_travel_and_the_rates_are_derivatives(times: list[float]) -> None:
+    trajectory = BUSY.trajectory(PATH)
+    t, h = np.array(times), 1e-4
+    now, ahead, behind = (trajectory.states(t + shift) for shift in (0.0, h, -h))
+    velocity = (ahead[:, :2] - behind[:, :2]) / (2.0 * h)
+    np.testing.assert_allclose(np.hypot(*velocity.T), now[:, SPEED], rtol=1e-6)
+    assert np.abs(wrap_angles(np.arctan2(velocity[:, 1], velocity[:, 0]) - now[:, YAW])).max() < 1e-6
+    # Where a spline piece, a lane change or a speed ramp begins, the derivative of a rate may jump.
+    yaw_rate = wrap_angles(ahead[:, YAW] - behind[:, YAW]) / (2.0 * h)
+    np.testing.assert_allclose(now[:, YAW_RATE], yaw_rate, atol=1e-4)
+    np.testing.assert_allclose(now[:, ACCEL], (ahead[:, SPEED] - behind[:, SPEED]) / (2.0 * h), atol=1e-2)
+
+
+def test_the_yaw_stays_in_its_range_over_several_laps() -> None:
+    yaw = BUSY.trajectory(PATH).states(np.linspace(0.0, 120.0, 5000))[:, YAW]
+    assert (np.abs(yaw) <= np.pi).all()
+    assert yaw.max() > 3.1
+    assert yaw.min() < -3.1
+
+
+def test_a_vehicle_starts_where_it_is_told_and_covers_the_distance_of_its_speed() -> None:
+    start, end = OVAL.frenet(BUSY.trajectory(PATH).states(np.array([0.0, 10.0]))[:, :2])[0]
+    assert start == pytest.approx(2350.0, abs=1e-3)
+    # The ramp from 60 to 75 m/s is symmetric: 67.5 m/s on average.
+    assert end == pytest.approx((2350.0 + 675.0) % OVAL.length_m, abs=1e-2)
+
+
+def test_a_speed_profile_goes_through_its_knots_and_is_constant_outside() -> None:
+    vehicle = TrackVehicle(arc_m=0.0, speed=((5.0, 60.0), (10.0, 70.0)))
+    trajectory = vehicle.trajectory(PATH)
+    speed = trajectory.states(np.array([0.0, 4.0, 5.0, 7.5, 10.0, 50.0]))[:, SPEED]
+    np.testing.assert_allclose(speed, [60.0, 60.0, 60.0, 65.0, 70.0, 70.0], rtol=1e-5)
+    s = OVAL.frenet(trajectory.states(np.array([0.0, 4.0]))[:, :2])[0]
+    np.testing.assert_allclose(s, [0.0, 240.0], atol=1e-3)
+
+
+def test_a_lane_change_ends_at_its_target_without_a_step() -> None:
+    times = np.linspace(0.0, 40.0, 4001)
+    lateral = OVAL.frenet(TrackTrajectory(BUSY, PATH).states(times)[:, :2])[1]
+    for time_s, expected in ((0.0, -4.0), (1.0, -4.0), (4.0, 4.0), (6.0, 0.0), (25.0, 0.0), (31.0, -5.0)):
+        assert lateral[round(time_s * 100.0)] == pytest.approx(expected, abs=5e-3)
+    assert np.abs(np.diff(lateral)).max() < 0.08
+
+
+def test_a_drawn_vehicle_without_noise_drives_the_exact_arc() -> None:
+    vehicle = DrawnVehicle(1.0, 2.0, 3.0, 60.0, 0.3, motion=STILL)
+    times = np.array([0.0, 0.0049, 0.01, 1.2345, 20.0])
+    states = vehicle.trajectory(np.random.default_rng(0), 20.0).states(times)
+    expected = CTRV().predict(np.array([1.0, 2.0, 3.0, 60.0, 0.3]), times)
+    expected[:, YAW] = wrap_angles(expected[:, YAW])
+    np.testing.assert_allclose(states[:, :5], expected, atol=1e-9)
+    assert (states[:, ACCEL] == 0.0).all()
+
+
+@pytest.mark.parametrize(("start_s", "step_s"), [(0.0, 0.05), (0.0037, 0.05), (0.0, 0.4)])
+def test_a_drawn_vehicle_moves_as_its_motion_model_says(start_s: float, step_s: float) -> None:
+    motion = CTRV()
+    vehicle = DrawnVehicle(0.0, 0.0, 1.0, 60.0, 0.2, motion=motion)
+    states = vehicle.trajectory(np.random.default_rng(2), 80.0).states(np.arange(start_s, 80.0, step_s))
+    x = states[:, : motion.dim]
+    error = x[1:] - motion.predict(x[:-1], step_s)
+    error[:, YAW] = wrap_angles(error[:, YAW])
+    Q = motion.process_noise(x[:-1], step_s)
+    nees = np.einsum("ni,ni->n", error, np.linalg.solve(Q, error[:, :, None])[:, :, 0])
+    chi2 = stats.chi2(motion.dim * len(nees))
+    assert chi2.ppf(1e-4) < nees.sum() < chi2.ppf(1.0 - 1e-4)
+
+
+def test_a_drawn_motion_has_no_jump_at_its_steps() -> None:
+    trajectory = DrawnVehicle(0.0, 0.0, 0.0, 60.0).trajectory(np.random.default_rng(3), 5.0)
+    times = np.arange(1, 500) * 0.01
+    before, after = trajectory.states(times - 1e-12), trajectory.states(times + 1e-12)
+    np.testing.assert_allclose(before, after, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: TrackVehicle(0.0, speed=()), "speed: must have at least one knot"),
+        (lambda: TrackVehicle(0.0, speed=((0.0, 0.0),)), "speed: must be positive"),
+        (lambda: TrackVehicle(0.0, speed=((1.0, 9.0), (1.0, 9.0))), "speed: times of the knots"),
+        (lambda: TrackVehicle(float("inf"), speed=((0.0, 9.0),)), "arc_m"),
+        (lambda: LaneChange(-1.0, 1.0, 0.0), "start_s"),
+        (lambda: LaneChange(1.0, 0.0, 0.0), "duration_s"),
+        (
+            lambda: TrackVehicle(
+                0.0,
+                speed=((0.0, 9.0),),
+                lane_changes=(LaneChange(0.0, 2.0, 1.0), LaneChange(1.0, 2.0, 0.0)),
+            ),
+            "lane_changes: one must end before the next",
+        ),
+        (lambda: DrawnVehicle(0.0, 0.0, float("nan"), 9.0), "yaw_rad"),
+        (lambda: DrawnVehicle(0.0, 0.0, 0.0, 9.0, step_s=0.0), "step_s"),
+    ],
+)
+def test_a_setting_that_makes_no_sense_is_named(make: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()  # type: ignore[operator]
