@@ -83,12 +83,15 @@ class BackwardForwardBank:
 
     def _advance_steps(self, steps: int) -> None:
         rows = self._all_rows()
+        if not len(rows):
+            self._grid += max(steps, 0)
+            self._grid_ns += max(steps, 0) * self._step_ns
+            return
         for done in range(0, max(steps, 0), self._length):
             part = min(self._length, steps - done)
             self._grid += part
             self._grid_ns += part * self._step_ns
-            if len(rows):
-                self._integrate(rows, part)
+            self._integrate(rows, part)
         np.maximum(self._oldest, self._grid - self._length + 1, out=self._oldest)
 
     def _integrate(self, rows: IntArray, steps: int) -> None:
@@ -128,9 +131,9 @@ class BackwardForwardBank:
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
         """Correct the stored states nearest to `stamp_ns` and integrate them forward to the present."""
-        groups: dict[int, list[int]] = {}
+        groups: dict[tuple[int, int], list[int]] = {}
         for position, measurement in enumerate(measurements):
-            groups.setdefault(id(measurement.model), []).append(position)
+            groups.setdefault((id(measurement.model), id(measurement.pose)), []).append(position)
         results: dict[int, UpdateResult] = {}
         for positions in groups.values():
             part = self._update_alike(stamp_ns, [track_ids[i] for i in positions], [measurements[i] for i in positions])
@@ -149,8 +152,11 @@ class BackwardForwardBank:
         else:
             mean, covariance = self._mean[rows], self._covariance[rows]
         corrected = self._correct(mean, covariance, measurements)
-        if not np.isfinite(corrected.mean).all():
-            return [UpdateResult(UpdateStatus.FAILED) for _ in measurements]
+        if corrected is None:
+            if len(measurements) == 1:
+                return [UpdateResult(UpdateStatus.FAILED)]
+            each = zip(track_ids, measurements, strict=True)
+            return [self._update_alike(stamp_ns, [track_id], [one])[0] for track_id, one in each]
         self._mean[rows] = self._propagator.settle(corrected.mean)
         self._covariance[rows] = corrected.covariance
         self._store(back, slot, rows)
@@ -167,10 +173,18 @@ class BackwardForwardBank:
             for i in range(len(measurements))
         ]
 
-    def _correct(self, mean: FloatArray, covariance: FloatArray, measurements: Sequence[Measurement]) -> Correction:
+    def _correct(
+        self, mean: FloatArray, covariance: FloatArray, measurements: Sequence[Measurement]
+    ) -> Correction | None:
+        """Posteriors; None where one of the measurements cannot be fused."""
         z = np.array([measurement.z for measurement in measurements])
         R = np.array([measurement.R for measurement in measurements])
-        return correct(mean, covariance, z, R, measurements[0].model, measurements[0].pose)
+        try:
+            corrected = correct(mean, covariance, z, R, measurements[0].model, measurements[0].pose)
+        except np.linalg.LinAlgError:  # a singular innovation covariance
+            return None
+        sound = np.isfinite(corrected.mean).all() and np.isfinite(corrected.covariance).all()
+        return corrected if sound else None
 
     def _store(self, back: int, slot: int, rows: IntArray) -> None:
         """Let the corrected states replace the stored ones."""

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from fgtrack.core.linalg import symmetrise
 from fgtrack.core.types import ACCEL, SPEED, YAW, YAW_RATE, FloatArray
 from fgtrack.estimation.base import BirthPrior
 from fgtrack.models.motion import MotionModel
@@ -21,10 +22,10 @@ def birth_state(motion: MotionModel, prior: BirthPrior) -> tuple[FloatArray, Flo
         [0.0, 0.0, prior.yaw_std_rad, prior.speed_std_mps, prior.yaw_rate_std_radps, prior.accel_std_mps2]
     )
     covariance = np.diag(deviations**2)
-    covariance[:2, :2] = prior.position_covariance
+    covariance[:2, :2] = symmetrise(prior.position_covariance)
     if prior.yaw_rad is None and motion.linear:
         spread = np.zeros((motion.dim, motion.dim))
-        spread[:2, :2] = prior.position_covariance
+        spread[:2, :2] = covariance[:2, :2]
         spread[2:, 2:] = np.eye(motion.dim - 2) * (prior.speed_std_mps**2 + prior.speed_mps**2)
         start = np.zeros(motion.dim)
         start[:2] = prior.position_m

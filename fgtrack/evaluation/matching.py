@@ -23,8 +23,8 @@ class MatchOptions:
     """How tracks are paired to true objects."""
 
     gate_m: float = 5.0
-    """Largest distance of a pair. The default is the tracker's own association distance, a car's length: a track
-    farther off cannot be updated by its object any more. It bounds the errors, so compare runs with one gate."""
+    """Largest distance of a pair. The default is the tracker's own association distance, a car's length: a
+    track farther off cannot be updated by its object any more. It bounds the errors: compare at one gate."""
     confirmed_only: bool = True
     """Judge only rows with at least `CONFIRMED_MEASUREMENTS` measurements."""
 

@@ -200,8 +200,7 @@ def _sensor_metrics(run: Run) -> dict[str, SensorMetrics]:
         mine = updates["sensor"] == sensor
         with_nis = mine & np.isfinite(updates["nis"])
         moments = {
-            name: (Moments.of_angles if name in ANGULAR else Moments.of)(values[name][mine])
-            for name in RESIDUAL_NAMES
+            name: (Moments.of_angles if name in ANGULAR else Moments.of)(values[name][mine]) for name in RESIDUAL_NAMES
         }
         dispositions = updates["disposition"][mine].tolist()
         sensors[sensor] = SensorMetrics(

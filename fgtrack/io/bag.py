@@ -14,13 +14,12 @@ from typing import Any, cast
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
-from rosbags.typesys.store import Typestore
 
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.io.bag_files import BagFile, BagFolder, Rosbag1File, merged, storage_of
 from fgtrack.io.errors import TruncatedInput
-from fgtrack.io.typestore import build_typestore, missing_type, one_line, type_name
+from fgtrack.io.typestore import build_typestore, one_line, type_name
 
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _BAG_SUFFIXES = (".mcap", ".db3")
@@ -72,9 +71,10 @@ class Bag:
             connections = [item for file in files for item in file.connections]
             _check_serialization(self.path, connections)
             self._ros1 = any(isinstance(file, Rosbag1File) for file in files)
-            self._store, unreadable = build_typestore(connections, self._ros1, message_definitions)
+            definitions = {item.msgtype: item.msgdef for item in connections}
+            self._store, problems = build_typestore(definitions, self._ros1, message_definitions)
             self.break_off = _break_off(files)
-        self.topics = _topics(connections, self._store, unreadable)
+        self.topics = _topics(connections, problems)
         """Topics by name; a topic with two types is listed twice."""
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
@@ -136,9 +136,7 @@ class Bag:
             except FgtrackError:
                 raise
             except Exception as error:  # whatever damaged bytes make rosbags or its decompressors raise
-                raise TruncatedInput(
-                    f"{self.path}: breaks off after {count} messages ({one_line(error)})"
-                ) from error
+                raise TruncatedInput(f"{self.path}: breaks off after {count} messages ({one_line(error)})") from error
             if broken := _break_off(files):
                 raise TruncatedInput(f"{broken}, after {count} messages")
 
@@ -153,30 +151,20 @@ def is_bag_file(path: Path) -> bool:
     return storage_of(path) is not None
 
 
-def _topics(
-    connections: list[Connection], store: Typestore, unreadable: Mapping[str, str]
-) -> tuple[BagTopic, ...]:
+def _topics(connections: list[Connection], problems: Mapping[str, str]) -> tuple[BagTopic, ...]:
     counts: Counter[tuple[str, str]] = Counter()
     for item in connections:
         counts[item.topic, item.msgtype] += item.msgcount
-    topics = []
-    for (name, msgtype), count in sorted(counts.items()):
-        problem = unreadable.get(msgtype)
-        if problem is None and (missing := missing_type(store, msgtype)):
-            problem = (
-                f"the definition of {missing} is neither in the recording nor known, "
-                "name its .msg file in message_definitions"
-            )
-        topics.append(BagTopic(name, msgtype, count, problem))
-    return tuple(topics)
+    return tuple(
+        BagTopic(name, msgtype, count, problems.get(msgtype)) for (name, msgtype), count in sorted(counts.items())
+    )
 
 
 def _check_serialization(path: Path, connections: list[Connection]) -> None:
     for item in connections:
         if isinstance(item.ext, ConnectionExtRosbag2) and item.ext.serialization_format != "cdr":
             raise DataError(
-                f"{path}: topic {item.topic} is serialized as {item.ext.serialization_format!r}, "
-                "only 'cdr' can be read"
+                f"{path}: topic {item.topic} is serialized as {item.ext.serialization_format!r}, only 'cdr' can be read"
             )
 
 

@@ -2,9 +2,9 @@
 
 import heapq
 import shutil
+import tempfile
 from collections.abc import Collection, Generator, Iterator
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Protocol, cast
 
 import apsw
@@ -64,12 +64,11 @@ class McapFile(McapReader):
     def _open(self) -> None:
         try:
             super()._open()
-        except (
-            Exception
-        ):  # rosbags reads files with an end only; whatever it stumbles over, try from the start
+        except Exception:  # rosbags reads files with an end only; whatever it stumbles over, try from the start
             if not self.data_start:
                 raise
             self._index_by_walking()
+            self.break_off = self.break_off or "lacks its end"
             return
         if any(not chunk.channel_count for chunk in self.chunks) or not self.chunks:
             self._index_by_walking()
@@ -147,7 +146,8 @@ class Sqlite3File(Sqlite3Reader):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self._copies: TemporaryDirectory[str] | None = None
+        self._copies: tempfile.TemporaryDirectory[str] | None = None
+        self._damaged = False
 
     def _open(self) -> None:
         journals = [self.path.with_name(self.path.name + suffix) for suffix in ("-wal", "-journal")]
@@ -159,11 +159,10 @@ class Sqlite3File(Sqlite3Reader):
             super()._open()
             self._reconnect()
         except (apsw.Error, ReaderError):
-            self._reconnect()
             self._open_damaged()
 
     def close(self) -> None:
-        """Close the file and remove its healed copy."""
+        """Close the file and remove its copies."""
         super().close()
         if self._copies:
             self._copies.cleanup()
@@ -174,7 +173,7 @@ class Sqlite3File(Sqlite3Reader):
         """Records of `connections` in log-time order; equal times keep the order of writing."""
         assert self.dbconn
         by_id = {connection.id: connection for connection in connections}
-        if self.schema < 0:
+        if self._damaged:
             rows = sorted(self._rows_before_break(), key=lambda row: row[1])
         else:
             query = "SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp, id"
@@ -190,12 +189,27 @@ class Sqlite3File(Sqlite3Reader):
         flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
         self.dbconn = apsw.Connection(f"{self.path.absolute().as_uri()}?immutable=1", flags=flags)
 
+    def _copy(self, files: list[Path]) -> Path:
+        """Copy the recording and the `files` beside it; the recording itself is never touched."""
+        self._copies = self._copies or tempfile.TemporaryDirectory()
+        folder = Path(tempfile.mkdtemp(dir=self._copies.name))
+        for file in (self.path, *files):
+            shutil.copyfile(file, folder / file.name)
+        return folder / self.path.name
+
+    def _whole_pages(self) -> Path:
+        """A copy without the page that was cut in two: SQLite would read zeros for the rest of it."""
+        copy = self._copy([])
+        size = copy.stat().st_size
+        with copy.open("r+b") as file:
+            page_size = int.from_bytes(file.read(18)[16:], "big")
+            page_size = 65536 if page_size == 1 else max(page_size, 512)
+            file.truncate(size - size % page_size)
+        return copy
+
     def _healed_copy(self, journals: list[Path]) -> Path:
-        """A copy whose journals SQLite has played back; the recording itself is not touched."""
-        self._copies = TemporaryDirectory()
-        for file in (self.path, *journals):
-            shutil.copyfile(file, Path(self._copies.name, file.name))
-        copy = Path(self._copies.name, self.path.name)
+        """A copy whose journals SQLite has played back."""
+        copy = self._copy(journals)
         connection = apsw.Connection(str(copy))
         connection.execute("SELECT count(*) FROM sqlite_master").fetchall()
         connection.execute("PRAGMA journal_mode=DELETE").fetchall()
@@ -203,9 +217,13 @@ class Sqlite3File(Sqlite3Reader):
         return copy
 
     def _open_damaged(self) -> None:
-        assert self.dbconn
-        self.schema = -1
+        self._damaged = True
         self.break_off = self.break_off or "is truncated"
+        self.path = self._whole_pages()
+        self._reconnect()
+        assert self.dbconn
+        # Without it SQLite refuses a file that is shorter than its header says.
+        self.dbconn.execute("PRAGMA writable_schema=ON").fetchall()
         definitions = self._definitions()
         query = "SELECT id, name, type, serialization_format FROM topics ORDER BY id"
         topics = cast("list[tuple[int, str, str, str]]", self.dbconn.execute(query).fetchall())
@@ -241,10 +259,8 @@ class Sqlite3File(Sqlite3Reader):
         """Topic id, log time and message, in the order of writing."""
         assert self.dbconn
         try:
-            yield from cast(
-                "Iterator[tuple[int, int, bytes]]",
-                self.dbconn.execute("SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id"),
-            )
+            query = "SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id"
+            yield from cast("Iterator[tuple[int, int, bytes]]", self.dbconn.execute(query))
         except apsw.Error as error:
             self.break_off = f"is truncated ({error})"
 

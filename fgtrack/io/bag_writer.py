@@ -125,9 +125,7 @@ class _MessageWriter:
         self._write_list_twin(message, self._twin_types[sensor])
 
     def _write_list_twin(self, message: DetectionList, msgtype: str) -> None:
-        make = (
-            self._factory.detected_objects if msgtype == DETECTED_OBJECTS else self._factory.detection3d_array
-        )
+        make = self._factory.detected_objects if msgtype == DETECTED_OBJECTS else self._factory.detection3d_array
         self._put(f"/detections/{_token(message.sensor)}", make(message), message.receipt_ns)
 
     def _write_truth_twin(self) -> None:

@@ -177,9 +177,7 @@ def _name_and_type(message: Message) -> tuple[str, str]:
     return ("ego", "ego") if isinstance(message, EgoState) else ("truth", "truth")
 
 
-def _info(
-    path: Path, kind: Kind, topics: tuple[TopicInfo, ...], times: list[_Times], problem: str | None
-) -> InputInfo:
+def _info(path: Path, kind: Kind, topics: tuple[TopicInfo, ...], times: list[_Times], problem: str | None) -> InputInfo:
     receipts_ns = [receipt for item in times for receipt in item.receipts_ns]
     start_ns = min(receipts_ns, default=None)
     duration_s = 0.0 if start_ns is None else seconds(max(receipts_ns) - start_ns)

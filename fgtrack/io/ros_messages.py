@@ -1,8 +1,10 @@
 """Makes ROS messages: fgtrack's own, and the standard ones that other tools show."""
 
 import math
+from functools import cache
 
 import numpy as np
+from rosbags.typesys.store import Typestore
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
@@ -20,11 +22,17 @@ _FRAME_IDS: dict[Frame, str] = {"map": "map", "ego": "base_link"}
 _SECONDS_LIMIT = 1 << 31  # builtin_interfaces/Time holds 32 bits
 
 
+@cache
+def _typestore() -> Typestore:
+    types = (EGO, DETECTIONS, TRUTH, ODOMETRY, DETECTION3D_ARRAY, DETECTED_OBJECTS, POSE_ARRAY)
+    return build_typestore(dict.fromkeys(types), ros1=False)[0]
+
+
 class MessageFactory:
     """Makes and serializes messages of the types that fgtrack writes."""
 
     def __init__(self) -> None:
-        self.typestore, _ = build_typestore((), ros1=False)
+        self.typestore = _typestore()
 
     def serialize(self, message: RosMessage) -> memoryview:
         """CDR bytes of `message`."""
@@ -58,7 +66,7 @@ class MessageFactory:
             x_m=state.x_m,
             y_m=state.y_m,
             present=presence(state, TRUTH_OPTIONAL),
-            **{name: getattr(state, name) or 0.0 for name in TRUTH_OPTIONAL},
+            **{name: _or_zero(getattr(state, name)) for name in TRUTH_OPTIONAL},
         )
 
     def odometry(self, state: EgoState) -> RosMessage:
@@ -109,7 +117,7 @@ class MessageFactory:
         return self._header(message.stamp_ns, _FRAME_IDS.get(message.frame, message.sensor))
 
     def _detection(self, item: Detection) -> RosMessage:
-        given = {name: getattr(item, name) or 0 for name in DETECTION_OPTIONAL}
+        given: dict[str, RosMessage] = {name: _or_zero(getattr(item, name)) for name in DETECTION_OPTIONAL}
         given["covariance"] = np.array(item.covariance or (), dtype=np.float64)
         return self._make("fgtrack_msgs/msg/Detection", present=presence(item, DETECTION_OPTIONAL), **given)
 
@@ -120,9 +128,7 @@ class MessageFactory:
             hypothesis = self._make("vision_msgs/msg/ObjectHypothesis", class_id="", score=1.0)
             result = "vision_msgs/msg/ObjectHypothesisWithPose"
             results.append(
-                self._make(
-                    result, hypothesis=hypothesis, pose=self._with_covariance("Pose", pose, covariance[0])
-                )
+                self._make(result, hypothesis=hypothesis, pose=self._with_covariance("Pose", pose, covariance[0]))
             )
         return self._make(
             "vision_msgs/msg/Detection3D",
@@ -138,9 +144,7 @@ class MessageFactory:
         pose, twist = (None, None) if covariance is None else covariance
         kinematics = self._make(
             f"{package}/DetectedObjectKinematics",
-            pose_with_covariance=self._with_covariance(
-                "Pose", self._pose(item.x_m, item.y_m, item.yaw_rad), pose
-            ),
+            pose_with_covariance=self._with_covariance("Pose", self._pose(item.x_m, item.y_m, item.yaw_rad), pose),
             has_position_covariance=pose is not None,
             orientation_availability=0 if item.yaw_rad is None else 2,
             twist_with_covariance=self._with_covariance("Twist", self._twist(item.speed_mps, 0.0), twist),
@@ -161,13 +165,14 @@ class MessageFactory:
         return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
     def _pose(self, x_m: float | None, y_m: float | None, yaw_rad: float | None) -> RosMessage:
-        """A pose; an unknown yaw is the quaternion of norm 0."""
-        half = 0.0 if yaw_rad is None else 0.5 * yaw_rad
-        w = 0.0 if yaw_rad is None else math.cos(half)
+        """A pose; an unknown yaw is the quaternion of norm 0, one that is not finite is not a number."""
+        z = w = 0.0
+        if yaw_rad is not None:
+            z, w = (math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad)) if math.isfinite(yaw_rad) else (math.nan,) * 2
         return self._make(
             "geometry_msgs/msg/Pose",
             position=self._make("geometry_msgs/msg/Point", x=x_m, y=y_m, z=0.0),
-            orientation=self._make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(half), w=w),
+            orientation=self._make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w),
         )
 
     def _twist(self, speed_mps: float | None, yaw_rate_radps: float) -> RosMessage:
@@ -181,6 +186,10 @@ class MessageFactory:
         flat = np.zeros(36) if covariance is None else covariance.ravel()
         fields = {kind.lower(): value, "covariance": flat}
         return self._make(f"geometry_msgs/msg/{kind}WithCovariance", **fields)
+
+
+def _or_zero(value: float | None) -> float:
+    return 0 if value is None else value
 
 
 def _has_position(item: Detection) -> bool:

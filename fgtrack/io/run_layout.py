@@ -10,9 +10,7 @@ RUN_FORMAT = "fgtrack-run/1"
 COVARIANCE_STATES = ("x", "y", "yaw", "speed", "yaw_rate")
 
 #: Upper triangle of the covariance, row by row.
-COVARIANCE_COLUMNS = tuple(
-    f"p_{a}_{b}" for i, a in enumerate(COVARIANCE_STATES) for b in COVARIANCE_STATES[i:]
-)
+COVARIANCE_COLUMNS = tuple(f"p_{a}_{b}" for i, a in enumerate(COVARIANCE_STATES) for b in COVARIANCE_STATES[i:])
 
 #: Columns of every table of a run folder, in their order.
 COLUMNS: Mapping[str, tuple[str, ...]] = {

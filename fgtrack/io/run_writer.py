@@ -49,9 +49,7 @@ class RunWriter:
         `path` is a file, or a folder that holds something else than a run.
     """
 
-    def __init__(
-        self, path: Path | str, config_text: str = "", meta: Mapping[str, object] | None = None
-    ) -> None:
+    def __init__(self, path: Path | str, config_text: str = "", meta: Mapping[str, object] | None = None) -> None:
         self.path = Path(path)
         self._files: dict[str, BinaryIO] = {}
         self._counts: dict[str, Counter[Disposition]] = {}

@@ -59,9 +59,7 @@ def open_input(path: Path | str, config: InputConfig | None = None) -> InputSour
         case "autoferry":
             return InputSource(path, kind, lambda: read_scenario(path))
         case "fusiontracking":
-            frames: dict[str, Frame] = {
-                sensor: item.frame for sensor, item in config.detections.items() if item.frame
-            }
+            frames: dict[str, Frame] = {sensor: item.frame for sensor, item in config.detections.items() if item.frame}
             return InputSource(path, kind, lambda: read_log(path, frames))
 
 

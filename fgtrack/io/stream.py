@@ -88,9 +88,7 @@ def read_header(path: Path | str) -> Mapping[str, Any]:
         return _check_header(path, next(records, None))
 
 
-def write_stream(
-    path: Path | str, messages: Iterable[Message], header: Mapping[str, object] | None = None
-) -> int:
+def write_stream(path: Path | str, messages: Iterable[Message], header: Mapping[str, object] | None = None) -> int:
     """Write `messages`, which must be in receipt order, to `path`; gives their number.
 
     A name that ends in `.gz` is gzipped; the same messages give the same bytes. Writes to `<path>.part` and
@@ -264,9 +262,7 @@ def _detection(item: object, unknown: Counter[str]) -> Detection:
     measured = {name: _number(item, name) for name in MEASURABLE if item.get(name) is not None}
     return Detection(
         **measured,
-        covariance=_covariance(item["covariance"], len(measured))
-        if item.get("covariance") is not None
-        else None,
+        covariance=_covariance(item["covariance"], len(measured)) if item.get("covariance") is not None else None,
         stamp_ns=_integer(item, "stamp_ns") if item.get("stamp_ns") is not None else None,
         object_id=_integer(item, "object_id") if item.get("object_id") is not None else None,
     )

@@ -50,9 +50,7 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
     names = {topic.name for topic in bag.topics}
     named = [item.topic for item in (config.ego, *config.detections.values(), config.truth) if item]
     native = tuple(
-        TopicUse(topic, "messages", _native(topic.type))
-        for topic in bag.topics
-        if topic.type in NATIVE_ADAPTERS
+        TopicUse(topic, "messages", _native(topic.type)) for topic in bag.topics if topic.type in NATIVE_ADAPTERS
     )
     if native and names.isdisjoint(named):
         return native

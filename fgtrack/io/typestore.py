@@ -5,7 +5,7 @@ from functools import cache
 from pathlib import Path
 from typing import cast
 
-from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat, Nodetype
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
 from rosbags.interfaces.typing import FieldDesc, Typesdict
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -23,11 +23,20 @@ def type_name(name: str) -> str:
 
 
 def build_typestore(
-    connections: Iterable[Connection], ros1: bool, message_definitions: Iterable[str] = ()
+    definitions: Mapping[str, MessageDefinition | None], ros1: bool, message_definitions: Iterable[str] = ()
 ) -> tuple[Typestore, Mapping[str, str]]:
-    """Types for the messages of `connections`; by type name, why a definition of theirs cannot be read.
+    """Types for messages of the types that are the keys of `definitions`, and of those which cannot be read why.
 
     A definition that the recording carries goes before the user's, that before ours, that before rosbags'.
+
+    Parameters
+    ----------
+    definitions
+        What the recording carries, by type name.
+    ros1
+        Whether the messages are serialized as ROS 1 does.
+    message_definitions
+        The user's `.msg` files, or folders of them.
 
     Raises
     ------
@@ -37,15 +46,23 @@ def build_typestore(
     types: Typesdict = dict(_shipped_types(ros1))
     for path in message_definitions:
         types |= _user_types(Path(path))
-    unreadable: dict[str, str] = {}
-    for connection in connections:
+    problems: dict[str, str] = {}
+    for name, definition in definitions.items():
         try:
-            types |= _embedded_types(connection.msgtype, connection.msgdef)
+            types |= _embedded_types(name, definition) if definition else {}
         except Exception as error:  # whatever a foreign definition makes the parser raise
-            unreadable[connection.msgtype] = f"its embedded definition cannot be read ({one_line(error)})"
+            problems[name] = f"its embedded definition cannot be read ({one_line(error)})"
+    needed: Typesdict = {}
+    for name in definitions:
+        missing = _collect(types, name, needed)
+        if missing and name not in problems:
+            problems[name] = (
+                f"the definition of {missing} is neither in the recording nor known, "
+                "name its .msg file in message_definitions"
+            )
     store = get_typestore(Stores.EMPTY)
-    store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
-    return store, unreadable
+    store.register({name: fields for name, fields in needed.items() if name not in store.fielddefs})
+    return store, problems
 
 
 def one_line(error: BaseException) -> str:
@@ -53,19 +70,17 @@ def one_line(error: BaseException) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
-def missing_type(store: Typestore, name: str) -> str | None:
-    """Name of the first type that is not in `store` and that `name` needs, itself included."""
-    pending, seen = [name], {name}
+def _collect(types: Typesdict, name: str, needed: Typesdict) -> str | None:
+    """Add `name` and all that it is made of to `needed`; gives the name of one that is missing in `types`."""
+    pending, missing = [name], None
     while pending:
         current = pending.pop()
-        if current not in store.fielddefs:
-            return current
-        for _, description in store.fielddefs[current][1]:
-            for needed in _named_types(description):
-                if needed not in seen:
-                    seen.add(needed)
-                    pending.append(needed)
-    return None
+        if current not in types:
+            missing = current
+        elif current not in needed:
+            needed[current] = types[current]
+            pending += [part for _, field in types[current][1] for part in _named_types(field)]
+    return missing
 
 
 def _named_types(description: FieldDesc) -> list[str]:

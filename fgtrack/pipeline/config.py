@@ -182,7 +182,7 @@ class Config:
     merge: MergeConfig = field(default_factory=ConnectedMerge)
     association: AssociationConfig = field(default_factory=GatedEuclidean)
     lifecycle: LifecycleConfig = field(default_factory=LifecycleConfig)
-    birth: BirthConfig = field(default_factory=MeasuredBirth)
+    birth: BirthConfig = field(default_factory=FixedBirth)
     motion: MotionConfig = field(default_factory=MotionConfig)
     filter: FilterConfig = field(default_factory=FilterConfig)
 

@@ -56,9 +56,7 @@ class Scanner:
         sightings = _joined([self._clutter(clutter_rng, track), *seen])
         order = np.lexsort((sightings.key, sightings.scan))
         components = self.sensor.components
-        detections = [
-            Detection(**dict(zip(components, row, strict=True))) for row in sightings.z[order].tolist()
-        ]
+        detections = [Detection(**dict(zip(components, row, strict=True))) for row in sightings.z[order].tolist()]
         bounds = np.searchsorted(sightings.scan[order], np.arange(len(self.ego) + 1)).tolist()
         return [tuple(detections[a:b]) for a, b in pairwise(bounds)]
 

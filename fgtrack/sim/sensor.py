@@ -80,9 +80,7 @@ class SimulatedSensor:
             require(value >= 0.0, f"std.{name}", "must not be negative", value)
         require(self.rate_hz > 0.0, "rate_hz", "must be positive", self.rate_hz)
         require(self.phase_s >= 0.0, "phase_s", "must not be negative", self.phase_s)
-        require(
-            0.0 <= self.jitter_s < 1.0 / self.rate_hz, "jitter_s", "must be below a period", self.jitter_s
-        )
+        require(0.0 <= self.jitter_s < 1.0 / self.rate_hz, "jitter_s", "must be below a period", self.jitter_s)
         require(
             0.0 < self.field_of_view_rad <= math.tau,
             "field_of_view_rad",
@@ -90,9 +88,7 @@ class SimulatedSensor:
             self.field_of_view_rad,
         )
         require(self.min_range_m >= 0.0, "min_range_m", "must not be negative", self.min_range_m)
-        require(
-            self.max_range_m > self.min_range_m, "max_range_m", "must exceed min_range_m", self.max_range_m
-        )
+        require(self.max_range_m > self.min_range_m, "max_range_m", "must exceed min_range_m", self.max_range_m)
         for name in ("detection_probability", "split_probability", "outlier_probability"):
             value = getattr(self, name)
             require(0.0 <= value <= 1.0, name, "must lie in [0, 1]", value)

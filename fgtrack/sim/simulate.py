@@ -137,9 +137,7 @@ def _track(scenario: Scenario) -> TrackMap | None:
     return make_oval() if scenario.map == OVAL else TrackMap.read(scenario.map)
 
 
-def _receipts(
-    delay: DelayModel, rng: np.random.Generator, stamps: list[int], times_s: FloatArray
-) -> list[int | None]:
+def _receipts(delay: DelayModel, rng: np.random.Generator, stamps: list[int], times_s: FloatArray) -> list[int | None]:
     """Receipt of each stamp, None where the message is lost."""
     delays = delay.draw(rng, times_s).tolist()
     return [

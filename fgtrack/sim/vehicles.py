@@ -74,9 +74,10 @@ class TrackVehicle:
 class TrackTrajectory:
     """Motion along a path with a lateral offset; yaw is the direction of travel.
 
-    With path parameter u(t), lateral offset d(t), tangent direction psi(u) and scale g(u) (metres of path per
-    unit of u), a dot by time and a prime by u: the velocity is w along the tangent and d' across it, with
-    w = u' (g - d psi'), and yaw = psi + atan2(d', w). Yaw rate and acceleration are its exact derivatives.
+    The path parameter u and the lateral offset d are functions of time with derivatives u1, u2 and d1, d2. With
+    the direction psi of the tangent and the scale g (metres of path per unit of u), a prime for the derivative
+    by u: the velocity is w = u1 (g - d psi') along the tangent and d1 across it, and yaw = psi + atan2(d1, w).
+    Yaw rate and acceleration are the exact derivatives of yaw and speed.
     """
 
     vehicle: TrackVehicle

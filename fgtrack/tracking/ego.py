@@ -8,6 +8,7 @@ from typing import Protocol
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import EgoState
+from fgtrack.tracking.validity import is_number
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +43,8 @@ class EgoSource(Protocol):
 
 
 def is_finite(ego: EgoState) -> bool:
-    """Whether every number of `ego` is one."""
-    return all(map(math.isfinite, (ego.x_m, ego.y_m, ego.yaw_rad, ego.speed_mps, ego.yaw_rate_radps, ego.accel_mps2)))
+    """Whether every number of `ego` is one (see `is_number`)."""
+    return all(map(is_number, (ego.x_m, ego.y_m, ego.yaw_rad, ego.speed_mps, ego.yaw_rate_radps, ego.accel_mps2)))
 
 
 def extrapolated(ego: EgoState, stamp_ns: int) -> EgoPose:

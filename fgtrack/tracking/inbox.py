@@ -1,6 +1,5 @@
 """Detections on their way from receipt to the tick that processes them."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -8,6 +7,7 @@ from typing import Protocol
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Detection, DetectionList, Disposition, Frame, UpdateRecord
 from fgtrack.models.sensors import SensorModel
+from fgtrack.tracking.validity import is_covariance, is_number
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,15 +62,15 @@ class Inbox(Protocol):
 
 
 def is_usable(detection: Detection, sensor: SensorModel) -> bool:
-    """Whether `detection` has finite values, says where it is, and is no empty slot (x = y = 0) of a fixed list."""
+    """Whether `detection` has sound values, says where it is, and is no empty slot (x = y = 0) of a fixed list."""
     measured = [name for name in sensor.components if getattr(detection, name) is not None]
-    if not all(math.isfinite(getattr(detection, name)) for name in measured):
-        return False
-    if detection.covariance is not None and not all(map(math.isfinite, detection.covariance)):
+    if not all(is_number(getattr(detection, name)) for name in measured) or not is_covariance(detection, sensor):
         return False
     if detection.x_m == 0.0 and detection.y_m == 0.0:
         return False
-    return ("x_m" in measured and "y_m" in measured) or "bearing_rad" in measured
+    if "x_m" in measured or "y_m" in measured:
+        return "x_m" in measured and "y_m" in measured
+    return "bearing_rad" in measured
 
 
 def stamps(message: DetectionList, sensor: SensorModel) -> list[int]:

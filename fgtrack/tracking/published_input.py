@@ -1,6 +1,5 @@
 """How the published implementation of Karle et al. 2023 takes its input, each defect a component of its own."""
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -8,8 +7,9 @@ import numpy as np
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Disposition, EgoState, UpdateRecord
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.ego import EgoPose, extrapolated, low_passed
+from fgtrack.tracking.ego import EgoPose, extrapolated, is_finite, low_passed
 from fgtrack.tracking.inbox import Batch, record, records
+from fgtrack.tracking.validity import is_covariance, is_number
 
 
 class PublishedEgo:
@@ -41,7 +41,7 @@ class PublishedEgo:
             self._in_pit = ego.in_pit
         if self._current is not None and ego.stamp_ns == self._current.stamp_ns:
             return "repeated stamp"
-        if math.isnan(ego.x_m) or math.isnan(ego.y_m):
+        if not is_finite(ego):
             return "not finite"
         self._current = ego
         return None
@@ -93,7 +93,7 @@ class SlotInbox:
             values = [getattr(detection, name) for name in sensor.components]
             if (detection.x_m or 0.0) == 0.0 and (detection.y_m or 0.0) == 0.0:
                 ended.append(record(message, index, Disposition.INVALID))
-            elif all(value is not None and math.isfinite(value) for value in values):
+            elif all(value is not None and is_number(value) for value in values) and is_covariance(detection, sensor):
                 kept.append(index)
             else:
                 broken = True

@@ -50,10 +50,8 @@ class PublishedLane:
     def at(self, point: Array) -> Place:
         """Heading, curvature and distances to the bound points at `point`."""
         arc = self.arc(point)
-        hi = 0
-        while hi < len(self.arcs) - 1 and self.arcs[hi] < arc:
-            hi += 1
-        hi = max(hi, 1)
+        first_not_before = int(np.searchsorted(self.arcs, arc, side="left"))
+        hi = min(max(first_not_before, 1), len(self.arcs) - 1)
         lo = hi - 1
 
         def value(column: Array) -> Array:

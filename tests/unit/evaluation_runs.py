@@ -123,6 +123,4 @@ def update(
 ) -> UpdateRecord:
     """An update of the detection sensed at `tick`."""
     stamp_ns = START_NS + tick * TICK_NS
-    return UpdateRecord(
-        sensor, stamp_ns, stamp_ns + delay_ns, index, disposition, track_id, nis, dict(innovation)
-    )
+    return UpdateRecord(sensor, stamp_ns, stamp_ns + delay_ns, index, disposition, track_id, nis, dict(innovation))

@@ -77,9 +77,10 @@ def test_the_ego_and_rows_without_position_are_no_true_objects(tmp_path: Path) -
     assert [path.object_id for path in true_paths(run.truth)] == [7]
 
 
-def test_truth_in_any_order_and_twice_is_one_path(tmp_path: Path) -> None:
+def test_truth_in_any_order_is_one_path_and_its_last_word_counts(tmp_path: Path) -> None:
     rows = WEST.truth(range(4))
-    run = write_run(tmp_path / "run", truth=[rows[2], rows[0], rows[3], rows[1], rows[2]])
+    wrong = dataclasses.replace(rows[2], x_m=99.0)
+    run = write_run(tmp_path / "run", truth=[wrong, rows[0], rows[3], rows[1], rows[2]])
     (path,) = true_paths(run.truth)
     assert path.stamps_ns.tolist() == [row.stamp_ns for row in rows]
     assert path.states[:, 0].tolist() == [row.x_m for row in rows]
@@ -87,8 +88,7 @@ def test_truth_in_any_order_and_twice_is_one_path(tmp_path: Path) -> None:
 
 def test_errors_are_along_and_across_the_true_heading(tmp_path: Path) -> None:
     tracks = [
-        [WEST.track(k, 1, along_m=0.3, across_m=-0.4, yaw_rad=0.1, speed_mps=2.0), ROUND.track(k, 2)]
-        for k in range(5)
+        [WEST.track(k, 1, along_m=0.3, across_m=-0.4, yaw_rad=0.1, speed_mps=2.0), ROUND.track(k, 2)] for k in range(5)
     ]
     run = write_run(tmp_path / "run", tracks, truth=[*WEST.truth(range(5)), *ROUND.truth(range(5))])
     matching = match(run)

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -130,9 +131,7 @@ def test_an_object_that_no_confirmed_track_followed_is_no_true_positive(tmp_path
 
 
 @pytest.mark.parametrize(("paired", "false"), [(4, 1), (5, 0)])
-def test_a_track_is_false_when_paired_for_less_than_half_of_its_life(
-    tmp_path: Path, paired: int, false: int
-) -> None:
+def test_a_track_is_false_when_paired_for_less_than_half_of_its_life(tmp_path: Path, paired: int, false: int) -> None:
     tracks = [[WEST.track(k, 1, across_m=0.0 if k < paired else 20.0)] for k in range(10)]
     metrics = evaluate(write_run(tmp_path / "run", tracks, truth=WEST.truth(range(10))))
     assert metrics.truth is not None
@@ -155,15 +154,14 @@ def test_truth_without_heading_gives_position_errors_only(tmp_path: Path) -> Non
     assert [errors[name].count for name in ("along_m", "across_m", "yaw_rad", "speed_mps")] == [0] * 4
 
 
-def test_residuals_turn_into_the_direction_of_the_track(tmp_path: Path) -> None:
-    tracks = [[ROUND.track(k, 1)] for k in range(3)]
-    yaw_rad = ROUND.state(0.01)[2]  # half a tick after the first
+@pytest.mark.parametrize("start_yaw_rad", [0.3, math.pi - 0.005], ids=["anywhere", "over the jump"])
+def test_residuals_turn_into_the_direction_of_the_track(tmp_path: Path, start_yaw_rad: float) -> None:
+    car = dataclasses.replace(ROUND, yaw_rad=start_yaw_rad)
+    yaw_rad = car.state(0.01)[2]  # half a tick after the first
     forward = {"x_m": 2.0 * math.cos(yaw_rad), "y_m": 2.0 * math.sin(yaw_rad)}
     record = update(nis=1.5, **forward)
-    between = type(record)(
-        record.sensor, record.stamp_ns + 10_000_000, *(getattr(record, n) for n in record.__slots__[2:])
-    )
-    metrics = evaluate(write_run(tmp_path / "run", tracks, updates={1: [between]}))
+    between = dataclasses.replace(record, stamp_ns=record.stamp_ns + 10_000_000)
+    metrics = evaluate(write_run(tmp_path / "run", [[car.track(k, 1)] for k in range(3)], updates={1: [between]}))
     residuals = metrics.sensors["lidar"].residuals
     assert residuals["along_m"].mean == pytest.approx(2.0)
     assert residuals["across_m"].mean == pytest.approx(0.0, abs=1e-9)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from fgtrack.core.geometry import wrap_angles
+from fgtrack.core.types import FloatArray
 from fgtrack.models.track_map import COLUMNS, TrackMap
 from fgtrack.sim.oval import make_oval, make_pit_lane
 from fgtrack.sim.path import Path as DrivenPath
@@ -59,14 +60,22 @@ def test_the_pit_road_lies_left_of_the_front_straight_and_beside_the_track() -> 
     assert OVAL.outside(points, 0.0, 0.0).all()
 
 
-def test_a_path_frame_holds_the_exact_derivatives() -> None:
-    path = DrivenPath.along(OVAL)
+ANGLES = np.array([0.0, 0.4, 1.0, 1.3, 2.2, 3.0, 3.3, 4.4, 5.0, 5.8])
+COARSE = np.stack([300.0 * np.cos(ANGLES), 200.0 * np.sin(ANGLES)], axis=1)
+
+
+@pytest.mark.parametrize(
+    "path", [DrivenPath.along(OVAL), DrivenPath.through(np.vstack([COARSE, COARSE[:1]]))], ids=["fine", "coarse"]
+)
+def test_a_path_frame_holds_the_exact_derivatives(path: DrivenPath) -> None:
     u, h = np.linspace(-50.0, 2500.0, 997), 1e-4
     frame, ahead, behind = path.frame(u), path.frame(u + h), path.frame(u - h)
-    tangent = np.stack([ahead.x_m - behind.x_m, ahead.y_m - behind.y_m]) / (2.0 * h)
-    np.testing.assert_allclose(frame.scale * np.cos(frame.heading_rad), tangent[0], atol=1e-7)
-    np.testing.assert_allclose(frame.scale * np.sin(frame.heading_rad), tangent[1], atol=1e-7)
-    turn = wrap_angles(ahead.heading_rad - behind.heading_rad) / (2.0 * h)
-    np.testing.assert_allclose(frame.turn, turn, atol=1e-8)
-    np.testing.assert_allclose(frame.turn_rate, (ahead.turn - behind.turn) / (2.0 * h), atol=2e-6)
-    np.testing.assert_allclose(frame.scale_rate, (ahead.scale - behind.scale) / (2.0 * h), atol=2e-6)
+
+    def assert_derivative(value: FloatArray, difference: FloatArray, atol: float) -> None:
+        np.testing.assert_allclose(value, difference / (2.0 * h), atol=atol)
+
+    assert_derivative(frame.scale * np.cos(frame.heading_rad), ahead.x_m - behind.x_m, 1e-7)
+    assert_derivative(frame.scale * np.sin(frame.heading_rad), ahead.y_m - behind.y_m, 1e-7)
+    assert_derivative(frame.turn, wrap_angles(ahead.heading_rad - behind.heading_rad), 1e-8)
+    assert_derivative(frame.turn_rate, ahead.turn - behind.turn, 2e-6)
+    assert_derivative(frame.scale_rate, ahead.scale - behind.scale, 1e-8)

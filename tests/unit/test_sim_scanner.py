@@ -64,9 +64,7 @@ def test_yaw_is_relative_to_the_ego_and_speed_over_ground() -> None:
 
 
 def test_range_and_bearing_are_relative_to_the_mounted_sensor() -> None:
-    sensor = SimulatedSensor(
-        "radar", {"range_m": 0.0, "bearing_rad": 0.0}, mount=Mount(x_m=3.0, y_m=1.0, yaw_rad=0.2)
-    )
+    sensor = SimulatedSensor("radar", {"range_m": 0.0, "bearing_rad": 0.0}, mount=Mount(x_m=3.0, y_m=1.0, yaw_rad=0.2))
     assert sensor.frame == "sensor"
     _, z = scan(sensor, seen_from(3.0 + 40.0, 1.0 + 30.0), num_scans=1)
     np.testing.assert_allclose(z, [[50.0, math.atan2(30.0, 40.0) - 0.2]], atol=1e-9)
@@ -145,11 +143,11 @@ def test_noise_on_angles_wraps() -> None:
 
 
 def test_outliers_are_as_many_and_as_wild_as_told() -> None:
-    sensor = SimulatedSensor("lidar", {"x_m": 0.3, "y_m": 0.3}, outlier_probability=0.2, outlier_factor=100.0)
+    sensor = SimulatedSensor("lidar", {"x_m": 0.3, "y_m": 0.3}, outlier_probability=0.2, outlier_factor=10.0)
     _, z = scan(sensor, seen_from(20.0, 0.0))
-    squared = np.sum((z - (20.0, 0.0)) ** 2, axis=1) / 0.3**2  # chi-square of 2 degrees, or 10^4 times it
-    wild = squared > 50.0
-    expected = 0.8 * math.exp(-25.0) + 0.2 * math.exp(-25.0 / 100.0**2)
+    squared = np.sum((z - (20.0, 0.0)) ** 2, axis=1) / 0.3**2  # chi-square of 2 degrees, or 100 times it
+    wild = squared > 200.0
+    expected = 0.8 * math.exp(-100.0) + 0.2 * math.exp(-1.0)
     assert stats.binomtest(int(wild.sum()), N, expected).pvalue > ALPHA
 
 

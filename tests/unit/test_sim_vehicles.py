@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -23,6 +23,7 @@ STILL = CTRV(0.0, 0.0, 0.0, 0.0)
 
 
 @given(st.lists(st.floats(0.01, 60.0), min_size=1, max_size=50))
+@example([34.89984906191907])
 @settings(deadline=None)
 def test_yaw_is_the_direction_of_travel_and_the_rates_are_derivatives(times: list[float]) -> None:
     trajectory = BUSY.trajectory(PATH)
@@ -31,10 +32,14 @@ def test_yaw_is_the_direction_of_travel_and_the_rates_are_derivatives(times: lis
     velocity = (ahead[:, :2] - behind[:, :2]) / (2.0 * h)
     np.testing.assert_allclose(np.hypot(*velocity.T), now[:, SPEED], rtol=1e-6)
     assert np.abs(wrap_angles(np.arctan2(velocity[:, 1], velocity[:, 0]) - now[:, YAW])).max() < 1e-6
-    # Where a spline piece, a lane change or a speed ramp begins, the derivative of a rate may jump.
     yaw_rate = wrap_angles(ahead[:, YAW] - behind[:, YAW]) / (2.0 * h)
     np.testing.assert_allclose(now[:, YAW_RATE], yaw_rate, atol=1e-4)
-    np.testing.assert_allclose(now[:, ACCEL], (ahead[:, SPEED] - behind[:, SPEED]) / (2.0 * h), atol=1e-2)
+    # Where a piece of the path begins, the acceleration off the line jumps: a numeric one is half the jump off.
+    knots = PATH.spline.x
+    jump = np.abs(PATH.frame(knots + 1e-9).turn_rate - PATH.frame(knots - 1e-9).turn_rate).max()
+    atol = 0.5 * jump * 75.0**2 * 5.0 + 1e-3
+    assert atol < 0.1
+    np.testing.assert_allclose(now[:, ACCEL], (ahead[:, SPEED] - behind[:, SPEED]) / (2.0 * h), atol=atol)
 
 
 def test_the_yaw_stays_in_its_range_over_several_laps() -> None:

@@ -85,9 +85,7 @@ def test_road_coordinates_run_on_over_rows_closing_point_and_heading_jump(latera
 def test_lateral_is_the_distance_from_the_line_and_positive_to_the_left() -> None:
     points = np.array([[97.0, 0.0], [103.0, 0.0]])  # beside a row of a circle driven counter-clockwise
     np.testing.assert_allclose(TrackMap(circle_table()).frenet(points)[1], [3.0, -3.0], atol=1e-12)
-    np.testing.assert_allclose(
-        TrackMap(circle_table(direction=-1.0)).frenet(points)[1], [-3.0, 3.0], atol=1e-12
-    )
+    np.testing.assert_allclose(TrackMap(circle_table(direction=-1.0)).frenet(points)[1], [-3.0, 3.0], atol=1e-12)
 
 
 def test_the_line_is_closed_whether_or_not_the_last_row_repeats_the_first() -> None:
@@ -104,6 +102,15 @@ def test_points_beyond_the_centre_of_curvature_and_far_away_give_finite_answers(
     track = TrackMap(circle_table())
     assert np.isfinite(track.frenet(points)).all()
     assert np.isfinite(track.heading(points)).all()
+
+
+def test_the_centre_of_curvature_itself_gives_a_finite_answer() -> None:
+    table = circle_table(num=4)
+    table[:, :2] = [[0.0, -100.0], [100.0, 0.0], [0.0, 100.0], [-100.0, 0.0]]
+    table[:, HEADING] = [0.0, np.pi / 2.0, np.pi, -np.pi / 2.0]
+    s, lateral = TrackMap(table).frenet(np.array([[0.0, 0.0], [0.0, -1e-9]]))
+    np.testing.assert_allclose(lateral, 100.0)  # the point lies on the normals of a whole segment
+    assert (s <= np.hypot(100.0, 100.0)).all()
 
 
 def test_no_points_give_no_answers() -> None:
@@ -163,13 +170,9 @@ def test_the_widths_are_those_of_the_rows_and_linear_between_them() -> None:
 
 @given(s=st.floats(0.0, 2400.0), inner=st.floats(-3.0, 3.0), outer=st.floats(-3.0, 3.0))
 @settings(deadline=None)
-def test_a_positive_buffer_lets_points_in_and_a_negative_one_shrinks(
-    s: float, inner: float, outer: float
-) -> None:
+def test_a_positive_buffer_lets_points_in_and_a_negative_one_shrinks(s: float, inner: float, outer: float) -> None:
     left, right = (float(width[0]) for width in OVAL.bounds(np.array([s])))
-    lateral = np.array(
-        [left + inner - 1e-6, left + inner + 1e-6, -right - outer + 1e-6, -right - outer - 1e-6]
-    )
+    lateral = np.array([left + inner - 1e-6, left + inner + 1e-6, -right - outer + 1e-6, -right - outer - 1e-6])
     points = OVAL.position(np.full(4, s), lateral)
     assert OVAL.outside(points, inner, outer).tolist() == [False, True, False, True]
 
@@ -256,9 +259,7 @@ def with_line(row: int, line: str) -> list[str]:
         (edited(10, "psi_ref_rad", "2"), r"map\.csv:11: no map: psi_ref_rad is .* rad off"),
     ],
 )
-def test_a_file_that_is_no_map_is_refused_with_its_line(
-    tmp_path: Path, lines: list[str], message: str
-) -> None:
+def test_a_file_that_is_no_map_is_refused_with_its_line(tmp_path: Path, lines: list[str], message: str) -> None:
     (tmp_path / "map.csv").write_text("\n".join(lines))
     with pytest.raises(DataError, match=message) as caught:
         TrackMap.read(tmp_path / "map.csv")

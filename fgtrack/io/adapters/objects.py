@@ -43,9 +43,7 @@ def _detection3d(item: RosMessage) -> Detection:
     values = {"x_m": pose.position.x, "y_m": pose.position.y, "yaw_rad": yaw_rad(pose.orientation)}
     return Detection(
         **values,
-        covariance=None
-        if hypothesis is None
-        else covariance(measured(values), planar(hypothesis.covariance)),
+        covariance=None if hypothesis is None else covariance(measured(values), planar(hypothesis.covariance)),
         stamp_ns=object_stamp_ns(item.header),
         object_id=int(text) if text.isascii() and text.isdigit() and int(text) <= _ID_MASK else None,
     )
@@ -121,9 +119,7 @@ def _radar_track(item: RosMessage) -> Detection:
     }
     variance = speed_variance(velocity.x, velocity.y, _planar_triangle(item.velocity_covariance))
     uuid = int.from_bytes(bytes(item.uuid.uuid), "little") & _ID_MASK
-    return Detection(
-        **values, covariance=covariance(measured(values), pose, variance), object_id=uuid or None
-    )
+    return Detection(**values, covariance=covariance(measured(values), pose, variance), object_id=uuid or None)
 
 
 def _planar_triangle(triangle: RosMessage) -> np.ndarray:
@@ -135,10 +131,7 @@ def _planar_triangle(triangle: RosMessage) -> np.ndarray:
 def pose_array(message: RosMessage) -> ObjectList:
     """`geometry_msgs/PoseArray`: position and yaw."""
     poses = message.poses
-    objects = [
-        Detection(x_m=pose.position.x, y_m=pose.position.y, yaw_rad=yaw_rad(pose.orientation))
-        for pose in poses
-    ]
+    objects = [Detection(x_m=pose.position.x, y_m=pose.position.y, yaw_rad=yaw_rad(pose.orientation)) for pose in poses]
     return object_list(message.header, objects)
 
 
@@ -153,9 +146,7 @@ def odometry(message: RosMessage) -> ObjectList:
     }
     planar_twist = np.asarray(message.twist.covariance, dtype=float).reshape(6, 6)[:2, :2]
     variance = speed_variance(velocity.x, velocity.y, planar_twist)
-    item = Detection(
-        **values, covariance=covariance(measured(values), planar(message.pose.covariance), variance)
-    )
+    item = Detection(**values, covariance=covariance(measured(values), planar(message.pose.covariance), variance))
     return object_list(message.header, [item])
 
 

@@ -1,0 +1,103 @@
+"""What each defect of the published code costs: one component switched at a time.
+
+    python experiments/defects/defects.py STREAM --map TRACK.csv --pit-map PIT.csv -o OUT
+
+Every defect is switched twice: repaired in the published tracker, and added to the clean one. The map buffers,
+the birth covariance and all parameters are the same everywhere.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fgtrack.evaluation.metrics import evaluate
+from fgtrack.io.run_folder import Run, read_run
+from fgtrack.io.stream import read_stream
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.load import load
+from fgtrack.pipeline.replay import replay
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+#: Defect -> the sections of the configuration that hold it, with the keys there; without keys the whole section.
+DEFECTS = {
+    "Q2 yaw sticks at its limit": {"motion": ["yaw"]},
+    "Q3 heading interpolated through its jump": {"map": ["lookup"]},
+    "Q3, Q4 whole map look-up": {"map": ["lookup"]},
+    "Q5 acceleration drives the speed": {"motion": ["acceleration", "std_per_s"]},
+    "Q6 noise per step": {"motion": ["noise"]},
+    "Q8 present state not stored": {"filter": ["present"]},
+    "Q9, Q15, Q22 ageing": {"lifecycle": [], "sensors": []},
+    "Q10 gate after the assignment": {"association": []},
+    "Q11 merge not transitive": {"merge": []},
+    "Q12 one slot per sensor": {"inbox": []},
+    "Q13 ego filtered again and again": {"ego": []},
+    "Q14 tracking time leads the clock": {"filter": ["clock"]},
+}
+#: Q3 alone is the step between the published look-up and the same with the heading on the circle.
+HEADING = "Q3 heading interpolated through its jump"
+
+
+def switched(config: Config, other: Config, defect: str) -> Config:
+    """`config` with the parts that hold `defect` taken from `other`."""
+    for section, keys in DEFECTS[defect].items():
+        part = getattr(other, section)
+        if keys:
+            part = replace(getattr(config, section), **{key: getattr(part, key) for key in keys})
+        config = replace(config, **{section: part})
+    return config
+
+
+def variants(published: Config, clean: Config) -> dict[str, Config]:
+    """All configurations by name."""
+    found = {"published": published, "clean": clean}
+    circular = replace(published.map, lookup="published_circular_heading")
+    for defect in DEFECTS:
+        if defect == HEADING:
+            found[f"published without {defect}"] = replace(published, map=circular)
+            continue
+        found[f"published without {defect}"] = switched(published, clean, defect)
+        found[f"clean with {defect}"] = switched(clean, published, defect)
+    return found
+
+
+def row(name: str, run: Run) -> str:
+    """A line of the table."""
+    metrics = evaluate(run)
+    assert metrics.truth is not None, "the stream has no truth"
+    errors = metrics.truth.overall.errors
+    cells = [f"{errors[part].rmse:.3f}" for part in ("position_m", "along_m", "across_m")]
+    cells.append(f"{errors['yaw_rad'].rmse:.4f}")
+    cells.append(f"{errors['speed_mps'].rmse:.2f}")
+    for sensor in ("lidar_cluster", "radar"):
+        residuals = metrics.sensors[sensor].residuals
+        cells.append(" / ".join(f"{residuals[part].std:.3f}" for part in ("along_m", "across_m")))
+    cells += [str(metrics.num_tracks), str(metrics.num_confirmed), f"{100 * metrics.truth.overall.tracked_share:.1f}"]
+    return f"| {name} | " + " | ".join(cells) + " |"
+
+
+def main(
+    stream: Path,
+    track_map: Annotated[str, typer.Option("--map")],
+    pit_map: Annotated[str, typer.Option("--pit-map")],
+    out: Annotated[Path, typer.Option("-o", "--out")] = Path("out/defects"),
+) -> None:
+    """Print the table as Markdown; the runs stay in OUT."""
+    maps = [f"map.track={track_map}", f"map.pit={pit_map}"]
+    published = load(Config, CONFIGS / "karle2023_reference.yaml", maps)
+    clean = load(Config, CONFIGS / "karle2023.yaml", maps)
+    print(
+        "| tracker | position [m] | along [m] | across [m] | yaw [rad] | speed [m/s] "
+        "| LiDAR residual std along / across [m] | RADAR residual std along / across [m] "
+        "| tracks | tracks 3+ | tracked [%] |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|---|")
+    for number, (name, config) in enumerate(variants(published, clean).items()):
+        result = replay(read_stream(stream), config, out / f"{number:02d}", origin=str(stream), kind="stream")
+        print(row(name, read_run(result.path)), flush=True)
+
+
+if __name__ == "__main__":
+    typer.run(main)
