@@ -23,7 +23,7 @@ def wrap_angles(angles_rad: FloatArray) -> FloatArray:
     if inside.all():
         return angles_rad
     wrapped = np.pi - np.mod(np.pi - angles_rad, TWO_PI)
-    wrapped = np.where(wrapped > -np.pi, wrapped, np.pi)  # one rounding above pi
+    wrapped = np.where(wrapped <= -np.pi, np.pi, wrapped)  # one rounding above pi; NaN stays NaN
     return np.asarray(np.where(inside, angles_rad, wrapped))
 
 

@@ -6,26 +6,66 @@ is the baseline, and not a replay.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from fgtrack.core.time import seconds
-from fgtrack.core.types import FloatArray, IntArray, TrackState
-from fgtrack.estimation.base import (
-    BirthPrior,
-    Measurement,
-    StatesAt,
-    UpdateResult,
-    UpdateStatus,
-    no_states,
-)
+from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.estimation.base import BirthPrior, Measurement, StatesAt, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.birth import birth_state
-from fgtrack.estimation.ekf import Correction, correct
+from fgtrack.estimation.ekf import correct
 from fgtrack.estimation.propagation import Propagator, wrapped_yaw
+
+_LONGEST_STRETCH = 64  # steps of pure prediction after which a state is stored, so that predictions stay short
+
+
+class Anchor(NamedTuple):
+    """A stored state; all states up to the next anchor are predicted from it."""
+
+    grid: int
+    """Grid index of the state."""
+    visible_from: int
+    """Grid index from which a look-up finds it."""
+    mean: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(slots=True)
+class _Storage:
+    """The stored past of one object."""
+
+    anchors: list[Anchor]
+    oldest: int
+    """Grid index before which the object is not known."""
+    newest_fused_ns: int
+
+    def at(self, grid: int) -> Anchor:
+        """The anchor that the state at `grid` is predicted from."""
+        for anchor in reversed(self.anchors):
+            if anchor.visible_from <= grid:
+                return anchor
+        return self.anchors[0]
+
+    def put(self, anchor: Anchor) -> None:
+        """Let `anchor` replace all that was stored at and after it."""
+        while self.anchors and self.anchors[-1].visible_from >= anchor.visible_from:
+            self.anchors.pop()
+        self.anchors.append(anchor)
+
+    def trim(self, oldest: int) -> None:
+        """Forget what is older than `oldest`."""
+        self.oldest = max(self.oldest, oldest)
+        while len(self.anchors) > 1 and self.anchors[1].visible_from <= self.oldest:
+            del self.anchors[0]
 
 
 class BackwardForwardBank:
-    """EKFs of all objects with a shared grid of stored states (the paper's object storage).
+    """EKFs of all objects on a shared time grid, with their stored states (the paper's object storage).
+
+    Between two corrections the stored states are pure prediction, so only corrected states are kept, and a state
+    in between is predicted when it is asked for.
 
     Parameters
     ----------
@@ -34,7 +74,7 @@ class BackwardForwardBank:
     step_ns
         Grid step, the inverse of the filter frequency.
     storage_steps
-        Number of grid states kept for each object.
+        Number of grid states that the storage reaches back.
     """
 
     def __init__(self, propagator: Propagator, step_ns: int, storage_steps: int) -> None:
@@ -42,21 +82,11 @@ class BackwardForwardBank:
         self._step_ns = step_ns
         self._step_s = seconds(step_ns)
         self._length = storage_steps
-        self._dim = propagator.motion.dim
         self._now_ns: int | None = None
         self._grid_ns = 0  # stamp of the newest grid state
         self._grid = 0  # its index
-        self._rows: dict[int, int] = {}
-        self._reserve(4)
-
-    def _reserve(self, capacity: int) -> None:
-        n, length = self._dim, self._length
-        self._mean = np.zeros((capacity, n))
-        self._covariance = np.zeros((capacity, n, n))
-        self._stored_mean = np.zeros((length, capacity, n))
-        self._stored_covariance = np.zeros((length, capacity, n, n))
-        self._oldest = np.zeros(capacity, dtype=np.int64)  # grid index of the oldest stored state
-        self._newest_fused_ns = np.zeros(capacity, dtype=np.int64)
+        self._objects: dict[int, _Storage] = {}
+        self._cached: dict[int, StatesAt] = {}  # by grid index; valid until anything changes
 
     @property
     def present_ns(self) -> int:
@@ -71,10 +101,10 @@ class BackwardForwardBank:
     @property
     def track_ids(self) -> tuple[int, ...]:
         """See `TrackBank.track_ids`."""
-        return tuple(self._rows)
+        return tuple(self._objects)
 
     def advance(self, now_ns: int) -> None:
-        """Predict every object, grid step by grid step, up to the last grid stamp not after `now_ns`."""
+        """Move the present to the last grid stamp that is not after `now_ns`."""
         grid_ns = now_ns // self._step_ns * self._step_ns
         if self._now_ns is None:
             self._grid_ns = grid_ns
@@ -82,157 +112,155 @@ class BackwardForwardBank:
         self._advance_steps((grid_ns - self._grid_ns) // self._step_ns)
 
     def _advance_steps(self, steps: int) -> None:
-        rows = self._all_rows()
-        if not len(rows):
-            self._grid += max(steps, 0)
-            self._grid_ns += max(steps, 0) * self._step_ns
-            return
-        for done in range(0, max(steps, 0), self._length):
-            part = min(self._length, steps - done)
+        """Move the present by `steps`, through stored states wherever the prediction would become long."""
+        while steps > 0:
+            part = min(steps, _LONGEST_STRETCH)
+            steps -= part
             self._grid += part
             self._grid_ns += part * self._step_ns
-            self._integrate(rows, part)
-        np.maximum(self._oldest, self._grid - self._length + 1, out=self._oldest)
+            self._cached.clear()
+            self._store_present()
+        for storage in self._objects.values():
+            storage.trim(self._grid - self._length + 1)
 
-    def _integrate(self, rows: IntArray, steps: int) -> None:
-        """Predict `rows` by `steps` that end at the newest grid stamp, and store every state on the way."""
-        means, covariances = self._propagator.propagate(self._mean[rows], self._covariance[rows], steps, self._step_s)
-        slots = np.arange(self._grid - steps + 1, self._grid + 1) % self._length
-        self._stored_mean[slots[:, None], rows] = means
-        self._stored_covariance[slots[:, None], rows] = covariances
-        self._mean[rows] = means[-1]
-        self._covariance[rows] = covariances[-1]
+    def _store_present(self) -> None:
+        """Store the present state of objects that have been predicted for long."""
+        due = [i for i, storage in self._objects.items() if self._grid - storage.anchors[-1].grid >= _LONGEST_STRETCH]
+        if due:
+            states = self._predicted(due, self._grid)
+            for track_id, mean, covariance in zip(due, states.means, states.covariances, strict=True):
+                self._objects[track_id].put(Anchor(self._grid, self._grid, mean, covariance))
 
-    def _all_rows(self) -> IntArray:
-        return np.fromiter(self._rows.values(), dtype=np.int64, count=len(self._rows))
+    def _predicted(self, track_ids: Sequence[int], grid: int) -> StatesAt:
+        """States at `grid`; at the present they are the filters' own."""
+        if not track_ids:
+            return no_states(self._propagator.motion.dim)
+        objects = [self._objects[track_id] for track_id in track_ids]
+        anchors = [storage.anchors[-1] if grid == self._grid else storage.at(grid) for storage in objects]
+        means, covariances = self._propagator.propagate(
+            np.array([anchor.mean for anchor in anchors]),
+            np.array([anchor.covariance for anchor in anchors]),
+            np.array([grid - anchor.grid for anchor in anchors], dtype=np.int64),
+            self._step_s,
+        )
+        return StatesAt(tuple(track_ids), means, covariances)
+
+    def _at_grid(self, grid: int) -> StatesAt:
+        """States at `grid` of all objects that are known there."""
+        if grid not in self._cached:
+            known = [i for i, storage in self._objects.items() if grid == self._grid or storage.oldest <= grid]
+            self._cached[grid] = self._predicted(known, grid)
+        return self._cached[grid]
 
     def steps_back(self, stamp_ns: int) -> int:
-        """Grid steps from the newest stored state back to the one nearest to `stamp_ns`; the newer one on a tie."""
+        """Grid steps from the present back to the state nearest to `stamp_ns`; the newer one on a tie."""
         late_ns = self._grid_ns - stamp_ns
         return max(-((self._step_ns - 2 * late_ns) // (2 * self._step_ns)), 0)
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """Stored states nearest to `stamp_ns`, of those objects whose storage reaches back so far."""
-        back = self.steps_back(stamp_ns)
-        if back == 0:
-            rows = self._all_rows()
-            return StatesAt(self.track_ids, self._mean[rows], self._covariance[rows])
-        ids = tuple(track_id for track_id, row in self._rows.items() if self._oldest[row] <= self._grid - back)
-        if not ids:
-            return no_states(self._dim)
-        rows = self._rows_of(ids)
-        slot = (self._grid - back) % self._length
-        return StatesAt(ids, self._stored_mean[slot, rows], self._stored_covariance[slot, rows])
-
-    def _rows_of(self, track_ids: Sequence[int]) -> IntArray:
-        return np.array([self._rows[track_id] for track_id in track_ids], dtype=np.int64)
+        return self._at_grid(self._grid - self.steps_back(stamp_ns))
 
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
-        """Correct the stored states nearest to `stamp_ns` and integrate them forward to the present."""
-        groups: dict[tuple[int, int], list[int]] = {}
+        """Correct the stored states nearest to `stamp_ns`; the present is predicted from them."""
+        states = self.states_at(stamp_ns)
+        rows = {track_id: row for row, track_id in enumerate(states.track_ids)}
+        groups: dict[int, list[int]] = {}
         for position, measurement in enumerate(measurements):
-            groups.setdefault((id(measurement.model), id(measurement.pose)), []).append(position)
+            groups.setdefault(id(measurement.model), []).append(position)
         results: dict[int, UpdateResult] = {}
         for positions in groups.values():
-            part = self._update_alike(stamp_ns, [track_ids[i] for i in positions], [measurements[i] for i in positions])
+            chosen = [rows[track_ids[position]] for position in positions]
+            part = self._update_alike(
+                [track_ids[position] for position in positions],
+                states.means[chosen],
+                states.covariances[chosen],
+                [measurements[position] for position in positions],
+                self.steps_back(stamp_ns),
+            )
             results.update(zip(positions, part, strict=True))
+        self._cached.clear()
         return [results[position] for position in range(len(measurements))]
 
     def _update_alike(
-        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+        self,
+        track_ids: Sequence[int],
+        means: FloatArray,
+        covariances: FloatArray,
+        measurements: Sequence[Measurement],
+        back: int,
     ) -> list[UpdateResult]:
-        """Update with measurements that share a model and a sensor pose."""
-        back = self.steps_back(stamp_ns)
-        rows = self._rows_of(track_ids)
-        slot = (self._grid - back) % self._length
-        if back:
-            mean, covariance = self._stored_mean[slot, rows], self._stored_covariance[slot, rows]
-        else:
-            mean, covariance = self._mean[rows], self._covariance[rows]
-        corrected = self._correct(mean, covariance, measurements)
-        if corrected is None:
-            if len(measurements) == 1:
-                return [UpdateResult(UpdateStatus.FAILED)]
-            each = zip(track_ids, measurements, strict=True)
-            return [self._update_alike(stamp_ns, [track_id], [one])[0] for track_id, one in each]
-        self._mean[rows] = self._propagator.settle(corrected.mean)
-        self._covariance[rows] = corrected.covariance
-        self._store(back, slot, rows)
-        if back:
-            self._integrate(rows, back)
-        late = self._newest_fused_ns[rows] > stamp_ns
-        np.maximum.at(self._newest_fused_ns, rows, stamp_ns)
-        return [
-            UpdateResult(
-                UpdateStatus.OUT_OF_SEQUENCE if late[i] else UpdateStatus.IN_SEQUENCE,
-                corrected.innovation[i],
-                float(corrected.nis[i]),
-            )
-            for i in range(len(measurements))
-        ]
-
-    def _correct(
-        self, mean: FloatArray, covariance: FloatArray, measurements: Sequence[Measurement]
-    ) -> Correction | None:
-        """Posteriors; None where one of the measurements cannot be fused."""
+        """Update with measurements that share a model, a sensor pose and a stamp."""
         z = np.array([measurement.z for measurement in measurements])
         R = np.array([measurement.R for measurement in measurements])
         try:
-            corrected = correct(mean, covariance, z, R, measurements[0].model, measurements[0].pose)
-        except np.linalg.LinAlgError:  # a singular innovation covariance
-            return None
-        sound = np.isfinite(corrected.mean).all() and np.isfinite(corrected.covariance).all()
-        return corrected if sound else None
+            corrected = correct(means, covariances, z, R, measurements[0].model, measurements[0].pose)
+        except np.linalg.LinAlgError:
+            return self._update_one_by_one(track_ids, means, covariances, measurements, back)
+        settled = self._propagator.settle(corrected.mean)
+        finite = np.isfinite(settled.sum(axis=1) + corrected.covariance.sum(axis=(1, 2))).tolist()
+        results = []
+        for row, (track_id, measurement) in enumerate(zip(track_ids, measurements, strict=True)):
+            if not finite[row]:
+                results.append(UpdateResult(UpdateStatus.FAILED))
+                continue
+            storage = self._objects[track_id]
+            storage.put(
+                Anchor(self._grid - back, self._visible_from(back), settled[row], corrected.covariance[row])
+            )
+            late = storage.newest_fused_ns > measurement.stamp_ns
+            storage.newest_fused_ns = max(storage.newest_fused_ns, measurement.stamp_ns)
+            status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
+            results.append(UpdateResult(status, corrected.innovation[row], float(corrected.nis[row])))
+        return results
 
-    def _store(self, back: int, slot: int, rows: IntArray) -> None:
-        """Let the corrected states replace the stored ones."""
-        self._stored_mean[slot, rows] = self._mean[rows]
-        self._stored_covariance[slot, rows] = self._covariance[rows]
+    def _update_one_by_one(
+        self,
+        track_ids: Sequence[int],
+        means: FloatArray,
+        covariances: FloatArray,
+        measurements: Sequence[Measurement],
+        back: int,
+    ) -> list[UpdateResult]:
+        """Find the measurement that cannot be fused, and fuse the others."""
+        if len(track_ids) == 1:
+            return [UpdateResult(UpdateStatus.FAILED)]
+        return [
+            self._update_alike([track_id], means[row, None], covariances[row, None], [measurement], back)[0]
+            for row, (track_id, measurement) in enumerate(zip(track_ids, measurements, strict=True))
+        ]
+
+    def _visible_from(self, back: int) -> int:
+        """Grid index from which a look-up finds a state corrected `back` steps ago."""
+        return self._grid - back
 
     def birth(self, track_id: int, prior: BirthPrior) -> None:
-        """Start an object on the grid stamp nearest to its first detection and integrate it to the present."""
-        if len(self._rows) == len(self._mean):
-            self._grow()
-        used = set(self._rows.values())
-        row = next(row for row in range(len(self._mean)) if row not in used)
+        """Start an object on the grid stamp nearest to its first detection."""
         back = max(round((self._grid_ns - prior.stamp_ns) / self._step_ns), 0)
-        self._rows[track_id] = row
-        rows = np.array([row], dtype=np.int64)
-        mean, self._covariance[row] = birth_state(self._propagator.motion, prior)
-        self._mean[row] = self._propagator.settle(mean)
-        self._newest_fused_ns[row] = prior.stamp_ns
-        self._oldest[row] = max(self._grid - back, self._grid - self._length + 1)
-        slot = (self._grid - back) % self._length
-        self._stored_mean[slot, row] = self._mean[row]
-        self._stored_covariance[slot, row] = self._covariance[row]
-        if back:
-            self._integrate(rows, back)
-
-    def _grow(self) -> None:
-        old = (self._mean, self._covariance, self._stored_mean, self._stored_covariance)
-        ages = (self._oldest, self._newest_fused_ns)
-        count = len(self._mean)
-        self._reserve(2 * count)
-        self._mean[:count], self._covariance[:count] = old[0], old[1]
-        self._stored_mean[:, :count], self._stored_covariance[:, :count] = old[2], old[3]
-        self._oldest[:count], self._newest_fused_ns[:count] = ages
+        start = self._grid - back
+        mean, covariance = birth_state(self._propagator.motion, prior)
+        anchor = Anchor(start, start, self._propagator.settle(mean), covariance)
+        self._objects[track_id] = _Storage([anchor], start, prior.stamp_ns)
+        self._objects[track_id].trim(self._grid - self._length + 1)
+        self._cached.clear()
 
     def remove(self, track_id: int) -> None:
         """See `TrackBank.remove`."""
-        del self._rows[track_id]
+        del self._objects[track_id]
+        self._cached.clear()
 
     def present(self) -> list[TrackState]:
         """See `TrackBank.present`; the part of a step beyond the newest grid stamp is predicted."""
-        rows = self._all_rows()
-        if not len(rows):
+        states = self._at_grid(self._grid)
+        if not states.track_ids:
             return []
-        mean, covariance = self._mean[rows], self._covariance[rows]
+        mean, covariance = states.means, states.covariances
         rest_s = seconds(self.present_ns - self._grid_ns)
         if rest_s:
-            means, covariances = self._propagator.propagate(mean, covariance, 1, rest_s)
-            mean, covariance = means[0], covariances[0]
+            one = np.ones(len(mean), dtype=np.int64)
+            mean, covariance = self._propagator.propagate(mean, covariance, one, rest_s)
         mean, covariance = self._propagator.motion.kinematic(mean, covariance)
         mean = wrapped_yaw(mean)
         return [TrackState(self.present_ns, m, P) for m, P in zip(mean, covariance, strict=True)]

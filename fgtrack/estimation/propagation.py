@@ -1,4 +1,4 @@
-"""Propagators: many equal time steps of many objects at once, as the state storage of the paper needs them."""
+"""Propagators: many objects through equal time steps, each through its own number of them."""
 
 from typing import Protocol
 
@@ -6,42 +6,38 @@ import numpy as np
 
 from fgtrack.core.geometry import rotations, wrap_angles
 from fgtrack.core.linalg import symmetrise
-from fgtrack.core.types import SPEED, YAW, YAW_RATE, FloatArray
+from fgtrack.core.types import SPEED, YAW, YAW_RATE, FloatArray, IntArray
+from fgtrack.estimation.ekf import predict
 from fgtrack.models.motion import MotionModel
 
 
 class Propagator(Protocol):
-    """Takes m objects through equal steps and gives every state on the way."""
+    """Predicts m objects at once."""
 
     motion: MotionModel
     """Names and conversions of the state; its equations too, where the propagator has none of its own."""
 
     def propagate(
-        self, mean: FloatArray, covariance: FloatArray, steps: int, dt_s: float
+        self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
     ) -> tuple[FloatArray, FloatArray]:
-        """States after 1 ... `steps` steps of `dt_s`: shapes (steps, m, n) and (steps, m, n, n)."""
+        """States (m, n) and (m, n, n), each after its own number of `steps` (m,) of `dt_s`; yaw is not wrapped."""
 
     def settle(self, mean: FloatArray) -> FloatArray:
-        """Means, shape (m, n), with the angles brought back to their range after a correction."""
+        """Means, shape (..., n), with the angles brought back to their range after a correction."""
 
 
 class ExactPropagator:
-    """Every step straight from the start: exact, because flow and process noise of a motion model compose."""
+    """All steps in one: exact, because flow and process noise of a motion model compose."""
 
     def __init__(self, motion: MotionModel) -> None:
         self.motion = motion
         self._yawed = "yaw_rad" in motion.state_names
 
     def propagate(
-        self, mean: FloatArray, covariance: FloatArray, steps: int, dt_s: float
+        self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
     ) -> tuple[FloatArray, FloatArray]:
         """See `Propagator.propagate`."""
-        dts_s = dt_s * np.arange(1, steps + 1, dtype=float)[:, None]
-        starts = np.broadcast_to(mean, (steps, *mean.shape))
-        F = self.motion.jacobian(starts, dts_s)
-        Q = self.motion.process_noise(starts, dts_s)
-        spread = F @ covariance @ np.swapaxes(F, -1, -2) + Q
-        return self.motion.predict(starts, dts_s), symmetrise(spread)
+        return predict(mean, covariance, self.motion, steps * dt_s)
 
     def settle(self, mean: FloatArray) -> FloatArray:
         """See `Propagator.settle`."""
@@ -51,72 +47,105 @@ class ExactPropagator:
 class EulerCtrv:
     """CTRV in Euler steps (Karle et al. 2023, eq. 10), all of them in closed form.
 
-    The transition of one step differs from the identity in five entries, so the product of k steps is made of
-    running sums, and so is its inverse. With Phi_k the product, P_k = Phi_k (P_0 + sum_j Phi_j^-1 Q Phi_j^-T) Phi_k'.
-    States beyond the yaw rate are carried along unchanged.
+    The transition of one step differs from the identity in five entries, so the product Phi(K, j) of the steps from
+    j to K is made of differences of running sums; the noise gathered is the sum of Phi(K, j) Q Phi(K, j)' over j.
+    States beyond the yaw rate are carried along unchanged, and so is their noise.
     """
 
     def __init__(self, motion: MotionModel, density: FloatArray) -> None:
         """`density`: diagonal of Q per second, shape (n,), along and across the heading first."""
         self.motion = motion
         self._density = density
+        self._root = np.sqrt(density[YAW : YAW_RATE + 1])
         self._isotropic = bool(density[0] == density[1])
 
     def propagate(
-        self, mean: FloatArray, covariance: FloatArray, steps: int, dt_s: float
+        self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
     ) -> tuple[FloatArray, FloatArray]:
         """See `Propagator.propagate`."""
-        before = np.arange(steps, dtype=float)[:, None]
-        yaw = self.yaws(mean, before * dt_s)
-        speed = self.speeds(mean, before * dt_s)
-        c, s = dt_s * np.cos(yaw), dt_s * np.sin(yaw)
-        dx, dy = speed * c, speed * s
+        longest = int(steps.max(initial=0))
+        if not longest:
+            return mean, covariance
+        before_s = dt_s * np.arange(longest, dtype=float)  # elapsed before each step
+        going = (np.arange(longest) < steps[:, None]).astype(float)  # (m, K); 0 where an object has arrived
+        yaw = self.yaws(mean, before_s)
+        speed = self.speeds(mean, before_s)
+        sums = np.empty((6, *yaw.shape))
+        c, s, x, y, x_late, y_late = sums
+        step_s = dt_s * going
+        np.multiply(np.cos(yaw), step_s, out=c)
+        np.multiply(np.sin(yaw), step_s, out=s)
+        np.multiply(speed, c, out=x)
+        np.multiply(speed, s, out=y)
+        np.multiply(x, before_s, out=x_late)
+        np.multiply(y, before_s, out=y_late)
+        sums.cumsum(axis=2, out=sums)
+        total = sums[:, :, -1]
 
-        out = np.repeat(mean[None], steps, axis=0)
-        out[:, :, 0] += np.cumsum(dx, axis=0)
-        out[:, :, 1] += np.cumsum(dy, axis=0)
-        out[:, :, YAW] = self.yaws(mean, (before + 1.0) * dt_s)
-        out[:, :, SPEED] = self.speeds(mean, (before + 1.0) * dt_s)
+        elapsed_s = np.asarray(steps * dt_s)
+        after = mean.copy()
+        after[:, 0] += total[2]
+        after[:, 1] += total[3]
+        after[:, YAW] = self.yaws(mean, elapsed_s[:, None])[:, 0]
+        after[:, SPEED] = self.speeds(mean, elapsed_s[:, None])[:, 0]
 
-        elapsed = (before + 1.0) * dt_s
-        turn = np.array([-dy, dx])  # one step's dx'/dyaw and dy'/dyaw, shape (2, steps, m)
-        by_yaw = np.cumsum(turn, axis=1)
-        by_speed = np.cumsum(np.array([c, s]), axis=1)
-        by_rate = np.cumsum(turn * (before * dt_s), axis=1)
-        n = mean.shape[-1]
-        forward = np.zeros((2, *yaw.shape, n, n))  # Phi and its inverse
-        forward[..., range(n), range(n)] = 1.0
-        phi, psi = forward
-        phi[:, :, :2, YAW] = np.moveaxis(by_yaw, 0, -1)
-        phi[:, :, :2, SPEED] = np.moveaxis(by_speed, 0, -1)
-        phi[:, :, :2, YAW_RATE] = np.moveaxis(by_rate, 0, -1)
-        phi[:, :, YAW, YAW_RATE] = elapsed
-        psi[:, :, :2, YAW : YAW_RATE + 1] = -phi[:, :, :2, YAW : YAW_RATE + 1]
-        psi[:, :, :2, YAW_RATE] += np.moveaxis(by_yaw * elapsed, 0, -1)
-        psi[:, :, YAW, YAW_RATE] = -elapsed
+        Phi = np.zeros(covariance.shape)
+        Phi[:, range(len(self._density)), range(len(self._density))] = 1.0
+        Phi[:, 0, YAW : YAW_RATE + 1] = np.array([-total[3], total[0], -total[5]]).T
+        Phi[:, 1, YAW : YAW_RATE + 1] = np.array([total[2], total[1], total[4]]).T
+        Phi[:, YAW, YAW_RATE] = elapsed_s
+        spread = Phi @ covariance @ np.swapaxes(Phi, -1, -2)
+        spread += self._gathered(sums, total, yaw, going, elapsed_s, before_s + dt_s, dt_s)
+        return after, symmetrise(spread)
 
+    def _gathered(
+        self,
+        sums: FloatArray,
+        total: FloatArray,
+        yaw: FloatArray,
+        going: FloatArray,
+        elapsed_s: FloatArray,
+        passed_s: FloatArray,
+        dt_s: float,
+    ) -> FloatArray:
+        """Noise gathered: the sum over j of G_j G_j', with G_j the driven columns of Phi(K, j) times sqrt(Q)."""
+        n = len(self._density)
+        rest = total[:, :, None] - sums  # from step j to the end
+        rest_s = elapsed_s[:, None] - passed_s
+        driven = np.zeros((len(yaw), 5, 3, yaw.shape[1]))  # rows x, y, yaw, speed, rate; by yaw, speed, rate
+        np.negative(rest[3], out=driven[:, 0, 0])
+        driven[:, 1, 0] = rest[2]
+        driven[:, 0, 1] = rest[0]
+        driven[:, 1, 1] = rest[1]
+        # the yaw rate at j turns only what comes later: sum over i >= j of dx_i (t_i - t_j)
+        driven[:, 0, 2] = passed_s * rest[3] - rest[5]
+        driven[:, 1, 2] = rest[4] - passed_s * rest[2]
+        driven[:, 2, 0] = going
+        driven[:, 3, 1] = going
+        driven[:, 2, 2] = rest_s * going
+        driven[:, 4, 2] = going
+        driven *= np.sqrt(dt_s) * self._root[:, None]
+        flat = driven.reshape(len(yaw), 5, -1)
+        gathered = np.zeros((len(yaw), n, n))
+        gathered[:, :5, :5] = flat @ np.swapaxes(flat, -1, -2)
         if self._isotropic:
-            noise = (psi * (self._density * dt_s)) @ np.swapaxes(psi, -1, -2)
+            gathered[:, 0, 0] += self._density[0] * elapsed_s
+            gathered[:, 1, 1] += self._density[0] * elapsed_s
         else:
-            noise = psi @ self._turned_noise(yaw, dt_s) @ np.swapaxes(psi, -1, -2)
-        gathered = covariance + np.cumsum(noise, axis=0)
-        return out, symmetrise(phi @ gathered @ np.swapaxes(phi, -1, -2))
-
-    def _turned_noise(self, yaw: FloatArray, dt_s: float) -> FloatArray:
-        """Q of one step with its position block turned from the heading to the map, shape (..., n, n)."""
-        Q = np.zeros((*yaw.shape, len(self._density), len(self._density)))
-        Q[...] = np.diag(self._density * dt_s)
-        turn = rotations(yaw)
-        Q[..., :2, :2] = turn @ Q[..., :2, :2] @ np.swapaxes(turn, -1, -2)
-        return Q
+            turn = rotations(yaw)
+            turned = turn @ np.diag(self._density[:2] * dt_s) @ np.swapaxes(turn, -1, -2)
+            gathered[:, :2, :2] += np.sum(turned * going[:, :, None, None], axis=1)
+        for rest_of_state in range(5, n):
+            gathered[:, rest_of_state, rest_of_state] = self._density[rest_of_state] * elapsed_s
+        return gathered
 
     def yaws(self, mean: FloatArray, elapsed_s: FloatArray) -> FloatArray:
-        """Yaw after `elapsed_s` (k, 1), shape (k, m)."""
-        return np.asarray(mean[:, YAW] + elapsed_s * mean[:, YAW_RATE])
+        """Yaw of each object after `elapsed_s`, (k,) or (m, k); shape (m, k)."""
+        return np.asarray(mean[:, YAW, None] + elapsed_s * mean[:, YAW_RATE, None])
 
     def speeds(self, mean: FloatArray, elapsed_s: FloatArray) -> FloatArray:
-        """Speed after `elapsed_s` (k, 1), shape (k, m)."""
-        return np.broadcast_to(mean[:, SPEED], (len(elapsed_s), len(mean)))
+        """Speed of each object after `elapsed_s`, (k,) or (m, k); shape (m, k) or (m, 1)."""
+        return mean[:, SPEED, None]
 
     def settle(self, mean: FloatArray) -> FloatArray:
         """See `Propagator.settle`."""

@@ -6,7 +6,7 @@ Its yaw is 0 along +y and jumps at +-pi there, which in REP-103 is at 3 pi / 2 (
 import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
-from fgtrack.core.types import ACCEL, SPEED, YAW, FloatArray, IntArray
+from fgtrack.core.types import ACCEL, SPEED, YAW, FloatArray
 from fgtrack.estimation.backward_forward import BackwardForwardBank
 from fgtrack.estimation.propagation import EulerCtrv
 
@@ -24,7 +24,7 @@ class AcceleratedEulerCtrv(EulerCtrv):
 
     def speeds(self, mean: FloatArray, elapsed_s: FloatArray) -> FloatArray:
         """See `EulerCtrv.speeds`."""
-        return np.asarray(mean[:, SPEED] + elapsed_s * mean[:, ACCEL])
+        return np.asarray(mean[:, SPEED, None] + elapsed_s * mean[:, ACCEL, None])
 
 
 class SaturatedYaw:
@@ -66,9 +66,8 @@ class LeadingClock(BackwardForwardBank):
 class StalePresent(BackwardForwardBank):
     """An update that is not delayed does not reach the stored present state (defect Q8)."""
 
-    def _store(self, back: int, slot: int, rows: IntArray) -> None:
-        if back:
-            super()._store(back, slot, rows)
+    def _visible_from(self, back: int) -> int:
+        return self._grid - back if back else self._grid + 1
 
 
 class LeadingClockStalePresent(LeadingClock, StalePresent):

@@ -1,5 +1,6 @@
 """How figures look, and how they are saved: the same bytes every time, whatever the user's own settings."""
 
+import math
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -13,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 
 #: Colours of Okabe and Ito, which the colour-blind tell apart as well.
@@ -21,7 +21,7 @@ PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 WRONG = "#000000"
 GREY = "#777777"
 
-_BREAK_NS = NS_PER_S // 2  # a line is not drawn across a longer pause
+_PAUSE_STEPS = 3  # a line is not drawn across a pause that is longer than as many usual steps
 
 _LINES = ("-", "--", ":", "-.")
 
@@ -94,11 +94,17 @@ def log_axis(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def broken_line(stamps_ns: IntArray, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Points in order of time, with a NaN where the time jumps, so that no line is drawn there."""
+def usual_step_ns(stamps_ns: IntArray) -> float:
+    """Median step between distinct stamps; infinite where there is only one."""
+    steps_ns = np.diff(np.unique(stamps_ns))
+    return float(np.median(steps_ns)) if len(steps_ns) else math.inf
+
+
+def broken_line(stamps_ns: IntArray, x: FloatArray, y: FloatArray, step_ns: float) -> tuple[FloatArray, FloatArray]:
+    """Points in order of time, usually `step_ns` apart, with a NaN in every pause, so that no line is drawn there."""
     order = np.argsort(stamps_ns, kind="stable")
-    jumps = np.flatnonzero(np.diff(stamps_ns[order]) > _BREAK_NS) + 1
-    return np.insert(x[order], jumps, np.nan), np.insert(y[order], jumps, np.nan)
+    pauses = np.flatnonzero(np.diff(stamps_ns[order]) > _PAUSE_STEPS * step_ns) + 1
+    return np.insert(x[order], pauses, np.nan), np.insert(y[order], pauses, np.nan)
 
 
 @styled

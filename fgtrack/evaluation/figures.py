@@ -18,6 +18,7 @@ from fgtrack.evaluation.figure_style import (
     log_axis,
     save,
     styled,
+    usual_step_ns,
 )
 from fgtrack.evaluation.labels import labelled
 from fgtrack.evaluation.map_figure import figure_map
@@ -98,7 +99,7 @@ def save_figures(runs: Sequence[Run], out_dir: Path, options: MatchOptions | Non
 def figure_residuals(run: Run, title: str = "") -> Figure:
     """Residuals (innovations) per sensor, a row per component: over time, and how they are distributed.
 
-    Bins and axes cover all but the outermost 0.5 % on either side; the legend says how many lie outside.
+    Bins and axes cover the bulk of every sensor's residuals; the legend says how many lie outside.
     """
     values = residuals(run)
     updates = run.updates
@@ -110,11 +111,10 @@ def figure_residuals(run: Run, title: str = "") -> Figure:
     figure = Figure(figsize=(10.0, 0.8 + 2.4 * len(names)))
     rows = figure.subplots(len(names), 2, squeeze=False, sharey="row", width_ratios=(2, 1))
     for (over_time, histogram), name in zip(rows, names, strict=True):
-        known = np.isfinite(values[name])
-        low, high = _core(values[name][known])
+        known = {sensor: np.isfinite(values[name]) & (updates["sensor"] == sensor) for sensor in sensors}
+        low, high = _core([values[name][mine] for mine in known.values() if mine.any()])
         bins = np.linspace(low, high, 41)
-        for k, sensor in enumerate(sensors):
-            mine = known & (updates["sensor"] == sensor)
+        for k, (sensor, mine) in enumerate(known.items()):
             sample = values[name][mine]
             if not len(sample):
                 continue
@@ -175,18 +175,19 @@ def figure_errors(matchings: Mapping[str, Matching], object_id: int) -> Figure:
         if object_id in matching.object_ids:
             every = track_errors(matching)
             mine = every.object_index == matching.object_ids.index(object_id)
-            errors[label] = (every.stamps_ns[mine], {k: v[mine] for k, v in every.values.items()})
-    start_ns = min((int(stamps.min()) for stamps, _ in errors.values() if len(stamps)), default=0)
-    names = [k for k in _QUANTITIES if any(np.isfinite(v[k]).any() for _, v in errors.values())]
+            values = {k: v[mine] for k, v in every.values.items()}
+            errors[label] = every.stamps_ns[mine], values, usual_step_ns(matching.tracks["now_ns"])
+    start_ns = min((int(stamps.min()) for stamps, _, _ in errors.values() if len(stamps)), default=0)
+    names = [k for k in _QUANTITIES if any(np.isfinite(v[k]).any() for _, v, _ in errors.values())]
     names = names or ["position_m"]
     figure = Figure(figsize=(10.0, 1.4 + 2.0 * len(names)))
     rows = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     for axes, name in zip(rows, names, strict=True):
-        for k, (label, (stamps_ns, values)) in enumerate(errors.items()):
+        for k, (label, (stamps_ns, values, step_ns)) in enumerate(errors.items()):
             moments = Moments.of(values[name])
             unit = _QUANTITIES[name].rpartition("[")[2][:-1]
             rmse = f"RMSE {moments.rmse:.3g} {unit}" if moments.count else "never tracked"
-            line = broken_line(stamps_ns, (stamps_ns - start_ns) / NS_PER_S, values[name])
+            line = broken_line(stamps_ns, (stamps_ns - start_ns) / NS_PER_S, values[name], step_ns)
             axes.plot(*line, color=colour(k), ls=line_style(k), lw=0.9, alpha=0.85, label=f"{label}: {rmse}")
         axes.set_ylabel(_QUANTITIES[name])
         legend_above(axes, width=140)
@@ -233,11 +234,15 @@ def _title(run: str, what: str) -> str:
     return f"{run}: {what}" if run else what[0].upper() + what[1:]
 
 
-def _core(sample: FloatArray) -> tuple[float, float]:
-    """Range of `sample` without its outermost 0.5 % on either side, a little wider."""
-    low, high = np.quantile(sample, (0.005, 0.995)).tolist()
-    margin = max(0.15 * (high - low), 1e-6)
-    return low - margin, high + margin
+def _core(samples: Sequence[FloatArray]) -> tuple[float, float]:
+    """Range that holds the bulk of every one of `samples`: three interquartile ranges beyond the quartiles."""
+    lows, highs = [], []
+    for sample in samples:
+        first, third = np.quantile(sample, (0.25, 0.75)).tolist()
+        lows.append(max(float(sample.min()), first - 3.0 * (third - first)))
+        highs.append(min(float(sample.max()), third + 3.0 * (third - first)))
+    margin = max(0.05 * (max(highs) - min(lows)), 1e-6)
+    return min(lows) - margin, max(highs) + margin
 
 
 def _delays(run: Run) -> dict[str, tuple[IntArray, FloatArray]]:

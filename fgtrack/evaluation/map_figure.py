@@ -5,36 +5,48 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
-from fgtrack.evaluation.figure_style import GREY, WRONG, broken_line, colour, legend_above, styled
+from fgtrack.core.errors import DataError
+from fgtrack.evaluation.figure_style import GREY, WRONG, broken_line, colour, legend_above, styled, usual_step_ns
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, Matching
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run_folder import Run, Table
 from fgtrack.models.track_map import TrackMap
+from fgtrack.sim.oval import make_oval
+from fgtrack.sim.scenario import OVAL
 
 _NAMED_OBJECTS = 8  # more objects than these share two entries of the legend
 
 
 @styled
 def figure_map(run: Run, matching: Matching | None, title: str = "") -> Figure:
-    """Tracks and truth on the map whose file `meta.json` names as `map`.
+    """Tracks and truth on the map that `config.yaml` names as `map.track`.
 
     Truth is a broad pale line, so a stretch that nothing tracked stays visible; a track has the colour of the
     object that it is paired to, and is black where it is paired to none. Without truth every track with
     enough measurements has a colour.
+
+    Raises
+    ------
+    DataError
+        `config.yaml` is not YAML, or the map that it names is no map.
     """
     figure = Figure(figsize=(8.0, 7.0))
     axes = figure.add_subplot()
-    file = run.meta.get("map")
-    if file is not None:
-        if Path(str(file)).exists():
-            _draw_bounds(axes, TrackMap.read(Path(str(file))))
-        else:
-            title += "\n(the map file is not there any more)"
+    name = _map_name(run)
+    if name == OVAL:
+        _draw_bounds(axes, make_oval())
+    elif name and Path(name).exists():
+        _draw_bounds(axes, TrackMap.read(Path(name)))
+    elif name:
+        title += "\n(the map file is not there any more)"
     if matching is None:
         tracks = run.tracks.where(run.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS)
+        step_ns = usual_step_ns(tracks["now_ns"])
         for k, track_id in enumerate(np.unique(tracks["track_id"]).tolist()):
-            _draw_tracks(axes, tracks.where(tracks["track_id"] == track_id), colour(k), "")
+            _draw_tracks(axes, tracks.where(tracks["track_id"] == track_id), step_ns, colour(k), "")
         count = len(np.unique(tracks["track_id"]))
         title += f"\n{count} tracks with at least {CONFIRMED_MEASUREMENTS} measurements, no truth"
     else:
@@ -47,6 +59,16 @@ def figure_map(run: Run, matching: Matching | None, title: str = "") -> Figure:
     return figure
 
 
+def _map_name(run: Run) -> str | None:
+    try:
+        config = YAML(typ="safe", pure=True).load(run.config_text)
+    except YAMLError as error:
+        raise DataError(f"{run.path / 'config.yaml'}: is not YAML, repeat the run") from error
+    section = config.get("map") if isinstance(config, dict) else None
+    name = section.get("track") if isinstance(section, dict) else None
+    return None if name is None else str(name)
+
+
 def _draw_bounds(axes: Axes, track_map: TrackMap) -> None:
     s_m = np.linspace(0.0, track_map.length_m, 2000)
     left_m, right_m = track_map.bounds(s_m)
@@ -55,21 +77,23 @@ def _draw_bounds(axes: Axes, track_map: TrackMap) -> None:
 
 
 def _draw_matched(axes: Axes, run: Run, matching: Matching) -> None:
-    paths = true_paths(run.truth)
+    paths, tracks = true_paths(run.truth), matching.tracks
+    step_ns = usual_step_ns(tracks["now_ns"])
     few = len(paths) <= _NAMED_OBJECTS
     for index, path in enumerate(paths):
         name = f"object {path.object_id}" if few else "objects"
         label = f"{name}, truth" if few or not index else ""
-        line = broken_line(path.stamps_ns, *path.states[:, :2].T)
+        x_m, y_m = path.states[:, :2].T
+        line = broken_line(path.stamps_ns, x_m, y_m, usual_step_ns(path.stamps_ns))
         axes.plot(*line, color=colour(index), lw=4.0, alpha=0.3, label=label)
         label = f"{name}, track" if few or not index else ""
-        _draw_tracks(axes, matching.tracks.where(matching.object_index == index), colour(index), label)
-    _draw_tracks(axes, matching.tracks.where(~matching.paired), WRONG, "paired to no object")
+        _draw_tracks(axes, tracks.where(matching.object_index == index), step_ns, colour(index), label)
+    _draw_tracks(axes, tracks.where(~matching.paired), step_ns, WRONG, "paired to no object")
 
 
-def _draw_tracks(axes: Axes, tracks: Table, color: str, label: str) -> None:
+def _draw_tracks(axes: Axes, tracks: Table, step_ns: float, color: str, label: str) -> None:
     for track_id in np.unique(tracks["track_id"]).tolist():
         rows = tracks.where(tracks["track_id"] == track_id)
-        line = broken_line(rows["stamp_ns"], rows["x_m"], rows["y_m"])
+        line = broken_line(rows["stamp_ns"], rows["x_m"], rows["y_m"], step_ns)
         axes.plot(*line, color=color, lw=1.2, label=label, zorder=4)
         label = ""

@@ -1,6 +1,7 @@
 """Reads recordings: rosbag2 folders, single MCAP and SQLite files, ROS 1 bags; without ROS.
 
-This module and those behind it (`bag_files`, `typestore`, `bag_writer`) are the only importers of rosbags.
+This module and those behind it (`bag_files`, `mcap_file`, `sqlite3_file`, `rosbag1_file`, `typestore`), the writer
+(`bag_writer`, `ros_messages`) and nothing else import rosbags.
 """
 
 import re
@@ -17,8 +18,9 @@ from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
 
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S
-from fgtrack.io.bag_files import BagFile, BagFolder, Rosbag1File, merged, storage_of
+from fgtrack.io.bag_files import BagFile, BagFolder, EmptyFile, merged, storage_of
 from fgtrack.io.errors import TruncatedInput
+from fgtrack.io.rosbag1_file import Rosbag1File
 from fgtrack.io.typestore import build_typestore, one_line, type_name
 
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -181,6 +183,16 @@ def _bag_files(path: Path) -> list[Path]:
     return sorted((file for file in path.iterdir() if file.suffix in _BAG_SUFFIXES), key=natural)
 
 
+def _bag_file(path: Path, alone: bool) -> BagFile:
+    empty = path.stat().st_size == 0
+    if empty and not alone:
+        return EmptyFile(path)
+    kind = storage_of(path)
+    if kind is None:
+        raise DataError(f"{path}: {'is empty' if empty else 'is not a bag file'}")
+    return kind(path)
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[list[BagFile]]:
     with ExitStack() as stack:
@@ -192,12 +204,9 @@ def _opened(path: Path) -> Iterator[list[BagFile]]:
             # Its storages are made from STORAGE_PLUGINS, which are BagFiles.
             files += cast("list[BagFile]", folder.storages)
         else:
-            for part in _bag_files(path) if path.is_dir() else [path]:
-                kind = storage_of(part)
-                if kind is None:
-                    empty = part.stat().st_size == 0
-                    raise DataError(f"{part}: {'is empty' if empty else 'is not a bag file'}")
-                file = kind(part)
+            parts = _bag_files(path) if path.is_dir() else [path]
+            for part in parts:
+                file = _bag_file(part, alone=len(parts) == 1)
                 file.open()
                 stack.callback(file.close)
                 files.append(file)

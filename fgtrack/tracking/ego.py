@@ -2,7 +2,7 @@
 
 import bisect
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 from fgtrack.core.geometry import wrap_angle
@@ -59,12 +59,20 @@ def extrapolated(ego: EgoState, stamp_ns: int) -> EgoPose:
     )
 
 
-def low_passed(previous: EgoState, ego: EgoState, yaw_weight: float, yaw_rate_weight: float) -> EgoState:
-    """`ego` with yaw and yaw rate drawn towards `previous`; the weights are those of the new value."""
-    return replace(
-        ego,
-        yaw_rad=wrap_angle(previous.yaw_rad + yaw_weight * wrap_angle(ego.yaw_rad - previous.yaw_rad)),
-        yaw_rate_radps=(1.0 - yaw_rate_weight) * previous.yaw_rate_radps + yaw_rate_weight * ego.yaw_rate_radps,
+def low_passed(
+    yaw_rad: float, yaw_rate_radps: float, ego: EgoState, yaw_weight: float, yaw_rate_weight: float
+) -> EgoState:
+    """`ego` with its yaw and yaw rate drawn towards the given ones; the weights are those of the new values."""
+    return EgoState(
+        ego.stamp_ns,
+        ego.receipt_ns,
+        ego.x_m,
+        ego.y_m,
+        wrap_angle(yaw_rad + yaw_weight * wrap_angle(ego.yaw_rad - yaw_rad)),
+        ego.speed_mps,
+        (1.0 - yaw_rate_weight) * yaw_rate_radps + yaw_rate_weight * ego.yaw_rate_radps,
+        ego.accel_mps2,
+        ego.in_pit,
     )
 
 
@@ -112,8 +120,8 @@ class EgoTrajectory:
         return None
 
     def _filtered(self, previous: EgoState, ego: EgoState) -> EgoState:
-        turned = replace(previous, yaw_rad=extrapolated(previous, ego.stamp_ns).yaw_rad)
-        return low_passed(turned, ego, self._yaw_weight, self._yaw_rate_weight)
+        expected_rad = previous.yaw_rad + previous.yaw_rate_radps * seconds(ego.stamp_ns - previous.stamp_ns)
+        return low_passed(expected_rad, previous.yaw_rate_radps, ego, self._yaw_weight, self._yaw_rate_weight)
 
     def start_tick(self) -> None:
         """See `EgoSource.start_tick`; nothing depends on ticks here."""

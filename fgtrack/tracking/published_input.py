@@ -53,7 +53,13 @@ class PublishedEgo:
         repeated = bool(self._stored) and self._stored[-1].stamp_ns == self._current.stamp_ns
         before = self._stored[-2:-1] if repeated else self._stored[-1:]
         if before:
-            self._current = low_passed(before[0], self._current, self._yaw_weight, self._yaw_rate_weight)
+            self._current = low_passed(
+                before[0].yaw_rad,
+                before[0].yaw_rate_radps,
+                self._current,
+                self._yaw_weight,
+                self._yaw_rate_weight,
+            )
         if repeated:
             self._stored[-1] = self._current
         else:

@@ -1,3 +1,4 @@
+import math
 import os
 import signal
 import sqlite3
@@ -39,13 +40,22 @@ def read(path: Path, config: InputConfig | None = None) -> list:
 # --- what fgtrack writes
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=25)
 @given(messages=message_lists(), storage=st.sampled_from(STORAGES), standard=st.booleans())
 def test_every_field_survives_the_bag_to_the_bit_and_in_order(tmp_path_factory, messages, storage, standard):
     path = tmp_path_factory.mktemp("bag") / "bag"
     assert write_bag(path, messages, storage, standard) == len(messages)
     if messages:
         assert exact(read(path)) == exact(messages)
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_zero_minus_zero_not_a_number_and_absent_are_four_different_things(tmp_path, storage):
+    values = (0.0, -0.0, math.nan, None)
+    objects = tuple(Detection(x_m=value, yaw_rad=value, speed_mps=value, object_id=0) for value in values)
+    messages = [DetectionList("lidar", 0, 0, objects), *(TruthState(0, 0, 0, -0.0, 0.0, value) for value in values)]
+    write_bag(tmp_path / "bag", messages, storage)
+    assert exact(read(tmp_path / "bag")) == exact(messages)
 
 
 def test_both_storages_read_back_the_same_as_the_stream(tmp_path):
@@ -248,11 +258,12 @@ def make_odometry(store, stamp_ns, ros1=False):
 ODOMETRY_STATE = EgoState(5, 9, 1.0, 2.0, pytest.approx(1.5707963267948966), -3.0, 0.5)
 
 
-@pytest.mark.parametrize("mode", list(CompressionMode))
-@pytest.mark.parametrize("plugin", list(StoragePlugin))
-def test_compressed_recordings_are_read(tmp_path, humble, mode, plugin):
-    if mode == CompressionMode.STORAGE and plugin == StoragePlugin.SQLITE3:
-        pytest.skip("SQLite has no compression of its own")
+@pytest.mark.parametrize(
+    ("plugin", "mode"),
+    [(StoragePlugin.MCAP, mode) for mode in CompressionMode]
+    + [(StoragePlugin.SQLITE3, mode) for mode in CompressionMode if mode != CompressionMode.STORAGE],
+)
+def test_compressed_recordings_are_read(tmp_path, humble, plugin, mode):
     writer = Writer(tmp_path / "bag", version=9, storage_plugin=plugin)
     writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
@@ -269,6 +280,39 @@ def test_a_ros1_bag_is_read(tmp_path):
         data = store.serialize_ros1(make_odometry(store, 5, ros1=True), "nav_msgs/msg/Odometry")
         writer.write(connection, 9, bytes(data))
     assert read(tmp_path / "a.bag", InputConfig(ego=TopicInput("/odom"))) == [ODOMETRY_STATE]
+
+
+@pytest.mark.parametrize("compression", [None, *Rosbag1Writer.CompressionFormat])
+def test_a_truncated_ros1_bag_gives_its_whole_chunks(tmp_path, compression):
+    store = get_typestore(Stores.ROS1_NOETIC)
+    path = tmp_path / "a.bag"
+    writer = Rosbag1Writer(path)
+    if compression:
+        writer.set_compression(compression)
+    writer.chunk_threshold = 2000
+    with writer:
+        connection = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=store)
+        for time_ns in range(20):
+            data = store.serialize_ros1(make_odometry(store, 5, ros1=True), "nav_msgs/msg/Odometry")
+            writer.write(connection, time_ns, bytes(data))
+    config = InputConfig(ego=TopicInput("/odom"))
+    assert len(read(path, config)) == 20
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * 0.6)])
+    readable = UntilBreak(open_input(path, config).messages())
+    found = list(readable)
+    assert readable.error is not None
+    assert 5 < len(found) < 20
+    assert [message.receipt_ns for message in found] == list(range(len(found)))
+
+
+def test_an_empty_last_part_is_a_break_and_the_others_are_read(tmp_path):
+    write_bag(tmp_path / "bag_0", drive())
+    (tmp_path / "bag_0/metadata.yaml").unlink()
+    (tmp_path / "bag_0/bag_1.mcap").touch()
+    readable = UntilBreak(open_input(tmp_path / "bag_0").messages())
+    assert list(readable) == drive()
+    assert "is empty" in str(readable.error)
 
 
 def test_messages_of_split_files_come_in_log_time_order(tmp_path, humble):

@@ -27,7 +27,7 @@ class Situation:
     duration_s: float = 5.0
     epoch_ns: int = 1_000_000_000_000
     clock: str = "node"  # node, jitter, gaps
-    start: str = "anywhere"  # anywhere, closing (point of the lap), jump (of the heading)
+    start: str = "anywhere"  # anywhere, closing (point of the lap), jump (of the heading), jump_rep103
 
     ego_speed_mps: tuple[float, ...] = (40.0, 70.0)  # one of these ...
     ego_speed_changes_mps: float = 0.0  # ... plus what a sine adds
@@ -54,10 +54,12 @@ class Situation:
     num_objects: tuple[int, int] = (1, 6)
     spread_m: float = 60.0
     objects_gone_s: Interval = NEVER
+    relative_speed_mps: float = 3.0  # standard deviation over the objects
     in_pit_p: float = 0.0
     seen_p: float = 0.9
     clutter: float = 0.3
     noise_m: float = 0.3
+    noise_rad: float = 0.1
     zero_p: float = 0.0
     nan_p: float = 0.0
 
@@ -104,14 +106,21 @@ SITUATIONS = {
     "only_radar": Situation(sensors=("radar",), objects_gone_s=(1.5, 3.0), spread_m=100.0),
     "empty_lists": Situation(empty_p=0.4, delay="huge"),
     "nothing_but_clutter": Situation(num_objects=(0, 0), clutter=3.0),
-    "faulty_objects": Situation(zero_p=0.3, nan_p=0.3, num_objects=(0, 3), clutter=0.1),
+    "faulty_objects": Situation(zero_p=0.3, nan_p=0.3, num_objects=(0, 3), clutter=0.1, object_stamps=True),
     "duplicates": Situation(duplicate_p=0.3, burst_p=0.1),
     "bursts": Situation(burst_p=0.5),
     "jittering_clock": Situation(clock="jitter"),
     "jittering_clock_on_time": Situation(clock="jitter", delay="none"),
     "clock_with_gaps": Situation(duration_s=14.0, clock="gaps", sensors_hz=5.0, ego_hz=20.0),
+    "rare_lists_and_gaps": Situation(duration_s=14.0, clock="gaps", sensors_hz=0.5, ego_hz=20.0),
+    "wound_up_yaw": Situation(
+        duration_s=30.0, clock="gaps", sensors_hz=5.0, ego_hz=10.0, ego_speed_mps=(0.0,), relative_speed_mps=0.0, noise_rad=2.0
+    ),
     "closing_point": Situation(start="closing", duration_s=4.0),
     "heading_jump": Situation(start="jump", duration_s=4.0),
+    "heading_jump_dense": Situation(start="jump", duration_s=3.0, num_objects=(8, 14), spread_m=30.0),
+    "heading_jump_slow": Situation(start="jump", ego_speed_mps=(6.0,), num_objects=(8, 14), spread_m=30.0),
+    "rep103_jump_dense": Situation(start="jump_rep103", duration_s=3.0, num_objects=(8, 14), spread_m=30.0),
 }
 
 
@@ -129,7 +138,7 @@ def anything(rng: np.random.Generator) -> Situation:
         duration_s=6.0,
         epoch_ns=sometimes(TODAY_NS, 1_000_000_000_000),
         clock=sometimes(str(rng.choice(["jitter", "gaps"])), "node"),
-        start=str(rng.choice(["anywhere", "closing", "jump"])),
+        start=str(rng.choice(["anywhere", "closing", "jump", "jump_rep103"])),
         ego_speed_mps=(0.0, 5.0, 9.9, 10.0, 30.0, 60.0, 90.0),
         ego_speed_changes_mps=float(rng.uniform(0.0, 5.0)),
         ego_exact_speeds_mps=sometimes((10.0, 0.0), ()),
@@ -141,6 +150,7 @@ def anything(rng: np.random.Generator) -> Situation:
         ego_resent_p=sometimes(0.03, 0.0),
         ego_nan_p=sometimes(0.2, 0.0),
         pit_toggle_p=sometimes(0.02, 0.0),
+        sensors=tuple(str(name) for name in rng.permutation(list(DELAYS_S))[: rng.integers(1, 4)]),
         sensors_silent_s=sometimes(silence(), NEVER),
         sensors_hz=float(rng.choice([5.0, 20.0, 33.0])),
         delay=str(rng.choice(["usual", "none", "tiny", "future", "huge"])),
@@ -156,6 +166,7 @@ def anything(rng: np.random.Generator) -> Situation:
         seen_p=float(rng.uniform(0.5, 1.0)),
         clutter=float(rng.uniform(0.0, 1.5)),
         noise_m=float(rng.choice([0.0, 0.3, 2.0])),
+        noise_rad=float(rng.choice([0.0, 0.1, 2.0])),
         zero_p=sometimes(0.1, 0.0),
         nan_p=sometimes(0.1, 0.0),
     )
@@ -170,6 +181,7 @@ class Line:
         self.arcs = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.points, axis=0).T))])
         self.lap_m = float(self.arcs[-1])
         self.jump_m = float(self.arcs[np.argmax(np.abs(np.diff(heading)))])
+        self.jump_rep103_m = float(self.arcs[np.argmin(np.abs(heading - math.pi / 2))])
 
     def pose(self, arc: float, left: float) -> tuple[Array, float]:
         """Position, shape (2,), `left` of the line, and yaw (REP-103)."""
@@ -186,7 +198,12 @@ class World:
 
     def __init__(self, situation: Situation, rng: np.random.Generator, track: Line, pit: Line) -> None:
         self.situation, self.rng, self.track = situation, rng, track
-        begin = {"anywhere": rng.uniform(0.0, track.lap_m), "closing": track.lap_m, "jump": track.jump_m}
+        begin = {
+            "anywhere": rng.uniform(0.0, track.lap_m),
+            "closing": track.lap_m,
+            "jump": track.jump_m,
+            "jump_rep103": track.jump_rep103_m,
+        }
         self.speed = float(rng.choice(situation.ego_speed_mps))
         ahead_m = 0.0 if situation.start == "anywhere" else rng.uniform(0.2, 0.8) * situation.duration_s * self.speed
         self.begin_m = float(begin[situation.start] - ahead_m)
@@ -197,7 +214,7 @@ class World:
                 pit if rng.random() < situation.in_pit_p else track,
                 float(rng.uniform(-spread, spread)),
                 float(rng.uniform(-6.0, 6.0)),
-                float(rng.normal(0.0, 3.0)),
+                float(rng.normal(0.0, situation.relative_speed_mps)),
             )
             for _ in range(rng.integers(low, high + 1))
         ]
@@ -233,7 +250,7 @@ class World:
         dx, dy = position - origin + rng.normal(0.0, 1.0, 2) * self.situation.noise_m
         x = math.cos(ego_yaw) * dx + math.sin(ego_yaw) * dy + REAR_AXLE_M
         y = -math.sin(ego_yaw) * dx + math.cos(ego_yaw) * dy
-        values = [float(x), float(y), math.remainder(yaw - ego_yaw + rng.normal(0.0, 0.1), math.tau)]
+        values = [float(x), float(y), math.remainder(yaw - ego_yaw + rng.normal(0.0, self.situation.noise_rad), math.tau)]
         values.append(float(abs(speed + rng.normal(0.0, 0.3))))
         if rng.random() < self.situation.zero_p:
             values[0:2] = [0.0, 0.0]
@@ -259,6 +276,11 @@ def _times(situation: Situation, rng: np.random.Generator, hz: float, silent_s: 
     return [float(time) for time in times if not silent_s[0] <= time < silent_s[1]]
 
 
+def _stamp_ns(situation: Situation, time_s: float) -> int:
+    stamp_ns = situation.epoch_ns + round(time_s * 1e9)
+    return stamp_ns // situation.stamp_grid_ns * situation.stamp_grid_ns
+
+
 def _ego_messages(situation: Situation, world: World, rng: np.random.Generator) -> Messages:
     messages: list[EgoState] = []
     in_pit = False
@@ -276,7 +298,7 @@ def _ego_messages(situation: Situation, world: World, rng: np.random.Generator) 
         told: bool | None = None
         if rng.random() < situation.pit_toggle_p:
             told = in_pit = not in_pit
-        stamp_ns = situation.epoch_ns + round(time_s * 1e9)
+        stamp_ns = _stamp_ns(situation, time_s)
         receipt_ns = stamp_ns + int(rng.integers(1_000_000, 3_000_000))
         if messages and rng.random() < situation.ego_repeated_p:
             stamp_ns = messages[-1].stamp_ns
@@ -293,10 +315,10 @@ def _detection_lists(situation: Situation, world: World, rng: np.random.Generato
     newest_ns = 0
     for time_s in _times(situation, rng, situation.sensors_hz, situation.sensors_silent_s):
         objects = world.seen(time_s, sensor)
-        stamp_ns = (situation.epoch_ns + round(time_s * 1e9)) // situation.stamp_grid_ns * situation.stamp_grid_ns
+        stamp_ns = _stamp_ns(situation, time_s)
         receipt_ns = stamp_ns + _delay_ns(situation, rng, sensor)
         newest_ns = receipt_ns = max(receipt_ns, newest_ns, situation.epoch_ns)
-        if situation.object_stamps and sensor == "radar":
+        if situation.object_stamps:
             spread_ns = rng.integers(-20_000_000, 1_000_000, len(objects))
             objects = [_stamped(item, stamp_ns + int(own)) for item, own in zip(objects, spread_ns, strict=True)]
         messages.append(DetectionList(sensor, stamp_ns, receipt_ns, tuple(objects)))

@@ -90,13 +90,14 @@ def write_run(
     truth: Iterable[TruthState] = (),
     updates: Mapping[int, Sequence[UpdateRecord]] | None = None,
     meta: Mapping[str, object] | None = None,
+    config_text: str = "",
     process_ns: Sequence[int] = (),
     num_detections: Sequence[int] = (),
 ) -> Run:
     """A run with the `tracks` of every tick, and the `updates` by tick."""
     updates = updates or {}
     ticks = max(len(tracks), len(process_ns), 1 + max(updates, default=-1))
-    with RunWriter(path) as writer:
+    with RunWriter(path, config_text) as writer:
         for row in truth:
             writer.write_truth(row)
         for tick in range(ticks):

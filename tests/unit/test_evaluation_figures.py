@@ -22,7 +22,7 @@ from fgtrack.models.track_map import COLUMNS, TrackMap
 TICKS = range(60)
 
 
-def a_run(folder: Path, *, truth: bool = True, along_m: float = 0.3, **meta: object) -> Run:
+def a_run(folder: Path, *, truth: bool = True, along_m: float = 0.3, config_text: str = "") -> Run:
     tracks = [
         [WEST.track(k, 1, along_m=along_m), WEST.track(k, 3, across_m=50.0)]
         + ([ROUND.track(k, 2)] if k < 10 or k > 50 else [])
@@ -36,7 +36,9 @@ def a_run(folder: Path, *, truth: bool = True, along_m: float = 0.3, **meta: obj
         for k in TICKS
     }
     rows = [*WEST.truth(TICKS), *ROUND.truth(TICKS)] if truth else []
-    return write_run(folder, tracks, truth=rows, updates=updates, meta={"estimator": folder.name, **meta})
+    return write_run(
+        folder, tracks, truth=rows, updates=updates, meta={"estimator": folder.name}, config_text=config_text
+    )
 
 
 def circle_map(path: Path) -> Path:
@@ -87,7 +89,7 @@ def test_an_empty_run_has_no_figures(tmp_path: Path) -> None:
 
 
 def test_the_map_shows_bounds_truth_and_false_tracks(tmp_path: Path) -> None:
-    run = a_run(tmp_path / "run", map=str(circle_map(tmp_path / "map.csv")))
+    run = a_run(tmp_path / "run", config_text=f"map:\n  track: {circle_map(tmp_path / 'map.csv')}\n")
     (axes,) = figure_map(run, match(run)).axes
     legend = axes.get_legend()
     assert legend is not None
@@ -103,13 +105,23 @@ def test_the_map_shows_bounds_truth_and_false_tracks(tmp_path: Path) -> None:
 
 
 def test_a_map_that_is_gone_is_said_and_one_that_is_none_is_refused(tmp_path: Path) -> None:
-    gone = a_run(tmp_path / "gone", map=str(tmp_path / "nowhere.csv"))
+    gone = a_run(tmp_path / "gone", config_text="map: {track: nowhere.csv}")
     figure = figure_map(gone, match(gone))
     assert "not there any more" in figure.get_suptitle()
     (tmp_path / "bad.csv").write_text("no map\n")
-    bad = a_run(tmp_path / "bad", map=str(tmp_path / "bad.csv"))
+    bad = a_run(tmp_path / "bad", config_text=f"map:\n  track: {tmp_path / 'bad.csv'}\n")
     with pytest.raises(DataError, match="no map"):
         figure_map(bad, match(bad))
+    broken = a_run(tmp_path / "broken", config_text="map: {")
+    with pytest.raises(DataError, match="not YAML"):
+        figure_map(broken, match(broken))
+
+
+def test_the_built_in_oval_is_drawn_and_open_space_has_no_bounds(tmp_path: Path) -> None:
+    oval = a_run(tmp_path / "oval", config_text="map: {track: oval}")
+    space = a_run(tmp_path / "space", config_text="map: {track: null}")
+    count = [len(figure_map(run, match(run)).axes[0].lines) for run in (oval, space)]
+    assert count[0] == count[1] + 2
 
 
 def test_the_residual_figure_has_a_row_per_component_and_says_mean_and_deviation(tmp_path: Path) -> None:
@@ -118,6 +130,17 @@ def test_the_residual_figure_has_a_row_per_component_and_says_mean_and_deviation
     legend = axes[4].get_legend()
     assert legend is not None
     assert [text.get_text() for text in legend.get_texts()] == ["radar: mean 0.200, std 0.163, n 60"]
+
+
+def test_outliers_do_not_widen_the_residual_figure_but_are_counted(tmp_path: Path) -> None:
+    values = [0.1 * (k % 11) - 0.5 for k in TICKS]
+    values[7] = 99.0
+    updates = {k: [update(tick=k, speed_mps=value)] for k, value in enumerate(values)}
+    axes = figure_residuals(write_run(tmp_path / "run", updates=updates)).axes[0]
+    assert axes.get_ylim()[1] < 5.0
+    legend = axes.get_legend()
+    assert legend is not None
+    assert legend.get_texts()[0].get_text().endswith("n 60 (1 outside)")
 
 
 def test_the_delay_figure_says_mean_and_quantile(tmp_path: Path) -> None:
@@ -149,9 +172,16 @@ def test_the_time_figure_leaves_out_ticks_without_detections(tmp_path: Path) -> 
 
 def test_a_line_is_not_drawn_across_a_pause() -> None:
     stamps_ns = START_NS + TICK_NS * np.array([1, 0, 40, 41])
-    x, y = broken_line(stamps_ns, np.array([1.0, 0.0, 2.0, 3.0]), np.arange(4.0))
+    x, y = broken_line(stamps_ns, np.array([1.0, 0.0, 2.0, 3.0]), np.arange(4.0), TICK_NS)
     np.testing.assert_array_equal(x, [0.0, 1.0, np.nan, 2.0, 3.0])
     np.testing.assert_array_equal(y, [1.0, 0.0, np.nan, 2.0, 3.0])
+
+
+def test_two_rows_that_are_far_apart_are_no_line(tmp_path: Path) -> None:
+    tracks = [[WEST.track(k, 1), *([WEST.track(k, 2, across_m=9.0)] if k in (0, 59) else [])] for k in TICKS]
+    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS))
+    wrong = figure_map(run, match(run)).axes[0].lines[-1]
+    assert np.isnan(np.asarray(wrong.get_xdata(), dtype=float)).tolist() == [False, True, False]
 
 
 def test_a_folder_that_cannot_be_made_is_one_clear_error(tmp_path: Path) -> None:

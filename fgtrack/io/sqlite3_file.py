@@ -1,0 +1,144 @@
+"""A SQLite file of a recording, also one that was not closed or breaks off."""
+
+import shutil
+import tempfile
+from collections.abc import Collection, Generator, Iterator
+from pathlib import Path
+from typing import cast
+
+import apsw
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    MessageDefinition,
+    MessageDefinitionFormat,
+)
+from rosbags.rosbag2.errors import ReaderError
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+
+class Sqlite3File(Sqlite3Reader):
+    """A SQLite file; one that was not closed is healed in a copy, a truncated one is read row by row."""
+
+    path: Path
+    break_off: str | None = None
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._copies: tempfile.TemporaryDirectory[str] | None = None
+        self._damaged = False
+
+    def _open(self) -> None:
+        journals = [self.path.with_name(self.path.name + suffix) for suffix in ("-wal", "-journal")]
+        left = [journal for journal in journals if journal.exists() and journal.stat().st_size]
+        if left:
+            self.break_off = f"was not closed by its writer ({left[0].name} is left)"
+            self.path = self._healed_copy(left)
+        try:
+            super()._open()
+            self._reconnect()
+        except (apsw.Error, ReaderError):
+            self._open_damaged()
+
+    def close(self) -> None:
+        """Close the file and remove its copies."""
+        super().close()
+        if self._copies:
+            self._copies.cleanup()
+
+    def messages(
+        self, connections: Collection[Connection], start: int | None = None, stop: int | None = None
+    ) -> Generator[tuple[Connection, int, bytes], None, None]:
+        """Records of `connections` in log-time order; equal times keep the order of writing."""
+        assert self.dbconn
+        by_id = {connection.id: connection for connection in connections}
+        if self._damaged:
+            rows = sorted(self._rows_before_break(), key=lambda row: row[1])
+        else:
+            query = "SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp, id"
+            rows = cast("list[tuple[int, int, bytes]]", self.dbconn.execute(query))
+        for topic_id, log_ns, data in rows:
+            if topic_id in by_id:
+                yield by_id[topic_id], log_ns, data
+
+    def _reconnect(self) -> None:
+        """Connect anew: rosbags' `_open` uses a connection of its own, `open` made ours before healing."""
+        if self.dbconn:
+            self.dbconn.close()
+        flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
+        self.dbconn = apsw.Connection(f"{self.path.absolute().as_uri()}?immutable=1", flags=flags)
+
+    def _copy(self, files: list[Path]) -> Path:
+        """Copy the recording and the `files` beside it; the recording itself is never touched."""
+        self._copies = self._copies or tempfile.TemporaryDirectory()
+        folder = Path(tempfile.mkdtemp(dir=self._copies.name))
+        for file in (self.path, *files):
+            shutil.copyfile(file, folder / file.name)
+        return folder / self.path.name
+
+    def _whole_pages(self) -> Path:
+        """A copy without the page that was cut in two: SQLite would read zeros for the rest of it."""
+        copy = self._copy([])
+        size = copy.stat().st_size
+        with copy.open("r+b") as file:
+            page_size = int.from_bytes(file.read(18)[16:], "big")
+            page_size = 65536 if page_size == 1 else max(page_size, 512)
+            file.truncate(size - size % page_size)
+        return copy
+
+    def _healed_copy(self, journals: list[Path]) -> Path:
+        """A copy whose journals SQLite has played back."""
+        copy = self._copy(journals)
+        connection = apsw.Connection(str(copy))
+        connection.execute("SELECT count(*) FROM sqlite_master").fetchall()
+        connection.execute("PRAGMA journal_mode=DELETE").fetchall()
+        connection.close()
+        return copy
+
+    def _open_damaged(self) -> None:
+        self._damaged = True
+        self.break_off = self.break_off or "is truncated"
+        self.path = self._whole_pages()
+        self._reconnect()
+        assert self.dbconn
+        # Without it SQLite refuses a file that is shorter than its header says.
+        self.dbconn.execute("PRAGMA writable_schema=ON").fetchall()
+        definitions = self._definitions()
+        query = "SELECT id, name, type, serialization_format FROM topics ORDER BY id"
+        topics = cast("list[tuple[int, str, str, str]]", self.dbconn.execute(query).fetchall())
+        counts: dict[int, int] = {}
+        for topic_id, *_ in self._rows_before_break():
+            counts[topic_id] = counts.get(topic_id, 0) + 1
+        none = MessageDefinition(MessageDefinitionFormat.NONE, "")
+        self.connections = [
+            Connection(
+                topic_id,
+                topic,
+                msgtype,
+                definitions.get(msgtype, none),
+                "",
+                counts.get(topic_id, 0),
+                ConnectionExtRosbag2(serialization, []),
+                self,
+            )
+            for topic_id, topic, msgtype, serialization in topics
+        ]
+
+    def _definitions(self) -> dict[str, MessageDefinition]:
+        assert self.dbconn
+        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+        try:
+            rows = cast("list[tuple[str, str, str]]", self.dbconn.execute(query).fetchall())
+        except apsw.Error:  # an old schema has no such table
+            return {}
+        formats = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
+        return {name: MessageDefinition(formats[kind], text) for name, kind, text in rows if kind in formats}
+
+    def _rows_before_break(self) -> Iterator[tuple[int, int, bytes]]:
+        """Topic id, log time and message, in the order of writing."""
+        assert self.dbconn
+        try:
+            query = "SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id"
+            yield from cast("Iterator[tuple[int, int, bytes]]", self.dbconn.execute(query))
+        except apsw.Error as error:
+            self.break_off = f"is truncated ({error})"

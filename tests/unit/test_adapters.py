@@ -1,0 +1,213 @@
+import math
+from types import SimpleNamespace as Message
+
+import pytest
+
+from fgtrack.core.types import Detection
+from fgtrack.io.adapters.common import yaw_rad
+from fgtrack.io.adapters.ego import ego_from_odometry
+from fgtrack.io.adapters.fields import FieldError, ego_by_fields, objects_by_fields
+from fgtrack.io.adapters.objects import OBJECT_ADAPTERS, register_adapter
+
+
+def xyz(x=0.0, y=0.0, z=0.0):
+    return Message(x=x, y=y, z=z)
+
+
+def quaternion(yaw=None, norm=1.0):
+    if yaw is None:
+        return Message(x=0.0, y=0.0, z=0.0, w=0.0)
+    return Message(x=0.0, y=0.0, z=norm * math.sin(yaw / 2), w=norm * math.cos(yaw / 2))
+
+
+def pose(x, y, yaw=None):
+    return Message(position=xyz(x, y), orientation=quaternion(yaw))
+
+
+def header(stamp_ns=1_500_000_002, frame_id="base_link"):
+    return Message(stamp=Message(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9), frame_id=frame_id)
+
+
+def square(size, **cells):
+    """Row-major covariance of a 6 x 6 matrix; `c05=2.0` sets row 0, column 5, and its mirror."""
+    values = [0.0] * (size * size)
+    for name, value in cells.items():
+        row, column = int(name[1]), int(name[2])
+        values[row * size + column] = values[column * size + row] = value
+    return values
+
+
+POSE_COVARIANCE = square(6, c00=1.0, c11=2.0, c55=3.0, c01=0.1, c05=0.2, c15=0.3)
+XY = (1.0, 0.1, 0.1, 2.0)
+XY_YAW = (1.0, 0.1, 0.2, 0.1, 2.0, 0.3, 0.2, 0.3, 3.0)
+
+
+def read(name, message):
+    return OBJECT_ADAPTERS[name](message)
+
+
+def autoware(availability=2, has_twist=True, has_covariance=True, velocity=(-3.0, 0.0)):
+    kinematics = Message(
+        pose_with_covariance=Message(pose=pose(1.0, 2.0, 0.5), covariance=POSE_COVARIANCE),
+        has_position_covariance=has_covariance,
+        orientation_availability=availability,
+        twist_with_covariance=Message(twist=Message(linear=xyz(*velocity)), covariance=square(6, c00=0.25)),
+        has_twist=has_twist,
+        has_twist_covariance=has_covariance,
+    )
+    return Message(header=header(), objects=[Message(kinematics=kinematics)])
+
+
+@pytest.mark.parametrize("package", ["autoware_perception_msgs", "autoware_auto_perception_msgs"])
+def test_autoware_gives_pose_and_a_speed_with_the_sign_of_the_forward_axis(package):
+    found = read(f"{package}/msg/DetectedObjects", autoware())
+    (item,) = found.objects
+    assert (found.stamp_ns, found.frame) == (1_500_000_002, "ego")
+    assert (item.x_m, item.y_m, item.speed_mps) == (1.0, 2.0, -3.0)
+    assert item.yaw_rad == pytest.approx(0.5)
+    assert item.covariance[10:] == (3.0, 0.0, 0.0, 0.0, 0.0, 0.25)
+
+
+@pytest.mark.parametrize("availability", [0, 1])
+def test_an_orientation_that_is_not_available_is_no_yaw(availability):
+    (item,) = read("autoware_perception_msgs/msg/DetectedObjects", autoware(availability)).objects
+    assert item.yaw_rad is None
+    assert item.speed_mps == 3.0
+
+
+def test_what_autoware_marks_as_absent_is_absent():
+    message = autoware(has_twist=False, has_covariance=False)
+    (item,) = read("autoware_perception_msgs/msg/DetectedObjects", message).objects
+    assert item.speed_mps is None
+    assert item.covariance is None
+
+
+def test_a_covariance_that_does_not_cover_the_speed_is_not_given():
+    message = autoware()
+    message.objects[0].kinematics.has_twist_covariance = False
+    (item,) = read("autoware_perception_msgs/msg/DetectedObjects", message).objects
+    assert item.speed_mps is not None
+    assert item.covariance is None
+
+
+def vision(size=1.0, results=True, **identity):
+    covariance = Message(pose=Message(pose=pose(5.0, 6.0, -1.0), covariance=POSE_COVARIANCE))
+    box = Message(center=pose(1.0, 2.0, 0.5), size=xyz(size, size, size))
+    item = Message(header=header(0), results=[covariance] if results else [], bbox=box, **identity)
+    return Message(header=header(frame_id="/map"), detections=[item])
+
+
+@pytest.mark.parametrize(
+    ("identity", "object_id"),
+    [({"id": "12"}, 12), ({"id": ""}, None), ({"id": "car"}, None), ({"tracking_id": "4"}, 4), ({}, None)],
+)
+def test_vision_detections_of_every_version_give_pose_covariance_and_id(identity, object_id):
+    found = read("vision_msgs/msg/Detection3DArray", vision(**identity))
+    (item,) = found.objects
+    assert found.frame == "map"
+    assert (item.x_m, item.y_m, item.object_id, item.stamp_ns) == (1.0, 2.0, object_id, None)
+    assert item.covariance == XY_YAW
+
+
+def test_a_box_without_size_leaves_the_pose_to_the_hypothesis():
+    (item,) = read("vision_msgs/msg/Detection3DArray", vision(size=0.0)).objects
+    assert (item.x_m, item.y_m) == (5.0, 6.0)
+    (item,) = read("vision_msgs/msg/Detection3DArray", vision(size=0.0, results=False)).objects
+    assert (item.x_m, item.covariance) == (1.0, None)
+
+
+@pytest.mark.parametrize(("velocity", "speed_mps"), [((0.0, 4.0), 4.0), ((0.0, -4.0), -4.0)])
+def test_a_derived_object_moves_backwards_when_its_velocity_opposes_its_heading(velocity, speed_mps):
+    twist = Message(linear=xyz(*velocity))
+    item = Message(header=header(7), id=9, pose=pose(1.0, 2.0, math.pi / 2), twist=twist)
+    message = Message(header=header(), objects=[item])
+    (found,) = read("derived_object_msgs/msg/ObjectArray", message).objects
+    assert found == Detection(
+        x_m=1.0,
+        y_m=2.0,
+        yaw_rad=pytest.approx(math.pi / 2),
+        speed_mps=speed_mps,
+        stamp_ns=7,
+        object_id=9,
+    )
+
+
+def test_a_radar_track_has_a_speed_without_sign_and_no_yaw():
+    item = Message(
+        uuid=Message(uuid=[3] + [0] * 15),
+        position=xyz(1.0, 2.0),
+        velocity=xyz(-3.0, 4.0),
+        position_covariance=[1.0, 0.1, 0.0, 2.0, 0.0, 0.0],
+        velocity_covariance=[1.0, 0.0, 0.0, 1.0, 0.0, 0.0],
+    )
+    (found,) = read("radar_msgs/msg/RadarTracks", Message(header=header(), tracks=[item])).objects
+    assert (found.speed_mps, found.yaw_rad, found.object_id) == (5.0, None, 3)
+    assert found.covariance == pytest.approx((1.0, 0.1, 0.0, 0.1, 2.0, 0.0, 0.0, 0.0, 1.0))
+
+
+def test_a_pose_array_keeps_every_pose_with_and_without_an_orientation():
+    message = Message(header=header(), poses=[pose(1.0, 2.0, 0.5), pose(math.nan, 2.0)])
+    first, second = read("geometry_msgs/msg/PoseArray", message).objects
+    assert first.yaw_rad == pytest.approx(0.5)
+    assert second.yaw_rad is None
+    assert math.isnan(second.x_m)
+
+
+def test_the_yaw_of_a_quaternion_does_not_depend_on_its_norm():
+    assert yaw_rad(quaternion(-2.0, norm=7.0)) == pytest.approx(-2.0)
+    assert yaw_rad(quaternion()) is None
+    assert math.isnan(yaw_rad(Message(x=math.nan, y=0.0, z=0.0, w=1.0)))
+
+
+def odometry(yaw):
+    twist = Message(twist=Message(linear=xyz(3.0, 4.0), angular=xyz(0.0, 0.0, 0.7)), covariance=square(6))
+    return Message(header=header(), pose=Message(pose=pose(1.0, 2.0, yaw), covariance=square(6)), twist=twist)
+
+
+def test_an_ego_without_orientation_has_no_number_for_its_yaw():
+    state = ego_from_odometry(odometry(None), 9)
+    assert math.isnan(state.yaw_rad)
+    assert (state.speed_mps, state.yaw_rate_radps, state.receipt_ns) == (5.0, 0.7, 9)
+
+
+def test_an_adapter_of_ones_own_is_registered_by_type():
+    register_adapter("my_msgs/msg/Things", OBJECT_ADAPTERS["geometry_msgs/msg/PoseArray"])
+    message = Message(header=header(), poses=[])
+    assert read("my_msgs/msg/Things", message).objects == ()
+    del OBJECT_ADAPTERS["my_msgs/msg/Things"]
+
+
+def test_paths_read_vectors_quaternions_and_the_stamps_of_objects():
+    item = Message(p=pose(1.0, 2.0, 0.5), v=[3.0, 4.0], vel=xyz(3.0, 4.0), t=2.5, number=4)
+    message = Message(header=header(frame_id="odom"), tracks=[item])
+    fields = {
+        "objects": "tracks",
+        "x_m": "p.position.x",
+        "yaw_rad": "p.orientation",
+        "speed_mps": ["vel.x", "vel.y"],
+        "object_stamp": "t",
+        "object_id": "number",
+    }
+    found = objects_by_fields(message, fields)
+    assert (found.stamp_ns, found.frame) == (1_500_000_002, "map")
+    assert found.objects == (
+        Detection(x_m=1.0, yaw_rad=pytest.approx(0.5), speed_mps=5.0, stamp_ns=2_500_000_000, object_id=4),
+    )
+
+
+def test_a_message_without_a_list_is_one_object_and_without_a_header_has_no_stamp():
+    found = objects_by_fields(Message(a=1, b=2.0), {"x_m": "a", "y_m": "b"})
+    assert (found.stamp_ns, found.frame, found.objects) == (None, None, (Detection(x_m=1.0, y_m=2.0),))
+
+
+@pytest.mark.parametrize("fields", [{"x_m": "a.b"}, {"x_m": "text"}, {"objects": "a", "x_m": "a"}])
+def test_a_path_that_does_not_lead_to_a_number_is_named(fields):
+    with pytest.raises(FieldError, match=r"a\.b|text|a"):
+        objects_by_fields(Message(a=1, text="far"), fields)
+
+
+def test_the_ego_is_read_by_paths():
+    fields = {"x_m": "x", "y_m": "y", "yaw_rad": "q", "speed_mps": "v", "in_pit": "pit", "stamp": "ns"}
+    state = ego_by_fields(Message(x=1, y=2, q=quaternion(), v=3, pit=1, ns=5), fields, 9)
+    assert (state.stamp_ns, state.receipt_ns, state.in_pit) == (5, 9, True)
+    assert math.isnan(state.yaw_rad)

@@ -1,0 +1,152 @@
+import json
+import math
+from collections import Counter
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from support.messages import shared
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.types import Detection, DetectionList, EgoState, TruthState
+from fgtrack.io.source import open_input
+
+SCENARIOS = range(2, 7)
+
+
+def record(sensor: int, time_text: str, measurement: object) -> str:
+    return (
+        f'{{"sensorID": {sensor}, "measurements": [], "ownshipPosition": [10.0, 20.0], '
+        f'"time": {time_text}, "measurement": {json.dumps(measurement)}}}'
+    )
+
+
+def scenario(folder, *records: str, truth: object = None):
+    (folder / "scenario9_detections.json").write_text(f"[{','.join(records)}]")
+    if truth is not None:
+        (folder / "scenario9_groundTruth.json").write_text(json.dumps(truth))
+    return folder
+
+
+def lists(folder) -> list[DetectionList]:
+    return [item for item in open_input(folder).messages() if isinstance(item, DetectionList)]
+
+
+@pytest.mark.parametrize(
+    ("measurement", "points"),
+    [
+        ([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], [(24.0, 11.0), (25.0, 12.0), (26.0, 13.0)]),
+        ([[1.0, 2.0], [4.0, 5.0]], [(24.0, 11.0), (25.0, 12.0)]),
+        ([1.0, 4.0], [(24.0, 11.0)]),
+        ([[1.0], [4.0]], [(24.0, 11.0)]),
+        ([], []),
+    ],
+)
+def test_points_get_the_own_ship_and_become_east_and_north(tmp_path, measurement, points):
+    (message,) = lists(scenario(tmp_path, record(1, "1.0", measurement)))
+    assert (message.sensor, message.frame) == ("lidar", "map")
+    assert [(item.x_m, item.y_m) for item in message.objects] == points
+
+
+@pytest.mark.parametrize(
+    ("measurement", "bearings"),
+    [
+        (0.0, [math.pi / 2]),
+        ([0.5 * math.pi], [0.0]),
+        ([-3.0, 1.0], [math.pi / 2 + 3.0 - 2 * math.pi, math.pi / 2 - 1.0]),
+        ([], []),
+    ],
+)
+def test_bearings_from_the_north_become_bearings_from_the_east(tmp_path, measurement, bearings):
+    (message,) = lists(scenario(tmp_path, record(3, "1.0", measurement)))
+    assert (message.sensor, message.frame) == ("infrared", "ego")
+    assert [item.bearing_rad for item in message.objects] == [pytest.approx(value) for value in bearings]
+    assert message.objects == tuple(Detection(bearing_rad=item.bearing_rad) for item in message.objects)
+
+
+def test_the_stamp_is_the_decimal_text_to_the_nanosecond(tmp_path):
+    (message,) = lists(scenario(tmp_path, record(2, "1.6201148918494244E+9", [])))
+    assert message.stamp_ns == 1_620_114_891_849_424_400
+
+
+def test_the_file_order_is_the_receipt_order_and_the_newest_stamp_so_far_the_receipt(tmp_path):
+    folder = scenario(tmp_path, record(3, "2.0", []), record(4, "1.5", []), record(1, "2.5", []))
+    messages = list(open_input(folder).messages())
+    assert [(type(m).__name__, m.stamp_ns, m.receipt_ns) for m in messages] == [
+        ("EgoState", 2_000_000_000, 2_000_000_000),
+        ("DetectionList", 2_000_000_000, 2_000_000_000),
+        ("DetectionList", 1_500_000_000, 2_000_000_000),
+        ("EgoState", 2_500_000_000, 2_500_000_000),
+        ("DetectionList", 2_500_000_000, 2_500_000_000),
+    ]
+    ego = messages[0]
+    assert (ego.x_m, ego.y_m, ego.yaw_rad) == (20.0, 10.0, 0.0)
+
+
+def test_a_repeated_fix_is_one_truth_state_in_time_order(tmp_path):
+    fixes = [{"targetID": target, "position": [1.0, 2.0, 0], "time": time_s} for target, time_s in ((2, 3), (1, 2))]
+    folder = scenario(tmp_path, record(1, "1.0", []), record(1, "4.0", []), truth=[fixes, fixes])
+    truth = [item for item in open_input(folder).messages() if isinstance(item, TruthState)]
+    assert truth == [
+        TruthState(2 * 10**9, 2 * 10**9, 1, x_m=2.0, y_m=1.0),
+        TruthState(3 * 10**9, 3 * 10**9, 2, x_m=2.0, y_m=1.0),
+    ]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{}", "[1]", "[{}]", "[[]]", f"[{record(7, '1.0', [])}]", f"[{record(1, '1.0', [[1.0], []])}]"]
+)
+def test_a_damaged_scenario_is_one_line_that_names_the_file(tmp_path, text):
+    (tmp_path / "scenario9_detections.json").write_text(text)
+    with pytest.raises(DataError, match=r"scenario9_detections\.json: ") as caught:
+        list(open_input(tmp_path).messages())
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_of_a_scenario_points_to_its_folder(tmp_path):
+    scenario(tmp_path)
+    with pytest.raises(CallError, match="name its folder"):
+        open_input(tmp_path / "scenario9_detections.json")
+
+
+@pytest.mark.parametrize("number", SCENARIOS)
+def test_every_record_of_the_data_set_is_read_in_receipt_order(number):
+    folder = shared(f"data/autoferry/scenario{number}")
+    messages = list(open_input(folder).messages())
+    assert all(a.receipt_ns <= b.receipt_ns for a, b in pairwise(messages))
+    assert all(message.receipt_ns >= message.stamp_ns for message in messages)
+    records = json.loads((folder / f"scenario{number}_detections.json").read_text())
+    names = {1: "lidar", 2: "radar", 3: "infrared", 4: "daylight"}
+    found = [message for message in messages if isinstance(message, DetectionList)]
+    assert Counter(m.sensor for m in found) == Counter(names[r["sensorID"]] for r in records)
+    fixes = json.loads((folder / f"scenario{number}_groundTruth.json").read_text())
+    distinct = {(fix["targetID"], fix["time"]) for item in fixes for fix in item}
+    assert sum(isinstance(m, TruthState) for m in messages) == len(distinct)
+
+
+@pytest.mark.parametrize("number", SCENARIOS)
+def test_lidar_points_and_bearings_lie_at_the_true_vessels(number):
+    messages = list(open_input(shared(f"data/autoferry/scenario{number}")).messages())
+
+    def track(states):
+        return np.array([(state.stamp_ns * 1e-9, state.x_m, state.y_m) for state in states]).T
+
+    vessels = [track(m for m in messages if isinstance(m, TruthState) and m.object_id == i) for i in (1, 2)]
+    ego = track(m for m in messages if isinstance(m, EgoState))
+    misses_m, misses_rad = [], []
+    for message in messages:
+        if not isinstance(message, DetectionList):
+            continue
+        now_s = message.stamp_ns * 1e-9
+        (ego_x, *true_x), (ego_y, *true_y) = (
+            [np.interp(now_s, item[0], item[axis]) for item in (ego, *vessels)] for axis in (1, 2)
+        )
+        bearings = np.arctan2(np.array(true_y) - ego_y, np.array(true_x) - ego_x)
+        for item in message.objects:
+            if message.sensor == "lidar":
+                misses_m.append(np.hypot(np.array(true_x) - item.x_m, np.array(true_y) - item.y_m).min())
+            elif message.sensor == "daylight":
+                off = np.angle(np.exp(1j * (bearings - item.bearing_rad)))
+                misses_rad.append(np.abs(off).min())
+    assert np.quantile(misses_m, 0.3) < 10.0  # points of a wrong frame miss by hundreds of metres
+    assert np.quantile(misses_rad, 0.3) < 0.06  # bias and scatter that the data set states

@@ -1,0 +1,456 @@
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.estimation.backward_forward import BackwardForwardBank
+from fgtrack.estimation.base import BirthPrior, Measurement, UpdateStatus
+from fgtrack.estimation.ekf import correct
+from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator, Propagator
+from fgtrack.estimation.published import LeadingClock, StalePresent
+from fgtrack.models.measurement import SensorPose, measurement_model
+from fgtrack.models.motion import CTRV, CV
+
+STEP_NS = 10_000_000
+START_NS = 1_600_000_000_000_000_000
+DENSITY = np.array([4e-4, 4e-4, 9e-4, 1e-2, 2.5e-3])
+POSITION = measurement_model(("x_m", "y_m"), CTRV())
+POSE = measurement_model(("x_m", "y_m", "yaw_rad"), CTRV())
+BEARING = measurement_model(("bearing_rad",), CTRV())
+
+
+def euler() -> EulerCtrv:
+    return EulerCtrv(CTRV(), DENSITY)
+
+
+def bank(storage_steps: int = 50) -> BackwardForwardBank:
+    made = BackwardForwardBank(euler(), STEP_NS, storage_steps)
+    made.advance(START_NS)
+    return made
+
+
+def prior(stamp_ns: int, x_m: float = 0.0, y_m: float = 0.0, yaw_rad: float | None = 0.2) -> BirthPrior:
+    return BirthPrior(stamp_ns, np.array([x_m, y_m]), 0.1 * np.eye(2), yaw_rad, 0.3, 40.0, 2.0, 0.1, 0.2, 0.0, 1.0)
+
+
+def position(stamp_ns: int, x_m: float, y_m: float = 0.0) -> Measurement:
+    return Measurement(stamp_ns, POSITION, np.array([x_m, y_m]), 0.09 * np.eye(2))
+
+
+def same(a: FloatArray, b: FloatArray) -> None:
+    np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
+
+
+def ms(value: float) -> int:
+    return round(value * 1e6)
+
+
+# --- the nearest stored state
+
+
+@pytest.mark.parametrize(
+    ("late_ms", "back"),
+    [(-500, 0), (-5, 0), (0, 0), (4.999999, 0), (5, 0), (5.000001, 1), (10, 1), (15, 1), (15.000001, 2), (20, 2)],
+)
+def test_the_nearest_stored_state_is_used_and_of_two_the_newer(late_ms: float, back: int) -> None:
+    assert bank().steps_back(START_NS - ms(late_ms)) == back
+
+
+@settings(deadline=None)
+@given(late_ns=st.integers(-(10**8), 10**9), step_ns=st.integers(1, 10**8))
+def test_the_steps_back_are_those_of_a_search_over_all_slots(late_ns: int, step_ns: int) -> None:
+    made = BackwardForwardBank(euler(), step_ns, 10)
+    made.advance(START_NS // step_ns * step_ns)
+    stamp_ns = made.present_ns - late_ns
+    near = max(late_ns // step_ns, 0)
+    assert made.steps_back(stamp_ns) == min(range(near, near + 2), key=lambda k: abs(late_ns - k * step_ns))
+
+
+# --- an update in the past
+
+
+def test_an_update_in_the_past_is_rewind_correct_and_predict() -> None:
+    made = bank()
+    made.birth(7, prior(START_NS))
+    for tick in range(1, 16):
+        made.advance(START_NS + 2 * tick * STEP_NS)
+    present_ns = made.present_ns
+    stamp_ns = present_ns - ms(123)
+    before = made.states_at(stamp_ns)
+    same(before.means, made.states_at(present_ns - ms(120)).means)
+    measurement = position(stamp_ns, float(before.means[0, 0]) + 0.7, float(before.means[0, 1]) - 0.4)
+    [result] = made.update(stamp_ns, [7], [measurement])
+    by_hand = correct(
+        before.means, before.covariances, measurement.z[None], measurement.R[None], POSITION, SensorPose()
+    )
+    assert result.status is UpdateStatus.IN_SEQUENCE
+    same(result.innovation, [0.7, -0.4])
+    assert result.nis == pytest.approx(by_hand.nis[0])
+    means, covariances = euler().propagate(by_hand.mean, by_hand.covariance, 12, 0.01)
+    [present] = made.present()
+    assert present.stamp_ns == present_ns
+    same(present.mean, means[-1, 0])
+    same(present.covariance, covariances[-1, 0])
+    for back in range(12):  # every state on the way was stored
+        stored = made.states_at(present_ns - back * STEP_NS)
+        same(stored.means, means[-1 - back])
+        same(stored.covariances, covariances[-1 - back])
+    same(made.states_at(stamp_ns).means, by_hand.mean)
+    older = made.states_at(present_ns - ms(130))
+    assert not np.allclose(older.means, by_hand.mean)  # what is older stays as it was
+
+
+def test_what_was_fused_after_a_late_stamp_is_forgotten() -> None:
+    """The definition of the method: after the late update, the newer one has left no trace."""
+    with_newer, without_newer = bank(), bank()
+    for made in (with_newer, without_newer):
+        made.birth(0, prior(START_NS))
+        made.advance(START_NS + 20 * STEP_NS)
+    newer_ns, late_ns = START_NS + 15 * STEP_NS, START_NS + 10 * STEP_NS
+    [newer] = with_newer.update(newer_ns, [0], [position(newer_ns, 9.0, 9.0)])
+    assert newer.status is UpdateStatus.IN_SEQUENCE
+    [late] = with_newer.update(late_ns, [0], [position(late_ns, 4.0)])
+    [only] = without_newer.update(late_ns, [0], [position(late_ns, 4.0)])
+    assert (late.status, only.status) == (UpdateStatus.OUT_OF_SEQUENCE, UpdateStatus.IN_SEQUENCE)
+    same(with_newer.present()[0].mean, without_newer.present()[0].mean)
+    same(with_newer.present()[0].covariance, without_newer.present()[0].covariance)
+
+
+def test_equal_stamps_are_in_sequence_and_older_than_birth_is_not() -> None:
+    made = bank()
+    made.advance(START_NS + 10 * STEP_NS)
+    made.birth(0, prior(START_NS + ms(52)))
+    for stamp_ms, status in [(52, "in_sequence"), (48, "out_of_sequence"), (60, "in_sequence"), (59, "out_of_sequence")]:
+        stamp_ns = START_NS + ms(stamp_ms)
+        [result] = made.update(stamp_ns, [0], [position(stamp_ns, 0.0)])
+        assert result.status == status
+
+
+def test_a_measurement_of_the_future_is_fused_at_present() -> None:
+    made = bank()
+    made.birth(0, prior(START_NS))
+    stamp_ns = START_NS + ms(300)
+    before = made.states_at(stamp_ns)
+    made.update(stamp_ns, [0], [position(stamp_ns, 1.0)])
+    after = made.states_at(START_NS)
+    by_hand = correct(before.means, before.covariances, np.array([[1.0, 0.0]]), 0.09 * np.eye(2)[None], POSITION, SensorPose())
+    same(after.means, by_hand.mean)
+
+
+# --- births
+
+
+def test_a_track_born_late_starts_at_its_stamp_and_is_not_offered_at_older_ones() -> None:
+    made = bank()
+    made.advance(START_NS + 20 * STEP_NS)
+    made.birth(1, prior(START_NS + ms(123)))
+    made.birth(2, prior(START_NS + ms(200), x_m=50.0))
+    assert made.states_at(START_NS + ms(114)).track_ids == ()
+    assert made.states_at(START_NS + ms(114)).means.shape == (0, 5)
+    start = made.states_at(START_NS + ms(120))
+    assert start.track_ids == (1,)
+    same(start.means, [[0.0, 0.0, 0.2, 40.0, 0.1]])
+    same(np.diag(start.covariances[0]), [0.1, 0.1, 0.09, 4.0, 0.04])
+    means, covariances = euler().propagate(start.means, start.covariances, 8, 0.01)
+    same(made.present()[0].mean, means[-1, 0])
+    same(made.present()[0].covariance, covariances[-1, 0])
+    assert made.states_at(START_NS + ms(200)).track_ids == (1, 2)
+
+
+def test_a_birth_between_two_grid_stamps_goes_to_the_nearer_and_of_the_future_to_the_present() -> None:
+    made = bank()
+    made.advance(START_NS + 20 * STEP_NS)
+    for track_id, stamp_ms, oldest_ms in [(0, 104.9, 100), (1, 105.1, 110), (2, 900.0, 200)]:
+        made.birth(track_id, prior(START_NS + ms(stamp_ms)))
+        assert track_id in made.states_at(START_NS + ms(oldest_ms)).track_ids
+        assert track_id not in made.states_at(START_NS + ms(oldest_ms - 10)).track_ids
+
+
+def test_a_birth_of_unknown_heading_starts_at_yaw_zero_or_with_a_wide_velocity() -> None:
+    made = bank()
+    made.birth(0, prior(START_NS, yaw_rad=None))
+    assert made.present()[0].mean.tolist() == [0.0, 0.0, 0.0, 40.0, 0.1]
+    cartesian = BackwardForwardBank(ExactPropagator(CV()), STEP_NS, 10)
+    cartesian.advance(START_NS)
+    cartesian.birth(0, prior(START_NS, 3.0, 4.0, yaw_rad=None))
+    state = cartesian.states_at(START_NS)
+    assert state.means.tolist() == [[3.0, 4.0, 0.0, 0.0]]
+    same(state.covariances[0], np.diag([0.1, 0.1, 1604.0, 1604.0]))
+
+
+# --- storage
+
+
+def test_the_storage_ends_at_its_length() -> None:
+    made = bank(storage_steps=20)
+    made.birth(0, prior(START_NS))
+    for tick in range(1, 31):
+        made.advance(START_NS + tick * STEP_NS)
+    oldest_ns = START_NS + 11 * STEP_NS
+    assert made.window_start_ns == oldest_ns - STEP_NS // 2
+    assert made.states_at(oldest_ns).track_ids == (0,)
+    assert made.states_at(made.window_start_ns).track_ids == (0,)
+    assert made.states_at(made.window_start_ns - 1).track_ids == ()
+
+
+@pytest.mark.parametrize("length", [19, 20])
+def test_a_birth_at_the_very_start_of_the_window_is_integrated_to_the_present(length: int) -> None:
+    made = bank(storage_steps=length)
+    made.advance(START_NS + 100 * STEP_NS)
+    made.birth(0, prior(made.window_start_ns))
+    [state] = made.present()
+    assert state.mean[0] == pytest.approx(40.0 * 0.01 * (length - 0.5) * math.cos(0.2), abs=0.3)
+    assert made.states_at(made.window_start_ns).track_ids == (0,)
+
+
+def test_a_clock_that_jumps_far_ahead_predicts_all_the_way() -> None:
+    made, slow = bank(20), bank(20)
+    for each in (made, slow):
+        each.birth(0, prior(START_NS))
+    made.advance(START_NS + 1017 * STEP_NS)
+    for tick in range(1, 1018):
+        slow.advance(START_NS + tick * STEP_NS)
+    np.testing.assert_allclose(made.present()[0].mean, slow.present()[0].mean, atol=1e-7)
+    np.testing.assert_allclose(made.present()[0].covariance, slow.present()[0].covariance, rtol=1e-9)
+    for back in (0, 7, 19):
+        stamp_ns = made.present_ns - back * STEP_NS
+        np.testing.assert_allclose(made.states_at(stamp_ns).means, slow.states_at(stamp_ns).means, atol=1e-7)
+
+
+def test_a_gap_of_decades_without_tracks_costs_nothing() -> None:
+    made = BackwardForwardBank(euler(), STEP_NS, 350)
+    made.advance(0)
+    made.advance(START_NS)
+    made.birth(0, prior(START_NS - ms(50)))
+    assert made.states_at(START_NS - ms(50)).track_ids == (0,)
+    assert made.states_at(START_NS - ms(60)).track_ids == ()
+
+
+def test_a_clock_that_stands_still_or_goes_back_changes_no_state() -> None:
+    made = bank()
+    made.birth(0, prior(START_NS))
+    made.advance(START_NS + 5 * STEP_NS)
+    before = made.states_at(START_NS + 5 * STEP_NS).means
+    made.advance(START_NS + 5 * STEP_NS)
+    assert np.array_equal(made.states_at(START_NS + 5 * STEP_NS).means, before)
+
+
+def test_the_present_lies_between_grid_stamps_and_its_yaw_is_wrapped() -> None:
+    made = bank()
+    made.birth(0, prior(START_NS, yaw_rad=math.pi - 1e-4))
+    made.advance(START_NS + ms(14))
+    [state] = made.present()
+    assert state.stamp_ns == made.present_ns == START_NS + ms(14)
+    grid = made.states_at(START_NS + ms(10))
+    means, _ = euler().propagate(grid.means, grid.covariances, 1, 0.004)
+    same(state.mean[:2], means[0, 0, :2])
+    assert state.mean[2] == pytest.approx(-math.pi - 1e-4 + 0.0014)
+
+
+# --- several measurements
+
+
+def test_measurements_of_several_kinds_and_poses_in_one_call_are_fused_each_for_itself() -> None:
+    together, alone = bank(), bank()
+    for made in (together, alone):
+        for track_id in range(4):
+            made.birth(track_id, prior(START_NS, x_m=10.0 * track_id, y_m=1.0))
+        made.advance(START_NS + 10 * STEP_NS)
+    stamp_ns = START_NS + ms(60)
+    R = np.array([[1e-3]])
+    measurements = [
+        position(stamp_ns, 3.0, 1.5),
+        Measurement(stamp_ns, POSE, np.array([12.0, 1.0, 0.3]), 0.1 * np.eye(3)),
+        Measurement(stamp_ns, BEARING, np.array([0.1]), R, SensorPose(0.0, 0.0, 0.0)),
+        Measurement(stamp_ns, BEARING, np.array([0.1]), R, SensorPose(5.0, -3.0, 0.5)),
+    ]
+    ids = [2, 0, 3, 1]
+    results = together.update(stamp_ns, ids, measurements)
+    for track_id, measurement, result in zip(ids, measurements, results, strict=True):
+        [one] = alone.update(stamp_ns, [track_id], [measurement])
+        assert (one.status, one.nis) == (result.status, pytest.approx(result.nis))
+        same(one.innovation, result.innovation)
+    for a, b in zip(together.present(), alone.present(), strict=True):
+        same(a.mean, b.mean)
+        same(a.covariance, b.covariance)
+
+
+def test_a_measurement_that_cannot_be_fused_fails_alone_and_changes_nothing() -> None:
+    made = bank()
+    for track_id in range(3):
+        made.birth(track_id, prior(START_NS))
+    before = made.present()
+    bad = Measurement(START_NS, POSITION, np.array([math.nan, 0.0]), np.eye(2))
+    results = made.update(START_NS, [0, 1, 2], [position(START_NS, 1.0), bad, position(START_NS, 2.0)])
+    assert [result.status for result in results] == ["in_sequence", "failed", "in_sequence"]
+    assert (results[1].innovation, results[1].nis) == (None, None)
+    after = made.present()
+    assert np.array_equal(before[1].mean, after[1].mean)
+    assert not np.array_equal(before[0].mean, after[0].mean)
+    assert not np.array_equal(before[2].mean, after[2].mean)
+
+
+def test_a_singular_innovation_covariance_is_a_failure_and_no_crash() -> None:
+    made = BackwardForwardBank(EulerCtrv(CTRV(), np.zeros(5)), STEP_NS, 5)
+    made.advance(START_NS)
+    certain = BirthPrior(START_NS, np.zeros(2), np.zeros((2, 2)), 0.0, 0.1, 0.0, 0.1, 0.0, 0.1, 0.0, 0.1)
+    made.birth(0, certain)
+    exact = Measurement(START_NS, POSITION, np.ones(2), np.zeros((2, 2)))
+    assert [result.status for result in made.update(START_NS, [0], [exact])] == ["failed"]
+    assert made.present()[0].mean.tolist() == [0.0] * 5
+
+
+# --- against the simplest bank there is
+
+
+@dataclass
+class NaiveTrack:
+    """Newest state last; a list, cut at its length."""
+
+    stamps_ns: list[int]
+    means: list[FloatArray]
+    covariances: list[FloatArray]
+
+
+@dataclass
+class NaiveBank:
+    """The method for one track at a time, on lists, one step after the other."""
+
+    propagator: Propagator
+    length: int
+    grid_ns: int
+    tracks: dict[int, NaiveTrack] = field(default_factory=dict)
+
+    def step(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        means, covariances = self.propagator.propagate(mean[None], covariance[None], 1, STEP_NS / 1e9)
+        return means[0, 0], covariances[0, 0]
+
+    def advance(self, grid_ns: int) -> None:
+        while self.grid_ns < grid_ns:
+            self.grid_ns += STEP_NS
+            for track in self.tracks.values():
+                self.grow(track)
+
+    def grow(self, track: NaiveTrack) -> None:
+        mean, covariance = self.step(track.means[-1], track.covariances[-1])
+        track.stamps_ns.append(track.stamps_ns[-1] + STEP_NS)
+        track.means.append(mean)
+        track.covariances.append(covariance)
+        for column in (track.stamps_ns, track.means, track.covariances):
+            del column[: -self.length]
+
+    def birth(self, track_id: int, mean: FloatArray, covariance: FloatArray, stamp_ns: int) -> None:
+        start_ns = self.grid_ns - max(round((self.grid_ns - stamp_ns) / STEP_NS), 0) * STEP_NS
+        track = self.tracks[track_id] = NaiveTrack([start_ns], [mean], [covariance])
+        while track.stamps_ns[-1] < self.grid_ns:
+            self.grow(track)
+
+    def nearest(self, stamp_ns: int) -> dict[int, int]:
+        """Place of the stored state for every track that reaches back so far."""
+        places = {}
+        for track_id, track in self.tracks.items():
+            if track.stamps_ns[0] - stamp_ns <= STEP_NS / 2:
+                gaps = [abs(stored_ns - stamp_ns) for stored_ns in track.stamps_ns]
+                places[track_id] = len(gaps) - 1 - gaps[::-1].index(min(gaps))
+        return places
+
+    def update(self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]) -> None:
+        places = self.nearest(stamp_ns)
+        for track_id, m in zip(track_ids, measurements, strict=True):
+            track, place = self.tracks[track_id], places[track_id]
+            done = correct(
+                track.means[place][None], track.covariances[place][None], m.z[None], m.R[None], m.model, m.pose
+            )
+            steps = len(track.means) - 1 - place
+            del track.stamps_ns[place + 1 :], track.means[place:], track.covariances[place:]
+            track.means.append(self.propagator.settle(done.mean)[0])
+            track.covariances.append(done.covariance[0])
+            for _ in range(steps):
+                self.grow(track)
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 2**32 - 1), length=st.integers(1, 25))
+def test_any_history_of_operations_is_that_of_a_bank_of_lists(seed: int, length: int) -> None:
+    """Growth, reuse of rows, cut storage, births and updates anywhere in the window keep tracks apart."""
+    rng = np.random.default_rng(seed)
+    made = BackwardForwardBank(euler(), STEP_NS, length)
+    made.advance(START_NS)
+    naive = NaiveBank(euler(), length, START_NS)
+    next_id = 0
+    for _ in range(40):
+        stamp_ns = made.present_ns - int(rng.integers(-STEP_NS, max(length - 1, 1) * STEP_NS))
+        match rng.choice(["advance", "birth", "birth", "update", "update", "remove"], p=[0.3, 0.2, 0.1, 0.2, 0.1, 0.1]):
+            case "advance":
+                now_ns = made.present_ns + int(rng.integers(0, 3 * length)) * STEP_NS
+                made.advance(now_ns)
+                naive.advance(now_ns)
+            case "birth":
+                given_prior = prior(stamp_ns, *rng.normal(scale=100.0, size=2), yaw_rad=rng.uniform(-3.0, 3.0))
+                made.birth(next_id, given_prior)
+                mean = np.array([*given_prior.position_m, given_prior.yaw_rad, 40.0, 0.1])
+                naive.birth(next_id, mean, np.diag([0.1, 0.1, 0.09, 4.0, 0.04]), stamp_ns)
+                next_id += 1
+            case "update":
+                ids = [i for i in naive.nearest(stamp_ns) if rng.random() < 0.7]
+                rng.shuffle(ids)
+                measurements = [position(stamp_ns, *rng.normal(scale=100.0, size=2)) for _ in ids]
+                made.update(stamp_ns, ids, measurements)
+                naive.update(stamp_ns, ids, measurements)
+            case "remove" if naive.tracks:
+                gone = int(rng.choice(list(naive.tracks)))
+                made.remove(gone)
+                del naive.tracks[gone]
+        assert made.track_ids == tuple(naive.tracks)
+        for back in range(length):
+            at_ns = made.present_ns - back * STEP_NS
+            states, places = made.states_at(at_ns), naive.nearest(at_ns)
+            assert states.track_ids == tuple(places)
+            for row, (track_id, place) in enumerate(places.items()):
+                track = naive.tracks[track_id]
+                np.testing.assert_allclose(states.means[row], track.means[place], rtol=1e-9, atol=1e-7)
+                np.testing.assert_allclose(states.covariances[row], track.covariances[place], rtol=1e-7, atol=1e-8)
+
+
+# --- the published storage
+
+
+def test_a_leading_clock_reaches_now_or_leads_by_less_than_a_step_and_never_waits() -> None:
+    made = LeadingClock(euler(), STEP_NS, 20)
+    for now_ms, lead_ms in [(0, 0), (20, 20), (33, 40), (34, 50), (50, 60), (60, 70), (200, 200)]:
+        made.advance(START_NS + ms(now_ms))
+        assert made.present_ns == START_NS + ms(lead_ms)
+
+
+def test_a_stale_storage_keeps_the_prior_of_an_update_without_delay() -> None:
+    made = StalePresent(euler(), STEP_NS, 20)
+    made.advance(START_NS)
+    made.birth(0, prior(START_NS))
+    made.update(START_NS, [0], [position(START_NS, 1.0)])
+    present = made.states_at(START_NS).means[0, 0]
+    assert present > 0.3
+    made.advance(START_NS + STEP_NS)
+    stored = made.states_at(START_NS)
+    assert stored.means[0, 0] == 0.0
+    made.update(START_NS, [0], [position(START_NS, 1.0)])  # delayed now: reaches the storage
+    assert made.states_at(START_NS).means[0, 0] == pytest.approx(present)
+
+
+def test_present_states_are_in_order_of_birth_and_kinematic() -> None:
+    made = BackwardForwardBank(ExactPropagator(CV()), STEP_NS, 10)
+    made.advance(START_NS)
+    assert made.present() == []
+    for track_id in (5, 3, 9):
+        made.birth(track_id, prior(START_NS, x_m=float(track_id)))
+    made.remove(3)
+    made.birth(4, prior(START_NS, x_m=4.0))
+    assert made.track_ids == (5, 9, 4)
+    states: list[TrackState] = made.present()
+    assert [state.mean[0] for state in states] == [5.0, 9.0, 4.0]
+    assert [state.mean.shape for state in states] == [(5,)] * 3
+    same(states[0].mean[2:], [0.2, 40.0, 0.0])

@@ -1,0 +1,147 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.ekf import correct, correct_with_innovation, predict
+from fgtrack.models.measurement import SensorPose, measurement_model
+from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def positive_definite(rng: np.random.Generator, count: int, n: int) -> FloatArray:
+    root = rng.normal(size=(count, n, n))
+    return root @ np.swapaxes(root, -1, -2) + 0.1 * np.eye(n)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=seeds, components=st.sampled_from([("x_m", "y_m"), ("x_m", "y_m", "yaw_rad", "speed_mps")]))
+def test_the_correction_is_the_textbook_formula(seed: int, components: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(seed)
+    model = measurement_model(components, CTRV())
+    k = len(components)
+    x, P = rng.normal(size=(4, 5)), positive_definite(rng, 4, 5)
+    z, R = x[:, :k] + rng.normal(scale=0.3, size=(4, k)), positive_definite(rng, 4, k)
+    done = correct(x, P, z, R, model, SensorPose())
+    for i in range(4):
+        H = np.eye(5)[:k]
+        y = z[i] - H @ x[i]
+        S = H @ P[i] @ H.T + R[i]
+        K = P[i] @ H.T @ np.linalg.inv(S)
+        np.testing.assert_allclose(done.innovation[i], y, atol=1e-14)
+        np.testing.assert_allclose(done.mean[i], x[i] + K @ y, atol=1e-11)
+        np.testing.assert_allclose(done.covariance[i], (np.eye(5) - K @ H) @ P[i], atol=1e-11)
+        assert done.nis[i] == pytest.approx(y @ np.linalg.inv(S) @ y, rel=1e-9)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=seeds)
+def test_corrections_one_by_one_give_the_batch_least_squares_posterior(seed: int) -> None:
+    """Any number of linear measurements in any order: the posterior is that of the normal equations."""
+    rng = np.random.default_rng(seed)
+    n, count = 5, 6
+    x0, P0 = rng.normal(size=n), positive_definite(rng, 1, n)[0]
+    information, vector = np.linalg.inv(P0), np.linalg.solve(P0, x0)
+    mean, covariance = x0[None], P0[None]
+    for _ in range(count):
+        k = int(rng.integers(1, 4))
+        H, R, z = rng.normal(size=(k, n)), positive_definite(rng, 1, k)[0], rng.normal(size=k)
+        information = information + H.T @ np.linalg.solve(R, H)
+        vector = vector + H.T @ np.linalg.solve(R, z)
+        done = correct_with_innovation(mean, covariance, (z - H @ mean[0])[None], R[None], H)
+        mean, covariance = done.mean, done.covariance
+    np.testing.assert_allclose(covariance[0], np.linalg.inv(information), atol=1e-9)
+    np.testing.assert_allclose(mean[0], np.linalg.solve(information, vector), atol=1e-9)
+
+
+def test_a_filter_over_linear_motion_is_the_batch_solution_of_the_whole_chain() -> None:
+    """The last state of a Kalman filter equals that of one least-squares problem over all states."""
+    rng = np.random.default_rng(3)
+    motion, steps, dt_s = CV(velocity_density_m2ps3=0.7), 6, 0.3
+    n = motion.dim
+    F, Q = motion.jacobian(np.zeros(n), dt_s), motion.process_noise(np.zeros(n), dt_s)
+    H, R = np.eye(n)[:2], np.diag([0.2, 0.4])
+    x0, P0 = rng.normal(size=n), positive_definite(rng, 1, n)[0]
+    measurements = rng.normal(size=(steps, 2))
+    information = np.zeros((n * (steps + 1), n * (steps + 1)))
+    vector = np.zeros(n * (steps + 1))
+
+    def add(J: FloatArray, target: FloatArray, noise: FloatArray) -> None:
+        nonlocal information, vector
+        information = information + J.T @ np.linalg.solve(noise, J)
+        vector = vector + J.T @ np.linalg.solve(noise, target)
+
+    blocks = np.eye(n * (steps + 1)).reshape(steps + 1, n, -1)
+    add(blocks[0], x0, P0)
+    mean, covariance = x0[None], P0[None]
+    model = measurement_model(("x_m", "y_m"), motion)
+    for step, z in enumerate(measurements, start=1):
+        add(blocks[step] - F @ blocks[step - 1], np.zeros(n), Q)
+        add(H @ blocks[step], z, R)
+        mean, covariance = predict(mean, covariance, motion, dt_s)
+        mean, covariance, _, _ = correct(mean, covariance, z[None], R[None], model, SensorPose())
+    np.testing.assert_allclose(mean[0], np.linalg.solve(information, vector)[-n:], atol=1e-9)
+    np.testing.assert_allclose(covariance[0], np.linalg.inv(information)[-n:, -n:], atol=1e-9)
+
+
+def test_the_innovation_of_a_yaw_takes_the_short_way_round() -> None:
+    model = measurement_model(("x_m", "y_m", "yaw_rad"), CTRV())
+    x, P = np.array([[0.0, 0.0, 3.1, 0.0, 0.0]]), np.eye(5)[None]
+    done = correct(x, P, np.array([[0.0, 0.0, -3.1]]), np.eye(3)[None], model, SensorPose())
+    assert done.innovation[0, 2] == pytest.approx(2 * np.pi - 6.2)
+    assert done.mean[0, 2] == pytest.approx(np.pi, abs=1e-12)
+
+
+def test_a_bearing_is_seen_from_the_sensor_pose() -> None:
+    model = measurement_model(("bearing_rad",), CTRV())
+    x, P = np.array([[10.0, 10.0, 0.0, 0.0, 0.0]]), np.eye(5)[None]
+    pose = SensorPose(10.0, 0.0, np.pi / 2)
+    done = correct(x, P, np.array([[0.1]]), np.array([[[1e-6]]]), model, pose)
+    assert done.innovation[0, 0] == pytest.approx(0.1)
+    assert done.mean[0, :2] == pytest.approx([9.0, 10.0], abs=0.02)  # to the left of the line of sight
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=seeds, scale=st.sampled_from([1e-12, 1e-6, 1.0, 1e6]))
+def test_the_posterior_stays_symmetric_and_positive_however_good_the_measurement(seed: int, scale: float) -> None:
+    rng = np.random.default_rng(seed)
+    P = positive_definite(rng, 3, 5) * 1e4
+    model = measurement_model(("x_m", "y_m", "yaw_rad"), CTRV())
+    R = positive_definite(rng, 3, 3) * scale
+    done = correct(rng.normal(size=(3, 5)), P, rng.normal(size=(3, 3)), R, model, SensorPose())
+    assert np.array_equal(done.covariance, np.swapaxes(done.covariance, -1, -2))
+    assert np.linalg.eigvalsh(done.covariance).min() > -1e-10 * 1e4
+    assert np.all(np.diagonal(done.covariance, axis1=-2, axis2=-1) <= np.diagonal(P, axis1=-2, axis2=-1))
+
+
+def test_a_singular_innovation_covariance_is_an_error() -> None:
+    model = measurement_model(("x_m", "y_m"), CTRV())
+    with pytest.raises(np.linalg.LinAlgError):
+        correct(np.zeros((1, 5)), np.zeros((1, 5, 5)), np.ones((1, 2)), np.zeros((1, 2, 2)), model, SensorPose())
+
+
+@pytest.mark.parametrize("motion", [CTRV(), CTRA(), CV()])
+def test_a_prediction_is_the_motion_model_with_its_noise_and_changes_no_input(motion: MotionModel) -> None:
+    rng = np.random.default_rng(1)
+    x, P = rng.normal(size=(3, motion.dim)), positive_definite(rng, 3, motion.dim)
+    before = x.copy(), P.copy()
+    mean, covariance = predict(x, P, motion, 0.25)
+    np.testing.assert_array_equal(mean, motion.predict(x, 0.25))
+    F, Q = motion.jacobian(x, 0.25), motion.process_noise(x, 0.25)
+    for i in range(3):
+        np.testing.assert_allclose(covariance[i], F[i] @ P[i] @ F[i].T + Q[i], atol=1e-12)
+    assert np.array_equal(x, before[0])
+    assert np.array_equal(P, before[1])
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=seeds, share=st.floats(0.05, 0.95))
+def test_a_split_prediction_of_linear_motion_is_the_whole_one(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    x, P = rng.normal(size=(2, 4)), positive_definite(rng, 2, 4)
+    whole = predict(x, P, CV(), 2.0)
+    parts = predict(*predict(x, P, CV(), 2.0 * share), CV(), 2.0 * (1.0 - share))
+    for a, b in zip(parts, whole, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-11)
