@@ -1,14 +1,18 @@
 """Propagators: many objects through equal time steps, each through its own number of them."""
 
+import math
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from fgtrack.core.geometry import rotations, wrap_angles
 from fgtrack.core.linalg import symmetrise
 from fgtrack.core.types import SPEED, YAW, YAW_RATE, FloatArray, IntArray
 from fgtrack.estimation.ekf import predict
 from fgtrack.models.motion import MotionModel
+
+ComplexArray = npt.NDArray[np.complex128]
 
 
 class Propagator(Protocol):
@@ -37,7 +41,7 @@ class ExactPropagator:
         self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
     ) -> tuple[FloatArray, FloatArray]:
         """See `Propagator.propagate`."""
-        return predict(mean, covariance, self.motion, steps * dt_s)
+        return predict(mean, covariance, self.motion, steps * np.float64(dt_s))
 
     def settle(self, mean: FloatArray) -> FloatArray:
         """See `Propagator.settle`."""
@@ -58,6 +62,11 @@ class EulerCtrv:
         self._density = density
         self._root = np.sqrt(density[YAW : YAW_RATE + 1])
         self._isotropic = bool(density[0] == density[1])
+        self._undirected = np.diag(density)  # noise of what nothing else depends on, and of an isotropic position
+        self._undirected[YAW : YAW_RATE + 1] = 0.0
+        if not self._isotropic:
+            self._undirected[:2] = 0.0
+        self._identity = np.eye(len(density))
 
     def propagate(
         self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
@@ -66,77 +75,65 @@ class EulerCtrv:
         longest = int(steps.max(initial=0))
         if not longest:
             return mean, covariance
-        before_s = dt_s * np.arange(longest, dtype=float)  # elapsed before each step
-        going = (np.arange(longest) < steps[:, None]).astype(float)  # (m, K); 0 where an object has arrived
-        yaw = self.yaws(mean, before_s)
-        speed = self.speeds(mean, before_s)
-        sums = np.empty((6, *yaw.shape))
-        c, s, x, y, x_late, y_late = sums
-        step_s = dt_s * going
-        np.multiply(np.cos(yaw), step_s, out=c)
-        np.multiply(np.sin(yaw), step_s, out=s)
-        np.multiply(speed, c, out=x)
-        np.multiply(speed, s, out=y)
-        np.multiply(x, before_s, out=x_late)
-        np.multiply(y, before_s, out=y_late)
-        sums.cumsum(axis=2, out=sums)
-        total = sums[:, :, -1]
+        index = np.arange(longest, dtype=np.float64)
+        start_s = index * np.float64(dt_s)  # of each step
+        going = (index < steps[:, None]).astype(np.float64)  # (m, K); 0 where an object has arrived
+        yaw = self.yaws(mean, start_s)
+        # Displacements are complex, x + i y: by a speed of 1, by the speed, and by the speed times the time.
+        paths = np.empty((3, *yaw.shape), dtype=np.complex128)
+        np.multiply(np.exp(1j * yaw), dt_s * going, out=paths[0])
+        np.multiply(self.speeds(mean, start_s), paths[0], out=paths[1])
+        np.multiply(start_s, paths[1], out=paths[2])
+        paths.cumsum(axis=2, out=paths)
+        total = paths[:, :, -1]
+        elapsed_s = steps * np.float64(dt_s)
 
-        elapsed_s = np.asarray(steps * dt_s)
         after = mean.copy()
-        after[:, 0] += total[2]
-        after[:, 1] += total[3]
+        after[:, 0] += total[1].real
+        after[:, 1] += total[1].imag
         after[:, YAW] = self.yaws(mean, elapsed_s[:, None])[:, 0]
         after[:, SPEED] = self.speeds(mean, elapsed_s[:, None])[:, 0]
 
         Phi = np.zeros(covariance.shape)
-        Phi[:, range(len(self._density)), range(len(self._density))] = 1.0
-        Phi[:, 0, YAW : YAW_RATE + 1] = np.array([-total[3], total[0], -total[5]]).T
-        Phi[:, 1, YAW : YAW_RATE + 1] = np.array([total[2], total[1], total[4]]).T
+        Phi[:] = self._identity
+        by_state = np.array([1j * total[1], total[0], 1j * total[2]]).T  # by yaw, speed and yaw rate
+        Phi[:, 0, YAW : YAW_RATE + 1] = by_state.real
+        Phi[:, 1, YAW : YAW_RATE + 1] = by_state.imag
         Phi[:, YAW, YAW_RATE] = elapsed_s
         spread = Phi @ covariance @ np.swapaxes(Phi, -1, -2)
-        spread += self._gathered(sums, total, yaw, going, elapsed_s, before_s + dt_s, dt_s)
+        spread += self._gathered(total[:, :, None] - paths, start_s + dt_s, yaw, going, elapsed_s, dt_s)
         return after, symmetrise(spread)
 
     def _gathered(
         self,
-        sums: FloatArray,
-        total: FloatArray,
+        rest: ComplexArray,
+        end_s: FloatArray,
         yaw: FloatArray,
         going: FloatArray,
         elapsed_s: FloatArray,
-        passed_s: FloatArray,
         dt_s: float,
     ) -> FloatArray:
-        """Noise gathered: the sum over j of G_j G_j', with G_j the driven columns of Phi(K, j) times sqrt(Q)."""
-        n = len(self._density)
-        rest = total[:, :, None] - sums  # from step j to the end
-        rest_s = elapsed_s[:, None] - passed_s
-        driven = np.zeros((len(yaw), 5, 3, yaw.shape[1]))  # rows x, y, yaw, speed, rate; by yaw, speed, rate
-        np.negative(rest[3], out=driven[:, 0, 0])
-        driven[:, 1, 0] = rest[2]
-        driven[:, 0, 1] = rest[0]
-        driven[:, 1, 1] = rest[1]
-        # the yaw rate at j turns only what comes later: sum over i >= j of dx_i (t_i - t_j)
-        driven[:, 0, 2] = passed_s * rest[3] - rest[5]
-        driven[:, 1, 2] = rest[4] - passed_s * rest[2]
-        driven[:, 2, 0] = going
-        driven[:, 3, 1] = going
-        driven[:, 2, 2] = rest_s * going
-        driven[:, 4, 2] = going
-        driven *= np.sqrt(dt_s) * self._root[:, None]
-        flat = driven.reshape(len(yaw), 5, -1)
-        gathered = np.zeros((len(yaw), n, n))
+        """Noise gathered, the sum over j of G_j G_j': G_j holds the driven columns of Phi(K, j) times sqrt(Q).
+
+        `rest` (3, m, K): displacements from the end of step j, at `end_s` (K,), on.
+        """
+        m, K = yaw.shape
+        driven = np.zeros((m, 5, 3, K))  # x, y, yaw, speed, yaw rate; by the noise of yaw, speed, yaw rate
+        rest[2] -= end_s * rest[1]  # the yaw rate at j turns only what comes later
+        driven[:, 0, 0], driven[:, 1, 0] = -rest[1].imag, rest[1].real
+        driven[:, 0, 1], driven[:, 1, 1] = rest[0].real, rest[0].imag
+        driven[:, 0, 2], driven[:, 1, 2] = -rest[2].imag, rest[2].real
+        driven[:, 2, 0] = driven[:, 3, 1] = driven[:, 4, 2] = going
+        driven[:, 2, 2] = (elapsed_s[:, None] - end_s) * going
+        driven *= math.sqrt(dt_s) * self._root[:, None]
+        flat = driven.reshape(m, 5, 3 * K)
+        gathered = np.zeros((m, len(self._density), len(self._density)))
         gathered[:, :5, :5] = flat @ np.swapaxes(flat, -1, -2)
-        if self._isotropic:
-            gathered[:, 0, 0] += self._density[0] * elapsed_s
-            gathered[:, 1, 1] += self._density[0] * elapsed_s
-        else:
+        gathered += self._undirected * elapsed_s[:, None, None]
+        if not self._isotropic:
             turn = rotations(yaw)
             turned = turn @ np.diag(self._density[:2] * dt_s) @ np.swapaxes(turn, -1, -2)
             gathered[:, :2, :2] += np.sum(turned * going[:, :, None, None], axis=1)
-        for rest_of_state in range(5, n):
-            gathered[:, rest_of_state, rest_of_state] = self._density[rest_of_state] * elapsed_s
         return gathered
 
     def yaws(self, mean: FloatArray, elapsed_s: FloatArray) -> FloatArray:

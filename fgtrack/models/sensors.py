@@ -21,7 +21,7 @@ class Mount:
 
 @dataclass(frozen=True)
 class SensorModel:
-    """One modality. Standard deviations are of the measured components, positions along and across the line of sight."""
+    """One modality. Positions have their standard deviations along and across the line of sight."""
 
     std: Mapping[str, float]
     """Standard deviation of each measured component; the keys say what the sensor measures."""

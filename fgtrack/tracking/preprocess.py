@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from fgtrack.core.geometry import circular_mean, parent_from_child, rotation, wrap_angle
+from fgtrack.core.geometry import circular_mean, rotation, wrap_angle
 from fgtrack.core.types import MEASURABLE, Detection, Disposition, FloatArray, UpdateRecord
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.measurement import SensorPose, measurement_model
@@ -106,20 +106,21 @@ class Located:
 
     index: int
     values: dict[str, float]
-    R: FloatArray
-    position_m: FloatArray | None
-    position_covariance: FloatArray | None
+    point_m: tuple[float, float] | None
+    """Position in the map; None where only a bearing was measured."""
 
 
 class Preprocess:
     """Transformation to the map, false-positive filter and merge (Karle et al. 2023, sections III-B and III-C)."""
 
-    def __init__(self, road: Road, merge: Merge, motion: MotionModel, detection_origin_m: tuple[float, float]) -> None:
+    def __init__(
+        self, road: Road, merge: Merge, motion: MotionModel, detection_origin_m: tuple[float, float]
+    ) -> None:
         """`detection_origin_m`: origin of the ego frame of detections, seen from the ego reference point."""
         self._road = road
         self._merge = merge
         self._motion = motion
-        self._origin_m = np.array([detection_origin_m])
+        self._origin_m = detection_origin_m
 
     def __call__(
         self, batch: Batch, sensor: SensorModel, ego: EgoPose | None
@@ -129,154 +130,154 @@ class Preprocess:
         `ego` is the pose at the batch's stamp; it may be None for detections in the map frame.
         """
         pose = self._sensor_pose(batch, sensor, ego)
-        located = [
-            self._locate(index, batch.message.objects[index], sensor, pose, batch.frame == "map")
-            for index in batch.indices
-        ]
+        located = [self._locate(index, batch, sensor, pose) for index in batch.indices]
         inside, records = self._on_road(located, batch, sensor)
-        return self._merged(inside, batch, pose), records
+        return self._candidates(inside, batch, sensor, pose), records
 
     def _sensor_pose(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> SensorPose:
+        """Pose of the frame that the detections are given in."""
         if ego is None:
             return SensorPose()
-        vx, vy = ego.speed_mps * math.cos(ego.yaw_rad), ego.speed_mps * math.sin(ego.yaw_rad)
-        origin = parent_from_child(self._origin_m, (ego.x_m, ego.y_m), ego.yaw_rad)
         yaw_rad = ego.yaw_rad
+        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+        x_m, y_m = self._origin_m
         if batch.frame == "sensor":
-            mount = sensor.mount
-            origin = parent_from_child(np.array([[mount.x_m, mount.y_m]]), tuple(origin[0]), yaw_rad)
-            yaw_rad += mount.yaw_rad
-        return SensorPose(float(origin[0, 0]), float(origin[0, 1]), yaw_rad, vx, vy)
+            x_m, y_m = x_m + sensor.mount.x_m, y_m + sensor.mount.y_m
+            yaw_rad += sensor.mount.yaw_rad
+        return SensorPose(
+            ego.x_m + c * x_m - s * y_m,
+            ego.y_m + s * x_m + c * y_m,
+            yaw_rad,
+            ego.speed_mps * c,
+            ego.speed_mps * s,
+        )
 
-    def _locate(self, index: int, detection: Detection, sensor: SensorModel, pose: SensorPose, in_map: bool) -> Located:
-        names = tuple(name for name in sensor.components if getattr(detection, name) is not None)
-        values = {name: float(getattr(detection, name)) for name in names}
-        R = _noise(detection, sensor, names)
-        if "x_m" not in values:
-            return _located_polar(index, values, R, names, pose)
-        point = np.array([[values["x_m"], values["y_m"]]])
-        if not in_map:
-            point = parent_from_child(point, (pose.x_m, pose.y_m), pose.yaw_rad)
-            values["x_m"], values["y_m"] = float(point[0, 0]), float(point[0, 1])
-            if "yaw_rad" in values:
-                values["yaw_rad"] = wrap_angle(values["yaw_rad"] + pose.yaw_rad)
-        _turn_position(R, _axes_yaw(detection, sensor, point[0], pose, in_map))
-        return Located(index, values, R, point[0], R[:2, :2])
+    def _locate(self, index: int, batch: Batch, sensor: SensorModel, pose: SensorPose) -> Located:
+        detection = batch.message.objects[index]
+        values: dict[str, float] = {}
+        for name in sensor.components:
+            value = getattr(detection, name)
+            if value is not None:
+                values[name] = float(value)
+        if "x_m" in values:
+            if batch.frame != "map":
+                values["x_m"], values["y_m"] = _in_map(values["x_m"], values["y_m"], pose)
+                if "yaw_rad" in values:
+                    values["yaw_rad"] = wrap_angle(values["yaw_rad"] + pose.yaw_rad)
+            return Located(index, values, (values["x_m"], values["y_m"]))
+        if "range_m" not in values:
+            return Located(index, values, None)
+        range_m, bearing_rad = values["range_m"], values["bearing_rad"]
+        ahead, left = range_m * math.cos(bearing_rad), range_m * math.sin(bearing_rad)
+        return Located(index, values, _in_map(ahead, left, pose))
 
     def _on_road(
         self, located: list[Located], batch: Batch, sensor: SensorModel
     ) -> tuple[list[Located], list[UpdateRecord]]:
         """Drop what lies outside the bounds, and take the map heading for a yaw that was not measured."""
-        placed = [i for i, item in enumerate(located) if item.position_m is not None]
+        placed = [item for item in located if item.point_m is not None]
         if not self._road.known or not placed:
             return located, []
-        view = self._road.view(np.array([located[i].position_m for i in placed]))
-        outside = {i for i, out in zip(placed, view.outside.tolist(), strict=True) if out}
-        records = [batch.record(located[i].index, Disposition.OUT_OF_BOUNDS) for i in sorted(outside)]
+        view = self._road.view(np.array([item.point_m for item in placed]))
+        outside = {item.index for item, out in zip(placed, view.outside.tolist(), strict=True) if out}
         if sensor.yaw_from_map_std_rad is not None:
-            for i, yaw_rad in zip(placed, view.yaw_rad.tolist(), strict=True):
-                if i not in outside and "yaw_rad" not in located[i].values:
-                    located[i] = _with_yaw(located[i], yaw_rad, sensor.yaw_from_map_std_rad)
-        return [item for i, item in enumerate(located) if i not in outside], records
+            for item, yaw_rad in zip(placed, view.yaw_rad.tolist(), strict=True):
+                item.values.setdefault("yaw_rad", yaw_rad)
+        records = [batch.record(item.index, Disposition.OUT_OF_BOUNDS) for item in located if item.index in outside]
+        return [item for item in located if item.index not in outside], records
 
-    def _merged(self, located: list[Located], batch: Batch, pose: SensorPose) -> list[Candidate]:
-        placed = [item for item in located if item.position_m is not None]
-        bearings = [item for item in located if item.position_m is None]
-        groups = self._merge.groups(np.array([item.position_m for item in placed]).reshape(-1, 2))
+    def _candidates(
+        self, located: list[Located], batch: Batch, sensor: SensorModel, pose: SensorPose
+    ) -> list[Candidate]:
+        placed = [item for item in located if item.point_m is not None]
+        groups = self._merge.groups(np.array([item.point_m for item in placed]).reshape(-1, 2))
         led = {group.first for group in groups}
         candidates = []
         claimed: set[int] = set()
         for group in groups:
             others = [i for i in group.members if i not in led and i not in claimed]
             claimed.update(others)
+            merged = tuple(placed[i].index for i in others)
             parts = [placed[i] for i in group.members]
-            candidates.append(
-                self._candidate(placed[group.first].index, [placed[i].index for i in others], parts, batch, pose)
-            )
-        candidates += [self._candidate(item.index, [], [item], batch, pose) for item in bearings]
-        return candidates
+            candidates.append(self._candidate(placed[group.first].index, merged, parts, batch, sensor, pose))
+        bearings = [item for item in located if item.point_m is None]
+        return candidates + [self._candidate(item.index, (), [item], batch, sensor, pose) for item in bearings]
 
     def _candidate(
-        self, index: int, merged: list[int], parts: Sequence[Located], batch: Batch, pose: SensorPose
+        self,
+        index: int,
+        merged: tuple[int, ...],
+        parts: Sequence[Located],
+        batch: Batch,
+        sensor: SensorModel,
+        pose: SensorPose,
     ) -> Candidate:
-        names = tuple(name for name in parts[0].values if all(name in part.values for part in parts))
+        """One detection, or the average of several over what all of them measure."""
+        names = tuple(name for name in MEASURABLE if all(name in part.values for part in parts))
+        covariances = [_covariance(batch.message.objects[p.index], sensor, names, p, batch, pose) for p in parts]
         if len(parts) == 1:
-            values, R, position_m = parts[0].values, parts[0].R, parts[0].position_m
-            position_covariance = parts[0].position_covariance
+            values, R, point_m = parts[0].values, covariances[0], parts[0].point_m
         else:
-            values = {name: self._merge.mean(name, np.array([part.values[name] for part in parts])) for name in names}
-            R = np.mean([_select(part, names) for part in parts], axis=0)
-            position_m = _average([part.position_m for part in parts])
-            position_covariance = _average([part.position_covariance for part in parts])
-        measurement = Measurement(
-            batch.stamp_ns,
-            measurement_model(names, self._motion),
-            np.array([values[name] for name in names]),
-            R,
-            pose,
+            values = {n: self._merge.mean(n, np.array([part.values[n] for part in parts])) for n in names}
+            R = np.asarray(np.mean(covariances, axis=0))
+            x_m, y_m = np.mean([part.point_m for part in parts if part.point_m is not None], axis=0).tolist()
+            point_m = (x_m, y_m)
+        z = np.array([values[name] for name in names])
+        return Candidate(
+            index,
+            merged,
+            Measurement(batch.stamp_ns, measurement_model(names, self._motion), z, R, pose),
+            None if point_m is None else np.array(point_m),
+            None if point_m is None else _position_covariance(values, R, names, pose),
+            {name: values[name] for name in names},
         )
-        return Candidate(index, tuple(merged), measurement, position_m, position_covariance, values)
 
 
-def _noise(detection: Detection, sensor: SensorModel, names: tuple[str, ...]) -> FloatArray:
-    """R of the used components: the detection's own covariance where it has one, else the sensor's deviations."""
+def _in_map(x_m: float, y_m: float, pose: SensorPose) -> tuple[float, float]:
+    c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
+    return pose.x_m + c * x_m - s * y_m, pose.y_m + s * x_m + c * y_m
+
+
+def _covariance(
+    detection: Detection,
+    sensor: SensorModel,
+    names: tuple[str, ...],
+    item: Located,
+    batch: Batch,
+    pose: SensorPose,
+) -> FloatArray:
+    """R of `names` in the map: the detection's own covariance where it has one, else the sensor's deviations.
+
+    A yaw that the map gave has the sensor's deviation for it and is not correlated with the rest.
+    """
+    R = sensor.noise(names)
     if detection.covariance is None or not sensor.message_covariance:
-        return sensor.noise(names)
+        if "x_m" in names and item.point_m is not None and sensor.std["x_m"] != sensor.std["y_m"]:
+            x_m, y_m = item.point_m
+            R = _turned(R, math.atan2(y_m - pose.y_m, x_m - pose.x_m))
+        return R
     measured = detection.measured
     own = np.array(detection.covariance).reshape(len(measured), len(measured))
-    used = [measured.index(name) for name in names]
-    return np.ascontiguousarray(own[np.ix_(used, used)])
+    common = [name for name in names if name in measured]
+    here = [names.index(name) for name in common]
+    there = [measured.index(name) for name in common]
+    R[np.ix_(here, here)] = own[np.ix_(there, there)]
+    return _turned(R, pose.yaw_rad) if "x_m" in names and batch.frame != "map" else R
 
 
-def _axes_yaw(detection: Detection, sensor: SensorModel, point_m: FloatArray, pose: SensorPose, in_map: bool) -> float:
-    """Direction, in the map, of the axes that R's position block is given in; 0 where it does not matter."""
-    if detection.covariance is not None and sensor.message_covariance:
-        return 0.0 if in_map else pose.yaw_rad
-    if sensor.std["x_m"] == sensor.std["y_m"]:
-        return 0.0
-    return math.atan2(point_m[1] - pose.y_m, point_m[0] - pose.x_m)
+def _turned(R: FloatArray, yaw_rad: float) -> FloatArray:
+    """R with its position block, and the correlations of the position with the rest, turned by `yaw_rad`."""
+    turn = np.eye(len(R))
+    turn[:2, :2] = rotation(yaw_rad)
+    return turn @ R @ turn.T
 
 
-def _turn_position(R: FloatArray, yaw_rad: float) -> None:
-    """Turn the position block of R, and its correlations with the rest, by `yaw_rad`, in place."""
-    if yaw_rad:
-        turn = rotation(yaw_rad)
-        R[:2] = turn @ R[:2]
-        R[:, :2] = R[:, :2] @ turn.T
-
-
-def _located_polar(
-    index: int, values: dict[str, float], R: FloatArray, names: tuple[str, ...], pose: SensorPose
-) -> Located:
-    """A detection by range and bearing, or by a bearing alone; its measurement stays in the sensor frame."""
-    if "range_m" not in values:
-        return Located(index, values, R, None, None)
-    yaw_rad = pose.yaw_rad + values["bearing_rad"]
-    axes = rotation(yaw_rad)
-    range_m = values["range_m"]
-    point = np.array([pose.x_m, pose.y_m]) + range_m * axes[:, 0]
+def _position_covariance(
+    values: Mapping[str, float], R: FloatArray, names: tuple[str, ...], pose: SensorPose
+) -> FloatArray:
+    """Covariance of the position in the map, shape (2, 2); of range and bearing to first order."""
+    if "x_m" in names:
+        return R[:2, :2]
     polar = [names.index("range_m"), names.index("bearing_rad")]
-    arm = axes * np.array([1.0, range_m])
-    return Located(index, values, R, point, arm @ R[np.ix_(polar, polar)] @ arm.T)
-
-
-def _with_yaw(item: Located, yaw_rad: float, std_rad: float) -> Located:
-    """`item` with a yaw that is not correlated with the rest."""
-    names = [name for name in MEASURABLE if name in item.values or name == "yaw_rad"]
-    values = {name: item.values.get(name, yaw_rad) for name in names}
-    place = names.index("yaw_rad")
-    R = np.zeros((len(values), len(values)))
-    rest = [i for i in range(len(values)) if i != place]
-    R[np.ix_(rest, rest)] = item.R
-    R[place, place] = std_rad**2
-    return Located(item.index, values, R, item.position_m, item.position_covariance)
-
-
-def _average(arrays: Sequence[FloatArray | None]) -> FloatArray:
-    return np.asarray(np.mean([array for array in arrays if array is not None], axis=0))
-
-
-def _select(part: Located, names: tuple[str, ...]) -> FloatArray:
-    own = tuple(part.values)
-    used = [own.index(name) for name in names]
-    return part.R[np.ix_(used, used)]
+    arm = rotation(pose.yaw_rad + values["bearing_rad"]) * np.array([1.0, values["range_m"]])
+    return np.asarray(arm @ R[np.ix_(polar, polar)] @ arm.T)
