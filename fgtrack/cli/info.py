@@ -12,6 +12,8 @@ from fgtrack.io.info import DelayInfo, InputInfo, describe
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
 
+_OTHER_CLOCK_S = 3600.0  # nothing is that late: the stamps and the recorder have different clocks
+
 
 def info(recording: Input, config_file: ConfigFile = None) -> int:
     """List topics, types, rates and delays, and what a configuration would take."""
@@ -43,7 +45,7 @@ def _table(found: InputInfo) -> Table:
     table.add_column("taken as")
     table.add_column("messages", justify="right")
     table.add_column("rate [Hz]", justify="right")
-    table.add_column("delay [ms] mean/p50/p90/max", justify="right")
+    table.add_column(r"delay \[ms] mean/p50/p90/max", justify="right")
     for topic in found.topics:
         rate = "–" if topic.rate_hz is None else f"{topic.rate_hz:.1f}"
         table.add_row(topic.name, topic.type, topic.used_as or "–", str(topic.count), rate, _delay(topic.delay))
@@ -53,4 +55,6 @@ def _table(found: InputInfo) -> Table:
 def _delay(delay: DelayInfo | None) -> str:
     if delay is None:
         return "–"
+    if abs(delay.p50_s) > _OTHER_CLOCK_S:
+        return "other clock"
     return "/".join(f"{1e3 * value:.0f}" for value in (delay.mean_s, delay.p50_s, delay.p90_s, delay.max_s))

@@ -5,12 +5,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
-from fgtrack.core.errors import DataError
 from fgtrack.evaluation.figure_style import GREY, WRONG, broken_line, colour, legend_above, styled, usual_step_ns
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, Matching
+from fgtrack.evaluation.run_config import section
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run_folder import Run, Table
 from fgtrack.models.track_map import TrackMap
@@ -60,12 +58,7 @@ def figure_map(run: Run, matching: Matching | None, title: str = "") -> Figure:
 
 
 def _map_name(run: Run) -> str | None:
-    try:
-        config = YAML(typ="safe", pure=True).load(run.config_text)
-    except YAMLError as error:
-        raise DataError(f"{run.path / 'config.yaml'}: is not YAML, repeat the run") from error
-    section = config.get("map") if isinstance(config, dict) else None
-    name = section.get("track") if isinstance(section, dict) else None
+    name = section(run, "map").get("track")
     return None if name is None else str(name)
 
 

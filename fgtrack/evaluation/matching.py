@@ -8,6 +8,7 @@ from scipy.optimize import linear_sum_assignment
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.evaluation.run_config import section
 from fgtrack.evaluation.truth import TRUE_STATE, TruePath, true_paths
 from fgtrack.io.run_folder import NO_TRACK, Run, Table
 
@@ -66,14 +67,22 @@ class TrackErrors:
 ERROR_NAMES = ("position_m", "along_m", "across_m", "yaw_rad", "speed_mps")
 
 
+def run_options(run: Run) -> MatchOptions:
+    """The options that the run's configuration asks for, else the defaults."""
+    gate_m = section(run, "evaluation").get("gate_m")
+    return MatchOptions() if gate_m is None else MatchOptions(gate_m=float(gate_m))
+
+
 def match(run: Run, options: MatchOptions | None = None) -> Matching | None:
     """Pair the tracks of `run` to its true objects at every tick; None for a run without truth.
+
+    Without `options` those that its configuration asks for.
 
     As CLEAR does (Bernardin and Stiefelhagen 2008): a pair of the tick before stays while it lies inside the
     gate, the rest is assigned by the Hungarian method, first as many pairs as possible, then the least sum of
     distances. Ticks are those of timing.csv, so ticks without any track count as well.
     """
-    options = options or MatchOptions()
+    options = options or run_options(run)
     paths = true_paths(run.truth)
     if not paths:
         return None

@@ -15,6 +15,7 @@ from fgtrack.evaluation.matching import (
     Matching,
     MatchOptions,
     match,
+    run_options,
     track_errors,
 )
 from fgtrack.evaluation.residuals import ANGULAR, RESIDUAL_NAMES, residuals
@@ -136,7 +137,7 @@ class Metrics:
 
 def evaluate(run: Run, options: MatchOptions | None = None) -> Metrics:
     """Metrics of `run`; without truth, those that need none."""
-    options = options or MatchOptions()
+    options = options or run_options(run)
     matching = match(run, options)
     ids = run.tracks["track_id"]
     confirmed = run.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS

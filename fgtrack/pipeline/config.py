@@ -167,6 +167,18 @@ class MotionConfig:
 
 
 @dataclass(frozen=True)
+class EvaluationConfig:
+    """How the run is judged against truth."""
+
+    gate_m: float = 5.0
+    """Largest distance of a track from its true object; a car's length, more for ships."""
+
+    def __post_init__(self) -> None:
+        if not self.gate_m > 0.0:
+            raise ValueError(f"gate_m: must be positive, is {self.gate_m}")
+
+
+@dataclass(frozen=True)
 class Config:
     """Everything that decides a run besides its input."""
 
@@ -185,6 +197,7 @@ class Config:
     birth: BirthConfig = field(default_factory=FixedBirth)
     motion: MotionConfig = field(default_factory=MotionConfig)
     filter: FilterConfig = field(default_factory=FilterConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
     def __post_init__(self) -> None:
         if not self.sensors:

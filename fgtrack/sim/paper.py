@@ -42,7 +42,7 @@ def paper_scenario() -> Scenario:
     )
     radar = SimulatedSensor(
         name="radar",
-        std={"x_m": 3.0, "y_m": 3.0, "speed_mps": 0.2},
+        std={"x_m": 1.0, "y_m": 1.0, "speed_mps": 0.2},
         phase_s=0.023,
         jitter_s=0.003,
         mount=Mount(x_m=3.0),
