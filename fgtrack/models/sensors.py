@@ -39,6 +39,8 @@ class SensorModel:
     """A detection's stamp: the list's, its own where it carries one, or the mean of those that do."""
     message_covariance: bool = True
     """Use a detection's own covariance where the message carries one."""
+    max_range_m: float | None = None
+    """A detection further from the sensor than this is out of bounds: beyond it clutter outweighs objects."""
     births: bool = True
     """Whether an unmatched detection of this sensor starts a track."""
     mount: Mount = field(default_factory=Mount)
@@ -54,7 +56,7 @@ class SensorModel:
                 raise ValueError(f"std.{name}: must be positive and finite, is {value}")
         if ("x_m" in self.std) != ("y_m" in self.std):
             raise ValueError("std: x_m and y_m are measured together")
-        for name in ("yaw_from_map_std_rad", "max_delay_s"):
+        for name in ("yaw_from_map_std_rad", "max_delay_s", "max_range_m"):
             value = getattr(self, name)
             if value is not None and not value > 0.0:
                 raise ValueError(f"{name}: must be positive, is {value}")

@@ -16,13 +16,14 @@ class Life:
     counter: int
     last_seen_ns: int
     num_measured: int = 1
-    missed: bool = False
+    misses: int = 0
+    """Misses since the last match."""
 
     def status(self, confirm_count: int) -> TrackStatus:
         """How far the track can be trusted."""
         if self.num_measured < confirm_count:
             return TrackStatus.TENTATIVE
-        return TrackStatus.COASTING if self.missed else TrackStatus.CONFIRMED
+        return TrackStatus.COASTING if self.misses else TrackStatus.CONFIRMED
 
 
 @dataclass(frozen=True)
@@ -36,10 +37,14 @@ class LifecycleRules:
     """Up to here short-range sensors age a track, beyond it long-range sensors do."""
     confirm_count: int = 3
     """Measurements after which a track is confirmed."""
+    tentative_misses: int | None = None
+    """A track that is not yet confirmed ends after so many misses; null leaves it to its counter."""
 
     def __post_init__(self) -> None:
         if self.counter_cap < 1 or self.confirm_count < 1:
             raise ValueError("counter_cap and confirm_count must be at least 1")
+        if self.tentative_misses is not None and self.tentative_misses < 1:
+            raise ValueError(f"tentative_misses: must be at least 1, is {self.tentative_misses}")
         if not self.forget_s > 0.0 or not self.short_range_m >= 0.0:
             raise ValueError("forget_s must be positive and short_range_m not negative")
 
@@ -88,7 +93,7 @@ class CountingLifecycle:
         life = self.lives[track_id]
         life.counter = min(life.counter + self._sensors[sensor].counter_add, self._rules.counter_cap)
         life.last_seen_ns = max(life.last_seen_ns, stamp_ns)
-        life.missed = False
+        life.misses = 0
 
     def fused(self, track_id: int) -> None:
         """See `Lifecycle.fused`."""
@@ -101,10 +106,14 @@ class CountingLifecycle:
             if ages_at(self._sensors[sensor].ages, range_m, self._rules.short_range_m):
                 life = self.lives[track_id]
                 life.counter -= 1
-                life.missed = True
-                if life.counter <= 0:
+                life.misses += 1
+                if life.counter <= 0 or self._unconfirmed_too_long(life):
                     ended.append(track_id)
         return ended
+
+    def _unconfirmed_too_long(self, life: Life) -> bool:
+        limit = self._rules.tentative_misses
+        return limit is not None and life.misses >= limit and life.num_measured < self._rules.confirm_count
 
     def expired(self, present_ns: int) -> list[int]:
         """See `Lifecycle.expired`."""

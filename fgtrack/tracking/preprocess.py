@@ -131,8 +131,9 @@ class Preprocess:
         """
         pose = self._sensor_pose(batch, sensor, ego)
         located = [self._locate(index, batch, sensor, pose) for index in batch.indices]
-        inside, records = self._on_road(located, batch, sensor)
-        return self._candidates(inside, batch, sensor, pose), records
+        near, records = _in_range(located, batch, sensor, pose) if ego is not None else (located, [])
+        inside, outside = self._on_road(near, batch, sensor)
+        return self._candidates(inside, batch, sensor, pose), records + outside
 
     def _sensor_pose(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> SensorPose:
         """Pose of the frame that the detections are given in."""
@@ -231,6 +232,23 @@ class Preprocess:
             None if point_m is None else _position_covariance(values, R, names, pose),
             {name: values[name] for name in names},
         )
+
+
+def _in_range(
+    located: list[Located], batch: Batch, sensor: SensorModel, pose: SensorPose
+) -> tuple[list[Located], list[UpdateRecord]]:
+    """Drop what lies further from the sensor than it can be trusted."""
+    limit_m = sensor.max_range_m
+    if limit_m is None:
+        return located, []
+    far = {
+        item.index
+        for item in located
+        if item.point_m is not None
+        and math.hypot(item.point_m[0] - pose.x_m, item.point_m[1] - pose.y_m) > limit_m
+    }
+    records = [batch.record(item.index, Disposition.OUT_OF_BOUNDS) for item in located if item.index in far]
+    return [item for item in located if item.index not in far], records
 
 
 def _in_map(x_m: float, y_m: float, pose: SensorPose) -> tuple[float, float]:

@@ -92,7 +92,7 @@ class PublishedLifecycle:
         if life.counter < self._rules.counter_cap:
             life.counter += self._sensors[sensor].counter_add
         life.last_seen_ns = stamp_ns
-        life.missed = False
+        life.misses = 0
 
     def fused(self, track_id: int) -> None:
         """See `Lifecycle.fused`."""
@@ -107,7 +107,7 @@ class PublishedLifecycle:
             near = range_m <= self._rules.short_range_m
             if (near and ages == "short_range") or (not near and ages == "long_range"):
                 life.counter -= 1
-                life.missed = True
+                life.misses += 1
             if present_ns - life.last_seen_ns > self._forget_ns:
                 life.counter = -1
             if life.counter <= 0:
