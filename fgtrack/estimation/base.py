@@ -120,3 +120,20 @@ class TrackBank(Protocol):
 def no_states(dim: int) -> StatesAt:
     """The states of no track at all."""
     return StatesAt((), np.empty((0, dim)), np.empty((0, dim, dim)))
+
+
+class Estimator(Protocol):
+    """One object: fuses measurements in any order of arrival."""
+
+    @property
+    def window_ns(self) -> tuple[int, int]:
+        """Oldest stamp that can still be fused or asked for, and the newest stamp fused."""
+
+    def update(self, measurement: Measurement) -> UpdateResult:
+        """Fuse `measurement` at its own stamp; one that is older than the window changes nothing."""
+
+    def state_at(self, stamp_ns: int) -> TrackState:
+        """State, in the motion model's own form, at any stamp in or after the window."""
+
+    def advance(self, now_ns: int) -> None:
+        """The clock moved: move the window, nothing else."""

@@ -9,6 +9,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.time import period_ns, seconds
 from fgtrack.estimation.backward_forward import BackwardForwardBank
 from fgtrack.estimation.base import TrackBank
+from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator, Propagator
 from fgtrack.estimation.published import (
     AcceleratedEulerCtrv,
@@ -18,6 +19,7 @@ from fgtrack.estimation.published import (
     SaturatedEulerCtrv,
     StalePresent,
 )
+from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.published_map import CircularHeadingMap, PublishedMap, PublishedRoad
 from fgtrack.models.road import FrenetRoad, OpenSpace, Road
 from fgtrack.models.track_map import TrackMap
@@ -93,8 +95,16 @@ def _build_backward_forward(config: Config) -> TrackBank:
     return storage(build_propagator(config.motion, seconds(step_ns)), step_ns, steps)
 
 
+def _build_replay(config: Config) -> TrackBank:
+    motion, lag_s = config.motion.model(), config.filter.storage_s
+    return ObjectBank(motion, lambda prior: ReplayEkf(motion, prior, lag_s), lag_s)
+
+
 #: Estimators by name.
-ESTIMATORS: Mapping[str, Callable[[Config], TrackBank]] = {"ekf-backward-forward": _build_backward_forward}
+ESTIMATORS: Mapping[str, Callable[[Config], TrackBank]] = {
+    "ekf-backward-forward": _build_backward_forward,
+    "ekf-replay": _build_replay,
+}
 
 
 def build_bank(config: Config) -> TrackBank:

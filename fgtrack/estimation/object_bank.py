@@ -1,0 +1,97 @@
+"""A bank of estimators that know nothing of each other."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from fgtrack.core.time import nanoseconds
+from fgtrack.core.types import TrackState
+from fgtrack.estimation.base import (
+    BirthPrior,
+    Estimator,
+    Measurement,
+    StatesAt,
+    UpdateResult,
+    no_states,
+)
+from fgtrack.estimation.propagation import wrapped_yaw
+from fgtrack.models.motion import MotionModel
+
+
+class ObjectBank:
+    """One `Estimator` per object.
+
+    Parameters
+    ----------
+    motion
+        The motion model of all estimators.
+    start
+        Makes the estimator of a new object.
+    lag_s
+        Length of the estimators' windows.
+    """
+
+    def __init__(self, motion: MotionModel, start: Callable[[BirthPrior], Estimator], lag_s: float) -> None:
+        self._motion = motion
+        self._start = start
+        self._lag_ns = nanoseconds(lag_s)
+        self._estimators: dict[int, Estimator] = {}
+        self._now_ns = 0
+
+    @property
+    def present_ns(self) -> int:
+        """See `TrackBank.present_ns`."""
+        return self._now_ns
+
+    @property
+    def window_start_ns(self) -> int:
+        """See `TrackBank.window_start_ns`."""
+        return self._now_ns - self._lag_ns
+
+    @property
+    def track_ids(self) -> tuple[int, ...]:
+        """See `TrackBank.track_ids`."""
+        return tuple(self._estimators)
+
+    def advance(self, now_ns: int) -> None:
+        """See `TrackBank.advance`."""
+        self._now_ns = now_ns
+        for estimator in self._estimators.values():
+            estimator.advance(now_ns)
+
+    def states_at(self, stamp_ns: int) -> StatesAt:
+        """See `TrackBank.states_at`."""
+        known = [i for i, estimator in self._estimators.items() if estimator.window_ns[0] <= stamp_ns]
+        if not known:
+            return no_states(self._motion.dim)
+        states = [self._estimators[track_id].state_at(stamp_ns) for track_id in known]
+        means = np.array([state.mean for state in states])
+        return StatesAt(tuple(known), means, np.array([state.covariance for state in states]))
+
+    def update(
+        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+    ) -> list[UpdateResult]:
+        """See `TrackBank.update`."""
+        return [
+            self._estimators[track_id].update(measurement)
+            for track_id, measurement in zip(track_ids, measurements, strict=True)
+        ]
+
+    def birth(self, track_id: int, prior: BirthPrior) -> None:
+        """See `TrackBank.birth`."""
+        self._estimators[track_id] = self._start(prior)
+
+    def remove(self, track_id: int) -> None:
+        """See `TrackBank.remove`."""
+        del self._estimators[track_id]
+
+    def present(self) -> list[TrackState]:
+        """See `TrackBank.present`."""
+        if not self._estimators:
+            return []
+        states = [estimator.state_at(self._now_ns) for estimator in self._estimators.values()]
+        mean, covariance = self._motion.kinematic(
+            np.array([state.mean for state in states]), np.array([state.covariance for state in states])
+        )
+        mean = wrapped_yaw(mean)
+        return [TrackState(self._now_ns, m, P) for m, P in zip(mean, covariance, strict=True)]
