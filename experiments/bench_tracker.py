@@ -87,7 +87,8 @@ def test_tick_with_detections(benchmark, count):
         whole_ms=whole_ms, handling_ms=handling_ms, yardstick_us=yard_us, published_ms=published_ms
     )
     print(
-        f"\n{count} objects: yardstick {yard_us:.2f} us, published {PUBLISHED_MS[count]} ms, here {published_ms:.2f} ms; "
+        f"\n{count} objects: yardstick {yard_us:.2f} us; "
+        f"published {PUBLISHED_MS[count]} ms, here {published_ms:.2f} ms; "
         f"handling {handling_ms:.2f} ms, {published_ms / handling_ms:.1f} times as fast (bar {BAR:.0f}); "
         f"whole tick {whole_ms:.2f} ms, {published_ms / whole_ms:.1f} times"
     )

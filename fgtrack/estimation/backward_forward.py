@@ -114,7 +114,7 @@ class BackwardForwardBank:
     def _advance_steps(self, steps: int) -> None:
         """Move the present by `steps`, through stored states wherever the prediction would become long."""
         while steps > 0:
-            part = min(steps, _LONGEST_STRETCH)
+            part = min(steps, _LONGEST_STRETCH) if self._objects else steps
             steps -= part
             self._grid += part
             self._grid_ns += part * self._step_ns
@@ -167,9 +167,9 @@ class BackwardForwardBank:
         """Correct the stored states nearest to `stamp_ns`; the present is predicted from them."""
         states = self.states_at(stamp_ns)
         rows = {track_id: row for row, track_id in enumerate(states.track_ids)}
-        groups: dict[int, list[int]] = {}
+        groups: dict[tuple[int, int], list[int]] = {}
         for position, measurement in enumerate(measurements):
-            groups.setdefault(id(measurement.model), []).append(position)
+            groups.setdefault((id(measurement.model), id(measurement.pose)), []).append(position)
         results: dict[int, UpdateResult] = {}
         for positions in groups.values():
             chosen = [rows[track_ids[position]] for position in positions]

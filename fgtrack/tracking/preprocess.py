@@ -213,8 +213,11 @@ class Preprocess:
         sensor: SensorModel,
         pose: SensorPose,
     ) -> Candidate:
-        """One detection, or the average of several over what all of them measure."""
-        names = tuple(name for name in MEASURABLE if all(name in part.values for part in parts))
+        """One detection, or the average of several over what all of them measure, if that says where they are."""
+        names = _common_names(parts)
+        if len(parts) > 1 and "x_m" not in names and not {"range_m", "bearing_rad"} <= set(names):
+            parts = [part for part in parts if part.index == index]
+            names = _common_names(parts)
         covariances = [_covariance(batch.message.objects[p.index], sensor, names, p, batch, pose) for p in parts]
         if len(parts) == 1:
             values, R, point_m = parts[0].values, covariances[0], parts[0].point_m
@@ -251,6 +254,10 @@ def _in_range(
     return [item for item in located if item.index not in far], records
 
 
+def _common_names(parts: Sequence[Located]) -> tuple[str, ...]:
+    return tuple(name for name in MEASURABLE if all(name in part.values for part in parts))
+
+
 def _in_map(x_m: float, y_m: float, pose: SensorPose) -> tuple[float, float]:
     c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
     return pose.x_m + c * x_m - s * y_m, pose.y_m + s * x_m + c * y_m
@@ -276,7 +283,7 @@ def _covariance(
         return R
     measured = detection.measured
     own = np.array(detection.covariance).reshape(len(measured), len(measured))
-    common = [name for name in names if name in measured]
+    common = [name for name in names if name in measured and name in sensor.std]
     here = [names.index(name) for name in common]
     there = [measured.index(name) for name in common]
     R[np.ix_(here, here)] = own[np.ix_(there, there)]

@@ -91,15 +91,16 @@ def test_an_update_in_the_past_is_rewind_correct_and_predict() -> None:
     assert result.status is UpdateStatus.IN_SEQUENCE
     same(result.innovation, [0.7, -0.4])
     assert result.nis == pytest.approx(by_hand.nis[0])
-    means, covariances = euler().propagate(by_hand.mean, by_hand.covariance, 12, 0.01)
+    for back in range(12):  # every state on the way is the new one
+        steps = np.array([12 - back])
+        mean, covariance = euler().propagate(by_hand.mean, by_hand.covariance, steps, 0.01)
+        stored = made.states_at(present_ns - back * STEP_NS)
+        same(stored.means, mean)
+        same(stored.covariances, covariance)
     [present] = made.present()
     assert present.stamp_ns == present_ns
-    same(present.mean, means[-1, 0])
-    same(present.covariance, covariances[-1, 0])
-    for back in range(12):  # every state on the way was stored
-        stored = made.states_at(present_ns - back * STEP_NS)
-        same(stored.means, means[-1 - back])
-        same(stored.covariances, covariances[-1 - back])
+    same(present.mean, made.states_at(present_ns).means[0])
+    same(present.covariance, made.states_at(present_ns).covariances[0])
     same(made.states_at(stamp_ns).means, by_hand.mean)
     older = made.states_at(present_ns - ms(130))
     assert not np.allclose(older.means, by_hand.mean)  # what is older stays as it was
@@ -156,9 +157,9 @@ def test_a_track_born_late_starts_at_its_stamp_and_is_not_offered_at_older_ones(
     assert start.track_ids == (1,)
     same(start.means, [[0.0, 0.0, 0.2, 40.0, 0.1]])
     same(np.diag(start.covariances[0]), [0.1, 0.1, 0.09, 4.0, 0.04])
-    means, covariances = euler().propagate(start.means, start.covariances, 8, 0.01)
-    same(made.present()[0].mean, means[-1, 0])
-    same(made.present()[0].covariance, covariances[-1, 0])
+    means, covariances = euler().propagate(start.means, start.covariances, np.array([8]), 0.01)
+    same(made.present()[0].mean, means[0])
+    same(made.present()[0].covariance, covariances[0])
     assert made.states_at(START_NS + ms(200)).track_ids == (1, 2)
 
 
@@ -247,8 +248,8 @@ def test_the_present_lies_between_grid_stamps_and_its_yaw_is_wrapped() -> None:
     [state] = made.present()
     assert state.stamp_ns == made.present_ns == START_NS + ms(14)
     grid = made.states_at(START_NS + ms(10))
-    means, _ = euler().propagate(grid.means, grid.covariances, 1, 0.004)
-    same(state.mean[:2], means[0, 0, :2])
+    means, _ = euler().propagate(grid.means, grid.covariances, np.array([1]), 0.004)
+    same(state.mean[:2], means[0, :2])
     assert state.mean[2] == pytest.approx(-math.pi - 1e-4 + 0.0014)
 
 
@@ -327,8 +328,8 @@ class NaiveBank:
     tracks: dict[int, NaiveTrack] = field(default_factory=dict)
 
     def step(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        means, covariances = self.propagator.propagate(mean[None], covariance[None], 1, STEP_NS / 1e9)
-        return means[0, 0], covariances[0, 0]
+        means, covariances = self.propagator.propagate(mean[None], covariance[None], np.array([1]), STEP_NS / 1e9)
+        return means[0], covariances[0]
 
     def advance(self, grid_ns: int) -> None:
         while self.grid_ns < grid_ns:
@@ -374,20 +375,20 @@ class NaiveBank:
                 self.grow(track)
 
 
-@settings(deadline=None, max_examples=40)
-@given(seed=st.integers(0, 2**32 - 1), length=st.integers(1, 25))
+@settings(deadline=None, max_examples=15)
+@given(seed=st.integers(0, 2**32 - 1), length=st.sampled_from([1, 2, 7, 25, 150]))
 def test_any_history_of_operations_is_that_of_a_bank_of_lists(seed: int, length: int) -> None:
-    """Growth, reuse of rows, cut storage, births and updates anywhere in the window keep tracks apart."""
+    """Births, updates anywhere in the window, cut storage, long stretches and removals keep tracks apart."""
     rng = np.random.default_rng(seed)
     made = BackwardForwardBank(euler(), STEP_NS, length)
     made.advance(START_NS)
     naive = NaiveBank(euler(), length, START_NS)
     next_id = 0
-    for _ in range(40):
+    for _ in range(25):
         stamp_ns = made.present_ns - int(rng.integers(-STEP_NS, max(length - 1, 1) * STEP_NS))
         match rng.choice(["advance", "birth", "birth", "update", "update", "remove"], p=[0.3, 0.2, 0.1, 0.2, 0.1, 0.1]):
             case "advance":
-                now_ns = made.present_ns + int(rng.integers(0, 3 * length)) * STEP_NS
+                now_ns = made.present_ns + int(rng.integers(0, 2 * length)) * STEP_NS
                 made.advance(now_ns)
                 naive.advance(now_ns)
             case "birth":
@@ -397,9 +398,11 @@ def test_any_history_of_operations_is_that_of_a_bank_of_lists(seed: int, length:
                 naive.birth(next_id, mean, np.diag([0.1, 0.1, 0.09, 4.0, 0.04]), stamp_ns)
                 next_id += 1
             case "update":
-                ids = [i for i in naive.nearest(stamp_ns) if rng.random() < 0.7]
+                places = naive.nearest(stamp_ns)
+                ids = [i for i in places if rng.random() < 0.7]
                 rng.shuffle(ids)
-                measurements = [position(stamp_ns, *rng.normal(scale=100.0, size=2)) for _ in ids]
+                seen = [naive.tracks[i].means[places[i]][:2] + rng.normal(scale=0.3, size=2) for i in ids]
+                measurements = [position(stamp_ns, *xy) for xy in seen]
                 made.update(stamp_ns, ids, measurements)
                 naive.update(stamp_ns, ids, measurements)
             case "remove" if naive.tracks:
@@ -407,7 +410,7 @@ def test_any_history_of_operations_is_that_of_a_bank_of_lists(seed: int, length:
                 made.remove(gone)
                 del naive.tracks[gone]
         assert made.track_ids == tuple(naive.tracks)
-        for back in range(length):
+        for back in range(0, length, 1 + length // 10):
             at_ns = made.present_ns - back * STEP_NS
             states, places = made.states_at(at_ns), naive.nearest(at_ns)
             assert states.track_ids == tuple(places)

@@ -1,0 +1,71 @@
+"""Shortcuts for tests of the tracking floor."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fgtrack.core.types import Detection, DetectionList, FloatArray, Frame
+from fgtrack.estimation.base import Measurement, StatesAt
+from fgtrack.models.measurement import SensorPose, measurement_model
+from fgtrack.models.motion import CTRV
+from fgtrack.models.road import RoadView
+from fgtrack.tracking.inbox import Batch
+from fgtrack.tracking.preprocess import Candidate
+
+START_NS = 1_600_000_000_000_000_000
+
+
+def ms(value: float) -> int:
+    """Nanoseconds of `value` milliseconds."""
+    return round(value * 1e6)
+
+
+def message(
+    *objects: Detection, sensor: str = "lidar", stamp_ms: float = 0.0, delay_ms: float = 0.0, frame: Frame = "ego"
+) -> DetectionList:
+    """A message that is received `delay_ms` after its stamp."""
+    stamp_ns = START_NS + ms(stamp_ms)
+    return DetectionList(sensor, stamp_ns, stamp_ns + ms(delay_ms), objects, frame)
+
+
+def batch(*objects: Detection, frame: Frame = "ego") -> Batch:
+    """All of `objects` in one batch."""
+    return Batch(message(*objects, frame=frame), START_NS, tuple(range(len(objects))))
+
+
+def candidate(x_m: float, y_m: float, variance_m2: float = 0.09) -> Candidate:
+    """A position in the map."""
+    R = variance_m2 * np.eye(2)
+    position = np.array([x_m, y_m])
+    measurement = Measurement(START_NS, measurement_model(("x_m", "y_m"), CTRV()), position, R)
+    return Candidate(0, (), measurement, position, R, {"x_m": x_m, "y_m": y_m})
+
+
+def bearing(bearing_rad: float, pose: SensorPose, std_rad: float = 0.02) -> Candidate:
+    """A line of sight."""
+    model = measurement_model(("bearing_rad",), CTRV())
+    measurement = Measurement(START_NS, model, np.array([bearing_rad]), np.array([[std_rad**2]]), pose)
+    return Candidate(0, (), measurement, None, None, {"bearing_rad": bearing_rad})
+
+
+def states(positions_m: Sequence[tuple[float, float]], variance_m2: float = 0.09) -> StatesAt:
+    """Tracks 10, 11, ... at these positions."""
+    means = np.zeros((len(positions_m), 5))
+    means[:, :2] = np.array(positions_m).reshape(-1, 2)
+    covariances = np.tile(variance_m2 * np.eye(5), (len(positions_m), 1, 1))
+    return StatesAt(tuple(range(10, 10 + len(positions_m))), means, covariances)
+
+
+class StraightRoad:
+    """Runs along a heading; outside is what lies further than `half_width_m` from y = 0."""
+
+    known = True
+
+    def __init__(self, yaw_rad: float = 0.4, curvature_radpm: float = 0.01, half_width_m: float = np.inf) -> None:
+        self._yaw_rad, self._curvature_radpm, self._half_width_m = yaw_rad, curvature_radpm, half_width_m
+
+    def view(self, points_m: FloatArray) -> RoadView:
+        """See `fgtrack.models.road.Road.view`."""
+        count = len(points_m)
+        outside = np.abs(points_m[:, 1]) > self._half_width_m
+        return RoadView(np.full(count, self._yaw_rad), np.full(count, self._curvature_radpm), outside)

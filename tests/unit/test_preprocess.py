@@ -1,0 +1,241 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.tracking import StraightRoad, batch
+
+from fgtrack.core.geometry import rotation
+from fgtrack.core.types import Detection, Disposition, Frame
+from fgtrack.models.motion import CTRV
+from fgtrack.models.road import OpenSpace, Road
+from fgtrack.models.sensors import Mount, SensorModel
+from fgtrack.tracking.ego import EgoPose
+from fgtrack.tracking.preprocess import Candidate, ConnectedMerge, Merge, NoMerge, Preprocess
+from fgtrack.tracking.published_objects import NeighbourhoodMerge
+
+LIDAR = SensorModel(std={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.4}, mount=Mount(2.0, 1.0, math.pi / 2))
+POINTS = SensorModel(std={"x_m": 0.3, "y_m": 0.3}, yaw_from_map_std_rad=0.35)
+POLAR = SensorModel(std={"range_m": 0.5, "bearing_rad": 0.02}, mount=Mount(2.0, 1.0, math.pi / 2))
+EGO = EgoPose(100.0, 50.0, math.pi / 2, 20.0)
+ORIGIN_M = (-1.74, 0.0)
+
+
+def candidates(
+    *objects: Detection,
+    sensor: SensorModel = LIDAR,
+    frame: Frame = "ego",
+    merge: Merge = NoMerge(),
+    road: Road = OpenSpace(),
+    ego: EgoPose | None = EGO,
+) -> list[Candidate]:
+    found, records = Preprocess(road, merge, CTRV(), ORIGIN_M)(batch(*objects, frame=frame), sensor, ego)
+    assert records == []
+    return found
+
+
+# --- frames
+
+
+@pytest.mark.parametrize(
+    ("frame", "x_m", "y_m", "yaw_rad"),
+    [
+        ("map", 10.0, 3.0, 0.1),
+        ("ego", 100.0 - 3.0, 50.0 - 1.74 + 10.0, 0.1 + math.pi / 2),  # ahead is north, left is west
+        ("sensor", 100.0 - 1.0 - 10.0, 50.0 - 1.74 + 2.0 - 3.0, 0.1 + math.pi - 2 * math.pi),  # looks west
+    ],
+)
+def test_a_detection_comes_to_the_map_from_its_frame(frame: Frame, x_m: float, y_m: float, yaw_rad: float) -> None:
+    [found] = candidates(Detection(x_m=10.0, y_m=3.0, yaw_rad=0.1), frame=frame)
+    wanted = yaw_rad if frame != "sensor" else 0.1 - math.pi
+    assert found.values == pytest.approx({"x_m": x_m, "y_m": y_m, "yaw_rad": wanted})
+    assert found.position_m == pytest.approx([x_m, y_m])
+    assert found.measurement.z == pytest.approx([x_m, y_m, wanted])
+
+
+def test_the_sensor_pose_has_lever_arm_mount_and_the_velocity_of_the_ego() -> None:
+    [found] = candidates(Detection(range_m=10.0, bearing_rad=0.1), sensor=POLAR, frame="sensor")
+    pose = found.measurement.pose
+    assert (pose.x_m, pose.y_m) == pytest.approx((99.0, 50.26))
+    assert pose.yaw_rad == pytest.approx(math.pi)
+    assert (pose.vx_mps, pose.vy_mps) == pytest.approx((0.0, 20.0))
+    ego_frame = candidates(Detection(range_m=10.0, bearing_rad=0.1), sensor=POLAR)[0].measurement.pose
+    assert (ego_frame.x_m, ego_frame.y_m, ego_frame.yaw_rad) == pytest.approx((100.0, 48.26, math.pi / 2))
+
+
+def test_map_detections_need_no_ego() -> None:
+    [found] = candidates(Detection(x_m=10.0, y_m=3.0, yaw_rad=0.1), frame="map", ego=None)
+    assert found.values == {"x_m": 10.0, "y_m": 3.0, "yaw_rad": 0.1}
+
+
+@settings(deadline=None, max_examples=30)
+@given(x=st.floats(-80, 80), y=st.floats(-80, 80), ego_yaw=st.floats(-3.1, 3.1), mount_yaw=st.floats(-3.1, 3.1))
+def test_a_polar_and_a_cartesian_detection_of_one_place_agree(
+    x: float, y: float, ego_yaw: float, mount_yaw: float
+) -> None:
+    if math.hypot(x, y) < 0.1:
+        return
+    mount = Mount(2.0, 1.0, mount_yaw)
+    ego = EgoPose(5.0, -7.0, ego_yaw, 10.0)
+    polar = Detection(range_m=math.hypot(x, y), bearing_rad=math.atan2(y, x))
+    [a] = candidates(polar, sensor=replace(POLAR, mount=mount), frame="sensor", ego=ego)
+    [b] = candidates(Detection(x_m=x, y_m=y), sensor=replace(LIDAR, mount=mount), frame="sensor", ego=ego)
+    assert a.position_m == pytest.approx(b.position_m, abs=1e-9)
+    model = a.measurement.model
+    state = np.array([*b.position_m, 0.0, 0.0, 0.0])
+    predicted = model.predict(state, a.measurement.pose)  # the measurement stays in the sensor frame
+    assert model.residual(a.measurement.z, predicted) == pytest.approx([0.0, 0.0], abs=1e-9)
+
+
+# --- covariance
+
+
+def test_a_sensors_deviations_lie_along_and_across_the_line_of_sight() -> None:
+    radar = SensorModel(std={"x_m": 2.0, "y_m": 0.5})
+    [found] = candidates(Detection(x_m=10.0, y_m=10.0), sensor=radar)
+    sight = rotation(math.pi / 2 + math.pi / 4)
+    assert found.measurement.R == pytest.approx(sight @ np.diag([4.0, 0.25]) @ sight.T)
+    assert found.position_covariance == pytest.approx(found.measurement.R)
+
+
+@pytest.mark.parametrize(("frame", "turned_rad"), [("map", 0.0), ("ego", math.pi / 2), ("sensor", math.pi)])
+def test_a_detections_own_covariance_is_turned_with_its_frame(frame: Frame, turned_rad: float) -> None:
+    own = np.array([[4.0, 0.5, 0.1], [0.5, 1.0, 0.2], [0.1, 0.2, 0.3]])
+    item = Detection(x_m=10.0, y_m=3.0, yaw_rad=0.1, covariance=tuple(own.ravel().tolist()))
+    [found] = candidates(item, frame=frame)
+    turn = np.eye(3)
+    turn[:2, :2] = rotation(turned_rad)
+    assert found.measurement.R == pytest.approx(turn @ own @ turn.T)
+    [ignored] = candidates(item, frame=frame, sensor=replace(LIDAR, message_covariance=False))
+    assert ignored.measurement.R == pytest.approx(np.diag([0.09, 0.09, 0.16]))
+
+
+def test_only_the_components_that_the_sensor_measures_are_taken_of_a_covariance() -> None:
+    own = np.diag([4.0, 5.0, 6.0, 7.0])
+    item = Detection(x_m=10.0, y_m=3.0, yaw_rad=0.1, speed_mps=9.0, covariance=tuple(own.ravel().tolist()))
+    sensor = SensorModel(std={"x_m": 0.3, "y_m": 0.3, "speed_mps": 0.2})
+    [found] = candidates(item, sensor=sensor, frame="map")
+    assert found.measurement.model.components == ("x_m", "y_m", "speed_mps")
+    assert found.measurement.R == pytest.approx(np.diag([4.0, 5.0, 7.0]))
+
+
+def test_the_position_covariance_of_range_and_bearing_is_along_and_across_the_line_of_sight() -> None:
+    [found] = candidates(Detection(range_m=50.0, bearing_rad=0.2), sensor=POLAR)
+    sight = rotation(math.pi / 2 + 0.2)
+    assert found.position_covariance == pytest.approx(sight @ np.diag([0.25, (50.0 * 0.02) ** 2]) @ sight.T)
+    assert found.measurement.R == pytest.approx(np.diag([0.25, 0.0004]))
+
+
+def test_a_bearing_alone_has_no_place() -> None:
+    [placed, bearing] = candidates(
+        Detection(bearing_rad=0.2), Detection(range_m=9.0, bearing_rad=0.2), sensor=POLAR, road=StraightRoad()
+    )
+    assert (placed.index, bearing.index) == (1, 0)  # placed ones first
+    assert (bearing.position_m, bearing.position_covariance) == (None, None)
+    assert bearing.measurement.model.components == ("bearing_rad",)
+
+
+# --- the map
+
+
+def test_a_yaw_that_was_not_measured_comes_from_the_map_with_its_own_deviation() -> None:
+    own = Detection(x_m=1.0, y_m=2.0, yaw_rad=3.0, covariance=tuple(np.diag([4.0, 4.0, 9.0]).ravel().tolist()))
+    for item, variance in ((Detection(x_m=1.0, y_m=2.0), 0.09), (own, 4.0)):
+        [found] = candidates(item, sensor=POINTS, frame="map", road=StraightRoad(yaw_rad=0.4))
+        assert found.values == {"x_m": 1.0, "y_m": 2.0, "yaw_rad": 0.4}
+        assert found.measurement.R == pytest.approx(np.diag([variance, variance, 0.35**2]))
+    [measured] = candidates(Detection(x_m=1.0, y_m=2.0, yaw_rad=0.1), frame="map", road=StraightRoad(yaw_rad=0.4))
+    assert measured.values["yaw_rad"] == 0.1
+    [unknown] = candidates(Detection(x_m=1.0, y_m=2.0), sensor=POINTS, frame="map")
+    assert "yaw_rad" not in unknown.values
+
+
+def test_detections_off_the_road_are_recorded_and_dropped_before_the_merge() -> None:
+    step = Preprocess(StraightRoad(half_width_m=5.0), ConnectedMerge(distance_m=3.0), CTRV(), ORIGIN_M)
+    items = [Detection(x_m=1.0, y_m=y_m) for y_m in (6.0, 4.0, -9.0, 3.0)]
+    found, records = step(batch(*items, frame="map"), POINTS, EGO)
+    assert [(record.index, record.disposition) for record in records] == [
+        (0, Disposition.OUT_OF_BOUNDS),
+        (2, Disposition.OUT_OF_BOUNDS),
+    ]
+    [merged] = found
+    assert (merged.index, merged.merged) == (1, (3,))
+    assert merged.position_m == pytest.approx([1.0, 3.5])
+
+
+def test_detections_beyond_the_range_of_the_sensor_are_recorded_and_dropped() -> None:
+    step = Preprocess(OpenSpace(), NoMerge(), CTRV(), ORIGIN_M)
+    items = [Detection(x_m=29.9, y_m=0.0), Detection(x_m=30.1, y_m=0.0)]
+    found, records = step(batch(*items), replace(POINTS, max_range_m=30.0), EGO)
+    assert [item.index for item in found] == [0]
+    assert [(record.index, record.disposition) for record in records] == [(1, Disposition.OUT_OF_BOUNDS)]
+
+
+# --- merge
+
+CHAIN = np.array([[0.0, 0.0], [4.0, 0.0], [8.0, 0.0], [50.0, 0.0], [50.0, 5.1]])
+
+
+def test_a_chain_of_neighbours_is_one_object() -> None:
+    groups = ConnectedMerge().groups(CHAIN)
+    assert [(group.first, group.members) for group in groups] == [(0, (0, 1, 2)), (3, (3, 4))]
+
+
+def test_the_published_merge_makes_an_object_of_every_neighbourhood() -> None:
+    groups = NeighbourhoodMerge().groups(np.vstack([CHAIN, [[90.0, 0.0]]]))
+    assert {group.members for group in groups[:-1]} == {(0, 1), (0, 1, 2), (1, 2), (3, 4)}
+    assert (groups[-1].first, groups[-1].members) == (5, (5,))
+    assert {group.members: group.first for group in groups[:-1]} == {(0, 1): 0, (0, 1, 2): 1, (1, 2): 2, (3, 4): 3}
+
+
+@pytest.mark.parametrize("merge", [ConnectedMerge(), NeighbourhoodMerge(), NoMerge()])
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 12))
+def test_every_detection_leads_or_is_merged_into_exactly_one_candidate(merge: Merge, seed: int, count: int) -> None:
+    points = np.random.default_rng(seed).uniform(0.0, 15.0, size=(count, 2)).round(1)
+    items = [Detection(x_m=x, y_m=y, yaw_rad=0.0) for x, y in points.tolist()]
+    found = candidates(*items, merge=merge, frame="map")
+    indices = [i for item in found for i in (item.index, *item.merged)]
+    assert sorted(indices) == list(range(count))
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 12))
+def test_connected_groups_are_those_of_a_search_by_hand(seed: int, count: int) -> None:
+    points = np.random.default_rng(seed).uniform(0.0, 20.0, size=(count, 2))
+    groups = {frozenset([i]) for i in range(count)}
+    for i in range(count):
+        for j in range(i):
+            if math.dist(points[i], points[j]) <= 5.1:
+                a, b = (next(group for group in groups if k in group) for k in (i, j))
+                groups = groups - {a, b} | {a | b}
+    assert {frozenset(group.members) for group in ConnectedMerge().groups(points)} == groups
+
+
+def test_a_merged_yaw_is_the_mean_direction_and_the_published_one_is_not() -> None:
+    yaws = np.array([math.pi - 0.1, -math.pi + 0.1])
+    assert abs(ConnectedMerge().mean("yaw_rad", yaws)) == pytest.approx(math.pi)
+    jump = np.array([-math.pi / 2 - 0.1, -math.pi / 2 + 0.1])  # where the published yaw jumps
+    assert ConnectedMerge().mean("yaw_rad", jump) == pytest.approx(-math.pi / 2)
+    assert NeighbourhoodMerge().mean("yaw_rad", jump) == pytest.approx(math.pi / 2)
+    assert NeighbourhoodMerge().mean("yaw_rad", yaws) == pytest.approx(math.pi)
+    assert ConnectedMerge().mean("x_m", np.array([1.0, 2.0, 6.0])) == 3.0
+
+
+def test_merged_detections_keep_what_all_of_them_measure() -> None:
+    items = (Detection(x_m=0.0, y_m=0.0001, yaw_rad=0.2), Detection(x_m=2.0, y_m=0.0))
+    [found] = candidates(*items, merge=ConnectedMerge(), frame="map")
+    assert found.measurement.model.components == ("x_m", "y_m")
+    assert found.measurement.R == pytest.approx(0.09 * np.eye(2))
+    assert found.values == pytest.approx({"x_m": 1.0, "y_m": 0.00005})
+
+
+@pytest.mark.parametrize("merge", [ConnectedMerge(), NeighbourhoodMerge()])
+def test_detections_that_say_in_different_ways_where_they_are_merge_into_the_first(merge: Merge) -> None:
+    both = SensorModel(std={"x_m": 0.3, "y_m": 0.3, "range_m": 0.5, "bearing_rad": 0.02})
+    items = (Detection(range_m=20.0, bearing_rad=0.0), Detection(x_m=20.0, y_m=0.5, bearing_rad=0.0))
+    [found] = candidates(*items, sensor=both, merge=merge)
+    assert (found.index, found.merged) == (0, (1,))
+    assert found.values == {"range_m": 20.0, "bearing_rad": 0.0}
