@@ -37,7 +37,10 @@ def demo(
         if not (bag / "metadata.yaml").exists():
             raise CallError(f"{bag}: is in the way and no recording, choose another folder with -o")
         shutil.rmtree(bag)
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CallError(f"{out}: cannot be made a folder ({error.strerror}), choose another one with -o") from error
     with progress("simulate"):
         write_bag(bag, simulate(paper_scenario(), np.random.default_rng(_SEED)))
     config = Config()

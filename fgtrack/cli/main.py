@@ -6,19 +6,17 @@ import traceback
 from collections.abc import Sequence
 from typing import Annotated
 
-import click
 import typer
 
 import fgtrack
 from fgtrack.cli import compare, config, convert, demo, figure, info, replay, simulate
 from fgtrack.core.errors import CallError, FgtrackError
 
-DONE, BAD_DATA, BAD_CALL = 0, 1, 2
+DONE, BAD_DATA, BAD_CALL, INTERRUPTED = 0, 1, 2, 130
 
 app = typer.Typer(
     name="fgtrack",
     help="Track objects from delayed object lists, and compare how delays are dealt with.",
-    no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -57,19 +55,16 @@ def run(arguments: Sequence[str]) -> int:
     words = [word for word in arguments if word != "--debug"]
     logging.basicConfig(level=logging.WARNING, format="fgtrack: %(message)s", force=True)
     try:
-        outcome = typer.main.get_command(app).main(words, prog_name="fgtrack", standalone_mode=False)
-        return outcome if isinstance(outcome, int) else DONE
-    except click.exceptions.NoArgsIsHelpError as error:
-        print(error.format_message())
-        return BAD_CALL
-    except click.ClickException as error:
+        outcome = typer.main.get_command(app).main(words or ["--help"], prog_name="fgtrack", standalone_mode=False)
+        if outcome == INTERRUPTED:  # typer turns the exception into this code
+            return _failed("interrupted; what was computed so far is in the output folder", INTERRUPTED, debug)
+        return BAD_CALL if not words else outcome if isinstance(outcome, int) else DONE
+    except typer.TyperException as error:
         return _failed(error.format_message(), BAD_CALL, debug)
     except CallError as error:
         return _failed(str(error), BAD_CALL, debug)
     except FgtrackError as error:
         return _failed(str(error), BAD_DATA, debug)
-    except (KeyboardInterrupt, click.Abort):
-        return _failed("interrupted; what was computed so far is in the output folder", 130, debug)
     except BrokenPipeError:
         sys.stderr.close()  # the reader of a pipe has left: not an error worth a line
         return DONE

@@ -35,10 +35,12 @@ def replay(
     config = changed(
         config, map=changed(config.map, track=track_map or config.map.track, pit=pit_map or config.map.pit)
     )
-    names = tuple(name.strip() for name in (estimators or config.estimator).split(","))
+    names = tuple(name.strip() for name in (config.estimator if estimators is None else estimators).split(","))
     for name in names:
         if name not in ESTIMATORS:
             raise CallError(f"estimator {name!r} is unknown: there are {', '.join(ESTIMATORS)}")
+        if names.count(name) > 1:
+            raise CallError(f"estimator {name!r} is named twice")
     source = open_input(recording, config.input)
     with progress("replay") as show:
         results = replay_each(
@@ -55,7 +57,8 @@ def replay(
     broken = next((result.broken for result in results if result.broken is not None), None)
     if broken is None:
         return 0
-    print(f"fgtrack: error: {' '.join(broken.split())}; replayed up to there", file=sys.stderr)
+    where = "" if str(recording) in broken else f"{recording}: "
+    print(f"fgtrack: error: {where}{' '.join(broken.split())}; replayed up to there", file=sys.stderr)
     return 1
 
 

@@ -1,5 +1,6 @@
 """`fgtrack simulate`: a scenario to a stream or a bag."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -31,8 +32,8 @@ def simulate(
     """Simulate a scenario: ego, detections with noise and delays, and the truth."""
     scenario = read_scenario(scenario_file)
     if duration_s is not None:
-        if not duration_s > 0.0:
-            raise CallError(f"--duration {duration_s:g}: must be positive")
+        if not 0.0 < duration_s < math.inf:
+            raise CallError(f"--duration {duration_s:g}: must be positive and finite")
         scenario = replace(scenario, duration_s=duration_s)
     with progress("simulate"):
         count = write_recording(out, simulated(scenario, np.random.default_rng(seed)), storage)

@@ -19,9 +19,9 @@ def wrap_angle(angle_rad: float) -> float:
 
 def wrap_angles(angles_rad: FloatArray) -> FloatArray:
     """Angles in (-pi, pi], any shape; exact (unchanged to the bit) where they lie there already."""
-    inside = (angles_rad > -np.pi) & (angles_rad <= np.pi)
-    if inside.all():
+    if np.abs(angles_rad).max(initial=0.0) < np.pi:
         return angles_rad
+    inside = (angles_rad > -np.pi) & (angles_rad <= np.pi)
     wrapped = np.pi - np.mod(np.pi - angles_rad, TWO_PI)
     wrapped = np.where(wrapped <= -np.pi, np.pi, wrapped)  # one rounding above pi; NaN stays NaN
     return np.asarray(np.where(inside, angles_rad, wrapped))
@@ -39,9 +39,7 @@ def rotations(yaws_rad: FloatArray) -> FloatArray:
     return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
 
 
-def parent_from_child(
-    points_m: FloatArray, origin_m: tuple[float, float], yaw_rad: float
-) -> FloatArray:
+def parent_from_child(points_m: FloatArray, origin_m: tuple[float, float], yaw_rad: float) -> FloatArray:
     """Points, shape (n, 2), of a child frame at `origin_m`, `yaw_rad`, expressed in its parent."""
     return np.asarray(points_m @ rotation(yaw_rad).T + np.asarray(origin_m))
 

@@ -1,13 +1,23 @@
 """Small dense linear algebra on stacks of symmetric matrices."""
 
+from functools import cache
+
 import numpy as np
 
 from fgtrack.core.types import FloatArray
 
 
+@cache
+def identity(n: int) -> FloatArray:
+    """The identity matrix, shape (n, n); one shared read-only array for each `n`."""
+    matrix = np.eye(n)
+    matrix.flags.writeable = False
+    return matrix
+
+
 def symmetrise(matrix: FloatArray) -> FloatArray:
     """Symmetric part of `matrix`, shape (..., n, n)."""
-    return np.asarray(0.5 * (matrix + np.swapaxes(matrix, -1, -2)))
+    return 0.5 * (matrix + matrix.mT)
 
 
 def psd_solve(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
@@ -20,5 +30,4 @@ def psd_solve(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
 
 def mahalanobis_squared(residual: FloatArray, covariance: FloatArray) -> FloatArray:
     """Squared Mahalanobis distance y' S^-1 y; shapes (..., n) and (..., n, n), result (...)."""
-    solved = psd_solve(covariance, residual[..., None])[..., 0]
-    return np.asarray(np.sum(residual * solved, axis=-1))
+    return np.asarray(np.vecdot(residual, psd_solve(covariance, residual[..., None])[..., 0]))

@@ -7,6 +7,7 @@ is the baseline, and not a replay.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -195,8 +196,10 @@ class BackwardForwardBank:
         """Update with measurements that share a model, a sensor pose and a stamp."""
         z = np.array([measurement.z for measurement in measurements])
         R = np.array([measurement.R for measurement in measurements])
+        model = measurements[0].model
+        residual = partial(self._propagator.residual, model)
         try:
-            corrected = correct(means, covariances, z, R, measurements[0].model, measurements[0].pose)
+            corrected = correct(means, covariances, z, R, model, measurements[0].pose, residual)
         except np.linalg.LinAlgError:
             return self._update_one_by_one(track_ids, means, covariances, measurements, back)
         settled = self._propagator.settle(corrected.mean)
@@ -207,9 +210,7 @@ class BackwardForwardBank:
                 results.append(UpdateResult(UpdateStatus.FAILED))
                 continue
             storage = self._objects[track_id]
-            storage.put(
-                Anchor(self._grid - back, self._visible_from(back), settled[row], corrected.covariance[row])
-            )
+            storage.put(Anchor(self._grid - back, self._visible_from(back), settled[row], corrected.covariance[row]))
             late = storage.newest_fused_ns > measurement.stamp_ns
             storage.newest_fused_ns = max(storage.newest_fused_ns, measurement.stamp_ns)
             status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE

@@ -1,10 +1,11 @@
 """The extended Kalman filter's two steps, on stacks of independent states."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.linalg import psd_solve, symmetrise
+from fgtrack.core.linalg import identity, psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.models.measurement import MeasurementModel, SensorPose
 from fgtrack.models.motion import MotionModel
@@ -31,7 +32,7 @@ def predict(
     Shapes (..., n) and (..., n, n); `dt_s` a number or of shape (...).
     """
     F = motion.jacobian(mean, dt_s)
-    spread = F @ covariance @ np.swapaxes(F, -1, -2) + motion.process_noise(mean, dt_s)
+    spread = F @ covariance @ F.mT + motion.process_noise(mean, dt_s)
     return motion.predict(mean, dt_s), symmetrise(spread)
 
 
@@ -42,13 +43,16 @@ def correct(
     R: FloatArray,
     model: MeasurementModel,
     pose: SensorPose,
+    residual: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
 ) -> Correction:
     """Fuse z (m, k) with covariance R (m, k, k) into m states (Karle et al. 2023, eqs. 5 to 9).
 
-    The posterior covariance is in Joseph form. Raises `numpy.linalg.LinAlgError` for a singular S.
+    `residual` may take the place of the model's own. The posterior covariance is in Joseph form. Raises
+    `numpy.linalg.LinAlgError` for a singular S.
     """
-    y = model.residual(z, model.predict(mean, pose))
-    return correct_with_innovation(mean, covariance, y, R, model.jacobian(mean, pose))
+    y = (residual or model.residual)(z, model.predict(mean, pose))
+    H = model.selection(mean.shape[-1]) if model.linear else model.jacobian(mean, pose)
+    return correct_with_innovation(mean, covariance, y, R, H)
 
 
 def correct_with_innovation(
@@ -56,15 +60,14 @@ def correct_with_innovation(
 ) -> Correction:
     """Fuse the innovations y (m, k) of measurements with Jacobians H (m, k, n) or (k, n)."""
     HP = H @ covariance
-    S = HP @ np.swapaxes(H, -1, -2) + R
+    S = HP @ H.mT + R
     solved = psd_solve(S, np.concatenate([HP, y[..., None]], axis=-1))
-    K = np.swapaxes(solved[..., :-1], -1, -2)
-    weighted = solved[..., -1]
-    A = np.eye(mean.shape[-1]) - K @ H
-    posterior = A @ covariance @ np.swapaxes(A, -1, -2) + K @ R @ np.swapaxes(K, -1, -2)
+    K = solved[..., :-1].mT
+    A = identity(mean.shape[-1]) - K @ H
+    posterior = A @ covariance @ A.mT + K @ R @ K.mT
     return Correction(
         mean + (K @ y[..., None])[..., 0],
         symmetrise(posterior),
         y,
-        np.asarray(np.sum(y * weighted, axis=-1)),
+        np.asarray(np.vecdot(y, solved[..., -1])),
     )

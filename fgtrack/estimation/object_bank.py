@@ -86,10 +86,10 @@ class ObjectBank:
         del self._estimators[track_id]
 
     def present(self) -> list[TrackState]:
-        """See `TrackBank.present`."""
+        """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
         if not self._estimators:
             return []
-        states = [estimator.state_at(self._now_ns) for estimator in self._estimators.values()]
+        states = [one.state_at(max(self._now_ns, one.window_ns[0])) for one in self._estimators.values()]
         mean, covariance = self._motion.kinematic(
             np.array([state.mean for state in states]), np.array([state.covariance for state in states])
         )

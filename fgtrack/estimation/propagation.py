@@ -1,18 +1,18 @@
 """Propagators: many objects through equal time steps, each through its own number of them."""
 
-import math
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from fgtrack.core.geometry import rotations, wrap_angles
 from fgtrack.core.linalg import symmetrise
 from fgtrack.core.types import SPEED, YAW, YAW_RATE, FloatArray, IntArray
 from fgtrack.estimation.ekf import predict
+from fgtrack.models.measurement import MeasurementModel
 from fgtrack.models.motion import MotionModel
 
-ComplexArray = npt.NDArray[np.complex128]
+_TURNING = slice(YAW, YAW_RATE + 1)  # the states that the position depends on
+_EYE_3 = np.eye(3)[..., None]
 
 
 class Propagator(Protocol):
@@ -28,6 +28,9 @@ class Propagator(Protocol):
 
     def settle(self, mean: FloatArray) -> FloatArray:
         """Means, shape (..., n), with the angles brought back to their range after a correction."""
+
+    def residual(self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
+        """Measured minus predicted, shape (..., k), in the angles' range."""
 
 
 class ExactPropagator:
@@ -47,23 +50,27 @@ class ExactPropagator:
         """See `Propagator.settle`."""
         return wrapped_yaw(mean) if self._yawed else mean
 
+    def residual(self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
+        """See `Propagator.residual`: the model's own."""
+        return model.residual(z, z_predicted)
+
 
 class EulerCtrv:
     """CTRV in Euler steps (Karle et al. 2023, eq. 10), all of them in closed form.
 
     The transition of one step differs from the identity in five entries, so the product Phi(K, j) of the steps from
-    j to K is made of differences of running sums; the noise gathered is the sum of Phi(K, j) Q Phi(K, j)' over j.
-    States beyond the yaw rate are carried along unchanged, and so is their noise.
+    j to K is made of running sums from the end, and P' = Phi(K, 0) P Phi(K, 0)' + sum over j > 0 of
+    Phi(K, j) Q Phi(K, j)'. States beyond the yaw rate are carried along unchanged, and so is their noise.
     """
 
     def __init__(self, motion: MotionModel, density: FloatArray) -> None:
         """`density`: diagonal of Q per second, shape (n,), along and across the heading first."""
         self.motion = motion
         self._density = density
-        self._root = np.sqrt(density[YAW : YAW_RATE + 1])
+        self._directed = density[_TURNING, None]
         self._isotropic = bool(density[0] == density[1])
         self._undirected = np.diag(density)  # noise of what nothing else depends on, and of an isotropic position
-        self._undirected[YAW : YAW_RATE + 1] = 0.0
+        self._undirected[_TURNING, _TURNING] = 0.0
         if not self._isotropic:
             self._undirected[:2] = 0.0
         self._identity = np.eye(len(density))
@@ -72,69 +79,62 @@ class EulerCtrv:
         self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
     ) -> tuple[FloatArray, FloatArray]:
         """See `Propagator.propagate`."""
-        longest = int(steps.max(initial=0))
+        longest = max(steps.tolist(), default=0)
         if not longest:
             return mean, covariance
-        index = np.arange(longest, dtype=np.float64)
-        start_s = index * np.float64(dt_s)  # of each step
-        going = (index < steps[:, None]).astype(np.float64)  # (m, K); 0 where an object has arrived
-        yaw = self.yaws(mean, start_s)
-        # Displacements are complex, x + i y: by a speed of 1, by the speed, and by the speed times the time.
-        paths = np.empty((3, *yaw.shape), dtype=np.complex128)
-        np.multiply(np.exp(1j * yaw), dt_s * going, out=paths[0])
-        np.multiply(self.speeds(mean, start_s), paths[0], out=paths[1])
-        np.multiply(start_s, paths[1], out=paths[2])
-        paths.cumsum(axis=2, out=paths)
-        total = paths[:, :, -1]
+        at_s = np.arange(longest + 1.0) * dt_s  # where steps begin and end, (K + 1,)
         elapsed_s = steps * np.float64(dt_s)
+        left_s = elapsed_s[:, None] - at_s
+        lasts_s = np.minimum(np.maximum(left_s, 0.0), dt_s)  # of the step that begins there; 0 after an object's last
+        yaw = self.yaws(mean, at_s)
+
+        moved = np.zeros((*mean.shape, 3, longest + 1))  # columns yaw, speed and yaw rate of Phi(K, j)
+        self._fill_ways(moved[:, :2], yaw, self.speeds(mean, at_s), at_s, lasts_s)
+        moved[:, _TURNING] = _EYE_3
+        moved[:, YAW, 2] = left_s
 
         after = mean.copy()
-        after[:, 0] += total[1].real
-        after[:, 1] += total[1].imag
+        after[:, 0] += moved[:, 1, 0, 0]  # by the yaw, a way turns by a right angle
+        after[:, 1] -= moved[:, 0, 0, 0]
         after[:, YAW] = self.yaws(mean, elapsed_s[:, None])[:, 0]
         after[:, SPEED] = self.speeds(mean, elapsed_s[:, None])[:, 0]
 
-        Phi = np.zeros(covariance.shape)
+        Phi = np.empty(covariance.shape)
         Phi[:] = self._identity
-        by_state = np.array([1j * total[1], total[0], 1j * total[2]]).T  # by yaw, speed and yaw rate
-        Phi[:, 0, YAW : YAW_RATE + 1] = by_state.real
-        Phi[:, 1, YAW : YAW_RATE + 1] = by_state.imag
-        Phi[:, YAW, YAW_RATE] = elapsed_s
-        spread = Phi @ covariance @ np.swapaxes(Phi, -1, -2)
-        spread += self._gathered(total[:, :, None] - paths, start_s + dt_s, yaw, going, elapsed_s, dt_s)
+        Phi[:, :, _TURNING] = moved[..., 0]
+        spread = Phi @ (covariance + self._undirected * elapsed_s[:, None, None]) @ Phi.mT
+
+        gathered_s = np.zeros(left_s.shape)  # of the step that ends there: its noise enters at its end
+        gathered_s[:, 1:] = lasts_s[:, :-1]
+        driven = moved * (self._directed * gathered_s[:, None, None])
+        flat = (*mean.shape, -1)
+        spread += driven.reshape(flat) @ moved.reshape(flat).mT
+        if not self._isotropic:
+            spread[:, :2, :2] += self._turned(yaw, lasts_s)
         return after, symmetrise(spread)
 
-    def _gathered(
-        self,
-        rest: ComplexArray,
-        end_s: FloatArray,
-        yaw: FloatArray,
-        going: FloatArray,
-        elapsed_s: FloatArray,
-        dt_s: float,
-    ) -> FloatArray:
-        """Noise gathered, the sum over j of G_j G_j': G_j holds the driven columns of Phi(K, j) times sqrt(Q).
+    @staticmethod
+    def _fill_ways(ways: FloatArray, yaw: FloatArray, speed: FloatArray, at_s: FloatArray, lasts_s: FloatArray) -> None:
+        """Write the derivatives of x and y at the end by yaw, speed and yaw rate at each of `at_s`, (m, 2, 3, K + 1).
 
-        `rest` (3, m, K): displacements from the end of step j, at `end_s` (K,), on.
+        First those of single steps, then the sums from there to the end.
         """
-        m, K = yaw.shape
-        driven = np.zeros((m, 5, 3, K))  # x, y, yaw, speed, yaw rate; by the noise of yaw, speed, yaw rate
-        rest[2] -= end_s * rest[1]  # the yaw rate at j turns only what comes later
-        driven[:, 0, 0], driven[:, 1, 0] = -rest[1].imag, rest[1].real
-        driven[:, 0, 1], driven[:, 1, 1] = rest[0].real, rest[0].imag
-        driven[:, 0, 2], driven[:, 1, 2] = -rest[2].imag, rest[2].real
-        driven[:, 2, 0] = driven[:, 3, 1] = driven[:, 4, 2] = going
-        driven[:, 2, 2] = (elapsed_s[:, None] - end_s) * going
-        driven *= math.sqrt(dt_s) * self._root[:, None]
-        flat = driven.reshape(m, 5, 3 * K)
-        gathered = np.zeros((m, len(self._density), len(self._density)))
-        gathered[:, :5, :5] = flat @ np.swapaxes(flat, -1, -2)
-        gathered += self._undirected * elapsed_s[:, None, None]
-        if not self._isotropic:
-            turn = rotations(yaw)
-            turned = turn @ np.diag(self._density[:2] * dt_s) @ np.swapaxes(turn, -1, -2)
-            gathered[:, :2, :2] += np.sum(turned * going[:, :, None, None], axis=1)
-        return gathered
+        by_yaw, by_speed, by_yaw_rate = ways[:, :, 0], ways[:, :, 1], ways[:, :, 2]
+        np.cos(yaw, out=by_speed[:, 0])
+        np.sin(yaw, out=by_speed[:, 1])
+        by_speed *= lasts_s[:, None]
+        np.multiply(-speed, by_speed[:, 1], out=by_yaw[:, 0])
+        np.multiply(speed, by_speed[:, 0], out=by_yaw[:, 1])
+        np.multiply(at_s, by_yaw, out=by_yaw_rate)
+        backwards = ways[..., ::-1]
+        np.add.accumulate(backwards, axis=-1, out=backwards)
+        by_yaw_rate -= at_s * by_yaw  # it turns only what comes later
+
+    def _turned(self, yaw: FloatArray, lasts_s: FloatArray) -> FloatArray:
+        """Position noise along and across the headings `yaw` (m, K) of steps that last so long, shape (m, 2, 2)."""
+        turn = rotations(yaw)
+        along_across = turn * self._density[:2] @ turn.mT
+        return np.asarray((along_across * lasts_s[:, :, None, None]).sum(axis=1))
 
     def yaws(self, mean: FloatArray, elapsed_s: FloatArray) -> FloatArray:
         """Yaw of each object after `elapsed_s`, (k,) or (m, k); shape (m, k)."""
@@ -147,6 +147,10 @@ class EulerCtrv:
     def settle(self, mean: FloatArray) -> FloatArray:
         """See `Propagator.settle`."""
         return wrapped_yaw(mean)
+
+    def residual(self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
+        """See `Propagator.residual`: the model's own."""
+        return model.residual(z, z_predicted)
 
 
 def wrapped_yaw(mean: FloatArray) -> FloatArray:

@@ -5,18 +5,24 @@ Its yaw is 0 along +y and jumps at +-pi there, which in REP-103 is at 3 pi / 2 (
 
 import numpy as np
 
-from fgtrack.core.geometry import wrap_angles
+from fgtrack.core.geometry import TWO_PI
 from fgtrack.core.types import ACCEL, SPEED, YAW, FloatArray
 from fgtrack.estimation.backward_forward import BackwardForwardBank
 from fgtrack.estimation.propagation import EulerCtrv
+from fgtrack.models.measurement import MeasurementModel
 
 #: The published yaw range in REP-103 is (YAW_LIMIT - 2 pi, YAW_LIMIT].
 YAW_LIMIT_RAD = 1.5 * np.pi
 
 
+def one_turn(angle_rad: FloatArray) -> FloatArray:
+    """Angle wrapped by at most one turn: in (-pi, pi] only for what is less than a turn and a half away."""
+    return np.asarray(angle_rad + TWO_PI * (1.0 * (angle_rad <= -np.pi) - (angle_rad > np.pi)))
+
+
 def published_yaw(yaw_rad: FloatArray) -> FloatArray:
-    """Yaw in the published range: in (-pi, pi] from +y, hence in (-pi/2, 3 pi/2] from +x."""
-    return np.asarray(wrap_angles(yaw_rad - 0.5 * np.pi) + 0.5 * np.pi)
+    """Yaw in the published range: in (-pi, pi] from +y, hence in (-pi/2, 3 pi/2] from +x; by at most one turn."""
+    return one_turn(yaw_rad - 0.5 * np.pi) + 0.5 * np.pi
 
 
 class AcceleratedEulerCtrv(EulerCtrv):
@@ -28,7 +34,7 @@ class AcceleratedEulerCtrv(EulerCtrv):
 
 
 class SaturatedYaw:
-    """Mix-in: the predicted yaw sticks at the upper end of its range instead of wrapping (defect Q2)."""
+    """Mix-in: the predicted yaw sticks at the upper end of its range, and runs on below the lower one (defect Q2)."""
 
     def yaws(self, mean: FloatArray, elapsed_s: FloatArray) -> FloatArray:
         """See `EulerCtrv.yaws`."""
@@ -40,6 +46,16 @@ class SaturatedYaw:
         settled = mean.copy()
         settled[..., YAW] = published_yaw(mean[..., YAW])
         return settled
+
+    def residual(self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
+        """Measured minus predicted, angles wrapped by one turn only: a yaw that has wound up stays off by turns."""
+        y = np.asarray(z - z_predicted)
+        for index, name in enumerate(model.components):
+            if name == "yaw_rad":
+                y[..., index] = one_turn(published_yaw(z[..., index]) - z_predicted[..., index])
+            elif model.angular[index]:
+                y[..., index] = one_turn(y[..., index])
+        return y
 
 
 class SaturatedEulerCtrv(SaturatedYaw, EulerCtrv):

@@ -80,7 +80,7 @@ class MeasurementModel:
     def predict(self, x: FloatArray, pose: SensorPose = SensorPose()) -> FloatArray:
         """Measurement expected of the states `x`, shape (..., n) -> (..., k). Angles are not wrapped."""
         if self.linear:
-            return x[..., self._selected]
+            return x.take(self._selected, axis=-1)
         scene = _Scene(x, pose, self._cartesian)
         return np.stack([_COMPONENTS[name].value(scene) for name in self.components], axis=-1)
 
@@ -92,13 +92,16 @@ class MeasurementModel:
         """
         shape = (*x.shape[:-1], len(self.components), x.shape[-1])
         if self.linear:
-            H = _selection_matrix(self, x.shape[-1])
-            return H if x.ndim == 1 else np.broadcast_to(H, shape)
+            return np.broadcast_to(self.selection(x.shape[-1]), shape)
         scene = _Scene(x, pose, self._cartesian)
         H = np.zeros(shape)
         for row, name in enumerate(self.components):
             H[..., row, :2], H[..., row, 2:4] = _COMPONENTS[name].gradient(scene)
         return H
+
+    def selection(self, n: int) -> FloatArray:
+        """`jacobian` of a linear model at any state of `n` entries, shape (k, n), read-only."""
+        return _selection_matrix(self, n)
 
     def residual(self, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
         """Measured minus predicted, shape (..., k), with angles in (-pi, pi]; the only place that wraps."""

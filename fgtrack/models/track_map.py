@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from fgtrack.core.errors import DataError
@@ -41,10 +42,13 @@ _SAME_POINT_M = 1e-3
 _MAX_GAP = 10.0  # closing segment, in lengths of the longest other segment
 _MAX_HEADING_ERROR_RAD = 1.0  # coarse maps turn much in a row; a wrong convention is off by pi / 2
 
-# Quantities of a segment row: the values where it starts; `_CHANGE` further on, the change to its end.
-_X, _Y, _NORMAL_X, _NORMAL_Y, _HEADING, _CURVATURE, _LEFT, _RIGHT, _ARC = range(9)
-_CHANGE = 9
-_FRAME, _FRAME_CHANGE = slice(_X, _HEADING), slice(_CHANGE + _X, _CHANGE + _HEADING)
+# A segment row holds these quantities where the segment starts, and then the changes to its end. Points and directions
+# are complex, x + i y; `_ALONG` is the component of the segment along the tangent.
+_POINT, _TANGENT, (_HEADING, _CURVATURE, _LEFT, _RIGHT, _ARC, _ALONG) = slice(0, 2), slice(2, 4), range(4, 10)
+_QUANTITIES = 10
+_FEW_DISTANCES = 3000  # so many are calculated sooner than the tree is asked
+
+ComplexArray = npt.NDArray[np.complex128]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,21 +85,24 @@ class TrackMap:
         table = _closed(table)
         table[:, _HEADINGS] = wrap_angles(table[:, _HEADINGS])
         x, y = points = np.ascontiguousarray(table[:, :2].T)
-        lengths = np.hypot(np.diff(x), np.diff(y))
-        arc = np.concatenate([[0.0], np.cumsum(lengths)])
+        arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
         heading = np.unwrap(table[:, _COLUMN["psi_ref_rad"]])
-        knots = [  # in the order of a segment row
-            x,
-            y,
-            -np.sin(heading),
-            np.cos(heading),
-            heading,
-            table[:, _COLUMN["kappa_ref_radpm"]],
-            table[:, _COLUMN["width_left_m"]],
-            table[:, _COLUMN["width_right_m"]],
-            arc,
-        ]
-        segments = np.concatenate([np.stack(knots)[:, :-1], np.diff(np.stack(knots))]).T.copy()
+        knots = np.stack(
+            [  # in the order of a segment row
+                x,
+                y,
+                np.cos(heading),
+                np.sin(heading),
+                heading,
+                table[:, _COLUMN["kappa_ref_radpm"]],
+                table[:, _COLUMN["width_left_m"]],
+                table[:, _COLUMN["width_right_m"]],
+                arc,
+            ]
+        )
+        starts, changes = knots[:, :-1], np.diff(knots)
+        along = [(changes[_POINT] * part[_TANGENT]).sum(axis=0, keepdims=True) for part in (starts, changes)]
+        segments = np.concatenate([starts, along[0], changes, along[1]]).T.copy()
         for array in (table, points, arc, segments):
             array.flags.writeable = False
         for name, value in (
@@ -156,31 +163,31 @@ class TrackMap:
 
     def frenet(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Arc length s in [0, length) and lateral offset (left positive) of `points_m`, shape (n, 2)."""
-        at, part, lateral = self._locate(points_m)
-        s = _value(at, part, _ARC)
+        foot, lateral = self._locate(points_m)
+        s = foot[:, _ARC]
         return np.where(s < self.length_m, s, 0.0), lateral
 
     def position(self, s_m: FloatArray, lateral_m: FloatArray) -> FloatArray:
         """Points, shape (n, 2), at arc length `s_m` (any lap) and `lateral_m`; the inverse of `frenet`."""
-        at, part = self._at(s_m)
-        frame = at[:, _FRAME] + part[:, None] * at[:, _FRAME_CHANGE]
-        foot, normal = frame[:, :2], frame[:, 2:]
-        return np.asarray(foot + (lateral_m / np.hypot(normal[:, 0], normal[:, 1]))[:, None] * normal)
+        foot = self._at(s_m)
+        tangent = _complex(foot[:, _TANGENT])
+        points = _complex(foot[:, _POINT]) + lateral_m * 1j * tangent / np.abs(tangent)
+        return points.view(np.float64).reshape(-1, 2)
 
     def heading(self, points_m: FloatArray) -> FloatArray:
         """Driving direction of the line beside `points_m`, shape (n,), interpolated along the circle."""
-        at, part, _ = self._locate(points_m)
-        return wrap_angles(_value(at, part, _HEADING))
+        foot, _ = self._locate(points_m)
+        return wrap_angles(foot[:, _HEADING])
 
     def curvature(self, points_m: FloatArray) -> FloatArray:
         """Curvature of the line beside `points_m` in rad/m, shape (n,), positive in a left turn."""
-        at, part, _ = self._locate(points_m)
-        return _value(at, part, _CURVATURE)
+        foot, _ = self._locate(points_m)
+        return foot[:, _CURVATURE]
 
     def bounds(self, s_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Widths (left, right) from the line to the bounds at arc length `s_m`, shapes (n,)."""
-        at, part = self._at(s_m)
-        return _value(at, part, _LEFT), _value(at, part, _RIGHT)
+        foot = self._at(s_m)
+        return foot[:, _LEFT], foot[:, _RIGHT]
 
     def outside(self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float) -> BoolArray:
         """Which of `points_m` lie outside the bounds, shape (n,).
@@ -188,71 +195,72 @@ class TrackMap:
         A positive buffer lets points in that lie up to that far beyond the bound; a negative one shrinks the
         track. The inner bound is the one that the lap encloses: the left one if driven counter-clockwise.
         """
-        return self._outside(*self._locate(points_m), inner_buffer_m, outer_buffer_m)
+        return self.view(points_m, inner_buffer_m, outer_buffer_m)[2]
 
     def view(
         self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """`heading`, `curvature` and `outside` of `points_m` at the price of one look-up."""
-        at, part, lateral = self._locate(points_m)
-        return (
-            wrap_angles(_value(at, part, _HEADING)),
-            _value(at, part, _CURVATURE),
-            self._outside(at, part, lateral, inner_buffer_m, outer_buffer_m),
-        )
-
-    def _outside(
-        self,
-        at: FloatArray,
-        part: FloatArray,
-        lateral_m: FloatArray,
-        inner_buffer_m: float,
-        outer_buffer_m: float,
-    ) -> BoolArray:
-        """`outside` of what `_locate` gave."""
+        foot, lateral = self._locate(points_m)
         left_m, right_m = (
             (inner_buffer_m, outer_buffer_m) if self.counter_clockwise else (outer_buffer_m, inner_buffer_m)
         )
-        too_left = lateral_m > _value(at, part, _LEFT) + left_m
-        too_right = -lateral_m > _value(at, part, _RIGHT) + right_m
-        return np.asarray(too_left | too_right)
+        outside = (lateral > foot[:, _LEFT] + left_m) | (-lateral > foot[:, _RIGHT] + right_m)
+        return wrap_angles(foot[:, _HEADING]), foot[:, _CURVATURE], outside
 
-    def _at(self, s_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Segment rows (n, 18) at arc length `s_m` and how far into them, 0 to 1."""
+    def _at(self, s_m: FloatArray) -> FloatArray:
+        """Quantities at arc length `s_m`, shape (n, 10)."""
         s = np.mod(np.asarray(s_m, dtype=np.float64), self.length_m)
         index: IntArray = np.minimum(np.searchsorted(self._arc, s, side="right") - 1, len(self._segments) - 1)
         at = self._segments[index]
-        return at, (s - at[:, _ARC]) / at[:, _CHANGE + _ARC]
+        return _interpolated(at, (s - at[:, _ARC]) / at[:, _QUANTITIES + _ARC])
 
-    def _locate(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Segment rows (n, 18) that `points_m` lie beside, how far into them (0 to 1), and lateral offsets.
+    def _locate(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Quantities at the feet of `points_m` on the line, shape (n, 10), and lateral offsets, shape (n,).
 
-        The foot at the part t of a segment has the point on its normal: cross(q - t e, n + t dn) = 0 with q
-        from the start of the segment to the point, e the segment, n and dn the normal and its change.
+        The foot at the part t of a segment has the point on its normal: along(q - t e, T + t dT) = 0 with q from
+        the start of the segment to the point, e the segment, T and dT the tangent and its change, and
+        along(a, b) = Re(a conj(b)).
         """
-        _, nearest = self._tree.query(points_m)
-        offset = points_m - self._points[nearest]
-        at = self._segments[nearest]
-        behind = offset[:, 0] * at[:, _NORMAL_Y] < offset[:, 1] * at[:, _NORMAL_X]
-        if behind.any():
-            at = self._segments[nearest - behind]
-        ax, ay, nx, ny = at[:, _FRAME].T
-        ex, ey, mx, my = at[:, _FRAME_CHANGE].T
-        qx, qy = points_m[:, 0] - ax, points_m[:, 1] - ay
-        c = qx * ny - qy * nx
+        points = _complex(points_m)
+        nearest = self._nearest(points_m)
+        plane = self._segments.take(nearest, axis=0).view(np.complex128)
+        behind = ((points - plane[:, 0]) * plane[:, 1].conj()).real < 0.0
+        at = self._segments.take(nearest - behind, axis=0, mode="wrap")
+        plane = at.view(np.complex128)
+        start, tangent, segment, turn = plane[:, 0], plane[:, 1], plane[:, 5], plane[:, 6]
+        offset = points - start
+        c = (offset * tangent.conj()).real
         # Negative as far as the centre of curvature; beyond it the nearer end of the segment is the foot.
-        b = np.minimum((qx * my - qy * mx) - (ex * ny - ey * nx), -1e-12)
-        a = ey * mx - ex * my
-        root = np.sqrt(np.maximum(b * b - 4.0 * a * c, 0.0))
-        part = np.minimum(np.maximum(-2.0 * c / (b - root), 0.0), 1.0)
-        nx, ny = nx + part * mx, ny + part * my
-        lateral = ((qx - part * ex) * nx + (qy - part * ey) * ny) / np.sqrt(nx * nx + ny * ny)
-        return at, part, lateral
+        b = np.minimum((offset * turn.conj()).real - at[:, _ALONG], -1e-12)
+        a = at[:, _QUANTITIES + _ALONG]
+        root = np.sqrt(np.maximum(b * b + 4.0 * a * c, 0.0))
+        part = np.minimum(np.maximum(2.0 * c / (root - b), 0.0), 1.0)
+        tangent = tangent + part * turn
+        lateral = ((offset - part * segment) * tangent.conj()).imag / np.abs(tangent)
+        return _interpolated(at, part), lateral
+
+    def _nearest(self, points_m: FloatArray) -> IntArray:
+        """Index of the row nearest to each of `points_m`."""
+        if len(points_m) * len(self._points) > _FEW_DISTANCES:
+            return np.asarray(self._tree.query(points_m)[1])
+        x, y = self._points.T
+        squared = x - points_m[:, 0, None]
+        squared *= squared
+        across = y - points_m[:, 1, None]
+        across *= across
+        squared += across
+        return np.asarray(squared.argmin(axis=1))
 
 
-def _value(at: FloatArray, part: FloatArray, quantity: int) -> FloatArray:
-    """One quantity of the segment rows `at`, shape (n, 18), at `part` of the segments, shape (n,)."""
-    return np.asarray(at[:, quantity] + part * at[:, _CHANGE + quantity])
+def _complex(vectors: FloatArray) -> ComplexArray:
+    """x + i y of `vectors`, shape (n, 2)."""
+    return np.asarray(np.ascontiguousarray(vectors).view(np.complex128)[:, 0])
+
+
+def _interpolated(at: FloatArray, part: FloatArray) -> FloatArray:
+    """Quantities, shape (n, 10), at `part` (n,) of the segment rows `at` (n, 20)."""
+    return np.asarray(at[:, :_QUANTITIES] + part[:, None] * at[:, _QUANTITIES:])
 
 
 def _closed(table: FloatArray) -> FloatArray:

@@ -85,7 +85,11 @@ def build_road(config: MapConfig) -> Road:
 
 
 def _read_map(name: str, built_in: Callable[[], TrackMap]) -> TrackMap:
-    return built_in() if name == "oval" else TrackMap.read(Path(name))
+    if name == "oval":
+        return built_in()
+    if not Path(name).is_file():
+        raise CallError(f"{name}: there is no such map file")
+    return TrackMap.read(Path(name))
 
 
 def _build_backward_forward(config: Config) -> TrackBank:

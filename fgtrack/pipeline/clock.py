@@ -7,8 +7,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.time import first_multiple, period_ns, seconds
+from fgtrack.core.errors import CallError
+from fgtrack.core.time import first_multiple, period_ns
 from fgtrack.core.types import DetectionList, EgoState
 
 Delivered = EgoState | DetectionList
@@ -21,13 +21,10 @@ class Tick(NamedTuple):
     messages: list[Delivered]
 
 
-_LONGEST_GAP_S = 3600.0
-
-
 def node_ticks(messages: Iterable[Delivered], node_hz: float) -> Iterator[Tick]:
     """Ticks on multiples of the node period, from the first at or after the first receipt until all is delivered.
 
-    What was received at or before a tick is delivered with it. Raises `DataError` for a gap of more than an hour.
+    What was received at or before a tick is delivered with it.
     """
     step_ns = period_ns(node_hz)
     waiting: list[Delivered] = []
@@ -35,11 +32,6 @@ def node_ticks(messages: Iterable[Delivered], node_hz: float) -> Iterator[Tick]:
     for message in messages:
         if now_ns is None:
             now_ns = first_multiple(message.receipt_ns, step_ns)
-        gap_s = seconds(message.receipt_ns - now_ns)
-        if gap_s > _LONGEST_GAP_S:
-            raise DataError(
-                f"nothing was received for {gap_s:.0f} s before {message.receipt_ns} ns: cut the recording there"
-            )
         while message.receipt_ns > now_ns:
             yield Tick(now_ns, waiting)
             waiting = []

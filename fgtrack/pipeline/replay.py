@@ -17,6 +17,7 @@ from fgtrack.pipeline.config import ClockConfig, Config
 from fgtrack.pipeline.load import dump
 
 _LARGEST_STEP_BACK_S = 1.0
+_LONGEST_GAP_S = 3600.0
 _PACKAGES = ("fgtrack", "numpy", "scipy", "rosbags")
 
 
@@ -57,14 +58,19 @@ class _Feed:
                     yield message
         except DataError as error:
             self.broken = str(error)
+        if self._last_receipt_ns is None and self.broken is None:
+            self.broken = "holds neither ego states nor detections"
 
     def _check_time(self, message: Delivered) -> None:
         """Receipts never go back; ego stamps do a little, but not as they do where a recording starts over."""
-        last_ns = self._last_receipt_ns
-        if last_ns is not None and message.receipt_ns < last_ns:
-            back_s = seconds(last_ns - message.receipt_ns)
+        gap_s = 0.0 if self._last_receipt_ns is None else seconds(message.receipt_ns - self._last_receipt_ns)
+        if gap_s < 0.0:
             raise DataError(
-                f"receipt time goes back by {back_s:g} s at {message.receipt_ns} ns: sort the input by receipt"
+                f"receipt time goes back by {-gap_s:g} s at {message.receipt_ns} ns: sort the input by receipt"
+            )
+        if gap_s > _LONGEST_GAP_S:
+            raise DataError(
+                f"nothing was received for {gap_s:.0f} s before {message.receipt_ns} ns: cut the recording there"
             )
         self._last_receipt_ns = message.receipt_ns
         if isinstance(message, EgoState):

@@ -18,6 +18,8 @@ class Batch:
     stamp_ns: int
     indices: tuple[int, ...]
     """Positions, in the message, of the detections to process."""
+    last: bool = True
+    """Whether this is the newest batch of its message; only detections with stamps of their own make several."""
 
     @property
     def sensor(self) -> str:
@@ -108,7 +110,10 @@ class QueueInbox:
                 kept.setdefault(stamp_ns, []).append(index)
             else:
                 ended.append(record(message, index, refusal))
-        self._pending += [Batch(message, stamp_ns, tuple(indices)) for stamp_ns, indices in kept.items()]
+        newest_ns = max(kept, default=0)
+        self._pending += [
+            Batch(message, stamp_ns, tuple(indices), last=stamp_ns == newest_ns) for stamp_ns, indices in kept.items()
+        ]
         return ended
 
     def _refusal(self, message: DetectionList, index: int, stamp_ns: int) -> Disposition | None:

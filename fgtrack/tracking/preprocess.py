@@ -113,9 +113,7 @@ class Located:
 class Preprocess:
     """Transformation to the map, false-positive filter and merge (Karle et al. 2023, sections III-B and III-C)."""
 
-    def __init__(
-        self, road: Road, merge: Merge, motion: MotionModel, detection_origin_m: tuple[float, float]
-    ) -> None:
+    def __init__(self, road: Road, merge: Merge, motion: MotionModel, detection_origin_m: tuple[float, float]) -> None:
         """`detection_origin_m`: origin of the ego frame of detections, seen from the ego reference point."""
         self._road = road
         self._merge = merge
@@ -247,8 +245,7 @@ def _in_range(
     far = {
         item.index
         for item in located
-        if item.point_m is not None
-        and math.hypot(item.point_m[0] - pose.x_m, item.point_m[1] - pose.y_m) > limit_m
+        if item.point_m is not None and math.hypot(item.point_m[0] - pose.x_m, item.point_m[1] - pose.y_m) > limit_m
     }
     records = [batch.record(item.index, Disposition.OUT_OF_BOUNDS) for item in located if item.index in far]
     return [item for item in located if item.index not in far], records

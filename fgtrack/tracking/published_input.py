@@ -1,6 +1,7 @@
 """How the published implementation of Karle et al. 2023 takes its input, each defect a component of its own."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -47,24 +48,25 @@ class PublishedEgo:
         return None
 
     def start_tick(self) -> None:
-        """Store the current state, low-passed against the entry before it."""
+        """Store the current state, low-passed against the entry before it; of a stamp that is stored already, its yaw
+        and yaw rate alone."""
         if self._current is None:
             return
-        repeated = bool(self._stored) and self._stored[-1].stamp_ns == self._current.stamp_ns
-        before = self._stored[-2:-1] if repeated else self._stored[-1:]
-        if before:
-            self._current = low_passed(
-                before[0].yaw_rad,
-                before[0].yaw_rate_radps,
-                self._current,
-                self._yaw_weight,
-                self._yaw_rate_weight,
-            )
-        if repeated:
-            self._stored[-1] = self._current
-        else:
+        newest = self._stored[-1] if self._stored else None
+        if newest is None or newest.stamp_ns != self._current.stamp_ns:
+            if newest is not None:
+                self._current = self._filtered(newest, self._current)
             self._stored.append(self._current)
             del self._stored[: -self._length]
+        elif len(self._stored) > 1:
+            filtered = self._filtered(self._stored[-2], self._current)
+            turned = replace(newest, yaw_rad=filtered.yaw_rad, yaw_rate_radps=filtered.yaw_rate_radps)
+            if newest is self._current:  # the stored entry and the current state are one object
+                self._current = turned
+            self._stored[-1] = turned
+
+    def _filtered(self, before: EgoState, ego: EgoState) -> EgoState:
+        return low_passed(before.yaw_rad, before.yaw_rate_radps, ego, self._yaw_weight, self._yaw_rate_weight)
 
     def pose_at(self, stamp_ns: int, present_ns: int) -> EgoPose | None:
         """See `EgoSource.pose_at`; from the nearest entry, however far away it is."""

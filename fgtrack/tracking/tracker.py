@@ -56,6 +56,7 @@ class Tracker:
         self._tick = -1
         self._next_id = 0
         self._records: list[UpdateRecord] = []
+        self._seen: dict[int, set[int]] = {}  # in this tick, by message: tracks that it has matched or started
         self.refused_ego: Counter[str] = Counter()
         """Ego messages that were not used, by reason."""
 
@@ -81,6 +82,7 @@ class Tracker:
         self._end(self._parts.lifecycle.expired(now_ns))
         self._parts.bank.advance(now_ns)
         self._parts.ego.start_tick()
+        self._seen = {id(batch.message): set() for batch in batches}
         for batch in batches:
             self._process(batch)
         updates, self._records = tuple(self._records), []
@@ -96,7 +98,7 @@ class Tracker:
             return
         candidates, out_of_bounds = parts.preprocess(batch, sensor, ego)
         self._records += out_of_bounds
-        if batch.stamp_ns < parts.bank.window_start_ns:
+        if self._is_too_old(batch):
             for candidate in candidates:
                 self._conclude(batch, candidate, Disposition.TOO_OLD)
             return
@@ -106,6 +108,10 @@ class Tracker:
         self._estimate(batch, candidates, assignment, states)
         for position in assignment.new:
             self._give_birth(batch, candidates[position], sensor)
+
+    def _is_too_old(self, batch: Batch) -> bool:
+        """Whether no track could fuse anything of `batch`."""
+        return batch.stamp_ns < self._parts.bank.window_start_ns
 
     def _offered(self, batch: Batch) -> StatesAt:
         """The tracks that `batch` may be associated with, at its stamp."""
@@ -118,14 +124,20 @@ class Tracker:
         return np.asarray(np.hypot(positions_m[:, 0] - ego.x_m, positions_m[:, 1] - ego.y_m))
 
     def _count(self, batch: Batch, assignment: Assignment, states: StatesAt, ego: EgoPose | None) -> None:
-        """Status counters of matched and missed tracks; tracks that run out end here."""
+        """Status counters of matched and missed tracks; tracks that run out end here.
+
+        A track is missed by a message as a whole, so only its last batch tells.
+        """
         lifecycle = self._parts.lifecycle
+        seen = self._seen[id(batch.message)]
         for _, track in assignment.pairs:
             lifecycle.matched(states.track_ids[track], batch.sensor, batch.stamp_ns)
-        if not assignment.missed:
+            seen.add(states.track_ids[track])
+        rows = [track for track in assignment.missed if states.track_ids[track] not in seen]
+        if not rows or not batch.last:
             return
-        missed = [states.track_ids[track] for track in assignment.missed]
-        ranges_m = self._ranges_m(missed, states.means[assignment.missed, :2], ego)
+        missed = [states.track_ids[track] for track in rows]
+        ranges_m = self._ranges_m(missed, states.means[rows, :2], ego)
         self._end(lifecycle.missed(missed, batch.sensor, ranges_m, self._parts.bank.present_ns))
 
     def _estimate(
@@ -152,6 +164,7 @@ class Tracker:
         track_id = self._next_id
         self._next_id += 1
         parts.bank.birth(track_id, prior)
+        self._seen[id(batch.message)].add(track_id)
         parts.lifecycle.born(track_id, batch.sensor, batch.stamp_ns, parts.bank.present_ns)
         self._conclude(batch, candidate, Disposition.BIRTH, track_id)
 
@@ -196,8 +209,9 @@ class Tracker:
 class PublishedTracker(Tracker):
     """The published implementation's order of things, where it differs (defects Q9 and Q22).
 
-    An empty list ages every track. The range that ages a track is measured from the present ego to where the
-    track was after the batch before, or at the end of the tick before.
+    A list older than the storage still starts tracks, and an empty list ages every track. The range that ages a
+    track is measured from the present ego to where the track was after the batch before, or at the end of the tick
+    before.
     """
 
     def __init__(self, parts: TrackerParts) -> None:
@@ -217,6 +231,9 @@ class PublishedTracker(Tracker):
     def _remember(self) -> None:
         states = self._parts.bank.states_at(self._parts.bank.present_ns)
         self._last_known = dict(zip(states.track_ids, states.means[:, :2], strict=True))
+
+    def _is_too_old(self, batch: Batch) -> bool:
+        return False
 
     def _offered(self, batch: Batch) -> StatesAt:
         if batch.indices:

@@ -18,9 +18,7 @@ START_NS = 1_790_000_000_000_000_000
 
 
 def prior() -> BirthPrior:
-    return BirthPrior(
-        START_NS, np.array([3.0, -2.0]), np.diag([0.5, 0.5]), 0.4, 0.3, 20.0, 3.0, 0.1, 0.3, 0.0, 1.0
-    )
+    return BirthPrior(START_NS, np.array([3.0, -2.0]), np.diag([0.5, 0.5]), 0.4, 0.3, 20.0, 3.0, 0.1, 0.3, 0.0, 1.0)
 
 
 def replay(motion: MotionModel) -> Estimator:

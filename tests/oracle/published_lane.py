@@ -68,7 +68,4 @@ class PublishedLane:
     def outside(self, point: Array) -> bool:
         """Whether `point` is off the lane."""
         place = self.at(point)
-        return (
-            place.to_right - place.width > self.inner_buffer
-            or place.to_left - place.width > self.outer_buffer
-        )
+        return place.to_right - place.width > self.inner_buffer or place.to_left - place.width > self.outer_buffer

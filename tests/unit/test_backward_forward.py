@@ -126,7 +126,12 @@ def test_equal_stamps_are_in_sequence_and_older_than_birth_is_not() -> None:
     made = bank()
     made.advance(START_NS + 10 * STEP_NS)
     made.birth(0, prior(START_NS + ms(52)))
-    for stamp_ms, status in [(52, "in_sequence"), (48, "out_of_sequence"), (60, "in_sequence"), (59, "out_of_sequence")]:
+    for stamp_ms, status in [
+        (52, "in_sequence"),
+        (48, "out_of_sequence"),
+        (60, "in_sequence"),
+        (59, "out_of_sequence"),
+    ]:
         stamp_ns = START_NS + ms(stamp_ms)
         [result] = made.update(stamp_ns, [0], [position(stamp_ns, 0.0)])
         assert result.status == status
@@ -139,7 +144,9 @@ def test_a_measurement_of_the_future_is_fused_at_present() -> None:
     before = made.states_at(stamp_ns)
     made.update(stamp_ns, [0], [position(stamp_ns, 1.0)])
     after = made.states_at(START_NS)
-    by_hand = correct(before.means, before.covariances, np.array([[1.0, 0.0]]), 0.09 * np.eye(2)[None], POSITION, SensorPose())
+    by_hand = correct(
+        before.means, before.covariances, np.array([[1.0, 0.0]]), 0.09 * np.eye(2)[None], POSITION, SensorPose()
+    )
     same(after.means, by_hand.mean)
 
 

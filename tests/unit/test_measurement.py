@@ -44,9 +44,7 @@ def one_by_hand(name: str, kinematic: FloatArray, pose: SensorPose) -> float:
     left = north * math.cos(pose.yaw_rad) - east * math.sin(pose.yaw_rad)
     opening = east * (speed * math.cos(yaw) - pose.vx_mps) + north * (speed * math.sin(yaw) - pose.vy_mps)
     values = {"x_m": x, "y_m": y, "yaw_rad": yaw, "speed_mps": speed, "range_m": distance}
-    return float(
-        {**values, "bearing_rad": math.atan2(left, ahead), "range_rate_mps": opening / distance}[name]
-    )
+    return float({**values, "bearing_rad": math.atan2(left, ahead), "range_rate_mps": opening / distance}[name])
 
 
 def far_from(pose: SensorPose, kinematic: FloatArray) -> FloatArray:
@@ -59,9 +57,7 @@ def far_from(pose: SensorPose, kinematic: FloatArray) -> FloatArray:
 @every_model
 @given(kinematic=kinematics(), pose=poses())
 @settings(deadline=None)
-def test_every_component_is_what_the_sensor_sees(
-    motion: MotionModel, kinematic: FloatArray, pose: SensorPose
-) -> None:
+def test_every_component_is_what_the_sensor_sees(motion: MotionModel, kinematic: FloatArray, pose: SensorPose) -> None:
     kinematic = far_from(pose, kinematic)
     model = measurement_model(MEASURABLE, motion)
     by_hand = np.array([one_by_hand(name, kinematic, pose) for name in MEASURABLE])
@@ -72,9 +68,7 @@ def test_every_component_is_what_the_sensor_sees(
 @every_model
 @given(kinematic=kinematics(), pose=poses())
 @settings(deadline=None)
-def test_the_jacobian_is_the_numeric_derivative(
-    motion: MotionModel, kinematic: FloatArray, pose: SensorPose
-) -> None:
+def test_the_jacobian_is_the_numeric_derivative(motion: MotionModel, kinematic: FloatArray, pose: SensorPose) -> None:
     x = state_of(motion, far_from(pose, kinematic))
     model = measurement_model(MEASURABLE, motion)
     step = 1e-5 * np.eye(motion.dim)
@@ -157,9 +151,7 @@ def test_residuals_wrap_angles_and_nothing_else(angle: float, turns: int, other:
     for name, entry, plain in zip(MEASURABLE, y, z - other, strict=True):
         if name in ("yaw_rad", "bearing_rad"):
             assert -math.pi < entry <= math.pi
-            assert_allclose(
-                [math.cos(entry), math.sin(entry)], [math.cos(plain), math.sin(plain)], atol=1e-12
-            )
+            assert_allclose([math.cos(entry), math.sin(entry)], [math.cos(plain), math.sin(plain)], atol=1e-12)
         else:
             assert entry == plain
 
@@ -192,9 +184,7 @@ def test_an_object_that_drives_like_the_sensor_has_no_range_rate(motion: MotionM
 
 @every_model
 @pytest.mark.parametrize("side_m", [1e-3, -1e-3])
-def test_the_bearing_of_an_object_behind_crosses_the_seam_smoothly(
-    motion: MotionModel, side_m: float
-) -> None:
+def test_the_bearing_of_an_object_behind_crosses_the_seam_smoothly(motion: MotionModel, side_m: float) -> None:
     model = measurement_model(("bearing_rad",), motion)
     pose = SensorPose(2.0, 1.0, yaw_rad=0.5 * math.pi)
     x = np.zeros(motion.dim)

@@ -72,9 +72,7 @@ def test_no_time_changes_nothing_to_the_bit(model: MotionModel, kinematic: Float
 @every_model
 @given(kinematic=states(), dt_s=st.floats(-3.0, 3.0))
 @settings(deadline=None, max_examples=25)
-def test_the_flow_solves_its_differential_equation(
-    model: MotionModel, kinematic: FloatArray, dt_s: float
-) -> None:
+def test_the_flow_solves_its_differential_equation(model: MotionModel, kinematic: FloatArray, dt_s: float) -> None:
     x = state_of(model, kinematic)
     solution = solve_ivp(
         lambda _, y: derivative_in_time(model, y), (0.0, dt_s), x, method="DOP853", rtol=1e-11, atol=1e-9
@@ -98,9 +96,7 @@ def test_the_flow_and_its_jacobian_compose_forwards_and_backwards(
 @every_model
 @given(kinematic=states(), dt_s=st.floats(-2.0, 2.0))
 @settings(deadline=None)
-def test_the_jacobian_is_the_numeric_derivative(
-    model: MotionModel, kinematic: FloatArray, dt_s: float
-) -> None:
+def test_the_jacobian_is_the_numeric_derivative(model: MotionModel, kinematic: FloatArray, dt_s: float) -> None:
     x = state_of(model, kinematic)
     step = 1e-4 * np.eye(model.dim)
     numeric = (model.predict(x + step, dt_s) - model.predict(x - step, dt_s)).T / 2e-4
@@ -211,9 +207,7 @@ def test_many_states_and_durations_at_once_equal_one_by_one(model: MotionModel) 
         together = method(x, dt_s)
         for index in np.ndindex(3, 4):
             assert_allclose(together[index], method(x[index], float(dt_s[index])), rtol=1e-13, atol=1e-11)
-        assert_allclose(
-            method(x[0, 0], dt_s)[2, 1], method(x[0, 0], float(dt_s[2, 1])), rtol=1e-13, atol=1e-11
-        )
+        assert_allclose(method(x[0, 0], dt_s)[2, 1], method(x[0, 0], float(dt_s[2, 1])), rtol=1e-13, atol=1e-11)
         assert_allclose(method(x, 0.5)[2, 1], method(x[2, 1], 0.5), rtol=1e-13, atol=1e-11)
 
 

@@ -21,14 +21,15 @@ POINTS = SensorModel(std={"x_m": 0.3, "y_m": 0.3}, yaw_from_map_std_rad=0.35)
 POLAR = SensorModel(std={"range_m": 0.5, "bearing_rad": 0.02}, mount=Mount(2.0, 1.0, math.pi / 2))
 EGO = EgoPose(100.0, 50.0, math.pi / 2, 20.0)
 ORIGIN_M = (-1.74, 0.0)
+ALONE, OPEN = NoMerge(), OpenSpace()
 
 
 def candidates(
     *objects: Detection,
     sensor: SensorModel = LIDAR,
     frame: Frame = "ego",
-    merge: Merge = NoMerge(),
-    road: Road = OpenSpace(),
+    merge: Merge = ALONE,
+    road: Road = OPEN,
     ego: EgoPose | None = EGO,
 ) -> list[Candidate]:
     found, records = Preprocess(road, merge, CTRV(), ORIGIN_M)(batch(*objects, frame=frame), sensor, ego)
@@ -44,15 +45,14 @@ def candidates(
     [
         ("map", 10.0, 3.0, 0.1),
         ("ego", 100.0 - 3.0, 50.0 - 1.74 + 10.0, 0.1 + math.pi / 2),  # ahead is north, left is west
-        ("sensor", 100.0 - 1.0 - 10.0, 50.0 - 1.74 + 2.0 - 3.0, 0.1 + math.pi - 2 * math.pi),  # looks west
+        ("sensor", 100.0 - 1.0 - 10.0, 50.0 - 1.74 + 2.0 - 3.0, 0.1 - math.pi),  # looks west
     ],
 )
 def test_a_detection_comes_to_the_map_from_its_frame(frame: Frame, x_m: float, y_m: float, yaw_rad: float) -> None:
     [found] = candidates(Detection(x_m=10.0, y_m=3.0, yaw_rad=0.1), frame=frame)
-    wanted = yaw_rad if frame != "sensor" else 0.1 - math.pi
-    assert found.values == pytest.approx({"x_m": x_m, "y_m": y_m, "yaw_rad": wanted})
+    assert found.values == pytest.approx({"x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad})
     assert found.position_m == pytest.approx([x_m, y_m])
-    assert found.measurement.z == pytest.approx([x_m, y_m, wanted])
+    assert found.measurement.z == pytest.approx([x_m, y_m, yaw_rad])
 
 
 def test_the_sensor_pose_has_lever_arm_mount_and_the_velocity_of_the_ego() -> None:
@@ -96,7 +96,7 @@ def test_a_sensors_deviations_lie_along_and_across_the_line_of_sight() -> None:
     radar = SensorModel(std={"x_m": 2.0, "y_m": 0.5})
     [found] = candidates(Detection(x_m=10.0, y_m=10.0), sensor=radar)
     sight = rotation(math.pi / 2 + math.pi / 4)
-    assert found.measurement.R == pytest.approx(sight @ np.diag([4.0, 0.25]) @ sight.T)
+    assert pytest.approx(sight @ np.diag([4.0, 0.25]) @ sight.T) == found.measurement.R
     assert found.position_covariance == pytest.approx(found.measurement.R)
 
 
@@ -107,9 +107,9 @@ def test_a_detections_own_covariance_is_turned_with_its_frame(frame: Frame, turn
     [found] = candidates(item, frame=frame)
     turn = np.eye(3)
     turn[:2, :2] = rotation(turned_rad)
-    assert found.measurement.R == pytest.approx(turn @ own @ turn.T)
+    assert pytest.approx(turn @ own @ turn.T) == found.measurement.R
     [ignored] = candidates(item, frame=frame, sensor=replace(LIDAR, message_covariance=False))
-    assert ignored.measurement.R == pytest.approx(np.diag([0.09, 0.09, 0.16]))
+    assert pytest.approx(np.diag([0.09, 0.09, 0.16])) == ignored.measurement.R
 
 
 def test_only_the_components_that_the_sensor_measures_are_taken_of_a_covariance() -> None:
@@ -118,14 +118,14 @@ def test_only_the_components_that_the_sensor_measures_are_taken_of_a_covariance(
     sensor = SensorModel(std={"x_m": 0.3, "y_m": 0.3, "speed_mps": 0.2})
     [found] = candidates(item, sensor=sensor, frame="map")
     assert found.measurement.model.components == ("x_m", "y_m", "speed_mps")
-    assert found.measurement.R == pytest.approx(np.diag([4.0, 5.0, 7.0]))
+    assert pytest.approx(np.diag([4.0, 5.0, 7.0])) == found.measurement.R
 
 
 def test_the_position_covariance_of_range_and_bearing_is_along_and_across_the_line_of_sight() -> None:
     [found] = candidates(Detection(range_m=50.0, bearing_rad=0.2), sensor=POLAR)
     sight = rotation(math.pi / 2 + 0.2)
     assert found.position_covariance == pytest.approx(sight @ np.diag([0.25, (50.0 * 0.02) ** 2]) @ sight.T)
-    assert found.measurement.R == pytest.approx(np.diag([0.25, 0.0004]))
+    assert pytest.approx(np.diag([0.25, 0.0004])) == found.measurement.R
 
 
 def test_a_bearing_alone_has_no_place() -> None:
@@ -145,7 +145,7 @@ def test_a_yaw_that_was_not_measured_comes_from_the_map_with_its_own_deviation()
     for item, variance in ((Detection(x_m=1.0, y_m=2.0), 0.09), (own, 4.0)):
         [found] = candidates(item, sensor=POINTS, frame="map", road=StraightRoad(yaw_rad=0.4))
         assert found.values == {"x_m": 1.0, "y_m": 2.0, "yaw_rad": 0.4}
-        assert found.measurement.R == pytest.approx(np.diag([variance, variance, 0.35**2]))
+        assert pytest.approx(np.diag([variance, variance, 0.35**2])) == found.measurement.R
     [measured] = candidates(Detection(x_m=1.0, y_m=2.0, yaw_rad=0.1), frame="map", road=StraightRoad(yaw_rad=0.4))
     assert measured.values["yaw_rad"] == 0.1
     [unknown] = candidates(Detection(x_m=1.0, y_m=2.0), sensor=POINTS, frame="map")
@@ -228,7 +228,7 @@ def test_merged_detections_keep_what_all_of_them_measure() -> None:
     items = (Detection(x_m=0.0, y_m=0.0001, yaw_rad=0.2), Detection(x_m=2.0, y_m=0.0))
     [found] = candidates(*items, merge=ConnectedMerge(), frame="map")
     assert found.measurement.model.components == ("x_m", "y_m")
-    assert found.measurement.R == pytest.approx(0.09 * np.eye(2))
+    assert pytest.approx(0.09 * np.eye(2)) == found.measurement.R
     assert found.values == pytest.approx({"x_m": 1.0, "y_m": 0.00005})
 
 

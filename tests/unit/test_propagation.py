@@ -141,11 +141,13 @@ def test_the_published_yaw_range_ends_where_the_published_yaw_is_pi() -> None:
     yaws = np.array([0.0, math.pi, -math.pi / 2, -math.pi / 2 + 1e-9, 3 * math.pi / 2])
     wanted = [0.0, math.pi, 3 * math.pi / 2, -math.pi / 2 + 1e-9, 3 * math.pi / 2]
     assert published_yaw(yaws) == pytest.approx(wanted)
-    assert YAW_LIMIT_RAD == 3 * math.pi / 2
+    assert 3 * math.pi / 2 == YAW_LIMIT_RAD
 
 
 def test_a_saturated_yaw_sticks_at_its_limit_and_may_fall_below_the_range() -> None:
     x = np.array([[0.0, 0.0, YAW_LIMIT_RAD - 0.05, 0.0, 1.0], [0.0, 0.0, -math.pi / 2 + 0.05, 0.0, -1.0]])
-    means, _ = SaturatedEulerCtrv(CTRV(), ISOTROPIC).propagate(x, np.eye(5)[None].repeat(2, 0), np.array([20, 20]), 0.01)
+    means, _ = SaturatedEulerCtrv(CTRV(), ISOTROPIC).propagate(
+        x, np.eye(5)[None].repeat(2, 0), np.array([20, 20]), 0.01
+    )
     assert means[0, 2] == YAW_LIMIT_RAD
     assert means[1, 2] == pytest.approx(-math.pi / 2 - 0.15)

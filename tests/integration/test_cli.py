@@ -1,0 +1,412 @@
+"""The command line in-process: exit codes, one line for every error, and the chain from scenario to figure."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from fgtrack.cli import demo
+from fgtrack.cli.main import run
+from fgtrack.core.types import Detection, DetectionList, EgoState, Message
+from fgtrack.io.bag_writer import write_bag
+from fgtrack.io.run_folder import read_run
+from fgtrack.io.stream import read_stream, write_stream
+from fgtrack.pipeline.build import ESTIMATORS
+from fgtrack.sim.paper import paper_scenario
+
+MS = 1_000_000
+START_NS = 1_600_000_000_000_000_000
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command left behind."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def error(self) -> str:
+        """The one line on stderr."""
+        lines = self.err.splitlines()
+        assert len(lines) == 1, self.err
+        assert lines[0].startswith("fgtrack: error: "), self.err
+        assert "Traceback" not in self.out + self.err
+        assert "internal error" not in self.err
+        return lines[0].removeprefix("fgtrack: error: ")
+
+
+Command = Callable[..., Outcome]
+
+
+@pytest.fixture
+def fgtrack(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Runs a command in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: object) -> Outcome:
+        capsys.readouterr()
+        code = run([str(argument) for argument in arguments])
+        out, err = capsys.readouterr()
+        return Outcome(code, out, err)
+
+    return call
+
+
+def drive(count: int = 60) -> list[Message]:
+    """An ego at rest and one car ahead of it, seen by a lidar."""
+    messages: list[Message] = []
+    for k in range(count):
+        now_ns = START_NS + k * 20 * MS
+        messages.append(EgoState(now_ns, now_ns, 0.0, 0.0, 0.0, 0.0))
+        car = Detection(x_m=20.0 + 0.1 * k, y_m=1.0, yaw_rad=0.0)
+        messages.append(DetectionList("lidar", now_ns - 50 * MS, now_ns, (car,)))
+    return messages
+
+
+@pytest.fixture
+def stream(tmp_path: Path) -> Path:
+    path = tmp_path / "drive.jsonl"
+    write_stream(path, drive())
+    return path
+
+
+def rows(path: Path) -> dict[str, bytes]:
+    return {name: (path / name).read_bytes() for name in ("tracks.csv", "updates.csv")}
+
+
+# --- the chain
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """One simulated scenario, written in every way."""
+    folder = tmp_path_factory.mktemp("recordings")
+    made = {}
+    for name, extra in [("s.jsonl", ()), ("s.jsonl.gz", ()), ("mcap", ()), ("sqlite3", ("--storage", "sqlite3"))]:
+        made[name] = folder / name
+        assert run(["simulate", "default", "-o", str(made[name]), "--duration", "2", "--seed", "3", *extra]) == 0
+    return made
+
+
+@pytest.fixture(scope="module")
+def runs(recordings: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A replay of each of them."""
+    folder = tmp_path_factory.mktemp("runs")
+    for name, path in recordings.items():
+        assert run(["replay", str(path), "-o", str(folder / name), "--map", "oval", "--pit-map", "oval"]) == 0
+    return {name: folder / name for name in recordings}
+
+
+def test_every_storage_gives_the_same_run_to_the_byte(runs: dict[str, Path]) -> None:
+    contents = [rows(path) for path in runs.values()]
+    assert all(content == contents[0] for content in contents)
+    assert len({read_run(path).meta["digest"] for path in runs.values()}) == 1
+    assert len(read_run(runs["mcap"]).tracks) > 50
+
+
+def test_the_same_replay_twice_gives_the_same_digest(fgtrack: Command, recordings: dict[str, Path]) -> None:
+    digests = []
+    for _ in range(2):  # the second one replaces the first
+        assert fgtrack("replay", recordings["s.jsonl"], "-o", "run", "--map", "oval").code == 0
+        digests.append(read_run("run").meta["digest"])
+    assert digests[0] == digests[1]
+
+
+def test_the_seed_decides_the_recording(fgtrack: Command, recordings: dict[str, Path]) -> None:
+    for seed, same in [(3, True), (4, False)]:
+        assert fgtrack("simulate", "default", "-o", "again.jsonl", "--duration", 2, "--seed", seed).code == 0
+        assert (Path("again.jsonl").read_bytes() == recordings["s.jsonl"].read_bytes()) == same
+
+
+def test_stream_to_bag_to_stream_is_the_stream(fgtrack: Command, recordings: dict[str, Path]) -> None:
+    assert fgtrack("convert", recordings["s.jsonl"], "bag").code == 0
+    assert fgtrack("convert", "bag", "lite", "--storage", "sqlite3").code == 0
+    assert fgtrack("convert", "lite", "back.jsonl.gz").code == 0
+    assert list(read_stream("back.jsonl.gz")) == list(read_stream(recordings["s.jsonl"]))
+
+
+def test_several_estimators_have_a_folder_each(fgtrack: Command, stream: Path) -> None:
+    assert fgtrack("replay", stream, "-o", "runs", "-e", ",".join(ESTIMATORS)).code == 0
+    for name in ESTIMATORS:
+        assert read_run(Path("runs") / name).meta["estimator"] == name
+    table = fgtrack("compare", "runs")
+    assert table.code == 0
+    assert all(name in table.out for name in ESTIMATORS)
+
+
+def test_runs_are_compared_as_tables_and_as_json(fgtrack: Command, runs: dict[str, Path]) -> None:
+    assert fgtrack("compare", runs["mcap"], runs["sqlite3"]).code == 0
+    told = fgtrack("compare", runs["mcap"], runs["sqlite3"], "--json")
+    assert told.code == 0
+    assert json.loads(told.out)
+    assert json.loads((runs["mcap"] / "metrics.json").read_text())
+
+
+def test_figures_are_drawn(fgtrack: Command, runs: dict[str, Path]) -> None:
+    drawn = fgtrack("figure", runs["mcap"], "-o", "figures")
+    assert drawn.code == 0
+    files = [Path(line) for line in drawn.out.splitlines()]
+    assert files
+    assert all(file.read_bytes().startswith(b"\x89PNG") for file in files)
+
+
+def test_info_tells_topics_and_delays(fgtrack: Command, recordings: dict[str, Path]) -> None:
+    for path in recordings.values():
+        told = fgtrack("info", path)
+        assert (told.code, told.err) == (0, "")
+        assert "radar" in told.out
+
+
+def test_the_printed_configuration_is_one(fgtrack: Command, stream: Path) -> None:
+    printed = fgtrack("config", "--set", "filter.storage_s=2.0")
+    assert printed.code == 0
+    Path("c.yaml").write_text(printed.out)
+    assert fgtrack("config", "-c", "c.yaml").out == printed.out
+    assert fgtrack("replay", stream, "-c", "c.yaml", "-o", "run").code == 0
+    assert read_run("run").config_text == printed.out
+
+
+def test_the_demo_goes_from_scenario_to_figures(
+    fgtrack: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(demo, "paper_scenario", lambda: replace(paper_scenario(), duration_s=2.0))
+    shown = fgtrack("demo", "-o", "demo")
+    assert (shown.code, shown.err) == (0, "")
+    assert (tmp_path / "demo/recording/metadata.yaml").exists()
+    assert {path.name for path in (tmp_path / "demo/runs").iterdir()} >= (
+        set(ESTIMATORS) if len(ESTIMATORS) > 1 else {"meta.json"}
+    )
+    assert list((tmp_path / "demo/figures").glob("*.png"))
+
+
+# --- the call is bad: 2
+
+
+def foreign_folder(path: Path) -> None:
+    path.mkdir()
+    (path / "thesis.tex").write_text("years of work")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("replay", "missing", "-o", "run"), "missing: there is no such file"),
+        (("info", "missing"), "missing: there is no such file"),
+        (("convert", "missing", "out.jsonl"), "missing: there is no such file"),
+        (("compare", "missing"), "missing: no run folder"),
+        (("compare", "drive.jsonl"), "drive.jsonl: no run folder"),
+        (("figure", "missing", "-o", "figures"), "missing: no run folder"),
+        (("simulate", "missing.yaml", "-o", "x.jsonl"), "missing.yaml: configuration cannot be read"),
+        (("simulate", "default", "-o", "x.jsonl", "--duration", "0"), "--duration 0: must be positive"),
+        (("simulate", "default", "-o", "x.jsonl", "--duration", "nan"), "--duration nan"),
+        (("simulate", "default", "-o", "x.jsonl", "--duration", "inf"), "--duration inf"),
+        (("simulate", "default", "-o", "x.jsonl", "--seed", "-1"), "--seed"),
+        (("simulate", "default", "-o", "x", "--storage", "tape"), "--storage"),
+        (("replay", "drive.jsonl", "-o", "drive.jsonl"), "drive.jsonl: is a file"),
+        (("replay", "drive.jsonl", "-o", "foreign"), "foreign: is not empty and not a run folder"),
+        (("replay", "drive.jsonl", "-o", "run", "-e", "magic"), "estimator 'magic' is unknown"),
+        (("replay", "drive.jsonl", "-o", "run", "-e", ""), "estimator '' is unknown"),
+        (("replay", "drive.jsonl", "-o", "run", "-e", "ekf-replay,ekf-replay"), "named twice"),
+        (("replay", "drive.jsonl", "-o", "run", "-c", "missing.yaml"), "missing.yaml: configuration cannot be read"),
+        (("replay", "drive.jsonl", "-o", "run", "-c", "drive.jsonl"), "drive.jsonl"),
+        (("replay", "drive.jsonl", "-o", "run", "--map", "missing.csv"), "missing.csv: there is no such map"),
+        (("replay", "drive.jsonl", "-o", "run", "--set", "clock.ticks_file=missing"), "missing: ticks cannot be read"),
+        (("replay", "drive.jsonl", "-o", "run", "--set", "nonsense"), "--set nonsense: write key=value"),
+        (("replay", "drive.jsonl", "-o", "run", "--set", "filter.speed=1"), "filter.speed: unknown key"),
+        (("replay", "drive.jsonl", "-o", "run", "--set", "filter.storage_s=long"), "filter.storage_s"),
+        (("config", "-c", "broken.yaml"), "broken.yaml:2: no valid YAML"),
+        (("demo", "-o", "drive.jsonl"), "drive.jsonl: cannot be made a folder"),
+        (("demo", "-o", "busy"), "busy/recording: is in the way"),
+        (("replay", "drive.jsonl"), "--out"),
+        (("replay", "-o", "run"), "ecording"),
+        (("fly",), "fly"),
+        (("replay", "drive.jsonl", "-o", "run", "--fast"), "--fast"),
+    ],
+    ids=" ".join,
+)
+def test_a_bad_call_is_one_line_and_exit_code_2(
+    fgtrack: Command, stream: Path, tmp_path: Path, arguments: Sequence[str], message: str
+) -> None:
+    foreign_folder(tmp_path / "foreign")
+    (tmp_path / "busy").mkdir()
+    foreign_folder(tmp_path / "busy/recording")
+    (tmp_path / "broken.yaml").write_text("filter: [1\n")
+    called = fgtrack(*arguments)
+    assert message in called.error
+    assert called.code == 2
+    assert (tmp_path / "foreign/thesis.tex").exists()
+    assert (tmp_path / "busy/recording/thesis.tex").exists()
+    assert list(read_stream(stream)) == drive()
+
+
+def test_no_command_shows_the_help_and_is_a_bad_call(fgtrack: Command) -> None:
+    for arguments in [(), ("--debug",)]:
+        called = fgtrack(*arguments)
+        assert called.code == 2
+        assert "replay" in called.out
+    assert fgtrack("--help").code == 0
+    assert fgtrack("--version").out.startswith("fgtrack ")
+
+
+# --- the data are bad: 1
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "is empty"),
+        (b"hello\n", "is none of the inputs"),
+        (b"\x00\x01\x02", "is none of the inputs"),
+        (b'{"type": "ego"}\n', "starts with a header"),
+        (b'{"type": "header", "format": "fgtrack-stream/2"}\n', "fgtrack-stream/2"),
+    ],
+)
+def test_a_file_that_is_no_input_is_one_line_and_exit_code_1(
+    fgtrack: Command, tmp_path: Path, content: bytes, message: str
+) -> None:
+    (tmp_path / "input").write_bytes(content)
+    for arguments in [("replay", "input", "-o", "run"), ("info", "input"), ("convert", "input", "out.jsonl")]:
+        called = fgtrack(*arguments)
+        assert message in called.error
+        assert "input" in called.error
+        assert called.code == 1
+
+
+def test_a_folder_that_is_nothing_is_one_line_and_exit_code_1(fgtrack: Command, tmp_path: Path) -> None:
+    foreign_folder(tmp_path / "folder")
+    called = fgtrack("replay", "folder", "-o", "run")
+    assert "folder: is none of the inputs" in called.error
+    assert called.code == 1
+
+
+@pytest.mark.parametrize("name", ["empty.jsonl", "empty"])
+def test_a_recording_without_anything_to_track_is_exit_code_1(fgtrack: Command, tmp_path: Path, name: str) -> None:
+    if name.endswith("jsonl"):
+        write_stream(tmp_path / name, [])
+    else:
+        write_bag(tmp_path / name, [])
+    called = fgtrack("replay", name, "-o", "run")
+    assert name in called.error
+    assert called.code == 1
+
+
+def test_a_truncated_stream_is_replayed_up_to_the_break(fgtrack: Command, stream: Path) -> None:
+    whole = stream.read_bytes()
+    cut = whole[: len(whole) // 2]
+    stream.write_bytes(cut)
+    called = fgtrack("replay", stream, "-o", "run")
+    assert "drive.jsonl:" in called.error
+    assert "replayed up to there" in called.error
+    assert called.code == 1
+    found = read_run("run")
+    assert found.meta["complete"] is True
+    assert "breaks off" in found.meta["broken_off"]
+    assert len(found.updates) == found.meta["detections_received"] == cut.count(b'"lidar"', 0, cut.rindex(b"\n"))
+    assert fgtrack("compare", "run").code == 0
+
+
+def edited(messages: list[Message], place: int, **changes: int) -> list[Message]:
+    return [replace(message, **changes) if i == place else message for i, message in enumerate(messages)]
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "message"),
+    [
+        ("loop.jsonl", {"receipt_ns": START_NS}, "receipt"),  # a bag is read in order of receipt
+        ("loop.jsonl", {"stamp_ns": START_NS - 5000 * MS}, "ego stamps jump back"),
+        ("loop", {"stamp_ns": START_NS - 5000 * MS}, "ego stamps jump back"),
+        ("loop.jsonl", {"receipt_ns": START_NS + 10**13}, "nothing was received for"),
+        ("loop", {"receipt_ns": START_NS + 10**13}, "nothing was received for"),
+    ],
+)
+def test_a_recording_with_broken_time_is_replayed_up_to_there(
+    fgtrack: Command, tmp_path: Path, name: str, changes: dict[str, int], message: str
+) -> None:
+    recording = tmp_path / name
+    (write_stream if name.endswith("jsonl") else write_bag)(recording, edited(drive(), 60, **changes))
+    called = fgtrack("replay", recording, "-o", "run")
+    assert message in called.error
+    assert name in called.error
+    assert called.code == 1
+    found = read_run("run")
+    assert len(found.updates) == found.meta["detections_received"] >= 30
+
+
+def test_an_unknown_sensor_says_what_to_do(fgtrack: Command, tmp_path: Path) -> None:
+    sonar = DetectionList("sonar", START_NS, START_NS, (Detection(x_m=1.0, y_m=2.0),))
+    write_stream(tmp_path / "sonar.jsonl", [sonar])
+    called = fgtrack("replay", "sonar.jsonl", "-o", "run")
+    assert "'sonar' has no model" in called.error
+    assert "ignore_sensors" in called.error
+    assert called.code == 1
+    assert read_run("run").meta["complete"] is False
+    ignored = fgtrack("replay", "sonar.jsonl", "-o", "run", "--set", "ignore_sensors=[sonar]")
+    assert ignored.code == 1  # nothing else in it
+    assert read_run("run").meta["detections_ignored"] == 1
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["input.ego.topic=/ego/odometry", "input.detections={lidar: {topic: /nowhere}}"], "/nowhere"),
+        (["input.ego={topic: /ego/odometry, type: std_msgs/msg/Nothing}"], "Nothing"),
+    ],
+)
+def test_topics_and_types_that_are_not_there_are_named(
+    fgtrack: Command, tmp_path: Path, settings: list[str], message: str
+) -> None:
+    write_bag(tmp_path / "bag", drive(5))
+    called = fgtrack("replay", "bag", "-o", "run", *[word for setting in settings for word in ("--set", setting)])
+    assert message in called.error
+    assert called.code in (1, 2)
+
+
+def test_detections_that_are_no_numbers_are_counted_and_not_an_error(fgtrack: Command, tmp_path: Path) -> None:
+    nan = float("nan")
+    broken = [
+        replace(message, objects=(Detection(x_m=nan, y_m=nan, yaw_rad=nan), *message.objects))
+        if isinstance(message, DetectionList)
+        else message
+        for message in drive()
+    ]
+    write_stream(tmp_path / "nan.jsonl", broken)
+    assert fgtrack("replay", "nan.jsonl", "-o", "run").code == 0
+    counts = read_run("run").meta["counts"]["lidar"]
+    assert counts["invalid"] == 60
+    assert sum(counts.values()) == 120
+    assert counts["birth"] >= 1
+
+
+@pytest.mark.parametrize("content", [b"", b"no map\n", b"1;2\n", b"\xff\xfe\x00"])
+def test_a_map_that_is_none_is_named(fgtrack: Command, stream: Path, tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "map.csv").write_bytes(content)
+    called = fgtrack("replay", stream, "-o", "run", "--map", "map.csv")
+    assert "map.csv" in called.error
+    assert called.code == 1
+
+
+def test_a_bug_is_one_line_and_shows_its_traceback_on_demand(
+    fgtrack: Command, stream: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("oh")
+
+    monkeypatch.setattr("fgtrack.cli.replay.replay_each", broken)
+    called = fgtrack("replay", stream, "-o", "run")
+    assert called.err == "fgtrack: error: internal error: ZeroDivisionError: oh (run with --debug)\n"
+    assert called.code == 1
+    assert "Traceback" in fgtrack("--debug", "replay", stream, "-o", "run").err
+
+
+def test_an_interrupt_is_exit_code_130(fgtrack: Command, stream: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("fgtrack.cli.replay.replay_each", interrupted)
+    called = fgtrack("replay", stream, "-o", "run")
+    assert "interrupted" in called.error
+    assert called.code == 130

@@ -1,0 +1,173 @@
+"""Situations that lead the published tracker into its corners."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+Interval = tuple[float, float]
+NEVER: Interval = (math.inf, math.inf)
+SENSORS = ("lidar", "lidar_cluster", "radar")
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What a stream is like; `_p` are probabilities per message or per object."""
+
+    duration_s: float = 2.0
+    epoch_ns: int = 1_000_000_000_000
+    clock: str = "node"  # node, jitter, gaps
+    start: str = "anywhere"  # anywhere, closing (point of the lap), jump (of the heading), jump_rep103
+
+    ego_speed_mps: tuple[float, ...] = (40.0, 70.0)  # one of these ...
+    ego_speed_changes_mps: float = 0.0  # ... plus what a sine adds
+    ego_exact_speeds_mps: tuple[float, ...] = ()  # reported instead of the true one, by chance
+    ego_noise: float = 1.0
+    ego_bias: float = 0.0  # of speed, yaw rate and acceleration: reported motion and poses contradict each other
+    ego_hz: float = 100.0
+    ego_silent_s: Interval = NEVER
+    ego_repeated_p: float = 0.0
+    ego_resent_p: float = 0.0  # an earlier record once more
+    ego_nan_p: float = 0.0
+    pit_toggle_p: float = 0.0
+
+    sensors: tuple[str, ...] = SENSORS
+    sensors_silent_s: Interval = NEVER
+    sensors_hz: float = 20.0
+    delay: str = "usual"  # usual, none, tiny, future, huge
+    stamp_grid_ns: int = 1
+    object_stamps: bool = False
+    duplicate_p: float = 0.0
+    burst_p: float = 0.0  # a second, slightly younger list right behind
+    empty_p: float = 0.0
+
+    num_objects: tuple[int, int] = (1, 6)
+    spread_m: float = 60.0
+    objects_gone_s: Interval = NEVER
+    relative_speed_mps: float = 3.0  # standard deviation over the objects
+    in_pit_p: float = 0.0
+    seen_p: float = 0.9
+    clutter: float = 0.3
+    noise_m: float = 0.3
+    noise_rad: float = 0.1
+    zero_p: float = 0.0
+    nan_p: float = 0.0
+
+
+TODAY_NS = 1_790_000_000_000_000_000
+
+SITUATIONS = {
+    "usual": Situation(),
+    "fast": Situation(ego_speed_mps=(75.0, 90.0), ego_speed_changes_mps=10.0),
+    "contradictory_ego": Situation(ego_noise=10.0, ego_bias=1.0),
+    "slow_ego": Situation(ego_speed_mps=(5.0, 6.0, 7.0, 8.0, 9.0), ego_bias=0.5),
+    "ego_around_ten": Situation(
+        ego_speed_mps=(10.0,), ego_speed_changes_mps=0.5, ego_exact_speeds_mps=(10.0, math.nextafter(10.0, 0.0))
+    ),
+    "standing_ego": Situation(ego_speed_mps=(0.0,), ego_noise=0.0, spread_m=30.0),
+    "standing_noisy_ego": Situation(ego_speed_mps=(0.0,), ego_noise=3.0),
+    "stalled_ego": Situation(duration_s=4.0, ego_silent_s=(1.0, 3.3), ego_bias=0.3),
+    "ego_repeats_itself": Situation(ego_repeated_p=0.3, ego_noise=3.0),
+    "ego_resends_old_records": Situation(ego_resent_p=0.3, ego_hz=40.0),
+    "rare_ego": Situation(ego_hz=7.0, ego_bias=0.5),
+    "nan_ego": Situation(ego_nan_p=0.3),
+    "late_first_ego": Situation(ego_silent_s=(0.0, 1.0)),
+    "dense": Situation(duration_s=1.5, num_objects=(10, 25), spread_m=25.0),
+    "dense_and_noisy": Situation(duration_s=1.5, num_objects=(10, 25), spread_m=40.0, noise_m=1.5, seen_p=0.7),
+    "today": Situation(epoch_ns=TODAY_NS, object_stamps=True),
+    "today_dense": Situation(
+        duration_s=1.5, epoch_ns=TODAY_NS, object_stamps=True, num_objects=(10, 25), sensors=("radar",)
+    ),
+    "no_delay": Situation(delay="none"),
+    "no_delay_on_grid": Situation(delay="none", stamp_grid_ns=5_000_000),
+    "tiny_delay": Situation(delay="tiny"),
+    "usual_delay_on_grid": Situation(stamp_grid_ns=5_000_000),
+    "future": Situation(delay="future"),
+    "huge_delay": Situation(delay="huge"),
+    "pit_lane": Situation(in_pit_p=0.6, pit_toggle_p=0.02, start="closing"),
+    "slow_in_pit_lane": Situation(
+        in_pit_p=0.6, pit_toggle_p=0.05, start="closing", ego_speed_mps=(8.0, 12.0), ego_nan_p=0.2, ego_repeated_p=0.2
+    ),
+    "vanishing_objects": Situation(duration_s=4.5, objects_gone_s=(1.5, 4.0), clutter=0.05),
+    "vanishing_objects_far_away": Situation(duration_s=4.5, objects_gone_s=(1.5, 4.0), clutter=0.05, spread_m=130.0),
+    "silent_sensors": Situation(duration_s=4.5, sensors_silent_s=(1.0, 3.7), clutter=0.1),
+    "only_lidar": Situation(duration_s=4.5, sensors=("lidar",), objects_gone_s=(1.0, 4.0)),
+    "only_clusters": Situation(duration_s=3.5, sensors=("lidar_cluster",), objects_gone_s=(1.5, 3.0)),
+    "only_radar": Situation(duration_s=4.5, sensors=("radar",), objects_gone_s=(1.5, 3.0), spread_m=100.0),
+    "empty_lists": Situation(empty_p=0.4, delay="huge"),
+    "nothing_but_clutter": Situation(num_objects=(0, 0), clutter=3.0),
+    "faulty_objects": Situation(zero_p=0.3, nan_p=0.3, num_objects=(0, 3), clutter=0.1, object_stamps=True),
+    "duplicates": Situation(duplicate_p=0.3, burst_p=0.1),
+    "bursts": Situation(burst_p=0.5),
+    "jittering_clock": Situation(clock="jitter"),
+    "jittering_clock_on_time": Situation(clock="jitter", delay="none"),
+    "clock_with_gaps": Situation(duration_s=8.0, clock="gaps", sensors_hz=5.0, ego_hz=20.0),
+    "rare_lists_and_gaps": Situation(duration_s=8.0, clock="gaps", sensors_hz=0.5, ego_hz=20.0),
+    "old_lists_after_gaps": Situation(
+        duration_s=15.0, clock="gaps", sensors_hz=0.25, ego_hz=10.0, empty_p=0.2, num_objects=(5, 10)
+    ),
+    "wound_up_yaw": Situation(
+        duration_s=9.0,
+        sensors_silent_s=(0.8, 8.5),
+        sensors=("lidar",),
+        ego_hz=10.0,
+        ego_speed_mps=(0.0,),
+        relative_speed_mps=0.0,
+        noise_rad=3.0,
+        num_objects=(6, 10),
+        clutter=0.0,
+    ),
+    "closing_point": Situation(start="closing"),
+    "heading_jump": Situation(start="jump"),
+    "heading_jump_dense": Situation(duration_s=1.5, start="jump", num_objects=(8, 14), spread_m=30.0),
+    "heading_jump_slow": Situation(start="jump", ego_speed_mps=(6.0,), num_objects=(5, 9), spread_m=30.0),
+    "rep103_jump_dense": Situation(duration_s=1.5, start="jump_rep103", num_objects=(8, 14), spread_m=30.0),
+}
+
+
+def anything(rng: np.random.Generator) -> Situation:
+    """Everything at once, by chance."""
+
+    def sometimes(value: Any, otherwise: Any, p: float = 0.25) -> Any:
+        return value if rng.random() < p else otherwise
+
+    def silence() -> Interval:
+        begin = float(rng.uniform(0.0, 1.5))
+        return (begin, begin + float(rng.uniform(0.1, 1.5)))
+
+    return Situation(
+        duration_s=3.0,
+        epoch_ns=sometimes(TODAY_NS, 1_000_000_000_000),
+        clock=sometimes(str(rng.choice(["jitter", "gaps"])), "node"),
+        start=str(rng.choice(["anywhere", "closing", "jump", "jump_rep103"])),
+        ego_speed_mps=(0.0, 5.0, 9.9, 10.0, 30.0, 60.0, 90.0),
+        ego_speed_changes_mps=float(rng.uniform(0.0, 5.0)),
+        ego_exact_speeds_mps=sometimes((10.0, 0.0), ()),
+        ego_noise=float(rng.choice([0.0, 1.0, 10.0])),
+        ego_bias=sometimes(1.0, 0.0),
+        ego_hz=float(rng.choice([10.0, 40.0, 100.0, 130.0])),
+        ego_silent_s=sometimes(silence(), NEVER),
+        ego_repeated_p=sometimes(0.2, 0.0),
+        ego_nan_p=sometimes(0.2, 0.0),
+        pit_toggle_p=sometimes(0.02, 0.0),
+        sensors=tuple(str(name) for name in rng.permutation(SENSORS)[: rng.integers(1, 4)]),
+        sensors_silent_s=sometimes(silence(), NEVER),
+        sensors_hz=float(rng.choice([5.0, 20.0, 33.0])),
+        delay=str(rng.choice(["usual", "none", "tiny", "future", "huge"])),
+        stamp_grid_ns=sometimes(5_000_000, 1),
+        object_stamps=sometimes(True, False),
+        duplicate_p=sometimes(0.1, 0.0),
+        burst_p=sometimes(0.2, 0.0),
+        empty_p=sometimes(0.2, 0.0),
+        num_objects=(0, 10),
+        spread_m=float(rng.choice([20.0, 60.0, 150.0])),
+        objects_gone_s=sometimes(silence(), NEVER),
+        in_pit_p=sometimes(0.5, 0.0),
+        seen_p=float(rng.uniform(0.5, 1.0)),
+        clutter=float(rng.uniform(0.0, 1.5)),
+        noise_m=float(rng.choice([0.0, 0.3, 2.0])),
+        noise_rad=float(rng.choice([0.0, 0.1, 2.0])),
+        zero_p=sometimes(0.1, 0.0),
+        nan_p=sometimes(0.1, 0.0),
+    )

@@ -1,0 +1,152 @@
+import math
+from itertools import permutations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chi2
+from support.tracking import bearing, candidate, states
+
+from fgtrack.models.measurement import SensorPose
+from fgtrack.tracking.association import (
+    Association,
+    GatedEuclidean,
+    GatedMahalanobis,
+    chi_square_quantile,
+    euclidean_distances,
+)
+from fgtrack.tracking.published_objects import UngatedEuclidean
+
+ALL = [GatedEuclidean(), GatedMahalanobis(), UngatedEuclidean()]
+
+
+def test_a_far_candidate_does_not_tear_a_good_pair_but_the_published_order_does() -> None:
+    """The sum over both pairs is least where the near candidate gives its track to the far one."""
+    near, far = candidate(1.0, 0.0), candidate(-8.0, 0.0)
+    tracks = states([(0.0, 0.0), (5.5, 0.0)])
+    clean = GatedEuclidean()([near, far], tracks)
+    assert clean.pairs == [(0, 0)]
+    assert (clean.new, clean.missed) == ([1], [1])
+    published = UngatedEuclidean()([near, far], tracks)
+    assert published.pairs == [(0, 1)]  # its second choice, at 4.5 m
+    assert (published.new, published.missed) == ([1], [0])
+
+
+def test_a_torn_pair_leaves_both_partners_alone_although_one_had_a_second_choice() -> None:
+    candidates = [candidate(0.0, 0.0), candidate(0.0, 20.0)]
+    tracks = states([(0.0, 4.0), (0.0, -6.0)])  # whichever way, ungated: sum 6 + 16 = 22 or 4 + 26 = 30
+    clean = GatedEuclidean()(candidates, tracks)
+    assert (clean.pairs, clean.new, clean.missed) == ([(0, 0)], [1], [1])
+    published = UngatedEuclidean()(candidates, tracks)
+    assert (published.pairs, published.new, published.missed) == ([], [0, 1], [0, 1])
+
+
+def test_torn_candidates_are_born_after_those_that_had_no_partner() -> None:
+    candidates = [candidate(100.0, 0.0), candidate(200.0, 0.0), candidate(0.5, 0.0), candidate(300.0, 0.0)]
+    assignment = UngatedEuclidean()(candidates, states([(0.0, 0.0), (90.0, 0.0)]))
+    assert assignment.pairs == [(2, 0)]
+    assert assignment.new == [1, 3, 0]
+    assert assignment.missed == [1]
+
+
+@pytest.mark.parametrize("association", [GatedEuclidean(gate_m=5.0), UngatedEuclidean(gate_m=5.0)])
+def test_the_gate_itself_is_inside(association: Association) -> None:
+    assert association([candidate(5.0, 0.0)], states([(0.0, 0.0)])).pairs == [(0, 0)]
+    assert association([candidate(np.nextafter(5.0, 6.0), 0.0)], states([(0.0, 0.0)])).pairs == []
+
+
+@pytest.mark.parametrize("association", ALL)
+def test_without_candidates_or_tracks_there_are_only_births_and_misses(association: Association) -> None:
+    assert association([], states([(0.0, 0.0), (1.0, 0.0)])) == ([], [], [0, 1])
+    assert association([candidate(0.0, 0.0), candidate(9.0, 0.0)], states([])) == ([], [0, 1], [])
+    assert association([], states([])) == ([], [], [])
+
+
+@pytest.mark.parametrize("association", ALL)
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_everything_is_paired_or_left_over_exactly_once(association: Association, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    candidates = [candidate(x, y) for x, y in rng.uniform(0.0, 12.0, size=(rng.integers(0, 6), 2))]
+    tracks = states([(x, y) for x, y in rng.uniform(0.0, 12.0, size=(rng.integers(0, 6), 2))])
+    pairs, new, missed = association(candidates, tracks)
+    assert sorted([i for i, _ in pairs] + new) == list(range(len(candidates)))
+    assert sorted([j for _, j in pairs] + missed) == list(range(len(tracks.track_ids)))
+    assert pairs == sorted(pairs)
+    assert missed == sorted(missed)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_gated_assignment_has_most_pairs_and_among_those_the_least_distance(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, places = rng.uniform(0.0, 9.0, size=(4, 2)), rng.uniform(0.0, 9.0, size=(4, 2))
+    distances = np.linalg.norm(points[:, None] - places, axis=-1)
+    choices = []
+    for order in permutations(range(4)):
+        inside = [distances[i, j] for i, j in enumerate(order) if distances[i, j] <= 3.0]
+        choices.append((-len(inside), sum(inside)))
+    found = GatedEuclidean(gate_m=3.0)([candidate(*point) for point in points], states([tuple(p) for p in places]))
+    total = sum(distances[i, j] for i, j in found.pairs)
+    best = min(choices)
+    assert (-len(found.pairs), total) == (best[0], pytest.approx(best[1], abs=1e-6))
+
+
+@pytest.mark.parametrize("probability", [0.9, 0.99])
+def test_the_mahalanobis_gate_is_a_chi_square_quantile(probability: float) -> None:
+    limit_m = math.sqrt((0.16 + 0.09) * float(chi2.ppf(probability, 2)))
+    associate = GatedMahalanobis(gate_probability=probability)
+    tracks = states([(0.0, 0.0)], variance_m2=0.16)
+    assert associate([candidate(limit_m - 1e-6, 0.0)], tracks).pairs == [(0, 0)]
+    assert associate([candidate(0.0, limit_m + 1e-6)], tracks).pairs == []
+
+
+def test_the_chi_square_gate_lets_its_share_of_good_measurements_through() -> None:
+    rng = np.random.default_rng(4)
+    points = rng.normal(scale=math.sqrt(0.16 + 0.09), size=(2000, 2))
+    squared = np.sum(points**2, axis=1) / 0.25
+    inside = int(np.count_nonzero(squared <= chi_square_quantile(0.9, 2)))
+    assert abs(inside / 2000 - 0.9) < 4.0 * math.sqrt(0.09 / 2000)
+
+
+def test_a_vague_track_does_not_win_by_being_vague() -> None:
+    sharp, vague = states([(0.0, 0.0), (0.2, 0.0)]), 400.0 * np.eye(5)
+    covariances = np.array([sharp.covariances[0], vague])
+    tracks = type(sharp)(sharp.track_ids, sharp.means, covariances)
+    assert GatedMahalanobis()([candidate(0.5, 0.0)], tracks).pairs == [(0, 0)]
+
+
+def test_a_wide_covariance_does_not_reach_beyond_the_largest_distance() -> None:
+    tracks = states([(0.0, 0.0)], variance_m2=1e6)
+    assert GatedMahalanobis(max_distance_m=50.0)([candidate(49.0, 0.0)], tracks).pairs == [(0, 0)]
+    assert GatedMahalanobis(max_distance_m=50.0)([candidate(51.0, 0.0)], tracks).pairs == []
+
+
+def test_the_distance_of_a_bearing_is_from_the_track_to_the_line_of_sight_ahead() -> None:
+    pose = SensorPose(1.0, 2.0, math.pi / 2)  # looks north; bearing -pi/2 is east
+    tracks = states([(11.0, 2.0), (11.0, 5.0), (-4.0, 2.0), (1.0, 2.0)])
+    distances = euclidean_distances([bearing(-math.pi / 2, pose), candidate(11.0, 2.0)], tracks.means)
+    assert distances[0] == pytest.approx([0.0, 3.0, 5.0, 0.0], abs=1e-12)
+    assert distances[1] == pytest.approx([0.0, 3.0, 15.0, 10.0])
+
+
+@pytest.mark.parametrize("association", ALL)
+def test_a_bearing_takes_the_track_in_its_line_of_sight(association: Association) -> None:
+    pose = SensorPose(0.0, 0.0, 0.0)
+    tracks = states([(30.0, 2.9), (30.0, -0.1)])
+    assert association([bearing(0.0, pose)], tracks).pairs == [(0, 1)]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: GatedEuclidean(gate_m=0.0), "gate_m"),
+        (lambda: GatedEuclidean(gate_m=math.nan), "gate_m"),
+        (lambda: GatedMahalanobis(gate_probability=1.0), "gate_probability"),
+        (lambda: GatedMahalanobis(max_distance_m=-1.0), "max_distance_m"),
+    ],
+)
+def test_a_gate_that_makes_no_sense_is_named(make, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -1,0 +1,101 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.tracking import START_NS, StraightRoad, bearing
+
+from fgtrack.core.geometry import rotation
+from fgtrack.core.types import EgoState
+from fgtrack.estimation.base import Measurement
+from fgtrack.estimation.birth import birth_state
+from fgtrack.models.measurement import SensorPose, measurement_model
+from fgtrack.models.motion import CTRA, CTRV, CV
+from fgtrack.models.road import OpenSpace
+from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
+from fgtrack.tracking.preprocess import Candidate
+
+EGO = EgoState(START_NS, START_NS, 0.0, 0.0, 0.0, speed_mps=50.0, accel_mps2=-2.0)
+ROAD = StraightRoad(yaw_rad=0.4, curvature_radpm=0.01)
+POSITION_COVARIANCE = np.array([[0.5, 0.1], [0.1, 0.3]])
+
+
+def seen(**values: float) -> Candidate:
+    """A candidate at (3, 4) with these further components, of standard deviation 0.7."""
+    components = {"x_m": 3.0, "y_m": 4.0, **values}
+    R = np.diag([0.49] * len(components))
+    R[:2, :2] = POSITION_COVARIANCE
+    z = np.array(list(components.values()))
+    measurement = Measurement(START_NS, measurement_model(tuple(components), CTRV()), z, R)
+    return Candidate(0, (), measurement, z[:2], R[:2, :2], components)
+
+
+@pytest.mark.parametrize("birth", [FixedBirth(), MeasuredBirth()])
+def test_what_is_not_measured_comes_from_the_map_and_the_ego(birth) -> None:
+    prior = birth.prior(seen(), ROAD, EGO, ego_in_pit=False)
+    assert prior.stamp_ns == START_NS
+    assert prior.position_m.tolist() == [3.0, 4.0]
+    assert prior.yaw_rad == 0.4
+    assert prior.speed_mps == pytest.approx(0.8 * 50.0)
+    assert prior.yaw_rate_radps == pytest.approx(40.0 * 0.01)
+    assert prior.accel_mps2 == 0.0
+    assert (prior.yaw_std_rad, prior.speed_std_mps) == (math.sqrt(0.3), 2.0)
+
+
+@pytest.mark.parametrize("birth", [FixedBirth(), MeasuredBirth()])
+def test_what_is_measured_stays(birth) -> None:
+    prior = birth.prior(seen(yaw_rad=1.0, speed_mps=20.0), ROAD, EGO, ego_in_pit=False)
+    assert (prior.yaw_rad, prior.speed_mps) == (1.0, 20.0)
+    assert prior.yaw_rate_radps == pytest.approx(20.0 * 0.01)
+
+
+def test_a_measured_component_starts_with_its_own_deviation_or_a_fixed_one() -> None:
+    candidate = seen(yaw_rad=1.0, speed_mps=20.0)
+    measured = MeasuredBirth().prior(candidate, ROAD, EGO, ego_in_pit=False)
+    assert (measured.yaw_std_rad, measured.speed_std_mps) == pytest.approx((0.7, 0.7))
+    assert measured.position_covariance == pytest.approx(POSITION_COVARIANCE)
+    fixed = FixedBirth(along_std_m=2.0, across_std_m=0.5).prior(candidate, ROAD, EGO, ego_in_pit=False)
+    assert (fixed.yaw_std_rad, fixed.speed_std_mps) == (math.sqrt(0.3), 2.0)
+    turn = rotation(1.0)
+    assert fixed.position_covariance == pytest.approx(turn @ np.diag([4.0, 0.25]) @ turn.T)
+
+
+@pytest.mark.parametrize(("ego", "in_pit"), [(None, False), (EGO, True)])
+def test_without_an_ego_on_the_track_an_object_is_assumed_to_stand(ego: EgoState | None, in_pit: bool) -> None:
+    prior = FixedBirth().prior(seen(), ROAD, ego, ego_in_pit=in_pit)
+    assert (prior.speed_mps, prior.yaw_rate_radps, prior.accel_mps2) == (0.0, 0.0, 0.0)
+
+
+def test_a_slow_ego_lends_its_acceleration() -> None:
+    for speed_mps, accel_mps2 in [(9.9, -2.0), (10.0, 0.0)]:
+        prior = FixedBirth().prior(seen(), ROAD, replace(EGO, speed_mps=speed_mps), ego_in_pit=False)
+        assert prior.accel_mps2 == accel_mps2
+
+
+def test_without_a_map_the_heading_is_unknown_and_the_road_straight() -> None:
+    prior = FixedBirth().prior(seen(), OpenSpace(), EGO, ego_in_pit=False)
+    assert prior.yaw_rad is None
+    assert prior.yaw_rate_radps == 0.0
+    assert FixedBirth().prior(seen(yaw_rad=0.3), OpenSpace(), EGO, ego_in_pit=False).yaw_rad == 0.3
+
+
+def test_a_bearing_alone_starts_nothing() -> None:
+    assert FixedBirth().prior(bearing(0.1, SensorPose()), ROAD, EGO, ego_in_pit=False) is None
+
+
+@pytest.mark.parametrize("name", ["yaw_std_rad", "speed_std_mps", "yaw_rate_std_radps", "accel_std_mps2"])
+def test_a_deviation_that_makes_no_sense_is_named(name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        FixedBirth(**{name: 0.0})
+
+
+@pytest.mark.parametrize("motion", [CTRV(), CTRA(), CV()], ids=lambda motion: type(motion).__name__)
+def test_the_first_state_of_every_motion_model_is_the_prior(motion) -> None:
+    prior = MeasuredBirth().prior(seen(yaw_rad=1.0, speed_mps=20.0), ROAD, EGO, ego_in_pit=False)
+    mean, P = birth_state(motion, prior)
+    assert mean.shape == (motion.dim,)
+    assert np.array_equal(P, P.T)
+    assert np.linalg.eigvalsh(P).min() > 0.0
+    kinematic, _ = motion.kinematic(mean, P)
+    assert kinematic[:4] == pytest.approx([3.0, 4.0, 1.0, 20.0])
+    assert P[:2, :2] == pytest.approx(POSITION_COVARIANCE)

@@ -1,0 +1,183 @@
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from fgtrack.core.errors import CallError
+from fgtrack.pipeline.build import ESTIMATORS, build_bank, build_tracker
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.load import dump, load, read_yaml, validate
+from fgtrack.sim.scenario import Scenario
+from fgtrack.tracking.association import GatedMahalanobis
+from fgtrack.tracking.tracker import PublishedTracker, Tracker
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+FILES = sorted(CONFIGS.rglob("*.yaml"))
+
+
+def kind_of(path: Path) -> type[Config] | type[Scenario]:
+    return Scenario if path.parent.name == "scenarios" else Config
+
+
+def written(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "config.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def keys(value: object) -> set[str]:
+    """Names of all fields, at any depth."""
+    if not is_dataclass(value):
+        return set()
+    return {field.name for field in fields(value)}.union(*(keys(getattr(value, field.name)) for field in fields(value)))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_every_file_of_the_project_loads_and_comes_back_from_its_dump(path: Path, tmp_path: Path) -> None:
+    loaded = load(kind_of(path), path)
+    again = load(kind_of(path), written(tmp_path, dump(loaded)))
+    assert again == loaded
+    assert dump(again) == dump(loaded)
+
+
+def test_there_are_files_of_both_kinds() -> None:
+    assert {kind_of(path) for path in FILES} == {Config, Scenario}
+    assert {"karle2023", "karle2023_reference", "autoferry"} <= {path.stem for path in FILES}
+
+
+def test_the_clean_method_is_the_default() -> None:
+    assert load(Config, CONFIGS / "karle2023.yaml") == load(Config, None) == Config()
+
+
+def test_a_dump_writes_every_key_out() -> None:
+    text = dump(Config())
+    assert [key for key in keys(Config()) if f"{key}:" not in text] == []
+
+
+@pytest.mark.parametrize("path", [path for path in FILES if kind_of(path) is Config], ids=lambda path: path.stem)
+def test_every_configuration_can_be_built(path: Path) -> None:
+    config = load(Config, path)
+    tracker = build_tracker(config)
+    assert type(tracker) is (PublishedTracker if config.lifecycle.kind == "published" else Tracker)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("motion", ["{kind: ctrv}", "{kind: cv, std_per_s: {velocity: 1.0}}", "{kind: ctrv_euler}"])
+def test_every_estimator_takes_every_motion_model(estimator: str, motion: str) -> None:
+    bank = build_bank(replace(load(Config, None, [f"motion={motion}"]), estimator=estimator))
+    bank.advance(10**9)
+    assert bank.track_ids == ()
+
+
+def test_an_unknown_estimator_is_a_bad_call() -> None:
+    with pytest.raises(CallError, match=r"'magic' is unknown: there are ekf-backward-forward"):
+        build_tracker(replace(Config(), estimator="magic"))
+
+
+def test_settings_stand_above_the_file_and_the_last_one_wins(tmp_path: Path) -> None:
+    path = written(tmp_path, "filter: {frequency_hz: 50.0, storage_s: 2.0}\n")
+    settings = [
+        "filter.frequency_hz=20",
+        "filter.frequency_hz=25.0",
+        "association={kind: mahalanobis}",
+        "map.track=oval",
+    ]
+    config = load(Config, path, settings)
+    assert (config.filter.frequency_hz, config.filter.storage_s) == (25.0, 2.0)
+    assert config.association == GatedMahalanobis()
+    assert config.map.track == "oval"
+
+
+def test_a_setting_does_not_change_what_it_stands_on() -> None:
+    raw = {"filter": {"storage_s": 2.0}}
+    validate(Config, raw, "here")
+    load(Config, None, ["filter.storage_s=1.0"])
+    assert raw == {"filter": {"storage_s": 2.0}}
+    assert Config().filter.storage_s == 3.5
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("filtre: {}\n", "config.yaml: filtre: unknown key, known here: estimator, sensors"),
+        ("filter: {frequence: 3.0}\n", "filter.frequence: unknown key, known here: frequency_hz"),
+        ("sensors: {lidar: {std: {x_m: 1.0, y_m: 1.0}, colour: red}}\n", "sensors.lidar.colour: unknown key"),
+        ("sensors: {lidar: {std: {x_m: 1.0, y_m: 1.0, mass_kg: 1.0}}}\n", "unknown component 'mass_kg'"),
+        ("sensors: {lidar: {counter_init: 3}}\n", "sensors.lidar.std"),
+        ("sensors: {}\n", "sensors: name at least one"),
+        ("ignore_sensors: [lidar]\n", "ignore_sensors: 'lidar'"),
+        ("input: {detections: {sonar: {topic: /sonar}}}\n", "input.detections: 'sonar' has no model"),
+        ("filter: 3\n", "filter: "),
+        ("filter: {frequency_hz: fast}\n", 'filter.frequency_hz: Input should be a valid number, not "fast"'),
+        ("filter: {frequency_hz: '50'}\n", "filter.frequency_hz"),
+        ("filter: {frequency_hz: 0.0}\n", "frequency_hz: must lie between 1 and 10000, is 0"),
+        ("filter: {storage_s: 1e9}\n", "storage_s: must lie"),
+        ("filter: {clock: other}\n", "filter.clock"),
+        ("clock: {node_hz: .nan}\n", "node_hz"),
+        ("clock: {node_hz: -.inf}\n", "node_hz"),
+        ("map: {inner_buffer_m: .inf}\n", "map.inner_buffer_m"),
+        ("ego: {yaw_weight: 0.0}\n", "yaw_weight: must lie in"),
+        ("ego: {storage_ticks: 2.5}\n", "ego.storage_ticks"),
+        ("association: {gate_m: 3.0}\n", "association: needs the key `kind`"),
+        ("association: {kind: nearest}\n", "association"),
+        ("association: {kind: mahalanobis, gate_m: 3.0}\n", "association.gate_m: unknown key"),
+        ("association: {kind: mahalanobis, gate_probability: 1.5}\n", "gate_probability: must lie between 0 and 1"),
+        ("motion: {kind: cv}\n", "std of CV: give velocity"),
+        ("motion: {kind: ctrv, yaw: saturated}\n", "may be changed for kind ctrv_euler only"),
+        ("lifecycle: {counter_cap: 0}\n", "counter_cap"),
+        ("evaluation: {gate_m: 0.0}\n", "gate_m: must be positive"),
+        ("filter: {storage_s: 1.0}\nfilter: {storage_s: 2.0}\n", "config.yaml:2: no valid YAML, found duplicate key"),
+        ("filter: {storage_s: 1.0\n", "no valid YAML"),
+        ("filter: {storage_s: &a [*a]}\n", "only plain YAML values"),
+        ("clock: {node_hz: 2020-01-01}\n", "only plain YAML values"),
+        ("- 1\n", "a mapping of keys to values is needed, this is [1]"),
+        ("text\n", 'a mapping of keys to values is needed, this is "text"'),
+        ("1: 2\n", "unknown key"),
+        ("? [1, 2]\n: 3\n", "config.yaml: "),
+        ("!!python/object:os.system {}\n", "config.yaml"),
+    ],
+)
+def test_every_error_is_one_line_with_the_file_and_the_key(tmp_path: Path, text: str, message: str) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(CallError) as error:
+        load(Config, path)
+    assert message in str(error.value)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("setting", ["", "=", "=1", "a", "a.=1", ".a=1", "a..b=1"])
+def test_a_setting_that_is_no_setting_says_how_to_write_it(setting: str) -> None:
+    with pytest.raises(CallError, match="write key=value"):
+        load(Config, None, [setting])
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("estimator.x=1", "estimator"),
+        ("filter.frequency_hz=[1", "--set filter.frequency_hz=[1"),
+        ("filter.frequency_hz=", "filter.frequency_hz"),
+        ("nothing=1", "defaults with --set: nothing: unknown key"),
+    ],
+)
+def test_a_wrong_setting_names_its_key(setting: str, message: str) -> None:
+    with pytest.raises(CallError) as error:
+        load(Config, None, [setting])
+    assert message in str(error.value)
+
+
+def test_a_path_through_a_single_value_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, "filter: {storage_s: 2.0}\n")
+    with pytest.raises(CallError, match="storage_s is a single value"):
+        load(Config, path, ["filter.storage_s.x=1"])
+
+
+def test_an_empty_file_is_the_default_and_a_missing_one_an_error(tmp_path: Path) -> None:
+    assert load(Config, written(tmp_path, "")) == load(Config, written(tmp_path, "# nothing\n")) == Config()
+    for path in (tmp_path / "missing.yaml", tmp_path):
+        with pytest.raises(CallError, match="configuration cannot be read"):
+            read_yaml(path)
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(CallError, match="is no text file"):
+        read_yaml(tmp_path / "binary.yaml")

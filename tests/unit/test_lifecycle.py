@@ -1,0 +1,141 @@
+import numpy as np
+import pytest
+from support.tracking import START_NS, ms
+
+from fgtrack.core.types import TrackStatus
+from fgtrack.models.sensors import SensorModel
+from fgtrack.tracking.lifecycle import CountingLifecycle, Life, Lifecycle, LifecycleRules, ages_at
+from fgtrack.tracking.published_objects import PublishedLifecycle
+
+STD = {"x_m": 0.3, "y_m": 0.3}
+SENSORS = {
+    "near": SensorModel(std=STD, counter_init=3, counter_add=1, ages="short_range"),
+    "far": SensorModel(std=STD, counter_init=5, counter_add=2, ages="long_range"),
+    "both": SensorModel(std=STD, counter_init=2, counter_add=2, ages="always"),
+    "blind": SensorModel(std=STD, counter_init=4, counter_add=0, ages="never"),
+}
+KINDS = [CountingLifecycle, PublishedLifecycle]
+
+
+def lifecycle(kind=CountingLifecycle, **rules) -> Lifecycle:
+    return kind(LifecycleRules(**rules), SENSORS)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_track_starts_with_the_counter_of_the_sensor_that_found_it(kind) -> None:
+    life = lifecycle(kind)
+    for track_id, sensor in enumerate(SENSORS):
+        life.born(track_id, sensor, START_NS, START_NS)
+    assert [life.lives[i].counter for i in range(4)] == [3, 5, 2, 4]
+    assert all(one.num_measured == 1 for one in life.lives.values())
+
+
+@pytest.mark.parametrize(
+    ("ages", "near", "at_limit", "far"),
+    [
+        ("always", True, True, True),
+        ("never", False, False, False),
+        ("short_range", True, True, False),
+        ("long_range", False, False, True),
+    ],
+)
+def test_a_sensor_ages_only_what_it_is_responsible_for(ages, near: bool, at_limit: bool, far: bool) -> None:
+    assert [ages_at(ages, range_m, 60.0) for range_m in (10.0, 60.0, 60.1)] == [near, at_limit, far]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_missed_track_counts_down_and_ends_at_zero(kind) -> None:
+    life = lifecycle(kind)
+    life.born(0, "near", START_NS, START_NS)
+    life.born(1, "near", START_NS, START_NS)
+    ranges_m = np.array([10.0, 61.0])
+    assert life.missed([0, 1], "near", ranges_m, START_NS) == []
+    assert life.missed([0, 1], "far", ranges_m, START_NS) == []
+    assert [life.lives[i].counter for i in (0, 1)] == [2, 2]
+    assert life.missed([0, 1], "near", ranges_m, START_NS) == []
+    assert life.missed([0, 1], "near", ranges_m, START_NS) == [0]
+    life.forget(0)
+    assert list(life.lives) == [1]
+
+
+def test_only_the_clean_life_cycle_knows_sensors_that_age_always() -> None:
+    clean, published = lifecycle(), lifecycle(PublishedLifecycle)
+    for life in (clean, published):
+        life.born(0, "both", START_NS, START_NS)
+        life.missed([0], "both", np.array([10.0]), START_NS)
+    assert (clean.lives[0].counter, published.lives[0].counter) == (1, 2)
+
+
+def test_the_counter_stops_at_its_cap_but_the_published_one_may_pass_it() -> None:
+    clean, published = lifecycle(counter_cap=6), lifecycle(PublishedLifecycle, counter_cap=6)
+    for life in (clean, published):
+        life.born(0, "far", START_NS, START_NS)
+        for _ in range(3):
+            life.matched(0, "far", START_NS)
+    assert (clean.lives[0].counter, published.lives[0].counter) == (6, 7)
+
+
+def test_the_last_sight_is_the_newest_stamp_and_in_the_published_one_the_last() -> None:
+    clean, published = lifecycle(), lifecycle(PublishedLifecycle)
+    for life in (clean, published):
+        life.born(0, "near", START_NS, START_NS + ms(100))
+    assert clean.lives[0].last_seen_ns == START_NS
+    assert published.lives[0].last_seen_ns == START_NS + ms(100)
+    for life in (clean, published):
+        life.matched(0, "near", START_NS + ms(50))
+        life.matched(0, "near", START_NS + ms(20))
+    assert clean.lives[0].last_seen_ns == START_NS + ms(50)
+    assert published.lives[0].last_seen_ns == START_NS + ms(20)
+
+
+def test_time_alone_ends_a_track_but_the_published_one_needs_a_list() -> None:
+    clean, published = lifecycle(forget_s=2.0), lifecycle(PublishedLifecycle, forget_s=2.0)
+    late_ns = START_NS + ms(2000) + 1
+    for life in (clean, published):
+        life.born(0, "blind", START_NS, START_NS)
+        assert life.expired(late_ns - 1) == []
+    assert clean.expired(late_ns) == [0]
+    assert published.expired(late_ns) == []
+    assert published.missed([0], "blind", np.array([10.0]), late_ns - 1) == []
+    assert published.missed([0], "blind", np.array([10.0]), late_ns) == [0]
+    assert published.lives[0].counter == -1
+
+
+def test_the_status_tells_unconfirmed_from_seen_from_missed() -> None:
+    life = lifecycle(confirm_count=3)
+    life.born(0, "both", START_NS, START_NS)
+    status = []
+    for _ in range(2):
+        life.matched(0, "both", START_NS)
+        life.fused(0)
+        status.append(life.lives[0].status(3))
+    life.missed([0], "both", np.array([1.0]), START_NS)
+    status.append(life.lives[0].status(3))
+    life.matched(0, "both", START_NS)
+    status.append(life.lives[0].status(3))
+    assert status == [
+        TrackStatus.TENTATIVE,
+        TrackStatus.CONFIRMED,
+        TrackStatus.COASTING,
+        TrackStatus.CONFIRMED,
+    ]
+    assert Life(1, START_NS, num_measured=2, misses=1).status(3) is TrackStatus.TENTATIVE
+
+
+def test_an_unconfirmed_track_ends_at_its_first_misses_where_that_is_asked_for() -> None:
+    life = lifecycle(tentative_misses=2, confirm_count=2)
+    for track_id in (0, 1):
+        life.born(track_id, "far", START_NS, START_NS)
+    life.fused(1)
+    ranges_m = np.array([80.0, 80.0])
+    assert life.missed([0, 1], "far", ranges_m, START_NS) == []
+    assert life.missed([0, 1], "far", ranges_m, START_NS) == [0]
+
+
+@pytest.mark.parametrize(
+    "rules",
+    [{"counter_cap": 0}, {"confirm_count": 0}, {"forget_s": 0.0}, {"short_range_m": -1.0}, {"tentative_misses": 0}],
+)
+def test_rules_that_make_no_sense_are_named(rules: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(rules))):
+        LifecycleRules(**rules)

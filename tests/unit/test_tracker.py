@@ -1,0 +1,144 @@
+from dataclasses import replace
+
+import pytest
+from support.tracking import START_NS, ms
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, TickReport, TrackStatus
+from fgtrack.models.sensors import SensorModel
+from fgtrack.pipeline.build import ESTIMATORS, build_tracker
+from fgtrack.pipeline.config import Config
+from fgtrack.tracking.tracker import Tracker
+
+POINTS = SensorModel(std={"x_m": 0.3, "y_m": 0.3})
+
+
+def tracker(**sensors: SensorModel) -> Tracker:
+    return build_tracker(replace(Config(), sensors=sensors or {"lidar": POINTS}))
+
+
+def seen(
+    *places: tuple[float, float], at_ms: float = 0.0, late_ms: float = 0.0, sensor: str = "lidar", frame: str = "map"
+) -> DetectionList:
+    receipt_ns = START_NS + ms(at_ms)
+    items = tuple(Detection(x_m=x_m, y_m=y_m) for x_m, y_m in places)
+    return DetectionList(sensor, receipt_ns - ms(late_ms), receipt_ns, items, frame)
+
+
+def tick(tracker: Tracker, at_ms: float, *messages: DetectionList | EgoState) -> TickReport:
+    for message in messages:
+        tracker.receive(message)
+    return tracker.tick(START_NS + ms(at_ms))
+
+
+def ids(report: TickReport) -> list[int]:
+    return [track.track_id for track in report.tracks]
+
+
+def dispositions(report: TickReport) -> list[str]:
+    return [record.disposition.value for record in report.updates]
+
+
+@pytest.mark.parametrize("stamp_from", ["message", "object"])
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_a_track_is_missed_by_a_message_as_a_whole_and_not_by_each_stamp_in_it(stamp_from, estimator: str) -> None:
+    sensor = replace(POINTS, stamp_from=stamp_from)
+    one = build_tracker(replace(Config(), sensors={"lidar": sensor}, estimator=estimator))
+    for k in range(10):
+        stamp_ns = START_NS + k * ms(50)
+        items = tuple(Detection(x_m=20.0 * i, y_m=1.0, stamp_ns=stamp_ns - ms(3 * i)) for i in range(4))
+        one.receive(DetectionList("lidar", stamp_ns, stamp_ns, items, "map"))
+        report = one.tick(stamp_ns)
+    assert sorted(ids(report)) == [0, 1, 2, 3]
+    assert all(track.status is TrackStatus.CONFIRMED for track in report.tracks)
+    assert all(track.num_measured == 10 for track in report.tracks)
+    only_one = DetectionList("lidar", stamp_ns + ms(50), stamp_ns + ms(50), items[:1], "map")
+    one.receive(only_one)
+    report = one.tick(stamp_ns + ms(50))
+    assert sorted(track.status for track in report.tracks) == ["coasting"] * 3 + ["confirmed"]
+
+
+def test_batches_of_one_tick_are_processed_in_order_of_their_stamps() -> None:
+    one = tracker(a=POINTS, b=POINTS)
+    report = tick(
+        one,
+        100.0,
+        seen((1.0, 1.0), at_ms=90.0, late_ms=10.0, sensor="a"),
+        seen((1.0, 1.0), at_ms=95.0, late_ms=80.0, sensor="b"),
+    )
+    assert [(record.sensor, record.disposition.value) for record in report.updates] == [
+        ("b", "birth"),
+        ("a", "in_sequence"),
+    ]
+
+
+def test_a_list_that_saw_nothing_ages_the_tracks_until_they_end() -> None:
+    one = tracker()
+    assert ids(tick(one, 0.0, seen((10.0, 0.0)))) == [0]
+    for k in (1, 2):
+        [track] = tick(one, 50.0 * k, seen(at_ms=50.0 * k)).tracks
+        assert track.track_id == 0
+    assert ids(tick(one, 150.0, seen(at_ms=150.0))) == []
+    assert ids(tick(one, 200.0, seen((10.0, 0.0), at_ms=200.0))) == [1]  # ids are not used again
+
+
+def test_time_alone_ends_a_track() -> None:
+    one = tracker()
+    tick(one, 0.0, seen((10.0, 0.0)))
+    assert ids(tick(one, 2000.0)) == [0]
+    assert ids(tick(one, 2000.1)) == []
+
+
+def test_without_an_ego_pose_only_map_detections_can_be_placed() -> None:
+    one = tracker()
+    report = tick(one, 0.0, seen((10.0, 0.0), frame="ego"), seen((30.0, 0.0), frame="map", late_ms=1.0))
+    assert sorted(dispositions(report)) == ["birth", "failed"]
+    ego = EgoState(START_NS, START_NS, 0.0, 0.0, 0.0, 0.0)
+    assert "failed" not in dispositions(tick(one, 50.0, ego, seen((10.0, 0.0), at_ms=50.0, frame="ego")))
+
+
+def test_what_is_older_than_the_storage_is_too_old() -> None:
+    one = tracker()
+    report = tick(one, 0.0, seen((10.0, 0.0), (50.0, 0.0), late_ms=3600.0), seen((10.0, 0.0), late_ms=3400.0))
+    assert dispositions(report) == ["too_old", "too_old", "birth"]
+
+
+def test_a_sensor_that_starts_no_tracks_leaves_its_detections_gated() -> None:
+    one = tracker(lidar=POINTS, camera=replace(POINTS, births=False))
+    assert dispositions(tick(one, 0.0, seen((10.0, 0.0), sensor="camera"))) == ["gated"]
+    tick(one, 50.0, seen((10.0, 0.0), at_ms=50.0))
+    report = tick(one, 100.0, seen((10.0, 0.0), at_ms=100.0, sensor="camera"))
+    assert dispositions(report) == ["in_sequence"]
+    assert report.updates[0].track_id == 0
+
+
+def test_the_members_of_a_merged_group_share_the_track_and_one_carries_the_outcome() -> None:
+    report = tick(tracker(), 0.0, seen((10.0, 0.0), (12.0, 0.0), (60.0, 0.0), (14.0, 0.0)))
+    outcome = {record.index: (record.disposition, record.track_id) for record in report.updates}
+    assert outcome == {
+        0: (Disposition.BIRTH, 0),
+        1: (Disposition.MERGED, 0),
+        3: (Disposition.MERGED, 0),
+        2: (Disposition.BIRTH, 1),
+    }
+
+
+def test_refused_ego_messages_are_counted_by_reason() -> None:
+    one = tracker()
+    good = EgoState(START_NS, START_NS, 0.0, 0.0, 0.0, 0.0)
+    for message in (good, good, replace(good, stamp_ns=START_NS + 1, x_m=float("nan")), good):
+        one.receive(message)
+    assert dict(one.refused_ego) == {"repeated stamp": 2, "not finite": 1}
+
+
+def test_an_unknown_sensor_is_an_error_that_says_what_to_do() -> None:
+    with pytest.raises(DataError, match=r"'sonar' has no model .*lidar.*ignore_sensors"):
+        tracker().receive(seen((1.0, 1.0), sensor="sonar"))
+
+
+def test_an_innovation_is_named_by_what_was_measured() -> None:
+    one = tracker()
+    tick(one, 0.0, seen((10.0, 0.0)))
+    [record] = tick(one, 10.0, seen((10.0, 0.5), at_ms=10.0)).updates
+    assert record.innovation == pytest.approx({"x_m": 0.0, "y_m": 0.5}, abs=1e-9)
+    assert record.nis > 0.0
