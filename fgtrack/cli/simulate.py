@@ -1,6 +1,5 @@
 """`fgtrack simulate`: a scenario to a stream or a bag."""
 
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -32,9 +31,10 @@ def simulate(
     """Simulate a scenario: ego, detections with noise and delays, and the truth."""
     scenario = read_scenario(scenario_file)
     if duration_s is not None:
-        if not 0.0 < duration_s < math.inf:
-            raise CallError(f"--duration {duration_s:g}: must be positive and finite")
-        scenario = replace(scenario, duration_s=duration_s)
+        try:
+            scenario = replace(scenario, duration_s=duration_s)
+        except ValueError as error:
+            raise CallError(f"--duration: {error}") from error
     with progress("simulate"):
         count = write_recording(out, simulated(scenario, np.random.default_rng(seed)), storage)
     console().print(f"{out}: {count} messages", highlight=False, soft_wrap=True)

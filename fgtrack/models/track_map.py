@@ -132,7 +132,8 @@ class TrackMap:
         try:
             text = Path(path).read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            raise DataError(f"{path}: cannot read the map: {error}") from error
+            reason = getattr(error, "strerror", None) or "it is no text file"
+            raise DataError(f"{path}: cannot read the map ({reason})") from error
         for number, line in enumerate(text.splitlines(), start=1):
             if not line.strip() or line.lstrip().startswith("#"):
                 continue

@@ -54,7 +54,7 @@ class Scenario:
     """Stamp of the start."""
 
     def __post_init__(self) -> None:
-        require(self.duration_s > 0.0, "duration_s", "must be positive", self.duration_s)
+        require(0.0 < self.duration_s <= 86_400.0, "duration_s", "must lie in (0, 86400]", self.duration_s)
         require(self.truth_rate_hz > 0.0, "truth_rate_hz", "must be positive", self.truth_rate_hz)
         require(True, "detection_origin_x_m", "must be finite", self.detection_origin_x_m)
         require(self.start_ns >= 0, "start_ns", "must not be negative", self.start_ns)

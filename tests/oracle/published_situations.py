@@ -35,7 +35,7 @@ class Situation:
     sensors: tuple[str, ...] = SENSORS
     sensors_silent_s: Interval = NEVER
     sensors_hz: float = 20.0
-    delay: str = "usual"  # usual, none, tiny, future, huge
+    delay: str = "usual"  # usual, none, mixed (of these two), tiny, future, huge
     stamp_grid_ns: int = 1
     object_stamps: bool = False
     duplicate_p: float = 0.0
@@ -63,7 +63,10 @@ SITUATIONS = {
     "contradictory_ego": Situation(ego_noise=10.0, ego_bias=1.0),
     "slow_ego": Situation(ego_speed_mps=(5.0, 6.0, 7.0, 8.0, 9.0), ego_bias=0.5),
     "ego_around_ten": Situation(
-        ego_speed_mps=(10.0,), ego_speed_changes_mps=0.5, ego_exact_speeds_mps=(10.0, math.nextafter(10.0, 0.0))
+        ego_speed_mps=(10.0,),
+        ego_speed_changes_mps=0.5,
+        ego_exact_speeds_mps=(10.0, math.nextafter(10.0, 0.0)),
+        clutter=2.0,
     ),
     "standing_ego": Situation(ego_speed_mps=(0.0,), ego_noise=0.0, spread_m=30.0),
     "standing_noisy_ego": Situation(ego_speed_mps=(0.0,), ego_noise=3.0),
@@ -83,6 +86,7 @@ SITUATIONS = {
     "no_delay_on_grid": Situation(delay="none", stamp_grid_ns=5_000_000),
     "tiny_delay": Situation(delay="tiny"),
     "usual_delay_on_grid": Situation(stamp_grid_ns=5_000_000),
+    "mixed_delay_on_grid": Situation(delay="mixed", stamp_grid_ns=5_000_000, ego_noise=5.0),
     "future": Situation(delay="future"),
     "huge_delay": Situation(delay="huge"),
     "pit_lane": Situation(in_pit_p=0.6, pit_toggle_p=0.02, start="closing"),
@@ -154,7 +158,7 @@ def anything(rng: np.random.Generator) -> Situation:
         sensors=tuple(str(name) for name in rng.permutation(SENSORS)[: rng.integers(1, 4)]),
         sensors_silent_s=sometimes(silence(), NEVER),
         sensors_hz=float(rng.choice([5.0, 20.0, 33.0])),
-        delay=str(rng.choice(["usual", "none", "tiny", "future", "huge"])),
+        delay=str(rng.choice(["usual", "none", "mixed", "tiny", "future", "huge"])),
         stamp_grid_ns=sometimes(5_000_000, 1),
         object_stamps=sometimes(True, False),
         duplicate_p=sometimes(0.1, 0.0),

@@ -190,10 +190,11 @@ def _stamped(item: Detection, stamp_ns: int) -> Detection:
 
 
 def _delay_ns(situation: Situation, rng: np.random.Generator, sensor: str) -> int:
-    mean_s, std_s = DELAYS_S[sensor]
+    usual_s = max(rng.normal(*DELAYS_S[sensor]), 0.0)
     delay_s = {
-        "usual": max(rng.normal(mean_s, std_s), 0.0),
+        "usual": usual_s,
         "none": 0.0,
+        "mixed": rng.choice([0.0, usual_s]),
         "tiny": rng.uniform(0.0, 0.006),
         "future": rng.uniform(-0.1, 0.02),
         "huge": rng.uniform(0.0, 0.6),

@@ -97,7 +97,10 @@ def covariance(
     full[:3, :3] = pose
     full[3, 3] = speed or 0.0
     index = [MEASURABLE.index(name) for name in components]
-    return tuple(full[np.ix_(index, index)].ravel().tolist())
+    chosen = full[np.ix_(index, index)]
+    if (np.diag(chosen) <= 0.0).any():  # ROS says "not known" by 0 or -1
+        return None
+    return tuple(chosen.ravel().tolist())
 
 
 def planar(covariance36: Sequence[float]) -> FloatArray:
