@@ -3,6 +3,7 @@
 from functools import cache
 
 import numpy as np
+from scipy.linalg.lapack import dgesv
 
 from fgtrack.core.types import FloatArray
 
@@ -25,7 +26,12 @@ def psd_solve(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
 
     Shapes (..., n, n) and (..., n, k). Raises `numpy.linalg.LinAlgError` when `matrix` is singular.
     """
-    return np.asarray(np.linalg.solve(matrix, rhs))
+    if matrix.shape[:-2] != (1,):
+        return np.asarray(np.linalg.solve(matrix, rhs))
+    _, _, solution, info = dgesv(matrix[0], rhs[0])  # the same routine at a third of the time
+    if info:
+        raise np.linalg.LinAlgError("singular matrix")
+    return np.asarray(solution[None])
 
 
 def mahalanobis_squared(residual: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -176,8 +176,8 @@ class BackwardForwardBank:
             chosen = [rows[track_ids[position]] for position in positions]
             part = self._update_alike(
                 [track_ids[position] for position in positions],
-                states.means[chosen],
-                states.covariances[chosen],
+                states.means.take(chosen, axis=0),
+                states.covariances.take(chosen, axis=0),
                 [measurements[position] for position in positions],
                 self.steps_back(stamp_ns),
             )
@@ -203,7 +203,8 @@ class BackwardForwardBank:
         except np.linalg.LinAlgError:
             return self._update_one_by_one(track_ids, means, covariances, measurements, back)
         settled = self._propagator.settle(corrected.mean)
-        finite = np.isfinite(settled.sum(axis=1) + corrected.covariance.sum(axis=(1, 2))).tolist()
+        flat = corrected.covariance.reshape(len(settled), -1)
+        finite = np.isfinite(np.vecdot(settled, settled) + np.vecdot(flat, flat)).tolist()
         results = []
         for row, (track_id, measurement) in enumerate(zip(track_ids, measurements, strict=True)):
             if not finite[row]:

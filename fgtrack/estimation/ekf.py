@@ -65,9 +65,5 @@ def correct_with_innovation(
     K = solved[..., :-1].mT
     A = identity(mean.shape[-1]) - K @ H
     posterior = A @ covariance @ A.mT + K @ R @ K.mT
-    return Correction(
-        mean + (K @ y[..., None])[..., 0],
-        symmetrise(posterior),
-        y,
-        np.asarray(np.vecdot(y, solved[..., -1])),
-    )
+    nis = np.vecdot(y, solved[..., -1])
+    return Correction(mean + np.vecdot(K, y[..., None, :]), symmetrise(posterior), y, np.asarray(nis))

@@ -13,6 +13,7 @@ from fgtrack.models.motion import MotionModel
 
 _TURNING = slice(YAW, YAW_RATE + 1)  # the states that the position depends on
 _EYE_3 = np.eye(3)[..., None]
+_QUARTER_TURN = np.array([[-1.0], [1.0]])  # of x and y in reverse order
 
 
 class Propagator(Protocol):
@@ -82,27 +83,25 @@ class EulerCtrv:
         longest = max(steps.tolist(), default=0)
         if not longest:
             return mean, covariance
-        at_s = np.arange(longest + 1.0) * dt_s  # where steps begin and end, (K + 1,)
-        elapsed_s = steps * np.float64(dt_s)
-        left_s = elapsed_s[:, None] - at_s
-        lasts_s = np.minimum(np.maximum(left_s, 0.0), dt_s)  # of the step that begins there; 0 after an object's last
-        yaw = self.yaws(mean, at_s)
+        elapsed_s = steps[:, None] * dt_s
+        at_s = np.minimum(np.arange(longest + 1.0) * dt_s, elapsed_s)  # where steps begin and end, (m, K + 1)
+        left_s = elapsed_s - at_s
+        lasts_s = np.minimum(left_s, dt_s)  # of the step that begins there; 0 after an object's last
+        yaw, speed = self.yaws(mean, at_s), self.speeds(mean, at_s)
 
         moved = np.zeros((*mean.shape, 3, longest + 1))  # columns yaw, speed and yaw rate of Phi(K, j)
-        self._fill_ways(moved[:, :2], yaw, self.speeds(mean, at_s), at_s, lasts_s)
+        self._fill_ways(moved[:, :2], yaw, speed, lasts_s, dt_s)
         moved[:, _TURNING] = _EYE_3
         moved[:, YAW, 2] = left_s
 
         after = mean.copy()
-        after[:, 0] += moved[:, 1, 0, 0]  # by the yaw, a way turns by a right angle
-        after[:, 1] -= moved[:, 0, 0, 0]
-        after[:, YAW] = self.yaws(mean, elapsed_s[:, None])[:, 0]
-        after[:, SPEED] = self.speeds(mean, elapsed_s[:, None])[:, 0]
+        after[:, :2] -= _QUARTER_TURN[:, 0] * moved[:, 1::-1, 0, 0]  # turned back: the derivative of a way by yaw
+        after[:, YAW], after[:, SPEED] = yaw[:, -1], speed[:, -1]
 
         Phi = np.empty(covariance.shape)
         Phi[:] = self._identity
         Phi[:, :, _TURNING] = moved[..., 0]
-        spread = Phi @ (covariance + self._undirected * elapsed_s[:, None, None]) @ Phi.mT
+        spread = Phi @ (covariance + self._undirected * elapsed_s[:, None]) @ Phi.mT
 
         gathered_s = np.zeros(left_s.shape)  # of the step that ends there: its noise enters at its end
         gathered_s[:, 1:] = lasts_s[:, :-1]
@@ -114,21 +113,20 @@ class EulerCtrv:
         return after, symmetrise(spread)
 
     @staticmethod
-    def _fill_ways(ways: FloatArray, yaw: FloatArray, speed: FloatArray, at_s: FloatArray, lasts_s: FloatArray) -> None:
-        """Write the derivatives of x and y at the end by yaw, speed and yaw rate at each of `at_s`, (m, 2, 3, K + 1).
+    def _fill_ways(ways: FloatArray, yaw: FloatArray, speed: FloatArray, lasts_s: FloatArray, dt_s: float) -> None:
+        """Write the derivatives of x and y at the end by yaw, speed and yaw rate before each step, (m, 2, 3, K + 1).
 
-        First those of single steps, then the sums from there to the end.
+        Those by yaw and speed are sums over the steps to come. The yaw rate turns the yaw from the next step on.
         """
         by_yaw, by_speed, by_yaw_rate = ways[:, :, 0], ways[:, :, 1], ways[:, :, 2]
         np.cos(yaw, out=by_speed[:, 0])
         np.sin(yaw, out=by_speed[:, 1])
         by_speed *= lasts_s[:, None]
-        np.multiply(-speed, by_speed[:, 1], out=by_yaw[:, 0])
-        np.multiply(speed, by_speed[:, 0], out=by_yaw[:, 1])
-        np.multiply(at_s, by_yaw, out=by_yaw_rate)
+        np.multiply(speed[:, None] * _QUARTER_TURN, by_speed[:, ::-1], out=by_yaw)
         backwards = ways[..., ::-1]
-        np.add.accumulate(backwards, axis=-1, out=backwards)
-        by_yaw_rate -= at_s * by_yaw  # it turns only what comes later
+        np.add.accumulate(backwards[:, :, :2], axis=-1, out=backwards[:, :, :2])
+        np.multiply(by_yaw[..., 1:], dt_s, out=by_yaw_rate[..., :-1])
+        np.add.accumulate(backwards[:, :, 2], axis=-1, out=backwards[:, :, 2])
 
     def _turned(self, yaw: FloatArray, lasts_s: FloatArray) -> FloatArray:
         """Position noise along and across the headings `yaw` (m, K) of steps that last so long, shape (m, 2, 2)."""

@@ -42,9 +42,9 @@ _SAME_POINT_M = 1e-3
 _MAX_GAP = 10.0  # closing segment, in lengths of the longest other segment
 _MAX_HEADING_ERROR_RAD = 1.0  # coarse maps turn much in a row; a wrong convention is off by pi / 2
 
-# A segment row holds these quantities where the segment starts, and then the changes to its end. Points and directions
-# are complex, x + i y; `_ALONG` is the component of the segment along the tangent.
-_POINT, _TANGENT, (_HEADING, _CURVATURE, _LEFT, _RIGHT, _ARC, _ALONG) = slice(0, 2), slice(2, 4), range(4, 10)
+# A segment row holds these quantities where the segment starts, and then the changes to its end. A point is complex,
+# x + i y; times `_BACK`, exp(-i heading), a vector is along + i left. `_ALONG` is the segment's own part along.
+_POINT, _BACK, (_HEADING, _CURVATURE, _LEFT, _RIGHT, _ARC, _ALONG) = slice(0, 2), slice(2, 4), range(4, 10)
 _QUANTITIES = 10
 _FEW_DISTANCES = 3000  # so many are calculated sooner than the tree is asked
 
@@ -87,12 +87,13 @@ class TrackMap:
         x, y = points = np.ascontiguousarray(table[:, :2].T)
         arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
         heading = np.unwrap(table[:, _COLUMN["psi_ref_rad"]])
+        line, back = x + 1j * y, np.exp(-1j * heading)
         knots = np.stack(
             [  # in the order of a segment row
                 x,
                 y,
-                np.cos(heading),
-                np.sin(heading),
+                back.real,
+                back.imag,
                 heading,
                 table[:, _COLUMN["kappa_ref_radpm"]],
                 table[:, _COLUMN["width_left_m"]],
@@ -101,8 +102,8 @@ class TrackMap:
             ]
         )
         starts, changes = knots[:, :-1], np.diff(knots)
-        along = [(changes[_POINT] * part[_TANGENT]).sum(axis=0, keepdims=True) for part in (starts, changes)]
-        segments = np.concatenate([starts, along[0], changes, along[1]]).T.copy()
+        along = (np.diff(line) * [back[:-1], np.diff(back)]).real
+        segments = np.concatenate([starts, along[:1], changes, along[1:]]).T.copy()
         for array in (table, points, arc, segments):
             array.flags.writeable = False
         for name, value in (
@@ -171,8 +172,8 @@ class TrackMap:
     def position(self, s_m: FloatArray, lateral_m: FloatArray) -> FloatArray:
         """Points, shape (n, 2), at arc length `s_m` (any lap) and `lateral_m`; the inverse of `frenet`."""
         foot = self._at(s_m)
-        tangent = _complex(foot[:, _TANGENT])
-        points = _complex(foot[:, _POINT]) + lateral_m * 1j * tangent / np.abs(tangent)
+        back = _complex(foot[:, _BACK])
+        points = _complex(foot[:, _POINT]) + 1j * lateral_m * np.abs(back) / back
         return points.view(np.float64).reshape(-1, 2)
 
     def heading(self, points_m: FloatArray) -> FloatArray:
@@ -219,26 +220,25 @@ class TrackMap:
     def _locate(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Quantities at the feet of `points_m` on the line, shape (n, 10), and lateral offsets, shape (n,).
 
-        The foot at the part t of a segment has the point on its normal: along(q - t e, T + t dT) = 0 with q from
-        the start of the segment to the point, e the segment, T and dT the tangent and its change, and
-        along(a, b) = Re(a conj(b)).
+        The foot at the part t of a segment has the point on its normal: Re((q - t e) (B + t dB)) = 0 with q from the
+        start of the segment to the point, e the segment, B and dB `_BACK` and its change.
         """
         points = _complex(points_m)
         nearest = self._nearest(points_m)
         plane = self._segments.take(nearest, axis=0).view(np.complex128)
-        behind = ((points - plane[:, 0]) * plane[:, 1].conj()).real < 0.0
+        behind = ((points - plane[:, 0]) * plane[:, 1]).real < 0.0
         at = self._segments.take(nearest - behind, axis=0, mode="wrap")
         plane = at.view(np.complex128)
-        start, tangent, segment, turn = plane[:, 0], plane[:, 1], plane[:, 5], plane[:, 6]
+        start, back, segment, turn = plane[:, 0], plane[:, 1], plane[:, 5], plane[:, 6]  # values, then changes
         offset = points - start
-        c = (offset * tangent.conj()).real
+        c = (offset * back).real
         # Negative as far as the centre of curvature; beyond it the nearer end of the segment is the foot.
-        b = np.minimum((offset * turn.conj()).real - at[:, _ALONG], -1e-12)
+        b = np.minimum((offset * turn).real - at[:, _ALONG], -1e-12)
         a = at[:, _QUANTITIES + _ALONG]
         root = np.sqrt(np.maximum(b * b + 4.0 * a * c, 0.0))
         part = np.minimum(np.maximum(2.0 * c / (root - b), 0.0), 1.0)
-        tangent = tangent + part * turn
-        lateral = ((offset - part * segment) * tangent.conj()).imag / np.abs(tangent)
+        back = back + part * turn
+        lateral = ((offset - part * segment) * back).imag / np.abs(back)
         return _interpolated(at, part), lateral
 
     def _nearest(self, points_m: FloatArray) -> IntArray:

@@ -14,6 +14,7 @@ from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.estimation.base import StatesAt
 from fgtrack.tracking.preprocess import Candidate
 
+_NOWHERE = np.zeros(2)  # in place of a position that a bearing does not give
 _REFUSED = 1e9  # cost of a pair outside its gate: any number of good pairs is cheaper
 
 
@@ -37,17 +38,13 @@ class Association(Protocol):
 
 def euclidean_distances(candidates: Sequence[Candidate], means: FloatArray) -> FloatArray:
     """Distances, shape (candidates, tracks), in the map; of a bearing, from the track to the line of sight."""
-    positions = [candidate.position_m for candidate in candidates]
-    placed = [i for i, position in enumerate(positions) if position is not None]
-    distances = np.empty((len(candidates), len(means)))
-    if placed:
-        points = np.array([positions[i] for i in placed])
-        offsets = points[:, None, :] - means[None, :, :2]
-        distances[placed] = np.sqrt(np.sum(offsets * offsets, axis=-1))
-    for i, position in enumerate(positions):
-        if position is None:
-            distances[i] = _distances_to_ray(candidates[i], means)
-    return distances
+    points = [_NOWHERE if candidate.position_m is None else candidate.position_m for candidate in candidates]
+    offsets = np.array(points)[:, None] - means[:, :2]
+    distances = np.sqrt(np.vecdot(offsets, offsets))
+    for row, candidate in enumerate(candidates):
+        if candidate.position_m is None:
+            distances[row] = _distances_to_ray(candidate, means)
+    return np.asarray(distances)
 
 
 def _distances_to_ray(candidate: Candidate, means: FloatArray) -> FloatArray:
@@ -106,7 +103,7 @@ class GatedMahalanobis:
             model = measurement.model
             y = model.residual(measurement.z, model.predict(states.means, measurement.pose))
             H = model.jacobian(states.means, measurement.pose)
-            S = H @ states.covariances @ np.swapaxes(H, -1, -2) + measurement.R
+            S = H @ states.covariances @ H.mT + measurement.R
             squared = mahalanobis_squared(y, S)
             cost[row] = squared + np.linalg.slogdet(S)[1]
             inside[row] &= squared <= chi_square_quantile(self.gate_probability, len(measurement.z))
@@ -124,7 +121,8 @@ def _unpaired(candidates: int, tracks: int) -> Assignment:
 
 
 def _assigned(cost: FloatArray, inside: BoolArray) -> Assignment:
-    rows, columns = linear_sum_assignment(np.where(inside, cost, _REFUSED))
+    cost[~inside] = _REFUSED
+    rows, columns = linear_sum_assignment(cost)
     pairs = [(i, j) for i, j in zip(rows.tolist(), columns.tolist(), strict=True) if inside[i, j]]
     paired = {i for i, _ in pairs}
     seen = {j for _, j in pairs}

@@ -2,12 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Protocol
 
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Detection, DetectionList, Disposition, Frame, UpdateRecord
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.validity import is_covariance, is_number
+
+NO_INNOVATION: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +34,19 @@ class Batch:
         """Frame that the detections are given in."""
         return self.message.frame
 
-    def record(self, index: int, disposition: Disposition) -> UpdateRecord:
+    def record(self, index: int, disposition: Disposition, track_id: int | None = None) -> UpdateRecord:
         """Say what became of detection `index`, where nothing was fused."""
-        return record(self.message, index, disposition)
+        return record(self.message, index, disposition, track_id)
 
 
-def record(message: DetectionList, index: int, disposition: Disposition) -> UpdateRecord:
+def record(
+    message: DetectionList,
+    index: int,
+    disposition: Disposition,
+    track_id: int | None = None,
+    nis: float | None = None,
+    innovation: Mapping[str, float] = NO_INNOVATION,
+) -> UpdateRecord:
     """What became of detection `index` of `message`."""
     stamp_ns = message.objects[index].stamp_ns
     return UpdateRecord(
@@ -45,6 +55,9 @@ def record(message: DetectionList, index: int, disposition: Disposition) -> Upda
         message.receipt_ns,
         index,
         disposition,
+        track_id,
+        nis,
+        innovation,
     )
 
 
@@ -65,7 +78,7 @@ class Inbox(Protocol):
 
 def is_usable(detection: Detection, sensor: SensorModel) -> bool:
     """Whether `detection` has sound values, says where it is, and is no empty slot (x = y = 0) of a fixed list."""
-    measured = [name for name in sensor.components if getattr(detection, name) is not None]
+    measured = [name for name in sensor.std if getattr(detection, name) is not None]
     if not all(is_number(getattr(detection, name)) for name in measured) or not is_covariance(detection, sensor):
         return False
     if detection.x_m == 0.0 and detection.y_m == 0.0:

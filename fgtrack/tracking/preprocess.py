@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal, Protocol
 
 import numpy as np
@@ -119,6 +120,7 @@ class Preprocess:
         self._merge = merge
         self._motion = motion
         self._origin_m = detection_origin_m
+        self._noises: dict[tuple[int, tuple[str, ...]], tuple[SensorModel, FloatArray]] = {}
 
     def __call__(
         self, batch: Batch, sensor: SensorModel, ego: EgoPose | None
@@ -154,7 +156,7 @@ class Preprocess:
     def _locate(self, index: int, batch: Batch, sensor: SensorModel, pose: SensorPose) -> Located:
         detection = batch.message.objects[index]
         values: dict[str, float] = {}
-        for name in sensor.components:
+        for name in sensor.std:
             value = getattr(detection, name)
             if value is not None:
                 values[name] = float(value)
@@ -216,7 +218,8 @@ class Preprocess:
         if len(parts) > 1 and "x_m" not in names and not {"range_m", "bearing_rad"} <= set(names):
             parts = [part for part in parts if part.index == index]
             names = _common_names(parts)
-        covariances = [_covariance(batch.message.objects[p.index], sensor, names, p, batch, pose) for p in parts]
+        R = self._noise(sensor, names)
+        covariances = [_covariance(batch.message.objects[p.index], sensor, R, names, p, batch, pose) for p in parts]
         if len(parts) == 1:
             values, R, point_m = parts[0].values, covariances[0], parts[0].point_m
         else:
@@ -224,15 +227,25 @@ class Preprocess:
             R = np.asarray(np.mean(covariances, axis=0))
             x_m, y_m = np.mean([part.point_m for part in parts if part.point_m is not None], axis=0).tolist()
             point_m = (x_m, y_m)
-        z = np.array([values[name] for name in names])
+        values = {name: values[name] for name in names}
+        z = np.array(list(values.values()))
         return Candidate(
             index,
             merged,
             Measurement(batch.stamp_ns, measurement_model(names, self._motion), z, R, pose),
             None if point_m is None else np.array(point_m),
             None if point_m is None else _position_covariance(values, R, names, pose),
-            {name: values[name] for name in names},
+            values,
         )
+
+    def _noise(self, sensor: SensorModel, names: tuple[str, ...]) -> FloatArray:
+        """The sensor's own R of `names`, read-only: one array for each sensor and set of components."""
+        key = id(sensor), names
+        if key not in self._noises:
+            R = sensor.noise(names)
+            R.flags.writeable = False
+            self._noises[key] = sensor, R  # an id is unique as long as its owner is kept
+        return self._noises[key][1]
 
 
 def _in_range(
@@ -252,7 +265,13 @@ def _in_range(
 
 
 def _common_names(parts: Sequence[Located]) -> tuple[str, ...]:
-    return tuple(name for name in MEASURABLE if all(name in part.values for part in parts))
+    return _in_order(frozenset(parts[0].values).intersection(*[part.values for part in parts[1:]]))
+
+
+@cache
+def _in_order(names: frozenset[str]) -> tuple[str, ...]:
+    """`names` in the order of `MEASURABLE`."""
+    return tuple(name for name in MEASURABLE if name in names)
 
 
 def _in_map(x_m: float, y_m: float, pose: SensorPose) -> tuple[float, float]:
@@ -263,16 +282,16 @@ def _in_map(x_m: float, y_m: float, pose: SensorPose) -> tuple[float, float]:
 def _covariance(
     detection: Detection,
     sensor: SensorModel,
+    R: FloatArray,
     names: tuple[str, ...],
     item: Located,
     batch: Batch,
     pose: SensorPose,
 ) -> FloatArray:
-    """R of `names` in the map: the detection's own covariance where it has one, else the sensor's deviations.
+    """Covariance of `names` in the map: the detection's own where it has one, else the sensor's R.
 
     A yaw that the map gave has the sensor's deviation for it and is not correlated with the rest.
     """
-    R = sensor.noise(names)
     if detection.covariance is None or not sensor.message_covariance:
         if "x_m" in names and item.point_m is not None and sensor.std["x_m"] != sensor.std["y_m"]:
             x_m, y_m = item.point_m
@@ -283,6 +302,7 @@ def _covariance(
     common = [name for name in names if name in measured and name in sensor.std]
     here = [names.index(name) for name in common]
     there = [measured.index(name) for name in common]
+    R = R.copy()
     R[np.ix_(here, here)] = own[np.ix_(there, there)]
     return _turned(R, pose.yaw_rad) if "x_m" in names and batch.frame != "map" else R
 

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -23,7 +23,7 @@ from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, Association
 from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.ego import EgoPose, EgoSource
-from fgtrack.tracking.inbox import Batch, Inbox
+from fgtrack.tracking.inbox import NO_INNOVATION, Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Lifecycle
 from fgtrack.tracking.preprocess import Candidate, Preprocess
 
@@ -177,15 +177,13 @@ class Tracker:
         result: UpdateResult | None = None,
     ) -> None:
         """Record the outcome of a candidate, and of the detections that were merged into it."""
-        outcome = replace(batch.record(candidate.index, disposition), track_id=track_id)
+        nis, innovation = None, NO_INNOVATION
         if result is not None and result.innovation is not None:
             names = candidate.measurement.model.components
-            innovation = dict(zip(names, result.innovation.tolist(), strict=True))
-            outcome = replace(outcome, nis=result.nis, innovation=MappingProxyType(innovation))
-        self._records.append(outcome)
-        for index in candidate.merged:
-            merged = batch.record(index, Disposition.MERGED)
-            self._records.append(replace(merged, track_id=track_id))
+            nis = result.nis
+            innovation = MappingProxyType(dict(zip(names, result.innovation.tolist(), strict=True)))
+        self._records.append(record(batch.message, candidate.index, disposition, track_id, nis, innovation))
+        self._records += [batch.record(index, Disposition.MERGED, track_id) for index in candidate.merged]
 
     def _end(self, track_ids: Sequence[int]) -> None:
         for track_id in track_ids:

@@ -51,6 +51,7 @@ class Situation:
     clutter: float = 0.3
     noise_m: float = 0.3
     noise_rad: float = 0.1
+    noise_mps: float = 0.3
     zero_p: float = 0.0
     nan_p: float = 0.0
 
@@ -153,6 +154,7 @@ def anything(rng: np.random.Generator) -> Situation:
         ego_hz=float(rng.choice([10.0, 40.0, 100.0, 130.0])),
         ego_silent_s=sometimes(silence(), NEVER),
         ego_repeated_p=sometimes(0.2, 0.0),
+        ego_resent_p=sometimes(0.1, 0.0),
         ego_nan_p=sometimes(0.2, 0.0),
         pit_toggle_p=sometimes(0.02, 0.0),
         sensors=tuple(str(name) for name in rng.permutation(SENSORS)[: rng.integers(1, 4)]),

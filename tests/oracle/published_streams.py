@@ -100,7 +100,7 @@ class World:
             float(y),
             math.remainder(yaw - ego_yaw + rng.normal(0.0, self.situation.noise_rad), math.tau),
         ]
-        values.append(float(abs(speed + rng.normal(0.0, 0.3))))
+        values.append(float(abs(speed + rng.normal(0.0, self.situation.noise_mps))))
         if rng.random() < self.situation.zero_p:
             values[0:2] = [0.0, 0.0]
         if rng.random() < self.situation.nan_p:
