@@ -11,8 +11,6 @@ from fgtrack.estimation.ekf import predict
 from fgtrack.models.measurement import MeasurementModel
 from fgtrack.models.motion import MotionModel
 
-_TURNING = slice(YAW, YAW_RATE + 1)  # the states that the position depends on
-_EYE_3 = np.eye(3)[..., None]
 _QUARTER_TURN = np.array([[-1.0], [1.0]])  # of x and y in reverse order
 
 
@@ -67,14 +65,12 @@ class EulerCtrv:
     def __init__(self, motion: MotionModel, density: FloatArray) -> None:
         """`density`: diagonal of Q per second, shape (n,), along and across the heading first."""
         self.motion = motion
-        self._density = density
-        self._directed = density[_TURNING, None]
+        self._identity = np.eye(len(density))[..., None]
+        self._along_across = density[:2]
+        self._undirected = density[:, None].copy()  # what does not turn with the heading
         self._isotropic = bool(density[0] == density[1])
-        self._undirected = np.diag(density)  # noise of what nothing else depends on, and of an isotropic position
-        self._undirected[_TURNING, _TURNING] = 0.0
         if not self._isotropic:
             self._undirected[:2] = 0.0
-        self._identity = np.eye(len(density))
 
     def propagate(
         self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
@@ -89,25 +85,21 @@ class EulerCtrv:
         lasts_s = np.minimum(left_s, dt_s)  # of the step that begins there; 0 after an object's last
         yaw, speed = self.yaws(mean, at_s), self.speeds(mean, at_s)
 
-        moved = np.zeros((*mean.shape, 3, longest + 1))  # columns yaw, speed and yaw rate of Phi(K, j)
-        self._fill_ways(moved[:, :2], yaw, speed, lasts_s, dt_s)
-        moved[:, _TURNING] = _EYE_3
-        moved[:, YAW, 2] = left_s
+        Phi = np.empty((*covariance.shape, longest + 1))  # Phi(K, j) for each j
+        Phi[:] = self._identity
+        Phi[:, YAW, YAW_RATE] = left_s
+        self._fill_ways(Phi[:, :2, YAW : YAW_RATE + 1], yaw, speed, lasts_s, dt_s)
+        start = Phi[..., 0]
 
         after = mean.copy()
-        after[:, :2] -= _QUARTER_TURN[:, 0] * moved[:, 1::-1, 0, 0]  # turned back: the derivative of a way by yaw
+        after[:, :2] -= _QUARTER_TURN[:, 0] * start[:, 1::-1, YAW]  # turned back: the derivative of a way by yaw
         after[:, YAW], after[:, SPEED] = yaw[:, -1], speed[:, -1]
-
-        Phi = np.empty(covariance.shape)
-        Phi[:] = self._identity
-        Phi[:, :, _TURNING] = moved[..., 0]
-        spread = Phi @ (covariance + self._undirected * elapsed_s[:, None]) @ Phi.mT
 
         gathered_s = np.zeros(left_s.shape)  # of the step that ends there: its noise enters at its end
         gathered_s[:, 1:] = lasts_s[:, :-1]
-        driven = moved * (self._directed * gathered_s[:, None, None])
+        driven = Phi * (self._undirected * gathered_s[:, None, None])
         flat = (*mean.shape, -1)
-        spread += driven.reshape(flat) @ moved.reshape(flat).mT
+        spread = start @ covariance @ start.mT + driven.reshape(flat) @ Phi.reshape(flat).mT
         if not self._isotropic:
             spread[:, :2, :2] += self._turned(yaw, lasts_s)
         return after, symmetrise(spread)
@@ -131,7 +123,7 @@ class EulerCtrv:
     def _turned(self, yaw: FloatArray, lasts_s: FloatArray) -> FloatArray:
         """Position noise along and across the headings `yaw` (m, K) of steps that last so long, shape (m, 2, 2)."""
         turn = rotations(yaw)
-        along_across = turn * self._density[:2] @ turn.mT
+        along_across = turn * self._along_across @ turn.mT
         return np.asarray((along_across * lasts_s[:, :, None, None]).sum(axis=1))
 
     def yaws(self, mean: FloatArray, elapsed_s: FloatArray) -> FloatArray:
