@@ -1,6 +1,7 @@
 """Propagators: many objects through equal time steps, each through its own number of them."""
 
-from typing import Protocol
+from functools import lru_cache
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -54,6 +55,33 @@ class ExactPropagator:
         return model.residual(z, z_predicted)
 
 
+class _Times(NamedTuple):
+    """When steps begin and end, each of shape (m, K + 1), read-only; after an object's last step all is at its end."""
+
+    at_s: FloatArray
+    left_s: FloatArray
+    """Until the end of the last step."""
+    lasts_s: FloatArray
+    """Duration of the step that begins there."""
+    gathered_s: FloatArray
+    """Duration of the step that ends there: its noise enters at its end."""
+
+
+@lru_cache(maxsize=1024)
+def _times(steps: tuple[int, ...], dt_s: float) -> _Times:
+    """Times of `steps` of `dt_s` for each object; shared, because the same ones come again and again."""
+    end_s = np.array(steps)[:, None] * dt_s
+    at_s = np.minimum(np.arange(max(steps) + 1) * dt_s, end_s)
+    left_s = end_s - at_s
+    lasts_s = np.minimum(left_s, dt_s)
+    gathered_s = np.zeros(at_s.shape)
+    gathered_s[:, 1:] = lasts_s[:, :-1]
+    times = _Times(at_s, left_s, lasts_s, gathered_s)
+    for array in times:
+        array.flags.writeable = False
+    return times
+
+
 class EulerCtrv:
     """CTRV in Euler steps (Karle et al. 2023, eq. 10), all of them in closed form.
 
@@ -76,32 +104,27 @@ class EulerCtrv:
         self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
     ) -> tuple[FloatArray, FloatArray]:
         """See `Propagator.propagate`."""
-        longest = max(steps.tolist(), default=0)
-        if not longest:
+        counts = tuple(steps.tolist())
+        if not any(counts):
             return mean, covariance
-        elapsed_s = steps[:, None] * dt_s
-        at_s = np.minimum(np.arange(longest + 1.0) * dt_s, elapsed_s)  # where steps begin and end, (m, K + 1)
-        left_s = elapsed_s - at_s
-        lasts_s = np.minimum(left_s, dt_s)  # of the step that begins there; 0 after an object's last
-        yaw, speed = self.yaws(mean, at_s), self.speeds(mean, at_s)
+        times = _times(counts, dt_s)
+        yaw, speed = self.yaws(mean, times.at_s), self.speeds(mean, times.at_s)
 
-        Phi = np.empty((*covariance.shape, longest + 1))  # Phi(K, j) for each j
+        Phi = np.empty((*covariance.shape, times.at_s.shape[-1]))  # Phi(K, j) for each j
         Phi[:] = self._identity
-        Phi[:, YAW, YAW_RATE] = left_s
-        self._fill_ways(Phi[:, :2, YAW : YAW_RATE + 1], yaw, speed, lasts_s, dt_s)
+        Phi[:, YAW, YAW_RATE] = times.left_s
+        self._fill_ways(Phi[:, :2, YAW : YAW_RATE + 1], yaw, speed, times.lasts_s, dt_s)
         start = Phi[..., 0]
 
         after = mean.copy()
         after[:, :2] -= _QUARTER_TURN[:, 0] * start[:, 1::-1, YAW]  # turned back: the derivative of a way by yaw
         after[:, YAW], after[:, SPEED] = yaw[:, -1], speed[:, -1]
 
-        gathered_s = np.zeros(left_s.shape)  # of the step that ends there: its noise enters at its end
-        gathered_s[:, 1:] = lasts_s[:, :-1]
-        driven = Phi * (self._undirected * gathered_s[:, None, None])
+        driven = Phi * (self._undirected * times.gathered_s[:, None, None])
         flat = (*mean.shape, -1)
         spread = start @ covariance @ start.mT + driven.reshape(flat) @ Phi.reshape(flat).mT
         if not self._isotropic:
-            spread[:, :2, :2] += self._turned(yaw, lasts_s)
+            spread[:, :2, :2] += self._turned(yaw, times.lasts_s)
         return after, symmetrise(spread)
 
     @staticmethod

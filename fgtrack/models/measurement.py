@@ -101,7 +101,11 @@ class MeasurementModel:
 
     def selection(self, n: int) -> FloatArray:
         """`jacobian` of a linear model at any state of `n` entries, shape (k, n), read-only."""
-        return _selection_matrix(self, n)
+        if n not in self._selections:
+            H = np.eye(n)[self._selected]
+            H.flags.writeable = False
+            self._selections[n] = H
+        return self._selections[n]
 
     def residual(self, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
         """Measured minus predicted, shape (..., k), with angles in (-pi, pi]; the only place that wraps."""
@@ -113,6 +117,10 @@ class MeasurementModel:
     @cached_property
     def _cartesian(self) -> bool:
         return "vx_mps" in self.state_names
+
+    @cached_property
+    def _selections(self) -> dict[int, FloatArray]:
+        return {}
 
     @cached_property
     def _selected(self) -> IntArray:
@@ -131,14 +139,6 @@ def measurement_model(components: tuple[str, ...], motion_model: MotionModel) ->
 @cache
 def _shared_model(components: tuple[str, ...], state_names: tuple[str, ...]) -> MeasurementModel:
     return MeasurementModel(components, state_names)
-
-
-@cache
-def _selection_matrix(model: MeasurementModel, n: int) -> FloatArray:
-    """Jacobian of a linear model for states of `n` entries, shape (k, n), read-only."""
-    H = np.eye(n)[model._selected]
-    H.flags.writeable = False
-    return H
 
 
 class _Scene:

@@ -2,8 +2,7 @@
 
 import bisect
 import math
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import nanoseconds, seconds
@@ -11,8 +10,7 @@ from fgtrack.core.types import EgoState
 from fgtrack.tracking.validity import is_number
 
 
-@dataclass(frozen=True, slots=True)
-class EgoPose:
+class EgoPose(NamedTuple):
     """Pose of the ego reference point in the map."""
 
     x_m: float

@@ -17,7 +17,7 @@ from fgtrack.core.types import (
     TrackReport,
     UpdateRecord,
 )
-from fgtrack.estimation.base import StatesAt, TrackBank, UpdateResult
+from fgtrack.estimation.base import StatesAt, TrackBank, UpdateResult, UpdateStatus
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, Association
@@ -26,6 +26,8 @@ from fgtrack.tracking.ego import EgoPose, EgoSource
 from fgtrack.tracking.inbox import NO_INNOVATION, Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Lifecycle
 from fgtrack.tracking.preprocess import Candidate, Preprocess
+
+_DISPOSITIONS = {status: Disposition(status.value) for status in UpdateStatus}
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,7 @@ class Tracker:
         for candidate, track_id, result in zip(matched, track_ids, results, strict=True):
             if result.innovation is not None:
                 self._parts.lifecycle.fused(track_id)
-            self._conclude(batch, candidate, Disposition(result.status.value), track_id, result)
+            self._conclude(batch, candidate, _DISPOSITIONS[result.status], track_id, result)
 
     def _give_birth(self, batch: Batch, candidate: Candidate, sensor: SensorModel) -> None:
         parts = self._parts

@@ -102,6 +102,7 @@ SITUATIONS = {
     "only_radar": Situation(duration_s=4.5, sensors=("radar",), objects_gone_s=(1.5, 3.0), spread_m=100.0),
     "empty_lists": Situation(empty_p=0.4, delay="huge"),
     "nothing_but_clutter": Situation(num_objects=(0, 0), clutter=3.0),
+    "wild_speeds": Situation(noise_mps=20.0, clutter=1.0),
     "faulty_objects": Situation(zero_p=0.3, nan_p=0.3, num_objects=(0, 3), clutter=0.1, object_stamps=True),
     "duplicates": Situation(duplicate_p=0.3, burst_p=0.1),
     "bursts": Situation(burst_p=0.5),

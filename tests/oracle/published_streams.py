@@ -199,7 +199,7 @@ def _delay_ns(situation: Situation, rng: np.random.Generator, sensor: str) -> in
         "future": rng.uniform(-0.1, 0.02),
         "huge": rng.uniform(0.0, 0.6),
     }[situation.delay]
-    return round(delay_s * 1e9)
+    return round(float(delay_s) * 1e9)
 
 
 def _ticks(situation: Situation, rng: np.random.Generator, messages: Messages) -> list[int]:

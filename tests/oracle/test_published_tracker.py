@@ -11,6 +11,7 @@ from zlib import crc32
 
 import numpy as np
 import pytest
+from published_filter import DT, predict
 from published_lane import Array
 from published_situations import SITUATIONS, Situation, anything
 from published_streams import generate
@@ -19,7 +20,7 @@ from support.messages import SHARED, shared
 
 from fgtrack.core.types import EgoState
 from fgtrack.io.stream import read_stream
-from fgtrack.pipeline.build import build_tracker
+from fgtrack.pipeline.build import build_propagator, build_tracker
 from fgtrack.pipeline.clock import Delivered, listed_ticks
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
@@ -183,6 +184,40 @@ def test_fgtrack_does_what_the_oracle_does_on_every_map(name: str, maps: dict[st
     for seed, lanes in enumerate(chain(maps.values(), maps.values())):
         longer = replace(SITUATIONS[name], duration_s=2.0 * SITUATIONS[name].duration_s)
         assert_same_run(longer, 100 + seed, *lanes)
+
+
+@pytest.mark.parametrize("num_steps", [1, 2, 15, 350])
+@pytest.mark.parametrize(
+    "yaw_range_rad",
+    [
+        (-np.pi, np.pi),
+        (-40.0, -np.pi),
+        pytest.param(
+            (np.pi, 40.0),
+            marks=pytest.mark.xfail(
+                reason="section 7: a yaw that an update left beyond the limit steers its first step as it is",
+                strict=True,
+            ),
+        ),
+    ],
+)
+def test_fgtrack_predicts_as_the_oracle_does(yaw_range_rad: tuple[float, float], num_steps: int) -> None:
+    rng = np.random.default_rng(num_steps)
+    yaws = rng.uniform(*yaw_range_rad, 20)
+    states = np.stack(
+        [*rng.normal(0.0, 300.0, (2, 20)), yaws, *(rng.normal(0.0, 1.0, (3, 20)) * [[40.0], [1.0], [2.0]])]
+    )
+    roots = rng.normal(0.0, 1.0, (20, 6, 6))
+    covariances = roots @ roots.transpose(0, 2, 1)
+    propagator = build_propagator(load(Config, REFERENCE_CONFIG).motion, DT)
+    to_rep103 = np.array([0.0, 0.0, np.pi / 2.0, 0.0, 0.0, 0.0])
+    means, spreads = propagator.propagate(states.T + to_rep103, covariances, np.full(20, num_steps), DT)
+    for i in range(20):
+        x, P = states[:, i], covariances[i]
+        for _ in range(num_steps):
+            x, P = predict(x, P)
+        np.testing.assert_allclose(means[i], x + to_rep103, rtol=1e-11, atol=TOLERANCE)
+        np.testing.assert_allclose(spreads[i], P, rtol=1e-11, atol=TOLERANCE * (1.0 + np.abs(P).max()))
 
 
 def test_an_ego_turned_by_a_millionth_is_seen(maps: dict[str, Maps]) -> None:
