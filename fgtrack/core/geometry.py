@@ -19,7 +19,8 @@ def wrap_angle(angle_rad: float) -> float:
 
 def wrap_angles(angles_rad: FloatArray) -> FloatArray:
     """Angles in (-pi, pi], any shape; exact (unchanged to the bit) where they lie there already."""
-    if np.maximum.reduce(np.abs(angles_rad), axis=None, initial=0.0) < np.pi:
+    largest_rad = abs(angles_rad.item()) if angles_rad.size == 1 else np.abs(angles_rad).max(initial=0.0)
+    if largest_rad < np.pi:
         return angles_rad
     inside = (angles_rad > -np.pi) & (angles_rad <= np.pi)
     wrapped = np.pi - np.mod(np.pi - angles_rad, TWO_PI)

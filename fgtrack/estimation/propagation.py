@@ -56,7 +56,10 @@ class ExactPropagator:
 
 
 class _Times(NamedTuple):
-    """When steps begin and end, each of shape (m, K + 1), read-only; after an object's last step all is at its end."""
+    """When steps begin and end, read-only, each of shape (m, K + 1), or (1, K + 1) where all objects take as many.
+
+    After an object's last step all is at its end.
+    """
 
     at_s: FloatArray
     left_s: FloatArray
@@ -67,7 +70,7 @@ class _Times(NamedTuple):
     """Duration of the step that ends there: its noise enters at its end."""
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=128)
 def _times(steps: tuple[int, ...], dt_s: float) -> _Times:
     """Times of `steps` of `dt_s` for each object; shared, because the same ones come again and again."""
     end_s = np.array(steps)[:, None] * dt_s
@@ -104,10 +107,11 @@ class EulerCtrv:
         self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
     ) -> tuple[FloatArray, FloatArray]:
         """See `Propagator.propagate`."""
-        counts = tuple(steps.tolist())
+        counts = steps.tolist()
         if not any(counts):
             return mean, covariance
-        times = _times(counts, dt_s)
+        alike = counts.count(counts[0]) == len(counts)
+        times = _times(tuple(counts[:1] if alike else counts), dt_s)
         yaw, speed = self.yaws(mean, times.at_s), self.speeds(mean, times.at_s)
 
         Phi = np.empty((*covariance.shape, times.at_s.shape[-1]))  # Phi(K, j) for each j
@@ -167,7 +171,11 @@ class EulerCtrv:
 
 
 def wrapped_yaw(mean: FloatArray) -> FloatArray:
-    """A copy of means (..., n) with the yaw in (-pi, pi]."""
+    """Means (..., n) with the yaw in (-pi, pi]: `mean` itself where it lies there already, else a copy."""
+    yaw = mean[..., YAW]
+    wrapped = wrap_angles(yaw)
+    if wrapped is yaw:
+        return mean
     settled = mean.copy()
-    settled[..., YAW] = wrap_angles(mean[..., YAW])
+    settled[..., YAW] = wrapped
     return settled

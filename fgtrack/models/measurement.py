@@ -31,8 +31,7 @@ _ANGULAR = ("yaw_rad", "bearing_rad")
 _NONE = np.zeros(2)
 
 
-@dataclass(frozen=True, slots=True)
-class SensorPose:
+class SensorPose(NamedTuple):
     """Pose and velocity of a sensor in the map at the stamp of the measurement."""
 
     x_m: float = 0.0
@@ -40,6 +39,9 @@ class SensorPose:
     yaw_rad: float = 0.0
     vx_mps: float = 0.0
     vy_mps: float = 0.0
+
+
+_AT_ORIGIN = SensorPose()
 
 
 @dataclass(frozen=True)
@@ -77,14 +79,14 @@ class MeasurementModel:
         """Whether the measurement selects entries of the state, whatever the sensor pose."""
         return set(self.components) <= set(self.state_names)
 
-    def predict(self, x: FloatArray, pose: SensorPose = SensorPose()) -> FloatArray:
+    def predict(self, x: FloatArray, pose: SensorPose = _AT_ORIGIN) -> FloatArray:
         """Measurement expected of the states `x`, shape (..., n) -> (..., k). Angles are not wrapped."""
         if self.linear:
             return x.take(self._selected, axis=-1)
         scene = _Scene(x, pose, self._cartesian)
         return np.stack([_COMPONENTS[name].value(scene) for name in self.components], axis=-1)
 
-    def jacobian(self, x: FloatArray, pose: SensorPose = SensorPose()) -> FloatArray:
+    def jacobian(self, x: FloatArray, pose: SensorPose = _AT_ORIGIN) -> FloatArray:
         """Derivative H of `predict` by `x`, shape (..., k, n); read-only where the model is linear.
 
         Finite everywhere: the gradient of an angle grows up to `MIN_RANGE_M` and `MIN_SPEED_MPS` and no
@@ -111,7 +113,10 @@ class MeasurementModel:
         """Measured minus predicted, shape (..., k), with angles in (-pi, pi]; the only place that wraps."""
         y = np.asarray(z - z_predicted)
         for index in self._angular_indices:
-            y[..., index] = wrap_angles(y[..., index])
+            angles = y[..., index]
+            wrapped = wrap_angles(angles)
+            if wrapped is not angles:
+                y[..., index] = wrapped
         return y
 
     @cached_property

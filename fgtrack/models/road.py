@@ -58,7 +58,7 @@ class FrenetRoad:
     def view(self, points_m: FloatArray) -> RoadView:
         """See `Road.view`; outside is what lies on neither track nor pit lane."""
         track = RoadView(*self.track.view(points_m, self.inner_buffer_m, self.outer_buffer_m))
-        if self.pit is None or not np.count_nonzero(track.outside):
+        if self.pit is None or not any(track.outside.tolist()):
             return track
         outside = track.outside.copy()
         strays = np.flatnonzero(outside)

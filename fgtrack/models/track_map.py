@@ -232,11 +232,10 @@ class TrackMap:
         start, back, segment, turn = plane[:, 0], plane[:, 1], plane[:, 5], plane[:, 6]  # values, then changes
         offset = points - start
         c = (offset * back).real
-        # Negative as far as the centre of curvature; beyond it the nearer end of the segment is the foot.
-        b = np.minimum((offset * turn).real - at[:, _ALONG], -1e-12)
-        a = at[:, _QUANTITIES + _ALONG]
-        root = np.sqrt(np.maximum(b * b + 4.0 * a * c, 0.0))
-        part = np.minimum(np.maximum(2.0 * c / (root - b), 0.0), 1.0)
+        # Positive as far as the centre of curvature; beyond it the nearer end of the segment is the foot.
+        b = np.maximum(0.5 * (at[:, _ALONG] - (offset * turn).real), 1e-12)
+        root = np.sqrt(np.maximum(b * b + at[:, _QUANTITIES + _ALONG] * c, 0.0))
+        part = np.minimum(np.maximum(c / (root + b), 0.0), 1.0)
         back = back + part * turn
         lateral = ((offset - part * segment) * back).imag / np.abs(back)
         return _interpolated(at, part), lateral
@@ -256,7 +255,7 @@ class TrackMap:
 
 def _complex(vectors: FloatArray) -> ComplexArray:
     """x + i y of `vectors`, shape (n, 2)."""
-    return np.asarray(np.ascontiguousarray(vectors).view(np.complex128)[:, 0])
+    return np.ascontiguousarray(vectors).view(np.complex128)[:, 0]
 
 
 def _interpolated(at: FloatArray, part: FloatArray) -> FloatArray:

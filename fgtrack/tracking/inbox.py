@@ -78,8 +78,8 @@ class Inbox(Protocol):
 
 def is_usable(detection: Detection, sensor: SensorModel) -> bool:
     """Whether `detection` has sound values, says where it is, and is no empty slot (x = y = 0) of a fixed list."""
-    measured = [name for name in sensor.std if getattr(detection, name) is not None]
-    if not all(is_number(getattr(detection, name)) for name in measured) or not is_covariance(detection, sensor):
+    measured = {name: value for name in sensor.std if (value := getattr(detection, name)) is not None}
+    if not all(map(is_number, measured.values())) or not is_covariance(detection, sensor):
         return False
     if detection.x_m == 0.0 and detection.y_m == 0.0:
         return False
@@ -118,7 +118,7 @@ class QueueInbox:
         ended: list[UpdateRecord] = []
         kept: dict[int, list[int]] = {} if message.objects else {message.stamp_ns: []}
         for index, stamp_ns in enumerate(stamps(message, sensor)):
-            refusal = self._refusal(message, index, stamp_ns)
+            refusal = self._refusal(message, sensor, index, stamp_ns)
             if refusal is None:
                 kept.setdefault(stamp_ns, []).append(index)
             else:
@@ -129,8 +129,7 @@ class QueueInbox:
         ]
         return ended
 
-    def _refusal(self, message: DetectionList, index: int, stamp_ns: int) -> Disposition | None:
-        sensor = self._sensors[message.sensor]
+    def _refusal(self, message: DetectionList, sensor: SensorModel, index: int, stamp_ns: int) -> Disposition | None:
         if not is_usable(message.objects[index], sensor):
             return Disposition.INVALID
         if stamp_ns - message.receipt_ns > self._max_future_ns:

@@ -179,12 +179,15 @@ class Preprocess:
         if not self._road.known or not placed:
             return located, []
         view = self._road.view(np.array([item.point_m for item in placed]))
-        outside = {item.index for item, out in zip(placed, view.outside.tolist(), strict=True) if out}
+        outside = [item.index for item, out in zip(placed, view.outside.tolist(), strict=True) if out]
         if sensor.yaw_from_map_std_rad is not None:
             for item, yaw_rad in zip(placed, view.yaw_rad.tolist(), strict=True):
                 item.values.setdefault("yaw_rad", yaw_rad)
-        records = [batch.record(item.index, Disposition.OUT_OF_BOUNDS) for item in located if item.index in outside]
-        return [item for item in located if item.index not in outside], records
+        if not outside:
+            return located, []
+        records = [batch.record(index, Disposition.OUT_OF_BOUNDS) for index in outside]
+        gone = set(outside)
+        return [item for item in located if item.index not in gone], records
 
     def _candidates(
         self, located: list[Located], batch: Batch, sensor: SensorModel, pose: SensorPose

@@ -15,7 +15,7 @@ SENSORS = ("lidar", "lidar_cluster", "radar")
 class Situation:
     """What a stream is like; `_p` are probabilities per message or per object."""
 
-    duration_s: float = 2.0
+    duration_s: float = 1.5
     epoch_ns: int = 1_000_000_000_000
     clock: str = "node"  # node, jitter, gaps
     start: str = "anywhere"  # anywhere, closing (point of the lap), jump (of the heading), jump_rep103
@@ -71,12 +71,12 @@ SITUATIONS = {
     ),
     "standing_ego": Situation(ego_speed_mps=(0.0,), ego_noise=0.0, spread_m=30.0),
     "standing_noisy_ego": Situation(ego_speed_mps=(0.0,), ego_noise=3.0),
-    "stalled_ego": Situation(duration_s=4.0, ego_silent_s=(1.0, 3.3), ego_bias=0.3),
+    "stalled_ego": Situation(duration_s=3.0, ego_silent_s=(0.6, 2.5), ego_bias=0.3),
     "ego_repeats_itself": Situation(ego_repeated_p=0.3, ego_noise=3.0),
     "ego_resends_old_records": Situation(ego_resent_p=0.3, ego_hz=40.0),
     "rare_ego": Situation(ego_hz=7.0, ego_bias=0.5),
     "nan_ego": Situation(ego_nan_p=0.3),
-    "late_first_ego": Situation(ego_silent_s=(0.0, 1.0)),
+    "late_first_ego": Situation(duration_s=2.0, ego_silent_s=(0.0, 1.0)),
     "dense": Situation(duration_s=1.5, num_objects=(10, 25), spread_m=25.0),
     "dense_and_noisy": Situation(duration_s=1.5, num_objects=(10, 25), spread_m=40.0, noise_m=1.5, seen_p=0.7),
     "today": Situation(epoch_ns=TODAY_NS, object_stamps=True),
@@ -86,20 +86,27 @@ SITUATIONS = {
     "no_delay": Situation(delay="none"),
     "no_delay_on_grid": Situation(delay="none", stamp_grid_ns=5_000_000),
     "tiny_delay": Situation(delay="tiny"),
+    "tiny_delay_on_grid": Situation(delay="tiny", stamp_grid_ns=5_000_000, sensors_hz=50.0),
     "usual_delay_on_grid": Situation(stamp_grid_ns=5_000_000),
     "mixed_delay_on_grid": Situation(delay="mixed", stamp_grid_ns=5_000_000, ego_noise=5.0),
     "future": Situation(delay="future"),
     "huge_delay": Situation(delay="huge"),
     "pit_lane": Situation(in_pit_p=0.6, pit_toggle_p=0.02, start="closing"),
     "slow_in_pit_lane": Situation(
-        in_pit_p=0.6, pit_toggle_p=0.05, start="closing", ego_speed_mps=(8.0, 12.0), ego_nan_p=0.2, ego_repeated_p=0.2
+        in_pit_p=0.6,
+        pit_toggle_p=0.2,
+        start="closing",
+        ego_speed_mps=(8.0, 12.0),
+        ego_nan_p=0.3,
+        ego_repeated_p=0.2,
+        clutter=1.0,
     ),
-    "vanishing_objects": Situation(duration_s=4.5, objects_gone_s=(1.5, 4.0), clutter=0.05),
-    "vanishing_objects_far_away": Situation(duration_s=4.5, objects_gone_s=(1.5, 4.0), clutter=0.05, spread_m=130.0),
-    "silent_sensors": Situation(duration_s=4.5, sensors_silent_s=(1.0, 3.7), clutter=0.1),
-    "only_lidar": Situation(duration_s=4.5, sensors=("lidar",), objects_gone_s=(1.0, 4.0)),
+    "vanishing_objects": Situation(duration_s=4.0, objects_gone_s=(1.2, 3.7), clutter=0.05),
+    "vanishing_objects_far_away": Situation(duration_s=4.0, objects_gone_s=(1.2, 3.7), clutter=0.05, spread_m=130.0),
+    "silent_sensors": Situation(duration_s=3.5, sensors_silent_s=(0.8, 3.0), clutter=0.1),
+    "only_lidar": Situation(duration_s=3.5, sensors=("lidar",), objects_gone_s=(0.8, 3.2)),
     "only_clusters": Situation(duration_s=3.5, sensors=("lidar_cluster",), objects_gone_s=(1.5, 3.0)),
-    "only_radar": Situation(duration_s=4.5, sensors=("radar",), objects_gone_s=(1.5, 3.0), spread_m=100.0),
+    "only_radar": Situation(duration_s=3.5, sensors=("radar",), objects_gone_s=(1.5, 3.0), spread_m=100.0),
     "empty_lists": Situation(empty_p=0.4, delay="huge"),
     "nothing_but_clutter": Situation(num_objects=(0, 0), clutter=3.0),
     "wild_speeds": Situation(noise_mps=20.0, clutter=1.0),
@@ -108,10 +115,10 @@ SITUATIONS = {
     "bursts": Situation(burst_p=0.5),
     "jittering_clock": Situation(clock="jitter"),
     "jittering_clock_on_time": Situation(clock="jitter", delay="none"),
-    "clock_with_gaps": Situation(duration_s=8.0, clock="gaps", sensors_hz=5.0, ego_hz=20.0),
-    "rare_lists_and_gaps": Situation(duration_s=8.0, clock="gaps", sensors_hz=0.5, ego_hz=20.0),
+    "clock_with_gaps": Situation(duration_s=16.0, clock="gaps", sensors_hz=5.0, ego_hz=20.0),
+    "rare_lists_and_gaps": Situation(duration_s=16.0, clock="gaps", sensors_hz=0.5, ego_hz=20.0),
     "old_lists_after_gaps": Situation(
-        duration_s=15.0, clock="gaps", sensors_hz=0.25, ego_hz=10.0, empty_p=0.2, num_objects=(5, 10)
+        duration_s=60.0, clock="gaps", sensors_hz=0.25, ego_hz=10.0, empty_p=0.2, num_objects=(5, 10)
     ),
     "wound_up_yaw": Situation(
         duration_s=9.0,
@@ -143,7 +150,7 @@ def anything(rng: np.random.Generator) -> Situation:
         return (begin, begin + float(rng.uniform(0.1, 1.5)))
 
     return Situation(
-        duration_s=3.0,
+        duration_s=2.5,
         epoch_ns=sometimes(TODAY_NS, 1_000_000_000_000),
         clock=sometimes(str(rng.choice(["jitter", "gaps"])), "node"),
         start=str(rng.choice(["anywhere", "closing", "jump", "jump_rep103"])),

@@ -215,7 +215,7 @@ def _ticks(situation: Situation, rng: np.random.Generator, messages: Messages) -
         ]
         steps_ns = np.choose(rng.choice(4, num_ticks, p=[0.3, 0.4, 0.2, 0.1]), kinds)
     if situation.clock == "gaps":
-        long = rng.random(num_ticks) < 0.01
+        long = rng.random(num_ticks) < 0.05
         steps_ns = np.where(long, rng.integers(500_000_000, 6_000_000_000, num_ticks), steps_ns)
     last_ns = messages[-1].receipt_ns + 500_000_000
     ticks = accumulate((int(step) for step in steps_ns), initial=first_ns)
