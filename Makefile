@@ -22,7 +22,7 @@ check: $(STAMP)
 	$(BIN)/lint-imports
 
 bench: $(STAMP)
-	$(BIN)/python -m pytest experiments -o addopts= -p no:warnings --benchmark-only -q -s
+	$(BIN)/python -m pytest experiments/bench_*.py -o addopts= -p no:warnings --benchmark-only -q -s
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fgtrack needs Python 3.11 or newer")'
