@@ -168,11 +168,12 @@ class UpdateRecord:
 
 @dataclass(frozen=True, slots=True)
 class SmoothedReport:
-    """One row of smoothed.csv: a state that later measurements have improved."""
+    """A state that later measurements have improved: final when it leaves the window, lagged before."""
 
     track_id: int
-    kind: Literal["lagged", "final"]
     state: TrackState
+    lag_s: float | None = None
+    """How long before the tick the state is; None of a final one."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.time import seconds
-from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import BirthPrior, Measurement, StatesAt, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.birth import birth_state
 from fgtrack.estimation.ekf import correct
@@ -266,3 +266,7 @@ class BackwardForwardBank:
         mean, covariance = self._propagator.motion.kinematic(mean, covariance)
         mean = wrapped_yaw(mean)
         return [TrackState(self.present_ns, m, P) for m, P in zip(mean, covariance, strict=True)]
+
+    def smoothed(self) -> list[SmoothedReport]:
+        """See `TrackBank.smoothed`: none."""
+        return []

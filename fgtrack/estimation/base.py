@@ -7,8 +7,9 @@ from typing import Protocol
 
 import numpy as np
 
-from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.models.measurement import MeasurementModel, SensorPose
+from fgtrack.models.sensors import RobustLoss
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +23,8 @@ class Measurement:
     R: FloatArray
     """Covariance, shape (k, k)."""
     pose: SensorPose = field(default_factory=SensorPose)
+    loss: RobustLoss | None = None
+    """Robust loss, for smoothers."""
 
 
 class UpdateStatus(StrEnum):
@@ -115,6 +118,13 @@ class TrackBank(Protocol):
 
     def present(self) -> list[TrackState]:
         """Kinematic states (x, y, yaw, speed, yaw rate[, acceleration]) now, in the order of `track_ids`."""
+
+    def smoothed(self) -> list[SmoothedReport]:
+        """Kinematic states of the past that later measurements have improved.
+
+        The lagged ones as they are now, the final ones that left a window, or whose track was removed, since the last
+        call. A filter has none.
+        """
 
 
 def no_states(dim: int) -> StatesAt:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import TrackState
+from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import (
     BirthPrior,
     Estimator,
@@ -95,3 +95,7 @@ class ObjectBank:
         )
         mean = wrapped_yaw(mean)
         return [TrackState(self._now_ns, m, P) for m, P in zip(mean, covariance, strict=True)]
+
+    def smoothed(self) -> list[SmoothedReport]:
+        """See `TrackBank.smoothed`: none."""
+        return []

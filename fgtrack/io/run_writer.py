@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from operator import itemgetter
 from pathlib import Path
@@ -99,10 +99,14 @@ class RunWriter:
             self._append("updates", "".join([f"{report.tick},{_update_row(row)}" for row in report.updates]))
             for record in report.updates:
                 self._counts.setdefault(record.sensor, Counter())[record.disposition] += 1
-        if report.smoothed:
-            self._append("smoothed", "".join([_smoothed_row(row) for row in report.smoothed]))
+        self.write_smoothed(report.smoothed)
         counts = f"{len(report.tracks)},{num_detections}"
         self._append("timing", f"{report.tick},{report.now_ns},{process_ns},{counts}\n")
+
+    def write_smoothed(self, reports: Sequence[SmoothedReport]) -> None:
+        """Append rows to smoothed.csv."""
+        if reports:
+            self._append("smoothed", "".join([_smoothed_row(row) for row in reports]))
 
     def write_truth(self, truth: TruthState) -> None:
         """Append one row to truth.csv."""
@@ -238,7 +242,7 @@ def _track_row(track: TrackReport) -> str:
 
 def _smoothed_row(row: SmoothedReport) -> str:
     mean = row.state.mean.tolist()
-    ids = (row.track_id, row.state.stamp_ns, row.kind)
+    ids = (row.track_id, row.state.stamp_ns, "final" if row.lag_s is None else "lagged")
     return _smoothed_format(len(mean)) % (*ids, *mean, *_upper_triangle(row.state))
 
 

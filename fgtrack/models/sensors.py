@@ -20,6 +20,19 @@ class Mount:
 
 
 @dataclass(frozen=True)
+class RobustLoss:
+    """A loss that grows slower than the square, so that an outlier pulls less; smoothers use it."""
+
+    kind: Literal["huber", "cauchy", "tukey", "geman_mcclure", "dcs"]
+    width: float
+    """Where the loss leaves the square, in standard deviations (of the whole measurement)."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.width) and self.width > 0.0):
+            raise ValueError(f"width: must be positive and finite, is {self.width}")
+
+
+@dataclass(frozen=True)
 class SensorModel:
     """One modality. Positions have their standard deviations along and across the line of sight."""
 
@@ -43,6 +56,8 @@ class SensorModel:
     """A detection further from the sensor than this is out of bounds: beyond it clutter outweighs objects."""
     births: bool = True
     """Whether an unmatched detection of this sensor starts a track."""
+    loss: RobustLoss | None = None
+    """Robust loss of its measurement factors; null is the Gaussian. A filter has no use for it."""
     mount: Mount = field(default_factory=Mount)
 
     def __post_init__(self) -> None:

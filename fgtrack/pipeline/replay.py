@@ -130,6 +130,7 @@ def replay(
             writer.write_tick(report, process_ns, _count(tick))
             if on_tick is not None:
                 on_tick(tick.now_ns, len(report.tracks))
+        writer.write_smoothed(tracker.finish())
         finished = writer.finish(
             {
                 "wall_s": time.perf_counter() - started,

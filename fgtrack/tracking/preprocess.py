@@ -234,7 +234,7 @@ class Preprocess:
         return Candidate(
             index,
             merged,
-            Measurement(batch.stamp_ns, measurement_model(names, self._motion), z, R, pose),
+            Measurement(batch.stamp_ns, measurement_model(names, self._motion), z, R, pose, sensor.loss),
             None if point_m is None else np.array(point_m),
             None if point_m is None else _position_covariance(values, R, names, pose),
             values,

@@ -13,6 +13,7 @@ from fgtrack.core.types import (
     Disposition,
     EgoState,
     FloatArray,
+    SmoothedReport,
     TickReport,
     TrackReport,
     UpdateRecord,
@@ -88,7 +89,12 @@ class Tracker:
         for batch in batches:
             self._process(batch)
         updates, self._records = tuple(self._records), []
-        return TickReport(self._tick, now_ns, self._reports(), updates)
+        return TickReport(self._tick, now_ns, self._reports(), updates, tuple(self._parts.bank.smoothed()))
+
+    def finish(self) -> tuple[SmoothedReport, ...]:
+        """End all tracks; gives the final smoothed states that were still inside a window."""
+        self._end(self._parts.bank.track_ids)
+        return tuple(self._parts.bank.smoothed())
 
     def _process(self, batch: Batch) -> None:
         """One object list, at its own stamp: transform, filter, merge, associate, age, estimate, give birth."""

@@ -63,7 +63,7 @@ def test_the_header_lines_are_those_of_the_contract(tmp_path):
     path = tmp_path / "run"
     with RunWriter(path) as writer:
         writer.write_truth(TruthState(1, 1, -1, 0.0, 0.0))
-        writer.write_tick(TickReport(0, 1, (), (), (SmoothedReport(1, "final", track().state),)), 1, 0)
+        writer.write_tick(TickReport(0, 1, (), (), (SmoothedReport(1, track().state),)), 1, 0)
     header = {file.stem: file.read_text().splitlines()[0] for file in path.glob("*.csv")}
     covariance = (
         "p_x_x,p_x_y,p_x_yaw,p_x_speed,p_x_yaw_rate,p_y_y,p_y_yaw,p_y_speed,p_y_yaw_rate,"
@@ -83,7 +83,7 @@ def test_the_header_lines_are_those_of_the_contract(tmp_path):
 def test_updates_truth_smoothed_and_timing_come_back(tmp_path):
     with RunWriter(tmp_path / "run", config_text="seed: 1\n") as writer:
         writer.write_tick(report(), 5, 2)
-        writer.write_tick(TickReport(1, 2000, (), (), (SmoothedReport(4, "lagged", track().state),)), 6, 0)
+        writer.write_tick(TickReport(1, 2000, (), (), (SmoothedReport(4, track().state, 0.3),)), 6, 0)
         writer.write_truth(TruthState(3, 3, -1, 1.0, 2.0, speed_mps=0.1))
         writer.finish({})
     run = read_run(tmp_path / "run")
