@@ -1,0 +1,54 @@
+"""What solves the window: one small protocol, two implementations on gtsam."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import gtsam
+
+from fgtrack.core.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Marginalised:
+    """The oldest variables, to be marginalised."""
+
+    keys: list[int]
+    cutoff_s: float
+    """Between their stamps and those of the others."""
+    prior: gtsam.NonlinearFactor
+    """What they say about the oldest of the others."""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One change of the window."""
+
+    values: dict[int, FloatArray]
+    """First estimates (n,) of new variables, by key."""
+    stamps_s: dict[int, float]
+    """Their stamps, in seconds since the run's first one."""
+    factors: list[gtsam.NonlinearFactor]
+    """Factors to add."""
+    removed: list[int]
+    """Slots of factors to remove."""
+    marginalised: Marginalised | None = None
+
+
+class Backend(Protocol):
+    """Keeps a graph and its solution."""
+
+    def update(self, change: Change) -> list[int]:
+        """Apply `change` and solve; gives the slots of `change.factors`, in order.
+
+        Raises `RuntimeError` or `numpy.linalg.LinAlgError` where it cannot be solved; then only a new backend helps.
+        """
+
+    def mean(self, key: int) -> FloatArray:
+        """Estimate of the variable `key`, shape (n,)."""
+
+    def covariance(self, keys: Sequence[int]) -> FloatArray:
+        """Joint covariance of one variable, shape (n, n), or of two neighbours, (2 n, 2 n)."""
+
+    def converge(self, max_iterations: int) -> None:
+        """Relinearise until no state moves by more than rounding, or `max_iterations` are done."""

@@ -1,0 +1,70 @@
+"""The order of the nodes in the window, and the graph slots of the segments between them."""
+
+import bisect
+from collections.abc import Container
+from dataclasses import dataclass, field
+
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.factor_graph.evidence import Evidence
+
+
+@dataclass(slots=True)
+class Node:
+    """One distinct stamp of the window."""
+
+    stamp_ns: int
+    key: int
+    """The variable's number in the graph."""
+    guess: FloatArray
+    """First estimate, shape (n,)."""
+    evidence: list[Evidence] = field(default_factory=list)
+    slot: int | None = None
+    """Graph slot of the motion factor to the next node; None of the newest node."""
+
+
+class Chain:
+    """Nodes in the order of their stamps. It never becomes empty."""
+
+    def __init__(self, first: Node) -> None:
+        self._nodes = [first]
+        self._next_key = first.key + 1
+
+    @property
+    def nodes(self) -> list[Node]:
+        """All nodes, oldest first."""
+        return self._nodes
+
+    @property
+    def oldest(self) -> Node:
+        """The anchor: no stamp before it can be inserted."""
+        return self._nodes[0]
+
+    @property
+    def newest(self) -> Node:
+        """The node with the newest stamp."""
+        return self._nodes[-1]
+
+    def place(self, stamp_ns: int) -> int:
+        """Index of the newest node at or before `stamp_ns`; -1 where all are after it."""
+        return bisect.bisect_right(self._nodes, stamp_ns, key=lambda node: node.stamp_ns) - 1
+
+    def at(self, stamp_ns: int) -> Node | None:
+        """The node at exactly `stamp_ns`."""
+        place = self.place(stamp_ns)
+        found = place >= 0 and self._nodes[place].stamp_ns == stamp_ns
+        return self._nodes[place] if found else None
+
+    def insert(self, stamp_ns: int, guess: FloatArray) -> Node:
+        """A new node at `stamp_ns`; the slot of the segment that it splits stays with its left neighbour."""
+        node = Node(stamp_ns, self._next_key, guess)
+        self._next_key += 1
+        self._nodes.insert(self.place(stamp_ns) + 1, node)
+        return node
+
+    def remove(self, keys: Container[int]) -> None:
+        """Take back the insertion of the nodes with `keys`."""
+        self._nodes = [node for node in self._nodes if node.key not in keys]
+
+    def drop(self, count: int) -> None:
+        """Forget the oldest `count` nodes."""
+        del self._nodes[:count]

@@ -1,0 +1,107 @@
+"""gtsam factors that call the motion and measurement models; no equation of their own.
+
+Errors are whitened here, because a motion factor's noise follows the state that it starts from.
+"""
+
+from collections.abc import Callable, Mapping
+
+import gtsam
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dtrtrs
+
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import Measurement
+from fgtrack.estimation.factor_graph.evidence import Equivalent, Evidence, linearised
+from fgtrack.models.motion import MotionModel
+from fgtrack.models.sensors import RobustLoss
+
+_ESTIMATORS: Mapping[str, Callable[[float], gtsam.noiseModel.mEstimator.Base]] = {
+    "huber": gtsam.noiseModel.mEstimator.Huber.Create,
+    "cauchy": gtsam.noiseModel.mEstimator.Cauchy.Create,
+    "tukey": gtsam.noiseModel.mEstimator.Tukey.Create,
+    "geman_mcclure": gtsam.noiseModel.mEstimator.GemanMcClure.Create,
+    "dcs": gtsam.noiseModel.mEstimator.DCS.Create,
+}
+
+
+def prior_factor(key: int, mean: FloatArray, covariance: FloatArray) -> gtsam.NonlinearFactor:
+    """N(mean, covariance) of the state at `key`; shapes (n,) and (n, n)."""
+    return gtsam.PriorFactorVector(key, mean, gtsam.noiseModel.Gaussian.Covariance(covariance))
+
+
+def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float) -> gtsam.NonlinearFactor:
+    """The state at `right` is that at `left` moved by `dt_s`, with the process noise of that time.
+
+    The error is L^-1 (x_right - f(x_left)), with L L' = Q(x_left, dt) taken at the same state: no derivative of L is
+    taken, so this is Gauss-Newton with reweighting, and its answer does not depend on where it began.
+    """
+    n = motion.dim
+    both = np.zeros((n, 2 * n + 1), order="F")
+    both[:, n : 2 * n] = np.eye(n)
+    flow, error_column = both[:, :n], both[:, 2 * n]
+    kept: list[FloatArray] = []  # L of the last linearisation: a line search compares errors of one and the same noise
+
+    def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
+        step = motion.step(values.atVector(left).tolist(), dt_s)
+        if jacobians is not None or not kept:
+            kept[:] = [_root(step.Q)]
+        gap = values.atVector(right) - step.mean
+        if jacobians is None:
+            return np.asarray(dtrtrs(kept[0], gap, lower=1)[0])
+        np.negative(step.F, out=flow)
+        error_column[:] = gap
+        whitened: FloatArray = dtrtrs(kept[0], both, lower=1)[0]
+        jacobians[0], jacobians[1] = whitened[:, :n], whitened[:, n : 2 * n]
+        return whitened[:, 2 * n]
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(n), [left, right], error)
+
+
+def evidence_factor(key: int, evidence: Evidence, mean: FloatArray) -> gtsam.NonlinearFactor:
+    """What `evidence` says of the state at `key`, presently near `mean` (n,).
+
+    A linear model with a Gaussian needs no callback; its angles are taken on the branch next to `mean`. Raises
+    `numpy.linalg.LinAlgError` for a covariance that is not positive definite.
+    """
+    if isinstance(evidence, Equivalent) or (evidence.model.linear and evidence.loss is None):
+        y, H, R = linearised(evidence, mean)
+        return _linear_factor(key, mean, y, H, _root(R))
+    return _callback_factor(key, evidence)
+
+
+def _linear_factor(
+    key: int, origin: FloatArray, y: FloatArray, H: FloatArray, root: FloatArray
+) -> gtsam.NonlinearFactor:
+    k = len(y)
+    whitened = dtrtrs(root, np.column_stack([H, y]), lower=1)[0]
+    linear = gtsam.JacobianFactor(key, whitened[:, :-1], whitened[:, -1], gtsam.noiseModel.Unit.Create(k))
+    at = gtsam.Values()
+    at.insert(key, origin)
+    return gtsam.LinearContainerFactor(linear, at)
+
+
+def _callback_factor(key: int, measurement: Measurement) -> gtsam.NonlinearFactor:
+    model, z, pose = measurement.model, measurement.z, measurement.pose
+    root = _root(measurement.R)
+
+    def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
+        x = values.atVector(key)
+        if jacobians is not None:
+            jacobians[0] = dtrtrs(root, np.asfortranarray(model.jacobian(x, pose)), lower=1)[0]
+        return np.asarray(dtrtrs(root, -model.residual(z, model.predict(x, pose)), lower=1)[0])
+
+    return gtsam.CustomFactor(_noise(measurement.loss, len(z)), [key], error)
+
+
+def _noise(loss: RobustLoss | None, k: int) -> gtsam.noiseModel.Base:
+    unit = gtsam.noiseModel.Unit.Create(k)
+    return unit if loss is None else gtsam.noiseModel.Robust.Create(_ESTIMATORS[loss.kind](loss.width), unit)
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """Lower Cholesky factor, shape (k, k)."""
+    root: FloatArray
+    root, info = dpotrf(covariance, lower=1)
+    if info:
+        raise np.linalg.LinAlgError("a covariance is not positive definite")
+    return root

@@ -1,0 +1,47 @@
+"""Settings of the smoother."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Literal
+
+#: Of a state that is linear in its entry: never relinearise.
+NEVER = 1e9
+
+_RELINEARISE = MappingProxyType({"yaw_rad": 0.02, "speed_mps": 1.0, "yaw_rate_radps": 0.05, "accel_mps2": 1.0})
+
+
+@dataclass(frozen=True)
+class SmootherSettings:
+    """Window, late policy, relinearisation and outputs of a fixed-lag smoother."""
+
+    lag_s: float = 1.0
+    """Length of the window behind the newest stamp of the track, or the clock."""
+    late: Literal["fuse", "drop", "raise"] = "fuse"
+    """What becomes of a detection older than the window: fused exactly through what the window has marginalised
+    (counted as `beyond_window`), dropped (`too_old`), or an error."""
+    ring_s: float = 2.0
+    """How far behind the window `fuse` reaches; older detections are `too_old`."""
+    relinearise: Mapping[str, float] = field(default_factory=lambda: _RELINEARISE)
+    """An entry of the state that moved further than this from its linearisation point is relinearised (iSAM2).
+    Entries that are not named never are: all models are linear in them, but for robust losses and bearings."""
+    max_iterations: int = 1
+    """Gauss-Newton steps per update; further ones are taken only while a state moves."""
+    lagged_s: tuple[float, ...] = (0.3,)
+    """Lags of the lagged output; the first one goes to smoothed.csv."""
+    final: bool = True
+    """Whether the smoothed state of a node is given when it leaves the window."""
+
+    def __post_init__(self) -> None:
+        for name in ("lag_s", "ring_s"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name}: must be finite and not negative, is {value}")
+        if not 1 <= self.max_iterations <= 100:
+            raise ValueError(f"max_iterations: must lie between 1 and 100, is {self.max_iterations}")
+        for name, value in self.relinearise.items():
+            if not value >= 0.0:
+                raise ValueError(f"relinearise.{name}: must not be negative, is {value}")
+        if any(not 0.0 <= lag_s <= self.lag_s for lag_s in self.lagged_s):
+            raise ValueError(f"lagged_s: must lie between 0 and lag_s = {self.lag_s}, is {list(self.lagged_s)}")

@@ -1,0 +1,141 @@
+"""The fixed-lag smoother of one object."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.linalg import psd_solve, symmetrise
+from fgtrack.core.time import nanoseconds, seconds
+from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.estimation.base import BirthPrior, Measurement, UpdateResult, UpdateStatus
+from fgtrack.estimation.birth import birth_state
+from fgtrack.estimation.factor_graph.backend import Backend
+from fgtrack.estimation.factor_graph.evidence import linearised
+from fgtrack.estimation.factor_graph.settings import SmootherSettings
+from fgtrack.estimation.factor_graph.tail import Prior
+from fgtrack.estimation.factor_graph.window import Window
+from fgtrack.models.motion import MotionModel
+
+
+class FixedLagSmoother:
+    """A sliding window of states at the stamps at which something was measured, smoothed together.
+
+    Measurements may arrive in any order: each becomes a factor of the node at its own stamp. The oldest node is the
+    newest one at or before the window's start, so every stamp inside the window has a left neighbour.
+
+    Parameters
+    ----------
+    motion
+        Motion model; its process noise composes, so a late measurement may split a segment.
+    prior
+        First state; nothing older than it can be fused.
+    settings
+        Window, late policy and outputs.
+    make_backend
+        Makes an empty backend; called again after a failed update.
+    """
+
+    def __init__(
+        self,
+        motion: MotionModel,
+        prior: BirthPrior,
+        settings: SmootherSettings,
+        make_backend: Callable[[], Backend],
+    ) -> None:
+        self._settings = settings
+        self._lag_ns, self._ring_ns = nanoseconds(settings.lag_s), nanoseconds(settings.ring_s)
+        self._first_ns = self._clock_ns = prior.stamp_ns
+        self._window = Window(motion, prior.stamp_ns, Prior(*birth_state(motion, prior)), make_backend)
+        self._final: list[TrackState] = []
+
+    @property
+    def window_ns(self) -> tuple[int, int]:
+        """See `Estimator.window_ns`."""
+        return max(self._reach_ns, self._window.reach_ns), self._window.newest_ns
+
+    @property
+    def num_rebuilt(self) -> int:
+        """How often the graph was built anew after a failed update."""
+        return self._window.num_rebuilt
+
+    def advance(self, now_ns: int) -> None:
+        """See `Estimator.advance`; the nodes that leave are marginalised at the next update."""
+        self._clock_ns = max(self._clock_ns, now_ns)
+
+    def update(self, measurement: Measurement) -> UpdateResult:
+        """See `Estimator.update`."""
+        return self.update_all([measurement])[0]
+
+    def update_all(self, measurements: Sequence[Measurement]) -> list[UpdateResult]:
+        """Fuse several measurements in one step; innovations are relative to the state before all of them.
+
+        Raises `DataError` for a measurement older than the window where the late policy is `raise`.
+        """
+        results = [self._judged(measurement) for measurement in measurements]
+        fusible = [m for m, result in zip(measurements, results, strict=True) if result.innovation is not None]
+        if not fusible:
+            return results
+        try:
+            self._final += self._window.update(fusible, self._start_ns, self._reach_ns, self._settings.final)
+        except RuntimeError:
+            return [r if r.innovation is None else UpdateResult(UpdateStatus.FAILED) for r in results]
+        if self._settings.max_iterations > 1:
+            self._window.converge(self._settings.max_iterations - 1)
+        return results
+
+    def state_at(self, stamp_ns: int) -> TrackState:
+        """See `Estimator.state_at`: smoothed in the past, interpolated under the motion model, predicted ahead."""
+        mean, covariance = self._window.state_at(stamp_ns)
+        return TrackState(stamp_ns, mean, symmetrise(covariance))
+
+    def take_final(self) -> list[TrackState]:
+        """Smoothed states of the nodes that have left the window since the last call, in order."""
+        final, self._final = self._final, []
+        return final
+
+    def take_rest(self) -> list[TrackState]:
+        """Like `take_final`, and of the nodes that are still inside: for when the track ends."""
+        inside = self._window.stamps_ns if self._settings.final else []
+        return self.take_final() + [self.state_at(stamp_ns) for stamp_ns in inside]
+
+    def converge(self, max_iterations: int = 50) -> None:
+        """Relinearise until nothing moves; for comparisons."""
+        self._window.converge(max_iterations)
+
+    @property
+    def _start_ns(self) -> int:
+        """The window's start, by the clock and the newest stamp."""
+        return max(max(self._clock_ns, self._window.newest_ns) - self._lag_ns, self._first_ns)
+
+    @property
+    def _reach_ns(self) -> int:
+        """Oldest stamp that may be fused."""
+        behind_ns = self._ring_ns if self._settings.late == "fuse" else 0
+        return max(self._start_ns - behind_ns, self._first_ns)
+
+    def _judged(self, measurement: Measurement) -> UpdateResult:
+        """What will become of `measurement`; without an innovation where it will not be fused."""
+        stamp_ns, start_ns = measurement.stamp_ns, self._start_ns
+        if stamp_ns < start_ns and self._settings.late == "raise":
+            raise DataError(
+                f"a measurement at {stamp_ns} ns is {seconds(start_ns - stamp_ns):g} s older than the window: "
+                "lengthen smoother.lag_s, or set smoother.late to fuse or drop"
+            )
+        if stamp_ns < self.window_ns[0]:
+            return UpdateResult(UpdateStatus.TOO_OLD)
+        try:
+            innovation, nis = self._innovation(measurement)
+        except np.linalg.LinAlgError:
+            return UpdateResult(UpdateStatus.FAILED)
+        if not np.isfinite(nis):
+            return UpdateResult(UpdateStatus.FAILED)
+        if stamp_ns < start_ns:
+            return UpdateResult(UpdateStatus.BEYOND_WINDOW, innovation, nis)
+        late = stamp_ns < self._window.newest_ns
+        return UpdateResult(UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE, innovation, nis)
+
+    def _innovation(self, measurement: Measurement) -> tuple[FloatArray, float]:
+        mean, covariance = self._window.state_at(measurement.stamp_ns)
+        y, H, R = linearised(measurement, mean)
+        return y, float(y @ psd_solve(H @ covariance @ H.T + R, y))

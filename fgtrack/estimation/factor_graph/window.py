@@ -1,0 +1,216 @@
+"""The graph of one object's window: nodes, segments and evidence, and the solver behind them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+
+from fgtrack.core.time import seconds
+from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.estimation.base import Measurement
+from fgtrack.estimation.factor_graph.backend import Backend, Change, Marginalised
+from fgtrack.estimation.factor_graph.chain import Chain, Node
+from fgtrack.estimation.factor_graph.evidence import Evidence
+from fgtrack.estimation.factor_graph.factors import evidence_factor, motion_factor, prior_factor
+from fgtrack.estimation.factor_graph.incremental import FIRST_KEY
+from fgtrack.estimation.factor_graph.tail import Prior, Tail
+from fgtrack.estimation.interpolation import between
+from fgtrack.models.motion import MotionModel
+
+_BROKEN = (RuntimeError, ValueError, IndexError, np.linalg.LinAlgError)
+
+
+class Window:
+    """Nodes from the oldest that is kept to the newest, and what lies behind them.
+
+    Parameters
+    ----------
+    motion
+        Motion model of the segments.
+    stamp_ns, prior
+        The first node.
+    make_backend
+        Makes an empty backend; called again after a failed update.
+    """
+
+    def __init__(self, motion: MotionModel, stamp_ns: int, prior: Prior, make_backend: Callable[[], Backend]) -> None:
+        self._motion = motion
+        self._make_backend = make_backend
+        self._first_ns = stamp_ns
+        self._chain = Chain(Node(stamp_ns, FIRST_KEY, prior.mean))
+        self._tail = Tail(motion, stamp_ns, prior)
+        self._means: dict[int, FloatArray] = {}
+        self._covariances: dict[tuple[int, ...], FloatArray] = {}
+        self._states: dict[int, tuple[FloatArray, FloatArray]] = {}
+        self.num_rebuilt = 0
+        """How often the graph was built anew after a failed update."""
+        self.rebuild({FIRST_KEY: prior.mean})
+
+    @property
+    def stamps_ns(self) -> list[int]:
+        """Stamps of the nodes, oldest first."""
+        return [node.stamp_ns for node in self._chain.nodes]
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest node."""
+        return self._chain.newest.stamp_ns
+
+    @property
+    def reach_ns(self) -> int:
+        """Oldest stamp at which something can still be fused."""
+        return self._tail.start_ns
+
+    def update(
+        self, measurements: Sequence[Measurement], start_ns: int, reach_ns: int, final: bool
+    ) -> list[TrackState]:
+        """Fuse `measurements` and marginalise the nodes that are not needed from `start_ns` on.
+
+        One node at or before `start_ns` stays. Conditionals of marginalised nodes are kept from `reach_ns` on. Gives
+        the states of the nodes that left, where `final`. Raises `RuntimeError` where it fails; all is as before then.
+        """
+        chain, tail = self._chain, self._tail.copy()
+        leaving = chain.nodes[: max(chain.place(start_ns), 0)]
+        anchor = chain.nodes[len(leaving)]
+        new: dict[int, FloatArray] = {}
+        try:
+            for node, right in zip(leaving, chain.nodes[1:], strict=False):
+                tail.pass_node(node.evidence, self._mean(node), right.stamp_ns, self._mean(right))
+            left = self._states_behind(tail, anchor, leaving) if final else []
+            old = [item for item in measurements if item.stamp_ns < anchor.stamp_ns]
+            added: list[tuple[Node, Evidence]] = [(anchor, tail.fuse(item)) for item in old]
+            live = [item for item in measurements if item.stamp_ns >= anchor.stamp_ns]
+            guesses = {item.stamp_ns: self.state_at(item.stamp_ns)[0] for item in live}
+            for item in live:
+                at = chain.at(item.stamp_ns)
+                if at is None:
+                    at = chain.insert(item.stamp_ns, guesses[item.stamp_ns])
+                    new[at.key] = at.guess
+                added.append((at, item))
+            self._solve(added, new, leaving, tail.prior)
+        except _BROKEN as error:
+            chain.remove(new)
+            self.rebuild({node.key: self._estimate(node) for node in chain.nodes})
+            self.num_rebuilt += 1
+            raise RuntimeError(f"the graph cannot be solved with the new measurements ({error})") from error
+        tail.forget_before(reach_ns)
+        self._tail = tail
+        chain.drop(len(leaving))
+        for node, evidence in added:
+            node.evidence.append(evidence)
+        return left
+
+    def state_at(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance at any stamp from `reach_ns` on: interpolated in the past, predicted ahead."""
+        state = self._states.get(stamp_ns)
+        if state is None:
+            state = self._states[stamp_ns] = self._state_at(stamp_ns)
+        return state
+
+    def _state_at(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
+        place = self._chain.place(stamp_ns)
+        if place < 0:
+            anchor = self._chain.oldest
+            return self._tail.state_at(stamp_ns, self._mean(anchor), self._covariance(anchor))
+        node = self._chain.nodes[place]
+        mean = self._mean(node)
+        if node.stamp_ns == stamp_ns:
+            return mean, self._covariance(node)
+        until_s = seconds(stamp_ns - node.stamp_ns)
+        if node is self._chain.newest:
+            step = self._motion.step(mean.tolist(), until_s)
+            return np.asarray(step.mean), step.F @ self._covariance(node) @ step.F.T + step.Q
+        right = self._chain.nodes[place + 1]
+        after_s = seconds(right.stamp_ns - stamp_ns)
+        inner = between(self._motion, mean.tolist(), self._mean(right), until_s, after_s)
+        weights = np.hstack([inner.Lambda, inner.Psi])
+        return inner.mean, weights @ self._covariance(node, right) @ weights.T + inner.Sigma
+
+    def converge(self, max_iterations: int) -> None:
+        """See `Backend.converge`."""
+        self._backend.converge(max_iterations)
+        self._forget_estimates()
+
+    def rebuild(self, means: Mapping[int, FloatArray], prior: Prior | None = None) -> None:
+        """Build the graph anew from the window's own records, near `means` by key; with another prior if given."""
+        if prior is not None:
+            self._tail = Tail(self._motion, self._chain.oldest.stamp_ns, prior)
+        nodes = self._chain.nodes
+        self._backend = self._make_backend()
+        segments = list(pairwise(nodes))
+        factors = [self._segment(left, right) for left, right in segments]
+        factors.append(prior_factor(nodes[0].key, self._tail.prior.mean, self._tail.prior.covariance))
+        factors += [evidence_factor(node.key, item, means[node.key]) for node in nodes for item in node.evidence]
+        stamps_s = {node.key: self._seconds(node.stamp_ns) for node in nodes}
+        slots = self._backend.update(Change(dict(means), stamps_s, factors, []))
+        for (left, _), slot in zip(segments, slots, strict=False):
+            left.slot = slot
+        self._forget_estimates()
+
+    def _states_behind(self, tail: Tail, anchor: Node, leaving: Sequence[Node]) -> list[TrackState]:
+        if not leaving:
+            return []
+        mean, covariance = self._mean(anchor), self._covariance(anchor)
+        return [TrackState(node.stamp_ns, *tail.state_at(node.stamp_ns, mean, covariance)) for node in leaving]
+
+    def _solve(
+        self,
+        added: Sequence[tuple[Node, Evidence]],
+        new: dict[int, FloatArray],
+        leaving: Sequence[Node],
+        prior: Prior,
+    ) -> None:
+        """Update the backend, and note the slots of the new segments."""
+        nodes = self._chain.nodes
+        segments = [pair for pair in pairwise(nodes) if pair[0].key in new or pair[1].key in new]
+        removed = [left.slot for left, _ in segments if left.slot is not None]
+        factors = [self._segment(left, right) for left, right in segments]
+        for node, evidence in added:
+            mean = new[node.key] if node.key in new else self._mean(node)
+            factors.append(evidence_factor(node.key, evidence, mean))
+        stamps_s = {node.key: self._seconds(node.stamp_ns) for node in nodes if node.key in new}
+        marginalised = None
+        if leaving:
+            oldest = nodes[len(leaving)]
+            marginalised = Marginalised(
+                [node.key for node in leaving],
+                0.5 * (self._seconds(leaving[-1].stamp_ns) + self._seconds(oldest.stamp_ns)),
+                prior_factor(oldest.key, prior.mean, prior.covariance),
+            )
+        slots = self._backend.update(Change(new, stamps_s, factors, removed, marginalised))
+        for (left, _), slot in zip(segments, slots, strict=False):
+            left.slot = slot
+        self._forget_estimates()
+
+    def _segment(self, left: Node, right: Node) -> gtsam.NonlinearFactor:
+        return motion_factor(self._motion, left.key, right.key, seconds(right.stamp_ns - left.stamp_ns))
+
+    def _seconds(self, stamp_ns: int) -> float:
+        return seconds(stamp_ns - self._first_ns)
+
+    def _estimate(self, node: Node) -> FloatArray:
+        """The mean of a node in a backend that may be broken."""
+        try:
+            mean = self._mean(node)
+        except _BROKEN:
+            return node.guess
+        return mean if np.isfinite(mean).all() else node.guess
+
+    def _mean(self, node: Node) -> FloatArray:
+        mean = self._means.get(node.key)
+        if mean is None:
+            mean = self._means[node.key] = self._backend.mean(node.key)
+        return mean
+
+    def _covariance(self, *nodes: Node) -> FloatArray:
+        keys = tuple(node.key for node in nodes)
+        covariance = self._covariances.get(keys)
+        if covariance is None:
+            covariance = self._covariances[keys] = self._backend.covariance(keys)
+        return covariance
+
+    def _forget_estimates(self) -> None:
+        self._means.clear()
+        self._covariances.clear()
+        self._states.clear()
