@@ -8,7 +8,9 @@ import numpy as np
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import period_ns, seconds
 from fgtrack.estimation.backward_forward import BackwardForwardBank
-from fgtrack.estimation.base import TrackBank
+from fgtrack.estimation.base import BirthPrior, TrackBank
+from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherBank
+from fgtrack.estimation.factor_graph.backend import Backend
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator, Propagator
 from fgtrack.estimation.published import (
@@ -20,6 +22,7 @@ from fgtrack.estimation.published import (
     StalePresent,
 )
 from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.models.motion import MotionModel
 from fgtrack.models.published_map import CircularHeadingMap, PublishedMap, PublishedRoad
 from fgtrack.models.road import FrenetRoad, OpenSpace, Road
 from fgtrack.models.track_map import TrackMap
@@ -104,10 +107,30 @@ def _build_replay(config: Config) -> TrackBank:
     return ObjectBank(motion, lambda prior: ReplayEkf(motion, prior, lag_s), lag_s)
 
 
+def _build_smoother(config: Config, make_backend: Callable[[MotionModel], Backend]) -> TrackBank:
+    motion, settings = config.motion.model(), config.smoother
+
+    def start(prior: BirthPrior) -> FixedLagSmoother:
+        return FixedLagSmoother(motion, prior, settings, lambda: make_backend(motion))
+
+    return SmootherBank(motion, start, settings)
+
+
+def _build_incremental(config: Config) -> TrackBank:
+    thresholds = config.smoother.relinearise
+    return _build_smoother(config, lambda motion: IncrementalBackend(motion.state_names, thresholds))
+
+
+def _build_batch(config: Config) -> TrackBank:
+    return _build_smoother(config, lambda motion: BatchBackend())
+
+
 #: Estimators by name.
 ESTIMATORS: Mapping[str, Callable[[Config], TrackBank]] = {
     "ekf-backward-forward": _build_backward_forward,
     "ekf-replay": _build_replay,
+    "smoother": _build_incremental,
+    "smoother-batch": _build_batch,
 }
 
 

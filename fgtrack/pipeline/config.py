@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Discriminator
 
+from fgtrack.estimation.factor_graph.settings import SmootherSettings
 from fgtrack.io.config import InputConfig
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import SensorModel
@@ -197,6 +198,7 @@ class Config:
     birth: BirthConfig = field(default_factory=FixedBirth)
     motion: MotionConfig = field(default_factory=MotionConfig)
     filter: FilterConfig = field(default_factory=FilterConfig)
+    smoother: SmootherSettings = field(default_factory=SmootherSettings)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
     def __post_init__(self) -> None:

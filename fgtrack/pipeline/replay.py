@@ -18,7 +18,7 @@ from fgtrack.pipeline.load import dump
 
 _LARGEST_STEP_BACK_S = 1.0
 _LONGEST_GAP_S = 3600.0
-_PACKAGES = ("fgtrack", "numpy", "scipy", "rosbags")
+_PACKAGES = ("fgtrack", "gtsam", "numpy", "scipy", "rosbags")
 
 
 @dataclass(frozen=True)

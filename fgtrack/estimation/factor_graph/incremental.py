@@ -58,7 +58,8 @@ class IncrementalBackend:
             self._newest_s = max(self._newest_s, *change.stamps_s.values())
         self._smoother.setSmootherLag(_FOREVER_S if gone is None else self._newest_s - gone.cutoff_s)
         stamps_s: dict[_Key, _Stamp] = {}
-        stamps_s.update(change.stamps_s)
+        for key, stamp_s in change.stamps_s.items():
+            stamps_s[key] = stamp_s
         self._smoother.update(graph, values, stamps_s, change.removed)
         return list(self._smoother.getISAM2Result().getNewFactorsIndices())[: len(change.factors)]
 
