@@ -24,14 +24,17 @@ def symmetrise(matrix: FloatArray) -> FloatArray:
 def psd_solve(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
     """Solve `matrix @ x = rhs` for a symmetric positive definite `matrix`.
 
-    Shapes (..., n, n) and (..., n, k). Raises `numpy.linalg.LinAlgError` when `matrix` is singular.
+    Shapes (..., n, n) and (..., n, k); with one matrix, `rhs` may be a vector (n,). Raises
+    `numpy.linalg.LinAlgError` when `matrix` is singular.
     """
-    if matrix.shape[:-2] != (1,):
-        return np.asarray(np.linalg.solve(matrix, rhs))
-    _, _, solution, info = dgesv(matrix[0], rhs[0])  # the same routine at a third of the time
+    if matrix.ndim > 2:
+        if matrix.shape[:-2] != (1,):
+            return np.asarray(np.linalg.solve(matrix, rhs))
+        return psd_solve(matrix[0], rhs[0])[None]
+    _, _, solution, info = dgesv(matrix, rhs)  # the same routine at a third of the time
     if info:
         raise np.linalg.LinAlgError("singular matrix")
-    return np.asarray(solution[None])
+    return np.asarray(solution)
 
 
 def mahalanobis_squared(residual: FloatArray, covariance: FloatArray) -> FloatArray:

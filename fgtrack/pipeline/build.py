@@ -22,7 +22,6 @@ from fgtrack.estimation.published import (
     StalePresent,
 )
 from fgtrack.estimation.replay import ReplayEkf
-from fgtrack.models.motion import MotionModel
 from fgtrack.models.published_map import CircularHeadingMap, PublishedMap, PublishedRoad
 from fgtrack.models.road import FrenetRoad, OpenSpace, Road
 from fgtrack.models.track_map import TrackMap
@@ -107,22 +106,26 @@ def _build_replay(config: Config) -> TrackBank:
     return ObjectBank(motion, lambda prior: ReplayEkf(motion, prior, lag_s), lag_s)
 
 
-def _build_smoother(config: Config, make_backend: Callable[[MotionModel], Backend]) -> TrackBank:
+def _build_smoother(config: Config, make_backend: Callable[[], Backend]) -> TrackBank:
     motion, settings = config.motion.model(), config.smoother
 
     def start(prior: BirthPrior) -> FixedLagSmoother:
-        return FixedLagSmoother(motion, prior, settings, lambda: make_backend(motion))
+        return FixedLagSmoother(motion, prior, settings, make_backend)
 
     return SmootherBank(motion, start, settings)
 
 
 def _build_incremental(config: Config) -> TrackBank:
-    thresholds = config.smoother.relinearise
-    return _build_smoother(config, lambda motion: IncrementalBackend(motion.state_names, thresholds))
+    names = config.motion.model().state_names
+    curved = any(
+        sensor.loss is not None or not set(sensor.components) <= set(names) for sensor in config.sensors.values()
+    )
+    thresholds = config.smoother.thresholds(names, curved)
+    return _build_smoother(config, lambda: IncrementalBackend(thresholds))
 
 
 def _build_batch(config: Config) -> TrackBank:
-    return _build_smoother(config, lambda motion: BatchBackend())
+    return _build_smoother(config, BatchBackend)
 
 
 #: Estimators by name.

@@ -119,7 +119,8 @@ def replay(
         "versions": _versions(),
         "seed": None,
     }
-    with RunWriter(out, dump(config), meta) as writer:
+    smoothed_lag_s = next(iter(config.smoother.lagged_s), None)
+    with RunWriter(out, dump(config), meta, smoothed_lag_s) as writer:
         feed = _Feed(messages, frozenset(config.ignore_sensors), writer.write_truth)
         for tick in _ticks(feed, config.clock):
             before_ns = time.perf_counter_ns()

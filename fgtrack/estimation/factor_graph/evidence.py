@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 
@@ -40,4 +38,5 @@ def linearised(evidence: Evidence, x: FloatArray) -> Linearised:
         return Linearised(evidence.y - evidence.H @ (x - evidence.origin), evidence.H, evidence.R)
     model = evidence.model
     y = model.residual(evidence.z, model.predict(x, evidence.pose))
-    return Linearised(y, np.asarray(model.jacobian(x, evidence.pose)), evidence.R)
+    H = model.selection(len(x)) if model.linear else model.jacobian(x, evidence.pose)
+    return Linearised(y, H, evidence.R)

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 
 import gtsam
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dtrtrs
+from scipy.linalg.blas import dtrsm
+from scipy.linalg.lapack import dpotrf
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
@@ -45,12 +46,11 @@ def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float) -> gt
         step = motion.step(values.atVector(left).tolist(), dt_s)
         if jacobians is not None or not kept:
             kept[:] = [_root(step.Q)]
-        gap = values.atVector(right) - step.mean
+        np.subtract(values.atVector(right), step.mean, out=error_column)
         if jacobians is None:
-            return np.asarray(dtrtrs(kept[0], gap, lower=1)[0])
+            return _whitened(kept[0], both)[:, 2 * n]
         np.negative(step.F, out=flow)
-        error_column[:] = gap
-        whitened: FloatArray = dtrtrs(kept[0], both, lower=1)[0]
+        whitened = _whitened(kept[0], both)
         jacobians[0], jacobians[1] = whitened[:, :n], whitened[:, n : 2 * n]
         return whitened[:, 2 * n]
 
@@ -73,7 +73,7 @@ def _linear_factor(
     key: int, origin: FloatArray, y: FloatArray, H: FloatArray, root: FloatArray
 ) -> gtsam.NonlinearFactor:
     k = len(y)
-    whitened = dtrtrs(root, np.column_stack([H, y]), lower=1)[0]
+    whitened = _whitened(root, np.column_stack([H, y]))
     linear = gtsam.JacobianFactor(key, whitened[:, :-1], whitened[:, -1], gtsam.noiseModel.Unit.Create(k))
     at = gtsam.Values()
     at.insert(key, origin)
@@ -87,8 +87,8 @@ def _callback_factor(key: int, measurement: Measurement) -> gtsam.NonlinearFacto
     def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
         x = values.atVector(key)
         if jacobians is not None:
-            jacobians[0] = dtrtrs(root, np.asfortranarray(model.jacobian(x, pose)), lower=1)[0]
-        return np.asarray(dtrtrs(root, -model.residual(z, model.predict(x, pose)), lower=1)[0])
+            jacobians[0] = _whitened(root, model.jacobian(x, pose))
+        return _whitened(root, -model.residual(z, model.predict(x, pose))[:, None])[:, 0]
 
     return gtsam.CustomFactor(_noise(measurement.loss, len(z)), [key], error)
 
@@ -96,6 +96,11 @@ def _callback_factor(key: int, measurement: Measurement) -> gtsam.NonlinearFacto
 def _noise(loss: RobustLoss | None, k: int) -> gtsam.noiseModel.Base:
     unit = gtsam.noiseModel.Unit.Create(k)
     return unit if loss is None else gtsam.noiseModel.Robust.Create(_ESTIMATORS[loss.kind](loss.width), unit)
+
+
+def _whitened(root: FloatArray, columns: FloatArray) -> FloatArray:
+    """L^-1 times `columns` (k, m); by BLAS, because LAPACK's dtrtrs starts threads for the smallest matrix."""
+    return np.asarray(dtrsm(1.0, root, columns, lower=1))
 
 
 def _root(covariance: FloatArray) -> FloatArray:

@@ -1,14 +1,12 @@
 """The default backend: gtsam's incremental fixed-lag smoother on iSAM2."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import SupportsFloat, SupportsIndex, SupportsInt
 
 import gtsam
-import numpy as np
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.factor_graph.backend import Change
-from fgtrack.estimation.factor_graph.settings import NEVER
 
 _Key = SupportsInt | SupportsIndex
 _Stamp = SupportsFloat | SupportsIndex
@@ -25,13 +23,11 @@ class IncrementalBackend:
 
     Parameters
     ----------
-    state_names
-        Names of the entries of a state.
     thresholds
-        See `SmootherSettings.relinearise`.
+        An entry of a state that moves further than this is relinearised, shape (n,); see `SmootherSettings`.
     """
 
-    def __init__(self, state_names: Sequence[str], thresholds: Mapping[str, float]) -> None:
+    def __init__(self, thresholds: FloatArray) -> None:
         params = gtsam.ISAM2Params()
         params.setFactorization("QR")
         params.findUnusedFactorSlots = True
@@ -40,7 +36,7 @@ class IncrementalBackend:
         gauss_newton.setWildfireThreshold(0.0)
         params.setOptimizationParams(gauss_newton)
         by_kind = gtsam.ISAM2ThresholdMap()
-        by_kind.insert((_KIND, np.array([thresholds.get(name, NEVER) for name in state_names])))
+        by_kind.insert((_KIND, thresholds))
         params.setRelinearizeThreshold(by_kind)
         self._smoother = gtsam.IncrementalFixedLagSmoother(_FOREVER_S, params)
         self._newest_s = 0.0

@@ -1,15 +1,19 @@
 """Settings of the smoother."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal
 
-#: Of a state that is linear in its entry: never relinearise.
-NEVER = 1e9
+import numpy as np
+
+from fgtrack.core.types import FloatArray
+
+_NEVER = 1e9
 
 _RELINEARISE = MappingProxyType({"yaw_rad": 0.02, "speed_mps": 1.0, "yaw_rate_radps": 0.05, "accel_mps2": 1.0})
+_CURVED = MappingProxyType({"x_m": 0.05, "y_m": 0.05, "vx_mps": 0.2, "vy_mps": 0.2})
 
 
 @dataclass(frozen=True)
@@ -25,7 +29,7 @@ class SmootherSettings:
     """How far behind the window `fuse` reaches; older detections are `too_old`."""
     relinearise: Mapping[str, float] = field(default_factory=lambda: _RELINEARISE)
     """An entry of the state that moved further than this from its linearisation point is relinearised (iSAM2).
-    Entries that are not named never are: all models are linear in them, but for robust losses and bearings."""
+    Entries that are not named never are where the models are linear in them; see `thresholds`."""
     max_iterations: int = 1
     """Gauss-Newton steps per update; further ones are taken only while a state moves."""
     lagged_s: tuple[float, ...] = (0.3,)
@@ -45,3 +49,12 @@ class SmootherSettings:
                 raise ValueError(f"relinearise.{name}: must not be negative, is {value}")
         if any(not 0.0 <= lag_s <= self.lag_s for lag_s in self.lagged_s):
             raise ValueError(f"lagged_s: must lie between 0 and lag_s = {self.lag_s}, is {list(self.lagged_s)}")
+
+    def thresholds(self, state_names: Sequence[str], curved: bool) -> FloatArray:
+        """Relinearisation thresholds of a state, shape (n,).
+
+        `curved` says that some measurement bends in the position (range, bearing, a robust loss), so that its
+        entries need a threshold as well.
+        """
+        named = {**(_CURVED if curved else {}), **self.relinearise}
+        return np.array([named.get(name, _NEVER) for name in state_names])

@@ -12,10 +12,13 @@ from fgtrack.estimation.base import BirthPrior, Measurement, UpdateResult, Updat
 from fgtrack.estimation.birth import birth_state
 from fgtrack.estimation.factor_graph.backend import Backend
 from fgtrack.estimation.factor_graph.evidence import linearised
+from fgtrack.estimation.factor_graph.initiation import straight_line
 from fgtrack.estimation.factor_graph.settings import SmootherSettings
 from fgtrack.estimation.factor_graph.tail import Prior
 from fgtrack.estimation.factor_graph.window import Window
 from fgtrack.models.motion import MotionModel
+
+_AIMING_ITERATIONS = 10
 
 
 class FixedLagSmoother:
@@ -47,6 +50,7 @@ class FixedLagSmoother:
         self._lag_ns, self._ring_ns = nanoseconds(settings.lag_s), nanoseconds(settings.ring_s)
         self._first_ns = self._clock_ns = prior.stamp_ns
         self._window = Window(motion, prior.stamp_ns, Prior(*birth_state(motion, prior)), make_backend)
+        self._aimed = prior.yaw_rad is not None or motion.linear
         self._final: list[TrackState] = []
 
     @property
@@ -80,6 +84,8 @@ class FixedLagSmoother:
             self._final += self._window.update(fusible, self._start_ns, self._reach_ns, self._settings.final)
         except RuntimeError:
             return [r if r.innovation is None else UpdateResult(UpdateStatus.FAILED) for r in results]
+        if not self._aimed:
+            self._aim()
         if self._settings.max_iterations > 1:
             self._window.converge(self._settings.max_iterations - 1)
         return results
@@ -102,6 +108,23 @@ class FixedLagSmoother:
     def converge(self, max_iterations: int = 50) -> None:
         """Relinearise until nothing moves; for comparisons."""
         self._window.converge(max_iterations)
+
+    def _aim(self) -> None:
+        """Begin again from a straight line through the positions so far, until their direction is certain.
+
+        A state that started with an unknown heading was linearised at a wrong one; from there the solver may not find
+        the right one.
+        """
+        if not self._window.whole:
+            self._aimed = True
+            return
+        try:
+            line = straight_line(self._window.fixes())
+        except np.linalg.LinAlgError:
+            return
+        self._aimed = line.certain
+        self._window.restart(line)
+        self._window.converge(_AIMING_ITERATIONS)
 
     @property
     def _start_ns(self) -> int:

@@ -7,13 +7,14 @@ import gtsam
 import numpy as np
 
 from fgtrack.core.time import seconds
-from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.factor_graph.backend import Backend, Change, Marginalised
 from fgtrack.estimation.factor_graph.chain import Chain, Node
 from fgtrack.estimation.factor_graph.evidence import Evidence
 from fgtrack.estimation.factor_graph.factors import evidence_factor, motion_factor, prior_factor
 from fgtrack.estimation.factor_graph.incremental import FIRST_KEY
+from fgtrack.estimation.factor_graph.initiation import Fix, Line, along, fix_of
 from fgtrack.estimation.factor_graph.tail import Prior, Tail
 from fgtrack.estimation.interpolation import between
 from fgtrack.models.motion import MotionModel
@@ -45,7 +46,7 @@ class Window:
         self._states: dict[int, tuple[FloatArray, FloatArray]] = {}
         self.num_rebuilt = 0
         """How often the graph was built anew after a failed update."""
-        self.rebuild({FIRST_KEY: prior.mean})
+        self._rebuild({FIRST_KEY: prior.mean})
 
     @property
     def stamps_ns(self) -> list[int]:
@@ -91,7 +92,7 @@ class Window:
             self._solve(added, new, leaving, tail.prior)
         except _BROKEN as error:
             chain.remove(new)
-            self.rebuild({node.key: self._estimate(node) for node in chain.nodes})
+            self._rebuild({node.key: self._estimate(node) for node in chain.nodes})
             self.num_rebuilt += 1
             raise RuntimeError(f"the graph cannot be solved with the new measurements ({error})") from error
         tail.forget_before(reach_ns)
@@ -132,10 +133,32 @@ class Window:
         self._backend.converge(max_iterations)
         self._forget_estimates()
 
-    def rebuild(self, means: Mapping[int, FloatArray], prior: Prior | None = None) -> None:
-        """Build the graph anew from the window's own records, near `means` by key; with another prior if given."""
-        if prior is not None:
-            self._tail = Tail(self._motion, self._chain.oldest.stamp_ns, prior)
+    @property
+    def whole(self) -> bool:
+        """Whether nothing has left the window yet."""
+        return self._chain.oldest.stamp_ns == self._first_ns
+
+    def fixes(self) -> list[Fix]:
+        """The positions measured at the nodes, after that of the prior."""
+        prior = self._tail.prior
+        fixes = [Fix(0.0, prior.mean[:2], prior.covariance[:2, :2])]
+        for node in self._chain.nodes:
+            time_s = self._seconds(node.stamp_ns)
+            found = [fix_of(item, time_s) for item in node.evidence if isinstance(item, Measurement)]
+            fixes += [fix for fix in found if fix is not None]
+        return fixes
+
+    def restart(self, line: Line) -> None:
+        """Solve again from states along `line`, with the prior's heading, which must be vague, turned there."""
+        nodes, prior = self._chain.nodes, self._tail.prior
+        means = {node.key: along(line, self._seconds(node.stamp_ns), self._motion.state_names) for node in nodes}
+        mean = prior.mean.copy()
+        mean[YAW] = means[nodes[0].key][YAW]
+        self._tail = Tail(self._motion, self._first_ns, Prior(mean, prior.covariance))
+        self._rebuild(means)
+
+    def _rebuild(self, means: Mapping[int, FloatArray]) -> None:
+        """Build the graph anew from the window's own records, near `means` by key."""
         nodes = self._chain.nodes
         self._backend = self._make_backend()
         segments = list(pairwise(nodes))

@@ -1,0 +1,69 @@
+"""The dense joint posterior of a linear chain: the oracle that exact estimators are held to.
+
+It knows all measurements at once, so there is no order of arrival in it; and it shares neither recursion nor graph
+with any estimator.
+"""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from fgtrack.core.errors import CallError
+from fgtrack.core.time import seconds
+from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.estimation.base import BirthPrior, Measurement
+from fgtrack.estimation.birth import birth_state
+from fgtrack.models.motion import MotionModel
+
+
+def dense_joint(
+    motion: MotionModel, prior: BirthPrior, measurements: Sequence[Measurement], stamps_ns: Iterable[int]
+) -> dict[int, TrackState]:
+    """States at `stamps_ns` (from the prior's stamp on) given all `measurements`, by stamp.
+
+    Every distinct stamp is a node, measured or not, so interpolating and predicting need no equation of their own.
+    With x_0 = m_0 + L_0 u_0 and x_k = F x_(k-1) + L_k u_k (L L' = P_0 or Q) all states are x = m + M u, u ~ N(0, I).
+    The rows u = 0 and W H M u = W (z - H m), W the inverse root of R, are solved by one QR. Beside the normal
+    equations of x itself this is the same least-squares problem, whose condition stays small where two stamps nearly
+    coincide and Q almost vanishes.
+
+    Raises `CallError` for a model that is not linear, or a stamp before the prior's.
+    """
+    wanted = set(stamps_ns)
+    stamps = sorted({prior.stamp_ns, *wanted, *(m.stamp_ns for m in measurements)})
+    if not motion.linear or not all(m.model.linear for m in measurements):
+        raise CallError("dense_joint: motion and measurements must be linear")
+    if stamps[0] < prior.stamp_ns:
+        raise CallError(f"dense_joint: stamp {stamps[0]} ns lies before the prior's, {prior.stamp_ns} ns")
+    m, M = _moments(motion, prior, stamps)
+    place = {stamp_ns: k for k, stamp_ns in enumerate(stamps)}
+    rows, right = [np.eye(M.shape[-1])], [np.zeros(M.shape[-1])]
+    for item in measurements:
+        k = place[item.stamp_ns]
+        H = item.model.selection(motion.dim)
+        y = item.model.residual(item.z, item.model.predict(m[k], item.pose))
+        whitened = np.linalg.solve(np.linalg.cholesky(item.R), np.column_stack([H @ M[k], y]))
+        rows.append(whitened[:, :-1])
+        right.append(whitened[:, -1])
+    Q, R = np.linalg.qr(np.vstack(rows))
+    u = np.linalg.solve(R, Q.T @ np.concatenate(right))
+    states = {}
+    for stamp_ns in wanted:
+        k = place[stamp_ns]
+        root = np.linalg.solve(R.T, M[k].T)
+        states[stamp_ns] = TrackState(stamp_ns, m[k] + M[k] @ u, root.T @ root)
+    return states
+
+
+def _moments(motion: MotionModel, prior: BirthPrior, stamps_ns: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+    """Prior mean m (N, n) of the states at `stamps_ns`, and how they depend on u: M (N, n, N n)."""
+    mean, covariance = birth_state(motion, prior)
+    n, count = motion.dim, len(stamps_ns)
+    m, M = np.zeros((count, n)), np.zeros((count, n, count * n))
+    m[0], M[0, :, :n] = mean, np.linalg.cholesky(covariance)
+    for k in range(1, count):
+        dt_s = seconds(stamps_ns[k] - stamps_ns[k - 1])
+        m[k] = motion.predict(m[k - 1], dt_s)
+        M[k] = motion.jacobian(m[k - 1], dt_s) @ M[k - 1]
+        M[k, :, k * n : (k + 1) * n] = np.linalg.cholesky(motion.process_noise(m[k - 1], dt_s))
+    return m, M

@@ -1,0 +1,76 @@
+"""Where a new object heads and how fast, from the positions and stamps of its first measurements."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.linalg import psd_solve
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import Measurement
+from fgtrack.models.motion import cartesian, cartesian_gradient, polar
+
+
+class Fix(NamedTuple):
+    """A measured position in the map."""
+
+    time_s: float
+    position_m: FloatArray
+    """Shape (2,)."""
+    covariance: FloatArray
+    """Shape (2, 2)."""
+
+
+class Line(NamedTuple):
+    """Position and velocity at time 0, and how well the velocity is known."""
+
+    position_m: FloatArray
+    velocity_mps: FloatArray
+    covariance: FloatArray
+    """Of the velocity, shape (2, 2)."""
+
+    @property
+    def certain(self) -> bool:
+        """Whether the velocity is more than three standard deviations from zero."""
+        return bool(self.velocity_mps @ psd_solve(self.covariance, self.velocity_mps) > 9.0)
+
+
+def fix_of(measurement: Measurement, time_s: float) -> Fix | None:
+    """The position that `measurement` gives, as x and y or as range and bearing; None where it gives none."""
+    names = measurement.model.components
+    for pair in (("x_m", "y_m"), ("bearing_rad", "range_m")):
+        if set(pair) <= set(names):
+            rows = [names.index(name) for name in pair]
+            z, R = measurement.z[rows], measurement.R[np.ix_(rows, rows)]
+            if pair[0] == "x_m":
+                return Fix(time_s, z, R)
+            pose = measurement.pose
+            direction_range = z + np.array([pose.yaw_rad, 0.0])
+            G = cartesian_gradient(direction_range)
+            return Fix(time_s, np.array([pose.x_m, pose.y_m]) + cartesian(direction_range), G @ R @ G.T)
+    return None
+
+
+def straight_line(fixes: Sequence[Fix]) -> Line:
+    """Weighted least squares of a straight line at constant velocity through at least two fixes at different times.
+
+    With two fixes this is two-point initiation: the velocity is their difference over their time. Raises
+    `numpy.linalg.LinAlgError` where all are of one time.
+    """
+    information, vector = np.zeros((4, 4)), np.zeros(4)
+    for time_s, position_m, covariance in fixes:
+        H = np.hstack([np.eye(2), time_s * np.eye(2)])
+        weighted = psd_solve(covariance, H).T
+        information += weighted @ H
+        vector += weighted @ position_m
+    spread = psd_solve(information, np.eye(4))
+    solution = spread @ vector
+    return Line(solution[:2], solution[2:], spread[2:, 2:])
+
+
+def along(line: Line, time_s: float, state_names: Sequence[str]) -> FloatArray:
+    """State (n,) of an object on `line` at `time_s`; what the line does not say is 0."""
+    yaw_rad, speed_mps = polar(line.velocity_mps).tolist()
+    x_m, y_m = (line.position_m + time_s * line.velocity_mps).tolist()
+    known = {"x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad, "speed_mps": speed_mps}
+    return np.array([known.get(name, 0.0) for name in state_names])
