@@ -1,0 +1,128 @@
+"""Truth drawn from the motion model itself: are the estimators as sure as they should be?"""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import BirthPrior, Estimator, Measurement
+from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
+from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.models.measurement import measurement_model
+from fgtrack.models.motion import CTRV, MotionModel
+from fgtrack.models.sensors import RobustLoss
+
+START_NS = 1_790_000_000_000_000_000
+MOTION = CTRV(yaw_density_rad2ps=0.002, yaw_rate_density_rad2ps3=0.02, speed_density_m2ps3=0.5)
+STEP_S = 0.05
+LAG_S = 0.3
+NUM_STEPS = 40
+NUM_RUNS = 60
+POSITION, WITH_SPEED = (measurement_model(("x_m", "y_m", *more), MOTION) for more in ((), ("speed_mps",)))
+
+
+def prior(mean: FloatArray) -> BirthPrior:
+    x_m, y_m, yaw_rad, speed_mps, yaw_rate_radps = mean.tolist()
+    position = np.array([x_m, y_m])
+    return BirthPrior(START_NS, position, 0.09 * np.eye(2), yaw_rad, 0.1, speed_mps, 2.0, yaw_rate_radps, 0.1, 0.0, 1.0)
+
+
+def smoother(motion: MotionModel, start: BirthPrior, curved: bool = False) -> FixedLagSmoother:
+    settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)
+    thresholds = settings.thresholds(motion.state_names, curved)
+    return FixedLagSmoother(motion, start, settings, lambda: IncrementalBackend(thresholds))
+
+
+def replay(motion: MotionModel, start: BirthPrior) -> ReplayEkf:
+    return ReplayEkf(motion, start, 1.0)
+
+
+def drawn_truth(rng: np.random.Generator, start: FloatArray) -> list[FloatArray]:
+    states = [start + np.linalg.cholesky(np.diag([0.09, 0.09, 0.01, 4.0, 0.01])) @ rng.standard_normal(5)]
+    for _ in range(NUM_STEPS):
+        Q = MOTION.process_noise(states[-1], STEP_S)
+        states.append(MOTION.predict(states[-1], STEP_S) + np.linalg.cholesky(Q) @ rng.standard_normal(5))
+    return states
+
+
+def arrivals(
+    rng: np.random.Generator, truth: list[FloatArray], outliers: float = 0.0
+) -> list[tuple[float, int, FloatArray]]:
+    """Receipt time, step and z: positions 151 ms late, positions and speeds 62 ms late, in order of receipt."""
+    found = []
+    for k in range(1, NUM_STEPS + 1):
+        slow = k % 2 == 0
+        z = truth[k][[0, 1]] if slow else truth[k][[0, 1, 3]]
+        std = np.full(len(z), 0.3)
+        if rng.random() < outliers:
+            std *= 10.0
+        late_s = 0.151 if slow else 0.062
+        found.append((k * STEP_S + late_s, k, z + std * rng.standard_normal(len(z))))
+    return sorted(found, key=lambda item: item[0])
+
+
+def fed(estimator: Estimator, items: list[tuple[float, int, FloatArray]], loss: RobustLoss | None = None) -> None:
+    for _, k, z in items:
+        model = POSITION if len(z) == 2 else WITH_SPEED
+        estimator.update(Measurement(stamp(k), model, z, 0.09 * np.eye(len(z)), loss=loss))
+
+
+def stamp(k: float) -> int:
+    return START_NS + round(k * STEP_S * NS_PER_S)
+
+
+def nees(estimator: Estimator, stamp_ns: int, truth: FloatArray) -> float:
+    state = estimator.state_at(stamp_ns)
+    error = state.mean - truth
+    return float(error @ np.linalg.solve(state.covariance, error))
+
+
+@pytest.mark.parametrize("make", [smoother, replay])
+def test_the_error_of_the_present_state_is_as_large_as_its_covariance_says(
+    make: Callable[[MotionModel, BirthPrior], Estimator],
+) -> None:
+    rng = np.random.default_rng(7)
+    start = np.array([100.0, -50.0, 0.7, 30.0, 0.05])
+    total = 0.0
+    for _ in range(NUM_RUNS):
+        truth = drawn_truth(rng, start)
+        estimator = make(MOTION, prior(start))
+        fed(estimator, arrivals(rng, truth))
+        total += nees(estimator, stamp(NUM_STEPS), truth[-1])
+    low, high = chi2.ppf([0.025, 0.975], 5 * NUM_RUNS)
+    assert low < total < high
+
+
+def test_the_error_of_the_lagged_state_is_smaller_and_as_large_as_its_covariance_says() -> None:
+    rng = np.random.default_rng(8)
+    start = np.array([100.0, -50.0, 0.7, 30.0, 0.05])
+    total = lagged = present = 0.0
+    for _ in range(NUM_RUNS):
+        truth = drawn_truth(rng, start)
+        estimator = smoother(MOTION, prior(start))
+        fed(estimator, arrivals(rng, truth))
+        back = round(LAG_S / STEP_S)
+        then = estimator.state_at(stamp(NUM_STEPS - back))
+        total += nees(estimator, then.stamp_ns, truth[-1 - back])
+        lagged += float(np.sum((then.mean - truth[-1 - back])[:2] ** 2))
+        present += float(np.sum((estimator.state_at(stamp(NUM_STEPS)).mean - truth[-1])[:2] ** 2))
+    low, high = chi2.ppf([0.025, 0.975], 5 * NUM_RUNS)
+    assert low < total < high
+    assert np.sqrt(lagged / present) < 0.9
+
+
+def test_a_robust_loss_takes_a_third_off_the_error_that_outliers_cause() -> None:
+    rng = np.random.default_rng(9)
+    start = np.array([100.0, -50.0, 0.7, 30.0, 0.05])
+    squared = {"gaussian": 0.0, "huber": 0.0}
+    for _ in range(NUM_RUNS // 2):
+        truth = drawn_truth(rng, start)
+        items = arrivals(rng, truth, outliers=0.1)
+        for name, loss in (("gaussian", None), ("huber", RobustLoss("huber", 1.5))):
+            estimator = smoother(MOTION, prior(start), curved=loss is not None)
+            fed(estimator, items, loss)
+            squared[name] += float(np.sum((estimator.state_at(stamp(NUM_STEPS)).mean - truth[-1])[:2] ** 2))
+    assert np.sqrt(squared["huber"] / squared["gaussian"]) < 0.7
