@@ -16,7 +16,6 @@ from fgtrack.evaluation.tables import comparison_tables
 from fgtrack.io.bag_writer import write_bag
 from fgtrack.io.run_folder import read_run
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.build import ESTIMATORS
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_each
 from fgtrack.sim.paper import paper_scenario
@@ -24,6 +23,8 @@ from fgtrack.sim.scenario import OVAL
 from fgtrack.sim.simulate import simulate
 
 _SEED = 1
+_ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
+_LAGGED_S = (0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 0.9)
 
 
 def demo(
@@ -44,13 +45,17 @@ def demo(
     with progress("simulate"):
         write_bag(bag, simulate(paper_scenario(), np.random.default_rng(_SEED)))
     config = Config()
-    config = replace(config, map=replace(config.map, track=OVAL, pit=OVAL))
+    config = replace(
+        config,
+        map=replace(config.map, track=OVAL, pit=OVAL),
+        smoother=replace(config.smoother, lagged_s=_LAGGED_S),
+    )
     source = open_input(bag, config.input)
     with progress("replay") as show:
         results = replay_each(
             source.messages,
             config,
-            tuple(ESTIMATORS),
+            _ESTIMATORS,
             out / "runs",
             origin=str(bag),
             kind=source.kind,

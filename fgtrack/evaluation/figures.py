@@ -1,4 +1,4 @@
-"""Figures of runs: map, residuals, delays, errors, time per tick. Drawn without pyplot: nothing is global."""
+"""Figures of runs: map, residuals, delays, errors, lags, time per tick. Drawn without pyplot: nothing is global."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -21,6 +21,8 @@ from fgtrack.evaluation.figure_style import (
     usual_step_ns,
 )
 from fgtrack.evaluation.labels import labelled
+from fgtrack.evaluation.lag_figure import figure_lag
+from fgtrack.evaluation.lagged import lag_metrics
 from fgtrack.evaluation.map_figure import figure_map
 from fgtrack.evaluation.matching import (
     Matching,
@@ -90,6 +92,9 @@ def save_figures(runs: Sequence[Run], out_dir: Path, options: MatchOptions | Non
     judged = {label: matching for label, matching in matchings.items() if matching is not None}
     for object_id in sorted({k for one in judged.values() for k in one.object_ids}):
         files.append(save(figure_errors(judged, object_id), out_dir / f"errors_object_{object_id}.png"))
+    lagged = {label: lag_metrics(named[label], matching) for label, matching in matchings.items()}
+    if any(entry.is_lagged for one in lagged.values() for entry in one):
+        files.append(save(figure_lag(lagged), out_dir / "error_against_lag.png"))
     if any((run.timing["num_detections"] > 0).any() for run in runs):
         files.append(save(figure_timing(named), out_dir / "timing.png"))
     return files

@@ -120,10 +120,20 @@ def match(run: Run, options: MatchOptions | None = None) -> Matching | None:
 
 def track_errors(matching: Matching) -> TrackErrors:
     """Errors of the paired rows against the truth at their own stamps."""
-    tracks, truth = matching.tracks.where(matching.paired), matching.true_states[matching.paired]
-    dx_m, dy_m = tracks["x_m"] - truth[:, 0], tracks["y_m"] - truth[:, 1]
+    tracks = matching.tracks.where(matching.paired)
+    return TrackErrors(
+        stamps_ns=tracks["stamp_ns"],
+        object_index=matching.object_index[matching.paired],
+        track_ids=tracks["track_id"],
+        values=state_errors(tracks, matching.true_states[matching.paired]),
+    )
+
+
+def state_errors(states: Table, truth: FloatArray) -> dict[str, FloatArray]:
+    """Errors by name of `ERROR_NAMES`, shape (n,) each, of n rows against x, y, yaw and speed, shape (n, 4)."""
+    dx_m, dy_m = states["x_m"] - truth[:, 0], states["y_m"] - truth[:, 1]
     c, s = np.cos(truth[:, 2]), np.sin(truth[:, 2])
-    yaw_rad = tracks["yaw_rad"] - truth[:, 2]
+    yaw_rad = states["yaw_rad"] - truth[:, 2]
     known = np.isfinite(yaw_rad)
     yaw_rad[known] = wrap_angles(yaw_rad[known])
     errors = (
@@ -131,14 +141,9 @@ def track_errors(matching: Matching) -> TrackErrors:
         c * dx_m + s * dy_m,
         c * dy_m - s * dx_m,
         yaw_rad,
-        tracks["speed_mps"] - truth[:, 3],
+        states["speed_mps"] - truth[:, 3],
     )
-    return TrackErrors(
-        stamps_ns=tracks["stamp_ns"],
-        object_index=matching.object_index[matching.paired],
-        track_ids=tracks["track_id"],
-        values=dict(zip(ERROR_NAMES, errors, strict=True)),
-    )
+    return dict(zip(ERROR_NAMES, errors, strict=True))
 
 
 def _judged(run: Run, options: MatchOptions) -> BoolArray:

@@ -9,6 +9,7 @@ import numpy as np
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, Disposition, FloatArray, IntArray
+from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
 from fgtrack.evaluation.matching import (
     CONFIRMED_MEASUREMENTS,
     ERROR_NAMES,
@@ -116,6 +117,8 @@ class Metrics:
     """Wall time of the ticks with a detection."""
     truth: TruthMetrics | None = field(default=None)
     """None for a run without truth."""
+    lagged: tuple[LagMetrics, ...] = ()
+    """Present, lagged and final states, see `lag_metrics`."""
 
     @property
     def precision(self) -> float:
@@ -151,6 +154,7 @@ def evaluate(run: Run, options: MatchOptions | None = None) -> Metrics:
         sensors=_sensor_metrics(run),
         time_per_tick_s=Distribution.of(run.timing["process_ns"][busy] / NS_PER_S),
         truth=None if matching is None else _truth_metrics(matching),
+        lagged=lag_metrics(run, matching),
     )
 
 
@@ -234,6 +238,8 @@ def _plain(value: Any) -> Any:
         return plain
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(entry) for entry in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -1,7 +1,7 @@
 """Tables that compare several runs; made for a terminal of 120 columns."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich import box
@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fgtrack.core.types import Disposition
+from fgtrack.evaluation.lagged import WINDOW, LagMetrics
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS
 from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics, ObjectMetrics
 from fgtrack.evaluation.residuals import RESIDUAL_NAMES
@@ -26,14 +27,16 @@ _ERROR_HEADINGS = {
     "yaw_rad": "yaw\n[rad]",
     "speed_mps": "speed\n[m/s]",
 }
+_LAG_ERRORS = ("position_m", "speed_mps", "yaw_rad")
+_MOST_LAGS = 8
 _CONTINUITY_HEADINGS = ("tracked\n[%]", "breaks/\nswitches", "false\ntracks", "preci-\nsion")
 _NOTE_WIDTH = 86  # so that no note is broken
 _MS = 1e3
 
 
 def comparison_tables(metrics: Mapping[str, Metrics]) -> list[Table]:
-    """All tables of `metrics`, by label: the main one, residuals of every sensor, dispositions."""
-    tables = [main_table(metrics), *residual_tables(metrics), disposition_table(metrics)]
+    """All tables of `metrics`, by label: the main one, lagged states, residuals of every sensor, dispositions."""
+    tables = [main_table(metrics), lag_table(metrics), *residual_tables(metrics), disposition_table(metrics)]
     return [table for table in tables if table.row_count]
 
 
@@ -70,6 +73,32 @@ def main_table(metrics: Mapping[str, Metrics]) -> Table:
     return table
 
 
+def lag_table(metrics: Mapping[str, Metrics]) -> Table:
+    """A row per run and lag, where any run has lagged or final states: errors, and by how much waiting lowers them."""
+    table = _table("Error against lag (RMSE against truth)")
+    _name(table, "run")
+    for heading in ("lag\n[s]", "states"):
+        _number(table, heading)
+    for name in _LAG_ERRORS:
+        _number(table, _ERROR_HEADINGS[name])
+        _number(table, "below\n[%]")
+    _number(table, "NEES\npos.")
+    if not any(len(one.lagged) > 1 for one in metrics.values()):
+        return table
+    for label, one in metrics.items():
+        for k, entry in enumerate(_shown_lags(one.lagged)):
+            table.add_row(Text(label if k == 0 else ""), *_lag_cells(entry))
+    notes = [
+        "lag 0: present states, as published; window: final states, which leave the window",
+        "below: by how much, than the present states of the same tracks at the same stamps",
+        "NEES: of the position; 2 if consistent",
+    ]
+    if any(len(_shown_lags(one.lagged)) < len(one.lagged) for one in metrics.values()):
+        notes.append(f"{_MOST_LAGS} lags of a run are shown at most, metrics.json has all")
+    table.caption = Text("\n".join([*notes, *_notes(metrics)]))
+    return table
+
+
 def residual_tables(metrics: Mapping[str, Metrics]) -> list[Table]:
     """A table per sensor, a row per run: mean and deviation of the innovations, NIS, delay."""
     return [
@@ -99,6 +128,23 @@ def disposition_table(metrics: Mapping[str, Metrics]) -> Table:
     notes = [f"none: {', '.join(absent)}"] if absent else []
     table.caption = Text("\n".join([*notes, *_notes(metrics)]))
     return table
+
+
+def _shown_lags(lagged: Sequence[LagMetrics]) -> list[LagMetrics]:
+    """The present and the final states, and of the lags between them at most so many that are evenly spread."""
+    lags = [entry for entry in lagged if entry.lag_s not in (0.0, WINDOW)]
+    if len(lags) > _MOST_LAGS:
+        lags = [lags[round(k * (len(lags) - 1) / (_MOST_LAGS - 1))] for k in range(_MOST_LAGS)]
+    return [entry for entry in lagged if entry.lag_s in (0.0, WINDOW) or entry in lags]
+
+
+def _lag_cells(entry: LagMetrics) -> list[str]:
+    lag = entry.lag_s if isinstance(entry.lag_s, str) else f"{entry.lag_s:g}"
+    cells = [lag, str(entry.errors["position_m"].count)]
+    for name in _LAG_ERRORS:
+        below = math.nan if entry.lag_s == 0.0 else 100.0 * entry.gain(name)
+        cells += [_short(entry.errors[name].rmse), _short(below)]
+    return [*cells, _short(entry.position_nees.mean)]
 
 
 def _residual_table(sensor: str, metrics: Mapping[str, Metrics]) -> Table:

@@ -1,12 +1,14 @@
-"""The run folder `fgtrack-run/1`, the interface of tracking and evaluation: writer, reader, layout."""
+"""The run folder `fgtrack-run/1`, the interface of tracking and evaluation: writer, reader, layout; runs in memory."""
 
 from fgtrack.io.run_layout import COLUMNS, COVARIANCE_COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
+from fgtrack.io.run_memory import MemoryRun
 from fgtrack.io.run_reader import NO_TRACK, Run, Table, read_run
 from fgtrack.io.run_writer import RunWriter, digest, is_run_folder, write_metrics
 
 __all__ = [
     "COLUMNS",
     "COVARIANCE_COLUMNS",
+    "MemoryRun",
     "NO_TRACK",
     "OPTIONAL_TABLES",
     "RUN_FORMAT",

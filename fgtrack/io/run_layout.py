@@ -26,8 +26,9 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     ),
     "timing": ("tick", "now_ns", "process_ns", "num_tracks", "num_detections"),
     "smoothed": ("track_id", "stamp_ns", "kind", *STATE_NAMES, *COVARIANCE_COLUMNS),
+    "lagged": ("tick", "now_ns", "lag_s", "track_id", "stamp_ns", *STATE_NAMES, *COVARIANCE_COLUMNS),
     "truth": ("stamp_ns", "object_id", *STATE_NAMES),
 }
 
 #: Tables that are written only when there is something to write.
-OPTIONAL_TABLES = ("smoothed", "truth")
+OPTIONAL_TABLES = ("smoothed", "lagged", "truth")

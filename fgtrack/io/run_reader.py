@@ -3,7 +3,7 @@
 import csv
 import io
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,6 +64,7 @@ class Run:
     tracks: Table
     updates: Table
     smoothed: Table
+    lagged: Table
     timing: Table
     truth: Table
 
@@ -108,7 +109,7 @@ def _read_meta(path: Path) -> Mapping[str, Any]:
 def _read_table(path: Path, table: str, complete: bool) -> Table:
     names = COLUMNS[table]
     if table in OPTIONAL_TABLES and not path.exists():
-        return Table({name: _column(name, ()) for name in names})
+        return Table({name: column(name, ()) for name in names})
     text = _read_text(path)
     if not text.endswith("\n"):
         if complete:
@@ -125,15 +126,16 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
             raise DataError(f"{path}:{line}: {len(row)} cells instead of {len(names)}, repeat the run")
     cells = zip(*rows[1:], strict=True) if len(rows) > 1 else ((),) * len(names)
     try:
-        return Table({name: _column(name, column) for name, column in zip(names, cells, strict=True)})
+        return Table({name: column(name, values) for name, values in zip(names, cells, strict=True)})
     except (ValueError, OverflowError) as error:
         raise DataError(f"{path}: holds a bad cell ({error}), repeat the run") from error
 
 
-def _column(name: str, cells: tuple[str, ...]) -> Column:
+def column(name: str, cells: Sequence[str | int | float | None]) -> Column:
+    """The column `name` from its cells, values or their text, shape (rows,); None and "" are empty."""
     if name in _TEXT_COLUMNS:
         return np.array(cells, dtype=np.str_)
-    convert: Callable[[str], float] = int if name in _INTEGER_COLUMNS else float
+    convert: Callable[[str | int | float], float] = int if name in _INTEGER_COLUMNS else float
     empty = NO_TRACK if name in _INTEGER_COLUMNS else np.nan
     dtype = np.int64 if name in _INTEGER_COLUMNS else np.float64
-    return np.array([convert(cell) if cell else empty for cell in cells], dtype=dtype)
+    return np.array([empty if cell is None or cell == "" else convert(cell) for cell in cells], dtype=dtype)

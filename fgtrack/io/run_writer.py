@@ -42,6 +42,8 @@ class RunWriter:
         Text of `config.yaml`, the resolved configuration.
     meta
         What `meta.json` says from the start on.
+    smoothed_lag_s
+        The lag whose states go to smoothed.csv beside the final ones; lagged.csv gets those of every lag.
 
     Raises
     ------
@@ -49,8 +51,15 @@ class RunWriter:
         `path` is a file, or a folder that holds something else than a run.
     """
 
-    def __init__(self, path: Path | str, config_text: str = "", meta: Mapping[str, object] | None = None) -> None:
+    def __init__(
+        self,
+        path: Path | str,
+        config_text: str = "",
+        meta: Mapping[str, object] | None = None,
+        smoothed_lag_s: float | None = None,
+    ) -> None:
         self.path = Path(path)
+        self._smoothed_lag_s = smoothed_lag_s
         self._files: dict[str, BinaryIO] = {}
         self._counts: dict[str, Counter[Disposition]] = {}
         self._meta: dict[str, object] = {"format": RUN_FORMAT, **(meta or {})}
@@ -81,7 +90,7 @@ class RunWriter:
             self._files.popitem()[1].close()
 
     def write_tick(self, report: TickReport, process_ns: int, num_detections: int) -> None:
-        """Append all rows of one tick.
+        """Append all rows of one tick; lagged states only of the tracks that the tick reports.
 
         Parameters
         ----------
@@ -92,14 +101,17 @@ class RunWriter:
         num_detections
             Detections that the tick received.
         """
+        prefix = f"{report.tick},{report.now_ns},"
         if report.tracks:
-            prefix = f"{report.tick},{report.now_ns},"
             self._append("tracks", "".join([prefix + _track_row(track) for track in report.tracks]))
         if report.updates:
             self._append("updates", "".join([f"{report.tick},{_update_row(row)}" for row in report.updates]))
             for record in report.updates:
                 self._counts.setdefault(record.sensor, Counter())[record.disposition] += 1
-        self.write_smoothed(report.smoothed)
+        smoothed = kept_smoothed(report)
+        if lagged := [prefix + _lagged_row(row) for row in smoothed if row.lag_s is not None]:
+            self._append("lagged", "".join(lagged))
+        self.write_smoothed([row for row in smoothed if row.lag_s in (None, self._smoothed_lag_s)])
         counts = f"{len(report.tracks)},{num_detections}"
         self._append("timing", f"{report.tick},{report.now_ns},{process_ns},{counts}\n")
 
@@ -121,10 +133,7 @@ class RunWriter:
         self.close()
         self._meta |= {
             **meta,
-            "counts": {
-                sensor: {disposition.value: counts[disposition] for disposition in Disposition}
-                for sensor, counts in sorted(self._counts.items())
-            },
+            "counts": disposition_counts(self._counts),
             "digest": digest(self.path),
         }
         self._write_meta(complete=True)
@@ -146,6 +155,20 @@ class RunWriter:
         part = self.path / "meta.json.part"
         part.write_text(json.dumps(self._meta, indent=2) + "\n", encoding="utf-8")
         os.replace(part, self.path / "meta.json")
+
+
+def kept_smoothed(report: TickReport) -> list[SmoothedReport]:
+    """The smoothed states of a tick that a run keeps: all final ones, lagged ones of the tracks that it reports."""
+    tracked = {track.track_id for track in report.tracks}
+    return [row for row in report.smoothed if row.lag_s is None or row.track_id in tracked]
+
+
+def disposition_counts(counts: Mapping[str, Counter[Disposition]]) -> dict[str, dict[str, int]]:
+    """Number of detections of every disposition, per sensor, as meta.json says them."""
+    return {
+        sensor: {disposition.value: counter[disposition] for disposition in Disposition}
+        for sensor, counter in sorted(counts.items())
+    }
 
 
 def write_metrics(path: Path, metrics: Mapping[str, object]) -> None:
@@ -224,6 +247,12 @@ def _smoothed_format(size: int) -> str:
     return f"%d,%d,%s,{mean},{covariance}\n"
 
 
+@lru_cache
+def _lagged_format(size: int) -> str:
+    mean, covariance, _ = _state_layout(size)
+    return f"%.17g,%d,%d,{mean},{covariance}\n"
+
+
 def _upper_triangle(state: TrackState) -> Iterable[float]:
     pick = _state_layout(len(state.mean))[2]
     return pick(state.covariance.ravel().tolist())
@@ -244,6 +273,12 @@ def _smoothed_row(row: SmoothedReport) -> str:
     mean = row.state.mean.tolist()
     ids = (row.track_id, row.state.stamp_ns, "final" if row.lag_s is None else "lagged")
     return _smoothed_format(len(mean)) % (*ids, *mean, *_upper_triangle(row.state))
+
+
+def _lagged_row(row: SmoothedReport) -> str:
+    mean = row.state.mean.tolist()
+    ids = (row.lag_s, row.track_id, row.state.stamp_ns)
+    return _lagged_format(len(mean)) % (*ids, *mean, *_upper_triangle(row.state))
 
 
 def _update_row(row: UpdateRecord) -> str:

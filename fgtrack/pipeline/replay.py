@@ -10,11 +10,12 @@ from pathlib import Path
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import seconds
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
-from fgtrack.io.run_folder import RunWriter
+from fgtrack.io.run_folder import MemoryRun, Run, RunWriter
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, Tick, listed_ticks, message_ticks, node_ticks, read_ticks
 from fgtrack.pipeline.config import ClockConfig, Config
 from fgtrack.pipeline.load import dump
+from fgtrack.tracking.tracker import Tracker
 
 _LARGEST_STEP_BACK_S = 1.0
 _LONGEST_GAP_S = 3600.0
@@ -112,36 +113,64 @@ def replay(
         A sensor of the input has no model.
     """
     tracker = build_tracker(config)
+    meta = _start_meta(config, origin, kind)
+    with RunWriter(out, dump(config), meta, _smoothed_lag_s(config)) as writer:
+        finished, broken = _drive(tracker, messages, config, writer, on_tick)
+    return ReplayResult(out, finished, broken)
+
+
+def replay_in_memory(messages: Iterable[Message], config: Config) -> tuple[Run, str | None]:
+    """The run that `replay` would write and `read_run` read, and why the input broke off, where it did.
+
+    Without files it takes less time; the digest, which is one of files, is missing. Raises as `replay`.
+    """
+    tracker = build_tracker(config)
+    memory = MemoryRun(dump(config), _start_meta(config, "", ""), _smoothed_lag_s(config))
+    _, broken = _drive(tracker, messages, config, memory, None)
+    return memory.run, broken
+
+
+def _drive(
+    tracker: Tracker,
+    messages: Iterable[Message],
+    config: Config,
+    writer: RunWriter | MemoryRun,
+    on_tick: Callable[[int, int], None] | None,
+) -> tuple[dict[str, object], str | None]:
+    """Run `tracker` over `messages` into `writer`; gives the finished meta and why the input broke off."""
     started = time.perf_counter()
-    meta: dict[str, object] = {
+    feed = _Feed(messages, frozenset(config.ignore_sensors), writer.write_truth)
+    for tick in _ticks(feed, config.clock):
+        before_ns = time.perf_counter_ns()
+        for message in tick.messages:
+            tracker.receive(message)
+        report = tracker.tick(tick.now_ns)
+        process_ns = time.perf_counter_ns() - before_ns
+        writer.write_tick(report, process_ns, _count(tick))
+        if on_tick is not None:
+            on_tick(tick.now_ns, len(report.tracks))
+    writer.write_smoothed(tracker.finish())
+    meta = {
+        "wall_s": time.perf_counter() - started,
+        "detections_received": feed.received_detections,
+        "detections_ignored": feed.ignored_detections,
+        "ego_refused": dict(tracker.refused_ego),
+        "broken_off": feed.broken,
+    }
+    return writer.finish(meta), feed.broken
+
+
+def _start_meta(config: Config, origin: str, kind: str) -> dict[str, object]:
+    return {
         "input": {"path": origin, "kind": kind},
         "estimator": config.estimator,
-        "versions": _versions(),
+        "versions": versions(),
         "seed": None,
     }
-    smoothed_lag_s = next(iter(config.smoother.lagged_s), None)
-    with RunWriter(out, dump(config), meta, smoothed_lag_s) as writer:
-        feed = _Feed(messages, frozenset(config.ignore_sensors), writer.write_truth)
-        for tick in _ticks(feed, config.clock):
-            before_ns = time.perf_counter_ns()
-            for message in tick.messages:
-                tracker.receive(message)
-            report = tracker.tick(tick.now_ns)
-            process_ns = time.perf_counter_ns() - before_ns
-            writer.write_tick(report, process_ns, _count(tick))
-            if on_tick is not None:
-                on_tick(tick.now_ns, len(report.tracks))
-        writer.write_smoothed(tracker.finish())
-        finished = writer.finish(
-            {
-                "wall_s": time.perf_counter() - started,
-                "detections_received": feed.received_detections,
-                "detections_ignored": feed.ignored_detections,
-                "ego_refused": dict(tracker.refused_ego),
-                "broken_off": feed.broken,
-            }
-        )
-    return ReplayResult(out, finished, feed.broken)
+
+
+def _smoothed_lag_s(config: Config) -> float | None:
+    return next(iter(config.smoother.lagged_s), None)
 
 
 def replay_each(
@@ -181,6 +210,7 @@ def _count(tick: Tick) -> int:
     return sum(len(message.objects) for message in tick.messages if isinstance(message, DetectionList))
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on, by name."""
     found = {name: importlib.metadata.version(name) for name in _PACKAGES}
     return {"python": platform.python_version(), **found}

@@ -9,6 +9,7 @@ import numpy as np
 
 from fgtrack.core.types import (
     Disposition,
+    SmoothedReport,
     TickReport,
     TrackReport,
     TrackState,
@@ -53,7 +54,7 @@ class Car:
 
     def track(
         self,
-        tick: int,
+        tick: float,
         track_id: int,
         *,
         along_m: float = 0.0,
@@ -74,7 +75,7 @@ class Car:
                 self.yaw_rate_radps,
             ]
         )
-        state = TrackState(START_NS + tick * TICK_NS, mean, np.eye(5))
+        state = TrackState(START_NS + round(tick * TICK_NS), mean, np.eye(5))
         return TrackReport(track_id, TrackStatus.CONFIRMED, state, num_measured)
 
 
@@ -89,21 +90,23 @@ def write_run(
     *,
     truth: Iterable[TruthState] = (),
     updates: Mapping[int, Sequence[UpdateRecord]] | None = None,
+    smoothed: Mapping[int, Sequence[SmoothedReport]] | None = None,
+    smoothed_lag_s: float | None = None,
     meta: Mapping[str, object] | None = None,
     config_text: str = "",
     process_ns: Sequence[int] = (),
     num_detections: Sequence[int] = (),
 ) -> Run:
-    """A run with the `tracks` of every tick, and the `updates` by tick."""
-    updates = updates or {}
+    """A run with the `tracks` of every tick, and the `updates` and `smoothed` states by tick."""
+    updates, smoothed = updates or {}, smoothed or {}
     ticks = max(len(tracks), len(process_ns), 1 + max(updates, default=-1))
-    with RunWriter(path, config_text) as writer:
+    with RunWriter(path, config_text, smoothed_lag_s=smoothed_lag_s) as writer:
         for row in truth:
             writer.write_truth(row)
         for tick in range(ticks):
             rows = tuple(tracks[tick]) if tick < len(tracks) else ()
             records = tuple(updates.get(tick, ()))
-            report = TickReport(tick, START_NS + tick * TICK_NS, rows, records)
+            report = TickReport(tick, START_NS + tick * TICK_NS, rows, records, tuple(smoothed.get(tick, ())))
             duration = process_ns[tick] if tick < len(process_ns) else 1_000_000
             count = num_detections[tick] if tick < len(num_detections) else len(records)
             writer.write_tick(report, duration, count)

@@ -1,3 +1,4 @@
+import dataclasses
 import hashlib
 import json
 import time
@@ -63,7 +64,8 @@ def test_the_header_lines_are_those_of_the_contract(tmp_path):
     path = tmp_path / "run"
     with RunWriter(path) as writer:
         writer.write_truth(TruthState(1, 1, -1, 0.0, 0.0))
-        writer.write_tick(TickReport(0, 1, (), (), (SmoothedReport(1, track().state),)), 1, 0)
+        writer.write_tick(TickReport(0, 1, (track(),), (), (SmoothedReport(1, track().state, 0.3),)), 1, 0)
+        writer.write_smoothed([SmoothedReport(1, track().state)])
     header = {file.stem: file.read_text().splitlines()[0] for file in path.glob("*.csv")}
     covariance = (
         "p_x_x,p_x_y,p_x_yaw,p_x_speed,p_x_yaw_rate,p_y_y,p_y_yaw,p_y_speed,p_y_yaw_rate,"
@@ -75,6 +77,7 @@ def test_the_header_lines_are_those_of_the_contract(tmp_path):
         "updates": "tick,sensor,stamp_ns,receipt_ns,index,disposition,track_id,nis,res_x_m,res_y_m,"
         "res_yaw_rad,res_speed_mps,res_range_m,res_bearing_rad,res_range_rate_mps",
         "smoothed": f"track_id,stamp_ns,kind,{state},{covariance}",
+        "lagged": f"tick,now_ns,lag_s,track_id,stamp_ns,{state},{covariance}",
         "timing": "tick,now_ns,process_ns,num_tracks,num_detections",
         "truth": f"stamp_ns,object_id,{state}",
     }
@@ -83,7 +86,7 @@ def test_the_header_lines_are_those_of_the_contract(tmp_path):
 def test_updates_truth_smoothed_and_timing_come_back(tmp_path):
     with RunWriter(tmp_path / "run", config_text="seed: 1\n") as writer:
         writer.write_tick(report(), 5, 2)
-        writer.write_tick(TickReport(1, 2000, (), (), (SmoothedReport(4, track().state, 0.3),)), 6, 0)
+        writer.write_tick(TickReport(1, 2000, (), (), (SmoothedReport(4, track().state),)), 6, 0)
         writer.write_truth(TruthState(3, 3, -1, 1.0, 2.0, speed_mps=0.1))
         writer.finish({})
     run = read_run(tmp_path / "run")
@@ -97,10 +100,60 @@ def test_updates_truth_smoothed_and_timing_come_back(tmp_path):
     assert np.isnan(run.updates["res_yaw_rad"][0])
     assert run.truth["speed_mps"].tolist() == [0.1]
     assert np.isnan(run.truth["yaw_rad"][0])
-    assert run.smoothed["kind"].tolist() == ["lagged"]
+    assert run.smoothed["kind"].tolist() == ["final"]
     assert run.timing["process_ns"].tolist() == [5, 6]
     assert run.timing["num_tracks"].tolist() == [2, 0]
     assert len(run.tracks.where(run.tracks["track_id"] == 2)) == 1
+
+
+@pytest.mark.parametrize("size", [4, 5, 6])
+def test_lagged_states_of_every_lag_come_back_to_the_bit(tmp_path, size):
+    lags_s = (0.3, 0.1, 2 / 3)
+    states = [track(5 + index, size, stamp_ns=100 + index).state for index in range(3)]
+    smoothed = tuple(SmoothedReport(2, state, lag_s) for state, lag_s in zip(states, lags_s, strict=True))
+    with RunWriter(tmp_path / "run", smoothed_lag_s=0.3) as writer:
+        writer.write_tick(TickReport(7, 1007, report(size=size).tracks, (), smoothed), 5, 0)
+        writer.finish({})
+    lagged = read_run(tmp_path / "run").lagged
+    assert lagged["lag_s"].tolist() == list(lags_s)
+    assert lagged["tick"].tolist() == [7, 7, 7]
+    assert lagged["now_ns"].tolist() == [1007, 1007, 1007]
+    assert lagged["track_id"].tolist() == [2, 2, 2]
+    assert lagged["stamp_ns"].tolist() == [100, 101, 102]
+    names = ["x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2"]
+    assert [[lagged[name][k] for name in names[:size]] for k in range(3)] == [state.mean.tolist() for state in states]
+    assert lagged["p_x_y"].tolist() == [state.covariance[0, 1] for state in states]
+    assert np.isnan(lagged["accel_mps2"]).all() == (size < 6)
+
+
+def test_of_the_lagged_states_the_first_lag_alone_stands_beside_the_final_ones(tmp_path):
+    smoothed = tuple(SmoothedReport(1, track(index).state, lag_s) for index, lag_s in enumerate((None, 0.1, 0.3, 0.5)))
+    for lag_s, expected in [(0.3, ["final", "lagged"]), (None, ["final"])]:
+        with RunWriter(tmp_path / "run", smoothed_lag_s=lag_s) as writer:
+            writer.write_tick(TickReport(0, 1000, (track(1),), (), smoothed), 5, 0)
+        run = read_run(tmp_path / "run")
+        assert run.smoothed["kind"].tolist() == expected
+        assert run.lagged["lag_s"].tolist() == [0.1, 0.3, 0.5]
+        if lag_s is not None:
+            assert run.smoothed["x_m"][1] == track(2).state.mean[0]
+
+
+def test_a_removed_track_has_final_states_but_no_lagged_ones(tmp_path):
+    smoothed = tuple(SmoothedReport(track_id, track().state, lag_s) for track_id in (1, 9) for lag_s in (None, 0.3))
+    with RunWriter(tmp_path / "run", smoothed_lag_s=0.3) as writer:
+        writer.write_tick(TickReport(0, 1000, (track(1),), (), smoothed), 5, 0)
+    run = read_run(tmp_path / "run")
+    assert run.lagged["track_id"].tolist() == [1]
+    rows = zip(run.smoothed["track_id"].tolist(), run.smoothed["kind"].tolist(), strict=True)
+    assert list(rows) == [(1, "final"), (1, "lagged"), (9, "final")]
+
+
+def test_smoothed_states_do_not_change_the_digest(tmp_path):
+    plain = write(tmp_path / "plain", report())
+    smoothed = (SmoothedReport(1, track().state, 0.3), SmoothedReport(2, track().state))
+    with_them = write(tmp_path / "smoothed", dataclasses.replace(report(), smoothed=smoothed))
+    assert (tmp_path / "smoothed/lagged.csv").exists()
+    assert with_them["digest"] == plain["digest"]
 
 
 def test_the_meta_file_counts_every_disposition_and_carries_the_digest(tmp_path):
@@ -116,11 +169,12 @@ def test_the_meta_file_counts_every_disposition_and_carries_the_digest(tmp_path)
     assert meta["digest"] == hashlib.sha256(tables).hexdigest()
 
 
-def test_there_is_no_smoothed_or_truth_file_without_a_row(tmp_path):
+def test_there_is_no_smoothed_lagged_or_truth_file_without_a_row(tmp_path):
     write(tmp_path / "run", report())
     assert not (tmp_path / "run/smoothed.csv").exists()
+    assert not (tmp_path / "run/lagged.csv").exists()
     run = read_run(tmp_path / "run")
-    assert len(run.smoothed) == len(run.truth) == 0
+    assert len(run.smoothed) == len(run.lagged) == len(run.truth) == 0
     assert run.truth["object_id"].dtype == np.int64
 
 
@@ -148,6 +202,7 @@ def test_an_older_run_is_replaced_and_nothing_of_it_is_left(tmp_path):
     path = tmp_path / "run"
     with RunWriter(path) as writer:
         writer.write_truth(TruthState(1, 1, -1, 0.0, 0.0))
+        writer.write_tick(TickReport(0, 1, (track(),), (), (SmoothedReport(1, track().state, 0.3),)), 1, 0)
         writer.finish({})
     (path / "metrics.json").write_text("{}")
     write(path, report())

@@ -1,0 +1,129 @@
+"""How much better the past is known than the present: errors of lagged and final states."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.evaluation.matching import Matching, state_errors
+from fgtrack.evaluation.statistics import Moments
+from fgtrack.evaluation.truth import TRUE_STATE, TruePath, true_paths
+from fgtrack.io.run_folder import Run, Table
+
+WINDOW: Literal["window"] = "window"
+"""The lag of a final state: the window's length, or less where the track ended before."""
+
+_NO_ROW = -1
+
+
+@dataclass(frozen=True)
+class LagMetrics:
+    """The states of one lag, and the present states of the same tracks at the same stamps.
+
+    Both know the same truth, so their difference is what waiting for the lag brings.
+    """
+
+    lag_s: float | Literal["window"]
+    """0 for the present states, `WINDOW` for the final ones."""
+    errors: Mapping[str, Moments]
+    """State minus truth at the state's own stamp, by name of `ERROR_NAMES`; `position_m` is the distance."""
+    position_nees: Moments
+    """Normalised error squared of x and y: a consistent estimator has a mean of 2."""
+    present_errors: Mapping[str, Moments]
+    """Those of the present states that were published for these stamps."""
+
+    @property
+    def is_lagged(self) -> bool:
+        """Whether these are judged states of one lag behind the present."""
+        return isinstance(self.lag_s, float) and self.lag_s > 0.0 and self.errors["position_m"].count > 0
+
+    def gain(self, name: str) -> float:
+        """Share by which the RMSE of `name` lies below that of the present states; NaN where there is none."""
+        present = self.present_errors[name].rmse
+        return 1.0 - self.errors[name].rmse / present if present > 0.0 else math.nan
+
+
+def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
+    """Metrics of the present states, of every lag of lagged.csv by rising lag, and of the final states.
+
+    A lagged state belongs to the object that its track was paired to at the tick of the same stamp; where no tick
+    has this stamp, at the one nearest to it. What has no such pair is not judged. Empty for a run without truth.
+    """
+    if matching is None:
+        return ()
+    parts: list[tuple[float | Literal["window"], Table]] = [
+        (lag_s, run.lagged.where(run.lagged["lag_s"] == lag_s))
+        for lag_s in np.unique(run.lagged["lag_s"]).tolist()
+        if lag_s > 0.0
+    ]
+    final = run.smoothed.where(run.smoothed["kind"] == "final")
+    if len(final):
+        parts.append((WINDOW, final))
+    paths = true_paths(run.truth)
+    return (_present(matching), *(_judged(matching, paths, lag_s, states) for lag_s, states in parts))
+
+
+def _present(matching: Matching) -> LagMetrics:
+    tracks, truth = matching.tracks.where(matching.paired), matching.true_states[matching.paired]
+    errors = _moments(tracks, truth)
+    return LagMetrics(0.0, errors, Moments.of(_position_nees(tracks, truth)), errors)
+
+
+def _judged(
+    matching: Matching, paths: Sequence[TruePath], lag_s: float | Literal["window"], states: Table
+) -> LagMetrics:
+    rows = _rows_at(matching, states)
+    alive = rows != _NO_ROW
+    states, rows = states.where(alive), rows[alive]
+    truth = np.full((len(states), len(TRUE_STATE)), np.nan)
+    for index, path in enumerate(paths):
+        mine = matching.object_index[rows] == index
+        truth[mine] = path.at(states["stamp_ns"][mine])
+    known = np.isfinite(truth[:, 0]) & np.isfinite(states["x_m"])  # no truth is known of a row without a pair
+    states, truth, rows = states.where(known), truth[known], rows[known]
+    present = Table({name: column[rows] for name, column in matching.tracks.columns.items()})
+    return LagMetrics(
+        lag_s,
+        _moments(states, truth),
+        Moments.of(_position_nees(states, truth)),
+        _moments(present, matching.true_states[rows]),
+    )
+
+
+def _rows_at(matching: Matching, states: Table) -> IntArray:
+    """The judged row of each state's track that is nearest in stamp, shape (n,); `_NO_ROW` outside of its life."""
+    found = np.full(len(states), _NO_ROW)
+    tracks, track_ids = matching.tracks, states["track_id"]
+    order = np.lexsort((tracks["stamp_ns"], tracks["track_id"]))
+    ids = tracks["track_id"][order]
+    for track_id in np.unique(track_ids).tolist():
+        start, end = np.searchsorted(ids, (track_id, track_id + 1)).tolist()
+        if start == end:
+            continue
+        rows, mine = order[start:end], np.flatnonzero(track_ids == track_id)
+        stamps_ns, wanted_ns = tracks["stamp_ns"][rows], states["stamp_ns"][mine]
+        right = np.searchsorted(stamps_ns, wanted_ns).clip(max=len(rows) - 1)
+        left = (right - 1).clip(min=0)
+        nearest = np.where(wanted_ns - stamps_ns[left] < stamps_ns[right] - wanted_ns, left, right)
+        alive = (wanted_ns >= stamps_ns[0]) & (wanted_ns <= stamps_ns[-1])
+        found[mine[alive]] = rows[nearest[alive]]
+    return found
+
+
+def _moments(states: Table, truth: FloatArray) -> dict[str, Moments]:
+    return {name: Moments.of(values) for name, values in state_errors(states, truth).items()}
+
+
+def _position_nees(states: Table, truth: FloatArray) -> FloatArray:
+    """Normalised error squared of x and y, shape (n,); NaN where the covariance is not positive definite."""
+    dx_m, dy_m = states["x_m"] - truth[:, 0], states["y_m"] - truth[:, 1]
+    xx, xy, yy = (states[f"p_{name}"] for name in ("x_x", "x_y", "y_y"))
+    determinant = xx * yy - xy**2
+    usable = (xx > 0.0) & (determinant > 0.0)
+    squared = yy * dx_m**2 - 2.0 * xy * dx_m * dy_m + xx * dy_m**2
+    nees = np.full(len(states), np.nan)
+    nees[usable] = squared[usable] / determinant[usable]
+    return nees
