@@ -5,6 +5,7 @@ with any estimator.
 """
 
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -67,3 +68,20 @@ def _moments(motion: MotionModel, prior: BirthPrior, stamps_ns: Sequence[int]) -
         M[k] = motion.jacobian(m[k - 1], dt_s) @ M[k - 1]
         M[k, :, k * n : (k + 1) * n] = np.linalg.cholesky(motion.process_noise(m[k - 1], dt_s))
     return m, M
+
+
+class Difference(NamedTuple):
+    """How far one Gaussian is from another."""
+
+    mean_sigma: float
+    """Largest difference of the means, in standard deviations."""
+    covariance: float
+    """Largest difference of the covariances, relative to the two standard deviations that belong to the entry."""
+
+
+def difference(found: TrackState, expected: TrackState) -> Difference:
+    """How far `found` is from `expected`; a NaN stays one."""
+    sigma = np.sqrt(np.diag(expected.covariance))
+    mean = np.abs(found.mean - expected.mean) / sigma
+    covariance = np.abs(found.covariance - expected.covariance) / np.outer(sigma, sigma)
+    return Difference(float(mean.max()), float(covariance.max()))

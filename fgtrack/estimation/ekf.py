@@ -1,9 +1,10 @@
-"""The extended Kalman filter's two steps, on stacks of independent states."""
+"""The extended Kalman filter's two steps, on stacks of independent states and on one state."""
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg.lapack import dgesv, dgetrs
 
 from fgtrack.core.linalg import identity, psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
@@ -67,3 +68,41 @@ def correct_with_innovation(
     posterior = A @ covariance @ A.mT + K @ R @ K.mT
     nis = np.vecdot(y, solved[..., -1])
     return Correction(mean + np.vecdot(K, y[..., None, :]), symmetrise(posterior), y, np.asarray(nis))
+
+
+class OneCorrection(NamedTuple):
+    """Result of `correct_one`."""
+
+    mean: FloatArray
+    """Posterior mean, shape (n,); angles are not wrapped."""
+    covariance: FloatArray
+    """Posterior covariance, shape (n, n)."""
+    innovation: FloatArray
+    """Shape (k,)."""
+    nis: float
+    """Normalised innovation squared."""
+
+
+def predict_one(
+    mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """`predict` of one state, shapes (n,) and (n, n), without the price of a stack."""
+    after, F, Q = motion.step(mean.tolist(), dt_s)
+    return np.array(after), symmetrise(F.dot(covariance).dot(F.T) + Q)
+
+
+def correct_one(
+    mean: FloatArray, covariance: FloatArray, z: FloatArray, R: FloatArray, model: MeasurementModel, pose: SensorPose
+) -> OneCorrection:
+    """`correct` of one state, shapes (n,) and (n, n), by one z (k,) with R (k, k), without the price of a stack."""
+    y = model.residual(z, model.predict(mean, pose))
+    H = model.selection(len(mean)) if model.linear else model.jacobian(mean, pose)
+    HP = H.dot(covariance)
+    factors, pivots, solved, singular = dgesv(HP.dot(H.T) + R, HP)
+    if singular:
+        raise np.linalg.LinAlgError("singular matrix")
+    weighted, _ = dgetrs(factors, pivots, y)
+    K = solved.T
+    A = identity(len(mean)) - K.dot(H)
+    posterior = A.dot(covariance).dot(A.T) + K.dot(R).dot(K.T)
+    return OneCorrection(mean + K.dot(y), symmetrise(posterior), y, float(y.dot(weighted)))

@@ -1,16 +1,17 @@
 """The replaying EKF: rewind to a late measurement, and apply again what came after it."""
 
 import bisect
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import nanoseconds, seconds
-from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import BirthPrior, Measurement, UpdateResult, UpdateStatus
 from fgtrack.estimation.birth import birth_state
-from fgtrack.estimation.ekf import Correction, correct, predict
-from fgtrack.estimation.propagation import wrapped_yaw
+from fgtrack.estimation.ekf import OneCorrection, correct_one, predict_one
 from fgtrack.models.motion import MotionModel
 
 _Order = tuple[int, tuple[str, ...], tuple[float, ...]]
@@ -44,6 +45,7 @@ class ReplayEkf:
 
     def __init__(self, motion: MotionModel, prior: BirthPrior, lag_s: float) -> None:
         self._motion = motion
+        self._yawed = "yaw_rad" in motion.state_names
         self._lag_ns = nanoseconds(lag_s)
         mean, covariance = birth_state(motion, prior)
         self._steps = [_Step((prior.stamp_ns, (), ()), None, mean, covariance)]
@@ -63,7 +65,8 @@ class ReplayEkf:
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: the filter's state, from the measurements up to that stamp."""
-        mean, covariance = self._predicted(bisect.bisect_right(self._steps, stamp_ns, key=_stamp) - 1, stamp_ns)
+        before = max(bisect.bisect_right(self._steps, stamp_ns, key=_stamp) - 1, 0)
+        mean, covariance = self._predicted(self._steps[before], stamp_ns)
         return TrackState(stamp_ns, mean, covariance)
 
     def update(self, measurement: Measurement) -> UpdateResult:
@@ -71,62 +74,42 @@ class ReplayEkf:
         if measurement.stamp_ns < self._start_ns:
             return UpdateResult(UpdateStatus.TOO_OLD)
         order = (measurement.stamp_ns, measurement.model.components, tuple(measurement.z.tolist()))
-        place = bisect.bisect_right(self._steps, order, lo=1, key=lambda step: step.order)
-        replayed = [measurement, *(step.measurement for step in self._steps[place:] if step.measurement is not None)]
-        steps, first = self._applied(place - 1, order, replayed)
-        if first is None:
+        place = bisect.bisect_right(self._steps, order, lo=1, key=_order)
+        try:
+            step, correction = self._fused(self._steps[place - 1], order, measurement)
+            steps = [step]
+            for later in self._steps[place:]:
+                if later.measurement is not None:
+                    steps.append(self._fused(steps[-1], later.order, later.measurement)[0])
+        except np.linalg.LinAlgError:
             return UpdateResult(UpdateStatus.FAILED)
         late = measurement.stamp_ns < self._newest_ns
         self._steps[place:] = steps
         self._newest_ns = max(self._newest_ns, measurement.stamp_ns)
         self.advance(self._newest_ns)
         status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
-        return UpdateResult(status, first.innovation[0], float(first.nis[0]))
+        return UpdateResult(status, correction.innovation, correction.nis)
 
-    def _applied(
-        self, before: int, order: _Order, measurements: list[Measurement]
-    ) -> tuple[list[_Step], Correction | None]:
-        """Steps of `measurements` after the step `before`, and the first correction; None where one fails."""
-        orders = [order, *(step.order for step in self._steps[before + 1 :])]
-        stamp_ns, mean, covariance = (
-            _stamp(self._steps[before]),
-            self._steps[before].mean,
-            self._steps[before].covariance,
-        )
-        steps: list[_Step] = []
-        first: Correction | None = None
-        for place, measurement in zip(orders, measurements, strict=True):
-            if measurement.stamp_ns != stamp_ns:
-                dt_s = seconds(measurement.stamp_ns - stamp_ns)
-                mean, covariance = predict(mean, covariance, self._motion, dt_s)
-                stamp_ns = measurement.stamp_ns
-            try:
-                corrected = correct(
-                    mean[None],
-                    covariance[None],
-                    measurement.z[None],
-                    measurement.R[None],
-                    measurement.model,
-                    measurement.pose,
-                )
-            except np.linalg.LinAlgError:
-                return [], None
-            if not np.isfinite(corrected.mean).all() or not np.isfinite(corrected.covariance).all():
-                return [], None
-            first = first or corrected
-            mean = corrected.mean[0]
-            if "yaw_rad" in self._motion.state_names:
-                mean = wrapped_yaw(mean)
-            covariance = corrected.covariance[0]
-            steps.append(_Step(place, measurement, mean, covariance))
-        return steps, first
+    def _fused(self, before: _Step, order: _Order, measurement: Measurement) -> tuple[_Step, OneCorrection]:
+        """The step after `before` with `measurement`; `numpy.linalg.LinAlgError` where it is not finite."""
+        mean, covariance = self._predicted(before, measurement.stamp_ns)
+        corrected = correct_one(mean, covariance, measurement.z, measurement.R, measurement.model, measurement.pose)
+        mean, covariance = corrected.mean, corrected.covariance
+        if not math.isfinite(mean.dot(mean) + np.vdot(covariance, covariance)):  # one number instead of a mask
+            raise np.linalg.LinAlgError("posterior is not finite")
+        if self._yawed:
+            mean[YAW] = wrap_angle(mean[YAW])
+        return _Step(order, measurement, mean, covariance), corrected
 
-    def _predicted(self, before: int, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
-        step = self._steps[max(before, 0)]
-        dt_s = seconds(stamp_ns - _stamp(step))
-        if not dt_s:
-            return step.mean, step.covariance
-        return predict(step.mean, step.covariance, self._motion, dt_s)
+    def _predicted(self, before: _Step, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance at `stamp_ns`, from the step before it."""
+        if stamp_ns == before.order[0]:
+            return before.mean, before.covariance
+        return predict_one(before.mean, before.covariance, self._motion, seconds(stamp_ns - before.order[0]))
+
+
+def _order(step: _Step) -> _Order:
+    return step.order
 
 
 def _stamp(step: _Step) -> int:

@@ -5,31 +5,41 @@ broadcast the two. A duration may be 0. For `predict` and `jacobian` it may be n
 backwards. `predict` does not wrap the yaw; `MeasurementModel.residual` does.
 """
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Protocol, Self, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-import numpy.typing as npt
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.linalg import symmetrise
+from fgtrack.core.linalg import identity, symmetrise
 from fgtrack.core.types import ACCEL, SPEED, STATE_NAMES, YAW, YAW_RATE, FloatArray, X, Y
-
-ComplexArray = npt.NDArray[np.complex128]
+from fgtrack.models.arc import (
+    NODES,
+    WEIGHTS,
+    ComplexArray,
+    heading_moments,
+    small_turn,
+    small_turn_noise,
+    way,
+    way_gradient,
+)
+from fgtrack.models.white_noise import WhiteNoise
 
 #: The gradient of a heading by the velocity grows as 1 / speed; below this speed it stays as it is there.
 MIN_SPEED_MPS = 1e-3
 
-# Gauss-Legendre rule on [0, 1].
-_LEGENDRE_NODES, _LEGENDRE_WEIGHTS = np.polynomial.legendre.leggauss(12)
-_NODES: FloatArray = 0.5 * (1.0 + _LEGENDRE_NODES)
-_WEIGHTS: FloatArray = 0.5 * _LEGENDRE_WEIGHTS
-_ORDERS = np.arange(3)
-_MOMENT_WEIGHTS: FloatArray = _WEIGHTS[:, None] * _NODES[:, None] ** _ORDERS
-_MAX_QUADRATURE_TURN_RAD = 4.0
+
+class Step(NamedTuple):
+    """One state after a duration: what `predict`, `jacobian` and `process_noise` give, at a fraction of the cost."""
+
+    mean: list[float]
+    """State, n entries; the yaw is not wrapped."""
+    F: FloatArray
+    """Derivative of the mean by the state before, shape (n, n)."""
+    Q: FloatArray
+    """Covariance of the noise gathered, shape (n, n)."""
 
 
 @runtime_checkable
@@ -61,6 +71,12 @@ class MotionModel(Protocol):
         detection may split a segment. Raises `CallError` where `dt_s` is negative.
         """
 
+    def step(self, x: Sequence[float], dt_s: float) -> Step:
+        """The one state `x` after `dt_s` >= 0; F and Q are new arrays. Raises `CallError` where `dt_s` is negative."""
+
+    def flow(self, x: Sequence[float], dt_s: float) -> tuple[list[float], FloatArray]:
+        """Mean and F of `step`, of any duration."""
+
     def kinematic(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean, shape (..., m), and covariance, (..., m, m), of the leading m entries of `STATE_NAMES`."""
 
@@ -69,37 +85,7 @@ class MotionModel(Protocol):
 
 
 @dataclass(frozen=True)
-class _WhiteNoise:
-    """Noise parameters: spectral densities, in fields `<what>_density_<unit>` in the order of the state."""
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{field.name}: must be finite and not negative, is {value}")
-
-    @classmethod
-    def from_std_per_step(cls, std: Mapping[str, float], frequency_hz: float) -> Self:
-        """Model as noisy as a filter that adds the variance (std / frequency_hz)^2 in each of its steps.
-
-        Its densities are std^2 / frequency_hz. `std` is per second, as in Karle et al. 2023; its keys are the
-        names of all densities up to `_density_`: `position`, `yaw`, `speed`, ... Raises `ValueError` when a
-        key is missing or unknown or the frequency is not positive.
-        """
-        names = {name.partition("_density_")[0]: name for name in cls._density_names()}
-        if set(std) != set(names):
-            raise ValueError(f"std of {cls.__name__}: give {', '.join(names)}, not {', '.join(std) or 'nothing'}")
-        if not frequency_hz > 0.0:
-            raise ValueError(f"frequency_hz: must be positive, is {frequency_hz}")
-        return cls(**{names[key]: value * value / frequency_hz for key, value in std.items()})
-
-    @classmethod
-    def _density_names(cls) -> tuple[str, ...]:
-        return tuple(field.name for field in fields(cls) if "_density_" in field.name)
-
-
-@dataclass(frozen=True)
-class CTRV(_WhiteNoise):
+class CTRV(WhiteNoise):
     """Constant turn rate and velocity; state x, y, yaw, speed, yaw rate.
 
     x(t) + i y(t) = x + i y + speed * integral over s in [0, t] of exp(i (yaw + yaw_rate s)). White noise
@@ -122,21 +108,19 @@ class CTRV(_WhiteNoise):
     def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """State after `dt_s` on the exact arc, shape (..., 5); the yaw is not wrapped."""
         t = np.asarray(dt_s, dtype=np.float64)
-        m0 = _heading_moments(x, t)[..., 0]
+        moved = way(heading_moments(x, t), 0, *self._drive(x))
         after = _broadcast_copy(x, t)
-        after[..., X] += x[..., SPEED] * m0.real
-        after[..., Y] += x[..., SPEED] * m0.imag
+        after[..., X] += moved.real
+        after[..., Y] += moved.imag
         after[..., YAW] += x[..., YAW_RATE] * t
         return after
 
     def jacobian(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """Derivative F of `predict` by `x`, shape (..., 5, 5)."""
         t = np.asarray(dt_s, dtype=np.float64)
-        moments = _heading_moments(x, t)
-        m0, m1 = moments[..., 0], moments[..., 1]
-        v = x[..., SPEED]
-        F = _identities(moments.shape[:-1], 5)
-        _set_position_rows(F, (1j * v * m0, m0, 1j * v * m1))
+        moments = heading_moments(x, t)
+        F = _identities(moments[0].shape, self.dim)
+        _set_position_rows(F, way_gradient(moments, *self._drive(x)))
         F[..., YAW, YAW_RATE] = t
         return F
 
@@ -149,11 +133,41 @@ class CTRV(_WhiteNoise):
         Raises `CallError` where `dt_s` is negative.
         """
         t = _forward(dt_s)[..., None]
-        states = self.predict(x[..., None, :], t * _NODES)
-        transitions = self.jacobian(states, t * (1.0 - _NODES))
-        roots = transitions * self._root_densities * np.sqrt(t * _WEIGHTS)[..., None, None]
+        states = self.predict(x[..., None, :], t * NODES)
+        transitions = self.jacobian(states, t * (1.0 - NODES))
+        roots = transitions * self._root_densities * np.sqrt(t * WEIGHTS)[..., None, None]
         root = np.swapaxes(roots, -3, -2).reshape(*roots.shape[:-3], self.dim, -1)
         return symmetrise(root @ np.swapaxes(root, -1, -2))
+
+    def step(self, x: Sequence[float], dt_s: float) -> Step:
+        """See `MotionModel.step`; fast up to a turn of `MAX_SMALL_TURN_RAD`."""
+        if dt_s < 0.0:
+            raise _backwards(dt_s)
+        arc = small_turn(x[YAW], x[YAW_RATE], dt_s)
+        if arc is None:
+            return Step(*self.flow(x, dt_s), self.process_noise(np.array(x, dtype=np.float64), dt_s))
+        mean, F = self._along(x, dt_s, arc.moments)
+        return Step(mean, F, small_turn_noise(arc, dt_s, self._densities, x[SPEED], *x[ACCEL:]))
+
+    def flow(self, x: Sequence[float], dt_s: float) -> tuple[list[float], FloatArray]:
+        """See `MotionModel.flow`; fast up to a turn of `MAX_SMALL_TURN_RAD`."""
+        arc = small_turn(x[YAW], x[YAW_RATE], dt_s)
+        if arc is not None:
+            return self._along(x, dt_s, arc.moments)
+        moments = heading_moments(np.array(x, dtype=np.float64), np.array(dt_s))
+        return self._along(x, dt_s, [complex(moment) for moment in moments])
+
+    def _along(self, x: Sequence[float], t: float, moments: Sequence[complex]) -> tuple[list[float], FloatArray]:
+        """`flow` with given heading moments."""
+        drive = x[SPEED], *x[ACCEL:]
+        moved = way(moments, 0, *drive)
+        F = identity(len(x)).copy()
+        column = YAW
+        for derivative in way_gradient(moments, *drive):
+            F[X, column], F[Y, column] = derivative.real, derivative.imag
+            column += 1
+        F[YAW, YAW_RATE] = t
+        return [x[X] + moved.real, x[Y] + moved.imag, x[YAW] + x[YAW_RATE] * t, *x[SPEED:]], F
 
     def kinematic(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The state and its covariance themselves."""
@@ -165,8 +179,17 @@ class CTRV(_WhiteNoise):
 
     @cached_property
     def _root_densities(self) -> FloatArray:
-        position, *others = (getattr(self, name) for name in self._density_names())
+        position, *others = (getattr(self, name) for name in self.density_names())
         return np.sqrt([position, position, *others])
+
+    @cached_property
+    def _densities(self) -> tuple[float, ...]:
+        """Of position, yaw, speed, yaw rate and acceleration; 0 where the state has none."""
+        return (*(getattr(self, name) for name in self.density_names()), 0.0)[:5]
+
+    def _drive(self, x: FloatArray) -> tuple[FloatArray, ...]:
+        """Arguments of `way` from the speed on."""
+        return (x[..., SPEED],)
 
 
 @dataclass(frozen=True)
@@ -185,26 +208,14 @@ class CTRA(CTRV):
 
     def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """State after `dt_s` on the exact curve, shape (..., 6); the yaw is not wrapped."""
-        t = np.asarray(dt_s, dtype=np.float64)
-        moments = _heading_moments(x, t)
-        moved = x[..., SPEED] * moments[..., 0] + x[..., ACCEL] * moments[..., 1]
-        after = _broadcast_copy(x, t)
-        after[..., X] += moved.real
-        after[..., Y] += moved.imag
-        after[..., YAW] += x[..., YAW_RATE] * t
-        after[..., SPEED] += x[..., ACCEL] * t
+        after = super().predict(x, dt_s)
+        after[..., SPEED] += x[..., ACCEL] * dt_s
         return after
 
     def jacobian(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """Derivative F of `predict` by `x`, shape (..., 6, 6)."""
-        t = np.asarray(dt_s, dtype=np.float64)
-        moments = _heading_moments(x, t)
-        m0, m1, m2 = moments[..., 0], moments[..., 1], moments[..., 2]
-        v, a = x[..., SPEED], x[..., ACCEL]
-        F = _identities(moments.shape[:-1], 6)
-        _set_position_rows(F, (1j * (v * m0 + a * m1), m0, 1j * (v * m1 + a * m2), m1))
-        F[..., YAW, YAW_RATE] = t
-        F[..., SPEED, ACCEL] = t
+        F = super().jacobian(x, dt_s)
+        F[..., SPEED, ACCEL] = dt_s
         return F
 
     def from_kinematic(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -217,9 +228,18 @@ class CTRA(CTRV):
         P[..., ACCEL, ACCEL] = self.accel_birth_variance_m2ps4
         return x, P
 
+    def _along(self, x: Sequence[float], t: float, moments: Sequence[complex]) -> tuple[list[float], FloatArray]:
+        mean, F = super()._along(x, t, moments)
+        mean[SPEED] += x[ACCEL] * t
+        F[SPEED, ACCEL] = t
+        return mean, F
+
+    def _drive(self, x: FloatArray) -> tuple[FloatArray, ...]:
+        return x[..., SPEED], x[..., ACCEL]
+
 
 @dataclass(frozen=True)
-class CV(_WhiteNoise):
+class CV(WhiteNoise):
     """Constant velocity, linear; state x, y and the velocities vx, vy along the axes of the map.
 
     White noise acceleration drives vx and vy alike. The default is the speed's density of Karle et al. 2023
@@ -252,12 +272,35 @@ class CV(_WhiteNoise):
         Raises `CallError` where `dt_s` is negative.
         """
         t = _forward(dt_s)
-        q = self.velocity_density_m2ps3
         Q = np.zeros((*np.broadcast_shapes(x.shape[:-1], t.shape), 4, 4))
-        Q[..., 0, 0] = Q[..., 1, 1] = q * t**3 / 3.0
-        Q[..., 0, 2] = Q[..., 2, 0] = Q[..., 1, 3] = Q[..., 3, 1] = q * t**2 / 2.0
-        Q[..., 2, 2] = Q[..., 3, 3] = q * t
+        position, shared, velocity = self._axis_noise(t)
+        Q[..., 0, 0] = Q[..., 1, 1] = position
+        Q[..., 0, 2] = Q[..., 2, 0] = Q[..., 1, 3] = Q[..., 3, 1] = shared
+        Q[..., 2, 2] = Q[..., 3, 3] = velocity
         return Q
+
+    def step(self, x: Sequence[float], dt_s: float) -> Step:
+        """See `MotionModel.step`."""
+        if dt_s < 0.0:
+            raise _backwards(dt_s)
+        Q = np.zeros((4, 4))
+        position, shared, velocity = self._axis_noise(dt_s)
+        Q[0, 0] = Q[1, 1] = position
+        Q[0, 2] = Q[2, 0] = Q[1, 3] = Q[3, 1] = shared
+        Q[2, 2] = Q[3, 3] = velocity
+        return Step(*self.flow(x, dt_s), Q)
+
+    def flow(self, x: Sequence[float], dt_s: float) -> tuple[list[float], FloatArray]:
+        """See `MotionModel.flow`."""
+        x_m, y_m, vx, vy = x
+        F = identity(4).copy()
+        F[0, 2] = F[1, 3] = dt_s
+        return [x_m + vx * dt_s, y_m + vy * dt_s, vx, vy], F
+
+    def _axis_noise(self, t: Any) -> tuple[Any, Any, Any]:
+        """Variance of the position, covariance, variance of the velocity on one axis, of a number or an array."""
+        q = self.velocity_density_m2ps3
+        return q * t**3 / 3.0, q * t**2 / 2.0, q * t
 
     def kinematic(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean, shape (..., 5), and first-order covariance, (..., 5, 5), of x, y, yaw, speed, yaw rate.
@@ -319,25 +362,6 @@ def cartesian_gradient(direction_length: FloatArray) -> FloatArray:
     return np.stack([np.stack([-length * s, c], axis=-1), np.stack([length * c, s], axis=-1)], axis=-2)
 
 
-def _heading_moments(x: FloatArray, t: FloatArray) -> ComplexArray:
-    """Moments m_k = integral over s in [0, t] of s^k exp(i (yaw + yaw_rate s)), k = 0, 1, 2; shape (..., 3).
-
-    The real part belongs to x, the imaginary part to y. A turn w of up to 4 rad is integrated by quadrature:
-    exact to rounding, and smooth through yaw rate 0, where the closed form would divide. Beyond, by parts:
-    on [0, 1] the moments are E_0 = (exp(i w) - 1) / (i w) and E_k = (exp(i w) - k E_(k-1)) / (i w).
-    """
-    turn = np.asarray(x[..., YAW_RATE] * t)
-    moments = np.exp(1j * turn[..., None] * _NODES) @ _MOMENT_WEIGHTS
-    large = np.abs(turn) > _MAX_QUADRATURE_TURN_RAD
-    if large.any():
-        iw = 1j * turn[large]
-        end = np.exp(iw)
-        e0 = (end - 1.0) / iw
-        e1 = (end - e0) / iw
-        moments[large] = np.stack([e0, e1, (end - 2.0 * e1) / iw], axis=-1)
-    return np.asarray(np.exp(1j * x[..., YAW])[..., None] * moments * t[..., None] ** (_ORDERS + 1))
-
-
 def _set_position_rows(F: FloatArray, columns: tuple[ComplexArray, ...]) -> None:
     """Write the derivatives of x (real) and y (imaginary) by yaw and the entries after it into `F`."""
     for column, derivative in enumerate(columns, start=YAW):
@@ -359,5 +383,9 @@ def _forward(dt_s: float | FloatArray) -> FloatArray:
     """`dt_s` as an array; noise is gathered forwards only."""
     t = np.asarray(dt_s, dtype=np.float64)
     if (t < 0.0).any():
-        raise CallError(f"process_noise: dt_s is {t.min()} s; noise needs a duration >= 0, swap the stamps")
+        raise _backwards(t.min())
     return t
+
+
+def _backwards(dt_s: float) -> CallError:
+    return CallError(f"process_noise: dt_s is {dt_s} s; noise needs a duration >= 0, swap the stamps")

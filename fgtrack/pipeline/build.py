@@ -1,6 +1,7 @@
 """From a configuration to a tracker."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,11 @@ import numpy as np
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import period_ns, seconds
 from fgtrack.estimation.backward_forward import BackwardForwardBank
-from fgtrack.estimation.base import BirthPrior, TrackBank
+from fgtrack.estimation.base import BirthPrior, Estimator, TrackBank
 from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherBank
 from fgtrack.estimation.factor_graph.backend import Backend
 from fgtrack.estimation.object_bank import ObjectBank
+from fgtrack.estimation.oosm import OOSM_METHODS
 from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator, Propagator
 from fgtrack.estimation.published import (
     AcceleratedEulerCtrv,
@@ -22,6 +24,7 @@ from fgtrack.estimation.published import (
     StalePresent,
 )
 from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.models.motion import MotionModel
 from fgtrack.models.published_map import CircularHeadingMap, PublishedMap, PublishedRoad
 from fgtrack.models.road import FrenetRoad, OpenSpace, Road
 from fgtrack.models.track_map import TrackMap
@@ -101,9 +104,9 @@ def _build_backward_forward(config: Config) -> TrackBank:
     return storage(build_propagator(config.motion, seconds(step_ns)), step_ns, steps)
 
 
-def _build_replay(config: Config) -> TrackBank:
+def _build_objects(start: Callable[[MotionModel, BirthPrior, float], Estimator], config: Config) -> TrackBank:
     motion, lag_s = config.motion.model(), config.filter.storage_s
-    return ObjectBank(motion, lambda prior: ReplayEkf(motion, prior, lag_s), lag_s)
+    return ObjectBank(motion, lambda prior: start(motion, prior, lag_s), lag_s)
 
 
 def _build_smoother(config: Config, make_backend: Callable[[], Backend]) -> TrackBank:
@@ -131,9 +134,10 @@ def _build_batch(config: Config) -> TrackBank:
 #: Estimators by name.
 ESTIMATORS: Mapping[str, Callable[[Config], TrackBank]] = {
     "ekf-backward-forward": _build_backward_forward,
-    "ekf-replay": _build_replay,
+    "ekf-replay": partial(_build_objects, ReplayEkf),
     "smoother": _build_incremental,
     "smoother-batch": _build_batch,
+    **{name: partial(_build_objects, method.start) for name, method in OOSM_METHODS.items()},
 }
 
 

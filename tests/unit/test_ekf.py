@@ -4,7 +4,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.ekf import correct, correct_with_innovation, predict
+from fgtrack.estimation.base import BirthPrior, Measurement
+from fgtrack.estimation.ekf import correct, correct_one, correct_with_innovation, predict, predict_one
+from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 
@@ -145,3 +147,65 @@ def test_a_split_prediction_of_linear_motion_is_the_whole_one(seed: int, share: 
     parts = predict(*predict(x, P, CV(), 2.0 * share), CV(), 2.0 * (1.0 - share))
     for a, b in zip(parts, whole, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-11)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=seeds, motion=st.sampled_from([CTRV(), CTRA(), CV()]), dt_s=st.sampled_from([0.0, 1e-6, 0.05, 3.0]))
+def test_the_prediction_of_one_state_is_that_of_a_stack(seed: int, motion: MotionModel, dt_s: float) -> None:
+    rng = np.random.default_rng(seed)
+    x, P = rng.normal(size=motion.dim) * 5.0, positive_definite(rng, 1, motion.dim)[0]
+    before = x.copy(), P.copy()
+    mean, covariance = predict_one(x, P, motion, dt_s)
+    expected_mean, expected = predict(x, P, motion, dt_s)
+    np.testing.assert_allclose(mean, expected_mean, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(covariance, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_array_equal(covariance, covariance.T)
+    assert np.array_equal(x, before[0])
+    assert np.array_equal(P, before[1])
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    seed=seeds,
+    motion=st.sampled_from([CTRV(), CTRA(), CV()]),
+    components=st.sampled_from(
+        [("x_m", "y_m"), ("x_m", "y_m", "speed_mps"), ("yaw_rad",), ("range_m", "bearing_rad", "range_rate_mps")]
+    ),
+)
+def test_the_correction_of_one_state_is_that_of_a_stack(
+    seed: int, motion: MotionModel, components: tuple[str, ...]
+) -> None:
+    rng = np.random.default_rng(seed)
+    model, k = measurement_model(components, motion), len(components)
+    x, P = rng.normal(size=motion.dim) * 5.0, positive_definite(rng, 1, motion.dim)[0]
+    z, R = rng.normal(size=k) * 3.0, positive_definite(rng, 1, k)[0]
+    inputs = [array.copy() for array in (x, P, z, R)]
+    pose = SensorPose(20.0, -3.0, 0.4, 5.0, 1.0)
+    one = correct_one(x, P, z, R, model, pose)
+    stack = correct(x[None], P[None], z[None], R[None], model, pose)
+    for found, expected in zip(one, stack, strict=True):
+        np.testing.assert_allclose(found, expected[0], rtol=1e-12, atol=1e-12 * np.abs(stack.mean).max())
+    np.testing.assert_array_equal(one.covariance, one.covariance.T)
+    for array, before in zip((x, P, z, R), inputs, strict=True):
+        np.testing.assert_array_equal(array, before)
+
+
+def test_a_singular_innovation_covariance_of_one_state_is_an_error() -> None:
+    model = measurement_model(("x_m", "y_m"), CTRV())
+    with pytest.raises(np.linalg.LinAlgError):
+        correct_one(np.zeros(5), np.zeros((5, 5)), np.ones(2), np.zeros((2, 2)), model, SensorPose())
+
+
+def test_the_replaying_filter_keeps_the_yaw_in_its_range_through_full_turns() -> None:
+    motion = CTRV()
+    start = np.array([0.0, 0.0, 3.0, 10.0, 1.0])
+    prior = BirthPrior(0, start[:2], np.eye(2), 3.0, 0.1, 10.0, 1.0, 1.0, 0.1, 0.0, 1.0)
+    estimator = ReplayEkf(motion, prior, 1.0)
+    model = measurement_model(("x_m", "y_m", "yaw_rad"), motion)
+    for step in range(1, 100):
+        truth = motion.predict(start, 0.1 * step)
+        stamp_ns = step * 100_000_000
+        assert estimator.update(Measurement(stamp_ns, model, truth[:3], 0.01 * np.eye(3))).status == "in_sequence"
+        found = estimator.state_at(stamp_ns).mean[2]
+        assert -np.pi < found <= np.pi
+        assert np.cos(found - truth[2]) > 0.99

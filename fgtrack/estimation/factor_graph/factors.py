@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 
 import gtsam
 import numpy as np
+from gtsam.noiseModel import mEstimator
 from scipy.linalg.blas import dtrsm
 from scipy.linalg.lapack import dpotrf
 
@@ -16,12 +17,14 @@ from fgtrack.estimation.factor_graph.evidence import Equivalent, Evidence, linea
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.sensors import RobustLoss
 
-_ESTIMATORS: Mapping[str, Callable[[float], gtsam.noiseModel.mEstimator.Base]] = {
-    "huber": gtsam.noiseModel.mEstimator.Huber.Create,
-    "cauchy": gtsam.noiseModel.mEstimator.Cauchy.Create,
-    "tukey": gtsam.noiseModel.mEstimator.Tukey.Create,
-    "geman_mcclure": gtsam.noiseModel.mEstimator.GemanMcClure.Create,
-    "dcs": gtsam.noiseModel.mEstimator.DCS.Create,
+_Loss = mEstimator.Huber | mEstimator.Cauchy | mEstimator.Tukey | mEstimator.GemanMcClure | mEstimator.DCS
+
+_LOSSES: Mapping[str, Callable[[float], _Loss]] = {
+    "huber": mEstimator.Huber.Create,
+    "cauchy": mEstimator.Cauchy.Create,
+    "tukey": mEstimator.Tukey.Create,
+    "geman_mcclure": mEstimator.GemanMcClure.Create,
+    "dcs": lambda width: mEstimator.DCS.Create(width * width),  # gtsam's is in squared deviations
 }
 
 
@@ -93,9 +96,14 @@ def _callback_factor(key: int, measurement: Measurement) -> gtsam.NonlinearFacto
     return gtsam.CustomFactor(_noise(measurement.loss, len(z)), [key], error)
 
 
+def weight(loss: RobustLoss, distance: float) -> float:
+    """What a measurement counts under `loss`, 1 for all of it, at a whitened residual of length `distance`."""
+    return _LOSSES[loss.kind](loss.width).weight(distance)
+
+
 def _noise(loss: RobustLoss | None, k: int) -> gtsam.noiseModel.Base:
     unit = gtsam.noiseModel.Unit.Create(k)
-    return unit if loss is None else gtsam.noiseModel.Robust.Create(_ESTIMATORS[loss.kind](loss.width), unit)
+    return unit if loss is None else gtsam.noiseModel.Robust.Create(_LOSSES[loss.kind](loss.width), unit)
 
 
 def _whitened(root: FloatArray, columns: FloatArray) -> FloatArray:

@@ -2,6 +2,7 @@
 older than the window."""
 
 import bisect
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,9 +11,13 @@ from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.factor_graph.evidence import Equivalent, Evidence, linearised
+from fgtrack.estimation.factor_graph.evidence import Equivalent, Evidence, Linearised, linearised
+from fgtrack.estimation.factor_graph.factors import weight
 from fgtrack.estimation.interpolation import between
 from fgtrack.models.motion import MotionModel
+
+#: An outlier that a loss ignores altogether still has a finite covariance.
+_LEAST_WEIGHT = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +74,7 @@ class Tail:
         """
         filtered, P = self.prior.mean, self.prior.covariance
         for item in evidence:
-            y, H, R = linearised(item, mean)
+            y, H, R = _weighed(item, mean)
             filtered, P = _corrected(filtered, P, y - H @ (filtered - mean), H, R)
         step = self._motion.step(mean.tolist(), seconds(next_ns - self._stamp_ns))
         predicted = np.asarray(step.mean) + step.F @ (filtered - mean)
@@ -105,7 +110,7 @@ class Tail:
         Raises `numpy.linalg.LinAlgError` for one that cannot be fused, and stays as it was.
         """
         before, path = self._path(measurement.stamp_ns)
-        y, H, R = linearised(measurement, path[0].mean)
+        y, H, R = _weighed(measurement, path[0].mean)
         updated = []
         for at in path:
             S = symmetrise(H @ at.C @ H.T + R)
@@ -132,13 +137,24 @@ class Tail:
         until_s, after_s = seconds(stamp_ns - left.stamp_ns), seconds(right_ns - stamp_ns)
         inner = between(self._motion, left.mean.tolist(), right, until_s, after_s)
         A = inner.Lambda @ left.A + inner.Psi
-        cross = left.C @ inner.Lambda.T
-        C = symmetrise(inner.Lambda @ cross + inner.Sigma)
+        C = symmetrise(inner.Lambda @ left.C @ inner.Lambda.T + inner.Sigma)
         b = inner.Lambda @ left.b
-        gain = psd_solve(C, cross.T).T
-        spread = symmetrise(left.C - gain @ cross.T)
+        # Given the state between them the left one no longer depends on the right one: left.A = gain A. Stamps close
+        # together leave hardly a digit of the same gain as C_left Lambda' C^-1.
+        gain = np.asarray(np.linalg.solve(A.T, left.A.T)).T
+        kept = np.eye(len(b)) - gain @ inner.Lambda
+        spread = symmetrise(kept @ left.C @ kept.T + gain @ inner.Sigma @ gain.T)
         outer = Conditional(left.stamp_ns, left.mean, gain, left.b - gain @ b, spread)
         return [*self._ring[:place], outer], [Conditional(stamp_ns, inner.mean, A, b, C), *self._ring[place + 1 :]]
+
+
+def _weighed(evidence: Evidence, x: FloatArray) -> Linearised:
+    """`evidence` near the state `x` (n,), with the weight that a robust loss leaves it there."""
+    y, H, R = linearised(evidence, x)
+    if isinstance(evidence, Equivalent) or evidence.loss is None:
+        return Linearised(y, H, R)
+    distance = math.sqrt(y @ psd_solve(R, y))
+    return Linearised(y, H, R / max(weight(evidence.loss, distance), _LEAST_WEIGHT))
 
 
 def _corrected(

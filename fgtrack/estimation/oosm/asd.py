@@ -1,0 +1,127 @@
+"""The joint density of all states in the window."""
+
+import bisect
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.linalg import symmetrise
+from fgtrack.core.time import nanoseconds, seconds
+from fgtrack.core.types import YAW, FloatArray, TrackState
+from fgtrack.estimation.base import BirthPrior, Measurement, UpdateResult, UpdateStatus
+from fgtrack.estimation.birth import birth_state
+from fgtrack.estimation.interpolation import between
+from fgtrack.estimation.oosm.crossing import Past, fuse_across
+from fgtrack.models.motion import MotionModel
+
+
+class _Stack(NamedTuple):
+    """States of N stamps, oldest first; yaws run on from state to state and are not wrapped."""
+
+    stamps_ns: tuple[int, ...]
+    mean: FloatArray
+    """Shape (N n,)."""
+    covariance: FloatArray
+    """Shape (N n, N n)."""
+
+
+class AccumulatedStateDensity:
+    """The Gaussian of all states in the window; a measurement at any of their stamps corrects them all.
+
+    Koch and Govaers, On accumulated state densities with applications to out-of-sequence measurement processing, IEEE
+    Transactions on Aerospace and Electronic Systems 47(4), 2011; Govaers and Koch, Generalized solution to smoothing
+    and out-of-sequence processing, same journal 50(3), 2014. The present goes on as x_{k+1} = F x_k + v, with the
+    cross-covariances F Cov(x_k, x_j). A stamp between two others becomes a state of its own, x = Lambda x_l + Psi x_r +
+    N(0, Sigma) (see `between`), with the cross-covariances [Lambda Psi] Cov([x_l; x_r], x_j). Every measurement, late
+    or not, is `fuse_across` of the whole stack. There is no history that could be out of date.
+
+    Exact for: any lag, any number of late measurements in any order. Of a state in the past it knows the smoothed one.
+
+    Parameters
+    ----------
+    motion, prior, lag_s
+        See `LateEkf`.
+    """
+
+    def __init__(self, motion: MotionModel, prior: BirthPrior, lag_s: float) -> None:
+        self._motion = motion
+        self._yawed = "yaw_rad" in motion.state_names
+        self._lag_ns = nanoseconds(lag_s)
+        self._stack = _Stack((prior.stamp_ns,), *birth_state(motion, prior))
+        self._start_ns = prior.stamp_ns
+
+    @property
+    def window_ns(self) -> tuple[int, int]:
+        """See `Estimator.window_ns`."""
+        return self._start_ns, self._newest_ns
+
+    @property
+    def _newest_ns(self) -> int:
+        return self._stack.stamps_ns[-1]
+
+    def advance(self, now_ns: int) -> None:
+        """See `Estimator.advance`: what leaves the window is marginalised."""
+        self._start_ns = max(self._start_ns, max(now_ns, self._newest_ns) - self._lag_ns)
+        stamps_ns, mean, covariance = self._stack
+        gone = bisect.bisect_right(stamps_ns, self._start_ns) - 1
+        if gone > 0:
+            kept = slice(gone * self._motion.dim, None)
+            self._stack = _Stack(stamps_ns[gone:], mean[kept], covariance[kept, kept])
+
+    def state_at(self, stamp_ns: int) -> TrackState:
+        """See `Estimator.state_at`: smoothed, from all measurements."""
+        stack, block = self._with_state(stamp_ns)
+        mean = stack.mean[block].copy()
+        if self._yawed:
+            mean[YAW] = wrap_angle(mean[YAW])
+        return TrackState(stamp_ns, mean, stack.covariance[block, block].copy())
+
+    def update(self, measurement: Measurement) -> UpdateResult:
+        """See `Estimator.update`."""
+        if measurement.stamp_ns < self._start_ns:
+            return UpdateResult(UpdateStatus.TOO_OLD)
+        late = measurement.stamp_ns < self._newest_ns
+        try:
+            stack, block = self._with_state(measurement.stamp_ns)
+            past = Past(stack.mean[block], stack.covariance[block, block], stack.covariance[:, block])
+            result = fuse_across(stack.mean, stack.covariance, past, measurement)
+        except np.linalg.LinAlgError:
+            return UpdateResult(UpdateStatus.FAILED)
+        self._stack = _Stack(stack.stamps_ns, result.mean, result.covariance)
+        self.advance(self._newest_ns)
+        status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
+        return UpdateResult(status, result.innovation, result.nis)
+
+    def _with_state(self, stamp_ns: int) -> tuple[_Stack, slice]:
+        """The stack with a state at `stamp_ns`, and where it stands."""
+        n, (stamps_ns, mean, covariance) = self._motion.dim, self._stack
+        place = max(bisect.bisect_right(stamps_ns, stamp_ns) - 1, 0)
+        if stamps_ns[place] == stamp_ns:
+            return self._stack, slice(place * n, place * n + n)
+        own, A, noise = self._told_by_neighbours(place, stamp_ns)
+        neighbours, at = slice(place * n, place * n + A.shape[1]), place * n + n
+        cross = A @ covariance[neighbours]
+        spread = cross[:, neighbours] @ A.T + noise
+        grown = np.empty((len(mean) + n, len(mean) + n))
+        others = np.delete(np.arange(len(grown)), np.s_[at : at + n])
+        grown[np.ix_(others, others)] = covariance
+        grown[at : at + n, others] = cross
+        grown[others, at : at + n] = cross.T
+        grown[at : at + n, at : at + n] = symmetrise(spread)
+        stamps_ns = (*stamps_ns[: place + 1], stamp_ns, *stamps_ns[place + 1 :])
+        return _Stack(stamps_ns, np.insert(mean, at, own), grown), slice(at, at + n)
+
+    def _told_by_neighbours(self, place: int, stamp_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Mean (n,), A and noise (n, n) of x = A [neighbours] + noise after the state at `place`.
+
+        A is (n, n) after the newest state, and (n, 2 n) between two.
+        """
+        n, (stamps_ns, mean, _) = self._motion.dim, self._stack
+        left, until_s = mean[place * n : place * n + n], seconds(stamp_ns - stamps_ns[place])
+        if place + 1 == len(stamps_ns):
+            step = self._motion.step(left.tolist(), until_s)
+            return np.array(step.mean), step.F, step.Q
+        right, after_s = mean[place * n + n : place * n + 2 * n], seconds(stamps_ns[place + 1] - stamp_ns)
+        inner = between(self._motion, left.tolist(), right, until_s, after_s)
+        return inner.mean, np.hstack((inner.Lambda, inner.Psi)), inner.Sigma

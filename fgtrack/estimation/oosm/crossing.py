@@ -1,0 +1,40 @@
+"""The update that most methods end in: the past corrects the present through their cross-covariance."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.linalg import psd_solve, symmetrise
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import Measurement
+from fgtrack.estimation.ekf import OneCorrection
+from fgtrack.estimation.oosm.history import linearised, require_finite
+
+
+class Past(NamedTuple):
+    """What a method knows of the state at the stamp tau of a late measurement."""
+
+    mean: FloatArray
+    """x_tau, shape (n,)."""
+    covariance: FloatArray
+    """P_tau, shape (n, n)."""
+    cross: FloatArray
+    """Cov(x, x_tau) of the state x to be corrected, shape (m, n)."""
+
+
+def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measurement: Measurement) -> OneCorrection:
+    """The state x, `mean` (m,) and `covariance` (m, m), after a measurement of the state `past`.
+
+    S = H P_tau H' + R, x+ = x + C H' S^-1 (z - h(x_tau)), P+ = P - C H' S^-1 H C' with C = Cov(x, x_tau) (Bar-Shalom
+    2002, see `A1`). Raises `numpy.linalg.LinAlgError` where S is not
+    positive definite or the result is not finite.
+    """
+    y, H = linearised(measurement, past.mean)
+    S = symmetrise(H @ past.covariance @ H.T + measurement.R)
+    np.linalg.cholesky(S)  # raises where S is not positive definite
+    across = past.cross @ H.T
+    weighted = psd_solve(S, np.column_stack((across.T, y)))
+    gain, nis = weighted[:, :-1].T, float(y @ weighted[:, -1])
+    result = OneCorrection(mean + gain @ y, symmetrise(covariance - gain @ across.T), y, nis)
+    require_finite(result)
+    return result

@@ -1,0 +1,123 @@
+"""Predict the late measurement forward as an estimate of its own, and fuse it with the present one."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from fgtrack.core.linalg import identity, psd_solve, symmetrise
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import BirthPrior, Measurement
+from fgtrack.estimation.ekf import OneCorrection
+from fgtrack.estimation.oosm.history import corrected
+from fgtrack.estimation.oosm.late import LateEkf
+from fgtrack.models.motion import MotionModel
+
+
+class Estimate(NamedTuple):
+    """A state at the present stamp."""
+
+    mean: FloatArray
+    """Shape (n,)."""
+    covariance: FloatArray
+    """Shape (n, n)."""
+
+
+class _ForwardEkf(LateEkf):
+    """Fuses the present x_k, P_k with the late estimate x_1, P_1, both of which know x_m.
+
+    x_1 is step m predicted to tau, corrected there and predicted to now; x_0, P_0 is step m predicted to now. The steps
+    are not repaired after a late measurement; x_k holds all that came since m, late or not.
+    """
+
+    def _fuse_late(self, measurement: Measurement) -> OneCorrection:
+        history, stamp_ns = self._history, measurement.stamp_ns
+        now = history.newest
+        mean, covariance = history.predicted(history.left(stamp_ns), stamp_ns)
+        at_tau = corrected(mean, covariance, measurement)
+        late = Estimate(*history.moved(at_tau.mean, at_tau.covariance, stamp_ns, now.stamp_ns))
+        common = Estimate(*history.moved(mean, covariance, stamp_ns, now.stamp_ns))
+        fused = self._fused(Estimate(now.mean, now.covariance), late, common)
+        np.linalg.cholesky(fused.covariance)
+        history.absorb(*fused)
+        return OneCorrection(*fused, at_tau.innovation, at_tau.nis)
+
+    @abstractmethod
+    def _fused(self, now: Estimate, late: Estimate, common: Estimate) -> Estimate:
+        """One estimate from `now` and `late`, which share what `common` knows."""
+
+
+class Fpfd(_ForwardEkf):
+    """Forward prediction, fusion, and decorrelation: fuse both estimates and take out once what both know.
+
+    Rheaume and Benaskeur, Forward prediction-based approach to target-tracking with out-of-sequence measurements, IEEE
+    Conference on Decision and Control, 2008:
+
+        P^-1 = P_k^-1 + P_1^-1 - P_0^-1,   P^-1 x = P_k^-1 x_k + P_1^-1 x_1 - P_0^-1 x_0
+
+    that is, both estimates are taken as if they shared x_0 and nothing else; they share the process noise since tau.
+
+    Exact for: one lag, the first late measurement since step m. Numerically the same as `Al1` in a linear model.
+    """
+
+    def _fused(self, now: Estimate, late: Estimate, common: Estimate) -> Estimate:
+        P_k, P_1, P_0 = (information(each.covariance) for each in (now, late, common))
+        covariance = symmetrise(information(P_k + P_1 - P_0))
+        pull = P_1 @ (late.mean - now.mean) - P_0 @ (common.mean - now.mean)
+        return Estimate(now.mean + covariance @ pull, covariance)
+
+
+def trace(covariance: FloatArray) -> float:
+    """Sum of the variances; it adds up entries of different units."""
+    return float(np.trace(covariance))
+
+
+def determinant(covariance: FloatArray) -> float:
+    """Squared volume of the ellipsoid, whatever the units."""
+    return float(np.linalg.det(covariance))
+
+
+class CovarianceIntersection(_ForwardEkf):
+    """Fuse both estimates without knowing what they share.
+
+    Julier and Uhlmann, Fusion of time delayed measurements with uncertain time delays, American Control Conference,
+    2005:
+
+        P^-1 = w P_k^-1 + (1 - w) P_1^-1,   P^-1 x = w P_k^-1 x_k + (1 - w) P_1^-1 x_1
+
+    with the w in [0, 1] that makes P smallest.
+
+    Exact for: nothing; never overconfident. Where one estimate is better than the other in all, it takes that one and
+    loses the other.
+
+    Parameters
+    ----------
+    motion, prior, lag_s
+        See `LateEkf`.
+    size
+        What shall be small: `trace` or `determinant`.
+    """
+
+    def __init__(
+        self, motion: MotionModel, prior: BirthPrior, lag_s: float, size: Callable[[FloatArray], float] = trace
+    ) -> None:
+        super().__init__(motion, prior, lag_s)
+        self._size = size
+
+    def _fused(self, now: Estimate, late: Estimate, common: Estimate) -> Estimate:
+        P_k, P_1 = information(now.covariance), information(late.covariance)
+
+        def covariance(w: float) -> FloatArray:
+            return symmetrise(information(w * P_k + (1.0 - w) * P_1))
+
+        inner = float(minimize_scalar(lambda w: self._size(covariance(w)), bounds=(0.0, 1.0), method="bounded").x)
+        w = min((0.0, inner, 1.0), key=lambda w: self._size(covariance(w)))
+        P = covariance(w)
+        return Estimate(now.mean + (1.0 - w) * P @ (P_1 @ (late.mean - now.mean)), P)
+
+
+def information(covariance: FloatArray) -> FloatArray:
+    """The matrix whose product with `covariance`, shape (n, n), is the identity."""
+    return symmetrise(psd_solve(covariance, identity(len(covariance))))

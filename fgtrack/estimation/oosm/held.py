@@ -1,0 +1,112 @@
+"""Wait until what is late has come: the industrial answers."""
+
+from abc import ABC, abstractmethod
+
+from fgtrack.core.errors import CallError
+from fgtrack.core.time import nanoseconds, seconds
+from fgtrack.core.types import TrackState
+from fgtrack.estimation.base import BirthPrior, Measurement, UpdateResult, UpdateStatus
+from fgtrack.estimation.ekf import predict_one
+from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.models.motion import MotionModel
+
+
+class HeldEkf(ABC):
+    """An EKF whose state ends at a front; measurements after the front are held and do not count yet.
+
+    Until the front has passed them they are kept in order of their stamps, so a measurement that comes before the
+    front has passed its stamp is in time. One behind the front is too old. Innovation and NIS are those against
+    everything that was known of that stamp when the measurement came, held measurements included.
+    """
+
+    def __init__(self, motion: MotionModel, prior: BirthPrior, lag_s: float, hold_s: float) -> None:
+        if not 0.0 <= hold_s <= lag_s:
+            raise CallError(f"measurements held for {hold_s} s: give a time from 0 to the window's {lag_s} s")
+        self._motion = motion
+        self._hold_ns = nanoseconds(hold_s)
+        self._now_ns = prior.stamp_ns
+        self._ordered = ReplayEkf(motion, prior, lag_s)
+
+    @property
+    def window_ns(self) -> tuple[int, int]:
+        """See `Estimator.window_ns`; what lies behind the front can be asked for, but not be fused any more."""
+        return self._ordered.window_ns
+
+    @property
+    @abstractmethod
+    def _front_ns(self) -> int:
+        """Stamp up to which measurements count."""
+
+    def advance(self, now_ns: int) -> None:
+        """See `Estimator.advance`."""
+        self._now_ns = max(self._now_ns, now_ns)
+        self._ordered.advance(now_ns)
+
+    def update(self, measurement: Measurement) -> UpdateResult:
+        """See `Estimator.update`."""
+        if measurement.stamp_ns < self._front_ns:
+            return UpdateResult(UpdateStatus.TOO_OLD)
+        result = self._ordered.update(measurement)
+        if result.status is not UpdateStatus.FAILED:
+            self._now_ns = max(self._now_ns, measurement.stamp_ns)
+        return result
+
+    def state_at(self, stamp_ns: int) -> TrackState:
+        """See `Estimator.state_at`: after the front it is pure prediction."""
+        front_ns = max(self._front_ns, self.window_ns[0])
+        if stamp_ns <= front_ns:
+            return self._ordered.state_at(stamp_ns)
+        front = self._ordered.state_at(front_ns)
+        dt_s = seconds(stamp_ns - front_ns)
+        return TrackState(stamp_ns, *predict_one(front.mean, front.covariance, self._motion, dt_s))
+
+
+class DelayedHorizon(HeldEkf):
+    """Run the filter at now - D, and predict from there to now.
+
+    Now is the clock, or the newest stamp where that is ahead, so D has to cover the longest delay. As in flight
+    controllers (the delayed fusion horizon of the PX4 EKF).
+
+    Exact for: the state at now - D, linear model, any number of measurements with delays up to D. At now it is the
+    prediction over D, however little was late.
+
+    Parameters
+    ----------
+    motion, prior, lag_s
+        See `LateEkf`.
+    horizon_s
+        D, at most `lag_s`. Raises `CallError` otherwise.
+    """
+
+    def __init__(self, motion: MotionModel, prior: BirthPrior, lag_s: float, horizon_s: float = 0.2) -> None:
+        super().__init__(motion, prior, lag_s, horizon_s)
+
+    @property
+    def _front_ns(self) -> int:
+        return self._now_ns - self._hold_ns
+
+
+class ReorderBuffer(HeldEkf):
+    """Hold every measurement until one has come whose stamp is D later, and fuse in order of stamps.
+
+    The stamps push the front and the clock does not, so D has to cover only how much later than its successors a
+    measurement comes, and not its whole delay. When nothing comes any more, the last D seconds stay held. As the
+    watermark of stream processing (Akidau et al., The dataflow model, Proceedings of the VLDB Endowment, 2015).
+
+    Exact for: the state D before the newest stamp, linear model, any number of measurements that come at most D behind
+    the newest stamp.
+
+    Parameters
+    ----------
+    motion, prior, lag_s
+        See `LateEkf`.
+    hold_s
+        D, at most `lag_s`. Raises `CallError` otherwise.
+    """
+
+    def __init__(self, motion: MotionModel, prior: BirthPrior, lag_s: float, hold_s: float = 0.1) -> None:
+        super().__init__(motion, prior, lag_s, hold_s)
+
+    @property
+    def _front_ns(self) -> int:
+        return self._ordered.window_ns[1] - self._hold_ns

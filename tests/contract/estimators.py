@@ -1,0 +1,106 @@
+"""Every estimator that promises an exact answer: a line in `SUBJECTS`, and the whole contract runs on it.
+
+A method that is exact in a linear model gives the mean and covariance of the dense joint Gaussian of all that it has
+accepted, whatever the order of arrival. In a nonlinear model it may promise the answer of its own time order: "at
+once", or, where it linearises at estimates that depend on the past, "at convergence" only. A method that is
+approximate from two lags on (such as Al1 or FPFD) belongs in no list here.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from fgtrack.core.time import seconds
+from fgtrack.estimation.base import BirthPrior, Estimator
+from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherSettings
+from fgtrack.estimation.factor_graph.backend import Backend
+from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
+
+LAG_S = 2.0
+START_NS = 1_790_000_000_000_000_000
+MOTIONS: dict[str, MotionModel] = {"cv": CV(), "ctrv": CTRV(), "ctra": CTRA()}
+NONLINEAR = ("ctrv", "ctra")
+
+TINY = {"yaw_rad": 1e-7, "speed_mps": 1e-7, "yaw_rate_radps": 1e-7, "accel_mps2": 1e-7}
+"""Relinearisation thresholds at which the smoother follows every move."""
+
+Late = Literal["fuse", "drop", "raise"]
+Start = Callable[[MotionModel, SmootherSettings], Estimator]
+
+
+def prior() -> BirthPrior:
+    return BirthPrior(START_NS, np.array([3.0, -2.0]), np.diag([0.5, 0.5]), 0.4, 0.3, 20.0, 3.0, 0.1, 0.3, 0.0, 1.0)
+
+
+def settings(lag_s: float = LAG_S, late: Late = "fuse", ring_s: float = 10.0) -> SmootherSettings:
+    return SmootherSettings(lag_s=lag_s, late=late, ring_s=ring_s, relinearise=TINY, lagged_s=())
+
+
+def _replay(motion: MotionModel, chosen: SmootherSettings) -> ReplayEkf:
+    return ReplayEkf(motion, prior(), chosen.lag_s)
+
+
+def incremental(motion: MotionModel) -> Backend:
+    return IncrementalBackend(settings().thresholds(motion.state_names, curved=False))
+
+
+def batch(motion: MotionModel) -> Backend:
+    return BatchBackend()
+
+
+def smoother(motion: MotionModel, chosen: SmootherSettings, make_backend: Callable[[], Backend]) -> FixedLagSmoother:
+    return FixedLagSmoother(motion, prior(), chosen, make_backend)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An estimator under the contract."""
+
+    start: Start
+    smooths: bool
+    """Whether a state of the past knows later measurements; a filter's does not."""
+    linear_bar: float
+    """Largest difference to the dense joint in a linear model, in standard deviations."""
+    nonlinear: Literal["at once", "at convergence"]
+    """When any order of arrival gives the answer of the time order in a nonlinear model."""
+    examples: int
+    """Random streams per property in the default suite."""
+    weights: bool
+    """Whether it divides by the process noise of a segment, which costs digits where stamps nearly coincide."""
+
+    def bar(self, motion: MotionModel, stamps_ns: list[int]) -> float:
+        """`linear_bar`, or what rounding leaves of it.
+
+        A short segment weighs a position by W = (q dt^3 / 12)^-1/2 (its deviation given the other end), 3e10 per
+        metre at 1 us; beside it an orthogonal factorisation keeps a measurement of sigma to eps W sigma. Ten times
+        that is allowed.
+        """
+        gaps_ns = np.diff(sorted({START_NS, *stamps_ns}))
+        if not self.weights or not gaps_ns.size:
+            return self.linear_bar
+        Q = motion.process_noise(np.zeros(motion.dim), seconds(int(gaps_ns.min())))
+        return max(self.linear_bar, 10.0 * np.finfo(float).eps * 0.5 * 2.0 / np.sqrt(Q[0, 0]))
+
+
+def _smoother(make: Callable[[MotionModel], Backend]) -> Start:
+    return lambda motion, chosen: smoother(motion, chosen, lambda: make(motion))
+
+
+BACKENDS: dict[str, Callable[[MotionModel], Backend]] = {"smoother": incremental, "smoother-batch": batch}
+
+SUBJECTS: dict[str, Subject] = {
+    "ekf-replay": Subject(_replay, False, 1e-9, "at once", 40, weights=False),
+    "smoother": Subject(_smoother(incremental), True, 1e-9, "at convergence", 40, weights=True),
+    "smoother-batch": Subject(_smoother(batch), True, 1e-6, "at convergence", 8, weights=True),
+}
+SMOOTHERS = tuple(BACKENDS)
+
+
+def converged(estimator: Estimator) -> Estimator:
+    """`estimator`, relinearised until nothing moves where it is of the kind that does."""
+    if isinstance(estimator, FixedLagSmoother):
+        estimator.converge(10)
+    return estimator
