@@ -1,0 +1,175 @@
+"""The posterior Cramer-Rao lower bound of the present state, gated by what has arrived.
+
+No estimate from the same data has a smaller mean squared error; see Tichavsky, Muravchik and Nehorai, "Posterior
+Cramer-Rao bounds for discrete-time nonlinear filtering", IEEE Transactions on Signal Processing 46(5), 1998.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.linalg import psd_solve, symmetrise
+from fgtrack.core.time import seconds
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.models.measurement import MeasurementModel, SensorPose
+from fgtrack.models.motion import MotionModel
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A measurement that will be made: its value does not matter for a bound."""
+
+    stamp_ns: int
+    receipt_ns: int
+    model: MeasurementModel
+    R: FloatArray
+    """Covariance, shape (k, k)."""
+    pose: SensorPose = field(default_factory=SensorPose)
+
+
+class Bounds(NamedTuple):
+    """Lower bounds of the covariance of the present state at m times, shape (m, n, n) each."""
+
+    in_time: FloatArray
+    """If everything arrived when it was sensed."""
+    arrived: FloatArray
+    """From what has arrived, each at its own stamp."""
+    dropped: FloatArray
+    """From what has arrived, without what came later than something sensed after it."""
+
+
+class _Segment(NamedTuple):
+    """Expected information of one step of the chain: the blocks of the recursion."""
+
+    D11: FloatArray
+    D12: FloatArray
+    D22: FloatArray
+
+
+def bounds(
+    motion: MotionModel,
+    start_ns: int,
+    prior_covariance: FloatArray,
+    measurements: Sequence[Planned],
+    truth: Callable[[IntArray], FloatArray],
+    now_ns: Sequence[int],
+) -> Bounds:
+    """Bounds at the times `now_ns`.
+
+    With F, Q and H at the true states, and E the mean over trajectories, the information of the newest state is
+    J' = D22 - D12' (J + D11)^-1 D12 with D11 = E[F' Q^-1 F], D12 = -E[F' Q^-1], D22 = E[Q^-1], plus E[H' R^-1 H] of
+    each measurement there. A measurement counts from its receipt on, at its own stamp.
+
+    Parameters
+    ----------
+    motion
+        Motion model; its process noise must be positive definite.
+    start_ns, prior_covariance
+        Stamp and covariance (n, n) of the first state.
+    measurements
+        In any order; none before `start_ns`.
+    truth
+        True states at stamps (s,), of one or more drawn trajectories, shape (trajectories, s, n).
+    now_ns
+        Ascending.
+
+    Raises
+    ------
+    ValueError
+        A measurement or a time lies before the start.
+    numpy.linalg.LinAlgError
+        The process noise is singular.
+    """
+    ordered = sorted(measurements, key=lambda item: item.stamp_ns)
+    stamps_ns = np.unique([start_ns, *(item.stamp_ns for item in ordered), *now_ns])
+    if stamps_ns[0] < start_ns:
+        raise ValueError(f"start_ns: {start_ns} is after a measurement or a time at {stamps_ns[0]}")
+    states = truth(stamps_ns)
+    chain = _Chain(motion, stamps_ns, states, psd_solve(prior_covariance, np.eye(motion.dim)), ordered)
+    kept = _in_sequence(ordered)
+    receipts_ns = np.array([item.receipt_ns for item in ordered], dtype=np.int64)
+    own_ns = np.array([item.stamp_ns for item in ordered], dtype=np.int64)
+    never_ns = np.iinfo(np.int64).max
+    return Bounds(
+        chain.covariances(now_ns, own_ns),
+        chain.covariances(now_ns, receipts_ns),
+        chain.covariances(now_ns, np.where(kept, receipts_ns, never_ns)),
+    )
+
+
+class _Chain:
+    """The information recursion over all stamps, with the expected information of every measurement."""
+
+    def __init__(
+        self,
+        motion: MotionModel,
+        stamps_ns: IntArray,
+        states: FloatArray,
+        information: FloatArray,
+        measurements: Sequence[Planned],
+    ) -> None:
+        self._stamps_ns = stamps_ns
+        self._start = information
+        self._places = np.searchsorted(stamps_ns, [item.stamp_ns for item in measurements])
+        self._gained = [
+            _information(item, states[:, place]) for item, place in zip(measurements, self._places, strict=True)
+        ]
+        durations_s = [seconds(int(after - before)) for before, after in pairwise(stamps_ns)]
+        self._segments = [_segment(motion, states[:, i], dt_s) for i, dt_s in enumerate(durations_s)]
+
+    def covariances(self, now_ns: Sequence[int], from_ns: IntArray) -> FloatArray:
+        """Bounds at `now_ns` where measurement i counts from `from_ns[i]` on, shape (m, n, n).
+
+        What lies before the oldest measurement that is still to come does not change any more and is kept.
+        """
+        found = []
+        settled, J = 0, self._start
+        for time_ns in now_ns:
+            here = int(np.searchsorted(self._stamps_ns, time_ns))
+            counts = from_ns <= time_ns
+            waiting = self._places[~counts & (from_ns != np.iinfo(np.int64).max)]
+            final = min(here, int(waiting.min()) if len(waiting) else here)
+            J = self._advanced(J, settled, final, counts)
+            settled = final
+            at_now = self._with_measurements(self._advanced(J, settled, here, counts), here, counts)
+            found.append(symmetrise(psd_solve(at_now, np.eye(len(J)))))
+        return np.array(found)
+
+    def _advanced(self, J: FloatArray, first: int, last: int, counts: BoolArray) -> FloatArray:
+        """Information of stamp `last`, before its own measurements, from that of `first`, before its own."""
+        for i in range(first, last):
+            D11, D12, D22 = self._segments[i]
+            J = symmetrise(D22 - D12.T @ psd_solve(self._with_measurements(J, i, counts) + D11, D12))
+        return J
+
+    def _with_measurements(self, J: FloatArray, place: int, counts: BoolArray) -> FloatArray:
+        first, last = np.searchsorted(self._places, [place, place + 1])
+        for i in range(first, last):
+            if counts[i]:
+                J = J + self._gained[i]
+        return J
+
+
+def _segment(motion: MotionModel, states: FloatArray, dt_s: float) -> _Segment:
+    F, Q = motion.jacobian(states, dt_s), motion.process_noise(states, dt_s)
+    weight = np.linalg.solve(Q, np.broadcast_to(np.eye(motion.dim), Q.shape))
+    weighted = F.mT @ weight
+    return _Segment((weighted @ F).mean(axis=0), -weighted.mean(axis=0), weight.mean(axis=0))
+
+
+def _information(item: Planned, states: FloatArray) -> FloatArray:
+    """E[H' R^-1 H] over states (trajectories, n)."""
+    H = item.model.jacobian(states, item.pose)
+    return np.asarray((H.mT @ psd_solve(item.R, np.eye(len(item.R))) @ H).mean(axis=0))
+
+
+def _in_sequence(ordered: Sequence[Planned]) -> BoolArray:
+    """Which of the measurements, in order of stamps, arrive before everything that is sensed after them."""
+    receipts_ns = np.array([item.receipt_ns for item in ordered], dtype=np.int64)
+    later_ns = np.minimum.accumulate(receipts_ns[::-1])[::-1]
+    kept = np.ones(len(ordered), dtype=np.bool_)
+    kept[:-1] = receipts_ns[:-1] <= later_ns[1:]
+    return kept

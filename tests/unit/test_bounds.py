@@ -1,0 +1,86 @@
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.estimation.base import BirthPrior, Measurement
+from fgtrack.estimation.birth import birth_state
+from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.evaluation.bounds import Planned, bounds
+from fgtrack.models.measurement import measurement_model
+from fgtrack.models.motion import CTRV, CV, MotionModel
+
+START_NS = 1_790_000_000 * NS_PER_S
+PRIOR = BirthPrior(START_NS, np.zeros(2), 0.5 * np.eye(2), 0.3, 0.2, 20.0, 2.0, 0.0, 0.2, 0.0, 1.0)
+
+
+def planned(motion: MotionModel, seed: int = 0) -> list[Planned]:
+    """Positions at 10 Hz 350 ms late, and others in between that come at once; jitter makes some overtake."""
+    rng = np.random.default_rng(seed)
+    model = measurement_model(("x_m", "y_m"), motion)
+    found = []
+    for k in range(1, 20):
+        late_ns = int(rng.uniform(0.3, 0.4) * NS_PER_S)
+        stamp_ns = START_NS + k * 100_000_000
+        found.append(Planned(stamp_ns, stamp_ns + late_ns, model, 0.04 * np.eye(2)))
+        found.append(Planned(stamp_ns + 40_000_000, stamp_ns + 45_000_000, model, 2.0 * np.eye(2)))
+    return found
+
+
+def straight(motion: MotionModel, x: FloatArray, trajectories: int = 1):
+    def truth(stamps_ns: IntArray) -> FloatArray:
+        states = motion.predict(x, (stamps_ns - START_NS) / NS_PER_S)
+        return np.broadcast_to(states, (trajectories, *states.shape))
+
+    return truth
+
+
+def replayed(motion: MotionModel, items: Sequence[Planned], now_ns: int) -> FloatArray:
+    """Covariance of the exact filter, given `items` with any values."""
+    estimator = ReplayEkf(motion, PRIOR, 100.0)
+    for item in items:
+        estimator.update(Measurement(item.stamp_ns, item.model, np.zeros(2), item.R))
+    return estimator.state_at(now_ns).covariance
+
+
+NOW_NS = [START_NS + k * 130_000_000 for k in range(1, 15)]
+
+
+def test_in_a_linear_model_the_bounds_are_the_covariances_of_the_exact_filter() -> None:
+    motion = CV(5.0)
+    items = planned(motion)
+    x, P = birth_state(motion, PRIOR)
+    found = bounds(motion, START_NS, P, items, straight(motion, x), NOW_NS)
+    for i, now_ns in enumerate(NOW_NS):
+        sensed = [item for item in items if item.stamp_ns <= now_ns]
+        arrived = [item for item in items if item.receipt_ns <= now_ns]
+        newest_ns = 0
+        kept = []
+        for item in sorted(arrived, key=lambda item: item.receipt_ns):
+            if item.stamp_ns >= newest_ns:
+                kept.append(item)
+            newest_ns = max(newest_ns, item.stamp_ns)
+        for covariance, expected in zip(
+            (found.in_time[i], found.arrived[i], found.dropped[i]), (sensed, arrived, kept), strict=True
+        ):
+            np.testing.assert_allclose(covariance, replayed(motion, expected, now_ns), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("motion", [CV(5.0), CTRV()])
+def test_what_has_arrived_lies_between_all_and_what_came_in_time(motion: MotionModel) -> None:
+    x, P = birth_state(motion, PRIOR)
+    found = bounds(motion, START_NS, P, planned(motion), straight(motion, x, trajectories=3), NOW_NS)
+    for smaller, larger in ((found.in_time, found.arrived), (found.arrived, found.dropped)):
+        least = np.linalg.eigvalsh(larger - smaller).min(axis=-1)
+        assert (least > -1e-9).all()
+    assert np.trace(found.dropped[-1] - found.arrived[-1]) > 1e-3
+
+
+def test_a_measurement_before_the_start_is_refused() -> None:
+    motion = CV(5.0)
+    x, P = birth_state(motion, PRIOR)
+    early = Planned(START_NS - 1, START_NS, measurement_model(("x_m", "y_m"), motion), np.eye(2))
+    with pytest.raises(ValueError, match="start_ns"):
+        bounds(motion, START_NS, P, [early], straight(motion, x), NOW_NS)
