@@ -27,6 +27,7 @@ from stonesoup.updater.kalman import ExtendedKalmanUpdater
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import BirthPrior, Estimator, Measurement, UpdateStatus
+from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
@@ -36,10 +37,19 @@ LAG_S = 1.0
 DURATION_S = 30.0
 START = np.array([0.0, 0.0, 0.3, 65.0, 0.05])  # x, y, yaw, speed, yaw rate
 
+
+def smoother(start: BirthPrior, lag_s: float) -> FixedLagSmoother:
+    settings = SmootherSettings(lag_s=lag_s, lagged_s=(), final=False)
+    thresholds = settings.thresholds(MOTION.state_names, curved=False)
+    return FixedLagSmoother(MOTION, start, settings, lambda: IncrementalBackend(thresholds))
+
+
 ESTIMATORS: dict[str, Callable[[BirthPrior], Estimator]] = {
     "ekf-replay": lambda prior: ReplayEkf(MOTION, prior, LAG_S),
+    "smoother, 1 s": lambda prior: smoother(prior, 1.0),
+    "smoother, 3 s": lambda prior: smoother(prior, 3.0),
 }
-BARS = {"ekf-replay": 10.0}
+BARS = {"ekf-replay": 10.0, "smoother, 1 s": 4.0, "smoother, 3 s": 2.6}
 """How many times as fast as one prediction and update of Stone Soup an estimator should be per detection."""
 
 SENSORS = (  # first stamp, delay, standard deviation of each component
