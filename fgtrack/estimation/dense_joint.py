@@ -24,13 +24,14 @@ def dense_joint(
 
     Every distinct stamp is a node, measured or not, so interpolating and predicting need no equation of their own.
     With x_0 = m_0 + L_0 u_0 and x_k = F x_(k-1) + L_k u_k (L L' = P_0 or Q) all states are x = m + M u, u ~ N(0, I).
-    The rows u = 0 and W H M u = W (z - H m), W the inverse root of R, are solved by one QR. Beside the normal
+    The rows u = 0 and W H M u = W (z - H m), W the inverse root of R, are solved by one QR, whose triangle also gives
+    the covariances, S S' with S = M R^-1. Beside the normal
     equations of x itself this is the same least-squares problem, whose condition stays small where two stamps nearly
     coincide and Q almost vanishes.
 
     Raises `CallError` for a model that is not linear, or a stamp before the prior's.
     """
-    wanted = set(stamps_ns)
+    wanted = sorted(set(stamps_ns))
     stamps = sorted({prior.stamp_ns, *wanted, *(m.stamp_ns for m in measurements)})
     if not motion.linear or not all(m.model.linear for m in measurements):
         raise CallError("dense_joint: motion and measurements must be linear")
@@ -38,22 +39,22 @@ def dense_joint(
         raise CallError(f"dense_joint: stamp {stamps[0]} ns lies before the prior's, {prior.stamp_ns} ns")
     m, M = _moments(motion, prior, stamps)
     place = {stamp_ns: k for k, stamp_ns in enumerate(stamps)}
-    rows, right = [np.eye(M.shape[-1])], [np.zeros(M.shape[-1])]
+    size = M.shape[-1]
+    rows = [np.eye(size, size + 1)]
     for item in measurements:
         k = place[item.stamp_ns]
         H = item.model.selection(motion.dim)
         y = item.model.residual(item.z, item.model.predict(m[k], item.pose))
-        whitened = np.linalg.solve(np.linalg.cholesky(item.R), np.column_stack([H @ M[k], y]))
-        rows.append(whitened[:, :-1])
-        right.append(whitened[:, -1])
-    Q, R = np.linalg.qr(np.vstack(rows))
-    u = np.linalg.solve(R, Q.T @ np.concatenate(right))
-    states = {}
-    for stamp_ns in wanted:
-        k = place[stamp_ns]
-        root = np.linalg.solve(R.T, M[k].T)
-        states[stamp_ns] = TrackState(stamp_ns, m[k] + M[k] @ u, root.T @ root)
-    return states
+        rows.append(np.linalg.solve(np.linalg.cholesky(item.R), np.column_stack([H @ M[k], y])))
+    R = np.asarray(np.linalg.qr(np.vstack(rows), mode="r"))
+    root, u = R[:size, :size], np.linalg.solve(R[:size, :size], R[:size, size])
+    places = [place[stamp_ns] for stamp_ns in wanted]
+    roots = np.linalg.solve(root.T, M[places].reshape(len(wanted) * motion.dim, size).T).T
+    roots = roots.reshape(len(wanted), motion.dim, size)
+    return {
+        stamp_ns: TrackState(stamp_ns, m[k] + M[k] @ u, S @ S.T)
+        for stamp_ns, k, S in zip(wanted, places, roots, strict=True)
+    }
 
 
 def _moments(motion: MotionModel, prior: BirthPrior, stamps_ns: Sequence[int]) -> tuple[FloatArray, FloatArray]:
@@ -85,3 +86,18 @@ def difference(found: TrackState, expected: TrackState) -> Difference:
     mean = np.abs(found.mean - expected.mean) / sigma
     covariance = np.abs(found.covariance - expected.covariance) / np.outer(sigma, sigma)
     return Difference(float(mean.max()), float(covariance.max()))
+
+
+def rounding_bound(motion: MotionModel, stamps_ns: Iterable[int], sigma_m: float = 0.5) -> float:
+    """What rounding may cost a solver that divides by the process noise of a linear model, in standard deviations.
+
+    Given its end, the start of a segment is known to 1 / W = sqrt(Q_xx) / 2, 3e-11 m for 1 us of CV; beside a row that
+    weighs W an orthogonal factorisation keeps one of a measurement of `sigma_m` to eps W sigma only. Ten times that,
+    for the shortest segment between `stamps_ns`. A filter in covariance form divides by no process noise and needs no
+    such bound.
+    """
+    gaps_ns = np.diff(sorted(set(stamps_ns)))
+    if not gaps_ns.size:
+        return 0.0
+    Q = motion.process_noise(np.zeros(motion.dim), seconds(int(gaps_ns.min())))
+    return float(10.0 * np.finfo(np.float64).eps * sigma_m * 2.0 / np.sqrt(Q[0, 0]))

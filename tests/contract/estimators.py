@@ -12,8 +12,8 @@ from typing import Literal
 
 import numpy as np
 
-from fgtrack.core.time import seconds
 from fgtrack.estimation.base import BirthPrior, Estimator
+from fgtrack.estimation.dense_joint import rounding_bound
 from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherSettings
 from fgtrack.estimation.factor_graph.backend import Backend
 from fgtrack.estimation.replay import ReplayEkf
@@ -68,21 +68,12 @@ class Subject:
     """When any order of arrival gives the answer of the time order in a nonlinear model."""
     examples: int
     """Random streams per property in the default suite."""
-    weights: bool
-    """Whether it divides by the process noise of a segment, which costs digits where stamps nearly coincide."""
+    rounding: float
+    """How many times the `rounding_bound` it may be off where stamps nearly coincide."""
 
     def bar(self, motion: MotionModel, stamps_ns: list[int]) -> float:
-        """`linear_bar`, or what rounding leaves of it.
-
-        A short segment weighs a position by W = (q dt^3 / 12)^-1/2 (its deviation given the other end), 3e10 per
-        metre at 1 us; beside it an orthogonal factorisation keeps a measurement of sigma to eps W sigma. Ten times
-        that is allowed.
-        """
-        gaps_ns = np.diff(sorted({START_NS, *stamps_ns}))
-        if not self.weights or not gaps_ns.size:
-            return self.linear_bar
-        Q = motion.process_noise(np.zeros(motion.dim), seconds(int(gaps_ns.min())))
-        return max(self.linear_bar, 10.0 * np.finfo(float).eps * 0.5 * 2.0 / np.sqrt(Q[0, 0]))
+        """`linear_bar`, or what rounding leaves of it."""
+        return max(self.linear_bar, self.rounding * rounding_bound(motion, [START_NS, *stamps_ns]))
 
 
 def _smoother(make: Callable[[MotionModel], Backend]) -> Start:
@@ -92,9 +83,10 @@ def _smoother(make: Callable[[MotionModel], Backend]) -> Start:
 BACKENDS: dict[str, Callable[[MotionModel], Backend]] = {"smoother": incremental, "smoother-batch": batch}
 
 SUBJECTS: dict[str, Subject] = {
-    "ekf-replay": Subject(_replay, False, 1e-9, "at once", 40, weights=False),
-    "smoother": Subject(_smoother(incremental), True, 1e-9, "at convergence", 40, weights=True),
-    "smoother-batch": Subject(_smoother(batch), True, 1e-6, "at convergence", 8, weights=True),
+    "ekf-replay": Subject(_replay, False, 1e-9, "at once", 40, rounding=0.0),
+    "smoother": Subject(_smoother(incremental), True, 1e-9, "at convergence", 40, rounding=1.0),
+    # Levenberg-Marquardt compares errors at absolute positions: eps W of 50 m instead of the deviation, 0.5 m.
+    "smoother-batch": Subject(_smoother(batch), True, 1e-6, "at convergence", 8, rounding=100.0),
 }
 SMOOTHERS = tuple(BACKENDS)
 

@@ -15,7 +15,7 @@ from fgtrack.models.motion import CV, MotionModel
 
 FUSED = (UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE)
 CONVERGED_BAR = 1e-3
-MANY = 300
+MORE = 5
 
 
 def fused(name: str, motion: MotionModel, measurements: list[Measurement]) -> Estimator:
@@ -86,7 +86,7 @@ def test_in_a_nonlinear_model_any_order_gives_the_answer_of_the_time_order(name:
 @pytest.mark.parametrize("name", SUBJECTS)
 def test_any_order_holds_for_many_long_streams(name: str, kind: str) -> None:
     @given(case=arrivals(close=True, max_size=40, min_size=10))
-    @hypothesis_settings(deadline=None, max_examples=MANY)
+    @hypothesis_settings(deadline=None, max_examples=MORE * SUBJECTS[name].examples)
     def check(case: Arrivals) -> None:
         if kind == "cv":
             check_dense_joint(name, case)

@@ -14,7 +14,7 @@ from fgtrack.estimation.factor_graph import FixedLagSmoother
 from fgtrack.models.motion import CV, MotionModel
 
 LAG_S = 0.3
-MANY = 300
+MORE = 5
 
 
 def started(name: str, motion: MotionModel, late: Late = "fuse", lag_s: float = LAG_S) -> FixedLagSmoother:
@@ -65,7 +65,7 @@ def test_in_a_linear_model_the_state_at_every_stamp_is_the_dense_joint_of_all_th
 @pytest.mark.parametrize("name", SUBJECTS)
 def test_what_was_accepted_is_in_the_answer_for_many_long_streams(name: str, close: bool) -> None:
     @given(case=arrivals(span_s=4.0, close=close, max_size=40, min_size=10))
-    @hypothesis_settings(deadline=None, max_examples=MANY)
+    @hypothesis_settings(deadline=None, max_examples=MORE * SUBJECTS[name].examples)
     def check(case: Arrivals) -> None:
         check_accepted(name, case, "fuse", 10.0)
 

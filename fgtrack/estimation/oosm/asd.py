@@ -62,7 +62,7 @@ class AccumulatedStateDensity:
 
     def advance(self, now_ns: int) -> None:
         """See `Estimator.advance`: what leaves the window is marginalised."""
-        self._start_ns = max(self._start_ns, max(now_ns, self._newest_ns) - self._lag_ns)
+        self._start_ns = max(self._start_ns, now_ns - self._lag_ns)
         stamps_ns, mean, covariance = self._stack
         gone = bisect.bisect_right(stamps_ns, self._start_ns) - 1
         if gone > 0:

@@ -46,7 +46,7 @@ class LateEkf(ABC):
 
     def advance(self, now_ns: int) -> None:
         """See `Estimator.advance`."""
-        self._start_ns = max(self._start_ns, max(now_ns, self._newest_ns) - self._lag_ns)
+        self._start_ns = max(self._start_ns, now_ns - self._lag_ns)
         self._history.forget_before(self._start_ns)
 
     def state_at(self, stamp_ns: int) -> TrackState:

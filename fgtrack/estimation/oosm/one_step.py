@@ -38,7 +38,7 @@ class Bl1(_OneStep):
     """Algorithm Bl1: Al1 without the noise in the retrodicted state.
 
     Bar-Shalom, Chen and Mallick 2004 (see `Al1`): x_tau = F(tau, k) x_k and P_vv = Q, so that of the steps only the
-    covariances are needed. The function `retrodict` of the Sensor Fusion and Tracking Toolbox of MathWorks names this paper.
+    covariances are needed. The Sensor Fusion and Tracking Toolbox of MathWorks names this paper for its `retrodict`.
 
     Exact for: nothing, but close to `Al1`.
     """
