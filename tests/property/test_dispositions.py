@@ -59,6 +59,24 @@ CONFIGS = {
     "replaying": replace(
         _with_all_sensors(load(Config, None, [*OVAL, "filter.storage_s=0.3"])), estimator="ekf-replay"
     ),
+    "smoothing": replace(
+        _with_all_sensors(load(Config, None, ["smoother={lag_s: 0.3, ring_s: 0.3}", "motion={kind: ctrv}"])),
+        estimator="smoother",
+    ),
+    "smoothing what is not too late": replace(
+        _with_all_sensors(
+            load(
+                Config,
+                None,
+                [
+                    *OVAL,
+                    "smoother={lag_s: 0.3, late: drop}",
+                    "motion={kind: ctra, std_per_s: {position: 0.2, yaw: 0.3, speed: 1.0, yaw_rate: 0.5, accel: 3.0}}",
+                ],
+            )
+        ),
+        estimator="smoother",
+    ),
     "published": load(Config, REFERENCE, OVAL),
     "published in open space": _with_all_sensors(load(Config, REFERENCE)),
 }
@@ -163,6 +181,9 @@ def key(record: UpdateRecord) -> tuple[str, int, int, int]:
     return record.sensor, record.receipt_ns, record.stamp_ns, record.index
 
 
+FUSED = (Disposition.IN_SEQUENCE, Disposition.OUT_OF_SEQUENCE, Disposition.BEYOND_WINDOW)
+
+
 @pytest.mark.parametrize("name", CONFIGS)
 @settings(deadline=None, max_examples=40)
 @given(messages=streams())
@@ -178,7 +199,7 @@ def test_every_detection_ends_in_exactly_one_row_and_every_state_is_sound(name: 
         ids |= born
         assert {track.track_id for track in report.tracks} <= ids
         for record in report.updates:
-            fused = record.disposition in (Disposition.IN_SEQUENCE, Disposition.OUT_OF_SEQUENCE)
+            fused = record.disposition in FUSED
             assert fused == (record.nis is not None) == bool(record.innovation)
             if record.nis is not None:
                 assert record.nis >= 0.0
