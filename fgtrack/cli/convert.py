@@ -1,26 +1,57 @@
-"""`fgtrack convert`: from any input to a stream or a bag."""
+"""`fgtrack convert`: from any input to a stream or a bag, with other delays if wanted."""
 
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from fgtrack.cli.arguments import ConfigFile, Input
 from fgtrack.cli.show import console, progress
 from fgtrack.cli.storage import Storage, StorageOption, write_recording
+from fgtrack.core.errors import CallError
+from fgtrack.core.types import Message
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
+from fgtrack.sim.redelay import Redelayed, SensorDelays, redelay
 
 
 def convert(
     recording: Input,
     out: Annotated[Path, typer.Argument(help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder.")],
     config_file: ConfigFile = None,
+    delays_file: Annotated[
+        Path | None,
+        typer.Option("--delays", help="Give detections other delays, losses and clock errors by sensor (YAML)."),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, help="Seed of the random generator of --delays.", show_default="0")
+    ] = None,
     storage: StorageOption = Storage.MCAP,
 ) -> None:
     """Convert a recording to an fgtrack stream or a rosbag2 folder."""
+    if seed is not None and delays_file is None:
+        raise CallError("--seed: only --delays draws random numbers, name its file")
     source = open_input(recording, load(Config, config_file).input)
     with progress("convert"):
-        count = write_recording(out, source.messages(), storage)
-    console().print(f"{out}: {count} messages", highlight=False, soft_wrap=True)
+        if delays_file is None:
+            count, lost = write_recording(out, source.messages(), storage), ""
+        else:
+            redelayed = _redelayed(source.messages, delays_file, seed or 0)
+            count, lost = write_recording(out, redelayed, storage), _losses(redelayed)
+    console().print(f"{out}: {count} messages{lost}", highlight=False, soft_wrap=True)
+
+
+def _redelayed(read: Callable[[], Iterator[Message]], delays_file: Path, seed: int) -> Redelayed:
+    delays = load(dict[str, SensorDelays], delays_file)
+    try:
+        return redelay(read, delays, np.random.default_rng(seed))
+    except CallError as error:
+        raise CallError(f"{delays_file}: {error}") from error
+
+
+def _losses(redelayed: Redelayed) -> str:
+    lost = [f"{count} of {sensor}" for sensor, count in redelayed.num_lost.items() if count]
+    return f", lost {', '.join(lost)}" if lost else ""

@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
+from functools import lru_cache
 from io import StringIO
 from pathlib import Path
 from typing import Any, TypeVar
@@ -84,7 +85,7 @@ def validate(kind: type[T], raw: Mapping[str, Any], origin: str) -> T:
     except (TypeError, ValueError) as error:
         raise CallError(f"{origin}: only plain YAML values and text keys are allowed ({error})") from error
     try:
-        value = TypeAdapter(kind).validate_json(text, strict=True)
+        value: T = _adapter(kind).validate_json(text, strict=True)  # type: ignore[arg-type]  # a class is hashable
     except ValidationError as error:
         raise CallError(f"{origin}: {_first(error)}") from error
     for where, name, known in _unknown(raw, value, ""):
@@ -92,6 +93,11 @@ def validate(kind: type[T], raw: Mapping[str, Any], origin: str) -> T:
     for where in _not_finite(raw, ""):
         raise CallError(f"{origin}: {where}: must be a finite number")
     return value
+
+
+@lru_cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:  # Any: one for each dataclass, which takes pydantic a while to make
+    return TypeAdapter(kind)
 
 
 def _first(error: ValidationError) -> str:
@@ -137,13 +143,14 @@ def _not_finite(raw: object, where: str) -> list[str]:
     return [found for name, item in inner for found in _not_finite(item, f"{where}{name}.")]
 
 
-def _plain(value: object) -> object:
+def plain(value: object) -> Any:  # Any: JSON values, as `validate` takes them
+    """A dataclass as mappings, lists and scalars, every key written out; `validate` reads it back to an equal value."""
     if is_dataclass(value):
-        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, Mapping):
-        return {name: _plain(item) for name, item in value.items()}
+        return {name: plain(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     return value
 
 
@@ -153,5 +160,5 @@ def dump(value: object) -> str:
     yaml.default_flow_style = False
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]  # ruamel declares it as None
     text = StringIO()
-    yaml.dump(_plain(value), text)
+    yaml.dump(plain(value), text)
     return text.getvalue()

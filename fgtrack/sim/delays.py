@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Discriminator
 from scipy import optimize, special
 
-from fgtrack.core.types import FloatArray
+from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.sim.require import require
 
 
@@ -180,9 +180,79 @@ class LossyDelay:
         return delays
 
 
+@dataclass(frozen=True)
+class MarkovDelay:
+    """A chain of two states, good and bad, each with a model of its own, that moves from message to message.
+
+    After a message in the good state the next one is in the bad state with probability `to_bad`, and back with
+    `to_good` (E. N. Gilbert, Capacity of a burst-noise channel, Bell System Technical Journal 39(5), 1960). A
+    share `bad_share` of the messages is in the bad state, in bursts of 1 / `to_good` messages on average. The
+    first message finds the chain as it is in the long run.
+    """
+
+    good: "AnyDelay"
+    bad: "AnyDelay"
+    to_bad: float
+    to_good: float
+    kind: Literal["markov"] = "markov"
+
+    def __post_init__(self) -> None:
+        require(0.0 <= self.to_bad <= 1.0, "to_bad", "must lie in [0, 1]", self.to_bad)
+        require(0.0 < self.to_good <= 1.0, "to_good", "must lie in (0, 1]", self.to_good)
+
+    @property
+    def bad_share(self) -> float:
+        """Share of the messages that are in the bad state."""
+        return self.to_bad / (self.to_bad + self.to_good)
+
+    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
+        """See `DelayModel`."""
+        moves = np.ones(len(stamps_s))
+        bad = _two_states(rng, self.bad_share, self.to_bad * moves, self.to_good * moves)
+        return _either(rng, stamps_s, bad, self.good, self.bad)
+
+
+@dataclass(frozen=True)
+class MarkovTimeDelay:
+    """`MarkovDelay` in continuous time: the link itself is good or bad, whoever sends how often.
+
+    In the good state it turns bad at the rate `to_bad_per_s` (a), and back at `to_good_per_s` (b): it is bad for
+    a share a / (a + b) of the time, for 1 / b on average. Over dt, P(bad | good) = a / (a + b) (1 - exp(-(a + b) dt)).
+    """
+
+    good: "AnyDelay"
+    bad: "AnyDelay"
+    to_bad_per_s: float
+    to_good_per_s: float
+    kind: Literal["markov_time"] = "markov_time"
+
+    def __post_init__(self) -> None:
+        require(self.to_bad_per_s >= 0.0, "to_bad_per_s", "must not be negative", self.to_bad_per_s)
+        require(self.to_good_per_s > 0.0, "to_good_per_s", "must be positive", self.to_good_per_s)
+
+    @property
+    def bad_share(self) -> float:
+        """Share of the time that the link is bad."""
+        return self.to_bad_per_s / (self.to_bad_per_s + self.to_good_per_s)
+
+    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
+        """See `DelayModel`."""
+        forgotten = -np.expm1(-(self.to_bad_per_s + self.to_good_per_s) * np.diff(stamps_s, prepend=stamps_s[:1]))
+        bad = _two_states(rng, self.bad_share, self.bad_share * forgotten, (1.0 - self.bad_share) * forgotten)
+        return _either(rng, stamps_s, bad, self.good, self.bad)
+
+
 #: Every delay model, told apart by `kind`.
 AnyDelay = Annotated[
-    NoDelay | ConstantDelay | UniformDelay | NormalDelay | GammaDelay | BurstDelay | LossyDelay,
+    NoDelay
+    | ConstantDelay
+    | UniformDelay
+    | NormalDelay
+    | GammaDelay
+    | BurstDelay
+    | LossyDelay
+    | MarkovDelay
+    | MarkovTimeDelay,
     Discriminator("kind"),
 ]
 
@@ -193,3 +263,26 @@ def _relative_q90(log_shape: float) -> float:
     """90 % quantile of a gamma distribution over its mean."""
     shape = math.exp(log_shape)
     return float(special.gammaincinv(shape, 0.9)) / shape
+
+
+def _two_states(rng: np.random.Generator, share: float, to_bad: FloatArray, to_good: FloatArray) -> BoolArray:
+    """Whether the chain is bad at each of n messages: at the first one with probability `share`.
+
+    Entry k of `to_bad` and `to_good`, shape (n,), is the probability to move from message k - 1 to k; the first
+    is not used.
+    """
+    bad = np.zeros(len(to_bad), dtype=bool)
+    for k, draw in enumerate(rng.random(len(bad))):
+        if k == 0:
+            bad[k] = draw < share
+        else:
+            bad[k] = draw >= to_good[k] if bad[k - 1] else draw < to_bad[k]
+    return bad
+
+
+def _either(
+    rng: np.random.Generator, stamps_s: FloatArray, bad: BoolArray, if_good: DelayModel, if_bad: DelayModel
+) -> FloatArray:
+    """Delays of one model where the chain is good, of the other where it is bad; both are drawn for all messages."""
+    good_delays = if_good.draw(rng, stamps_s)
+    return np.where(bad, if_bad.draw(rng, stamps_s), good_delays)

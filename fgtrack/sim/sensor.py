@@ -9,6 +9,7 @@ import numpy as np
 
 from fgtrack.core.types import MEASURABLE, BoolArray, FloatArray, Frame
 from fgtrack.models.sensors import Mount
+from fgtrack.sim.clocks import AnyClock
 from fgtrack.sim.delays import AnyDelay, NoDelay
 from fgtrack.sim.require import require
 
@@ -21,8 +22,8 @@ class Clutter:
     """Detections of nothing: each scan has a Poisson number of them, uniform over a region."""
 
     mean_per_scan: float = 0.0
-    """In the field of view or, for `track`, on the stretch of track no further off than the maximum range; of
-    these a sensor reports the ones in its field of view."""
+    """Between the ranges and bearings of the sensor or, for `track`, on the stretch of track no further off than the
+    maximum range; of these a sensor reports the ones that it can see."""
     region: Literal["field_of_view", "track"] = "field_of_view"
     speed_mps: tuple[float, float] = (0.0, 0.0)
     """Range of the speed that clutter seems to have, along the track or in any direction."""
@@ -50,11 +51,14 @@ class SimulatedSensor:
     jitter_s: float = 0.0
     """Each scan is up to this much late, uniformly."""
     delay: AnyDelay = field(default_factory=NoDelay)
+    clock: tuple[AnyClock, ...] = ()
     mount: Mount = field(default_factory=Mount)
     field_of_view_rad: float = math.tau
     """Full angle, centred on the axis of the sensor."""
     min_range_m: float = 0.0
     max_range_m: float = 100.0
+    max_range_behind_m: float | None = None
+    """Maximum range in the half behind the sensor, where it is shorter; null is `max_range_m`."""
     detection_probability: float = 1.0
     clutter: Clutter = field(default_factory=Clutter)
     split_probability: float = 0.0
@@ -89,6 +93,10 @@ class SimulatedSensor:
         )
         require(self.min_range_m >= 0.0, "min_range_m", "must not be negative", self.min_range_m)
         require(self.max_range_m > self.min_range_m, "max_range_m", "must exceed min_range_m", self.max_range_m)
+        if self.max_range_behind_m is not None:
+            behind_m = self.max_range_behind_m
+            inside = self.min_range_m < behind_m <= self.max_range_m
+            require(inside, "max_range_behind_m", "must lie in (min_range_m, max_range_m]", behind_m)
         for name in ("detection_probability", "split_probability", "outlier_probability"):
             value = getattr(self, name)
             require(0.0 <= value <= 1.0, name, "must lie in [0, 1]", value)

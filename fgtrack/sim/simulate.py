@@ -1,6 +1,7 @@
 """From a scenario to the messages that a tracker would have received."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -15,12 +16,14 @@ from fgtrack.core.types import (
     DetectionList,
     EgoState,
     FloatArray,
+    IntArray,
     Message,
     TruthState,
     X,
     Y,
 )
 from fgtrack.models.track_map import TrackMap
+from fgtrack.sim.clocks import ClockModel, reported_stamps
 from fgtrack.sim.delays import DelayModel
 from fgtrack.sim.oval import make_oval
 from fgtrack.sim.path import Path
@@ -36,9 +39,9 @@ def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
     """Messages of `scenario` in order of receipt; at the same receipt truth, ego, sensors in their order.
 
     Same scenario and same state of `rng`, same messages. Every vehicle and every sensor, and in it the
-    delays, the clutter and the detections of each object, draw from a generator of their own: another sensor
-    or another delay model leaves everything else as it was. A message that its delay model loses is not in
-    the list.
+    delays, the clock errors, the clutter and the detections of each object, draw from a generator of their own:
+    another sensor, delay or clock model leaves everything else as it was. A clock changes what is reported as the
+    stamp, never when or what was sensed. A message that its delay model loses is not in the list.
 
     Raises
     ------
@@ -107,17 +110,18 @@ class _Simulation:
         ]
 
     def _scans(self, sensor: SimulatedSensor, rng: np.random.Generator) -> list[Message]:
-        times_rng, delay_rng, scanner_rng = rng.spawn(3)
+        times_rng, delay_rng, scanner_rng, clock_rng = rng.spawn(4)
         stamps = self._stamps(sensor.scan_times(times_rng, self.scenario.duration_s))
         times = self._seconds(stamps)
         scanner = Scanner(sensor, self.ego.states(times), self.scenario.detection_origin_x_m)
         objects = [trajectory.states(times) for trajectory in self.opponents]
         scans = scanner.scans(scanner_rng, objects, self.track)
         receipts = _receipts(sensor.delay, delay_rng, stamps, times)
+        reported = _reported(sensor.clock, clock_rng, stamps, receipts)
         silent = sensor.silent(times)
         return [
             DetectionList(sensor.name, stamp, receipt, detections, sensor.frame)
-            for stamp, receipt, detections, quiet in zip(stamps, receipts, scans, silent, strict=True)
+            for stamp, receipt, detections, quiet in zip(reported, receipts, scans, silent, strict=True)
             if receipt is not None and not quiet
         ]
 
@@ -144,3 +148,13 @@ def _receipts(delay: DelayModel, rng: np.random.Generator, stamps: list[int], ti
         None if math.isnan(delay_s) else stamp + nanoseconds(delay_s)
         for stamp, delay_s in zip(stamps, delays, strict=True)
     ]
+
+
+def _reported(
+    clocks: Sequence[ClockModel], rng: np.random.Generator, stamps: list[int], receipts: list[int | None]
+) -> list[int]:
+    """Stamp that the sensor reports in place of each of `stamps`; of a lost message it does not matter."""
+    sensed_ns: IntArray = np.array(stamps, dtype=np.int64)
+    receipts_ns = [stamp if receipt is None else receipt for stamp, receipt in zip(stamps, receipts, strict=True)]
+    reported = reported_stamps(clocks, rng, sensed_ns, np.array(receipts_ns, dtype=np.int64))
+    return [int(stamp) for stamp in reported]

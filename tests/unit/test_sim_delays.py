@@ -2,13 +2,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fgtrack.core.types import FloatArray
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.sim.delays import (
     AnyDelay,
     BurstDelay,
     ConstantDelay,
     GammaDelay,
     LossyDelay,
+    MarkovDelay,
+    MarkovTimeDelay,
     NoDelay,
     NormalDelay,
     UniformDelay,
@@ -26,6 +28,8 @@ ALL = (
     RADAR,
     BurstDelay(0.01, 0.5, 1.0, base=LIDAR),
     LossyDelay(0.1, base=RADAR),
+    MarkovDelay(RADAR, LossyDelay(0.7, base=LIDAR), to_bad=0.05, to_good=0.2),
+    MarkovTimeDelay(RADAR, BurstDelay(0.1, 0.5, 1.0), to_bad_per_s=0.5, to_good_per_s=2.0),
 )
 
 
@@ -83,6 +87,70 @@ def test_a_lossy_delay_loses_its_share_and_leaves_the_others_alone() -> None:
     assert np.isnan(drawn(LossyDelay(1.0))).all()
 
 
+GOOD, BAD = ConstantDelay(0.1), ConstantDelay(0.5)
+
+
+def runs(bad: BoolArray) -> IntArray:
+    """Lengths of the bursts, without those at either end."""
+    edges = np.flatnonzero(np.diff(bad.astype(int)))
+    return np.diff(edges)[bad[edges[:-1] + 1]]
+
+
+@pytest.mark.parametrize(("to_bad", "to_good"), [(0.05, 0.2), (0.3, 0.9), (0.9, 0.6)])
+def test_a_chain_is_bad_as_often_and_as_long_as_its_probabilities_say(to_bad: float, to_good: float) -> None:
+    model = MarkovDelay(GOOD, BAD, to_bad, to_good)
+    bad = drawn(model) == 0.5
+    share, memory = to_bad / (to_bad + to_good), 1.0 - to_bad - to_good
+    assert model.bad_share == share
+    # Messages k apart correlate with memory^k, hence the variance of their mean.
+    variance = share * (1.0 - share) * (1.0 + memory) / (1.0 - memory) / len(bad)
+    assert bad.mean() == pytest.approx(share, abs=4.0 * np.sqrt(variance))
+    lengths = runs(bad)
+    assert lengths.mean() == pytest.approx(1.0 / to_good, abs=4.0 * np.sqrt((1.0 - to_good) / len(lengths)) / to_good)
+    # Geometric, not only in the mean; long bursts in one class, so that each has enough of them.
+    longest = int(stats.geom(to_good).isf(50.0 / len(lengths))) + 1
+    found = np.bincount(np.minimum(lengths, longest), minlength=longest + 1)[1:]
+    chances = np.append(stats.geom(to_good).pmf(np.arange(1, longest)), stats.geom(to_good).sf(longest - 1))
+    assert stats.chisquare(found, chances * len(lengths)).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 20.0, 200.0])
+def test_a_chain_in_time_is_the_same_however_often_it_is_looked_at(rate_hz: float) -> None:
+    to_bad, to_good, count = 0.5, 2.0, 40_000
+    model = MarkovTimeDelay(GOOD, BAD, to_bad, to_good)
+    bad = model.draw(np.random.default_rng(3), np.arange(count) / rate_hz) == 0.5
+    memory = np.exp(-(to_bad + to_good) / rate_hz)
+    assert model.bad_share == 0.2
+    variance = 0.2 * 0.8 * (1.0 + memory) / (1.0 - memory) / count
+    assert bad.mean() == pytest.approx(0.2, abs=4.0 * np.sqrt(variance))
+    leave = 0.8 * (1.0 - memory)  # P(good | bad) from one look to the next
+    lengths = runs(bad)
+    assert lengths.mean() == pytest.approx(1.0 / leave, abs=4.0 * np.sqrt((1.0 - leave) / len(lengths)) / leave)
+    if rate_hz == 200.0:  # often enough to see a burst from its beginning to its end: 1 / to_good on average
+        assert lengths.mean() / rate_hz == pytest.approx(1.0 / to_good, abs=4.0 * 0.5 / np.sqrt(len(lengths)))
+
+
+def test_a_chain_in_time_forgets_over_a_gap_and_stays_at_equal_stamps() -> None:
+    model = MarkovTimeDelay(GOOD, BAD, 1.0, 1.0)
+    pairs = np.array([model.draw(np.random.default_rng(seed), np.array([0.0, 0.0, 1e6])) for seed in range(400)])
+    np.testing.assert_array_equal(pairs[:, 0], pairs[:, 1])
+    assert stats.binomtest(int((pairs[:, 1] == pairs[:, 2]).sum()), 400, 0.5).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("make", [MarkovDelay, MarkovTimeDelay])
+def test_the_first_message_finds_a_chain_as_it_is_in_the_long_run(make: type[MarkovDelay | MarkovTimeDelay]) -> None:
+    model = make(GOOD, BAD, 0.1, 0.3)
+    first = [model.draw(np.random.default_rng(seed), np.zeros(1))[0] for seed in range(1000)]
+    assert stats.binomtest(first.count(0.5), 1000, 0.25).pvalue > 1e-4
+
+
+def test_a_chain_moves_alike_whatever_delays_its_states_have() -> None:
+    plain = drawn(MarkovDelay(GOOD, BAD, 0.05, 0.2)) == 0.5
+    lossy = drawn(MarkovDelay(RADAR, LossyDelay(1.0), 0.05, 0.2))
+    np.testing.assert_array_equal(np.isnan(lossy), plain)
+    assert stats.kstest(lossy[~plain], stats.gamma(RADAR.shape, loc=0.03, scale=RADAR.scale_s).cdf).pvalue > 1e-4
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -99,6 +167,10 @@ def test_a_lossy_delay_loses_its_share_and_leaves_the_others_alone() -> None:
         (lambda: BurstDelay(0.1, 0.0, 1.0), "duration_s"),
         (lambda: BurstDelay(0.1, 1.0, -1.0), "extra_s"),
         (lambda: LossyDelay(-0.1), "probability"),
+        (lambda: MarkovDelay(GOOD, BAD, 1.1, 0.5), "to_bad: must lie in"),
+        (lambda: MarkovDelay(GOOD, BAD, 0.5, 0.0), "to_good: must lie in"),
+        (lambda: MarkovTimeDelay(GOOD, BAD, -1.0, 0.5), "to_bad_per_s"),
+        (lambda: MarkovTimeDelay(GOOD, BAD, 1.0, 0.0), "to_good_per_s"),
     ],
 )
 def test_a_setting_that_makes_no_sense_is_named(make: object, message: str) -> None:

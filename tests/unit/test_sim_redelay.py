@@ -1,0 +1,254 @@
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+from support.messages import START_NS, drive, exact, message_lists
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray, Message, TruthState
+from fgtrack.io.errors import TruncatedInput
+from fgtrack.pipeline.load import load
+from fgtrack.sim.clocks import ArrivalClock, JitterClock, OffsetClock
+from fgtrack.sim.delays import (
+    BurstDelay,
+    ConstantDelay,
+    GammaDelay,
+    LossyDelay,
+    MarkovDelay,
+    NoDelay,
+    UniformDelay,
+)
+from fgtrack.sim.redelay import OTHERS, SensorDelays, redelay
+from fgtrack.sim.scenario import Scenario
+from fgtrack.sim.simulate import simulate
+
+SCENARIOS = Path(__file__).resolve().parents[2] / "configs/scenarios"
+MS = 1_000_000
+LATE = SensorDelays(UniformDelay(0.0, 0.4))
+DRIVE = drive(200)
+
+
+def redelayed(messages: list[Message], seed: int = 0, **delays: SensorDelays) -> list[Message]:
+    return list(redelay(lambda: messages, delays, np.random.default_rng(seed)))
+
+
+def lists(messages: list[Message], sensor: str) -> list[DetectionList]:
+    found = [m for m in messages if isinstance(m, DetectionList) and m.sensor == sensor]
+    return sorted(found, key=lambda m: m.stamp_ns)
+
+
+def delays_s(messages: list[Message], sensor: str) -> list[float]:
+    return [(m.receipt_ns - m.stamp_ns) / 1e9 for m in lists(messages, sensor)]
+
+
+# What changes, and what does not
+
+
+@given(messages=message_lists(), seed=st.integers(0, 9))
+@settings(deadline=None)
+def test_messages_come_in_order_of_the_new_receipt_and_none_is_lost_or_changed(
+    messages: list[Message], seed: int
+) -> None:
+    found = list(redelay(lambda: messages, {OTHERS: LATE}, np.random.default_rng(seed)))
+    receipts = [m.receipt_ns for m in found]
+    assert receipts == sorted(receipts)
+    untouched = [m for m in messages if not isinstance(m, DetectionList)]
+    assert exact([m for m in found if not isinstance(m, DetectionList)]) == exact(untouched)
+    old, new = ([replace(m, receipt_ns=0) for m in ms if isinstance(m, DetectionList)] for ms in (messages, found))
+    assert sorted(exact(new)) == sorted(exact(old))
+    assert all(0 <= m.receipt_ns - m.stamp_ns <= 400 * MS for m in found if isinstance(m, DetectionList))
+
+
+@given(messages=message_lists())
+@settings(deadline=None)
+def test_without_any_sensor_named_everything_stays_to_the_bit(messages: list[Message]) -> None:
+    assert exact(redelayed(messages)) == exact(messages)
+    assert exact(list(redelay(lambda: messages, {OTHERS: SensorDelays()}, np.random.default_rng(0)))) == exact(messages)
+
+
+def test_a_sensor_that_is_not_named_keeps_its_receipts() -> None:
+    found = redelayed(DRIVE, radar=LATE)
+    assert lists(found, "lidar") == lists(DRIVE, "lidar")
+    assert delays_s(found, "radar") != delays_s(DRIVE, "radar")
+
+
+def test_the_same_generator_gives_the_same_messages_and_another_one_others() -> None:
+    result = redelay(lambda: DRIVE, {"radar": LATE}, np.random.default_rng(5))
+    first = list(result)
+    assert list(result) == first == redelayed(DRIVE, 5, radar=LATE)
+    assert redelayed(DRIVE, 6, radar=LATE) != first
+
+
+def test_another_sensor_loss_or_clock_leaves_the_delays_of_the_first() -> None:
+    alone = lists(redelayed(DRIVE, lidar=LATE), "lidar")
+    assert lists(redelayed(DRIVE, lidar=LATE, radar=LATE), "lidar") == alone
+    some = lists(redelayed(DRIVE, lidar=replace(LATE, loss_probability=0.5)), "lidar")
+    assert 5 < len(some) < 35
+    assert all(m in alone for m in some)
+    jittered = lists(redelayed(DRIVE, lidar=replace(LATE, clock=(JitterClock(0.001),))), "lidar")
+    assert [m.receipt_ns for m in jittered] == [m.receipt_ns for m in alone]
+
+
+def test_drawn_delays_follow_their_model_in_the_order_of_the_stamps() -> None:
+    stamps = [START_NS + k * 50 * MS for k in range(4000)]
+    lidar = [DetectionList("lidar", stamp, stamp, ()) for stamp in stamps]
+    shuffled: list[Message] = [lidar[k] for k in np.random.default_rng(1).permutation(4000)]
+    model = GammaDelay(0.09, 0.151, 0.191)
+    drawn = delays_s(redelayed(shuffled, lidar=SensorDelays(model)), "lidar")
+    assert stats.kstest(drawn, stats.gamma(model.shape, loc=0.09, scale=model.scale_s).cdf).pvalue > 1e-4
+    burst = delays_s(redelayed(shuffled, lidar=SensorDelays(BurstDelay(0.02, 0.5, 1.0))), "lidar")
+    edges = np.flatnonzero(np.diff(burst))
+    assert set(np.diff(edges)[burst[int(edges[0]) + 1] < 0.5 :: 2] % 10) == {0}  # 0.5 s at 20 Hz, also when shuffled
+
+
+def test_no_delay_takes_every_stamp_as_the_arrival() -> None:
+    found = list(redelay(lambda: DRIVE, {OTHERS: SensorDelays(NoDelay())}, np.random.default_rng(0)))
+    assert {m.receipt_ns - m.stamp_ns for m in found if isinstance(m, DetectionList)} == {0}
+
+
+def test_losses_are_counted_by_sensor_whether_drawn_alone_or_by_the_delay_model() -> None:
+    delays = {
+        "lidar": SensorDelays(loss_probability=0.5),
+        "radar": SensorDelays(MarkovDelay(ConstantDelay(0.1), LossyDelay(1.0), 0.2, 0.3)),
+    }
+    result = redelay(lambda: DRIVE, delays, np.random.default_rng(0))
+    found = list(result)
+    for sensor in delays:
+        assert 5 < result.num_lost[sensor] < 35
+        assert result.num_lost[sensor] + len(lists(found, sensor)) == len(lists(DRIVE, sensor))
+    assert set(delays_s(found, "radar")) == {0.1}
+    assert all(m in DRIVE for m in lists(found, "lidar"))
+
+
+def test_settings_of_all_others_do_not_touch_the_named_ones() -> None:
+    delays = {OTHERS: SensorDelays(ConstantDelay(0.3)), "radar": SensorDelays(ConstantDelay(0.1))}
+    found = list(redelay(lambda: DRIVE, delays, np.random.default_rng(0)))
+    assert (set(delays_s(found, "lidar")), set(delays_s(found, "radar"))) == ({0.3}, {0.1})
+
+
+# Clocks
+
+
+def test_a_clock_changes_the_stamp_and_not_when_it_arrives() -> None:
+    found = redelayed(DRIVE, lidar=SensorDelays(ConstantDelay(0.2), clock=(OffsetClock(0.5),)))
+    for old, new in zip(lists(DRIVE, "lidar"), lists(found, "lidar"), strict=True):
+        assert (new.stamp_ns - old.stamp_ns, new.receipt_ns - old.stamp_ns) == (500 * MS, 200 * MS)
+        assert new.objects == old.objects
+
+
+def test_arrival_stamps_are_the_new_receipts() -> None:
+    found = redelayed(DRIVE, lidar=replace(LATE, clock=(ArrivalClock(), OffsetClock(-0.1))))
+    assert set(delays_s(found, "lidar")) == {0.1}
+    kept = redelayed(DRIVE, lidar=SensorDelays(clock=(ArrivalClock(),)))
+    assert [m.stamp_ns for m in lists(kept, "lidar")] == [m.receipt_ns for m in lists(DRIVE, "lidar")]
+
+
+def test_detections_with_stamps_of_their_own_follow_their_list() -> None:
+    items = (Detection(x_m=1.0, y_m=1.0, stamp_ns=START_NS - 7), Detection(x_m=2.0, y_m=1.0))
+    moved = redelayed(
+        [DetectionList("lidar", START_NS, START_NS, items)], lidar=SensorDelays(clock=(OffsetClock(0.5),))
+    )
+    assert isinstance(moved[0], DetectionList)
+    assert [item.stamp_ns for item in moved[0].objects] == [START_NS - 7 + 500 * MS, None]
+
+
+# Round trips
+
+
+def test_constant_delays_restore_what_other_delays_have_shuffled() -> None:
+    scenario = replace(load(Scenario, SCENARIOS / "single_opponent.yaml"), duration_s=5.0)
+    constant = [replace(s, delay=ConstantDelay(d)) for s, d in zip(scenario.sensors, (0.15, 0.06), strict=True)]
+    original = simulate(replace(scenario, sensors=tuple(constant)), np.random.default_rng(0))
+    shuffled = redelayed(original, lidar_cluster=LATE, radar=LATE)
+    stamps = [m.stamp_ns for m in shuffled if isinstance(m, DetectionList)]
+    assert shuffled != original
+    assert np.count_nonzero(np.diff(stamps) < 0) > 50
+    back = {"lidar_cluster": SensorDelays(ConstantDelay(0.15)), "radar": SensorDelays(ConstantDelay(0.06))}
+    assert redelayed(shuffled, **back) == original
+
+
+@given(first=st.integers(0, 99), second=st.integers(0, 99))
+@settings(deadline=None)
+def test_the_delays_before_leave_no_trace(first: int, second: int) -> None:
+    both = {"lidar": LATE, "radar": LATE}
+    assert redelayed(redelayed(DRIVE, first, **both), second, **both) == redelayed(DRIVE, second, **both)
+
+
+def test_at_the_same_receipt_what_keeps_it_comes_first_then_sensor_by_sensor() -> None:
+    at = (START_NS, START_NS)
+    radar = [DetectionList("radar", START_NS - k, START_NS, ()) for k in (0, 2)]
+    untouched = [EgoState(*at, 0.0, 0.0, 0.0, 0.0), TruthState(*at, 0, 0.0, 0.0), DetectionList("camera", *at, ())]
+    lidar = DetectionList("lidar", *at, ())
+    messages = [radar[0], untouched[0], lidar, radar[1], *untouched[1:]]
+    found = redelayed(messages, lidar=SensorDelays(NoDelay()), radar=SensorDelays(ConstantDelay(2e-9)))
+    assert found[:-1] == [*untouched, lidar, radar[1]]
+    assert found[-1] == replace(radar[0], receipt_ns=START_NS + 2)
+
+
+class AllAtOnce:
+    """Everything arrives when the last message does."""
+
+    kind = "constant"
+
+    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
+        return np.asarray(stamps_s[-1] - stamps_s)
+
+
+def test_lists_of_one_sensor_at_the_same_receipt_come_in_the_order_of_their_stamps() -> None:
+    lists = [DetectionList("lidar", START_NS + k * 50 * MS, START_NS + 200 * MS, ()) for k in (2, 0, 3, 1)]
+    found = redelayed(list(lists), lidar=SensorDelays(AllAtOnce()))  # type: ignore[arg-type]  # a model of our own
+    assert {m.receipt_ns for m in found} == {START_NS + 150 * MS}
+    assert [(m.stamp_ns - START_NS) // (50 * MS) for m in found] == [0, 1, 2, 3]
+
+
+# Memory and damage
+
+
+@pytest.mark.parametrize(("delay_s", "most"), [(0.16, 3), (0.0, 25)])
+def test_no_more_messages_wait_than_the_delays_need(delay_s: float, most: int) -> None:
+    # 100 ms later than recorded: two or three lists of the lidar wait. 60 ms earlier: all others wait, 340 a second.
+    num_read = 0
+
+    def read() -> Iterator[Message]:
+        nonlocal num_read
+        for message in DRIVE:
+            num_read += 1
+            yield message
+
+    result = redelay(read, {"lidar": SensorDelays(ConstantDelay(delay_s))}, np.random.default_rng(0))
+    num_read = 0
+    assert most / 2 < max(num_read - given for given, _ in enumerate(result, 1)) <= most
+
+
+def broken(count: int, error: DataError) -> Iterator[Message]:
+    yield from DRIVE[:count]
+    raise error
+
+
+@pytest.mark.parametrize("error", [TruncatedInput("breaks off"), DataError("is bad")])
+def test_an_input_that_breaks_off_gives_everything_before_the_break(error: DataError) -> None:
+    result = redelay(lambda: broken(500, error), {"lidar": LATE}, np.random.default_rng(0))
+    found: list[Message] = []
+    with pytest.raises(DataError) as raised:
+        found.extend(result)
+    assert raised.value is error
+    assert found == redelayed(DRIVE[:500], lidar=LATE)
+
+
+@pytest.mark.parametrize("count", [100, 900])
+def test_an_input_that_changes_meanwhile_is_an_error(count: int) -> None:
+    readings = iter([DRIVE[:500], DRIVE[:count]])
+    with pytest.raises(DataError, match="has changed"):
+        list(redelay(lambda: next(readings), {"lidar": LATE}, np.random.default_rng(0)))
+
+
+def test_a_sensor_that_is_not_there_is_named() -> None:
+    with pytest.raises(CallError, match="sensor 'sonar' is not in the input, whose sensors are: lidar, radar"):
+        redelay(lambda: DRIVE, {"sonar": LATE}, np.random.default_rng(0))
+    with pytest.raises(ValueError, match="loss_probability: must lie in"):
+        SensorDelays(loss_probability=1.5)
