@@ -9,6 +9,7 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.matching import Matching, state_errors
+from fgtrack.evaluation.nees import normalised_squares
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.evaluation.truth import TRUE_STATE, TruePath, true_paths
 from fgtrack.io.run_folder import Run, Table
@@ -119,11 +120,4 @@ def _moments(states: Table, truth: FloatArray) -> dict[str, Moments]:
 
 def _position_nees(states: Table, truth: FloatArray) -> FloatArray:
     """Normalised error squared of x and y, shape (n,); NaN where the covariance is not positive definite."""
-    dx_m, dy_m = states["x_m"] - truth[:, 0], states["y_m"] - truth[:, 1]
-    xx, xy, yy = (states[f"p_{name}"] for name in ("x_x", "x_y", "y_y"))
-    determinant = xx * yy - xy**2
-    usable = (xx > 0.0) & (determinant > 0.0)
-    squared = yy * dx_m**2 - 2.0 * xy * dx_m * dy_m + xx * dy_m**2
-    nees = np.full(len(states), np.nan)
-    nees[usable] = squared[usable] / determinant[usable]
-    return nees
+    return normalised_squares(states, np.stack([states["x_m"], states["y_m"]], axis=-1) - truth[:, :2])

@@ -40,7 +40,13 @@ class Matching:
     object_index: IntArray
     """Object that each row is paired to, shape (r,); `NO_OBJECT` where none."""
     true_states: FloatArray
-    """x, y, yaw, speed of that object at the row's stamp, shape (r, 4); NaN where none."""
+    """x, y, yaw, speed, yaw rate of that object at the row's stamp, shape (r, 5); NaN where none."""
+    distances_m: FloatArray
+    """Distance of each row from every object at the row's stamp, shape (r, objects); NaN where one is not known."""
+    now_ns: IntArray
+    """Time of every tick, shape (ticks,)."""
+    tick_index: IntArray
+    """Number of each row's tick among the ticks, shape (r,)."""
     present: BoolArray
     """Whether there is truth at the tick's `now_ns`, shape (ticks, objects)."""
     track_ids: IntArray
@@ -91,31 +97,38 @@ def match(run: Run, options: MatchOptions | None = None) -> Matching | None:
     candidates = np.stack([path.at(tracks["stamp_ns"]) for path in paths], axis=1)
     xy = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
     distances_m = np.linalg.norm(candidates[..., :2] - xy[:, None], axis=-1)
-    distances_m[~(distances_m <= options.gate_m)] = np.inf  # NaN, too: no truth or no finite state
-    object_index = np.full(len(tracks), NO_OBJECT)
-    track_ids = np.full((len(ticks), len(paths)), NO_TRACK)
-    order = np.argsort(tracks["tick"], kind="stable")
-    edges = np.searchsorted(tracks["tick"][order], ticks, side="left")
-    ends = np.searchsorted(tracks["tick"][order], ticks, side="right")
-    previous = np.full(len(paths), NO_TRACK)
-    for k, (start, end) in enumerate(zip(edges.tolist(), ends.tolist(), strict=True)):
-        rows = order[start:end]
-        ids = tracks["track_id"][rows]
-        for row, column in _assign(distances_m[rows], ids, previous):
-            object_index[rows[row]] = column
-            track_ids[k, column] = ids[row]
-        previous = track_ids[k]
-    true_states = np.full((len(tracks), len(TRUE_STATE)), np.nan)
+    inside = distances_m <= options.gate_m  # not where NaN: no truth or no finite state
+    tick_index = np.searchsorted(ticks, tracks["tick"])
+    object_index = _pair(np.where(inside, distances_m, np.inf), tracks["track_id"], tick_index, len(ticks))
     paired = np.flatnonzero(object_index != NO_OBJECT)
+    track_ids = np.full((len(ticks), len(paths)), NO_TRACK)
+    track_ids[tick_index[paired], object_index[paired]] = tracks["track_id"][paired]
+    true_states = np.full((len(tracks), len(TRUE_STATE)), np.nan)
     true_states[paired] = candidates[paired, object_index[paired]]
     return Matching(
         object_ids=tuple(path.object_id for path in paths),
         tracks=tracks,
         object_index=object_index,
         true_states=true_states,
+        distances_m=distances_m,
+        now_ns=now_ns,
+        tick_index=tick_index,
         present=_present(paths, now_ns),
         track_ids=track_ids,
     )
+
+
+def contested(inside: BoolArray, tick_index: IntArray, num_ticks: int) -> BoolArray:
+    """Ticks at which there is a choice: a row with several objects, or an object with several rows; shape (ticks,).
+
+    At every other tick the pairs are those of `inside`, shape (rows, objects), whatever the distances are.
+    """
+    rows, columns = np.nonzero(inside)
+    objects = inside.shape[1]
+    rows_of = np.bincount(tick_index[rows] * objects + columns, minlength=num_ticks * objects)
+    several = np.asarray((rows_of.reshape(num_ticks, objects) > 1).any(axis=1))
+    several[tick_index[inside.sum(axis=1) > 1]] = True
+    return several
 
 
 def track_errors(matching: Matching) -> TrackErrors:
@@ -130,7 +143,7 @@ def track_errors(matching: Matching) -> TrackErrors:
 
 
 def state_errors(states: Table, truth: FloatArray) -> dict[str, FloatArray]:
-    """Errors by name of `ERROR_NAMES`, shape (n,) each, of n rows against x, y, yaw and speed, shape (n, 4)."""
+    """Errors by name of `ERROR_NAMES`, shape (n,) each, of n rows against x, y, yaw, speed ..., shape (n, 5)."""
     dx_m, dy_m = states["x_m"] - truth[:, 0], states["y_m"] - truth[:, 1]
     c, s = np.cos(truth[:, 2]), np.sin(truth[:, 2])
     yaw_rad = states["yaw_rad"] - truth[:, 2]
@@ -161,6 +174,25 @@ def _judged(run: Run, options: MatchOptions) -> BoolArray:
 
 def _present(paths: list[TruePath], now_ns: IntArray) -> BoolArray:
     return np.stack([np.isfinite(path.at(now_ns)[:, 0]) for path in paths], axis=-1)
+
+
+def _pair(distances_m: FloatArray, ids: IntArray, tick_index: IntArray, num_ticks: int) -> IntArray:
+    """Object of every row, shape (rows,); `distances_m`, shape (rows, objects), is infinite outside the gate."""
+    object_index = np.full(len(ids), NO_OBJECT)
+    inside = np.isfinite(distances_m)
+    unclear = contested(inside, tick_index, num_ticks)
+    clear_rows, columns = np.nonzero(inside & ~unclear[tick_index, None])
+    object_index[clear_rows] = columns
+    order = np.argsort(tick_index, kind="stable")
+    edges = np.searchsorted(tick_index[order], np.arange(num_ticks + 1)).tolist()
+    for k in np.flatnonzero(unclear).tolist():
+        before, rows = order[edges[max(k - 1, 0)] : edges[k]], order[edges[k] : edges[k + 1]]
+        before = before[object_index[before] != NO_OBJECT]
+        previous = np.full(distances_m.shape[1], NO_TRACK)
+        previous[object_index[before]] = ids[before]
+        for row, column in _assign(distances_m[rows], ids[rows], previous):
+            object_index[rows[row]] = column
+    return object_index
 
 
 def _assign(distances_m: FloatArray, ids: IntArray, previous: IntArray) -> list[tuple[int, int]]:

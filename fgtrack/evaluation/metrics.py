@@ -9,18 +9,14 @@ import numpy as np
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, Disposition, FloatArray, IntArray
+from fgtrack.evaluation.consistency import Consistency, consistency
+from fgtrack.evaluation.continuity import late_switches, times_to_confirm
 from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
-from fgtrack.evaluation.matching import (
-    CONFIRMED_MEASUREMENTS,
-    ERROR_NAMES,
-    Matching,
-    MatchOptions,
-    match,
-    run_options,
-    track_errors,
-)
+from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, ERROR_NAMES, Matching, match, track_errors
+from fgtrack.evaluation.multi_object import MultiObjectMetrics, multi_object_metrics
+from fgtrack.evaluation.options import EvaluationOptions, evaluation_options
 from fgtrack.evaluation.residuals import ANGULAR, RESIDUAL_NAMES, residuals
-from fgtrack.evaluation.statistics import Distribution, Moments
+from fgtrack.evaluation.statistics import ChiSquareMean, Distribution, Moments
 from fgtrack.io.run_folder import NO_TRACK, Run, Table
 
 FALSE_TRACK_SHARE = 0.5
@@ -41,6 +37,10 @@ class ObjectMetrics:
     """How often tracking went on after a loss, or with another track."""
     id_switches: int
     """How often it went on with another track than the last one."""
+    late_id_switches: int
+    """Those that follow on an out-of-sequence update, see `late_switches`."""
+    time_to_confirm_s: Moments
+    """From the first detection to the first confirmed track, a sample for each object, see `times_to_confirm`."""
 
     @property
     def tracked_share(self) -> float:
@@ -54,10 +54,12 @@ class ObjectMetrics:
             self.ticks_tracked + other.ticks_tracked,
             self.breaks + other.breaks,
             self.id_switches + other.id_switches,
+            self.late_id_switches + other.late_id_switches,
+            self.time_to_confirm_s + other.time_to_confirm_s,
         )
 
 
-NOTHING_TRACKED = ObjectMetrics({name: Moments() for name in ERROR_NAMES}, 0, 0, 0, 0)
+NOTHING_TRACKED = ObjectMetrics({name: Moments() for name in ERROR_NAMES}, 0, 0, 0, 0, 0, Moments())
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ class Metrics:
     name: str
     """Name of the run folder."""
     estimator: str
-    options: MatchOptions
+    options: EvaluationOptions
     num_tracks: int
     """Distinct ids in tracks.csv."""
     num_confirmed: int
@@ -115,10 +117,15 @@ class Metrics:
     sensors: Mapping[str, SensorMetrics]
     time_per_tick_s: Distribution
     """Wall time of the ticks with a detection."""
+    time_per_detection_s: float
+    """Wall time of these ticks per detection received; NaN without any."""
+    consistency: Consistency
     truth: TruthMetrics | None = field(default=None)
     """None for a run without truth."""
     lagged: tuple[LagMetrics, ...] = ()
     """Present, lagged and final states, see `lag_metrics`."""
+    multi_object: MultiObjectMetrics | None = None
+    """None for a run without truth, and where they are not asked for."""
 
     @property
     def precision(self) -> float:
@@ -138,13 +145,17 @@ class Metrics:
         return values
 
 
-def evaluate(run: Run, options: MatchOptions | None = None) -> Metrics:
-    """Metrics of `run`; without truth, those that need none."""
-    options = options or run_options(run)
+def evaluate(run: Run, options: EvaluationOptions | None = None) -> Metrics:
+    """Metrics of `run`; without truth, those that need none.
+
+    Without `options` those that its configuration asks for.
+    """
+    options = options or evaluation_options(run)
     matching = match(run, options)
     ids = run.tracks["track_id"]
     confirmed = run.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS
     busy = run.timing["num_detections"] > 0
+    time_s, detections = run.timing["process_ns"][busy] / NS_PER_S, run.timing["num_detections"][busy]
     return Metrics(
         name=run.path.resolve().name,
         estimator=str(run.meta.get("estimator", "")),
@@ -152,14 +163,19 @@ def evaluate(run: Run, options: MatchOptions | None = None) -> Metrics:
         num_tracks=len(np.unique(ids)),
         num_confirmed=len(np.unique(ids[confirmed])),
         sensors=_sensor_metrics(run),
-        time_per_tick_s=Distribution.of(run.timing["process_ns"][busy] / NS_PER_S),
-        truth=None if matching is None else _truth_metrics(matching),
+        time_per_tick_s=Distribution.of(time_s),
+        time_per_detection_s=float(time_s.sum() / detections.sum()) if len(time_s) else math.nan,
+        consistency=consistency(run, matching),
+        truth=None if matching is None else _truth_metrics(run, matching, options),
         lagged=lag_metrics(run, matching),
+        multi_object=multi_object_metrics(run, matching, options),
     )
 
 
-def _truth_metrics(matching: Matching) -> TruthMetrics:
+def _truth_metrics(run: Run, matching: Matching, options: EvaluationOptions) -> TruthMetrics:
     errors = track_errors(matching)
+    late = late_switches(run, matching, options.late_switch_s)
+    confirm_s = times_to_confirm(run, matching, options.gate_m)
     objects = {}
     for index, object_id in enumerate(matching.object_ids):
         mine = errors.object_index == index
@@ -167,6 +183,8 @@ def _truth_metrics(matching: Matching) -> TruthMetrics:
             {name: Moments.of(values[mine]) for name, values in errors.values.items()},
             matching.present[:, index],
             matching.track_ids[:, index],
+            int(late[index]),
+            Moments.of(confirm_s[index : index + 1]),
         )
     tracks, paired = matching.tracks, matching.paired
     ids, inverse = np.unique(tracks["track_id"], return_inverse=True)
@@ -181,7 +199,13 @@ def _truth_metrics(matching: Matching) -> TruthMetrics:
     )
 
 
-def _object_metrics(errors: Mapping[str, Moments], present: BoolArray, track_ids: IntArray) -> ObjectMetrics:
+def _object_metrics(
+    errors: Mapping[str, Moments],
+    present: BoolArray,
+    track_ids: IntArray,
+    late_id_switches: int,
+    time_to_confirm_s: Moments,
+) -> ObjectMetrics:
     """Counts from the track paired to one object at every tick, shape (ticks,)."""
     track_ids = track_ids[present]
     tracked = track_ids != NO_TRACK
@@ -194,6 +218,8 @@ def _object_metrics(errors: Mapping[str, Moments], present: BoolArray, track_ids
         ticks_tracked=len(sequence),
         breaks=max(stretches - 1, 0),
         id_switches=int((sequence[1:] != sequence[:-1]).sum()),
+        late_id_switches=late_id_switches,
+        time_to_confirm_s=time_to_confirm_s,
     )
 
 
@@ -229,7 +255,7 @@ def message_delays(updates: Table) -> tuple[IntArray, FloatArray]:
 
 def _plain(value: Any) -> Any:
     """`value` as JSON: derived properties beside the fields, NaN as None, keys as text."""
-    if isinstance(value, Moments):
+    if isinstance(value, Moments | ChiSquareMean):
         return {name: _plain(number) for name, number in value.as_dict().items()}
     if is_dataclass(value):
         plain = {entry.name: _plain(getattr(value, entry.name)) for entry in fields(value)}

@@ -5,9 +5,13 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from fgtrack.core.geometry import circular_mean, wrap_angle, wrap_angles
-from fgtrack.core.types import FloatArray
+from fgtrack.core.types import FloatArray, IntArray
+
+NORMAL_95 = 1.959963984540054
+"""A normal variable stays within as many standard deviations with 95 % probability."""
 
 
 @dataclass(frozen=True)
@@ -82,3 +86,49 @@ class Distribution:
             return cls()
         quantiles = np.quantile(values, (0.5, 0.9, 0.99, 1.0)).tolist()
         return cls(len(values), float(values.mean()), *quantiles)
+
+
+@dataclass(frozen=True)
+class ChiSquareMean:
+    """Mean of independent normalised squares (NEES, NIS), and what it must be; those of two samples add up."""
+
+    count: int = 0
+    mean: float = math.nan
+    dof: float = math.nan
+    """Mean of the degrees of freedom: the expected value of `mean`."""
+
+    @classmethod
+    def of(cls, values: FloatArray, dof: IntArray) -> Self:
+        """Mean of `values` with `dof` degrees of freedom each, both of shape (n,), without the NaN among them."""
+        known = ~np.isnan(values)
+        if not known.any():
+            return cls()
+        return cls(int(known.sum()), float(values[known].mean()), float(dof[known].mean()))
+
+    def __add__(self, other: "ChiSquareMean") -> "ChiSquareMean":
+        if not self.count or not other.count:
+            return self if self.count else other
+        count = self.count + other.count
+        share = other.count / count
+        return ChiSquareMean(
+            count, self.mean + share * (other.mean - self.mean), self.dof + share * (other.dof - self.dof)
+        )
+
+    @property
+    def band(self) -> tuple[float, float]:
+        """Where `mean` lies with 95 % probability, as much below as above; NaN of an empty sample."""
+        if not self.count:
+            return math.nan, math.nan
+        low, high = chi_square_band(np.array([self.count * self.dof]), np.array([self.count]))
+        return float(low[0]), float(high[0])
+
+    def as_dict(self) -> dict[str, float]:
+        """Values by name."""
+        low, high = self.band
+        return {"count": self.count, "mean": self.mean, "dof": self.dof, "band_low": low, "band_high": high}
+
+
+def chi_square_band(dof: FloatArray, count: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Two-sided 95 % band of the mean of `count` squares with `dof` degrees of freedom in all, shape (n,) each."""
+    low, high = (2.0 * gammaincinv(dof / 2.0, share) / count for share in (0.025, 0.975))
+    return low, high

@@ -9,11 +9,13 @@ from rich.table import Table
 from rich.text import Text
 
 from fgtrack.core.types import Disposition
+from fgtrack.evaluation.consistency import Consistency
 from fgtrack.evaluation.lagged import WINDOW, LagMetrics
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS
 from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics, ObjectMetrics
 from fgtrack.evaluation.residuals import RESIDUAL_NAMES
-from fgtrack.evaluation.statistics import Distribution, Moments
+from fgtrack.evaluation.statistics import ChiSquareMean, Distribution, Moments
+from fgtrack.evaluation.whiteness import FEWEST, LAGS
 
 BACKWARD_FORWARD = "ekf-backward-forward"
 BACKWARD_FORWARD_NOTE = "backward-forward forgets what was fused after the stamp of a late detection"
@@ -30,13 +32,19 @@ _ERROR_HEADINGS = {
 _LAG_ERRORS = ("position_m", "speed_mps", "yaw_rad")
 _MOST_LAGS = 8
 _CONTINUITY_HEADINGS = ("tracked\n[%]", "breaks/\nswitches", "false\ntracks", "preci-\nsion")
+_MULTI_OBJECT_HEADINGS = (
+    *("GOSPA\n[m]", "local.\n[m]", "missed\n[m]", "false\n[m]"),
+    *("MOTA\n[%]", "IDF1\n[%]", "HOTA\n[%]", "DetA\n[%]", "AssA\n[%]"),
+    *("switches/\nlate", "confirm\n[s]"),
+)
 _NOTE_WIDTH = 86  # so that no note is broken
 _MS = 1e3
 
 
 def comparison_tables(metrics: Mapping[str, Metrics]) -> list[Table]:
-    """All tables of `metrics`, by label: the main one, lagged states, residuals of every sensor, dispositions."""
-    tables = [main_table(metrics), lag_table(metrics), *residual_tables(metrics), disposition_table(metrics)]
+    """All tables of `metrics`, by label, that have a row; the main one first."""
+    tables = [main_table(metrics), multi_object_table(metrics), lag_table(metrics), consistency_table(metrics)]
+    tables += [*residual_tables(metrics), disposition_table(metrics)]
     return [table for table in tables if table.row_count]
 
 
@@ -69,6 +77,46 @@ def main_table(metrics: Mapping[str, Metrics]) -> Table:
             "breaks: tracked again after a loss, or by another track; switches: by another track",
             f"precision: true objects tracked / tracks with {CONFIRMED_MEASUREMENTS}+ measurements",
         ]
+    table.caption = Text("\n".join([*notes, *_notes(metrics)]))
+    return table
+
+
+def multi_object_table(metrics: Mapping[str, Metrics]) -> Table:
+    """A row per run with truth: GOSPA and its parts, CLEAR, IDF1, HOTA, identity switches, time to confirm."""
+    table = _table("Multi-object metrics")
+    _name(table, "run")
+    for heading in _MULTI_OBJECT_HEADINGS:
+        _number(table, heading)
+    if not any(one.multi_object for one in metrics.values()):
+        return table
+    for label, one in metrics.items():
+        table.add_row(Text(label), *_multi_object_cells(one))
+    notes = [
+        "GOSPA: root mean square over the ticks; the squares of its parts add up to its own",
+        "scores: 100 is perfect; docs/metrics.md tells what each of them counts",
+        "late: switches soon after an out-of-sequence update of one of the two tracks",
+        "confirm: from an object's first detection to its first confirmed track",
+    ]
+    table.caption = Text("\n".join([*notes, *_notes(metrics)]))
+    return table
+
+
+def consistency_table(metrics: Mapping[str, Metrics]) -> Table:
+    """A row per run and normalised square: NEES of the present states, NIS and whiteness of every sensor."""
+    table = _table("Consistency (means of normalised squares, and what they must be)")
+    _name(table, "run")
+    _name(table, "of")
+    for heading in ("samples", "mean", "expected", "95 % band", "correlation\nat lag 1", "outside\n[%]"):
+        _number(table, heading)
+    for label, one in metrics.items():
+        for k, cells in enumerate(_consistency_rows(one.consistency)):
+            table.add_row(Text(label if k == 0 else ""), *cells)
+    notes = [
+        "band: of the mean of independent samples; errors along one run are not independent,",
+        "so NEES of a single run may leave it (several runs tell)",
+        f"correlation: of the innovations (position first), of tracks with {FEWEST}+; ± 95 % band if white",
+        f"outside: tracks and lags 1 to {LAGS} outside their own bands; 5 if white",
+    ]
     table.caption = Text("\n".join([*notes, *_notes(metrics)]))
     return table
 
@@ -182,6 +230,40 @@ def _truth_cells(one: Metrics) -> list[str]:
         str(one.truth.false_tracks),
         _NONE if math.isnan(one.precision) else f"{one.precision:.2f}",
     ]
+
+
+def _multi_object_cells(one: Metrics) -> list[str]:
+    if one.multi_object is None or one.truth is None:
+        return [_NONE] * len(_MULTI_OBJECT_HEADINGS)
+    gospa, overall = one.multi_object.gospa, one.truth.overall
+    parts_m = (math.sqrt(part) for part in (gospa.localisation_m2, gospa.missed_m2, gospa.false_m2))
+    clear, identity, hota = one.multi_object.clear, one.multi_object.identity, one.multi_object.hota
+    return [
+        *(_short(value) for value in (gospa.rms_m, *parts_m)),
+        *(_short(100.0 * score) for score in (clear.mota, identity.idf1, hota.hota, hota.deta, hota.assa)),
+        f"{overall.id_switches}/{overall.late_id_switches}",
+        _short(overall.time_to_confirm_s.mean),
+    ]
+
+
+def _consistency_rows(found: Consistency) -> list[list[str]]:
+    """Cells of every row behind the name of the run."""
+    rows = []
+    for name, nees in (("NEES position", found.position_nees), ("NEES state", found.state_nees)):
+        if nees.count:
+            rows.append([name, *_chi_square_cells(nees), _NONE, _NONE])
+    for sensor, nis in found.nis.items():
+        if nis.count:
+            first = next(iter(found.autocorrelation[sensor].values()), None)
+            correlation = f"{_short(first.lag1)} ± {_short(first.lag1_band)}" if first else _NONE
+            outside = _short(100.0 * first.share_outside) if first else _NONE
+            rows.append([f"NIS {sensor}", *_chi_square_cells(nis), correlation, outside])
+    return rows
+
+
+def _chi_square_cells(one: ChiSquareMean) -> list[str]:
+    low, high = one.band
+    return [str(one.count), _short(one.mean), _short(one.dof), f"{_short(low)} to {_short(high)}"]
 
 
 def _notes(metrics: Mapping[str, Metrics]) -> list[str]:

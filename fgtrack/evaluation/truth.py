@@ -13,7 +13,7 @@ EGO_ID = -1
 """Object id of the ego in truth.csv."""
 
 #: What is interpolated, in the order of the columns of `TruePath.at`.
-TRUE_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps")
+TRUE_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
 
 _SHORTEST_GAP_NS = NS_PER_S
 _GAP_PERIODS = 5
@@ -27,13 +27,13 @@ class TruePath:
     stamps_ns: IntArray
     """Shape (n,)."""
     states: FloatArray
-    """x, y, yaw, speed, shape (n, 4); NaN where the truth does not say."""
+    """x, y, yaw, speed, yaw rate, shape (n, 5); NaN where the truth does not say."""
 
     def at(self, stamps_ns: IntArray) -> FloatArray:
-        """States at `stamps_ns`, shape (m,); shape (m, 4), NaN where there is no truth.
+        """States at `stamps_ns`, shape (m,); shape (m, 5), NaN where there is no truth.
 
         The position is a cubic Hermite curve where both neighbours have yaw and speed, else linear. Yaw goes
-        the shorter way round, speed is linear. There is no truth before the first stamp, after the last one,
+        the shorter way round, the rest is linear. There is no truth before the first stamp, after the last one,
         and in a gap: neighbours more than a second and more than five usual periods apart (the object was
         away).
         """

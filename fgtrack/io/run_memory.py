@@ -61,9 +61,10 @@ class MemoryRun:
             self._append("tracks", ids, track.state)
         for record in report.updates:
             self._counts.setdefault(record.sensor, Counter())[record.disposition] += 1
-            ids = (tick, record.sensor, record.stamp_ns, record.receipt_ns, record.index, record.disposition.value)
+            times = (record.stamp_ns, record.receipt_ns)
+            outcome = (record.index, record.disposition.value, record.track_id, record.nis)
             innovation = [record.innovation.get(name) for name in MEASURABLE]
-            self._rows["updates"].append((*ids, record.track_id, record.nis, *innovation))
+            self._rows["updates"].append((tick, record.sensor, *times, *outcome, *innovation))
         smoothed = kept_smoothed(report)
         for row in smoothed:
             if row.lag_s is not None:

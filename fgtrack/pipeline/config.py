@@ -173,10 +173,20 @@ class EvaluationConfig:
 
     gate_m: float = 5.0
     """Largest distance of a track from its true object; a car's length, more for ships."""
+    multi_object: bool = True
+    """Whether GOSPA, CLEAR, IDF1 and HOTA are computed."""
+    gospa_c_m: float | None = None
+    """Cut-off distance c of GOSPA; null for `gate_m`."""
+    late_switch_s: float = 0.5
+    """An identity switch within this time after an out-of-sequence update counts as late."""
 
     def __post_init__(self) -> None:
-        if not self.gate_m > 0.0:
-            raise ValueError(f"gate_m: must be positive, is {self.gate_m}")
+        for name in ("gate_m", "gospa_c_m"):
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise ValueError(f"{name}: must be positive, is {value}")
+        if not self.late_switch_s >= 0.0:
+            raise ValueError(f"late_switch_s: must not be negative, is {self.late_switch_s}")
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 from scipy.optimize import linear_sum_assignment
 
 from fgtrack.core.types import TruthState
-from fgtrack.evaluation.matching import NO_OBJECT, MatchOptions, _assign, match, track_errors
+from fgtrack.evaluation.matching import NO_OBJECT, MatchOptions, _assign, _pair, contested, match, track_errors
 from fgtrack.evaluation.truth import TruePath, true_paths
 from fgtrack.io.run_folder import NO_TRACK
 
@@ -180,3 +180,32 @@ def test_the_assignment_is_the_largest_and_then_the_cheapest(distances_m: np.nda
     assert sum(distances_m[pair] for pair in pairs) == pytest.approx(
         distances_m[cheapest][inside[cheapest]].sum(), abs=1e-6
     )
+
+
+@settings(deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([0.1, 0.3, 0.6]))
+def test_where_there_is_no_choice_the_pairs_are_those_of_the_assignment(seed: int, density: float) -> None:
+    """Rows of the ticks stand in any order; few, some or most of the distances lie inside the gate."""
+    rng = np.random.default_rng(seed)
+    ticks, columns = 8, int(rng.integers(1, 4))
+    tick_index = rng.permutation(np.repeat(np.arange(ticks), rng.integers(0, 4, ticks)))
+    ids = np.zeros(len(tick_index), np.int64)
+    for tick in range(ticks):
+        ids[tick_index == tick] = rng.permutation(4)[: (tick_index == tick).sum()]
+    distances_m = rng.uniform(0.0, 5.0, (len(ids), columns))
+    distances_m[rng.random(distances_m.shape) > density] = np.inf
+    expected = np.full(len(ids), NO_OBJECT)
+    previous = np.full(columns, NO_TRACK)
+    for tick in range(ticks):
+        rows = np.flatnonzero(tick_index == tick)
+        pairs = _assign(distances_m[rows], ids[rows], previous)
+        previous = np.full(columns, NO_TRACK)
+        for row, column in pairs:
+            expected[rows[row]], previous[column] = column, ids[rows[row]]
+    assert _pair(distances_m, ids, tick_index, ticks).tolist() == expected.tolist()
+
+
+def test_a_tick_is_contested_where_a_row_or_an_object_has_a_choice() -> None:
+    inside = np.array([[1, 0], [0, 1], [1, 1], [1, 0], [1, 0], [0, 0]], dtype=bool)
+    tick_index = np.array([0, 0, 1, 2, 2, 3])
+    assert contested(inside, tick_index, 5).tolist() == [False, True, True, False, False]

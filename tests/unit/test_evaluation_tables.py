@@ -15,8 +15,10 @@ from fgtrack.evaluation.tables import (
     BACKWARD_FORWARD_NOTE,
     comparison_dict,
     comparison_tables,
+    consistency_table,
     disposition_table,
     main_table,
+    multi_object_table,
     residual_tables,
 )
 from fgtrack.io.run_folder import Run
@@ -59,7 +61,7 @@ def test_every_table_fits_a_terminal_of_120_columns(metrics: dict[str, Metrics])
         lines = text_of(shown).splitlines()
         assert max(map(len, lines)) <= 120
         assert not any("…" in line for line in lines)
-    assert len(tables) == 4
+    assert len(tables) == 6
     for estimator in ESTIMATORS:
         assert f"race/{estimator} " in text_of([main_table(wide)])
 
@@ -72,6 +74,47 @@ def test_the_main_table_shows_errors_with_units(metrics: dict[str, Metrics]) -> 
     assert row.split()[1:] == expected.split()
     for unit in ("[m]", "[rad]", "[m/s]", "[%]", "ms/tick"):
         assert unit in text
+
+
+def test_the_multi_object_table_shows_gospa_scores_switches_and_the_time_to_confirm(tmp_path: Path) -> None:
+    """WEST is 2.75 m off, with a late switch at tick 2; ROUND is missed; track 9 is false."""
+    tracks = [[WEST.track(k, 1 if k < 2 else 2, along_m=2.75), WEST.track(k, 9, across_m=60.0)] for k in range(4)]
+    updates = {
+        0: [update(tick=-3, disposition=Disposition.BIRTH)],
+        2: [update(tick=1, disposition=Disposition.OUT_OF_SEQUENCE, track_id=2)],
+    }
+    run = write_run(tmp_path / "run", tracks, truth=[*WEST.truth(range(4)), *ROUND.truth(range(4))], updates=updates)
+    plain = write_run(tmp_path / "plain", tracks)
+    metrics = {"run": evaluate(run), "plain": evaluate(plain)}
+    text = text_of([multi_object_table(metrics)])
+    rows = [line.split() for line in text.splitlines() if line.startswith((" run ", " plain "))]
+    # GOSPA^2 = 2.75^2 + 12.5 + 12.5 at every tick; MOTA 1 - (4 + 4 + 1) / 8; IDF1 2 * 2 / (8 + 8)
+    # a similarity of 0.725 passes 14 of 19 bounds: DetA 14/19 * 4/12, AssA 14/19 * 1/2, HOTA 14/19 sqrt(1/6)
+    (_, *units), (_, *shown), (_, *dashes) = rows
+    assert units == [*["[m]"] * 4, *["[%]"] * 5, "late", "[s]"]
+    assert shown == ["5.71", "2.75", "3.54", "3.54", "-12.5", "25.0", "30.1", "24.6", "36.8", "1/1", "0.060"]
+    assert dashes == ["-"] * 11
+
+
+def test_the_consistency_table_shows_means_bands_and_whiteness(tmp_path: Path) -> None:
+    flips = [update(tick=k, nis=5.0, x_m=(-1.0) ** k, y_m=0.0) for k in range(30)]
+    tracks = [[WEST.track(k, 1, along_m=3.0)] for k in range(40)]
+    updates = {k: [record, update("radar", tick=k, nis=1.0, speed_mps=2.0)] for k, record in enumerate(flips)}
+    metrics = {"run": evaluate(write_run(tmp_path / "run", tracks, truth=WEST.truth(range(40)), updates=updates))}
+    lines = text_of([consistency_table(metrics)]).splitlines()
+    rows = [" ".join(line.split()) for line in lines]
+    assert "run NEES position 40 9.00 2.00 1.43 to 2.67 - -" in rows
+    assert "NEES state 40 9.00 4.00 3.17 to 4.92 - -" in rows
+    assert "NIS lidar 30 5.00 2.00 1.35 to 2.78 -0.967 ± 0.352 100" in rows
+    assert "NIS radar 30 1.00 1.00 0.560 to 1.57 0.967 ± 0.352 100" in rows
+
+
+def test_without_truth_the_consistency_table_has_the_sensors(tmp_path: Path) -> None:
+    metrics = {"a": evaluate(a_run(tmp_path / "without", "smoother", truth=False))}
+    text = text_of([consistency_table(metrics)])
+    assert "NEES position" not in text
+    assert "NIS lidar_cluster" in text
+    assert multi_object_table(metrics).row_count == 0
 
 
 def test_a_residual_table_shows_mean_deviation_nis_and_delay(metrics: dict[str, Metrics]) -> None:
@@ -104,7 +147,7 @@ def test_the_note_on_backward_forward_stands_where_it_is_shown_only(metrics: dic
 
 def test_a_name_in_brackets_is_shown_as_it_is(tmp_path: Path) -> None:
     metrics = {"[bold]run": evaluate(a_run(tmp_path / "run", "smoother"))}
-    assert text_of(comparison_tables(metrics)).count("[bold]run") == 4
+    assert text_of(comparison_tables(metrics)).count("[bold]run") == 6
 
 
 def test_runs_without_truth_have_a_table_without_errors(tmp_path: Path) -> None:

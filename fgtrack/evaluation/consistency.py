@@ -1,0 +1,164 @@
+"""Whether the covariances tell the truth: NEES and NIS beside their chi-square bands."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from fgtrack.core.types import YAW, FloatArray, IntArray
+from fgtrack.evaluation.matching import Matching, state_errors
+from fgtrack.evaluation.nees import normalised_squares
+from fgtrack.evaluation.statistics import ChiSquareMean, Moments, chi_square_band
+from fgtrack.evaluation.truth import TRUE_STATE
+from fgtrack.evaluation.whiteness import Autocorrelation, autocorrelations
+from fgtrack.io.run_folder import Run
+
+_POSITION, _POSE_AND_SPEED, _WITH_YAW_RATE = 2, 4, 5
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Normalised squared errors and innovations of one run, and how white the innovations are.
+
+    The bands are those of independent samples. Innovations of a consistent estimator are independent, errors along a
+    run are not: a single run may leave the band of its NEES, see `nees_over_runs`.
+    """
+
+    position_nees: ChiSquareMean
+    """Of the present position, where there is truth."""
+    state_nees: ChiSquareMean
+    """Of the present x, y, yaw, speed and yaw rate; without the yaw rate where truth or the model has none."""
+    nis: Mapping[str, ChiSquareMean]
+    """By sensor."""
+    autocorrelation: Mapping[str, Mapping[str, Autocorrelation]]
+    """By sensor and innovation, see `autocorrelations`."""
+
+
+@dataclass(frozen=True)
+class Nees:
+    """NEES of n present states."""
+
+    stamps_ns: IntArray
+    object_ids: IntArray
+    values: FloatArray
+    dof: IntArray
+    """Degrees of freedom of each value: what a consistent estimator has on average."""
+
+
+@dataclass(frozen=True)
+class NeesOverRuns:
+    """NEES averaged over Monte-Carlo runs: at m objects and stamps, each with at most one value of a run."""
+
+    object_ids: IntArray
+    """Shape (m,)."""
+    stamps_ns: IntArray
+    """Shape (m,)."""
+    num_runs: IntArray
+    """Runs with a value there, shape (m,)."""
+    mean: FloatArray
+    """Shape (m,)."""
+    low: FloatArray
+    """Lower end of the 95 % band of `mean`, shape (m,)."""
+    high: FloatArray
+    """Its upper end."""
+    run_means: FloatArray = field(repr=False)
+    """Average of every run's own values, shape (runs,); these are independent. NaN for a run without any."""
+
+    @property
+    def share_inside(self) -> float:
+        """Share of the objects and stamps inside the band; 0.95 on average for a consistent estimator."""
+        return float(((self.mean >= self.low) & (self.mean <= self.high)).mean()) if len(self.mean) else np.nan
+
+    @property
+    def overall(self) -> Moments:
+        """Moments of `run_means`: std / sqrt(count - 1) is the standard error of the mean, without any assumption."""
+        return Moments.of(self.run_means)
+
+
+def consistency(run: Run, matching: Matching | None) -> Consistency:
+    """NEES of the judged rows of `run`, NIS and whiteness of its innovations."""
+    updates = run.updates
+    measured = np.sum([np.isfinite(updates[name]) for name in updates if name.startswith("res_")], axis=0)
+    sensors = {name: updates["sensor"] == name for name in np.unique(updates["sensor"]).tolist()}
+    return Consistency(
+        position_nees=ChiSquareMean() if matching is None else _mean(position_nees(matching)),
+        state_nees=ChiSquareMean() if matching is None else _mean(state_nees(matching)),
+        nis={name: ChiSquareMean.of(updates["nis"][mine], measured[mine]) for name, mine in sensors.items()},
+        autocorrelation={name: autocorrelations(updates.where(mine)) for name, mine in sensors.items()},
+    )
+
+
+def position_nees(matching: Matching) -> Nees:
+    """NEES of the position of every paired row."""
+    return _nees(matching, _POSITION)
+
+
+def state_nees(matching: Matching) -> Nees:
+    """NEES of x, y, yaw, speed and yaw rate of every paired row with known true yaw and speed.
+
+    The yaw rate is left out where the truth does not tell it or the model has none (its variance is 0).
+    """
+    with_yaw_rate, without = _nees(matching, _WITH_YAW_RATE), _nees(matching, _POSE_AND_SPEED)
+    variance = matching.tracks["p_yaw_rate_yaw_rate"][matching.paired]
+    full = np.isfinite(matching.true_states[matching.paired, _WITH_YAW_RATE - 1]) & (variance > 0.0)
+    values = np.where(full, with_yaw_rate.values, without.values)
+    return replace(without, values=values, dof=np.where(full, with_yaw_rate.dof, without.dof))
+
+
+def nees_over_runs(samples: Sequence[Nees]) -> NeesOverRuns:
+    """NEES averaged over runs that differ in their seeds, an entry of `samples` for each: `position_nees(match(run))`.
+
+    Errors along one run are correlated, those of different runs are not. So at every object and stamp the values of
+    N runs are averaged, and N times this mean is chi-square with N times the degrees of freedom. Runs must have the
+    same ticks (`clock.node_hz`); where some have no value, N is the number of the others. Of several values of a
+    run at one stamp the last counts. The objects and stamps themselves remain correlated, so `share_inside` scatters
+    more than the share of as many independent draws.
+
+    Raises
+    ------
+    ValueError
+        There is no run.
+    """
+    if not samples:
+        raise ValueError("at least one run is needed")
+    kept = [_one_each(sample) for sample in samples]
+    keys = np.concatenate([np.stack([one.object_ids, one.stamps_ns], axis=-1) for one in kept])
+    places, inverse = np.unique(keys, axis=0, return_inverse=True)
+    num_runs = np.bincount(inverse, minlength=len(places))
+    values, dof = (np.concatenate([getattr(one, name) for one in kept]) for name in ("values", "dof"))
+    total, total_dof = (np.bincount(inverse, part, len(places)).astype(np.float64) for part in (values, dof))
+    low, high = chi_square_band(total_dof, num_runs)
+    return NeesOverRuns(
+        object_ids=places[:, 0],
+        stamps_ns=places[:, 1],
+        num_runs=num_runs,
+        mean=total / num_runs,
+        low=low,
+        high=high,
+        run_means=np.array([Moments.of(one.values).mean for one in kept]),
+    )
+
+
+def _nees(matching: Matching, size: int) -> Nees:
+    """NEES of the first `size` components of every paired row; NaN where there is none."""
+    tracks, truth = matching.tracks.where(matching.paired), matching.true_states[matching.paired]
+    errors = np.stack([tracks[name] for name in TRUE_STATE], axis=-1) - truth
+    errors[:, YAW] = state_errors(tracks, truth)["yaw_rad"]
+    return Nees(
+        stamps_ns=tracks["stamp_ns"],
+        object_ids=np.array(matching.object_ids)[matching.object_index[matching.paired]],
+        values=normalised_squares(tracks, errors[:, :size]),
+        dof=np.full(len(tracks), size),
+    )
+
+
+def _mean(nees: Nees) -> ChiSquareMean:
+    return ChiSquareMean.of(nees.values, nees.dof)
+
+
+def _one_each(nees: Nees) -> Nees:
+    """The finite values, the last one of each object and stamp."""
+    rows = np.flatnonzero(np.isfinite(nees.values))[::-1]
+    keys = np.stack([nees.object_ids[rows], nees.stamps_ns[rows]], axis=-1)
+    rows = rows[np.unique(keys, axis=0, return_index=True)[1]]
+    return Nees(nees.stamps_ns[rows], nees.object_ids[rows], nees.values[rows], nees.dof[rows])

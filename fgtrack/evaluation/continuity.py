@@ -1,0 +1,80 @@
+"""When an object gets its first confirmed track, and identity switches that late measurements bring."""
+
+import numpy as np
+
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import BoolArray, Disposition, FloatArray, IntArray
+from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, Matching
+from fgtrack.evaluation.truth import true_paths
+from fgtrack.io.run_folder import NO_TRACK, Run, Table
+
+#: What became of a detection that was fused later than in order.
+LATE = (Disposition.OUT_OF_SEQUENCE, Disposition.BEYOND_WINDOW)
+
+#: What became of a detection that says something about its track.
+FUSED = (Disposition.BIRTH, Disposition.IN_SEQUENCE, *LATE)
+
+
+def late_switches(run: Run, matching: Matching, within_s: float) -> IntArray:
+    """Identity switches of every object that follow on an out-of-sequence update, shape (objects,).
+
+    A switch counts where the track before it or the one after it had such an update in the ticks from `within_s`
+    before the switch up to it.
+    """
+    updates = run.updates.where(with_disposition(run.updates, LATE))
+    updates = updates.where(np.isin(updates["tick"], run.timing["tick"]))  # not of a tick that was never finished
+    updated_ns = matching.now_ns[np.searchsorted(run.timing["tick"], updates["tick"])]
+    counts = np.zeros(len(matching.object_ids), dtype=np.int64)
+    for index in range(len(counts)):
+        ticks = np.flatnonzero(matching.present[:, index] & (matching.track_ids[:, index] != NO_TRACK))
+        sequence = matching.track_ids[ticks, index]
+        for k in np.flatnonzero(sequence[1:] != sequence[:-1]).tolist():
+            age_ns = matching.now_ns[ticks[k + 1]] - updated_ns
+            recent = (age_ns >= 0) & (age_ns <= within_s * NS_PER_S)
+            counts[index] += np.isin(updates["track_id"][recent], sequence[k : k + 2]).any()
+    return counts
+
+
+def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
+    """Time from the first detection of every object to its first confirmed track in s, shape (objects,).
+
+    It begins at the stamp of the first detection that was fused into a track which then lies on the object (nearest
+    object within `gate_m`), and ends with the tick at which the object is first paired to a row with
+    `CONFIRMED_MEASUREMENTS` measurements. NaN where there is no such row.
+    """
+    count = len(matching.object_ids)
+    updates = run.updates.where(with_disposition(run.updates, FUSED) & (run.updates["track_id"] != NO_TRACK))
+    rows = _published(run.tracks, updates)
+    stamps_ns, rows = updates["stamp_ns"][rows >= 0], rows[rows >= 0]
+    xy = np.stack([run.tracks["x_m"][rows], run.tracks["y_m"][rows]], axis=-1)
+    truth = np.stack([path.at(run.tracks["stamp_ns"][rows])[:, :2] for path in true_paths(run.truth)], axis=1)
+    distances_m = np.linalg.norm(truth - xy[:, None], axis=-1)
+    distances_m[~(distances_m <= gate_m)] = np.inf
+    near = np.isfinite(distances_m).any(axis=1)
+    never = np.iinfo(np.int64).max
+    seen_ns, confirmed_ns = np.full(count, never), np.full(count, never)
+    np.minimum.at(seen_ns, distances_m[near].argmin(axis=1), stamps_ns[near])
+    confirmed = matching.paired & (matching.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS)
+    at_ns = matching.now_ns[matching.tick_index[confirmed]]
+    np.minimum.at(confirmed_ns, matching.object_index[confirmed], at_ns)
+    known = (seen_ns != never) & (confirmed_ns != never)
+    times_s = np.full(count, np.nan)
+    times_s[known] = (confirmed_ns[known] - seen_ns[known]) / NS_PER_S
+    return times_s
+
+
+def with_disposition(updates: Table, dispositions: tuple[Disposition, ...]) -> BoolArray:
+    """Whether each row of `updates` has one of `dispositions`, shape (rows,)."""
+    return np.isin(updates["disposition"], [name.value for name in dispositions])
+
+
+def _published(tracks: Table, updates: Table) -> IntArray:
+    """The row of `tracks` with tick and track of each of `updates`, shape (updates,); -1 where there is none."""
+    if not len(tracks):
+        return np.full(len(updates), -1)
+    step = 1 + max(int(tracks["track_id"].max()), int(updates["track_id"].max(initial=0)))
+    keys = tracks["tick"] * step + tracks["track_id"]
+    wanted = updates["tick"] * step + updates["track_id"]
+    order = np.argsort(keys)
+    rows = order[np.searchsorted(keys[order], wanted).clip(max=len(keys) - 1)]
+    return np.where(keys[rows] == wanted, rows, -1)

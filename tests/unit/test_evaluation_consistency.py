@@ -1,0 +1,304 @@
+"""NEES and NIS with their bands, over one run and over many, and the whiteness of innovations."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluation_runs import ROUND, START_NS, TICK_NS, WEST, update, write_run
+from scipy.stats import chi2
+
+from fgtrack.core.types import MEASURABLE, Disposition, UpdateRecord
+from fgtrack.evaluation.consistency import Nees, nees_over_runs, position_nees, state_nees
+from fgtrack.evaluation.matching import Matching, match
+from fgtrack.evaluation.metrics import evaluate
+from fgtrack.evaluation.nees import normalised_squares
+from fgtrack.evaluation.statistics import ChiSquareMean
+from fgtrack.evaluation.whiteness import FEWEST, LAGS, Autocorrelation, autocorrelations
+from fgtrack.io.run_folder import COVARIANCE_COLUMNS, Run, Table
+
+
+def table_of(covariances: np.ndarray) -> Table:
+    rows, columns = np.triu_indices(5)
+    return Table(dict(zip(COVARIANCE_COLUMNS, covariances[:, rows, columns].T, strict=True)))
+
+
+def matching_of(run: Run) -> Matching:
+    found = match(run)
+    assert found is not None
+    return found
+
+
+# --- normalised squares
+
+
+@pytest.mark.parametrize("size", [1, 2, 4, 5])
+def test_a_normalised_square_weighs_the_errors_with_their_covariance(size: int) -> None:
+    rng = np.random.default_rng(3)
+    roots = rng.normal(size=(50, 5, 5))
+    covariances = roots @ np.swapaxes(roots, 1, 2)
+    errors = rng.normal(size=(50, size))
+    expected = [e @ np.linalg.solve(P[:size, :size], e) for e, P in zip(errors, covariances, strict=True)]
+    assert normalised_squares(table_of(covariances), errors) == pytest.approx(np.array(expected), rel=1e-8)
+
+
+def test_without_a_positive_definite_covariance_there_is_no_square() -> None:
+    indefinite = np.eye(5)
+    indefinite[0, 1] = indefinite[1, 0] = 2.0
+    unknown = np.eye(5)
+    unknown[4, :] = unknown[:, 4] = np.nan
+    covariances = np.array([np.eye(5), indefinite, np.zeros((5, 5)), -np.eye(5), unknown])
+    squares = normalised_squares(table_of(covariances), np.ones((5, 2)))
+    assert np.isnan(squares).tolist() == [False, True, True, True, False]
+    assert np.isnan(normalised_squares(table_of(covariances), np.ones((5, 5))))[4]
+    assert np.isnan(normalised_squares(table_of(covariances[:1]), np.array([[1.0, np.nan]])))[0]
+
+
+# --- one run
+
+
+def test_nees_of_the_position_and_of_the_state_have_their_known_values(tmp_path: Path) -> None:
+    """The covariance is the identity; the yaw of WEST jumps from pi to -pi."""
+    errors = {"along_m": 3.0, "across_m": 4.0, "yaw_rad": 0.5, "speed_mps": 2.0}
+    tracks = [[WEST.track(k, 1, **errors), WEST.track(k, 2, across_m=60.0)] for k in range(5)]
+    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(5)))
+    found = evaluate(replace(run, config_text="evaluation: {gate_m: 6}")).consistency
+    assert found.position_nees == ChiSquareMean(5, pytest.approx(25.0), 2.0)
+    assert found.state_nees == ChiSquareMean(5, pytest.approx(29.25), 4.0)
+
+
+def test_the_yaw_rate_counts_where_truth_and_model_have_one(tmp_path: Path) -> None:
+    truth = [replace(row, yaw_rate_radps=0.75) for row in ROUND.truth(range(4))]
+    tracks = [[ROUND.track(k, 1)] for k in range(4)]  # its yaw rate is 0.5
+    straight = np.eye(5)
+    straight[4, 4] = 0.0
+    state = tracks[3][0].state
+    tracks[3] = [replace(tracks[3][0], state=replace(state, covariance=straight))]
+    nees = state_nees(matching_of(write_run(tmp_path / "run", tracks, truth=truth)))
+    assert nees.dof.tolist() == [5, 5, 5, 4]
+    assert nees.values == pytest.approx([0.0625] * 3 + [0.0], abs=1e-9)
+
+
+def test_truth_without_yaw_gives_the_nees_of_the_position_only(tmp_path: Path) -> None:
+    tracks = [[WEST.track(k, 1, along_m=2.0)] for k in range(3)]
+    found = evaluate(write_run(tmp_path / "run", tracks, truth=WEST.truth(range(3), pose=False))).consistency
+    assert (found.position_nees.count, found.position_nees.mean) == (3, pytest.approx(4.0))
+    assert found.state_nees.count == 0
+
+
+def test_nis_has_the_degrees_of_freedom_of_what_was_measured(tmp_path: Path) -> None:
+    updates = {
+        0: [update(disposition=Disposition.BIRTH)],
+        1: [
+            update(nis=1.0, x_m=1.0, y_m=0.0),
+            update(nis=4.0, x_m=3.0, y_m=0.0, yaw_rad=0.2, index=1),
+            update("radar", nis=2.0, speed_mps=-2.0),
+        ],
+    }
+    found = evaluate(write_run(tmp_path / "run", updates=updates)).consistency
+    assert dict(found.nis) == {"lidar": ChiSquareMean(2, 2.5, 2.5), "radar": ChiSquareMean(1, 2.0, 1.0)}
+    assert found.position_nees.count == found.state_nees.count == 0
+
+
+def test_the_band_is_that_of_a_sum_of_independent_squares() -> None:
+    low, high = ChiSquareMean(40, 2.0, 2.5).band
+    assert (low, high) == pytest.approx(tuple(chi2.ppf([0.025, 0.975], 100) / 40))
+    assert all(map(math.isnan, ChiSquareMean().band))
+
+
+def test_means_of_two_samples_add_up() -> None:
+    rng = np.random.default_rng(1)
+    values, dof = rng.chisquare(3, 30), rng.integers(1, 6, 30)
+    values[4] = np.nan
+    both = ChiSquareMean.of(values, dof)
+    added = ChiSquareMean.of(values[:10], dof[:10]) + ChiSquareMean.of(values[10:], dof[10:]) + ChiSquareMean()
+    assert (added.count, added.mean, added.dof) == (29, pytest.approx(both.mean), pytest.approx(both.dof))
+
+
+def test_the_band_holds_the_mean_of_19_in_20_samples() -> None:
+    rng = np.random.default_rng(2)
+    samples = [ChiSquareMean.of(rng.chisquare(2, 15), np.full(15, 2)) for _ in range(2000)]
+    below = np.mean([one.mean < one.band[0] for one in samples])
+    above = np.mean([one.mean > one.band[1] for one in samples])
+    spread = 4.0 * math.sqrt(0.025 * 0.975 / 2000)  # 4 standard deviations of each share
+    assert below == pytest.approx(0.025, abs=spread)
+    assert above == pytest.approx(0.025, abs=spread)
+
+
+# --- many runs
+
+
+def runs_of(errors: np.ndarray, scale: float = 1.0) -> list[Nees]:
+    """NEES of correlated `errors`, shape (runs, stamps, 2), whose covariance is told as `scale` times the truth."""
+    stamps_ns = START_NS + TICK_NS * np.arange(errors.shape[1])
+    ids, dof = np.full(len(stamps_ns), 7), np.full(len(stamps_ns), 2)
+    return [Nees(stamps_ns, ids, np.square(one).sum(axis=-1) / scale, dof) for one in errors]
+
+
+def correlated_errors(num_runs: int, num_stamps: int, memory: float) -> np.ndarray:
+    """Errors of variance 1 with the autocorrelation `memory` from one stamp to the next."""
+    rng = np.random.default_rng(5)
+    errors = rng.normal(size=(num_runs, num_stamps, 2))
+    for k in range(1, num_stamps):
+        errors[:, k] = memory * errors[:, k - 1] + math.sqrt(1.0 - memory**2) * errors[:, k]
+    return errors
+
+
+def test_many_runs_tell_a_consistent_estimator_where_one_run_cannot() -> None:
+    samples = runs_of(correlated_errors(60, 2000, 0.95))
+    single = [ChiSquareMean.of(one.values, one.dof) for one in samples]
+    assert np.mean([one.band[0] <= one.mean <= one.band[1] for one in single]) < 0.6  # bands as if independent
+    found = nees_over_runs(samples)
+    assert found.share_inside == pytest.approx(0.95, abs=0.03)
+    assert found.num_runs.tolist() == [60] * 2000
+    assert found.low[0] == pytest.approx(chi2.ppf(0.025, 120) / 60)
+    assert found.high[0] == pytest.approx(chi2.ppf(0.975, 120) / 60)
+    overall = found.overall
+    assert overall.count == 60
+    assert abs(overall.mean - 2.0) < 4.0 * overall.std / math.sqrt(overall.count - 1)
+
+
+@pytest.mark.parametrize("scale", [0.7, 1.4])
+def test_many_runs_tell_a_covariance_that_is_too_small_or_too_large(scale: float) -> None:
+    assert nees_over_runs(runs_of(correlated_errors(60, 2000, 0.95), scale)).share_inside < 0.6
+
+
+def test_values_of_different_runs_meet_at_the_same_object_and_stamp() -> None:
+    two = np.full(3, 2)
+    first = Nees(np.array([10, 20, 30]), np.array([1, 1, 1]), np.array([1.0, np.nan, 5.0]), two)
+    second = Nees(np.array([10, 10, 20]), np.array([1, 2, 1]), np.array([3.0, 7.0, 9.0]), np.array([2, 2, 5]))
+    third = Nees(np.array([30, 30]), np.array([1, 1]), np.array([100.0, 6.0]), two[:2])
+    found = nees_over_runs([first, second, third])
+    places = list(zip(found.object_ids.tolist(), found.stamps_ns.tolist(), strict=True))
+    assert places == [(1, 10), (1, 20), (1, 30), (2, 10)]
+    assert found.num_runs.tolist() == [2, 1, 2, 1]
+    assert found.mean.tolist() == [2.0, 9.0, 5.5, 7.0]  # of two values of a run at one stamp the last
+    assert found.high[1] == pytest.approx(chi2.ppf(0.975, 5))
+    assert found.run_means.tolist() == [3.0, pytest.approx(19 / 3), 6.0]
+
+
+def test_nees_of_runs_comes_from_their_matchings(tmp_path: Path) -> None:
+    runs = []
+    for seed, along_m in enumerate((1.0, 3.0)):
+        tracks = [[WEST.track(k, 1 + seed, along_m=along_m), ROUND.track(k, 5)] for k in range(4)]
+        truth = [*WEST.truth(range(4)), *ROUND.truth(range(4))]
+        runs.append(write_run(tmp_path / str(seed), tracks, truth=truth))
+    found = nees_over_runs([position_nees(matching_of(run)) for run in runs])
+    assert found.mean[found.object_ids == 7] == pytest.approx([5.0] * 4)
+    assert found.mean[found.object_ids == 8] == pytest.approx([0.0] * 4, abs=1e-9)
+    with pytest.raises(ValueError, match="at least one"):
+        nees_over_runs([])
+
+
+# --- whiteness
+
+
+def innovations_run(folder: Path, series: dict[int, np.ndarray], names: tuple[str, ...] = ("x_m", "y_m")) -> Run:
+    """Updates of the tracks of `series`, one of each at a tick; an innovation each, shape (n, components)."""
+    updates: dict[int, list[UpdateRecord]] = {}
+    for track_id, values in series.items():
+        for tick, nu in enumerate(values):
+            known = dict(zip(names, nu.tolist(), strict=True))
+            updates.setdefault(tick, []).append(update(tick=tick, track_id=track_id, **known))
+    return write_run(folder, updates=updates)
+
+
+def whiteness(run: Run, name: str = "position_m") -> Autocorrelation:
+    return evaluate(run).consistency.autocorrelation["lidar"][name]
+
+
+def test_an_alternating_innovation_has_the_autocorrelation_that_can_be_counted(tmp_path: Path) -> None:
+    n = 30
+    series = (-1.0) ** np.arange(n)[:, None]
+    found = whiteness(innovations_run(tmp_path / "run", {1: series}, ("speed_mps",)), "speed_mps")
+    assert (found.tracks, found.count) == (1, n)
+    assert found.lag1 == pytest.approx(-(n - 1) / n)
+    assert found.lag1_band == pytest.approx(1.96 * math.sqrt(n - 1) / n, rel=1e-4)
+    assert found.share_outside == 1.0
+
+
+def test_tracks_do_not_run_into_each_other(tmp_path: Path) -> None:
+    """Each alternates, but between the two there is no correlation; a third one is too short."""
+    flips = (-1.0) ** np.arange(40)[:, None] * np.ones(2)
+    run = innovations_run(tmp_path / "run", {1: flips, 2: 3.0 * flips[:30], 3: flips[: FEWEST - 1]})
+    found = whiteness(run)
+    assert (found.tracks, found.count) == (2, 70)
+    assert found.lag1 == pytest.approx(-(39 * 2 + 29 * 18) / (40 * 2 + 30 * 18))
+
+
+def test_white_innovations_stay_inside_their_bands_whatever_their_covariance() -> None:
+    """Long and thin ellipses that turn, and grow threefold."""
+    rng = np.random.default_rng(11)
+    tracks, n = 200, 200
+    turn = np.linspace(0.0, 3.0, n)
+    c, s = np.cos(turn), np.sin(turn)
+    nu = rng.normal(size=(tracks, n, 2)) * np.array([5.0, 0.5]) * np.linspace(1.0, 3.0, n)[:, None]
+    nu = np.stack([c * nu[..., 0] - s * nu[..., 1], s * nu[..., 0] + c * nu[..., 1]], axis=-1)
+
+    def found(track_ids: list[int]) -> Autocorrelation:
+        values = nu[track_ids].reshape(-1, 2)
+        updates = {f"res_{name}": np.full(len(values), np.nan) for name in MEASURABLE}
+        updates |= {"res_x_m": values[:, 0], "res_y_m": values[:, 1], "track_id": np.repeat(track_ids, n)}
+        return autocorrelations(Table(updates))["position_m"]
+
+    every, alone = found(list(range(tracks))), [found([k]) for k in range(tracks)]
+    # 4 standard deviations of a share of 5 % and of a deviation, and half as much again: lags are not independent
+    assert every.share_outside == pytest.approx(0.05, abs=6.0 * math.sqrt(0.05 * 0.95 / (tracks * LAGS)))
+    assert every.share_outside == pytest.approx(np.mean([one.share_outside for one in alone]))
+    band = math.sqrt(np.mean([one.lag1_band**2 for one in alone]))
+    assert 1.96 * np.std([one.lag1 for one in alone]) == pytest.approx(band, rel=6.0 / math.sqrt(2 * tracks))
+    assert every.lag1_band == pytest.approx(band / math.sqrt(tracks), rel=0.1)
+    assert abs(every.lag1) < 2.0 * every.lag1_band
+
+
+def test_correlated_and_biased_innovations_leave_their_bands(tmp_path: Path) -> None:
+    errors = correlated_errors(5, 400, 0.5)
+    found = whiteness(innovations_run(tmp_path / "correlated", dict(enumerate(errors))))
+    assert found.lag1 == pytest.approx(0.5, abs=0.06)
+    assert found.lag1 > 3.0 * found.lag1_band
+    assert found.share_outside > 0.15
+    biased = whiteness(innovations_run(tmp_path / "biased", {0: 1.0 + correlated_errors(1, 400, 0.0)[0]}))
+    assert biased.lag1 == pytest.approx(0.5, abs=0.1)
+    assert biased.share_outside == 1.0
+
+
+def test_every_innovation_of_a_sensor_is_looked_at(tmp_path: Path) -> None:
+    values = np.random.default_rng(0).normal(size=(FEWEST, 4))
+    run = innovations_run(tmp_path / "run", {1: values}, ("x_m", "y_m", "yaw_rad", "speed_mps"))
+    found = evaluate(run).consistency.autocorrelation["lidar"]
+    assert list(found) == ["position_m", "yaw_rad", "speed_mps"]
+    bearings = innovations_run(tmp_path / "bearings", {1: values[:, :1]}, ("bearing_rad",))
+    assert list(evaluate(bearings).consistency.autocorrelation["lidar"]) == ["bearing_rad"]
+
+
+def test_too_few_innovations_tell_nothing(tmp_path: Path) -> None:
+    run = innovations_run(tmp_path / "run", {1: np.ones((FEWEST - 1, 2)), 2: np.zeros((0, 2))})
+    assert evaluate(run).consistency.autocorrelation["lidar"] == {}
+    zeros = innovations_run(tmp_path / "zeros", {1: np.zeros((FEWEST, 2))})
+    assert evaluate(zeros).consistency.autocorrelation["lidar"] == {}
+
+
+def test_consistency_is_strict_json(tmp_path: Path) -> None:
+    tracks = [[WEST.track(k, 1, along_m=2.0)] for k in range(3)]
+    updates = {k: [update(tick=k, nis=2.0, x_m=1.0, y_m=float(k))] for k in range(FEWEST)}
+    plain = evaluate(write_run(tmp_path / "run", tracks, truth=WEST.truth(range(3)), updates=updates)).as_dict()
+    again = json.loads(json.dumps(plain, allow_nan=False))
+    assert again == plain
+    nees = again["consistency"]["position_nees"]
+    low, high = chi2.ppf([0.025, 0.975], 6) / 3
+    assert nees == {
+        "count": 3,
+        "mean": 4.0,
+        "dof": 2.0,
+        "band_low": pytest.approx(low),
+        "band_high": pytest.approx(high),
+    }
+    assert again["consistency"]["nis"]["lidar"]["mean"] == 2.0
+    assert again["consistency"]["autocorrelation"]["lidar"]["position_m"]["tracks"] == 1
+    assert again["multi_object"]["gospa"]["localisation_m2"] == pytest.approx(4.0)
+    assert again["multi_object"]["clear"]["pairs"] == 3
+    assert set(again["multi_object"]["identity"]) == {"idf1", "idp", "idr"}
+    assert set(again["multi_object"]["hota"]) == {"hota", "deta", "assa"}
+    assert again["options"]["gospa_c_m"] is None

@@ -1,0 +1,173 @@
+"""Late identity switches and the time to confirm an object, told tick by tick (20 ms each)."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluation_runs import ROUND, WEST, update, write_run
+
+from fgtrack.core.types import Disposition, UpdateRecord
+from fgtrack.evaluation.continuity import late_switches, times_to_confirm
+from fgtrack.evaluation.matching import match
+from fgtrack.evaluation.metrics import evaluate
+from fgtrack.evaluation.options import EvaluationOptions
+from fgtrack.io.run_folder import Run
+
+LATE = Disposition.OUT_OF_SEQUENCE
+GATE_M = 5.0
+
+
+def switching_run(folder: Path, updates: dict[int, list[UpdateRecord]]) -> Run:
+    """Track 1 follows WEST to tick 9, track 2 from tick 12 on; track 3 follows ROUND all the time."""
+    tracks = []
+    for k in range(20):
+        west = [WEST.track(k, 1)] if k < 10 else [WEST.track(k, 2)] if k >= 12 else []
+        tracks.append([*west, ROUND.track(k, 3)])
+    return write_run(folder, tracks, truth=[*WEST.truth(range(20)), *ROUND.truth(range(20))], updates=updates)
+
+
+def late_of(run: Run, within_s: float) -> list[int]:
+    matching = match(run)
+    assert matching is not None
+    return late_switches(run, matching, within_s).tolist()
+
+
+@pytest.mark.parametrize(
+    ("tick", "track_id", "disposition", "late"),
+    [
+        (9, 1, LATE, 1),
+        (12, 2, LATE, 1),
+        (12, 2, Disposition.BEYOND_WINDOW, 1),
+        (7, 1, LATE, 1),  # 100 ms before the switch, not more
+        (6, 1, LATE, 0),
+        (13, 2, LATE, 0),  # after it
+        (9, 3, LATE, 0),  # another track
+        (9, 1, Disposition.IN_SEQUENCE, 0),
+        (9, 1, Disposition.TOO_OLD, 0),
+    ],
+)
+def test_a_switch_is_late_soon_after_an_out_of_sequence_update_of_one_of_the_two_tracks(
+    tmp_path: Path, tick: int, track_id: int, disposition: Disposition, late: int
+) -> None:
+    # sensed long before: it counts when it was fused
+    updates = {tick: [update(tick=0, disposition=disposition, track_id=track_id)]}
+    assert late_of(switching_run(tmp_path / "run", updates), 0.1) == [late, 0]
+
+
+def test_several_late_updates_make_one_late_switch(tmp_path: Path) -> None:
+    updates = {k: [update(tick=k, disposition=LATE, track_id=1)] for k in range(8, 10)}
+    run = switching_run(tmp_path / "run", updates)
+    overall = evaluate(run).truth
+    assert overall is not None
+    assert (overall.overall.id_switches, overall.overall.late_id_switches) == (1, 1)
+    assert late_of(run, 0.0) == [0, 0]
+
+
+def test_the_setting_says_how_soon(tmp_path: Path) -> None:
+    run = switching_run(tmp_path / "run", {6: [update(disposition=LATE, track_id=1)]})
+    for late_switch_s, late in ((0.1, 0), (0.12, 1)):
+        truth = evaluate(run, EvaluationOptions(late_switch_s=late_switch_s)).truth
+        assert truth is not None
+        assert truth.objects[7].late_id_switches == late
+
+
+def test_an_update_of_a_tick_that_was_never_finished_does_not_count(tmp_path: Path) -> None:
+    run = switching_run(tmp_path / "run", {12: [update(disposition=LATE, track_id=2)], 19: [update(disposition=LATE)]})
+    finished = run.timing["tick"] < 15
+    assert late_of(replace(run, timing=run.timing.where(finished)), 0.1) == [1, 0]
+
+
+# --- time to confirm
+
+
+def confirm_of(run: Run) -> list[float]:
+    matching = match(run)
+    assert matching is not None
+    return times_to_confirm(run, matching, GATE_M).tolist()
+
+
+def test_the_time_to_confirm_is_from_the_first_stamp_to_the_tick_of_the_first_confirmed_row(tmp_path: Path) -> None:
+    """WEST is sensed at tick 2 and 4, received and fused at 5, 6, 8; the third measurement confirms it at tick 8."""
+    measured = {5: 1, 6: 2, 7: 2, 8: 3, 9: 4}
+    tracks = [[WEST.track(k, 1, num_measured=measured[k])] if k in measured else [] for k in range(10)]
+    updates = {
+        5: [update(tick=2, delay_ns=50_000_000, disposition=Disposition.BIRTH)],
+        6: [update(tick=4, disposition=Disposition.IN_SEQUENCE)],
+        8: [update(tick=3, disposition=LATE)],
+    }
+    run = write_run(tmp_path / "run", tracks, truth=[*WEST.truth(range(10)), *ROUND.truth(range(10))], updates=updates)
+    west, round_ = confirm_of(run)
+    assert west == pytest.approx((8 - 2) * 0.02)
+    assert math.isnan(round_)
+
+
+def test_a_row_counts_at_its_tick_and_when_it_is_confirmed_whatever_is_judged(tmp_path: Path) -> None:
+    """Rows are stamped a tick before the one that publishes them."""
+    tracks = [[], *[[WEST.track(k - 1, 1, num_measured=k)] for k in range(1, 6)]]
+    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(6)), updates={1: [update(tick=0)]})
+    for options in (EvaluationOptions(), EvaluationOptions(confirmed_only=False)):
+        matching = match(run, options)
+        assert matching is not None
+        assert times_to_confirm(run, matching, GATE_M).tolist() == [pytest.approx(3 * 0.02)]
+
+
+def test_a_track_that_died_unconfirmed_counts_as_the_first_detection(tmp_path: Path) -> None:
+    tracks = [[WEST.track(k, 1, num_measured=1)] if k < 2 else [WEST.track(k, 2, num_measured=k - 3)] for k in range(9)]
+    updates = {k: [update(tick=k, track_id=1 if k < 2 else 2)] for k in (0, 4, 5, 6)}
+    assert confirm_of(write_run(tmp_path / "run", tracks, truth=WEST.truth(range(9)), updates=updates)) == [0.12]
+
+
+@pytest.mark.parametrize(
+    "stranger",
+    [
+        update(tick=0, track_id=7),  # lies 60 m away
+        update(tick=0, track_id=8),  # never published
+        update(tick=0, track_id=None, disposition=Disposition.GATED),
+        update(tick=0, track_id=1, disposition=Disposition.TOO_OLD),
+        update(tick=0, track_id=1, disposition=Disposition.MERGED),
+    ],
+)
+def test_what_was_not_fused_into_a_track_of_the_object_is_not_its_first_detection(
+    tmp_path: Path, stranger: UpdateRecord
+) -> None:
+    """The object's own detection is sensed at tick 2, its track is confirmed at tick 4."""
+    tracks = [[WEST.track(k, 1, num_measured=k - 1), WEST.track(k, 7, across_m=60.0)] for k in range(6)]
+    updates = {1: [stranger], 3: [update(tick=2)]}
+    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(6)), updates=updates)
+    assert confirm_of(run) == [pytest.approx(2 * 0.02)]
+
+
+def test_a_detection_belongs_to_the_nearest_object(tmp_path: Path) -> None:
+    """The twin drives 4 m beside: both tracks lie inside the gate of both objects."""
+    twin = replace(WEST, object_id=9, y_m=4.0)
+    tracks = [[car.track(k, i, num_measured=k - 2) for car, i in ((WEST, 1), (twin, 2))] for k in range(6)]
+    updates = {3: [update(tick=1, track_id=2)], 4: [update(tick=3, track_id=1)]}
+    run = write_run(tmp_path / "run", tracks, truth=[*WEST.truth(range(6)), *twin.truth(range(6))], updates=updates)
+    assert confirm_of(run) == [pytest.approx(2 * 0.02), pytest.approx(4 * 0.02)]
+
+
+def test_an_object_that_is_never_confirmed_has_no_time(tmp_path: Path) -> None:
+    tracks = [[WEST.track(k, 1, num_measured=2)] for k in range(4)]
+    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(4)), updates={0: [update()]})
+    assert np.isnan(confirm_of(run)).all()
+    assert np.isnan(confirm_of(write_run(tmp_path / "empty", truth=WEST.truth(range(4))))).all()
+
+
+def test_overall_is_the_mean_of_the_objects(tmp_path: Path) -> None:
+    tracks = [[WEST.track(k, 1, num_measured=k + 1), ROUND.track(k, 2, num_measured=k - 2)] for k in range(6)]
+    updates = {0: [update(track_id=1)], 2: [update(tick=2, track_id=2)]}
+    run = write_run(tmp_path / "run", tracks, truth=[*WEST.truth(range(6)), *ROUND.truth(range(6))], updates=updates)
+    truth = evaluate(run).truth
+    assert truth is not None
+    overall = truth.overall
+    assert (overall.time_to_confirm_s.count, overall.time_to_confirm_s.mean) == (2, pytest.approx(0.05))
+    times_s = [one.time_to_confirm_s.mean for one in truth.objects.values()]
+    assert times_s == [pytest.approx(0.04), pytest.approx(0.06)]
+
+
+def test_the_time_per_detection_is_that_of_the_ticks_with_detections(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", process_ns=[1_000, 4_000, 9_000, 6_000], num_detections=[0, 2, 0, 3])
+    assert evaluate(run).time_per_detection_s == pytest.approx(2e-6)
+    assert math.isnan(evaluate(write_run(tmp_path / "none", process_ns=[5])).time_per_detection_s)

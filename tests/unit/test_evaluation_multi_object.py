@@ -1,0 +1,261 @@
+"""GOSPA against Stone Soup, CLEAR, IDF1 and HOTA against TrackEval, and both on scenes that can be counted by hand."""
+
+import math
+from dataclasses import replace
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluation_runs import ROUND, WEST, write_run
+from evaluation_scenes import Positions, random_scenes
+
+from fgtrack.core.types import TrackReport
+from fgtrack.evaluation.clear import Clear
+from fgtrack.evaluation.gospa import Gospa, gospa
+from fgtrack.evaluation.identity import Frames, Hota, Identity
+from fgtrack.evaluation.matching import match
+from fgtrack.evaluation.metrics import evaluate
+from fgtrack.evaluation.multi_object import MultiObjectMetrics
+from fgtrack.evaluation.options import EvaluationOptions
+from fgtrack.evaluation.scenes import Scenes, scenes
+from fgtrack.io.run_folder import Run, Table
+
+C_M, GATE_M = 5.0, 4.0
+
+#: Many, some and hardly any pairs to choose from.
+SCENES = [(seed, side_m) for seed in range(12) for side_m in (3.0, 15.0, 200.0)]
+
+
+def multi_object(run: Run, options: EvaluationOptions | None = None) -> MultiObjectMetrics:
+    found = evaluate(run, options).multi_object
+    assert found is not None
+    return found
+
+
+# --- GOSPA
+
+
+@pytest.mark.parametrize(("seed", "side_m"), SCENES)
+def test_gospa_and_its_parts_are_those_of_stone_soup(seed: int, side_m: float) -> None:
+    ospametric = pytest.importorskip("stonesoup.metricgenerator.ospametric")
+    from stonesoup.measures import Euclidean
+    from stonesoup.types.state import State
+
+    objects, tracks, there = random_scenes(seed, side_m)
+    generator = ospametric.GOSPAMetric(c=C_M, p=2, measure=Euclidean())
+    start = datetime(2024, 1, 1)
+    found = gospa(there, C_M)
+    for tick in range(there.num_ticks):
+        if not len(objects.ids[tick]) + len(tracks.ids[tick]):
+            assert found.total_m[tick] == 0.0
+            continue
+        stamp = start + timedelta(seconds=tick)
+        states = [[State(xy[:, None], timestamp=stamp) for xy in one.xy[tick]] for one in (tracks, objects)]
+        expected = generator.compute_gospa_metric(*states)[0].value
+        assert found.total_m[tick] == pytest.approx(expected["distance"], abs=1e-9)
+        for name in ("localisation", "missed", "false"):
+            assert getattr(found, f"{name}_m2")[tick] == pytest.approx(expected[name], abs=1e-9)
+
+
+def test_the_parts_of_gospa_add_up_over_the_run() -> None:
+    for seed, side_m in SCENES:
+        one = Gospa.of(gospa(random_scenes(seed, side_m)[2], C_M), C_M)
+        assert one.rms_m**2 == pytest.approx(one.localisation_m2 + one.missed_m2 + one.false_m2)
+        assert one.mean_m <= one.rms_m
+
+
+@pytest.fixture
+def story(tmp_path: Path) -> Run:
+    """Ten ticks. WEST: track 1, wrong by 0.8 m, then track 2 from tick 6; nothing at tick 5. ROUND: never. Track 3 is
+    false at ticks 0 and 1. Truth of ROUND ends at tick 7, that of WEST at tick 9.
+    """
+    tracks: list[list[TrackReport]] = []
+    for k in range(12):
+        rows = [] if k == 5 else [WEST.track(k, 1 if k < 5 else 2, along_m=0.8)]
+        tracks.append([*rows, WEST.track(k, 3, across_m=60.0)] if k < 2 else rows)
+    return write_run(tmp_path / "story", tracks, truth=[*WEST.truth(range(10)), *ROUND.truth(range(8))])
+
+
+def test_gospa_of_a_run_is_what_can_be_counted(story: Run) -> None:
+    found = multi_object(story).gospa
+    # 9 pairs 0.8 m apart, 8 times ROUND and once WEST missed, 2 rows false; each of these costs 5^2 / 2
+    assert (found.c_m, found.ticks) == (5.0, 10)
+    assert found.localisation_m2 == pytest.approx(0.9 * 0.64)
+    assert found.missed_m2 == pytest.approx(9 * 12.5 / 10)
+    assert found.false_m2 == pytest.approx(2 * 12.5 / 10)
+    missed_one, with_false, missed_two = math.sqrt(13.14), math.sqrt(25.64), math.sqrt(25.0)
+    # ticks 0, 1; then 2, 3, 4, 6, 7; then 5; and 8, 9 with WEST alone
+    assert found.mean_m == pytest.approx((2 * with_false + 5 * missed_one + missed_two + 2 * 0.8) / 10)
+
+
+def test_the_cut_off_is_the_gate_unless_it_is_set(story: Run) -> None:
+    assert multi_object(story, EvaluationOptions(gate_m=2.0)).gospa.c_m == 2.0
+    own = multi_object(story, EvaluationOptions(gospa_c_m=0.5)).gospa
+    assert own.localisation_m2 == 0.0
+    assert own.false_m2 == pytest.approx(11 * 0.125 / 10)  # a pair at 0.8 m is a miss and a false track
+
+
+def test_a_pair_at_the_cut_off_is_a_miss_and_a_false_track() -> None:
+    there = Scenes(np.array([0]), np.array([1]), np.array([[2.0]]), np.array([[True]]))
+    at, inside = gospa(there, 2.0), gospa(there, 2.0 + 1e-9)
+    assert (at.localisation_m2[0], at.missed_m2[0], at.false_m2[0]) == (0.0, 2.0, 2.0)
+    assert (inside.localisation_m2[0], inside.missed_m2[0], inside.false_m2[0]) == (4.0, 0.0, 0.0)
+
+
+def test_without_a_tick_gospa_is_no_number() -> None:
+    empty = Scenes(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 1)), np.zeros((0, 1), bool))
+    assert math.isnan(Gospa.of(gospa(empty, C_M), C_M).rms_m)
+
+
+# --- CLEAR, IDF1, HOTA
+
+
+def trackeval_data(trackeval: Any, objects: Positions, tracks: Positions) -> dict[str, Any]:  # Any: has no types
+    """What TrackEval takes, with its own similarity of positions."""
+    similarity = trackeval.datasets._base_dataset._BaseDataset._calculate_euclidean_similarity
+    data: dict[str, Any] = {"num_timesteps": len(objects.ids)}
+    for name, det, one in (("gt_ids", "gt_dets", objects), ("tracker_ids", "tracker_dets", tracks)):
+        every, dense = np.unique(np.concatenate(one.ids), return_inverse=True)
+        data[name] = np.split(dense, np.cumsum([len(ids) for ids in one.ids])[:-1])
+        data[f"num_{name}"], data[f"num_{det}"] = len(every), len(dense)
+    data["similarity_scores"] = [
+        similarity(a, b, zero_distance=2.0 * GATE_M) for a, b in zip(objects.xy, tracks.xy, strict=True)
+    ]
+    return data
+
+
+@pytest.mark.parametrize(("seed", "side_m"), SCENES)
+def test_clear_identity_and_hota_are_those_of_trackeval(seed: int, side_m: float) -> None:
+    trackeval = pytest.importorskip("trackeval", reason="trackeval is not installed (extra `test`)")
+    objects, tracks, there = random_scenes(seed, side_m)
+    data = trackeval_data(trackeval, objects, tracks)
+    quiet = {"PRINT_CONFIG": False}
+    frames = Frames.of(there, GATE_M)
+
+    expected = trackeval.metrics.CLEAR(quiet).eval_sequence(data)
+    clear = Clear.of(there, GATE_M)
+    counts = (clear.pairs, clear.misses, clear.false_positives, clear.id_switches)
+    assert counts == tuple(expected[name] for name in ("CLR_TP", "CLR_FN", "CLR_FP", "IDSW"))
+    assert clear.mota == pytest.approx(expected["MOTA"], abs=1e-6)
+    if clear.pairs:
+        assert clear.motp_m == pytest.approx((1.0 - expected["MOTP"]) * 2.0 * GATE_M, abs=1e-6)
+
+    expected = trackeval.metrics.Identity(quiet).eval_sequence(data)
+    identity = Identity.of(frames)
+    for name in ("IDF1", "IDP", "IDR"):
+        assert getattr(identity, name.lower()) == pytest.approx(expected[name], abs=1e-6)
+
+    expected = trackeval.metrics.HOTA().eval_sequence(data)
+    hota = Hota.of(frames)
+    for name in ("HOTA", "DetA", "AssA"):
+        assert getattr(hota, name.lower()) == pytest.approx(np.mean(expected[name]), abs=1e-6)
+
+
+def test_the_random_scenes_have_switches_to_find() -> None:
+    clear = [Clear.of(random_scenes(seed, side_m)[2], GATE_M) for seed, side_m in SCENES]
+    assert sum(one.id_switches for one in clear) > 50
+    assert min(one.mota for one in clear) < 0.3
+    assert max(one.mota for one in clear) > 0.35
+
+
+def test_clear_of_a_run_is_what_can_be_counted(story: Run) -> None:
+    clear = multi_object(story).clear
+    assert (clear.pairs, clear.misses, clear.false_positives, clear.id_switches) == (9, 9, 2, 1)
+    assert clear.mota == pytest.approx(1 - (9 + 2 + 1) / 18)
+    assert clear.motp_m == pytest.approx(0.8)
+
+
+def test_identity_and_hota_of_a_run_are_what_can_be_counted(story: Run) -> None:
+    found = multi_object(story)
+    # WEST's track is the first one, at 5 of 18 objects and of 11 rows
+    assert (found.identity.idr, found.identity.idp) == (pytest.approx(5 / 18), pytest.approx(5 / 11))
+    assert found.identity.idf1 == pytest.approx(2 * 5 / (18 + 11))
+    # 0.8 m is a similarity of 0.92: 18 of the 19 bounds are below it, 9 pairs of 18 objects and 11 rows in all
+    assert found.hota.deta == pytest.approx(18 / 19 * 9 / (18 + 11 - 9))
+    # track 1: 5 pairs, 10 objects, 5 rows; track 2: 4 pairs, 4 rows
+    assert found.hota.assa == pytest.approx(18 / 19 * (5 * 5 / 10 + 4 * 4 / 10) / 9)
+
+
+def test_a_pair_at_the_gate_counts_and_one_beyond_it_does_not() -> None:
+    for distance_m, pairs in ((GATE_M, 1), (GATE_M + 1e-6, 0)):
+        there = Scenes(np.array([0]), np.array([1]), np.array([[distance_m]]), np.array([[True]]))
+        assert Clear.of(there, GATE_M).pairs == pairs
+        assert Identity.of(Frames.of(there, GATE_M)).idf1 == pairs
+
+
+def test_without_any_object_scores_are_no_numbers() -> None:
+    there = Scenes(np.array([0]), np.array([1]), np.array([[np.inf]]), np.array([[False]]))
+    frames = Frames.of(there, GATE_M)
+    scores = [
+        Clear.of(there, GATE_M).mota,
+        Clear.of(there, GATE_M).motp_m,
+        Identity.of(frames).idf1,
+        Hota.of(frames).hota,
+    ]
+    assert all(map(math.isnan, scores))
+    assert Clear.of(there, GATE_M).false_positives == 1
+
+
+# --- what is judged
+
+
+def test_ticks_without_recorded_truth_are_not_judged(story: Run) -> None:
+    matching = match(story)
+    assert matching is not None
+    there = scenes(story, matching)
+    assert (len(story.timing), there.num_ticks) == (12, 10)
+    assert there.present.sum(axis=0).tolist() == [10, 8]
+    assert np.isinf(there.distances_m[there.tick_index >= 8, 1]).all()
+
+
+def test_ticks_before_the_truth_are_not_judged(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", [[WEST.track(k, 1)] for k in range(6)], truth=WEST.truth(range(2, 5)))
+    assert multi_object(run).gospa.ticks == 3
+    assert multi_object(run).clear.pairs == 3
+
+
+def test_an_object_that_has_left_has_no_pair_though_a_row_has_an_earlier_stamp(tmp_path: Path) -> None:
+    truth = [*WEST.truth(range(3)), *ROUND.truth(range(5))]
+    run = write_run(tmp_path / "run", [[], [], [], [WEST.track(2, 1)], []], truth=truth)
+    matching = match(run)
+    assert matching is not None
+    assert matching.distances_m[0, 0] == pytest.approx(0.0, abs=1e-9)
+    clear = multi_object(run).clear
+    assert (clear.pairs, clear.misses, clear.false_positives) == (0, 8, 1)
+
+
+def test_the_order_of_the_rows_does_not_matter(story: Run) -> None:
+    tracks = Table({name: column[::-1] for name, column in story.tracks.columns.items()})
+    assert multi_object(replace(story, tracks=tracks)) == multi_object(story)
+
+
+def test_a_late_stamped_row_is_as_far_as_it_is_at_its_own_stamp(tmp_path: Path) -> None:
+    tracks = [[], [], [WEST.track(1, 1)]]
+    found = multi_object(write_run(tmp_path / "run", tracks, truth=WEST.truth(range(3))))
+    assert (found.clear.pairs, found.clear.misses) == (1, 2)
+    assert found.clear.motp_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_tracks_count_when_they_are_confirmed(tmp_path: Path) -> None:
+    tracks = [[WEST.track(k, 1, num_measured=k + 1)] for k in range(4)]
+    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(4)))
+    assert multi_object(run).clear.pairs == 2
+    assert multi_object(run, EvaluationOptions(confirmed_only=False)).clear.pairs == 4
+
+
+def test_the_configuration_of_the_run_says_how_it_is_judged(story: Run) -> None:
+    without = replace(story, config_text="evaluation: {multi_object: false}")
+    assert evaluate(without).multi_object is None
+    assert evaluate(without).truth == evaluate(story).truth
+    options = "evaluation: {gate_m: 3, gospa_c_m: 7, late_switch_s: 2, multi_object: true}"
+    one = evaluate(replace(story, config_text=options))
+    assert one.options == EvaluationOptions(3.0, True, True, 7.0, 2.0)
+    assert one.multi_object is not None
+    assert one.multi_object.gospa.c_m == 7.0
+    assert evaluate(story).options == EvaluationOptions()
+
+
+def test_without_truth_there_is_nothing_to_score(tmp_path: Path) -> None:
+    assert evaluate(write_run(tmp_path / "run", [[WEST.track(0, 1)]])).multi_object is None

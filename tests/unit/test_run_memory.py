@@ -1,0 +1,119 @@
+"""A run kept in memory is the run that is written and read back."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluation_runs import START_NS, WEST, update
+
+from fgtrack.core.types import (
+    EgoState,
+    Message,
+    SmoothedReport,
+    TickReport,
+    TrackReport,
+    TrackState,
+    TrackStatus,
+    TruthState,
+)
+from fgtrack.evaluation.metrics import evaluate
+from fgtrack.io.run_folder import COLUMNS, MemoryRun, Run, RunWriter, read_run
+from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
+from fgtrack.pipeline.replay import replay, replay_in_memory
+from fgtrack.sim.paper import paper_scenario
+from fgtrack.sim.simulate import simulate
+
+#: Columns and entries that no two runs share: wall times.
+TIMES = ("process_ns",)
+UNSHARED = ("wall_s", "digest")
+NAMES_AND_TIMES = ("name", "time_")
+
+
+def assert_same(memory: Run, written: Run) -> None:
+    assert memory.config_text == written.config_text
+    assert without(memory.meta) == without(written.meta)
+    for table in COLUMNS:
+        kept, read = getattr(memory, table), getattr(written, table)
+        assert list(kept) == list(read) == list(COLUMNS[table])
+        for name in read:
+            assert kept[name].dtype == read[name].dtype, (table, name)
+            if name not in TIMES:
+                assert kept[name].tobytes() == read[name].tobytes(), (table, name)
+
+
+def without(meta: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in meta.items() if name not in UNSHARED}
+
+
+@pytest.fixture(scope="module")
+def messages() -> list[Message]:
+    return simulate(replace(paper_scenario(), duration_s=3.0), np.random.default_rng(4))
+
+
+@pytest.mark.parametrize("estimator", ["smoother", "ekf-replay", "ekf-backward-forward"])
+def test_replays_are_the_same_in_memory_and_written(estimator: str, messages: list[Message], tmp_path: Path) -> None:
+    config = Config(estimator=estimator, map=MapConfig(track="oval"))
+    config = replace(config, smoother=replace(config.smoother, lagged_s=(0.3, 0.1)))
+    if estimator == "smoother":
+        config = replace(config, motion=MotionConfig(kind="ctrv"))
+    replay(messages, config, tmp_path / "run")
+    written = read_run(tmp_path / "run")
+    memory, broken = replay_in_memory(messages, config)
+    assert broken is None
+    assert len(memory.tracks) > 100
+    assert (len(memory.lagged) > 100) == (len(memory.smoothed) > 100) == (estimator == "smoother")
+    assert_same(memory, written)
+    kept, read = (evaluate(run).as_dict() for run in (memory, written))
+    assert {name: kept[name] for name in kept if not name.startswith(NAMES_AND_TIMES)} == {
+        name: read[name] for name in read if not name.startswith(NAMES_AND_TIMES)
+    }
+
+
+def test_a_break_in_the_input_is_told(messages: list[Message]) -> None:
+    first = next(message for message in messages if isinstance(message, EgoState))
+    memory, broken = replay_in_memory([*messages, first], Config())
+    assert broken is not None
+    assert "receipt time goes back" in broken
+    assert memory.meta["broken_off"] == broken
+    assert memory.meta["complete"] is True
+
+
+@pytest.mark.parametrize("size", [4, 5, 6])
+def test_every_kind_of_row_is_the_same(size: int, tmp_path: Path) -> None:
+    """Also what a tracker gives rarely: no tick, no pose of the truth, no NIS, text that a CSV has to quote."""
+    rng = np.random.default_rng(size)
+
+    def state() -> TrackState:
+        return TrackState(START_NS, rng.normal(size=size), rng.normal(size=(size, size)))
+
+    tracks = tuple(TrackReport(k, TrackStatus.COASTING, state(), 9) for k in range(3))
+    smoothed = tuple(SmoothedReport(k, state(), lag) for k in (1, 7) for lag in (None, 0.3, 0.0, 0.1))
+    records = (update('a "b", c', track_id=None), update(nis=0.0, x_m=-0.0, yaw_rad=1e-300))
+    reports = [TickReport(0, START_NS, (), ()), TickReport(1, START_NS + 1, tracks, records, smoothed)]
+    truth = [*WEST.truth(range(3)), *WEST.truth([4], pose=False), TruthState(5, 5, -1, 0.0, 1.0)]
+    with RunWriter(tmp_path / "run", "a: 1\n", {"seed": None}, 0.3) as writer:
+        memory = MemoryRun("a: 1\n", {"seed": None}, 0.3)
+        assert_same(memory.run, read_run(tmp_path / "run"))
+        for sink in (writer, memory):
+            for row in truth:
+                sink.write_truth(row)
+            for report in reports:
+                sink.write_tick(report, 17, 2)
+            sink.write_smoothed([SmoothedReport(7, reports[1].tracks[0].state)])
+            sink.finish({"broken_off": None})
+    assert_same(memory.run, read_run(tmp_path / "run"))
+    assert len(memory.run.smoothed) == 4
+
+
+def test_states_are_kept_as_they_were_when_they_came() -> None:
+    mean, covariance = np.zeros(5), np.eye(5)
+    memory = MemoryRun()
+    track = TrackReport(1, TrackStatus.CONFIRMED, TrackState(START_NS, mean, covariance), 3)
+    memory.write_tick(TickReport(0, START_NS, (track,), ()), 0, 0)
+    mean += 1.0
+    covariance += 1.0
+    assert memory.run.tracks["x_m"].tolist() == [0.0]
+    assert memory.run.tracks["p_x_y"].tolist() == [0.0]
