@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 import fgtrack
-from fgtrack.cli import compare, config, convert, demo, figure, info, replay, simulate
+from fgtrack.cli import compare, config, convert, demo, figure, info, replay, simulate, sweep, verify
 from fgtrack.core.errors import CallError, FgtrackError
 
 DONE, BAD_DATA, BAD_CALL, INTERRUPTED = 0, 1, 2, 130
@@ -44,6 +44,8 @@ app.command()(simulate.simulate)
 app.command()(replay.replay)
 app.command()(compare.compare)
 app.command()(figure.figure)
+app.command()(sweep.sweep)
+app.command()(verify.verify)
 app.command()(info.info)
 app.command()(convert.convert)
 app.command()(config.config)

@@ -7,6 +7,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.pipeline.build import ESTIMATORS, build_bank, build_tracker
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import dump, load, read_yaml, validate
+from fgtrack.pipeline.sweep_config import SweepConfig
 from fgtrack.sim.scenario import Scenario
 from fgtrack.tracking.association import GatedMahalanobis
 from fgtrack.tracking.tracker import PublishedTracker, Tracker
@@ -15,8 +16,11 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 FILES = sorted(CONFIGS.rglob("*.yaml"))
 
 
-def kind_of(path: Path) -> type[Config] | type[Scenario]:
-    return Scenario if path.parent.name == "scenarios" else Config
+KINDS = {"scenarios": Scenario, "sweeps": SweepConfig}
+
+
+def kind_of(path: Path) -> type[Config] | type[Scenario] | type[SweepConfig]:
+    return KINDS.get(path.parent.name, Config)
 
 
 def written(tmp_path: Path, text: str) -> Path:
@@ -40,8 +44,8 @@ def test_every_file_of_the_project_loads_and_comes_back_from_its_dump(path: Path
     assert dump(again) == dump(loaded)
 
 
-def test_there_are_files_of_both_kinds() -> None:
-    assert {kind_of(path) for path in FILES} == {Config, Scenario}
+def test_there_are_files_of_every_kind() -> None:
+    assert {kind_of(path) for path in FILES} == {Config, Scenario, SweepConfig}
     assert {"karle2023", "karle2023_reference", "autoferry"} <= {path.stem for path in FILES}
 
 
@@ -126,6 +130,8 @@ def test_a_setting_does_not_change_what_it_stands_on() -> None:
         ("motion: {kind: ctrv, yaw: saturated}\n", "may be changed for kind ctrv_euler only"),
         ("lifecycle: {counter_cap: 0}\n", "counter_cap"),
         ("evaluation: {gate_m: 0.0}\n", "gate_m: must be positive"),
+        ("evaluation: {gospa_c_m: 0.0}\n", "gospa_c_m: must be positive"),
+        ("evaluation: {late_switch_s: -0.1}\n", "late_switch_s: must not be negative"),
         ("filter: {storage_s: 1.0}\nfilter: {storage_s: 2.0}\n", "config.yaml:2: no valid YAML, found duplicate key"),
         ("filter: {storage_s: 1.0\n", "no valid YAML"),
         ("filter: {storage_s: &a [*a]}\n", "only plain YAML values"),

@@ -1,0 +1,113 @@
+"""`fgtrack sweep`: settings x seeds x estimators into one table."""
+
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from fgtrack.cli.show import console
+from fgtrack.core.errors import CallError
+from fgtrack.evaluation.metrics import evaluate
+from fgtrack.io.run_folder import Run
+from fgtrack.pipeline.sweep import Scores, Sweep
+from fgtrack.pipeline.sweep_plan import load_plan
+from fgtrack.pipeline.sweep_store import ERROR_TABLE, SWEEP_TABLE, Cell, Scalar, SweepResult
+
+#: Wall times among the metrics; they have a table of their own.
+_TIMES = "time_per_"
+_NAMES = ("name", "estimator")
+
+_SPEED_PERIOD_S = 600.0  # over which the time of the rest is estimated: jobs differ
+
+
+def sweep(
+    sweep_file: Annotated[Path, typer.Argument(metavar="SWEEP", help="What is varied (YAML, fgtrack-sweep/1).")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the tables; what is done there is kept.")],
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", help="Processes on this machine.", show_default="one for each core")
+    ] = None,
+    dask: Annotated[
+        str | None, typer.Option("--dask", metavar="ADDRESS", help="Let the workers of a dask cluster do it.")
+    ] = None,
+) -> int:
+    """Run every point of a grid with every seed and estimator; goes on where it was stopped."""
+    if jobs is not None and jobs < 1:
+        raise CallError(f"--jobs {jobs}: at least one process is needed")
+    if jobs is not None and dask is not None:
+        raise CallError("--jobs, --dask: the cluster has its own number of workers, give one of them")
+    work = Sweep.open(load_plan(sweep_file), out)
+    left = len(work.todo)
+    _say(f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {left}")
+    if work.num_unused:
+        _say(f"{work.num_unused} parts in {out} belong to other settings, files or versions and stay unused")
+    with _counting(left) as count:
+        result = work.run(score, jobs=jobs or -1, dask=dask, on_job=count)
+    _say(f"{out / SWEEP_TABLE}: {result.num_good} of {result.num_cells} cells")
+    return _complain(result, sweep_file, out)
+
+
+def score(run: Run) -> Scores:
+    """All scalars of the metrics of `run`, by path."""
+    scalars = {name: value for name, value in _scalars(evaluate(run).as_dict(), "") if name not in _NAMES}
+    times = {name: value for name, value in scalars.items() if name.startswith(_TIMES)}
+    return Scores({name: value for name, value in scalars.items() if name not in times}, times)
+
+
+def _scalars(value: object, path: str) -> Iterator[tuple[str, Scalar]]:
+    """Path and value of every scalar; what is a list of entries with a lag is told apart by it."""
+    if isinstance(value, Mapping):
+        for name, entry in value.items():
+            yield from _scalars(entry, f"{path}.{name}" if path else name)
+    elif isinstance(value, Sequence) and not isinstance(value, str):
+        for index, entry in enumerate(value):
+            name = entry.get("lag_s", index) if isinstance(entry, Mapping) else index
+            yield from _scalars(entry, f"{path}.{name}")
+    elif value is None or isinstance(value, (str, int, float)):
+        yield path, value
+
+
+def _complain(result: SweepResult, sweep_file: Path, out: Path) -> int:
+    """A line on stderr for what is bad; gives the exit code."""
+    problems = []
+    if result.num_bad:
+        problems.append(f"{out / ERROR_TABLE}: {result.num_bad} bad cells, the first: {result.first_error}")
+    if result.unknown_metrics:
+        names = ", ".join(result.unknown_metrics)
+        problems.append(f"{sweep_file}: metrics: no column fits {names}; without `metrics` {SWEEP_TABLE} has all")
+    for problem in problems:
+        print(f"fgtrack: error: {' '.join(problem.split())}", file=sys.stderr)
+    return 1 if problems else 0
+
+
+def _say(line: str) -> None:
+    console().print(line, highlight=False, soft_wrap=True, markup=False)
+
+
+@contextmanager
+def _counting(total: int) -> Iterator[Callable[[Sequence[Cell]], None]]:
+    """A bar with the number of jobs done and the time that the rest will take; the function given counts a job."""
+    stderr = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(
+        *columns,
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=stderr,
+        disable=not stderr.is_terminal,
+        transient=True,
+        speed_estimate_period=_SPEED_PERIOD_S,
+    ) as bar:
+        task = bar.add_task("sweep", total=total)
+        bad = 0
+
+        def count(cells: Sequence[Cell]) -> None:
+            nonlocal bad
+            bad += sum(cell.error is not None for cell in cells)
+            bar.update(task, advance=1, description=f"sweep, {bad} bad cells" if bad else "sweep")
+
+        yield count

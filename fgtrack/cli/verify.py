@@ -1,0 +1,60 @@
+"""`fgtrack verify`: the certificate of exactness."""
+
+import json
+
+import numpy as np
+from rich import box
+from rich.table import Table
+
+from fgtrack.cli.arguments import Json
+from fgtrack.cli.show import console, progress
+from fgtrack.pipeline import verify as pipeline
+from fgtrack.pipeline.verify import Certificate, Check
+
+_SEED = 1
+_BAD = 1
+
+
+def verify(as_json: Json = False) -> int:
+    """Measure that the order of arrival does not change the answer of the exact estimators; exit code 1 if it does."""
+    with progress("verify"):
+        certificate = pipeline.verify(np.random.default_rng(_SEED), pipeline.EXACT)
+    if as_json:
+        print(json.dumps(certificate.as_dict(), indent=2, allow_nan=False))
+    else:
+        console().print(_table(certificate))
+        console().print(_closing(certificate), highlight=False, soft_wrap=True)
+    return _BAD if certificate.missed else 0
+
+
+def _table(certificate: Certificate) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False)
+    for heading in ("stream", "estimator", "order", "against"):
+        table.add_column(heading)
+    for heading in ("mean\n[sigma]", "covariance\n[relative]", "bar"):
+        table.add_column(heading, justify="right")
+    table.add_column("verdict")
+    last = None
+    for check in certificate.checks:
+        if last not in (None, check.stream):
+            table.add_section()
+        last = check.stream
+        bar = "-" if check.bar is None else f"{check.bar:.0e}"
+        numbers = (f"{check.mean_sigma:.1e}", f"{check.covariance:.1e}", bar)
+        table.add_row(check.stream, check.estimator, check.order, check.against, *numbers, _verdict(check))
+    return table
+
+
+def _verdict(check: Check) -> str:
+    if check.bar is None:
+        return "no promise"
+    if check.num_refused:
+        return f"{check.num_refused} not fused"
+    return "met" if check.met else "missed"
+
+
+def _closing(certificate: Certificate) -> str:
+    num_missed = len(certificate.missed)
+    if not num_missed:
+        return f"all {certificate.num_promises} bars met: the order of arrival does not change the answer"
+    return f"{num_missed} of {certificate.num_promises} bars missed: the order of arrival changes the answer"

@@ -1,0 +1,159 @@
+"""What a sweep leaves in its folder: a part for each finished job, and tables made from the parts."""
+
+import csv
+import io
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.pipeline.sweep_config import KEY_COLUMNS, Value, compact
+from fgtrack.pipeline.sweep_plan import Job, Plan
+
+PART_FORMAT = "fgtrack-sweep-part/1"
+SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE = "sweep.csv", "timing.csv", "errors.csv"
+
+Scalar = str | int | float | None
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One estimator on the stream of one job."""
+
+    estimator: str
+    values: Mapping[str, Scalar]
+    """Metrics by column: the same wherever and whenever the cell is computed."""
+    times: Mapping[str, Scalar]
+    """Wall times by column."""
+    error: str | None = None
+    """Why there is no result, in a line."""
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """What the tables of a sweep hold."""
+
+    num_cells: int
+    """Cells of the plan: finished, bad and left ones."""
+    num_good: int
+    num_bad: int
+    first_error: str | None
+    unknown_metrics: tuple[str, ...]
+    """The plan's metrics that stand for no column."""
+
+
+class PartStore:
+    """The parts of a sweep, each in a file named by the key of its job and written whole or not at all."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder / "parts"
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise CallError(f"{folder}: cannot be made a folder ({error.strerror}), choose another one") from error
+
+    def keys(self) -> frozenset[str]:
+        """Keys of all parts, also those of other sweeps."""
+        return frozenset(path.stem for path in self._folder.glob("*.json"))
+
+    def read(self, key: str) -> tuple[Cell, ...] | None:
+        """The cells of a job; None where it has no part."""
+        path = self._folder / f"{key}.json"
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            if content["format"] != PART_FORMAT:
+                raise DataError(f"{path}: does not say format {PART_FORMAT!r}, delete it")
+            return tuple(Cell(**cell) for cell in content["cells"])
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+        except (ValueError, KeyError, TypeError) as error:
+            raise DataError(f"{path}: is no part of a sweep, delete it") from error
+
+    def write(self, key: str, cells: Sequence[Cell]) -> None:
+        """Keep the cells of a finished job."""
+        content = {"format": PART_FORMAT, "cells": [asdict(cell) for cell in cells]}
+        _replace(self._folder / f"{key}.json", json.dumps(content))
+
+
+def write_tables(folder: Path, plan: Plan, done: Mapping[str, Sequence[Cell]]) -> SweepResult:
+    """Write sweep.csv, timing.csv and errors.csv from the cells of the finished jobs, by key, in grid order."""
+    good: list[tuple[tuple[Value, ...], Cell]] = []
+    bad: list[tuple[tuple[Value, ...], dict[str, str]]] = []
+    for job, cell in _rows(plan, done):
+        keys = (*job.cells, job.seed, cell.estimator)
+        if cell.error is None:
+            good.append((keys, cell))
+        else:
+            bad.append((keys, {"error": cell.error}))
+    names = (*plan.columns, *KEY_COLUMNS)
+    columns = _columns([cell.values for _, cell in good])
+    chosen, unknown = _chosen(columns, plan.metrics)
+    _write_csv(folder / SWEEP_TABLE, names, chosen, [(keys, cell.values) for keys, cell in good])
+    times = _columns([cell.times for _, cell in good])
+    _write_csv(folder / TIMING_TABLE, names, times, [(keys, cell.times) for keys, cell in good])
+    _write_csv(folder / ERROR_TABLE, names, ["error"], bad)
+    return SweepResult(
+        num_cells=len(plan.jobs) * len(plan.estimators),
+        num_good=len(good),
+        num_bad=len(bad),
+        first_error=next((values["error"] for _, values in bad), None),
+        unknown_metrics=tuple(unknown) if good else (),
+    )
+
+
+def _rows(plan: Plan, done: Mapping[str, Sequence[Cell]]) -> list[tuple[Job, Cell]]:
+    rows: list[tuple[Job, Cell]] = []
+    for job in plan.jobs:
+        if job.problem is not None:
+            rows += [(job, Cell(name, {}, {}, job.problem)) for name in plan.estimators]
+        else:
+            rows += [(job, cell) for cell in done.get(job.key, ())]
+    return rows
+
+
+def _columns(rows: Sequence[Mapping[str, Scalar]]) -> list[str]:
+    """Every column that occurs, in the order in which the rows bring them."""
+    return list(dict.fromkeys(name for row in rows for name in row))
+
+
+def _chosen(columns: Sequence[str], patterns: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The columns that `patterns` stand for, in their order, and the patterns that stand for none."""
+    found = {pattern: [name for name in columns if fnmatchcase(name, pattern)] for pattern in patterns or ("*",)}
+    chosen = list(dict.fromkeys(name for names in found.values() for name in names))
+    return chosen, [pattern for pattern, names in found.items() if not names]
+
+
+def _write_csv(
+    path: Path,
+    names: Sequence[str],
+    columns: Sequence[str],
+    rows: Sequence[tuple[Sequence[Value], Mapping[str, Scalar]]],
+) -> None:
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*names, *columns])
+    for keys, values in rows:
+        writer.writerow([_cell(value) for value in (*keys, *(values.get(name) for name in columns))])
+    _replace(path, text.getvalue())
+
+
+def _cell(value: Value) -> str:
+    """Text of a cell: floats with all digits, lists and mappings as JSON."""
+    if value is None or isinstance(value, str):
+        return value or ""
+    return repr(value) if isinstance(value, float) else compact(value)
+
+
+def _replace(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    part = path.with_name(f"{path.name}.part")
+    try:
+        part.write_text(text, encoding="utf-8", newline="")
+        os.replace(part, path)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written ({error.strerror}), free some space") from error

@@ -1,0 +1,371 @@
+"""Sweeps end to end: the same bytes however they come about, and nothing lost when something goes wrong."""
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fgtrack.cli.main import run
+from fgtrack.cli.sweep import score
+from fgtrack.io.run_folder import Run
+from fgtrack.io.stream import write_stream
+from fgtrack.pipeline.load import load
+from fgtrack.pipeline.sweep import Scores, Sweep
+from fgtrack.pipeline.sweep_plan import load_plan
+from fgtrack.sim.scenario import Scenario
+from fgtrack.sim.simulate import simulate
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+FGTRACK = (sys.executable, "-c", "from fgtrack.cli.main import main; main()")
+PATIENCE_S = 120.0
+POINT = ("lidar_delay_s", "association.gate_m", "seed")
+
+CLUSTER = """
+import sys
+from distributed import LocalCluster
+
+if __name__ == "__main__":
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
+    ) as cluster:
+        print(cluster.scheduler_address, flush=True)
+        sys.stdin.read()
+        done = {entry[0] for entry in cluster.scheduler.transition_log if entry[2] == "memory"}
+        print(sum("run_job" in key for key in done), flush=True)
+"""
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def parts(out: Path) -> list[Path]:
+    return sorted((out / "parts").glob("*.json"))
+
+
+def write_sweep(folder: Path, text: str, name: str = "sweep.yaml") -> Path:
+    """A sweep of the clean scenario with one car."""
+    path = folder / name
+    path.write_text(f"format: fgtrack-sweep/1\nscenario: {CONFIGS}/scenarios/single_opponent.yaml\n{text}")
+    return path
+
+
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The committed smoke sweep with more seeds, so that there is time to stop it."""
+    text = (CONFIGS / "sweeps/smoke.yaml").read_text().replace("../", f"{CONFIGS}/").replace("seeds: 2", "seeds: 3")
+    path = tmp_path_factory.mktemp("smoke") / "smoke.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture(scope="module")
+def done(smoke: Path) -> Path:
+    """Folder of that sweep, done by one process."""
+    out = smoke.parent / "one"
+    assert run(["sweep", str(smoke), "-o", str(out), "--jobs", "1"]) == 0
+    return out
+
+
+# --- the table
+
+
+def test_the_committed_smoke_sweep_has_a_row_for_every_cell(done: Path) -> None:
+    table = rows(done / "sweep.csv")
+    cells = [(row["lidar_delay_s"], row["association.gate_m"], row["seed"], row["estimator"]) for row in table]
+    names = ("smoother", "ekf-backward-forward")
+    expected = [
+        (delay, gate, str(seed), name)
+        for delay in ("0.05", "0.15")
+        for gate in ("5.0", "3.0")
+        for seed in range(3)
+        for name in names
+    ]
+    assert cells == expected
+    assert rows(done / "errors.csv") == []
+    assert all(0.0 < float(row["truth.overall.errors.position_m.rmse"]) < 3.0 for row in table)
+
+
+def test_wall_times_have_a_table_of_their_own(done: Path) -> None:
+    table, timing = rows(done / "sweep.csv"), rows(done / "timing.csv")
+    assert len(timing) == len(table)
+    assert set(timing[0]) & set(table[0]) == {*POINT, "scenario.sensors.lidar_cluster.delay", "estimator"}
+    assert all(float(row[name]) > 0.0 for row in timing for name in ("replay_s", "score_s", "time_per_tick_s.mean"))
+
+
+def test_the_numbers_are_those_of_simulate_replay_and_compare(
+    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenario, stream, folder = CONFIGS / "scenarios/single_opponent.yaml", tmp_path / "s.jsonl", tmp_path / "runs"
+    assert run(["simulate", str(scenario), "-o", str(stream), "--seed", "2", "--duration", "2"]) == 0
+    names = ["smoother", "ekf-backward-forward"]
+    call = ["replay", str(stream), "-c", str(CONFIGS / "smoother.yaml"), "-e", ",".join(names), "-o", str(folder)]
+    assert run([*call, "--map", "oval"]) == 0
+    capsys.readouterr()
+    assert run(["compare", str(folder), "--json"]) == 0
+    runs = json.loads(capsys.readouterr().out)["runs"]
+    wanted = ("0.15", "5.0", "2")
+    table = [row for row in rows(done / "sweep.csv") if tuple(row[name] for name in POINT) == wanted]
+    assert [row["estimator"] for row in table] == names
+    for row in table:
+        metrics = runs[row["estimator"]]
+        error = metrics["truth"]["overall"]["errors"]["position_m"]["rmse"]
+        assert row["truth.overall.errors.position_m.rmse"] == repr(error)
+        assert row["sensors.radar.nis.mean"] == repr(metrics["sensors"]["radar"]["nis"]["mean"])
+        received = metrics["sensors"]["lidar_cluster"]["detections"]
+        assert row["sensors.lidar_cluster.detections"] == str(received)
+
+
+def test_all_estimators_of_a_job_see_the_same_stream(done: Path) -> None:
+    seen: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
+    for row in rows(done / "sweep.csv"):
+        stream = tuple(row[f"sensors.{name}.detections"] for name in ("radar", "lidar_cluster"))
+        stream += tuple(row[f"sensors.{name}.delay_s.mean"] for name in ("radar", "lidar_cluster"))
+        seen.setdefault(tuple(row[name] for name in POINT), set()).add(stream)
+    assert all(len(streams) == 1 for streams in seen.values())
+    assert len({next(iter(streams)) for streams in seen.values()}) >= 3  # another seed, another stream
+
+
+# --- the same bytes
+
+
+def test_two_processes_give_the_same_bytes_as_one(smoke: Path, done: Path, tmp_path: Path) -> None:
+    assert run(["sweep", str(smoke), "-o", str(tmp_path / "two"), "--jobs", "2"]) == 0
+    assert (tmp_path / "two/sweep.csv").read_bytes() == (done / "sweep.csv").read_bytes()
+    assert [path.name for path in parts(tmp_path / "two")] == [path.name for path in parts(done)]
+
+
+def wait_for_parts(out: Path, process: subprocess.Popen[str]) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not parts(out):
+        assert process.poll() is None, "the sweep ended before it was to be stopped"
+        assert time.monotonic() < end, "no job was finished in time"
+        time.sleep(0.02)
+
+
+def children(pid: int) -> list[int]:
+    """Processes started by the process `pid`."""
+    asked = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True, check=True)
+    return [int(line) for line in asked.stdout.split()]
+
+
+def runs(pid: int) -> bool:
+    """Whether the process `pid` exists and is more than an entry that waits for its parent to ask for it."""
+    asked = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True, check=False)
+    return bool(asked.stdout.strip()) and not asked.stdout.startswith("Z")
+
+
+def test_a_killed_sweep_goes_on_where_it_was_and_gives_the_same_bytes(
+    smoke: Path, done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "killed"
+    with subprocess.Popen([*FGTRACK, "sweep", str(smoke), "-o", str(out), "--jobs", "2"], text=True) as process:
+        wait_for_parts(out, process)
+        orphans = children(process.pid)
+        process.kill()
+    end = time.monotonic() + PATIENCE_S
+    while any(map(runs, orphans)) and time.monotonic() < end:
+        time.sleep(0.1)
+    assert len(orphans) >= 2
+    assert not any(map(runs, orphans)), "processes outlive their sweep"
+    kept = {path: path.stat().st_mtime_ns for path in parts(out)}
+    total = len(parts(done))
+    assert 0 < len(kept) < total
+    assert not (out / "sweep.csv").exists()
+    capsys.readouterr()
+    assert run(["sweep", str(smoke), "-o", str(out), "--jobs", "1"]) == 0
+    assert f"jobs: {total}, each of 2 estimators; to do: {total - len(kept)}" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    assert (out / "sweep.csv").read_bytes() == (done / "sweep.csv").read_bytes()
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_ctrl_c_is_one_line_and_what_is_done_stays(smoke: Path, tmp_path: Path, jobs: int) -> None:
+    out = tmp_path / "interrupted"
+    call = [*FGTRACK, "sweep", str(smoke), "-o", str(out), "--jobs", str(jobs)]
+    with subprocess.Popen(call, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        wait_for_parts(out, process)
+        os.killpg(process.pid, signal.SIGINT)  # a terminal tells every process of the group
+        assert process.stderr is not None
+        said = process.stderr.read().splitlines()
+    assert process.returncode == 130
+    assert said == ["fgtrack: error: interrupted; what was computed so far is in the output folder"]
+    assert len(rows(out / "sweep.csv")) == 2 * len(parts(out))
+
+
+def test_a_dask_cluster_gives_the_same_bytes(smoke: Path, done: Path, tmp_path: Path) -> None:
+    if find_spec("distributed") is None:
+        pytest.skip("distributed is not installed (extra `dask`)")
+    script, out = tmp_path / "cluster.py", tmp_path / "out"
+    script.write_text(CLUSTER)
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, str(script)], stdin=pipe, stdout=pipe, text=True) as cluster:
+        assert cluster.stdout is not None
+        call = [*FGTRACK, "sweep", str(smoke), "-o", str(out), "--dask", cluster.stdout.readline().strip()]
+        try:
+            subprocess.run(call, check=True, timeout=PATIENCE_S)
+        finally:
+            count, _ = cluster.communicate("")
+    assert int(count) == len(parts(done))  # the workers did it, not this machine
+    assert (out / "sweep.csv").read_bytes() == (done / "sweep.csv").read_bytes()
+
+
+def surroundings(run: Run) -> Scores:
+    """What a process of the pool finds."""
+    deaf = signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    return Scores({"threads": os.environ.get("OMP_NUM_THREADS"), "deaf": int(deaf)}, {"pid": os.getpid()})
+
+
+def test_processes_have_one_thread_each_and_leave_ctrl_c_to_the_first(tmp_path: Path) -> None:
+    text = "duration_s: 0.5\nestimators: [ekf-replay]\nseeds: 4\n"
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    Sweep.open(load_plan(write_sweep(tmp_path, text)), tmp_path / "out").run(surroundings, jobs=2)
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before
+    assert {(row["threads"], row["deaf"]) for row in rows(tmp_path / "out/sweep.csv")} == {("1", "1")}
+    assert str(os.getpid()) not in {row["pid"] for row in rows(tmp_path / "out/timing.csv")}
+
+
+# --- what goes wrong
+
+
+def test_bad_cells_are_told_and_the_rest_is_done(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One point that does not fit, one whose map is missing, and one that only one estimator cannot do."""
+    sweep = write_sweep(
+        tmp_path,
+        """
+duration_s: 1.0
+estimators: [ekf-replay, smoother]
+metrics: [truth.overall.errors.position_m.rmse]
+vary:
+  what:
+    label: [good, negative gate, no map, refused, good again]
+    association.gate_m: [5.0, -1.0, 5.0, 5.0, 4.0]
+    scenario.map: [oval, oval, missing.csv, oval, oval]
+    smoother.late: [fuse, fuse, fuse, raise, fuse]
+    smoother.lag_s: [1.0, 1.0, 1.0, 0.0, 1.0]
+    smoother.lagged_s: [[], [], [], [], []]
+""",
+    )
+    assert run(["sweep", str(sweep), "-o", str(tmp_path / "out"), "--jobs", "1"]) == 1
+    good = [(row["what"], row["estimator"]) for row in rows(tmp_path / "out/sweep.csv")]
+    bad = {(row["what"], row["estimator"]): row["error"] for row in rows(tmp_path / "out/errors.csv")}
+    assert sorted([*good, *bad]) == sorted(
+        (what, name)
+        for what in ("good", "negative gate", "no map", "refused", "good again")
+        for name in ("ekf-replay", "smoother")
+    )
+    assert set(bad) == {
+        *((what, name) for what in ("negative gate", "no map") for name in ("ekf-replay", "smoother")),
+        ("refused", "smoother"),
+    }
+    assert "gate_m: must be positive, is -1.0" in bad["negative gate", "smoother"]
+    assert "missing.csv" in bad["no map", "ekf-replay"]
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1
+    assert re.match(r"fgtrack: error: .*errors\.csv: 5 bad cells, the first: what=negative gate: ", said[0])
+
+
+def test_a_bad_cell_is_tried_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sweep = write_sweep(tmp_path, "duration_s: 1.0\nestimators: [ekf-replay]\nset: {scenario.map: track.csv}\n")
+    call = ["sweep", str(sweep), "-o", str(tmp_path / "out"), "--jobs", "1"]
+    for _ in range(2):
+        assert run(call) == 1
+        assert "jobs: 1, each of 1 estimators; to do: 1" in capsys.readouterr().out
+
+
+def deadly(run: Run) -> Scores:
+    """Dies of the backward-forward EKF with a gate of 3 m."""
+    scores = score(run)
+    if run.meta["estimator"] == "ekf-backward-forward" and scores.values["options.gate_m"] == 3.0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return scores
+
+
+def test_a_cell_that_kills_its_process_is_bad_and_the_rest_is_done(tmp_path: Path) -> None:
+    sweep = write_sweep(
+        tmp_path,
+        """
+duration_s: 0.5
+estimators: [ekf-replay, ekf-backward-forward]
+vary: {evaluation.gate_m: [5.0, 3.0, 4.0, 6.0, 7.0, 8.0]}
+""",
+    )
+    result = Sweep.open(load_plan(sweep), tmp_path / "out").run(deadly, jobs=2)
+    assert (result.num_good, result.num_bad) == (11, 1)
+    bad = rows(tmp_path / "out/errors.csv")
+    assert [(row["evaluation.gate_m"], row["estimator"]) for row in bad] == [("3.0", "ekf-backward-forward")]
+    assert "the process that ran it died" in bad[0]["error"]
+
+
+@pytest.mark.parametrize(
+    ("extra", "said"),
+    [
+        (["--jobs", "0"], "--jobs 0: at least one process is needed"),
+        (["--jobs", "2", "--dask", "tcp://127.0.0.1:1"], "give one of them"),
+    ],
+)
+def test_a_bad_call_is_told(
+    smoke: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], extra: Sequence[str], said: str
+) -> None:
+    assert run(["sweep", str(smoke), "-o", str(tmp_path / "out"), *extra]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_metrics_that_do_not_exist_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = "duration_s: 0.5\nestimators: [ekf-replay]\nmetrics: [num_tracks, truth.positon]\n"
+    assert run(["sweep", str(write_sweep(tmp_path, text)), "-o", str(tmp_path / "out"), "--jobs", "1"]) == 1
+    assert "metrics: no column fits truth.positon" in capsys.readouterr().err
+    assert list(rows(tmp_path / "out/sweep.csv")[0]) == ["seed", "estimator", "num_tracks"]
+
+
+# --- going on
+
+
+def test_a_changed_sweep_reuses_what_it_can_and_says_what_it_cannot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = "duration_s: 0.5\nestimators: [ekf-replay]\nseeds: 2\nvary: {association.gate_m: [5.0, 3.0]}\n"
+    out = tmp_path / "out"
+    call = ["sweep", str(write_sweep(tmp_path, text)), "-o", str(out), "--jobs", "1"]
+    assert run(call) == 0
+    assert "unused" not in capsys.readouterr().out
+    write_sweep(tmp_path, text.replace("seeds: 2", "seeds: 3").replace("3.0", "2.0"))
+    assert run(call) == 0
+    said = capsys.readouterr().out
+    assert "jobs: 6, each of 1 estimators; to do: 4" in said
+    assert f"2 parts in {out} belong to other settings, files or versions and stay unused" in said
+    assert [row["association.gate_m"] for row in rows(out / "sweep.csv")] == ["5.0"] * 3 + ["2.0"] * 3
+
+
+def test_a_recording_is_swept_over_delays(tmp_path: Path) -> None:
+    scenario = load(Scenario, CONFIGS / "scenarios/single_opponent.yaml")
+    messages = simulate(scenario, np.random.default_rng(0))
+    start_ns = messages[0].receipt_ns
+    write_stream(tmp_path / "drive.jsonl", [m for m in messages if m.receipt_ns < start_ns + 2_000_000_000])
+    sweep = tmp_path / "sweep.yaml"
+    sweep.write_text(
+        """
+format: fgtrack-sweep/1
+input: drive.jsonl
+seeds: [3, 4]
+estimators: [ekf-replay]
+vary:
+  delays.radar.delay: [{kind: constant, delay_s: 0.1}, {kind: uniform, min_s: 0.1, max_s: 0.2}]
+"""
+    )
+    assert run(["sweep", str(sweep), "-o", str(tmp_path / "out"), "--jobs", "1"]) == 0
+    means = [float(row["sensors.radar.delay_s.mean"]) for row in rows(tmp_path / "out/sweep.csv")]
+    assert means[:2] == pytest.approx([0.1, 0.1], abs=1e-9)
+    assert all(0.12 < mean < 0.18 for mean in means[2:])
+    assert means[2] != means[3]  # the seed draws the delays

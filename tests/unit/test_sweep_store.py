@@ -1,0 +1,99 @@
+"""Parts and tables of a sweep."""
+
+from pathlib import Path
+
+import pytest
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.pipeline.sweep_plan import Job, Plan, Recipe
+from fgtrack.pipeline.sweep_store import Cell, PartStore, write_tables
+
+RECIPE = Recipe(None, None, {}, {}, 0, ("a", "b"))
+PLAN = Plan(
+    columns=("rate_hz", "delay"),
+    jobs=(
+        Job((5.0, {"kind": "none"}), 0, "k0", RECIPE),
+        Job((5.0, None), 1, "k1", RECIPE),
+        Job((-1, "x,y"), 0, "", None, "rate_hz=-1: must be positive"),
+    ),
+    estimators=("a", "b"),
+    metrics=(),
+)
+
+
+def cell(name: str, error: str | None = None, **values: float | None) -> Cell:
+    return Cell(name, {} if error else values, {} if error else {"replay_s": 0.25}, error)
+
+
+DONE = {
+    "k1": [cell("a", x=1 / 3, n=2), cell("b", error="it, broke")],
+    "k0": [cell("a", x=0.1), cell("b", y=1e-300, x=None)],
+}
+
+
+def lines(path: Path) -> list[str]:
+    return path.read_text().splitlines()
+
+
+def test_tables_are_in_the_order_of_the_grid_with_all_digits(tmp_path: Path) -> None:
+    result = write_tables(tmp_path, PLAN, DONE)
+    assert lines(tmp_path / "sweep.csv") == [
+        "rate_hz,delay,seed,estimator,x,y,n",
+        '5.0,"{""kind"":""none""}",0,a,0.1,,',
+        '5.0,"{""kind"":""none""}",0,b,,1e-300,',
+        "5.0,,1,a,0.3333333333333333,,2",
+    ]
+    assert lines(tmp_path / "timing.csv")[1] == '5.0,"{""kind"":""none""}",0,a,0.25'
+    assert lines(tmp_path / "errors.csv") == [
+        "rate_hz,delay,seed,estimator,error",
+        '5.0,,1,b,"it, broke"',
+        '-1,"x,y",0,a,rate_hz=-1: must be positive',
+        '-1,"x,y",0,b,rate_hz=-1: must be positive',
+    ]
+    assert (result.num_cells, result.num_good, result.num_bad) == (6, 3, 3)
+    assert result.first_error == "it, broke"
+
+
+def test_jobs_that_are_not_finished_have_no_row(tmp_path: Path) -> None:
+    result = write_tables(tmp_path, PLAN, {"k0": DONE["k0"]})
+    assert len(lines(tmp_path / "sweep.csv")) == 3
+    assert (result.num_good, result.num_bad) == (2, 2)
+
+
+def test_metrics_are_chosen_by_name_or_pattern_and_unknown_ones_told(tmp_path: Path) -> None:
+    plan = Plan(PLAN.columns, PLAN.jobs, PLAN.estimators, ("n", "[xz]", "n*", "missing", "m.*"))
+    result = write_tables(tmp_path, plan, DONE)
+    assert lines(tmp_path / "sweep.csv")[0] == "rate_hz,delay,seed,estimator,n,x"
+    assert result.unknown_metrics == ("missing", "m.*")
+
+
+def test_a_part_gives_back_its_cells_to_the_last_bit(tmp_path: Path) -> None:
+    store = PartStore(tmp_path)
+    cells = (cell("a", x=0.1 + 0.2, n=3, y=None), cell("b", error="no"))
+    store.write("key", cells)
+    assert PartStore(tmp_path).read("key") == cells
+    assert store.keys() == {"key"}
+    assert store.read("other") is None
+
+
+def test_a_half_written_part_is_none(tmp_path: Path) -> None:
+    store = PartStore(tmp_path)
+    (tmp_path / "parts/key.json.part").write_text('{"format": "fgtrack-sw')
+    assert store.keys() == frozenset()
+    assert store.read("key") is None
+
+
+@pytest.mark.parametrize(
+    "text", ['{"format": "fgtrack-sw', "[]", '{"format": "x"}', '{"format": "fgtrack-sweep-part/1", "cells": [{}]}']
+)
+def test_a_damaged_part_is_told(tmp_path: Path, text: str) -> None:
+    store = PartStore(tmp_path)
+    (tmp_path / "parts/key.json").write_text(text)
+    with pytest.raises(DataError, match=r"key\.json: .*, delete it"):
+        store.read("key")
+
+
+def test_a_file_is_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CallError, match="file: cannot be made a folder"):
+        PartStore(tmp_path / "file")
