@@ -21,10 +21,24 @@ from fgtrack.pipeline.replay import replay_each
 from fgtrack.sim.paper import paper_scenario
 from fgtrack.sim.scenario import OVAL
 from fgtrack.sim.simulate import simulate
+from fgtrack.tracking.birth import MeasuredBirth
 
 _SEED = 1
 _ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
 _LAGGED_S = (0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 0.9)
+
+
+def demo_config() -> Config:
+    """What configs/smoother.yaml says, on the built-in oval and with more lags."""
+    config = Config()
+    return replace(
+        config,
+        map=replace(config.map, track=OVAL, pit=OVAL),
+        motion=replace(config.motion, kind="ctrv"),
+        birth=MeasuredBirth(),
+        smoother=replace(config.smoother, lagged_s=_LAGGED_S),
+        filter=replace(config.filter, storage_s=3.0),
+    )
 
 
 def demo(
@@ -44,12 +58,7 @@ def demo(
         raise CallError(f"{out}: cannot be made a folder ({error.strerror}), choose another one with -o") from error
     with progress("simulate"):
         write_bag(bag, simulate(paper_scenario(), np.random.default_rng(_SEED)))
-    config = Config()
-    config = replace(
-        config,
-        map=replace(config.map, track=OVAL, pit=OVAL),
-        smoother=replace(config.smoother, lagged_s=_LAGGED_S),
-    )
+    config = demo_config()
     source = open_input(bag, config.input)
     with progress("replay") as show:
         results = replay_each(
