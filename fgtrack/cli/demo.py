@@ -35,7 +35,7 @@ def demo_config() -> Config:
         config,
         map=replace(config.map, track=OVAL, pit=OVAL),
         motion=replace(config.motion, kind="ctrv"),
-        birth=MeasuredBirth(),
+        birth=MeasuredBirth(speed_std_mps=10.0),
         smoother=replace(config.smoother, lagged_s=_LAGGED_S),
         filter=replace(config.filter, storage_s=3.0),
     )

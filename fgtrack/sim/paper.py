@@ -1,4 +1,7 @@
-"""The default scenario: an oval at racing speed with the sensors and delays of Karle et al. 2023."""
+"""The default scenario: an oval at racing speed with the sensors and delays of Karle et al. 2023.
+
+`configs/scenarios/default.yaml` is the same scenario and names the source of each number.
+"""
 
 from fgtrack.models.sensors import Mount
 from fgtrack.sim.delays import GammaDelay
@@ -12,28 +15,39 @@ RADAR_DELAY = GammaDelay(min_s=0.03, mean_s=0.062, q90_s=0.089)
 
 
 def paper_scenario() -> Scenario:
-    """One car to overtake and one that overtakes; noise, misses and clutter are plausible for the sensors."""
+    """One car to follow and overtake, then one that overtakes and is followed.
+
+    Geometry and detections are those of the paper's data (section III-H); noise and clutter are such that the
+    residuals of the baseline are those of its table I.
+    """
     ego = TrackVehicle(
         arc_m=100.0,
         lateral_m=-2.0,
-        speed=((0.0, 65.0), (14.0, 70.0), (40.0, 68.0), (60.0, 66.0)),
-        lane_changes=(LaneChange(3.0, 4.0, 2.5), LaneChange(22.0, 4.0, -2.0)),
+        speed=(
+            *((4.0, 52.0), (10.0, 57.0), (15.5, 57.0), (20.5, 66.0), (28.0, 66.0)),
+            *((32.0, 60.0), (40.0, 60.0), (45.0, 64.0), (47.0, 64.0), (53.0, 70.0)),
+        ),
+        lane_changes=(LaneChange(16.0, 4.0, 2.0), LaneChange(27.0, 4.0, -2.0)),
     )
-    overtaken = TrackVehicle(arc_m=175.0, lateral_m=-2.5, speed=((0.0, 63.0), (20.0, 65.0), (60.0, 64.0)))
+    overtaken = TrackVehicle(arc_m=140.0, lateral_m=-2.5, speed=((3.0, 52.0), (9.0, 57.0)))
     overtaking = TrackVehicle(
-        arc_m=45.0,
-        lateral_m=-3.0,
-        speed=((0.0, 66.0), (25.0, 69.0), (45.0, 73.0), (60.0, 68.0)),
-        lane_changes=(LaneChange(24.0, 5.0, 3.5), LaneChange(54.0, 4.0, -2.5)),
+        arc_m=0.0,
+        lateral_m=2.5,
+        speed=(
+            *((4.0, 52.0), (10.0, 57.0), (17.0, 57.0), (24.0, 70.0)),
+            *((39.0, 70.0), (44.0, 64.0), (46.0, 64.0), (52.0, 70.0)),
+        ),
+        lane_changes=(LaneChange(41.0, 4.0, -2.0),),
     )
     lidar = SimulatedSensor(
         name="lidar_cluster",
-        std={"x_m": 0.3, "y_m": 0.3},
+        std={"x_m": 0.3, "y_m": 0.1},
         jitter_s=0.003,
         min_range_m=2.0,
         max_range_m=98.0,
+        max_range_behind_m=57.0,
         detection_probability=0.9,
-        clutter=Clutter(mean_per_scan=0.3),
+        clutter=Clutter(mean_per_scan=0.002, region="track"),
         split_probability=0.03,
         outlier_probability=0.01,
         outlier_factor=5.0,
@@ -42,18 +56,18 @@ def paper_scenario() -> Scenario:
     )
     radar = SimulatedSensor(
         name="radar",
-        std={"x_m": 1.0, "y_m": 1.0, "speed_mps": 0.2},
+        std={"x_m": 0.8, "y_m": 0.4, "speed_mps": 1.0},
         phase_s=0.023,
         jitter_s=0.003,
         mount=Mount(x_m=3.0),
-        field_of_view_rad=1.4,
+        field_of_view_rad=1.57,
         min_range_m=3.0,
         max_range_m=105.0,
-        detection_probability=0.85,
-        clutter=Clutter(mean_per_scan=0.3, region="track", speed_mps=(10.0, 80.0)),
+        detection_probability=0.5,
+        clutter=Clutter(mean_per_scan=0.006, region="track", speed_mps=(0.0, 5.0)),
         outlier_probability=0.01,
         outlier_factor=3.0,
-        drop_outs=((31.0, 31.5),),
+        drop_outs=((52.0, 52.5),),
         delay=RADAR_DELAY,
     )
     return Scenario(ego=ego, opponents=(overtaken, overtaking), sensors=(lidar, radar))

@@ -129,8 +129,11 @@ class Scanner:
         """Which of `states` lie in the field of view, shape (m,)."""
         sensor = self.sensor
         distance, bearing, _ = self._relative(scan, states).T
-        in_range = (distance >= sensor.min_range_m) & (distance <= sensor.max_range_m)
-        return np.asarray(in_range & (np.abs(bearing) <= sensor.field_of_view_rad / 2.0))
+        off_axis = np.abs(bearing)
+        behind_m = sensor.max_range_m if sensor.max_range_behind_m is None else sensor.max_range_behind_m
+        limit = np.where(off_axis > math.pi / 2.0, behind_m, sensor.max_range_m)
+        in_range = (distance >= sensor.min_range_m) & (distance <= limit)
+        return np.asarray(in_range & (off_axis <= sensor.field_of_view_rad / 2.0))
 
     def _relative(self, scan: IntArray, states: FloatArray) -> FloatArray:
         """Range, bearing and range rate of `states` from the sensor, shape (m, 3), with its own motion."""

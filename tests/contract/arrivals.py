@@ -57,12 +57,21 @@ def middles(stamps_ns: list[int]) -> list[int]:
 
 @st.composite
 def arrivals(
-    draw: st.DrawFn, span_s: float = LAG_S, max_size: int = 10, close: bool = False, min_size: int = 2
+    draw: st.DrawFn,
+    span_s: float = LAG_S,
+    max_size: int = 10,
+    close: bool = False,
+    min_size: int = 2,
+    every_ms: int | None = None,
 ) -> Arrivals:
-    """Stamps less than `span_s` after the first node in any order; some equal, and some 1 us apart where `close`."""
+    """Stamps less than `span_s` after the first node in any order; some equal, and some 1 us apart where `close`.
+
+    Those of `every_ms` are always among them.
+    """
     last = round(span_s * NS_PER_S) // _GRID_NS - 1
     offsets = [_GRID_NS * k for k in draw(st.lists(st.integers(1, last), min_size=min_size, max_size=max_size))]
     equal = [offset for offset in offsets if draw(st.integers(0, 3)) == 0]
     near = [offset + US for offset in offsets if close and draw(st.booleans())]
-    order = draw(st.permutations(offsets + equal + near))
+    regular = [] if every_ms is None else [ms * MS for ms in range(every_ms, round(1e3 * span_s), every_ms)]
+    order = draw(st.permutations(regular + offsets + equal + near))
     return Arrivals(tuple(order), draw(st.integers(0, 2**31)))

@@ -15,6 +15,9 @@ from fgtrack.models.motion import CV, MotionModel
 
 FUSED = (UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE)
 CONVERGED_BAR = 1e-3
+EVERY_MS = 200
+"""Without a measurement now and then a state is hardly determined, and what reweights itself may not converge."""
+ORDERLY = [name for name, subject in SUBJECTS.items() if subject.nonlinear != "never"]
 MORE = 5
 
 
@@ -71,9 +74,9 @@ def test_in_a_linear_model_any_order_gives_the_dense_joint_at_every_stamp(name: 
 
 
 @pytest.mark.parametrize("kind", NONLINEAR)
-@pytest.mark.parametrize("name", SUBJECTS)
+@pytest.mark.parametrize("name", ORDERLY)
 def test_in_a_nonlinear_model_any_order_gives_the_answer_of_the_time_order(name: str, kind: str) -> None:
-    @given(case=arrivals(close=True))
+    @given(case=arrivals(close=True, every_ms=EVERY_MS if SUBJECTS[name].nonlinear == "at convergence" else None))
     @hypothesis_settings(deadline=None, max_examples=SUBJECTS[name].examples)
     def check(case: Arrivals) -> None:
         check_time_order(name, kind, case)
@@ -82,16 +85,24 @@ def test_in_a_nonlinear_model_any_order_gives_the_answer_of_the_time_order(name:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", MOTIONS)
 @pytest.mark.parametrize("name", SUBJECTS)
-def test_any_order_holds_for_many_long_streams(name: str, kind: str) -> None:
+def test_any_order_gives_the_dense_joint_for_many_long_streams(name: str) -> None:
     @given(case=arrivals(close=True, max_size=40, min_size=10))
     @hypothesis_settings(deadline=None, max_examples=MORE * SUBJECTS[name].examples)
     def check(case: Arrivals) -> None:
-        if kind == "cv":
-            check_dense_joint(name, case)
-        else:
-            check_time_order(name, kind, case)
+        check_dense_joint(name, case)
+
+    check()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", NONLINEAR)
+@pytest.mark.parametrize("name", ORDERLY)
+def test_any_order_gives_the_answer_of_the_time_order_for_many_long_streams(name: str, kind: str) -> None:
+    @given(case=arrivals(close=True, max_size=40, min_size=10, every_ms=EVERY_MS))
+    @hypothesis_settings(deadline=None, max_examples=MORE * SUBJECTS[name].examples)
+    def check(case: Arrivals) -> None:
+        check_time_order(name, kind, case)
 
     check()
 

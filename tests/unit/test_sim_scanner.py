@@ -109,6 +109,20 @@ def test_a_sensor_sees_between_its_ranges_and_inside_its_field_of_view_only() ->
         assert scan(sensor, seen_from(x, y), num_scans=1)[0].tolist() == [int(seen)]
 
 
+def test_a_sensor_may_see_less_far_behind_than_ahead() -> None:
+    sensor = SimulatedSensor("lidar", NO_NOISE, max_range_m=98.0, max_range_behind_m=57.0)
+    for x, y, seen in (
+        (97.9, 0.0, True),
+        (-56.9, 0.0, True),
+        (-57.1, 0.0, False),
+        (1.0, 90.0, True),  # just ahead of the line across the sensor
+        (-1.0, 90.0, False),
+        (-1.0, -90.0, False),
+        (-1.0, 56.0, True),
+    ):
+        assert scan(sensor, seen_from(x, y), num_scans=1)[0].tolist() == [int(seen)]
+
+
 # Statistics
 
 
@@ -243,6 +257,9 @@ def test_scans_come_at_their_rate_phase_and_jitter() -> None:
         ({"field_of_view_rad": 7.0}, "field_of_view_rad"),
         ({"min_range_m": -1.0}, "min_range_m"),
         ({"max_range_m": math.inf}, "max_range_m"),
+        ({"max_range_behind_m": 100.1}, "max_range_behind_m"),
+        ({"max_range_behind_m": 0.0}, "max_range_behind_m"),
+        ({"max_range_behind_m": math.nan}, "max_range_behind_m"),
         ({"detection_probability": 1.1}, "detection_probability"),
         ({"split_probability": -0.1}, "split_probability"),
         ({"split_distance_m": (3.0, 2.0)}, "split_distance_m"),

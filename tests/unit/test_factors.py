@@ -1,0 +1,252 @@
+"""The graph's factors against numeric derivatives and written-out losses."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
+
+import gtsam
+import numpy as np
+import pytest
+
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import BirthPrior, Measurement
+from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherSettings
+from fgtrack.estimation.factor_graph.evidence import Equivalent, Evidence
+from fgtrack.estimation.factor_graph.factors import evidence_factor, motion_factor, prior_factor, weight
+from fgtrack.models.measurement import SensorPose, measurement_model
+from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
+from fgtrack.models.sensors import RobustLoss
+
+MOTIONS: dict[str, MotionModel] = {"cv": CV(), "ctrv": CTRV(), "ctra": CTRA()}
+LEFT, RIGHT = 3, 7
+POSE = SensorPose(2.0, -1.0, 0.3, 4.0, 1.0)
+COMPONENTS = {
+    "position": ("x_m", "y_m"),
+    "position, yaw": ("x_m", "y_m", "yaw_rad"),
+    "position, speed": ("x_m", "y_m", "speed_mps"),
+    "range, bearing": ("range_m", "bearing_rad"),
+    "range, bearing, Doppler": ("range_m", "bearing_rad", "range_rate_mps"),
+    "bearing": ("bearing_rad",),
+}
+LOSSES = ("huber", "cauchy", "tukey", "geman_mcclure", "dcs")
+
+
+def state(motion: MotionModel, seed: int) -> FloatArray:
+    rng = np.random.default_rng(seed)
+    if motion.linear:
+        return np.array([12.0, 7.0, 18.0, 6.0]) + rng.standard_normal(4)
+    return (np.array([12.0, 7.0, 0.4, 20.0, 0.3, 1.5]) + 0.2 * rng.standard_normal(6))[: motion.dim]
+
+
+def values(**states: FloatArray) -> gtsam.Values:
+    found = gtsam.Values()
+    for name, x in states.items():
+        found.insert(LEFT if name == "left" else RIGHT, x)
+    return found
+
+
+def linear_parts(factor: gtsam.NonlinearFactor, at: gtsam.Values) -> tuple[FloatArray, FloatArray]:
+    """A and b of A dx = b, with the weight of a loss."""
+    A, b = factor.linearize(at).jacobian()
+    return A, b
+
+
+def numeric_jacobian(function: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
+    """Central differences, with steps that suit metres, radians and metres per second alike."""
+    columns = []
+    for k in range(len(x)):
+        step = 1e-5 * max(1.0, abs(x[k])) * (np.arange(len(x)) == k)
+        columns.append((function(x + step) - function(x - step)) / (2.0 * step[k]))
+    return np.stack(columns, axis=-1)
+
+
+# --- motion
+
+
+@pytest.mark.parametrize("dt_s", [1e-3, 0.05, 0.9, 3.0])
+@pytest.mark.parametrize("kind", MOTIONS)
+def test_a_motion_factor_is_the_whitened_gap_and_its_derivative_under_the_noise_of_the_linearisation_point(
+    kind: str, dt_s: float
+) -> None:
+    """The derivative of the noise itself is left out on purpose, so L stays as it is at `left`."""
+    motion = MOTIONS[kind]
+    left = state(motion, 0)
+    right = motion.predict(left, dt_s) + 0.1 * np.random.default_rng(1).standard_normal(motion.dim)
+    L = np.linalg.cholesky(motion.process_noise(left, dt_s))
+
+    def residual(both: FloatArray) -> FloatArray:
+        x_left, x_right = both[: motion.dim], both[motion.dim :]
+        return np.linalg.solve(L, x_right - motion.predict(x_left, dt_s))
+
+    A, b = linear_parts(motion_factor(motion, LEFT, RIGHT, dt_s), values(left=left, right=right))
+    both = np.concatenate([left, right])
+    expected = numeric_jacobian(residual, both)
+    np.testing.assert_allclose(A, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
+    np.testing.assert_allclose(b, -residual(both), rtol=1e-9, atol=1e-9 * np.abs(b).max())
+
+
+@pytest.mark.parametrize("kind", ["ctrv", "ctra"])
+def test_errors_between_two_linearisations_are_of_one_and_the_same_noise(kind: str) -> None:
+    """A line search compares them; a noise that follows the state would reward states that are noisy."""
+    motion, dt_s = MOTIONS[kind], 0.5
+    factor = motion_factor(motion, LEFT, RIGHT, dt_s)
+    first, second = state(motion, 0), state(motion, 0) + np.array([0, 0, 1.0, 30.0, 0.0, 0.0])[: motion.dim]
+    right = motion.predict(first, dt_s) + 0.1
+    factor.linearize(values(left=first, right=right))
+    L = np.linalg.cholesky(motion.process_noise(first, dt_s))
+    gap = np.linalg.solve(L, right - motion.predict(second, dt_s))
+    moved = values(left=second, right=right)
+    assert factor.error(moved) == pytest.approx(0.5 * gap @ gap, rel=1e-9)
+    factor.linearize(moved)
+    L = np.linalg.cholesky(motion.process_noise(second, dt_s))
+    gap = np.linalg.solve(L, right - motion.predict(second, dt_s))
+    assert factor.error(moved) == pytest.approx(0.5 * gap @ gap, rel=1e-9)
+
+
+@pytest.mark.parametrize("kind", MOTIONS)
+def test_a_motion_factor_hands_out_jacobians_of_its_own(kind: str) -> None:
+    """Its scratch arrays are used again at the next call; what gtsam was given must not follow."""
+    motion = MOTIONS[kind]
+    factor = motion_factor(motion, LEFT, RIGHT, 0.2)
+    first = factor.linearize(values(left=state(motion, 0), right=state(motion, 1)))
+    A, b = (part.copy() for part in first.jacobian())
+    factor.linearize(values(left=state(motion, 2), right=state(motion, 3)))
+    np.testing.assert_array_equal(first.jacobian()[0], A)
+    np.testing.assert_array_equal(first.jacobian()[1], b)
+
+
+def test_a_prior_factor_is_the_gaussian_that_it_is_given() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((5, 5))
+    mean, P = rng.standard_normal(5), root @ root.T + np.eye(5)
+    A, b = linear_parts(prior_factor(LEFT, mean, P), values(left=mean + 1.0))
+    np.testing.assert_allclose(A.T @ A, np.linalg.inv(P), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.solve(A.T @ A, A.T @ b), -np.ones(5), atol=1e-9)
+
+
+# --- measurements
+
+
+def measurement(kind: str, what: str, loss: RobustLoss | None, off: float = 1.0) -> tuple[Measurement, FloatArray]:
+    """A measurement of a state, and a state that is `off` away from it."""
+    motion = MOTIONS[kind]
+    model = measurement_model(COMPONENTS[what], motion)
+    x, rng = state(motion, 4), np.random.default_rng(5)
+    k = len(COMPONENTS[what])
+    root = np.eye(k) + 0.3 * rng.standard_normal((k, k))
+    R = 0.04 * root @ root.T
+    z = model.predict(x, POSE) + off * np.linalg.cholesky(R) @ np.full(k, 1.0 / math.sqrt(k))
+    return Measurement(0, model, z, R, POSE, loss), x
+
+
+def whitened(item: Measurement, x: FloatArray) -> FloatArray:
+    L = np.linalg.cholesky(item.R)
+    return np.linalg.solve(L, -item.model.residual(item.z, item.model.predict(x, item.pose)))
+
+
+def loss_and_weight(kind: str, width: float, e: float) -> tuple[float, float]:
+    """Loss of a whitened residual of length `e` and its weight, loss' / e, as the literature writes them."""
+    c2, e2 = width * width, e * e
+    if kind == "huber":
+        return (0.5 * e2, 1.0) if e <= width else (width * (e - 0.5 * width), width / e)
+    if kind == "cauchy":
+        return 0.5 * c2 * math.log1p(e2 / c2), c2 / (c2 + e2)
+    if kind == "tukey":
+        inside = max(1.0 - e2 / c2, 0.0)
+        return c2 / 6.0 * (1.0 - inside**3), inside**2
+    if kind == "geman_mcclure":
+        return 0.5 * c2 * e2 / (c2 + e2), (c2 / (c2 + e2)) ** 2
+    # Dynamic covariance scaling leaves the square at e = width, so its phi is width^2 (Agarwal et al. 2013).
+    if e2 <= c2:
+        return 0.5 * e2, 1.0
+    return 1.5 * c2 - 2.0 * c2 * c2 / (c2 + e2), (2.0 * c2 / (c2 + e2)) ** 2
+
+
+@pytest.mark.parametrize("loss", [None, *LOSSES], ids=str)
+@pytest.mark.parametrize(("kind", "what"), list(product(MOTIONS, COMPONENTS)))
+def test_an_evidence_factor_is_the_weighted_residual_and_its_derivative(kind: str, what: str, loss: str | None) -> None:
+    for off in (0.4, 2.0, 5.0):
+        item, x = measurement(kind, what, None if loss is None else RobustLoss(loss, 1.5), off)
+        root_weight = 1.0 if loss is None else math.sqrt(loss_and_weight(loss, 1.5, off)[1])
+        A, b = linear_parts(evidence_factor(LEFT, item, x), values(left=x))
+        expected = numeric_jacobian(lambda at, item=item: whitened(item, at), x)
+        np.testing.assert_allclose(A, root_weight * expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
+        np.testing.assert_allclose(b, -root_weight * whitened(item, x), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("off", [0.3, 1.4, 1.6, 2.5, 8.0])
+@pytest.mark.parametrize("width", [1.5, 2.5])
+@pytest.mark.parametrize("kind", LOSSES)
+def test_a_robust_loss_is_its_formula(kind: str, width: float, off: float) -> None:
+    item, x = measurement("ctrv", "position", RobustLoss(kind, width), off)
+    factor = evidence_factor(LEFT, item, x)
+    loss, expected_weight = loss_and_weight(kind, width, off)
+    assert factor.error(values(left=x)) == pytest.approx(loss, rel=1e-9)
+    assert weight(RobustLoss(kind, width), off) == pytest.approx(expected_weight, rel=1e-9, abs=1e-12)
+    step = 1e-6
+    slope = (loss_and_weight(kind, width, off + step)[0] - loss_and_weight(kind, width, off - step)[0]) / (2 * step)
+    assert slope == pytest.approx(expected_weight * off, rel=1e-5, abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", LOSSES)
+def test_a_robust_loss_leaves_the_square_about_its_width(kind: str) -> None:
+    """Below, a measurement counts almost in full; three widths out it counts half at most."""
+    assert weight(RobustLoss(kind, 3.0), 0.5) > 0.9
+    assert weight(RobustLoss(kind, 3.0), 9.0) < 0.5
+
+
+def test_an_equivalent_detection_is_the_linear_measurement_that_it_says() -> None:
+    rng = np.random.default_rng(6)
+    H, origin, y = rng.standard_normal((2, 5)), rng.standard_normal(5), rng.standard_normal(2)
+    item = Equivalent(origin, H, y, np.array([[0.5, 0.1], [0.1, 0.3]]))
+    L = np.linalg.cholesky(item.R)
+    for x in (origin, origin + rng.standard_normal(5)):
+        for mean in (origin, x, np.zeros(5)):
+            A, b = linear_parts(evidence_factor(LEFT, item, mean), values(left=x))
+            np.testing.assert_allclose(A, np.linalg.solve(L, H), atol=1e-12)
+            np.testing.assert_allclose(b, np.linalg.solve(L, y - H @ (x - origin)), atol=1e-12)
+
+
+def _broken(kind: str) -> Evidence:
+    item, _ = measurement("ctrv", kind, None)
+    return replace(item, R=-item.R)
+
+
+@pytest.mark.parametrize("what", ["position", "bearing"])
+def test_a_covariance_that_is_not_positive_definite_is_refused(what: str) -> None:
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+        evidence_factor(LEFT, _broken(what), state(MOTIONS["ctrv"], 4))
+
+
+# --- angles
+
+
+@pytest.mark.parametrize("loss", [None, RobustLoss("huber", 2.0)], ids=["gaussian", "huber"])
+@pytest.mark.parametrize("turns", [-1, 0, 2])
+def test_a_yaw_is_taken_on_the_branch_next_to_the_state(loss: RobustLoss | None, turns: int) -> None:
+    model = measurement_model(("yaw_rad",), CTRV())
+    item = Measurement(0, model, np.array([-math.pi + 0.1]), np.array([[0.01]]), loss=loss)
+    x = np.array([0.0, 0.0, math.pi - 0.05 + 2.0 * math.pi * turns, 10.0, 0.0])
+    _, b = linear_parts(evidence_factor(LEFT, item, x), values(left=x))
+    assert b == pytest.approx([1.5])
+
+
+@pytest.mark.parametrize("backend", ["incremental", "batch"])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_smoother_turns_through_pi_with_its_measurements(backend: str, sign: float) -> None:
+    """The object turns from 3.0 rad on at 0.5 rad/s; sensors report yaws wrapped, and some late."""
+    motion = CTRV()
+    prior = BirthPrior(0, np.zeros(2), np.eye(2), 3.0 * sign, 0.2, 20.0, 1.0, 0.5 * sign, 0.2, 0.0, 1.0)
+    settings = SmootherSettings(lag_s=2.0, lagged_s=())
+    thresholds = settings.thresholds(motion.state_names, curved=False)
+    make = BatchBackend if backend == "batch" else lambda: IncrementalBackend(thresholds)
+    smoother = FixedLagSmoother(motion, prior, settings, make)
+    start = np.array([0.0, 0.0, 3.0 * sign, 20.0, 0.5 * sign])
+    model = measurement_model(("x_m", "y_m", "yaw_rad"), motion)
+    for k in (2, 4, 6, 8, 3, 5, 7, 9, 10, 1):
+        truth = motion.predict(start, 0.1 * k)
+        z = truth[:3] - np.array([0.0, 0.0, 2.0 * math.pi * round(truth[2] / (2.0 * math.pi))])
+        smoother.update(Measurement(k * 100_000_000, model, z, np.diag([0.01, 0.01, 1e-4])))
+    for k in range(11):
+        np.testing.assert_allclose(smoother.state_at(k * 100_000_000).mean, motion.predict(start, 0.1 * k), atol=0.02)
