@@ -1,6 +1,6 @@
 """An estimator stays usable after a failure: as it was before, and ready for the next measurement."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -20,7 +20,7 @@ When = Literal["before", "after"]
 
 
 class Flaky:
-    """A backend whose next update raises once `fuse_ns` is lit, before it is applied or after it."""
+    """A backend whose next update raises once its fuse is lit, before the update is applied or after it."""
 
     def __init__(self, inner: Backend, fuse: "Fuse") -> None:
         self._inner, self._fuse = inner, fuse
@@ -56,8 +56,7 @@ class Fuse:
 
 def flaky(name: str, motion: MotionModel) -> tuple[FixedLagSmoother, Fuse]:
     fuse = Fuse()
-    make: Callable[[], Backend] = lambda: Flaky(BACKENDS[name](motion), fuse)  # noqa: E731
-    return smoother(motion, settings(lag_s=0.3), make), fuse
+    return smoother(motion, settings(lag_s=0.3), lambda: Flaky(BACKENDS[name](motion), fuse)), fuse
 
 
 STAMPS_NS = [START_NS + ms * MS for ms in (0, 120, 345, 450, 475, 500, 600)]

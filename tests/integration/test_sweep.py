@@ -194,7 +194,10 @@ def test_a_killed_sweep_goes_on_where_it_was_and_gives_the_same_bytes(
 def test_ctrl_c_is_one_line_and_what_is_done_stays(smoke: Path, tmp_path: Path, jobs: int) -> None:
     out = tmp_path / "interrupted"
     call = [*FGTRACK, "sweep", str(smoke), "-o", str(out), "--jobs", str(jobs)]
+    # Whatever started the tests may ignore SIGINT, and a child inherits that.
+    here = signal.signal(signal.SIGINT, signal.default_int_handler)
     with subprocess.Popen(call, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        signal.signal(signal.SIGINT, here)
         wait_for_parts(out, process)
         os.killpg(process.pid, signal.SIGINT)  # a terminal tells every process of the group
         assert process.stderr is not None

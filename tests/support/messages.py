@@ -35,7 +35,7 @@ def detections(draw: st.DrawFn) -> Detection:
     return Detection(
         **{name: draw(numbers) for name in names},
         covariance=draw(st.none() | st.lists(numbers, min_size=size, max_size=size).map(tuple)),
-        stamp_ns=draw(st.none() | ids),
+        stamp_ns=draw(st.none() | times_ns),
         object_id=draw(st.none() | ids),
     )
 
