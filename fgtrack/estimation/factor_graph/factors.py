@@ -37,7 +37,8 @@ def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float) -> gt
     """The state at `right` is that at `left` moved by `dt_s`, with the process noise of that time.
 
     The error is L^-1 (x_right - f(x_left)), with L L' = Q(x_left, dt) taken at the same state: no derivative of L is
-    taken, so this is Gauss-Newton with reweighting, and its answer does not depend on where it began.
+    taken, so this is Gauss-Newton with reweighting. Where it converges its answer does not depend on where it began;
+    over long gaps it may swing between two answers (docs/exactness.md).
     """
     n = motion.dim
     both = np.zeros((n, 2 * n + 1), order="F")
