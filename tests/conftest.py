@@ -1,6 +1,8 @@
-"""Makes `tests/support` importable as `support`."""
+"""Makes `tests/support` importable as `support`, and keeps BLAS to one thread, as the command line does."""
 
+import os
 import sys
 from pathlib import Path
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parent))

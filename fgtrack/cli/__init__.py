@@ -1,1 +1,7 @@
 """The command line: one thin module per command; the only place that prints and exits."""
+
+import os
+
+# Before numpy is loaded. The matrices here are small: more threads of BLAS only wait for each other, and a sweep has a
+# process per core already.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
