@@ -46,7 +46,9 @@ def measured(stamp_ns: int, motion: MotionModel, rng: np.random.Generator) -> Me
 
 
 def in_time_order(measurements: list[Measurement]) -> list[Measurement]:
-    return sorted(measurements, key=lambda m: m.stamp_ns)
+    """By stamp; those of one stamp the other way round, because their order must not matter either."""
+    order = sorted(range(len(measurements)), key=lambda k: (measurements[k].stamp_ns, -k))
+    return [measurements[k] for k in order]
 
 
 def middles(stamps_ns: list[int]) -> list[int]:
@@ -62,16 +64,11 @@ def arrivals(
     max_size: int = 10,
     close: bool = False,
     min_size: int = 2,
-    every_ms: int | None = None,
 ) -> Arrivals:
-    """Stamps less than `span_s` after the first node in any order; some equal, and some 1 us apart where `close`.
-
-    Those of `every_ms` are always among them.
-    """
+    """Stamps less than `span_s` after the first node in any order; some equal, and some 1 us apart where `close`."""
     last = round(span_s * NS_PER_S) // _GRID_NS - 1
     offsets = [_GRID_NS * k for k in draw(st.lists(st.integers(1, last), min_size=min_size, max_size=max_size))]
     equal = [offset for offset in offsets if draw(st.integers(0, 3)) == 0]
     near = [offset + US for offset in offsets if close and draw(st.booleans())]
-    regular = [] if every_ms is None else [ms * MS for ms in range(every_ms, round(1e3 * span_s), every_ms)]
-    order = draw(st.permutations(regular + offsets + equal + near))
+    order = draw(st.permutations(offsets + equal + near))
     return Arrivals(tuple(order), draw(st.integers(0, 2**31)))

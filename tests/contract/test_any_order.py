@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from arrivals import MS, Arrivals, arrivals, in_time_order, measured, middles
-from estimators import MOTIONS, NONLINEAR, START_NS, SUBJECTS, converged, prior, settings
+from arrivals import MS, US, Arrivals, arrivals, in_time_order, measured, middles
+from estimators import MOTIONS, NONLINEAR, SMOOTHERS, START_NS, SUBJECTS, converged, prior, settings
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -14,9 +14,7 @@ from fgtrack.estimation.dense_joint import dense_joint, difference
 from fgtrack.models.motion import CV, MotionModel
 
 FUSED = (UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE)
-CONVERGED_BAR = 1e-3
-EVERY_MS = 200
-"""Without a measurement now and then a state is hardly determined, and what reweights itself may not converge."""
+CONVERGED_BAR = 1e-5
 ORDERLY = [name for name, subject in SUBJECTS.items() if subject.nonlinear != "never"]
 MORE = 5
 
@@ -76,12 +74,19 @@ def test_in_a_linear_model_any_order_gives_the_dense_joint_at_every_stamp(name: 
 @pytest.mark.parametrize("kind", NONLINEAR)
 @pytest.mark.parametrize("name", ORDERLY)
 def test_in_a_nonlinear_model_any_order_gives_the_answer_of_the_time_order(name: str, kind: str) -> None:
-    @given(case=arrivals(close=True, every_ms=EVERY_MS if SUBJECTS[name].nonlinear == "at convergence" else None))
+    @given(case=arrivals(close=True))
     @hypothesis_settings(deadline=None, max_examples=SUBJECTS[name].examples)
     def check(case: Arrivals) -> None:
         check_time_order(name, kind, case)
 
     check()
+
+
+@pytest.mark.parametrize("gap_ms", [1422, 1444])
+@pytest.mark.parametrize("name", SMOOTHERS)
+def test_states_that_whole_steps_swing_about_converge(name: str, gap_ms: int) -> None:
+    """Two clusters of positions: the noise of the motion between them follows the state before it, and so on."""
+    check_time_order(name, "ctrv", Arrivals((gap_ms * MS, gap_ms * MS + US, 2 * MS, 2 * MS + US), seed=295))
 
 
 @pytest.mark.slow
@@ -99,7 +104,7 @@ def test_any_order_gives_the_dense_joint_for_many_long_streams(name: str) -> Non
 @pytest.mark.parametrize("kind", NONLINEAR)
 @pytest.mark.parametrize("name", ORDERLY)
 def test_any_order_gives_the_answer_of_the_time_order_for_many_long_streams(name: str, kind: str) -> None:
-    @given(case=arrivals(close=True, max_size=40, min_size=10, every_ms=EVERY_MS))
+    @given(case=arrivals(close=True, max_size=40, min_size=10))
     @hypothesis_settings(deadline=None, max_examples=MORE * SUBJECTS[name].examples)
     def check(case: Arrivals) -> None:
         check_time_order(name, kind, case)

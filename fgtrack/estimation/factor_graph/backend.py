@@ -8,6 +8,9 @@ import gtsam
 
 from fgtrack.core.types import FloatArray
 
+#: A step of a state, in m, rad, m/s or rad/s, that is rounding.
+AT_REST = 1e-7
+
 
 @dataclass(frozen=True, slots=True)
 class Marginalised:

@@ -38,7 +38,7 @@ def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float) -> gt
 
     The error is L^-1 (x_right - f(x_left)), with L L' = Q(x_left, dt) taken at the same state: no derivative of L is
     taken, so this is Gauss-Newton with reweighting. Where it converges its answer does not depend on where it began;
-    over long gaps it may swing between two answers (docs/exactness.md).
+    over long gaps whole steps may swing between two answers (see `Window.settle`).
     """
     n = motion.dim
     both = np.zeros((n, 2 * n + 1), order="F")

@@ -108,6 +108,7 @@ class FixedLagSmoother:
     def converge(self, max_iterations: int = 50) -> None:
         """Relinearise until nothing moves; for comparisons."""
         self._window.converge(max_iterations)
+        self._window.settle(max_iterations)
 
     def _aim(self) -> None:
         """Begin again from a straight line through the positions so far, until their direction is certain.

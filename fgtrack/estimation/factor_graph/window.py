@@ -9,7 +9,7 @@ import numpy as np
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.factor_graph.backend import Backend, Change, Marginalised
+from fgtrack.estimation.factor_graph.backend import AT_REST, Backend, Change, Marginalised
 from fgtrack.estimation.factor_graph.chain import Chain, Node
 from fgtrack.estimation.factor_graph.evidence import Evidence
 from fgtrack.estimation.factor_graph.factors import evidence_factor, motion_factor, prior_factor
@@ -92,7 +92,7 @@ class Window:
             self._solve(added, new, leaving, tail.prior)
         except _BROKEN as error:
             chain.remove(new)
-            self._rebuild({node.key: self._estimate(node) for node in chain.nodes})
+            self._rebuild(self._estimates())
             self.num_rebuilt += 1
             raise RuntimeError(f"the graph cannot be solved with the new measurements ({error})") from error
         tail.forget_before(reach_ns)
@@ -132,6 +132,20 @@ class Window:
         """See `Backend.converge`."""
         self._backend.converge(max_iterations)
         self._forget_estimates()
+
+    def settle(self, max_iterations: int) -> None:
+        """Go half of each step until none is left, or `max_iterations` are done.
+
+        Noise that follows its state can make full steps swing between two answers, in which half ones meet.
+        """
+        at = self._estimates()
+        self.converge(1)
+        for _ in range(max_iterations):
+            to = self._estimates()
+            if all(np.abs(to[key] - mean).max() < AT_REST for key, mean in at.items()):
+                return
+            at = {key: 0.5 * (to[key] + mean) for key, mean in at.items()}
+            self._rebuild(at)
 
     @property
     def whole(self) -> bool:
@@ -211,6 +225,9 @@ class Window:
 
     def _seconds(self, stamp_ns: int) -> float:
         return seconds(stamp_ns - self._first_ns)
+
+    def _estimates(self) -> dict[int, FloatArray]:
+        return {node.key: self._estimate(node) for node in self._chain.nodes}
 
     def _estimate(self, node: Node) -> FloatArray:
         """The mean of a node in a backend that may be broken."""

@@ -1,0 +1,288 @@
+"""Constant clock offsets of sensors, from tracks whose association is known.
+
+A sensor whose clock is off reports the stamp t + offset for what it sensed at t. A wrong stamp moves a detection in the
+map twice: the object was elsewhere, and so was the ego. With T(t) = map_from_ego and a detection z in the ego frame,
+
+    d/d offset of [p(stamp - offset) - T(stamp - offset) z] = -v_object + dT/dt z:
+
+what tells the offset is the velocity of the object in the (turning) ego frame, and a second sensor that saw it there.
+
+One sensor alone tells something too, if one believes the process noise: with wrong stamps its objects seem to move less
+smoothly. But how smoothly drivers drive is no white noise, and this pull is as strong as a weak second sensor. So it is
+left out: maximised is p(all | offsets) / product of p(one sensor | its offset), how well sensors agree with each other.
+"""
+
+import bisect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+
+from fgtrack.core.linalg import psd_solve, symmetrise
+from fgtrack.core.time import nanoseconds, seconds
+from fgtrack.core.types import YAW, BoolArray, FloatArray
+from fgtrack.estimation.factor_graph.factors import motion_factor, prior_factor
+from fgtrack.estimation.factor_graph.initiation import along, fix_of, straight_line
+from fgtrack.estimation.factor_graph.levenberg import solved
+from fgtrack.estimation.factor_graph.timed import Nodes, Reading, Sighting, rates, reading, reading_factor
+from fgtrack.models.motion import MotionModel
+
+#: Nothing is known of an object before its first detection; deviations of its first state.
+_WIDE = {
+    "x_m": 1e3,
+    "y_m": 1e3,
+    "yaw_rad": np.pi,
+    "speed_mps": 100.0,
+    "yaw_rate_radps": 1.0,
+    "accel_mps2": 10.0,
+    "vx_mps": 100.0,
+    "vy_mps": 100.0,
+}
+_LINE = 12  # sightings that a first guess of a state is a line through
+_LARGEST_MOVE_S = 0.1  # of an offset in one round
+_SMALLEST_STEP_S, _LARGEST_STEP_S = 2e-4, 5e-3  # of differences by an offset
+_NEGLIGIBLE = 0.05  # of a standard deviation
+_LOST, _PATIENCE = 0.1, 3  # an offset that is known no better than that share of the prior is let go after some rounds
+
+
+@dataclass(frozen=True)
+class OffsetSettings:
+    """Prior, loss and accuracy of `solve_offsets`."""
+
+    prior_std_s: float = 0.5
+    """Standard deviation of an offset before anything was seen; its mean is 0."""
+    huber_width: float | None = 3.0
+    """Huber loss of the detections, in standard deviations: associations are not perfect. Null is the Gaussian."""
+    node_s: float = 0.1
+    """Time between two nodes of a track."""
+    tolerance_s: float = 1e-5
+    """An offset is settled when it moves less, or less than a twentieth of its standard deviation."""
+    max_rounds: int = 8
+
+    def __post_init__(self) -> None:
+        for name in ("prior_std_s", "node_s", "tolerance_s"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name}: must be positive, is {getattr(self, name)}")
+        if self.huber_width is not None and not self.huber_width > 0.0:
+            raise ValueError(f"huber_width: must be positive, is {self.huber_width}")
+        if self.max_rounds < 1:
+            raise ValueError(f"max_rounds: must be at least 1, is {self.max_rounds}")
+
+    @property
+    def reach_s(self) -> float:
+        """No offset is larger."""
+        return 2.0 * self.prior_std_s
+
+
+@dataclass(frozen=True, eq=False)
+class OffsetSolution:
+    """Offsets of m sensors."""
+
+    sensors: tuple[str, ...]
+    offsets_s: FloatArray
+    """Shape (m,)."""
+    covariance: FloatArray
+    """Shape (m, m); never wider than the prior."""
+    settled: BoolArray
+    """Which of them came to rest, shape (m,); the others may be anywhere."""
+    rounds: int
+    speeds_mps: Mapping[str, float]
+    """RMS velocity of a sensor's objects against the frame that it measured them in."""
+    residuals: Mapping[str, float]
+    """RMS residual of a sensor in its assumed standard deviations; near 1 where they are right."""
+
+
+def solve_offsets(
+    motion: MotionModel, tracks: Sequence[Sequence[Sighting]], start_s: Mapping[str, float], settings: OffsetSettings
+) -> OffsetSolution:
+    """The offsets of the sensors in `start_s` with which all sensors agree best; all other sensors have none.
+
+    Newton's method: each step takes the gradient, with the states at their best, on both sides of the offsets. The
+    covariance is the inverse curvature, from the same differences: that of Gauss-Newton would take the noise of
+    estimated velocities for motion.
+
+    Parameters
+    ----------
+    tracks
+        Sightings of one object each, in any order.
+    start_s
+        First guess of each offset.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        A track has no two sightings at different times.
+    """
+    prior = settings.prior_std_s**-2
+    objective = _Agreement(motion, tracks, start_s, settings)
+    offsets_s = np.array(list(start_s.values()))
+    covariance = np.eye(len(offsets_s)) / prior
+    settled = np.zeros(len(offsets_s), dtype=np.bool_)
+    for rounds in range(1, settings.max_rounds + 1):
+        steps_s = np.clip(np.sqrt(np.diag(covariance)), _SMALLEST_STEP_S, _LARGEST_STEP_S)
+        gradient, curvature = objective.derivatives(offsets_s, steps_s)
+        eigenvalues, axes = np.linalg.eigh(curvature)
+        covariance = np.asarray(axes / (prior + np.maximum(eigenvalues, 0.0)) @ axes.T)
+        newton_s = -covariance @ (gradient + prior * offsets_s)
+        offsets_s = np.clip(
+            offsets_s + np.clip(newton_s, -_LARGEST_MOVE_S, _LARGEST_MOVE_S), -settings.reach_s, settings.reach_s
+        )
+        std_s = np.sqrt(np.diag(covariance))
+        settled = np.abs(newton_s) < np.maximum(settings.tolerance_s, _NEGLIGIBLE * std_s)
+        lost = (std_s > _LOST * settings.prior_std_s) & (rounds >= _PATIENCE)
+        if (settled | lost).all():
+            break
+    return OffsetSolution(tuple(start_s), offsets_s, covariance, settled, rounds, *objective.summary(offsets_s))
+
+
+class _Path:
+    """One object: its sightings, and the states of its nodes with the offsets held."""
+
+    def __init__(
+        self, motion: MotionModel, sightings: Sequence[Sighting], nodes: Nodes, huber_width: float | None
+    ) -> None:
+        self._motion = motion
+        self._sightings = sightings
+        self._huber_width = huber_width
+        self._nodes = nodes
+        self._keys = [gtsam.symbol("x", i) for i in range(len(nodes.stamps_ns))]
+        wide = np.diag([_WIDE[name] ** 2 for name in motion.state_names])
+        step_s = seconds(nodes.stamps_ns[1] - nodes.stamps_ns[0])
+        self._chain = [
+            prior_factor(self._keys[0], nodes.means[0], wide),
+            *(motion_factor(motion, left, right, step_s) for left, right in pairwise(self._keys)),
+        ]
+
+    def settle(self, offsets_s: Mapping[str, float]) -> None:
+        """Bring the states to their best for these offsets, near where they are."""
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for factor in self._chain:
+            graph.add(factor)
+        for item in self._sightings:
+            found = self.reading(item, offsets_s)
+            graph.add(reading_factor(self._keys, self._nodes, found, self._huber_width))
+        for key, mean in zip(self._keys, self._nodes.means, strict=True):
+            values.insert(key, mean)
+        values = solved(graph, values, self._keys)
+        self._nodes = Nodes(self._nodes.stamps_ns, np.array([values.atVector(key) for key in self._keys]))
+
+    def slopes(self, offsets_s: Mapping[str, float]) -> dict[str, float]:
+        """Derivative of -log p by each offset, after `settle`: the states are at their best, so only through the time.
+
+        sum of -w (dy/dt)' R^-1 y, with the weight w of the loss. That R changes with the time is left out.
+        """
+        slopes = dict.fromkeys(offsets_s, 0.0)
+        for item in self._sightings:
+            if item.sensor in slopes:
+                found = self.reading(item, offsets_s)
+                rate = rates(self._motion, self._nodes, item, _sensed_ns(item, offsets_s)).y
+                slopes[item.sensor] -= _weight(found, self._huber_width) * float(rate @ psd_solve(found.R, found.y))
+        return slopes
+
+    def reading(self, item: Sighting, offsets_s: Mapping[str, float]) -> Reading:
+        """What `item` says, at the time that the offsets give it."""
+        return reading(self._motion, self._nodes, item, _sensed_ns(item, offsets_s))
+
+    def squares(self, offsets_s: Mapping[str, float]) -> list[tuple[str, float, float]]:
+        """Sensor, squared velocity against its frame, and squared residual per component, of each sighting."""
+        found = []
+        for item in self._sightings:
+            velocity_mps = rates(self._motion, self._nodes, item, _sensed_ns(item, offsets_s)).velocity_mps
+            one = self.reading(item, offsets_s)
+            found.append((item.sensor, float(velocity_mps @ velocity_mps), one.distance**2 / len(one.y)))
+        return found
+
+
+class _Agreement:
+    """-log of p(all | offsets) / product of p(one sensor | its offset); keeps the states from one call to the next."""
+
+    def __init__(
+        self,
+        motion: MotionModel,
+        tracks: Sequence[Sequence[Sighting]],
+        start_s: Mapping[str, float],
+        settings: OffsetSettings,
+    ) -> None:
+        self._sensors = tuple(start_s)
+        self._all: list[_Path] = []
+        self._alone: list[_Path] = []
+        for sightings in tracks:
+            nodes = _first_nodes(motion, sightings, start_s, settings)
+            self._all.append(_Path(motion, sightings, nodes, settings.huber_width))
+            for sensor in start_s:
+                own = [item for item in sightings if item.sensor == sensor]
+                if own:
+                    self._alone.append(_Path(motion, own, nodes, settings.huber_width))
+        self._settle(start_s)
+
+    def derivatives(self, offsets_s: FloatArray, steps_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gradient (m,) and curvature (m, m) at `offsets_s`, from differences over `steps_s` (m,) to both sides."""
+        self._settle(self._named(offsets_s))
+        gradients = []
+        curvature = np.empty((len(offsets_s), len(offsets_s)))
+        for j, step_s in enumerate(steps_s):
+            shift_s = step_s * np.eye(len(offsets_s))[j]
+            ahead, behind = self._gradient(offsets_s + shift_s), self._gradient(offsets_s - shift_s)
+            gradients.append((ahead + behind) / 2.0)
+            curvature[:, j] = (ahead - behind) / (2.0 * step_s)
+        return np.mean(gradients, axis=0), symmetrise(curvature)
+
+    def summary(self, offsets_s: FloatArray) -> tuple[dict[str, float], dict[str, float]]:
+        """Speeds and residuals of `OffsetSolution`."""
+        self._settle(self._named(offsets_s))
+        rows = [row for path in self._all for row in path.squares(self._named(offsets_s))]
+        speeds, residuals = {}, {}
+        for sensor in dict.fromkeys(name for name, _, _ in rows):
+            mean = np.mean([squares for name, *squares in rows if name == sensor], axis=0)
+            speeds[sensor], residuals[sensor] = np.sqrt(mean).tolist()
+        return speeds, residuals
+
+    def _named(self, offsets_s: FloatArray) -> dict[str, float]:
+        return dict(zip(self._sensors, offsets_s.tolist(), strict=True))
+
+    def _settle(self, offsets_s: Mapping[str, float]) -> None:
+        for path in (*self._all, *self._alone):
+            path.settle(offsets_s)
+
+    def _gradient(self, offsets_s: FloatArray) -> FloatArray:
+        named = self._named(offsets_s)
+        self._settle(named)
+        gradient = np.zeros(len(offsets_s))
+        for sign, paths in ((1.0, self._all), (-1.0, self._alone)):
+            for path in paths:
+                gradient += sign * np.array(list(path.slopes(named).values()))
+        return gradient
+
+
+def _first_nodes(
+    motion: MotionModel, sightings: Sequence[Sighting], offsets_s: Mapping[str, float], settings: OffsetSettings
+) -> Nodes:
+    """Nodes over all times at which the sightings may have been sensed, each on a line through sightings around it."""
+    stamps = [item.stamp_ns for item in sightings]
+    reach_ns, step_ns = nanoseconds(settings.reach_s), nanoseconds(settings.node_s)
+    stamps_ns = range(min(stamps) - reach_ns, max(stamps) + reach_ns + step_ns, step_ns)
+    timed = sorted(((_sensed_ns(item, offsets_s), item) for item in sightings), key=lambda pair: pair[0])
+    times_ns = [time_ns for time_ns, _ in timed]
+    means = []
+    for stamp_ns in stamps_ns:
+        first = min(max(bisect.bisect(times_ns, stamp_ns) - _LINE // 2, 0), max(len(timed) - _LINE, 0))
+        around = timed[first : first + _LINE]
+        fixes = [fix_of(item.sensed_at(time_ns), seconds(time_ns - stamp_ns)) for time_ns, item in around]
+        means.append(along(straight_line([fix for fix in fixes if fix is not None]), 0.0, motion.state_names))
+    nodes = np.array(means)
+    if "yaw_rad" in motion.state_names:
+        nodes[:, YAW] = np.unwrap(nodes[:, YAW])
+    return Nodes(stamps_ns, nodes)
+
+
+def _sensed_ns(item: Sighting, offsets_s: Mapping[str, float]) -> int:
+    return item.stamp_ns - nanoseconds(offsets_s.get(item.sensor, 0.0))
+
+
+def _weight(item: Reading, huber_width: float | None) -> float:
+    """Of the loss, at the residual of `item`."""
+    if huber_width is None:
+        return 1.0
+    return float(gtsam.noiseModel.mEstimator.Huber.Create(huber_width).weight(item.distance))
