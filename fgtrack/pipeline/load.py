@@ -21,15 +21,18 @@ T = TypeVar("T")
 def load(kind: type[T], path: Path | None, settings: Sequence[str] = ()) -> T:
     """An instance of the dataclass `kind` from the YAML file `path`, with `settings` of the form a.b=value on top.
 
-    Without a file, from the defaults. Raises `CallError` for a missing file, wrong YAML, an unknown or repeated key,
-    and a value of the wrong type or range.
+    A setting below a mapping of names, as of sensors, that the file leaves out changes that mapping's default.
+    Without a file, from the defaults, which a `kind` that takes settings must have. Raises `CallError` for a missing
+    file, wrong YAML, an unknown or repeated key, and a value of the wrong type or range.
     """
     raw = {} if path is None else read_yaml(path)
     origin = "defaults" if path is None else str(path)
+    if not settings:
+        return validate(kind, raw, origin)
+    defaults = validate(kind, {}, "defaults")
     for setting in settings:
-        raw = _with_setting(raw, setting)
-        origin = f"{origin.removesuffix(' with --set')} with --set"
-    return validate(kind, raw, origin)
+        raw = _with_setting(raw, setting, defaults)
+    return validate(kind, raw, f"{origin} with --set")
 
 
 def read_yaml(path: Path) -> dict[str, Any]:  # Any: what YAML says is only known after validation
@@ -61,7 +64,7 @@ def _parse(text: str, origin: str) -> Any:
         raise CallError(f"{origin}: no valid YAML, {' '.join(str(error).split())}") from error
 
 
-def _with_setting(raw: dict[str, Any], setting: str) -> dict[str, Any]:
+def _with_setting(raw: dict[str, Any], setting: str, defaults: object) -> dict[str, Any]:
     key, equals, text = setting.partition("=")
     names = key.strip().split(".")
     if not equals or not all(names):
@@ -69,7 +72,8 @@ def _with_setting(raw: dict[str, Any], setting: str) -> dict[str, Any]:
     changed = dict(raw)
     inner = changed
     for name in names[:-1]:
-        below = inner.get(name)
+        defaults = getattr(defaults, name, None)
+        below = inner.get(name, plain(defaults) if isinstance(defaults, Mapping) else None)
         if below is not None and not isinstance(below, dict):
             raise CallError(f"--set {setting}: {name} is a single value and has no keys below it")
         inner[name] = dict(below or {})

@@ -6,7 +6,7 @@ import pytest
 from fgtrack.cli.demo import demo_config
 from fgtrack.core.errors import CallError
 from fgtrack.pipeline.build import ESTIMATORS, build_bank, build_tracker
-from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.config import PAPER_SENSORS, Config
 from fgtrack.pipeline.load import dump, load, read_yaml, validate
 from fgtrack.pipeline.sweep_config import SweepConfig
 from fgtrack.sim.scenario import Scenario
@@ -91,6 +91,17 @@ def test_settings_stand_above_the_file_and_the_last_one_wins(tmp_path: Path) -> 
     assert (config.filter.frequency_hz, config.filter.storage_s) == (25.0, 2.0)
     assert config.association == GatedMahalanobis()
     assert config.map.track == "oval"
+
+
+def test_a_setting_of_one_sensor_leaves_the_other_default_ones() -> None:
+    sensors = load(Config, None, ["sensors.radar.max_delay_s=1.5", "sensors.radar.counter_add=2"]).sensors
+    radar = replace(PAPER_SENSORS["radar"], max_delay_s=1.5, counter_add=2)
+    assert sensors == {**PAPER_SENSORS, "radar": radar}
+
+
+def test_a_setting_below_a_key_of_the_file_adds_nothing_to_it(tmp_path: Path) -> None:
+    path = written(tmp_path, "sensors: {radar: {std: {x_m: 1.0, y_m: 1.0}}}\n")
+    assert list(load(Config, path, ["sensors.radar.max_delay_s=1.5"]).sensors) == ["radar"]
 
 
 def test_a_setting_does_not_change_what_it_stands_on() -> None:
