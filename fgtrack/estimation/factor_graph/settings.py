@@ -49,6 +49,8 @@ class SmootherSettings:
                 raise ValueError(f"relinearise.{name}: must not be negative, is {value}")
         if any(not 0.0 <= lag_s <= self.lag_s for lag_s in self.lagged_s):
             raise ValueError(f"lagged_s: must lie between 0 and lag_s = {self.lag_s}, is {list(self.lagged_s)}")
+        if len(set(self.lagged_s)) < len(self.lagged_s):
+            raise ValueError(f"lagged_s: names a lag twice, is {list(self.lagged_s)}")
 
     def thresholds(self, state_names: Sequence[str], curved: bool) -> FloatArray:
         """Relinearisation thresholds of a state, shape (n,).
