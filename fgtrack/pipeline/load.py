@@ -21,7 +21,7 @@ T = TypeVar("T")
 def load(kind: type[T], path: Path | None, settings: Sequence[str] = ()) -> T:
     """An instance of the dataclass `kind` from the YAML file `path`, with `settings` of the form a.b=value on top.
 
-    A setting below a mapping of names, as of sensors, that the file leaves out changes that mapping's default.
+    A setting below a key that the file leaves out changes that key's default: one sensor of all, the same `kind`.
     Without a file, from the defaults, which a `kind` that takes settings must have. Raises `CallError` for a missing
     file, wrong YAML, an unknown or repeated key, and a value of the wrong type or range.
     """
@@ -73,13 +73,21 @@ def _with_setting(raw: dict[str, Any], setting: str, defaults: object) -> dict[s
     inner = changed
     for name in names[:-1]:
         defaults = getattr(defaults, name, None)
-        below = inner.get(name, plain(defaults) if isinstance(defaults, Mapping) else None)
+        below = inner.get(name, _kept(defaults))
         if below is not None and not isinstance(below, dict):
             raise CallError(f"--set {setting}: {name} is a single value and has no keys below it")
         inner[name] = dict(below or {})
         inner = inner[name]
     inner[names[-1]] = _parse(text, f"--set {setting}")
     return changed
+
+
+def _kept(default: object) -> dict[str, Any] | None:
+    """What of a default stays where one key below it is set: the other names of a mapping, the form of a choice."""
+    if isinstance(default, Mapping):
+        kept: dict[str, Any] = plain(default)
+        return kept
+    return {"kind": default.kind} if hasattr(default, "kind") else None
 
 
 def validate(kind: type[T], raw: Mapping[str, Any], origin: str) -> T:

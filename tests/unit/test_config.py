@@ -10,7 +10,7 @@ from fgtrack.pipeline.config import PAPER_SENSORS, Config
 from fgtrack.pipeline.load import dump, load, read_yaml, validate
 from fgtrack.pipeline.sweep_config import SweepConfig
 from fgtrack.sim.scenario import Scenario
-from fgtrack.tracking.association import GatedMahalanobis
+from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.tracker import PublishedTracker, Tracker
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -97,6 +97,11 @@ def test_a_setting_of_one_sensor_leaves_the_other_default_ones() -> None:
     sensors = load(Config, None, ["sensors.radar.max_delay_s=1.5", "sensors.radar.counter_add=2"]).sensors
     radar = replace(PAPER_SENSORS["radar"], max_delay_s=1.5, counter_add=2)
     assert sensors == {**PAPER_SENSORS, "radar": radar}
+
+
+def test_a_setting_of_a_choice_is_of_the_default_kind_unless_it_names_another() -> None:
+    assert load(Config, None, ["association.gate_m=3.0"]).association == GatedEuclidean(gate_m=3.0)
+    assert load(Config, None, ["association.kind=mahalanobis"]).association == GatedMahalanobis()
 
 
 def test_a_setting_below_a_key_of_the_file_adds_nothing_to_it(tmp_path: Path) -> None:
