@@ -27,6 +27,8 @@ class Assignment(NamedTuple):
     """Candidates without a track, in the order of their birth."""
     missed: list[int]
     """Tracks without a candidate, ascending."""
+    refused: tuple[int, ...] = ()
+    """Candidates that neither belong to a track nor may start one."""
 
 
 class Association(Protocol):
@@ -58,21 +60,35 @@ def _distances_to_ray(candidate: Candidate, means: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class GatedEuclidean:
-    """Hungarian assignment on distances; pairs further apart than the gate are out before the assignment."""
+    """Hungarian assignment on distances; pairs further apart than the gate are out before the assignment.
+
+    `max_nis` is for what the distance does not show, as a ghost that crosses a track at another speed: a pair whose
+    innovation is larger is out as well, and the candidate starts no track, which would compete for the next detections.
+    Without it, as in the paper, every pair inside the gate is believed.
+    """
 
     kind: Literal["euclidean"] = "euclidean"
     gate_m: float = 5.0
+    max_nis: float | None = None
 
     def __post_init__(self) -> None:
         if not self.gate_m > 0.0:
             raise ValueError(f"gate_m: must be positive, is {self.gate_m}")
+        if self.max_nis is not None and not self.max_nis > 0.0:
+            raise ValueError(f"max_nis: must be positive, is {self.max_nis}")
 
     def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
         """See `Association`."""
         if not candidates or not states.track_ids:
             return _unpaired(len(candidates), len(states.track_ids))
         cost = euclidean_distances(candidates, states.means)
-        return _assigned(cost, cost <= self.gate_m)
+        near = cost <= self.gate_m
+        if self.max_nis is None:
+            return _assigned(cost, near)
+        believed = near & (_innovations(candidates, states).nis <= self.max_nis)
+        found = _assigned(cost, believed)
+        refused = tuple(i for i in found.new if near[i].any())
+        return found._replace(new=[i for i in found.new if not near[i].any()], refused=refused)
 
 
 @dataclass(frozen=True)
@@ -96,18 +112,33 @@ class GatedMahalanobis:
         """See `Association`; the cost adds log det S, so that a vague track does not win by being vague."""
         if not candidates or not states.track_ids:
             return _unpaired(len(candidates), len(states.track_ids))
-        cost = np.empty((len(candidates), len(states.track_ids)))
+        innovations = _innovations(candidates, states)
         inside = euclidean_distances(candidates, states.means) <= self.max_distance_m
         for row, candidate in enumerate(candidates):
-            measurement = candidate.measurement
-            model = measurement.model
-            y = model.residual(measurement.z, model.predict(states.means, measurement.pose))
-            H = model.jacobian(states.means, measurement.pose)
-            S = H @ states.covariances @ H.mT + measurement.R
-            squared = mahalanobis_squared(y, S)
-            cost[row] = squared + np.linalg.slogdet(S)[1]
-            inside[row] &= squared <= chi_square_quantile(self.gate_probability, len(measurement.z))
-        return _assigned(cost, inside)
+            gate = chi_square_quantile(self.gate_probability, len(candidate.measurement.z))
+            inside[row] &= innovations.nis[row] <= gate
+        return _assigned(innovations.nis + innovations.log_volume, inside)
+
+
+class _Innovations(NamedTuple):
+    """Of every candidate and track, shape (candidates, tracks)."""
+
+    nis: FloatArray
+    log_volume: FloatArray
+    """log det S."""
+
+
+def _innovations(candidates: Sequence[Candidate], states: StatesAt) -> _Innovations:
+    nis, log_volume = np.empty((2, len(candidates), len(states.track_ids)))
+    for row, candidate in enumerate(candidates):
+        measurement = candidate.measurement
+        model = measurement.model
+        y = model.residual(measurement.z, model.predict(states.means, measurement.pose))
+        H = model.jacobian(states.means, measurement.pose)
+        S = H @ states.covariances @ H.mT + measurement.R
+        nis[row] = mahalanobis_squared(y, S)
+        log_volume[row] = np.linalg.slogdet(S)[1]
+    return _Innovations(nis, log_volume)
 
 
 @cache

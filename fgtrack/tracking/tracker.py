@@ -114,6 +114,8 @@ class Tracker:
         assignment = parts.association(candidates, states)
         self._count(batch, assignment, states, ego)
         self._estimate(batch, candidates, assignment, states)
+        for position in assignment.refused:
+            self._conclude(batch, candidates[position], Disposition.GATED)
         for position in assignment.new:
             self._give_birth(batch, candidates[position], sensor)
 

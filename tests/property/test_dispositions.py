@@ -57,7 +57,8 @@ CONFIGS = {
         load(Config, None, ["merge={kind: none}", "motion={kind: cv, std_per_s: {velocity: 5.0}}", "clock.node_hz=7.0"])
     ),
     "replaying": replace(
-        _with_all_sensors(load(Config, None, [*OVAL, "filter.storage_s=0.3"])), estimator="ekf-replay"
+        _with_all_sensors(load(Config, None, [*OVAL, "filter.storage_s=0.3", "association.max_nis=50.0"])),
+        estimator="ekf-replay",
     ),
     "smoothing": replace(
         _with_all_sensors(load(Config, None, ["smoother={lag_s: 0.3, ring_s: 0.3}", "motion={kind: ctrv}"])),

@@ -10,6 +10,7 @@ from support.tracking import bearing, candidate, states
 
 from fgtrack.models.measurement import SensorPose
 from fgtrack.tracking.association import (
+    Assignment,
     Association,
     GatedEuclidean,
     GatedMahalanobis,
@@ -18,7 +19,7 @@ from fgtrack.tracking.association import (
 )
 from fgtrack.tracking.published_objects import UngatedEuclidean
 
-ALL = [GatedEuclidean(), GatedMahalanobis(), UngatedEuclidean()]
+ALL = [GatedEuclidean(), GatedEuclidean(max_nis=20.0), GatedMahalanobis(), UngatedEuclidean()]
 
 
 def test_a_far_candidate_does_not_tear_a_good_pair_but_the_published_order_does() -> None:
@@ -58,9 +59,9 @@ def test_the_gate_itself_is_inside(association: Association) -> None:
 
 @pytest.mark.parametrize("association", ALL)
 def test_without_candidates_or_tracks_there_are_only_births_and_misses(association: Association) -> None:
-    assert association([], states([(0.0, 0.0), (1.0, 0.0)])) == ([], [], [0, 1])
-    assert association([candidate(0.0, 0.0), candidate(9.0, 0.0)], states([])) == ([], [0, 1], [])
-    assert association([], states([])) == ([], [], [])
+    assert association([], states([(0.0, 0.0), (1.0, 0.0)])) == Assignment([], [], [0, 1])
+    assert association([candidate(0.0, 0.0), candidate(9.0, 0.0)], states([])) == Assignment([], [0, 1], [])
+    assert association([], states([])) == Assignment([], [], [])
 
 
 @pytest.mark.parametrize("association", ALL)
@@ -70,8 +71,8 @@ def test_everything_is_paired_or_left_over_exactly_once(association: Association
     rng = np.random.default_rng(seed)
     candidates = [candidate(x, y) for x, y in rng.uniform(0.0, 12.0, size=(rng.integers(0, 6), 2))]
     tracks = states([(x, y) for x, y in rng.uniform(0.0, 12.0, size=(rng.integers(0, 6), 2))])
-    pairs, new, missed = association(candidates, tracks)
-    assert sorted([i for i, _ in pairs] + new) == list(range(len(candidates)))
+    pairs, new, missed, refused = association(candidates, tracks)
+    assert sorted([*(i for i, _ in pairs), *new, *refused]) == list(range(len(candidates)))
     assert sorted([j for _, j in pairs] + missed) == list(range(len(tracks.track_ids)))
     assert pairs == sorted(pairs)
     assert missed == sorted(missed)
@@ -91,6 +92,15 @@ def test_the_gated_assignment_has_most_pairs_and_among_those_the_least_distance(
     total = sum(distances[i, j] for i, j in found.pairs)
     best = min(choices)
     assert (-len(found.pairs), total) == (best[0], pytest.approx(best[1], abs=1e-6))
+
+
+def test_what_is_near_but_not_believed_goes_nowhere_and_leaves_the_track_to_others() -> None:
+    """A variance of 0.16 and 0.09 m2: 3 m off is 36."""
+    ghost, other, far = candidate(3.0, 0.0), candidate(-1.0, 0.0), candidate(0.0, 9.0)
+    tracks = states([(0.0, 0.0)], variance_m2=0.16)
+    assert GatedEuclidean(max_nis=36.1)([ghost], tracks) == Assignment([(0, 0)], [], [])
+    assert GatedEuclidean(max_nis=35.9)([ghost, far], tracks) == Assignment([], [1], [0], (0,))
+    assert GatedEuclidean(max_nis=35.9)([ghost, other], tracks) == Assignment([(1, 0)], [], [], (0,))
 
 
 @pytest.mark.parametrize("probability", [0.9, 0.99])
@@ -143,6 +153,7 @@ def test_a_bearing_takes_the_track_in_its_line_of_sight(association: Association
     [
         (lambda: GatedEuclidean(gate_m=0.0), "gate_m"),
         (lambda: GatedEuclidean(gate_m=math.nan), "gate_m"),
+        (lambda: GatedEuclidean(max_nis=0.0), "max_nis"),
         (lambda: GatedMahalanobis(gate_probability=1.0), "gate_probability"),
         (lambda: GatedMahalanobis(max_distance_m=-1.0), "max_distance_m"),
     ],

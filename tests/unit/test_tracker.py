@@ -8,6 +8,7 @@ from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, 
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import ESTIMATORS, build_tracker
 from fgtrack.pipeline.config import Config
+from fgtrack.tracking.association import GatedEuclidean
 from fgtrack.tracking.tracker import Tracker
 
 POINTS = SensorModel(std={"x_m": 0.3, "y_m": 0.3})
@@ -70,6 +71,19 @@ def test_batches_of_one_tick_are_processed_in_order_of_their_stamps() -> None:
         ("b", "birth"),
         ("a", "in_sequence"),
     ]
+
+
+def test_a_detection_that_no_noise_explains_is_gated_and_starts_no_track() -> None:
+    one = build_tracker(
+        replace(Config(), sensors={"lidar": POINTS}, association=GatedEuclidean(gate_m=20.0, max_nis=50.0))
+    )
+    tick(one, 0.0, seen((10.0, 0.0)))
+    report = tick(one, 50.0, seen((28.0, 0.0), (40.0, 0.0), at_ms=50.0))
+    assert sorted(dispositions(report)) == ["birth", "gated"]
+    assert ids(report) == [0, 1]
+    for k in (2, 3):
+        report = tick(one, 50.0 * k, seen((28.0, 0.0), (40.0, 0.0), at_ms=50.0 * k))
+    assert ids(report) == [1]  # and the track that it was near was not seen
 
 
 def test_a_list_that_saw_nothing_ages_the_tracks_until_they_end() -> None:
