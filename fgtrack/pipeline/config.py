@@ -13,6 +13,7 @@ from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
+from fgtrack.tracking.duplicates import DuplicateRules
 from fgtrack.tracking.lifecycle import LifecycleRules
 from fgtrack.tracking.preprocess import ConnectedMerge, NoMerge
 from fgtrack.tracking.published_objects import NeighbourhoodMerge, UngatedEuclidean
@@ -205,6 +206,7 @@ class Config:
     merge: MergeConfig = field(default_factory=ConnectedMerge)
     association: AssociationConfig = field(default_factory=GatedEuclidean)
     lifecycle: LifecycleConfig = field(default_factory=LifecycleConfig)
+    duplicates: DuplicateRules = field(default_factory=DuplicateRules)
     birth: BirthConfig = field(default_factory=FixedBirth)
     motion: MotionConfig = field(default_factory=MotionConfig)
     filter: FilterConfig = field(default_factory=FilterConfig)
