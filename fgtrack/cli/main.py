@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 import fgtrack
-from fgtrack.cli import compare, config, convert, demo, figure, info, replay, simulate, sweep, verify
+from fgtrack.cli import compare, config, convert, demo, figure, info, offsets, replay, simulate, sweep, verify
 from fgtrack.core.errors import CallError, FgtrackError
 
 DONE, BAD_DATA, BAD_CALL, INTERRUPTED = 0, 1, 2, 130
@@ -48,6 +48,7 @@ app.command()(sweep.sweep)
 app.command()(verify.verify)
 app.command()(info.info)
 app.command()(convert.convert)
+app.command()(offsets.offsets)
 app.command()(config.config)
 
 

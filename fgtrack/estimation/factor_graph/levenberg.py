@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 _START, _LARGEST, _FACTOR = 1e-5, 1e8, 10.0
-_TOLERANCE = 1e-6  # of the error, in which one standard deviation is a half
+_TOLERANCE = 1e-4  # of the error, in which one standard deviation is a half
 _MAX_STEPS = 20
 
 

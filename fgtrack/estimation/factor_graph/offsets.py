@@ -41,9 +41,9 @@ _WIDE = {
     "vy_mps": 100.0,
 }
 _LINE = 12  # sightings that a first guess of a state is a line through
-_LARGEST_MOVE_S = 0.1  # of an offset in one round
+_LARGEST_MOVE_S = 0.1  # of an offset in one round, at first
 _SMALLEST_STEP_S, _LARGEST_STEP_S = 2e-4, 5e-3  # of differences by an offset
-_NEGLIGIBLE = 0.05  # of a standard deviation
+_NEGLIGIBLE = 0.2  # of a standard deviation: what is left after such a Newton step is far less
 _LOST, _PATIENCE = 0.1, 3  # an offset that is known no better than that share of the prior is let go after some rounds
 
 
@@ -58,8 +58,8 @@ class OffsetSettings:
     node_s: float = 0.1
     """Time between two nodes of a track."""
     tolerance_s: float = 1e-5
-    """An offset is settled when it moves less, or less than a twentieth of its standard deviation."""
-    max_rounds: int = 8
+    """An offset is settled when it moves less, or less than a fifth of its standard deviation."""
+    max_rounds: int = 10
 
     def __post_init__(self) -> None:
         for name in ("prior_std_s", "node_s", "tolerance_s"):
@@ -120,15 +120,17 @@ def solve_offsets(
     offsets_s = np.array(list(start_s.values()))
     covariance = np.eye(len(offsets_s)) / prior
     settled = np.zeros(len(offsets_s), dtype=np.bool_)
+    limits_s, last_s = np.full(len(offsets_s), _LARGEST_MOVE_S), np.zeros(len(offsets_s))
     for rounds in range(1, settings.max_rounds + 1):
         steps_s = np.clip(np.sqrt(np.diag(covariance)), _SMALLEST_STEP_S, _LARGEST_STEP_S)
         gradient, curvature = objective.derivatives(offsets_s, steps_s)
         eigenvalues, axes = np.linalg.eigh(curvature)
         covariance = np.asarray(axes / (prior + np.maximum(eigenvalues, 0.0)) @ axes.T)
         newton_s = -covariance @ (gradient + prior * offsets_s)
-        offsets_s = np.clip(
-            offsets_s + np.clip(newton_s, -_LARGEST_MOVE_S, _LARGEST_MOVE_S), -settings.reach_s, settings.reach_s
-        )
+        limits_s = np.where(newton_s * last_s < 0.0, limits_s / 2.0, limits_s)  # back and forth: far out, a Huber loss
+        last_s = newton_s  # is nearly straight, and Newton's step leads beyond the other end
+        offsets_s = offsets_s + np.clip(newton_s, -limits_s, limits_s)
+        offsets_s = np.clip(offsets_s, -settings.reach_s, settings.reach_s)
         std_s = np.sqrt(np.diag(covariance))
         settled = np.abs(newton_s) < np.maximum(settings.tolerance_s, _NEGLIGIBLE * std_s)
         lost = (std_s > _LOST * settings.prior_std_s) & (rounds >= _PATIENCE)
@@ -230,8 +232,7 @@ class _Agreement:
         return np.mean(gradients, axis=0), symmetrise(curvature)
 
     def summary(self, offsets_s: FloatArray) -> tuple[dict[str, float], dict[str, float]]:
-        """Speeds and residuals of `OffsetSolution`."""
-        self._settle(self._named(offsets_s))
+        """Speeds and residuals of `OffsetSolution`, with the present states."""
         rows = [row for path in self._all for row in path.squares(self._named(offsets_s))]
         speeds, residuals = {}, {}
         for sensor in dict.fromkeys(name for name, _, _ in rows):

@@ -1,0 +1,240 @@
+"""What is wrong with the clocks of a recording: a constant offset per sensor, and whether it can be known at all."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+
+import numpy as np
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.time import nanoseconds, seconds
+from fgtrack.core.types import DetectionList, EgoState, Message
+from fgtrack.estimation.factor_graph.offsets import OffsetSettings, OffsetSolution, solve_offsets
+from fgtrack.estimation.factor_graph.timed import Sighting
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.ego_path import EgoPath
+from fgtrack.pipeline.replay import replay_in_memory
+from fgtrack.pipeline.sightings import Remeasure, sightings_by_track
+
+Track = Sequence[Sighting]
+
+
+@dataclass(frozen=True)
+class OffsetRules:
+    """Which tracks count, and when an offset is known."""
+
+    solver: OffsetSettings = field(default_factory=OffsetSettings)
+    max_std_s: float = 0.01
+    """An offset is identifiable where its standard deviation is below this ..."""
+    max_prior_share: float = 0.1
+    """... and below this share of the prior's."""
+    min_track_s: float = 2.0
+    """Shorter tracks are left out."""
+    min_detections: int = 10
+    """Of a sensor on a track, for the track to tell something of the sensor."""
+    max_detections: int = 10_000
+    """Tracks with the most detections come first; what exceeds this is left out."""
+    ego_cutoff_hz: float = 2.0
+    """See `EgoPath`."""
+    repeat_above_s: float = 0.005
+    """Where an offset is larger, tracks are made a second time, with corrected stamps."""
+
+    @property
+    def needed_std_s(self) -> float:
+        """Largest standard deviation of an identifiable offset."""
+        return min(self.max_std_s, self.max_prior_share * self.solver.prior_std_s)
+
+    @property
+    def needed_information(self) -> float:
+        """What detections must tell for that, in 1 / s^2, besides the prior."""
+        return self.needed_std_s**-2 - self.solver.prior_std_s**-2
+
+
+@dataclass(frozen=True)
+class SensorOffset:
+    """One sensor: reported stamp = time at which it sensed + offset."""
+
+    sensor: str
+    offset_s: float | None
+    """None where nothing could be estimated."""
+    std_s: float | None
+    num_detections: int
+    """Used in the estimate."""
+    identifiable: bool
+    why: str
+    """A line."""
+    residual: float | None = None
+    """RMS residual over the configured standard deviation: `std_s` is as right as this is near 1."""
+
+
+@dataclass(frozen=True)
+class OffsetReport:
+    """The offsets of all sensors against the clock of one of them, which is taken for that of the ego."""
+
+    reference: str
+    sensors: tuple[SensorOffset, ...]
+    num_tracks: int
+    """Tracks used."""
+    num_detections: int
+    broken: str | None
+    """Why the input broke off, where it did; what came before was used."""
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values for JSON."""
+        return asdict(self)
+
+
+def estimate_offsets(
+    messages: Iterable[Message], config: Config, reference: str | None = None, rules: OffsetRules | None = None
+) -> OffsetReport:
+    """Estimate the clock offsets of the sensors in `messages`, from tracks that the tracker of `config` makes.
+
+    Sensors are not refused for their delays here: a wrong stamp looks like one.
+
+    Parameters
+    ----------
+    messages
+        In receipt order. Where they end in a `DataError`, what came before is used.
+    reference
+        The sensor whose offset is 0; None takes the one with most detections on tracks.
+
+    Raises
+    ------
+    CallError
+        The reference is not in the input, or the configuration cannot be built.
+    DataError
+        There are no detections, fewer than five ego states, or a sensor has no model.
+    """
+    rules = rules or OffsetRules()
+    config = replace(config, sensors={name: replace(one, max_delay_s=None) for name, one in config.sensors.items()})
+    heard: list[EgoState | DetectionList] = []
+    run, broken = replay_in_memory(_recorded(messages, heard), config)
+    raw = _lists(heard, config)
+    sensors = [name for name in config.sensors if any(one.sensor == name for one in raw)]
+    if not sensors:
+        raise DataError("there are no detections of a sensor that the configuration has")
+    if reference is not None and reference not in sensors:
+        raise CallError(f"reference {reference!r} is no sensor of the input, which has {', '.join(sensors)}")
+    remeasure = Remeasure(config, _path(heard, raw, rules))
+    tracks = sightings_by_track(run, raw, raw, config.sensors, remeasure)
+    reference = reference or _most_seen(tracks, sensors)
+    used = _chosen(tracks, reference, rules)
+    solution = _solution(used, reference, config, rules, {})
+    known_s = {} if solution is None else _known(solution, rules)
+    if any(abs(offset_s) > rules.repeat_above_s for offset_s in known_s.values()):
+        corrected = [_restamped(message, known_s) for message in heard]
+        run, _ = replay_in_memory(corrected, config)
+        used = _chosen(
+            sightings_by_track(run, _lists(corrected, config), raw, config.sensors, remeasure), reference, rules
+        )
+        solution = _solution(used, reference, config, rules, known_s)
+    counts = Counter(item.sensor for track in used for item in track)
+    rows = tuple(_row(name, reference, counts[name], solution, len(sensors), rules) for name in sensors)
+    return OffsetReport(reference, rows, len(used), counts.total(), broken)
+
+
+def _recorded(messages: Iterable[Message], heard: list[EgoState | DetectionList]) -> Iterator[Message]:
+    """The same messages; those that a tracker hears are kept in `heard` as well."""
+    for message in messages:
+        if isinstance(message, (EgoState, DetectionList)):
+            heard.append(message)
+        yield message
+
+
+def _lists(heard: Iterable[EgoState | DetectionList], config: Config) -> list[DetectionList]:
+    return [one for one in heard if isinstance(one, DetectionList) and one.sensor in config.sensors]
+
+
+def _path(
+    heard: Iterable[EgoState | DetectionList], raw: Iterable[DetectionList], rules: OffsetRules
+) -> EgoPath | None:
+    """The path of the ego; None where nobody needs it."""
+    if all(one.frame == "map" for one in raw):
+        return None
+    return EgoPath((message for message in heard if isinstance(message, EgoState)), rules.ego_cutoff_hz)
+
+
+def _most_seen(tracks: Sequence[Track], sensors: Sequence[str]) -> str:
+    counts = Counter(item.sensor for track in tracks for item in track)
+    return max(sensors, key=lambda name: counts[name])
+
+
+def _chosen(tracks: Sequence[Track], reference: str, rules: OffsetRules) -> list[Track]:
+    """Tracks that live long enough and were seen by the reference and another sensor, the longest ones first."""
+    chosen: list[Track] = []
+    total = 0
+    for track in sorted(tracks, key=len, reverse=True):
+        seen = _often_seen(track, rules)
+        if reference not in seen or len(seen) == 1:
+            continue
+        if seconds(track[-1].stamp_ns - track[0].stamp_ns) < rules.min_track_s:
+            continue
+        total += len(track)
+        if chosen and total > rules.max_detections:
+            break
+        chosen.append([item for item in track if item.sensor in seen])
+    return chosen
+
+
+def _often_seen(track: Track, rules: OffsetRules) -> set[str]:
+    counts = Counter(item.sensor for item in track)
+    return {name for name, count in counts.items() if count >= rules.min_detections}
+
+
+def _solution(
+    used: Sequence[Track], reference: str, config: Config, rules: OffsetRules, start_s: Mapping[str, float]
+) -> OffsetSolution | None:
+    """The offsets of all sensors of `used` but the reference; None where there are none."""
+    seen = dict.fromkeys(item.sensor for track in used for item in track)
+    if not seen:
+        return None
+    free_s = {name: start_s.get(name, 0.0) for name in seen if name != reference}
+    return solve_offsets(config.motion.model(), used, free_s, rules.solver)
+
+
+def _known(solution: OffsetSolution, rules: OffsetRules) -> dict[str, float]:
+    """Offsets that are good enough to correct stamps by."""
+    limit_s = rules.max_prior_share * rules.solver.prior_std_s
+    columns = solution.offsets_s.tolist(), np.sqrt(np.diag(solution.covariance)).tolist(), solution.settled.tolist()
+    rows = zip(solution.sensors, *columns, strict=True)
+    return {name: offset_s for name, offset_s, std_s, settled in rows if settled and std_s < limit_s}
+
+
+def _restamped(message: EgoState | DetectionList, offsets_s: Mapping[str, float]) -> EgoState | DetectionList:
+    """`message` with the stamps that a right clock would have given it."""
+    if isinstance(message, EgoState) or message.sensor not in offsets_s:
+        return message
+    offset_ns = nanoseconds(offsets_s[message.sensor])
+    objects = tuple(
+        item if item.stamp_ns is None else replace(item, stamp_ns=item.stamp_ns - offset_ns) for item in message.objects
+    )
+    return replace(message, stamp_ns=message.stamp_ns - offset_ns, objects=objects)
+
+
+def _row(
+    name: str, reference: str, count: int, solution: OffsetSolution | None, num_sensors: int, rules: OffsetRules
+) -> SensorOffset:
+    if num_sensors == 1:
+        return SensorOffset(name, None, None, count, False, "the only modality: nothing to compare it with")
+    if name == reference:
+        why = "the reference: its clock is taken for that of the ego"
+        return SensorOffset(name, 0.0, 0.0, count, False, why, _residual(solution, name))
+    if solution is None or name not in solution.sensors:
+        why = (
+            f"no track of {rules.min_track_s:g} s has {rules.min_detections} detections of it and of {reference}: "
+            "nothing to compare"
+        )
+        return SensorOffset(name, None, None, count, False, why)
+    residual = _residual(solution, name)
+    place = solution.sensors.index(name)
+    speed = f"objects move {solution.speeds_mps[name]:.2g} m/s (rms) in its frame"
+    if not solution.settled[place]:
+        return SensorOffset(name, None, None, count, False, f"nothing holds the estimate: {speed}", residual)
+    offset_s, std_s = float(solution.offsets_s[place]), float(np.sqrt(solution.covariance[place, place]))
+    information = max(std_s**-2 - rules.solver.prior_std_s**-2, 0.0)
+    why = f"information {information:.3g} /s2, {rules.needed_information:.3g} /s2 needed: {speed}"
+    return SensorOffset(name, offset_s, std_s, count, std_s < rules.needed_std_s, why, residual)
+
+
+def _residual(solution: OffsetSolution | None, name: str) -> float | None:
+    return None if solution is None else solution.residuals.get(name)
