@@ -17,6 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import typer
 
+from fgtrack.core.types import FloatArray
 from fgtrack.io.run_folder import Run, read_run
 from fgtrack.pipeline.config import ClockConfig, Config
 from fgtrack.pipeline.replay import replay
@@ -47,6 +48,11 @@ def scenario(lidar_delay_s: float, lidar_rate_hz: float, duration_s: float) -> S
     return Scenario(ego, (replace(ego, arc_m=140.0),), (lidar, radar), duration_s=duration_s)
 
 
+def expected_share(lidar_delay_s: FloatArray | float, lidar_rate_hz: float) -> FloatArray:
+    """min(1, (d_LiDAR - d_RADAR) f_LiDAR): how often a scan falls into the time by which the LiDAR is later."""
+    return np.minimum(1.0, (np.asarray(lidar_delay_s) - RADAR_DELAY_S) * lidar_rate_hz)
+
+
 def wiped_share(run: Run) -> float:
     """Share of the RADAR updates that a later update of the same track, with an older stamp, has wiped."""
     fused = run.updates.where(np.isin(run.updates["disposition"], ["in_sequence", "out_of_sequence"]))
@@ -75,8 +81,7 @@ def main(
             with tempfile.TemporaryDirectory() as folder:
                 replay(messages, config, Path(folder) / "run")
                 measured = wiped_share(read_run(Path(folder) / "run"))
-            expected = min(1.0, (delay_s - RADAR_DELAY_S) * rate_hz)
-            rows.append((rate_hz, delay_s, measured, expected))
+            rows.append((rate_hz, delay_s, measured, float(expected_share(delay_s, rate_hz))))
     with (out / "survival.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["lidar_hz", "lidar_delay_s", "wiped", "expected"])
@@ -84,12 +89,13 @@ def main(
     figure, axis = plt.subplots(figsize=(6.0, 4.0), layout="constrained")
     for index, rate_hz in enumerate(LIDAR_RATES_HZ):
         some = [row for row in rows if row[0] == rate_hz]
-        delays_ms = [1e3 * row[1] for row in some]
-        axis.plot(delays_ms, [100.0 * row[3] for row in some], color=f"C{index}", label=f"LiDAR {rate_hz:g} Hz")
-        axis.plot(delays_ms, [100.0 * row[2] for row in some], "o", color=f"C{index}")
+        delays_s = np.linspace(RADAR_DELAY_S, LIDAR_DELAYS_S[-1], 500)  # dense: the line has a kink
+        axis.plot(1e3 * delays_s, 100.0 * expected_share(delays_s, rate_hz), color=f"C{index}")
+        label = f"LiDAR {rate_hz:g} Hz"
+        axis.plot([1e3 * row[1] for row in some], [100.0 * row[2] for row in some], "o", color=f"C{index}", label=label)
     axis.set(xlabel="LiDAR delay [ms] (RADAR: 62 ms)", ylabel="RADAR updates wiped [%]")
     axis.grid(alpha=0.3)
-    axis.legend(title="dots: measured, lines: (d_L - d_R) f_L", fontsize=8, title_fontsize=8)
+    axis.legend(title="dots: measured\nlines: min(1, (d_L - d_R) f_L)", fontsize=8, title_fontsize=8)
     figure.savefig(out / "survival.png", dpi=150)
     plt.close(figure)
     largest = max(abs(measured - expected) for *_, measured, expected in rows)

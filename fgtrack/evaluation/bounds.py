@@ -82,12 +82,53 @@ def bounds(
         A measurement or a time lies before the start.
     numpy.linalg.LinAlgError
         The process noise is singular.
+
+    Notes
+    -----
+    Where F varies much from one trajectory to the next, as with headings in every direction, its mean loses what ties
+    position, heading and speed together, and the bound is far from what can be reached: see `bounds_along`.
     """
-    ordered = sorted(measurements, key=lambda item: item.stamp_ns)
-    stamps_ns = np.unique([start_ns, *(item.stamp_ns for item in ordered), *now_ns])
+    stamps_ns = _chain_stamps(start_ns, measurements, now_ns)
+    return _bounds(motion, stamps_ns, truth(stamps_ns), prior_covariance, measurements, now_ns)
+
+
+def bounds_along(
+    motion: MotionModel,
+    start_ns: int,
+    prior_covariance: FloatArray,
+    measurements: Sequence[Planned],
+    truth: Callable[[IntArray], FloatArray],
+    now_ns: Sequence[int],
+) -> Bounds:
+    """Mean over trajectories of the bounds along each of them; parameters and errors are those of `bounds`.
+
+    In a linear model they are the same. In a nonlinear one each is the covariance of a filter that is linearised at
+    the true states: closer to what can be reached, but no bound in the strict sense, since no theorem forbids an
+    estimator to do better.
+    """
+    stamps_ns = _chain_stamps(start_ns, measurements, now_ns)
+    each = [_bounds(motion, stamps_ns, one[None], prior_covariance, measurements, now_ns) for one in truth(stamps_ns)]
+    return Bounds(*(np.mean(covariances, axis=0) for covariances in zip(*each, strict=True)))
+
+
+def _chain_stamps(start_ns: int, measurements: Sequence[Planned], now_ns: Sequence[int]) -> IntArray:
+    """All stamps that matter, ascending. Raises `ValueError` where one lies before the start."""
+    stamps_ns = np.unique([start_ns, *(item.stamp_ns for item in measurements), *now_ns])
     if stamps_ns[0] < start_ns:
         raise ValueError(f"start_ns: {start_ns} is after a measurement or a time at {stamps_ns[0]}")
-    states = truth(stamps_ns)
+    return np.asarray(stamps_ns)
+
+
+def _bounds(
+    motion: MotionModel,
+    stamps_ns: IntArray,
+    states: FloatArray,
+    prior_covariance: FloatArray,
+    measurements: Sequence[Planned],
+    now_ns: Sequence[int],
+) -> Bounds:
+    """`bounds` from the true `states` (trajectories, s, n) at `stamps_ns` (s,)."""
+    ordered = sorted(measurements, key=lambda item: item.stamp_ns)
     chain = _Chain(motion, stamps_ns, states, psd_solve(prior_covariance, np.eye(motion.dim)), ordered)
     kept = _in_sequence(ordered)
     receipts_ns = np.array([item.receipt_ns for item in ordered], dtype=np.int64)

@@ -3,33 +3,19 @@
 The scenario, and what of it had to be found out, is told in `experiments/ladder/ladder.py`.
 """
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from support.scripts import load
 
-SCRIPT = Path(__file__).parents[2] / "experiments/ladder/ladder.py"
 SEED = 1
 ROUNDING_M, ROUNDING_ANEES = 0.001, 0.01  # of a difference of two entries of the reference
 CONSISTENT = ("ekf-replay", "rts", "zlz", "asd", "drop", "delayed-horizon", "reorder-buffer", "backward-forward")
 
-
-def load(path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = module  # dataclasses look their module up there
-    spec.loader.exec_module(module)
-    return module
-
-
-script = load(SCRIPT)
+script = load("ladder")
 
 
 @pytest.fixture(scope="module", params=[60, pytest.param(400, marks=pytest.mark.slow)], ids=lambda runs: f"{runs} runs")

@@ -1,4 +1,6 @@
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,10 +10,11 @@ from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import BirthPrior, Measurement
 from fgtrack.estimation.birth import birth_state
 from fgtrack.estimation.replay import ReplayEkf
-from fgtrack.evaluation.bounds import Planned, bounds
+from fgtrack.evaluation.bounds import Bounds, Planned, bounds, bounds_along
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
 
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs/bounds.md"
 START_NS = 1_790_000_000 * NS_PER_S
 PRIOR = BirthPrior(START_NS, np.zeros(2), 0.5 * np.eye(2), 0.3, 0.2, 20.0, 2.0, 0.0, 0.2, 0.0, 1.0)
 
@@ -78,9 +81,38 @@ def test_what_has_arrived_lies_between_all_and_what_came_in_time(motion: MotionM
     assert np.trace(found.dropped[-1] - found.arrived[-1]) > 1e-3
 
 
-def test_a_measurement_before_the_start_is_refused() -> None:
+def test_the_bounds_along_trajectories_are_the_mean_of_those_of_each() -> None:
+    motion = CTRV()
+    x, P = birth_state(motion, PRIOR)
+    starts = x + np.random.default_rng(1).standard_normal((3, 5)) @ np.linalg.cholesky(P).T
+
+    def truth(stamps_ns: IntArray) -> FloatArray:
+        return motion.predict(starts[:, None], (stamps_ns - START_NS) / NS_PER_S)
+
+    found = bounds_along(motion, START_NS, P, planned(motion), truth, NOW_NS)
+    each = [bounds(motion, START_NS, P, planned(motion), straight(motion, start), NOW_NS) for start in starts]
+    for mean, single in zip(found, zip(*each, strict=True), strict=True):
+        np.testing.assert_allclose(mean, np.mean(single, axis=0), rtol=1e-12)
+
+
+def test_in_a_linear_model_trajectories_do_not_matter() -> None:
+    motion = CV(5.0)
+    x, P = birth_state(motion, PRIOR)
+    about = motion, START_NS, P, planned(motion), straight(motion, x, trajectories=2), NOW_NS
+    for along, posterior in zip(bounds_along(*about), bounds(*about), strict=True):
+        np.testing.assert_allclose(along, posterior, rtol=1e-12)
+
+
+@pytest.mark.parametrize("function", [bounds, bounds_along])
+def test_a_measurement_before_the_start_is_refused(function: Callable[..., Bounds]) -> None:
     motion = CV(5.0)
     x, P = birth_state(motion, PRIOR)
     early = Planned(START_NS - 1, START_NS, measurement_model(("x_m", "y_m"), motion), np.eye(2))
     with pytest.raises(ValueError, match="start_ns"):
-        bounds(motion, START_NS, P, [early], straight(motion, x), NOW_NS)
+        function(motion, START_NS, P, [early], straight(motion, x), NOW_NS)
+
+
+def test_the_example_of_the_document_prints_what_stands_below_it(capsys: pytest.CaptureFixture[str]) -> None:
+    code, printed = re.findall(r"```(?:python)?\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
+    exec(compile(code, "docs/bounds.md", "exec"), {})
+    assert capsys.readouterr().out == printed
