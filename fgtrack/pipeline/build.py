@@ -69,6 +69,7 @@ def build_tracker(config: Config) -> Tracker:
         preprocess=Preprocess(road, config.merge, motion, origin_m),
         association=config.association,
         bank=build_bank(config),
+        motion=motion,
         lifecycle=lifecycle,
         duplicates=_build_duplicates(config.duplicates),
         birth=config.birth,

@@ -8,6 +8,7 @@ from types import MappingProxyType
 import numpy as np
 
 from fgtrack.core.errors import DataError
+from fgtrack.core.time import seconds
 from fgtrack.core.types import (
     DetectionList,
     Disposition,
@@ -18,7 +19,8 @@ from fgtrack.core.types import (
     TrackReport,
     UpdateRecord,
 )
-from fgtrack.estimation.base import StatesAt, TrackBank, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import StatesAt, TrackBank, UpdateResult, UpdateStatus, no_states
+from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, Association
@@ -42,6 +44,7 @@ class TrackerParts:
     preprocess: Preprocess
     association: Association
     bank: TrackBank
+    motion: MotionModel
     lifecycle: Lifecycle
     duplicates: Duplicates | None
     birth: Birth
@@ -119,8 +122,40 @@ class Tracker:
         self._estimate(batch, candidates, assignment, states)
         for position in assignment.refused:
             self._conclude(batch, candidates[position], Disposition.GATED)
-        for position in assignment.new:
+        for position in self._unclaimed(batch, candidates, assignment.new, states):
             self._give_birth(batch, candidates[position], sensor)
+
+    def _unclaimed(
+        self, batch: Batch, candidates: Sequence[Candidate], new: Sequence[int], states: StatesAt
+    ) -> Sequence[int]:
+        """Those of `new` that no track claims which began after the batch's stamp.
+
+        The detection that started it has overtaken them. They are too old for it, and no other object.
+        """
+        younger = self._younger(batch.stamp_ns, states)
+        if not new or not younger.track_ids:
+            return new
+        claims = self._parts.association([candidates[position] for position in new], younger)
+        for place, track in claims.pairs:
+            self._conclude(batch, candidates[new[place]], Disposition.TOO_OLD, younger.track_ids[track])
+        return [new[place] for place in claims.new]
+
+    def _younger(self, stamp_ns: int, states: StatesAt) -> StatesAt:
+        """Tracks that are not among `states`: their present states, moved back to `stamp_ns`."""
+        parts = self._parts
+        known = set(states.track_ids)
+        if len(known) == len(parts.bank.track_ids):
+            return no_states(parts.motion.dim)
+        now = parts.bank.states_at(parts.bank.present_ns)
+        back_s = seconds(parts.bank.present_ns - stamp_ns)
+        means, covariances, ids = [], [], []
+        for track_id, x, P in zip(now.track_ids, now.means, now.covariances, strict=True):
+            if track_id not in known:
+                mean, F = parts.motion.flow(x.tolist(), -back_s)
+                means.append(mean)
+                covariances.append(F @ P @ F.T + parts.motion.process_noise(x, back_s))
+                ids.append(track_id)
+        return StatesAt(tuple(ids), np.array(means), np.array(covariances))
 
     def _is_too_old(self, batch: Batch) -> bool:
         """Whether no track could fuse anything of `batch`."""
@@ -227,7 +262,8 @@ class Tracker:
 class PublishedTracker(Tracker):
     """The published implementation's order of things, where it differs (defects Q9 and Q22).
 
-    A list older than the storage still starts tracks, and an empty list ages every track. The range that ages a
+    A list older than the storage, or than a track that it belongs to, still starts tracks, and an empty list ages every
+    track. The range that ages a
     track is measured from the present ego to where the track was after the batch before, or at the end of the tick
     before.
     """
@@ -252,6 +288,11 @@ class PublishedTracker(Tracker):
 
     def _is_too_old(self, batch: Batch) -> bool:
         return False
+
+    def _unclaimed(
+        self, batch: Batch, candidates: Sequence[Candidate], new: Sequence[int], states: StatesAt
+    ) -> Sequence[int]:
+        return new
 
     def _offered(self, batch: Batch) -> StatesAt:
         if batch.indices:

@@ -244,7 +244,7 @@ def test_every_committed_sweep_can_be_run(path: Path) -> None:
     assert all(job.problem is None for job in load_plan(path).jobs)
 
 
-def test_the_delay_sweep_is_six_delays_by_five_rates_by_twenty_seeds_by_six_estimators() -> None:
+def test_the_delay_sweep_is_seven_delays_by_five_rates_by_twenty_seeds_by_six_estimators() -> None:
     made = load_plan(CONFIGS / "sweeps/delay.yaml")
-    assert len(made.jobs) == len({job.key for job in made.jobs}) == 6 * 5 * 20
+    assert len(made.jobs) == len({job.key for job in made.jobs}) == 7 * 5 * 20
     assert len(made.estimators) == 6

@@ -86,6 +86,29 @@ def test_a_detection_that_no_noise_explains_is_gated_and_starts_no_track() -> No
     assert ids(report) == [1]  # and the track that it was near was not seen
 
 
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_detections_that_the_first_one_has_overtaken_start_no_second_track(estimator: str) -> None:
+    one = build_tracker(replace(Config(), sensors={"lidar": POINTS, "radar": POINTS}, estimator=estimator))
+    tick(one, 100.0, seen((10.0, 0.0), at_ms=100.0, sensor="radar"))
+    late = seen((10.5, 0.0), (30.0, 0.0), at_ms=110.0, late_ms=50.0)
+    report = tick(one, 120.0, late)
+    assert [(record.index, record.disposition.value, record.track_id) for record in report.updates] == [
+        (0, "too_old", 0),
+        (1, "birth", 1),
+    ]
+
+
+def test_where_a_track_was_before_it_began_follows_its_motion() -> None:
+    """20 m/s along x, first seen at 0.1 s at x = 50: 0.5 s before it was at 40."""
+    road_runner = SensorModel(std={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.1, "speed_mps": 0.2})
+    one = tracker(lidar=POINTS, v2v=road_runner)
+    stamp_ns = START_NS + ms(600)
+    first = Detection(x_m=50.0, y_m=0.0, yaw_rad=0.0, speed_mps=20.0)
+    tick(one, 600.0, DetectionList("v2v", stamp_ns, stamp_ns, (first,), "map"))
+    report = tick(one, 620.0, seen((40.0, 0.0), (47.0, 0.0), at_ms=610.0, late_ms=510.0))
+    assert dispositions(report) == ["too_old", "birth"]
+
+
 def test_a_list_that_saw_nothing_ages_the_tracks_until_they_end() -> None:
     one = tracker()
     assert ids(tick(one, 0.0, seen((10.0, 0.0)))) == [0]
