@@ -38,7 +38,7 @@ def demo_config() -> Config:
         map=replace(config.map, track=OVAL, pit=OVAL),
         motion=replace(config.motion, kind="ctrv"),
         association=GatedEuclidean(max_nis=400.0),
-        duplicates=DuplicateRules(distance_m=1.5),
+        duplicates=DuplicateRules(distance_m=1.5, claim_overtaken=True),
         birth=MeasuredBirth(speed_std_mps=10.0),
         smoother=replace(config.smoother, lagged_s=_LAGGED_S),
         filter=replace(config.filter, storage_s=3.0),

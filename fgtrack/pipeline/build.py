@@ -72,6 +72,7 @@ def build_tracker(config: Config) -> Tracker:
         motion=motion,
         lifecycle=lifecycle,
         duplicates=_build_duplicates(config.duplicates),
+        claim_overtaken=config.duplicates.claim_overtaken,
         birth=config.birth,
         road=road,
         confirm_count=config.lifecycle.confirm_count,

@@ -12,12 +12,15 @@ from fgtrack.tracking.lifecycle import Life
 
 @dataclass(frozen=True)
 class DuplicateRules:
-    """When two tracks are taken for one object."""
+    """What is done against two tracks of one object; nothing by default, as in the paper."""
 
     distance_m: float | None = None
-    """Tracks closer together than two objects can be; null, as in the paper: never."""
+    """Tracks closer together than two objects can be; null: never."""
     after_s: float = 0.5
     """They must have been that close for so long."""
+    claim_overtaken: bool = False
+    """Whether a track claims a detection that the newer one which started it has overtaken. As in the paper it does
+    not, and the detection starts a second track: with a fast and a slow sensor nearly every new object gets two."""
 
     def __post_init__(self) -> None:
         if self.distance_m is not None and not self.distance_m > 0.0:

@@ -47,6 +47,7 @@ class TrackerParts:
     motion: MotionModel
     lifecycle: Lifecycle
     duplicates: Duplicates | None
+    claim_overtaken: bool
     birth: Birth
     road: Road
     confirm_count: int
@@ -132,12 +133,14 @@ class Tracker:
 
         The detection that started it has overtaken them. They are too old for it, and no other object.
         """
-        younger = self._younger(batch.stamp_ns, states)
-        if not new or not younger.track_ids:
+        if not new or not self._parts.claim_overtaken:
             return new
+        younger = self._younger(batch.stamp_ns, states)
         claims = self._parts.association([candidates[position] for position in new], younger)
         for place, track in claims.pairs:
             self._conclude(batch, candidates[new[place]], Disposition.TOO_OLD, younger.track_ids[track])
+        for place in claims.refused:
+            self._conclude(batch, candidates[new[place]], Disposition.GATED)
         return [new[place] for place in claims.new]
 
     def _younger(self, stamp_ns: int, states: StatesAt) -> StatesAt:
@@ -262,8 +265,7 @@ class Tracker:
 class PublishedTracker(Tracker):
     """The published implementation's order of things, where it differs (defects Q9 and Q22).
 
-    A list older than the storage, or than a track that it belongs to, still starts tracks, and an empty list ages every
-    track. The range that ages a
+    A list older than the storage still starts tracks, and an empty list ages every track. The range that ages a
     track is measured from the present ego to where the track was after the batch before, or at the end of the tick
     before.
     """
@@ -288,11 +290,6 @@ class PublishedTracker(Tracker):
 
     def _is_too_old(self, batch: Batch) -> bool:
         return False
-
-    def _unclaimed(
-        self, batch: Batch, candidates: Sequence[Candidate], new: Sequence[int], states: StatesAt
-    ) -> Sequence[int]:
-        return new
 
     def _offered(self, batch: Batch) -> StatesAt:
         if batch.indices:

@@ -32,6 +32,7 @@ EXTRA_SENSORS = {
         std={"x_m": 1.0, "y_m": 0.5, "yaw_rad": 0.2, "range_m": 1.0, "bearing_rad": 0.1}, births=False
     ),
 }
+CLAIM = "duplicates={distance_m: 3.0, claim_overtaken: true}"
 OVAL = ['map.track="oval"', 'map.pit="oval"']
 
 
@@ -57,11 +58,11 @@ CONFIGS = {
         load(Config, None, ["merge={kind: none}", "motion={kind: cv, std_per_s: {velocity: 5.0}}", "clock.node_hz=7.0"])
     ),
     "replaying": replace(
-        _with_all_sensors(load(Config, None, [*OVAL, "filter.storage_s=0.3", "association.max_nis=50.0"])),
+        _with_all_sensors(load(Config, None, [*OVAL, "filter.storage_s=0.3", "association.max_nis=50.0", CLAIM])),
         estimator="ekf-replay",
     ),
     "smoothing": replace(
-        _with_all_sensors(load(Config, None, ["smoother={lag_s: 0.3, ring_s: 0.3}", "motion={kind: ctrv}"])),
+        _with_all_sensors(load(Config, None, ["smoother={lag_s: 0.3, ring_s: 0.3}", "motion={kind: ctrv}", CLAIM])),
         estimator="smoother",
     ),
     "smoothing what is not too late": replace(
