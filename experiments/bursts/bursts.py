@@ -7,7 +7,6 @@ Draws the table of the sweep configs/sweeps/bursts.yaml in the folder; where the
 
 import csv
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -16,12 +15,9 @@ import numpy as np
 import typer
 from matplotlib.axes import Axes
 
-from fgtrack.cli.sweep import score
+from fgtrack.cli.sweep import swept
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.figure_style import PALETTE
-from fgtrack.pipeline.sweep import Sweep
-from fgtrack.pipeline.sweep_plan import load_plan
-from fgtrack.pipeline.sweep_store import SWEEP_TABLE
 
 SWEEP = Path(__file__).parents[2] / "configs/sweeps/bursts.yaml"
 QUICK_SEEDS = 2
@@ -35,16 +31,6 @@ BAD = ("late", "lost")
 #: By what becomes of a list in a burst, share of the time in bursts, their mean length in s, and estimator: a value for
 #: each seed, in their order.
 Found = Mapping[tuple[str, float, float, str], FloatArray]
-
-
-def table(out: Path, quick: bool) -> list[dict[str, str]]:
-    """Rows of the sweep in `out`, which is run where there is none."""
-    if not (out / SWEEP_TABLE).exists():
-        plan = load_plan(SWEEP)
-        jobs = tuple(job for job in plan.jobs if not quick or job.seed < QUICK_SEEDS)
-        Sweep.open(replace(plan, jobs=jobs), out).run(score)
-    with (out / SWEEP_TABLE).open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def values(rows: list[dict[str, str]], columns: tuple[str, ...]) -> Found:
@@ -84,7 +70,7 @@ def main(
     quick: Annotated[bool, typer.Option(help=f"Run {QUICK_SEEDS} seeds only, where there is no sweep yet.")] = False,
 ) -> None:
     """Write bursts.csv and bursts.png beside sweep.csv."""
-    rows = table(out, quick)
+    rows = swept(SWEEP, out, QUICK_SEEDS if quick else None)
     found, fused = values(rows, (RMSE,)), values(rows, FUSED)
     lengths_s = sorted({length_s for _, share, length_s, _ in found if share > 0.0})
     with (out / "bursts.csv").open("w", newline="") as file:

@@ -7,7 +7,6 @@ Draws the table of the sweep configs/sweeps/delay.yaml in the folder; where ther
 
 import csv
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -17,12 +16,9 @@ import typer
 from matplotlib.axes import Axes
 from scipy.stats import t
 
-from fgtrack.cli.sweep import score
+from fgtrack.cli.sweep import swept
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.figure_style import log_axis
-from fgtrack.pipeline.sweep import Sweep
-from fgtrack.pipeline.sweep_plan import load_plan
-from fgtrack.pipeline.sweep_store import SWEEP_TABLE
 
 SWEEP = Path(__file__).parents[2] / "configs/sweeps/delay.yaml"
 QUICK_SEEDS = 2
@@ -33,16 +29,6 @@ RATIOS, ERRORS_M = (0.3, 5.0), (0.15, 12.0)  # of the figure
 
 #: RMSE by delay of the LiDAR in s, rate in Hz and estimator: one for each seed, in their order.
 Errors = Mapping[tuple[float, float, str], FloatArray]
-
-
-def table(out: Path, quick: bool) -> list[dict[str, str]]:
-    """Rows of the sweep in `out`, which is run where there is none."""
-    if not (out / SWEEP_TABLE).exists():
-        plan = load_plan(SWEEP)
-        jobs = tuple(job for job in plan.jobs if not quick or job.seed < QUICK_SEEDS)
-        Sweep.open(replace(plan, jobs=jobs), out).run(score)
-    with (out / SWEEP_TABLE).open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def errors(rows: list[dict[str, str]], column: str) -> Errors:
@@ -118,7 +104,7 @@ def main(
     quick: Annotated[bool, typer.Option(help=f"Run {QUICK_SEEDS} seeds only, where there is no sweep yet.")] = False,
 ) -> None:
     """Write ratios.csv and delay.png beside sweep.csv."""
-    rows = table(out, quick)
+    rows = swept(SWEEP, out, QUICK_SEEDS if quick else None)
     position, speed = errors(rows, POSITION), errors(rows, SPEED)
     rates_hz = sorted({rate_hz for _, rate_hz, _ in position})
     delays_s = sorted({delay_s for delay_s, _, _ in position})

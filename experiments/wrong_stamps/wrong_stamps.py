@@ -7,7 +7,6 @@ Draws the table of the sweep configs/sweeps/wrong_stamps.yaml in the folder; whe
 
 import csv
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -16,12 +15,9 @@ import numpy as np
 import typer
 from matplotlib.axes import Axes
 
-from fgtrack.cli.sweep import score
+from fgtrack.cli.sweep import swept
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.figure_style import PALETTE, log_axis
-from fgtrack.pipeline.sweep import Sweep
-from fgtrack.pipeline.sweep_plan import load_plan
-from fgtrack.pipeline.sweep_store import SWEEP_TABLE
 
 SWEEP = Path(__file__).parents[2] / "configs/sweeps/wrong_stamps.yaml"
 QUICK_SEEDS = 2
@@ -37,16 +33,6 @@ RMS = {"jitter": 1.0, "quantised": 1.0 / np.sqrt(3.0), "drift": 1.0 / np.sqrt(3.
 
 #: By label of the clock and estimator: a value for each seed, in their order.
 Found = Mapping[tuple[str, str], FloatArray]
-
-
-def table(out: Path, quick: bool) -> list[dict[str, str]]:
-    """Rows of the sweep in `out`, which is run where there is none."""
-    if not (out / SWEEP_TABLE).exists():
-        plan = load_plan(SWEEP)
-        jobs = tuple(job for job in plan.jobs if not quick or job.seed < QUICK_SEEDS)
-        Sweep.open(replace(plan, jobs=jobs), out).run(score)
-    with (out / SWEEP_TABLE).open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def values(rows: list[dict[str, str]], column: str) -> Found:
@@ -102,7 +88,7 @@ def main(
     quick: Annotated[bool, typer.Option(help=f"Run {QUICK_SEEDS} seeds only, where there is no sweep yet.")] = False,
 ) -> None:
     """Write stamps.csv and stamps.png beside sweep.csv."""
-    rows = table(out, quick)
+    rows = swept(SWEEP, out, QUICK_SEEDS if quick else None)
     rmse, nis, nees = (values(rows, column) for column in (RMSE, NIS, NEES))
     labels = list(dict.fromkeys(label for label, _ in rmse))
     shown = effects(labels)

@@ -1,8 +1,10 @@
 """`fgtrack sweep`: settings x seeds x estimators into one table."""
 
+import csv
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -49,6 +51,20 @@ def sweep(
         result = work.run(score, jobs=jobs or -1, dask=dask, on_job=count)
     _say(f"{out / SWEEP_TABLE}: {result.num_good} of {result.num_cells} cells")
     return _complain(result, sweep_file, out)
+
+
+def swept(sweep_file: Path, out: Path, num_seeds: int | None = None) -> list[dict[str, str]]:
+    """Rows of the table in `out`, by column; for scripts that draw a sweep.
+
+    Where there is no table the sweep is run first, with the seeds below `num_seeds` alone if that is given. Raises
+    `CallError` for a sweep that cannot be run.
+    """
+    if not (out / SWEEP_TABLE).exists():
+        plan = load_plan(sweep_file)
+        jobs = tuple(job for job in plan.jobs if num_seeds is None or job.seed < num_seeds)
+        Sweep.open(replace(plan, jobs=jobs), out).run(score)
+    with (out / SWEEP_TABLE).open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def score(run: Run) -> Scores:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from fgtrack.cli.main import run
-from fgtrack.cli.sweep import score
+from fgtrack.cli.sweep import score, swept
 from fgtrack.io.run_folder import Run
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.load import load
@@ -372,3 +372,12 @@ vary:
     assert means[:2] == pytest.approx([0.1, 0.1], abs=1e-9)
     assert all(0.12 < mean < 0.18 for mean in means[2:])
     assert means[2] != means[3]  # the seed draws the delays
+
+
+def test_a_script_gets_the_table_that_is_there_or_runs_the_first_seeds(tmp_path: Path) -> None:
+    sweep = write_sweep(
+        tmp_path, "duration_s: 0.5\nestimators: [ekf-replay]\nseeds: 3\nvary: {association.gate_m: [5.0, 3.0]}\n"
+    )
+    found = swept(sweep, tmp_path / "out", num_seeds=2)
+    assert [(row["association.gate_m"], row["seed"]) for row in found] == [(g, s) for g in ("5.0", "3.0") for s in "01"]
+    assert swept(sweep, tmp_path / "out") == found
