@@ -23,11 +23,12 @@ import numpy as np
 from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import YAW, BoolArray, FloatArray
-from fgtrack.estimation.factor_graph.factors import motion_factor, prior_factor
+from fgtrack.estimation.factor_graph.factors import motion_factor, prior_factor, weight
 from fgtrack.estimation.factor_graph.initiation import along, fix_of, straight_line
 from fgtrack.estimation.factor_graph.levenberg import solved
 from fgtrack.estimation.factor_graph.timed import Nodes, Reading, Sighting, rates, reading, reading_factor
 from fgtrack.models.motion import MotionModel
+from fgtrack.models.sensors import RobustLoss
 
 #: Nothing is known of an object before its first detection; deviations of its first state.
 _WIDE = {
@@ -284,6 +285,4 @@ def _sensed_ns(item: Sighting, offsets_s: Mapping[str, float]) -> int:
 
 def _weight(item: Reading, huber_width: float | None) -> float:
     """Of the loss, at the residual of `item`."""
-    if huber_width is None:
-        return 1.0
-    return float(gtsam.noiseModel.mEstimator.Huber.Create(huber_width).weight(item.distance))
+    return 1.0 if huber_width is None else weight(RobustLoss("huber", huber_width), item.distance)
