@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from support.late_positions import STEP_NS, late_positions
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
@@ -18,22 +19,11 @@ from fgtrack.models.motion import CV
 START_NS = 1_790_000_000 * NS_PER_S
 MOTION = CV(5.0)
 PRIOR = BirthPrior(START_NS, np.zeros(2), 0.5 * np.eye(2), 0.0, 0.2, 20.0, 2.0, 0.0, 0.2, 0.0, 1.0)
-STEP_NS = 50_000_000
 NUM_STEPS = 40
 NUM_RUNS = 80
 NOW_NS = START_NS + NUM_STEPS * STEP_NS + STEP_NS // 2
 POSITION = measurement_model(("x_m", "y_m"), MOTION)
 EXACT = ("ekf-replay", "smoother")
-
-
-def planned() -> list[Planned]:
-    """Good positions 151 ms late at every other step, bad ones 62 ms late in between, in order of receipt."""
-    found = []
-    for k in range(1, NUM_STEPS + 1):
-        stamp_ns = START_NS + k * STEP_NS
-        late_ns, std_m = (151_000_000, 0.3) if k % 2 else (62_000_000, 1.0)
-        found.append(Planned(stamp_ns, stamp_ns + late_ns, POSITION, std_m**2 * np.eye(2)))
-    return sorted(found, key=lambda item: item.receipt_ns)
 
 
 def make(name: str) -> Estimator:
@@ -73,12 +63,12 @@ def gated() -> FloatArray:
     def truth(stamps_ns: IntArray) -> FloatArray:
         return MOTION.predict(x0, (stamps_ns - START_NS) / NS_PER_S)[None]
 
-    return bounds(MOTION, START_NS, P0, planned(), truth, [NOW_NS]).arrived[0]
+    return bounds(MOTION, START_NS, P0, late_positions(MOTION, START_NS, NUM_STEPS), truth, [NOW_NS]).arrived[0]
 
 
 @pytest.mark.parametrize("name", EXACT)
 def test_the_exact_methods_reach_the_gated_bound(name: str, gated: FloatArray) -> None:
-    found = errors(name, planned())
+    found = errors(name, late_positions(MOTION, START_NS, NUM_STEPS))
     total = np.sum(found @ np.linalg.solve(gated, np.eye(4)) * found)
     low, high = chi2.ppf([0.025, 0.975], 4 * NUM_RUNS)
     assert low < total < high
@@ -86,11 +76,11 @@ def test_the_exact_methods_reach_the_gated_bound(name: str, gated: FloatArray) -
 
 @pytest.mark.parametrize("name", OOSM_METHODS)
 def test_no_method_is_better_than_the_gated_bound(name: str, gated: FloatArray) -> None:
-    squared_m2 = np.sum(errors(name, planned())[:, :2] ** 2, axis=1)
+    squared_m2 = np.sum(errors(name, late_positions(MOTION, START_NS, NUM_STEPS))[:, :2] ** 2, axis=1)
     standard_error = squared_m2.std() / np.sqrt(NUM_RUNS)
     assert squared_m2.mean() > np.trace(gated[:2, :2]) - 3.0 * standard_error
 
 
 def test_what_drops_the_good_sensor_is_clearly_above_the_bound(gated: FloatArray) -> None:
-    squared_m2 = np.sum(errors("drop", planned())[:, :2] ** 2, axis=1)
+    squared_m2 = np.sum(errors("drop", late_positions(MOTION, START_NS, NUM_STEPS))[:, :2] ** 2, axis=1)
     assert squared_m2.mean() > 1.3 * np.trace(gated[:2, :2])

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from support.late_positions import STEP_NS, late_positions
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
@@ -12,29 +13,16 @@ from fgtrack.estimation.birth import birth_state
 from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.evaluation.bounds import Bounds, Planned, bounds, bounds_along
-from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
 
 START_NS = 1_790_000_000 * NS_PER_S
 PRIOR = BirthPrior(START_NS, np.zeros(2), 0.09 * np.eye(2), 0.4, 0.1, 30.0, 2.0, 0.05, 0.02, 0.0, 1.0)
 PAPER = CTRV()
 LOOSE_TIES = CTRV(position_density_m2ps=0.05)  # headings matter less, so their spread does not spoil the bound
-STEP_NS = 50_000_000
 NUM_STEPS = 50
 NUM_RUNS = 60
 NOWS_NS = [START_NS + k * STEP_NS + STEP_NS // 2 for k in (30, 40, 50)]
 NAMES = ("ekf-replay", "smoother")
-
-
-def planned(motion: MotionModel) -> list[Planned]:
-    """Good positions 151 ms late at every other step, bad ones 62 ms late in between, in order of receipt."""
-    position = measurement_model(("x_m", "y_m"), motion)
-    found = []
-    for k in range(1, NUM_STEPS + 1):
-        stamp_ns = START_NS + k * STEP_NS
-        late_ns, std_m = (151_000_000, 0.3) if k % 2 else (62_000_000, 1.0)
-        found.append(Planned(stamp_ns, stamp_ns + late_ns, position, std_m**2 * np.eye(2)))
-    return sorted(found, key=lambda item: item.receipt_ns)
 
 
 def make(name: str, motion: MotionModel) -> Estimator:
@@ -54,7 +42,7 @@ class Trial:
 
 def tried(motion: MotionModel) -> Trial:
     rng = np.random.default_rng(3)
-    items = planned(motion)
+    items = late_positions(motion, START_NS, NUM_STEPS)
     stamps_ns = np.unique([START_NS, *(item.stamp_ns for item in items), *NOWS_NS])
     x0, P0 = birth_state(motion, PRIOR)
     states = [x0 + rng.standard_normal((NUM_RUNS, 5)) @ np.linalg.cholesky(P0).T]
