@@ -23,7 +23,6 @@ from fgtrack.sim.scenario import OVAL
 from fgtrack.sim.simulate import simulate
 from fgtrack.tracking.association import GatedEuclidean
 from fgtrack.tracking.birth import MeasuredBirth
-from fgtrack.tracking.duplicates import DuplicateRules
 
 _SEED = 1
 _ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
@@ -38,7 +37,7 @@ def demo_config() -> Config:
         map=replace(config.map, track=OVAL, pit=OVAL),
         motion=replace(config.motion, kind="ctrv"),
         association=GatedEuclidean(max_nis=400.0),
-        duplicates=DuplicateRules(distance_m=1.5, claim_overtaken=True),
+        lifecycle=replace(config.lifecycle, claim_overtaken=True),
         birth=MeasuredBirth(speed_std_mps=10.0),
         smoother=replace(config.smoother, lagged_s=_LAGGED_S),
         filter=replace(config.filter, storage_s=3.0),

@@ -30,7 +30,6 @@ from fgtrack.models.road import FrenetRoad, OpenSpace, Road
 from fgtrack.models.track_map import TrackMap
 from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
 from fgtrack.sim.oval import make_oval, make_pit_lane
-from fgtrack.tracking.duplicates import DuplicateRules, Duplicates
 from fgtrack.tracking.ego import EgoSource, EgoTrajectory
 from fgtrack.tracking.inbox import Inbox, QueueInbox
 from fgtrack.tracking.lifecycle import CountingLifecycle, Lifecycle
@@ -71,17 +70,12 @@ def build_tracker(config: Config) -> Tracker:
         bank=build_bank(config),
         motion=motion,
         lifecycle=lifecycle,
-        duplicates=_build_duplicates(config.duplicates),
-        claim_overtaken=config.duplicates.claim_overtaken,
+        claim_overtaken=config.lifecycle.claim_overtaken,
         birth=config.birth,
         road=road,
         confirm_count=config.lifecycle.confirm_count,
     )
     return (PublishedTracker if published_order else Tracker)(parts)
-
-
-def _build_duplicates(rules: DuplicateRules) -> Duplicates | None:
-    return None if rules.distance_m is None else Duplicates(rules.distance_m, rules.after_s)
 
 
 def build_road(config: MapConfig) -> Road:

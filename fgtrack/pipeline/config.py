@@ -13,7 +13,6 @@ from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
-from fgtrack.tracking.duplicates import DuplicateRules
 from fgtrack.tracking.lifecycle import LifecycleRules
 from fgtrack.tracking.preprocess import ConnectedMerge, NoMerge
 from fgtrack.tracking.published_objects import NeighbourhoodMerge, UngatedEuclidean
@@ -113,9 +112,12 @@ class InboxConfig:
 
 @dataclass(frozen=True)
 class LifecycleConfig(LifecycleRules):
-    """When a track ends."""
+    """When a track starts and ends."""
 
     kind: Literal["counting", "published"] = "counting"
+    claim_overtaken: bool = False
+    """Whether a track claims a detection that the newer one which started it has overtaken. As in the paper it does
+    not, and the detection starts a second track: with a fast and a slow sensor nearly every new object gets two."""
 
 
 @dataclass(frozen=True)
@@ -206,7 +208,6 @@ class Config:
     merge: MergeConfig = field(default_factory=ConnectedMerge)
     association: AssociationConfig = field(default_factory=GatedEuclidean)
     lifecycle: LifecycleConfig = field(default_factory=LifecycleConfig)
-    duplicates: DuplicateRules = field(default_factory=DuplicateRules)
     birth: BirthConfig = field(default_factory=FixedBirth)
     motion: MotionConfig = field(default_factory=MotionConfig)
     filter: FilterConfig = field(default_factory=FilterConfig)

@@ -25,7 +25,6 @@ from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, Association
 from fgtrack.tracking.birth import Birth
-from fgtrack.tracking.duplicates import Duplicates
 from fgtrack.tracking.ego import EgoPose, EgoSource
 from fgtrack.tracking.inbox import NO_INNOVATION, Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Lifecycle
@@ -46,7 +45,6 @@ class TrackerParts:
     bank: TrackBank
     motion: MotionModel
     lifecycle: Lifecycle
-    duplicates: Duplicates | None
     claim_overtaken: bool
     birth: Birth
     road: Road
@@ -94,7 +92,6 @@ class Tracker:
         self._seen = {id(batch.message): set() for batch in batches}
         for batch in batches:
             self._process(batch)
-        self._end(self._duplicates(now_ns))
         updates, self._records = tuple(self._records), []
         return TickReport(self._tick, now_ns, self._reports(), updates, tuple(self._parts.bank.smoothed()))
 
@@ -235,13 +232,6 @@ class Tracker:
             innovation = MappingProxyType(dict(zip(names, result.innovation.tolist(), strict=True)))
         self._records.append(record(batch.message, candidate.index, disposition, track_id, nis, innovation))
         self._records += [batch.record(index, Disposition.MERGED, track_id) for index in candidate.merged]
-
-    def _duplicates(self, now_ns: int) -> list[int]:
-        bank = self._parts.bank
-        if self._parts.duplicates is None:
-            return []
-        positions_m = np.array([state.mean[:2] for state in bank.present()]).reshape(-1, 2)
-        return self._parts.duplicates.ended(now_ns, bank.track_ids, positions_m, self._parts.lifecycle.lives)
 
     def _end(self, track_ids: Sequence[int]) -> None:
         for track_id in track_ids:

@@ -32,7 +32,7 @@ EXTRA_SENSORS = {
         std={"x_m": 1.0, "y_m": 0.5, "yaw_rad": 0.2, "range_m": 1.0, "bearing_rad": 0.1}, births=False
     ),
 }
-CLAIM = "duplicates={distance_m: 3.0, claim_overtaken: true}"
+CLAIM = "lifecycle.claim_overtaken=true"
 OVAL = ['map.track="oval"', 'map.pit="oval"']
 
 

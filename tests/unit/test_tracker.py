@@ -7,12 +7,11 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, TickReport, TrackStatus
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import ESTIMATORS, build_tracker
-from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.config import Config, LifecycleConfig
 from fgtrack.tracking.association import GatedEuclidean
-from fgtrack.tracking.duplicates import DuplicateRules
 from fgtrack.tracking.tracker import Tracker
 
-CLAIMING = DuplicateRules(claim_overtaken=True)
+CLAIMING = LifecycleConfig(claim_overtaken=True)
 POINTS = SensorModel(std={"x_m": 0.3, "y_m": 0.3})
 
 
@@ -91,7 +90,7 @@ def test_a_detection_that_no_noise_explains_is_gated_and_starts_no_track() -> No
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_detections_that_the_first_one_has_overtaken_start_no_second_track(estimator: str) -> None:
     one = build_tracker(
-        replace(Config(), sensors={"lidar": POINTS, "radar": POINTS}, estimator=estimator, duplicates=CLAIMING)
+        replace(Config(), sensors={"lidar": POINTS, "radar": POINTS}, estimator=estimator, lifecycle=CLAIMING)
     )
     tick(one, 100.0, seen((10.0, 0.0), at_ms=100.0, sensor="radar"))
     late = seen((10.5, 0.0), (30.0, 0.0), at_ms=110.0, late_ms=50.0)
@@ -108,7 +107,7 @@ def test_what_is_near_a_younger_track_but_not_believed_is_gated() -> None:
             Config(),
             sensors={"lidar": POINTS, "radar": POINTS},
             association=GatedEuclidean(gate_m=20.0, max_nis=50.0),
-            duplicates=CLAIMING,
+            lifecycle=CLAIMING,
         )
     )
     tick(one, 100.0, seen((10.0, 0.0), at_ms=100.0, sensor="radar"))
@@ -119,7 +118,7 @@ def test_what_is_near_a_younger_track_but_not_believed_is_gated() -> None:
 def test_where_a_track_was_before_it_began_follows_its_motion() -> None:
     """20 m/s along x, first seen at 0.1 s at x = 50: 0.5 s before it was at 40."""
     road_runner = SensorModel(std={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.1, "speed_mps": 0.2})
-    one = build_tracker(replace(Config(), sensors={"lidar": POINTS, "v2v": road_runner}, duplicates=CLAIMING))
+    one = build_tracker(replace(Config(), sensors={"lidar": POINTS, "v2v": road_runner}, lifecycle=CLAIMING))
     stamp_ns = START_NS + ms(600)
     first = Detection(x_m=50.0, y_m=0.0, yaw_rad=0.0, speed_mps=20.0)
     tick(one, 600.0, DetectionList("v2v", stamp_ns, stamp_ns, (first,), "map"))
