@@ -27,7 +27,7 @@ from stonesoup.updater.kalman import ExtendedKalmanUpdater
 
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import BirthPrior, Estimator, Measurement, UpdateStatus
+from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
 from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import measurement_model
@@ -39,13 +39,13 @@ DURATION_S = 30.0
 START = np.array([0.0, 0.0, 0.3, 65.0, 0.05])  # x, y, yaw, speed, yaw rate
 
 
-def smoother(start: BirthPrior, lag_s: float) -> FixedLagSmoother:
+def smoother(start: Start, lag_s: float) -> FixedLagSmoother:
     settings = SmootherSettings(lag_s=lag_s, lagged_s=(), final=False)
     thresholds = settings.thresholds(MOTION.state_names, curved=False)
     return FixedLagSmoother(MOTION, start, settings, lambda: IncrementalBackend(thresholds))
 
 
-ESTIMATORS: dict[str, Callable[[BirthPrior], Estimator]] = {
+ESTIMATORS: dict[str, Callable[[Start], Estimator]] = {
     "ekf-replay": lambda prior: ReplayEkf(MOTION, prior, LAG_S),
     "smoother, 1 s": lambda prior: smoother(prior, 1.0),
     "smoother, 3 s": lambda prior: smoother(prior, 3.0),
@@ -89,9 +89,9 @@ def stream() -> list[Measurement]:
     return [measurement for _, measurement in sorted(arrivals, key=lambda arrival: arrival[0])]
 
 
-def prior() -> BirthPrior:
+def prior() -> Start:
     x, y, yaw, speed, yaw_rate = START.tolist()
-    return BirthPrior(0, np.array([x, y]), np.eye(2), yaw, 0.3, speed, 3.0, yaw_rate, 0.3, 0.0, 1.0)
+    return Start(0, np.array([x, y]), np.eye(2), yaw, 0.3, speed, 3.0, yaw_rate, 0.3, 0.0, 1.0)
 
 
 def run_estimator(name: str, measurements: list[Measurement]) -> tuple[list[int], list[bool], FloatArray]:

@@ -34,8 +34,8 @@ from matplotlib.figure import Figure
 
 from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.base import BirthPrior, Measurement, StatesAt, TrackBank
-from fgtrack.estimation.birth import birth_state
+from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank
+from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherBank, SmootherSettings
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.replay import ReplayEkf
@@ -127,17 +127,17 @@ def _grid(first_s: float, period_s: float, last_s: float) -> IntArray:
     return START_NS + np.array([nanoseconds(first_s + i * period_s) for i in range(count)])
 
 
-def _prior(place: int, rng: np.random.Generator) -> BirthPrior:
+def _prior(place: int, rng: np.random.Generator) -> Start:
     """Side by side, `SPACING_M` apart, each up to `AHEAD_M` ahead or behind."""
     along_m, across_m = rng.uniform(-AHEAD_M, AHEAD_M), place * SPACING_M
     c, s = np.cos(YAW_RAD), np.sin(YAW_RAD)
     position_m = np.array([c * along_m - s * across_m, s * along_m + c * across_m])
-    return BirthPrior(START_NS, position_m, 0.09 * np.eye(2), YAW_RAD, 0.03, SPEED_MPS, 1.0, 0.0, 0.03, 0.0, 1.0)
+    return Start(START_NS, position_m, 0.09 * np.eye(2), YAW_RAD, 0.03, SPEED_MPS, 1.0, 0.0, 0.03, 0.0, 1.0)
 
 
-def _drawn(priors: Sequence[BirthPrior], stamps_ns: IntArray, rng: np.random.Generator) -> FloatArray:
+def _drawn(priors: Sequence[Start], stamps_ns: IntArray, rng: np.random.Generator) -> FloatArray:
     """States of all objects, shape (s, objects, n)."""
-    starts = [birth_state(MOTION, prior) for prior in priors]
+    starts = [initial_state(MOTION, prior) for prior in priors]
     states = [np.array([rng.multivariate_normal(*start) for start in starts])]
     for step_ns in np.diff(stamps_ns).tolist():
         roots = np.linalg.cholesky(MOTION.process_noise(states[-1], seconds(step_ns)))

@@ -17,7 +17,7 @@ from matplotlib.ticker import LogFormatter
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import BirthPrior, Estimator, Measurement
+from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import measurement_model
@@ -31,26 +31,26 @@ GOOD_M, GOOD_MPS = 0.5, 2.0
 TRUTH = CTRV()
 
 
-def smoother(prior: BirthPrior) -> Estimator:
+def smoother(prior: Start) -> Estimator:
     settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)
     thresholds = settings.thresholds(TRUTH.state_names, curved=False)
     return FixedLagSmoother(TRUTH, prior, settings, lambda: IncrementalBackend(thresholds))
 
 
 #: By name: the motion model of the estimator, and how it starts. The last one shows what a linear model does.
-ESTIMATORS: dict[str, tuple[MotionModel, Callable[[BirthPrior], Estimator]]] = {
+ESTIMATORS: dict[str, tuple[MotionModel, Callable[[Start], Estimator]]] = {
     "smoother (CTRV)": (TRUTH, smoother),
     "ekf-replay (CTRV)": (TRUTH, lambda prior: ReplayEkf(TRUTH, prior, 1.0)),
     "ekf-replay (CV)": (CV(25.0), lambda prior: ReplayEkf(CV(25.0), prior, 1.0)),
 }
 
 
-def errors(motion: MotionModel, start: Callable[[BirthPrior], Estimator], rng: np.random.Generator) -> FloatArray:
+def errors(motion: MotionModel, start: Callable[[Start], Estimator], rng: np.random.Generator) -> FloatArray:
     """Errors of position and velocity after each detection of one object, shape (NUM_STEPS, 2)."""
     x = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi), rng.uniform(20.0, 70.0), rng.uniform(-0.1, 0.1)])
     z = x[:2] + STD_M * rng.standard_normal(2)
     R = STD_M**2 * np.eye(2)
-    estimator = start(BirthPrior(START_NS, z, R, None, np.pi, 0.0, 40.0, 0.0, 0.3, 0.0, 1.0))
+    estimator = start(Start(START_NS, z, R, None, np.pi, 0.0, 40.0, 0.0, 0.3, 0.0, 1.0))
     model = measurement_model(("x_m", "y_m"), motion)
     found = []
     for k in range(1, NUM_STEPS + 1):

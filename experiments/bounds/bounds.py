@@ -27,12 +27,12 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.base import BirthPrior, Estimator, Measurement
-from fgtrack.estimation.birth import birth_state
+from fgtrack.estimation.base import Estimator, Measurement, Start
+from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
 from fgtrack.estimation.oosm import OOSM_METHODS, DelayedHorizon, ReorderBuffer
 from fgtrack.estimation.replay import ReplayEkf
-from fgtrack.evaluation.bounds import Planned, bounds, bounds_along
+from fgtrack.evaluation.bounds import ScheduledMeasurement, bounds, bounds_along
 from fgtrack.evaluation.figure_style import GREY, WRONG, colour, save, styled
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
@@ -44,10 +44,10 @@ DELAYS_S = (0.0, 0.05, 0.1, 0.2, 0.3)
 #: Of the lines of the figure; above 25 ms the good sensor is overtaken by the poor one.
 LINE_DELAYS_S = (0.0, 0.0125, 0.025, 0.0255, 0.0375, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3)
 LAG_S = 1.0
-PRIOR = BirthPrior(START_NS, np.zeros(2), 0.09 * np.eye(2), 0.4, 0.1, 30.0, 2.0, 0.05, 0.1, 0.0, 1.0)
+PRIOR = Start(START_NS, np.zeros(2), 0.09 * np.eye(2), 0.4, 0.1, 30.0, 2.0, 0.05, 0.1, 0.0, 1.0)
 BOUNDS = ("in time", "arrived", "dropped", "posterior, arrived")
 EXACT = ("ekf-replay", "smoother")
-DRAWN = ("ekf-replay", "smoother", "larsen", "backward-forward", "delayed-horizon", "drop")
+DRAWN = ("ekf-replay", "smoother", "larsen", "rewind-forget", "delayed-horizon", "drop")
 MARKERS = "osv^DP"
 DODGE_S = 0.003  # between the markers of two estimators
 
@@ -106,7 +106,7 @@ class Case:
         exact = measurement_model(tuple(std), self.world.motion).predict(self.truth(stamps_ns))
         return exact + np.array(list(std.values())) * rng.standard_normal(exact.shape)
 
-    def planned(self, delay_s: float) -> list[tuple[Planned, FloatArray]]:
+    def planned(self, delay_s: float) -> list[tuple[ScheduledMeasurement, FloatArray]]:
         """Every measurement with its values in all runs, shape (runs, k), in order of receipt."""
         found = []
         for stamps_ns, std, late_s, z in (
@@ -116,7 +116,7 @@ class Case:
             model = measurement_model(tuple(std), self.world.motion)
             R = np.diag(np.array(list(std.values())) ** 2)
             for i, stamp_ns in enumerate(stamps_ns.tolist()):
-                found.append((Planned(stamp_ns, stamp_ns + nanoseconds(late_s), model, R), z[:, i]))
+                found.append((ScheduledMeasurement(stamp_ns, stamp_ns + nanoseconds(late_s), model, R), z[:, i]))
         return sorted(found, key=lambda item: item[0].receipt_ns)
 
 
@@ -128,7 +128,7 @@ def grid_ns(first_s: float, period_s: float, last_s: float) -> IntArray:
 
 def drawn(motion: MotionModel, stamps_ns: IntArray, runs: int, rng: np.random.Generator) -> FloatArray:
     """States of objects that move as `motion` says, shape (runs, s, n)."""
-    mean, covariance = birth_state(motion, PRIOR)
+    mean, covariance = initial_state(motion, PRIOR)
     states = [mean + rng.standard_normal((runs, motion.dim)) @ np.linalg.cholesky(covariance).T]
     for step_ns in np.diff(stamps_ns).tolist():
         roots = np.linalg.cholesky(motion.process_noise(states[-1], seconds(step_ns)))
@@ -159,7 +159,7 @@ def squared_errors(case: Case, start: Callable[[], Estimator], delay_s: float) -
 def mean_bounds(case: Case, delay_s: float) -> dict[str, float]:
     """Bounds of the mean squared position error in m^2, by name of `BOUNDS`."""
     planned = [item for item, _ in case.planned(delay_s)]
-    _, covariance = birth_state(case.world.motion, PRIOR)
+    _, covariance = initial_state(case.world.motion, PRIOR)
     about = case.world.motion, START_NS, covariance, planned, case.truth, case.now_ns.tolist()
     found = (*bounds_along(*about), bounds(*about).arrived)
     traces = [np.trace(one[:, :2, :2], axis1=1, axis2=2).mean() for one in found]

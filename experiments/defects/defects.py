@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.run_folder import Run, read_run
+from fgtrack.io.run import Run, read_run
 from fgtrack.io.stream import read_stream
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load

@@ -33,7 +33,7 @@ from matplotlib.ticker import FixedLocator, NullLocator
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import BirthPrior, Estimator, Measurement, UpdateStatus
+from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
 from fgtrack.estimation.oosm import OOSM_METHODS, DelayedHorizon, ReorderBuffer
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.evaluation.figure_style import WRONG, colour, line_style, log_axis, save, styled
@@ -50,7 +50,7 @@ SPEED_STD_MPS = 10.0
 LAG_S = 10.0  # the window, longer than a run
 LAGS = (1, 2, 3, 5, 7, 10)
 MAX_RMSE_M, MAX_ANEES = 2.0, 30.0  # of the figure
-PRIOR = BirthPrior(0, np.zeros(2), np.eye(2), None, 0.0, 0.0, SPEED_STD_MPS, 0.0, 0.0, 0.0, 0.0)
+PRIOR = Start(0, np.zeros(2), np.eye(2), None, 0.0, 0.0, SPEED_STD_MPS, 0.0, 0.0, 0.0, 0.0)
 
 REFERENCE_RUNS = 400
 REFERENCE_LAGS = (1, 3, 10)
@@ -66,7 +66,7 @@ REFERENCE: dict[str, tuple[tuple[float, float], ...]] = {
     "c": ((0.286, 2.03), (0.405, 2.31), (0.545, 18.9)),
     "larsen": ((0.359, 1.96), (0.469, 1.93), (0.536, 1.94)),
     "ci": ((0.302, 2.04), (0.554, 1.99), (0.536, 1.91)),
-    "backward-forward": ((0.302, 2.05), (0.518, 2.01), (1.729, 1.90)),
+    "rewind-forget": ((0.302, 2.05), (0.518, 2.01), (1.729, 1.90)),
     "drop": ((0.542, 1.98), (0.560, 2.01), (0.536, 1.92)),
     "as-current": ((0.530, 5.1), (2.19, 69.0), (8.05, 929.0)),
 }

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import BirthPrior, Measurement
+from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
@@ -58,7 +58,7 @@ def smoother(start: FloatArray, lag_s: float) -> FixedLagSmoother:
     x_m, y_m, yaw_rad, speed_mps, yaw_rate_radps = start.tolist()
     position = np.array([x_m, y_m])
     deviations = (yaw_rad, PRIOR_STD[2], speed_mps, PRIOR_STD[3], yaw_rate_radps, PRIOR_STD[4])
-    prior = BirthPrior(START_NS, position, PRIOR_STD[0] ** 2 * np.eye(2), *deviations, 0.0, 1.0)
+    prior = Start(START_NS, position, PRIOR_STD[0] ** 2 * np.eye(2), *deviations, 0.0, 1.0)
     settings = SmootherSettings(lag_s=lag_s, lagged_s=(), final=False)
     thresholds = settings.thresholds(MOTION.state_names, curved=False)
     return FixedLagSmoother(MOTION, prior, settings, lambda: IncrementalBackend(thresholds))

@@ -16,7 +16,7 @@ import typer
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import BirthPrior, Estimator, Measurement
+from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import measurement_model
@@ -47,7 +47,7 @@ def start(name: str, loss: RobustLoss | None, x: FloatArray) -> Estimator:
     """The estimator `name` of an object that starts at `x`."""
     x_m, y_m, yaw_rad, speed_mps, yaw_rate_radps = x.tolist()
     position, R = np.array([x_m, y_m]), STD_M**2 * np.eye(2)
-    prior = BirthPrior(START_NS, position, R, yaw_rad, 0.3, speed_mps, 2.0, yaw_rate_radps, 0.1, 0.0, 1.0)
+    prior = Start(START_NS, position, R, yaw_rad, 0.3, speed_mps, 2.0, yaw_rate_radps, 0.1, 0.0, 1.0)
     if name == "ekf-replay":
         return ReplayEkf(MOTION, prior, 1.0)
     settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)

@@ -18,7 +18,7 @@ import numpy as np
 import typer
 
 from fgtrack.core.types import FloatArray
-from fgtrack.io.run_folder import Run, read_run
+from fgtrack.io.run import Run, read_run
 from fgtrack.pipeline.config import ClockConfig, Config
 from fgtrack.pipeline.replay import replay
 from fgtrack.sim.delays import ConstantDelay

@@ -8,7 +8,7 @@ from fgtrack.cli.show import console
 from fgtrack.evaluation.labels import labelled
 from fgtrack.evaluation.metrics import Metrics, evaluate
 from fgtrack.evaluation.tables import comparison_dict, comparison_tables
-from fgtrack.io.run_folder import Run, write_metrics
+from fgtrack.io.run import Run, write_metrics
 
 
 def compare(runs: Runs, as_json: Json = False) -> None:

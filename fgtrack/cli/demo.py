@@ -13,13 +13,13 @@ from fgtrack.cli.show import TickProgress, console, progress
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.figures import save_figures
 from fgtrack.evaluation.tables import comparison_tables
-from fgtrack.io.bag_writer import write_bag
-from fgtrack.io.run_folder import read_run
+from fgtrack.io.ros.bag_writer import write_bag
+from fgtrack.io.run import read_run
 from fgtrack.io.source import open_input
+from fgtrack.models.oval import OVAL
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_each
 from fgtrack.sim.paper import paper_scenario
-from fgtrack.sim.scenario import OVAL
 from fgtrack.sim.simulate import simulate
 from fgtrack.tracking.association import GatedEuclidean
 from fgtrack.tracking.birth import MeasuredBirth

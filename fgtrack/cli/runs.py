@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from fgtrack.core.errors import CallError
-from fgtrack.io.run_folder import Run, is_run_folder, read_run
+from fgtrack.io.run import Run, is_run_folder, read_run
 
 
 def read_runs(paths: list[Path]) -> list[Run]:

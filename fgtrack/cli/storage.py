@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from fgtrack.core.types import Message
-from fgtrack.io.bag_writer import write_bag
+from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.stream import write_stream
 
 

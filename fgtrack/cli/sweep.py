@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from fgtrack.cli.show import console
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.run_folder import Run
+from fgtrack.io.run import Run
 from fgtrack.pipeline.sweep import Scores, Sweep
 from fgtrack.pipeline.sweep_plan import load_plan
 from fgtrack.pipeline.sweep_store import ERROR_TABLE, SWEEP_TABLE, Cell, Scalar, SweepResult

@@ -14,8 +14,8 @@ import numpy as np
 
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
-from fgtrack.estimation.base import BirthPrior, Measurement, StatesAt, UpdateResult, UpdateStatus, no_states
-from fgtrack.estimation.birth import birth_state
+from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
+from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import correct
 from fgtrack.estimation.propagation import Propagator, wrapped_yaw
 
@@ -202,16 +202,16 @@ class BackwardForwardBank:
             corrected = correct(means, covariances, z, R, model, measurements[0].pose, residual)
         except np.linalg.LinAlgError:
             return self._update_one_by_one(track_ids, means, covariances, measurements, back)
-        settled = self._propagator.settle(corrected.mean)
-        flat = corrected.covariance.reshape(len(settled), -1)
-        finite = np.isfinite(np.vecdot(settled, settled) + np.vecdot(flat, flat)).tolist()
+        wrapped = self._propagator.wrap(corrected.mean)
+        flat = corrected.covariance.reshape(len(wrapped), -1)
+        finite = np.isfinite(np.vecdot(wrapped, wrapped) + np.vecdot(flat, flat)).tolist()
         results = []
         for row, (track_id, measurement) in enumerate(zip(track_ids, measurements, strict=True)):
             if not finite[row]:
                 results.append(UpdateResult(UpdateStatus.FAILED))
                 continue
             storage = self._objects[track_id]
-            storage.put(Anchor(self._grid - back, self._visible_from(back), settled[row], corrected.covariance[row]))
+            storage.put(Anchor(self._grid - back, self._visible_from(back), wrapped[row], corrected.covariance[row]))
             late = storage.newest_fused_ns > measurement.stamp_ns
             storage.newest_fused_ns = max(storage.newest_fused_ns, measurement.stamp_ns)
             status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
@@ -238,12 +238,12 @@ class BackwardForwardBank:
         """Grid index from which a look-up finds a state corrected `back` steps ago."""
         return self._grid - back
 
-    def birth(self, track_id: int, prior: BirthPrior) -> None:
+    def birth(self, track_id: int, prior: Start) -> None:
         """Start an object on the grid stamp nearest to its first detection."""
         back = max(round((self._grid_ns - prior.stamp_ns) / self._step_ns), 0)
         start = self._grid - back
-        mean, covariance = birth_state(self._propagator.motion, prior)
-        anchor = Anchor(start, start, self._propagator.settle(mean), covariance)
+        mean, covariance = initial_state(self._propagator.motion, prior)
+        anchor = Anchor(start, start, self._propagator.wrap(mean), covariance)
         self._objects[track_id] = _Storage([anchor], start, prior.stamp_ns)
         self._objects[track_id].trim(self._grid - self._length + 1)
         self._cached.clear()

@@ -49,7 +49,7 @@ class UpdateResult:
 
 
 @dataclass(frozen=True, slots=True)
-class BirthPrior:
+class Start:
     """What is known of a new object at its first stamp; standard deviations beside the values.
 
     `yaw_rad` None means that the direction of travel is unknown.
@@ -110,7 +110,7 @@ class TrackBank(Protocol):
     ) -> list[UpdateResult]:
         """Fuse one measurement for each of `track_ids`, all of the same stamp."""
 
-    def birth(self, track_id: int, prior: BirthPrior) -> None:
+    def birth(self, track_id: int, prior: Start) -> None:
         """Start a track at the prior's stamp."""
 
     def remove(self, track_id: int) -> None:

@@ -4,11 +4,11 @@ import numpy as np
 
 from fgtrack.core.linalg import symmetrise
 from fgtrack.core.types import ACCEL, SPEED, YAW, YAW_RATE, FloatArray
-from fgtrack.estimation.base import BirthPrior
+from fgtrack.estimation.base import Start
 from fgtrack.models.motion import MotionModel
 
 
-def birth_state(motion: MotionModel, prior: BirthPrior) -> tuple[FloatArray, FloatArray]:
+def initial_state(motion: MotionModel, prior: Start) -> tuple[FloatArray, FloatArray]:
     """Mean (n,) and covariance (n, n), in the state of `motion`, of what `prior` knows.
 
     Where the direction of travel is unknown, a Cartesian model starts with an isotropic velocity of mean zero; a

@@ -12,13 +12,13 @@ import numpy as np
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.base import BirthPrior, Measurement
-from fgtrack.estimation.birth import birth_state
+from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.birth import initial_state
 from fgtrack.models.motion import MotionModel
 
 
 def dense_joint(
-    motion: MotionModel, prior: BirthPrior, measurements: Sequence[Measurement], stamps_ns: Iterable[int]
+    motion: MotionModel, prior: Start, measurements: Sequence[Measurement], stamps_ns: Iterable[int]
 ) -> dict[int, TrackState]:
     """States at `stamps_ns` (from the prior's stamp on) given all `measurements`, by stamp.
 
@@ -57,9 +57,9 @@ def dense_joint(
     }
 
 
-def _moments(motion: MotionModel, prior: BirthPrior, stamps_ns: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+def _moments(motion: MotionModel, prior: Start, stamps_ns: Sequence[int]) -> tuple[FloatArray, FloatArray]:
     """Prior mean m (N, n) of the states at `stamps_ns`, and how they depend on u: M (N, n, N n)."""
-    mean, covariance = birth_state(motion, prior)
+    mean, covariance = initial_state(motion, prior)
     n, count = motion.dim, len(stamps_ns)
     m, M = np.zeros((count, n)), np.zeros((count, n, count * n))
     m[0], M[0, :, :n] = mean, np.linalg.cholesky(covariance)

@@ -7,9 +7,9 @@ import numpy as np
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import (
-    BirthPrior,
     Estimator,
     Measurement,
+    Start,
     StatesAt,
     UpdateResult,
     no_states,
@@ -31,7 +31,7 @@ class ObjectBank:
         Length of the estimators' windows.
     """
 
-    def __init__(self, motion: MotionModel, start: Callable[[BirthPrior], Estimator], lag_s: float) -> None:
+    def __init__(self, motion: MotionModel, start: Callable[[Start], Estimator], lag_s: float) -> None:
         self._motion = motion
         self._start = start
         self._lag_ns = nanoseconds(lag_s)
@@ -77,7 +77,7 @@ class ObjectBank:
             for track_id, measurement in zip(track_ids, measurements, strict=True)
         ]
 
-    def birth(self, track_id: int, prior: BirthPrior) -> None:
+    def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
         self._estimators[track_id] = self._start(prior)
 

@@ -26,7 +26,7 @@ class Propagator(Protocol):
     ) -> tuple[FloatArray, FloatArray]:
         """States (m, n) and (m, n, n), each after its own number of `steps` (m,) of `dt_s`; yaw is not wrapped."""
 
-    def settle(self, mean: FloatArray) -> FloatArray:
+    def wrap(self, mean: FloatArray) -> FloatArray:
         """Means, shape (..., n), with the angles brought back to their range after a correction."""
 
     def residual(self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
@@ -46,8 +46,8 @@ class ExactPropagator:
         """See `Propagator.propagate`."""
         return predict(mean, covariance, self.motion, steps * np.float64(dt_s))
 
-    def settle(self, mean: FloatArray) -> FloatArray:
-        """See `Propagator.settle`."""
+    def wrap(self, mean: FloatArray) -> FloatArray:
+        """See `Propagator.wrap`."""
         return wrapped_yaw(mean) if self._yawed else mean
 
     def residual(self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
@@ -161,8 +161,8 @@ class EulerCtrv:
         """Speed of each object after `elapsed_s`, (k,) or (m, k); shape (m, k) or (m, 1)."""
         return mean[:, SPEED, None]
 
-    def settle(self, mean: FloatArray) -> FloatArray:
-        """See `Propagator.settle`."""
+    def wrap(self, mean: FloatArray) -> FloatArray:
+        """See `Propagator.wrap`."""
         return wrapped_yaw(mean)
 
     def residual(self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray) -> FloatArray:

@@ -43,11 +43,11 @@ class SaturatedYaw:
         stuck = np.minimum(after_first + rate * (elapsed_s - first_s), YAW_LIMIT_RAD)
         return np.where(elapsed_s > 0.0, stuck, yaw)
 
-    def settle(self, mean: FloatArray) -> FloatArray:
+    def wrap(self, mean: FloatArray) -> FloatArray:
         """Means with the yaw in the published range."""
-        settled = mean.copy()
-        settled[..., YAW] = published_yaw(mean[..., YAW])
-        return settled
+        wrapped = mean.copy()
+        wrapped[..., YAW] = published_yaw(mean[..., YAW])
+        return wrapped
 
     def residual(self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
         """Measured minus predicted, angles wrapped by one turn only: a yaw that has wound up stays off by turns."""

@@ -9,8 +9,8 @@ import numpy as np
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
-from fgtrack.estimation.base import BirthPrior, Measurement, UpdateResult, UpdateStatus
-from fgtrack.estimation.birth import birth_state
+from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
+from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import OneCorrection, correct_one, predict_one
 from fgtrack.models.motion import MotionModel
 
@@ -18,7 +18,7 @@ _Order = tuple[int, tuple[str, ...], tuple[float, ...]]
 
 
 @dataclass(slots=True)
-class _Step:
+class _Stored:
     """A measurement with the state after it."""
 
     order: _Order
@@ -43,12 +43,12 @@ class ReplayEkf:
         Length of the window behind the newest stamp or the clock.
     """
 
-    def __init__(self, motion: MotionModel, prior: BirthPrior, lag_s: float) -> None:
+    def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
         self._motion = motion
         self._yawed = "yaw_rad" in motion.state_names
         self._lag_ns = nanoseconds(lag_s)
-        mean, covariance = birth_state(motion, prior)
-        self._steps = [_Step((prior.stamp_ns, (), ()), None, mean, covariance)]
+        mean, covariance = initial_state(motion, prior)
+        self._steps = [_Stored((prior.stamp_ns, (), ()), None, mean, covariance)]
         self._start_ns = prior.stamp_ns
         self._newest_ns = prior.stamp_ns
 
@@ -90,7 +90,7 @@ class ReplayEkf:
         status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
         return UpdateResult(status, correction.innovation, correction.nis)
 
-    def _fused(self, before: _Step, order: _Order, measurement: Measurement) -> tuple[_Step, OneCorrection]:
+    def _fused(self, before: _Stored, order: _Order, measurement: Measurement) -> tuple[_Stored, OneCorrection]:
         """The step after `before` with `measurement`; `numpy.linalg.LinAlgError` where it is not finite."""
         mean, covariance = self._predicted(before, measurement.stamp_ns)
         corrected = correct_one(mean, covariance, measurement.z, measurement.R, measurement.model, measurement.pose)
@@ -99,18 +99,18 @@ class ReplayEkf:
             raise np.linalg.LinAlgError("posterior is not finite")
         if self._yawed:
             mean[YAW] = wrap_angle(mean[YAW])
-        return _Step(order, measurement, mean, covariance), corrected
+        return _Stored(order, measurement, mean, covariance), corrected
 
-    def _predicted(self, before: _Step, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
+    def _predicted(self, before: _Stored, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance at `stamp_ns`, from the step before it."""
         if stamp_ns == before.order[0]:
             return before.mean, before.covariance
         return predict_one(before.mean, before.covariance, self._motion, seconds(stamp_ns - before.order[0]))
 
 
-def _order(step: _Step) -> _Order:
+def _order(step: _Stored) -> _Order:
     return step.order
 
 
-def _stamp(step: _Step) -> int:
+def _stamp(step: _Stored) -> int:
     return step.order[0]

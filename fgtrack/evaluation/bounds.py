@@ -19,7 +19,7 @@ from fgtrack.models.motion import MotionModel
 
 
 @dataclass(frozen=True)
-class Planned:
+class ScheduledMeasurement:
     """A measurement that will be made: its value does not matter for a bound."""
 
     stamp_ns: int
@@ -53,7 +53,7 @@ def bounds(
     motion: MotionModel,
     start_ns: int,
     prior_covariance: FloatArray,
-    measurements: Sequence[Planned],
+    measurements: Sequence[ScheduledMeasurement],
     truth: Callable[[IntArray], FloatArray],
     now_ns: Sequence[int],
 ) -> Bounds:
@@ -96,7 +96,7 @@ def bounds_along(
     motion: MotionModel,
     start_ns: int,
     prior_covariance: FloatArray,
-    measurements: Sequence[Planned],
+    measurements: Sequence[ScheduledMeasurement],
     truth: Callable[[IntArray], FloatArray],
     now_ns: Sequence[int],
 ) -> Bounds:
@@ -111,7 +111,7 @@ def bounds_along(
     return Bounds(*(np.mean(covariances, axis=0) for covariances in zip(*each, strict=True)))
 
 
-def _chain_stamps(start_ns: int, measurements: Sequence[Planned], now_ns: Sequence[int]) -> IntArray:
+def _chain_stamps(start_ns: int, measurements: Sequence[ScheduledMeasurement], now_ns: Sequence[int]) -> IntArray:
     """All stamps that matter, ascending. Raises `ValueError` where one lies before the start."""
     stamps_ns = np.unique([start_ns, *(item.stamp_ns for item in measurements), *now_ns])
     if stamps_ns[0] < start_ns:
@@ -124,7 +124,7 @@ def _bounds(
     stamps_ns: IntArray,
     states: FloatArray,
     prior_covariance: FloatArray,
-    measurements: Sequence[Planned],
+    measurements: Sequence[ScheduledMeasurement],
     now_ns: Sequence[int],
 ) -> Bounds:
     """`bounds` from the true `states` (trajectories, s, n) at `stamps_ns` (s,)."""
@@ -150,7 +150,7 @@ class _Chain:
         stamps_ns: IntArray,
         states: FloatArray,
         information: FloatArray,
-        measurements: Sequence[Planned],
+        measurements: Sequence[ScheduledMeasurement],
     ) -> None:
         self._stamps_ns = stamps_ns
         self._start = information
@@ -201,13 +201,13 @@ def _segment(motion: MotionModel, states: FloatArray, dt_s: float) -> _Segment:
     return _Segment((weighted @ F).mean(axis=0), -weighted.mean(axis=0), weight.mean(axis=0))
 
 
-def _information(item: Planned, states: FloatArray) -> FloatArray:
+def _information(item: ScheduledMeasurement, states: FloatArray) -> FloatArray:
     """E[H' R^-1 H] over states (trajectories, n)."""
     H = item.model.jacobian(states, item.pose)
     return np.asarray((H.mT @ psd_solve(item.R, np.eye(len(item.R))) @ H).mean(axis=0))
 
 
-def _in_sequence(ordered: Sequence[Planned]) -> BoolArray:
+def _in_sequence(ordered: Sequence[ScheduledMeasurement]) -> BoolArray:
     """Which of the measurements, in order of stamps, arrive before everything that is sensed after them."""
     receipts_ns = np.array([item.receipt_ns for item in ordered], dtype=np.int64)
     later_ns = np.minimum.accumulate(receipts_ns[::-1])[::-1]

@@ -15,7 +15,7 @@ from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.identity import AT_GATE, similarities
 from fgtrack.evaluation.matching import NO_OBJECT, contested
 from fgtrack.evaluation.scenes import Scenes
-from fgtrack.io.run_folder import NO_TRACK
+from fgtrack.io.run import NO_TRACK
 
 _CONTINUATION = 1000.0  # a pair of the tick before weighs more than the similarities of all pairs together
 

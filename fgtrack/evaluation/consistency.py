@@ -11,7 +11,7 @@ from fgtrack.evaluation.nees import normalised_squares
 from fgtrack.evaluation.statistics import ChiSquareMean, Moments, chi_square_band
 from fgtrack.evaluation.truth import TRUE_STATE
 from fgtrack.evaluation.whiteness import Autocorrelation, autocorrelations
-from fgtrack.io.run_folder import Run
+from fgtrack.io.run import Run
 
 _POSITION, _POSE_AND_SPEED, _WITH_YAW_RATE = 2, 4, 5
 

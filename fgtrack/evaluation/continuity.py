@@ -6,7 +6,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, Disposition, FloatArray, IntArray
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, Matching
 from fgtrack.evaluation.truth import true_paths
-from fgtrack.io.run_folder import NO_TRACK, Run, Table
+from fgtrack.io.run import NO_TRACK, Run, Table
 
 #: What became of a detection that was fused later than in order.
 LATE = (Disposition.OUT_OF_SEQUENCE, Disposition.BEYOND_WINDOW)

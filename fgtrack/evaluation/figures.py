@@ -33,7 +33,7 @@ from fgtrack.evaluation.matching import (
 from fgtrack.evaluation.metrics import message_delays
 from fgtrack.evaluation.residuals import ANGULAR, RESIDUAL_NAMES, residuals
 from fgtrack.evaluation.statistics import Distribution, Moments
-from fgtrack.io.run_folder import Run
+from fgtrack.io.run import Run
 
 _QUANTITIES = {
     "position_m": "position error [m]",

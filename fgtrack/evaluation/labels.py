@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from fgtrack.core.errors import CallError
-from fgtrack.io.run_folder import Run
+from fgtrack.io.run import Run
 
 
 def labelled(runs: Sequence[Run]) -> dict[str, Run]:

@@ -12,7 +12,7 @@ from fgtrack.evaluation.matching import Matching, state_errors
 from fgtrack.evaluation.nees import normalised_squares
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.evaluation.truth import TRUE_STATE, TruePath, true_paths
-from fgtrack.io.run_folder import Run, Table
+from fgtrack.io.run import Run, Table
 
 WINDOW: Literal["window"] = "window"
 """The lag of a final state: the window's length, or less where the track ended before."""

@@ -10,10 +10,9 @@ from fgtrack.evaluation.figure_style import GREY, WRONG, broken_line, colour, le
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, Matching
 from fgtrack.evaluation.run_config import section
 from fgtrack.evaluation.truth import true_paths
-from fgtrack.io.run_folder import Run, Table
+from fgtrack.io.run import Run, Table
+from fgtrack.models.oval import OVAL, make_oval
 from fgtrack.models.track_map import TrackMap
-from fgtrack.sim.oval import make_oval
-from fgtrack.sim.scenario import OVAL
 
 _NAMED_OBJECTS = 8  # more objects than these share two entries of the legend
 

@@ -10,7 +10,7 @@ from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.evaluation.run_config import section
 from fgtrack.evaluation.truth import TRUE_STATE, TruePath, true_paths
-from fgtrack.io.run_folder import NO_TRACK, Run, Table
+from fgtrack.io.run import NO_TRACK, Run, Table
 
 CONFIRMED_MEASUREMENTS = 3
 """Measurements from which on a track counts: the "valid" tracks of Karle et al. 2023."""

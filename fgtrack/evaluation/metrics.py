@@ -17,7 +17,7 @@ from fgtrack.evaluation.multi_object import MultiObjectMetrics, multi_object_met
 from fgtrack.evaluation.options import EvaluationOptions, evaluation_options
 from fgtrack.evaluation.residuals import ANGULAR, RESIDUAL_NAMES, residuals
 from fgtrack.evaluation.statistics import ChiSquareMean, Distribution, Moments
-from fgtrack.io.run_folder import NO_TRACK, Run, Table
+from fgtrack.io.run import NO_TRACK, Run, Table
 
 FALSE_TRACK_SHARE = 0.5
 """A track that is paired to a true object in less than this share of its judged life is false."""

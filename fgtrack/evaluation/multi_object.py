@@ -8,7 +8,7 @@ from fgtrack.evaluation.identity import Frames, Hota, Identity
 from fgtrack.evaluation.matching import Matching
 from fgtrack.evaluation.options import EvaluationOptions
 from fgtrack.evaluation.scenes import scenes
-from fgtrack.io.run_folder import Run
+from fgtrack.io.run import Run
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from fgtrack.core.types import FloatArray
-from fgtrack.io.run_folder import Table
+from fgtrack.io.run import Table
 
 #: Components of a state in the order of the covariance columns; a part of them is always a leading one.
 _COMPONENTS = ("x", "y", "yaw", "speed", "yaw_rate")

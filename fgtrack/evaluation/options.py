@@ -5,7 +5,7 @@ from typing import Any
 
 from fgtrack.evaluation.matching import MatchOptions, run_options
 from fgtrack.evaluation.run_config import section
-from fgtrack.io.run_folder import Run
+from fgtrack.io.run import Run
 
 
 @dataclass(frozen=True)

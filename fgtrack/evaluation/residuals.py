@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from fgtrack.core.types import MEASURABLE, BoolArray, FloatArray
-from fgtrack.io.run_folder import Run
+from fgtrack.io.run import Run
 
 #: Every residual, in the order in which it is shown.
 RESIDUAL_NAMES = ("along_m", "across_m", *MEASURABLE)

@@ -8,7 +8,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from fgtrack.core.errors import DataError
-from fgtrack.io.run_folder import Run
+from fgtrack.io.run import Run
 
 
 def section(run: Run, name: str) -> Mapping[str, Any]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.evaluation.matching import Matching
-from fgtrack.io.run_folder import Run
+from fgtrack.io.run import Run
 
 
 @dataclass(frozen=True)

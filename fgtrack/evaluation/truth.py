@@ -7,7 +7,7 @@ import numpy as np
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.io.run_folder import Table
+from fgtrack.io.run import Table
 
 EGO_ID = -1
 """Object id of the ego in truth.csv."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from fgtrack.core.types import MEASURABLE, FloatArray
 from fgtrack.evaluation.statistics import NORMAL_95
-from fgtrack.io.run_folder import NO_TRACK, Table
+from fgtrack.io.run import NO_TRACK, Table
 
 LAGS = 10
 """Lags 1 to this many innovations are looked at."""

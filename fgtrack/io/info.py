@@ -11,11 +11,11 @@ from fgtrack.core.types import DetectionList, EgoState, Message
 from fgtrack.io.adapters.ego import ODOMETRY
 from fgtrack.io.adapters.native import NATIVE_ADAPTERS
 from fgtrack.io.adapters.objects import OBJECT_ADAPTERS
-from fgtrack.io.bag import Bag, BagTopic
 from fgtrack.io.config import InputConfig
 from fgtrack.io.errors import TruncatedInput
+from fgtrack.io.ros.bag import Bag, BagTopic
+from fgtrack.io.ros.topics import topic_uses
 from fgtrack.io.source import Kind, input_kind, open_input
-from fgtrack.io.topics import topic_uses
 
 _OTHER_CLOCK_S = 3600.0
 

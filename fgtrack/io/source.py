@@ -9,10 +9,10 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Frame, Message
 from fgtrack.io.adapters.autoferry import detections_file, read_scenario
 from fgtrack.io.adapters.fusiontracking import LOG_NAME, read_log
-from fgtrack.io.bag import Bag, is_bag_file, is_bag_folder
 from fgtrack.io.config import InputConfig
+from fgtrack.io.ros.bag import Bag, is_bag_file, is_bag_folder
+from fgtrack.io.ros.topics import TopicUse, bag_messages, topic_uses
 from fgtrack.io.stream import GZIP_MAGIC, read_stream
-from fgtrack.io.topics import TopicUse, bag_messages, topic_uses
 
 Kind = Literal["recording", "stream", "autoferry", "fusiontracking"]
 

@@ -31,7 +31,7 @@ from fgtrack.models.white_noise import WhiteNoise
 MIN_SPEED_MPS = 1e-3
 
 
-class Step(NamedTuple):
+class Prediction(NamedTuple):
     """One state after a duration: what `predict`, `jacobian` and `process_noise` give, at a fraction of the cost."""
 
     mean: list[float]
@@ -71,7 +71,7 @@ class MotionModel(Protocol):
         detection may split a segment. Raises `CallError` where `dt_s` is negative.
         """
 
-    def step(self, x: Sequence[float], dt_s: float) -> Step:
+    def step(self, x: Sequence[float], dt_s: float) -> Prediction:
         """The one state `x` after `dt_s` >= 0; F and Q are new arrays. Raises `CallError` where `dt_s` is negative."""
 
     def flow(self, x: Sequence[float], dt_s: float) -> tuple[list[float], FloatArray]:
@@ -139,15 +139,15 @@ class CTRV(WhiteNoise):
         root = np.swapaxes(roots, -3, -2).reshape(*roots.shape[:-3], self.dim, -1)
         return symmetrise(root @ np.swapaxes(root, -1, -2))
 
-    def step(self, x: Sequence[float], dt_s: float) -> Step:
+    def step(self, x: Sequence[float], dt_s: float) -> Prediction:
         """See `MotionModel.step`; fast up to a turn of `MAX_SMALL_TURN_RAD`."""
         if dt_s < 0.0:
             raise _backwards(dt_s)
         arc = small_turn(x[YAW], x[YAW_RATE], dt_s)
         if arc is None:
-            return Step(*self.flow(x, dt_s), self.process_noise(np.array(x, dtype=np.float64), dt_s))
+            return Prediction(*self.flow(x, dt_s), self.process_noise(np.array(x, dtype=np.float64), dt_s))
         mean, F = self._along(x, dt_s, arc.moments)
-        return Step(mean, F, small_turn_noise(arc, dt_s, self._densities, x[SPEED], *x[ACCEL:]))
+        return Prediction(mean, F, small_turn_noise(arc, dt_s, self._densities, x[SPEED], *x[ACCEL:]))
 
     def flow(self, x: Sequence[float], dt_s: float) -> tuple[list[float], FloatArray]:
         """See `MotionModel.flow`; fast up to a turn of `MAX_SMALL_TURN_RAD`."""
@@ -279,7 +279,7 @@ class CV(WhiteNoise):
         Q[..., 2, 2] = Q[..., 3, 3] = velocity
         return Q
 
-    def step(self, x: Sequence[float], dt_s: float) -> Step:
+    def step(self, x: Sequence[float], dt_s: float) -> Prediction:
         """See `MotionModel.step`."""
         if dt_s < 0.0:
             raise _backwards(dt_s)
@@ -288,7 +288,7 @@ class CV(WhiteNoise):
         Q[0, 0] = Q[1, 1] = position
         Q[0, 2] = Q[2, 0] = Q[1, 3] = Q[3, 1] = shared
         Q[2, 2] = Q[3, 3] = velocity
-        return Step(*self.flow(x, dt_s), Q)
+        return Prediction(*self.flow(x, dt_s), Q)
 
     def flow(self, x: Sequence[float], dt_s: float) -> tuple[list[float], FloatArray]:
         """See `MotionModel.flow`."""

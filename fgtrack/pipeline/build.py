@@ -9,9 +9,9 @@ import numpy as np
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import period_ns, seconds
 from fgtrack.estimation.backward_forward import BackwardForwardBank
-from fgtrack.estimation.base import BirthPrior, Estimator, TrackBank
+from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherBank
-from fgtrack.estimation.factor_graph.backend import Backend
+from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.oosm import OOSM_METHODS
 from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator, Propagator
@@ -25,11 +25,11 @@ from fgtrack.estimation.published import (
 )
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.motion import MotionModel
+from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.published_map import CircularHeadingMap, PublishedMap, PublishedRoad
 from fgtrack.models.road import FrenetRoad, OpenSpace, Road
 from fgtrack.models.track_map import TrackMap
 from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
-from fgtrack.sim.oval import make_oval, make_pit_lane
 from fgtrack.tracking.ego import EgoSource, EgoTrajectory
 from fgtrack.tracking.inbox import Inbox, QueueInbox
 from fgtrack.tracking.lifecycle import CountingLifecycle, Lifecycle
@@ -92,7 +92,7 @@ def build_road(config: MapConfig) -> Road:
 
 
 def _read_map(name: str, built_in: Callable[[], TrackMap]) -> TrackMap:
-    if name == "oval":
+    if name == OVAL:
         return built_in()
     if not Path(name).is_file():
         raise CallError(f"{name}: there is no such map file")
@@ -106,7 +106,7 @@ def _build_backward_forward(config: Config) -> TrackBank:
     return storage(build_propagator(config.motion, seconds(step_ns)), step_ns, steps)
 
 
-def _build_objects(start: Callable[[MotionModel, BirthPrior, float], Estimator], config: Config) -> TrackBank:
+def _build_objects(start: Callable[[MotionModel, Start, float], Estimator], config: Config) -> TrackBank:
     motion, lag_s = config.motion.model(), config.filter.storage_s
     return ObjectBank(motion, lambda prior: start(motion, prior, lag_s), lag_s)
 
@@ -114,7 +114,7 @@ def _build_objects(start: Callable[[MotionModel, BirthPrior, float], Estimator],
 def _build_smoother(config: Config, make_backend: Callable[[], Backend]) -> TrackBank:
     motion, settings = config.motion.model(), config.smoother
 
-    def start(prior: BirthPrior) -> FixedLagSmoother:
+    def start(prior: Start) -> FixedLagSmoother:
         return FixedLagSmoother(motion, prior, settings, make_backend)
 
     return SmootherBank(motion, start, settings)

@@ -9,14 +9,14 @@ import numpy as np
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import DetectionList, EgoState, Message
-from fgtrack.estimation.factor_graph.offsets import OffsetSettings, OffsetSolution, solve_offsets
-from fgtrack.estimation.factor_graph.timed import Sighting
+from fgtrack.estimation.factor_graph.clock_calibration.offsets import OffsetSettings, OffsetSolution, solve_offsets
+from fgtrack.estimation.factor_graph.clock_calibration.time_shift import ShiftableMeasurement
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.ego_path import EgoPath
+from fgtrack.pipeline.offset_measurements import Remeasure, measurements_by_track
 from fgtrack.pipeline.replay import replay_in_memory
-from fgtrack.pipeline.sightings import Remeasure, sightings_by_track
 
-Track = Sequence[Sighting]
+Track = Sequence[ShiftableMeasurement]
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def estimate_offsets(
     if reference is not None and reference not in sensors:
         raise CallError(f"reference {reference!r} is no sensor of the input, which has {', '.join(sensors)}")
     remeasure = Remeasure(config, _path(heard, raw, rules))
-    tracks = sightings_by_track(run, raw, raw, config.sensors, remeasure)
+    tracks = measurements_by_track(run, raw, raw, config.sensors, remeasure)
     reference = reference or _most_seen(tracks, sensors)
     used = _chosen(tracks, reference, rules)
     solution = _solution(used, reference, config, rules, {})
@@ -125,7 +125,7 @@ def estimate_offsets(
         corrected = [_restamped(message, known_s) for message in heard]
         run, _ = replay_in_memory(corrected, config)
         used = _chosen(
-            sightings_by_track(run, _lists(corrected, config), raw, config.sensors, remeasure), reference, rules
+            measurements_by_track(run, _lists(corrected, config), raw, config.sensors, remeasure), reference, rules
         )
         solution = _solution(used, reference, config, rules, known_s)
     counts = Counter(item.sensor for track in used for item in track)
@@ -195,9 +195,9 @@ def _solution(
 def _known(solution: OffsetSolution, rules: OffsetRules) -> dict[str, float]:
     """Offsets that are good enough to correct stamps by."""
     limit_s = rules.max_prior_share * rules.solver.prior_std_s
-    columns = solution.offsets_s.tolist(), np.sqrt(np.diag(solution.covariance)).tolist(), solution.settled.tolist()
+    columns = solution.offsets_s.tolist(), np.sqrt(np.diag(solution.covariance)).tolist(), solution.converged.tolist()
     rows = zip(solution.sensors, *columns, strict=True)
-    return {name: offset_s for name, offset_s, std_s, settled in rows if settled and std_s < limit_s}
+    return {name: offset_s for name, offset_s, std_s, converged in rows if converged and std_s < limit_s}
 
 
 def _restamped(message: EgoState | DetectionList, offsets_s: Mapping[str, float]) -> EgoState | DetectionList:
@@ -228,7 +228,7 @@ def _row(
     residual = _residual(solution, name)
     place = solution.sensors.index(name)
     speed = f"objects move {solution.speeds_mps[name]:.2g} m/s (rms) in its frame"
-    if not solution.settled[place]:
+    if not solution.converged[place]:
         return SensorOffset(name, None, None, count, False, f"nothing holds the estimate: {speed}", residual)
     offset_s, std_s = float(solution.offsets_s[place]), float(np.sqrt(solution.covariance[place, place]))
     information = max(std_s**-2 - rules.solver.prior_std_s**-2, 0.0)

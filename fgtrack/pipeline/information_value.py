@@ -12,7 +12,7 @@ from fgtrack.estimation.base import Estimator, Measurement, UpdateStatus
 
 
 @dataclass(frozen=True, slots=True)
-class Arrival:
+class ReceivedMeasurement:
     """A measurement that is known to be of the object, and when it arrives."""
 
     sensor: str
@@ -42,7 +42,7 @@ class InformationValue:
 
 def information_values(
     estimator: Estimator,
-    arrivals: Iterable[Arrival],
+    arrivals: Iterable[ReceivedMeasurement],
     true_position: Callable[[int], FloatArray | None] | None = None,
 ) -> Iterator[InformationValue]:
     """Feed `arrivals`, in order of receipt, to `estimator`; the value of each for the present, its receipt.

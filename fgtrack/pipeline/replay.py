@@ -10,7 +10,7 @@ from pathlib import Path
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import seconds
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
-from fgtrack.io.run_folder import MemoryRun, Run, RunWriter
+from fgtrack.io.run import MemoryRun, Run, RunWriter
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, Tick, listed_ticks, message_ticks, node_ticks, read_ticks
 from fgtrack.pipeline.config import ClockConfig, Config

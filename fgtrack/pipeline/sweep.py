@@ -18,7 +18,7 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError  # type
 
 from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.core.types import Message
-from fgtrack.io.run_folder import Run
+from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import validate

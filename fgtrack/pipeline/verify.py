@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.base import BirthPrior, Estimator, Measurement, UpdateStatus
+from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
 from fgtrack.estimation.dense_joint import Difference, dense_joint, difference, rounding_bound
 from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
@@ -43,7 +43,7 @@ _TINY = MappingProxyType({"yaw_rad": 1e-7, "speed_mps": 1e-7, "yaw_rate_radps": 
 class Subject:
     """An estimator that promises to be exact."""
 
-    start: Callable[[MotionModel, BirthPrior, float], Estimator]
+    start: Callable[[MotionModel, Start, float], Estimator]
     """Makes one, with a window of that many seconds."""
     linear_bar: float
     """Largest difference to the dense joint in a linear model."""
@@ -125,7 +125,7 @@ class _Stream:
 
     name: str
     motion: MotionModel
-    prior: BirthPrior
+    prior: Start
     measurements: tuple[Measurement, ...]
     orders: Mapping[str, Sequence[int]]
     lag_s: float
@@ -143,19 +143,19 @@ class _Stream:
         return sorted({*past[:: max(len(past) // 5, 1)], (past[0] + self.newest_ns) // 2})
 
 
-def _start_replay(motion: MotionModel, prior: BirthPrior, lag_s: float) -> ReplayEkf:
+def _start_replay(motion: MotionModel, prior: Start, lag_s: float) -> ReplayEkf:
     return ReplayEkf(motion, prior, lag_s)
 
 
 def _start_incremental(
-    relinearise: Mapping[str, float], motion: MotionModel, prior: BirthPrior, lag_s: float
+    relinearise: Mapping[str, float], motion: MotionModel, prior: Start, lag_s: float
 ) -> FixedLagSmoother:
     settings = SmootherSettings(lag_s=lag_s, ring_s=_RING_S, relinearise=relinearise, lagged_s=())
     thresholds = settings.thresholds(motion.state_names, curved=False)
     return FixedLagSmoother(motion, prior, settings, lambda: IncrementalBackend(thresholds))
 
 
-def _start_batch(motion: MotionModel, prior: BirthPrior, lag_s: float) -> FixedLagSmoother:
+def _start_batch(motion: MotionModel, prior: Start, lag_s: float) -> FixedLagSmoother:
     settings = SmootherSettings(lag_s=lag_s, ring_s=_RING_S, lagged_s=())
     return FixedLagSmoother(motion, prior, settings, BatchBackend)
 
@@ -313,7 +313,7 @@ def _stream(
 ) -> _Stream:
     """Truth with the motion model's own noise, measured as `plan` says; in the random order up to `reach_s` late."""
     stamps_s, sensors = plan
-    prior = BirthPrior(_START_NS, np.array([20.0, -5.0]), np.eye(2), 0.6, 0.35, 65.0, 3.0, 0.1, 0.1, 0.0, 1.0)
+    prior = Start(_START_NS, np.array([20.0, -5.0]), np.eye(2), 0.6, 0.35, 65.0, 3.0, 0.1, 0.1, 0.0, 1.0)
     x = motion.from_kinematic(np.array([20.0, -5.0, 0.6, 65.0, 0.1, 0.0]), np.zeros((6, 6)))[0]
     measurements, last_s = [], 0.0
     for stamp_s, sensor in zip(stamps_s.tolist(), sensors.tolist(), strict=True):

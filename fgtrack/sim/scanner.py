@@ -17,7 +17,7 @@ from fgtrack.sim.sensor import POLAR, SimulatedSensor
 
 
 @dataclass(frozen=True, eq=False)
-class _Sightings:
+class _Detected:
     """m detections of one sensor: the scan of each, its values, and a random key that shuffles a scan."""
 
     scan: IntArray
@@ -25,9 +25,9 @@ class _Sightings:
     key: FloatArray
 
 
-def _joined(parts: Sequence[_Sightings]) -> _Sightings:
-    """All sightings of `parts`."""
-    return _Sightings(
+def _joined(parts: Sequence[_Detected]) -> _Detected:
+    """All detected of `parts`."""
+    return _Detected(
         scan=np.concatenate([part.scan for part in parts]),
         z=np.concatenate([part.z for part in parts]),
         key=np.concatenate([part.key for part in parts]),
@@ -53,14 +53,14 @@ class Scanner:
         clutter_rng, objects_rng = rng.spawn(2)
         children = objects_rng.spawn(len(objects))
         seen = [self._see(child, states) for child, states in zip(children, objects, strict=True)]
-        sightings = _joined([self._clutter(clutter_rng, track), *seen])
-        order = np.lexsort((sightings.key, sightings.scan))
+        detected = _joined([self._clutter(clutter_rng, track), *seen])
+        order = np.lexsort((detected.key, detected.scan))
         components = self.sensor.components
-        detections = [Detection(**dict(zip(components, row, strict=True))) for row in sightings.z[order].tolist()]
-        bounds = np.searchsorted(sightings.scan[order], np.arange(len(self.ego) + 1)).tolist()
+        detections = [Detection(**dict(zip(components, row, strict=True))) for row in detected.z[order].tolist()]
+        bounds = np.searchsorted(detected.scan[order], np.arange(len(self.ego) + 1)).tolist()
         return [tuple(detections[a:b]) for a, b in pairwise(bounds)]
 
-    def _see(self, rng: np.random.Generator, states: FloatArray) -> _Sightings:
+    def _see(self, rng: np.random.Generator, states: FloatArray) -> _Detected:
         """Sightings of one object: none, one or two (a split) in every scan."""
         sensor, n = self.sensor, len(states)
         everything = np.arange(n)
@@ -73,10 +73,10 @@ class Scanner:
             moved[:, X] += sign * shift_m * np.cos(states[:, YAW])
             moved[:, Y] += sign * shift_m * np.sin(states[:, YAW])
             z = self._add_noise(rng, everything, moved)
-            parts.append(_Sightings(everything[present], z[present], rng.random(n)[present]))
+            parts.append(_Detected(everything[present], z[present], rng.random(n)[present]))
         return _joined(parts)
 
-    def _clutter(self, rng: np.random.Generator, track: TrackMap | None) -> _Sightings:
+    def _clutter(self, rng: np.random.Generator, track: TrackMap | None) -> _Detected:
         """Sightings of ghosts, measured without noise."""
         sensor, clutter = self.sensor, self.sensor.clutter
         scan = np.repeat(np.arange(len(self.ego)), rng.poisson(clutter.mean_per_scan, len(self.ego)))
@@ -98,7 +98,7 @@ class Scanner:
             ghosts[:, YAW] = rng.uniform(-math.pi, math.pi, m)
         ghosts[:, SPEED] = rng.uniform(*clutter.speed_mps, m)
         visible = self._visible(scan, ghosts)
-        return _Sightings(scan[visible], self._measure(scan, ghosts)[visible], rng.random(m)[visible])
+        return _Detected(scan[visible], self._measure(scan, ghosts)[visible], rng.random(m)[visible])
 
     def _add_noise(self, rng: np.random.Generator, scan: IntArray, states: FloatArray) -> FloatArray:
         """Noisy measurements of `states`, shape (m, k)."""

@@ -2,13 +2,11 @@
 
 from dataclasses import dataclass, field
 
+from fgtrack.models.oval import OVAL
 from fgtrack.sim.delays import AnyDelay, ConstantDelay
 from fgtrack.sim.require import require
 from fgtrack.sim.sensor import SimulatedSensor
 from fgtrack.sim.vehicles import AnyVehicle, TrackVehicle
-
-#: Value of `Scenario.map` that stands for the track of `fgtrack.sim.oval.make_oval`.
-OVAL = "oval"
 
 
 @dataclass(frozen=True)

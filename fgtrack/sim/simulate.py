@@ -22,13 +22,13 @@ from fgtrack.core.types import (
     X,
     Y,
 )
+from fgtrack.models.oval import OVAL, make_oval
+from fgtrack.models.path import Path
 from fgtrack.models.track_map import TrackMap
 from fgtrack.sim.clocks import ClockModel, reported_stamps
 from fgtrack.sim.delays import DelayModel
-from fgtrack.sim.oval import make_oval
-from fgtrack.sim.path import Path
 from fgtrack.sim.scanner import Scanner
-from fgtrack.sim.scenario import OVAL, Scenario
+from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.sensor import SimulatedSensor
 from fgtrack.sim.vehicles import AnyVehicle, DrawnVehicle, Trajectory
 

@@ -12,7 +12,7 @@ from scipy.interpolate import CubicHermiteSpline
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import STATE_NAMES, YAW, FloatArray
 from fgtrack.models.motion import CTRV
-from fgtrack.sim.path import Path
+from fgtrack.models.path import Path
 from fgtrack.sim.require import require
 
 

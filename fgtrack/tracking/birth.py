@@ -9,7 +9,7 @@ import numpy as np
 
 from fgtrack.core.geometry import rotation
 from fgtrack.core.types import EgoState, FloatArray
-from fgtrack.estimation.base import BirthPrior
+from fgtrack.estimation.base import Start
 from fgtrack.models.road import Road
 from fgtrack.tracking.preprocess import Candidate
 
@@ -20,7 +20,7 @@ UNKNOWN_YAW_STD_RAD = math.pi / math.sqrt(3.0)
 class Birth(Protocol):
     """Makes the first state of a track."""
 
-    def prior(self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool) -> BirthPrior | None:
+    def prior(self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool) -> Start | None:
         """Prior at the candidate's stamp; None where it has no position to start from."""
 
 
@@ -50,7 +50,7 @@ class Assumptions:
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name}: must be positive, is {getattr(self, name)}")
 
-    def prior(self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool) -> BirthPrior | None:
+    def prior(self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool) -> Start | None:
         """See `Birth.prior`: what was measured, then map heading, road curvature and a share of the ego speed."""
         if candidate.position_m is None:
             return None
@@ -59,7 +59,7 @@ class Assumptions:
         speed_mps = candidate.values.get("speed_mps", assumed_mps)
         slow = ego is not None and ego.speed_mps < self.slow_ego_mps
         deviations = self.deviations(candidate, yaw_rad or 0.0)
-        return BirthPrior(
+        return Start(
             stamp_ns=candidate.measurement.stamp_ns,
             position_m=candidate.position_m,
             position_covariance=deviations.position_covariance,

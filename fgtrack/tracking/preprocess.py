@@ -101,7 +101,7 @@ class NoMerge:
 
 
 @dataclass(frozen=True, slots=True)
-class Located:
+class _MapDetection:
     """A detection with its components in the map frame."""
 
     index: int
@@ -152,7 +152,7 @@ class Preprocess:
             ego.speed_mps * s,
         )
 
-    def _locate(self, index: int, batch: Batch, sensor: SensorModel, pose: SensorPose) -> Located:
+    def _locate(self, index: int, batch: Batch, sensor: SensorModel, pose: SensorPose) -> _MapDetection:
         detection = batch.message.objects[index]
         values: dict[str, float] = {}
         for name in sensor.std:
@@ -164,16 +164,16 @@ class Preprocess:
                 values["x_m"], values["y_m"] = _in_map(values["x_m"], values["y_m"], pose)
                 if "yaw_rad" in values:
                     values["yaw_rad"] = wrap_angle(values["yaw_rad"] + pose.yaw_rad)
-            return Located(index, values, (values["x_m"], values["y_m"]))
+            return _MapDetection(index, values, (values["x_m"], values["y_m"]))
         if "range_m" not in values:
-            return Located(index, values, None)
+            return _MapDetection(index, values, None)
         range_m, bearing_rad = values["range_m"], values["bearing_rad"]
         ahead, left = range_m * math.cos(bearing_rad), range_m * math.sin(bearing_rad)
-        return Located(index, values, _in_map(ahead, left, pose))
+        return _MapDetection(index, values, _in_map(ahead, left, pose))
 
     def _on_road(
-        self, located: list[Located], batch: Batch, sensor: SensorModel
-    ) -> tuple[list[Located], list[UpdateRecord]]:
+        self, located: list[_MapDetection], batch: Batch, sensor: SensorModel
+    ) -> tuple[list[_MapDetection], list[UpdateRecord]]:
         """Drop what lies outside the bounds, and take the map heading for a yaw that was not measured."""
         placed = [item for item in located if item.point_m is not None]
         if not self._road.known or not placed:
@@ -190,7 +190,7 @@ class Preprocess:
         return [item for item in located if item.index not in gone], records
 
     def _candidates(
-        self, located: list[Located], batch: Batch, sensor: SensorModel, pose: SensorPose
+        self, located: list[_MapDetection], batch: Batch, sensor: SensorModel, pose: SensorPose
     ) -> list[Candidate]:
         placed = [item for item in located if item.point_m is not None]
         groups = self._merge.groups(np.array([item.point_m for item in placed]).reshape(-1, 2))
@@ -210,7 +210,7 @@ class Preprocess:
         self,
         index: int,
         merged: tuple[int, ...],
-        parts: Sequence[Located],
+        parts: Sequence[_MapDetection],
         batch: Batch,
         sensor: SensorModel,
         pose: SensorPose,
@@ -251,8 +251,8 @@ class Preprocess:
 
 
 def _in_range(
-    located: list[Located], batch: Batch, sensor: SensorModel, pose: SensorPose
-) -> tuple[list[Located], list[UpdateRecord]]:
+    located: list[_MapDetection], batch: Batch, sensor: SensorModel, pose: SensorPose
+) -> tuple[list[_MapDetection], list[UpdateRecord]]:
     """Drop what lies further from the sensor than it can be trusted."""
     limit_m = sensor.max_range_m
     if limit_m is None:
@@ -266,7 +266,7 @@ def _in_range(
     return [item for item in located if item.index not in far], records
 
 
-def _common_names(parts: Sequence[Located]) -> tuple[str, ...]:
+def _common_names(parts: Sequence[_MapDetection]) -> tuple[str, ...]:
     return _in_order(frozenset(parts[0].values).intersection(*[part.values for part in parts[1:]]))
 
 
@@ -286,7 +286,7 @@ def _covariance(
     sensor: SensorModel,
     R: FloatArray,
     names: tuple[str, ...],
-    item: Located,
+    item: _MapDetection,
     batch: Batch,
     pose: SensorPose,
 ) -> FloatArray:

@@ -13,10 +13,10 @@ from typing import Literal
 
 import numpy as np
 
-from fgtrack.estimation.base import BirthPrior, Estimator
+from fgtrack.estimation.base import Estimator, Start
 from fgtrack.estimation.dense_joint import rounding_bound
 from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherSettings
-from fgtrack.estimation.factor_graph.backend import Backend
+from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.oosm import AccumulatedStateDensity
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
@@ -30,11 +30,11 @@ TINY = dict.fromkeys(("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "a
 """Relinearisation thresholds at which the smoother of a nonlinear model follows every move."""
 
 Late = Literal["fuse", "drop", "raise"]
-Start = Callable[[MotionModel, SmootherSettings], Estimator]
+StartEstimator = Callable[[MotionModel, SmootherSettings], Estimator]
 
 
-def prior() -> BirthPrior:
-    return BirthPrior(START_NS, np.array([3.0, -2.0]), np.diag([0.5, 0.5]), 0.4, 0.3, 20.0, 3.0, 0.1, 0.3, 0.0, 1.0)
+def prior() -> Start:
+    return Start(START_NS, np.array([3.0, -2.0]), np.diag([0.5, 0.5]), 0.4, 0.3, 20.0, 3.0, 0.1, 0.3, 0.0, 1.0)
 
 
 def settings(lag_s: float = LAG_S, late: Late = "fuse", ring_s: float = 10.0) -> SmootherSettings:
@@ -66,7 +66,7 @@ def smoother(motion: MotionModel, chosen: SmootherSettings, make_backend: Callab
 class Subject:
     """An estimator under the contract."""
 
-    start: Start
+    start: StartEstimator
     smooths: bool
     """Whether a state of the past knows later measurements; a filter's does not."""
     linear_bar: float
@@ -83,7 +83,7 @@ class Subject:
         return max(self.linear_bar, self.rounding * rounding_bound(motion, [START_NS, *stamps_ns]))
 
 
-def _smoother(make: Callable[[MotionModel], Backend]) -> Start:
+def _smoother(make: Callable[[MotionModel], Backend]) -> StartEstimator:
     return lambda motion, chosen: smoother(motion, chosen, lambda: make(motion))
 
 

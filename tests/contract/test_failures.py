@@ -13,7 +13,7 @@ from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, UpdateStatus
 from fgtrack.estimation.dense_joint import difference
 from fgtrack.estimation.factor_graph import FixedLagSmoother
-from fgtrack.estimation.factor_graph.backend import Backend, Change
+from fgtrack.estimation.factor_graph.backends.base import Backend, Change
 from fgtrack.models.motion import CV, MotionModel
 
 When = Literal["before", "after"]

@@ -13,8 +13,8 @@ from support.messages import shared
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import STATE_NAMES
-from fgtrack.io.run_folder import Run, read_run
-from fgtrack.io.run_layout import COVARIANCE_STATES
+from fgtrack.io.run import Run, read_run
+from fgtrack.io.run.schema import COVARIANCE_STATES
 from fgtrack.io.stream import read_stream
 from fgtrack.pipeline import replay as pipeline
 from fgtrack.pipeline.config import Config

@@ -19,10 +19,10 @@ from support.messages import START_NS, drive, exact, message_lists, shared
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, TruthState
-from fgtrack.io.bag import Bag
-from fgtrack.io.bag_writer import write_bag
 from fgtrack.io.config import InputConfig, TopicInput
 from fgtrack.io.errors import TruncatedInput, UntilBreak
+from fgtrack.io.ros.bag import Bag
+from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.source import open_input
 from fgtrack.io.stream import read_stream
 
@@ -185,7 +185,7 @@ def test_a_killed_writer_leaves_a_recording_that_is_read(tmp_path, storage):
 import os, signal, sys
 sys.path[:0] = {[str(Path(__file__).resolve().parents[1])]!r}
 from support.messages import drive
-from fgtrack.io.bag_writer import write_bag
+from fgtrack.io.ros.bag_writer import write_bag
 def messages():
     yield from drive(1200)
     os.kill(os.getpid(), signal.SIGKILL)

@@ -10,8 +10,8 @@ import pytest
 from fgtrack.cli import demo
 from fgtrack.cli.main import run
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
-from fgtrack.io.bag_writer import write_bag
-from fgtrack.io.run_folder import read_run
+from fgtrack.io.ros.bag_writer import write_bag
+from fgtrack.io.run import read_run
 from fgtrack.io.stream import read_stream, write_stream
 from fgtrack.sim.paper import paper_scenario
 

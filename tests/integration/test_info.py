@@ -2,9 +2,9 @@ import pytest
 from support.messages import START_NS, drive, shared
 
 from fgtrack.core.errors import DataError
-from fgtrack.io.bag_writer import write_bag
 from fgtrack.io.config import InputConfig, TopicInput
 from fgtrack.io.info import describe
+from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.stream import write_stream
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from fgtrack.cli.main import run
 from fgtrack.core.types import DetectionList, Message
-from fgtrack.io.run_folder import read_run
+from fgtrack.io.run import read_run
 from fgtrack.io.source import open_input
 
 Command = Callable[..., tuple[int, str, str]]

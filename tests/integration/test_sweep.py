@@ -17,7 +17,7 @@ import pytest
 
 from fgtrack.cli.main import run
 from fgtrack.cli.sweep import score, swept
-from fgtrack.io.run_folder import Run
+from fgtrack.io.run import Run
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.load import load
 from fgtrack.pipeline.sweep import Scores, Sweep

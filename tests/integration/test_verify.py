@@ -8,7 +8,7 @@ import pytest
 
 from fgtrack.cli.main import run
 from fgtrack.core.types import TrackState
-from fgtrack.estimation.base import BirthPrior, Estimator, Measurement, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.motion import MotionModel
 from fgtrack.pipeline import verify as pipeline
@@ -56,7 +56,7 @@ Kind = type[Careless]
 
 
 def subject(kind: Kind) -> Mapping[str, Subject]:
-    def start(motion: MotionModel, prior: BirthPrior, lag_s: float) -> Estimator:
+    def start(motion: MotionModel, prior: Start, lag_s: float) -> Estimator:
         return kind(ReplayEkf(motion, prior, lag_s))
 
     return {"broken": Subject(start, 1e-9)}

@@ -20,11 +20,11 @@ from support.messages import SHARED, shared
 
 from fgtrack.core.types import EgoState
 from fgtrack.io.stream import read_stream
+from fgtrack.models.oval import make_oval, make_pit_lane
 from fgtrack.pipeline.build import build_propagator, build_tracker
 from fgtrack.pipeline.clock import Delivered, listed_ticks
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
-from fgtrack.sim.oval import make_oval, make_pit_lane
 
 REFERENCE_CONFIG = Path(__file__).resolve().parents[2] / "configs/karle2023_reference.yaml"
 SHARED_MAPS = ("lvms", "ims")

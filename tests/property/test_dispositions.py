@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, TickReport, UpdateRecord
+from fgtrack.models.oval import make_oval
 from fgtrack.models.sensors import Mount, SensorModel
 from fgtrack.pipeline.build import ESTIMATORS, build_tracker
 from fgtrack.pipeline.clock import Delivered, node_ticks
 from fgtrack.pipeline.config import PAPER_SENSORS, Config
 from fgtrack.pipeline.load import load
-from fgtrack.sim.oval import make_oval
 
 REFERENCE = Path(__file__).resolve().parents[2] / "configs/karle2023_reference.yaml"
 START_NS = 1_600_000_000_000_000_000

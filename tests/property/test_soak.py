@@ -10,7 +10,7 @@ import pytest
 
 from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import BirthPrior, Measurement, UpdateStatus
+from fgtrack.estimation.base import Measurement, Start, UpdateStatus
 from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherBank, SmootherSettings
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
@@ -72,7 +72,7 @@ def drive(num_detections: int, seed: int) -> Drive:
     rng, done = np.random.default_rng(seed), Drive()
     thresholds = SETTINGS.thresholds(MOTION.state_names, curved=False)
 
-    def start(prior: BirthPrior) -> FixedLagSmoother:
+    def start(prior: Start) -> FixedLagSmoother:
         smoother = FixedLagSmoother(MOTION, prior, SETTINGS, lambda: IncrementalBackend(thresholds))
         done.smoothers.append(smoother)
         return smoother
@@ -88,7 +88,7 @@ def drive(num_detections: int, seed: int) -> Drive:
         z = model.predict(x) + std * rng.standard_normal(len(std))
         if vehicle not in bank.track_ids:
             R = np.diag(std[:2] ** 2)
-            bank.birth(vehicle, BirthPrior(stamp_ns, z[:2], R, x[2] + 0.1, 0.3, x[3] + 1.0, 3.0, 0.0, 0.2, 0.0, 1.0))
+            bank.birth(vehicle, Start(stamp_ns, z[:2], R, x[2] + 0.1, 0.3, x[3] + 1.0, 3.0, 0.0, 0.2, 0.0, 1.0))
             continue
         [result] = bank.update(stamp_ns, [vehicle], [Measurement(stamp_ns, model, z, np.diag(std**2))])
         done.statuses[result.status] += 1

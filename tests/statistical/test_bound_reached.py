@@ -7,18 +7,18 @@ from support.late_positions import STEP_NS, late_positions
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.base import BirthPrior, Estimator, Measurement
-from fgtrack.estimation.birth import birth_state
+from fgtrack.estimation.base import Estimator, Measurement, Start
+from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
 from fgtrack.estimation.oosm import OOSM_METHODS
 from fgtrack.estimation.replay import ReplayEkf
-from fgtrack.evaluation.bounds import Planned, bounds
+from fgtrack.evaluation.bounds import ScheduledMeasurement, bounds
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
 
 START_NS = 1_790_000_000 * NS_PER_S
 MOTION = CV(5.0)
-PRIOR = BirthPrior(START_NS, np.zeros(2), 0.5 * np.eye(2), 0.0, 0.2, 20.0, 2.0, 0.0, 0.2, 0.0, 1.0)
+PRIOR = Start(START_NS, np.zeros(2), 0.5 * np.eye(2), 0.0, 0.2, 20.0, 2.0, 0.0, 0.2, 0.0, 1.0)
 NUM_STEPS = 40
 NUM_RUNS = 80
 NOW_NS = START_NS + NUM_STEPS * STEP_NS + STEP_NS // 2
@@ -34,9 +34,9 @@ def make(name: str) -> Estimator:
     return ReplayEkf(MOTION, PRIOR, 1.0) if name == "ekf-replay" else OOSM_METHODS[name].start(MOTION, PRIOR, 1.0)
 
 
-def errors(name: str, items: list[Planned]) -> FloatArray:
+def errors(name: str, items: list[ScheduledMeasurement]) -> FloatArray:
     """Errors of the state at NOW_NS over all runs, shape (NUM_RUNS, 4); each estimator sees the same runs."""
-    x0, P0 = birth_state(MOTION, PRIOR)
+    x0, P0 = initial_state(MOTION, PRIOR)
     found = []
     for run in range(NUM_RUNS):
         rng = np.random.default_rng([11, run])
@@ -58,7 +58,7 @@ def errors(name: str, items: list[Planned]) -> FloatArray:
 
 @pytest.fixture(scope="module")
 def gated() -> FloatArray:
-    x0, P0 = birth_state(MOTION, PRIOR)
+    x0, P0 = initial_state(MOTION, PRIOR)
 
     def truth(stamps_ns: IntArray) -> FloatArray:
         return MOTION.predict(x0, (stamps_ns - START_NS) / NS_PER_S)[None]

@@ -8,15 +8,15 @@ from support.late_positions import STEP_NS, late_positions
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.base import BirthPrior, Estimator, Measurement
-from fgtrack.estimation.birth import birth_state
+from fgtrack.estimation.base import Estimator, Measurement, Start
+from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
-from fgtrack.evaluation.bounds import Bounds, Planned, bounds, bounds_along
+from fgtrack.evaluation.bounds import Bounds, ScheduledMeasurement, bounds, bounds_along
 from fgtrack.models.motion import CTRV, MotionModel
 
 START_NS = 1_790_000_000 * NS_PER_S
-PRIOR = BirthPrior(START_NS, np.zeros(2), 0.09 * np.eye(2), 0.4, 0.1, 30.0, 2.0, 0.05, 0.02, 0.0, 1.0)
+PRIOR = Start(START_NS, np.zeros(2), 0.09 * np.eye(2), 0.4, 0.1, 30.0, 2.0, 0.05, 0.02, 0.0, 1.0)
 PAPER = CTRV()
 LOOSE_TIES = CTRV(position_density_m2ps=0.05)  # headings matter less, so their spread does not spoil the bound
 NUM_STEPS = 50
@@ -44,7 +44,7 @@ def tried(motion: MotionModel) -> Trial:
     rng = np.random.default_rng(3)
     items = late_positions(motion, START_NS, NUM_STEPS)
     stamps_ns = np.unique([START_NS, *(item.stamp_ns for item in items), *NOWS_NS])
-    x0, P0 = birth_state(motion, PRIOR)
+    x0, P0 = initial_state(motion, PRIOR)
     states = [x0 + rng.standard_normal((NUM_RUNS, 5)) @ np.linalg.cholesky(P0).T]
     for dt_s in (np.diff(stamps_ns) / NS_PER_S).tolist():
         roots = np.linalg.cholesky(motion.process_noise(states[-1], dt_s))
@@ -64,7 +64,7 @@ def tried(motion: MotionModel) -> Trial:
     )
 
 
-def errors_of(name: str, motion: MotionModel, items: list[Planned], z: FloatArray) -> list[FloatArray]:
+def errors_of(name: str, motion: MotionModel, items: list[ScheduledMeasurement], z: FloatArray) -> list[FloatArray]:
     """States at NOWS_NS, from what has arrived by then."""
     estimator, place, found = make(name, motion), 0, []
     for now_ns in NOWS_NS:

@@ -2,9 +2,9 @@
 
 import numpy as np
 from scipy.stats import chi2
-from support.sightings import MOTION, Eye, World
+from support.shiftable import MOTION, Eye, World
 
-from fgtrack.estimation.factor_graph.offsets import OffsetSettings, solve_offsets
+from fgtrack.estimation.factor_graph.clock_calibration.offsets import OffsetSettings, solve_offsets
 
 NUM_RUNS = 24
 TRUE_S = 0.04
@@ -16,8 +16,8 @@ def test_the_covariance_covers_the_error_and_the_error_has_no_bias() -> None:
     scaled = []
     for seed in range(NUM_RUNS):
         rng = np.random.default_rng([7, seed])
-        found = solve_offsets(MOTION, [world.sightings(rng)], {"b": 0.0}, settings)
-        assert found.settled.all()
+        found = solve_offsets(MOTION, [world.measurements(rng)], {"b": 0.0}, settings)
+        assert found.converged.all()
         scaled.append((found.offsets_s[0] - TRUE_S) / np.sqrt(found.covariance[0, 0]))
     low, high = chi2.ppf([0.005, 0.995], NUM_RUNS)
     assert low < np.sum(np.square(scaled)) < high

@@ -13,7 +13,7 @@ from support.scripts import load
 
 SEED = 1
 ROUNDING_M, ROUNDING_ANEES = 0.001, 0.01  # of a difference of two entries of the reference
-CONSISTENT = ("ekf-replay", "rts", "zlz", "asd", "drop", "delayed-horizon", "reorder-buffer", "backward-forward")
+CONSISTENT = ("ekf-replay", "rts", "zlz", "asd", "drop", "delayed-horizon", "reorder-buffer", "rewind-forget")
 
 script = load("ladder")
 

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import BirthPrior, Estimator, Measurement
+from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import measurement_model
@@ -24,19 +24,19 @@ NUM_RUNS = 60
 POSITION, WITH_SPEED = (measurement_model(("x_m", "y_m", *more), MOTION) for more in ((), ("speed_mps",)))
 
 
-def prior(mean: FloatArray) -> BirthPrior:
+def prior(mean: FloatArray) -> Start:
     x_m, y_m, yaw_rad, speed_mps, yaw_rate_radps = mean.tolist()
     position = np.array([x_m, y_m])
-    return BirthPrior(START_NS, position, 0.09 * np.eye(2), yaw_rad, 0.1, speed_mps, 2.0, yaw_rate_radps, 0.1, 0.0, 1.0)
+    return Start(START_NS, position, 0.09 * np.eye(2), yaw_rad, 0.1, speed_mps, 2.0, yaw_rate_radps, 0.1, 0.0, 1.0)
 
 
-def smoother(motion: MotionModel, start: BirthPrior, curved: bool = False) -> FixedLagSmoother:
+def smoother(motion: MotionModel, start: Start, curved: bool = False) -> FixedLagSmoother:
     settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)
     thresholds = settings.thresholds(motion.state_names, curved)
     return FixedLagSmoother(motion, start, settings, lambda: IncrementalBackend(thresholds))
 
 
-def replay(motion: MotionModel, start: BirthPrior) -> ReplayEkf:
+def replay(motion: MotionModel, start: Start) -> ReplayEkf:
     return ReplayEkf(motion, start, 1.0)
 
 
@@ -82,7 +82,7 @@ def nees(estimator: Estimator, stamp_ns: int, truth: FloatArray) -> float:
 
 @pytest.mark.parametrize("make", [smoother, replay])
 def test_the_error_of_the_present_state_is_as_large_as_its_covariance_says(
-    make: Callable[[MotionModel, BirthPrior], Estimator],
+    make: Callable[[MotionModel, Start], Estimator],
 ) -> None:
     rng = np.random.default_rng(7)
     start = np.array([100.0, -50.0, 0.7, 30.0, 0.05])

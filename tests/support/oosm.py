@@ -6,7 +6,7 @@ import numpy as np
 
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import TrackState
-from fgtrack.estimation.base import BirthPrior, Estimator, Measurement
+from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.oosm import OOSM_METHODS
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import measurement_model
@@ -30,9 +30,9 @@ def stamp(at_s: float) -> int:
     return START_NS + nanoseconds(at_s)
 
 
-def prior(yaw_rad: float = 0.4) -> BirthPrior:
+def prior(yaw_rad: float = 0.4) -> Start:
     position = np.array([3.0, -2.0])
-    return BirthPrior(START_NS, position, np.diag([0.5, 0.5]), yaw_rad, 0.3, 20.0, 3.0, 0.1, 0.3, 0.0, 1.0)
+    return Start(START_NS, position, np.diag([0.5, 0.5]), yaw_rad, 0.3, 20.0, 3.0, 0.1, 0.3, 0.0, 1.0)
 
 
 def started(name: str, motion: MotionModel = LINEAR, lag_s: float = LAG_S) -> Estimator:

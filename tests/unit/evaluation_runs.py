@@ -17,7 +17,7 @@ from fgtrack.core.types import (
     TruthState,
     UpdateRecord,
 )
-from fgtrack.io.run_folder import Run, RunWriter, read_run
+from fgtrack.io.run import Run, RunWriter, read_run
 
 START_NS = 1_700_000_000_000_000_000
 TICK_NS = 20_000_000

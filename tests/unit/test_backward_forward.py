@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.backward_forward import BackwardForwardBank
-from fgtrack.estimation.base import BirthPrior, Measurement, UpdateStatus
+from fgtrack.estimation.base import Measurement, Start, UpdateStatus
 from fgtrack.estimation.ekf import correct
 from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator, Propagator
 from fgtrack.estimation.published import LeadingClock, StalePresent
@@ -34,8 +34,8 @@ def bank(storage_steps: int = 50) -> BackwardForwardBank:
     return made
 
 
-def prior(stamp_ns: int, x_m: float = 0.0, y_m: float = 0.0, yaw_rad: float | None = 0.2) -> BirthPrior:
-    return BirthPrior(stamp_ns, np.array([x_m, y_m]), 0.1 * np.eye(2), yaw_rad, 0.3, 40.0, 2.0, 0.1, 0.2, 0.0, 1.0)
+def prior(stamp_ns: int, x_m: float = 0.0, y_m: float = 0.0, yaw_rad: float | None = 0.2) -> Start:
+    return Start(stamp_ns, np.array([x_m, y_m]), 0.1 * np.eye(2), yaw_rad, 0.3, 40.0, 2.0, 0.1, 0.2, 0.0, 1.0)
 
 
 def position(stamp_ns: int, x_m: float, y_m: float = 0.0) -> Measurement:
@@ -306,7 +306,7 @@ def test_a_measurement_that_cannot_be_fused_fails_alone_and_changes_nothing() ->
 def test_a_singular_innovation_covariance_is_a_failure_and_no_crash() -> None:
     made = BackwardForwardBank(EulerCtrv(CTRV(), np.zeros(5)), STEP_NS, 5)
     made.advance(START_NS)
-    certain = BirthPrior(START_NS, np.zeros(2), np.zeros((2, 2)), 0.0, 0.1, 0.0, 0.1, 0.0, 0.1, 0.0, 0.1)
+    certain = Start(START_NS, np.zeros(2), np.zeros((2, 2)), 0.0, 0.1, 0.0, 0.1, 0.0, 0.1, 0.0, 0.1)
     made.birth(0, certain)
     exact = Measurement(START_NS, POSITION, np.ones(2), np.zeros((2, 2)))
     assert [result.status for result in made.update(START_NS, [0], [exact])] == ["failed"]
@@ -376,7 +376,7 @@ class NaiveBank:
             )
             steps = len(track.means) - 1 - place
             del track.stamps_ns[place + 1 :], track.means[place:], track.covariances[place:]
-            track.means.append(self.propagator.settle(done.mean)[0])
+            track.means.append(self.propagator.wrap(done.mean)[0])
             track.covariances.append(done.covariance[0])
             for _ in range(steps):
                 self.grow(track)

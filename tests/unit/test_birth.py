@@ -8,7 +8,7 @@ from support.tracking import START_NS, StraightRoad, bearing
 from fgtrack.core.geometry import rotation
 from fgtrack.core.types import EgoState
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.birth import birth_state
+from fgtrack.estimation.birth import initial_state
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV
 from fgtrack.models.road import OpenSpace
@@ -92,7 +92,7 @@ def test_a_deviation_that_makes_no_sense_is_named(name: str) -> None:
 @pytest.mark.parametrize("motion", [CTRV(), CTRA(), CV()], ids=lambda motion: type(motion).__name__)
 def test_the_first_state_of_every_motion_model_is_the_prior(motion) -> None:
     prior = MeasuredBirth().prior(seen(yaw_rad=1.0, speed_mps=20.0), ROAD, EGO, ego_in_pit=False)
-    mean, P = birth_state(motion, prior)
+    mean, P = initial_state(motion, prior)
     assert mean.shape == (motion.dim,)
     assert np.array_equal(P, P.T)
     assert np.linalg.eigvalsh(P).min() > 0.0

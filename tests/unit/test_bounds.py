@@ -7,19 +7,19 @@ import pytest
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.base import BirthPrior, Measurement
-from fgtrack.estimation.birth import birth_state
+from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.replay import ReplayEkf
-from fgtrack.evaluation.bounds import Bounds, Planned, bounds, bounds_along
+from fgtrack.evaluation.bounds import Bounds, ScheduledMeasurement, bounds, bounds_along
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs/bounds.md"
 START_NS = 1_790_000_000 * NS_PER_S
-PRIOR = BirthPrior(START_NS, np.zeros(2), 0.5 * np.eye(2), 0.3, 0.2, 20.0, 2.0, 0.0, 0.2, 0.0, 1.0)
+PRIOR = Start(START_NS, np.zeros(2), 0.5 * np.eye(2), 0.3, 0.2, 20.0, 2.0, 0.0, 0.2, 0.0, 1.0)
 
 
-def planned(motion: MotionModel, seed: int = 0) -> list[Planned]:
+def planned(motion: MotionModel, seed: int = 0) -> list[ScheduledMeasurement]:
     """Positions at 10 Hz 350 ms late, and others in between that come at once; jitter makes some overtake."""
     rng = np.random.default_rng(seed)
     model = measurement_model(("x_m", "y_m"), motion)
@@ -27,8 +27,8 @@ def planned(motion: MotionModel, seed: int = 0) -> list[Planned]:
     for k in range(1, 20):
         late_ns = int(rng.uniform(0.3, 0.4) * NS_PER_S)
         stamp_ns = START_NS + k * 100_000_000
-        found.append(Planned(stamp_ns, stamp_ns + late_ns, model, 0.04 * np.eye(2)))
-        found.append(Planned(stamp_ns + 40_000_000, stamp_ns + 45_000_000, model, 2.0 * np.eye(2)))
+        found.append(ScheduledMeasurement(stamp_ns, stamp_ns + late_ns, model, 0.04 * np.eye(2)))
+        found.append(ScheduledMeasurement(stamp_ns + 40_000_000, stamp_ns + 45_000_000, model, 2.0 * np.eye(2)))
     return found
 
 
@@ -40,7 +40,7 @@ def straight(motion: MotionModel, x: FloatArray, trajectories: int = 1):
     return truth
 
 
-def replayed(motion: MotionModel, items: Sequence[Planned], now_ns: int) -> FloatArray:
+def replayed(motion: MotionModel, items: Sequence[ScheduledMeasurement], now_ns: int) -> FloatArray:
     """Covariance of the exact filter, given `items` with any values."""
     estimator = ReplayEkf(motion, PRIOR, 100.0)
     for item in items:
@@ -54,7 +54,7 @@ NOW_NS = [START_NS + k * 130_000_000 for k in range(1, 15)]
 def test_in_a_linear_model_the_bounds_are_the_covariances_of_the_exact_filter() -> None:
     motion = CV(5.0)
     items = planned(motion)
-    x, P = birth_state(motion, PRIOR)
+    x, P = initial_state(motion, PRIOR)
     found = bounds(motion, START_NS, P, items, straight(motion, x), NOW_NS)
     for i, now_ns in enumerate(NOW_NS):
         sensed = [item for item in items if item.stamp_ns <= now_ns]
@@ -73,7 +73,7 @@ def test_in_a_linear_model_the_bounds_are_the_covariances_of_the_exact_filter() 
 
 @pytest.mark.parametrize("motion", [CV(5.0), CTRV()])
 def test_what_has_arrived_lies_between_all_and_what_came_in_time(motion: MotionModel) -> None:
-    x, P = birth_state(motion, PRIOR)
+    x, P = initial_state(motion, PRIOR)
     found = bounds(motion, START_NS, P, planned(motion), straight(motion, x, trajectories=3), NOW_NS)
     for smaller, larger in ((found.in_time, found.arrived), (found.arrived, found.dropped)):
         least = np.linalg.eigvalsh(larger - smaller).min(axis=-1)
@@ -83,7 +83,7 @@ def test_what_has_arrived_lies_between_all_and_what_came_in_time(motion: MotionM
 
 def test_the_bounds_along_trajectories_are_the_mean_of_those_of_each() -> None:
     motion = CTRV()
-    x, P = birth_state(motion, PRIOR)
+    x, P = initial_state(motion, PRIOR)
     starts = x + np.random.default_rng(1).standard_normal((3, 5)) @ np.linalg.cholesky(P).T
 
     def truth(stamps_ns: IntArray) -> FloatArray:
@@ -97,7 +97,7 @@ def test_the_bounds_along_trajectories_are_the_mean_of_those_of_each() -> None:
 
 def test_in_a_linear_model_trajectories_do_not_matter() -> None:
     motion = CV(5.0)
-    x, P = birth_state(motion, PRIOR)
+    x, P = initial_state(motion, PRIOR)
     about = motion, START_NS, P, planned(motion), straight(motion, x, trajectories=2), NOW_NS
     for along, posterior in zip(bounds_along(*about), bounds(*about), strict=True):
         np.testing.assert_allclose(along, posterior, rtol=1e-12)
@@ -106,8 +106,8 @@ def test_in_a_linear_model_trajectories_do_not_matter() -> None:
 @pytest.mark.parametrize("function", [bounds, bounds_along])
 def test_a_measurement_before_the_start_is_refused(function: Callable[..., Bounds]) -> None:
     motion = CV(5.0)
-    x, P = birth_state(motion, PRIOR)
-    early = Planned(START_NS - 1, START_NS, measurement_model(("x_m", "y_m"), motion), np.eye(2))
+    x, P = initial_state(motion, PRIOR)
+    early = ScheduledMeasurement(START_NS - 1, START_NS, measurement_model(("x_m", "y_m"), motion), np.eye(2))
     with pytest.raises(ValueError, match="start_ns"):
         function(motion, START_NS, P, [early], straight(motion, x), NOW_NS)
 

@@ -44,5 +44,5 @@ def test_the_example_prints_what_stands_below_it(capsys: pytest.CaptureFixture[s
     assert [row[:3] for row in found[1:]] == [row[:3] for row in shown[1:]]
     gains, below = ({(row[0], row[1]): float(row[column]) for row in found[1:]} for column in (3, 4))
     assert below["ReplayEkf", "lidar"] == below["ReplayEkf", "radar"] == 0.0
-    assert below["BackwardForward", "lidar"] > 10.0
-    assert gains["ReplayEkf", "lidar"] > gains["BackwardForward", "lidar"] > gains["Drop", "lidar"]
+    assert below["RewindForget", "lidar"] > 10.0
+    assert gains["ReplayEkf", "lidar"] > gains["RewindForget", "lidar"] > gains["Drop", "lidar"]

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import BirthPrior, Measurement
+from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.ekf import correct, correct_one, correct_with_innovation, predict, predict_one
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import SensorPose, measurement_model
@@ -199,7 +199,7 @@ def test_a_singular_innovation_covariance_of_one_state_is_an_error() -> None:
 def test_the_replaying_filter_keeps_the_yaw_in_its_range_through_full_turns() -> None:
     motion = CTRV()
     start = np.array([0.0, 0.0, 3.0, 10.0, 1.0])
-    prior = BirthPrior(0, start[:2], np.eye(2), 3.0, 0.1, 10.0, 1.0, 1.0, 0.1, 0.0, 1.0)
+    prior = Start(0, start[:2], np.eye(2), 3.0, 0.1, 10.0, 1.0, 1.0, 0.1, 0.0, 1.0)
     estimator = ReplayEkf(motion, prior, 1.0)
     model = measurement_model(("x_m", "y_m", "yaw_rad"), motion)
     for step in range(1, 100):

@@ -17,7 +17,7 @@ from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.nees import normalised_squares
 from fgtrack.evaluation.statistics import ChiSquareMean
 from fgtrack.evaluation.whiteness import FEWEST, LAGS, Autocorrelation, autocorrelations
-from fgtrack.io.run_folder import COVARIANCE_COLUMNS, Run, Table
+from fgtrack.io.run import COVARIANCE_COLUMNS, Run, Table
 
 
 def table_of(covariances: np.ndarray) -> Table:

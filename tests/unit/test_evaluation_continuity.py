@@ -13,7 +13,7 @@ from fgtrack.evaluation.continuity import late_switches, times_to_confirm
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.options import EvaluationOptions
-from fgtrack.io.run_folder import Run
+from fgtrack.io.run import Run
 
 LATE = Disposition.OUT_OF_SEQUENCE
 GATE_M = 5.0

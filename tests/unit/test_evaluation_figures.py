@@ -16,7 +16,7 @@ from fgtrack.evaluation.figures import (
 )
 from fgtrack.evaluation.map_figure import figure_map
 from fgtrack.evaluation.matching import match
-from fgtrack.io.run_folder import Run
+from fgtrack.io.run import Run
 from fgtrack.models.track_map import COLUMNS, TrackMap
 
 TICKS = range(60)

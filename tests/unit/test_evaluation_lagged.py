@@ -19,7 +19,7 @@ from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.metrics import Metrics, evaluate
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.evaluation.tables import comparison_tables, lag_table
-from fgtrack.io.run_folder import Run
+from fgtrack.io.run import Run
 
 TICKS = range(20)
 STEPS = {0.1: 5, 0.2: 10}  # ticks that a lag is long

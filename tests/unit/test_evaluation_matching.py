@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from fgtrack.core.types import TruthState
 from fgtrack.evaluation.matching import NO_OBJECT, MatchOptions, _assign, _pair, contested, match, track_errors
 from fgtrack.evaluation.truth import TruePath, true_paths
-from fgtrack.io.run_folder import NO_TRACK
+from fgtrack.io.run import NO_TRACK
 
 S_NS = 1_000_000_000
 

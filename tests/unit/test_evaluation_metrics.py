@@ -14,7 +14,7 @@ from fgtrack.core.types import Disposition
 from fgtrack.evaluation.metrics import Metrics, ObjectMetrics, evaluate
 from fgtrack.evaluation.options import EvaluationOptions
 from fgtrack.evaluation.statistics import Distribution, Moments
-from fgtrack.io.run_folder import Run
+from fgtrack.io.run import Run
 
 samples = hnp.arrays(np.float64, st.integers(0, 20), elements=st.floats(-1e3, 1e3))
 

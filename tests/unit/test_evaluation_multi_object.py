@@ -20,7 +20,7 @@ from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.multi_object import MultiObjectMetrics
 from fgtrack.evaluation.options import EvaluationOptions
 from fgtrack.evaluation.scenes import Scenes, scenes
-from fgtrack.io.run_folder import Run, Table
+from fgtrack.io.run import Run, Table
 
 C_M, GATE_M = 5.0, 4.0
 

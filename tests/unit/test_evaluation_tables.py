@@ -21,7 +21,7 @@ from fgtrack.evaluation.tables import (
     multi_object_table,
     residual_tables,
 )
-from fgtrack.io.run_folder import Run
+from fgtrack.io.run import Run
 
 ESTIMATORS = ("ekf-backward-forward", "ekf-replay", "smoother")
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import BirthPrior, Measurement
+from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherSettings
-from fgtrack.estimation.factor_graph.evidence import Equivalent, Evidence
-from fgtrack.estimation.factor_graph.factors import evidence_factor, motion_factor, prior_factor, weight
+from fgtrack.estimation.factor_graph.factors import measurement_factor, motion_factor, prior_factor, weight
+from fgtrack.estimation.factor_graph.terms import EquivalentMeasurement, MeasurementTerm
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
@@ -171,7 +171,7 @@ def test_an_evidence_factor_is_the_weighted_residual_and_its_derivative(kind: st
     for off in (0.4, 2.0, 5.0):
         item, x = measurement(kind, what, None if loss is None else RobustLoss(loss, 1.5), off)
         root_weight = 1.0 if loss is None else math.sqrt(loss_and_weight(loss, 1.5, off)[1])
-        A, b = linear_parts(evidence_factor(LEFT, item, x), values(left=x))
+        A, b = linear_parts(measurement_factor(LEFT, item, x), values(left=x))
         expected = numeric_jacobian(lambda at, item=item: whitened(item, at), x)
         np.testing.assert_allclose(A, root_weight * expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
         np.testing.assert_allclose(b, -root_weight * whitened(item, x), rtol=1e-9, atol=1e-9)
@@ -182,7 +182,7 @@ def test_an_evidence_factor_is_the_weighted_residual_and_its_derivative(kind: st
 @pytest.mark.parametrize("kind", LOSSES)
 def test_a_robust_loss_is_its_formula(kind: str, width: float, off: float) -> None:
     item, x = measurement("ctrv", "position", RobustLoss(kind, width), off)
-    factor = evidence_factor(LEFT, item, x)
+    factor = measurement_factor(LEFT, item, x)
     loss, expected_weight = loss_and_weight(kind, width, off)
     assert factor.error(values(left=x)) == pytest.approx(loss, rel=1e-9)
     assert weight(RobustLoss(kind, width), off) == pytest.approx(expected_weight, rel=1e-9, abs=1e-12)
@@ -201,16 +201,16 @@ def test_a_robust_loss_leaves_the_square_about_its_width(kind: str) -> None:
 def test_an_equivalent_detection_is_the_linear_measurement_that_it_says() -> None:
     rng = np.random.default_rng(6)
     H, origin, y = rng.standard_normal((2, 5)), rng.standard_normal(5), rng.standard_normal(2)
-    item = Equivalent(origin, H, y, np.array([[0.5, 0.1], [0.1, 0.3]]))
+    item = EquivalentMeasurement(origin, H, y, np.array([[0.5, 0.1], [0.1, 0.3]]))
     L = np.linalg.cholesky(item.R)
     for x in (origin, origin + rng.standard_normal(5)):
         for mean in (origin, x, np.zeros(5)):
-            A, b = linear_parts(evidence_factor(LEFT, item, mean), values(left=x))
+            A, b = linear_parts(measurement_factor(LEFT, item, mean), values(left=x))
             np.testing.assert_allclose(A, np.linalg.solve(L, H), atol=1e-12)
             np.testing.assert_allclose(b, np.linalg.solve(L, y - H @ (x - origin)), atol=1e-12)
 
 
-def _broken(kind: str) -> Evidence:
+def _broken(kind: str) -> MeasurementTerm:
     item, _ = measurement("ctrv", kind, None)
     return replace(item, R=-item.R)
 
@@ -218,7 +218,7 @@ def _broken(kind: str) -> Evidence:
 @pytest.mark.parametrize("what", ["position", "bearing"])
 def test_a_covariance_that_is_not_positive_definite_is_refused(what: str) -> None:
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
-        evidence_factor(LEFT, _broken(what), state(MOTIONS["ctrv"], 4))
+        measurement_factor(LEFT, _broken(what), state(MOTIONS["ctrv"], 4))
 
 
 # --- angles
@@ -230,7 +230,7 @@ def test_a_yaw_is_taken_on_the_branch_next_to_the_state(loss: RobustLoss | None,
     model = measurement_model(("yaw_rad",), CTRV())
     item = Measurement(0, model, np.array([-math.pi + 0.1]), np.array([[0.01]]), loss=loss)
     x = np.array([0.0, 0.0, math.pi - 0.05 + 2.0 * math.pi * turns, 10.0, 0.0])
-    _, b = linear_parts(evidence_factor(LEFT, item, x), values(left=x))
+    _, b = linear_parts(measurement_factor(LEFT, item, x), values(left=x))
     assert b == pytest.approx([1.5])
 
 
@@ -239,7 +239,7 @@ def test_a_yaw_is_taken_on_the_branch_next_to_the_state(loss: RobustLoss | None,
 def test_a_smoother_turns_through_pi_with_its_measurements(backend: str, sign: float) -> None:
     """The object turns from 3.0 rad on at 0.5 rad/s; sensors report yaws wrapped, and some late."""
     motion = CTRV()
-    prior = BirthPrior(0, np.zeros(2), np.eye(2), 3.0 * sign, 0.2, 20.0, 1.0, 0.5 * sign, 0.2, 0.0, 1.0)
+    prior = Start(0, np.zeros(2), np.eye(2), 3.0 * sign, 0.2, 20.0, 1.0, 0.5 * sign, 0.2, 0.0, 1.0)
     settings = SmootherSettings(lag_s=2.0, lagged_s=())
     thresholds = settings.thresholds(motion.state_names, curved=False)
     make = BatchBackend if backend == "batch" else lambda: IncrementalBackend(thresholds)

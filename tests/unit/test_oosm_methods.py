@@ -28,7 +28,7 @@ from support.oosm import (
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import TrackState
-from fgtrack.estimation.base import BirthPrior, Measurement, UpdateStatus
+from fgtrack.estimation.base import Measurement, Start, UpdateStatus
 from fgtrack.estimation.dense_joint import dense_joint
 from fgtrack.estimation.oosm import (
     A1,
@@ -155,7 +155,7 @@ def test_backward_forward_forgets_what_came_between(lag: int) -> None:
     rng = np.random.default_rng(lag)
     steps, more = in_sequence(rng), late(rng, lag)
     kept = [m for m in steps if m.stamp_ns <= more.stamp_ns]
-    estimator = fed(started("backward-forward"), [*steps, more])
+    estimator = fed(started("rewind-forget"), [*steps, more])
     assert_same(last(estimator), dense_joint(LINEAR, prior(), [*kept, more], [stamp(2.0)])[stamp(2.0)])
     assert estimator.window_ns[1] == stamp(2.0)
     between = measured(rng, 1.995)
@@ -239,9 +239,9 @@ def test_measurements_cannot_be_held_longer_than_the_window(kind, hold_s: float)
 def test_covariance_intersection_makes_small_what_it_is_told_to(size, takes_late: bool) -> None:
     rng = np.random.default_rng(3)
     steps, more = [measured(rng, k * STEP_S) for k in range(1, 41)], measured(rng, 3.75, std=0.3)
-    start = BirthPrior(START_NS, np.zeros(2), np.eye(2), None, 0.0, 0.0, 10.0, 0.0, 0.0, 0.0, 0.0)
+    start = Start(START_NS, np.zeros(2), np.eye(2), None, 0.0, 0.0, 10.0, 0.0, 0.0, 0.0, 0.0)
     estimator = fed(CovarianceIntersection(LINEAR, start, LAG_S, size), [*steps, more])
-    other = OOSM_METHODS["backward-forward" if takes_late else "drop"].start(LINEAR, start, LAG_S)
+    other = OOSM_METHODS["rewind-forget" if takes_late else "drop"].start(LINEAR, start, LAG_S)
     assert_same(estimator.state_at(stamp(4.0)), fed(other, [*steps, more]).state_at(stamp(4.0)))
 
 
@@ -252,7 +252,7 @@ def test_covariance_intersection_weighs_where_neither_estimate_is_better_in_all(
     late_y = Measurement(stamp(1.85), measurement_model(("y_m",), LINEAR), np.array([20.0]), np.eye(1))
     arrived = [*one_axis, late_y]
     now, found = (last(fed(started(name), arrived)).covariance for name in ("drop", "ci"))
-    late_only = last(fed(started("backward-forward"), arrived)).covariance
+    late_only = last(fed(started("rewind-forget"), arrived)).covariance
 
     def mixed(w: float) -> np.ndarray:
         return np.linalg.inv(w * np.linalg.inv(now) + (1.0 - w) * np.linalg.inv(late_only))

@@ -68,7 +68,7 @@ def test_all_euler_steps_at_once_are_the_steps_one_by_one(
     if motion.dim == 6:
         density = np.append(density, 9e-2)
     x, P = random_states(np.random.default_rng(seed), len(steps), motion.dim)
-    x = make(motion, density).settle(x)
+    x = make(motion, density).wrap(x)
     before = x.copy(), P.copy()
     means, covariances = make(motion, density).propagate(x, P, np.array(steps), 0.01)
     assert means.shape == x.shape
@@ -118,22 +118,22 @@ def test_an_acceleration_is_carried_along_where_it_does_not_drive() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settle", "wrapped"),
+    ("wrap", "wrapped"),
     [
-        (EulerCtrv(CTRV(), ISOTROPIC).settle, math.pi + 0.5 - 2 * math.pi),
-        (ExactPropagator(CTRV()).settle, math.pi + 0.5 - 2 * math.pi),
-        (SaturatedEulerCtrv(CTRV(), ISOTROPIC).settle, math.pi + 0.5),
+        (EulerCtrv(CTRV(), ISOTROPIC).wrap, math.pi + 0.5 - 2 * math.pi),
+        (ExactPropagator(CTRV()).wrap, math.pi + 0.5 - 2 * math.pi),
+        (SaturatedEulerCtrv(CTRV(), ISOTROPIC).wrap, math.pi + 0.5),
     ],
 )
-def test_settling_wraps_a_copy_to_the_propagators_own_range(settle, wrapped: float) -> None:
+def test_settling_wraps_a_copy_to_the_propagators_own_range(wrap, wrapped: float) -> None:
     mean = np.array([[1.0, 2.0, math.pi + 0.5, 4.0, 5.0]])
-    assert settle(mean)[0] == pytest.approx([1.0, 2.0, wrapped, 4.0, 5.0])
+    assert wrap(mean)[0] == pytest.approx([1.0, 2.0, wrapped, 4.0, 5.0])
     assert mean[0, 2] == math.pi + 0.5
 
 
 def test_settling_leaves_a_state_without_yaw_alone() -> None:
     mean = np.array([[1.0, 2.0, 30.0, 40.0]])
-    assert np.array_equal(ExactPropagator(CV()).settle(mean), mean)
+    assert np.array_equal(ExactPropagator(CV()).wrap(mean), mean)
 
 
 def test_the_published_yaw_range_ends_where_the_published_yaw_is_pi() -> None:

@@ -17,7 +17,7 @@ from fgtrack.core.types import (
     TruthState,
     UpdateRecord,
 )
-from fgtrack.io.run_folder import NO_TRACK, RunWriter, read_run
+from fgtrack.io.run import NO_TRACK, RunWriter, read_run
 
 
 def track(track_id: int = 1, size: int = 5, stamp_ns: int = 990) -> TrackReport:

@@ -20,7 +20,7 @@ from fgtrack.core.types import (
     TruthState,
 )
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.run_folder import COLUMNS, MemoryRun, Run, RunWriter, read_run
+from fgtrack.io.run import COLUMNS, MemoryRun, Run, RunWriter, read_run
 from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
 from fgtrack.pipeline.replay import replay, replay_in_memory
 from fgtrack.sim.paper import paper_scenario

@@ -5,9 +5,9 @@ import pytest
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import FloatArray
+from fgtrack.models.oval import make_oval, make_pit_lane
+from fgtrack.models.path import Path as DrivenPath
 from fgtrack.models.track_map import COLUMNS, TrackMap
-from fgtrack.sim.oval import make_oval, make_pit_lane
-from fgtrack.sim.path import Path as DrivenPath
 
 MAPS = Path(__file__).resolve().parents[2] / "configs/maps"
 OVAL, PIT_LANE = make_oval(), make_pit_lane()

@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 
 from fgtrack.core.types import ACCEL, SPEED, STATE_NAMES, YAW, YAW_RATE, FloatArray
+from fgtrack.models.oval import make_oval
 from fgtrack.models.sensors import Mount
-from fgtrack.sim.oval import make_oval
 from fgtrack.sim.scanner import Scanner
 from fgtrack.sim.sensor import Clutter, SimulatedSensor
 

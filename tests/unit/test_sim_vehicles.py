@@ -7,8 +7,8 @@ from scipy import stats
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import ACCEL, SPEED, YAW, YAW_RATE
 from fgtrack.models.motion import CTRV
-from fgtrack.sim.oval import make_oval
-from fgtrack.sim.path import Path
+from fgtrack.models.oval import make_oval
+from fgtrack.models.path import Path
 from fgtrack.sim.vehicles import DrawnVehicle, LaneChange, TrackTrajectory, TrackVehicle
 
 OVAL = make_oval()

@@ -1,4 +1,4 @@
-"""The parts of a window on their own: chain, tail, and the state between two nodes."""
+"""The parts of a window on their own: chain, past, and the state between two nodes."""
 
 from itertools import permutations
 
@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.base import BirthPrior, Measurement
-from fgtrack.estimation.birth import birth_state
+from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.dense_joint import dense_joint, difference
 from fgtrack.estimation.factor_graph.chain import Chain, Node
-from fgtrack.estimation.factor_graph.tail import Prior, Tail
+from fgtrack.estimation.factor_graph.marginalised_past import MarginalisedPast, Prior
 from fgtrack.estimation.interpolation import between
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
@@ -67,16 +67,16 @@ def test_what_was_inserted_can_be_taken_back_and_its_key_is_not_used_again() -> 
     assert [node.stamp_ns for node in made.nodes] == [30]
 
 
-# --- tail
+# --- past
 
 
 def prior(motion: MotionModel) -> Prior:
-    start = BirthPrior(START_NS, np.array([3.0, -2.0]), np.eye(2) * 0.5, 0.4, 0.3, 20.0, 3.0, 0.1, 0.3, 0.0, 1.0)
-    return Prior(*birth_state(motion, start))
+    start = Start(START_NS, np.array([3.0, -2.0]), np.eye(2) * 0.5, 0.4, 0.3, 20.0, 3.0, 0.1, 0.3, 0.0, 1.0)
+    return Prior(*initial_state(motion, start))
 
 
-def birth_prior() -> BirthPrior:
-    return BirthPrior(START_NS, np.array([3.0, -2.0]), np.eye(2) * 0.5, 0.4, 0.3, 20.0, 3.0, 0.1, 0.3, 0.0, 1.0)
+def birth_prior() -> Start:
+    return Start(START_NS, np.array([3.0, -2.0]), np.eye(2) * 0.5, 0.4, 0.3, 20.0, 3.0, 0.1, 0.3, 0.0, 1.0)
 
 
 def position(offset_ns: int, x_m: float, y_m: float, loss: RobustLoss | None = None) -> Measurement:
@@ -84,21 +84,21 @@ def position(offset_ns: int, x_m: float, y_m: float, loss: RobustLoss | None = N
     return Measurement(START_NS + offset_ns, model, np.array([x_m, y_m]), 0.09 * np.eye(2), loss=loss)
 
 
-def passed(offsets_ns: tuple[int, ...], evidence: dict[int, Measurement]) -> Tail:
-    """A tail whose nodes left at some guess of their means, the last of `offsets_ns` being the oldest that is left."""
-    tail = Tail(CV(), START_NS, prior(CV()))
+def passed(offsets_ns: tuple[int, ...], measured: dict[int, Measurement]) -> MarginalisedPast:
+    """A past whose nodes left at some guess of their means, the last of `offsets_ns` being the oldest that is left."""
+    past = MarginalisedPast(CV(), START_NS, prior(CV()))
     guesses = [np.array([3.0 + 18.0 * o / 1e9, -2.0 + 8.0 * o / 1e9, 17.0, 9.0]) for o in offsets_ns]
     for k in range(len(offsets_ns) - 1):
-        items = [evidence[offsets_ns[k]]] if offsets_ns[k] in evidence else []
-        tail.pass_node(items, guesses[k], START_NS + offsets_ns[k + 1], guesses[k + 1])
-    return tail
+        items = [measured[offsets_ns[k]]] if offsets_ns[k] in measured else []
+        past.pass_node(items, guesses[k], START_NS + offsets_ns[k + 1], guesses[k + 1])
+    return past
 
 
-def fused(tail: Tail, measurements: list[Measurement]) -> tuple[FloatArray, FloatArray]:
+def fused(past: MarginalisedPast, measurements: list[Measurement]) -> tuple[FloatArray, FloatArray]:
     """The oldest node's state after `measurements` behind it, one after the other."""
-    mean, P = tail.prior.mean, tail.prior.covariance
+    mean, P = past.prior.mean, past.prior.covariance
     for item in measurements:
-        seen = tail.fuse(item)
+        seen = past.fuse(item)
         S = seen.H @ P @ seen.H.T + seen.R
         K = np.linalg.solve(S, seen.H @ P).T
         mean, P = mean + K @ (seen.y - seen.H @ (mean - seen.origin)), P - K @ S @ K.T
@@ -114,34 +114,34 @@ def test_detections_close_together_behind_the_window_are_exact_in_any_order(
     at_node = position(300 * MS, 8.6, 0.6)
     offsets = (500 * MS, 500 * MS + gap_ns, 500 * MS + 2 * gap_ns, 700 * MS - gap_ns)
     late = [position(offset, 12.4 + 0.3 * k, 2.0 - 0.4 * k) for k, offset in enumerate(offsets)]
-    tail = passed((0, 300 * MS, 700 * MS), {300 * MS: at_node})
-    mean, P = fused(tail, [late[k] for k in order])
+    past = passed((0, 300 * MS, 700 * MS), {300 * MS: at_node})
+    mean, P = fused(past, [late[k] for k in order])
     stamps_ns = [START_NS + 700 * MS, START_NS, *(item.stamp_ns for item in late), START_NS + 420 * MS]
     joint = dense_joint(CV(), birth_prior(), [at_node, *late], stamps_ns)
     found = {stamps_ns[0]: TrackState(stamps_ns[0], mean, P)}
     for stamp_ns in stamps_ns[1:]:
-        found[stamp_ns] = TrackState(stamp_ns, *tail.state_at(stamp_ns, mean, P))
+        found[stamp_ns] = TrackState(stamp_ns, *past.state_at(stamp_ns, mean, P))
     for stamp_ns, state in found.items():
         assert max(difference(state, joint[stamp_ns])) < (1e-8 if gap_ns < 10 * US else 1e-9)
 
 
 def test_the_ring_forgets_what_is_not_needed_any_more() -> None:
-    tail = passed((0, 100 * MS, 200 * MS, 300 * MS), {})
-    assert tail.start_ns == START_NS
-    tail.forget_before(START_NS + 150 * MS)
-    assert tail.start_ns == START_NS + 100 * MS
-    tail.forget_before(START_NS + 200 * MS)
-    assert tail.start_ns == START_NS + 200 * MS
-    tail.forget_before(START_NS + 5000 * MS)
-    assert tail.start_ns == START_NS + 200 * MS
+    past = passed((0, 100 * MS, 200 * MS, 300 * MS), {})
+    assert past.start_ns == START_NS
+    past.forget_before(START_NS + 150 * MS)
+    assert past.start_ns == START_NS + 100 * MS
+    past.forget_before(START_NS + 200 * MS)
+    assert past.start_ns == START_NS + 200 * MS
+    past.forget_before(START_NS + 5000 * MS)
+    assert past.start_ns == START_NS + 200 * MS
 
 
 def test_a_copy_knows_nothing_of_what_the_other_fuses() -> None:
-    tail = passed((0, 100 * MS, 200 * MS), {})
-    at = tail.prior.mean, tail.prior.covariance
-    before = tail.state_at(START_NS + 50 * MS, *at)
-    tail.copy().fuse(position(40 * MS, 9.0, 9.0))
-    after = tail.state_at(START_NS + 50 * MS, *at)
+    past = passed((0, 100 * MS, 200 * MS), {})
+    at = past.prior.mean, past.prior.covariance
+    before = past.state_at(START_NS + 50 * MS, *at)
+    past.copy().fuse(position(40 * MS, 9.0, 9.0))
+    after = past.state_at(START_NS + 50 * MS, *at)
     np.testing.assert_array_equal(before[0], after[0])
     np.testing.assert_array_equal(before[1], after[1])
 

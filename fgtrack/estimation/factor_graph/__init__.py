@@ -4,10 +4,10 @@ One node per distinct stamp, one motion factor per pair of neighbours, one measu
 detection splits the motion factor that it falls into; nodes that leave the window are marginalised.
 """
 
-from fgtrack.estimation.factor_graph.bank import SmootherBank
-from fgtrack.estimation.factor_graph.batch import BatchBackend
-from fgtrack.estimation.factor_graph.incremental import IncrementalBackend
+from fgtrack.estimation.factor_graph.backends.batch import BatchBackend
+from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
 from fgtrack.estimation.factor_graph.settings import SmootherSettings
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
+from fgtrack.estimation.factor_graph.smoother_bank import SmootherBank
 
 __all__ = ["BatchBackend", "FixedLagSmoother", "IncrementalBackend", "SmootherBank", "SmootherSettings"]

@@ -5,7 +5,7 @@ from collections.abc import Container
 from dataclasses import dataclass, field
 
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.factor_graph.evidence import Evidence
+from fgtrack.estimation.factor_graph.terms import MeasurementTerm
 
 
 @dataclass(slots=True)
@@ -17,7 +17,7 @@ class Node:
     """The variable's number in the graph."""
     guess: FloatArray
     """First estimate, shape (n,)."""
-    evidence: list[Evidence] = field(default_factory=list)
+    terms: list[MeasurementTerm] = field(default_factory=list)
     slot: int | None = None
     """Graph slot of the motion factor to the next node; None of the newest node."""
 

@@ -13,7 +13,7 @@ from scipy.linalg.lapack import dpotrf
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.factor_graph.evidence import Equivalent, Evidence, linearised
+from fgtrack.estimation.factor_graph.terms import EquivalentMeasurement, MeasurementTerm, linearised
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.sensors import RobustLoss
 
@@ -38,7 +38,7 @@ def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float) -> gt
 
     The error is L^-1 (x_right - f(x_left)), with L L' = Q(x_left, dt) taken at the same state: no derivative of L is
     taken, so this is Gauss-Newton with reweighting. Where it converges its answer does not depend on where it began;
-    over long gaps whole steps may swing between two answers (see `Window.settle`).
+    over long gaps whole steps may swing between two answers (see `Window.converge_damped`).
     """
     n = motion.dim
     both = np.zeros((n, 2 * n + 1), order="F")
@@ -61,16 +61,16 @@ def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float) -> gt
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(n), [left, right], error)
 
 
-def evidence_factor(key: int, evidence: Evidence, mean: FloatArray) -> gtsam.NonlinearFactor:
-    """What `evidence` says of the state at `key`, presently near `mean` (n,).
+def measurement_factor(key: int, term: MeasurementTerm, mean: FloatArray) -> gtsam.NonlinearFactor:
+    """What `term` says of the state at `key`, presently near `mean` (n,).
 
     A linear model with a Gaussian needs no callback; its angles are taken on the branch next to `mean`. Raises
     `numpy.linalg.LinAlgError` for a covariance that is not positive definite.
     """
-    if isinstance(evidence, Equivalent) or (evidence.model.linear and evidence.loss is None):
-        y, H, R = linearised(evidence, mean)
+    if isinstance(term, EquivalentMeasurement) or (term.model.linear and term.loss is None):
+        y, H, R = linearised(term, mean)
         return _linear_factor(key, mean, y, H, _root(R))
-    return _callback_factor(key, evidence)
+    return _callback_factor(key, term)
 
 
 def _linear_factor(

@@ -8,13 +8,13 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.base import BirthPrior, Measurement, UpdateResult, UpdateStatus
-from fgtrack.estimation.birth import birth_state
-from fgtrack.estimation.factor_graph.backend import Backend
-from fgtrack.estimation.factor_graph.evidence import linearised
+from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
+from fgtrack.estimation.birth import initial_state
+from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.initiation import straight_line
+from fgtrack.estimation.factor_graph.marginalised_past import Prior
 from fgtrack.estimation.factor_graph.settings import SmootherSettings
-from fgtrack.estimation.factor_graph.tail import Prior
+from fgtrack.estimation.factor_graph.terms import linearised
 from fgtrack.estimation.factor_graph.window import Window
 from fgtrack.models.motion import MotionModel
 
@@ -42,14 +42,14 @@ class FixedLagSmoother:
     def __init__(
         self,
         motion: MotionModel,
-        prior: BirthPrior,
+        prior: Start,
         settings: SmootherSettings,
         make_backend: Callable[[], Backend],
     ) -> None:
         self._settings = settings
         self._lag_ns, self._ring_ns = nanoseconds(settings.lag_s), nanoseconds(settings.ring_s)
         self._first_ns = self._clock_ns = prior.stamp_ns
-        self._window = Window(motion, prior.stamp_ns, Prior(*birth_state(motion, prior)), make_backend)
+        self._window = Window(motion, prior.stamp_ns, Prior(*initial_state(motion, prior)), make_backend)
         self._aimed = prior.yaw_rad is not None or motion.linear
         self._final: list[TrackState] = []
 
@@ -108,7 +108,7 @@ class FixedLagSmoother:
     def converge(self, max_iterations: int = 50) -> None:
         """Relinearise until nothing moves; for comparisons."""
         self._window.converge(max_iterations)
-        self._window.settle(max_iterations)
+        self._window.converge_damped(max_iterations)
 
     def _aim(self) -> None:
         """Begin again from a straight line through the positions so far, until their direction is certain.

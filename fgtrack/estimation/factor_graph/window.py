@@ -1,4 +1,4 @@
-"""The graph of one object's window: nodes, segments and evidence, and the solver behind them."""
+"""The graph of one object's window: nodes, segments and measurement terms, and the solver behind them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
@@ -9,13 +9,13 @@ import numpy as np
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.factor_graph.backend import AT_REST, Backend, Change, Marginalised
+from fgtrack.estimation.factor_graph.backends.base import AT_REST, Backend, Change, Marginalised
+from fgtrack.estimation.factor_graph.backends.incremental import FIRST_KEY
 from fgtrack.estimation.factor_graph.chain import Chain, Node
-from fgtrack.estimation.factor_graph.evidence import Evidence
-from fgtrack.estimation.factor_graph.factors import evidence_factor, motion_factor, prior_factor
-from fgtrack.estimation.factor_graph.incremental import FIRST_KEY
+from fgtrack.estimation.factor_graph.factors import measurement_factor, motion_factor, prior_factor
 from fgtrack.estimation.factor_graph.initiation import Fix, Line, along, fix_of
-from fgtrack.estimation.factor_graph.tail import Prior, Tail
+from fgtrack.estimation.factor_graph.marginalised_past import MarginalisedPast, Prior
+from fgtrack.estimation.factor_graph.terms import MeasurementTerm
 from fgtrack.estimation.interpolation import between
 from fgtrack.models.motion import MotionModel
 
@@ -40,7 +40,7 @@ class Window:
         self._make_backend = make_backend
         self._first_ns = stamp_ns
         self._chain = Chain(Node(stamp_ns, FIRST_KEY, prior.mean))
-        self._tail = Tail(motion, stamp_ns, prior)
+        self._past = MarginalisedPast(motion, stamp_ns, prior)
         self._means: dict[int, FloatArray] = {}
         self._covariances: dict[tuple[int, ...], FloatArray] = {}
         self._states: dict[int, tuple[FloatArray, FloatArray]] = {}
@@ -61,7 +61,7 @@ class Window:
     @property
     def reach_ns(self) -> int:
         """Oldest stamp at which something can still be fused."""
-        return self._tail.start_ns
+        return self._past.start_ns
 
     def update(
         self, measurements: Sequence[Measurement], start_ns: int, reach_ns: int, final: bool
@@ -71,16 +71,16 @@ class Window:
         One node at or before `start_ns` stays. Conditionals of marginalised nodes are kept from `reach_ns` on. Gives
         the states of the nodes that left, where `final`. Raises `RuntimeError` where it fails; all is as before then.
         """
-        chain, tail = self._chain, self._tail.copy()
+        chain, past = self._chain, self._past.copy()
         leaving = chain.nodes[: max(chain.place(start_ns), 0)]
         anchor = chain.nodes[len(leaving)]
         new: dict[int, FloatArray] = {}
         try:
             for node, right in zip(leaving, chain.nodes[1:], strict=False):
-                tail.pass_node(node.evidence, self._mean(node), right.stamp_ns, self._mean(right))
-            left = self._states_behind(tail, anchor, leaving) if final else []
+                past.pass_node(node.terms, self._mean(node), right.stamp_ns, self._mean(right))
+            left = self._states_behind(past, anchor, leaving) if final else []
             old = [item for item in measurements if item.stamp_ns < anchor.stamp_ns]
-            added: list[tuple[Node, Evidence]] = [(anchor, tail.fuse(item)) for item in old]
+            added: list[tuple[Node, MeasurementTerm]] = [(anchor, past.fuse(item)) for item in old]
             live = [item for item in measurements if item.stamp_ns >= anchor.stamp_ns]
             guesses = {item.stamp_ns: self.state_at(item.stamp_ns)[0] for item in live}
             for item in live:
@@ -89,17 +89,17 @@ class Window:
                     at = chain.insert(item.stamp_ns, guesses[item.stamp_ns])
                     new[at.key] = at.guess
                 added.append((at, item))
-            self._solve(added, new, leaving, tail.prior)
+            self._solve(added, new, leaving, past.prior)
         except _BROKEN as error:
             chain.remove(new)
             self._rebuild(self._estimates())
             self.num_rebuilt += 1
             raise RuntimeError(f"the graph cannot be solved with the new measurements ({error})") from error
-        tail.forget_before(reach_ns)
-        self._tail = tail
+        past.forget_before(reach_ns)
+        self._past = past
         chain.drop(len(leaving))
-        for node, evidence in added:
-            node.evidence.append(evidence)
+        for node, term in added:
+            node.terms.append(term)
         return left
 
     def state_at(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
@@ -113,7 +113,7 @@ class Window:
         place = self._chain.place(stamp_ns)
         if place < 0:
             anchor = self._chain.oldest
-            return self._tail.state_at(stamp_ns, self._mean(anchor), self._covariance(anchor))
+            return self._past.state_at(stamp_ns, self._mean(anchor), self._covariance(anchor))
         node = self._chain.nodes[place]
         mean = self._mean(node)
         if node.stamp_ns == stamp_ns:
@@ -133,7 +133,7 @@ class Window:
         self._backend.converge(max_iterations)
         self._forget_estimates()
 
-    def settle(self, max_iterations: int) -> None:
+    def converge_damped(self, max_iterations: int) -> None:
         """Go half of each step until none is left, or `max_iterations` are done.
 
         Noise that follows its state can make full steps swing between two answers, in which half ones meet.
@@ -154,21 +154,21 @@ class Window:
 
     def fixes(self) -> list[Fix]:
         """The positions measured at the nodes, after that of the prior."""
-        prior = self._tail.prior
+        prior = self._past.prior
         fixes = [Fix(0.0, prior.mean[:2], prior.covariance[:2, :2])]
         for node in self._chain.nodes:
             time_s = self._seconds(node.stamp_ns)
-            found = [fix_of(item, time_s) for item in node.evidence if isinstance(item, Measurement)]
+            found = [fix_of(item, time_s) for item in node.terms if isinstance(item, Measurement)]
             fixes += [fix for fix in found if fix is not None]
         return fixes
 
     def restart(self, line: Line) -> None:
         """Solve again from states along `line`, with the prior's heading, which must be vague, turned there."""
-        nodes, prior = self._chain.nodes, self._tail.prior
+        nodes, prior = self._chain.nodes, self._past.prior
         means = {node.key: along(line, self._seconds(node.stamp_ns), self._motion.state_names) for node in nodes}
         mean = prior.mean.copy()
         mean[YAW] = means[nodes[0].key][YAW]
-        self._tail = Tail(self._motion, self._first_ns, Prior(mean, prior.covariance))
+        self._past = MarginalisedPast(self._motion, self._first_ns, Prior(mean, prior.covariance))
         self._rebuild(means)
 
     def _rebuild(self, means: Mapping[int, FloatArray]) -> None:
@@ -177,23 +177,23 @@ class Window:
         self._backend = self._make_backend()
         segments = list(pairwise(nodes))
         factors = [self._segment(left, right) for left, right in segments]
-        factors.append(prior_factor(nodes[0].key, self._tail.prior.mean, self._tail.prior.covariance))
-        factors += [evidence_factor(node.key, item, means[node.key]) for node in nodes for item in node.evidence]
+        factors.append(prior_factor(nodes[0].key, self._past.prior.mean, self._past.prior.covariance))
+        factors += [measurement_factor(node.key, item, means[node.key]) for node in nodes for item in node.terms]
         stamps_s = {node.key: self._seconds(node.stamp_ns) for node in nodes}
         slots = self._backend.update(Change(dict(means), stamps_s, factors, []))
         for (left, _), slot in zip(segments, slots, strict=False):
             left.slot = slot
         self._forget_estimates()
 
-    def _states_behind(self, tail: Tail, anchor: Node, leaving: Sequence[Node]) -> list[TrackState]:
+    def _states_behind(self, past: MarginalisedPast, anchor: Node, leaving: Sequence[Node]) -> list[TrackState]:
         if not leaving:
             return []
         mean, covariance = self._mean(anchor), self._covariance(anchor)
-        return [TrackState(node.stamp_ns, *tail.state_at(node.stamp_ns, mean, covariance)) for node in leaving]
+        return [TrackState(node.stamp_ns, *past.state_at(node.stamp_ns, mean, covariance)) for node in leaving]
 
     def _solve(
         self,
-        added: Sequence[tuple[Node, Evidence]],
+        added: Sequence[tuple[Node, MeasurementTerm]],
         new: dict[int, FloatArray],
         leaving: Sequence[Node],
         prior: Prior,
@@ -203,9 +203,9 @@ class Window:
         segments = [pair for pair in pairwise(nodes) if pair[0].key in new or pair[1].key in new]
         removed = [left.slot for left, _ in segments if left.slot is not None]
         factors = [self._segment(left, right) for left, right in segments]
-        for node, evidence in added:
+        for node, term in added:
             mean = new[node.key] if node.key in new else self._mean(node)
-            factors.append(evidence_factor(node.key, evidence, mean))
+            factors.append(measurement_factor(node.key, term, mean))
         stamps_s = {node.key: self._seconds(node.stamp_ns) for node in nodes if node.key in new}
         marginalised = None
         if leaving:

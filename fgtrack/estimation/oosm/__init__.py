@@ -7,15 +7,15 @@ counted in steps. The methods differ in what they know of the state at tau; most
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from fgtrack.estimation.base import BirthPrior, Estimator
+from fgtrack.estimation.base import Estimator, Start
 from fgtrack.estimation.oosm.asd import AccumulatedStateDensity
-from fgtrack.estimation.oosm.backward_forward import BackwardForward
 from fgtrack.estimation.oosm.forward import CovarianceIntersection, Fpfd, determinant, trace
 from fgtrack.estimation.oosm.held import DelayedHorizon, ReorderBuffer
 from fgtrack.estimation.oosm.larsen import Larsen
 from fgtrack.estimation.oosm.one_step import Al1, Bl1
 from fgtrack.estimation.oosm.policies import AsCurrent, Drop
 from fgtrack.estimation.oosm.retrodiction import A1, B1, C
+from fgtrack.estimation.oosm.rewind_forget import RewindForget
 from fgtrack.estimation.oosm.rts import RtsCrossCovariance
 from fgtrack.estimation.oosm.zlz import FixedPoint
 from fgtrack.models.motion import MotionModel
@@ -27,7 +27,7 @@ __all__ = [
     "Al1",
     "AsCurrent",
     "B1",
-    "BackwardForward",
+    "RewindForget",
     "Bl1",
     "C",
     "CovarianceIntersection",
@@ -48,7 +48,7 @@ __all__ = [
 class Method:
     """A way to deal with late measurements."""
 
-    start: Callable[[MotionModel, BirthPrior, float], Estimator]
+    start: Callable[[MotionModel, Start, float], Estimator]
     """The estimator of a new object, from motion model, prior and length of the window in s."""
     exact: str
     """For which late measurements a linear model gets the answer of the time order; empty where for none."""
@@ -71,5 +71,5 @@ OOSM_METHODS: Mapping[str, Method] = {
     "fpfd": Method(Fpfd, "one lag, first late measurement"),
     "ci": Method(CovarianceIntersection, ""),
     "larsen": Method(Larsen, ""),
-    "backward-forward": Method(BackwardForward, ""),
+    "rewind-forget": Method(RewindForget, ""),
 }

@@ -9,8 +9,8 @@ from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.linalg import symmetrise
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
-from fgtrack.estimation.base import BirthPrior, Measurement, UpdateResult, UpdateStatus
-from fgtrack.estimation.birth import birth_state
+from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
+from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.oosm.crossing import Past, fuse_across
 from fgtrack.models.motion import MotionModel
@@ -44,11 +44,11 @@ class AccumulatedStateDensity:
         See `LateEkf`.
     """
 
-    def __init__(self, motion: MotionModel, prior: BirthPrior, lag_s: float) -> None:
+    def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
         self._motion = motion
         self._yawed = "yaw_rad" in motion.state_names
         self._lag_ns = nanoseconds(lag_s)
-        self._stack = _Stack((prior.stamp_ns,), *birth_state(motion, prior))
+        self._stack = _Stack((prior.stamp_ns,), *initial_state(motion, prior))
         self._start_ns = prior.stamp_ns
 
     @property

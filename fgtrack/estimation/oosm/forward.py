@@ -9,7 +9,7 @@ from scipy.optimize import minimize_scalar
 
 from fgtrack.core.linalg import identity, psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import BirthPrior, Measurement
+from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.ekf import OneCorrection
 from fgtrack.estimation.oosm.history import corrected
 from fgtrack.estimation.oosm.late import LateEkf
@@ -101,7 +101,7 @@ class CovarianceIntersection(_ForwardEkf):
     """
 
     def __init__(
-        self, motion: MotionModel, prior: BirthPrior, lag_s: float, size: Callable[[FloatArray], float] = trace
+        self, motion: MotionModel, prior: Start, lag_s: float, size: Callable[[FloatArray], float] = trace
     ) -> None:
         super().__init__(motion, prior, lag_s)
         self._size = size

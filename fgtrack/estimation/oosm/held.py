@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import TrackState
-from fgtrack.estimation.base import BirthPrior, Measurement, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.ekf import predict_one
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.motion import MotionModel
@@ -19,7 +19,7 @@ class HeldEkf(ABC):
     everything that was known of that stamp when the measurement came, held measurements included.
     """
 
-    def __init__(self, motion: MotionModel, prior: BirthPrior, lag_s: float, hold_s: float) -> None:
+    def __init__(self, motion: MotionModel, prior: Start, lag_s: float, hold_s: float) -> None:
         if not 0.0 <= hold_s <= lag_s:
             raise CallError(f"measurements held for {hold_s} s: give a time from 0 to the window's {lag_s} s")
         self._motion = motion
@@ -78,7 +78,7 @@ class DelayedHorizon(HeldEkf):
         D, at most `lag_s`. Raises `CallError` otherwise.
     """
 
-    def __init__(self, motion: MotionModel, prior: BirthPrior, lag_s: float, horizon_s: float = 0.2) -> None:
+    def __init__(self, motion: MotionModel, prior: Start, lag_s: float, horizon_s: float = 0.2) -> None:
         super().__init__(motion, prior, lag_s, horizon_s)
 
     @property
@@ -104,7 +104,7 @@ class ReorderBuffer(HeldEkf):
         D, at most `lag_s`. Raises `CallError` otherwise.
     """
 
-    def __init__(self, motion: MotionModel, prior: BirthPrior, lag_s: float, hold_s: float = 0.1) -> None:
+    def __init__(self, motion: MotionModel, prior: Start, lag_s: float, hold_s: float = 0.1) -> None:
         super().__init__(motion, prior, lag_s, hold_s)
 
     @property

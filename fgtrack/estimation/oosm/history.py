@@ -14,7 +14,7 @@ from fgtrack.models.motion import MotionModel
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class FilterStep:
     """A state before and after a measurement, and what the measurement said; yaws are not wrapped."""
 
     stamp_ns: int
@@ -58,15 +58,15 @@ class History:
     def __init__(self, motion: MotionModel, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
         self._motion = motion
         nothing = np.zeros_like(mean), np.zeros_like(covariance)
-        self.steps = [Step(stamp_ns, mean, covariance, mean, covariance, *nothing)]
+        self.steps = [FilterStep(stamp_ns, mean, covariance, mean, covariance, *nothing)]
 
     @property
-    def newest(self) -> Step:
+    def newest(self) -> FilterStep:
         """The present."""
         return self.steps[-1]
 
     @property
-    def first_at_newest(self) -> Step:
+    def first_at_newest(self) -> FilterStep:
         """The first of the steps that share the present stamp."""
         return self.steps[bisect.bisect_left(self.steps, self.newest.stamp_ns, key=_stamp)]
 
@@ -96,7 +96,7 @@ class History:
         before = self.steps[place - 1]
         return self.transition(before.mean, before.stamp_ns, self.steps[place].stamp_ns)
 
-    def stepped(self, place: int, measurement: Measurement) -> tuple[Step, OneCorrection]:
+    def stepped(self, place: int, measurement: Measurement) -> tuple[FilterStep, OneCorrection]:
         """The ordinary step from the one at `place` to `measurement`; the history stays as it is.
 
         Raises `numpy.linalg.LinAlgError` for a measurement that cannot be fused.
@@ -107,11 +107,11 @@ class History:
         weighted = psd_solve(H @ covariance @ H.T + measurement.R, np.column_stack((result.innovation, H)))
         score, weight = H.T @ weighted[:, 0], symmetrise(H.T @ weighted[:, 1:])
         return (
-            Step(measurement.stamp_ns, result.mean, result.covariance, mean, covariance, score, weight),
+            FilterStep(measurement.stamp_ns, result.mean, result.covariance, mean, covariance, score, weight),
             result,
         )
 
-    def append(self, step: Step) -> None:
+    def append(self, step: FilterStep) -> None:
         """Let `step` be the present."""
         self.steps.append(step)
 
@@ -126,7 +126,7 @@ class History:
         gained = psd_solve(now.covariance, now.covariance - covariance)
         score = psd_solve(now.covariance, mean - now.mean)
         weight = symmetrise(psd_solve(now.covariance, gained.T))
-        self.append(Step(now.stamp_ns, mean, covariance, now.mean, now.covariance, score, weight))
+        self.append(FilterStep(now.stamp_ns, mean, covariance, now.mean, now.covariance, score, weight))
 
     def forget_after(self, place: int) -> None:
         """Drop the steps after `place`."""
@@ -137,5 +137,5 @@ class History:
         del self.steps[: self.left(stamp_ns)]
 
 
-def _stamp(step: Step) -> int:
+def _stamp(step: FilterStep) -> int:
     return step.stamp_ns

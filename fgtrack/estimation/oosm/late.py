@@ -7,8 +7,8 @@ import numpy as np
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
-from fgtrack.estimation.base import BirthPrior, Measurement, UpdateResult, UpdateStatus
-from fgtrack.estimation.birth import birth_state
+from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
+from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import OneCorrection
 from fgtrack.estimation.oosm.crossing import Past, fuse_across
 from fgtrack.estimation.oosm.history import History
@@ -31,11 +31,11 @@ class LateEkf(ABC):
         Length of the window behind the newest stamp or the clock.
     """
 
-    def __init__(self, motion: MotionModel, prior: BirthPrior, lag_s: float) -> None:
+    def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
         self._motion = motion
         self._yawed = "yaw_rad" in motion.state_names
         self._lag_ns = nanoseconds(lag_s)
-        self._history = History(motion, prior.stamp_ns, *birth_state(motion, prior))
+        self._history = History(motion, prior.stamp_ns, *initial_state(motion, prior))
         self._start_ns = prior.stamp_ns
         self._newest_ns = prior.stamp_ns
 

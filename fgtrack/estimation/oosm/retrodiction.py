@@ -8,13 +8,13 @@ from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.oosm.crossing import Past
-from fgtrack.estimation.oosm.history import Step
+from fgtrack.estimation.oosm.history import FilterStep
 from fgtrack.estimation.oosm.late import CrossingEkf
 from fgtrack.models.motion import MotionModel
 
 
 def retrodicted(
-    motion: MotionModel, now: Step, before: tuple[FloatArray, FloatArray], back_s: float, noise_in_state: bool
+    motion: MotionModel, now: FilterStep, before: tuple[FloatArray, FloatArray], back_s: float, noise_in_state: bool
 ) -> Past:
     """The state `back_s` before `now`, from `now` and the state `before` the measurements that made it.
 

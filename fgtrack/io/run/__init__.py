@@ -1,9 +1,9 @@
 """The run folder `fgtrack-run/1`, the interface of tracking and evaluation: writer, reader, layout; runs in memory."""
 
-from fgtrack.io.run_layout import COLUMNS, COVARIANCE_COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
-from fgtrack.io.run_memory import MemoryRun
-from fgtrack.io.run_reader import NO_TRACK, Run, Table, read_run
-from fgtrack.io.run_writer import RunWriter, digest, is_run_folder, write_metrics
+from fgtrack.io.run.memory import MemoryRun
+from fgtrack.io.run.reader import NO_TRACK, Run, Table, read_run
+from fgtrack.io.run.schema import COLUMNS, COVARIANCE_COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
+from fgtrack.io.run.writer import RunWriter, digest, is_run_folder, write_metrics
 
 __all__ = [
     "COLUMNS",

@@ -8,7 +8,7 @@ from fgtrack.estimation.base import Measurement
 
 
 @dataclass(frozen=True, slots=True)
-class Equivalent:
+class EquivalentMeasurement:
     """A detection older than the window, as a linear measurement y = H (x - origin) + N(0, R) of its oldest node."""
 
     origin: FloatArray
@@ -21,7 +21,7 @@ class Equivalent:
     """Shape (k, k)."""
 
 
-Evidence = Measurement | Equivalent
+MeasurementTerm = Measurement | EquivalentMeasurement
 
 
 class Linearised(NamedTuple):
@@ -32,11 +32,11 @@ class Linearised(NamedTuple):
     R: FloatArray
 
 
-def linearised(evidence: Evidence, x: FloatArray) -> Linearised:
-    """`evidence` near the state `x`, shape (n,)."""
-    if isinstance(evidence, Equivalent):
-        return Linearised(evidence.y - evidence.H @ (x - evidence.origin), evidence.H, evidence.R)
-    model = evidence.model
-    y = model.residual(evidence.z, model.predict(x, evidence.pose))
-    H = model.selection(len(x)) if model.linear else model.jacobian(x, evidence.pose)
-    return Linearised(y, H, evidence.R)
+def linearised(term: MeasurementTerm, x: FloatArray) -> Linearised:
+    """`term` near the state `x`, shape (n,)."""
+    if isinstance(term, EquivalentMeasurement):
+        return Linearised(term.y - term.H @ (x - term.origin), term.H, term.R)
+    model = term.model
+    y = model.residual(term.z, model.predict(x, term.pose))
+    H = model.selection(len(x)) if model.linear else model.jacobian(x, term.pose)
+    return Linearised(y, H, term.R)

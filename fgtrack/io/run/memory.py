@@ -18,9 +18,9 @@ from fgtrack.core.types import (
     TrackState,
     TruthState,
 )
-from fgtrack.io.run_layout import COLUMNS, COVARIANCE_COLUMNS, COVARIANCE_STATES, RUN_FORMAT
-from fgtrack.io.run_reader import Column, Run, Table, column
-from fgtrack.io.run_writer import disposition_counts, kept_smoothed
+from fgtrack.io.run.reader import Column, Run, Table, column
+from fgtrack.io.run.schema import COLUMNS, COVARIANCE_COLUMNS, COVARIANCE_STATES, RUN_FORMAT
+from fgtrack.io.run.writer import disposition_counts, kept_smoothed
 
 _Cell = str | int | float | None
 

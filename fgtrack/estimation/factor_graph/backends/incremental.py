@@ -6,7 +6,7 @@ from typing import SupportsFloat, SupportsIndex, SupportsInt
 import gtsam
 
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.factor_graph.backend import Change
+from fgtrack.estimation.factor_graph.backends.base import Change
 
 _Key = SupportsInt | SupportsIndex
 _Stamp = SupportsFloat | SupportsIndex

@@ -16,9 +16,9 @@ from fgtrack.io.adapters.fields import (
 )
 from fgtrack.io.adapters.native import NATIVE_ADAPTERS
 from fgtrack.io.adapters.objects import OBJECT_ADAPTERS
-from fgtrack.io.bag import Bag, BagTopic, type_name
 from fgtrack.io.config import InputConfig, TopicInput
 from fgtrack.io.errors import TruncatedInput
+from fgtrack.io.ros.bag import Bag, BagTopic, type_name
 
 Convert = Callable[[RosMessage, int], Iterator[Message]]
 

@@ -7,7 +7,7 @@ import numpy as np
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import SmoothedReport, TrackState
-from fgtrack.estimation.base import BirthPrior, StatesAt
+from fgtrack.estimation.base import Start, StatesAt
 from fgtrack.estimation.factor_graph.settings import SmootherSettings
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
 from fgtrack.estimation.object_bank import ObjectBank
@@ -29,7 +29,7 @@ class SmootherBank(ObjectBank):
     """
 
     def __init__(
-        self, motion: MotionModel, start: Callable[[BirthPrior], FixedLagSmoother], settings: SmootherSettings
+        self, motion: MotionModel, start: Callable[[Start], FixedLagSmoother], settings: SmootherSettings
     ) -> None:
         super().__init__(motion, start, settings.lag_s + (settings.ring_s if settings.late == "fuse" else 0.0))
         self._smoothers: dict[int, FixedLagSmoother] = {}
@@ -51,7 +51,7 @@ class SmootherBank(ObjectBank):
             )
         return super().states_at(stamp_ns)
 
-    def birth(self, track_id: int, prior: BirthPrior) -> None:
+    def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
         smoother = self._start_smoother(prior)
         self._smoothers[track_id] = self._estimators[track_id] = smoother

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg.lapack import dtrtri
 
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.factor_graph.backend import AT_REST, Change
+from fgtrack.estimation.factor_graph.backends.base import AT_REST, Change
 
 
 class BatchBackend:

@@ -18,10 +18,10 @@ from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
 
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S
-from fgtrack.io.bag_files import BagFile, BagFolder, EmptyFile, merged, storage_of
 from fgtrack.io.errors import TruncatedInput
-from fgtrack.io.rosbag1_file import Rosbag1File
-from fgtrack.io.typestore import build_typestore, one_line, type_name
+from fgtrack.io.ros.bag_files import BagFile, BagFolder, EmptyFile, merged, storage_of
+from fgtrack.io.ros.rosbag1_file import Rosbag1File
+from fgtrack.io.ros.typestore import build_typestore, one_line, type_name
 
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _BAG_SUFFIXES = (".mcap", ".db3")

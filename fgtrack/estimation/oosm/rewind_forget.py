@@ -5,7 +5,7 @@ from fgtrack.estimation.ekf import OneCorrection
 from fgtrack.estimation.oosm.late import LateEkf
 
 
-class BackwardForward(LateEkf):
+class RewindForget(LateEkf):
     """Update at the late stamp, and forget what was fused after it.
 
     Karle, Fent, Huch, Sauerbeck and Lienkamp, Multi-modal sensor fusion and object tracking for autonomous racing, IEEE

@@ -26,7 +26,7 @@ _STEP_NS = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
+class ShiftableMeasurement:
     """One detection of a known object."""
 
     sensor: str
@@ -57,8 +57,8 @@ class Nodes:
         return between(motion, left, right, seconds(inside_ns - start_ns), seconds(end_ns - inside_ns))
 
 
-class Reading(NamedTuple):
-    """What a sighting says about the two nodes around it, had it been sensed at a given time.
+class PairTerm(NamedTuple):
+    """What a measurement says about the two nodes around it, had it been sensed at a given time.
 
     y + left dx_left + right dx_right + N(0, R) = 0 with y = predicted minus measured, and dx how far the nodes are from
     their present means.
@@ -80,17 +80,17 @@ class Reading(NamedTuple):
         return float(np.linalg.norm(np.linalg.solve(np.linalg.cholesky(self.R), self.y)))
 
 
-def reading(motion: MotionModel, nodes: Nodes, sighting: Sighting, time_ns: int) -> Reading:
-    """`sighting` near the means of `nodes`, had it been sensed at `time_ns`."""
+def pair_term(motion: MotionModel, nodes: Nodes, measurement: ShiftableMeasurement, time_ns: int) -> PairTerm:
+    """`measurement` near the means of `nodes`, had it been sensed at `time_ns`."""
     place = nodes.left_of(time_ns)
-    state, measured = nodes.between(motion, place, time_ns), sighting.sensed_at(time_ns)
+    state, measured = nodes.between(motion, place, time_ns), measurement.sensed_at(time_ns)
     H = measured.model.jacobian(state.mean, measured.pose)
     R = measured.R + H @ state.Sigma @ H.T
-    return Reading(place, _error(state, measured), H @ state.Lambda, H @ state.Psi, R)
+    return PairTerm(place, _error(state, measured), H @ state.Lambda, H @ state.Psi, R)
 
 
 class Rates(NamedTuple):
-    """How a reading changes with the time at which the sighting was sensed."""
+    """How a term changes with the time at which the measurement was sensed."""
 
     y: FloatArray
     """Of predicted minus measured, by the second, shape (k,)."""
@@ -98,14 +98,14 @@ class Rates(NamedTuple):
     """Of the object against the frame that it was measured in, shape (2,)."""
 
 
-def rates(motion: MotionModel, nodes: Nodes, sighting: Sighting, time_ns: int) -> Rates:
+def rates(motion: MotionModel, nodes: Nodes, measurement: ShiftableMeasurement, time_ns: int) -> Rates:
     """Central differences by the time at `time_ns`."""
     errors, gaps = [], []
     for moved_ns in (time_ns - _STEP_NS, time_ns + _STEP_NS):
         state = nodes.between(motion, nodes.left_of(moved_ns), moved_ns)
-        measured = sighting.sensed_at(moved_ns)
+        measured = measurement.sensed_at(moved_ns)
         fix = fix_of(measured, 0.0)
-        assert fix is not None, "a sighting holds a position"
+        assert fix is not None, "a measurement holds a position"
         errors.append(_error(state, measured))
         gaps.append(state.mean[:2] - fix.position_m)
     span_s = seconds(2 * _STEP_NS)
@@ -116,7 +116,7 @@ def _error(state: Between, measured: Measurement) -> FloatArray:
     return -measured.model.residual(measured.z, measured.model.predict(state.mean, measured.pose))
 
 
-def reading_factor(keys: Sequence[int], nodes: Nodes, item: Reading, huber_width: float | None) -> gtsam.CustomFactor:
+def pair_factor(keys: Sequence[int], nodes: Nodes, item: PairTerm, huber_width: float | None) -> gtsam.CustomFactor:
     """What `item` says of the two states around it; `keys` are those of `nodes`."""
     left, right = keys[item.place], keys[item.place + 1]
     left_mean, right_mean = nodes.means[item.place], nodes.means[item.place + 1]

@@ -10,7 +10,7 @@ from fgtrack.core.geometry import rotation
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.factor_graph.timed import Sighting
+from fgtrack.estimation.factor_graph.clock_calibration.time_shift import ShiftableMeasurement
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV
 
@@ -60,7 +60,7 @@ class World:
     frozen: bool = False
     """The object has no process noise."""
 
-    def sightings(self, rng: np.random.Generator) -> list[Sighting]:
+    def measurements(self, rng: np.random.Generator) -> list[ShiftableMeasurement]:
         """One object drawn from the motion model, as all sensors see it."""
         times = sorted(
             (eye.phase_s + k / eye.rate_hz, name)
@@ -79,13 +79,15 @@ class World:
             found.append(self._seen(rng, name, x, START_NS + nanoseconds(time_s)))
         return found
 
-    def _seen(self, rng: np.random.Generator, name: str, x: FloatArray, sensed_ns: int) -> Sighting:
+    def _seen(self, rng: np.random.Generator, name: str, x: FloatArray, sensed_ns: int) -> ShiftableMeasurement:
         eye = self.eyes[name]
         pose = self.ego(sensed_ns)
         std_m = eye.std_m * (10.0 if rng.random() < eye.outliers else 1.0)
         z = rotation(-pose.yaw_rad) @ (x[:2] - np.array(pose[:2])) + std_m * rng.standard_normal(2)
         stamp_ns = sensed_ns + nanoseconds(eye.offset_s)
-        return Sighting(name, stamp_ns, polar(z, self.ego, eye.std_m) if eye.polar else in_ego(z, self.ego, eye.std_m))
+        return ShiftableMeasurement(
+            name, stamp_ns, polar(z, self.ego, eye.std_m) if eye.polar else in_ego(z, self.ego, eye.std_m)
+        )
 
 
 def in_ego(z: FloatArray, ego: Callable[[int], SensorPose], std_m: float) -> Callable[[int], Measurement]:
@@ -107,6 +109,6 @@ def polar(z: FloatArray, ego: Callable[[int], SensorPose], std_m: float) -> Call
     return lambda time_ns: Measurement(time_ns, POLAR, ranged, R, ego(time_ns))
 
 
-def shuffled(rng: np.random.Generator, items: Sequence[Sighting]) -> list[Sighting]:
+def shuffled(rng: np.random.Generator, items: Sequence[ShiftableMeasurement]) -> list[ShiftableMeasurement]:
     """`items` in another order."""
     return [items[i] for i in rng.permutation(len(items))]

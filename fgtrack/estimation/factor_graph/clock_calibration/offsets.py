@@ -23,10 +23,17 @@ import numpy as np
 from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import YAW, BoolArray, FloatArray
+from fgtrack.estimation.factor_graph.clock_calibration.levenberg_marquardt import solved
+from fgtrack.estimation.factor_graph.clock_calibration.time_shift import (
+    Nodes,
+    PairTerm,
+    ShiftableMeasurement,
+    pair_factor,
+    pair_term,
+    rates,
+)
 from fgtrack.estimation.factor_graph.factors import motion_factor, prior_factor, weight
 from fgtrack.estimation.factor_graph.initiation import along, fix_of, straight_line
-from fgtrack.estimation.factor_graph.levenberg import solved
-from fgtrack.estimation.factor_graph.timed import Nodes, Reading, Sighting, rates, reading, reading_factor
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.sensors import RobustLoss
 
@@ -41,7 +48,7 @@ _WIDE = {
     "vx_mps": 100.0,
     "vy_mps": 100.0,
 }
-_LINE = 12  # sightings that a first guess of a state is a line through
+_LINE = 12  # measurements that a first guess of a state is a line through
 _LARGEST_MOVE_S = 0.1  # of an offset in one round, at first
 _SMALLEST_STEP_S, _LARGEST_STEP_S = 2e-4, 5e-3  # of differences by an offset
 _NEGLIGIBLE = 0.2  # of a standard deviation: what is left after such a Newton step is far less
@@ -59,7 +66,7 @@ class OffsetSettings:
     node_s: float = 0.1
     """Time between two nodes of a track."""
     tolerance_s: float = 1e-5
-    """An offset is settled when it moves less, or less than a fifth of its standard deviation."""
+    """An offset is converged when it moves less, or less than a fifth of its standard deviation."""
     max_rounds: int = 10
 
     def __post_init__(self) -> None:
@@ -86,7 +93,7 @@ class OffsetSolution:
     """Shape (m,)."""
     covariance: FloatArray
     """Shape (m, m); never wider than the prior."""
-    settled: BoolArray
+    converged: BoolArray
     """Which of them came to rest, shape (m,); the others may be anywhere."""
     rounds: int
     speeds_mps: Mapping[str, float]
@@ -96,7 +103,10 @@ class OffsetSolution:
 
 
 def solve_offsets(
-    motion: MotionModel, tracks: Sequence[Sequence[Sighting]], start_s: Mapping[str, float], settings: OffsetSettings
+    motion: MotionModel,
+    tracks: Sequence[Sequence[ShiftableMeasurement]],
+    start_s: Mapping[str, float],
+    settings: OffsetSettings,
 ) -> OffsetSolution:
     """The offsets of the sensors in `start_s` with which all sensors agree best; all other sensors have none.
 
@@ -114,13 +124,13 @@ def solve_offsets(
     Raises
     ------
     numpy.linalg.LinAlgError
-        A track has no two sightings at different times.
+        A track has no two measurements at different times.
     """
     prior = settings.prior_std_s**-2
     objective = _Agreement(motion, tracks, start_s, settings)
     offsets_s = np.array(list(start_s.values()))
     covariance = np.eye(len(offsets_s)) / prior
-    settled = np.zeros(len(offsets_s), dtype=np.bool_)
+    converged = np.zeros(len(offsets_s), dtype=np.bool_)
     limits_s, last_s = np.full(len(offsets_s), _LARGEST_MOVE_S), np.zeros(len(offsets_s))
     for rounds in range(1, settings.max_rounds + 1):
         steps_s = np.clip(np.sqrt(np.diag(covariance)), _SMALLEST_STEP_S, _LARGEST_STEP_S)
@@ -133,21 +143,21 @@ def solve_offsets(
         offsets_s = offsets_s + np.clip(newton_s, -limits_s, limits_s)
         offsets_s = np.clip(offsets_s, -settings.reach_s, settings.reach_s)
         std_s = np.sqrt(np.diag(covariance))
-        settled = np.abs(newton_s) < np.maximum(settings.tolerance_s, _NEGLIGIBLE * std_s)
+        converged = np.abs(newton_s) < np.maximum(settings.tolerance_s, _NEGLIGIBLE * std_s)
         lost = (std_s > _LOST * settings.prior_std_s) & (rounds >= _PATIENCE)
-        if (settled | lost).all():
+        if (converged | lost).all():
             break
-    return OffsetSolution(tuple(start_s), offsets_s, covariance, settled, rounds, *objective.summary(offsets_s))
+    return OffsetSolution(tuple(start_s), offsets_s, covariance, converged, rounds, *objective.summary(offsets_s))
 
 
 class _Path:
-    """One object: its sightings, and the states of its nodes with the offsets held."""
+    """One object: its measurements, and the states of its nodes with the offsets held."""
 
     def __init__(
-        self, motion: MotionModel, sightings: Sequence[Sighting], nodes: Nodes, huber_width: float | None
+        self, motion: MotionModel, measurements: Sequence[ShiftableMeasurement], nodes: Nodes, huber_width: float | None
     ) -> None:
         self._motion = motion
-        self._sightings = sightings
+        self._measurements = measurements
         self._huber_width = huber_width
         self._nodes = nodes
         self._keys = [gtsam.symbol("x", i) for i in range(len(nodes.stamps_ns))]
@@ -158,42 +168,42 @@ class _Path:
             *(motion_factor(motion, left, right, step_s) for left, right in pairwise(self._keys)),
         ]
 
-    def settle(self, offsets_s: Mapping[str, float]) -> None:
+    def optimise(self, offsets_s: Mapping[str, float]) -> None:
         """Bring the states to their best for these offsets, near where they are."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for factor in self._chain:
             graph.add(factor)
-        for item in self._sightings:
-            found = self.reading(item, offsets_s)
-            graph.add(reading_factor(self._keys, self._nodes, found, self._huber_width))
+        for item in self._measurements:
+            found = self.pair_term(item, offsets_s)
+            graph.add(pair_factor(self._keys, self._nodes, found, self._huber_width))
         for key, mean in zip(self._keys, self._nodes.means, strict=True):
             values.insert(key, mean)
         values = solved(graph, values, self._keys)
         self._nodes = Nodes(self._nodes.stamps_ns, np.array([values.atVector(key) for key in self._keys]))
 
     def slopes(self, offsets_s: Mapping[str, float]) -> dict[str, float]:
-        """Derivative of -log p by each offset, after `settle`: the states are at their best, so only through the time.
+        """Derivative of -log p by each offset, after `optimise`: the states are optimal, so through the time only.
 
         sum of -w (dy/dt)' R^-1 y, with the weight w of the loss. That R changes with the time is left out.
         """
         slopes = dict.fromkeys(offsets_s, 0.0)
-        for item in self._sightings:
+        for item in self._measurements:
             if item.sensor in slopes:
-                found = self.reading(item, offsets_s)
+                found = self.pair_term(item, offsets_s)
                 rate = rates(self._motion, self._nodes, item, _sensed_ns(item, offsets_s)).y
                 slopes[item.sensor] -= _weight(found, self._huber_width) * float(rate @ psd_solve(found.R, found.y))
         return slopes
 
-    def reading(self, item: Sighting, offsets_s: Mapping[str, float]) -> Reading:
+    def pair_term(self, item: ShiftableMeasurement, offsets_s: Mapping[str, float]) -> PairTerm:
         """What `item` says, at the time that the offsets give it."""
-        return reading(self._motion, self._nodes, item, _sensed_ns(item, offsets_s))
+        return pair_term(self._motion, self._nodes, item, _sensed_ns(item, offsets_s))
 
     def squares(self, offsets_s: Mapping[str, float]) -> list[tuple[str, float, float]]:
-        """Sensor, squared velocity against its frame, and squared residual per component, of each sighting."""
+        """Sensor, squared velocity against its frame, and squared residual per component, of each measurement."""
         found = []
-        for item in self._sightings:
+        for item in self._measurements:
             velocity_mps = rates(self._motion, self._nodes, item, _sensed_ns(item, offsets_s)).velocity_mps
-            one = self.reading(item, offsets_s)
+            one = self.pair_term(item, offsets_s)
             found.append((item.sensor, float(velocity_mps @ velocity_mps), one.distance**2 / len(one.y)))
         return found
 
@@ -204,25 +214,25 @@ class _Agreement:
     def __init__(
         self,
         motion: MotionModel,
-        tracks: Sequence[Sequence[Sighting]],
+        tracks: Sequence[Sequence[ShiftableMeasurement]],
         start_s: Mapping[str, float],
         settings: OffsetSettings,
     ) -> None:
         self._sensors = tuple(start_s)
         self._all: list[_Path] = []
         self._alone: list[_Path] = []
-        for sightings in tracks:
-            nodes = _first_nodes(motion, sightings, start_s, settings)
-            self._all.append(_Path(motion, sightings, nodes, settings.huber_width))
+        for measurements in tracks:
+            nodes = _first_nodes(motion, measurements, start_s, settings)
+            self._all.append(_Path(motion, measurements, nodes, settings.huber_width))
             for sensor in start_s:
-                own = [item for item in sightings if item.sensor == sensor]
+                own = [item for item in measurements if item.sensor == sensor]
                 if own:
                     self._alone.append(_Path(motion, own, nodes, settings.huber_width))
-        self._settle(start_s)
+        self._optimise(start_s)
 
     def derivatives(self, offsets_s: FloatArray, steps_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gradient (m,) and curvature (m, m) at `offsets_s`, from differences over `steps_s` (m,) to both sides."""
-        self._settle(self._named(offsets_s))
+        self._optimise(self._named(offsets_s))
         gradients = []
         curvature = np.empty((len(offsets_s), len(offsets_s)))
         for j, step_s in enumerate(steps_s):
@@ -244,13 +254,13 @@ class _Agreement:
     def _named(self, offsets_s: FloatArray) -> dict[str, float]:
         return dict(zip(self._sensors, offsets_s.tolist(), strict=True))
 
-    def _settle(self, offsets_s: Mapping[str, float]) -> None:
+    def _optimise(self, offsets_s: Mapping[str, float]) -> None:
         for path in (*self._all, *self._alone):
-            path.settle(offsets_s)
+            path.optimise(offsets_s)
 
     def _gradient(self, offsets_s: FloatArray) -> FloatArray:
         named = self._named(offsets_s)
-        self._settle(named)
+        self._optimise(named)
         gradient = np.zeros(len(offsets_s))
         for sign, paths in ((1.0, self._all), (-1.0, self._alone)):
             for path in paths:
@@ -259,13 +269,16 @@ class _Agreement:
 
 
 def _first_nodes(
-    motion: MotionModel, sightings: Sequence[Sighting], offsets_s: Mapping[str, float], settings: OffsetSettings
+    motion: MotionModel,
+    measurements: Sequence[ShiftableMeasurement],
+    offsets_s: Mapping[str, float],
+    settings: OffsetSettings,
 ) -> Nodes:
-    """Nodes over all times at which the sightings may have been sensed, each on a line through sightings around it."""
-    stamps = [item.stamp_ns for item in sightings]
+    """Nodes over all times that may have been meant, each on a line through the measurements around it."""
+    stamps = [item.stamp_ns for item in measurements]
     reach_ns, step_ns = nanoseconds(settings.reach_s), nanoseconds(settings.node_s)
     stamps_ns = range(min(stamps) - reach_ns, max(stamps) + reach_ns + step_ns, step_ns)
-    timed = sorted(((_sensed_ns(item, offsets_s), item) for item in sightings), key=lambda pair: pair[0])
+    timed = sorted(((_sensed_ns(item, offsets_s), item) for item in measurements), key=lambda pair: pair[0])
     times_ns = [time_ns for time_ns, _ in timed]
     means = []
     for stamp_ns in stamps_ns:
@@ -279,10 +292,10 @@ def _first_nodes(
     return Nodes(stamps_ns, nodes)
 
 
-def _sensed_ns(item: Sighting, offsets_s: Mapping[str, float]) -> int:
+def _sensed_ns(item: ShiftableMeasurement, offsets_s: Mapping[str, float]) -> int:
     return item.stamp_ns - nanoseconds(offsets_s.get(item.sensor, 0.0))
 
 
-def _weight(item: Reading, huber_width: float | None) -> float:
+def _weight(item: PairTerm, huber_width: float | None) -> float:
     """Of the loss, at the residual of `item`."""
     return 1.0 if huber_width is None else weight(RobustLoss("huber", huber_width), item.distance)

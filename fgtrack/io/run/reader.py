@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import BoolArray
-from fgtrack.io.run_layout import COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
+from fgtrack.io.run.schema import COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
 
 # A column holds floats, integers or strings, as its name says; the reader of it knows which.
 Column = npt.NDArray[Any]

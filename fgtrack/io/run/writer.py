@@ -23,7 +23,7 @@ from fgtrack.core.types import (
     TruthState,
     UpdateRecord,
 )
-from fgtrack.io.run_layout import COLUMNS, COVARIANCE_STATES, OPTIONAL_TABLES, RUN_FORMAT
+from fgtrack.io.run.schema import COLUMNS, COVARIANCE_STATES, OPTIONAL_TABLES, RUN_FORMAT
 
 _FILES = ("meta.json", "config.yaml", "metrics.json", *(f"{table}.csv" for table in COLUMNS))
 

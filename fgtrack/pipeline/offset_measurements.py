@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from fgtrack.core.types import DetectionList, Disposition
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.factor_graph.timed import Sighting
-from fgtrack.io.run_folder import NO_TRACK, Run
+from fgtrack.estimation.factor_graph.clock_calibration.time_shift import ShiftableMeasurement
+from fgtrack.io.run import NO_TRACK, Run
 from fgtrack.models.road import OpenSpace
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
@@ -29,7 +29,7 @@ _OF_A_TRACK = (
 
 
 class Remeasure:
-    """Makes sightings: detections that are transformed to the map, and merged, as the tracker does, at any time."""
+    """Measurements of detections, transformed to the map and merged as the tracker does, at any time."""
 
     def __init__(self, config: Config, path: EgoPath | None) -> None:
         """`path`: that of the ego; None where all detections are in the map frame."""
@@ -38,14 +38,16 @@ class Remeasure:
         self._preprocess = Preprocess(OpenSpace(), config.merge, config.motion.model(), origin_m)
         self._sensors = {name: _position_only(sensor) for name, sensor in config.sensors.items()}
 
-    def sighting(self, message: DetectionList, stamp_ns: int, indices: tuple[int, ...]) -> Sighting | None:
+    def measurement(
+        self, message: DetectionList, stamp_ns: int, indices: tuple[int, ...]
+    ) -> ShiftableMeasurement | None:
         """Detections `indices` of `message` as one; None where the ego or the position is not known."""
         if self._path is not None and not self._path.start_ns <= stamp_ns <= self._path.end_ns:
             return None
         used = self._sensors[message.sensor].std.keys()
         if not all(_is_position(used & set(message.objects[index].measured)) for index in indices):
             return None
-        return Sighting(message.sensor, stamp_ns, partial(self._measured, message, indices))
+        return ShiftableMeasurement(message.sensor, stamp_ns, partial(self._measured, message, indices))
 
     def _measured(self, message: DetectionList, indices: tuple[int, ...], time_ns: int) -> Measurement:
         pose = None if self._path is None else self._path(time_ns)
@@ -62,21 +64,21 @@ def _position_only(sensor: SensorModel) -> SensorModel:
     return replace(sensor, std=std, yaw_from_map_std_rad=None, max_range_m=None)
 
 
-def sightings_by_track(
+def measurements_by_track(
     run: Run,
     processed: Sequence[DetectionList],
     raw: Sequence[DetectionList],
     sensors: Mapping[str, SensorModel],
     remeasure: Remeasure,
-) -> list[list[Sighting]]:
-    """The sightings of each track of `run`, in order of stamp.
+) -> list[list[ShiftableMeasurement]]:
+    """The measurements of each track of `run`, in order of stamp.
 
     Parameters
     ----------
     processed
         The lists that the tracker got, all of `sensors`.
     raw
-        The same lists, with the stamps that the sightings are to have.
+        The same lists, with the stamps that the measurements are to have.
     """
     places = _places(processed)
     batches = [stamps(message, sensors[message.sensor]) for message in raw]
@@ -86,10 +88,10 @@ def sightings_by_track(
         if place is not None:
             index = row.detection[-1]
             groups[row.track_id, place, batches[place][index]].append((index, row.leads))
-    tracks: dict[int, list[Sighting]] = defaultdict(list)
+    tracks: dict[int, list[ShiftableMeasurement]] = defaultdict(list)
     for (track_id, place, stamp_ns), members in groups.items():
         if any(leads for _, leads in members):
-            found = remeasure.sighting(raw[place], stamp_ns, tuple(sorted(index for index, _ in members)))
+            found = remeasure.measurement(raw[place], stamp_ns, tuple(sorted(index for index, _ in members)))
             if found is not None:
                 tracks[track_id].append(found)
     return [sorted(tracks[track_id], key=lambda item: item.stamp_ns) for track_id in sorted(tracks)]

@@ -6,8 +6,11 @@ from collections.abc import Callable
 import numpy as np
 
 from fgtrack.core.types import FloatArray
+from fgtrack.models.path import Path
 from fgtrack.models.track_map import COLUMNS, TrackMap
-from fgtrack.sim.path import Path
+
+#: The name that stands for this map wherever a map file may be named.
+OVAL = "oval"
 
 _LENGTH_M = 2400.0
 _TURN_RADIUS_M = 220.0

@@ -11,8 +11,8 @@ from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.factor_graph.evidence import Equivalent, Evidence, Linearised, linearised
 from fgtrack.estimation.factor_graph.factors import weight
+from fgtrack.estimation.factor_graph.terms import EquivalentMeasurement, Linearised, MeasurementTerm, linearised
 from fgtrack.estimation.interpolation import between
 from fgtrack.models.motion import MotionModel
 
@@ -40,7 +40,7 @@ class Prior:
     covariance: FloatArray
 
 
-class Tail:
+class MarginalisedPast:
     """The past of a window.
 
     When the oldest node leaves, its filtered state splits into the prior of the next node and a conditional
@@ -55,9 +55,9 @@ class Tail:
         self._origin = prior.mean
         self.prior = prior
 
-    def copy(self) -> "Tail":
+    def copy(self) -> "MarginalisedPast":
         """An independent copy."""
-        other = Tail(self._motion, self._stamp_ns, self.prior)
+        other = MarginalisedPast(self._motion, self._stamp_ns, self.prior)
         other._ring, other._origin = list(self._ring), self._origin
         return other
 
@@ -66,15 +66,15 @@ class Tail:
         """Oldest stamp that `fuse` and `state_at` reach."""
         return self._ring[0].stamp_ns if self._ring else self._stamp_ns
 
-    def pass_node(self, evidence: list[Evidence], mean: FloatArray, next_ns: int, next_mean: FloatArray) -> None:
-        """The oldest node leaves the window with its evidence; the node at `next_ns` becomes the oldest.
+    def pass_node(self, terms: list[MeasurementTerm], mean: FloatArray, next_ns: int, next_mean: FloatArray) -> None:
+        """The oldest node leaves the window with its terms; the node at `next_ns` becomes the oldest.
 
         `mean` and `next_mean`, shape (n,), are the two nodes' present estimates. Raises `numpy.linalg.LinAlgError` for
-        evidence that cannot be fused.
+        a term that cannot be fused.
         """
         filtered, P = self.prior.mean, self.prior.covariance
-        for item in evidence:
-            y, H, R = _weighed(item, mean)
+        for term in terms:
+            y, H, R = _weighed(term, mean)
             filtered, P = _corrected(filtered, P, y - H @ (filtered - mean), H, R)
         step = self._motion.step(mean.tolist(), seconds(next_ns - self._stamp_ns))
         predicted = np.asarray(step.mean) + step.F @ (filtered - mean)
@@ -104,7 +104,7 @@ class Tail:
             P = conditional.A @ P @ conditional.A.T + conditional.C
         return path[0].mean + offset, symmetrise(P)
 
-    def fuse(self, measurement: Measurement) -> Equivalent:
+    def fuse(self, measurement: Measurement) -> EquivalentMeasurement:
         """Take a detection older than the window into the ring; gives what it says about the oldest node.
 
         Raises `numpy.linalg.LinAlgError` for one that cannot be fused, and stays as it was.
@@ -119,7 +119,7 @@ class Tail:
             updated.append(Conditional(at.stamp_ns, at.mean, A, b, C))
             y, H, R = y - H @ at.b, H @ at.A, S
         self._ring = before + updated
-        return Equivalent(self._origin, H, y, R)
+        return EquivalentMeasurement(self._origin, H, y, R)
 
     def _place(self, stamp_ns: int) -> int:
         return bisect.bisect_right(self._ring, stamp_ns, key=lambda at: at.stamp_ns) - 1
@@ -148,13 +148,13 @@ class Tail:
         return [*self._ring[:place], outer], [Conditional(stamp_ns, inner.mean, A, b, C), *self._ring[place + 1 :]]
 
 
-def _weighed(evidence: Evidence, x: FloatArray) -> Linearised:
-    """`evidence` near the state `x` (n,), with the weight that a robust loss leaves it there."""
-    y, H, R = linearised(evidence, x)
-    if isinstance(evidence, Equivalent) or evidence.loss is None:
+def _weighed(term: MeasurementTerm, x: FloatArray) -> Linearised:
+    """`term` near the state `x` (n,), with the weight that a robust loss leaves it there."""
+    y, H, R = linearised(term, x)
+    if isinstance(term, EquivalentMeasurement) or term.loss is None:
         return Linearised(y, H, R)
     distance = math.sqrt(y @ psd_solve(R, y))
-    return Linearised(y, H, R / max(weight(evidence.loss, distance), _LEAST_WEIGHT))
+    return Linearised(y, H, R / max(weight(term.loss, distance), _LEAST_WEIGHT))
 
 
 def _corrected(

@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from fgtrack.core.errors import CallError
-from fgtrack.io.definitions import DEFINITIONS
+from fgtrack.io.ros.definitions import DEFINITIONS
 
 _IDL_SEPARATOR = "=" * 80 + "\n"
 

@@ -11,7 +11,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import STATE_NAMES, Detection, DetectionList, EgoState, FloatArray, Frame, TruthState
 from fgtrack.io.adapters.common import RosMessage
 from fgtrack.io.adapters.native import DETECTION_OPTIONAL, DETECTIONS, EGO, TRUTH, TRUTH_OPTIONAL, presence
-from fgtrack.io.typestore import build_typestore
+from fgtrack.io.ros.typestore import build_typestore
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 DETECTION3D_ARRAY = "vision_msgs/msg/Detection3DArray"

@@ -8,9 +8,9 @@ from typing import Protocol
 from rosbags.interfaces import Connection
 from rosbags.rosbag2.reader import DirectoryReader
 
-from fgtrack.io.mcap_file import McapFile
-from fgtrack.io.rosbag1_file import Rosbag1File
-from fgtrack.io.sqlite3_file import Sqlite3File
+from fgtrack.io.ros.mcap_file import McapFile
+from fgtrack.io.ros.rosbag1_file import Rosbag1File
+from fgtrack.io.ros.sqlite3_file import Sqlite3File
 
 Record = tuple[Connection, int, bytes]
 """Connection, log time in ns, serialized message."""

@@ -1,0 +1,1 @@
+"""What solves the window: a protocol and its implementations on gtsam."""

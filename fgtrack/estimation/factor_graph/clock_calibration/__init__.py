@@ -1,0 +1,1 @@
+"""Clock offsets of sensors, estimated from tracks."""

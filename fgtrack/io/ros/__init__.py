@@ -1,0 +1,1 @@
+"""ROS recordings: the only importer of rosbags."""
