@@ -91,7 +91,16 @@ def stream() -> list[Measurement]:
 
 def prior() -> Start:
     x, y, yaw, speed, yaw_rate = START.tolist()
-    return Start(0, np.array([x, y]), np.eye(2), yaw, 0.3, speed, 3.0, yaw_rate, 0.3, 0.0, 1.0)
+    return Start(
+        stamp_ns=0,
+        position_m=(x, y),
+        yaw_rad=yaw,
+        yaw_std_rad=0.3,
+        speed_mps=speed,
+        speed_std_mps=3.0,
+        yaw_rate_radps=yaw_rate,
+        yaw_rate_std_radps=0.3,
+    )
 
 
 def run_estimator(name: str, measurements: list[Measurement]) -> tuple[list[int], list[bool], FloatArray]:

@@ -132,7 +132,16 @@ def _prior(place: int, rng: np.random.Generator) -> Start:
     along_m, across_m = rng.uniform(-AHEAD_M, AHEAD_M), place * SPACING_M
     c, s = np.cos(YAW_RAD), np.sin(YAW_RAD)
     position_m = np.array([c * along_m - s * across_m, s * along_m + c * across_m])
-    return Start(START_NS, position_m, 0.09 * np.eye(2), YAW_RAD, 0.03, SPEED_MPS, 1.0, 0.0, 0.03, 0.0, 1.0)
+    return Start(
+        stamp_ns=START_NS,
+        position_m=position_m,
+        position_std_m=0.3,
+        yaw_rad=YAW_RAD,
+        yaw_std_rad=0.03,
+        speed_mps=SPEED_MPS,
+        speed_std_mps=1.0,
+        yaw_rate_std_radps=0.03,
+    )
 
 
 def _drawn(priors: Sequence[Start], stamps_ns: IntArray, rng: np.random.Generator) -> FloatArray:

@@ -50,7 +50,18 @@ def errors(motion: MotionModel, start: Callable[[Start], Estimator], rng: np.ran
     x = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi), rng.uniform(20.0, 70.0), rng.uniform(-0.1, 0.1)])
     z = x[:2] + STD_M * rng.standard_normal(2)
     R = STD_M**2 * np.eye(2)
-    estimator = start(Start(START_NS, z, R, None, np.pi, 0.0, 40.0, 0.0, 0.3, 0.0, 1.0))
+    estimator = start(
+        Start(
+            stamp_ns=START_NS,
+            position_m=z,
+            position_covariance=R,
+            yaw_rad=None,
+            yaw_std_rad=np.pi,
+            speed_mps=0.0,
+            speed_std_mps=40.0,
+            yaw_rate_std_radps=0.3,
+        )
+    )
     model = measurement_model(("x_m", "y_m"), motion)
     found = []
     for k in range(1, NUM_STEPS + 1):

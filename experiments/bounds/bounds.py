@@ -44,7 +44,16 @@ DELAYS_S = (0.0, 0.05, 0.1, 0.2, 0.3)
 #: Of the lines of the figure; above 25 ms the good sensor is overtaken by the poor one.
 LINE_DELAYS_S = (0.0, 0.0125, 0.025, 0.0255, 0.0375, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3)
 LAG_S = 1.0
-PRIOR = Start(START_NS, np.zeros(2), 0.09 * np.eye(2), 0.4, 0.1, 30.0, 2.0, 0.05, 0.1, 0.0, 1.0)
+PRIOR = Start(
+    stamp_ns=START_NS,
+    position_std_m=0.3,
+    yaw_rad=0.4,
+    yaw_std_rad=0.1,
+    speed_mps=30.0,
+    speed_std_mps=2.0,
+    yaw_rate_radps=0.05,
+    yaw_rate_std_radps=0.1,
+)
 BOUNDS = ("in time", "arrived", "dropped", "posterior, arrived")
 EXACT = ("ekf-replay", "smoother")
 DRAWN = ("ekf-replay", "smoother", "larsen", "rewind-forget", "delayed-horizon", "drop")

@@ -50,7 +50,15 @@ SPEED_STD_MPS = 10.0
 LAG_S = 10.0  # the window, longer than a run
 LAGS = (1, 2, 3, 5, 7, 10)
 MAX_RMSE_M, MAX_ANEES = 2.0, 30.0  # of the figure
-PRIOR = Start(0, np.zeros(2), np.eye(2), None, 0.0, 0.0, SPEED_STD_MPS, 0.0, 0.0, 0.0, 0.0)
+PRIOR = Start(
+    stamp_ns=0,
+    yaw_rad=None,
+    yaw_std_rad=0.0,
+    speed_mps=0.0,
+    speed_std_mps=SPEED_STD_MPS,
+    yaw_rate_std_radps=0.0,
+    accel_std_mps2=0.0,
+)
 
 REFERENCE_RUNS = 400
 REFERENCE_LAGS = (1, 3, 10)

@@ -56,9 +56,17 @@ def stamp(k: int) -> int:
 
 def smoother(start: FloatArray, lag_s: float) -> FixedLagSmoother:
     x_m, y_m, yaw_rad, speed_mps, yaw_rate_radps = start.tolist()
-    position = np.array([x_m, y_m])
-    deviations = (yaw_rad, PRIOR_STD[2], speed_mps, PRIOR_STD[3], yaw_rate_radps, PRIOR_STD[4])
-    prior = Start(START_NS, position, PRIOR_STD[0] ** 2 * np.eye(2), *deviations, 0.0, 1.0)
+    prior = Start(
+        stamp_ns=START_NS,
+        position_m=(x_m, y_m),
+        position_std_m=PRIOR_STD[0],
+        yaw_rad=yaw_rad,
+        yaw_std_rad=PRIOR_STD[2],
+        speed_mps=speed_mps,
+        speed_std_mps=PRIOR_STD[3],
+        yaw_rate_radps=yaw_rate_radps,
+        yaw_rate_std_radps=PRIOR_STD[4],
+    )
     settings = SmootherSettings(lag_s=lag_s, lagged_s=(), final=False)
     thresholds = settings.thresholds(MOTION.state_names, curved=False)
     return FixedLagSmoother(MOTION, prior, settings, lambda: IncrementalBackend(thresholds))

@@ -47,7 +47,17 @@ def start(name: str, loss: RobustLoss | None, x: FloatArray) -> Estimator:
     """The estimator `name` of an object that starts at `x`."""
     x_m, y_m, yaw_rad, speed_mps, yaw_rate_radps = x.tolist()
     position, R = np.array([x_m, y_m]), STD_M**2 * np.eye(2)
-    prior = Start(START_NS, position, R, yaw_rad, 0.3, speed_mps, 2.0, yaw_rate_radps, 0.1, 0.0, 1.0)
+    prior = Start(
+        stamp_ns=START_NS,
+        position_m=position,
+        position_covariance=R,
+        yaw_rad=yaw_rad,
+        yaw_std_rad=0.3,
+        speed_mps=speed_mps,
+        speed_std_mps=2.0,
+        yaw_rate_radps=yaw_rate_radps,
+        yaw_rate_std_radps=0.1,
+    )
     if name == "ekf-replay":
         return ReplayEkf(MOTION, prior, 1.0)
     settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)

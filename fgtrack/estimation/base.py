@@ -1,5 +1,6 @@
 """What the tracker asks of an estimator."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -7,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from fgtrack.core.errors import CallError
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.models.measurement import MeasurementModel, SensorPose
 from fgtrack.models.sensors import RobustLoss
@@ -48,26 +50,46 @@ class UpdateResult:
     """Normalised innovation squared against the prior at that stamp."""
 
 
-@dataclass(frozen=True, slots=True)
-class Start:
-    """What is known of a new object at its first stamp; standard deviations beside the values.
+#: Standard deviation of a direction of which nothing is known: that of the uniform distribution.
+UNKNOWN_YAW_STD_RAD = math.pi / math.sqrt(3.0)
+KNOWN_YAW_STD_RAD = 0.1
 
-    `yaw_rad` None means that the direction of travel is unknown.
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Start:
+    """What is known of a new object at its first stamp, with standard deviations.
+
+    Raises `CallError` for a value that is not finite, a negative standard deviation or a wrong shape.
     """
 
-    stamp_ns: int
-    position_m: FloatArray
-    """Shape (2,)."""
-    position_covariance: FloatArray
+    stamp_ns: int = 0
+    position_m: Sequence[float] | FloatArray = (0.0, 0.0)
+    position_std_m: float = 1.0
+    """Along both axes; not used where `position_covariance` is given."""
+    position_covariance: FloatArray | None = None
     """Shape (2, 2)."""
-    yaw_rad: float | None
-    yaw_std_rad: float
-    speed_mps: float
-    speed_std_mps: float
-    yaw_rate_radps: float
-    yaw_rate_std_radps: float
-    accel_mps2: float
-    accel_std_mps2: float
+    yaw_rad: float | None = None
+    """Direction of travel; None where it is unknown."""
+    yaw_std_rad: float | None = None
+    """None for `KNOWN_YAW_STD_RAD`, or `UNKNOWN_YAW_STD_RAD` where `yaw_rad` is None."""
+    speed_mps: float = 0.0
+    speed_std_mps: float = 10.0
+    yaw_rate_radps: float = 0.0
+    yaw_rate_std_radps: float = 0.3
+    accel_mps2: float = 0.0
+    accel_std_mps2: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, shape in (("position_m", (2,)), ("position_covariance", (2, 2))):
+            given = getattr(self, name)
+            if given is not None and not (np.shape(given) == shape and np.isfinite(given).all()):
+                raise CallError(f"Start: {name}: must be finite and of shape {shape}, is {given}")
+        for name in ("yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2"):
+            if not math.isfinite(getattr(self, name) or 0.0):
+                raise CallError(f"Start: {name}: must be finite, is {getattr(self, name)}")
+        for name in ("position_std_m", "yaw_std_rad", "speed_std_mps", "yaw_rate_std_radps", "accel_std_mps2"):
+            if not 0.0 <= (getattr(self, name) or 0.0) < math.inf:
+                raise CallError(f"Start: {name}: must be finite and not negative, is {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,31 +3,32 @@
 import numpy as np
 
 from fgtrack.core.linalg import symmetrise
-from fgtrack.core.types import ACCEL, SPEED, YAW, YAW_RATE, FloatArray
-from fgtrack.estimation.base import Start
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import KNOWN_YAW_STD_RAD, UNKNOWN_YAW_STD_RAD, Start
 from fgtrack.models.motion import MotionModel
 
 
-def initial_state(motion: MotionModel, prior: Start) -> tuple[FloatArray, FloatArray]:
-    """Mean (n,) and covariance (n, n), in the state of `motion`, of what `prior` knows.
+def initial_state(motion: MotionModel, start: Start) -> tuple[FloatArray, FloatArray]:
+    """Mean (n,) and covariance (n, n), in the state of `motion`, of what `start` knows.
 
     Where the direction of travel is unknown, a Cartesian model starts with an isotropic velocity of mean zero; a
-    model with a yaw starts at yaw 0 with the prior's (wide) deviation.
+    model with a yaw starts at yaw 0 with its (wide) standard deviation.
     """
-    mean = np.zeros(6)
-    mean[:2] = prior.position_m
-    mean[YAW] = 0.0 if prior.yaw_rad is None else prior.yaw_rad
-    mean[SPEED], mean[YAW_RATE], mean[ACCEL] = prior.speed_mps, prior.yaw_rate_radps, prior.accel_mps2
-    deviations = np.array(
-        [0.0, 0.0, prior.yaw_std_rad, prior.speed_std_mps, prior.yaw_rate_std_radps, prior.accel_std_mps2]
-    )
-    covariance = np.diag(deviations**2)
-    covariance[:2, :2] = symmetrise(prior.position_covariance)
-    if prior.yaw_rad is None and motion.linear:
-        spread = np.zeros((motion.dim, motion.dim))
-        spread[:2, :2] = covariance[:2, :2]
-        spread[2:, 2:] = np.eye(motion.dim - 2) * (prior.speed_std_mps**2 + prior.speed_mps**2)
-        start = np.zeros(motion.dim)
-        start[:2] = prior.position_m
-        return start, spread
-    return motion.from_kinematic(mean, covariance)
+    position = np.eye(2) * start.position_std_m**2
+    if start.position_covariance is not None:
+        position = symmetrise(np.asarray(start.position_covariance, dtype=np.float64))
+    unknown = start.yaw_rad is None
+    if unknown and motion.linear:
+        mean, variances = np.zeros(motion.dim), np.zeros(motion.dim)
+        variances[2:] = start.speed_std_mps**2 + start.speed_mps**2
+        covariance = np.diag(variances)
+        mean[:2], covariance[:2, :2] = start.position_m, position
+        return mean, covariance
+    yaw_std_rad = start.yaw_std_rad
+    if yaw_std_rad is None:
+        yaw_std_rad = UNKNOWN_YAW_STD_RAD if unknown else KNOWN_YAW_STD_RAD
+    std = 0.0, 0.0, yaw_std_rad, start.speed_std_mps, start.yaw_rate_std_radps, start.accel_std_mps2
+    covariance = np.diag(np.square(std))
+    covariance[:2, :2] = position
+    values = *start.position_m, start.yaw_rad or 0.0, start.speed_mps, start.yaw_rate_radps, start.accel_mps2
+    return motion.from_kinematic(np.array(values, dtype=np.float64), covariance)

@@ -313,7 +313,16 @@ def _stream(
 ) -> _Stream:
     """Truth with the motion model's own noise, measured as `plan` says; in the random order up to `reach_s` late."""
     stamps_s, sensors = plan
-    prior = Start(_START_NS, np.array([20.0, -5.0]), np.eye(2), 0.6, 0.35, 65.0, 3.0, 0.1, 0.1, 0.0, 1.0)
+    prior = Start(
+        stamp_ns=_START_NS,
+        position_m=(20.0, -5.0),
+        yaw_rad=0.6,
+        yaw_std_rad=0.35,
+        speed_mps=65.0,
+        speed_std_mps=3.0,
+        yaw_rate_radps=0.1,
+        yaw_rate_std_radps=0.1,
+    )
     x = motion.from_kinematic(np.array([20.0, -5.0, 0.6, 65.0, 0.1, 0.0]), np.zeros((6, 6)))[0]
     measurements, last_s = [], 0.0
     for stamp_s, sensor in zip(stamps_s.tolist(), sensors.tolist(), strict=True):

@@ -13,9 +13,6 @@ from fgtrack.estimation.base import Start
 from fgtrack.models.road import Road
 from fgtrack.tracking.preprocess import Candidate
 
-#: Standard deviation of a direction of which nothing is known.
-UNKNOWN_YAW_STD_RAD = math.pi / math.sqrt(3.0)
-
 
 class Birth(Protocol):
     """Makes the first state of a track."""
@@ -64,7 +61,7 @@ class Assumptions:
             position_m=candidate.position_m,
             position_covariance=deviations.position_covariance,
             yaw_rad=yaw_rad,
-            yaw_std_rad=deviations.yaw_std_rad if yaw_rad is not None else UNKNOWN_YAW_STD_RAD,
+            yaw_std_rad=deviations.yaw_std_rad if yaw_rad is not None else None,
             speed_mps=speed_mps,
             speed_std_mps=deviations.speed_std_mps,
             yaw_rate_radps=speed_mps * curvature_radpm,

@@ -34,7 +34,17 @@ StartEstimator = Callable[[MotionModel, SmootherSettings], Estimator]
 
 
 def prior() -> Start:
-    return Start(START_NS, np.array([3.0, -2.0]), np.diag([0.5, 0.5]), 0.4, 0.3, 20.0, 3.0, 0.1, 0.3, 0.0, 1.0)
+    return Start(
+        stamp_ns=START_NS,
+        position_m=(3.0, -2.0),
+        position_covariance=np.diag([0.5, 0.5]),
+        yaw_rad=0.4,
+        yaw_std_rad=0.3,
+        speed_mps=20.0,
+        speed_std_mps=3.0,
+        yaw_rate_radps=0.1,
+        yaw_rate_std_radps=0.3,
+    )
 
 
 def settings(lag_s: float = LAG_S, late: Late = "fuse", ring_s: float = 10.0) -> SmootherSettings:

@@ -88,7 +88,19 @@ def drive(num_detections: int, seed: int) -> Drive:
         z = model.predict(x) + std * rng.standard_normal(len(std))
         if vehicle not in bank.track_ids:
             R = np.diag(std[:2] ** 2)
-            bank.birth(vehicle, Start(stamp_ns, z[:2], R, x[2] + 0.1, 0.3, x[3] + 1.0, 3.0, 0.0, 0.2, 0.0, 1.0))
+            bank.birth(
+                vehicle,
+                Start(
+                    stamp_ns=stamp_ns,
+                    position_m=z[:2],
+                    position_covariance=R,
+                    yaw_rad=x[2] + 0.1,
+                    yaw_std_rad=0.3,
+                    speed_mps=x[3] + 1.0,
+                    speed_std_mps=3.0,
+                    yaw_rate_std_radps=0.2,
+                ),
+            )
             continue
         [result] = bank.update(stamp_ns, [vehicle], [Measurement(stamp_ns, model, z, np.diag(std**2))])
         done.statuses[result.status] += 1

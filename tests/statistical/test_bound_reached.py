@@ -18,7 +18,15 @@ from fgtrack.models.motion import CV
 
 START_NS = 1_790_000_000 * NS_PER_S
 MOTION = CV(5.0)
-PRIOR = Start(START_NS, np.zeros(2), 0.5 * np.eye(2), 0.0, 0.2, 20.0, 2.0, 0.0, 0.2, 0.0, 1.0)
+PRIOR = Start(
+    stamp_ns=START_NS,
+    position_covariance=0.5 * np.eye(2),
+    yaw_rad=0.0,
+    yaw_std_rad=0.2,
+    speed_mps=20.0,
+    speed_std_mps=2.0,
+    yaw_rate_std_radps=0.2,
+)
 NUM_STEPS = 40
 NUM_RUNS = 80
 NOW_NS = START_NS + NUM_STEPS * STEP_NS + STEP_NS // 2

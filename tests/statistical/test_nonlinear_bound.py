@@ -16,7 +16,16 @@ from fgtrack.evaluation.bounds import Bounds, ScheduledMeasurement, bounds, boun
 from fgtrack.models.motion import CTRV, MotionModel
 
 START_NS = 1_790_000_000 * NS_PER_S
-PRIOR = Start(START_NS, np.zeros(2), 0.09 * np.eye(2), 0.4, 0.1, 30.0, 2.0, 0.05, 0.02, 0.0, 1.0)
+PRIOR = Start(
+    stamp_ns=START_NS,
+    position_std_m=0.3,
+    yaw_rad=0.4,
+    yaw_std_rad=0.1,
+    speed_mps=30.0,
+    speed_std_mps=2.0,
+    yaw_rate_radps=0.05,
+    yaw_rate_std_radps=0.02,
+)
 PAPER = CTRV()
 LOOSE_TIES = CTRV(position_density_m2ps=0.05)  # headings matter less, so their spread does not spoil the bound
 NUM_STEPS = 50

@@ -27,7 +27,17 @@ POSITION, WITH_SPEED = (measurement_model(("x_m", "y_m", *more), MOTION) for mor
 def prior(mean: FloatArray) -> Start:
     x_m, y_m, yaw_rad, speed_mps, yaw_rate_radps = mean.tolist()
     position = np.array([x_m, y_m])
-    return Start(START_NS, position, 0.09 * np.eye(2), yaw_rad, 0.1, speed_mps, 2.0, yaw_rate_radps, 0.1, 0.0, 1.0)
+    return Start(
+        stamp_ns=START_NS,
+        position_m=position,
+        position_std_m=0.3,
+        yaw_rad=yaw_rad,
+        yaw_std_rad=0.1,
+        speed_mps=speed_mps,
+        speed_std_mps=2.0,
+        yaw_rate_radps=yaw_rate_radps,
+        yaw_rate_std_radps=0.1,
+    )
 
 
 def smoother(motion: MotionModel, start: Start, curved: bool = False) -> FixedLagSmoother:

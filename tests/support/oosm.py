@@ -32,7 +32,17 @@ def stamp(at_s: float) -> int:
 
 def prior(yaw_rad: float = 0.4) -> Start:
     position = np.array([3.0, -2.0])
-    return Start(START_NS, position, np.diag([0.5, 0.5]), yaw_rad, 0.3, 20.0, 3.0, 0.1, 0.3, 0.0, 1.0)
+    return Start(
+        stamp_ns=START_NS,
+        position_m=position,
+        position_covariance=np.diag([0.5, 0.5]),
+        yaw_rad=yaw_rad,
+        yaw_std_rad=0.3,
+        speed_mps=20.0,
+        speed_std_mps=3.0,
+        yaw_rate_radps=0.1,
+        yaw_rate_std_radps=0.3,
+    )
 
 
 def started(name: str, motion: MotionModel = LINEAR, lag_s: float = LAG_S) -> Estimator:

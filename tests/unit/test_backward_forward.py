@@ -35,7 +35,17 @@ def bank(storage_steps: int = 50) -> BackwardForwardBank:
 
 
 def prior(stamp_ns: int, x_m: float = 0.0, y_m: float = 0.0, yaw_rad: float | None = 0.2) -> Start:
-    return Start(stamp_ns, np.array([x_m, y_m]), 0.1 * np.eye(2), yaw_rad, 0.3, 40.0, 2.0, 0.1, 0.2, 0.0, 1.0)
+    return Start(
+        stamp_ns=stamp_ns,
+        position_m=(x_m, y_m),
+        position_covariance=0.1 * np.eye(2),
+        yaw_rad=yaw_rad,
+        yaw_std_rad=0.3,
+        speed_mps=40.0,
+        speed_std_mps=2.0,
+        yaw_rate_radps=0.1,
+        yaw_rate_std_radps=0.2,
+    )
 
 
 def position(stamp_ns: int, x_m: float, y_m: float = 0.0) -> Measurement:
@@ -306,7 +316,16 @@ def test_a_measurement_that_cannot_be_fused_fails_alone_and_changes_nothing() ->
 def test_a_singular_innovation_covariance_is_a_failure_and_no_crash() -> None:
     made = BackwardForwardBank(EulerCtrv(CTRV(), np.zeros(5)), STEP_NS, 5)
     made.advance(START_NS)
-    certain = Start(START_NS, np.zeros(2), np.zeros((2, 2)), 0.0, 0.1, 0.0, 0.1, 0.0, 0.1, 0.0, 0.1)
+    certain = Start(
+        stamp_ns=START_NS,
+        position_std_m=0.0,
+        yaw_rad=0.0,
+        yaw_std_rad=0.1,
+        speed_mps=0.0,
+        speed_std_mps=0.1,
+        yaw_rate_std_radps=0.1,
+        accel_std_mps2=0.1,
+    )
     made.birth(0, certain)
     exact = Measurement(START_NS, POSITION, np.ones(2), np.zeros((2, 2)))
     assert [result.status for result in made.update(START_NS, [0], [exact])] == ["failed"]

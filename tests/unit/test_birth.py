@@ -34,7 +34,7 @@ def seen(**values: float) -> Candidate:
 def test_what_is_not_measured_comes_from_the_map_and_the_ego(birth) -> None:
     prior = birth.prior(seen(), ROAD, EGO, ego_in_pit=False)
     assert prior.stamp_ns == START_NS
-    assert prior.position_m.tolist() == [3.0, 4.0]
+    assert tuple(prior.position_m) == (3.0, 4.0)
     assert prior.yaw_rad == 0.4
     assert prior.speed_mps == pytest.approx(0.8 * 50.0)
     assert prior.yaw_rate_radps == pytest.approx(40.0 * 0.01)

@@ -16,7 +16,15 @@ from fgtrack.models.motion import CTRV, CV, MotionModel
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs/bounds.md"
 START_NS = 1_790_000_000 * NS_PER_S
-PRIOR = Start(START_NS, np.zeros(2), 0.5 * np.eye(2), 0.3, 0.2, 20.0, 2.0, 0.0, 0.2, 0.0, 1.0)
+PRIOR = Start(
+    stamp_ns=START_NS,
+    position_covariance=0.5 * np.eye(2),
+    yaw_rad=0.3,
+    yaw_std_rad=0.2,
+    speed_mps=20.0,
+    speed_std_mps=2.0,
+    yaw_rate_std_radps=0.2,
+)
 
 
 def planned(motion: MotionModel, seed: int = 0) -> list[ScheduledMeasurement]:

@@ -199,7 +199,16 @@ def test_a_singular_innovation_covariance_of_one_state_is_an_error() -> None:
 def test_the_replaying_filter_keeps_the_yaw_in_its_range_through_full_turns() -> None:
     motion = CTRV()
     start = np.array([0.0, 0.0, 3.0, 10.0, 1.0])
-    prior = Start(0, start[:2], np.eye(2), 3.0, 0.1, 10.0, 1.0, 1.0, 0.1, 0.0, 1.0)
+    prior = Start(
+        stamp_ns=0,
+        position_m=start[:2],
+        yaw_rad=3.0,
+        yaw_std_rad=0.1,
+        speed_mps=10.0,
+        speed_std_mps=1.0,
+        yaw_rate_radps=1.0,
+        yaw_rate_std_radps=0.1,
+    )
     estimator = ReplayEkf(motion, prior, 1.0)
     model = measurement_model(("x_m", "y_m", "yaw_rad"), motion)
     for step in range(1, 100):

@@ -239,7 +239,15 @@ def test_a_yaw_is_taken_on_the_branch_next_to_the_state(loss: RobustLoss | None,
 def test_a_smoother_turns_through_pi_with_its_measurements(backend: str, sign: float) -> None:
     """The object turns from 3.0 rad on at 0.5 rad/s; sensors report yaws wrapped, and some late."""
     motion = CTRV()
-    prior = Start(0, np.zeros(2), np.eye(2), 3.0 * sign, 0.2, 20.0, 1.0, 0.5 * sign, 0.2, 0.0, 1.0)
+    prior = Start(
+        stamp_ns=0,
+        yaw_rad=3.0 * sign,
+        yaw_std_rad=0.2,
+        speed_mps=20.0,
+        speed_std_mps=1.0,
+        yaw_rate_radps=0.5 * sign,
+        yaw_rate_std_radps=0.2,
+    )
     settings = SmootherSettings(lag_s=2.0, lagged_s=())
     thresholds = settings.thresholds(motion.state_names, curved=False)
     make = BatchBackend if backend == "batch" else lambda: IncrementalBackend(thresholds)

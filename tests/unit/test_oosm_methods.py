@@ -239,7 +239,15 @@ def test_measurements_cannot_be_held_longer_than_the_window(kind, hold_s: float)
 def test_covariance_intersection_makes_small_what_it_is_told_to(size, takes_late: bool) -> None:
     rng = np.random.default_rng(3)
     steps, more = [measured(rng, k * STEP_S) for k in range(1, 41)], measured(rng, 3.75, std=0.3)
-    start = Start(START_NS, np.zeros(2), np.eye(2), None, 0.0, 0.0, 10.0, 0.0, 0.0, 0.0, 0.0)
+    start = Start(
+        stamp_ns=START_NS,
+        yaw_rad=None,
+        yaw_std_rad=0.0,
+        speed_mps=0.0,
+        speed_std_mps=10.0,
+        yaw_rate_std_radps=0.0,
+        accel_std_mps2=0.0,
+    )
     estimator = fed(CovarianceIntersection(LINEAR, start, LAG_S, size), [*steps, more])
     other = OOSM_METHODS["rewind-forget" if takes_late else "drop"].start(LINEAR, start, LAG_S)
     assert_same(estimator.state_at(stamp(4.0)), fed(other, [*steps, more]).state_at(stamp(4.0)))

@@ -71,12 +71,32 @@ def test_what_was_inserted_can_be_taken_back_and_its_key_is_not_used_again() -> 
 
 
 def prior(motion: MotionModel) -> Prior:
-    start = Start(START_NS, np.array([3.0, -2.0]), np.eye(2) * 0.5, 0.4, 0.3, 20.0, 3.0, 0.1, 0.3, 0.0, 1.0)
+    start = Start(
+        stamp_ns=START_NS,
+        position_m=(3.0, -2.0),
+        position_covariance=np.eye(2) * 0.5,
+        yaw_rad=0.4,
+        yaw_std_rad=0.3,
+        speed_mps=20.0,
+        speed_std_mps=3.0,
+        yaw_rate_radps=0.1,
+        yaw_rate_std_radps=0.3,
+    )
     return Prior(*initial_state(motion, start))
 
 
 def birth_prior() -> Start:
-    return Start(START_NS, np.array([3.0, -2.0]), np.eye(2) * 0.5, 0.4, 0.3, 20.0, 3.0, 0.1, 0.3, 0.0, 1.0)
+    return Start(
+        stamp_ns=START_NS,
+        position_m=(3.0, -2.0),
+        position_covariance=np.eye(2) * 0.5,
+        yaw_rad=0.4,
+        yaw_std_rad=0.3,
+        speed_mps=20.0,
+        speed_std_mps=3.0,
+        yaw_rate_radps=0.1,
+        yaw_rate_std_radps=0.3,
+    )
 
 
 def position(offset_ns: int, x_m: float, y_m: float, loss: RobustLoss | None = None) -> Measurement:
