@@ -20,20 +20,14 @@ from fgtrack.evaluation.figure_style import (
     styled,
     usual_step_ns,
 )
+from fgtrack.evaluation.innovations import ANGULAR, RESIDUAL_NAMES, message_delays, residuals
 from fgtrack.evaluation.labels import labelled
 from fgtrack.evaluation.lag_figure import figure_lag
 from fgtrack.evaluation.lagged import lag_metrics
 from fgtrack.evaluation.map_figure import figure_map
-from fgtrack.evaluation.matching import (
-    Matching,
-    MatchOptions,
-    match,
-    track_errors,
-)
-from fgtrack.evaluation.metrics import message_delays
-from fgtrack.evaluation.residuals import ANGULAR, RESIDUAL_NAMES, residuals
+from fgtrack.evaluation.matching import Matching, match, track_errors
 from fgtrack.evaluation.statistics import Distribution, Moments
-from fgtrack.io.run import Run
+from fgtrack.io.run import EvaluationConfig, Run
 
 _QUANTITIES = {
     "position_m": "position error [m]",
@@ -54,7 +48,7 @@ _RESIDUALS = {
 _MS = 1e3
 
 
-def save_figures(runs: Sequence[Run], out_dir: Path, options: MatchOptions | None = None) -> list[Path]:
+def save_figures(runs: Sequence[Run], out_dir: Path, options: EvaluationConfig | None = None) -> list[Path]:
     """Write every figure that `runs` have data for as PNG into `out_dir`; gives the files.
 
     A figure that would show the same for several runs (delays of one input) is written once.

@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.evaluation.consistency import normalised_squares
 from fgtrack.evaluation.matching import Matching, state_errors
-from fgtrack.evaluation.nees import normalised_squares
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.evaluation.truth import TRUE_STATE, TruePath, true_paths
 from fgtrack.io.run import Run, Table

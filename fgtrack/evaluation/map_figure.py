@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 
 from fgtrack.evaluation.figure_style import GREY, WRONG, broken_line, colour, legend_above, styled, usual_step_ns
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, Matching
-from fgtrack.evaluation.run_config import section
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import Run, Table
+from fgtrack.io.run.judging import section
 from fgtrack.models.oval import OVAL, make_oval
 from fgtrack.models.track_map import TrackMap
 

@@ -1,6 +1,6 @@
 """Which track follows which true object, tick by tick, and how far off it is."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,26 +8,14 @@ from scipy.optimize import linear_sum_assignment
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.evaluation.run_config import section
 from fgtrack.evaluation.truth import TRUE_STATE, TruePath, true_paths
-from fgtrack.io.run import NO_TRACK, Run, Table
+from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, Table, evaluation_config
 
 CONFIRMED_MEASUREMENTS = 3
 """Measurements from which on a track counts: the "valid" tracks of Karle et al. 2023."""
 
 NO_OBJECT = -1
 """Object index of a track row that is paired to no true object."""
-
-
-@dataclass(frozen=True)
-class MatchOptions:
-    """How tracks are paired to true objects."""
-
-    gate_m: float = 5.0
-    """Largest distance of a pair. The default is the tracker's own association distance, a car's length: a
-    track farther off cannot be updated by its object any more. It bounds the errors: compare at one gate."""
-    confirmed_only: bool = True
-    """Judge only rows with at least `CONFIRMED_MEASUREMENTS` measurements."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +47,34 @@ class Matching:
 
 
 @dataclass(frozen=True)
+class Scenes:
+    """Tracks and true objects at t ticks; rows are those of the tracks, r in all, by rising tick."""
+
+    tick_index: IntArray
+    """Tick of each row, shape (r,), rising."""
+    track_ids: IntArray
+    """Shape (r,)."""
+    distances_m: FloatArray
+    """Distance of each row from every object, shape (r, objects); infinite from what is not there."""
+    present: BoolArray
+    """Whether an object is there, shape (t, objects)."""
+
+    @property
+    def num_ticks(self) -> int:
+        """Number of ticks t."""
+        return len(self.present)
+
+    def per_tick(self, values: FloatArray | IntArray) -> FloatArray:
+        """Sum of `values`, one of each row, over the rows of every tick, shape (t,)."""
+        return np.bincount(self.tick_index, values, self.num_ticks).astype(np.float64)
+
+    def __iter__(self) -> Iterator[slice]:
+        """The rows of every tick."""
+        edges = np.searchsorted(self.tick_index, np.arange(self.num_ticks + 1)).tolist()
+        return map(slice, edges[:-1], edges[1:])
+
+
+@dataclass(frozen=True)
 class TrackErrors:
     """Track minus truth of every paired row, each of shape (p,); NaN where the truth does not say."""
 
@@ -73,13 +89,7 @@ class TrackErrors:
 ERROR_NAMES = ("position_m", "along_m", "across_m", "yaw_rad", "speed_mps")
 
 
-def run_options(run: Run) -> MatchOptions:
-    """The options that the run's configuration asks for, else the defaults."""
-    gate_m = section(run, "evaluation").get("gate_m")
-    return MatchOptions() if gate_m is None else MatchOptions(gate_m=float(gate_m))
-
-
-def match(run: Run, options: MatchOptions | None = None) -> Matching | None:
+def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     """Pair the tracks of `run` to its true objects at every tick; None for a run without truth.
 
     Without `options` those that its configuration asks for.
@@ -88,7 +98,7 @@ def match(run: Run, options: MatchOptions | None = None) -> Matching | None:
     gate, the rest is assigned by the Hungarian method, first as many pairs as possible, then the least sum of
     distances. Ticks are those of timing.csv, so ticks without any track count as well.
     """
-    options = options or run_options(run)
+    options = options or evaluation_config(run)
     paths = true_paths(run.truth)
     if not paths:
         return None
@@ -159,7 +169,23 @@ def state_errors(states: Table, truth: FloatArray) -> dict[str, FloatArray]:
     return dict(zip(ERROR_NAMES, errors, strict=True))
 
 
-def _judged(run: Run, options: MatchOptions) -> BoolArray:
+def scenes(run: Run, matching: Matching) -> Scenes:
+    """The ticks of `run` between the first and the last stamp of its truth, with the judged rows there.
+
+    An object is there where its truth is known at the tick. A row is as far from it as it is at the row's own stamp.
+    """
+    truth_ns = run.truth["stamp_ns"]
+    recorded = (matching.now_ns >= truth_ns.min()) & (matching.now_ns <= truth_ns.max())
+    number = np.cumsum(recorded) - 1
+    rows = np.flatnonzero(recorded[matching.tick_index])
+    rows = rows[np.argsort(matching.tick_index[rows], kind="stable")]
+    tick_index, present = number[matching.tick_index[rows]], matching.present[recorded]
+    distances_m = matching.distances_m[rows]
+    known = present[tick_index] & np.isfinite(distances_m)
+    return Scenes(tick_index, matching.tracks["track_id"][rows], np.where(known, distances_m, np.inf), present)
+
+
+def _judged(run: Run, options: EvaluationConfig) -> BoolArray:
     """Rows of tracks.csv to judge: stamped while truth was recorded, of a finished tick, confirmed if asked.
 
     Only a run that was killed has rows of a tick that timing.csv does not know.

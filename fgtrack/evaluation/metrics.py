@@ -8,16 +8,15 @@ from typing import Any
 import numpy as np
 
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import BoolArray, Disposition, FloatArray, IntArray
+from fgtrack.core.types import BoolArray, Disposition, IntArray
 from fgtrack.evaluation.consistency import Consistency, consistency
 from fgtrack.evaluation.continuity import late_switches, times_to_confirm
+from fgtrack.evaluation.innovations import ANGULAR, RESIDUAL_NAMES, message_delays, residuals
 from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, ERROR_NAMES, Matching, match, track_errors
 from fgtrack.evaluation.multi_object import MultiObjectMetrics, multi_object_metrics
-from fgtrack.evaluation.options import EvaluationOptions, evaluation_options
-from fgtrack.evaluation.residuals import ANGULAR, RESIDUAL_NAMES, residuals
 from fgtrack.evaluation.statistics import ChiSquareMean, Distribution, Moments
-from fgtrack.io.run import NO_TRACK, Run, Table
+from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, evaluation_config
 
 FALSE_TRACK_SHARE = 0.5
 """A track that is paired to a true object in less than this share of its judged life is false."""
@@ -109,7 +108,7 @@ class Metrics:
     name: str
     """Name of the run folder."""
     estimator: str
-    options: EvaluationOptions
+    options: EvaluationConfig
     num_tracks: int
     """Distinct ids in tracks.csv."""
     num_confirmed: int
@@ -145,12 +144,12 @@ class Metrics:
         return values
 
 
-def evaluate(run: Run, options: EvaluationOptions | None = None) -> Metrics:
+def evaluate(run: Run, options: EvaluationConfig | None = None) -> Metrics:
     """Metrics of `run`; without truth, those that need none.
 
     Without `options` those that its configuration asks for.
     """
-    options = options or evaluation_options(run)
+    options = options or evaluation_config(run)
     matching = match(run, options)
     ids = run.tracks["track_id"]
     confirmed = run.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS
@@ -172,7 +171,7 @@ def evaluate(run: Run, options: EvaluationOptions | None = None) -> Metrics:
     )
 
 
-def _truth_metrics(run: Run, matching: Matching, options: EvaluationOptions) -> TruthMetrics:
+def _truth_metrics(run: Run, matching: Matching, options: EvaluationConfig) -> TruthMetrics:
     errors = track_errors(matching)
     late = late_switches(run, matching, options.late_switch_s)
     confirm_s = times_to_confirm(run, matching, options.gate_m)
@@ -242,15 +241,6 @@ def _sensor_metrics(run: Run) -> dict[str, SensorMetrics]:
             nis_dof=Moments.of(measured[with_nis].astype(np.float64)),
         )
     return sensors
-
-
-def message_delays(updates: Table) -> tuple[IntArray, FloatArray]:
-    """Receipt in ns and delay in s of every message behind `updates` of one sensor, in order of receipt.
-
-    A message counts once, however many detections it holds; one without any does not appear in updates.csv.
-    """
-    messages = np.unique(np.stack([updates["receipt_ns"], updates["stamp_ns"]], axis=-1), axis=0)
-    return messages[:, 0], (messages[:, 0] - messages[:, 1]) / NS_PER_S
 
 
 def _plain(value: Any) -> Any:

@@ -10,12 +10,11 @@ from rich.text import Text
 
 from fgtrack.core.types import Disposition
 from fgtrack.evaluation.consistency import Consistency
+from fgtrack.evaluation.innovations import FEWEST, LAGS, RESIDUAL_NAMES
 from fgtrack.evaluation.lagged import WINDOW, LagMetrics
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS
 from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics, ObjectMetrics
-from fgtrack.evaluation.residuals import RESIDUAL_NAMES
 from fgtrack.evaluation.statistics import ChiSquareMean, Distribution, Moments
-from fgtrack.evaluation.whiteness import FEWEST, LAGS
 
 BACKWARD_FORWARD = "ekf-backward-forward"
 BACKWARD_FORWARD_NOTE = "backward-forward forgets what was fused after the stamp of a late detection"

@@ -9,6 +9,7 @@ from pydantic import Discriminator
 
 from fgtrack.estimation.factor_graph.settings import SmootherSettings
 from fgtrack.io.config import InputConfig
+from fgtrack.io.run import EvaluationConfig
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
@@ -168,28 +169,6 @@ class MotionConfig:
         if self.kind == "ctra" or self.acceleration == "driving":
             return CTRA.from_std_per_step(self.std_per_s, self.noise_hz)
         return CTRV.from_std_per_step(self.std_per_s, self.noise_hz)
-
-
-@dataclass(frozen=True)
-class EvaluationConfig:
-    """How the run is judged against truth."""
-
-    gate_m: float = 5.0
-    """Largest distance of a track from its true object; a car's length, more for ships."""
-    multi_object: bool = True
-    """Whether GOSPA, CLEAR, IDF1 and HOTA are computed."""
-    gospa_c_m: float | None = None
-    """Cut-off distance c of GOSPA; null for `gate_m`."""
-    late_switch_s: float = 0.5
-    """An identity switch within this time after an out-of-sequence update counts as late."""
-
-    def __post_init__(self) -> None:
-        for name in ("gate_m", "gospa_c_m"):
-            value = getattr(self, name)
-            if value is not None and not value > 0.0:
-                raise ValueError(f"{name}: must be positive, is {value}")
-        if not self.late_switch_s >= 0.0:
-            raise ValueError(f"late_switch_s: must not be negative, is {self.late_switch_s}")
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,11 @@ from evaluation_runs import ROUND, START_NS, TICK_NS, WEST, update, write_run
 from scipy.stats import chi2
 
 from fgtrack.core.types import MEASURABLE, Disposition, UpdateRecord
-from fgtrack.evaluation.consistency import Nees, nees_over_runs, position_nees, state_nees
+from fgtrack.evaluation.consistency import Nees, nees_over_runs, normalised_squares, position_nees, state_nees
+from fgtrack.evaluation.innovations import FEWEST, LAGS, Autocorrelation, autocorrelations
 from fgtrack.evaluation.matching import Matching, match
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.nees import normalised_squares
 from fgtrack.evaluation.statistics import ChiSquareMean
-from fgtrack.evaluation.whiteness import FEWEST, LAGS, Autocorrelation, autocorrelations
 from fgtrack.io.run import COVARIANCE_COLUMNS, Run, Table
 
 

@@ -12,8 +12,7 @@ from fgtrack.core.types import Disposition, UpdateRecord
 from fgtrack.evaluation.continuity import late_switches, times_to_confirm
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.options import EvaluationOptions
-from fgtrack.io.run import Run
+from fgtrack.io.run import EvaluationConfig, Run
 
 LATE = Disposition.OUT_OF_SEQUENCE
 GATE_M = 5.0
@@ -68,7 +67,7 @@ def test_several_late_updates_make_one_late_switch(tmp_path: Path) -> None:
 def test_the_setting_says_how_soon(tmp_path: Path) -> None:
     run = switching_run(tmp_path / "run", {6: [update(disposition=LATE, track_id=1)]})
     for late_switch_s, late in ((0.1, 0), (0.12, 1)):
-        truth = evaluate(run, EvaluationOptions(late_switch_s=late_switch_s)).truth
+        truth = evaluate(run, EvaluationConfig(late_switch_s=late_switch_s)).truth
         assert truth is not None
         assert truth.objects[7].late_id_switches == late
 
@@ -107,7 +106,7 @@ def test_a_row_counts_at_its_tick_and_when_it_is_confirmed_whatever_is_judged(tm
     """Rows are stamped a tick before the one that publishes them."""
     tracks = [[], *[[WEST.track(k - 1, 1, num_measured=k)] for k in range(1, 6)]]
     run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(6)), updates={1: [update(tick=0)]})
-    for options in (EvaluationOptions(), EvaluationOptions(confirmed_only=False)):
+    for options in (EvaluationConfig(), EvaluationConfig(confirmed_only=False)):
         matching = match(run, options)
         assert matching is not None
         assert times_to_confirm(run, matching, GATE_M).tolist() == [pytest.approx(3 * 0.02)]

@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.optimize import linear_sum_assignment
 
+from fgtrack.core.errors import DataError
 from fgtrack.core.types import TruthState
-from fgtrack.evaluation.matching import NO_OBJECT, MatchOptions, _assign, _pair, contested, match, track_errors
+from fgtrack.evaluation.matching import NO_OBJECT, _assign, _pair, contested, match, track_errors
 from fgtrack.evaluation.truth import TruePath, true_paths
-from fgtrack.io.run import NO_TRACK
+from fgtrack.io.run import NO_TRACK, EvaluationConfig, evaluation_config
 
 S_NS = 1_000_000_000
 
@@ -116,7 +117,7 @@ def test_a_pair_inside_the_gate_stays_though_another_track_is_nearer(tmp_path: P
 def test_nothing_is_paired_outside_the_gate(tmp_path: Path) -> None:
     tracks = [[WEST.track(0, 1, across_m=2.1)], [WEST.track(1, 1, across_m=2.0 - 1e-9)], []]
     run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(3)))
-    matching = match(run, MatchOptions(gate_m=2.0))
+    matching = match(run, EvaluationConfig(gate_m=2.0))
     assert matching is not None
     assert matching.track_ids[:, 0].tolist() == [NO_TRACK, 1, NO_TRACK]
     assert matching.present.all()
@@ -126,7 +127,7 @@ def test_nothing_is_paired_outside_the_gate(tmp_path: Path) -> None:
 def test_tentative_tracks_are_judged_only_if_asked(tmp_path: Path) -> None:
     tracks = [[WEST.track(k, 1, num_measured=k + 1)] for k in range(4)]
     run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(4)))
-    confirmed, everything = match(run), match(run, MatchOptions(confirmed_only=False))
+    confirmed, everything = match(run), match(run, EvaluationConfig(confirmed_only=False))
     assert confirmed is not None
     assert everything is not None
     assert confirmed.track_ids[:, 0].tolist() == [NO_TRACK, NO_TRACK, 1, 1]
@@ -209,3 +210,23 @@ def test_a_tick_is_contested_where_a_row_or_an_object_has_a_choice() -> None:
     inside = np.array([[1, 0], [0, 1], [1, 1], [1, 0], [1, 0], [0, 0]], dtype=bool)
     tick_index = np.array([0, 0, 1, 2, 2, 3])
     assert contested(inside, tick_index, 5).tolist() == [False, True, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("evaluation: {gate_m: -1}", r"run.config\.yaml: evaluation: gate_m: must be positive, is -1"),
+        ("evaluation: {gate_m: wide}", r"run.config\.yaml: evaluation: "),
+        ("evaluation: {", r"run.config\.yaml: is not YAML"),
+    ],
+)
+def test_a_configuration_that_cannot_be_used_is_one_clear_error(tmp_path: Path, text: str, message: str) -> None:
+    run = write_run(tmp_path / "run", config_text=text)
+    with pytest.raises(DataError, match=message):
+        evaluation_config(run)
+
+
+def test_what_the_configuration_does_not_say_has_its_default(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", config_text="evaluation: {confirmed_only: false, of_a_later_version: 1}")
+    assert evaluation_config(run) == EvaluationConfig(confirmed_only=False)
+    assert evaluation_config(dataclasses.replace(run, config_text="")) == EvaluationConfig()

@@ -12,9 +12,8 @@ from hypothesis.extra import numpy as hnp
 
 from fgtrack.core.types import Disposition
 from fgtrack.evaluation.metrics import Metrics, ObjectMetrics, evaluate
-from fgtrack.evaluation.options import EvaluationOptions
 from fgtrack.evaluation.statistics import Distribution, Moments
-from fgtrack.io.run import Run
+from fgtrack.io.run import EvaluationConfig, Run
 
 samples = hnp.arrays(np.float64, st.integers(0, 20), elements=st.floats(-1e3, 1e3))
 
@@ -115,7 +114,7 @@ def test_false_tracks_and_precision(story: Run) -> None:
 
 
 def test_precision_counts_confirmed_tracks_whatever_is_judged(story: Run) -> None:
-    metrics = evaluate(story, EvaluationOptions(confirmed_only=False))
+    metrics = evaluate(story, EvaluationConfig(confirmed_only=False))
     assert metrics.truth is not None
     assert metrics.truth.judged_tracks == 5
     assert metrics.precision == pytest.approx(2 / 4)
@@ -124,7 +123,7 @@ def test_precision_counts_confirmed_tracks_whatever_is_judged(story: Run) -> Non
 def test_an_object_that_no_confirmed_track_followed_is_no_true_positive(tmp_path: Path) -> None:
     tracks = [[WEST.track(k, 1), ROUND.track(k, 2, num_measured=2)] for k in range(3)]
     run = write_run(tmp_path / "run", tracks, truth=[*WEST.truth(range(3)), *ROUND.truth(range(3))])
-    metrics = evaluate(run, EvaluationOptions(confirmed_only=False))
+    metrics = evaluate(run, EvaluationConfig(confirmed_only=False))
     assert metrics.truth is not None
     assert metrics.truth.tracked_objects == 1
     assert metrics.truth.overall.ticks_tracked == 6

@@ -12,15 +12,10 @@ from evaluation_runs import ROUND, WEST, write_run
 from evaluation_scenes import Positions, random_scenes
 
 from fgtrack.core.types import TrackReport
-from fgtrack.evaluation.clear import Clear
-from fgtrack.evaluation.gospa import Gospa, gospa
-from fgtrack.evaluation.identity import Frames, Hota, Identity
-from fgtrack.evaluation.matching import match
+from fgtrack.evaluation.matching import Scenes, match, scenes
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.multi_object import MultiObjectMetrics
-from fgtrack.evaluation.options import EvaluationOptions
-from fgtrack.evaluation.scenes import Scenes, scenes
-from fgtrack.io.run import Run, Table
+from fgtrack.evaluation.multi_object import Clear, Frames, Gospa, Hota, Identity, MultiObjectMetrics, gospa
+from fgtrack.io.run import EvaluationConfig, Run, Table
 
 C_M, GATE_M = 5.0, 4.0
 
@@ -28,7 +23,7 @@ C_M, GATE_M = 5.0, 4.0
 SCENES = [(seed, side_m) for seed in range(12) for side_m in (3.0, 15.0, 200.0)]
 
 
-def multi_object(run: Run, options: EvaluationOptions | None = None) -> MultiObjectMetrics:
+def multi_object(run: Run, options: EvaluationConfig | None = None) -> MultiObjectMetrics:
     found = evaluate(run, options).multi_object
     assert found is not None
     return found
@@ -91,8 +86,8 @@ def test_gospa_of_a_run_is_what_can_be_counted(story: Run) -> None:
 
 
 def test_the_cut_off_is_the_gate_unless_it_is_set(story: Run) -> None:
-    assert multi_object(story, EvaluationOptions(gate_m=2.0)).gospa.c_m == 2.0
-    own = multi_object(story, EvaluationOptions(gospa_c_m=0.5)).gospa
+    assert multi_object(story, EvaluationConfig(gate_m=2.0)).gospa.c_m == 2.0
+    own = multi_object(story, EvaluationConfig(gospa_c_m=0.5)).gospa
     assert own.localisation_m2 == 0.0
     assert own.false_m2 == pytest.approx(11 * 0.125 / 10)  # a pair at 0.8 m is a miss and a false track
 
@@ -242,7 +237,7 @@ def test_tracks_count_when_they_are_confirmed(tmp_path: Path) -> None:
     tracks = [[WEST.track(k, 1, num_measured=k + 1)] for k in range(4)]
     run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(4)))
     assert multi_object(run).clear.pairs == 2
-    assert multi_object(run, EvaluationOptions(confirmed_only=False)).clear.pairs == 4
+    assert multi_object(run, EvaluationConfig(confirmed_only=False)).clear.pairs == 4
 
 
 def test_the_configuration_of_the_run_says_how_it_is_judged(story: Run) -> None:
@@ -251,10 +246,10 @@ def test_the_configuration_of_the_run_says_how_it_is_judged(story: Run) -> None:
     assert evaluate(without).truth == evaluate(story).truth
     options = "evaluation: {gate_m: 3, gospa_c_m: 7, late_switch_s: 2, multi_object: true}"
     one = evaluate(replace(story, config_text=options))
-    assert one.options == EvaluationOptions(3.0, True, True, 7.0, 2.0)
+    assert one.options == EvaluationConfig(3.0, True, True, 7.0, 2.0)
     assert one.multi_object is not None
     assert one.multi_object.gospa.c_m == 7.0
-    assert evaluate(story).options == EvaluationOptions()
+    assert evaluate(story).options == EvaluationConfig()
 
 
 def test_without_truth_there_is_nothing_to_score(tmp_path: Path) -> None:

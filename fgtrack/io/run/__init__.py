@@ -1,5 +1,6 @@
 """The run folder `fgtrack-run/1`, the interface of tracking and evaluation: writer, reader, layout; runs in memory."""
 
+from fgtrack.io.run.judging import EvaluationConfig, evaluation_config, section
 from fgtrack.io.run.memory import MemoryRun
 from fgtrack.io.run.reader import NO_TRACK, Run, Table, read_run
 from fgtrack.io.run.schema import COLUMNS, COVARIANCE_COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
@@ -8,6 +9,7 @@ from fgtrack.io.run.writer import RunWriter, digest, is_run_folder, write_metric
 __all__ = [
     "COLUMNS",
     "COVARIANCE_COLUMNS",
+    "EvaluationConfig",
     "MemoryRun",
     "NO_TRACK",
     "OPTIONAL_TABLES",
@@ -16,7 +18,9 @@ __all__ = [
     "RunWriter",
     "Table",
     "digest",
+    "evaluation_config",
     "is_run_folder",
     "read_run",
+    "section",
     "write_metrics",
 ]

@@ -1,0 +1,76 @@
+"""How a run is judged: what its configuration says to those who read it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from fgtrack.core.errors import DataError
+from fgtrack.io.run.reader import Run
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """How tracks are paired with true objects, and which metrics are computed."""
+
+    gate_m: float = 5.0
+    """Largest distance of a track from its true object. The default is the tracker's own association distance, a
+    car's length (more for ships): a track farther off is not updated by its object any more. It bounds the errors,
+    so compare at one gate."""
+    confirmed_only: bool = True
+    """Whether only tracks with at least 3 measurements are judged, the "valid" ones of Karle et al. 2023."""
+    multi_object: bool = True
+    """Whether GOSPA, CLEAR, IDF1 and HOTA are computed."""
+    gospa_c_m: float | None = None
+    """Cut-off distance c of GOSPA; null for `gate_m`."""
+    late_switch_s: float = 0.5
+    """An identity switch within this time after an out-of-sequence update counts as late."""
+
+    def __post_init__(self) -> None:
+        for name in ("gate_m", "gospa_c_m"):
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise ValueError(f"{name}: must be positive, is {value}")
+        if not self.late_switch_s >= 0.0:
+            raise ValueError(f"late_switch_s: must not be negative, is {self.late_switch_s}")
+
+
+def evaluation_config(run: Run) -> EvaluationConfig:
+    """The section `evaluation` of the run's config.yaml; defaults for what it does not say.
+
+    Raises
+    ------
+    DataError
+        config.yaml is not YAML, or a value is out of range.
+    """
+    found = section(run, "evaluation")
+    known = {entry.name: found[entry.name] for entry in fields(EvaluationConfig) if entry.name in found}
+    try:
+        return EvaluationConfig(**known)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{run.path / 'config.yaml'}: evaluation: {error}") from error
+
+
+def section(run: Run, name: str) -> Mapping[str, Any]:
+    """The section `name` of the run's config.yaml; empty where it has none.
+
+    Raises
+    ------
+    DataError
+        config.yaml is not YAML.
+    """
+    try:
+        config = _load(run.config_text)
+    except YAMLError as error:
+        raise DataError(f"{run.path / 'config.yaml'}: is not YAML, repeat the run") from error
+    found = config.get(name) if isinstance(config, dict) else None
+    return found if isinstance(found, dict) else {}
+
+
+@lru_cache(maxsize=64)
+def _load(text: str) -> Any:
+    """The YAML values of `text`. Cached: parsing takes longer than evaluating a run of 20 s, and sweeps repeat it."""
+    return YAML(typ="safe", pure=True).load(text)
