@@ -1,17 +1,20 @@
 """What the tracker asks of an estimator."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Protocol
 
 import numpy as np
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
-from fgtrack.models.measurement import MeasurementModel, SensorPose
+from fgtrack.core.types import MEASURABLE, FloatArray, SmoothedReport, TrackState
+from fgtrack.models.measurement import MeasurementModel, SensorPose, measurement_model
+from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.sensors import RobustLoss
+
+_AT_ORIGIN = SensorPose()
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,9 +27,50 @@ class Measurement:
     """Measured components, shape (k,)."""
     R: FloatArray
     """Covariance, shape (k, k)."""
-    pose: SensorPose = field(default_factory=SensorPose)
+    pose: SensorPose = _AT_ORIGIN
     loss: RobustLoss | None = None
     """Robust loss, for smoothers."""
+
+    @classmethod
+    def of(
+        cls,
+        stamp_ns: int,
+        *,
+        std: Mapping[str, float] | None = None,
+        covariance: FloatArray | None = None,
+        pose: SensorPose = _AT_ORIGIN,
+        loss: RobustLoss | None = None,
+        **values: float,
+    ) -> "Measurement":
+        """The measurement of `values`, by name of `MEASURABLE`, with a standard deviation each or a covariance.
+
+        `covariance`, shape (k, k), is in the order of `MEASURABLE`. Raises `CallError` for an unknown or missing name
+        and a value or covariance that makes no sense.
+        """
+        names = tuple(name for name in MEASURABLE if name in values)
+        if not names or len(names) < len(values):
+            given = ", ".join(name for name in values if name not in MEASURABLE) or "nothing"
+            raise CallError(f"measurement of {given}: give one or more of {', '.join(MEASURABLE)}")
+        if (std is None) == (covariance is None):
+            raise CallError(f"measurement of {', '.join(names)}: give either std or covariance")
+        if std is not None and std.keys() != values.keys():
+            raise CallError(f"measurement of {', '.join(names)}: std must name the same, names {', '.join(std)}")
+        z = np.array([values[name] for name in names], dtype=np.float64)
+        R = np.diag([std[name] ** 2 for name in names]) if std is not None else np.array(covariance, dtype=np.float64)
+        sound = R.shape == (len(z), len(z)) and np.isfinite(R).all() and (R == R.T).all() and np.isfinite(z).all()
+        if not sound or np.linalg.eigvalsh(R)[0] <= 0.0:
+            raise CallError(
+                f"measurement of {', '.join(names)}: values must be finite, the covariance symmetric, positive "
+                f"definite and of shape {(len(z), len(z))}, are {z.tolist()} and {R.tolist()}"
+            )
+        return cls(stamp_ns, measurement_model(names, CTRV()), z, R, pose, loss)
+
+    def seen_by(self, motion: MotionModel) -> "Measurement":
+        """This measurement with the model for the state of `motion`: itself where that is its model already."""
+        names = self.model.state_names
+        if names is motion.state_names or names[:4] == motion.state_names[:4]:
+            return self
+        return replace(self, model=measurement_model(self.model.components, motion))
 
 
 class UpdateStatus(StrEnum):

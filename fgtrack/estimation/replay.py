@@ -73,6 +73,7 @@ class ReplayEkf:
         """See `Estimator.update`."""
         if measurement.stamp_ns < self._start_ns:
             return UpdateResult(UpdateStatus.TOO_OLD)
+        measurement = measurement.seen_by(self._motion)
         order = (measurement.stamp_ns, measurement.model.components, tuple(measurement.z.tolist()))
         place = bisect.bisect_right(self._steps, order, lo=1, key=_order)
         try:

@@ -46,6 +46,7 @@ class FixedLagSmoother:
         settings: SmootherSettings,
         make_backend: Callable[[], Backend],
     ) -> None:
+        self._motion = motion
         self._settings = settings
         self._lag_ns, self._ring_ns = nanoseconds(settings.lag_s), nanoseconds(settings.ring_s)
         self._first_ns = self._clock_ns = prior.stamp_ns
@@ -76,6 +77,7 @@ class FixedLagSmoother:
 
         Raises `DataError` for a measurement older than the window where the late policy is `raise`.
         """
+        measurements = [measurement.seen_by(self._motion) for measurement in measurements]
         results = [self._judged(measurement) for measurement in measurements]
         fusible = [m for m, result in zip(measurements, results, strict=True) if result.innovation is not None]
         if not fusible:

@@ -81,6 +81,7 @@ class AccumulatedStateDensity:
         """See `Estimator.update`."""
         if measurement.stamp_ns < self._start_ns:
             return UpdateResult(UpdateStatus.TOO_OLD)
+        measurement = measurement.seen_by(self._motion)
         late = measurement.stamp_ns < self._newest_ns
         try:
             stack, block = self._with_state(measurement.stamp_ns)

@@ -62,6 +62,7 @@ class LateEkf(ABC):
         """See `Estimator.update`."""
         if measurement.stamp_ns < self._start_ns:
             return UpdateResult(UpdateStatus.TOO_OLD)
+        measurement = measurement.seen_by(self._motion)
         late = measurement.stamp_ns < self._newest_ns
         try:
             result = self._fuse_late(measurement) if late else self._fuse_next(measurement)

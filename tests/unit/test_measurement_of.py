@@ -1,0 +1,79 @@
+"""Tests of measurements made from named values, and of estimators that are given them."""
+
+import numpy as np
+import pytest
+
+from fgtrack.core.errors import CallError
+from fgtrack.core.types import TrackState
+from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
+from fgtrack.estimation.oosm import AccumulatedStateDensity, Al1, ReorderBuffer
+from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.models.measurement import SensorPose, measurement_model
+from fgtrack.models.motion import CTRA, CTRV, CV
+from fgtrack.models.sensors import RobustLoss
+
+STD = {"x_m": 0.3, "y_m": 0.4}
+
+
+def test_values_are_ordered_as_the_model_orders_them() -> None:
+    pose, loss = SensorPose(1.0, 2.0), RobustLoss("huber", 3.0)
+    found = Measurement.of(5, speed_mps=7.0, x_m=1.0, std={"x_m": 0.3, "speed_mps": 0.1}, pose=pose, loss=loss)
+    assert (found.stamp_ns, found.pose, found.loss) == (5, pose, loss)
+    assert found.model.components == ("x_m", "speed_mps")
+    assert found.z.tolist() == [1.0, 7.0]
+    assert found.R.tolist() == np.diag([0.3**2, 0.1**2]).tolist()
+    R = [[2.0, 0.5], [0.5, 1.0]]
+    assert Measurement.of(5, y_m=1.0, x_m=2.0, covariance=np.array(R)).R.tolist() == R
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"std": {}}, "of nothing: give one or more of x_m"),
+        ({"x": 1.0, "std": {"x": 1.0}}, "of x: give one or more of x_m"),
+        ({"x_m": 1.0, "y_m": 2.0}, "either std or covariance"),
+        ({"x_m": 1.0, "y_m": 2.0, "std": STD, "covariance": np.eye(2)}, "either std or covariance"),
+        ({"x_m": 1.0, "y_m": 2.0, "std": {"x_m": 0.3}}, "std must name the same, names x_m"),
+        ({"x_m": 1.0, "std": STD}, "std must name the same, names x_m, y_m"),
+        ({"x_m": np.nan, "y_m": 2.0, "std": STD}, "values must be finite"),
+        ({"x_m": 1.0, "std": {"x_m": 0.0}}, "symmetric, positive definite"),
+        ({"x_m": 1.0, "covariance": np.eye(2)}, r"of shape \(1, 1\)"),
+        ({"x_m": 1.0, "covariance": np.array([[np.inf]])}, "symmetric, positive definite"),
+        ({"x_m": 1.0, "y_m": 1.0, "covariance": np.array([[1.0, 0.3], [0.0, 1.0]])}, "symmetric"),
+    ],
+)
+def test_what_makes_no_sense_is_one_line(given: dict, message: str) -> None:
+    with pytest.raises(CallError, match=message) as raised:
+        Measurement.of(0, **given)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("motion", [CV(), CTRV(), CTRA()], ids=lambda motion: type(motion).__name__)
+def test_every_kind_of_estimator_sees_it_in_its_own_state(motion) -> None:
+    start, settings = Start(yaw_rad=0.5, speed_mps=20.0), SmootherSettings()
+    values = {"x_m": 1.5, "y_m": 0.8, "yaw_rad": 0.5, "speed_mps": 21.0}
+    std = {"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.1, "speed_mps": 1.0}
+    stamp_ns = 100_000_000
+    own = measurement_model(tuple(values), motion)
+    named = Measurement.of(stamp_ns, std=std, **values)
+    bound = Measurement(stamp_ns, own, np.array(list(values.values())), np.diag(np.square(list(std.values()))))
+
+    def smoother(motion, start: Start, lag_s: float) -> FixedLagSmoother:
+        return FixedLagSmoother(motion, start, settings, lambda: IncrementalBackend(thresholds))
+
+    thresholds = settings.thresholds(motion.state_names, curved=True)
+    for make in (ReplayEkf, AccumulatedStateDensity, Al1, ReorderBuffer, smoother):
+        found, expected = make(motion, start, 1.0), make(motion, start, 1.0)
+        found.update(named)
+        expected.update(bound)
+        state = found.state_at(stamp_ns)
+        assert isinstance(state, TrackState)
+        assert state.mean.tolist() == expected.state_at(stamp_ns).mean.tolist()
+
+
+def test_a_measurement_that_fits_is_used_itself() -> None:
+    one = Measurement.of(0, x_m=1.0, y_m=2.0, std=STD)
+    assert one.seen_by(CTRV()) is one
+    assert one.seen_by(CTRA()) is one
+    assert one.seen_by(CV()).seen_by(CV()).model is measurement_model(("x_m", "y_m"), CV())
