@@ -17,7 +17,7 @@ from fgtrack.core.types import DetectionList, TruthState
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Tick, node_ticks
 from fgtrack.pipeline.config import Config, MapConfig
-from fgtrack.sim.paper import LIDAR_DELAY, RADAR_DELAY
+from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.sensor import SimulatedSensor
 from fgtrack.sim.simulate import simulate

@@ -21,8 +21,8 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.pipeline.clock_offsets import estimate_offsets
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
+from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.sim.clocks import OffsetClock
-from fgtrack.sim.paper import paper_scenario
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate
 from fgtrack.sim.vehicles import TrackVehicle
@@ -34,7 +34,7 @@ EGO_MPS, SLOW_MPS, GAP_M = 60.0, 30.0, 90.0
 
 
 def scenario(name: str, offset_s: float) -> Scenario:
-    made = paper_scenario()
+    made = read_scenario("default")
     sensors = tuple(replace(one, clock=(OffsetClock(offset_s),) if one.name == WRONG else ()) for one in made.sensors)
     made = replace(made, sensors=sensors, duration_s=max(LENGTHS_S[name]))
     if name == "default":
@@ -51,7 +51,7 @@ def scenario(name: str, offset_s: float) -> Scenario:
 def configuration() -> Config:
     """The smoother's, with what the simulated sensors are really like."""
     config = load(Config, Path("configs/smoother.yaml"), ["map.track=oval", "map.pit=oval"])
-    std = {one.name: one.std for one in paper_scenario().sensors}
+    std = {one.name: one.std for one in read_scenario("default").sensors}
     return replace(
         config,
         sensors={name: replace(sensor, std=std.get(name, sensor.std)) for name, sensor in config.sensors.items()},

@@ -10,7 +10,8 @@ Input = Annotated[
     typer.Argument(help="Recording: rosbag2 folder, .mcap, .db3, .bag, fgtrack stream or Autoferry folder."),
 ]
 ConfigFile = Annotated[
-    Path | None, typer.Option("-c", "--config", help="Configuration (YAML); without it the defaults.")
+    str | None,
+    typer.Option("-c", "--config", help="Configuration: a file (YAML) or a shipped name; without it the defaults."),
 ]
 Settings = Annotated[
     list[str] | None,

@@ -12,7 +12,7 @@ from fgtrack.io.run import Run, write_metrics
 
 
 def compare(runs: Runs, as_json: Json = False) -> None:
-    """Print the metrics of runs beside each other, and write metrics.json into each."""
+    """Compare runs in tables, and write metrics.json into each."""
     metrics = evaluated(read_runs(runs))
     if as_json:
         print(json.dumps(comparison_dict(metrics), indent=2, allow_nan=False))

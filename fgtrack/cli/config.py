@@ -1,10 +1,27 @@
-"""`fgtrack config`: the resolved configuration."""
+"""`fgtrack config`: the resolved configuration, and the shipped files."""
+
+from typing import Annotated, get_args
+
+import typer
 
 from fgtrack.cli.arguments import ConfigFile, Settings
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import dump, load
+from fgtrack.cli.show import console
+from fgtrack.pipeline.load import dump
+from fgtrack.pipeline.shipped import Kind, read_config, shipped, summary
 
 
-def config(config_file: ConfigFile = None, settings: Settings = None) -> None:
-    """Print the configuration with every default written out."""
-    print(dump(load(Config, config_file, settings or [])), end="")
+def config(
+    config_file: ConfigFile = None,
+    settings: Settings = None,
+    listed: Annotated[
+        bool, typer.Option("--list", help="List the shipped configurations, scenarios and sweeps.")
+    ] = False,
+) -> None:
+    """Print the resolved configuration, or list the shipped ones."""
+    if not listed:
+        print(dump(read_config(config_file, settings or [])), end="")
+        return
+    for kind in get_args(Kind):
+        console().print(f"{kind}s")
+        for name, path in shipped(kind).items():
+            console().print(f"  {name:20} {summary(path)}", highlight=False, soft_wrap=True, markup=False)

@@ -13,8 +13,8 @@ from fgtrack.cli.storage import Storage, StorageOption, write_recording
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Message
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
+from fgtrack.pipeline.shipped import read_config
 from fgtrack.sim.redelay import Redelayed, SensorDelays, redelay
 
 
@@ -31,10 +31,10 @@ def convert(
     ] = None,
     storage: StorageOption = Storage.MCAP,
 ) -> None:
-    """Convert a recording to an fgtrack stream or a rosbag2 folder."""
+    """Convert a recording into a stream or a rosbag2 folder."""
     if seed is not None and delays_file is None:
         raise CallError("--seed: only --delays draws random numbers, name its file")
-    source = open_input(recording, load(Config, config_file).input)
+    source = open_input(recording, read_config(config_file).input)
     with progress("convert"):
         if delays_file is None:
             count, lost = write_recording(out, source.messages(), storage), ""

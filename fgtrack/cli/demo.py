@@ -1,7 +1,6 @@
 """`fgtrack demo`: the whole chain in a minute."""
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -17,31 +16,13 @@ from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.run import read_run
 from fgtrack.io.source import open_input
 from fgtrack.models.oval import OVAL
-from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_each
-from fgtrack.sim.paper import paper_scenario
+from fgtrack.pipeline.shipped import read_config, read_scenario
 from fgtrack.sim.simulate import simulate
-from fgtrack.tracking.association import GatedEuclidean
-from fgtrack.tracking.birth import MeasuredBirth
 
 _SEED = 1
 _ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
-_LAGGED_S = (0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 0.9)
-
-
-def demo_config() -> Config:
-    """What configs/smoother.yaml says, on the built-in oval and with more lags."""
-    config = Config()
-    return replace(
-        config,
-        map=replace(config.map, track=OVAL, pit=OVAL),
-        motion=replace(config.motion, kind="ctrv"),
-        association=GatedEuclidean(max_nis=400.0),
-        lifecycle=replace(config.lifecycle, claim_overtaken=True),
-        birth=MeasuredBirth(speed_std_mps=10.0),
-        smoother=replace(config.smoother, lagged_s=_LAGGED_S),
-        filter=replace(config.filter, storage_s=3.0),
-    )
+_LAGS = "smoother.lagged_s=[0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 0.9]"
 
 
 def demo(
@@ -49,7 +30,7 @@ def demo(
         "fgtrack-demo"
     ),
 ) -> None:
-    """Simulate the paper's scenario, record it as a rosbag2, replay the recording, compare and draw."""
+    """Simulate, record, replay with three estimators, compare, draw."""
     bag = out / "recording"
     if bag.exists():
         if not (bag / "metadata.yaml").exists():
@@ -60,8 +41,8 @@ def demo(
     except OSError as error:
         raise CallError(f"{out}: cannot be made a folder ({error.strerror}), choose another one with -o") from error
     with progress("simulate"):
-        write_bag(bag, simulate(paper_scenario(), np.random.default_rng(_SEED)))
-    config = demo_config()
+        write_bag(bag, simulate(read_scenario("default"), np.random.default_rng(_SEED)))
+    config = read_config("smoother", [_LAGS], track_map=OVAL, pit_map=OVAL)
     source = open_input(bag, config.input)
     with progress("replay") as show:
         results = replay_each(

@@ -15,7 +15,7 @@ def figure(
     runs: Runs,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the pictures (PNG).")],
 ) -> None:
-    """Draw tracks on the map, residuals, delays, errors (over time, against lag) and time per tick."""
+    """Draw runs: map, residuals, delays, errors, lag, time per tick."""
     with progress("draw"):
         files = save_figures(read_runs(runs), out)
     for file in files:

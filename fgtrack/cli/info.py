@@ -9,15 +9,17 @@ from rich.table import Table
 from fgtrack.cli.arguments import ConfigFile, Input
 from fgtrack.cli.show import console
 from fgtrack.io.info import DelayInfo, InputInfo, describe
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import load
+from fgtrack.pipeline.shipped import read_config
 
 _OTHER_CLOCK_S = 3600.0  # nothing is that late: the stamps and the recorder have different clocks
 
 
 def info(recording: Input, config_file: ConfigFile = None) -> int:
-    """List topics, types, rates and delays, and what a configuration would take."""
-    config = None if config_file is None else load(Config, config_file).input
+    """Show topics, rates and delays of a recording.
+
+    With a configuration also what it would take from them.
+    """
+    config = None if config_file is None else read_config(config_file).input
     found = describe(recording, config)
     console().print(_heading(found), highlight=False, soft_wrap=True)
     console().print(_table(found))

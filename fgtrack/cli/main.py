@@ -1,26 +1,59 @@
 """Entry point: runs a command and turns what went wrong into one line and an exit code."""
 
+import ast
 import logging
 import sys
 import traceback
 from collections.abc import Sequence
-from typing import Annotated
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 import fgtrack
-from fgtrack.cli import compare, config, convert, demo, figure, info, offsets, replay, simulate, sweep, verify
 from fgtrack.core.errors import CallError, FgtrackError
 
 DONE, BAD_DATA, BAD_CALL, INTERRUPTED = 0, 1, 2, 130
 
+#: Commands in the order of the help; each is a function in the module of its name.
+COMMANDS = (
+    *("demo", "simulate", "replay", "compare", "figure", "sweep"),
+    *("verify", "info", "convert", "offsets", "config"),
+)
+_STYLE: dict[str, Any] = {"add_completion": False, "rich_markup_mode": None, "pretty_exceptions_enable": False}
+
+
+class _LazyCommands(TyperGroup):
+    """Imports a command's module when the command is called; the help needs none of them."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        name, _, rest = super().resolve_command(ctx, args)
+        return name, None if name is None else _command(name), rest
+
+
+def _command(name: str) -> Any:  # Any: Typer does not export the type of its commands
+    single = typer.Typer(**_STYLE)
+    single.command(name)(getattr(import_module(f"fgtrack.cli.{name}"), name))
+    return typer.main.get_command(single)
+
+
+def _help(name: str) -> str:
+    """Docstring of a command, read from its source."""
+    module = ast.parse(Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8"))
+    functions = [item for item in module.body if isinstance(item, ast.FunctionDef) and item.name == name]
+    return ast.get_docstring(functions[0]) or ""
+
+
 app = typer.Typer(
     name="fgtrack",
+    cls=_LazyCommands,
     help="Track objects from delayed object lists, and compare how delays are dealt with.",
-    add_completion=False,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
+    **_STYLE,
 )
+for _name in COMMANDS:
+    app.command(_name, help=_help(_name))(lambda: None)
 
 
 def _version(wanted: bool) -> None:
@@ -37,19 +70,6 @@ def _options(
     ] = False,
 ) -> None:
     """Options before the command; `main` reads --debug itself."""
-
-
-app.command()(demo.demo)
-app.command()(simulate.simulate)
-app.command()(replay.replay)
-app.command()(compare.compare)
-app.command()(figure.figure)
-app.command()(sweep.sweep)
-app.command()(verify.verify)
-app.command()(info.info)
-app.command()(convert.convert)
-app.command()(offsets.offsets)
-app.command()(config.config)
 
 
 def run(arguments: Sequence[str]) -> int:

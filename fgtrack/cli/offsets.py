@@ -2,7 +2,6 @@
 
 import json
 import sys
-from dataclasses import replace as changed
 from typing import Annotated
 
 import typer
@@ -13,8 +12,7 @@ from fgtrack.cli.arguments import ConfigFile, Input, Json, Settings
 from fgtrack.cli.show import console, progress
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.clock_offsets import OffsetReport, SensorOffset, estimate_offsets
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import load
+from fgtrack.pipeline.shipped import read_config
 
 
 def offsets(
@@ -30,11 +28,11 @@ def offsets(
     settings: Settings = None,
     as_json: Json = False,
 ) -> int:
-    """Estimate a constant clock offset per sensor, and say which ones cannot be known."""
-    config = load(Config, config_file, settings or [])
-    config = changed(
-        config, map=changed(config.map, track=track_map or config.map.track, pit=pit_map or config.map.pit)
-    )
+    """Estimate constant clock offsets of sensors.
+
+    Says which ones are not identifiable.
+    """
+    config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
     source = open_input(recording, config.input)
     with progress("offsets"):
         report = estimate_offsets(source.messages(), config, reference)

@@ -1,7 +1,6 @@
 """`fgtrack replay`: a recording through the tracker into a run folder."""
 
 import sys
-from dataclasses import replace as changed
 from pathlib import Path
 from typing import Annotated
 
@@ -12,9 +11,8 @@ from fgtrack.cli.show import TickProgress, console, progress
 from fgtrack.core.errors import CallError
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.build import ESTIMATORS
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import load
 from fgtrack.pipeline.replay import ReplayResult, replay_each
+from fgtrack.pipeline.shipped import read_config
 
 
 def replay(
@@ -31,10 +29,7 @@ def replay(
     settings: Settings = None,
 ) -> int:
     """Replay a recording through the tracker."""
-    config = load(Config, config_file, settings or [])
-    config = changed(
-        config, map=changed(config.map, track=track_map or config.map.track, pit=pit_map or config.map.pit)
-    )
+    config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
     names = tuple(name.strip() for name in (config.estimator if estimators is None else estimators).split(","))
     for name in names:
         if name not in ESTIMATORS:

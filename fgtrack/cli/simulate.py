@@ -10,16 +10,14 @@ import typer
 from fgtrack.cli.show import console, progress
 from fgtrack.cli.storage import Storage, StorageOption, write_recording
 from fgtrack.core.errors import CallError
-from fgtrack.pipeline.load import load
-from fgtrack.sim.paper import paper_scenario
-from fgtrack.sim.scenario import Scenario
+from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.sim.simulate import simulate as simulated
 
 
 def simulate(
     scenario_file: Annotated[
-        Path,
-        typer.Argument(metavar="SCENARIO", help="Scenario (YAML), or `default` for the paper's sensors."),
+        str,
+        typer.Argument(metavar="SCENARIO", help="Scenario: a file (YAML) or a shipped name, as `default`."),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder.")],
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random generator.")] = 0,
@@ -28,7 +26,7 @@ def simulate(
     ] = None,
     storage: StorageOption = Storage.MCAP,
 ) -> None:
-    """Simulate a scenario: ego, detections with noise and delays, and the truth."""
+    """Simulate a scenario into a stream or a rosbag2 folder."""
     scenario = read_scenario(scenario_file)
     if duration_s is not None:
         try:
@@ -38,10 +36,3 @@ def simulate(
     with progress("simulate"):
         count = write_recording(out, simulated(scenario, np.random.default_rng(seed)), storage)
     console().print(f"{out}: {count} messages", highlight=False, soft_wrap=True)
-
-
-def read_scenario(path: Path) -> Scenario:
-    """The scenario of a file, or the built-in one by the name `default`."""
-    if str(path) == "default" and not path.exists():
-        return paper_scenario()
-    return load(Scenario, path)

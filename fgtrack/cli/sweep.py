@@ -16,6 +16,7 @@ from fgtrack.cli.show import console
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.io.run import Run
+from fgtrack.pipeline.shipped import find_file
 from fgtrack.pipeline.sweep import Scores, Sweep
 from fgtrack.pipeline.sweep_plan import load_plan
 from fgtrack.pipeline.sweep_store import ERROR_TABLE, SWEEP_TABLE, Cell, Scalar, SweepResult
@@ -28,7 +29,9 @@ _SPEED_PERIOD_S = 600.0  # over which the time of the rest is estimated: jobs di
 
 
 def sweep(
-    sweep_file: Annotated[Path, typer.Argument(metavar="SWEEP", help="What is varied (YAML, fgtrack-sweep/1).")],
+    sweep_name: Annotated[
+        str, typer.Argument(metavar="SWEEP", help="What is varied: a file (YAML, fgtrack-sweep/1) or a shipped name.")
+    ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the tables; what is done there is kept.")],
     jobs: Annotated[
         int | None, typer.Option("--jobs", help="Processes on this machine.", show_default="one for each core")
@@ -37,11 +40,12 @@ def sweep(
         str | None, typer.Option("--dask", metavar="ADDRESS", help="Let the workers of a dask cluster do it.")
     ] = None,
 ) -> int:
-    """Run every point of a grid with every seed and estimator; goes on where it was stopped."""
+    """Run settings x seeds x estimators into one table; resumes."""
     if jobs is not None and jobs < 1:
         raise CallError(f"--jobs {jobs}: at least one process is needed")
     if jobs is not None and dask is not None:
         raise CallError("--jobs, --dask: the cluster has its own number of workers, give one of them")
+    sweep_file = find_file("sweep", sweep_name)
     work = Sweep.open(load_plan(sweep_file), out)
     left = len(work.todo)
     _say(f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {left}")

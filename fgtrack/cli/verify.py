@@ -16,7 +16,10 @@ _BAD = 1
 
 
 def verify(as_json: Json = False) -> int:
-    """Measure that the order of arrival does not change the answer of the exact estimators; exit code 1 if it does."""
+    """Certify that estimates do not depend on the order of arrival.
+
+    Exit code 1 where those of an exact estimator do.
+    """
     with progress("verify"):
         certificate = pipeline.verify(np.random.default_rng(_SEED), pipeline.EXACT)
     if as_json:

@@ -12,7 +12,6 @@ from pydantic import BeforeValidator
 Value = Any
 
 #: Name of a scenario that needs no file.
-DEFAULT_SCENARIO = "default"
 
 #: Columns that every table of a sweep has behind those of its axes.
 KEY_COLUMNS = ("seed", "estimator")

@@ -13,8 +13,8 @@ from fgtrack.pipeline.build import ESTIMATORS
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load, plain, read_yaml, validate
 from fgtrack.pipeline.replay import versions
+from fgtrack.pipeline.shipped import read_config, read_scenario
 from fgtrack.pipeline.sweep_config import (
-    DEFAULT_SCENARIO,
     DELAYS,
     SCENARIO,
     Axis,
@@ -22,7 +22,6 @@ from fgtrack.pipeline.sweep_config import (
     Value,
     with_value,
 )
-from fgtrack.sim.paper import paper_scenario
 from fgtrack.sim.redelay import SensorDelays
 from fgtrack.sim.scenario import Scenario
 
@@ -118,14 +117,13 @@ def _grid(axes: Sequence[Axis]) -> Iterator[_Point]:
 def _base(sweep: SweepConfig, path: Path) -> dict[str, Value]:
     """Scenario, delays and configuration before anything is varied, with every key written out."""
     folder = path.parent
-    config = load(Config, None if sweep.config is None else folder / sweep.config)
+    config = read_config(sweep.config, folder=folder)
     if sweep.input is not None:
         open_input(folder / sweep.input, config.input)  # raises where it is none
     delays = {} if sweep.delays is None else read_yaml(folder / sweep.delays)
     base = {_CONFIG: plain(config), DELAYS: delays}
     if sweep.scenario is not None:
-        given = sweep.scenario == DEFAULT_SCENARIO
-        base[SCENARIO] = plain(paper_scenario() if given else load(Scenario, folder / sweep.scenario))
+        base[SCENARIO] = plain(read_scenario(sweep.scenario, folder))
         if sweep.duration_s is not None:
             base[SCENARIO]["duration_s"] = sweep.duration_s
     return base

@@ -23,7 +23,7 @@ from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
 from fgtrack.pipeline.config import PAPER_SENSORS
-from fgtrack.sim.paper import LIDAR_DELAY, RADAR_DELAY
+from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY
 
 ORDER_BAR = 1e-9
 #: At convergence, where nothing has left the window, and where what has left keeps its linearisation.

@@ -280,6 +280,11 @@ def _two_states(rng: np.random.Generator, share: float, to_bad: FloatArray, to_g
     return bad
 
 
+#: Delays of Karle et al. 2023, section IV-B: mean and 90 % quantile.
+LIDAR_DELAY = GammaDelay(min_s=0.09, mean_s=0.151, q90_s=0.191)
+RADAR_DELAY = GammaDelay(min_s=0.03, mean_s=0.062, q90_s=0.089)
+
+
 def _either(
     rng: np.random.Generator, stamps_s: FloatArray, bad: BoolArray, if_good: DelayModel, if_bad: DelayModel
 ) -> FloatArray:

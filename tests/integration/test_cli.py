@@ -13,7 +13,7 @@ from fgtrack.core.types import Detection, DetectionList, EgoState, Message
 from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.run import read_run
 from fgtrack.io.stream import read_stream, write_stream
-from fgtrack.sim.paper import paper_scenario
+from fgtrack.pipeline.shipped import read_scenario
 
 MS = 1_000_000
 START_NS = 1_600_000_000_000_000_000
@@ -173,7 +173,7 @@ def test_the_printed_configuration_is_one(fgtrack: Command, stream: Path) -> Non
 def test_the_demo_goes_from_scenario_to_figures(
     fgtrack: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(demo, "paper_scenario", lambda: replace(paper_scenario(), duration_s=2.0))
+    monkeypatch.setattr(demo, "read_scenario", lambda name: replace(read_scenario(name), duration_s=2.0))
     shown = fgtrack("demo", "-o", "demo")
     assert (shown.code, shown.err) == (0, "")
     assert (tmp_path / "demo/recording/metadata.yaml").exists()
@@ -207,7 +207,7 @@ def foreign_folder(path: Path) -> None:
         (("compare", "missing"), "missing: no run folder"),
         (("compare", "drive.jsonl"), "drive.jsonl: no run folder"),
         (("figure", "missing", "-o", "figures"), "missing: no run folder"),
-        (("simulate", "missing.yaml", "-o", "x.jsonl"), "missing.yaml: configuration cannot be read"),
+        (("simulate", "missing.yaml", "-o", "x.jsonl"), "missing.yaml: there is no such scenario file"),
         (("simulate", "default", "-o", "x.jsonl", "--duration", "0"), "duration_s: must lie in (0, 86400], is 0"),
         (("simulate", "default", "-o", "x.jsonl", "--duration", "nan"), "duration_s: must lie in (0, 86400], is nan"),
         (("simulate", "default", "-o", "x.jsonl", "--duration", "inf"), "duration_s: must lie in (0, 86400], is inf"),
@@ -218,7 +218,10 @@ def foreign_folder(path: Path) -> None:
         (("replay", "drive.jsonl", "-o", "run", "-e", "magic"), "estimator 'magic' is unknown"),
         (("replay", "drive.jsonl", "-o", "run", "-e", ""), "estimator '' is unknown"),
         (("replay", "drive.jsonl", "-o", "run", "-e", "ekf-replay,ekf-replay"), "named twice"),
-        (("replay", "drive.jsonl", "-o", "run", "-c", "missing.yaml"), "missing.yaml: configuration cannot be read"),
+        (
+            ("replay", "drive.jsonl", "-o", "run", "-c", "missing.yaml"),
+            "missing.yaml: there is no such configuration file",
+        ),
         (("replay", "drive.jsonl", "-o", "run", "-c", "drive.jsonl"), "drive.jsonl"),
         (("replay", "drive.jsonl", "-o", "run", "--map", "missing.csv"), "missing.csv: there is no such map"),
         (("replay", "drive.jsonl", "-o", "run", "--set", "clock.ticks_file=missing"), "missing: ticks cannot be read"),

@@ -16,8 +16,8 @@ from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.clock_offsets import OffsetReport, OffsetRules, SensorOffset, estimate_offsets
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
+from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.sim.clocks import OffsetClock
-from fgtrack.sim.paper import paper_scenario
 from fgtrack.sim.simulate import simulate
 from fgtrack.sim.vehicles import TrackVehicle
 
@@ -37,7 +37,7 @@ OVAL = ("map.track=oval", "map.pit=oval")
 
 def traffic(wrong: str, offset_s: float, seconds_of: float) -> list[Message]:
     """The default scenario's sensors with one wrong clock, in an ego that overtakes slow cars."""
-    scenario = paper_scenario()
+    scenario = read_scenario("default")
     sensors = tuple(replace(s, clock=(OffsetClock(offset_s),) if s.name == wrong else ()) for s in scenario.sensors)
     slow = tuple(
         TrackVehicle(arc_m=150.0 + 90.0 * i, lateral_m=2.5 if i % 2 else 4.5, speed=((0.0, 30.0),)) for i in range(4)

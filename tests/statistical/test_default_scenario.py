@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgtrack.cli.demo import demo_config
 from fgtrack.evaluation.lagged import LagMetrics
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.pipeline.replay import replay_in_memory
-from fgtrack.sim.paper import paper_scenario
+from fgtrack.pipeline.shipped import read_config, read_scenario
 from fgtrack.sim.simulate import simulate
 
 NUM_SEEDS = 20
@@ -17,8 +16,8 @@ LAG_S = 0.3
 
 
 def by_lag(seed: int, estimator: str) -> dict[float, LagMetrics]:
-    config = replace(demo_config(), estimator=estimator)
-    run, broken = replay_in_memory(simulate(paper_scenario(), np.random.default_rng(seed)), config)
+    config = replace(read_config("smoother", track_map="oval", pit_map="oval"), estimator=estimator)
+    run, broken = replay_in_memory(simulate(read_scenario("default"), np.random.default_rng(seed)), config)
     assert broken is None
     return {found.lag_s: found for found in evaluate(run).lagged}
 

@@ -3,7 +3,6 @@ from pathlib import Path
 
 import pytest
 
-from fgtrack.cli.demo import demo_config
 from fgtrack.core.errors import CallError
 from fgtrack.pipeline.build import ESTIMATORS, build_bank, build_tracker
 from fgtrack.pipeline.config import PAPER_SENSORS, Config
@@ -204,8 +203,3 @@ def test_an_empty_file_is_the_default_and_a_missing_one_an_error(tmp_path: Path)
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(CallError, match="is no text file"):
         read_yaml(tmp_path / "binary.yaml")
-
-
-def test_the_demo_runs_what_the_smoother_configuration_says() -> None:
-    config = load(Config, CONFIGS / "smoother.yaml", ["map.track=oval", "map.pit=oval"])
-    assert replace(demo_config(), estimator="smoother", smoother=config.smoother) == config

@@ -23,7 +23,7 @@ from fgtrack.evaluation.metrics import evaluate
 from fgtrack.io.run import COLUMNS, MemoryRun, Run, RunWriter, read_run
 from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
 from fgtrack.pipeline.replay import replay, replay_in_memory
-from fgtrack.sim.paper import paper_scenario
+from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.sim.simulate import simulate
 
 #: Columns and entries that no two runs share: wall times.
@@ -50,7 +50,7 @@ def without(meta: Mapping[str, Any]) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def messages() -> list[Message]:
-    return simulate(replace(paper_scenario(), duration_s=3.0), np.random.default_rng(4))
+    return simulate(replace(read_scenario("default"), duration_s=3.0), np.random.default_rng(4))
 
 
 @pytest.mark.parametrize("estimator", ["smoother", "ekf-replay", "ekf-backward-forward"])

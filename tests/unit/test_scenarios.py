@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from fgtrack.core.types import DetectionList, FloatArray, Message, TruthState
-from fgtrack.pipeline.load import load
-from fgtrack.sim.paper import paper_scenario
-from fgtrack.sim.scenario import Scenario
+from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.sim.simulate import simulate
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -18,7 +16,7 @@ EGO_ID = -1
 
 @pytest.fixture(scope="module")
 def messages() -> list[Message]:
-    return simulate(paper_scenario(), np.random.default_rng(0))
+    return simulate(read_scenario("default"), np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +37,6 @@ def cars(messages: list[Message]) -> dict[int, FloatArray]:
 
 
 NAMES = ("lidar_cluster", "radar")
-
-
-def test_the_built_in_scenario_is_the_committed_default() -> None:
-    assert load(Scenario, CONFIGS / "scenarios/default.yaml") == paper_scenario()
 
 
 def test_most_detections_of_the_default_are_30_to_50_m_off(detections: dict[str, FloatArray]) -> None:

@@ -9,9 +9,9 @@ import pytest
 from fgtrack.core.errors import CallError
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.load import dump, plain
+from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.pipeline.sweep_config import with_value
 from fgtrack.pipeline.sweep_plan import Plan, load_plan
-from fgtrack.sim.paper import paper_scenario
 from fgtrack.sim.simulate import simulate
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -39,7 +39,7 @@ def plan(tmp_path: Path) -> Any:
 def test_a_sweep_that_varies_nothing_is_one_job(plan: Any) -> None:
     (job,) = plan("").jobs
     assert (job.cells, job.seed, job.recipe.estimators) == ((), 0, ("ekf-replay",))
-    assert job.recipe.scenario["duration_s"] == paper_scenario().duration_s
+    assert job.recipe.scenario["duration_s"] == read_scenario("default").duration_s
 
 
 def test_the_grid_is_the_product_with_the_last_axis_fastest_and_then_the_seed(plan: Any) -> None:
@@ -70,7 +70,7 @@ def test_scenario_lists_are_addressed_by_name_or_index(plan: Any) -> None:
     keys = ["scenario.sensors.radar.delay.mean_s", "scenario.sensors.1.rate_hz", "scenario.opponents.0.lateral_m"]
     made = plan(f"vary:\n  all:\n    {keys[0]}: [0.07]\n    {keys[1]}: [10.0]\n    {keys[2]}: [1.5]")
     scenario = made.jobs[0].recipe.scenario
-    base = plain(paper_scenario())
+    base = plain(read_scenario("default"))
     lidar, radar = scenario["sensors"]
     assert (radar["delay"]["mean_s"], radar["rate_hz"], scenario["opponents"][0]["lateral_m"]) == (0.07, 10.0, 1.5)
     assert lidar == base["sensors"][0]
@@ -128,7 +128,7 @@ def test_a_changed_value_leaves_the_original_alone() -> None:
         ("vary: {scenario.sensors.7.rate_hz: [5.0]}", "there is no '7' among 2 entries"),
         ("duration_s: 7.0\nvary: {scenario.duration_s.x: [5.0]}", "there is no 'x' in 7.0"),
         ("set: {scenario.sensors.lidr.rate_hz: 5.0}", "set.scenario.sensors.lidr.rate_hz: there is no 'lidr'"),
-        ("config: missing.yaml", "missing.yaml: configuration cannot be read"),
+        ("config: missing.yaml", "missing.yaml: there is no such configuration file"),
     ],
 )
 def test_a_wrong_file_is_told_by_the_path_of_the_key(plan: Any, text: str, said: str) -> None:
@@ -166,7 +166,7 @@ def test_a_point_that_cannot_be_run_is_a_problem_of_its_own_cells(plan: Any) -> 
 
 @pytest.fixture
 def recording(tmp_path: Path) -> str:
-    write_stream(tmp_path / "drive.jsonl", simulate(paper_scenario(), np.random.default_rng(0))[:200])
+    write_stream(tmp_path / "drive.jsonl", simulate(read_scenario("default"), np.random.default_rng(0))[:200])
     return "format: fgtrack-sweep/1\ninput: drive.jsonl\nestimators: [ekf-replay]\n"
 
 
@@ -196,7 +196,7 @@ def keys(made: Plan) -> list[str]:
 
 
 def test_the_key_of_a_job_is_that_of_its_content_however_it_is_written(plan: Any, tmp_path: Path) -> None:
-    (tmp_path / "scenario.yaml").write_text(dump(paper_scenario()))
+    (tmp_path / "scenario.yaml").write_text(dump(read_scenario("default")))
     reference = keys(plan("seeds: 3\nset: {association.gate_m: 3.0}"))
     assert keys(plan("set: {association.gate_m: 3.0}\nseeds: [0, 1, 2]")) == reference
     assert keys(plan("seeds: 3\nvary: {association.gate_m: [3.0]}\nmetrics: [num_tracks]")) == reference

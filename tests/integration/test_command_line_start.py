@@ -1,0 +1,34 @@
+"""What the command line imports, and what its help says."""
+
+import subprocess
+import sys
+
+from fgtrack.cli.main import COMMANDS, run
+
+HEAVY = ("gtsam", "scipy", "matplotlib", "numpy", "rosbags", "pydantic")
+
+
+def loaded_by(program: str) -> set[str]:
+    """The heavy packages that a new interpreter has loaded after `program`."""
+    code = f"{program}\nimport sys\nprint('loaded:', *[name for name in {HEAVY!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(done.stdout.splitlines()[-1].removeprefix("loaded:").split())
+
+
+def test_the_help_imports_nothing_heavy() -> None:
+    assert loaded_by("from fgtrack.cli.main import run; run(['--help'])") == set()
+
+
+def test_every_command_has_a_line_in_the_help_and_a_help_of_its_own(capsys) -> None:
+    assert run(["--help"]) == 0
+    listed = capsys.readouterr().out.partition("Commands:")[2]
+    assert [line.split()[0] for line in listed.splitlines() if line.strip()] == list(COMMANDS)
+    assert "..." not in listed
+    for name in COMMANDS:
+        assert run([name, "--help"]) == 0
+        assert f"fgtrack {name}" in capsys.readouterr().out
+
+
+def test_python_m_runs_the_command_line() -> None:
+    done = subprocess.run([sys.executable, "-m", "fgtrack", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("fgtrack ")
