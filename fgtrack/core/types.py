@@ -3,7 +3,7 @@
 Every message carries two times: `stamp_ns` (the world was sensed) and `receipt_ns` (the tracker got it).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
@@ -80,8 +80,13 @@ class DetectionList:
     sensor: str
     stamp_ns: int
     receipt_ns: int
-    objects: tuple[Detection, ...]
+    objects: Sequence[Detection]
+    """Kept as a tuple."""
     frame: Frame = "ego"
+
+    def __post_init__(self) -> None:
+        if type(self.objects) is not tuple:
+            object.__setattr__(self, "objects", tuple(self.objects))
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,12 +147,48 @@ class TrackStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TrackReport:
-    """One row of tracks.csv: a track as the tracker publishes it at a tick."""
+    """A track as the tracker publishes it; those of a tick are the rows of tracks.csv."""
 
     track_id: int
     status: TrackStatus
     state: TrackState
+    """Kinematic: x, y, yaw, speed, yaw rate and, if the motion model has it, acceleration."""
     num_measured: int
+
+    @property
+    def stamp_ns(self) -> int:
+        """When the object is there."""
+        return self.state.stamp_ns
+
+    @property
+    def x_m(self) -> float:
+        """Position in the map, to the east."""
+        return float(self.state.mean[X])
+
+    @property
+    def y_m(self) -> float:
+        """Position in the map, to the north."""
+        return float(self.state.mean[Y])
+
+    @property
+    def yaw_rad(self) -> float:
+        """Direction of travel in (-pi, pi], 0 along +x, counter-clockwise."""
+        return float(self.state.mean[YAW])
+
+    @property
+    def speed_mps(self) -> float:
+        """Speed along the yaw."""
+        return float(self.state.mean[SPEED])
+
+    @property
+    def yaw_rate_radps(self) -> float:
+        """Derivative of the yaw."""
+        return float(self.state.mean[YAW_RATE])
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the state, shape (n, n)."""
+        return self.state.covariance
 
 
 @dataclass(frozen=True, slots=True)

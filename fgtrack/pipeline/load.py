@@ -26,7 +26,11 @@ def load(kind: type[T], path: Path | None, settings: Sequence[str] = ()) -> T:
     file, wrong YAML, an unknown or repeated key, and a value of the wrong type or range.
     """
     raw = {} if path is None else read_yaml(path)
-    origin = "defaults" if path is None else str(path)
+    return with_settings(kind, raw, settings, "defaults" if path is None else str(path))
+
+
+def with_settings(kind: type[T], raw: dict[str, Any], settings: Sequence[str], origin: str) -> T:
+    """`raw` as an instance of `kind`, as `load` reads it from a file."""
     if not settings:
         return validate(kind, raw, origin)
     defaults = validate(kind, {}, "defaults")

@@ -1,14 +1,15 @@
 """Configurations, scenarios and sweeps that come with the package, by name."""
 
 import difflib
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 from fgtrack.core.errors import CallError
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import load
+from fgtrack.pipeline.load import load, plain, with_settings
 from fgtrack.sim.scenario import Scenario
 
 Kind = Literal["configuration", "scenario", "sweep"]
@@ -55,21 +56,34 @@ def summary(path: Path) -> str:
 
 
 def read_config(
-    name: str | Path | None,
+    name: str | Path | Config | None,
     settings: Sequence[str] = (),
     *,
-    track_map: str | None = None,
-    pit_map: str | None = None,
+    track_map: str | Path | None = None,
+    pit_map: str | Path | None = None,
+    estimator: str | None = None,
     folder: Path | None = None,
 ) -> Config:
     """The configuration of a file (in `folder`) or of that shipped name, else the defaults.
 
-    `settings` are of the form a.b=value; `track_map` and `pit_map` replace the maps that the file names. Raises
-    `CallError` for what does not fit.
+    `settings` are of the form a.b=value; maps and estimator replace those that the file names. Raises `CallError` for
+    what does not fit.
     """
-    config = load(Config, None if name is None else find_file("configuration", name, folder), settings)
+    if isinstance(name, Config):
+        config = with_settings(Config, plain(name), settings, "the given configuration") if settings else name
+    else:
+        config = load(Config, None if name is None else find_file("configuration", name, folder), settings)
     maps = config.map
-    return replace(config, map=replace(maps, track=track_map or maps.track, pit=pit_map or maps.pit))
+    return replace(
+        config,
+        map=replace(maps, track=str(track_map or maps.track or "") or None, pit=str(pit_map or maps.pit or "") or None),
+        estimator=estimator or config.estimator,
+    )
+
+
+def settings_of(values: Mapping[str, object] | None) -> list[str]:
+    """Settings of the form a.b=value from a mapping of keys to plain values."""
+    return [f"{key}={json.dumps(value)}" for key, value in (values or {}).items()]
 
 
 def read_scenario(name: str | Path, folder: Path | None = None) -> Scenario:

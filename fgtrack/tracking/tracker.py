@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from fgtrack.core.errors import DataError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import seconds
 from fgtrack.core.types import (
     DetectionList,
@@ -17,9 +17,12 @@ from fgtrack.core.types import (
     SmoothedReport,
     TickReport,
     TrackReport,
+    TrackState,
     UpdateRecord,
 )
 from fgtrack.estimation.base import StatesAt, TrackBank, UpdateResult, UpdateStatus, no_states
+from fgtrack.estimation.ekf import predict
+from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
@@ -99,6 +102,26 @@ class Tracker:
         """End all tracks; gives the final smoothed states that were still inside a window."""
         self._end(self._parts.bank.track_ids)
         return tuple(self._parts.bank.smoothed())
+
+    def state_at(self, track_id: int, stamp_ns: int) -> TrackReport:
+        """A track at any stamp in or after its window: smoothed or filtered in the past, predicted ahead of now.
+
+        Raises `CallError` for a track that does not exist and a stamp before its window.
+        """
+        bank, motion = self._parts.bank, self._parts.motion
+        if track_id not in bank.track_ids:
+            raise CallError(
+                f"track {track_id} does not exist: there are {', '.join(map(str, bank.track_ids)) or 'none'}"
+            )
+        states = bank.states_at(min(stamp_ns, bank.present_ns))
+        if track_id not in states.track_ids:
+            raise CallError(f"track {track_id} is not known at {stamp_ns} ns: that is before its window")
+        row = states.track_ids.index(track_id)
+        mean, covariance = states.means[row], states.covariances[row]
+        if stamp_ns > bank.present_ns:
+            mean, covariance = predict(mean, covariance, motion, seconds(stamp_ns - bank.present_ns))
+        mean, covariance = motion.kinematic(mean, covariance)
+        return self._report(track_id, TrackState(stamp_ns, wrapped_yaw(mean), covariance))
 
     def _process(self, batch: Batch) -> None:
         """One object list, at its own stamp: transform, filter, merge, associate, age, estimate, give birth."""
@@ -239,17 +262,14 @@ class Tracker:
             self._parts.lifecycle.forget(track_id)
 
     def _reports(self) -> tuple[TrackReport, ...]:
-        lives = self._parts.lifecycle.lives
         bank = self._parts.bank
         return tuple(
-            TrackReport(
-                track_id,
-                lives[track_id].status(self._parts.confirm_count),
-                state,
-                lives[track_id].num_measured,
-            )
-            for track_id, state in zip(bank.track_ids, bank.present(), strict=True)
+            self._report(track_id, state) for track_id, state in zip(bank.track_ids, bank.present(), strict=True)
         )
+
+    def _report(self, track_id: int, state: TrackState) -> TrackReport:
+        life = self._parts.lifecycle.lives[track_id]
+        return TrackReport(track_id, life.status(self._parts.confirm_count), state, life.num_measured)
 
 
 class PublishedTracker(Tracker):

@@ -1,0 +1,123 @@
+"""The tracker in a running system: nothing that arrives may end it, and nothing is lost without a count."""
+
+import math
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fgtrack.core.errors import CallError
+from fgtrack.core.types import Detection, DetectionList, EgoState, TickReport, TruthState
+from fgtrack.pipeline.live import Tracker
+from fgtrack.pipeline.replay import replay_in_memory
+from fgtrack.pipeline.shipped import read_config, read_scenario
+from fgtrack.sim.simulate import simulate
+
+MS = 1_000_000
+NOW_NS = 1_600_000_000_000_000_000
+
+
+def ego(stamp_ns: int) -> EgoState:
+    return EgoState(stamp_ns, stamp_ns, 10.0, -5.0, 0.3, 20.0)
+
+
+def seen(stamp_ns: int, receipt_ns: int, x_m: float = 30.0, sensor: str = "lidar_cluster") -> DetectionList:
+    return DetectionList(sensor, stamp_ns, receipt_ns, [Detection(x_m=x_m, y_m=1.0)], frame="ego")
+
+
+def started(name: str = "ekf-replay") -> tuple[Tracker, TickReport]:
+    """A tracker that has seen a car five times, and its last report."""
+    tracker = Tracker.from_config("smoother", estimator=name, set={"merge.distance_m": 3.0})
+    for k in range(5):
+        at_ns = NOW_NS + k * 50 * MS
+        tracker.receive(ego(at_ns))
+        tracker.receive(seen(at_ns, at_ns + 40 * MS))
+        report = tracker.tick(at_ns + 40 * MS)
+    return tracker, report
+
+
+def test_a_track_has_its_states_by_name() -> None:
+    tracker, report = started()
+    [track] = report.tracks
+    assert track.stamp_ns == report.now_ns
+    assert math.hypot(track.x_m - 10.0, track.y_m + 5.0) == pytest.approx(28.3, abs=3.0)
+    named = (track.x_m, track.y_m, track.yaw_rad, track.speed_mps, track.yaw_rate_radps)
+    assert named == tuple(track.state.mean)
+    assert track.covariance is track.state.covariance
+    assert tracker.counts == {"lidar_cluster": {"birth": 1, "in_sequence": 4}}
+
+
+@pytest.mark.parametrize("name", ["ekf-replay", "smoother", "ekf-backward-forward"])
+def test_a_track_can_be_asked_for_any_time_in_or_after_its_window(name: str) -> None:
+    tracker, report = started(name)
+    [track] = report.tracks
+    now = tracker.state_at(track.track_id, report.now_ns)
+    assert (now.track_id, now.status, now.num_measured) == (track.track_id, track.status, track.num_measured)
+    np.testing.assert_allclose(now.state.mean, track.state.mean, atol=0.5)
+    past, ahead = (tracker.state_at(track.track_id, report.now_ns + shift) for shift in (-80 * MS, 400 * MS))
+    assert past.stamp_ns == report.now_ns - 80 * MS
+    distance_m = math.hypot(ahead.x_m - now.x_m, ahead.y_m - now.y_m)
+    assert distance_m == pytest.approx(0.4 * now.speed_mps, rel=0.05)
+    assert np.trace(ahead.covariance[:2, :2]) > np.trace(now.covariance[:2, :2])
+    with pytest.raises(CallError, match="before its window"):
+        tracker.state_at(track.track_id, NOW_NS - 10_000 * MS)
+    with pytest.raises(CallError, match="track 77 does not exist: there are 0"):
+        tracker.state_at(77, report.now_ns)
+
+
+def test_an_unknown_sensor_is_counted_and_its_detections_are_invalid() -> None:
+    tracker, report = started()
+    at_ns = report.now_ns + 10 * MS
+    tracker.receive(seen(at_ns, at_ns, sensor="sonar"))
+    report = tracker.tick(at_ns)
+    assert tracker.refused == {"sensor 'sonar' has no model": 1}
+    assert [(row.sensor, row.disposition) for row in report.updates] == [("sonar", "invalid")]
+    assert tracker.counts["sonar"] == {"invalid": 1}
+
+
+def test_an_ignored_sensor_is_ignored() -> None:
+    tracker = Tracker.from_config("smoother", set={"ignore_sensors": ["sonar"]})
+    tracker.receive(seen(NOW_NS, NOW_NS, sensor="sonar"))
+    assert tracker.tick(NOW_NS).updates == ()
+    assert tracker.refused == {}
+
+
+def test_a_clock_that_runs_backwards_is_refused_and_counted_and_loses_nothing() -> None:
+    tracker, report = started()
+    later_ns = report.now_ns + 20 * MS
+    tracker.receive(seen(later_ns, later_ns))
+    refused = tracker.tick(report.now_ns - 1)
+    assert tracker.refused == {"tick before the last one": 1}
+    assert (refused.tick, refused.now_ns, refused.tracks, refused.updates) == (
+        *(report.tick, report.now_ns),
+        *(report.tracks, ()),
+    )
+    following = tracker.tick(later_ns)
+    assert following.tick == report.tick + 1
+    assert [row.disposition for row in following.updates] == ["in_sequence"]
+
+
+def test_ego_states_that_are_refused_are_counted() -> None:
+    tracker, _ = started()
+    tracker.receive(EgoState(NOW_NS, NOW_NS, math.nan, 0.0, 0.0, 0.0))
+    assert sum(tracker.refused.values()) == 1
+
+
+def test_it_gives_what_the_replay_of_the_same_messages_gives() -> None:
+    config = read_config("smoother", ["clock.node_hz=null"], track_map="oval", pit_map="oval")
+    scenario = replace(read_scenario("default"), duration_s=3.0)
+    messages = [m for m in simulate(scenario, np.random.default_rng(3)) if not isinstance(m, TruthState)]
+    run, broken = replay_in_memory(messages, config)
+    assert broken is None
+    tracker = Tracker(config)
+    rows: list[tuple[float, ...]] = []
+    for receipt_ns in sorted({m.receipt_ns for m in messages}):
+        for message in messages:
+            if message.receipt_ns == receipt_ns:
+                tracker.receive(message)
+        rows += [(track.x_m, track.y_m, track.speed_mps) for track in tracker.tick(receipt_ns).tracks]
+    assert len(rows) > 50
+    np.testing.assert_array_equal(rows, np.stack([run.tracks[n] for n in ("x_m", "y_m", "speed_mps")], axis=1))
+    received = Counter(m.sensor for m in messages if isinstance(m, DetectionList) for _ in m.objects)
+    assert {sensor: sum(counts.values()) for sensor, counts in tracker.counts.items()} == received
