@@ -29,9 +29,7 @@ from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
-from fgtrack.estimation.oosm import OOSM_METHODS, DelayedHorizon, ReorderBuffer
-from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.registry import ESTIMATORS, OOSM_GROUP, estimator
 from fgtrack.evaluation.bounds import ScheduledMeasurement, bounds, bounds_along
 from fgtrack.evaluation.figure_style import GREY, WRONG, colour, save, styled
 from fgtrack.models.measurement import measurement_model
@@ -80,17 +78,15 @@ WORLDS = {
 
 def starts(motion: MotionModel, delay_s: float) -> dict[str, Callable[[], Estimator]]:
     """The estimators by name."""
-    settings = SmootherSettings(lag_s=LAG_S, lagged_s=(), final=False)
-    thresholds = settings.thresholds(motion.state_names, curved=False)
-    found: dict[str, Callable[[], Estimator]] = {
-        "ekf-replay": lambda: ReplayEkf(motion, PRIOR, LAG_S),
-        "smoother": lambda: FixedLagSmoother(motion, PRIOR, settings, lambda: IncrementalBackend(thresholds)),
+    options = {
+        "smoother": {"final": False},
+        "delayed-horizon": {"horizon_s": delay_s},
+        "reorder-buffer": {"hold_s": delay_s},
     }
-    for name, method in OOSM_METHODS.items():
-        found[name] = lambda method=method: method.start(motion, PRIOR, LAG_S)
-    found["delayed-horizon"] = lambda: DelayedHorizon(motion, PRIOR, LAG_S, delay_s)
-    found["reorder-buffer"] = lambda: ReorderBuffer(motion, PRIOR, LAG_S, delay_s)
-    return found
+    return {
+        name: lambda name=name: estimator(name, motion, PRIOR, lag_s=LAG_S, **options.get(name, {}))
+        for name in ("ekf-replay", "smoother", *ESTIMATORS.loaded(OOSM_GROUP))
+    }
 
 
 class Case:

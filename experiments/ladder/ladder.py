@@ -34,8 +34,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
-from fgtrack.estimation.oosm import OOSM_METHODS, DelayedHorizon, ReorderBuffer
-from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.registry import ESTIMATORS, EXACT, OOSM_GROUP, Claims, estimator
 from fgtrack.evaluation.figure_style import WRONG, colour, line_style, log_axis, save, styled
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
@@ -59,6 +58,12 @@ PRIOR = Start(
     yaw_rate_std_radps=0.0,
     accel_std_mps2=0.0,
 )
+
+#: What each method is exact for, by name; plug-ins of the group `fgtrack.oosm` included.
+METHODS: dict[str, str] = {
+    "ekf-replay": EXACT,
+    **{name: Claims.of(factory).exact for name, factory in ESTIMATORS.loaded(OOSM_GROUP).items()},
+}
 
 REFERENCE_RUNS = 400
 REFERENCE_LAGS = (1, 3, 10)
@@ -87,12 +92,10 @@ def delay_s(lag: int) -> float:
 
 def starts(lag: int) -> dict[str, Callable[[], Estimator]]:
     """The estimators at `lag`; those that hold measurements back do so for as long as the late one needs."""
-    found: dict[str, Callable[[], Estimator]] = {"ekf-replay": lambda: ReplayEkf(MOTION, PRIOR, LAG_S)}
-    for name, method in OOSM_METHODS.items():
-        found[name] = lambda method=method: method.start(MOTION, PRIOR, LAG_S)
-    found["delayed-horizon"] = lambda: DelayedHorizon(MOTION, PRIOR, LAG_S, delay_s(lag))
-    found["reorder-buffer"] = lambda: ReorderBuffer(MOTION, PRIOR, LAG_S, delay_s(lag))
-    return found
+    held = {"delayed-horizon": {"horizon_s": delay_s(lag)}, "reorder-buffer": {"hold_s": delay_s(lag)}}
+    return {
+        name: lambda name=name: estimator(name, MOTION, PRIOR, lag_s=LAG_S, **held.get(name, {})) for name in METHODS
+    }
 
 
 def drawn(rng: np.random.Generator, lag: int) -> tuple[list[Measurement], FloatArray]:
@@ -183,8 +186,7 @@ def markdown(ladder: dict[int, dict[str, Samples]]) -> str:
     lines.append("|---" * (len(ladder) + 2) + "|")
     for name in next(iter(ladder.values())):
         cells = [cell(name, lag, methods[name]) for lag, methods in ladder.items()]
-        exact = OOSM_METHODS[name].exact if name in OOSM_METHODS else "any lag, any number"
-        lines.append(f"| {name} | " + " | ".join(cells) + f" | {exact or '-'} |")
+        lines.append(f"| {name} | " + " | ".join(cells) + f" | {METHODS[name] or '-'} |")
     return "\n".join(lines) + "\n"
 
 

@@ -9,8 +9,8 @@ import typer
 from fgtrack.cli.arguments import ConfigFile, Input, Settings
 from fgtrack.cli.show import TickProgress, console, progress
 from fgtrack.core.errors import CallError
+from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.build import ESTIMATORS
 from fgtrack.pipeline.replay import ReplayResult, replay_each
 from fgtrack.pipeline.shipped import read_config
 
@@ -30,10 +30,9 @@ def replay(
 ) -> int:
     """Replay a recording through the tracker."""
     config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
-    names = tuple(name.strip() for name in (config.estimator if estimators is None else estimators).split(","))
+    given = (config.estimator if estimators is None else estimators).split(",")
+    names = tuple(ESTIMATORS.resolve(name.strip()) for name in given)
     for name in names:
-        if name not in ESTIMATORS:
-            raise CallError(f"estimator {name!r} is unknown: there are {', '.join(ESTIMATORS)}")
         if names.count(name) > 1:
             raise CallError(f"estimator {name!r} is named twice")
     source = open_input(recording, config.input)

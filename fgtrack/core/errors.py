@@ -9,5 +9,5 @@ class DataError(FgtrackError):
     """An input or a run is bad (exit code 1)."""
 
 
-class CallError(FgtrackError):
-    """The call or the configuration is bad (exit code 2)."""
+class CallError(FgtrackError, ValueError):
+    """The call or the configuration is bad (exit code 2); of a configuration file, pydantic adds the key."""

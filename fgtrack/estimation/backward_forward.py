@@ -12,12 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.time import seconds
+from fgtrack.core.time import nanoseconds, period_ns, seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import correct
-from fgtrack.estimation.propagation import Propagator, wrapped_yaw
+from fgtrack.estimation.propagation import ExactPropagator, Propagator, wrapped_yaw
+from fgtrack.models.motion import MotionModel
 
 _LONGEST_STRETCH = 64  # steps of pure prediction after which a state is stored, so that predictions stay short
 
@@ -270,3 +271,12 @@ class BackwardForwardBank:
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`: none."""
         return []
+
+
+def backward_forward(motion: MotionModel, lag_s: float, frequency_hz: float = 100.0) -> BackwardForwardBank:
+    """Backward-forward delay compensation (Karle et al. 2023): forgets what was fused after a late measurement."""
+    step_ns = period_ns(frequency_hz)
+    return BackwardForwardBank(ExactPropagator(motion), step_ns, max(nanoseconds(lag_s) // step_ns, 1))
+
+
+vars(backward_forward)["bank"] = True

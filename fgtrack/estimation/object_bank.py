@@ -1,19 +1,22 @@
-"""A bank of estimators that know nothing of each other."""
+"""From estimators that know nothing of each other to a bank, and from a bank to the estimator of one object."""
 
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from fgtrack.core.time import nanoseconds
+from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import (
     Estimator,
     Measurement,
     Start,
     StatesAt,
+    TrackBank,
     UpdateResult,
+    UpdateStatus,
     no_states,
 )
+from fgtrack.estimation.ekf import predict_one
 from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.models.motion import MotionModel
 
@@ -99,3 +102,54 @@ class ObjectBank:
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`: none."""
         return []
+
+
+class OneObject:
+    """A bank with one object, as an `Estimator`: its clock follows the newest stamp.
+
+    Parameters
+    ----------
+    motion
+        The motion model of the bank.
+    bank
+        An empty bank. One on a time grid, such as `BackwardForwardBank`, gives the state of the nearest grid point.
+    start
+        What is known of the object at its first stamp.
+    """
+
+    def __init__(self, motion: MotionModel, bank: TrackBank, start: Start) -> None:
+        self._motion = motion
+        self._bank = bank
+        self._first_ns = self._newest_ns = start.stamp_ns
+        bank.advance(start.stamp_ns)
+        bank.birth(0, start)
+
+    @property
+    def window_ns(self) -> tuple[int, int]:
+        """See `Estimator.window_ns`."""
+        return max(self._bank.window_start_ns, self._first_ns), self._newest_ns
+
+    def advance(self, now_ns: int) -> None:
+        """See `Estimator.advance`."""
+        if now_ns > self._bank.present_ns:
+            self._bank.advance(now_ns)
+
+    def update(self, measurement: Measurement) -> UpdateResult:
+        """See `Estimator.update`."""
+        stamp_ns = measurement.stamp_ns
+        if stamp_ns < self.window_ns[0]:
+            return UpdateResult(UpdateStatus.TOO_OLD)
+        self.advance(stamp_ns)
+        result = self._bank.update(stamp_ns, [0], [measurement])[0]
+        if result.status is not UpdateStatus.FAILED:
+            self._newest_ns = max(self._newest_ns, stamp_ns)
+        return result
+
+    def state_at(self, stamp_ns: int) -> TrackState:
+        """See `Estimator.state_at`."""
+        known_ns = min(stamp_ns, self._bank.present_ns)
+        states = self._bank.states_at(known_ns)
+        mean, covariance = states.means[0], states.covariances[0]
+        if stamp_ns > known_ns:
+            mean, covariance = predict_one(mean, covariance, self._motion, seconds(stamp_ns - known_ns))
+        return TrackState(stamp_ns, mean, covariance)

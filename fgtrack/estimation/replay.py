@@ -43,6 +43,8 @@ class ReplayEkf:
         Length of the window behind the newest stamp or the clock.
     """
 
+    exact = "any lag, any number"
+
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
         self._motion = motion
         self._yawed = "yaw_rad" in motion.state_names

@@ -1,7 +1,6 @@
 """From a configuration to a tracker."""
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +8,9 @@ import numpy as np
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import period_ns, seconds
 from fgtrack.estimation.backward_forward import BackwardForwardBank
-from fgtrack.estimation.base import Estimator, Start, TrackBank
+from fgtrack.estimation.base import Start, TrackBank
 from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherBank
 from fgtrack.estimation.factor_graph.backends.base import Backend
-from fgtrack.estimation.object_bank import ObjectBank
-from fgtrack.estimation.oosm import OOSM_METHODS
 from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator, Propagator
 from fgtrack.estimation.published import (
     AcceleratedEulerCtrv,
@@ -23,8 +20,7 @@ from fgtrack.estimation.published import (
     SaturatedEulerCtrv,
     StalePresent,
 )
-from fgtrack.estimation.replay import ReplayEkf
-from fgtrack.models.motion import MotionModel
+from fgtrack.estimation.registry import estimator_bank
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.published_map import CircularHeadingMap, PublishedMap, PublishedRoad
 from fgtrack.models.road import FrenetRoad, OpenSpace, Road
@@ -106,11 +102,6 @@ def _build_backward_forward(config: Config) -> TrackBank:
     return storage(build_propagator(config.motion, seconds(step_ns)), step_ns, steps)
 
 
-def _build_objects(start: Callable[[MotionModel, Start, float], Estimator], config: Config) -> TrackBank:
-    motion, lag_s = config.motion.model(), config.filter.storage_s
-    return ObjectBank(motion, lambda prior: start(motion, prior, lag_s), lag_s)
-
-
 def _build_smoother(config: Config, make_backend: Callable[[], Backend]) -> TrackBank:
     motion, settings = config.motion.model(), config.smoother
 
@@ -133,21 +124,22 @@ def _build_batch(config: Config) -> TrackBank:
     return _build_smoother(config, BatchBackend)
 
 
-#: Estimators by name.
-ESTIMATORS: Mapping[str, Callable[[Config], TrackBank]] = {
+#: Banks that are built from settings of their own.
+_BANKS: Mapping[str, Callable[[Config], TrackBank]] = {
     "ekf-backward-forward": _build_backward_forward,
-    "ekf-replay": partial(_build_objects, ReplayEkf),
     "smoother": _build_incremental,
     "smoother-batch": _build_batch,
-    **{name: partial(_build_objects, method.start) for name, method in OOSM_METHODS.items()},
 }
 
 
 def build_bank(config: Config) -> TrackBank:
-    """The estimators of all objects."""
-    if config.estimator not in ESTIMATORS:
-        raise CallError(f"estimator {config.estimator!r} is unknown: there are {', '.join(ESTIMATORS)}")
-    return ESTIMATORS[config.estimator](config)
+    """The estimators of all objects. Raises `CallError` for options that the estimator does not take."""
+    build, options = _BANKS.get(config.estimator), config.options.get(config.estimator, {})
+    if build is None:
+        return estimator_bank(config.estimator, config.motion.model(), config.filter.storage_s, options)
+    if options:
+        raise CallError(f"options.{config.estimator}: set the keys of smoother or filter instead")
+    return build(config)
 
 
 def build_propagator(config: MotionConfig, step_s: float) -> Propagator:

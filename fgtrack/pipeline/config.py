@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Discriminator
 
 from fgtrack.estimation.factor_graph.settings import SmootherSettings
+from fgtrack.estimation.registry import ESTIMATORS, motion_model
 from fgtrack.io.config import InputConfig
 from fgtrack.io.run import EvaluationConfig
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
@@ -139,17 +140,22 @@ class FilterConfig:
             raise ValueError(f"storage_s: must lie between one step and 60 s, is {self.storage_s}")
 
 
+_PAPER_STD_PER_S = MappingProxyType({"position": 0.2, "yaw": 0.3, "speed": 1.0, "yaw_rate": 0.5})
+_BUILT_IN_MOTION: Mapping[str, type[CTRV | CV]] = {"ctrv_euler": CTRV, "ctrv": CTRV, "ctra": CTRA, "cv": CV}
+
+
 @dataclass(frozen=True)
 class MotionConfig:
     """Motion model and its process noise."""
 
-    kind: Literal["ctrv_euler", "ctrv", "ctra", "cv"] = "ctrv_euler"
-    std_per_s: Mapping[str, float] = field(
-        default_factory=lambda: MappingProxyType({"position": 0.2, "yaw": 0.3, "speed": 1.0, "yaw_rate": 0.5})
-    )
+    kind: str = "ctrv_euler"
+    """`ctrv_euler` (the paper's steps), `ctrv`, `ctra`, `cv`, or the name of a plug-in."""
+    std_per_s: Mapping[str, float] = field(default_factory=lambda: _PAPER_STD_PER_S)
     """The paper's process noise: each step of 1 / noise_hz adds (std_per_s / noise_hz)^2, hence the density
     std_per_s^2 / noise_hz. `ctra` takes `accel` as well, `cv` takes `velocity` alone."""
     noise_hz: float = 100.0
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    """Keyword parameters of a plug-in, which has no `std_per_s`."""
     noise: Literal["density", "per_step"] = "density"
     """`per_step`: (std_per_s dt)^2 in every step dt of the filter, whatever its frequency (`ctrv_euler`)."""
     yaw: Literal["free", "saturated"] = "free"
@@ -160,15 +166,18 @@ class MotionConfig:
         departures = (self.noise, self.yaw, self.acceleration) != ("density", "free", "none")
         if departures and self.kind != "ctrv_euler":
             raise ValueError("noise, yaw and acceleration may be changed for kind ctrv_euler only")
+        if self.kind in _BUILT_IN_MOTION and self.parameters:
+            raise ValueError(f"parameters: are a plug-in's, kind {self.kind} takes std_per_s")
+        if self.kind not in _BUILT_IN_MOTION and dict(self.std_per_s) != _PAPER_STD_PER_S:
+            raise ValueError(f"std_per_s: is that of the built-in models, give parameters for kind {self.kind}")
         self.model()
 
     def model(self) -> MotionModel:
         """The motion model, with the densities; raises `ValueError` where `std_per_s` does not fit it."""
-        if self.kind == "cv":
-            return CV.from_std_per_step(self.std_per_s, self.noise_hz)
-        if self.kind == "ctra" or self.acceleration == "driving":
-            return CTRA.from_std_per_step(self.std_per_s, self.noise_hz)
-        return CTRV.from_std_per_step(self.std_per_s, self.noise_hz)
+        if self.kind not in _BUILT_IN_MOTION:
+            return motion_model(self.kind, self.parameters)
+        model = CTRA if self.acceleration == "driving" else _BUILT_IN_MOTION[self.kind]
+        return model.from_std_per_step(self.std_per_s, self.noise_hz)
 
 
 @dataclass(frozen=True)
@@ -192,8 +201,14 @@ class Config:
     filter: FilterConfig = field(default_factory=FilterConfig)
     smoother: SmootherSettings = field(default_factory=SmootherSettings)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    options: Mapping[str, Mapping[str, bool | int | float | str]] = field(default_factory=dict)
+    """Options of estimators that have no section of their own, by name: `{reorder-buffer: {hold_s: 0.2}}`."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "estimator", ESTIMATORS.resolve(self.estimator))
+        for name in self.options:
+            if ESTIMATORS.resolve(name) != name:
+                raise ValueError(f"options: {name!r} is now {ESTIMATORS.resolve(name)!r}")
         if not self.sensors:
             raise ValueError("sensors: name at least one")
         both = set(self.sensors) & set(self.ignore_sensors)

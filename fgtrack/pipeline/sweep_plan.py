@@ -4,12 +4,12 @@ import hashlib
 import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fgtrack.core.errors import CallError
+from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.build import ESTIMATORS
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load, plain, read_yaml, validate
 from fgtrack.pipeline.replay import versions
@@ -79,9 +79,10 @@ def load_plan(path: Path) -> Plan:
         The file is wrong, something that it names is missing, or no grid point can be run.
     """
     sweep = load(SweepConfig, path)
-    for name in sweep.estimators:
-        if name not in ESTIMATORS:
-            raise CallError(f"{path}: estimators: {name!r} is unknown, there are {', '.join(ESTIMATORS)}")
+    try:
+        sweep = replace(sweep, estimators=tuple(ESTIMATORS.resolve(name) for name in sweep.estimators))
+    except CallError as error:
+        raise CallError(f"{path}: estimators: {error}") from error
     axes = sweep.axes()
     base = _with_keys(_base(sweep, path), sweep.set, f"{path}: set")
     recording = None if sweep.input is None else (path.parent / sweep.input).resolve()

@@ -11,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, TickReport, UpdateRecord
+from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.models.oval import make_oval
 from fgtrack.models.sensors import Mount, SensorModel
-from fgtrack.pipeline.build import ESTIMATORS, build_tracker
+from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, node_ticks
 from fgtrack.pipeline.config import PAPER_SENSORS, Config
 from fgtrack.pipeline.load import load

@@ -9,9 +9,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
-from fgtrack.estimation.oosm import OOSM_METHODS
-from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.registry import ESTIMATORS, OOSM_GROUP, estimator
 from fgtrack.evaluation.bounds import ScheduledMeasurement, bounds
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
@@ -35,11 +33,7 @@ EXACT = ("ekf-replay", "smoother")
 
 
 def make(name: str) -> Estimator:
-    if name == "smoother":
-        settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)
-        thresholds = settings.thresholds(MOTION.state_names, curved=False)
-        return FixedLagSmoother(MOTION, PRIOR, settings, lambda: IncrementalBackend(thresholds))
-    return ReplayEkf(MOTION, PRIOR, 1.0) if name == "ekf-replay" else OOSM_METHODS[name].start(MOTION, PRIOR, 1.0)
+    return estimator(name, MOTION, PRIOR, lag_s=1.0)
 
 
 def errors(name: str, items: list[ScheduledMeasurement]) -> FloatArray:
@@ -82,7 +76,7 @@ def test_the_exact_methods_reach_the_gated_bound(name: str, gated: FloatArray) -
     assert low < total < high
 
 
-@pytest.mark.parametrize("name", OOSM_METHODS)
+@pytest.mark.parametrize("name", ESTIMATORS.loaded(OOSM_GROUP))
 def test_no_method_is_better_than_the_gated_bound(name: str, gated: FloatArray) -> None:
     squared_m2 = np.sum(errors(name, late_positions(MOTION, START_NS, NUM_STEPS))[:, :2] ** 2, axis=1)
     standard_error = squared_m2.std() / np.sqrt(NUM_RUNS)

@@ -63,9 +63,9 @@ def test_the_script_writes_table_and_figure(tmp_path: Path, capsys: pytest.Captu
     script.main(tmp_path / "out", runs=2, seed=SEED, lags="1,4")
     table = (tmp_path / "out/ladder.md").read_text()
     assert capsys.readouterr().out == table
-    assert len(table.splitlines()) == 2 + 1 + len(script.OOSM_METHODS)
+    assert len(table.splitlines()) == 2 + len(script.METHODS)
     rows = (tmp_path / "out/ladder.csv").read_text().splitlines()
-    assert len(rows) == 1 + 2 * (1 + len(script.OOSM_METHODS))
+    assert len(rows) == 1 + 2 * len(script.METHODS)
     assert (tmp_path / "out/ladder.png").read_bytes().startswith(b"\x89PNG")
 
 

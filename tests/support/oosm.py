@@ -7,7 +7,7 @@ import numpy as np
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.oosm import OOSM_METHODS
+from fgtrack.estimation.registry import ESTIMATORS, OOSM_GROUP, estimator
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
@@ -19,11 +19,12 @@ NUM_STEPS = 20
 LINEAR = CV(velocity_density_m2ps3=5.0)
 MOTIONS = {"cv": LINEAR, "ctrv": CTRV(), "ctra": CTRA()}
 
+METHODS = tuple(ESTIMATORS.loaded(OOSM_GROUP))
 ANY_LAG = ("rts", "zlz", "asd")
 ONE_LAG = (*ANY_LAG, "a1", "al1", "fpfd")
 IGNORING = ("drop",)
 HOLDING = ("delayed-horizon", "reorder-buffer")
-FUSING = tuple(name for name in OOSM_METHODS if name not in (*IGNORING, *HOLDING))
+FUSING = tuple(name for name in METHODS if name not in (*IGNORING, *HOLDING))
 
 
 def stamp(at_s: float) -> int:
@@ -46,7 +47,7 @@ def prior(yaw_rad: float = 0.4) -> Start:
 
 
 def started(name: str, motion: MotionModel = LINEAR, lag_s: float = LAG_S) -> Estimator:
-    return OOSM_METHODS[name].start(motion, prior(), lag_s)
+    return estimator(name, motion, prior(), lag_s=lag_s)
 
 
 def measured(

@@ -4,7 +4,9 @@ from pathlib import Path
 import pytest
 
 from fgtrack.core.errors import CallError
-from fgtrack.pipeline.build import ESTIMATORS, build_bank, build_tracker
+from fgtrack.estimation.base import Start
+from fgtrack.estimation.registry import ESTIMATORS
+from fgtrack.pipeline.build import build_bank, build_tracker
 from fgtrack.pipeline.config import PAPER_SENSORS, Config
 from fgtrack.pipeline.load import dump, load, read_yaml, validate
 from fgtrack.pipeline.sweep_config import SweepConfig
@@ -66,16 +68,32 @@ def test_every_configuration_can_be_built(path: Path) -> None:
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize("motion", ["{kind: ctrv}", "{kind: cv, std_per_s: {velocity: 1.0}}", "{kind: ctrv_euler}"])
-def test_every_estimator_takes_every_motion_model(estimator: str, motion: str) -> None:
-    bank = build_bank(replace(load(Config, None, [f"motion={motion}"]), estimator=estimator))
+def test_every_estimator_starts_an_object(estimator: str) -> None:
+    bank = build_bank(load(Config, None, [f"estimator={estimator}", "motion={kind: cv, std_per_s: {velocity: 1.0}}"]))
     bank.advance(10**9)
-    assert bank.track_ids == ()
+    bank.birth(7, Start(stamp_ns=10**9, position_m=(3.0, -2.0)))
+    assert bank.track_ids == (7,)
+    assert bank.states_at(10**9).means[0, :2].tolist() == [3.0, -2.0]
+
+
+def test_an_estimator_gets_its_options_and_refuses_others() -> None:
+    name = "estimator=reorder-buffer"
+    build_bank(load(Config, None, [name, "options.reorder-buffer={hold_s: 0.2}"]))
+    with pytest.raises(CallError, match=r"reorder-buffer: .*'hold'; its options are hold_s"):
+        build_bank(load(Config, None, [name, "options.reorder-buffer={hold: 0.2}"]))
+    with pytest.raises(CallError, match=r"options\.smoother: set the keys of smoother"):
+        build_bank(load(Config, None, ["estimator=smoother", "options.smoother={late: drop}"]))
+
+
+def test_a_former_name_is_understood_and_replaced() -> None:
+    assert Config(estimator="backward-forward").estimator == "rewind-forget"
+    with pytest.raises(CallError, match="'backward-forward' is now 'rewind-forget'"):
+        load(Config, None, ["options={backward-forward: {}}"])
 
 
 def test_an_unknown_estimator_is_a_bad_call() -> None:
-    with pytest.raises(CallError, match=r"'magic' is unknown: there are ekf-backward-forward"):
-        build_tracker(replace(Config(), estimator="magic"))
+    with pytest.raises(CallError, match=r"'replay' is unknown, did you mean 'ekf-replay': there are ekf"):
+        build_tracker(replace(Config(), estimator="replay"))
 
 
 def test_settings_stand_above_the_file_and_the_last_one_wins(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from support.oosm import (
     HOLDING,
     IGNORING,
     LAG_S,
+    METHODS,
     MOTIONS,
     ONE_LAG,
     START_NS,
@@ -27,13 +28,13 @@ from support.oosm import (
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.estimation.base import Measurement, UpdateStatus
-from fgtrack.estimation.oosm import OOSM_METHODS
+from fgtrack.estimation.registry import estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
 
 
 @pytest.mark.parametrize("kind", MOTIONS)
-@pytest.mark.parametrize("name", OOSM_METHODS)
+@pytest.mark.parametrize("name", METHODS)
 def test_in_sequence_every_method_is_the_ekf(name: str, kind: str) -> None:
     motion, rng = MOTIONS[kind], np.random.default_rng(11)
     measurements = in_sequence(rng, motion)
@@ -72,20 +73,20 @@ def test_a_heading_that_passes_half_a_turn_stays_on_its_branch(name: str) -> Non
         z = model.predict(motion.predict(truth, at_s)) + 0.02 * rng.standard_normal(3)
         z[2] = (z[2] + np.pi) % (2.0 * np.pi) - np.pi
         items.append(Measurement(stamp(at_s), model, z, 0.02**2 * np.eye(3)))
-    estimator = OOSM_METHODS[name].start(motion, start, LAG_S)
+    one = estimator(name, motion, start, lag_s=LAG_S)
     for measurement in items:
-        result = estimator.update(measurement)
+        result = one.update(measurement)
         assert result.status in (UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE)
         if name != "as-current":
             assert result.nis is not None
             assert result.nis < 20.0
-    yaw_rad = estimator.state_at(stamp(2.0)).mean[2]
+    yaw_rad = one.state_at(stamp(2.0)).mean[2]
     assert -np.pi < yaw_rad <= np.pi
     assert abs((yaw_rad - truth[2] - 0.2 + np.pi) % (2.0 * np.pi) - np.pi) < 0.1
 
 
 @pytest.mark.parametrize("kind", MOTIONS)
-@pytest.mark.parametrize("name", OOSM_METHODS)
+@pytest.mark.parametrize("name", METHODS)
 def test_a_measurement_older_than_the_window_is_too_old_and_changes_nothing(name: str, kind: str) -> None:
     motion, rng = MOTIONS[kind], np.random.default_rng(14)
     estimator = fed(started(name, motion, 1.0), in_sequence(rng, motion))
@@ -110,7 +111,7 @@ def shuffled(rng: np.random.Generator, motion: MotionModel) -> list[Measurement]
 
 
 @pytest.mark.parametrize("kind", MOTIONS)
-@pytest.mark.parametrize("name", OOSM_METHODS)
+@pytest.mark.parametrize("name", METHODS)
 def test_covariances_are_symmetric_and_positive_definite_and_the_same_input_gives_the_same_bits(
     name: str, kind: str
 ) -> None:
@@ -140,7 +141,7 @@ def test_covariances_are_symmetric_and_positive_definite_and_the_same_input_give
 
 @pytest.mark.parametrize("broken", ["z", "R"])
 @pytest.mark.parametrize("at_s", [1.95, 2.05])
-@pytest.mark.parametrize("name", OOSM_METHODS)
+@pytest.mark.parametrize("name", METHODS)
 def test_a_measurement_that_cannot_be_fused_fails_and_leaves_the_estimator_usable(
     name: str, at_s: float, broken: str
 ) -> None:

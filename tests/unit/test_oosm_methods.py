@@ -32,7 +32,6 @@ from fgtrack.estimation.base import Measurement, Start, UpdateStatus
 from fgtrack.estimation.dense_joint import dense_joint
 from fgtrack.estimation.oosm import (
     A1,
-    OOSM_METHODS,
     CovarianceIntersection,
     DelayedHorizon,
     ReorderBuffer,
@@ -40,6 +39,7 @@ from fgtrack.estimation.oosm import (
     trace,
 )
 from fgtrack.estimation.oosm.crossing import Past, fuse_across
+from fgtrack.estimation.registry import estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
 
@@ -248,9 +248,9 @@ def test_covariance_intersection_makes_small_what_it_is_told_to(size, takes_late
         yaw_rate_std_radps=0.0,
         accel_std_mps2=0.0,
     )
-    estimator = fed(CovarianceIntersection(LINEAR, start, LAG_S, size), [*steps, more])
-    other = OOSM_METHODS["rewind-forget" if takes_late else "drop"].start(LINEAR, start, LAG_S)
-    assert_same(estimator.state_at(stamp(4.0)), fed(other, [*steps, more]).state_at(stamp(4.0)))
+    found = fed(CovarianceIntersection(LINEAR, start, LAG_S, size), [*steps, more])
+    other = estimator("rewind-forget" if takes_late else "drop", LINEAR, start, lag_s=LAG_S)
+    assert_same(found.state_at(stamp(4.0)), fed(other, [*steps, more]).state_at(stamp(4.0)))
 
 
 def test_covariance_intersection_weighs_where_neither_estimate_is_better_in_all() -> None:

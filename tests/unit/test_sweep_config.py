@@ -143,7 +143,10 @@ def test_a_wrong_file_is_told_by_the_path_of_the_key(plan: Any, text: str, said:
         ("scenario: default\nestimators: [ekf-replay]", "format: Field required"),
         ("format: fgtrack-sweep/2\nscenario: default\nestimators: [ekf-replay]", "format: Input should be"),
         ("format: fgtrack-sweep/1\nscenario: default\nestimators: []", "estimators: name at least one"),
-        ("format: fgtrack-sweep/1\nscenario: default\nestimators: [ukf]", "estimators: 'ukf' is unknown, there are"),
+        (
+            "format: fgtrack-sweep/1\nscenario: default\nestimators: [ukf]",
+            "estimators: estimator 'ukf' is unknown: there are",
+        ),
         ("format: fgtrack-sweep/1\nestimators: [ekf-replay]", "scenario, input: name one"),
         ("format: fgtrack-sweep/1\ninput: nothing.mcap\nestimators: [ekf-replay]", "nothing.mcap: there is no such"),
     ],

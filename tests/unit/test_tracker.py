@@ -5,8 +5,9 @@ from support.tracking import START_NS, ms
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, TickReport, TrackStatus
+from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.models.sensors import SensorModel
-from fgtrack.pipeline.build import ESTIMATORS, build_tracker
+from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config, LifecycleConfig
 from fgtrack.tracking.association import GatedEuclidean
 from fgtrack.tracking.tracker import Tracker

@@ -44,6 +44,12 @@ class AccumulatedStateDensity:
         See `LateEkf`.
     """
 
+    exact = "any lag, any number"
+    nonlinear = "never"
+    smooths = True
+    tolerance = 1e-7
+    """Splitting the state between two close neighbours off a joint covariance costs digits."""
+
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
         self._motion = motion
         self._yawed = "yaw_rad" in motion.state_names

@@ -62,6 +62,8 @@ class Fpfd(_ForwardEkf):
     Exact for: one lag, the first late measurement since step m. Numerically the same as `Al1` in a linear model.
     """
 
+    exact = "one lag, first late measurement"
+
     def _fused(self, now: Estimate, late: Estimate, common: Estimate) -> Estimate:
         P_k, P_1, P_0 = (information(each.covariance) for each in (now, late, common))
         covariance = symmetrise(information(P_k + P_1 - P_0))

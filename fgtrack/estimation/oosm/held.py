@@ -78,6 +78,8 @@ class DelayedHorizon(HeldEkf):
         D, at most `lag_s`. Raises `CallError` otherwise.
     """
 
+    exact = "up to now - D: any lag, any number"
+
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float, horizon_s: float = 0.2) -> None:
         super().__init__(motion, prior, lag_s, horizon_s)
 
@@ -103,6 +105,8 @@ class ReorderBuffer(HeldEkf):
     hold_s
         D, at most `lag_s`. Raises `CallError` otherwise.
     """
+
+    exact = "up to D before the newest stamp: any lag, any number"
 
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float, hold_s: float = 0.1) -> None:
         super().__init__(motion, prior, lag_s, hold_s)

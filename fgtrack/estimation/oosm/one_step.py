@@ -31,6 +31,8 @@ class Al1(_OneStep):
     Exact for: one lag, the first late measurement since step m. Numerically the same as `Fpfd` in a linear model.
     """
 
+    exact = "one lag, first late measurement"
+
     noise_in_state = True
 
 

@@ -65,6 +65,8 @@ class A1(_OneLag):
     covariance than there is, the more so the larger Q is; where none would be left the measurement is `failed`.
     """
 
+    exact = "one lag, first late measurement"
+
     noise_in_state = True
 
 
@@ -90,6 +92,8 @@ class C(CrossingEkf):
 
     Exact for: no process noise, any lag and number. Else overconfident, at many lags badly.
     """
+
+    exact = "no process noise: any lag, any number"
 
     def _past(self, stamp_ns: int) -> Past:
         now = self._history.newest

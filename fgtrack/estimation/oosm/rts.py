@@ -21,6 +21,8 @@ class RtsCrossCovariance(CrossingEkf):
     Exact for: any lag, the first late measurement since step m.
     """
 
+    exact = "any lag, first late measurement"
+
     def _past(self, stamp_ns: int) -> Past:
         steps = self._history.steps
         left, mean, covariance, F = self._predicted(stamp_ns)

@@ -19,6 +19,8 @@ class FixedPoint(CrossingEkf):
     Exact for: any lag, the first late measurement since step m.
     """
 
+    exact = "any lag, first late measurement"
+
     def _past(self, stamp_ns: int) -> Past:
         steps = self._history.steps
         left, mean, covariance, F = self._predicted(stamp_ns)

@@ -1,0 +1,110 @@
+"""Parts by name: built-in ones, and those of installed packages (entry points), loaded on first use."""
+
+import difflib
+import logging
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from fgtrack.core.errors import CallError
+
+_logger = logging.getLogger(__name__)
+
+
+class Registry:
+    """Parts of one kind by name.
+
+    A plug-in is an entry point of one of the groups. It is loaded when its name is used, so a broken one does not
+    disturb the others. One that takes the name of a built-in part, or of a plug-in found before, is left out with a
+    warning.
+
+    Parameters
+    ----------
+    noun
+        What the parts are, for messages: `estimator`.
+    built_in
+        Where the built-in parts are, `module:attribute`, by name, for every entry-point group.
+    aliases
+        Present names by former ones.
+    """
+
+    def __init__(
+        self, noun: str, built_in: Mapping[str, Mapping[str, str]], aliases: Mapping[str, str] | None = None
+    ) -> None:
+        self._noun = noun
+        self._built_in = built_in
+        self._aliases = dict(aliases or {})
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._entries or name in self._aliases
+
+    def loaded(self, group: str | None = None) -> dict[str, Any]:  # Any: see `load`
+        """All parts, or those of `group`, by name; a plug-in that cannot be loaded is left out with a warning."""
+        parts = {}
+        for name, entry in self._entries.items():
+            if group in (None, entry.group):
+                try:
+                    parts[name] = self.load(name)
+                except CallError as error:
+                    _logger.warning("%s", error)
+        return parts
+
+    def plugins(self) -> dict[str, str]:
+        """Names of the plug-ins, and the package of each."""
+        return {name: _package(entry) for name, entry in self._entries.items() if entry.dist is not None}
+
+    def resolve(self, name: str) -> str:
+        """The present form of `name`. Raises `CallError` for one that does not exist."""
+        name = self._aliases.get(name, name)
+        if name not in self._entries:
+            near = difflib.get_close_matches(name, [*self._entries, *self._aliases], n=1)
+            hint = f", did you mean {near[0]!r}" if near else ""
+            raise CallError(f"{self._noun} {name!r} is unknown{hint}: there are {', '.join(self)}")
+        return name
+
+    def load(self, name: str) -> Any:  # Any: what an entry point names is only known to its user
+        """What `name` stands for. Raises `CallError` for an unknown name and for a plug-in that cannot be loaded."""
+        entry = self._entries[self.resolve(name)]
+        if entry.dist is None:
+            return entry.load()
+        try:
+            return entry.load()
+        except Exception as error:  # of a foreign module: anything
+            what = " ".join(f"{type(error).__name__}: {error}".split())
+            raise CallError(
+                f"{self._noun} {name!r}: plug-in {entry.value} of {_package(entry)} cannot be loaded ({what}): "
+                "repair or uninstall it"
+            ) from error
+
+    @cached_property
+    def _entries(self) -> dict[str, EntryPoint]:
+        entries = {
+            name: EntryPoint(name, value, group)
+            for group, parts in self._built_in.items()
+            for name, value in parts.items()
+        }
+        for group in self._built_in:
+            for entry in sorted(entry_points(group=group), key=lambda entry: (entry.name, _package(entry))):
+                holder = entries.get(self._aliases.get(entry.name, entry.name))
+                if holder is None:
+                    entries[entry.name] = entry
+                elif (holder.value, _package(holder)) != (entry.value, _package(entry)):
+                    _logger.warning(
+                        "%s %r of %s is left out: the name belongs to %s; rename the entry point",
+                        self._noun,
+                        entry.name,
+                        _package(entry),
+                        _package(holder),
+                    )
+        return entries
+
+
+def _package(entry: EntryPoint) -> str:
+    return "fgtrack" if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"

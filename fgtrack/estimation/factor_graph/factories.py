@@ -1,0 +1,51 @@
+"""The smoother of one object, by name."""
+
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any
+
+from fgtrack.core.errors import CallError
+from fgtrack.estimation.base import Start
+from fgtrack.estimation.factor_graph.backends.batch import BatchBackend
+from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
+from fgtrack.estimation.factor_graph.settings import SmootherSettings
+from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
+from fgtrack.models.motion import MotionModel
+
+_OPTIONS = tuple(field.name for field in fields(SmootherSettings) if field.name != "lag_s")
+
+
+# Any: an option may be any value that `SmootherSettings` takes.
+def smoother(motion: MotionModel, start: Start, lag_s: float, **options: Any) -> FixedLagSmoother:
+    """Fixed-lag smoother, a factor graph that iSAM2 solves incrementally."""
+    settings = _settings(lag_s, options)
+    thresholds = settings.thresholds(motion.state_names, curved=True)
+    return FixedLagSmoother(motion, start, settings, lambda: IncrementalBackend(thresholds))
+
+
+def smoother_batch(motion: MotionModel, start: Start, lag_s: float, **options: Any) -> FixedLagSmoother:
+    """Fixed-lag smoother, a factor graph that Levenberg-Marquardt solves anew at every update: slow, for checks."""
+    return FixedLagSmoother(motion, start, _settings(lag_s, options), BatchBackend)
+
+
+def _settings(lag_s: float, options: dict[str, Any]) -> SmootherSettings:
+    unknown = sorted(set(options) - set(_OPTIONS))
+    if unknown:
+        raise CallError(f"smoother: unknown option {unknown[0]!r}; its options are {', '.join(_OPTIONS)}")
+    return SmootherSettings(lag_s=lag_s, **{"lagged_s": (), **options})
+
+
+def _claim(factory: Callable[..., FixedLagSmoother], rounding: float, tolerance: float = 1e-9) -> None:
+    """See `registry.Claims`."""
+    vars(factory).update(
+        exact="any lag, any number",
+        nonlinear="at convergence",
+        smooths=True,
+        tolerance=tolerance,
+        rounding=rounding,
+    )
+
+
+_claim(smoother, rounding=1.0)
+# Levenberg-Marquardt compares errors at absolute positions: eps W of 50 m instead of the standard deviation, 0.5 m.
+_claim(smoother_batch, rounding=100.0, tolerance=1e-6)

@@ -1,0 +1,159 @@
+"""All estimators and all motion models by name, plug-ins included.
+
+An estimator's entry is a class or function `(motion, start, lag_s, **options) -> Estimator`; one whose attribute `bank`
+is true is `(motion, lag_s, **options) -> TrackBank`, for all objects together. A motion model's entry is a class or
+function `(**parameters) -> MotionModel`.
+"""
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+from fgtrack.core.errors import CallError
+from fgtrack.core.plugins import Registry
+from fgtrack.estimation.base import Estimator, Start, TrackBank
+from fgtrack.estimation.object_bank import ObjectBank, OneObject
+from fgtrack.models.motion import MotionModel
+
+OOSM_GROUP = "fgtrack.oosm"
+EXACT = "any lag, any number"
+
+_OOSM = "fgtrack.estimation.oosm"
+ESTIMATORS = Registry(
+    "estimator",
+    {
+        "fgtrack.estimators": {
+            "ekf-backward-forward": "fgtrack.estimation.backward_forward:backward_forward",
+            "ekf-replay": "fgtrack.estimation.replay:ReplayEkf",
+            "smoother": "fgtrack.estimation.factor_graph.factories:smoother",
+            "smoother-batch": "fgtrack.estimation.factor_graph.factories:smoother_batch",
+        },
+        OOSM_GROUP: {
+            "drop": f"{_OOSM}:Drop",
+            "as-current": f"{_OOSM}:AsCurrent",
+            "delayed-horizon": f"{_OOSM}:DelayedHorizon",
+            "reorder-buffer": f"{_OOSM}:ReorderBuffer",
+            "a1": f"{_OOSM}:A1",
+            "b1": f"{_OOSM}:B1",
+            "c": f"{_OOSM}:C",
+            "al1": f"{_OOSM}:Al1",
+            "bl1": f"{_OOSM}:Bl1",
+            "rts": f"{_OOSM}:RtsCrossCovariance",
+            "zlz": f"{_OOSM}:FixedPoint",
+            "asd": f"{_OOSM}:AccumulatedStateDensity",
+            "fpfd": f"{_OOSM}:Fpfd",
+            "ci": f"{_OOSM}:CovarianceIntersection",
+            "larsen": f"{_OOSM}:Larsen",
+            "rewind-forget": f"{_OOSM}:RewindForget",
+        },
+    },
+    aliases={"backward-forward": "rewind-forget"},
+)
+MOTION_MODELS = Registry(
+    "motion model",
+    {"fgtrack.motion_models": {name: f"fgtrack.models.motion:{name.upper()}" for name in ("ctrv", "ctra", "cv")}},
+)
+
+Factory = Callable[..., Any]  # Any: an estimator or a bank, see the module
+
+
+@dataclass(frozen=True)
+class Claims:
+    """What an estimator says of itself, in attributes of its class or function; a missing one is the default."""
+
+    exact: str = ""
+    """For which late measurements a linear model gives the dense joint posterior of all accepted ones; empty for none.
+    One that says `any lag, any number` is held to it by `fgtrack verify` and `check_estimator`."""
+    nonlinear: Literal["at once", "at convergence", "never"] = "at once"
+    """When, in a nonlinear model, any order of arrival gives the estimate of the time order: by itself, after the
+    estimator's own method `converge()`, or never, where an estimate keeps its linearisation."""
+    smooths: bool = False
+    """Whether a state of the past knows later measurements; a filter's does not."""
+    tolerance: float = 1e-9
+    """Largest difference to the dense joint posterior, in standard deviations."""
+    rounding: float = 0.0
+    """Where stamps nearly coincide, the tolerance grows to this many times `dense_joint.rounding_bound`."""
+    bank: bool = False
+    """Whether the entry makes the estimators of all objects together."""
+
+    @classmethod
+    def of(cls, factory: Factory) -> "Claims":
+        """What `factory` says."""
+        return cls(**{f.name: getattr(factory, f.name) for f in fields(cls) if hasattr(factory, f.name)})
+
+
+def summary(factory: Factory) -> str:
+    """The first paragraph of a docstring, in one line."""
+    return " ".join((inspect.getdoc(factory) or "").split("\n\n")[0].split())
+
+
+# Any: options are the estimator's own.
+def estimator(name: str, motion: MotionModel, start: Start, *, lag_s: float = 1.0, **options: Any) -> Estimator:
+    """The estimator `name` of one object.
+
+    Parameters
+    ----------
+    name
+        A name of `ESTIMATORS`: `smoother`, `ekf-replay`, that of a method of the literature, of a plug-in.
+    motion
+        Motion model.
+    start
+        What is known of the object at its first stamp; nothing older can be fused.
+    lag_s
+        Length of the window behind the newest stamp or the clock.
+    options
+        Keyword parameters of that estimator.
+
+    Raises `CallError` for an unknown name and for options that the estimator does not take.
+    """
+    factory = ESTIMATORS.load(name)
+    if Claims.of(factory).bank:
+        return OneObject(motion, _made(name, factory, motion, lag_s, **options), start)
+    return _checked(name, _made(name, factory, motion, start, lag_s, **options))
+
+
+def estimator_bank(name: str, motion: MotionModel, lag_s: float, options: Mapping[str, Any]) -> TrackBank:
+    """The estimators `name` of all objects; raises as `estimator`."""
+    factory = ESTIMATORS.load(name)
+    if Claims.of(factory).bank:
+        bank: TrackBank = _made(name, factory, motion, lag_s, **options)
+        return bank
+    _check_options(name, factory, 3, options)
+
+    def start_one(start: Start) -> Estimator:
+        return _checked(name, _made(name, factory, motion, start, lag_s, **options))
+
+    return ObjectBank(motion, start_one, lag_s)
+
+
+def motion_model(name: str, parameters: Mapping[str, Any]) -> MotionModel:
+    """The motion model `name`. Raises `CallError` for an unknown name and for parameters that it does not take."""
+    model = _made(name, MOTION_MODELS.load(name), **parameters)
+    if not isinstance(model, MotionModel):
+        raise CallError(f"motion model {name!r}: is a {type(model).__name__}, not a MotionModel")
+    return model
+
+
+def _made(name: str, factory: Factory, *arguments: Any, **options: Any) -> Any:
+    _check_options(name, factory, len(arguments), options)
+    try:
+        return factory(*arguments, **options)
+    except ValueError as error:
+        raise CallError(f"{name}: {error}") from error
+
+
+def _check_options(name: str, factory: Factory, num_arguments: int, options: Mapping[str, Any]) -> None:
+    signature = inspect.signature(factory)
+    try:
+        signature.bind(*[None] * num_arguments, **options)
+    except TypeError as error:
+        taken = list(signature.parameters)[num_arguments:]
+        raise CallError(f"{name}: {error}; its options are {', '.join(taken) or 'none'}") from error
+
+
+def _checked(name: str, found: Estimator) -> Estimator:
+    lacking = [what for what in ("window_ns", "update", "state_at", "advance") if not hasattr(type(found), what)]
+    if lacking:
+        raise CallError(f"estimator {name!r}: {type(found).__name__} lacks {', '.join(lacking)}, see Estimator")
+    return found

@@ -1,0 +1,115 @@
+"""Names of built-in parts and of plug-ins, and what is said where one of them is wrong."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fgtrack.core.errors import CallError
+from fgtrack.core.plugins import Registry
+from fgtrack.estimation.base import Measurement, Start, UpdateStatus
+from fgtrack.estimation.registry import ESTIMATORS, Claims, estimator, motion_model, summary
+from fgtrack.models.measurement import measurement_model
+from fgtrack.models.motion import CTRV, CV
+
+GROUP = "fgtrack.tests"
+
+
+def installed(folder: Path, package: str, **entries: str) -> None:
+    info = folder / f"{package}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    lines = [f"{name} = {value}" for name, value in entries.items()]
+    (info / "entry_points.txt").write_text("\n".join([f"[{GROUP}]", *lines, ""]))
+
+
+@pytest.fixture
+def registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Registry:
+    (tmp_path / "sound_plugin.py").write_text("class Part:\n    pass\n")
+    (tmp_path / "broken_plugin.py").write_text("import no_such_module\n")
+    installed(tmp_path, "sound", part="sound_plugin:Part", ours="sound_plugin:Part", old="sound_plugin:Part")
+    installed(tmp_path, "wrecked", wrong="broken_plugin:Part", part="broken_plugin:Part")
+    monkeypatch.syspath_prepend(tmp_path)
+    return Registry("part", {GROUP: {"ours": "pathlib:Path"}}, aliases={"old": "ours"})
+
+
+def test_built_in_parts_come_first_and_plug_ins_are_loaded_by_name(registry: Registry) -> None:
+    assert list(registry) == ["ours", "part", "wrong"]
+    assert registry.load("ours") is Path
+    assert registry.load("part").__module__ == "sound_plugin"
+    assert registry.plugins() == {"part": "sound 1.0", "wrong": "wrecked 1.0"}
+
+
+def test_a_name_that_is_taken_is_left_out_with_a_line(registry: Registry, caplog: pytest.LogCaptureFixture) -> None:
+    assert registry.load("old") is Path
+    assert [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING] == [
+        "part 'old' of sound 1.0 is left out: the name belongs to fgtrack; rename the entry point",
+        "part 'ours' of sound 1.0 is left out: the name belongs to fgtrack; rename the entry point",
+        "part 'part' of wrecked 1.0 is left out: the name belongs to sound 1.0; rename the entry point",
+    ]
+
+
+def test_a_broken_plug_in_is_named_and_does_not_disturb_the_others(
+    registry: Registry, caplog: pytest.LogCaptureFixture
+) -> None:
+    with pytest.raises(CallError, match=r"^part 'wrong': plug-in broken_plugin:Part of wrecked 1\.0 cannot") as error:
+        registry.load("wrong")
+    assert "No module named 'no_such_module'" in str(error.value)
+    assert "\n" not in str(error.value)
+    caplog.clear()
+    assert set(registry.loaded(GROUP)) >= {"ours"}
+    assert "part 'wrong': plug-in broken_plugin:Part" in caplog.text
+
+
+def test_an_unknown_name_gives_the_nearest_and_all(registry: Registry) -> None:
+    with pytest.raises(CallError, match=r"^part 'prt' is unknown, did you mean 'part': there are ours, part, wrong$"):
+        registry.resolve("prt")
+    assert registry.resolve("old") == "ours"
+    assert "old" in registry
+    assert "prt" not in registry
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_every_estimator_is_made_by_name_and_says_what_it_is(name: str) -> None:
+    motion = CV()
+    one = estimator(name, motion, Start(position_m=(1.0, 2.0)), lag_s=1.0)
+    z = one.state_at(0).mean[:2]
+    assert z.tolist() == [1.0, 2.0]
+    measurement = Measurement(10**9 // 2, measurement_model(("x_m", "y_m"), motion), z, np.eye(2))
+    assert one.update(measurement).status is UpdateStatus.IN_SEQUENCE
+    assert one.window_ns[1] == 10**9 // 2
+    assert 0 < len(summary(ESTIMATORS.load(name))) < 300
+
+
+def test_the_paper_s_bank_is_an_estimator_of_one_object() -> None:
+    motion = CTRV()
+    one = estimator("ekf-backward-forward", motion, Start(yaw_rad=0.0, speed_mps=10.0), lag_s=0.5, frequency_hz=100.0)
+    model = measurement_model(("x_m", "y_m"), motion)
+    for ms in (100, 200, 300, 250):
+        z = one.state_at(ms * 10**6).mean[:2] + 0.01
+        status = one.update(Measurement(ms * 10**6, model, z, np.eye(2))).status
+        assert status is (UpdateStatus.OUT_OF_SEQUENCE if ms == 250 else UpdateStatus.IN_SEQUENCE)
+    assert one.window_ns == (0, 300 * 10**6)
+    ahead = one.state_at(1000 * 10**6)
+    assert 9.0 < ahead.mean[0] < 11.0
+    one.advance(1000 * 10**6)
+    assert one.window_ns[0] > 400 * 10**6
+    assert one.update(Measurement(10**8, model, z, np.eye(2))).status is UpdateStatus.TOO_OLD
+
+
+def test_options_that_an_estimator_does_not_take_are_refused() -> None:
+    start = Start()
+    with pytest.raises(CallError, match=r"^ekf-replay: .*'hold_s'; its options are none$"):
+        estimator("ekf-replay", CV(), start, hold_s=0.1)
+    with pytest.raises(CallError, match="unknown option 'ring'; its options are late, ring_s"):
+        estimator("smoother", CV(), start, ring=0.1)
+    with pytest.raises(CallError, match="smoother: max_iterations: must lie between"):
+        estimator("smoother", CV(), start, max_iterations=0)
+    with pytest.raises(CallError, match=r"cv: .*'drag'; its options are velocity_density_m2ps3"):
+        motion_model("cv", {"drag": 0.1})
+
+
+def test_what_an_estimator_does_not_say_of_itself_is_the_default() -> None:
+    assert Claims.of(ESTIMATORS.load("drop")) == Claims()
+    assert Claims.of(ESTIMATORS.load("asd")) == Claims("any lag, any number", "never", smooths=True, tolerance=1e-7)
