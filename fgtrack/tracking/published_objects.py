@@ -1,19 +1,17 @@
 """How the published implementation of Karle et al. 2023 merges, assigns and ages objects, one defect each."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
-from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import StatesAt
 from fgtrack.estimation.published import published_yaw
-from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, euclidean_distances
-from fgtrack.tracking.lifecycle import Life, LifecycleRules
+from fgtrack.tracking.lifecycle import CountingLifecycle
 from fgtrack.tracking.preprocess import Candidate, Group
 
 
@@ -69,22 +67,16 @@ class UngatedEuclidean:
         return Assignment(good, alone + torn, [j for j in tracks if j not in seen])
 
 
-class PublishedLifecycle:
+class PublishedLifecycle(CountingLifecycle):
     """Only two sensors age a track, each at its range; time counts only where a list came in; the cap may be passed;
     a birth is dated to the tick and a match to the sensor's stamp (defects Q9 and Q15).
 
     The range is that of a state which is one batch old; see `fgtrack.tracking.tracker.PublishedTracker`.
     """
 
-    def __init__(self, rules: LifecycleRules, sensors: Mapping[str, SensorModel]) -> None:
-        self._rules = rules
-        self._sensors = sensors
-        self._forget_ns = nanoseconds(rules.forget_s)
-        self.lives: dict[int, Life] = {}
-
     def born(self, track_id: int, sensor: str, stamp_ns: int, present_ns: int) -> None:
         """See `Lifecycle.born`."""
-        self.lives[track_id] = Life(self._sensors[sensor].counter_init, present_ns)
+        super().born(track_id, sensor, present_ns, present_ns)
 
     def matched(self, track_id: int, sensor: str, stamp_ns: int) -> None:
         """See `Lifecycle.matched`."""
@@ -93,10 +85,6 @@ class PublishedLifecycle:
             life.counter += self._sensors[sensor].counter_add
         life.last_seen_ns = stamp_ns
         life.misses = 0
-
-    def fused(self, track_id: int) -> None:
-        """See `Lifecycle.fused`."""
-        self.lives[track_id].num_measured += 1
 
     def missed(self, track_ids: Sequence[int], sensor: str, ranges_m: FloatArray, present_ns: int) -> list[int]:
         """See `Lifecycle.missed`."""
@@ -117,7 +105,3 @@ class PublishedLifecycle:
     def expired(self, present_ns: int) -> list[int]:
         """See `Lifecycle.expired`; never, without a list."""
         return []
-
-    def forget(self, track_id: int) -> None:
-        """See `Lifecycle.forget`."""
-        del self.lives[track_id]
