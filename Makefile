@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 .PHONY: demo test test-slow check bench clean
 
 demo: $(STAMP)
-	$(BIN)/fgtrack demo -o out/demo
+	$(BIN)/fgtrack demo -o out/demo --overwrite
 
 test: $(STAMP)
 	$(BIN)/python -m pytest

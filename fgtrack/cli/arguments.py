@@ -17,5 +17,6 @@ Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override one key of the configuration; may be repeated."),
 ]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what such a command wrote there before.")]
 Runs = Annotated[list[Path], typer.Argument(help="Run folders, or folders that hold run folders.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]

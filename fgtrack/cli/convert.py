@@ -7,9 +7,9 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from fgtrack.cli.arguments import ConfigFile, Input
+from fgtrack.cli.arguments import ConfigFile, Input, Overwrite
 from fgtrack.cli.show import console, progress
-from fgtrack.cli.storage import Storage, StorageOption, write_recording
+from fgtrack.cli.storage import Storage, StorageOption, check_recording, write_recording
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Message
 from fgtrack.io.source import open_input
@@ -30,17 +30,21 @@ def convert(
         int | None, typer.Option("--seed", min=0, help="Seed of the random generator of --delays.", show_default="0")
     ] = None,
     storage: StorageOption = Storage.MCAP,
+    overwrite: Overwrite = False,
 ) -> None:
     """Convert a recording into a stream or a rosbag2 folder."""
     if seed is not None and delays_file is None:
         raise CallError("--seed: only --delays draws random numbers, name its file")
+    if recording.exists() and out.exists() and recording.samefile(out):
+        raise CallError(f"{out}: is the input, choose another name")
+    check_recording(out, overwrite)
     source = open_input(recording, read_config(config_file).input)
     with progress("convert"):
         if delays_file is None:
-            count, lost = write_recording(out, source.messages(), storage), ""
+            count, lost = write_recording(out, source.messages(), storage, overwrite), ""
         else:
             redelayed = _redelayed(source.messages, delays_file, seed or 0)
-            count, lost = write_recording(out, redelayed, storage), _losses(redelayed)
+            count, lost = write_recording(out, redelayed, storage, overwrite), _losses(redelayed)
     console().print(f"{out}: {count} messages{lost}", highlight=False, soft_wrap=True)
 
 

@@ -1,19 +1,19 @@
 """`fgtrack demo`: the whole chain in a minute."""
 
-import shutil
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
+from fgtrack.cli.arguments import Overwrite
 from fgtrack.cli.compare import evaluated
 from fgtrack.cli.show import TickProgress, console, progress
-from fgtrack.core.errors import CallError
 from fgtrack.evaluation.figures import save_figures
 from fgtrack.evaluation.tables import comparison_tables
-from fgtrack.io.ros.bag_writer import write_bag
-from fgtrack.io.run import read_run
+from fgtrack.io.output import Kind, check_output, claimed, new_files
+from fgtrack.io.ros.bag_writer import RECORDING, write_bag
+from fgtrack.io.run import RUN, read_run
 from fgtrack.io.source import open_input
 from fgtrack.models.oval import OVAL
 from fgtrack.pipeline.replay import replay_each
@@ -29,36 +29,39 @@ def demo(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for recording, runs and figures.")] = Path(
         "fgtrack-demo"
     ),
+    overwrite: Overwrite = False,
 ) -> None:
     """Simulate, record, replay with three estimators, compare, draw."""
-    bag = out / "recording"
-    if bag.exists():
-        if not (bag / "metadata.yaml").exists():
-            raise CallError(f"{bag}: is in the way and no recording, choose another folder with -o")
-        shutil.rmtree(bag)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CallError(f"{out}: cannot be made a folder ({error.strerror}), choose another one with -o") from error
+    with claimed(out):
+        _demo(out, overwrite)
+
+
+def _demo(out: Path, overwrite: bool) -> None:
+    bag, figures = out / "recording", out / "figures"
+    folders = {name: out / "runs" / name for name in _ESTIMATORS}
+    check_output(bag, RECORDING, overwrite)
+    check_output(figures, Kind("a folder", Path.is_dir), overwrite)
+    for folder in folders.values():
+        check_output(folder, RUN, overwrite)
     with progress("simulate"):
-        write_bag(bag, simulate(read_scenario("default"), np.random.default_rng(_SEED)))
+        write_bag(bag, simulate(read_scenario("default"), np.random.default_rng(_SEED)), overwrite=overwrite)
     config = read_config("smoother", [_LAGS], track_map=OVAL, pit_map=OVAL)
     source = open_input(bag, config.input)
     with progress("replay") as show:
         results = replay_each(
             source.messages,
             config,
-            _ESTIMATORS,
-            out / "runs",
+            folders,
             origin=str(bag),
             kind=source.kind,
             on_tick=TickProgress(show),
+            overwrite=overwrite,
         )
     runs = [read_run(result.path) for result in results]
     for table in comparison_tables(evaluated(runs)):
         console().print(table)
-    with progress("draw"):
-        files = save_figures(runs, out / "figures")
+    with progress("draw"), new_files(figures, overwrite) as folder:
+        files = save_figures(runs, folder)
     console().print(f"recording: {bag}\nruns: {out / 'runs'}", highlight=False, soft_wrap=True)
     for file in files:
-        console().print(f"figure: {file}", highlight=False, soft_wrap=True)
+        console().print(f"figure: {figures / file.name}", highlight=False, soft_wrap=True)

@@ -12,6 +12,7 @@ from fgtrack.cli.arguments import ConfigFile, Input, Json, Settings
 from fgtrack.cli.show import console, progress
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.clock_offsets import OffsetReport, SensorOffset, estimate_offsets
+from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
 
 
@@ -43,8 +44,7 @@ def offsets(
         console().print(_table(report))
     if report.broken is None:
         return 0
-    where = "" if str(recording) in report.broken else f"{recording}: "
-    print(f"fgtrack: error: {where}{' '.join(report.broken.split())}; used up to there", file=sys.stderr)
+    print(f"fgtrack: error: {located(report.broken, str(recording))}; used up to there", file=sys.stderr)
     return 1
 
 

@@ -6,12 +6,12 @@ from typing import Annotated
 
 import typer
 
-from fgtrack.cli.arguments import ConfigFile, Input, Settings
+from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, Settings
 from fgtrack.cli.show import TickProgress, console, progress
 from fgtrack.core.errors import CallError
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.replay import ReplayResult, replay_each
+from fgtrack.pipeline.replay import ReplayResult, located, replay_each, run_folders
 from fgtrack.pipeline.shipped import read_config
 
 
@@ -27,6 +27,7 @@ def replay(
     ] = None,
     pit_map: Annotated[str | None, typer.Option("--pit-map", help="Map of the pit lane (CSV), or `oval`.")] = None,
     settings: Settings = None,
+    overwrite: Overwrite = False,
 ) -> int:
     """Replay a recording through the tracker."""
     config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
@@ -40,19 +41,18 @@ def replay(
         results = replay_each(
             source.messages,
             config,
-            names,
-            out,
+            run_folders(names, out),
             origin=str(recording),
             kind=source.kind,
             on_tick=TickProgress(show),
+            overwrite=overwrite,
         )
     for result in results:
         console().print(_summary(result), highlight=False, soft_wrap=True)
     broken = next((result.broken for result in results if result.broken is not None), None)
     if broken is None:
         return 0
-    where = "" if str(recording) in broken else f"{recording}: "
-    print(f"fgtrack: error: {where}{' '.join(broken.split())}; replayed up to there", file=sys.stderr)
+    print(f"fgtrack: error: {located(broken, str(recording))}; replayed up to there", file=sys.stderr)
     return 1
 
 

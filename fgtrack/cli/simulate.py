@@ -7,8 +7,9 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from fgtrack.cli.arguments import Overwrite
 from fgtrack.cli.show import console, progress
-from fgtrack.cli.storage import Storage, StorageOption, write_recording
+from fgtrack.cli.storage import Storage, StorageOption, check_recording, write_recording
 from fgtrack.core.errors import CallError
 from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.sim.simulate import simulate as simulated
@@ -25,8 +26,10 @@ def simulate(
         float | None, typer.Option("--duration", help="Length in seconds, instead of the scenario's.")
     ] = None,
     storage: StorageOption = Storage.MCAP,
+    overwrite: Overwrite = False,
 ) -> None:
     """Simulate a scenario into a stream or a rosbag2 folder."""
+    check_recording(out, overwrite)
     scenario = read_scenario(scenario_file)
     if duration_s is not None:
         try:
@@ -34,5 +37,5 @@ def simulate(
         except ValueError as error:
             raise CallError(f"--duration: {error}") from error
     with progress("simulate"):
-        count = write_recording(out, simulated(scenario, np.random.default_rng(seed)), storage)
+        count = write_recording(out, simulated(scenario, np.random.default_rng(seed)), storage, overwrite)
     console().print(f"{out}: {count} messages", highlight=False, soft_wrap=True)

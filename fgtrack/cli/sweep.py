@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from fgtrack.cli.arguments import Overwrite
 from fgtrack.cli.show import console
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.metrics import evaluate
@@ -39,6 +40,7 @@ def sweep(
     dask: Annotated[
         str | None, typer.Option("--dask", metavar="ADDRESS", help="Let the workers of a dask cluster do it.")
     ] = None,
+    overwrite: Overwrite = False,
 ) -> int:
     """Run settings x seeds x estimators into one table; resumes."""
     if jobs is not None and jobs < 1:
@@ -46,7 +48,7 @@ def sweep(
     if jobs is not None and dask is not None:
         raise CallError("--jobs, --dask: the cluster has its own number of workers, give one of them")
     sweep_file = find_file("sweep", sweep_name)
-    work = Sweep.open(load_plan(sweep_file), out)
+    work = Sweep.open(load_plan(sweep_file), out, overwrite)
     left = len(work.todo)
     _say(f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {left}")
     if work.num_unused:

@@ -3,13 +3,12 @@
 import gzip
 import json
 import logging
-import os
 import zlib
 from collections import Counter
 from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import IO, Any, get_args
+from typing import Any, BinaryIO, get_args
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import (
@@ -23,6 +22,7 @@ from fgtrack.core.types import (
     TruthState,
 )
 from fgtrack.io.errors import TruncatedInput, UntilBreak
+from fgtrack.io.output import Kind, new_file
 
 STREAM_FORMAT = "fgtrack-stream/1"
 GZIP_MAGIC = b"\x1f\x8b"
@@ -88,50 +88,62 @@ def read_header(path: Path | str) -> Mapping[str, Any]:
         return _check_header(path, next(records, None))
 
 
-def write_stream(path: Path | str, messages: Iterable[Message], header: Mapping[str, object] | None = None) -> int:
+def write_stream(
+    path: Path | str,
+    messages: Iterable[Message],
+    header: Mapping[str, object] | None = None,
+    overwrite: bool = False,
+) -> int:
     """Write `messages`, which must be in receipt order, to `path`; gives their number.
 
-    A name that ends in `.gz` is gzipped; the same messages give the same bytes. Writes to `<path>.part` and
-    renames at the end: a killed write leaves a readable part and no short file under the name.
+    A name that ends in `.gz` is gzipped; the same messages give the same bytes. The file gets its name when it is
+    whole; what a killed writer leaves beside it (`<path>.*.part`) is readable.
 
     Parameters
     ----------
     header
         Entries of the header record beside `type` and `format`.
+    overwrite
+        Replace a stream at `path`.
 
     Raises
     ------
     TruncatedInput
         `messages` broke off; what came before is written.
+    CallError
+        Something is at `path`, or it cannot be written.
     DataError
-        The file cannot be written.
+        The disk is full.
     """
     path = Path(path)
-    part = path.with_name(path.name + ".part")
     count = 0
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with _opened_for_writing(part, gzipped=path.name.endswith(".gz")) as file:
-            file.write(_line({"type": "header", "format": STREAM_FORMAT, **(header or {})}))
-            readable = UntilBreak(messages)
-            for message in readable:
-                file.write(_line(_record(message)))
-                count += 1
-        os.replace(part, path)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror})") from error
+    with new_file(path, STREAM, overwrite) as file, _packed(file, path.name.endswith(".gz")) as lines:
+        lines.write(_line({"type": "header", "format": STREAM_FORMAT, **(header or {})}))
+        readable = UntilBreak(messages)
+        for message in readable:
+            lines.write(_line(_record(message)))
+            count += 1
     readable.raise_error()
     return count
 
 
+def _is_stream(path: Path) -> bool:
+    try:
+        return path.is_file() and bool(read_header(path))
+    except DataError:
+        return False
+
+
+STREAM = Kind("an fgtrack stream", _is_stream)
+
+
 @contextmanager
-def _opened_for_writing(path: Path, gzipped: bool) -> Iterator[IO[bytes] | gzip.GzipFile]:
-    with path.open("wb") as file:
-        if not gzipped:
-            yield file
-            return
-        with gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as packed:
-            yield packed
+def _packed(file: BinaryIO, gzipped: bool) -> Iterator[BinaryIO | gzip.GzipFile]:
+    if not gzipped:
+        yield file
+        return
+    with gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as packed:
+        yield packed
 
 
 def _line(record: Mapping[str, object]) -> bytes:
@@ -172,7 +184,7 @@ def _records(path: Path) -> Generator[tuple[int, Record], None, None]:
         with path.open("rb") as raw:
             packed = raw.read(2) == GZIP_MAGIC
             raw.seek(0)
-            file: IO[bytes] | gzip.GzipFile = gzip.GzipFile(fileobj=raw) if packed else raw
+            file: BinaryIO | gzip.GzipFile = gzip.GzipFile(fileobj=raw) if packed else raw
             for line, text in enumerate(file, 1):
                 if not text.strip():
                     continue

@@ -3,7 +3,8 @@
 import importlib.metadata
 import platform
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -62,6 +63,11 @@ class _Feed:
         if self._last_receipt_ns is None and self.broken is None:
             self.broken = "holds neither ego states nor detections"
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing came out before the end or the break."""
+        return self._last_receipt_ns is None
+
     def _check_time(self, message: Delivered) -> None:
         """Receipts never go back; ego stamps do a little, but not as they do where a recording starts over."""
         gap_s = 0.0 if self._last_receipt_ns is None else seconds(message.receipt_ns - self._last_receipt_ns)
@@ -93,6 +99,7 @@ def replay(
     origin: str = "",
     kind: str = "",
     on_tick: Callable[[int, int], None] | None = None,
+    overwrite: bool = False,
 ) -> ReplayResult:
     """Run the tracker that `config` describes over `messages` and write the run folder `out`.
 
@@ -104,19 +111,26 @@ def replay(
         What the input is, for meta.json.
     on_tick
         Called after each tick with its time in ns and its number of tracks.
+    overwrite
+        Replace a run at `out`, once the first tick is done.
 
     Raises
     ------
     CallError
-        The configuration cannot be built, or `out` cannot be written to.
+        The configuration cannot be built, something is at `out`, or it cannot be written to.
     DataError
-        A sensor of the input has no model.
+        A sensor of the input has no model, or the input gives the tracker nothing.
     """
-    tracker = build_tracker(config)
-    meta = _start_meta(config, origin, kind)
-    with RunWriter(out, dump(config), meta, _smoothed_lag_s(config)) as writer:
-        finished, broken = _drive(tracker, messages, config, writer, on_tick)
-    return ReplayResult(out, finished, broken)
+    runs = replay_each(
+        lambda: messages,
+        config,
+        {config.estimator: out},
+        origin=origin,
+        kind=kind,
+        on_tick=on_tick,
+        overwrite=overwrite,
+    )
+    return runs[0]
 
 
 def replay_in_memory(messages: Iterable[Message], config: Config) -> tuple[Run, str | None]:
@@ -126,7 +140,7 @@ def replay_in_memory(messages: Iterable[Message], config: Config) -> tuple[Run, 
     """
     tracker = build_tracker(config)
     memory = MemoryRun(dump(config), _start_meta(config, "", ""), _smoothed_lag_s(config))
-    _, broken = _drive(tracker, messages, config, memory, None)
+    _, broken = _drive(tracker, messages, config, memory)
     return memory.run, broken
 
 
@@ -135,7 +149,8 @@ def _drive(
     messages: Iterable[Message],
     config: Config,
     writer: RunWriter | MemoryRun,
-    on_tick: Callable[[int, int], None] | None,
+    on_tick: Callable[[int, int], None] | None = None,
+    origin: str = "",
 ) -> tuple[dict[str, object], str | None]:
     """Run `tracker` over `messages` into `writer`; gives the finished meta and why the input broke off."""
     started = time.perf_counter()
@@ -149,6 +164,8 @@ def _drive(
         writer.write_tick(report, process_ns, _count(tick))
         if on_tick is not None:
             on_tick(tick.now_ns, len(report.tracks))
+    if feed.broken is not None and feed.is_empty:
+        raise DataError(located(feed.broken, origin))
     writer.write_smoothed(tracker.finish())
     meta = {
         "wall_s": time.perf_counter() - started,
@@ -176,26 +193,37 @@ def _smoothed_lag_s(config: Config) -> float | None:
 def replay_each(
     messages: Callable[[], Iterable[Message]],
     config: Config,
-    estimators: tuple[str, ...],
-    out: Path,
+    folders: Mapping[str, Path],
     *,
     origin: str = "",
     kind: str = "",
     on_tick: Callable[[int, int], None] | None = None,
+    overwrite: bool = False,
 ) -> list[ReplayResult]:
-    """One replay for each of `estimators`: into `out`, or into a folder of its name there for several."""
-    folders = [out / name for name in estimators] if len(estimators) > 1 else [out]
-    return [
-        replay(
-            messages(),
-            replace(config, estimator=estimator),
-            folder,
-            origin=origin,
-            kind=kind,
-            on_tick=on_tick,
-        )
-        for estimator, folder in zip(estimators, folders, strict=True)
-    ]
+    """A `replay` for every estimator of `folders` into its folder; all are built and claimed before the first one."""
+    results = []
+    with ExitStack() as claims:
+        runs = []
+        for estimator, folder in folders.items():
+            chosen = replace(config, estimator=estimator)
+            tracker, meta = build_tracker(chosen), _start_meta(chosen, origin, kind)
+            writer = RunWriter(folder, dump(chosen), meta, _smoothed_lag_s(chosen), overwrite)
+            runs.append((chosen, tracker, claims.enter_context(writer)))
+        for chosen, tracker, writer in runs:
+            finished, broken = _drive(tracker, messages(), chosen, writer, on_tick, origin)
+            results.append(ReplayResult(writer.path, finished, broken))
+    return results
+
+
+def located(problem: str, origin: str) -> str:
+    """A line that says what is wrong with the input `origin`, and names it."""
+    line = " ".join(problem.split())
+    return line if origin in line else f"{origin}: {line}"
+
+
+def run_folders(estimators: Sequence[str], out: Path) -> dict[str, Path]:
+    """The folder of every run: `out`, or below it one by the name of each of several estimators."""
+    return {name: out / name for name in estimators} if len(estimators) > 1 else {estimators[0]: out}
 
 
 def _ticks(messages: Iterable[Delivered], clock: ClockConfig) -> Iterator[Tick]:

@@ -18,6 +18,7 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError  # type
 
 from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.core.types import Message
+from fgtrack.io.output import claimed
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
@@ -59,12 +60,12 @@ class Sweep:
     store: PartStore
 
     @classmethod
-    def open(cls, plan: Plan, folder: Path) -> "Sweep":
+    def open(cls, plan: Plan, folder: Path, overwrite: bool = False) -> "Sweep":
         """The sweep `plan` in `folder`; what was finished there before is taken over.
 
-        Raises `CallError` where `folder` cannot be made one, `DataError` for a damaged part.
+        Raises as `PartStore`, and `DataError` for a damaged part.
         """
-        store = PartStore(folder)
+        store = PartStore(folder, overwrite)
         kept = store.keys()
         parts = {key: store.read(key) for key in dict.fromkeys(job.key for job in plan.jobs) if key in kept}
         return cls(plan, folder, {key: cells for key, cells in parts.items() if cells is not None}, store)
@@ -109,19 +110,20 @@ class Sweep:
         Raises
         ------
         CallError
-            There is no dask, or no scheduler at the address.
+            There is no dask, no scheduler at the address, or another sweep is at work in the folder.
         DataError
             The cluster failed, or the folder cannot be written to.
         """
         tasks = [(job.key, job.recipe) for job in self.todo if job.recipe is not None]
-        results = _local(tasks, score, jobs) if dask is None else _on_cluster(tasks, score, dask)
-        try:
-            for key, cells in results:
-                self.store.write(key, cells)
-                self.done[key] = cells
-                on_job(cells)
-        finally:
-            tables = write_tables(self.folder, self.plan, self.done)
+        with claimed(self.folder):
+            results = _local(tasks, score, jobs) if dask is None else _on_cluster(tasks, score, dask)
+            try:
+                for key, cells in results:
+                    self.store.write(key, cells)
+                    self.done[key] = cells
+                    on_job(cells)
+            finally:
+                tables = write_tables(self.folder, self.plan, self.done)
         return tables
 
     def _is_good(self, key: str) -> bool:

@@ -3,13 +3,13 @@
 import csv
 import io
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 from fgtrack.core.errors import CallError, DataError
+from fgtrack.io.output import Kind, check_output, write_file
 from fgtrack.pipeline.sweep_config import KEY_COLUMNS, Value, compact
 from fgtrack.pipeline.sweep_plan import Job, Plan
 
@@ -46,10 +46,17 @@ class SweepResult:
 
 
 class PartStore:
-    """The parts of a sweep, each in a file named by the key of its job and written whole or not at all."""
+    """The parts of a sweep, each in a file named by the key of its job and written whole or not at all.
 
-    def __init__(self, folder: Path) -> None:
+    Raises `CallError` where `folder` cannot be made one, or holds tables but no parts: those of another program, which
+    `overwrite` lets a sweep replace.
+    """
+
+    def __init__(self, folder: Path, overwrite: bool = False) -> None:
         self._folder = folder / "parts"
+        if not self._folder.is_dir():
+            for name in (SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE):
+                check_output(folder / name, Kind("a table", Path.is_file), overwrite)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -77,7 +84,7 @@ class PartStore:
     def write(self, key: str, cells: Sequence[Cell]) -> None:
         """Keep the cells of a finished job."""
         content = {"format": PART_FORMAT, "cells": [asdict(cell) for cell in cells]}
-        _replace(self._folder / f"{key}.json", json.dumps(content))
+        write_file(self._folder / f"{key}.json", json.dumps(content))
 
 
 def write_tables(folder: Path, plan: Plan, done: Mapping[str, Sequence[Cell]]) -> SweepResult:
@@ -139,7 +146,7 @@ def _write_csv(
     writer.writerow([*names, *columns])
     for keys, values in rows:
         writer.writerow([_cell(value) for value in (*keys, *(values.get(name) for name in columns))])
-    _replace(path, text.getvalue())
+    write_file(path, text.getvalue())
 
 
 def _cell(value: Value) -> str:
@@ -147,13 +154,3 @@ def _cell(value: Value) -> str:
     if value is None or isinstance(value, str):
         return value or ""
     return repr(value) if isinstance(value, float) else compact(value)
-
-
-def _replace(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    part = path.with_name(f"{path.name}.part")
-    try:
-        part.write_text(text, encoding="utf-8", newline="")
-        os.replace(part, path)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror}), free some space") from error

@@ -84,9 +84,10 @@ def test_a_folder_without_metadata_is_read(tmp_path):
 
 
 def test_an_existing_path_is_not_overwritten(tmp_path):
-    (tmp_path / "bag").mkdir()
-    with pytest.raises(DataError, match="exists already"):
+    write_bag(tmp_path / "bag", drive(5))
+    with pytest.raises(CallError, match="bag: exists"):
         write_bag(tmp_path / "bag", drive())
+    assert read(tmp_path / "bag") == drive(5)
 
 
 def test_a_stamp_that_ros_cannot_hold_is_one_line(tmp_path):
@@ -194,7 +195,9 @@ write_bag(sys.argv[1], messages(), {storage!r})
     done = subprocess.run([sys.executable, "-c", script, str(tmp_path / "bag")], check=False)
     assert done.returncode == -signal.SIGKILL
     messages = drive(1200)
-    readable = UntilBreak(open_input(tmp_path / "bag").messages())
+    assert not (tmp_path / "bag").exists()
+    (part,) = tmp_path.glob("bag.*.part/bag")
+    readable = UntilBreak(open_input(part).messages())
     found = list(readable)
     assert found == messages[: len(found)]
     assert len(found) >= len(messages) - 1000

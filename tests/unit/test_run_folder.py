@@ -2,6 +2,7 @@ import dataclasses
 import hashlib
 import json
 import time
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -129,7 +130,7 @@ def test_lagged_states_of_every_lag_come_back_to_the_bit(tmp_path, size):
 def test_of_the_lagged_states_the_first_lag_alone_stands_beside_the_final_ones(tmp_path):
     smoothed = tuple(SmoothedReport(1, track(index).state, lag_s) for index, lag_s in enumerate((None, 0.1, 0.3, 0.5)))
     for lag_s, expected in [(0.3, ["final", "lagged"]), (None, ["final"])]:
-        with RunWriter(tmp_path / "run", smoothed_lag_s=lag_s) as writer:
+        with RunWriter(tmp_path / "run", smoothed_lag_s=lag_s, overwrite=True) as writer:
             writer.write_tick(TickReport(0, 1000, (track(1),), (), smoothed), 5, 0)
         run = read_run(tmp_path / "run")
         assert run.smoothed["kind"].tolist() == expected
@@ -193,7 +194,8 @@ def test_a_killed_run_is_readable_up_to_its_last_whole_row(tmp_path):
 
 
 def test_an_exception_leaves_the_run_marked_as_incomplete(tmp_path):
-    with pytest.raises(ZeroDivisionError), RunWriter(tmp_path / "run"):
+    with suppress(ZeroDivisionError), RunWriter(tmp_path / "run") as writer:
+        writer.write_tick(report(), 5, 2)
         raise ZeroDivisionError
     assert read_run(tmp_path / "run").meta["complete"] is False
 
@@ -205,7 +207,8 @@ def test_an_older_run_is_replaced_and_nothing_of_it_is_left(tmp_path):
         writer.write_tick(TickReport(0, 1, (track(),), (), (SmoothedReport(1, track().state, 0.3),)), 1, 0)
         writer.finish({})
     (path / "metrics.json").write_text("{}")
-    write(path, report())
+    with RunWriter(path, overwrite=True) as writer:
+        writer.write_tick(report(), 5, 2)
     assert {file.name for file in path.iterdir()} == {
         *("meta.json", "config.yaml", "tracks.csv", "updates.csv", "timing.csv"),
     }
@@ -213,10 +216,10 @@ def test_an_older_run_is_replaced_and_nothing_of_it_is_left(tmp_path):
 
 def test_a_folder_with_something_else_in_it_is_refused_and_left_alone(tmp_path):
     (tmp_path / "letter.txt").write_text("dear")
-    with pytest.raises(CallError, match="not a run folder"):
+    with pytest.raises(CallError, match="in the way and not a run folder"):
         RunWriter(tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["letter.txt"]
-    with pytest.raises(CallError, match="is a file"):
+    with pytest.raises(CallError, match="cannot be made a folder"):
         RunWriter(tmp_path / "letter.txt")
 
 

@@ -96,7 +96,6 @@ def test_every_kind_of_row_is_the_same(size: int, tmp_path: Path) -> None:
     truth = [*WEST.truth(range(3)), *WEST.truth([4], pose=False), TruthState(5, 5, -1, 0.0, 1.0)]
     with RunWriter(tmp_path / "run", "a: 1\n", {"seed": None}, 0.3) as writer:
         memory = MemoryRun("a: 1\n", {"seed": None}, 0.3)
-        assert_same(memory.run, read_run(tmp_path / "run"))
         for sink in (writer, memory):
             for row in truth:
                 sink.write_truth(row)

@@ -1,5 +1,6 @@
 """Writes rosbag2 recordings: fgtrack's own messages, exact to the bit, and twins that other tools show."""
 
+import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,12 +15,14 @@ from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.io.adapters.common import RosMessage
 from fgtrack.io.errors import UntilBreak
+from fgtrack.io.output import Kind, new_folder
 from fgtrack.io.ros.messages import DETECTED_OBJECTS, DETECTION3D_ARRAY, MessageFactory
 from fgtrack.io.ros.typestore import one_line
 
 _CHECKPOINT = 1000  # messages; a killed writer loses no more than that
 _PLUGINS = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _INT64_LIMIT = 1 << 63
+_RECORDED = re.compile(r"metadata\.yaml|.*\.(mcap|db3(-wal|-shm|-journal)?)")
 
 
 def write_bag(
@@ -27,28 +30,32 @@ def write_bag(
     messages: Iterable[Message],
     storage: Literal["mcap", "sqlite3"] = "mcap",
     standard_topics: bool = True,
+    overwrite: bool = False,
 ) -> int:
-    """Write `messages` to the new rosbag2 folder `path`; gives their number.
+    """Write `messages` to the rosbag2 folder `path`; gives their number. With `overwrite` a recording is replaced.
 
     `/fgtrack/ego`, `/fgtrack/detections/SENSOR` and `/fgtrack/truth` hold every field to the bit and carry
     their definitions; the log time is the receipt, the header stamp the stamp. The twins for other tools are
     `/ego/odometry` (nav_msgs/Odometry), `/detections/SENSOR` (vision_msgs/Detection3DArray, or with speeds
     autoware_perception_msgs/DetectedObjects) and `/truth/poses` (geometry_msgs/PoseArray); an object
     without a position is not in them. What is written reaches the disk every thousand messages: a killed
-    writer leaves a recording that `Bag` reads up to there.
+    writer leaves a recording (`<path>.*.part`) that `Bag` reads up to there.
 
     Raises
     ------
     TruncatedInput
         `messages` broke off; what came before is written.
+    CallError
+        Something is at `path`, or it cannot be written.
     DataError
-        `path` exists or cannot be written, or a time lies outside what ROS messages hold.
+        The disk is full, or a time lies outside what ROS messages hold.
     """
     path = Path(path)
-    if path.exists():
-        raise DataError(f"{path}: exists already, choose another name or remove it")
     try:
-        with Writer(path, version=Writer.VERSION_LATEST, storage_plugin=_PLUGINS[storage]) as bag:
+        with (
+            new_folder(path, RECORDING, overwrite) as folder,
+            Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=_PLUGINS[storage]) as bag,
+        ):
             writer = _MessageWriter(bag, standard_topics)
             readable = UntilBreak(messages)
             for message in readable:
@@ -56,10 +63,18 @@ def write_bag(
             writer.flush()
     except FgtrackError:
         raise
-    except Exception as error:  # rosbags lets SQLite, struct and operating system errors through
+    except Exception as error:  # rosbags lets SQLite and struct errors through
         raise DataError(f"{path}: cannot be written ({one_line(error)})") from error
     readable.raise_error()
     return writer.count
+
+
+def _is_recording(path: Path) -> bool:
+    names = [file.name for file in path.iterdir() if file.is_file()] if path.is_dir() else []
+    return bool(names) and len(names) == len(os.listdir(path)) and all(map(_RECORDED.fullmatch, names))
+
+
+RECORDING = Kind("a rosbag2 folder with nothing else in it", _is_recording)
 
 
 class _MessageWriter:

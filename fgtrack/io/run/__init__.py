@@ -4,7 +4,7 @@ from fgtrack.io.run.judging import EvaluationConfig, evaluation_config, section
 from fgtrack.io.run.memory import MemoryRun
 from fgtrack.io.run.reader import NO_TRACK, Run, Table, read_run
 from fgtrack.io.run.schema import COLUMNS, COVARIANCE_COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
-from fgtrack.io.run.writer import RunWriter, digest, is_run_folder, write_metrics
+from fgtrack.io.run.writer import RUN, RunWriter, digest, is_run_folder, write_metrics
 
 __all__ = [
     "COLUMNS",
@@ -13,6 +13,7 @@ __all__ = [
     "MemoryRun",
     "NO_TRACK",
     "OPTIONAL_TABLES",
+    "RUN",
     "RUN_FORMAT",
     "Run",
     "RunWriter",

@@ -2,16 +2,15 @@
 
 import hashlib
 import json
-import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from functools import lru_cache
 from operator import itemgetter
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
 
-from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import (
     MEASURABLE,
     STATE_NAMES,
@@ -23,6 +22,7 @@ from fgtrack.core.types import (
     TruthState,
     UpdateRecord,
 )
+from fgtrack.io.output import Kind, check_output, claimed, write_error, write_file
 from fgtrack.io.run.schema import COLUMNS, COVARIANCE_STATES, OPTIONAL_TABLES, RUN_FORMAT
 
 _FILES = ("meta.json", "config.yaml", "metrics.json", *(f"{table}.csv" for table in COLUMNS))
@@ -31,8 +31,9 @@ _FILES = ("meta.json", "config.yaml", "metrics.json", *(f"{table}.csv" for table
 class RunWriter:
     """Writes a run folder as the run goes; a context manager.
 
-    Every tick reaches the files before `write_tick` returns, so a killed run leaves readable files and a
-    `meta.json` with `"complete": false`. An older run folder at `path` is replaced, file by file.
+    The folder is locked until the writer is closed. Its files appear with the first tick, so a run that fails before
+    leaves what was there. From then on every tick reaches the files before `write_tick` returns: a killed run leaves
+    readable files and a `meta.json` with `"complete": false`.
 
     Parameters
     ----------
@@ -44,11 +45,13 @@ class RunWriter:
         What `meta.json` says from the start on.
     smoothed_lag_s
         The lag whose states go to smoothed.csv beside the final ones; lagged.csv gets those of every lag.
+    overwrite
+        Replace a run at `path`; other files beside it stay.
 
     Raises
     ------
     CallError
-        `path` is a file, or a folder that holds something else than a run.
+        Something is at `path`, or another writer holds it.
     """
 
     def __init__(
@@ -57,21 +60,20 @@ class RunWriter:
         config_text: str = "",
         meta: Mapping[str, object] | None = None,
         smoothed_lag_s: float | None = None,
+        overwrite: bool = False,
     ) -> None:
         self.path = Path(path)
+        self._config_text = config_text
+        self._overwrite = overwrite
+        self._early: list[tuple[str, str]] | None = []  # rows before the files are there
         self._smoothed_lag_s = smoothed_lag_s
         self._files: dict[str, BinaryIO] = {}
         self._counts: dict[str, Counter[Disposition]] = {}
         self._meta: dict[str, object] = {"format": RUN_FORMAT, **(meta or {})}
-        _prepare_folder(self.path)
-        try:
-            (self.path / "config.yaml").write_text(config_text, encoding="utf-8")
-            self._write_meta(complete=False)
-        except OSError as error:
-            raise CallError(f"{self.path}: cannot be written to ({error.strerror})") from error
-        for table in COLUMNS:
-            if table not in OPTIONAL_TABLES:
-                self._append(table, "")
+        with ExitStack() as claim:
+            claim.enter_context(claimed(self.path))
+            check_output(self.path, RUN, overwrite)
+            self._claim = claim.pop_all()
 
     def __enter__(self) -> Self:
         return self
@@ -85,7 +87,11 @@ class RunWriter:
         self.close()
 
     def close(self) -> None:
-        """Close the tables; without `finish` before, the run stays marked as incomplete."""
+        """Close the tables and unlock the folder; without `finish` before, the run stays marked as incomplete."""
+        self._close_tables()
+        self._claim.close()
+
+    def _close_tables(self) -> None:
         while self._files:
             self._files.popitem()[1].close()
 
@@ -101,6 +107,7 @@ class RunWriter:
         num_detections
             Detections that the tick received.
         """
+        self._begin()
         prefix = f"{report.tick},{report.now_ns},"
         if report.tracks:
             self._append("tracks", "".join([prefix + _track_row(track) for track in report.tracks]))
@@ -130,31 +137,47 @@ class RunWriter:
 
         `counts` holds, per sensor, the number of detections of every disposition.
         """
-        self.close()
-        self._meta |= {
-            **meta,
-            "counts": disposition_counts(self._counts),
-            "digest": digest(self.path),
-        }
+        self._begin()
+        self._close_tables()
+        self._meta |= {**meta, "counts": disposition_counts(self._counts), "digest": digest(self.path)}
         self._write_meta(complete=True)
         return dict(self._meta)
 
+    def _begin(self) -> None:
+        """Make the files; of an older run there, meta.json goes first and is new last."""
+        if self._early is None:
+            return
+        early, self._early = self._early, None
+        try:
+            for name in _FILES if self._overwrite else ():
+                (self.path / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise write_error(self.path, error) from error
+        write_file(self.path / "config.yaml", self._config_text)
+        for table in COLUMNS:
+            if table not in OPTIONAL_TABLES:
+                self._append(table, "")
+        for table, rows in early:
+            self._append(table, rows)
+        self._write_meta(complete=False)
+
     def _append(self, table: str, rows: str) -> None:
+        if self._early is not None:
+            self._early.append((table, rows))
+            return
         file = self._files.get(table)
         path = self.path / f"{table}.csv"
         try:
             if file is None:
-                file = self._files[table] = path.open("wb", buffering=0)
+                file = self._files[table] = path.open("xb", buffering=0)
                 rows = ",".join(COLUMNS[table]) + "\n" + rows
             file.write(rows.encode())
         except OSError as error:
-            raise DataError(f"{path}: cannot be written ({error.strerror}), free some space") from error
+            raise write_error(path, error) from error
 
     def _write_meta(self, complete: bool) -> None:
         self._meta["complete"] = complete
-        part = self.path / "meta.json.part"
-        part.write_text(json.dumps(self._meta, indent=2) + "\n", encoding="utf-8")
-        os.replace(part, self.path / "meta.json")
+        write_file(self.path / "meta.json", json.dumps(self._meta, indent=2) + "\n")
 
 
 def kept_smoothed(report: TickReport) -> list[SmoothedReport]:
@@ -173,12 +196,7 @@ def disposition_counts(counts: Mapping[str, Counter[Disposition]]) -> dict[str, 
 
 def write_metrics(path: Path, metrics: Mapping[str, object]) -> None:
     """Write `metrics` as metrics.json into the run folder `path`, whole or not at all."""
-    part = path / "metrics.json.part"
-    try:
-        part.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(part, path / "metrics.json")
-    except OSError as error:
-        raise DataError(f"{path / 'metrics.json'}: cannot be written ({error.strerror})") from error
+    write_file(path / "metrics.json", json.dumps(metrics, indent=2, allow_nan=False) + "\n")
 
 
 def digest(path: Path) -> str:
@@ -200,17 +218,12 @@ def is_run_folder(path: Path) -> bool:
     return isinstance(meta, dict) and meta.get("format") == RUN_FORMAT
 
 
-def _prepare_folder(path: Path) -> None:
-    if path.exists() and not path.is_dir():
-        raise CallError(f"{path}: is a file, a run needs a folder")
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        if any(path.iterdir()) and not is_run_folder(path):
-            raise CallError(f"{path}: is not empty and not a run folder, choose another one")
-        for name in _FILES:
-            (path / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise CallError(f"{path}: cannot be made a run folder ({error.strerror})") from error
+def _is_run(path: Path) -> bool:
+    """Whether `path` holds a run, or what is left of one whose writer was killed at its beginning."""
+    return is_run_folder(path) or (path.is_dir() and {file.name for file in path.iterdir()} <= set(_FILES))
+
+
+RUN = Kind("a run folder", _is_run)
 
 
 def _cell(value: float | None) -> str:

@@ -1,0 +1,198 @@
+"""Outputs of commands: nothing foreign is removed or replaced, and nothing half-written has the name of an output.
+
+A file, or a folder that is written once, is made beside its place under a name that nobody can guess and is
+renamed when it is done; what a killed command leaves has that name and ends in `.part`. A folder that has to be
+readable at any time is claimed: made, and locked until the command ends.
+"""
+
+import errno
+import importlib
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from fgtrack.core.errors import CallError, DataError, FgtrackError
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of output, which replaces its like alone."""
+
+    name: str
+    recognises: Callable[[Path], bool]
+    """Whether an existing path holds this kind and nothing else."""
+
+
+def check_output(path: Path, kind: Kind, overwrite: bool) -> None:
+    """Raise `CallError` where `path` must not be written: for something foreign, or without `overwrite` for its like.
+
+    An empty folder is in nobody's way.
+    """
+    try:
+        if not os.path.lexists(path) or (path.is_dir() and not path.is_symlink() and not any(path.iterdir())):
+            return
+        own = not path.is_symlink() and kind.recognises(path)
+    except OSError as error:
+        raise write_error(path, error) from error
+    if not own:
+        raise CallError(f"{path}: is in the way and not {kind.name}, choose another name")
+    if not overwrite:
+        raise CallError(f"{path}: exists, choose another name or replace it with --overwrite")
+
+
+def write_error(path: Path, error: OSError) -> FgtrackError:
+    """What a user is told when `path` cannot be written: a bad call, or a disk that is full or broken."""
+    if error.errno in _FULL:
+        return DataError(f"{path}: cannot be written ({error.strerror}), free some space")
+    return CallError(f"{path}: cannot be written ({error.strerror or error}), choose another place")
+
+
+def write_file(path: Path, text: str) -> None:
+    """Write the text file `path`, which is the caller's own, whole or not at all."""
+    part = _part_of(path)
+    try:
+        with _removed_on_error(part):
+            with part.open("xb") as file:
+                file.write(text.encode())
+            os.replace(part, path)
+    except OSError as error:
+        raise write_error(path, error) from error
+
+
+@contextmanager
+def new_file(path: Path, kind: Kind, overwrite: bool) -> Iterator[BinaryIO]:
+    """A file that gets the name `path` when the block is left; raises as `check_output` and `write_error`."""
+    check_output(path, kind, overwrite)
+    part = _part_of(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with _removed_on_error(part):
+            with part.open("xb") as file:
+                yield file
+            check_output(path, kind, overwrite)
+            _rename(part, path, overwrite)
+    except OSError as error:
+        raise write_error(path, error) from error
+
+
+@contextmanager
+def new_folder(path: Path, kind: Kind, overwrite: bool) -> Iterator[Path]:
+    """Where to make the folder that gets the name `path` when the block is left; raises as `new_file`."""
+    check_output(path, kind, overwrite)
+    part = _part_of(path)
+    new, old = part / Path(os.path.abspath(path)).name, part / ".replaced"
+    try:
+        part.mkdir(parents=True)
+        with _removed_on_error(part):
+            yield new
+            if overwrite and path.exists():
+                check_output(path, kind, overwrite)
+                os.rename(path, old)
+            try:
+                os.rename(new, path)
+            except OSError:
+                if old.exists():
+                    os.rename(old, path)
+                raise
+        shutil.rmtree(part)
+    except OSError as error:
+        raise write_error(path, error) from error
+
+
+@contextmanager
+def new_files(folder: Path, overwrite: bool) -> Iterator[Path]:
+    """A folder whose files go into `folder` when the block is left: all, or none where one must not be replaced.
+
+    A file may replace one that starts with the same four bytes, and without `overwrite` one that is equal.
+    """
+    with claimed(folder):
+        part = folder / f"{secrets.token_hex(6)}.part"
+        try:
+            part.mkdir()
+            with _removed_on_error(part):
+                yield part
+                files = sorted(part.iterdir())
+                for file in files:
+                    content = file.read_bytes()
+                    alike = Kind(f"a {file.suffix[1:].upper()} file", _starting_with(content[:4]))
+                    place = folder / file.name
+                    same = place.is_file() and not place.is_symlink() and place.read_bytes() == content
+                    check_output(place, alike, overwrite or same)
+                for file in files:
+                    os.replace(file, folder / file.name)
+            part.rmdir()
+        except OSError as error:
+            raise write_error(folder, error) from error
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Make `folder` and lock it while the block runs; what stayed empty of what was made is removed again.
+
+    Raises `CallError` where it cannot be made, or another command holds it.
+    """
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise CallError(f"{folder}: cannot be made a folder ({error.strerror}), choose another one") from error
+    try:
+        _lock(lock, folder)
+        yield
+    finally:
+        with suppress(OSError):
+            for path in missing:
+                path.rmdir()
+        os.close(lock)
+
+
+def _lock(descriptor: int, folder: Path) -> None:
+    fcntl = importlib.import_module("fcntl")  # of POSIX
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise CallError(f"{folder}: another command is writing there, choose another folder or wait") from error
+    except OSError:  # a file system without locks
+        return
+
+
+def _rename(part: Path, path: Path, overwrite: bool) -> None:
+    if not overwrite:
+        try:
+            os.link(part, path)  # unlike a renaming it never replaces what was made meanwhile
+        except PermissionError:  # a file system without links
+            pass
+        else:
+            part.unlink()
+            return
+    os.replace(part, path)
+
+
+def _part_of(path: Path) -> Path:
+    path = Path(os.path.abspath(path))
+    return path.with_name(f"{path.name}.{secrets.token_hex(6)}.part")
+
+
+def _starting_with(start: bytes) -> Callable[[Path], bool]:
+    return lambda path: path.is_file() and path.read_bytes()[: len(start)] == start
+
+
+@contextmanager
+def _removed_on_error(part: Path) -> Iterator[None]:
+    """Remove the file or folder `part` after an error; an interrupt leaves it, as a kill does."""
+    try:
+        yield
+    except Exception:
+        if part.is_dir():
+            shutil.rmtree(part, ignore_errors=True)
+        else:
+            part.unlink(missing_ok=True)
+        raise

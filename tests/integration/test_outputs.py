@@ -1,0 +1,339 @@
+"""What a command did not make it neither removes nor replaces."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from fgtrack.cli import demo
+from fgtrack.cli.main import run
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.types import Detection, DetectionList, EgoState, Message
+from fgtrack.io.output import claimed, new_file, write_file
+from fgtrack.io.ros.bag_writer import write_bag
+from fgtrack.io.run import RunWriter, read_run
+from fgtrack.io.stream import STREAM, read_stream, write_stream
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.replay import replay_each
+
+MS = 1_000_000
+START_NS = 1_600_000_000_000_000_000
+SWEEP = "format: fgtrack-sweep/1\nscenario: default\nestimators: [ekf-replay]\nseeds: 1\n"
+
+Call = Callable[..., tuple[int, str]]
+
+
+def drive(count: int = 30) -> list[Message]:
+    """An ego at rest and one car ahead of it, seen by a lidar."""
+    messages: list[Message] = []
+    for k in range(count):
+        now_ns = START_NS + k * 20 * MS
+        messages.append(EgoState(now_ns, now_ns, 0.0, 0.0, 0.0, 0.0))
+        messages.append(DetectionList("lidar", now_ns - 50 * MS, now_ns, (Detection(x_m=20.0, y_m=1.0, yaw_rad=0.0),)))
+    return messages
+
+
+def content(path: Path) -> dict[str, bytes | None]:
+    """Every file below `path` with its bytes, and every folder."""
+    below = [path, *sorted(path.rglob("*"))]
+    return {str(item): item.read_bytes() if item.is_file() else None for item in below if os.path.lexists(item)}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with streams, a bag, a run, its figures and a demo."""
+    folder = tmp_path_factory.mktemp("made")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(demo, "simulate", lambda scenario, rng: drive())
+        write_stream("drive.jsonl", drive())
+        write_stream("other.jsonl", drive(10))
+        write_bag("bag", drive(10))
+        assert run(["replay", "other.jsonl", "-o", "run"]) == 0
+        assert run(["figure", "run", "-o", "figures"]) == 0
+        assert run(["demo", "-o", "demo"]) == 0
+    return folder
+
+
+@pytest.fixture
+def here(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, a copy of that one."""
+    folder = shutil.copytree(made, tmp_path / "here")
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(demo, "simulate", lambda scenario, rng: drive())
+    return folder
+
+
+@pytest.fixture
+def call(capfd: pytest.CaptureFixture[str]) -> Iterator[Call]:
+    """Runs a command; gives its exit code and the line on stderr."""
+
+    def called(*words: str) -> tuple[int, str]:
+        capfd.readouterr()
+        code = run(list(words))
+        lines = capfd.readouterr().err.splitlines()
+        assert len(lines) == (code != 0), lines
+        return code, "".join(lines)
+
+    return called
+
+
+WRITERS = [
+    (("simulate", "default", "--duration", "1", "-o", "other.jsonl"), "other.jsonl"),
+    (("simulate", "default", "--duration", "1", "-o", "bag"), "bag"),
+    (("convert", "drive.jsonl", "other.jsonl"), "other.jsonl"),
+    (("convert", "drive.jsonl", "bag"), "bag"),
+    (("convert", "drive.jsonl", "bag", "--storage", "sqlite3"), "bag"),
+    (("replay", "drive.jsonl", "-o", "run"), "run"),
+    (("replay", "drive.jsonl", "-o", "demo/runs", "-e", "ekf-replay,smoother"), "demo/runs"),
+    (("demo", "-o", "demo"), "demo"),
+]
+
+
+@pytest.mark.parametrize(("words", "out"), WRITERS, ids=str)
+def test_what_exists_is_refused_at_once_and_replaced_with_overwrite(
+    here: Path, call: Call, words: tuple[str, ...], out: str
+) -> None:
+    before = content(here)
+    code, error = call(*words)
+    assert code == 2
+    assert f"{out}" in error
+    assert "--overwrite" in error
+    assert content(here) == before
+    assert call(*words, "--overwrite")[0] == 0
+    after = content(here)
+    assert after != before
+    assert {name for name in after if not name.startswith(str(here / out))} == {
+        name for name in before if not name.startswith(str(here / out))
+    }
+    assert not [name for name in after if "part" in name]
+
+
+@pytest.mark.parametrize(("words", "out"), WRITERS, ids=str)
+def test_something_else_in_the_way_is_left_alone_even_with_overwrite(
+    here: Path, call: Call, words: tuple[str, ...], out: str
+) -> None:
+    place = here / out
+    if out == "demo":
+        place = here / "demo/recording"
+    if out == "demo/runs":
+        place = here / "demo/runs/smoother"
+    place.rename(here / "old")
+    for thesis in (place, place / "thesis"):
+        thesis.parent.mkdir(exist_ok=True)
+        thesis.write_text("years of work")
+        code, error = call(*words, "--overwrite")
+        assert code == 2
+        assert str(place.relative_to(here)) in error
+        assert content(place)[str(thesis)] == b"years of work"
+        assert len(content(place)) == 1 + (thesis != place)
+        thesis.unlink()
+
+
+def test_a_recording_with_something_else_in_its_folder_is_not_replaced(here: Path, call: Call) -> None:
+    (here / "bag/notes.txt").write_text("why")
+    before = content(here)
+    assert call("convert", "drive.jsonl", "bag", "--overwrite")[0] == 2
+    assert content(here) == before
+
+
+def test_other_files_beside_a_run_stay(here: Path, call: Call) -> None:
+    (here / "run/notes.txt").write_text("why")
+    assert call("replay", "drive.jsonl", "-o", "run", "--overwrite")[0] == 0
+    assert (here / "run/notes.txt").read_text() == "why"
+    assert read_run("run").meta["input"]["path"] == "drive.jsonl"
+
+
+@pytest.mark.parametrize("text", ['{"type": "ego"}\n', "", '{"type": "header", "format": "fgtrack-stream/1"}\n{"ty'])
+def test_an_input_that_gives_nothing_leaves_the_old_run(here: Path, call: Call, text: str) -> None:
+    Path("bad.jsonl").write_text(text)
+    before = content(here / "run")
+    code, error = call("replay", "bad.jsonl", "-o", "run", "--overwrite")
+    assert code == 1
+    assert "bad.jsonl" in error
+    assert content(here / "run") == before
+    assert call("replay", "bad.jsonl", "-o", "new/run")[0] == 1
+    assert not (here / "new").exists()
+
+
+def test_a_run_that_fails_before_its_first_tick_leaves_the_old_one(here: Path, call: Call) -> None:
+    write_stream("sonar.jsonl", [DetectionList("sonar", START_NS, START_NS, (Detection(x_m=1.0, y_m=2.0),))])
+    before = content(here / "run")
+    assert call("replay", "sonar.jsonl", "-o", "run", "--overwrite")[0] == 1
+    assert content(here / "run") == before
+
+
+def test_nothing_is_replayed_where_one_of_several_folders_is_in_use(here: Path, call: Call) -> None:
+    Path("runs/smoother").mkdir(parents=True)
+    Path("runs/smoother/thesis").write_text("x")
+    assert call("replay", "drive.jsonl", "-o", "runs", "-e", "ekf-replay,smoother")[0] == 2
+    assert os.listdir("runs") == ["smoother"]
+
+
+def test_two_runs_into_one_folder_do_not_mix(here: Path, call: Call) -> None:
+    write_stream("empty_run.jsonl", drive(5))
+    with RunWriter("run", overwrite=True):
+        before = content(here / "run")
+        code, error = call("replay", "drive.jsonl", "-o", "run", "--overwrite")
+        assert (code, content(here / "run")) == (2, before)
+        assert "another command is writing there" in error
+    assert call("replay", "drive.jsonl", "-o", "run", "--overwrite")[0] == 0
+
+
+def test_a_replay_that_is_under_way_holds_all_its_folders(here: Path) -> None:
+    folders = {name: Path("runs") / name for name in ("ekf-replay", "smoother")}
+
+    def messages() -> Iterator[Message]:
+        yield from drive(5)
+        for folder in folders.values():
+            with pytest.raises(CallError, match="another command is writing there"):
+                RunWriter(folder, overwrite=True)
+        yield from drive(10)[10:]
+
+    assert len(replay_each(messages, Config(), folders)) == 2
+
+
+def test_a_sweep_does_not_share_its_folder(here: Path, call: Call) -> None:
+    Path("sweep.yaml").write_text(SWEEP)
+    with claimed(Path("swept")):
+        assert "another command is writing there" in call("sweep", "sweep.yaml", "-o", "swept")[1]
+
+
+@pytest.mark.parametrize("table", ["sweep.csv", "timing.csv", "errors.csv"])
+def test_a_sweep_does_not_replace_a_table_that_it_did_not_make(here: Path, call: Call, table: str) -> None:
+    Path("sweep.yaml").write_text(SWEEP)
+    Path("swept").mkdir()
+    Path("swept", table).write_text("mine")
+    code, error = call("sweep", "sweep.yaml", "-o", "swept")
+    assert code == 2
+    assert f"swept/{table}: exists" in error
+    assert [file.name for file in Path("swept").iterdir()] == [table]
+    assert Path("swept", table).read_text() == "mine"
+
+
+def test_the_input_of_a_conversion_is_never_its_output(here: Path, call: Call) -> None:
+    Path("same").symlink_to("drive.jsonl")
+    before = content(here)
+    for out in ("drive.jsonl", "./drive.jsonl", "same"):
+        code, error = call("convert", "drive.jsonl", out, "--overwrite")
+        assert code == 2
+        assert "is the input" in error
+    assert content(here) == before
+
+
+def test_links_are_not_followed(here: Path, call: Call) -> None:
+    Path("precious").write_text("years of work")
+    Path("link.jsonl").symlink_to("precious")
+    Path("link").symlink_to("bag")
+    for words in (("link.jsonl",), ("link",)):
+        assert call("convert", "drive.jsonl", *words, "--overwrite")[0] == 2
+    (here / "run/tracks.csv").unlink()
+    (here / "run/tracks.csv").symlink_to(here / "precious")
+    (here / "run/meta.json.part").symlink_to(here / "precious")
+    assert call("replay", "drive.jsonl", "-o", "run", "--overwrite")[0] == 0
+    assert Path("precious").read_text() == "years of work"
+    assert read_run("run").tracks["tick"].size
+
+
+def test_part_files_of_others_stay(here: Path, call: Call) -> None:
+    for name in ("new.jsonl.part", "newbag.part", "run/meta.json.part", "run/metrics.json.part"):
+        Path(name).write_text("mine")
+    assert call("convert", "drive.jsonl", "new.jsonl")[0] == 0
+    assert call("convert", "drive.jsonl", "newbag")[0] == 0
+    assert call("replay", "drive.jsonl", "-o", "run", "--overwrite")[0] == 0
+    assert call("compare", "run")[0] == 0
+    for name in ("new.jsonl.part", "newbag.part", "run/meta.json.part", "run/metrics.json.part"):
+        assert Path(name).read_text() == "mine"
+
+
+def test_what_appears_while_a_recording_is_written_is_not_replaced(here: Path) -> None:
+    def messages(path: Path) -> Iterator[Message]:
+        yield from drive(5)
+        path.mkdir() if path.suffix == "" else path.write_text("mine")
+        (path / "mine").write_text("mine") if path.is_dir() else None
+
+    with pytest.raises(CallError, match=r"new\.jsonl"):
+        write_stream("new.jsonl", messages(Path("new.jsonl")))
+    assert Path("new.jsonl").read_text() == "mine"
+    with pytest.raises(CallError, match="newbag"):
+        write_bag("newbag", messages(Path("newbag")))
+    assert os.listdir("newbag") == ["mine"]
+    assert not list(here.glob("*.part"))
+
+
+def test_an_error_while_writing_keeps_the_old_recording(here: Path) -> None:
+    def failing() -> Iterator[Message]:
+        yield from drive(5)
+        raise DataError("broken")
+
+    before = content(here)
+    with pytest.raises(DataError, match="broken"):
+        write_stream("other.jsonl", failing(), overwrite=True)
+    with pytest.raises(DataError, match="broken"):
+        write_bag("bag", failing(), overwrite=True)
+    assert content(here) == before
+
+
+def test_a_file_has_the_usual_permissions(here: Path) -> None:
+    Path("plain").write_text("")
+    write_file(Path("written"), "x")
+    assert [oct(Path(name).stat().st_mode) for name in ("written", "drive.jsonl")] == [
+        oct(Path("plain").stat().st_mode)
+    ] * 2
+
+
+def test_figures_are_replaced_all_or_none(here: Path, call: Call) -> None:
+    figures = sorted(Path("figures").iterdir())
+    assert call("figure", "run", "-o", "figures")[0] == 0  # they would be the same
+    figures[-1].write_bytes(figures[-1].read_bytes() + b"x")
+    figures[0].unlink()
+    before = content(Path("figures"))
+    code, error = call("figure", "run", "-o", "figures")
+    assert code == 2
+    assert f"{figures[-1]}: exists" in error
+    assert content(Path("figures")) == before
+    assert call("figure", "run", "-o", "figures", "--overwrite")[0] == 0
+    assert sorted(Path("figures").iterdir()) == figures
+    figures[0].write_text("my own drawing")
+    assert call("figure", "run", "-o", "figures", "--overwrite")[0] == 2
+    assert figures[0].read_text() == "my own drawing"
+
+
+def test_an_output_that_cannot_be_written_is_a_bad_call_everywhere(here: Path, call: Call) -> None:
+    Path("file").write_text("")
+    for words in (
+        ("simulate", "default", "--duration", "1", "-o", "file/x.jsonl"),
+        ("simulate", "default", "--duration", "1", "-o", "file/x"),
+        ("convert", "drive.jsonl", "file/x.jsonl"),
+        ("replay", "drive.jsonl", "-o", "file/x"),
+        ("figure", "run", "-o", "file/x"),
+        ("demo", "-o", "file/x"),
+    ):
+        code, error = call(*words)
+        assert code == 2, words
+        assert "file/x" in error
+
+
+def test_a_full_disk_is_no_fault_of_the_call(here: Path) -> None:
+    with pytest.raises(DataError, match="free some space"), new_file(Path("new.jsonl"), STREAM, False):
+        raise OSError(28, "No space left on device")
+    assert not list(here.glob("new*"))
+
+
+def test_what_is_left_of_a_run_that_was_killed_at_its_beginning_can_be_replaced(here: Path, call: Call) -> None:
+    (here / "run/meta.json").unlink()
+    assert call("replay", "drive.jsonl", "-o", "run")[0] == 2
+    assert call("replay", "drive.jsonl", "-o", "run", "--overwrite")[0] == 0
+    assert json.loads(Path("run/meta.json").read_text())["complete"] is True
+
+
+def test_a_stream_replaces_a_stream_at_once(here: Path) -> None:
+    """Whoever reads the old one while the new one is written reads the old one to its end."""
+    reader = read_stream("other.jsonl")
+    first = next(reader)
+    write_stream("other.jsonl", drive(), overwrite=True)
+    assert [first, *reader] == drive(10)
+    assert list(read_stream("other.jsonl")) == drive()
