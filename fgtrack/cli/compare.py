@@ -1,29 +1,40 @@
 """`fgtrack compare`: runs beside each other."""
 
 import json
+from enum import StrEnum
+from typing import Annotated
+
+import typer
 
 from fgtrack.cli.arguments import Json, Runs
-from fgtrack.cli.runs import read_runs
 from fgtrack.cli.show import console
-from fgtrack.evaluation.labels import labelled
-from fgtrack.evaluation.metrics import Metrics, evaluate
-from fgtrack.evaluation.tables import comparison_dict, comparison_tables
-from fgtrack.io.run import Run, write_metrics
+from fgtrack.evaluation.comparison import compare as tables_of
 
 
-def compare(runs: Runs, as_json: Json = False) -> None:
+class Form(StrEnum):
+    """What the tables are printed as."""
+
+    MARKDOWN = "md"
+    CSV = "csv"
+    LATEX = "latex"
+    JSON = "json"
+
+
+def compare(
+    runs: Runs,
+    as_json: Json = False,
+    form: Annotated[Form | None, typer.Option("--format", help="Print this instead of tables for a terminal.")] = None,
+) -> None:
     """Compare runs in tables, and write metrics.json into each."""
-    metrics = evaluated(read_runs(runs))
-    if as_json:
-        print(json.dumps(comparison_dict(metrics), indent=2, allow_nan=False))
-        return
-    for table in comparison_tables(metrics):
-        console().print(table)
-
-
-def evaluated(runs: list[Run]) -> dict[str, Metrics]:
-    """Metrics by label; each is written into its run folder too."""
-    metrics = {label: evaluate(run) for label, run in labelled(runs).items()}
-    for run, one in zip(runs, metrics.values(), strict=True):
-        write_metrics(run.path, one.as_dict())
-    return metrics
+    tables = tables_of(*runs)
+    match Form.JSON if as_json else form:
+        case Form.JSON:
+            print(json.dumps(tables.to_dict(), indent=2, allow_nan=False))
+        case Form.MARKDOWN:
+            print(tables.to_markdown(), end="")
+        case Form.LATEX:
+            print(tables.to_latex(), end="")
+        case Form.CSV:
+            print(tables.to_csv(), end="")
+        case None:
+            console().print(tables)

@@ -7,10 +7,9 @@ import numpy as np
 import typer
 
 from fgtrack.cli.arguments import Overwrite
-from fgtrack.cli.compare import evaluated
 from fgtrack.cli.show import TickProgress, console, progress
+from fgtrack.evaluation.comparison import compare
 from fgtrack.evaluation.figures import save_figures
-from fgtrack.evaluation.tables import comparison_tables
 from fgtrack.io.output import Kind, check_output, claimed, new_files
 from fgtrack.io.ros.bag_writer import RECORDING, write_bag
 from fgtrack.io.run import RUN, read_run
@@ -58,8 +57,7 @@ def _demo(out: Path, overwrite: bool) -> None:
             overwrite=overwrite,
         )
     runs = [read_run(result.path) for result in results]
-    for table in comparison_tables(evaluated(runs)):
-        console().print(table)
+    console().print(compare(*runs))
     with progress("draw"), new_files(figures, overwrite) as folder:
         files = save_figures(runs, folder)
     console().print(f"recording: {bag}\nruns: {out / 'runs'}", highlight=False, soft_wrap=True)

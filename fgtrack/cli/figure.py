@@ -6,9 +6,9 @@ from typing import Annotated
 import typer
 
 from fgtrack.cli.arguments import Overwrite, Runs
-from fgtrack.cli.runs import read_runs
 from fgtrack.cli.show import console, progress
 from fgtrack.evaluation.figures import save_figures
+from fgtrack.evaluation.runs import judged
 from fgtrack.io.output import new_files
 
 
@@ -18,7 +18,7 @@ def figure(
     overwrite: Overwrite = False,
 ) -> None:
     """Draw runs: map, residuals, delays, errors, lag, time per tick."""
-    found = read_runs(runs)
+    found = [one.run for one in judged(runs)]
     with progress("draw"), new_files(out, overwrite) as folder:
         files = save_figures(found, folder)
     for file in files:

@@ -21,11 +21,11 @@ from fgtrack.evaluation.figure_style import (
     usual_step_ns,
 )
 from fgtrack.evaluation.innovations import ANGULAR, RESIDUAL_NAMES, message_delays, residuals
-from fgtrack.evaluation.labels import labelled
 from fgtrack.evaluation.lag_figure import figure_lag
 from fgtrack.evaluation.lagged import lag_metrics
 from fgtrack.evaluation.map_figure import figure_map
 from fgtrack.evaluation.matching import Matching, match, track_errors
+from fgtrack.evaluation.runs import labelled
 from fgtrack.evaluation.statistics import Distribution, Moments
 from fgtrack.io.run import EvaluationConfig, Run
 

@@ -106,7 +106,7 @@ class Metrics:
     """All metrics of one run."""
 
     name: str
-    """Name of the run folder."""
+    """Name of the run folder; empty for a run in memory."""
     estimator: str
     options: EvaluationConfig
     num_tracks: int
@@ -156,7 +156,7 @@ def evaluate(run: Run, options: EvaluationConfig | None = None) -> Metrics:
     busy = run.timing["num_detections"] > 0
     time_s, detections = run.timing["process_ns"][busy] / NS_PER_S, run.timing["num_detections"][busy]
     return Metrics(
-        name=run.path.resolve().name,
+        name="" if run.path is None else run.path.resolve().name,
         estimator=str(run.meta.get("estimator", "")),
         options=options,
         num_tracks=len(np.unique(ids)),

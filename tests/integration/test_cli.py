@@ -145,6 +145,10 @@ def test_runs_are_compared_as_tables_and_as_json(fgtrack: Command, runs: dict[st
     assert told.code == 0
     assert json.loads(told.out)
     assert json.loads((runs["mcap"] / "metrics.json").read_text())
+    for form, start in (("md", "### Tracking"), ("latex", r"\begin{table}"), ("csv", "table,run,"), ("json", "{")):
+        told = fgtrack("compare", runs["mcap"], "--format", form)
+        assert (told.code, told.err) == (0, "")
+        assert told.out.startswith(start)
 
 
 def test_figures_are_drawn(fgtrack: Command, runs: dict[str, Path]) -> None:

@@ -78,6 +78,10 @@ class Car:
         state = TrackState(START_NS + round(tick * TICK_NS), mean, np.eye(5))
         return TrackReport(track_id, TrackStatus.CONFIRMED, state, num_measured)
 
+    def later(self, tick: float, track_id: int, lag_s: float | None = None, **errors: float) -> SmoothedReport:
+        """What is known later of this car at `tick`; finally, without `lag_s`."""
+        return SmoothedReport(track_id, self.track(tick, track_id, **errors).state, lag_s)
+
 
 #: A car that drives west, where the heading jumps, and one that drives round and round.
 WEST = Car(7, 100.0, 0.0, math.pi, 20.0)

@@ -1,6 +1,5 @@
-"""Lagged and final states against truth: metrics, table and figure."""
+"""Lagged and final states against truth: metrics and figure."""
 
-import io
 import json
 import math
 from dataclasses import replace
@@ -8,26 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluation_runs import ROUND, WEST, Car, write_run
-from rich.console import Console
+from evaluation_runs import ROUND, WEST, write_run
 
 from fgtrack.core.types import SmoothedReport
 from fgtrack.evaluation.figures import save_figures
 from fgtrack.evaluation.lag_figure import figure_lag
 from fgtrack.evaluation.lagged import WINDOW, LagMetrics, lag_metrics
 from fgtrack.evaluation.matching import match
-from fgtrack.evaluation.metrics import Metrics, evaluate
+from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.statistics import Moments
-from fgtrack.evaluation.tables import comparison_tables, lag_table
 from fgtrack.io.run import Run
 
 TICKS = range(20)
 STEPS = {0.1: 5, 0.2: 10}  # ticks that a lag is long
-
-
-def late(car: Car, tick: float, track_id: int, lag_s: float | None = None, **errors: float) -> SmoothedReport:
-    """What is known later of `car` at `tick`."""
-    return SmoothedReport(track_id, car.track(tick, track_id, **errors).state, lag_s)
 
 
 def smoothed_run(folder: Path) -> Run:
@@ -39,10 +31,10 @@ def smoothed_run(folder: Path) -> Run:
         for lag_s, steps in STEPS.items():
             part = {name: error * 2.0 ** (-steps / 5) for name, error in full.items()}
             if k >= steps:
-                smoothed[k] += [late(car, k - steps, i, lag_s, **part) for car, i in ((WEST, 1), (ROUND, 2))]
+                smoothed[k] += [car.later(k - steps, i, lag_s, **part) for car, i in ((WEST, 1), (ROUND, 2))]
         if k >= 12:
             part = {name: 0.2 * error for name, error in full.items()}
-            smoothed[k] += [late(WEST, k - 12, 1, **part), late(ROUND, k - 12 + 0.3, 2, **part)]
+            smoothed[k] += [WEST.later(k - 12, 1, **part), ROUND.later(k - 12 + 0.3, 2, **part)]
     truth = [*WEST.truth(TICKS), *ROUND.truth(TICKS)]
     meta = {"estimator": "smoother"}
     return write_run(folder, tracks, truth=truth, smoothed=smoothed, smoothed_lag_s=0.1, meta=meta)
@@ -79,7 +71,7 @@ def test_every_lag_has_its_known_errors_at_its_own_stamps(tmp_path: Path) -> Non
 def test_the_present_beside_a_lag_is_that_of_the_same_stamps(tmp_path: Path) -> None:
     """Wrong by 3 m once nothing is measured any more: of these ticks there are no lagged states."""
     tracks = [[WEST.track(k, 1, along_m=1.0 if k < 15 else 3.0)] for k in TICKS]
-    smoothed = {k: [late(WEST, k - 5, 1, 0.1, along_m=0.5)] for k in range(5, 20)}
+    smoothed = {k: [WEST.later(k - 5, 1, 0.1, along_m=0.5)] for k in range(5, 20)}
     entry = lagged_of(write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS), smoothed=smoothed))[0.1]
     assert entry.errors["position_m"].count == entry.present_errors["position_m"].count == 15
     assert entry.present_errors["position_m"].rmse == pytest.approx(1.0)
@@ -89,7 +81,7 @@ def test_the_present_beside_a_lag_is_that_of_the_same_stamps(tmp_path: Path) -> 
 def test_a_state_without_a_pair_at_its_stamp_is_not_judged(tmp_path: Path) -> None:
     """Track 1 follows WEST from tick 4 to 9 and nothing else; it is confirmed at tick 2."""
     tracks = [[WEST.track(k, 1, across_m=0.0 if 4 <= k < 10 else 60.0, num_measured=9 if k >= 2 else 1)] for k in TICKS]
-    smoothed = {k: [late(WEST, k - 5, 1, 0.1, along_m=0.5), late(WEST, k - 5.25, 1)] for k in range(5, 20)}
+    smoothed = {k: [WEST.later(k - 5, 1, 0.1, along_m=0.5), WEST.later(k - 5.25, 1)] for k in range(5, 20)}
     lagged = lagged_of(write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS), smoothed=smoothed))
     assert lagged[0.1].errors["position_m"].count == 6
     assert lagged[WINDOW].errors["position_m"].count == 6  # at ticks 3.75, ..., 8.75; that of 2.75 goes with tick 3
@@ -98,7 +90,7 @@ def test_a_state_without_a_pair_at_its_stamp_is_not_judged(tmp_path: Path) -> No
 def test_a_state_belongs_to_the_object_that_its_track_followed_at_its_stamp(tmp_path: Path) -> None:
     twin = replace(WEST, object_id=9, y_m=30.0)
     tracks = [[(WEST if k < 10 else twin).track(k, 1)] for k in TICKS]
-    smoothed = {k: [late(WEST if k - 5 < 10 else twin, k - 5, 1, 0.1, along_m=0.5)] for k in range(5, 20)}
+    smoothed = {k: [(WEST if k - 5 < 10 else twin).later(k - 5, 1, 0.1, along_m=0.5)] for k in range(5, 20)}
     truth = [*WEST.truth(TICKS), *twin.truth(TICKS)]
     entry = lagged_of(write_run(tmp_path / "run", tracks, truth=truth, smoothed=smoothed))[0.1]
     assert entry.errors["position_m"].count == 15
@@ -107,7 +99,7 @@ def test_a_state_belongs_to_the_object_that_its_track_followed_at_its_stamp(tmp_
 
 def test_a_state_outside_of_the_life_of_its_track_is_not_judged(tmp_path: Path) -> None:
     tracks = [[WEST.track(k, 1)] if 5 <= k < 15 else [] for k in TICKS]
-    final = [late(WEST, tick, 1) for tick in (3, 4.9, 5, 7.7, 14, 14.1, 17)] + [late(WEST, 7, 2)]
+    final = [WEST.later(tick, 1) for tick in (3, 4.9, 5, 7.7, 14, 14.1, 17)] + [WEST.later(7, 2)]
     run = write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS), smoothed={19: final})
     assert lagged_of(run)[WINDOW].errors["position_m"].count == 3
 
@@ -116,7 +108,7 @@ def test_where_truth_has_ended_neither_the_state_nor_its_present_one_counts(tmp_
     """Truth of WEST ends at tick 10, which is nearest to the state at tick 10.4."""
     tracks = [[WEST.track(k, 1)] for k in TICKS]
     truth = [*WEST.truth(range(11)), *ROUND.truth(TICKS)]
-    run = write_run(tmp_path / "run", tracks, truth=truth, smoothed={19: [late(WEST, k, 1) for k in (9.4, 10.4)]})
+    run = write_run(tmp_path / "run", tracks, truth=truth, smoothed={19: [WEST.later(k, 1) for k in (9.4, 10.4)]})
     entry = lagged_of(run)[WINDOW]
     assert entry.errors["position_m"].count == entry.present_errors["position_m"].count == 1
 
@@ -127,7 +119,7 @@ def test_nees_weighs_the_error_with_the_covariance(tmp_path: Path) -> None:
     flat = np.zeros((5, 5))
     states = []
     for k, P in ((3, covariance), (4, covariance), (5, flat)):
-        report = late(WEST, k, 1, 0.1, along_m=-3.0, across_m=3.0)  # WEST drives west: 3 m east, 3 m south
+        report = WEST.later(k, 1, 0.1, along_m=-3.0, across_m=3.0)  # WEST drives west: 3 m east, 3 m south
         states.append(replace(report, state=replace(report.state, covariance=P)))
     tracks = [[WEST.track(k, 1)] for k in TICKS]
     run = write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS), smoothed={10: states})
@@ -146,7 +138,7 @@ def test_a_filter_has_its_present_states_alone(tmp_path: Path) -> None:
 
 
 def test_lag_zero_is_that_of_the_present_states_and_stands_there_once(tmp_path: Path) -> None:
-    smoothed = {k: [late(WEST, k, 1, 0.0, along_m=9.0)] for k in TICKS}
+    smoothed = {k: [WEST.later(k, 1, 0.0, along_m=9.0)] for k in TICKS}
     tracks = [[WEST.track(k, 1, along_m=1.0)] for k in TICKS]
     run = write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS), smoothed=smoothed)
     (present,) = lag_metrics(run, match(run))
@@ -154,12 +146,12 @@ def test_lag_zero_is_that_of_the_present_states_and_stands_there_once(tmp_path: 
 
 
 def test_without_truth_there_is_nothing_to_judge(tmp_path: Path) -> None:
-    run = write_run(tmp_path / "run", [[WEST.track(0, 1)]], smoothed={0: [late(WEST, 0, 1, 0.1)]})
+    run = write_run(tmp_path / "run", [[WEST.track(0, 1)]], smoothed={0: [WEST.later(0, 1, 0.1)]})
     assert evaluate(run).lagged == ()
 
 
 def test_a_gain_over_nothing_is_no_number(tmp_path: Path) -> None:
-    smoothed = {k: [late(WEST, k - 5, 1, 0.1)] for k in range(5, 20)}
+    smoothed = {k: [WEST.later(k - 5, 1, 0.1)] for k in range(5, 20)}
     far = [[WEST.track(k, 1, across_m=60.0)] for k in TICKS]
     entry = lagged_of(write_run(tmp_path / "run", far, truth=WEST.truth(TICKS), smoothed=smoothed))[0.1]
     assert math.isnan(entry.gain("position_m"))
@@ -176,60 +168,6 @@ def test_lags_are_strict_json(tmp_path: Path) -> None:
     assert again["lagged"][1]["errors"]["position_m"]["rmse"] == pytest.approx(1.25)
     assert again["lagged"][1]["present_errors"]["position_m"]["count"] == 30
     assert again["lagged"][2]["position_nees"]["mean"] == pytest.approx(6.25 / 16)
-
-
-# --- table
-
-
-def text_of(metrics: dict[str, Metrics]) -> str:
-    output = io.StringIO()
-    Console(file=output, width=120).print(lag_table(metrics))
-    return output.getvalue()
-
-
-def rows_of(text: str) -> list[str]:
-    """Rows and notes, from the first row on."""
-    lines = [" ".join(line.split()) for line in text.splitlines()]
-    return lines[next(k for k, line in enumerate(lines) if line.startswith("smoother")) :]
-
-
-def test_the_table_has_a_row_per_lag_and_says_what_waiting_brings(tmp_path: Path) -> None:
-    metrics = {
-        "smoother": evaluate(smoothed_run(tmp_path / "a")),
-        "race/ekf-backward-forward": evaluate(filter_run(tmp_path / "b")),
-    }
-    text = text_of(metrics)
-    assert rows_of(text) == [
-        "smoother 0 40 2.50 - 4.00 - 0.200 - 6.25",
-        "0.1 30 1.25 50.0 2.00 50.0 0.100 50.0 1.56",
-        "0.2 20 0.625 75.0 1.00 75.0 0.050 75.0 0.391",
-        "window 16 0.500 80.0 0.800 80.0 0.040 80.0 0.250",
-        "race/ekf-backward-forward 0 20 3.00 - 1.00 - 0.000 - 9.00",
-        "lag 0: present states, as published; window: final states, which leave the window",
-        "below: by how much, than the present states of the same tracks at the same stamps",
-        "NEES: of the position; 2 if consistent",
-    ]
-    for unit in ("[s]", "[m]", "[m/s]", "[rad]", "[%]"):
-        assert unit in text
-    assert max(map(len, text.splitlines())) <= 120
-
-
-def test_the_table_is_shown_where_a_run_has_lagged_states(tmp_path: Path) -> None:
-    smoother, plain = evaluate(smoothed_run(tmp_path / "a")), evaluate(filter_run(tmp_path / "b"))
-    shown = [table.title for table in comparison_tables({"a": smoother, "b": plain})]
-    assert any("Error against lag" in str(title) for title in shown)
-    assert not any("Error against lag" in str(table.title) for table in comparison_tables({"b": plain}))
-
-
-def test_of_many_lags_eight_are_shown_from_the_first_to_the_last(tmp_path: Path) -> None:
-    metrics = evaluate(smoothed_run(tmp_path / "run"))
-    present, one, _, final = metrics.lagged
-    lags = tuple(replace(one, lag_s=k / 10) for k in range(1, 21))
-    text = text_of({"smoother": replace(metrics, lagged=(present, *lags, final))})
-    shown = [row.split()[-9] for row in rows_of(text)[:10]]
-    assert shown == ["0", "0.1", "0.4", "0.6", "0.9", "1.2", "1.5", "1.7", "2", "window"]
-    assert "metrics.json has all" in text
-    assert "metrics.json has all" not in text_of({"smoother": metrics})
 
 
 # --- figure
@@ -270,7 +208,7 @@ def test_the_figure_is_drawn_where_a_run_has_lagged_states_and_the_same_every_ti
 
 def test_truth_without_speed_leaves_the_speed_out(tmp_path: Path) -> None:
     tracks = [[WEST.track(k, 1, along_m=1.0)] for k in TICKS]
-    smoothed = {k: [late(WEST, k - 5, 1, 0.1, along_m=0.5)] for k in range(5, 20)}
+    smoothed = {k: [WEST.later(k - 5, 1, 0.1, along_m=0.5)] for k in range(5, 20)}
     run = write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS, pose=False), smoothed=smoothed)
     assert [axes.get_ylabel() for axes in figure_lag({"run": lag_metrics(run, match(run))}).axes] == [
         "position RMSE [m]"

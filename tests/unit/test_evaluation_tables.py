@@ -1,38 +1,38 @@
+"""What the tables of a comparison say, and the forms that they take: the same numbers in each of them."""
+
+import csv
 import io
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from evaluation_runs import ROUND, WEST, update, write_run
-from rich.console import Console, RenderableType
+from rich.console import Console
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Disposition
-from fgtrack.evaluation.labels import labelled
-from fgtrack.evaluation.metrics import Metrics, evaluate
-from fgtrack.evaluation.tables import (
-    BACKWARD_FORWARD_NOTE,
-    comparison_dict,
-    comparison_tables,
-    consistency_table,
-    disposition_table,
-    main_table,
-    multi_object_table,
-    residual_tables,
-)
+from fgtrack.evaluation.comparison import BACKWARD_FORWARD_NOTE, compare, comparison
+from fgtrack.evaluation.metrics import evaluate
+from fgtrack.evaluation.runs import labelled
+from fgtrack.evaluation.tables import Column, Table, Tables, short
 from fgtrack.io.run import Run
 
 ESTIMATORS = ("ekf-backward-forward", "ekf-replay", "smoother")
+SENSORS = ("lidar_cluster", "radar_long_range")
 
-
-def text_of(tables: Sequence[RenderableType], width: int = 120) -> str:
-    console = Console(file=io.StringIO(), width=width)
-    for table in tables:
-        console.print(table)
-    output = console.file
-    assert isinstance(output, io.StringIO)
-    return output.getvalue()
+#: Every table of a comparison of runs with truth, and the column beside `run` that tells its rows apart.
+TABLES = {
+    "tracking": None,
+    "multi_object": None,
+    "lag": "lag",
+    "consistency": "of",
+    **{f"residuals_{sensor}": None for sensor in SENSORS},
+    "dispositions": "sensor",
+}
 
 
 def a_run(folder: Path, estimator: str, *, truth: bool = True) -> Run:
@@ -45,38 +45,185 @@ def a_run(folder: Path, estimator: str, *, truth: bool = True) -> Run:
         ]
     }
     rows = [*WEST.truth(range(4)), *ROUND.truth(range(4))] if truth else []
-    return write_run(folder, tracks, truth=rows, updates=updates, meta={"estimator": estimator})
+    smoothed = {3: [WEST.later(k, 1, along_m=0.1) for k in range(2)]} if estimator == "smoother" else {}
+    meta = {"estimator": estimator}
+    return write_run(folder, tracks, truth=rows, updates=updates, smoothed=smoothed, meta=meta)
 
 
-@pytest.fixture
-def metrics(tmp_path: Path) -> dict[str, Metrics]:
-    runs = [a_run(tmp_path / name, name) for name in ESTIMATORS]
-    return {label: evaluate(run) for label, run in labelled(runs).items()}
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
+    folder = tmp_path_factory.mktemp("runs")
+    return {name: a_run(folder / name, name) for name in ESTIMATORS}
 
 
-def test_every_table_fits_a_terminal_of_120_columns(metrics: dict[str, Metrics]) -> None:
-    tables = comparison_tables(metrics)
-    wide = {f"race/{label}": one for label, one in metrics.items()}
-    for shown in (tables, comparison_tables(wide)):
-        lines = text_of(shown).splitlines()
-        assert max(map(len, lines)) <= 120
-        assert not any("…" in line for line in lines)
-    assert len(tables) == 6
-    for estimator in ESTIMATORS:
-        assert f"race/{estimator} " in text_of([main_table(wide)])
+@pytest.fixture(scope="module")
+def tables(runs: dict[str, Run]) -> Tables:
+    return comparison({label: evaluate(run) for label, run in runs.items()})
 
 
-def test_the_main_table_shows_errors_with_units(metrics: dict[str, Metrics]) -> None:
-    text = text_of([main_table(metrics)])
-    (row,) = [line for line in text.splitlines() if line.strip().startswith("smoother")]
+def rows_of(table: Table) -> list[str]:
+    """Rows as they are shown."""
+    return [" ".join(cells) for cells in zip(*(column.cells for column in table.shown), strict=True)]
+
+
+def row_of(table: Table, row: int) -> dict[str, float]:
+    return {name: column[row] for name, column in table.items() if name not in (*table.row_keys, "estimator")}
+
+
+# --- forms
+
+
+def test_the_tables_stand_in_their_order(tables: Tables) -> None:
+    assert {name: (*table.row_keys, None)[1] for name, table in tables.items()} == TABLES
+    assert all(table.num_rows >= len(ESTIMATORS) for table in tables.values())
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_csv_gives_the_numbers_back(tables: Tables, name: str) -> None:
+    (*_,) = rows = list(csv.DictReader(io.StringIO(tables.to_csv(name))))
+    for column, values in tables[name].items():
+        read = [row[column] for row in rows]
+        if values.dtype.kind == "U":
+            assert read == values.tolist()
+        else:
+            np.testing.assert_array_equal([float(cell or math.nan) for cell in read], values)
+
+
+def test_csv_of_all_tables_has_every_number_once(tables: Tables) -> None:
+    rows = list(csv.DictReader(io.StringIO(tables.to_csv())))
+    found = {(row["table"], row["run"], row["part"], row["quantity"]): row["value"] for row in rows}
+    assert len(found) == len(rows) == sum(t.num_rows * (len(t) - len(t.row_keys)) for t in tables.values())
+    rmse_m = tables["tracking"]["position_rmse_m"][2]
+    assert float(found["tracking", "smoother", "", "position_rmse_m"]) == rmse_m
+    assert found["dispositions", "smoother", "lidar_cluster", "birth"] == "1"
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_markdown_has_the_cells_that_are_shown(tables: Tables, name: str) -> None:
+    lines = [line for line in tables.to_markdown(name).splitlines() if line.startswith("|")]
+    head, rule, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert len(head) == len(rule) == len(tables[name].shown)
+    shown = [list(cells) for cells in zip(*(column.cells for column in tables[name].shown), strict=True)]
+    assert [row[1:] for row in rows] == [row[1:] for row in shown]
+    assert [row[0] for row in rows if row[0]] == list(ESTIMATORS)
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_latex_has_a_cell_for_every_column(tables: Tables, name: str) -> None:
+    lines = tables.to_latex(name).splitlines()
+    rows = [line for line in lines if line.endswith(r" \\")]
+    assert {row.count(" & ") + 1 for row in rows} == {len(tables[name].shown)}
+    assert len(rows) == 1 + tables[name].num_rows
+    shown = "".join(line for line in lines if not line.startswith("%"))
+    assert "±" not in shown
+    assert not any(char in shown.replace(f"\\{char}", "") for char in "%_#")
+
+
+def test_what_means_something_in_latex_or_markdown_is_escaped() -> None:
+    rows = ["50%_a&b|c", r"{x}^\~#$", "1 ± 2 <3"]
+    table = Table("a_b", [Column("run", ("run",), lambda row: (row,), left=True)], rows)
+    cells = table.to_latex().splitlines()[7:10]
+    assert cells == [
+        r"50\%\_a\&b|c \\",
+        r"\{x\}\textasciicircum{}\textbackslash{}\textasciitilde{}\#\$ \\",
+        r"1 $\pm$ 2 $<$3 \\",
+    ]
+    assert r"\caption{a\_b}" in table.to_latex()
+    assert r"| 50%_a&b\|c |" in table.to_markdown().splitlines()
+
+
+def test_a_column_has_several_numbers_in_a_cell_and_a_dash_for_none() -> None:
+    rows: list[tuple[float, float] | None] = [(0.00123, 0.0156), None, (math.nan, 2.0)]
+    table = Table("times", [Column("ms/\ntick", ("p50_s", "p99_s"), lambda row: row, "{}/{}", 1e3)], rows)
+    (shown,) = table.shown
+    assert shown.cells == ("1.23/15.6", "-", "-/2000")
+    np.testing.assert_array_equal(table["p99_s"], [0.0156, math.nan, 2.0])
+    assert table.to_csv() == "p50_s,p99_s\n0.00123,0.0156\n,\n,2.0\n"
+    assert "| ms/tick |" in table.to_markdown()
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_is_a_data_frame(tables: Tables, name: str) -> None:
+    pandas = pytest.importorskip("pandas", reason="pandas is not installed")
+    frame = pandas.DataFrame(tables[name])
+    assert frame.shape == (tables[name].num_rows, len(tables[name]))
+    numbers = [column for column in frame if column not in (*tables[name].row_keys, "estimator")]
+    assert all(frame[column].dtype.kind in "if" for column in numbers)
+
+
+def test_tables_fit_a_terminal_of_120_columns(runs: dict[str, Run], tables: Tables) -> None:
+    wide = comparison({f"race/{label}": evaluate(run) for label, run in runs.items()})
+    for shown in (str(tables), str(wide)):
+        assert max(map(len, shown.splitlines())) <= 120
+        assert "…" not in shown
+    assert all(f"race/{estimator} " in str(wide["tracking"]) for estimator in ESTIMATORS)
+
+
+def test_what_is_printed_is_what_the_console_shows(tables: Tables) -> None:
+    console = Console(width=120, file=io.StringIO(), color_system=None)
+    with console.capture() as capture:
+        console.print(tables)
+    assert f"{tables}\n" == capture.get()
+    assert str(tables["lag"]) in str(tables)
+
+
+def test_json_has_the_metrics_the_notes_and_the_tables(tables: Tables) -> None:
+    plain = tables.to_dict()
+    assert json.loads(json.dumps(plain, allow_nan=False)) == plain
+    assert list(plain["runs"]) == list(ESTIMATORS)
+    assert plain["notes"] == [BACKWARD_FORWARD_NOTE]
+    assert plain["tables"]["lag"][0]["position_reduction"] is None
+    assert plain["tables"]["residuals_lidar_cluster"][1]["delay_mean_s"] == pytest.approx(0.151)
+
+
+def test_a_name_in_brackets_is_shown_as_it_is(runs: dict[str, Run]) -> None:
+    tables = comparison({"[bold]run": evaluate(runs["smoother"])})
+    assert str(tables).count("[bold]run") == len(TABLES)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.9999, "1.00"),
+        (9.996, "10.0"),
+        (99.96, "100"),
+        (12345.6, "12346"),
+        (-0.0001, "0.000"),
+        (math.nan, "-"),
+        (7, "7"),
+    ],
+)
+def test_numbers_have_three_significant_digits_and_no_more_than_three_decimals(value: float, text: str) -> None:
+    assert short(value) == text
+
+
+# --- what they say
+
+
+def test_the_tracking_table_has_errors_continuity_and_times(tables: Tables) -> None:
+    table = tables["tracking"]
     # position: 4 rows at 0.5 m, 4 at 0; along 0.3, across 0.4; tracked %, breaks/switches, false, precision
-    expected = "0.354 0.212 0.283 0.000 0.000 100 0/0 0 1.00 2/2 1.00/1.00"
-    assert row.split()[1:] == expected.split()
-    for unit in ("[m]", "[rad]", "[m/s]", "[%]", "ms/tick"):
-        assert unit in text
+    assert rows_of(table)[2] == "smoother 0.354 0.212 0.283 0.000 0.000 100 0/0 0 1.00 2/2 1.00/1.00"
+    assert row_of(table, 2) == pytest.approx(
+        {
+            "position_rmse_m": math.sqrt(0.125),
+            "along_rmse_m": 0.3 / math.sqrt(2.0),
+            "across_rmse_m": 0.4 / math.sqrt(2.0),
+            **dict.fromkeys(("yaw_rmse_rad", "speed_rmse_mps", "breaks", "id_switches", "false_tracks"), 0.0),
+            "tracked_share": 1.0,
+            "precision": 1.0,
+            "num_tracks": 2,
+            "num_confirmed": 2,
+            **dict.fromkeys(("time_per_tick_p50_s", "time_per_tick_p99_s"), 0.001),
+        },
+        abs=1e-9,
+    )
+    units = [column.heading.split("\n")[-1] for column in table.shown]
+    assert units[1:7] == ["[m]", "[m]", "[m]", "[rad]", "[m/s]", "[%]"]
+    assert "RMSE" in table.title
 
 
-def test_the_multi_object_table_shows_gospa_scores_switches_and_the_time_to_confirm(tmp_path: Path) -> None:
+def test_the_multi_object_table_has_gospa_scores_switches_and_the_time_to_confirm(tmp_path: Path) -> None:
     """WEST is 2.75 m off, with a late switch at tick 2; ROUND is missed; track 9 is false."""
     tracks = [[WEST.track(k, 1 if k < 2 else 2, along_m=2.75), WEST.track(k, 9, across_m=60.0)] for k in range(4)]
     updates = {
@@ -84,103 +231,125 @@ def test_the_multi_object_table_shows_gospa_scores_switches_and_the_time_to_conf
         2: [update(tick=1, disposition=Disposition.OUT_OF_SEQUENCE, track_id=2)],
     }
     run = write_run(tmp_path / "run", tracks, truth=[*WEST.truth(range(4)), *ROUND.truth(range(4))], updates=updates)
-    plain = write_run(tmp_path / "plain", tracks)
-    metrics = {"run": evaluate(run), "plain": evaluate(plain)}
-    text = text_of([multi_object_table(metrics)])
-    rows = [line.split() for line in text.splitlines() if line.startswith((" run ", " plain "))]
+    table = comparison({"run": evaluate(run), "plain": evaluate(write_run(tmp_path / "plain", tracks))})["multi_object"]
     # GOSPA^2 = 2.75^2 + 12.5 + 12.5 at every tick; MOTA 1 - (4 + 4 + 1) / 8; IDF1 2 * 2 / (8 + 8)
     # a similarity of 0.725 passes 14 of 19 bounds: DetA 14/19 * 4/12, AssA 14/19 * 1/2, HOTA 14/19 sqrt(1/6)
-    (_, *units), (_, *shown), (_, *dashes) = rows
-    assert units == [*["[m]"] * 4, *["[%]"] * 5, "late", "[s]"]
-    assert shown == ["5.71", "2.75", "3.54", "3.54", "-12.5", "25.0", "30.1", "24.6", "36.8", "1/1", "0.060"]
-    assert dashes == ["-"] * 11
+    assert rows_of(table) == ["run 5.71 2.75 3.54 3.54 -12.5 25.0 30.1 24.6 36.8 1/1 0.060", f"plain{' -' * 11}"]
+    assert (table["mota"][0], table["assa"][0]) == pytest.approx((-0.125, 7 / 19))
 
 
-def test_the_consistency_table_shows_means_bands_and_whiteness(tmp_path: Path) -> None:
+def test_the_lag_table_says_what_waiting_brings(tables: Tables) -> None:
+    table = tables["lag"]
+    assert rows_of(table)[2:] == [
+        "smoother 0 8 0.354 - 0.000 - 0.000 - 0.125",
+        "smoother window 2 0.100 80.0 0.000 - 0.000 - 0.010",
+    ]
+    assert table["lag"].tolist() == ["0", "0", "0", "window"]
+    np.testing.assert_array_equal(table["lag_s"], [0.0, 0.0, 0.0, math.nan])
+
+
+def test_of_many_lags_eight_are_shown_from_the_first_to_the_last(runs: dict[str, Run]) -> None:
+    metrics = evaluate(runs["smoother"])
+    present, final = metrics.lagged
+    lags = tuple(replace(final, lag_s=k / 10) for k in range(1, 21))
+    table = comparison({"smoother": replace(metrics, lagged=(present, *lags, final))})["lag"]
+    assert table["lag"].tolist() == ["0", "0.1", "0.4", "0.6", "0.9", "1.2", "1.5", "1.7", "2", "window"]
+    assert any("metrics.json has all" in note for note in table.notes)
+    assert not any("metrics.json has all" in note for note in comparison({"smoother": metrics})["lag"].notes)
+
+
+def test_the_consistency_table_has_means_bands_and_whiteness(tmp_path: Path) -> None:
     flips = [update(tick=k, nis=5.0, x_m=(-1.0) ** k, y_m=0.0) for k in range(30)]
     tracks = [[WEST.track(k, 1, along_m=3.0)] for k in range(40)]
     updates = {k: [record, update("radar", tick=k, nis=1.0, speed_mps=2.0)] for k, record in enumerate(flips)}
-    metrics = {"run": evaluate(write_run(tmp_path / "run", tracks, truth=WEST.truth(range(40)), updates=updates))}
-    lines = text_of([consistency_table(metrics)]).splitlines()
-    rows = [" ".join(line.split()) for line in lines]
-    assert "run NEES position 40 9.00 2.00 1.43 to 2.67 - -" in rows
-    assert "NEES state 40 9.00 4.00 3.17 to 4.92 - -" in rows
-    assert "NIS lidar 30 5.00 2.00 1.35 to 2.78 -0.967 ± 0.352 100" in rows
-    assert "NIS radar 30 1.00 1.00 0.560 to 1.57 0.967 ± 0.352 100" in rows
+    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(40)), updates=updates)
+    assert rows_of(comparison({"run": evaluate(run)})["consistency"]) == [
+        "run NEES position 40 9.00 2.00 1.43 to 2.67 - -",
+        "run NEES state 40 9.00 4.00 3.17 to 4.92 - -",
+        "run NIS lidar 30 5.00 2.00 1.35 to 2.78 -0.967 ± 0.352 100",
+        "run NIS radar 30 1.00 1.00 0.560 to 1.57 0.967 ± 0.352 100",
+    ]
 
 
-def test_without_truth_the_consistency_table_has_the_sensors(tmp_path: Path) -> None:
-    metrics = {"a": evaluate(a_run(tmp_path / "without", "smoother", truth=False))}
-    text = text_of([consistency_table(metrics)])
-    assert "NEES position" not in text
-    assert "NIS lidar_cluster" in text
-    assert multi_object_table(metrics).row_count == 0
-
-
-def test_a_residual_table_shows_mean_deviation_nis_and_delay(metrics: dict[str, Metrics]) -> None:
-    lidar, radar = residual_tables(metrics)
-    text = text_of([lidar])
-    assert "Residuals of lidar_cluster" in text
+def test_a_residual_table_has_mean_standard_deviation_nis_and_delay(tables: Tables) -> None:
     # WEST drives west: along is -x, across is -y
-    assert "0.500 ± 0.000" in text
-    assert "-0.250 ± 0.000" in text
-    assert "151/151" in text
-    assert "speed" not in text
-    assert "-123 ± 0.000" in text_of([radar])
+    lidar, radar = (tables[f"residuals_{sensor}"] for sensor in SENSORS)
+    assert rows_of(lidar)[2] == "smoother 0.500 ± 0.000 -0.250 ± 0.000 2.00 2.00 151/151"
+    assert rows_of(radar)[2] == "smoother -1.00 ± 0.000 -2.00 ± 0.000 -123 ± 0.000 3.00 3.00 62.0/62.0"
+    assert lidar["x_mean_m"].tolist() == [-0.5] * 3  # not shown beside along and across, but there
 
 
-def test_the_disposition_table_sums_up_and_names_what_never_occurred(metrics: dict[str, Metrics]) -> None:
-    text = text_of([disposition_table(metrics)])
-    rows = [line.split() for line in text.splitlines() if "lidar_cluster" in line]
-    assert [row[-3:] for row in rows] == [["1", "1", "2"]] * 3
-    assert "none: out of sequence, beyond window, too old, gated" in text.replace("\n", " ")
+def test_the_disposition_table_sums_up_and_names_what_never_occurred(tables: Tables) -> None:
+    table = tables["dispositions"]
+    assert rows_of(table)[-2:] == ["smoother lidar_cluster 1 1 2", "smoother radar_long_range 0 1 1"]
+    assert table.notes[0].startswith("none: out of sequence, beyond window, too old, gated")
+    assert sum(int(table[name.value].sum()) for name in Disposition) == table["detections"].sum() == 9
 
 
-def test_the_note_on_backward_forward_stands_where_it_is_shown_only(metrics: dict[str, Metrics]) -> None:
-    tables = comparison_tables(metrics)
-    assert all(BACKWARD_FORWARD_NOTE in text_of([table]) for table in tables)
-    others = {label: one for label, one in metrics.items() if label != "ekf-backward-forward"}
-    assert BACKWARD_FORWARD_NOTE not in text_of(comparison_tables(others))
-    assert comparison_dict(metrics)["notes"] == [BACKWARD_FORWARD_NOTE]
-    assert comparison_dict(others)["notes"] == []
+def test_the_note_on_backward_forward_stands_where_it_is_shown_only(runs: dict[str, Run], tables: Tables) -> None:
+    assert all(table.notes[-1] == BACKWARD_FORWARD_NOTE for table in tables.values())
+    others = comparison({"smoother": evaluate(runs["smoother"])})
+    assert BACKWARD_FORWARD_NOTE not in str(others)
+    assert others.to_dict()["notes"] == []
 
 
-def test_a_name_in_brackets_is_shown_as_it_is(tmp_path: Path) -> None:
-    metrics = {"[bold]run": evaluate(a_run(tmp_path / "run", "smoother"))}
-    assert text_of(comparison_tables(metrics)).count("[bold]run") == 6
-
-
-def test_runs_without_truth_have_a_table_without_errors(tmp_path: Path) -> None:
+def test_runs_without_truth_have_no_errors(tmp_path: Path, runs: dict[str, Run]) -> None:
     without = evaluate(a_run(tmp_path / "without", "smoother", truth=False))
-    assert "RMSE" not in text_of([main_table({"a": without})])
-    both = {"a": without, "b": evaluate(a_run(tmp_path / "with", "smoother"))}
-    (row,) = [line for line in text_of([main_table(both)]).splitlines() if line.startswith(" a ")]
-    assert row.split()[1:10] == ["-"] * 9
+    alone = comparison({"a": without})
+    assert [column.heading for column in alone["tracking"].shown] == ["run", "tracks\nall/3+", "ms/tick\np50/p99"]
+    assert np.isnan(alone["tracking"]["position_rmse_m"]).all()
+    assert alone["consistency"]["of"].tolist() == [f"NIS {sensor}" for sensor in SENSORS]
+    assert "Error against lag" not in str(alone)
+    assert "Multi-object" not in str(alone)
+    both = comparison({"a": without, "b": evaluate(runs["smoother"])})
+    assert rows_of(both["tracking"])[0] == f"a{' -' * 9} 2/2 1.00/1.00"
 
 
-def test_a_run_without_detections_has_no_empty_tables(tmp_path: Path) -> None:
-    assert len(comparison_tables({"a": evaluate(write_run(tmp_path / "run", [[]]))})) == 1
+def test_a_run_without_detections_shows_no_empty_tables(tmp_path: Path) -> None:
+    tables = comparison({"a": evaluate(write_run(tmp_path / "run", [[]]))})
+    assert tables["dispositions"].num_rows == tables["lag"].num_rows == 0
+    for text in (str(tables), tables.to_markdown()):
+        assert "Tracking" in text
+        assert "Dispositions" not in text
 
 
-def test_the_dictionary_is_strict_json(metrics: dict[str, Metrics]) -> None:
-    plain = comparison_dict(metrics)
-    assert json.loads(json.dumps(plain, allow_nan=False)) == plain
-    assert list(plain["runs"]) == list(ESTIMATORS)
+# --- which runs
+
+
+def contents(folder: Path) -> Mapping[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_runs_are_compared_from_folders_and_from_memory(tmp_path: Path) -> None:
+    kept = replace(a_run(tmp_path / "elsewhere", "smoother"), path=None)
+    a_run(tmp_path / "all" / "ekf-replay", "ekf-replay")
+    before = contents(tmp_path)
+    tables = compare(tmp_path / "all", kept, replace(kept))
+    assert tables["tracking"]["run"].tolist() == ["ekf-replay", "smoother", "smoother #2"]
+    new = contents(tmp_path).keys() - before.keys()
+    assert new == {"all/ekf-replay/metrics.json"}
+    written = json.loads((tmp_path / "all/ekf-replay/metrics.json").read_text())
+    assert written == tables.to_dict()["runs"]["ekf-replay"]
+    assert str(compare(str(tmp_path / "all/ekf-replay"))) == str(compare(tmp_path / "all"))
+
+
+def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(CallError, match="no run folder"):
+            compare(path)
+    with pytest.raises(CallError, match="no run is given"):
+        compare()
 
 
 def test_labels_are_as_long_as_they_must_be(tmp_path: Path) -> None:
-    paths = [tmp_path / "dry" / "smoother", tmp_path / "wet" / "smoother"]
-    runs = [write_run(path) for path in paths]
+    runs = [write_run(tmp_path / "dry" / "smoother"), write_run(tmp_path / "wet" / "smoother")]
     assert list(labelled(runs)) == ["dry/smoother", "wet/smoother"]
     assert list(labelled(runs[:1])) == ["smoother"]
-
-
-def test_a_label_names_the_estimator(tmp_path: Path) -> None:
-    run = write_run(tmp_path / "first", meta={"estimator": "ekf-replay"})
-    assert list(labelled([run])) == ["first (ekf-replay)"]
+    assert list(labelled([replace(runs[0], meta={"estimator": "ekf-replay"})])) == ["smoother (ekf-replay)"]
 
 
 def test_the_same_run_twice_is_refused(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
-    with pytest.raises(CallError, match="given twice"):
-        labelled([run, run])
+    for same in (run, replace(run, path=None)):
+        with pytest.raises(CallError, match="given twice"):
+            labelled([same, same])

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
@@ -51,7 +52,7 @@ def evaluation_config(run: Run) -> EvaluationConfig:
     try:
         return EvaluationConfig(**known)
     except (TypeError, ValueError) as error:
-        raise DataError(f"{run.path / 'config.yaml'}: evaluation: {error}") from error
+        raise DataError(f"{_origin(run)}: evaluation: {error}") from error
 
 
 def section(run: Run, name: str) -> Mapping[str, Any]:
@@ -65,9 +66,13 @@ def section(run: Run, name: str) -> Mapping[str, Any]:
     try:
         config = _load(run.config_text)
     except YAMLError as error:
-        raise DataError(f"{run.path / 'config.yaml'}: is not YAML, repeat the run") from error
+        raise DataError(f"{_origin(run)}: is not YAML, repeat the run") from error
     found = config.get(name) if isinstance(config, dict) else None
     return found if isinstance(found, dict) else {}
+
+
+def _origin(run: Run) -> str:
+    return str(Path(run.path or "") / "config.yaml")
 
 
 @lru_cache(maxsize=64)

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
@@ -90,8 +89,8 @@ class MemoryRun:
 
     @property
     def run(self) -> Run:
-        """The run; its path is empty."""
-        return Run(Path(), dict(self._meta), self._config_text, **{table: self._table(table) for table in COLUMNS})
+        """The run; it has no path."""
+        return Run(None, dict(self._meta), self._config_text, **{table: self._table(table) for table in COLUMNS})
 
     def _append(self, table: str, ids: tuple[_Cell, ...], state: TrackState) -> None:
         self._rows[table].append(ids)

@@ -57,7 +57,8 @@ class Table:
 class Run:
     """A run as evaluation sees it."""
 
-    path: Path
+    path: Path | None
+    """Folder of the run; None for a run in memory."""
     meta: Mapping[str, Any]
     """Content of meta.json; JSON values."""
     config_text: str

@@ -1,0 +1,83 @@
+"""Runs that are looked at together: read, labelled, and each matched and evaluated once."""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from fgtrack.core.errors import CallError
+from fgtrack.evaluation.matching import Matching, match
+from fgtrack.evaluation.metrics import Metrics, evaluate
+from fgtrack.io.run import Run, is_run_folder, read_run
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedRun:
+    """A run and what evaluation finds, computed when it is first asked for."""
+
+    label: str
+    """Name among the runs that it is shown with."""
+    run: Run
+
+    @cached_property
+    def matching(self) -> Matching | None:
+        """Pairs of tracks and true objects; None for a run without truth."""
+        return match(self.run)
+
+    @cached_property
+    def metrics(self) -> Metrics:
+        """All metrics, judged as the run's configuration says."""
+        return evaluate(self.run)
+
+
+def judged(runs: Iterable[Run | Path | str]) -> list[JudgedRun]:
+    """Runs under labels of their own; a path is a run folder, or a folder that holds run folders (by name).
+
+    Raises
+    ------
+    CallError
+        A path is neither, or a run is given twice.
+    DataError
+        A run folder is damaged.
+    """
+    every = [found for run in runs for found in ([run] if isinstance(run, Run) else _read(Path(run)))]
+    return [JudgedRun(label, run) for label, run in labelled(every).items()]
+
+
+def labelled(runs: Sequence[Run]) -> dict[str, Run]:
+    """Runs by a label of their own: the end of their path, as long as it must be to tell them apart.
+
+    The estimator stands behind it where the path does not name it, and alone for a run in memory.
+
+    Raises
+    ------
+    CallError
+        A run is given twice.
+    """
+    for identity, count in Counter(run.path.resolve() if run.path else id(run) for run in runs).items():
+        if count > 1:
+            raise CallError(f"{identity if isinstance(identity, Path) else 'run'}: is given twice, name every run once")
+    paths = [run.path.resolve() for run in runs if run.path]
+    length = 1
+    while len({path.parts[-length:] for path in paths}) < len(paths):
+        length += 1
+    labels: dict[str, Run] = {}
+    for run in runs:
+        estimator = str(run.meta.get("estimator", "run"))
+        label = "/".join(run.path.resolve().parts[-length:]) if run.path else estimator
+        label = label if estimator in label else f"{label} ({estimator})"
+        same = 1
+        while (unique := label if same == 1 else f"{label} #{same}") in labels:
+            same += 1
+        labels[unique] = run
+    return labels
+
+
+def _read(path: Path) -> list[Run]:
+    if is_run_folder(path):
+        return [read_run(path)]
+    below = [child for child in sorted(path.iterdir()) if is_run_folder(child)] if path.is_dir() else []
+    if not below:
+        raise CallError(f"{path}: no run folder, make one with `fgtrack replay`")
+    return [read_run(child) for child in below]
