@@ -48,3 +48,33 @@ def parent_from_child(points_m: FloatArray, origin_m: tuple[float, float], yaw_r
 def circular_mean(angles_rad: FloatArray) -> float:
     """Mean direction of `angles_rad`, shape (n,), in (-pi, pi]."""
     return math.atan2(float(np.sin(angles_rad).sum()), float(np.cos(angles_rad).sum()))
+
+
+def polar(vector: FloatArray) -> FloatArray:
+    """Direction in [-pi, pi], 0 for the zero vector, and length of `vector`; both of shape (..., 2)."""
+    x, y = vector[..., 0], vector[..., 1]
+    return np.stack([np.arctan2(y, x), np.hypot(x, y)], axis=-1)
+
+
+def polar_gradient(vector: FloatArray, floor: float) -> FloatArray:
+    """Derivative of `polar` by `vector`, shape (..., 2, 2).
+
+    The direction changes by 1 / length; a length below `floor` counts as `floor` there, so all is finite.
+    """
+    x, y = vector[..., 0], vector[..., 1]
+    direction, length = np.arctan2(y, x), np.maximum(np.hypot(x, y), floor)
+    c, s = np.cos(direction), np.sin(direction)
+    return np.stack([np.stack([-s / length, c / length], axis=-1), np.stack([c, s], axis=-1)], axis=-2)
+
+
+def cartesian(direction_length: FloatArray) -> FloatArray:
+    """Vector of a direction and a (signed) length, both of shape (..., 2)."""
+    direction, length = direction_length[..., 0], direction_length[..., 1]
+    return np.stack([length * np.cos(direction), length * np.sin(direction)], axis=-1)
+
+
+def cartesian_gradient(direction_length: FloatArray) -> FloatArray:
+    """Derivative of `cartesian` by direction and length, shape (..., 2, 2)."""
+    direction, length = direction_length[..., 0], direction_length[..., 1]
+    c, s = np.cos(direction), np.sin(direction)
+    return np.stack([np.stack([-length * s, c], axis=-1), np.stack([length * c, s], axis=-1)], axis=-2)

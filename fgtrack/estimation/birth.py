@@ -18,12 +18,6 @@ def initial_state(motion: MotionModel, start: Start) -> tuple[FloatArray, FloatA
     if start.position_covariance is not None:
         position = symmetrise(np.asarray(start.position_covariance, dtype=np.float64))
     unknown = start.yaw_rad is None
-    if unknown and motion.linear:
-        mean, variances = np.zeros(motion.dim), np.zeros(motion.dim)
-        variances[2:] = start.speed_std_mps**2 + start.speed_mps**2
-        covariance = np.diag(variances)
-        mean[:2], covariance[:2, :2] = start.position_m, position
-        return mean, covariance
     yaw_std_rad = start.yaw_std_rad
     if yaw_std_rad is None:
         yaw_std_rad = UNKNOWN_YAW_STD_RAD if unknown else KNOWN_YAW_STD_RAD
@@ -31,4 +25,8 @@ def initial_state(motion: MotionModel, start: Start) -> tuple[FloatArray, FloatA
     covariance = np.diag(np.square(std))
     covariance[:2, :2] = position
     values = *start.position_m, start.yaw_rad or 0.0, start.speed_mps, start.yaw_rate_radps, start.accel_mps2
-    return motion.from_kinematic(np.array(values, dtype=np.float64), covariance)
+    x, P = motion.from_kinematic(np.array(values, dtype=np.float64), covariance)
+    if unknown and motion.cartesian:
+        x[2:4] = P[2:4] = P[:, 2:4] = 0.0
+        P[2:4, 2:4] = np.eye(2) * (start.speed_std_mps**2 + start.speed_mps**2)
+    return x, P

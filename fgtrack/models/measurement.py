@@ -12,17 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.geometry import wrap_angles
-from fgtrack.core.types import MEASURABLE, STATE_NAMES, FloatArray, IntArray
-from fgtrack.models.motion import (
-    CV,
-    MIN_SPEED_MPS,
-    MotionModel,
-    cartesian,
-    cartesian_gradient,
-    polar,
-    polar_gradient,
-)
+from fgtrack.core.geometry import cartesian, cartesian_gradient, polar, polar_gradient, wrap_angles
+from fgtrack.core.types import MEASURABLE, FloatArray, IntArray
+from fgtrack.models.motion import CARTESIAN, MIN_SPEED_MPS, POLAR, MotionModel
 
 #: The gradient of a bearing by the position grows as 1 / range; below this range it stays as it is there.
 MIN_RANGE_M = 1e-6
@@ -63,10 +55,9 @@ class MeasurementModel:
                 f"measurement of {', '.join(self.components) or 'nothing'}: give one or more of "
                 f"{', '.join(MEASURABLE)}, each once and in this order"
             )
-        if self.state_names[:4] not in (STATE_NAMES[:4], CV.state_names):
+        if self.state_names[:4] not in (POLAR, CARTESIAN):
             raise CallError(
-                f"state of {', '.join(self.state_names)}: must begin with {', '.join(STATE_NAMES[:4])} "
-                f"or {', '.join(CV.state_names)}"
+                f"state of {', '.join(self.state_names)}: must begin with {', '.join(POLAR)} or {', '.join(CARTESIAN)}"
             )
 
     @cached_property
@@ -121,7 +112,7 @@ class MeasurementModel:
 
     @cached_property
     def _cartesian(self) -> bool:
-        return "vx_mps" in self.state_names
+        return self.state_names[:4] == CARTESIAN
 
     @cached_property
     def _selections(self) -> dict[int, FloatArray]:

@@ -5,14 +5,16 @@ broadcast the two. A duration may be 0. For `predict` and `jacobian` it may be n
 backwards. `predict` does not wrap the yaw; `MeasurementModel.residual` does.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from fgtrack.core.errors import CallError
+from fgtrack.core.geometry import cartesian, cartesian_gradient, polar, polar_gradient
 from fgtrack.core.linalg import identity, symmetrise
 from fgtrack.core.types import ACCEL, SPEED, STATE_NAMES, YAW, YAW_RATE, FloatArray, X, Y
 from fgtrack.models.arc import (
@@ -27,6 +29,9 @@ from fgtrack.models.arc import (
 )
 from fgtrack.models.white_noise import WhiteNoise
 
+#: The first entries of every model's state are either of these.
+POLAR, CARTESIAN = STATE_NAMES[:4], ("x_m", "y_m", "vx_mps", "vy_mps")
+
 #: The gradient of a heading by the velocity grows as 1 / speed; below this speed it stays as it is there.
 MIN_SPEED_MPS = 1e-3
 
@@ -39,53 +44,115 @@ class Prediction(NamedTuple):
     F: FloatArray
     """Derivative of the mean by the state before, shape (n, n)."""
     Q: FloatArray
-    """Covariance of the noise gathered, shape (n, n)."""
+    """Covariance of the accumulated noise, shape (n, n)."""
 
 
-@runtime_checkable
-class MotionModel(Protocol):
-    """How an object moves between two stamps, and how uncertain that is."""
+class MotionModel(ABC):
+    """How an object moves between two stamps, and how uncertain that is.
 
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """Names of the n entries of the state."""
+    A model has `state_names`, `predict`, `jacobian` and `process_noise`; what else is asked of it follows from them.
+    It is immutable, equal to one with the same parameters, and hashable: a frozen dataclass.
+    """
+
+    state_names: ClassVar[tuple[str, ...]]
+    """Names of the n entries of the state: those of `POLAR` or of `CARTESIAN`, then any others."""
+    linear: ClassVar[bool] = False
+    """Whether the Jacobian is the same at every state."""
 
     @property
     def dim(self) -> int:
         """Number n of entries of the state."""
+        return len(self.state_names)
 
     @property
-    def linear(self) -> bool:
-        """Whether the Jacobian is the same at every state."""
+    def cartesian(self) -> bool:
+        """Whether the state holds the velocity as vx and vy, and not as yaw and speed."""
+        return self.state_names[:4] == CARTESIAN
 
+    @abstractmethod
     def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """State after `dt_s`, shape (..., n); the yaw is not wrapped."""
 
+    @abstractmethod
     def jacobian(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """Derivative F of `predict` by `x`, shape (..., n, n)."""
 
+    @abstractmethod
     def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
-        """Covariance Q of the noise gathered over `dt_s`, shape (..., n, n).
+        """Covariance Q of the noise accumulated over `dt_s`, shape (..., n, n).
 
         Composes: Q(x, a + b) = F(x_a, b) Q(x, a) F(x_a, b)' + Q(x_a, b) with x_a = predict(x, a), so a late
-        detection may split a segment. Raises `CallError` where `dt_s` is negative.
+        detection may split a segment. Raises `CallError` where `dt_s` is negative (see `forward`).
         """
 
     def step(self, x: Sequence[float], dt_s: float) -> Prediction:
         """The one state `x` after `dt_s` >= 0; F and Q are new arrays. Raises `CallError` where `dt_s` is negative."""
+        return Prediction(*self.flow(x, dt_s), self.process_noise(np.array(x, dtype=np.float64), dt_s))
 
     def flow(self, x: Sequence[float], dt_s: float) -> tuple[list[float], FloatArray]:
         """Mean and F of `step`, of any duration."""
+        state = np.array(x, dtype=np.float64)
+        return self.predict(state, dt_s).tolist(), self.jacobian(state, dt_s)
+
+    def start_variance(self, name: str) -> float:
+        """Variance of the entry `name` of a new object of which nothing is known of it; its mean is 0."""
+        return 1.0
 
     def kinematic(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean, shape (..., m), and covariance, (..., m, m), of the leading m entries of `STATE_NAMES`."""
+        """Mean, shape (..., m), and first-order covariance, (..., m, m), of the leading m entries of `STATE_NAMES`.
+
+        m is 6 of a model with an acceleration, else 5; an entry that the state lacks is 0 with variance 0. Of a
+        Cartesian state the yaw is 0 at speed 0; its variance there is that of the velocity across over
+        `MIN_SPEED_MPS` squared, large but finite: nobody knows the heading of an object that stands still.
+        """
+        if self._leads:
+            return x, P
+        S = self._selection[: len(STATE_NAMES) if "accel_mps2" in self.state_names else ACCEL]
+        mean = x @ S.T
+        J = np.broadcast_to(S, (*x.shape[:-1], *S.shape)).copy()
+        if self.cartesian:
+            mean[..., YAW:YAW_RATE] = polar(x[..., 2:4])
+            J[..., YAW:YAW_RATE, 2:4] = polar_gradient(x[..., 2:4], MIN_SPEED_MPS)
+        return mean, symmetrise(J @ P @ np.swapaxes(J, -1, -2))
 
     def from_kinematic(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """State and covariance P of this model from what `kinematic` of any model gives."""
+        """State and covariance P of this model from what `kinematic` of any model gives.
+
+        What the kinematic state lacks is 0 with `start_variance`. The covariance of a Cartesian velocity is of first
+        order, plus the variance of the product of speed error and yaw error, across the heading: without it, an
+        object born at speed 0 could not move sideways.
+        """
+        n = self.dim
+        if self._leads and n <= mean.shape[-1]:
+            return mean[..., :n], covariance[..., :n, :n]
+        S = self._selection[: mean.shape[-1]]
+        x = mean @ S
+        J = np.broadcast_to(S.T, (*mean.shape[:-1], *S.T.shape)).copy()
+        unknown = [0.0 if column.any() else self.start_variance(self.state_names[k]) for k, column in enumerate(S.T)]
+        if self.cartesian:
+            unknown[2:4] = 0.0, 0.0
+            yaw_speed = mean[..., YAW:YAW_RATE]
+            x[..., 2:4], J[..., 2:4, YAW:YAW_RATE] = cartesian(yaw_speed), cartesian_gradient(yaw_speed)
+        P = symmetrise(J @ covariance @ np.swapaxes(J, -1, -2)) + np.diag(unknown)
+        if self.cartesian:
+            product = covariance[..., YAW, YAW] * covariance[..., SPEED, SPEED] + covariance[..., YAW, SPEED] ** 2
+            across = np.stack([-np.sin(mean[..., YAW]), np.cos(mean[..., YAW])], axis=-1)
+            P[..., 2:4, 2:4] += product[..., None, None] * across[..., :, None] * across[..., None, :]
+        return x, P
+
+    @cached_property
+    def _leads(self) -> bool:
+        """Whether the state is a kinematic state."""
+        return self.dim >= ACCEL and self.state_names == STATE_NAMES[: self.dim]
+
+    @cached_property
+    def _selection(self) -> FloatArray:
+        """1 where an entry of `STATE_NAMES` (rows) and one of the state (columns) have the same name, shape (6, n)."""
+        return np.array([[float(row == column) for column in self.state_names] for row in STATE_NAMES])
 
 
 @dataclass(frozen=True)
-class CTRV(WhiteNoise):
+class CTRV(WhiteNoise, MotionModel):
     """Constant turn rate and velocity; state x, y, yaw, speed, yaw rate.
 
     x(t) + i y(t) = x + i y + speed * integral over s in [0, t] of exp(i (yaw + yaw_rate s)). White noise
@@ -98,12 +165,6 @@ class CTRV(WhiteNoise):
     yaw_rate_density_rad2ps3: float = 0.5**2 / 100.0
 
     state_names: ClassVar[tuple[str, ...]] = STATE_NAMES[:ACCEL]
-    linear: ClassVar[bool] = False
-
-    @property
-    def dim(self) -> int:
-        """Number n of entries of the state."""
-        return len(self.state_names)
 
     def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """State after `dt_s` on the exact arc, shape (..., 5); the yaw is not wrapped."""
@@ -125,14 +186,14 @@ class CTRV(WhiteNoise):
         return F
 
     def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
-        """Covariance Q of the noise gathered over `dt_s` along the mean arc, shape (..., n, n).
+        """Covariance Q of the noise accumulated over `dt_s` along the mean arc, shape (..., n, n).
 
         Q(x, t) = integral over s in [0, t] of Phi(t, s) D Phi(t, s)', with Phi(t, s) the Jacobian of the flow
         from x(s) over t - s, and D the diagonal of densities. So Q composes (see `MotionModel`): to rounding
         while the object turns by less than 4 rad within `dt_s`, to 1e-8 relative up to 8 rad, worse beyond.
         Raises `CallError` where `dt_s` is negative.
         """
-        t = _forward(dt_s)[..., None]
+        t = forward(dt_s)[..., None]
         states = self.predict(x[..., None, :], t * NODES)
         transitions = self.jacobian(states, t * (1.0 - NODES))
         roots = transitions * self._root_densities * np.sqrt(t * WEIGHTS)[..., None, None]
@@ -169,14 +230,6 @@ class CTRV(WhiteNoise):
         F[YAW, YAW_RATE] = t
         return [x[X] + moved.real, x[Y] + moved.imag, x[YAW] + x[YAW_RATE] * t, *x[SPEED:]], F
 
-    def kinematic(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The state and its covariance themselves."""
-        return x, P
-
-    def from_kinematic(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The first five entries and their covariance; an acceleration is left out."""
-        return mean[..., :ACCEL], covariance[..., :ACCEL, :ACCEL]
-
     @cached_property
     def _root_densities(self) -> FloatArray:
         position, *others = (getattr(self, name) for name in self.density_names())
@@ -202,7 +255,7 @@ class CTRA(CTRV):
 
     accel_density_m2ps5: float = 3.0**2 / 100.0
     accel_birth_variance_m2ps4: float = 1.0
-    """Variance of the acceleration where `from_kinematic` is told none."""
+    """Variance of the acceleration where `from_kinematic` is given none."""
 
     state_names: ClassVar[tuple[str, ...]] = STATE_NAMES
 
@@ -218,15 +271,9 @@ class CTRA(CTRV):
         F[..., SPEED, ACCEL] = dt_s
         return F
 
-    def from_kinematic(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The kinematic state; an acceleration it lacks becomes 0 with `accel_birth_variance_m2ps4`."""
-        if mean.shape[-1] > ACCEL:
-            return mean, covariance
-        x = np.concatenate([mean, np.zeros((*mean.shape[:-1], 1))], axis=-1)
-        P = np.zeros((*mean.shape[:-1], 6, 6))
-        P[..., :ACCEL, :ACCEL] = covariance
-        P[..., ACCEL, ACCEL] = self.accel_birth_variance_m2ps4
-        return x, P
+    def start_variance(self, name: str) -> float:
+        """See `MotionModel.start_variance`: `accel_birth_variance_m2ps4`."""
+        return self.accel_birth_variance_m2ps4
 
     def _along(self, x: Sequence[float], t: float, moments: Sequence[complex]) -> tuple[list[float], FloatArray]:
         mean, F = super()._along(x, t, moments)
@@ -239,7 +286,7 @@ class CTRA(CTRV):
 
 
 @dataclass(frozen=True)
-class CV(WhiteNoise):
+class CV(WhiteNoise, MotionModel):
     """Constant velocity, linear; state x, y and the velocities vx, vy along the axes of the map.
 
     White noise acceleration drives vx and vy alike. The default is the speed's density of Karle et al. 2023
@@ -248,8 +295,7 @@ class CV(WhiteNoise):
 
     velocity_density_m2ps3: float = 1.0**2 / 100.0
 
-    state_names: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "vx_mps", "vy_mps")
-    dim: ClassVar[int] = 4
+    state_names: ClassVar[tuple[str, ...]] = CARTESIAN
     linear: ClassVar[bool] = True
 
     def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
@@ -271,7 +317,7 @@ class CV(WhiteNoise):
 
         Raises `CallError` where `dt_s` is negative.
         """
-        t = _forward(dt_s)
+        t = forward(dt_s)
         Q = np.zeros((*np.broadcast_shapes(x.shape[:-1], t.shape), 4, 4))
         position, shared, velocity = self._axis_noise(t)
         Q[..., 0, 0] = Q[..., 1, 1] = position
@@ -302,65 +348,6 @@ class CV(WhiteNoise):
         q = self.velocity_density_m2ps3
         return q * t**3 / 3.0, q * t**2 / 2.0, q * t
 
-    def kinematic(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean, shape (..., 5), and first-order covariance, (..., 5, 5), of x, y, yaw, speed, yaw rate.
-
-        The yaw rate is 0 with variance 0. At speed 0 the yaw is 0; its variance there is that of the velocity
-        across over `MIN_SPEED_MPS` squared, large but finite: nobody knows the heading of an object that
-        stands still.
-        """
-        mean = np.concatenate([x[..., :2], polar(x[..., 2:]), np.zeros((*x.shape[:-1], 1))], axis=-1)
-        J = np.zeros((*x.shape[:-1], 5, 4))
-        J[..., X, 0] = J[..., Y, 1] = 1.0
-        J[..., YAW:YAW_RATE, 2:] = polar_gradient(x[..., 2:], MIN_SPEED_MPS)
-        return mean, symmetrise(J @ P @ np.swapaxes(J, -1, -2))
-
-    def from_kinematic(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """State, shape (..., 4), and covariance, (..., 4, 4), with the velocity along the yaw.
-
-        Yaw rate and acceleration drop out. The covariance is of first order, plus the variance of the product
-        of speed error and yaw error, across the heading: without it, an object born at speed 0 could not move
-        sideways.
-        """
-        yaw_speed = mean[..., YAW:YAW_RATE]
-        J = _identities(mean.shape[:-1], 4)
-        J[..., 2:, 2:] = cartesian_gradient(yaw_speed)
-        P = symmetrise(J @ covariance[..., :4, :4] @ np.swapaxes(J, -1, -2))
-        product = covariance[..., YAW, YAW] * covariance[..., SPEED, SPEED] + covariance[..., YAW, SPEED] ** 2
-        across = np.stack([-np.sin(mean[..., YAW]), np.cos(mean[..., YAW])], axis=-1)
-        P[..., 2:, 2:] += product[..., None, None] * across[..., :, None] * across[..., None, :]
-        return np.concatenate([mean[..., :2], cartesian(yaw_speed)], axis=-1), P
-
-
-def polar(vector: FloatArray) -> FloatArray:
-    """Direction in [-pi, pi], 0 for the zero vector, and length of `vector`; both of shape (..., 2)."""
-    x, y = vector[..., 0], vector[..., 1]
-    return np.stack([np.arctan2(y, x), np.hypot(x, y)], axis=-1)
-
-
-def polar_gradient(vector: FloatArray, floor: float) -> FloatArray:
-    """Derivative of `polar` by `vector`, shape (..., 2, 2).
-
-    The direction changes by 1 / length; a length below `floor` counts as `floor` there, so all is finite.
-    """
-    x, y = vector[..., 0], vector[..., 1]
-    direction, length = np.arctan2(y, x), np.maximum(np.hypot(x, y), floor)
-    c, s = np.cos(direction), np.sin(direction)
-    return np.stack([np.stack([-s / length, c / length], axis=-1), np.stack([c, s], axis=-1)], axis=-2)
-
-
-def cartesian(direction_length: FloatArray) -> FloatArray:
-    """Vector of a direction and a (signed) length, both of shape (..., 2)."""
-    direction, length = direction_length[..., 0], direction_length[..., 1]
-    return np.stack([length * np.cos(direction), length * np.sin(direction)], axis=-1)
-
-
-def cartesian_gradient(direction_length: FloatArray) -> FloatArray:
-    """Derivative of `cartesian` by direction and length, shape (..., 2, 2)."""
-    direction, length = direction_length[..., 0], direction_length[..., 1]
-    c, s = np.cos(direction), np.sin(direction)
-    return np.stack([np.stack([-length * s, c], axis=-1), np.stack([length * c, s], axis=-1)], axis=-2)
-
 
 def _set_position_rows(F: FloatArray, columns: tuple[ComplexArray, ...]) -> None:
     """Write the derivatives of x (real) and y (imaginary) by yaw and the entries after it into `F`."""
@@ -379,8 +366,8 @@ def _identities(shape: tuple[int, ...], n: int) -> FloatArray:
     return np.broadcast_to(np.eye(n), (*shape, n, n)).copy()
 
 
-def _forward(dt_s: float | FloatArray) -> FloatArray:
-    """`dt_s` as an array; noise is gathered forwards only."""
+def forward(dt_s: float | FloatArray) -> FloatArray:
+    """`dt_s` as an array; noise accumulates forwards only."""
     t = np.asarray(dt_s, dtype=np.float64)
     if (t < 0.0).any():
         raise _backwards(t.min())

@@ -7,10 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from fgtrack.core.geometry import rotations, wrap_angles
+from fgtrack.core.geometry import cartesian, rotations, wrap_angles
 from fgtrack.core.types import SPEED, YAW, YAW_RATE, BoolArray, Detection, FloatArray, IntArray, X, Y
 from fgtrack.models.measurement import measurement_model
-from fgtrack.models.motion import CV, cartesian
+from fgtrack.models.motion import CV
 from fgtrack.models.sensors import Mount
 from fgtrack.models.track_map import TrackMap
 from fgtrack.sim.sensor import POLAR, SimulatedSensor

@@ -120,7 +120,7 @@ def test_a_state_with_further_entries_widens_the_jacobian_by_zeros(motion: Motio
 
 @every_model
 def test_a_model_is_linear_where_it_selects_entries_of_the_state(motion: MotionModel) -> None:
-    cartesian = isinstance(motion, CV)
+    cartesian = motion.cartesian
     assert measurement_model(("x_m", "y_m"), motion).linear
     assert measurement_model(SELECTION, motion).linear == (not cartesian)
     assert not measurement_model(("x_m", "y_m", "range_m"), motion).linear
@@ -204,7 +204,7 @@ def test_an_object_at_the_sensor_or_at_rest_gives_finite_numbers(motion: MotionM
     H = model.jacobian(x, pose)
     assert np.isfinite(H).all()
     assert_allclose(H[4:6, :2], [[1.0, 0.0], [0.0, 1.0 / MIN_RANGE_M]])
-    heading_row = [0.0, 1.0 / MIN_SPEED_MPS] if isinstance(motion, CV) else [1.0, 0.0]
+    heading_row = [0.0, 1.0 / MIN_SPEED_MPS] if motion.cartesian else [1.0, 0.0]
     assert_allclose(H[2, 2:4], heading_row)
 
 

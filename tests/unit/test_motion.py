@@ -37,7 +37,7 @@ def state_of(model: MotionModel, kinematic: FloatArray) -> FloatArray:
 
 def derivative_in_time(model: MotionModel, x: FloatArray) -> FloatArray:
     """The differential equation of the model, written down without its solution."""
-    if isinstance(model, CV):
+    if model.cartesian:
         return np.array([x[2], x[3], 0.0, 0.0])
     accel = x[5] if model.dim == 6 else 0.0
     rates = np.array([x[3] * math.cos(x[2]), x[3] * math.sin(x[2]), x[4], accel, 0.0, 0.0])
@@ -55,7 +55,7 @@ def assert_close_to_scale(actual: FloatArray, desired: FloatArray, rtol: float) 
 def test_every_model_keeps_the_protocol(model: MotionModel) -> None:
     assert isinstance(model, MotionModel)
     assert model.dim == len(model.state_names)
-    assert model.linear == isinstance(model, CV)
+    assert model.linear == model.cartesian
     assert model in {model}
 
 

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fgtrack.core.geometry import cartesian, cartesian_gradient, polar
 from fgtrack.core.linalg import psd_solve
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.models.motion import cartesian, cartesian_gradient, polar
 
 
 class Fix(NamedTuple):
@@ -71,6 +71,7 @@ def straight_line(fixes: Sequence[Fix]) -> Line:
 def along(line: Line, time_s: float, state_names: Sequence[str]) -> FloatArray:
     """State (n,) of an object on `line` at `time_s`; what the line does not say is 0."""
     yaw_rad, speed_mps = polar(line.velocity_mps).tolist()
+    vx_mps, vy_mps = line.velocity_mps.tolist()
     x_m, y_m = (line.position_m + time_s * line.velocity_mps).tolist()
-    known = {"x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad, "speed_mps": speed_mps}
+    known = {"x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad, "speed_mps": speed_mps, "vx_mps": vx_mps, "vy_mps": vy_mps}
     return np.array([known.get(name, 0.0) for name in state_names])
