@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 # The matrices are small; more threads only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo test test-slow check bench clean
+.PHONY: demo test test-slow check docs bench clean
 
 demo: $(STAMP)
 	$(BIN)/fgtrack demo -o out/demo --overwrite
@@ -22,6 +22,11 @@ check: $(STAMP)
 	$(BIN)/ruff format --check fgtrack tests experiments
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
+	$(BIN)/python -m sphinx -W --keep-going -q -c docs . out/docs
+	$(BIN)/python -m pytest tests/integration/test_docs.py
 
 bench: $(STAMP)
 	$(BIN)/python -m pytest experiments/bench_*.py -o addopts= -p no:warnings --benchmark-only -q -s

@@ -1,0 +1,40 @@
+"""Sphinx settings. Sources are the Markdown pages of the whole repository, so that links work on a code host as well."""
+
+import os
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "docs/_ext")]
+os.environ["PYTHONPATH"] = str(ROOT)
+
+import fgtrack  # noqa: E402
+
+project = "fgtrack"
+author = "The fgtrack developers"
+release = fgtrack.__version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_gallery.gen_gallery", "reference"]
+root_doc = "docs/index"
+include_patterns = ["CHANGELOG.md", "docs/**.md", "docs/generated/**.rst", "experiments/**.md"]
+exclude_patterns = [".venv", ".git", "out", "build", "tests", "fgtrack", "docs/tutorials"]
+html_theme = "furo"
+html_title = "fgtrack"
+nitpicky = False
+default_role = "literal"
+
+myst_heading_anchors = 4
+myst_enable_extensions = ["colon_fence"]
+
+autodoc_typehints = "description"
+autodoc_member_order = "bysource"
+
+sphinx_gallery_conf = {
+    "examples_dirs": "docs/tutorials",
+    "gallery_dirs": "docs/generated/tutorials",
+    "within_subsection_order": "FileNameSortKey",
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "show_memory": False,
+    "write_computation_times": False,
+}
