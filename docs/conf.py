@@ -1,4 +1,4 @@
-"""Sphinx settings. Sources are the Markdown pages of the whole repository, so that links work on a code host as well."""
+"""Sphinx settings. The sources are the Markdown pages of the whole repository: links work on a code host as well."""
 
 import os
 import sys

@@ -8,7 +8,7 @@ import dataclasses
 import inspect
 import textwrap
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from importlib import import_module
 from itertools import pairwise
@@ -143,17 +143,29 @@ def _one_line(text: str) -> str:
     return " ".join(text.split()).replace("|", "\\|")
 
 
-def settings_page(target: str, prefix: str = "") -> str:
+def settings_page(target: str) -> str:
     """Tables of all keys of the dataclass `target`, as `module:Class`."""
     module, _, name = target.partition(":")
     lines: list[str] = []
-    for section in sections(getattr(import_module(module), name), prefix):
+    for section in sections(getattr(import_module(module), name)):
         title = f"`{section.path}`" if section.path else "Top level"
         lines += [f"## {title}" + (f", kind `{section.kind}`" if section.kind else ""), "", section.doc, ""]
         if section.settings:
             lines += ["| key | value | default | meaning |", "|---|---|---|---|"]
             lines += [f"| `{one.name}` | {one.type} | {one.default} | {one.doc} |" for one in section.settings]
             lines.append("")
+    return "\n".join(lines)
+
+
+def estimators_page() -> str:
+    """A table of all estimators that come with fgtrack."""
+    from fgtrack.estimation.registry import ESTIMATORS, Claims, summary
+
+    lines = ["| name | method | exact in a linear model for |", "|---|---|---|"]
+    for name in ESTIMATORS:
+        if name not in ESTIMATORS.plugins():
+            factory = ESTIMATORS.load(name)
+            lines.append(f"| `{name}` | {_one_line(summary(factory))} | {Claims.of(factory).exact or '-'} |")
     return "\n".join(lines)
 
 
@@ -165,25 +177,26 @@ def public_names() -> str:
     for name in getattr(fgtrack, "__all__", ()):
         value = getattr(fgtrack, name)
         kind = "autoclass" if isinstance(value, type) else "autofunction" if callable(value) else "automodule"
-        lines += ["```{eval-rst}", f".. {kind}:: fgtrack.{name}", *(["   :members:"] * (kind != "autofunction")), "```", ""]
+        members = [] if kind == "autofunction" else ["   :members:"]
+        lines += [f"```{{eval-rst}}\n.. {kind}:: fgtrack.{name}", *members, "```", ""]
     return "\n".join(lines)
 
 
 def setup(app: Any) -> dict[str, bool]:
-    """Directives `settings` and `public-names` for Sphinx."""
+    """Directives `settings`, `estimators` and `public-names` for Sphinx."""
     from docutils.nodes import Node
     from sphinx.util.docutils import SphinxDirective
 
-    class Settings(SphinxDirective):
-        required_arguments, optional_arguments = 1, 1
+    def directive(page: Callable[..., str], num_arguments: int) -> type[SphinxDirective]:
+        class Generated(SphinxDirective):
+            required_arguments = num_arguments
 
-        def run(self) -> list[Node]:
-            return self.parse_text_to_nodes(settings_page(*self.arguments), allow_section_headings=True)
+            def run(self) -> list[Node]:
+                return self.parse_text_to_nodes(page(*self.arguments), allow_section_headings=True)
 
-    class PublicNames(SphinxDirective):
-        def run(self) -> list[Node]:
-            return self.parse_text_to_nodes(public_names(), allow_section_headings=True)
+        return Generated
 
-    app.add_directive("settings", Settings)
-    app.add_directive("public-names", PublicNames)
+    app.add_directive("settings", directive(settings_page, 1))
+    app.add_directive("estimators", directive(estimators_page, 0))
+    app.add_directive("public-names", directive(public_names, 0))
     return {"parallel_read_safe": True}

@@ -1,8 +1,10 @@
 """
-A plot of one's own
-===================
+From a recording to a plot
+==========================
 
-xx
+Replay a recording and draw something of one's own.
 """
+
 import fgtrack
+
 print(fgtrack.__version__)

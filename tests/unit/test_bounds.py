@@ -1,6 +1,4 @@
-import re
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +12,6 @@ from fgtrack.evaluation.bounds import Bounds, ScheduledMeasurement, bounds, boun
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
 
-DOCUMENT = Path(__file__).resolve().parents[2] / "docs/bounds.md"
 START_NS = 1_790_000_000 * NS_PER_S
 PRIOR = Start(
     stamp_ns=START_NS,
@@ -118,9 +115,3 @@ def test_a_measurement_before_the_start_is_refused(function: Callable[..., Bound
     early = ScheduledMeasurement(START_NS - 1, START_NS, measurement_model(("x_m", "y_m"), motion), np.eye(2))
     with pytest.raises(ValueError, match="start_ns"):
         function(motion, START_NS, P, [early], straight(motion, x), NOW_NS)
-
-
-def test_the_example_of_the_document_prints_what_stands_below_it(capsys: pytest.CaptureFixture[str]) -> None:
-    code, printed = re.findall(r"```(?:python)?\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
-    exec(compile(code, "docs/bounds.md", "exec"), {})
-    assert capsys.readouterr().out == printed

@@ -1,0 +1,271 @@
+"""The README, the pages and the experiments' READMEs against the code: everything that they show is tried."""
+
+import ast
+import json
+import re
+import shlex
+import shutil
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from functools import cache
+from itertools import chain
+from pathlib import Path
+from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
+from urllib.parse import urlsplit
+
+import pytest
+import typer
+from ruamel.yaml import YAML
+
+import fgtrack
+from fgtrack.cli.main import COMMANDS, app
+from fgtrack.cli.main import run as run_command
+from fgtrack.estimation.registry import ESTIMATORS
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.load import validate
+from fgtrack.pipeline.shipped import shipped
+from fgtrack.pipeline.sweep_config import SweepConfig
+from fgtrack.sim.clocks import AnyClock
+from fgtrack.sim.delays import AnyDelay
+from fgtrack.sim.redelay import SensorDelays
+from fgtrack.sim.scenario import Scenario
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted(
+    path.relative_to(ROOT)
+    for path in chain(ROOT.glob("*.md"), ROOT.glob("docs/*.md"), ROOT.glob("experiments/**/README.md"))
+)
+TUTORIALS = sorted((ROOT / "docs/tutorials").glob("plot_*.py"))
+
+
+class Block(NamedTuple):
+    """A fenced block of a page."""
+
+    page: Path
+    line: int
+    language: str
+    text: str
+    skipped: bool
+    printed: str | None
+
+
+@cache
+def blocks(page: Path) -> tuple[Block, ...]:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    found = []
+    for fence in re.finditer(r"^( *)```([\w-]*)\n(.*?)^\1```$", text, re.DOTALL | re.MULTILINE):
+        before, behind = text[: fence.start()], text[fence.end() :]
+        output = re.match(r"\s*```text\n(.*?)^```$", behind, re.DOTALL | re.MULTILINE)
+        skipped = re.search(r"<!-- not run: [^>]+ -->\s*$", before) is not None
+        line = before.count("\n") + 1
+        found.append(Block(page, line, fence[2], fence[3], skipped, None if output is None else output[1]))
+    return tuple(found)
+
+
+@cache
+def prose(page: Path) -> str:
+    """The page without its fenced blocks."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return re.sub(r"^( *)```.*?^\1```$", "", text, flags=re.DOTALL | re.MULTILINE)
+
+
+def all_blocks(*languages: str) -> list[Block]:
+    return [block for page in PAGES for block in blocks(page) if block.language in languages]
+
+
+# Python
+
+#: Pages with examples; docs/extending.md is followed in a folder of its own, see tests/contract.
+PYTHON_PAGES = [
+    page for page in PAGES if page.name != "extending.md" and any(block.language == "python" for block in blocks(page))
+]
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what the examples name: a recording and a map."""
+    folder = tmp_path_factory.mktemp("drive")
+    bag = folder / "bag"
+    assert run_command(["simulate", "single_opponent", "-o", str(bag), "--seed", "0", "--duration", "3"]) == 0
+    [recording] = bag.glob("*.mcap")
+    shutil.move(recording, folder / "drive.mcap")
+    shutil.copy(ROOT / "configs/maps/oval_track.csv", folder / "track.csv")
+    return folder
+
+
+@pytest.mark.parametrize("page", PYTHON_PAGES, ids=str)
+def test_python_blocks_run_and_print_what_they_show(
+    page: Path, drive: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if not hasattr(fgtrack, "replay") and "fgtrack.replay(" in (ROOT / page).read_text(encoding="utf-8"):
+        pytest.skip("the public names are not there yet")
+    monkeypatch.chdir(drive)
+    names: dict[str, Any] = {}
+    for block in blocks(page):
+        if block.language == "python" and not block.skipped:
+            exec(compile("\n" * block.line + block.text, str(page), "exec"), names)
+            printed = capsys.readouterr().out
+            if block.printed is not None:
+                assert_same_output(printed, block.printed, f"{page}:{block.line}")
+
+
+def assert_same_output(found: str, shown: str, where: str) -> None:
+    """Equal words; numbers may differ by one unit of the last digit that is shown."""
+    words, expected = re.findall(r"[-+]?\d+\.?\d*|[^\s\d]+", found), re.findall(r"[-+]?\d+\.?\d*|[^\s\d]+", shown)
+    assert len(words) == len(expected), f"{where} prints\n{found}"
+    for word, wanted in zip(words, expected, strict=True):
+        if re.fullmatch(r"[-+]?\d+\.?\d*", wanted):
+            unit = 10.0 ** -len(wanted.partition(".")[2])
+            assert abs(float(word) - float(wanted)) < 1.01 * unit, f"{where} prints\n{found}"
+        else:
+            assert word == wanted, f"{where} prints\n{found}"
+
+
+def test_the_first_tutorial_is_a_plot_from_a_recording_in_twelve_lines(
+    drive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not hasattr(fgtrack, "replay"):
+        pytest.skip("the public names are not there yet")
+    code = TUTORIALS[0].read_text(encoding="utf-8")
+    lines = {node.lineno for node in ast.walk(ast.parse(code)) if isinstance(node, ast.stmt)} - {1}
+    assert len(lines) <= 12
+    monkeypatch.chdir(drive)
+    exec(compile(code, str(TUTORIALS[0]), "exec"), {"__name__": "__main__"})
+
+
+# Links
+
+
+def links(page: Path) -> list[str]:
+    return re.findall(r"\]\(([^)\s]+)\)", re.sub(r"`[^`\n]*`", "", prose(page)))
+
+
+@cache
+def anchors(page: Path) -> frozenset[str]:
+    titles = re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)
+    return frozenset(re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=str)
+def test_links_have_targets(page: Path) -> None:
+    for link in links(page):
+        target = urlsplit(link)
+        if target.scheme or target.netloc:
+            assert (target.scheme, "." in target.netloc) == ("https", True), f"{page}: {link}"
+            continue
+        path = (ROOT / page).parent / target.path if target.path else ROOT / page
+        assert path.exists(), f"{page}: {link} does not exist"
+        if target.fragment:
+            assert target.fragment in anchors(path.resolve().relative_to(ROOT)), f"{page}: {link} has no such heading"
+
+
+def test_pages_named_in_the_code_exist() -> None:
+    files = chain(*(ROOT.glob(f"{folder}/**/*.{end}") for folder in ("fgtrack", "configs") for end in ("py", "yaml")))
+    for file in files:
+        for name in re.findall(r"docs/[\w/-]+\.md", file.read_text(encoding="utf-8")):
+            assert (ROOT / name).is_file(), f"{file}: {name} does not exist"
+
+
+# Commands
+
+
+def command_lines() -> Iterator[tuple[str, str]]:
+    for page in PAGES:
+        for block in blocks(page):
+            if block.language in ("", "sh"):
+                for line in block.text.splitlines():
+                    if re.match(r"(\.venv/bin/)?fgtrack ", line):
+                        yield f"{page}", line
+        for line in re.findall(r"`(fgtrack [^`]+)`", prose(page)):
+            yield f"{page}", line
+    for file in sorted(ROOT.glob("configs/**/*.yaml")):
+        for line in re.findall(r"^# +(fgtrack .*)$", file.read_text(encoding="utf-8"), re.MULTILINE):
+            yield str(file.relative_to(ROOT)), line
+
+
+@pytest.mark.parametrize(("where", "line"), list(command_lines()))
+def test_command_lines_can_be_parsed(where: str, line: str) -> None:
+    words = shlex.split(re.sub(r"[\[\]]", "", line), comments=True)[1:]
+    group = typer.main.get_command(app)
+    if words[0].startswith("-"):
+        assert words[0] in ("--help", "--version", "--debug")
+        return
+    assert words[0] in COMMANDS, where
+    with group.make_context("fgtrack", list(words)) as context:
+        command = group.resolve_command(context, words)[1]  # type: ignore[attr-defined]
+        with command.make_context(words[0], [], resilient_parsing=True) as inner:
+            options, _, _ = command.make_parser(inner).parse_args(list(words[1:]))
+    config = options.get("config")
+    if config is not None and re.fullmatch("[a-z0-9_]+", config):
+        assert config in shipped("configuration"), f"{where}: {line}"
+    for setting in options.get("settings") or []:
+        key, equals, _ = setting.partition("=")
+        assert equals
+        assert key == "key" or is_key(Config, key.split(".")), f"{where}: there is no {key}"
+    for name in (options.get("estimators") or "NAME").split(","):
+        assert name in ESTIMATORS or name.isupper() or not name, f"{where}: {line}"
+
+
+@pytest.mark.parametrize("block", all_blocks("", "sh"), ids=lambda block: f"{block.page}:{block.line}")
+def test_scripts_that_are_called_exist(block: Block) -> None:
+    for script in re.findall(r"^python ([\w/.]+\.py)", block.text, re.MULTILINE):
+        assert (ROOT / script).is_file(), f"{block.page}: {script}"
+    for target in re.findall(r"^make ([\w-]+)", block.text, re.MULTILINE):
+        assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+
+
+# Settings and files
+
+
+def is_key(hint: Any, names: list[str]) -> bool:
+    """Whether a value of type `hint` has the key `names`; in a mapping or list any name goes."""
+    if not names:
+        return True
+    if is_dataclass(hint):
+        hints = get_type_hints(hint)
+        return names[0] in {f.name for f in fields(hint)} and is_key(hints[names[0]], names[1:])
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Union or type(hint).__name__ == "UnionType":
+        return any(is_key(one, names) for one in arguments)
+    if origin is not None and arguments:
+        return is_key(arguments[-1] if arguments[-1] is not Ellipsis else arguments[0], names[1:])
+    return False
+
+
+@pytest.mark.parametrize("page", PAGES, ids=str)
+def test_settings_that_are_named_exist(page: Path) -> None:
+    roots = {field.name: Config for field in fields(Config)} | {"scenario": Scenario}
+    if page.name == "metrics.md":
+        del roots["sensors"]  # there a part of metrics.json
+    for key in re.findall(r"`([a-z_]+(?:\.\w+)+)`", prose(page)):
+        names = key.split(".")
+        if names[0] in roots and names[-1] not in ("csv", "json", "png", "yaml"):
+            names = names[1:] if names[0] == "scenario" else names
+            assert is_key(roots[key.split(".")[0]], names), f"{page}: there is no key {key}"
+
+
+@pytest.mark.parametrize("block", all_blocks("yaml"), ids=lambda block: f"{block.page}:{block.line}")
+def test_yaml_blocks_are_valid_files(block: Block) -> None:
+    raw = YAML(typ="safe", pure=True).load(block.text)
+    kind: Any = dict[str, SensorDelays]
+    if "format" in raw:
+        kind = SweepConfig
+    elif set(raw) <= {field.name for field in fields(Config)}:
+        kind = Config
+    validate(kind, raw, f"{block.page}:{block.line}")
+
+
+@pytest.mark.parametrize("block", all_blocks("json"), ids=lambda block: f"{block.page}:{block.line}")
+def test_json_blocks_are_json_lines(block: Block) -> None:
+    assert all(json.loads(line) for line in block.text.splitlines())
+
+
+@pytest.mark.parametrize("model", [*get_args(get_args(AnyDelay)[0]), *get_args(get_args(AnyClock)[0])])
+def test_every_delay_and_clock_model_has_a_row_with_its_parameters(model: Any) -> None:
+    names = ", ".join(f"`{field.name}`" for field in fields(model) if field.name != "kind")
+    assert f"| `{model.kind}` | {names}{' ' if names else ''}|" in (ROOT / "docs/delays.md").read_text(encoding="utf-8")
+
+
+def test_every_estimator_is_on_the_page_of_estimators() -> None:
+    page = (ROOT / "docs/estimators.md").read_text(encoding="utf-8")
+    assert [name for name in ESTIMATORS if name not in ESTIMATORS.plugins() and f"`{name}`" not in page] == []
