@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.run import Run, read_run
+from fgtrack.io.run import Run, load_run
 from fgtrack.io.stream import read_stream
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
@@ -96,7 +96,7 @@ def main(
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for number, (name, config) in enumerate(variants(published, clean).items()):
         result = replay(read_stream(stream), config, out / f"{number:02d}", origin=str(stream), kind="stream")
-        print(row(name, read_run(result.path)), flush=True)
+        print(row(name, load_run(result.path)), flush=True)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ import numpy as np
 import typer
 
 from fgtrack.core.types import FloatArray
-from fgtrack.io.run import Run, read_run
+from fgtrack.io.run import Run, load_run
 from fgtrack.pipeline.config import ClockConfig, Config
 from fgtrack.pipeline.replay import replay
 from fgtrack.sim.delays import ConstantDelay
@@ -80,7 +80,7 @@ def main(
             messages = simulate(scenario(delay_s, rate_hz, duration_s), np.random.default_rng(seed))
             with tempfile.TemporaryDirectory() as folder:
                 replay(messages, config, Path(folder) / "run")
-                measured = wiped_share(read_run(Path(folder) / "run"))
+                measured = wiped_share(load_run(Path(folder) / "run"))
             rows.append((rate_hz, delay_s, measured, float(expected_share(delay_s, rate_hz))))
     with (out / "survival.csv").open("w", newline="") as file:
         writer = csv.writer(file)

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from fgtrack.io.recording import Storage
+
 Input = Annotated[
     Path,
     typer.Argument(help="Recording: rosbag2 folder, .mcap, .db3, .bag, fgtrack stream or Autoferry folder."),
@@ -20,3 +22,4 @@ Settings = Annotated[
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what such a command wrote there before.")]
 Runs = Annotated[list[Path], typer.Argument(help="Run folders, or folders that hold run folders.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
+StorageOption = Annotated[Storage, typer.Option("--storage", help="Storage of a rosbag2 folder.")]

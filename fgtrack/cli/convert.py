@@ -7,11 +7,11 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from fgtrack.cli.arguments import ConfigFile, Input, Overwrite
+from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, StorageOption
 from fgtrack.cli.show import console, progress
-from fgtrack.cli.storage import Storage, StorageOption, check_recording, write_recording
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Message
+from fgtrack.io.recording import check_recording, write_recording
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.load import load
 from fgtrack.pipeline.shipped import read_config
@@ -29,7 +29,7 @@ def convert(
     seed: Annotated[
         int | None, typer.Option("--seed", min=0, help="Seed of the random generator of --delays.", show_default="0")
     ] = None,
-    storage: StorageOption = Storage.MCAP,
+    storage: StorageOption = "mcap",
     overwrite: Overwrite = False,
 ) -> None:
     """Convert a recording into a stream or a rosbag2 folder."""
@@ -41,10 +41,10 @@ def convert(
     source = open_input(recording, read_config(config_file).input)
     with progress("convert"):
         if delays_file is None:
-            count, lost = write_recording(out, source.messages(), storage, overwrite), ""
+            count, lost = write_recording(out, source.messages(), storage, overwrite=overwrite), ""
         else:
             redelayed = _redelayed(source.messages, delays_file, seed or 0)
-            count, lost = write_recording(out, redelayed, storage, overwrite), _losses(redelayed)
+            count, lost = write_recording(out, redelayed, storage, overwrite=overwrite), _losses(redelayed)
     console().print(f"{out}: {count} messages{lost}", highlight=False, soft_wrap=True)
 
 

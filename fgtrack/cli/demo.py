@@ -12,7 +12,7 @@ from fgtrack.evaluation.comparison import compare
 from fgtrack.evaluation.figures import save_figures
 from fgtrack.io.output import Kind, check_output, claimed, new_files
 from fgtrack.io.ros.bag_writer import RECORDING, write_bag
-from fgtrack.io.run import RUN, read_run
+from fgtrack.io.run import RUN, load_run
 from fgtrack.io.source import open_input
 from fgtrack.models.oval import OVAL
 from fgtrack.pipeline.replay import replay_each
@@ -56,7 +56,7 @@ def _demo(out: Path, overwrite: bool) -> None:
             on_tick=TickProgress(show),
             overwrite=overwrite,
         )
-    runs = [read_run(result.path) for result in results]
+    runs = [load_run(result.path) for result in results]
     console().print(compare(*runs))
     with progress("draw"), new_files(figures, overwrite) as folder:
         files = save_figures(runs, folder)

@@ -7,10 +7,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from fgtrack.cli.arguments import Overwrite
+from fgtrack.cli.arguments import Overwrite, StorageOption
 from fgtrack.cli.show import console, progress
-from fgtrack.cli.storage import Storage, StorageOption, check_recording, write_recording
 from fgtrack.core.errors import CallError
+from fgtrack.io.recording import check_recording, write_recording
 from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.sim.simulate import simulate as simulated
 
@@ -25,7 +25,7 @@ def simulate(
     duration_s: Annotated[
         float | None, typer.Option("--duration", help="Length in seconds, instead of the scenario's.")
     ] = None,
-    storage: StorageOption = Storage.MCAP,
+    storage: StorageOption = "mcap",
     overwrite: Overwrite = False,
 ) -> None:
     """Simulate a scenario into a stream or a rosbag2 folder."""
@@ -37,5 +37,5 @@ def simulate(
         except ValueError as error:
             raise CallError(f"--duration: {error}") from error
     with progress("simulate"):
-        count = write_recording(out, simulated(scenario, np.random.default_rng(seed)), storage, overwrite)
+        count = write_recording(out, simulated(scenario, np.random.default_rng(seed)), storage, overwrite=overwrite)
     console().print(f"{out}: {count} messages", highlight=False, soft_wrap=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.matching import Matching, match
 from fgtrack.evaluation.metrics import Metrics, evaluate
-from fgtrack.io.run import Run, is_run_folder, read_run
+from fgtrack.io.run import Run, is_run_folder, load_run
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +76,8 @@ def labelled(runs: Sequence[Run]) -> dict[str, Run]:
 
 def _read(path: Path) -> list[Run]:
     if is_run_folder(path):
-        return [read_run(path)]
+        return [load_run(path)]
     below = [child for child in sorted(path.iterdir()) if is_run_folder(child)] if path.is_dir() else []
     if not below:
         raise CallError(f"{path}: no run folder, make one with `fgtrack replay`")
-    return [read_run(child) for child in below]
+    return [load_run(child) for child in below]

@@ -133,14 +133,16 @@ def replay(
     return runs[0]
 
 
-def replay_in_memory(messages: Iterable[Message], config: Config) -> tuple[Run, str | None]:
-    """The run that `replay` would write and `read_run` read, and why the input broke off, where it did.
+def replay_in_memory(
+    messages: Iterable[Message], config: Config, *, origin: str = "", kind: str = ""
+) -> tuple[Run, str | None]:
+    """The run that `replay` would write and `load_run` read, and why the input broke off, where it did.
 
     Without files it takes less time; the digest, which is one of files, is missing. Raises as `replay`.
     """
     tracker = build_tracker(config)
-    memory = MemoryRun(dump(config), _start_meta(config, "", ""), _smoothed_lag_s(config))
-    _, broken = _drive(tracker, messages, config, memory)
+    memory = MemoryRun(dump(config), _start_meta(config, origin, kind), _smoothed_lag_s(config))
+    _, broken = _drive(tracker, messages, config, memory, origin=origin)
     return memory.run, broken
 
 

@@ -13,7 +13,7 @@ from support.messages import shared
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import STATE_NAMES
-from fgtrack.io.run import Run, read_run
+from fgtrack.io.run import Run, load_run
 from fgtrack.io.run.schema import COVARIANCE_STATES
 from fgtrack.io.stream import read_stream
 from fgtrack.pipeline import replay as pipeline
@@ -64,7 +64,7 @@ def golden(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     assert result.broken is None
     with gzip.open(expected_file) as file:
         expected = [json.loads(line) for line in file]
-    return Golden(expected, read_run(result.path), lives)
+    return Golden(expected, load_run(result.path), lives)
 
 
 def test_the_ticks_are_those_of_the_published_node(golden: Golden) -> None:

@@ -11,7 +11,7 @@ from fgtrack.cli import demo
 from fgtrack.cli.main import run
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
 from fgtrack.io.ros.bag_writer import write_bag
-from fgtrack.io.run import read_run
+from fgtrack.io.run import load_run
 from fgtrack.io.stream import read_stream, write_stream
 from fgtrack.pipeline.shipped import read_scenario
 
@@ -103,15 +103,15 @@ def runs(recordings: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) 
 def test_every_storage_gives_the_same_run_to_the_byte(runs: dict[str, Path]) -> None:
     contents = [rows(path) for path in runs.values()]
     assert all(content == contents[0] for content in contents)
-    assert len({read_run(path).meta["digest"] for path in runs.values()}) == 1
-    assert len(read_run(runs["mcap"]).tracks) > 50
+    assert len({load_run(path).meta["digest"] for path in runs.values()}) == 1
+    assert len(load_run(runs["mcap"]).tracks) > 50
 
 
 def test_the_same_replay_twice_gives_the_same_digest(fgtrack: Command, recordings: dict[str, Path]) -> None:
     digests = []
     for _ in range(2):  # the second one replaces the first
         assert fgtrack("replay", recordings["s.jsonl"], "-o", "run", "--map", "oval", "--overwrite").code == 0
-        digests.append(read_run("run").meta["digest"])
+        digests.append(load_run("run").meta["digest"])
     assert digests[0] == digests[1]
 
 
@@ -133,7 +133,7 @@ def test_several_estimators_have_a_folder_each(fgtrack: Command, stream: Path) -
     names = ("ekf-backward-forward", "ekf-replay", "smoother")
     assert fgtrack("replay", stream, "-o", "runs", "-e", ",".join(names)).code == 0
     for name in names:
-        assert read_run(Path("runs") / name).meta["estimator"] == name
+        assert load_run(Path("runs") / name).meta["estimator"] == name
     table = fgtrack("compare", "runs")
     assert table.code == 0
     assert all(name in table.out for name in names)
@@ -172,7 +172,7 @@ def test_the_printed_configuration_is_one(fgtrack: Command, stream: Path) -> Non
     Path("c.yaml").write_text(printed.out)
     assert fgtrack("config", "-c", "c.yaml").out == printed.out
     assert fgtrack("replay", stream, "-c", "c.yaml", "-o", "run").code == 0
-    assert read_run("run").config_text == printed.out
+    assert load_run("run").config_text == printed.out
 
 
 def test_the_demo_goes_from_scenario_to_figures(
@@ -183,7 +183,7 @@ def test_the_demo_goes_from_scenario_to_figures(
     assert (shown.code, shown.err) == (0, "")
     assert (tmp_path / "demo/recording/metadata.yaml").exists()
     names = ["smoother", "ekf-replay", "ekf-backward-forward"]
-    found = {name: read_run(tmp_path / "demo/runs" / name) for name in names}
+    found = {name: load_run(tmp_path / "demo/runs" / name) for name in names}
     assert {path.name for path in (tmp_path / "demo/runs").iterdir()} == set(names)
     assert [one.meta["estimator"] for one in found.values()] == names
     for text in shown.out.split("Error against lag"):
@@ -317,7 +317,7 @@ def test_a_truncated_stream_is_replayed_up_to_the_break(fgtrack: Command, stream
     assert "drive.jsonl:" in called.error
     assert "replayed up to there" in called.error
     assert called.code == 1
-    found = read_run("run")
+    found = load_run("run")
     assert found.meta["complete"] is True
     assert "breaks off" in found.meta["broken_off"]
     assert len(found.updates) == found.meta["detections_received"] == cut.count(b'"lidar"', 0, cut.rindex(b"\n"))
@@ -347,7 +347,7 @@ def test_a_recording_with_broken_time_is_replayed_up_to_there(
     assert message in called.error
     assert name in called.error
     assert called.code == 1
-    found = read_run("run")
+    found = load_run("run")
     assert len(found.updates) == found.meta["detections_received"] >= 30
 
 
@@ -390,7 +390,7 @@ def test_detections_that_are_no_numbers_are_counted_and_not_an_error(fgtrack: Co
     ]
     write_stream(tmp_path / "nan.jsonl", broken)
     assert fgtrack("replay", "nan.jsonl", "-o", "run").code == 0
-    counts = read_run("run").meta["counts"]["lidar"]
+    counts = load_run("run").meta["counts"]["lidar"]
     assert counts["invalid"] == 60
     assert sum(counts.values()) == 120
     assert counts["birth"] >= 1

@@ -14,7 +14,7 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
 from fgtrack.io.output import claimed, new_file, write_file
 from fgtrack.io.ros.bag_writer import write_bag
-from fgtrack.io.run import RunWriter, read_run
+from fgtrack.io.run import RunWriter, load_run
 from fgtrack.io.stream import STREAM, read_stream, write_stream
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_each
@@ -144,7 +144,7 @@ def test_other_files_beside_a_run_stay(here: Path, call: Call) -> None:
     (here / "run/notes.txt").write_text("why")
     assert call("replay", "drive.jsonl", "-o", "run", "--overwrite")[0] == 0
     assert (here / "run/notes.txt").read_text() == "why"
-    assert read_run("run").meta["input"]["path"] == "drive.jsonl"
+    assert load_run("run").meta["input"]["path"] == "drive.jsonl"
 
 
 @pytest.mark.parametrize("text", ['{"type": "ego"}\n', "", '{"type": "header", "format": "fgtrack-stream/1"}\n{"ty'])
@@ -235,7 +235,7 @@ def test_links_are_not_followed(here: Path, call: Call) -> None:
     (here / "run/meta.json.part").symlink_to(here / "precious")
     assert call("replay", "drive.jsonl", "-o", "run", "--overwrite")[0] == 0
     assert Path("precious").read_text() == "years of work"
-    assert read_run("run").tracks["tick"].size
+    assert load_run("run").tracks["tick"].size
 
 
 def test_part_files_of_others_stay(here: Path, call: Call) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from fgtrack.cli.main import run
 from fgtrack.core.types import DetectionList, Message
-from fgtrack.io.run import read_run
+from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
 
 Command = Callable[..., tuple[int, str, str]]
@@ -62,7 +62,7 @@ def read(path: str) -> list[Message]:
 
 def digest(fgtrack: Command, recording: str) -> object:
     assert fgtrack("replay", recording, "-o", f"runs/{recording}", "--map", "oval", "-e", "ekf-replay")[0] == 0
-    return read_run(Path(f"runs/{recording}")).meta["digest"]
+    return load_run(Path(f"runs/{recording}")).meta["digest"]
 
 
 def test_constant_delays_restore_a_stream_that_went_through_bursts_and_a_bag(fgtrack: Command) -> None:

@@ -17,7 +17,7 @@ from fgtrack.core.types import (
     TruthState,
     UpdateRecord,
 )
-from fgtrack.io.run import Run, RunWriter, read_run
+from fgtrack.io.run import Run, RunWriter, load_run
 
 START_NS = 1_700_000_000_000_000_000
 TICK_NS = 20_000_000
@@ -115,7 +115,7 @@ def write_run(
             count = num_detections[tick] if tick < len(num_detections) else len(records)
             writer.write_tick(report, duration, count)
         writer.finish(meta or {"estimator": "smoother"})
-    return read_run(path)
+    return load_run(path)
 
 
 def update(

@@ -18,7 +18,7 @@ from fgtrack.core.types import (
     TruthState,
     UpdateRecord,
 )
-from fgtrack.io.run import NO_TRACK, RunWriter, read_run
+from fgtrack.io.run import NO_TRACK, RunWriter, load_run
 
 
 def track(track_id: int = 1, size: int = 5, stamp_ns: int = 990) -> TrackReport:
@@ -49,7 +49,7 @@ def write(path, *reports: TickReport) -> dict[str, object]:
 @pytest.mark.parametrize("size", [4, 5, 6])
 def test_states_come_back_to_the_bit_and_missing_ones_are_nan(tmp_path, size):
     write(tmp_path / "run", report(size=size))
-    tracks = read_run(tmp_path / "run").tracks
+    tracks = load_run(tmp_path / "run").tracks
     state = track(2, size).state
     names = ["x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2"]
     assert [tracks[name][1] for name in names[:size]] == state.mean.tolist()
@@ -90,7 +90,7 @@ def test_updates_truth_smoothed_and_timing_come_back(tmp_path):
         writer.write_tick(TickReport(1, 2000, (), (), (SmoothedReport(4, track().state),)), 6, 0)
         writer.write_truth(TruthState(3, 3, -1, 1.0, 2.0, speed_mps=0.1))
         writer.finish({})
-    run = read_run(tmp_path / "run")
+    run = load_run(tmp_path / "run")
     assert run.config_text == "seed: 1\n"
     assert run.updates["sensor"].tolist() == ["lidar", "a,b"]
     assert run.updates["track_id"].tolist() == [1, NO_TRACK]
@@ -115,7 +115,7 @@ def test_lagged_states_of_every_lag_come_back_to_the_bit(tmp_path, size):
     with RunWriter(tmp_path / "run", smoothed_lag_s=0.3) as writer:
         writer.write_tick(TickReport(7, 1007, report(size=size).tracks, (), smoothed), 5, 0)
         writer.finish({})
-    lagged = read_run(tmp_path / "run").lagged
+    lagged = load_run(tmp_path / "run").lagged
     assert lagged["lag_s"].tolist() == list(lags_s)
     assert lagged["tick"].tolist() == [7, 7, 7]
     assert lagged["now_ns"].tolist() == [1007, 1007, 1007]
@@ -132,7 +132,7 @@ def test_of_the_lagged_states_the_first_lag_alone_stands_beside_the_final_ones(t
     for lag_s, expected in [(0.3, ["final", "lagged"]), (None, ["final"])]:
         with RunWriter(tmp_path / "run", smoothed_lag_s=lag_s, overwrite=True) as writer:
             writer.write_tick(TickReport(0, 1000, (track(1),), (), smoothed), 5, 0)
-        run = read_run(tmp_path / "run")
+        run = load_run(tmp_path / "run")
         assert run.smoothed["kind"].tolist() == expected
         assert run.lagged["lag_s"].tolist() == [0.1, 0.3, 0.5]
         if lag_s is not None:
@@ -143,7 +143,7 @@ def test_a_removed_track_has_final_states_but_no_lagged_ones(tmp_path):
     smoothed = tuple(SmoothedReport(track_id, track().state, lag_s) for track_id in (1, 9) for lag_s in (None, 0.3))
     with RunWriter(tmp_path / "run", smoothed_lag_s=0.3) as writer:
         writer.write_tick(TickReport(0, 1000, (track(1),), (), smoothed), 5, 0)
-    run = read_run(tmp_path / "run")
+    run = load_run(tmp_path / "run")
     assert run.lagged["track_id"].tolist() == [1]
     rows = zip(run.smoothed["track_id"].tolist(), run.smoothed["kind"].tolist(), strict=True)
     assert list(rows) == [(1, "final"), (1, "lagged"), (9, "final")]
@@ -174,7 +174,7 @@ def test_there_is_no_smoothed_lagged_or_truth_file_without_a_row(tmp_path):
     write(tmp_path / "run", report())
     assert not (tmp_path / "run/smoothed.csv").exists()
     assert not (tmp_path / "run/lagged.csv").exists()
-    run = read_run(tmp_path / "run")
+    run = load_run(tmp_path / "run")
     assert len(run.smoothed) == len(run.lagged) == len(run.truth) == 0
     assert run.truth["object_id"].dtype == np.int64
 
@@ -186,7 +186,7 @@ def test_a_killed_run_is_readable_up_to_its_last_whole_row(tmp_path):
         writer.write_tick(report(tick), 5, 2)
     data = (path / "tracks.csv").read_bytes()
     (path / "tracks.csv").write_bytes(data[:-30])
-    run = read_run(path)
+    run = load_run(path)
     assert run.meta["complete"] is False
     assert len(run.tracks) == 5
     assert len(run.timing) == 3
@@ -197,7 +197,7 @@ def test_an_exception_leaves_the_run_marked_as_incomplete(tmp_path):
     with suppress(ZeroDivisionError), RunWriter(tmp_path / "run") as writer:
         writer.write_tick(report(), 5, 2)
         raise ZeroDivisionError
-    assert read_run(tmp_path / "run").meta["complete"] is False
+    assert load_run(tmp_path / "run").meta["complete"] is False
 
 
 def test_an_older_run_is_replaced_and_nothing_of_it_is_left(tmp_path):
@@ -246,7 +246,7 @@ def test_a_missing_or_damaged_file_is_one_line_that_names_it(tmp_path, file, dam
     if damage is not None:
         (path / file).write_text(damage if isinstance(damage, str) else damage(text))
     with pytest.raises(DataError) as caught:
-        read_run(path)
+        load_run(path)
     assert file in str(caught.value)
     assert "\n" not in str(caught.value)
 

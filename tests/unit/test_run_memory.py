@@ -20,7 +20,7 @@ from fgtrack.core.types import (
     TruthState,
 )
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.run import COLUMNS, MemoryRun, Run, RunWriter, read_run
+from fgtrack.io.run import COLUMNS, MemoryRun, Run, RunWriter, load_run
 from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
 from fgtrack.pipeline.replay import replay, replay_in_memory
 from fgtrack.pipeline.shipped import read_scenario
@@ -60,7 +60,7 @@ def test_replays_are_the_same_in_memory_and_written(estimator: str, messages: li
     if estimator == "smoother":
         config = replace(config, motion=MotionConfig(kind="ctrv"))
     replay(messages, config, tmp_path / "run")
-    written = read_run(tmp_path / "run")
+    written = load_run(tmp_path / "run")
     memory, broken = replay_in_memory(messages, config)
     assert broken is None
     assert len(memory.tracks) > 100
@@ -103,7 +103,7 @@ def test_every_kind_of_row_is_the_same(size: int, tmp_path: Path) -> None:
                 sink.write_tick(report, 17, 2)
             sink.write_smoothed([SmoothedReport(7, reports[1].tracks[0].state)])
             sink.finish({"broken_off": None})
-    assert_same(memory.run, read_run(tmp_path / "run"))
+    assert_same(memory.run, load_run(tmp_path / "run"))
     assert len(memory.run.smoothed) == 4
 
 

@@ -2,7 +2,7 @@
 
 from fgtrack.io.run.judging import EvaluationConfig, evaluation_config, section
 from fgtrack.io.run.memory import MemoryRun
-from fgtrack.io.run.reader import NO_TRACK, Run, Table, read_run
+from fgtrack.io.run.reader import NO_TRACK, Run, Table, load_run
 from fgtrack.io.run.schema import COLUMNS, COVARIANCE_COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
 from fgtrack.io.run.writer import RUN, RunWriter, digest, is_run_folder, write_metrics
 
@@ -21,7 +21,7 @@ __all__ = [
     "digest",
     "evaluation_config",
     "is_run_folder",
-    "read_run",
+    "load_run",
     "section",
     "write_metrics",
 ]

@@ -1,4 +1,4 @@
-"""Keeps a run in memory: what `read_run` would give of the folder that `RunWriter` writes, without the files."""
+"""Keeps a run in memory: what `load_run` would give of the folder that `RunWriter` writes, without the files."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence

@@ -70,7 +70,7 @@ class Run:
     truth: Table
 
 
-def read_run(path: Path | str) -> Run:
+def load_run(path: Path | str) -> Run:
     """Read the run folder `path`.
 
     Of a run that did not finish (`meta["complete"]` is false) a half-written last row is left out.

@@ -1,33 +1,28 @@
-"""Writing recordings: what the name and the storage option mean."""
+"""Writes a recording: a stream or a rosbag2 folder, as its name says."""
 
 from collections.abc import Iterable
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
-
-import typer
+from typing import Literal
 
 from fgtrack.core.types import Message
 from fgtrack.io.output import check_output
 from fgtrack.io.ros.bag_writer import RECORDING, write_bag
 from fgtrack.io.stream import STREAM, write_stream
 
-
-class Storage(StrEnum):
-    """Storage of a rosbag2 folder."""
-
-    MCAP = "mcap"
-    SQLITE3 = "sqlite3"
+Storage = Literal["mcap", "sqlite3"]
+"""Storage of a rosbag2 folder."""
 
 
-StorageOption = Annotated[Storage, typer.Option("--storage", help="Storage of a rosbag2 folder.")]
+def write_recording(
+    out: Path, messages: Iterable[Message], storage: Storage = "mcap", *, overwrite: bool = False
+) -> int:
+    """Write a stream where `out` ends in .jsonl or .jsonl.gz, else a rosbag2 folder; gives the message count.
 
-
-def write_recording(out: Path, messages: Iterable[Message], storage: Storage, overwrite: bool) -> int:
-    """Write a stream where `out` ends in .jsonl or .jsonl.gz, else a rosbag2 folder; gives the message count."""
+    Raises `CallError` where something is at `out` that must not be replaced.
+    """
     if _is_stream(out):
         return write_stream(out, messages, overwrite=overwrite)
-    return write_bag(out, messages, "mcap" if storage is Storage.MCAP else "sqlite3", overwrite=overwrite)
+    return write_bag(out, messages, storage, overwrite=overwrite)
 
 
 def check_recording(out: Path, overwrite: bool) -> None:

@@ -1,0 +1,140 @@
+"""Replay and simulation in one call each, as `fgtrack.replay` and `fgtrack.simulate`."""
+
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace as changed
+from pathlib import Path
+from typing import overload
+
+import numpy as np
+
+from fgtrack.core.errors import CallError
+from fgtrack.core.types import Message
+from fgtrack.io.recording import Storage, write_recording
+from fgtrack.io.run import Run, load_run
+from fgtrack.io.source import open_input
+from fgtrack.pipeline import replay as pipeline
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.shipped import read_config, read_scenario, settings_of
+from fgtrack.sim.scenario import Scenario
+from fgtrack.sim.simulate import simulate as simulated
+
+
+def replay(
+    recording: str | Path | Iterable[Message],
+    config: str | Path | Config | None = None,
+    *,
+    map: str | Path | None = None,  # noqa: A002 - the name of the option
+    pit_map: str | Path | None = None,
+    estimator: str | None = None,
+    set: Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
+    out: str | Path | None = None,
+    overwrite: bool = False,
+) -> Run:
+    """Replay a recording through the tracker.
+
+    Gives the same numbers and the same digest as the command `fgtrack replay`. A recording that breaks off is replayed
+    up to the break, with a `UserWarning`; the run's `meta["broken_off"]` says why.
+
+    Parameters
+    ----------
+    recording
+        Path of anything that fgtrack reads, or messages in the order of their receipt.
+    config
+        Name of a shipped configuration, path of a YAML file, or a `Config`; None for the defaults.
+    map, pit_map
+        CSV files of the track and of the pit lane, or `oval`; in place of those of the configuration.
+    estimator
+        Name of the estimator, in place of that of the configuration.
+    set
+        Values of single settings: `{"smoother.lag_s": 3.0}`.
+    out
+        Folder to write the run to; None keeps it in memory.
+    overwrite
+        Whether a run in `out` may be replaced.
+
+    Raises
+    ------
+    CallError
+        The configuration or `out` does not fit.
+    DataError
+        The recording cannot be read, or a sensor of it has no model.
+    """
+    resolved = read_config(config, settings_of(set), track_map=map, pit_map=pit_map, estimator=estimator)
+    origin, kind = "", "messages"
+    if isinstance(recording, (str, Path)):
+        source = open_input(recording, resolved.input)
+        messages: Iterable[Message] = source.messages()
+        origin, kind = str(recording), source.kind
+    else:
+        messages = recording
+    if out is None:
+        run, broken = pipeline.replay_in_memory(messages, resolved, origin=origin, kind=kind)
+    else:
+        result = pipeline.replay(messages, resolved, Path(out), origin=origin, kind=kind, overwrite=overwrite)
+        run, broken = load_run(result.path), result.broken
+    if broken is not None:
+        warnings.warn(f"the input broke off, replayed up to there: {broken}", stacklevel=2)
+    return run
+
+
+@overload
+def simulate(
+    scenario: str | Path | Scenario = "default", *, seed: int = 0, duration_s: float | None = None, out: None = None
+) -> Iterator[Message]: ...
+
+
+@overload
+def simulate(
+    scenario: str | Path | Scenario = "default",
+    *,
+    seed: int = 0,
+    duration_s: float | None = None,
+    out: str | Path,
+    storage: Storage = "mcap",
+    overwrite: bool = False,
+) -> Path: ...
+
+
+def simulate(
+    scenario: str | Path | Scenario = "default",
+    *,
+    seed: int = 0,
+    duration_s: float | None = None,
+    out: str | Path | None = None,
+    storage: Storage = "mcap",
+    overwrite: bool = False,
+) -> Iterator[Message] | Path:
+    """Simulate a scenario: messages in the order of their receipt, or the path of the recording written.
+
+    Parameters
+    ----------
+    scenario
+        Name of a shipped scenario, path of a YAML file, or a `Scenario`.
+    seed
+        Of the random generator; the same seed gives the same bits.
+    duration_s
+        Length, in place of the scenario's.
+    out
+        Stream (`.jsonl`, `.jsonl.gz`), else a rosbag2 folder; None gives the messages.
+    storage
+        Storage of a rosbag2 folder.
+    overwrite
+        Whether a recording at `out` may be replaced.
+
+    Raises
+    ------
+    CallError
+        The scenario or `out` does not fit.
+    """
+    world = scenario if isinstance(scenario, Scenario) else read_scenario(scenario)
+    if duration_s is not None:
+        try:
+            world = changed(world, duration_s=duration_s)
+        except ValueError as error:
+            raise CallError(f"duration_s: {error}") from error
+    messages = simulated(world, np.random.default_rng(seed))
+    if out is None:
+        return iter(messages)
+    write_recording(Path(out), messages, storage, overwrite=overwrite)
+    return Path(out)
