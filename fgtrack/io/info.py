@@ -8,14 +8,14 @@ import numpy as np
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import seconds
 from fgtrack.core.types import DetectionList, EgoState, Message
+from fgtrack.io.adapters import ADAPTERS
 from fgtrack.io.adapters.ego import ODOMETRY
 from fgtrack.io.adapters.native import NATIVE_ADAPTERS
-from fgtrack.io.adapters.objects import OBJECT_ADAPTERS
 from fgtrack.io.config import InputConfig
 from fgtrack.io.errors import TruncatedInput
 from fgtrack.io.ros.bag import Bag, BagTopic
 from fgtrack.io.ros.topics import topic_uses
-from fgtrack.io.source import Kind, input_kind, open_input
+from fgtrack.io.source import input_kind, open_input
 
 _OTHER_CLOCK_S = 3600.0
 
@@ -52,7 +52,7 @@ class InputInfo:
     """What `fgtrack info` shows."""
 
     path: Path
-    kind: Kind
+    kind: str
     start_ns: int | None
     """First receipt; None of an empty input."""
     duration_s: float
@@ -145,10 +145,10 @@ def _possible_use(topic: BagTopic) -> str | None:
         return None
     if topic.type == ODOMETRY:
         return "could be the ego"
-    return "could be detections or truth" if topic.type in OBJECT_ADAPTERS else None
+    return "could be detections or truth" if topic.type in ADAPTERS else None
 
 
-def _describe_messages(path: Path, kind: Kind, config: InputConfig | None) -> InputInfo:
+def _describe_messages(path: Path, kind: str, config: InputConfig | None) -> InputInfo:
     problem: str | None = None
     times: dict[tuple[str, str], _Times] = {}
     try:
@@ -177,7 +177,7 @@ def _name_and_type(message: Message) -> tuple[str, str]:
     return ("ego", "ego") if isinstance(message, EgoState) else ("truth", "truth")
 
 
-def _info(path: Path, kind: Kind, topics: tuple[TopicInfo, ...], times: list[_Times], problem: str | None) -> InputInfo:
+def _info(path: Path, kind: str, topics: tuple[TopicInfo, ...], times: list[_Times], problem: str | None) -> InputInfo:
     receipts_ns = [receipt for item in times for receipt in item.receipts_ns]
     start_ns = min(receipts_ns, default=None)
     duration_s = 0.0 if start_ns is None else seconds(max(receipts_ns) - start_ns)

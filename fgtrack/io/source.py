@@ -1,25 +1,16 @@
 """Opens an input, whatever it is: a recording, a stream or a data set, recognised by its content."""
 
+import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.types import Frame, Message
-from fgtrack.io.adapters.autoferry import detections_file, read_scenario
-from fgtrack.io.adapters.fusiontracking import LOG_NAME, read_log
+from fgtrack.core.types import Message
+from fgtrack.io.adapters import ADAPTERS
 from fgtrack.io.config import InputConfig
-from fgtrack.io.ros.bag import Bag, is_bag_file, is_bag_folder
-from fgtrack.io.ros.topics import TopicUse, bag_messages, topic_uses
-from fgtrack.io.stream import GZIP_MAGIC, read_stream
 
-Kind = Literal["recording", "stream", "autoferry", "fusiontracking"]
-
-_KNOWN = (
-    "a rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file, an fgtrack stream (.jsonl, .jsonl.gz), "
-    f"an Autoferry scenario folder (*_detections.json), a FusionTracking log folder ({LOG_NAME})"
-)
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -27,14 +18,25 @@ class InputSource:
     """An input that can be read any number of times."""
 
     path: Path
-    kind: Kind
+    kind: str
+    """Name of its format."""
     messages: Callable[[], Iterator[Message]]
     """Gives the messages in receipt order.
 
     Raises `TruncatedInput` behind the last message before a break, `DataError` for all else that is wrong.
     """
-    topics: tuple[TopicUse, ...] = ()
-    """Of a recording: the topics that are read, and as what."""
+
+
+@dataclass(frozen=True)
+class FileFormat:
+    """A format of inputs: a file or a folder with messages in receipt order."""
+
+    description: str
+    """What such an input is, for messages: `an fgtrack stream (.jsonl)`."""
+    recognises: Callable[[Path], bool]
+    """Whether an existing file that is not empty, or a folder, is one, by its content; may raise `OSError`."""
+    open: Callable[[Path, InputConfig], Callable[[], Iterator[Message]]]
+    """Opens the input at a path: gives what `InputSource.messages` is, and raises as `open_input`."""
 
 
 def open_input(path: Path | str, config: InputConfig | None = None) -> InputSource:
@@ -48,48 +50,46 @@ def open_input(path: Path | str, config: InputConfig | None = None) -> InputSour
         It is nothing that fgtrack reads, or damaged.
     """
     path = Path(path)
-    config = config or InputConfig()
-    match kind := input_kind(path):
-        case "recording":
-            bag = Bag(path, config.message_definitions)
-            uses = topic_uses(bag, config)
-            return InputSource(path, kind, lambda: bag_messages(bag, uses), uses)
-        case "stream":
-            return InputSource(path, kind, lambda: read_stream(path))
-        case "autoferry":
-            return InputSource(path, kind, lambda: read_scenario(path))
-        case "fusiontracking":
-            frames: dict[str, Frame] = {sensor: item.frame for sensor, item in config.detections.items() if item.frame}
-            return InputSource(path, kind, lambda: read_log(path, frames))
+    name = input_kind(path)
+    return InputSource(path, name, file_format(name).open(path, config or InputConfig()))
 
 
-def input_kind(path: Path) -> Kind:
-    """What `path` is, by its content; raises as `open_input`."""
+def input_kind(path: Path) -> str:
+    """Name of the format of `path`, by its content; raises as `open_input`. Plug-ins are asked first."""
     if not path.exists():
         raise CallError(f"{path}: there is no such file or folder")
+    formats = _formats()
     try:
-        if path.is_dir():
-            return _folder_kind(path)
-        if path.name == LOG_NAME or detections_file(path.parent) == path:
-            raise CallError(f"{path}: is part of a data set, name its folder {path.parent}")
-        with path.open("rb") as file:
-            start = file.read(64)
-        if is_bag_file(path):
-            return "recording"
+        if path.is_file() and path.stat().st_size == 0:
+            raise DataError(f"{path}: is empty")
+        for name, form in formats.items():
+            if form.recognises(path):
+                return name
+        for form in formats.values():
+            if not path.is_dir() and form.recognises(path.parent):
+                raise CallError(f"{path}: is no input by itself, name its folder {path.parent} ({form.description})")
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-    if not start:
-        raise DataError(f"{path}: is empty")
-    if start.startswith(GZIP_MAGIC) or start.lstrip().startswith(b"{"):
-        return "stream"
-    raise DataError(f"{path}: is none of the inputs that fgtrack reads: {_KNOWN}")
+    known = ", ".join(form.description for form in reversed(formats.values()))
+    raise DataError(f"{path}: is none of the inputs that fgtrack reads: {known}")
 
 
-def _folder_kind(path: Path) -> Kind:
-    if is_bag_folder(path):
-        return "recording"
-    if detections_file(path):
-        return "autoferry"
-    if (path / LOG_NAME).is_file():
-        return "fusiontracking"
-    raise DataError(f"{path}: is none of the inputs that fgtrack reads: {_KNOWN}")
+def file_format(name: str) -> FileFormat:
+    """The format `name`. Raises `CallError` where there is none."""
+    found = ADAPTERS.load(name)
+    if not isinstance(found, FileFormat) and callable(found):
+        found = found()
+    if not isinstance(found, FileFormat):
+        raise CallError(f"adapter {name!r}: is a {type(found).__name__}, not a FileFormat")
+    return found
+
+
+def _formats() -> dict[str, FileFormat]:
+    """All formats by name, the last registered first: the built-in ones recognise the loosest last."""
+    formats = {}
+    for name in reversed([name for name in ADAPTERS if "/" not in name]):
+        try:
+            formats[name] = file_format(name)
+        except CallError as error:
+            _logger.warning("%s", error)
+    return formats

@@ -5,7 +5,7 @@ import json
 import logging
 import zlib
 from collections import Counter
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, get_args
@@ -21,8 +21,10 @@ from fgtrack.core.types import (
     Message,
     TruthState,
 )
+from fgtrack.io.config import InputConfig
 from fgtrack.io.errors import TruncatedInput, UntilBreak
 from fgtrack.io.output import Kind, new_file
+from fgtrack.io.source import FileFormat
 
 STREAM_FORMAT = "fgtrack-stream/1"
 GZIP_MAGIC = b"\x1f\x8b"
@@ -79,6 +81,21 @@ def read_stream(path: Path | str) -> Iterator[Message]:
     if unknown:
         names = ", ".join(f"{name} ({count})" for name, count in sorted(unknown.items()))
         _logger.warning("%s: ignored unknown keys: %s", path, names)
+
+
+def _recognises(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        start = file.read(64)
+    return start.startswith(GZIP_MAGIC) or start.lstrip().startswith(b"{")
+
+
+def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
+    return lambda: read_stream(path)
+
+
+FORMAT = FileFormat("an fgtrack stream (.jsonl, .jsonl.gz)", _recognises, _open)
 
 
 def read_header(path: Path | str) -> Mapping[str, Any]:

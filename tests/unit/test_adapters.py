@@ -4,10 +4,10 @@ from types import SimpleNamespace as Message
 import pytest
 
 from fgtrack.core.types import Detection
+from fgtrack.io.adapters import ADAPTERS
 from fgtrack.io.adapters.common import yaw_rad
 from fgtrack.io.adapters.ego import ego_from_odometry
 from fgtrack.io.adapters.fields import FieldError, ego_by_fields, objects_by_fields
-from fgtrack.io.adapters.objects import OBJECT_ADAPTERS, register_adapter
 
 
 def xyz(x=0.0, y=0.0, z=0.0):
@@ -43,7 +43,7 @@ XY_YAW = (1.0, 0.1, 0.2, 0.1, 2.0, 0.3, 0.2, 0.3, 3.0)
 
 
 def read(name, message):
-    return OBJECT_ADAPTERS[name](message)
+    return ADAPTERS.load(name)(message)
 
 
 def autoware(availability=2, has_twist=True, has_covariance=True, velocity=(-3.0, 0.0)):
@@ -168,13 +168,6 @@ def test_an_ego_without_orientation_has_no_number_for_its_yaw():
     state = ego_from_odometry(odometry(None), 9)
     assert math.isnan(state.yaw_rad)
     assert (state.speed_mps, state.yaw_rate_radps, state.receipt_ns) == (5.0, 0.7, 9)
-
-
-def test_an_adapter_of_ones_own_is_registered_by_type():
-    register_adapter("my_msgs/msg/Things", OBJECT_ADAPTERS["geometry_msgs/msg/PoseArray"])
-    message = Message(header=header(), poses=[])
-    assert read("my_msgs/msg/Things", message).objects == ()
-    del OBJECT_ADAPTERS["my_msgs/msg/Things"]
 
 
 def test_paths_read_vectors_quaternions_and_the_stamps_of_objects():

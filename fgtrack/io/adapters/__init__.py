@@ -1,1 +1,33 @@
-"""From foreign messages and data sets to fgtrack's own; the place where other conventions are converted."""
+"""From foreign messages and data sets to fgtrack's own; the place where other conventions are converted.
+
+A package adds an adapter by an entry point of the group `fgtrack.adapters`. Its name says what it is: a message type
+`package/msg/Type`, whose entry is a function from a message to an `ObjectList`, or a file format, whose entry is a
+`FileFormat` or a function that gives one.
+"""
+
+from fgtrack.core.plugins import Registry
+
+_OBJECTS = "fgtrack.io.adapters.objects"
+ADAPTERS = Registry(
+    "adapter",
+    {
+        "fgtrack.adapters": {
+            "stream": "fgtrack.io.stream:FORMAT",
+            "recording": "fgtrack.io.ros.topics:FORMAT",
+            "autoferry": "fgtrack.io.adapters.autoferry:FORMAT",
+            "fusiontracking": "fgtrack.io.adapters.fusiontracking:FORMAT",
+            "autoware_auto_perception_msgs/msg/DetectedObjects": f"{_OBJECTS}:detected_objects",
+            "autoware_perception_msgs/msg/DetectedObjects": f"{_OBJECTS}:detected_objects",
+            "derived_object_msgs/msg/ObjectArray": f"{_OBJECTS}:object_array",
+            "geometry_msgs/msg/PoseArray": f"{_OBJECTS}:pose_array",
+            "nav_msgs/msg/Odometry": f"{_OBJECTS}:odometry",
+            "radar_msgs/msg/RadarTracks": f"{_OBJECTS}:radar_tracks",
+            "vision_msgs/msg/Detection3DArray": f"{_OBJECTS}:detection3d_array",
+        }
+    },
+)
+
+
+def message_types() -> list[str]:
+    """Message types whose objects can be read without naming fields."""
+    return sorted(name for name in ADAPTERS if "/" in name)

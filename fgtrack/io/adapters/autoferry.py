@@ -17,7 +17,7 @@ Choices that the data leave open:
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from decimal import Decimal
 from heapq import merge
 from pathlib import Path
@@ -27,6 +27,8 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
+from fgtrack.io.config import InputConfig
+from fgtrack.io.source import FileFormat
 
 SENSORS = {1: "lidar", 2: "radar", 3: "infrared", 4: "daylight"}
 _CAMERAS = {3, 4}
@@ -38,6 +40,17 @@ Json = Any
 def detections_file(folder: Path) -> Path | None:
     """The file of detections of a scenario folder; None where `folder` is not one."""
     return next(iter(sorted(folder.glob("*_detections.json"))), None)
+
+
+def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
+    return lambda: read_scenario(path)
+
+
+FORMAT = FileFormat(
+    "an Autoferry scenario folder (*_detections.json)",
+    lambda path: path.is_dir() and detections_file(path) is not None,
+    _open,
+)
 
 
 def read_scenario(folder: Path) -> Iterator[Message]:

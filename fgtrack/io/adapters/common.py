@@ -1,7 +1,7 @@
 """What the adapters share: headers, quaternions, speeds and covariances of ROS messages."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,9 +26,6 @@ class ObjectList:
     frame: Frame | None
     """None where the message does not say."""
     objects: tuple[Detection, ...]
-
-
-Adapter = Callable[[RosMessage], ObjectList]
 
 
 def stamp_ns(time: RosMessage) -> int:

@@ -8,7 +8,6 @@ import numpy as np
 
 from fgtrack.core.types import Detection
 from fgtrack.io.adapters.common import (
-    Adapter,
     ObjectList,
     RosMessage,
     covariance,
@@ -148,20 +147,3 @@ def odometry(message: RosMessage) -> ObjectList:
     variance = speed_variance(velocity.x, velocity.y, planar_twist)
     item = Detection(**values, covariance=covariance(measured(values), planar(message.pose.covariance), variance))
     return object_list(message.header, [item])
-
-
-#: Adapters of object lists by type name; `register_adapter` adds to it.
-OBJECT_ADAPTERS: dict[str, Adapter] = {
-    "autoware_auto_perception_msgs/msg/DetectedObjects": detected_objects,
-    "autoware_perception_msgs/msg/DetectedObjects": detected_objects,
-    "derived_object_msgs/msg/ObjectArray": object_array,
-    "geometry_msgs/msg/PoseArray": pose_array,
-    "nav_msgs/msg/Odometry": odometry,
-    "radar_msgs/msg/RadarTracks": radar_tracks,
-    "vision_msgs/msg/Detection3DArray": detection3d_array,
-}
-
-
-def register_adapter(type_name: str, adapter: Adapter) -> None:
-    """Read messages of `type_name` (`package/msg/Type`) with `adapter` from now on."""
-    OBJECT_ADAPTERS[type_name] = adapter

@@ -143,13 +143,10 @@ class Bag:
                 raise TruncatedInput(f"{broken}, after {count} messages")
 
 
-def is_bag_folder(path: Path) -> bool:
-    """Whether the folder `path` holds a rosbag2 recording."""
-    return (path / "metadata.yaml").is_file() or bool(_bag_files(path))
-
-
-def is_bag_file(path: Path) -> bool:
-    """Whether the file `path` starts as a recording does."""
+def is_bag(path: Path) -> bool:
+    """Whether the folder `path` holds a rosbag2 recording, or the file `path` starts as one."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file() or bool(_bag_files(path))
     return storage_of(path) is not None
 
 
@@ -223,4 +220,4 @@ def _as_data_error(path: Path) -> Iterator[None]:
         raise DataError(f"{path}: cannot be read as a recording ({one_line(error)})") from error
 
 
-__all__ = ["Bag", "BagMessage", "BagTopic", "is_bag_file", "is_bag_folder", "type_name"]
+__all__ = ["Bag", "BagMessage", "BagTopic", "is_bag", "type_name"]

@@ -2,9 +2,11 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import DetectionList, Message, TruthState
+from fgtrack.io.adapters import ADAPTERS, message_types
 from fgtrack.io.adapters.common import ObjectList, RosMessage
 from fgtrack.io.adapters.ego import ODOMETRY, ego_from_odometry
 from fgtrack.io.adapters.fields import (
@@ -15,10 +17,10 @@ from fgtrack.io.adapters.fields import (
     objects_by_fields,
 )
 from fgtrack.io.adapters.native import NATIVE_ADAPTERS
-from fgtrack.io.adapters.objects import OBJECT_ADAPTERS
 from fgtrack.io.config import InputConfig, TopicInput
 from fgtrack.io.errors import TruncatedInput
-from fgtrack.io.ros.bag import Bag, BagTopic, type_name
+from fgtrack.io.ros.bag import Bag, BagTopic, is_bag, type_name
+from fgtrack.io.source import FileFormat
 
 Convert = Callable[[RosMessage, int], Iterator[Message]]
 
@@ -72,6 +74,15 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
         topic = _find(bag, config.truth)
         uses.append(TopicUse(topic, "truth", _truth(topic, config.truth)))
     return tuple(uses)
+
+
+def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
+    bag = Bag(path, config.message_definitions)
+    uses = topic_uses(bag, config)
+    return lambda: bag_messages(bag, uses)
+
+
+FORMAT = FileFormat("a rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file", is_bag, _open)
 
 
 def bag_messages(bag: Bag, uses: tuple[TopicUse, ...]) -> Iterator[Message]:
@@ -160,10 +171,10 @@ def _object_list(topic: BagTopic, item: TopicInput) -> Callable[[RosMessage], Ob
         fields = item.fields
         _check_fields(item, OBJECT_FIELDS)
         return lambda message: objects_by_fields(message, fields)
-    adapter = OBJECT_ADAPTERS.get(topic.type)
-    if adapter is None:
-        known = ", ".join(sorted(OBJECT_ADAPTERS))
+    if topic.type not in ADAPTERS:
+        known = ", ".join(message_types())
         raise CallError(f"topic {topic.name}: objects of type {topic.type} need fields, known are {known}")
+    adapter: Callable[[RosMessage], ObjectList] = ADAPTERS.load(topic.type)
     return adapter
 
 
