@@ -28,7 +28,7 @@ from stonesoup.updater.kalman import ExtendedKalmanUpdater
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
-from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
+from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
@@ -41,8 +41,7 @@ START = np.array([0.0, 0.0, 0.3, 65.0, 0.05])  # x, y, yaw, speed, yaw rate
 
 def smoother(start: Start, lag_s: float) -> FixedLagSmoother:
     settings = SmootherSettings(lag_s=lag_s, lagged_s=(), final=False)
-    thresholds = settings.thresholds(MOTION.state_names, curved=False)
-    return FixedLagSmoother(MOTION, start, settings, lambda: IncrementalBackend(thresholds))
+    return FixedLagSmoother(MOTION, start, settings)
 
 
 ESTIMATORS: dict[str, Callable[[Start], Estimator]] = {

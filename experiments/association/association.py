@@ -36,7 +36,7 @@ from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherBank, SmootherSettings
+from fgtrack.estimation.factor_graph import SmootherBank, SmootherSettings
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.evaluation.figure_style import colour, log_axis, save, styled
@@ -163,12 +163,7 @@ def replaying() -> TrackBank:
 def smoothing() -> TrackBank:
     """The bank of `smoother`."""
     settings = SmootherSettings(lag_s=LAG_S, lagged_s=(), final=False)
-    thresholds = settings.thresholds(MOTION.state_names, curved=False)
-    return SmootherBank(
-        MOTION,
-        lambda prior: FixedLagSmoother(MOTION, prior, settings, lambda: IncrementalBackend(thresholds)),
-        settings,
-    )
+    return SmootherBank(MOTION, settings)
 
 
 def at_stamp(bank: TrackBank, stamp_ns: int) -> StatesAt:

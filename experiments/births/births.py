@@ -18,7 +18,7 @@ from matplotlib.ticker import LogFormatter
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
+from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
@@ -33,8 +33,7 @@ TRUTH = CTRV()
 
 def smoother(prior: Start) -> Estimator:
     settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)
-    thresholds = settings.thresholds(TRUTH.state_names, curved=False)
-    return FixedLagSmoother(TRUTH, prior, settings, lambda: IncrementalBackend(thresholds))
+    return FixedLagSmoother(TRUTH, prior, settings)
 
 
 #: By name: the motion model of the estimator, and how it starts. The last one shows what a linear model does.

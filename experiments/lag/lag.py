@@ -18,7 +18,7 @@ from scipy.stats import chi2
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
+from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
 
@@ -68,8 +68,7 @@ def smoother(start: FloatArray, lag_s: float) -> FixedLagSmoother:
         yaw_rate_std_radps=PRIOR_STD[4],
     )
     settings = SmootherSettings(lag_s=lag_s, lagged_s=(), final=False)
-    thresholds = settings.thresholds(MOTION.state_names, curved=False)
-    return FixedLagSmoother(MOTION, prior, settings, lambda: IncrementalBackend(thresholds))
+    return FixedLagSmoother(MOTION, prior, settings)
 
 
 def judged(run: Run, lag_s: float) -> tuple[FloatArray, FloatArray, float]:

@@ -17,7 +17,7 @@ import typer
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
+from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
@@ -61,8 +61,7 @@ def start(name: str, loss: RobustLoss | None, x: FloatArray) -> Estimator:
     if name == "ekf-replay":
         return ReplayEkf(MOTION, prior, 1.0)
     settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)
-    thresholds = settings.thresholds(MOTION.state_names, curved=loss is not None)
-    return FixedLagSmoother(MOTION, prior, settings, lambda: IncrementalBackend(thresholds))
+    return FixedLagSmoother(MOTION, prior, settings)
 
 
 def squared_errors(name: str, share: float, rng: np.random.Generator) -> FloatArray:

@@ -8,9 +8,8 @@ import numpy as np
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import period_ns, seconds
 from fgtrack.estimation.backward_forward import BackwardForwardBank
-from fgtrack.estimation.base import Start, TrackBank
-from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherBank
-from fgtrack.estimation.factor_graph.backends.base import Backend
+from fgtrack.estimation.base import TrackBank
+from fgtrack.estimation.factor_graph import BatchBackend, SmootherBank
 from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator, Propagator
 from fgtrack.estimation.published import (
     AcceleratedEulerCtrv,
@@ -102,26 +101,12 @@ def _build_backward_forward(config: Config) -> TrackBank:
     return storage(build_propagator(config.motion, seconds(step_ns)), step_ns, steps)
 
 
-def _build_smoother(config: Config, make_backend: Callable[[], Backend]) -> TrackBank:
-    motion, settings = config.motion.model(), config.smoother
-
-    def start(prior: Start) -> FixedLagSmoother:
-        return FixedLagSmoother(motion, prior, settings, make_backend)
-
-    return SmootherBank(motion, start, settings)
-
-
 def _build_incremental(config: Config) -> TrackBank:
-    names = config.motion.model().state_names
-    curved = any(
-        sensor.loss is not None or not set(sensor.components) <= set(names) for sensor in config.sensors.values()
-    )
-    thresholds = config.smoother.thresholds(names, curved)
-    return _build_smoother(config, lambda: IncrementalBackend(thresholds))
+    return SmootherBank(config.motion.model(), config.smoother)
 
 
 def _build_batch(config: Config) -> TrackBank:
-    return _build_smoother(config, BatchBackend)
+    return SmootherBank(config.motion.model(), config.smoother, BatchBackend)
 
 
 #: Banks that are built from settings of their own.

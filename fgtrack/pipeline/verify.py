@@ -18,7 +18,7 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
 from fgtrack.estimation.dense_joint import Difference, dense_joint, difference, rounding_bound
-from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherSettings
+from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
@@ -151,8 +151,7 @@ def _start_incremental(
     relinearise: Mapping[str, float], motion: MotionModel, prior: Start, lag_s: float
 ) -> FixedLagSmoother:
     settings = SmootherSettings(lag_s=lag_s, ring_s=_RING_S, relinearise=relinearise, lagged_s=())
-    thresholds = settings.thresholds(motion.state_names, curved=False)
-    return FixedLagSmoother(motion, prior, settings, lambda: IncrementalBackend(thresholds))
+    return FixedLagSmoother(motion, prior, settings)
 
 
 def _start_batch(motion: MotionModel, prior: Start, lag_s: float) -> FixedLagSmoother:

@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Start
 from fgtrack.estimation.dense_joint import rounding_bound
 from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherSettings
@@ -30,6 +31,7 @@ TINY = dict.fromkeys(("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "a
 """Relinearisation thresholds at which the smoother of a nonlinear model follows every move."""
 
 Late = Literal["fuse", "drop", "raise"]
+MakeBackend = Callable[[FloatArray], Backend]
 StartEstimator = Callable[[MotionModel, SmootherSettings], Estimator]
 
 
@@ -59,16 +61,7 @@ def _accumulated(motion: MotionModel, chosen: SmootherSettings) -> AccumulatedSt
     return AccumulatedStateDensity(motion, prior(), chosen.lag_s)
 
 
-def incremental(motion: MotionModel) -> Backend:
-    chosen = SmootherSettings() if motion.linear else settings()
-    return IncrementalBackend(chosen.thresholds(motion.state_names, curved=False))
-
-
-def batch(motion: MotionModel) -> Backend:
-    return BatchBackend()
-
-
-def smoother(motion: MotionModel, chosen: SmootherSettings, make_backend: Callable[[], Backend]) -> FixedLagSmoother:
+def smoother(motion: MotionModel, chosen: SmootherSettings, make_backend: MakeBackend) -> FixedLagSmoother:
     return FixedLagSmoother(motion, prior(), chosen, make_backend)
 
 
@@ -93,19 +86,19 @@ class Subject:
         return max(self.linear_bar, self.rounding * rounding_bound(motion, [START_NS, *stamps_ns]))
 
 
-def _smoother(make: Callable[[MotionModel], Backend]) -> StartEstimator:
-    return lambda motion, chosen: smoother(motion, chosen, lambda: make(motion))
+def _smoother(make: MakeBackend) -> StartEstimator:
+    return lambda motion, chosen: smoother(motion, chosen, make)
 
 
-BACKENDS: dict[str, Callable[[MotionModel], Backend]] = {"smoother": incremental, "smoother-batch": batch}
+BACKENDS: dict[str, MakeBackend] = {"smoother": IncrementalBackend, "smoother-batch": BatchBackend}
 
 SUBJECTS: dict[str, Subject] = {
     "ekf-replay": Subject(_replay, False, 1e-9, "at once", 40, rounding=0.0),
     # Splits the state between two neighbours off a joint covariance, which costs digits where they are close.
     "asd": Subject(_accumulated, True, 1e-7, "never", 10, rounding=0.0),
-    "smoother": Subject(_smoother(incremental), True, 1e-9, "at convergence", 40, rounding=1.0),
+    "smoother": Subject(_smoother(IncrementalBackend), True, 1e-9, "at convergence", 40, rounding=1.0),
     # Levenberg-Marquardt compares errors at absolute positions: eps W of 50 m instead of the deviation, 0.5 m.
-    "smoother-batch": Subject(_smoother(batch), True, 1e-6, "at convergence", 8, rounding=100.0),
+    "smoother-batch": Subject(_smoother(BatchBackend), True, 1e-6, "at convergence", 8, rounding=100.0),
 }
 SMOOTHERS = tuple(BACKENDS)
 

@@ -39,8 +39,8 @@ class Flaky:
     def covariance(self, keys: Sequence[int]) -> FloatArray:
         return self._inner.covariance(keys)
 
-    def converge(self, max_iterations: int) -> None:
-        self._inner.converge(max_iterations)
+    def moves(self, keys: Sequence[int]) -> FloatArray:
+        return self._inner.moves(keys)
 
 
 class Fuse:
@@ -56,7 +56,7 @@ class Fuse:
 
 def flaky(name: str, motion: MotionModel) -> tuple[FixedLagSmoother, Fuse]:
     fuse = Fuse()
-    return smoother(motion, settings(lag_s=0.3), lambda: Flaky(BACKENDS[name](motion), fuse)), fuse
+    return smoother(motion, settings(lag_s=0.3), lambda thresholds: Flaky(BACKENDS[name](thresholds), fuse)), fuse
 
 
 STAMPS_NS = [START_NS + ms * MS for ms in (0, 120, 345, 450, 475, 500, 600)]

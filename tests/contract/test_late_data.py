@@ -18,7 +18,7 @@ MORE = 5
 
 
 def started(name: str, motion: MotionModel, late: Late = "fuse", lag_s: float = LAG_S) -> FixedLagSmoother:
-    return smoother(motion, settings(lag_s, late), lambda: BACKENDS[name](motion))
+    return smoother(motion, settings(lag_s, late), BACKENDS[name])
 
 
 def everything(estimator: Estimator, stamps_ns: list[int]) -> list[bytes]:
@@ -141,7 +141,7 @@ def test_a_measurement_that_is_too_old_is_reported_and_changes_nothing(name: str
 @pytest.mark.parametrize("name", SMOOTHERS)
 def test_fusing_late_data_reaches_as_far_as_the_ring_and_says_so(name: str) -> None:
     motion, rng = CV(), np.random.default_rng(0)
-    estimator = smoother(motion, settings(LAG_S, "fuse", 0.2), lambda: BACKENDS[name](motion))
+    estimator = smoother(motion, settings(LAG_S, "fuse", 0.2), BACKENDS[name])
     for k in range(1, 21):
         estimator.update(measured(START_NS + k * 50 * MS, motion, rng))
     assert estimator.window_ns == (START_NS + 500 * MS, START_NS + 1000 * MS)

@@ -11,7 +11,7 @@ import pytest
 from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
-from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherBank, SmootherSettings
+from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherBank, SmootherSettings
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
 
@@ -70,14 +70,7 @@ def schedule(num_detections: int, rng: np.random.Generator) -> list[tuple[int, i
 
 def drive(num_detections: int, seed: int) -> Drive:
     rng, done = np.random.default_rng(seed), Drive()
-    thresholds = SETTINGS.thresholds(MOTION.state_names, curved=False)
-
-    def start(prior: Start) -> FixedLagSmoother:
-        smoother = FixedLagSmoother(MOTION, prior, SETTINGS, lambda: IncrementalBackend(thresholds))
-        done.smoothers.append(smoother)
-        return smoother
-
-    bank = SmootherBank(MOTION, start, SETTINGS)
+    bank = SmootherBank(MOTION, SETTINGS)
     events = schedule(num_detections, rng)
     last_ns = max(stamp_ns for _, stamp_ns, _ in events)
     quarters = {len(events) * k // 4 for k in (1, 2, 3, 4)}
@@ -112,6 +105,7 @@ def drive(num_detections: int, seed: int) -> Drive:
         if number in quarters:
             gc.collect()
             done.resident.append(int(STATM.read_text().split()[1]) if STATM.exists() else 0)
+    done.smoothers += bank._smoothers.values()
     return done
 
 

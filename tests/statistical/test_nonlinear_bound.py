@@ -10,7 +10,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
+from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.evaluation.bounds import Bounds, ScheduledMeasurement, bounds, bounds_along
 from fgtrack.models.motion import CTRV, MotionModel
@@ -38,8 +38,7 @@ def make(name: str, motion: MotionModel) -> Estimator:
     if name == "ekf-replay":
         return ReplayEkf(motion, PRIOR, 1.0)
     settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)
-    thresholds = settings.thresholds(motion.state_names, curved=False)
-    return FixedLagSmoother(motion, PRIOR, settings, lambda: IncrementalBackend(thresholds))
+    return FixedLagSmoother(motion, PRIOR, settings)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
+from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
@@ -40,10 +40,9 @@ def prior(mean: FloatArray) -> Start:
     )
 
 
-def smoother(motion: MotionModel, start: Start, curved: bool = False) -> FixedLagSmoother:
+def smoother(motion: MotionModel, start: Start) -> FixedLagSmoother:
     settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)
-    thresholds = settings.thresholds(motion.state_names, curved)
-    return FixedLagSmoother(motion, start, settings, lambda: IncrementalBackend(thresholds))
+    return FixedLagSmoother(motion, start, settings)
 
 
 def replay(motion: MotionModel, start: Start) -> ReplayEkf:
@@ -132,7 +131,7 @@ def test_a_robust_loss_takes_a_third_off_the_error_that_outliers_cause() -> None
         truth = drawn_truth(rng, start)
         items = arrivals(rng, truth, outliers=0.1)
         for name, loss in (("gaussian", None), ("huber", RobustLoss("huber", 1.5))):
-            estimator = smoother(MOTION, prior(start), curved=loss is not None)
+            estimator = smoother(MOTION, prior(start))
             fed(estimator, items, loss)
             squared[name] += float(np.sum((estimator.state_at(stamp(NUM_STEPS)).mean - truth[-1])[:2] ** 2))
     assert np.sqrt(squared["huber"] / squared["gaussian"]) < 0.7

@@ -6,7 +6,7 @@ import pytest
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.factor_graph import FixedLagSmoother, IncrementalBackend, SmootherSettings
+from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
 from fgtrack.estimation.oosm import AccumulatedStateDensity, Al1, ReorderBuffer
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import SensorPose, measurement_model
@@ -60,9 +60,8 @@ def test_every_kind_of_estimator_sees_it_in_its_own_state(motion) -> None:
     bound = Measurement(stamp_ns, own, np.array(list(values.values())), np.diag(np.square(list(std.values()))))
 
     def smoother(motion, start: Start, lag_s: float) -> FixedLagSmoother:
-        return FixedLagSmoother(motion, start, settings, lambda: IncrementalBackend(thresholds))
+        return FixedLagSmoother(motion, start, settings)
 
-    thresholds = settings.thresholds(motion.state_names, curved=True)
     for make in (ReplayEkf, AccumulatedStateDensity, Al1, ReorderBuffer, smoother):
         found, expected = make(motion, start, 1.0), make(motion, start, 1.0)
         found.update(named)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from fgtrack.estimation.factor_graph import SmootherSettings
+from fgtrack.models.motion import CTRV, CV
 
 
 @pytest.mark.parametrize(
@@ -24,8 +25,13 @@ def test_settings_that_make_no_sense_are_refused(wrong: dict, said: str) -> None
 
 def test_thresholds_stand_in_the_order_of_the_state() -> None:
     settings = SmootherSettings(relinearise={"speed_mps": 2.0, "x_m": 0.3})
-    names = ("x_m", "y_m", "speed_mps")
-    straight, curved = (settings.thresholds(names, curved) for curved in (False, True))
-    np.testing.assert_array_equal(straight[[0, 2]], [0.3, 2.0])
-    assert straight[1] > 1e6
-    np.testing.assert_array_equal(curved, [0.3, 0.05, 2.0])
+    straight, curved = (settings.thresholds(CTRV(), curved) for curved in (False, True))
+    np.testing.assert_array_equal(straight[[0, 3]], [0.3, 2.0])
+    assert (straight[[1, 2, 4]] > 1e6).all()
+    np.testing.assert_array_equal(curved[:4], [0.3, 0.05, straight[2], 2.0])
+
+
+def test_where_all_is_linear_nothing_is_relinearised() -> None:
+    settings = SmootherSettings(relinearise={"x_m": 0.3})
+    assert (settings.thresholds(CV(), curved=False) > 1e6).all()
+    np.testing.assert_array_equal(settings.thresholds(CV(), curved=True), [0.3, 0.05, 0.2, 0.2])

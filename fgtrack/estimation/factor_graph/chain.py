@@ -15,8 +15,8 @@ class Node:
     stamp_ns: int
     key: int
     """The variable's number in the graph."""
-    guess: FloatArray
-    """First estimate, shape (n,)."""
+    origin: FloatArray
+    """Linearisation point, shape (n,); that of the noise of the motion factor to the next node as well."""
     terms: list[MeasurementTerm] = field(default_factory=list)
     slot: int | None = None
     """Graph slot of the motion factor to the next node; None of the newest node."""
@@ -54,9 +54,9 @@ class Chain:
         found = place >= 0 and self._nodes[place].stamp_ns == stamp_ns
         return self._nodes[place] if found else None
 
-    def insert(self, stamp_ns: int, guess: FloatArray) -> Node:
+    def insert(self, stamp_ns: int, origin: FloatArray) -> Node:
         """A new node at `stamp_ns`; the slot of the segment that it splits stays with its left neighbour."""
-        node = Node(stamp_ns, self._next_key, guess)
+        node = Node(stamp_ns, self._next_key, origin)
         self._next_key += 1
         self._nodes.insert(self.place(stamp_ns) + 1, node)
         return node

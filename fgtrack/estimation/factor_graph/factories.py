@@ -7,7 +7,6 @@ from typing import Any
 from fgtrack.core.errors import CallError
 from fgtrack.estimation.base import Start
 from fgtrack.estimation.factor_graph.backends.batch import BatchBackend
-from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
 from fgtrack.estimation.factor_graph.settings import SmootherSettings
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
 from fgtrack.models.motion import MotionModel
@@ -18,9 +17,7 @@ _OPTIONS = tuple(field.name for field in fields(SmootherSettings) if field.name 
 # Any: an option may be any value that `SmootherSettings` takes.
 def smoother(motion: MotionModel, start: Start, lag_s: float, **options: Any) -> FixedLagSmoother:
     """Fixed-lag smoother, a factor graph that iSAM2 solves incrementally."""
-    settings = _settings(lag_s, options)
-    thresholds = settings.thresholds(motion.state_names, curved=True)
-    return FixedLagSmoother(motion, start, settings, lambda: IncrementalBackend(thresholds))
+    return FixedLagSmoother(motion, start, _settings(lag_s, options))
 
 
 def smoother_batch(motion: MotionModel, start: Start, lag_s: float, **options: Any) -> FixedLagSmoother:

@@ -1,19 +1,16 @@
-"""gtsam factors that call the motion and measurement models; no equation of their own.
-
-Errors are whitened here, because a motion factor's noise follows the state that it starts from.
-"""
+"""gtsam factors that call the motion and measurement models; no equation of their own."""
 
 from collections.abc import Callable, Mapping
 
 import gtsam
 import numpy as np
 from gtsam.noiseModel import mEstimator
-from scipy.linalg.blas import dtrsm
-from scipy.linalg.lapack import dpotrf
+from scipy.linalg.lapack import dpotrf, dtrtri
 
+from fgtrack.core.linalg import identity
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.factor_graph.terms import EquivalentMeasurement, MeasurementTerm, linearised
+from fgtrack.estimation.factor_graph.terms import EquivalentMeasurement, Linearised, MeasurementTerm, linearised
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.sensors import RobustLoss
 
@@ -33,32 +30,21 @@ def prior_factor(key: int, mean: FloatArray, covariance: FloatArray) -> gtsam.No
     return gtsam.PriorFactorVector(key, mean, gtsam.noiseModel.Gaussian.Covariance(covariance))
 
 
-def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float) -> gtsam.NonlinearFactor:
-    """The state at `right` is that at `left` moved by `dt_s`, with the process noise of that time.
+def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float, at: FloatArray) -> gtsam.NonlinearFactor:
+    """The state at `right` is that at `left` moved by `dt_s`, with the process noise Q(`at`, dt_s).
 
-    The error is L^-1 (x_right - f(x_left)), with L L' = Q(x_left, dt) taken at the same state: no derivative of L is
-    taken, so this is Gauss-Newton with reweighting. Where it converges its answer does not depend on where it began;
-    over long gaps whole steps may swing between two answers (see `Window.converge_damped`).
+    `at`, shape (n,), is the linearisation point of `left`. No derivative of Q is taken: where the factor is replaced
+    when that point moves, this is Gauss-Newton with reweighting.
     """
-    n = motion.dim
-    both = np.zeros((n, 2 * n + 1), order="F")
-    both[:, n : 2 * n] = np.eye(n)
-    flow, error_column = both[:, :n], both[:, 2 * n]
-    kept: list[FloatArray] = []  # L of the last linearisation: a line search compares errors of one and the same noise
+    still = identity(motion.dim)
 
     def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
-        step = motion.step(values.atVector(left).tolist(), dt_s)
-        if jacobians is not None or not kept:
-            kept[:] = [_root(step.Q)]
-        np.subtract(values.atVector(right), step.mean, out=error_column)
-        if jacobians is None:
-            return _whitened(kept[0], both)[:, 2 * n]
-        np.negative(step.F, out=flow)
-        whitened = _whitened(kept[0], both)
-        jacobians[0], jacobians[1] = whitened[:, :n], whitened[:, n : 2 * n]
-        return whitened[:, 2 * n]
+        mean, F = motion.flow(values.atVector(left).tolist(), dt_s)
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = -F, still
+        return values.atVector(right) - mean
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(n), [left, right], error)
+    return gtsam.CustomFactor(_gaussian(motion.step(at.tolist(), dt_s).Q), [left, right], error)
 
 
 def measurement_factor(key: int, term: MeasurementTerm, mean: FloatArray) -> gtsam.NonlinearFactor:
@@ -68,33 +54,31 @@ def measurement_factor(key: int, term: MeasurementTerm, mean: FloatArray) -> gts
     `numpy.linalg.LinAlgError` for a covariance that is not positive definite.
     """
     if isinstance(term, EquivalentMeasurement) or (term.model.linear and term.loss is None):
-        y, H, R = linearised(term, mean)
-        return _linear_factor(key, mean, y, H, _root(R))
+        return _linear_factor(key, mean, linearised(term, mean))
     return _callback_factor(key, term)
 
 
-def _linear_factor(
-    key: int, origin: FloatArray, y: FloatArray, H: FloatArray, root: FloatArray
-) -> gtsam.NonlinearFactor:
-    k = len(y)
-    whitened = _whitened(root, np.column_stack([H, y]))
-    linear = gtsam.JacobianFactor(key, whitened[:, :-1], whitened[:, -1], gtsam.noiseModel.Unit.Create(k))
+def _linear_factor(key: int, origin: FloatArray, term: Linearised) -> gtsam.NonlinearFactor:
+    W = _inverse_root(term.R)
+    linear = gtsam.JacobianFactor(key, W @ term.H, W @ term.y, gtsam.noiseModel.Unit.Create(len(term.y)))
     at = gtsam.Values()
     at.insert(key, origin)
     return gtsam.LinearContainerFactor(linear, at)
 
 
 def _callback_factor(key: int, measurement: Measurement) -> gtsam.NonlinearFactor:
-    model, z, pose = measurement.model, measurement.z, measurement.pose
-    root = _root(measurement.R)
+    model, z, pose, loss = measurement.model, measurement.z, measurement.pose, measurement.loss
 
     def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
         x = values.atVector(key)
         if jacobians is not None:
-            jacobians[0] = _whitened(root, model.jacobian(x, pose))
-        return _whitened(root, -model.residual(z, model.predict(x, pose))[:, None])[:, 0]
+            jacobians[0] = model.jacobian(x, pose)
+        return -model.residual(z, model.predict(x, pose))
 
-    return gtsam.CustomFactor(_noise(measurement.loss, len(z)), [key], error)
+    noise = _gaussian(measurement.R)
+    if loss is not None:
+        noise = gtsam.noiseModel.Robust.Create(_LOSSES[loss.kind](loss.width), noise)
+    return gtsam.CustomFactor(noise, [key], error)
 
 
 def weight(loss: RobustLoss, distance: float) -> float:
@@ -102,20 +86,13 @@ def weight(loss: RobustLoss, distance: float) -> float:
     return _LOSSES[loss.kind](loss.width).weight(distance)
 
 
-def _noise(loss: RobustLoss | None, k: int) -> gtsam.noiseModel.Base:
-    unit = gtsam.noiseModel.Unit.Create(k)
-    return unit if loss is None else gtsam.noiseModel.Robust.Create(_LOSSES[loss.kind](loss.width), unit)
+def _gaussian(covariance: FloatArray) -> gtsam.noiseModel.Base:
+    return gtsam.noiseModel.Gaussian.SqrtInformation(_inverse_root(covariance), smart=False)
 
 
-def _whitened(root: FloatArray, columns: FloatArray) -> FloatArray:
-    """L^-1 times `columns` (k, m); by BLAS, because LAPACK's dtrtrs starts threads for the smallest matrix."""
-    return np.asarray(dtrsm(1.0, root, columns, lower=1))
-
-
-def _root(covariance: FloatArray) -> FloatArray:
-    """Lower Cholesky factor, shape (k, k)."""
-    root: FloatArray
+def _inverse_root(covariance: FloatArray) -> FloatArray:
+    """W with W' W = covariance^-1, shape (k, k): the inverse of the lower Cholesky factor."""
     root, info = dpotrf(covariance, lower=1)
     if info:
         raise np.linalg.LinAlgError("a covariance is not positive definite")
-    return root
+    return np.asarray(dtrtri(root, lower=1)[0])

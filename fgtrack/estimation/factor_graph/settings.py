@@ -1,7 +1,7 @@
 """Settings of the smoother."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal
@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from fgtrack.core.types import FloatArray
+from fgtrack.models.motion import MotionModel
 
 _NEVER = 1e9
 
@@ -28,8 +29,8 @@ class SmootherSettings:
     ring_s: float = 2.0
     """How far behind the window `fuse` reaches; older detections are `too_old`."""
     relinearise: Mapping[str, float] = field(default_factory=lambda: _RELINEARISE)
-    """An entry of the state that moved further than this from its linearisation point is relinearised (iSAM2).
-    Entries that are not named never are where the models are linear in them; see `thresholds`."""
+    """An entry of the state that moved further than this from its linearisation point is relinearised (iSAM2); see
+    `thresholds` for entries that are not named."""
     max_iterations: int = 1
     """Gauss-Newton steps per update; further ones are taken only while a state moves."""
     lagged_s: tuple[float, ...] = (0.3,)
@@ -52,11 +53,11 @@ class SmootherSettings:
         if len(set(self.lagged_s)) < len(self.lagged_s):
             raise ValueError(f"lagged_s: names a lag twice, is {list(self.lagged_s)}")
 
-    def thresholds(self, state_names: Sequence[str], curved: bool) -> FloatArray:
-        """Relinearisation thresholds of a state, shape (n,).
+    def thresholds(self, motion: MotionModel, curved: bool) -> FloatArray:
+        """Relinearisation thresholds of the state of `motion`, shape (n,).
 
-        `curved` says that some measurement bends in the position (range, bearing, a robust loss), so that its
-        entries need a threshold as well.
+        Motion models are linear in the position. `curved` says that some measurement is not, or has a robust loss:
+        then the position has a threshold as well. Where all is linear, nothing has one.
         """
-        named = {**(_CURVED if curved else {}), **self.relinearise}
-        return np.array([named.get(name, _NEVER) for name in state_names])
+        named = {**(_CURVED if curved else {}), **self.relinearise} if curved or not motion.linear else {}
+        return np.array([named.get(name, _NEVER) for name in motion.state_names])

@@ -11,6 +11,7 @@ from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.factor_graph.backends.base import Backend
+from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
 from fgtrack.estimation.factor_graph.initiation import straight_line
 from fgtrack.estimation.factor_graph.marginalised_past import Prior
 from fgtrack.estimation.factor_graph.settings import SmootherSettings
@@ -18,7 +19,8 @@ from fgtrack.estimation.factor_graph.terms import linearised
 from fgtrack.estimation.factor_graph.window import Window
 from fgtrack.models.motion import MotionModel
 
-_AIMING_ITERATIONS = 10
+_DEFAULT = SmootherSettings()
+_INITIATION_ITERATIONS = 10
 
 
 class FixedLagSmoother:
@@ -34,24 +36,25 @@ class FixedLagSmoother:
     prior
         First state; nothing older than it can be fused.
     settings
-        Window, late policy and outputs.
+        Window, late policy, relinearisation and outputs.
     make_backend
-        Makes an empty backend; called again after a failed update.
+        Makes an empty backend with given relinearisation thresholds, shape (n,): `IncrementalBackend` or
+        `BatchBackend`.
     """
 
     def __init__(
         self,
         motion: MotionModel,
         prior: Start,
-        settings: SmootherSettings,
-        make_backend: Callable[[], Backend],
+        settings: SmootherSettings = _DEFAULT,
+        make_backend: Callable[[FloatArray], Backend] = IncrementalBackend,
     ) -> None:
         self._motion = motion
         self._settings = settings
         self._lag_ns, self._ring_ns = nanoseconds(settings.lag_s), nanoseconds(settings.ring_s)
         self._first_ns = self._clock_ns = prior.stamp_ns
-        self._window = Window(motion, prior.stamp_ns, Prior(*initial_state(motion, prior)), make_backend)
-        self._aimed = prior.yaw_rad is not None or motion.linear
+        self._window = Window(motion, prior.stamp_ns, Prior(*initial_state(motion, prior)), settings, make_backend)
+        self._initiated = prior.yaw_rad is not None or motion.linear
         self._final: list[TrackState] = []
 
     @property
@@ -83,13 +86,12 @@ class FixedLagSmoother:
         if not fusible:
             return results
         try:
-            self._final += self._window.update(fusible, self._start_ns, self._reach_ns, self._settings.final)
+            self._final += self._window.update(fusible, self._start_ns, self._reach_ns)
         except RuntimeError:
             return [r if r.innovation is None else UpdateResult(UpdateStatus.FAILED) for r in results]
-        if not self._aimed:
-            self._aim()
-        if self._settings.max_iterations > 1:
-            self._window.converge(self._settings.max_iterations - 1)
+        if not self._initiated:
+            self._initiate()
+        self._window.iterate(self._settings.max_iterations - 1)
         return results
 
     def state_at(self, stamp_ns: int) -> TrackState:
@@ -110,24 +112,23 @@ class FixedLagSmoother:
     def converge(self, max_iterations: int = 50) -> None:
         """Relinearise until nothing moves; for comparisons."""
         self._window.converge(max_iterations)
-        self._window.converge_damped(max_iterations)
 
-    def _aim(self) -> None:
+    def _initiate(self) -> None:
         """Begin again from a straight line through the positions so far, until their direction is certain.
 
         A state that started with an unknown heading was linearised at a wrong one; from there the solver may not find
         the right one.
         """
         if not self._window.whole:
-            self._aimed = True
+            self._initiated = True
             return
         try:
             line = straight_line(self._window.fixes())
         except np.linalg.LinAlgError:
             return
-        self._aimed = line.certain
+        self._initiated = line.certain
         self._window.restart(line)
-        self._window.converge(_AIMING_ITERATIONS)
+        self._window.iterate(_INITIATION_ITERATIONS)
 
     @property
     def _start_ns(self) -> int:

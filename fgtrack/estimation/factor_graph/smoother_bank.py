@@ -6,8 +6,10 @@ import numpy as np
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import nanoseconds, seconds
-from fgtrack.core.types import SmoothedReport, TrackState
+from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Start, StatesAt
+from fgtrack.estimation.factor_graph.backends.base import Backend
+from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
 from fgtrack.estimation.factor_graph.settings import SmootherSettings
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
 from fgtrack.estimation.object_bank import ObjectBank
@@ -22,15 +24,19 @@ class SmootherBank(ObjectBank):
     ----------
     motion
         The motion model of all smoothers.
-    start
-        Makes the smoother of a new object.
-    settings
-        Those of the smoothers.
+    settings, make_backend
+        See `FixedLagSmoother`.
     """
 
     def __init__(
-        self, motion: MotionModel, start: Callable[[Start], FixedLagSmoother], settings: SmootherSettings
+        self,
+        motion: MotionModel,
+        settings: SmootherSettings,
+        make_backend: Callable[[FloatArray], Backend] = IncrementalBackend,
     ) -> None:
+        def start(prior: Start) -> FixedLagSmoother:
+            return FixedLagSmoother(motion, prior, settings, make_backend)
+
         super().__init__(motion, start, settings.lag_s + (settings.ring_s if settings.late == "fuse" else 0.0))
         self._smoothers: dict[int, FixedLagSmoother] = {}
         self._start_smoother = start

@@ -24,6 +24,11 @@ class EquivalentMeasurement:
 MeasurementTerm = Measurement | EquivalentMeasurement
 
 
+def curved(term: MeasurementTerm) -> bool:
+    """Whether `term` has to be linearised, or weighted, at the state of its node."""
+    return isinstance(term, Measurement) and (term.loss is not None or not term.model.linear)
+
+
 class Linearised(NamedTuple):
     """y = H (x - x0) + N(0, R) near the state x0."""
 

@@ -1,6 +1,6 @@
 """The graph of one object's window: nodes, segments and measurement terms, and the solver behind them."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from itertools import pairwise
 
 import gtsam
@@ -9,16 +9,19 @@ import numpy as np
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.factor_graph.backends.base import AT_REST, Backend, Change, Marginalised
+from fgtrack.estimation.factor_graph.backends.base import Backend, Change, Marginalised
 from fgtrack.estimation.factor_graph.backends.incremental import FIRST_KEY
 from fgtrack.estimation.factor_graph.chain import Chain, Node
 from fgtrack.estimation.factor_graph.factors import measurement_factor, motion_factor, prior_factor
 from fgtrack.estimation.factor_graph.initiation import Fix, Line, along, fix_of
 from fgtrack.estimation.factor_graph.marginalised_past import MarginalisedPast, Prior
-from fgtrack.estimation.factor_graph.terms import MeasurementTerm
+from fgtrack.estimation.factor_graph.settings import SmootherSettings
+from fgtrack.estimation.factor_graph.terms import MeasurementTerm, curved
 from fgtrack.estimation.interpolation import between
 from fgtrack.models.motion import MotionModel
 
+#: A step of a state, in m, rad, m/s or rad/s, that is rounding.
+_AT_REST = 1e-7
 _BROKEN = (RuntimeError, ValueError, IndexError, np.linalg.LinAlgError)
 
 
@@ -31,13 +34,26 @@ class Window:
         Motion model of the segments.
     stamp_ns, prior
         The first node.
+    settings
+        Those of relinearisation and outputs.
     make_backend
-        Makes an empty backend; called again after a failed update.
+        Makes an empty backend with the given relinearisation thresholds; called again after a failed update, and when
+        the first measurement comes that is not linear.
     """
 
-    def __init__(self, motion: MotionModel, stamp_ns: int, prior: Prior, make_backend: Callable[[], Backend]) -> None:
+    def __init__(
+        self,
+        motion: MotionModel,
+        stamp_ns: int,
+        prior: Prior,
+        settings: SmootherSettings,
+        make_backend: Callable[[FloatArray], Backend],
+    ) -> None:
         self._motion = motion
+        self._settings = settings
         self._make_backend = make_backend
+        self._thresholds = settings.thresholds(motion, curved=False)
+        self._curved = False
         self._first_ns = stamp_ns
         self._chain = Chain(Node(stamp_ns, FIRST_KEY, prior.mean))
         self._past = MarginalisedPast(motion, stamp_ns, prior)
@@ -63,14 +79,16 @@ class Window:
         """Oldest stamp at which something can still be fused."""
         return self._past.start_ns
 
-    def update(
-        self, measurements: Sequence[Measurement], start_ns: int, reach_ns: int, final: bool
-    ) -> list[TrackState]:
+    def update(self, measurements: Sequence[Measurement], start_ns: int, reach_ns: int) -> list[TrackState]:
         """Fuse `measurements` and marginalise the nodes that are not needed from `start_ns` on.
 
         One node at or before `start_ns` stays. Conditionals of marginalised nodes are kept from `reach_ns` on. Gives
-        the states of the nodes that left, where `final`. Raises `RuntimeError` where it fails; all is as before then.
+        the states of the nodes that left, where the settings want them. Raises `RuntimeError` where it fails; all is as
+        before then.
         """
+        if not self._curved and any(curved(item) for item in measurements):
+            self._curved, self._thresholds = True, self._settings.thresholds(self._motion, curved=True)
+            self._rebuild(self._estimates())
         chain, past = self._chain, self._past.copy()
         leaving = chain.nodes[: max(chain.place(start_ns), 0)]
         anchor = chain.nodes[len(leaving)]
@@ -78,7 +96,7 @@ class Window:
         try:
             for node, right in zip(leaving, chain.nodes[1:], strict=False):
                 past.pass_node(node.terms, self._mean(node), right.stamp_ns, self._mean(right))
-            left = self._states_behind(past, anchor, leaving) if final else []
+            left = self._states_behind(past, anchor, leaving) if self._settings.final else []
             old = [item for item in measurements if item.stamp_ns < anchor.stamp_ns]
             added: list[tuple[Node, MeasurementTerm]] = [(anchor, past.fuse(item)) for item in old]
             live = [item for item in measurements if item.stamp_ns >= anchor.stamp_ns]
@@ -87,7 +105,7 @@ class Window:
                 at = chain.at(item.stamp_ns)
                 if at is None:
                     at = chain.insert(item.stamp_ns, guesses[item.stamp_ns])
-                    new[at.key] = at.guess
+                    new[at.key] = at.origin
                 added.append((at, item))
             self._solve(added, new, leaving, past.prior)
         except _BROKEN as error:
@@ -128,24 +146,28 @@ class Window:
         weights = np.hstack([inner.Lambda, inner.Psi])
         return inner.mean, weights @ self._covariance(node, right) @ weights.T + inner.Sigma
 
-    def converge(self, max_iterations: int) -> None:
-        """See `Backend.converge`."""
-        self._backend.converge(max_iterations)
-        self._forget_estimates()
-
-    def converge_damped(self, max_iterations: int) -> None:
-        """Go half of each step until none is left, or `max_iterations` are done.
-
-        Noise that follows its state can make full steps swing between two answers, in which half ones meet.
-        """
-        at = self._estimates()
-        self.converge(1)
+    def iterate(self, max_iterations: int) -> None:
+        """Take Gauss-Newton steps while a state is further than a threshold from its linearisation point."""
         for _ in range(max_iterations):
-            to = self._estimates()
-            if all(np.abs(to[key] - mean).max() < AT_REST for key, mean in at.items()):
+            if not self._moved():
                 return
-            at = {key: 0.5 * (to[key] + mean) for key, mean in at.items()}
+            self._solve([], {}, [], self._past.prior)
+
+    def converge(self, max_iterations: int) -> None:
+        """Solve again, with all states linearised where the last step led, until none moves by more than rounding.
+
+        Half a step is taken where a whole one comes no closer: process noise that follows its state can make
+        Gauss-Newton oscillate.
+        """
+        at, last = self._estimates(), np.inf
+        for _ in range(max_iterations):
             self._rebuild(at)
+            steps = {key: mean - at[key] for key, mean in self._estimates().items()}
+            longest = max(float(np.abs(step).max()) for step in steps.values())
+            if longest < _AT_REST:
+                return
+            share = 1.0 if longest < 0.5 * last else 0.5
+            at, last = {key: mean + share * steps[key] for key, mean in at.items()}, longest
 
     @property
     def whole(self) -> bool:
@@ -174,8 +196,10 @@ class Window:
     def _rebuild(self, means: Mapping[int, FloatArray]) -> None:
         """Build the graph anew from the window's own records, near `means` by key."""
         nodes = self._chain.nodes
-        self._backend = self._make_backend()
+        self._backend, self._anchored = self._make_backend(self._thresholds), False
         segments = list(pairwise(nodes))
+        for node in nodes:
+            node.origin = means[node.key]
         factors = [self._segment(left, right) for left, right in segments]
         factors.append(prior_factor(nodes[0].key, self._past.prior.mean, self._past.prior.covariance))
         factors += [measurement_factor(node.key, item, means[node.key]) for node in nodes for item in node.terms]
@@ -198,9 +222,12 @@ class Window:
         leaving: Sequence[Node],
         prior: Prior,
     ) -> None:
-        """Update the backend, and note the slots of the new segments."""
-        nodes = self._chain.nodes
-        segments = [pair for pair in pairwise(nodes) if pair[0].key in new or pair[1].key in new]
+        """Update the backend, and note the slots of the new segments and of those whose noise follows a moved node."""
+        nodes, changed = self._chain.nodes, set(new)
+        for node in self._moved(new):
+            node.origin = self._mean(node)
+            changed.add(node.key)
+        segments = [pair for pair in pairwise(nodes) if pair[0].key in changed or pair[1].key in new]
         removed = [left.slot for left, _ in segments if left.slot is not None]
         factors = [self._segment(left, right) for left, right in segments]
         for node, term in added:
@@ -218,10 +245,20 @@ class Window:
         slots = self._backend.update(Change(new, stamps_s, factors, removed, marginalised))
         for (left, _), slot in zip(segments, slots, strict=False):
             left.slot = slot
+        self._anchored |= bool(leaving)
         self._forget_estimates()
 
+    def _moved(self, new: Container[int] = ()) -> list[Node]:
+        """The nodes, but for the `new` ones, that the next update of the backend relinearises."""
+        free = [node for node in self._chain.nodes[self._anchored :] if node.key not in new]
+        if not free:
+            return []
+        far = (np.abs(self._backend.moves([node.key for node in free])) > self._thresholds).any(axis=1)
+        return [free[place] for place in np.flatnonzero(far)]
+
     def _segment(self, left: Node, right: Node) -> gtsam.NonlinearFactor:
-        return motion_factor(self._motion, left.key, right.key, seconds(right.stamp_ns - left.stamp_ns))
+        dt_s = seconds(right.stamp_ns - left.stamp_ns)
+        return motion_factor(self._motion, left.key, right.key, dt_s, left.origin)
 
     def _seconds(self, stamp_ns: int) -> float:
         return seconds(stamp_ns - self._first_ns)
@@ -234,8 +271,8 @@ class Window:
         try:
             mean = self._mean(node)
         except _BROKEN:
-            return node.guess
-        return mean if np.isfinite(mean).all() else node.guess
+            return node.origin
+        return mean if np.isfinite(mean).all() else node.origin
 
     def _mean(self, node: Node) -> FloatArray:
         mean = self._means.get(node.key)

@@ -8,9 +8,6 @@ import gtsam
 
 from fgtrack.core.types import FloatArray
 
-#: A step of a state, in m, rad, m/s or rad/s, that is rounding.
-AT_REST = 1e-7
-
 
 @dataclass(frozen=True, slots=True)
 class Marginalised:
@@ -39,7 +36,11 @@ class Change:
 
 
 class Backend(Protocol):
-    """Keeps a graph and its solution."""
+    """Keeps a graph and its solution.
+
+    A variable whose estimate is further than a threshold from its linearisation point is relinearised there at the
+    next update, until it takes part in the prior of what was marginalised.
+    """
 
     def update(self, change: Change) -> list[int]:
         """Apply `change` and solve; gives the slots of `change.factors`, in order.
@@ -50,8 +51,8 @@ class Backend(Protocol):
     def mean(self, key: int) -> FloatArray:
         """Estimate of the variable `key`, shape (n,)."""
 
+    def moves(self, keys: Sequence[int]) -> FloatArray:
+        """How far m variables are from their linearisation points, shape (m, n)."""
+
     def covariance(self, keys: Sequence[int]) -> FloatArray:
         """Joint covariance of one variable, shape (n, n), or of two neighbours, (2 n, 2 n)."""
-
-    def converge(self, max_iterations: int) -> None:
-        """Relinearise until no state moves by more than rounding, or `max_iterations` are done."""

@@ -7,29 +7,43 @@ import numpy as np
 from scipy.linalg.lapack import dtrtri
 
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.factor_graph.backends.base import AT_REST, Change
+from fgtrack.estimation.factor_graph.backends.base import Change
 
 
 class BatchBackend:
-    """Solves the whole window from its last estimates. What leaves it is replaced by the prior it gives."""
+    """Solves the whole window from its last estimates. What leaves it is replaced by the prior it gives.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    thresholds
+        An entry of a state that moves further than this is relinearised, shape (n,); see `SmootherSettings`. It is the
+        process noise that follows these points: all else is linearised at every step.
+    """
+
+    def __init__(self, thresholds: FloatArray) -> None:
+        self._thresholds = thresholds
+        self._origins: dict[int, FloatArray] = {}
         self._factors: dict[int, gtsam.NonlinearFactor] = {}
         self._values = gtsam.Values()
         self._next_slot = 0
 
     def update(self, change: Change) -> list[int]:
         """See `Backend.update`."""
+        for key in self._origins:
+            if (np.abs(self.moves([key])) > self._thresholds).any():
+                self._origins[key] = self.mean(key)
         for slot in change.removed:
             del self._factors[slot]
         slots = [self._add(factor) for factor in change.factors]
         for key, mean in change.values.items():
             self._values.insert(key, mean)
+            self._origins[key] = mean
         if change.marginalised is not None:
             gone = set(change.marginalised.keys)
             self._factors = {slot: factor for slot, factor in self._factors.items() if gone.isdisjoint(factor.keys())}
             for key in gone:
                 self._values.erase(key)
+                del self._origins[key]
             self._add(change.marginalised.prior)
         self._solve()
         return slots
@@ -37,6 +51,10 @@ class BatchBackend:
     def mean(self, key: int) -> FloatArray:
         """See `Backend.mean`."""
         return self._values.atVector(key)
+
+    def moves(self, keys: Sequence[int]) -> FloatArray:
+        """See `Backend.moves`."""
+        return np.array([self.mean(key) - self._origins[key] for key in keys])
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
         """See `Backend.covariance`; from one dense QR of the whole linearised window."""
@@ -49,25 +67,6 @@ class BatchBackend:
         size = sum(len(self._values.atVector(key)) for key in keys)
         root = dtrtri(R[-size:, -size:])[0]
         return np.asarray(root @ root.T)
-
-    def converge(self, max_iterations: int) -> None:
-        """See `Backend.converge`; Gauss-Newton, half a step where a whole one does not come closer.
-
-        A motion factor's noise follows its state. Levenberg-Marquardt takes what that changes for a part of the error,
-        and near the answer refuses every step.
-        """
-        params = gtsam.GaussNewtonParams()
-        params.setLinearSolverType("MULTIFRONTAL_QR")
-        graph, last = self._graph(), np.inf
-        for _ in range(max_iterations):
-            optimizer = gtsam.GaussNewtonOptimizer(graph, self._values, params)
-            optimizer.iterate()
-            step = self._values.localCoordinates(optimizer.values())
-            length = float(np.abs(step.vector()).max())
-            self._values = self._values.retract(step.scale(1.0 if length < 0.5 * last else 0.5))
-            if length < AT_REST:
-                return
-            last = length
 
     def _add(self, factor: gtsam.NonlinearFactor) -> int:
         slot = self._next_slot

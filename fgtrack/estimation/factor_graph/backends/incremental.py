@@ -63,16 +63,12 @@ class IncrementalBackend:
         """See `Backend.mean`."""
         return self._smoother.calculateEstimateVector(key)
 
+    def moves(self, keys: Sequence[int]) -> FloatArray:
+        """See `Backend.moves`."""
+        return self._smoother.getDelta().vector(list(keys)).reshape(len(keys), -1)
+
     def covariance(self, keys: Sequence[int]) -> FloatArray:
         """See `Backend.covariance`."""
         if len(keys) == 1:
             return self._smoother.marginalCovariance(keys[0])
         return self._smoother.getISAM2().jointMarginalCovariance(list(keys)).fullMatrix()
-
-    def converge(self, max_iterations: int) -> None:
-        """See `Backend.converge`."""
-        self._smoother.setSmootherLag(_FOREVER_S)
-        for _ in range(max_iterations):
-            self._smoother.update()
-            if not self._smoother.getISAM2Result().getVariablesRelinearized():
-                return

@@ -15,29 +15,25 @@ _MAX_STEPS = 20
 
 
 def solved(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keys: Sequence[int]) -> gtsam.Values:
-    """Values near which `graph` has its least error; its variables are vectors, eliminated in the order of `keys`.
-
-    Factors may change their noise when they are linearised (see `motion_factor`), so errors are compared between two
-    linearisations only.
-    """
+    """Values near which `graph` has its least error; its variables are vectors, eliminated in the order of `keys`."""
     ordering = gtsam.Ordering()
     for key in keys:
         ordering.push_back(key)
     sizes = [len(values.atVector(key)) for key in keys]
-    damping = _START
+    damping, error = _START, graph.error(values)
     for _ in range(_MAX_STEPS):
         linear = graph.linearize(values)
-        before = after = graph.error(values)
+        before = error
         while damping < _LARGEST:
             damped = linear.clone()
             for key, size in zip(keys, sizes, strict=True):
                 damped.add(key, damping**0.5 * np.eye(size), np.zeros(size))
             trial = values.retract(damped.eliminateSequential(ordering, gtsam.EliminateQR).optimize())
-            after = graph.error(trial)
-            if after <= before:
-                values, damping = trial, damping / _FACTOR
+            trial_error = graph.error(trial)
+            if trial_error <= before:
+                values, error, damping = trial, trial_error, damping / _FACTOR
                 break
             damping *= _FACTOR
-        if not before - after > _TOLERANCE:
+        if not before - error > _TOLERANCE:
             break
     return values

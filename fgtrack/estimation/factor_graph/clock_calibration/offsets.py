@@ -162,17 +162,15 @@ class _Path:
         self._nodes = nodes
         self._keys = [gtsam.symbol("x", i) for i in range(len(nodes.stamps_ns))]
         wide = np.diag([_WIDE[name] ** 2 for name in motion.state_names])
-        step_s = seconds(nodes.stamps_ns[1] - nodes.stamps_ns[0])
-        self._chain = [
-            prior_factor(self._keys[0], nodes.means[0], wide),
-            *(motion_factor(motion, left, right, step_s) for left, right in pairwise(self._keys)),
-        ]
+        self._prior = prior_factor(self._keys[0], nodes.means[0], wide)
+        self._step_s = seconds(nodes.stamps_ns[1] - nodes.stamps_ns[0])
 
     def optimise(self, offsets_s: Mapping[str, float]) -> None:
-        """Bring the states to their best for these offsets, near where they are."""
+        """Bring the states to their best for these offsets, near where they are and with the process noise there."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for factor in self._chain:
-            graph.add(factor)
+        graph.add(self._prior)
+        for (left, right), mean in zip(pairwise(self._keys), self._nodes.means, strict=False):
+            graph.add(motion_factor(self._motion, left, right, self._step_s, mean))
         for item in self._measurements:
             found = self.pair_term(item, offsets_s)
             graph.add(pair_factor(self._keys, self._nodes, found, self._huber_width))
