@@ -31,7 +31,7 @@ from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.registry import ESTIMATORS, OOSM_GROUP, estimator
 from fgtrack.evaluation.bounds import ScheduledMeasurement, bounds, bounds_along
-from fgtrack.evaluation.figure_style import GREY, WRONG, colour, save, styled
+from fgtrack.evaluation.figures.style import GREY, WRONG, colour, save, styled
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
 

@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 
 from fgtrack.cli.sweep import swept
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.figure_style import PALETTE
+from fgtrack.evaluation.figures.style import PALETTE
 
 SWEEP = Path(__file__).parents[2] / "configs/sweeps/bursts.yaml"
 QUICK_SEEDS = 2

@@ -35,7 +35,7 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
 from fgtrack.estimation.registry import ESTIMATORS, EXACT, OOSM_GROUP, Claims, estimator
-from fgtrack.evaluation.figure_style import WRONG, colour, line_style, log_axis, save, styled
+from fgtrack.evaluation.figures.style import WRONG, colour, line_style, log_axis, save, styled
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
 

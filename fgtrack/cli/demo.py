@@ -9,7 +9,7 @@ import typer
 from fgtrack.cli.arguments import Overwrite
 from fgtrack.cli.show import TickProgress, console, progress
 from fgtrack.evaluation.comparison import compare
-from fgtrack.evaluation.figures import save_figures
+from fgtrack.evaluation.plot import save_figures
 from fgtrack.io.output import Kind, check_output, claimed, new_files
 from fgtrack.io.ros.bag_writer import RECORDING, write_bag
 from fgtrack.io.run import RUN, load_run

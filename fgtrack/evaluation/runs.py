@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 
 from fgtrack.core.errors import CallError
+from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
 from fgtrack.evaluation.matching import Matching, match
 from fgtrack.evaluation.metrics import Metrics, evaluate
 from fgtrack.io.run import Run, is_run_folder, load_run
@@ -26,12 +27,21 @@ class JudgedRun:
         return match(self.run)
 
     @cached_property
+    def lagged(self) -> tuple[LagMetrics, ...]:
+        """Errors of present, lagged and final states; empty for a run without truth."""
+        return lag_metrics(self.run, self.matching)
+
+    @cached_property
     def metrics(self) -> Metrics:
         """All metrics, judged as the run's configuration says."""
         return evaluate(self.run)
 
 
-def judged(runs: Iterable[Run | Path | str]) -> list[JudgedRun]:
+OneRun = Run | JudgedRun | Path | str
+Runs = OneRun | Iterable[OneRun]
+
+
+def judged(runs: Runs) -> list[JudgedRun]:
     """Runs under labels of their own; a path is a run folder, or a folder that holds run folders (by name).
 
     Raises
@@ -41,8 +51,33 @@ def judged(runs: Iterable[Run | Path | str]) -> list[JudgedRun]:
     DataError
         A run folder is damaged.
     """
-    every = [found for run in runs for found in ([run] if isinstance(run, Run) else _read(Path(run)))]
-    return [JudgedRun(label, run) for label, run in labelled(every).items()]
+    every = [runs] if isinstance(runs, OneRun) else list(runs)
+    if every and all(isinstance(run, JudgedRun) for run in every):
+        return [run for run in every if isinstance(run, JudgedRun)]
+    plain = [run.run if isinstance(run, JudgedRun) else run for run in every]
+    read = [found for run in plain for found in ([run] if isinstance(run, Run) else _read(Path(run)))]
+    return [JudgedRun(label, run) for label, run in labelled(read).items()]
+
+
+def one_judged(run: OneRun) -> JudgedRun:
+    """The one run that `run` stands for.
+
+    Raises
+    ------
+    CallError
+        It is a folder that holds several.
+    DataError
+        A run folder is damaged.
+    """
+    every = judged(run)
+    if len(every) > 1:
+        raise CallError(f"{run}: holds {len(every)} runs, name one of them")
+    return every[0]
+
+
+def start_ns(runs: Sequence[JudgedRun]) -> int:
+    """Time of the first tick of `runs`; 0 where there is none."""
+    return min((int(one.run.timing["now_ns"][0]) for one in runs if len(one.run.timing["now_ns"])), default=0)
 
 
 def labelled(runs: Sequence[Run]) -> dict[str, Run]:

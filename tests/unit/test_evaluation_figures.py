@@ -1,28 +1,63 @@
+"""Every figure by name, from one list: what it draws, what it says, and how it is saved."""
+
+import io
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 import pytest
 from evaluation_runs import ROUND, START_NS, TICK_NS, WEST, update, write_run
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.evaluation.figure_style import broken_line
-from fgtrack.evaluation.figures import (
-    figure_delays,
-    figure_errors,
-    figure_residuals,
-    figure_timing,
-    save_figures,
-)
-from fgtrack.evaluation.map_figure import figure_map
-from fgtrack.evaluation.matching import match
+from fgtrack.evaluation import plot
+from fgtrack.evaluation.figures.style import FORMATS, broken_line
+from fgtrack.evaluation.runs import judged
 from fgtrack.io.run import Run
 from fgtrack.models.track_map import COLUMNS, TrackMap
 
 TICKS = range(60)
 
+#: By name: the files of the two runs below, the text of the axes of the first, and the lines of its legend.
+EXPECTED: dict[str, tuple[list[str], list[str], list[str]]] = {
+    "map": (
+        ["map_smoother", "map_ekf-replay"],
+        ["x [m]", "y [m]"],
+        ["object 7, truth", "object 7, track", "object 8, truth", "object 8, track", "paired with no object"],
+    ),
+    "residuals": (
+        ["residuals_smoother", "residuals_ekf-replay"],
+        ["time [s]", "along track [m]", "density [1/m]"],
+        ["lidar: mean -0.200, std 0.141, n 60"],
+    ),
+    "delays": (
+        ["delays"],
+        ["delay [ms] (lines: mean; dashed: p90)", "share of the messages per bin", "share of the messages received"],
+        ["lidar: mean 150 ms, p90 150 ms, max 150 ms", "radar: mean 60 ms, p90 60 ms, max 60 ms"],
+    ),
+    "errors": (
+        ["errors_object_7", "errors_object_8"],
+        ["position error [m]", "speed error [m/s]", "yaw error [rad]", "time [s]"],
+        ["smoother: RMSE 0.3 m", "ekf-replay: RMSE 0.6 m"],
+    ),
+    "lag": (
+        ["error_against_lag"],
+        ["position RMSE [m]", "speed RMSE [m/s]", "lag [s] (how long the output waits)"],
+        ["smoother", "smoother: present states, same stamps", "ekf-replay: present, has no lag"],
+    ),
+    "timing": (
+        ["timing"],
+        ["time [s]", "time per tick with detections [ms]", "share of the ticks"],
+        ["smoother: median 1 ms, p99 1 ms", "ekf-replay: median 1 ms, p99 1 ms"],
+    ),
+}
+
 
 def a_run(folder: Path, *, truth: bool = True, along_m: float = 0.3, config_text: str = "") -> Run:
+    """WEST and a false track all the time, ROUND at times; the smoother has lagged states."""
     tracks = [
         [WEST.track(k, 1, along_m=along_m), WEST.track(k, 3, across_m=50.0)]
         + ([ROUND.track(k, 2)] if k < 10 or k > 50 else [])
@@ -36,9 +71,75 @@ def a_run(folder: Path, *, truth: bool = True, along_m: float = 0.3, config_text
         for k in TICKS
     }
     rows = [*WEST.truth(TICKS), *ROUND.truth(TICKS)] if truth else []
-    return write_run(
-        folder, tracks, truth=rows, updates=updates, meta={"estimator": folder.name}, config_text=config_text
-    )
+    smoothed = {k: [WEST.later(k - 5, 1, 0.1)] for k in TICKS[5:]} if folder.name == "smoother" else {}
+    meta = {"estimator": folder.name}
+    return write_run(folder, tracks, truth=rows, updates=updates, smoothed=smoothed, meta=meta, config_text=config_text)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Run]:
+    folder = tmp_path_factory.mktemp("runs")
+    return [a_run(folder / "smoother"), a_run(folder / "ekf-replay", along_m=0.6)]
+
+
+def found(name: str, runs: Sequence[Run]) -> dict[str, Figure]:
+    return dict(plot.FIGURES[name](judged(runs)))
+
+
+def legend(axes: Axes) -> list[str]:
+    shown = axes.get_legend()
+    assert shown is not None
+    return [text.get_text() for text in shown.get_texts()]
+
+
+def labels(figure: Figure) -> set[str]:
+    return {text for axes in figure.axes for text in (axes.get_xlabel(), axes.get_ylabel())} - {""}
+
+
+# --- every figure
+
+
+def test_the_list_has_every_figure() -> None:
+    assert list(EXPECTED) == list(plot.FIGURES)
+    assert set(plot.FIGURES) <= set(plot.__all__)
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_a_figure_says_what_it_shows(name: str, runs: list[Run]) -> None:
+    files, text, lines = EXPECTED[name]
+    figures = found(name, runs)
+    assert list(figures) == files
+    first = figures[files[0]]
+    assert set(text) <= labels(first)
+    assert legend(first.axes[0]) == lines
+    assert first.get_suptitle()
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_a_function_takes_runs_folders_and_runs_in_memory(name: str, runs: list[Run]) -> None:
+    draw = getattr(plot, name)
+    assert runs[0].path is not None
+    expected = labels(draw(runs[0]))
+    for run in (str(runs[0].path), replace(runs[0], path=None), judged(runs)[0]):
+        assert labels(draw(run)) == expected
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_a_run_without_data_has_no_figure(name: str, tmp_path: Path) -> None:
+    empty = write_run(tmp_path / "run", [[]])
+    assert found(name, [empty]) == {}
+    if name != "map":
+        with pytest.raises(DataError, match="to draw"):
+            getattr(plot, name)(empty)
+
+
+def test_a_run_without_truth_has_the_figures_that_need_none(tmp_path: Path) -> None:
+    plain = a_run(tmp_path / "smoother", truth=False)
+    assert [name for name in plot.FIGURES if found(name, [plain])] == ["map", "residuals", "delays", "timing"]
+    assert "no truth" in plot.map(plain).get_suptitle()
+
+
+# --- one by one
 
 
 def circle_map(path: Path) -> Path:
@@ -52,121 +153,83 @@ def circle_map(path: Path) -> Path:
     return path
 
 
-def test_every_figure_is_saved_and_the_common_ones_once(tmp_path: Path) -> None:
-    runs = [a_run(tmp_path / "smoother"), a_run(tmp_path / "ekf-replay", along_m=0.6)]
-    files = save_figures(runs, tmp_path / "out" / "figures")
-    assert [file.name for file in files] == [
-        "map_smoother.png",
-        "residuals_smoother.png",
-        "map_ekf-replay.png",
-        "residuals_ekf-replay.png",
-        "delays.png",
-        "errors_object_7.png",
-        "errors_object_8.png",
-        "timing.png",
-    ]
-    assert all(file.read_bytes().startswith(b"\x89PNG") for file in files)
-
-
-def test_figures_are_the_same_bytes_every_time_whatever_the_users_style(tmp_path: Path) -> None:
-    run = a_run(tmp_path / "smoother")
-    first = save_figures([run], tmp_path / "first")
-    with mpl.rc_context({"lines.linewidth": 9.0, "axes.facecolor": "red", "savefig.dpi": 30}):
-        before = dict(mpl.rcParams)
-        second = save_figures([run], tmp_path / "second")
-        assert dict(mpl.rcParams) == before
-    assert [file.read_bytes() for file in first] == [file.read_bytes() for file in second]
-    assert b"Software" not in first[0].read_bytes()
-
-
-def test_a_run_without_truth_has_the_figures_that_need_none(tmp_path: Path) -> None:
-    files = save_figures([a_run(tmp_path / "run", truth=False)], tmp_path / "out")
-    assert [file.name.split("_")[0] for file in files] == ["map", "residuals", "delays.png", "timing.png"]
-
-
-def test_an_empty_run_has_no_figures(tmp_path: Path) -> None:
-    assert save_figures([write_run(tmp_path / "run", [[]])], tmp_path / "out") == []
-
-
-def test_the_map_shows_bounds_truth_and_false_tracks(tmp_path: Path) -> None:
+def test_the_map_shows_the_bounds_of_the_track(tmp_path: Path) -> None:
     run = a_run(tmp_path / "run", config_text=f"map:\n  track: {circle_map(tmp_path / 'map.csv')}\n")
-    (axes,) = figure_map(run, match(run)).axes
-    legend = axes.get_legend()
-    assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == [
-        "object 7, truth",
-        "object 7, track",
-        "object 8, truth",
-        "object 8, track",
-        "paired to no object",
-    ]
+    (axes,) = plot.map(run).axes
     radii = [float(np.hypot(*np.asarray(line.get_data())).mean()) for line in axes.lines[:2]]
     assert radii == pytest.approx([292.5, 307.5], abs=0.5)
 
 
-def test_a_map_that_is_gone_is_said_and_one_that_is_none_is_refused(tmp_path: Path) -> None:
-    gone = a_run(tmp_path / "gone", config_text="map: {track: nowhere.csv}")
-    figure = figure_map(gone, match(gone))
-    assert "not there any more" in figure.get_suptitle()
+def test_a_map_that_is_gone_is_said_and_one_that_is_none_is_refused(tmp_path: Path, runs: list[Run]) -> None:
+    gone = replace(runs[0], config_text="map: {track: nowhere.csv}")
+    assert "not there any more" in plot.map(gone).get_suptitle()
     (tmp_path / "bad.csv").write_text("no map\n")
-    bad = a_run(tmp_path / "bad", config_text=f"map:\n  track: {tmp_path / 'bad.csv'}\n")
-    with pytest.raises(DataError, match="no map"):
-        figure_map(bad, match(bad))
-    broken = a_run(tmp_path / "broken", config_text="map: {")
-    with pytest.raises(DataError, match="not YAML"):
-        figure_map(broken, match(broken))
+    for text, message in ((f"map: {{track: {tmp_path / 'bad.csv'}}}", "no map"), ("map: {", "not YAML")):
+        with pytest.raises(DataError, match=message):
+            plot.map(replace(runs[0], config_text=text))
 
 
-def test_the_built_in_oval_is_drawn_and_open_space_has_no_bounds(tmp_path: Path) -> None:
-    oval = a_run(tmp_path / "oval", config_text="map: {track: oval}")
-    space = a_run(tmp_path / "space", config_text="map: {track: null}")
-    count = [len(figure_map(run, match(run)).axes[0].lines) for run in (oval, space)]
-    assert count[0] == count[1] + 2
+def test_the_built_in_oval_is_drawn_and_open_space_has_no_bounds(runs: list[Run]) -> None:
+    oval, space = (replace(runs[0], config_text=f"map: {{track: {name}}}") for name in ("oval", "null"))
+    assert len(plot.map(oval).axes[0].lines) == len(plot.map(space).axes[0].lines) + 2
 
 
-def test_the_residual_figure_has_a_row_per_component_and_says_mean_and_deviation(tmp_path: Path) -> None:
-    axes = figure_residuals(a_run(tmp_path / "run")).axes
+def test_two_rows_that_are_far_apart_are_no_line(tmp_path: Path) -> None:
+    tracks = [[WEST.track(k, 1), *([WEST.track(k, 2, across_m=9.0)] if k in (0, 59) else [])] for k in TICKS]
+    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS))
+    wrong = plot.map(run).axes[0].lines[-1]
+    assert np.isnan(np.asarray(wrong.get_xdata(), dtype=float)).tolist() == [False, True, False]
+
+
+def test_the_residual_figure_has_a_row_for_each_component(runs: list[Run]) -> None:
+    axes = plot.residuals(runs[0]).axes
     assert [one.get_ylabel() for one in axes[::2]] == ["along track [m]", "across track [m]", "speed [m/s]"]
-    legend = axes[4].get_legend()
-    assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == ["radar: mean 0.200, std 0.163, n 60"]
+    assert [one.get_xlabel() for one in axes[1::2]] == ["density [1/m]", "density [1/m]", "density [s/m]"]
+    assert legend(axes[4]) == ["radar: mean 0.200, std 0.163, n 60"]
 
 
 def test_outliers_do_not_widen_the_residual_figure_but_are_counted(tmp_path: Path) -> None:
     values = [0.1 * (k % 11) - 0.5 for k in TICKS]
     values[7] = 99.0
     updates = {k: [update(tick=k, speed_mps=value)] for k, value in enumerate(values)}
-    axes = figure_residuals(write_run(tmp_path / "run", updates=updates)).axes[0]
+    axes = plot.residuals(write_run(tmp_path / "run", updates=updates)).axes[0]
     assert axes.get_ylim()[1] < 5.0
-    legend = axes.get_legend()
-    assert legend is not None
-    assert legend.get_texts()[0].get_text().endswith("n 60 (1 outside)")
+    assert legend(axes)[0].endswith("n 60 (1 outside)")
 
 
-def test_the_delay_figure_says_mean_and_quantile(tmp_path: Path) -> None:
-    legend = figure_delays(a_run(tmp_path / "run")).axes[0].get_legend()
-    assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == [
-        "lidar: mean 150 ms, q90 150 ms, max 150 ms",
-        "radar: mean 60 ms, q90 60 ms, max 60 ms",
-    ]
+def test_runs_of_different_recordings_have_delays_of_their_own(tmp_path: Path, runs: list[Run]) -> None:
+    other = write_run(tmp_path / "other", updates={0: [update(delay_ns=1_000_000)]})
+    figures = found("delays", [*runs, other])
+    assert list(figures) == ["delays_smoother", "delays_other (smoother)"]
+    title = figures["delays_smoother"].get_suptitle()
+    assert title == "smoother, ekf-replay: delay of the messages with detections"
 
 
-def test_the_error_figure_is_broken_where_the_object_was_not_tracked(tmp_path: Path) -> None:
-    matching = match(a_run(tmp_path / "run"))
-    assert matching is not None
-    axes = figure_errors({"run": matching}, 8).axes
-    assert [one.get_ylabel() for one in axes] == [
-        "position error [m]",
-        "speed error [m/s]",
-        "yaw error [rad]",
-    ]
-    assert np.isnan(np.asarray(axes[0].lines[0].get_ydata(), dtype=float)).sum() == 1
+def test_the_error_figure_is_broken_where_the_object_was_not_tracked(runs: list[Run]) -> None:
+    (line, *_) = plot.errors(runs, 8).axes[0].lines
+    assert np.isnan(np.asarray(line.get_ydata(), dtype=float)).sum() == 1
+    x = np.asarray(line.get_xdata(), dtype=float)
+    assert (np.nanmin(x), np.nanmax(x)) == pytest.approx((0.0, 59 * 0.02))
+
+
+def test_errors_of_several_objects_are_their_root_mean_square(runs: list[Run]) -> None:
+    axes = plot.errors(runs[0]).axes[0]
+    y = np.asarray(axes.lines[0].get_ydata(), dtype=float)
+    assert y[[5, 30]] == pytest.approx([0.3 / np.sqrt(2.0), 0.3])  # both are tracked, WEST alone
+    assert legend(axes) == [f"smoother: RMSE {0.3 * np.sqrt(60 / 79):.3g} m"]
+    with pytest.raises(DataError, match="object 9: no run has truth of it, there are 7, 8"):
+        plot.errors(runs, 9)
+
+
+def test_a_folder_of_several_runs_is_not_one_run(runs: list[Run]) -> None:
+    assert runs[0].path is not None
+    with pytest.raises(CallError, match="holds 2 runs"):
+        plot.map(runs[0].path.parent)
 
 
 def test_the_time_figure_leaves_out_ticks_without_detections(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", process_ns=[1_000_000, 2_000_000, 4_000_000], num_detections=[0, 1, 1])
-    (over_time, _) = figure_timing({"run": run}).axes
+    (over_time, _) = plot.timing(run).axes
     assert np.asarray(over_time.lines[0].get_ydata()).tolist() == [2.0, 4.0]
 
 
@@ -177,14 +240,56 @@ def test_a_line_is_not_drawn_across_a_pause() -> None:
     np.testing.assert_array_equal(y, [1.0, 0.0, np.nan, 2.0, 3.0])
 
 
-def test_two_rows_that_are_far_apart_are_no_line(tmp_path: Path) -> None:
-    tracks = [[WEST.track(k, 1), *([WEST.track(k, 2, across_m=9.0)] if k in (0, 59) else [])] for k in TICKS]
-    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS))
-    wrong = figure_map(run, match(run)).axes[0].lines[-1]
-    assert np.isnan(np.asarray(wrong.get_xdata(), dtype=float)).tolist() == [False, True, False]
+# --- files
 
 
-def test_a_folder_that_cannot_be_made_is_one_clear_error(tmp_path: Path) -> None:
+@pytest.fixture
+def short_run(tmp_path: Path) -> Run:
+    return write_run(tmp_path / "a run", process_ns=[1_000_000], num_detections=[1])
+
+
+@pytest.mark.parametrize(
+    ("form", "start", "varying"),
+    [("png", b"\x89PNG", b"Software"), ("svg", b"<?xml", b"dc:date"), ("pdf", b"%PDF", b"CreationDate")],
+)
+def test_files_hold_no_date_and_no_version(
+    form: str, start: bytes, varying: bytes, short_run: Run, tmp_path: Path
+) -> None:
+    (file,) = plot.save_figures(short_run, tmp_path / "out", form)
+    assert file.name == f"timing.{form}"
+    content = file.read_bytes()
+    assert content.startswith(start)
+    assert varying not in content
+
+
+def test_a_figure_has_its_style_whenever_it_is_drawn_and_saved(short_run: Run) -> None:
+    def picture(figure: Figure) -> bytes:
+        file = io.BytesIO()
+        figure.savefig(file, dpi=30)
+        return file.getvalue()
+
+    first = plot.timing(short_run)
+    with mpl.rc_context({"lines.linewidth": 9.0, "axes.facecolor": "red", "xtick.labelsize": 30}):
+        before = dict(mpl.rcParams)
+        assert picture(plot.timing([short_run])) == picture(first)
+        assert dict(mpl.rcParams) == before
+    assert picture(first) == picture(plot.timing(short_run))
+
+
+def test_a_notebook_shows_a_figure(short_run: Run) -> None:
+    figure = plot.timing(short_run)
+    figure.set_dpi(30)
+    shown = figure._repr_html_()
+    assert shown is not None
+    assert shown.startswith('<img src="data:image/png;base64,')
+
+
+def test_what_cannot_be_written_is_one_clear_error(short_run: Run, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(CallError, match="cannot be made"):
-        save_figures([a_run(tmp_path / "run")], tmp_path / "file" / "out")
+        plot.save_figures(short_run, tmp_path / "file" / "out")
+    with pytest.raises(CallError, match="cannot be written"):
+        plot.save(plot.timing(short_run), tmp_path / "nowhere" / "timing.png")
+    for name in ("timing.gif", "timing"):
+        with pytest.raises(CallError, match=rf"no format of a figure.*{', .'.join(FORMATS)}"):
+            plot.save(plot.timing(short_run), tmp_path / name)

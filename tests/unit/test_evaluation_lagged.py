@@ -10,11 +10,10 @@ import pytest
 from evaluation_runs import ROUND, WEST, write_run
 
 from fgtrack.core.types import SmoothedReport
-from fgtrack.evaluation.figures import save_figures
-from fgtrack.evaluation.lag_figure import figure_lag
 from fgtrack.evaluation.lagged import WINDOW, LagMetrics, lag_metrics
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.metrics import evaluate
+from fgtrack.evaluation.plot import lag
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.io.run import Run
 
@@ -174,8 +173,7 @@ def test_lags_are_strict_json(tmp_path: Path) -> None:
 
 
 def test_the_figure_has_a_line_per_run_and_a_level_one_for_a_filter(tmp_path: Path) -> None:
-    runs = {"smoother": smoothed_run(tmp_path / "a"), "ekf-replay": filter_run(tmp_path / "b")}
-    figure = figure_lag({label: lag_metrics(run, match(run)) for label, run in runs.items()})
+    figure = lag([smoothed_run(tmp_path / "smoother"), filter_run(tmp_path / "ekf-replay")])
     position, speed = figure.axes
     assert (position.get_ylabel(), speed.get_ylabel()) == ("position RMSE [m]", "speed RMSE [m/s]")
     assert speed.get_xlabel().startswith("lag [s]")
@@ -197,19 +195,8 @@ def test_the_figure_has_a_line_per_run_and_a_level_one_for_a_filter(tmp_path: Pa
         assert high > max(float(np.max(np.asarray(line.get_ydata()))) for line in axes.lines)
 
 
-def test_the_figure_is_drawn_where_a_run_has_lagged_states_and_the_same_every_time(tmp_path: Path) -> None:
-    smoother, plain = smoothed_run(tmp_path / "smoother"), filter_run(tmp_path / "ekf-replay")
-    name = "error_against_lag.png"
-    assert name not in [file.name for file in save_figures([plain], tmp_path / "plain")]
-    for folder in ("first", "second"):
-        assert name in [file.name for file in save_figures([smoother, plain], tmp_path / folder)]
-    assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()
-
-
 def test_truth_without_speed_leaves_the_speed_out(tmp_path: Path) -> None:
     tracks = [[WEST.track(k, 1, along_m=1.0)] for k in TICKS]
     smoothed = {k: [WEST.later(k - 5, 1, 0.1, along_m=0.5)] for k in range(5, 20)}
     run = write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS, pose=False), smoothed=smoothed)
-    assert [axes.get_ylabel() for axes in figure_lag({"run": lag_metrics(run, match(run))}).axes] == [
-        "position RMSE [m]"
-    ]
+    assert [axes.get_ylabel() for axes in lag(run).axes] == ["position RMSE [m]"]

@@ -1,10 +1,12 @@
 """How figures look, and how they are saved: the same bytes every time, whatever the user's own settings."""
 
+import base64
+import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import matplotlib as mpl
 import numpy as np
@@ -46,10 +48,32 @@ _STYLE = {
     "savefig.dpi": 150,
     "path.simplify": True,
     "agg.path.chunksize": 20_000,
+    "svg.hashsalt": "fgtrack",
+}
+
+#: Formats of files, and the entries that would differ from one writing to the next.
+FORMATS: Mapping[str, Mapping[str, None]] = {
+    "png": {"Software": None},
+    "svg": {"Date": None, "Creator": None},
+    "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
 }
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+
+class StyledFigure(Figure):
+    """A figure with the style of fgtrack, whatever the user's settings are when it is drawn; notebooks show it."""
+
+    def draw(self, renderer: Any) -> None:  # Any: matplotlib does not export the type
+        """Draw it, see `matplotlib.figure.Figure.draw`."""
+        with mpl.rc_context(_STYLE):
+            super().draw(renderer)
+
+    def _repr_html_(self) -> str:
+        picture = io.BytesIO()
+        self.savefig(picture, format="png")
+        return f'<img src="data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}">'
 
 
 def styled(function: Callable[P, T]) -> Callable[P, T]:
@@ -71,6 +95,11 @@ def colour(index: int) -> str:
 def line_style(index: int) -> str:
     """Line style of the entry `index`: it changes when the colours repeat."""
     return _LINES[index // len(PALETTE) % len(_LINES)]
+
+
+def titled(label: str, what: str) -> str:
+    """Title of a figure that shows `what` of the run `label`, or of all runs where that is empty."""
+    return f"{label}: {what}" if label else what[0].upper() + what[1:]
 
 
 def legend_above(axes: Axes, width: int) -> None:
@@ -108,16 +137,20 @@ def broken_line(stamps_ns: IntArray, x: FloatArray, y: FloatArray, step_ns: floa
 
 
 @styled
-def save(figure: Figure, path: Path) -> Path:
-    """Write `figure` as PNG without date and version, so that equal figures are equal files.
+def save(figure: Figure, path: Path | str) -> Path:
+    """Write `figure` as PNG, SVG or PDF, as the suffix says, without date and version: equal figures, equal files.
 
     Raises
     ------
     CallError
-        The file cannot be written.
+        The suffix is none of these, or the file cannot be written.
     """
+    path = Path(path)
+    form = path.suffix.lower().removeprefix(".")
+    if form not in FORMATS:
+        raise CallError(f"{path}: no format of a figure, end the name with .{', .'.join(FORMATS)}")
     try:
-        figure.savefig(path, format="png", metadata={"Software": None})
+        figure.savefig(path, format=form, metadata=dict(FORMATS[form]))
     except OSError as error:
         raise CallError(f"{path}: cannot be written ({error.strerror}), choose another folder") from error
     return path

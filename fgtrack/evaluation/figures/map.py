@@ -6,8 +6,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from fgtrack.evaluation.figure_style import GREY, WRONG, broken_line, colour, legend_above, styled, usual_step_ns
+from fgtrack.evaluation.figures.style import (
+    GREY,
+    WRONG,
+    StyledFigure,
+    broken_line,
+    colour,
+    legend_above,
+    styled,
+    usual_step_ns,
+)
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, Matching
+from fgtrack.evaluation.runs import OneRun, one_judged
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import Run, Table
 from fgtrack.io.run.judging import section
@@ -18,11 +28,11 @@ _NAMED_OBJECTS = 8  # more objects than these share two entries of the legend
 
 
 @styled
-def figure_map(run: Run, matching: Matching | None, title: str = "") -> Figure:
+def tracks_on_map(run: OneRun) -> Figure:
     """Tracks and truth on the map that `config.yaml` names as `map.track`.
 
     Truth is a broad pale line, so a stretch that nothing tracked stays visible; a track has the colour of the
-    object that it is paired to, and is black where it is paired to none. Without truth every track with
+    object that it is paired with, and is black where it is paired with none. Without truth every track with
     enough measurements has a colour.
 
     Raises
@@ -30,35 +40,32 @@ def figure_map(run: Run, matching: Matching | None, title: str = "") -> Figure:
     DataError
         `config.yaml` is not YAML, or the map that it names is no map.
     """
-    figure = Figure(figsize=(8.0, 7.0))
+    one = one_judged(run)
+    title, matching = one.label, one.matching
+    figure = StyledFigure(figsize=(8.0, 7.0))
     axes = figure.add_subplot()
-    name = _map_name(run)
+    name = section(one.run, "map").get("track")
     if name == OVAL:
         _draw_bounds(axes, make_oval())
-    elif name and Path(name).exists():
-        _draw_bounds(axes, TrackMap.read(Path(name)))
+    elif name and Path(str(name)).exists():
+        _draw_bounds(axes, TrackMap.read(Path(str(name))))
     elif name:
         title += "\n(the map file is not there any more)"
     if matching is None:
-        tracks = run.tracks.where(run.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS)
+        tracks = one.run.tracks.where(one.run.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS)
         step_ns = usual_step_ns(tracks["now_ns"])
         for k, track_id in enumerate(np.unique(tracks["track_id"]).tolist()):
             _draw_tracks(axes, tracks.where(tracks["track_id"] == track_id), step_ns, colour(k), "")
         count = len(np.unique(tracks["track_id"]))
         title += f"\n{count} tracks with at least {CONFIRMED_MEASUREMENTS} measurements, no truth"
     else:
-        _draw_matched(axes, run, matching)
+        _draw_matched(axes, one.run, matching)
         legend_above(axes, width=75)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     figure.suptitle(title.strip())
     return figure
-
-
-def _map_name(run: Run) -> str | None:
-    name = section(run, "map").get("track")
-    return None if name is None else str(name)
 
 
 def _draw_bounds(axes: Axes, track_map: TrackMap) -> None:
@@ -80,7 +87,7 @@ def _draw_matched(axes: Axes, run: Run, matching: Matching) -> None:
         axes.plot(*line, color=colour(index), lw=4.0, alpha=0.3, label=label)
         label = f"{name}, track" if few or not index else ""
         _draw_tracks(axes, tracks.where(matching.object_index == index), step_ns, colour(index), label)
-    _draw_tracks(axes, tracks.where(~matching.paired), step_ns, WRONG, "paired to no object")
+    _draw_tracks(axes, tracks.where(~matching.paired), step_ns, WRONG, "paired with no object")
 
 
 def _draw_tracks(axes: Axes, tracks: Table, step_ns: float, color: str, label: str) -> None:

@@ -1,0 +1,87 @@
+"""The figure of the innovations."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import FloatArray
+from fgtrack.evaluation import innovations
+from fgtrack.evaluation.figures.style import StyledFigure, colour, legend_above, styled, titled
+from fgtrack.evaluation.innovations import ANGULAR, RESIDUAL_NAMES
+from fgtrack.evaluation.runs import OneRun, one_judged, start_ns
+from fgtrack.evaluation.statistics import Moments
+
+_RESIDUALS = {
+    "along_m": "along track [m]",
+    "across_m": "across track [m]",
+    "x_m": "x [m]",
+    "y_m": "y [m]",
+    "yaw_rad": "yaw [rad]",
+    "speed_mps": "speed [m/s]",
+    "range_m": "range [m]",
+    "bearing_rad": "bearing [rad]",
+    "range_rate_mps": "range rate [m/s]",
+}
+_DENSITIES = {"m": "1/m", "rad": "1/rad", "mps": "s/m"}
+
+
+@styled
+def residuals(run: OneRun) -> Figure:
+    """Residuals (innovations) per sensor, a row per component: over time, and how they are distributed.
+
+    Bins and axes cover the bulk of every sensor's residuals; the legend says how many lie outside.
+
+    Raises
+    ------
+    DataError
+        The run has no innovations.
+    """
+    one = one_judged(run)
+    values, updates = innovations.residuals(one.run), one.run.updates
+    time_s = (updates["stamp_ns"] - start_ns([one])) / NS_PER_S
+    sensors = np.unique(updates["sensor"]).tolist()
+    names = [name for name in RESIDUAL_NAMES if np.isfinite(values[name]).any()]
+    if "along_m" in names:
+        names = [name for name in names if name not in ("x_m", "y_m")]
+    if not names:
+        raise DataError(f"{one.label}: has no innovations, so there are no residuals to draw")
+    figure = StyledFigure(figsize=(10.0, 0.8 + 2.4 * len(names)))
+    rows = figure.subplots(len(names), 2, squeeze=False, sharey="row", width_ratios=(2, 1))
+    for (over_time, histogram), name in zip(rows, names, strict=True):
+        known = {sensor: np.isfinite(values[name]) & (updates["sensor"] == sensor) for sensor in sensors}
+        low, high = _core([values[name][mine] for mine in known.values() if mine.any()])
+        bins = np.linspace(low, high, 41)
+        for k, (sensor, mine) in enumerate(known.items()):
+            sample = values[name][mine]
+            if not len(sample):
+                continue
+            moments = (Moments.of_angles if name in ANGULAR else Moments.of)(sample)
+            outside = int(((sample < low) | (sample > high)).sum())
+            mean = round(moments.mean, 3) + 0.0  # no negative zero
+            label = f"{sensor}: mean {mean:.3f}, std {moments.std:.3f}, n {moments.count}"
+            label += f" ({outside} outside)" if outside else ""
+            over_time.plot(time_s[mine], sample, ".", ms=3.0, alpha=0.6, mew=0, color=colour(k), label=label)
+            density = np.histogram(sample, bins)[0] / (len(sample) * np.diff(bins))
+            histogram.stairs(density, bins, orientation="horizontal", color=colour(k), lw=1.4)
+        over_time.set_ylim(low, high)
+        over_time.set_ylabel(_RESIDUALS[name])
+        histogram.set_xlabel(f"density [{_DENSITIES[name.rpartition('_')[2]]}]")
+        over_time.set_xlabel("time [s]")
+        over_time.sharex(rows[0][0])
+        legend_above(over_time, width=80)
+    figure.suptitle(titled(one.label, "residuals (measured minus predicted)"))
+    return figure
+
+
+def _core(samples: Sequence[FloatArray]) -> tuple[float, float]:
+    """Range that holds the bulk of every one of `samples`: three interquartile ranges beyond the quartiles."""
+    lows, highs = [], []
+    for sample in samples:
+        first, third = np.quantile(sample, (0.25, 0.75)).tolist()
+        lows.append(max(float(sample.min()), first - 3.0 * (third - first)))
+        highs.append(min(float(sample.max()), third + 3.0 * (third - first)))
+    margin = max(0.05 * (max(highs) - min(lows)), 1e-6)
+    return min(lows) - margin, max(highs) + margin
