@@ -51,10 +51,19 @@ def test_torn_candidates_are_born_after_those_that_had_no_partner() -> None:
     assert assignment.missed == [1]
 
 
-@pytest.mark.parametrize("association", [GatedEuclidean(gate_m=5.0), UngatedEuclidean(gate_m=5.0)])
+@pytest.mark.parametrize(
+    "association",
+    [
+        GatedEuclidean(gate_m=5.0),
+        GatedEuclidean(gate_m=9.0, max_nis=25.0),
+        GatedMahalanobis(max_distance_m=5.0, gate_probability=1.0 - 1e-9),
+        UngatedEuclidean(gate_m=5.0),
+    ],
+)
 def test_the_gate_itself_is_inside(association: Association) -> None:
-    assert association([candidate(5.0, 0.0)], states([(0.0, 0.0)])).pairs == [(0, 0)]
-    assert association([candidate(np.nextafter(5.0, 6.0), 0.0)], states([(0.0, 0.0)])).pairs == []
+    tracks = states([(0.0, 0.0)], variance_m2=0.5)
+    assert association([candidate(5.0, 0.0, 0.5)], tracks).pairs == [(0, 0)]
+    assert association([candidate(np.nextafter(5.0, 6.0), 0.0, 0.5)], tracks).pairs == []
 
 
 @pytest.mark.parametrize("association", ALL)
@@ -92,6 +101,19 @@ def test_the_gated_assignment_has_most_pairs_and_among_those_the_least_distance(
     total = sum(distances[i, j] for i, j in found.pairs)
     best = min(choices)
     assert (-len(found.pairs), total) == (best[0], pytest.approx(best[1], abs=1e-6))
+
+
+@pytest.mark.parametrize("association", [GatedEuclidean(gate_m=5.0), GatedEuclidean(gate_m=5.0, max_nis=1e9)])
+def test_two_poor_pairs_are_better_than_one_good_one(association: Association) -> None:
+    tracks = states([(0.0, 0.0), (-4.9, 0.0)])
+    assert association([candidate(0.0, 0.0), candidate(4.9, 0.0)], tracks).pairs == [(0, 1), (1, 0)]
+
+
+@pytest.mark.parametrize("association", [GatedEuclidean(gate_m=5e6), GatedMahalanobis(max_distance_m=5e6)])
+def test_two_poor_pairs_are_better_than_one_good_one_however_far_the_gate_reaches(association: Association) -> None:
+    """Squared Mahalanobis distances of 6.5, and log det S of 59."""
+    tracks = states([(0.0, 0.0), (-4.9e6, 0.0)], variance_m2=4.9e6**2 / 6.5)
+    assert association([candidate(0.0, 0.0), candidate(4.9e6, 0.0)], tracks).pairs == [(0, 1), (1, 0)]
 
 
 def test_what_is_near_but_not_believed_goes_nowhere_and_leaves_the_track_to_others() -> None:
@@ -143,8 +165,8 @@ def test_the_distance_of_a_bearing_is_from_the_track_to_the_line_of_sight_ahead(
 
 @pytest.mark.parametrize("association", ALL)
 def test_a_bearing_takes_the_track_in_its_line_of_sight(association: Association) -> None:
-    pose = SensorPose(0.0, 0.0, 0.0)
-    tracks = states([(30.0, 2.9), (30.0, -0.1)])
+    pose = SensorPose(10.0, -20.0, math.pi / 2)
+    tracks = states([(7.1, 10.0), (10.1, 10.0)])
     assert association([bearing(0.0, pose)], tracks).pairs == [(0, 1)]
 
 
@@ -154,8 +176,9 @@ def test_a_bearing_takes_the_track_in_its_line_of_sight(association: Association
         (lambda: GatedEuclidean(gate_m=0.0), "gate_m"),
         (lambda: GatedEuclidean(gate_m=math.nan), "gate_m"),
         (lambda: GatedEuclidean(max_nis=0.0), "max_nis"),
+        (lambda: GatedMahalanobis(gate_probability=0.0), "gate_probability"),
         (lambda: GatedMahalanobis(gate_probability=1.0), "gate_probability"),
-        (lambda: GatedMahalanobis(max_distance_m=-1.0), "max_distance_m"),
+        (lambda: GatedMahalanobis(max_distance_m=0.0), "max_distance_m"),
     ],
 )
 def test_a_gate_that_makes_no_sense_is_named(make, message: str) -> None:
