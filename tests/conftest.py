@@ -1,8 +1,15 @@
-"""Makes `tests/support` importable as `support`, and keeps BLAS to one thread, as the command line does."""
+"""Makes `tests/support` importable as `support`, keeps BLAS to one thread, sets how many examples hypothesis draws."""
 
 import os
 import sys
 from pathlib import Path
 
+from hypothesis import settings
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parent))
+
+# The same examples at every run, and few; `--hypothesis-profile=thorough` draws others every time.
+settings.register_profile("fast", deadline=None, derandomize=True, max_examples=25)
+settings.register_profile("thorough", deadline=None, max_examples=200)
+settings.load_profile("fast")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -40,7 +40,6 @@ def read(path: Path, config: InputConfig | None = None) -> list:
 # --- what fgtrack writes
 
 
-@settings(deadline=None, max_examples=25)
 @given(messages=message_lists(), storage=st.sampled_from(STORAGES), standard=st.booleans())
 def test_every_field_survives_the_bag_to_the_bit_and_in_order(tmp_path_factory, messages, storage, standard):
     path = tmp_path_factory.mktemp("bag") / "bag"

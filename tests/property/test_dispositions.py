@@ -188,7 +188,6 @@ FUSED = (Disposition.IN_SEQUENCE, Disposition.OUT_OF_SEQUENCE, Disposition.BEYON
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-@settings(deadline=None, max_examples=40)
 @given(messages=streams())
 def test_every_detection_ends_in_exactly_one_row_and_every_state_is_sound(name: str, messages: list[Delivered]) -> None:
     config = CONFIGS[name]
@@ -226,7 +225,7 @@ def test_a_detection_stamped_ahead_of_the_clock_starts_a_track_at_once(estimator
     assert track.state.mean[:2] == pytest.approx([20.0, 1.0])
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(messages=streams(), name=st.sampled_from(list(CONFIGS)))
 def test_the_same_input_gives_the_same_bits(messages: list[Delivered], name: str) -> None:
     config = CONFIGS[name]

@@ -3,7 +3,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 from support.tracking import bearing, candidate, states
@@ -74,7 +74,6 @@ def test_without_candidates_or_tracks_there_are_only_births_and_misses(associati
 
 
 @pytest.mark.parametrize("association", ALL)
-@settings(deadline=None, max_examples=30)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_everything_is_paired_or_left_over_exactly_once(association: Association, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -87,7 +86,6 @@ def test_everything_is_paired_or_left_over_exactly_once(association: Association
     assert missed == sorted(missed)
 
 
-@settings(deadline=None, max_examples=30)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_the_gated_assignment_has_most_pairs_and_among_those_the_least_distance(seed: int) -> None:
     rng = np.random.default_rng(seed)

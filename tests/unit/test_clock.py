@@ -3,7 +3,7 @@ import json
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fgtrack.core.errors import CallError
@@ -32,7 +32,6 @@ def test_what_is_received_at_a_tick_is_delivered_with_it() -> None:
     assert found == [(40 * MS, [40 * MS]), (60 * MS, [60 * MS]), (80 * MS, [60 * MS + 1])]
 
 
-@settings(deadline=None)
 @given(receipts_ns=receipts, node_hz=st.sampled_from([7.0, 20.0, 50.0, 333.0]))
 def test_every_message_is_delivered_once_at_the_first_tick_after_it(receipts_ns: list[int], node_hz: float) -> None:
     step_ns = int(1e9 / node_hz)

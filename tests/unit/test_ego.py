@@ -2,7 +2,7 @@ import math
 from dataclasses import replace
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.tracking import START_NS, ms
 
@@ -56,7 +56,6 @@ def test_without_any_state_there_is_no_pose() -> None:
     assert trajectory().current is None
 
 
-@settings(deadline=None, max_examples=30)
 @given(order=st.permutations(range(6)))
 def test_states_that_come_out_of_order_stand_in_order(order: list[int]) -> None:
     source = trajectory()

@@ -3,7 +3,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -56,7 +56,6 @@ def far_from(pose: SensorPose, kinematic: FloatArray) -> FloatArray:
 
 @every_model
 @given(kinematic=kinematics(), pose=poses())
-@settings(deadline=None)
 def test_every_component_is_what_the_sensor_sees(motion: MotionModel, kinematic: FloatArray, pose: SensorPose) -> None:
     kinematic = far_from(pose, kinematic)
     model = measurement_model(MEASURABLE, motion)
@@ -67,7 +66,6 @@ def test_every_component_is_what_the_sensor_sees(motion: MotionModel, kinematic:
 
 @every_model
 @given(kinematic=kinematics(), pose=poses())
-@settings(deadline=None)
 def test_the_jacobian_is_the_numeric_derivative(motion: MotionModel, kinematic: FloatArray, pose: SensorPose) -> None:
     x = state_of(motion, far_from(pose, kinematic))
     model = measurement_model(MEASURABLE, motion)
@@ -143,7 +141,6 @@ def test_equal_questions_share_one_model_whatever_the_noise() -> None:
 
 
 @given(angle=st.floats(-50.0, 50.0), turns=st.integers(-5, 5), other=st.floats(-4.0, 4.0))
-@settings(deadline=None)
 def test_residuals_wrap_angles_and_nothing_else(angle: float, turns: int, other: float) -> None:
     model = measurement_model(MEASURABLE, CTRV())
     z = np.full(7, angle + 2.0 * math.pi * turns)

@@ -3,7 +3,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad_vec, solve_ivp
@@ -61,7 +61,6 @@ def test_every_model_keeps_the_protocol(model: MotionModel) -> None:
 
 @every_model
 @given(kinematic=states())
-@settings(deadline=None)
 def test_no_time_changes_nothing_to_the_bit(model: MotionModel, kinematic: FloatArray) -> None:
     x = state_of(model, kinematic)
     assert_array_equal(model.predict(x, 0.0), x)
@@ -71,7 +70,6 @@ def test_no_time_changes_nothing_to_the_bit(model: MotionModel, kinematic: Float
 
 @every_model
 @given(kinematic=states(), dt_s=st.floats(-3.0, 3.0))
-@settings(deadline=None, max_examples=25)
 def test_the_flow_solves_its_differential_equation(model: MotionModel, kinematic: FloatArray, dt_s: float) -> None:
     x = state_of(model, kinematic)
     solution = solve_ivp(
@@ -82,7 +80,6 @@ def test_the_flow_solves_its_differential_equation(model: MotionModel, kinematic
 
 @every_model
 @given(kinematic=states(), a_s=st.floats(-5.0, 5.0), b_s=st.floats(-5.0, 5.0))
-@settings(deadline=None)
 def test_the_flow_and_its_jacobian_compose_forwards_and_backwards(
     model: MotionModel, kinematic: FloatArray, a_s: float, b_s: float
 ) -> None:
@@ -95,7 +92,6 @@ def test_the_flow_and_its_jacobian_compose_forwards_and_backwards(
 
 @every_model
 @given(kinematic=states(), dt_s=st.floats(-2.0, 2.0))
-@settings(deadline=None)
 def test_the_jacobian_is_the_numeric_derivative(model: MotionModel, kinematic: FloatArray, dt_s: float) -> None:
     x = state_of(model, kinematic)
     step = 1e-4 * np.eye(model.dim)
@@ -105,7 +101,6 @@ def test_the_jacobian_is_the_numeric_derivative(model: MotionModel, kinematic: F
 
 @every_model
 @given(kinematic=states(), duration_s=st.floats(1e-6, 5.0), fraction=st.floats(0.0, 1.0))
-@settings(deadline=None)
 def test_a_split_segment_gathers_the_same_noise(
     model: MotionModel, kinematic: FloatArray, duration_s: float, fraction: float
 ) -> None:
@@ -121,7 +116,6 @@ def test_a_split_segment_gathers_the_same_noise(
 
 @every_model
 @given(kinematic=states(), dt_s=st.floats(0.0, 5.0))
-@settings(deadline=None)
 def test_process_noise_is_symmetric_and_positive_semidefinite(
     model: MotionModel, kinematic: FloatArray, dt_s: float
 ) -> None:
@@ -317,7 +311,6 @@ def test_at_speed_zero_the_heading_is_unknown_but_finite() -> None:
 
 
 @given(yaw=st.floats(-3.0, 3.0), speed=st.sampled_from([0.0, 3.0]))
-@settings(deadline=None, max_examples=20)
 def test_a_birth_with_constant_velocity_has_the_spread_of_its_samples(yaw: float, speed: float) -> None:
     """Also at speed 0, where the first order alone would be singular."""
     mean = np.array([0.0, 0.0, yaw, speed, 0.0])

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -53,7 +53,6 @@ def assert_close(actual: FloatArray, desired: FloatArray, rtol: float = 1e-12) -
 
 @every_model
 @given(case=cases())
-@settings(deadline=None, max_examples=200)
 def test_a_step_of_one_state_is_that_of_the_arrays(model: MotionModel, case: tuple[FloatArray, float]) -> None:
     kinematic, dt_s = case
     x = state_of(model, kinematic)
@@ -67,7 +66,6 @@ def test_a_step_of_one_state_is_that_of_the_arrays(model: MotionModel, case: tup
 
 @every_model
 @given(case=cases(), backwards=st.booleans())
-@settings(deadline=None, max_examples=200)
 def test_the_flow_of_one_state_is_that_of_the_arrays_in_both_directions(
     model: MotionModel, case: tuple[FloatArray, float], backwards: bool
 ) -> None:
@@ -86,7 +84,6 @@ def test_the_flow_of_one_state_is_that_of_the_arrays_in_both_directions(
 
 @every_model
 @given(case=cases(), fraction=st.floats(0.0, 1.0))
-@settings(deadline=None, max_examples=100)
 def test_steps_compose(model: MotionModel, case: tuple[FloatArray, float], fraction: float) -> None:
     kinematic, dt_s = case
     kinematic[4] = np.clip(kinematic[4], -1.0, 1.0)  # the arrays' own quadrature holds up to 4 rad
@@ -101,7 +98,6 @@ def test_steps_compose(model: MotionModel, case: tuple[FloatArray, float], fract
 
 @every_model
 @given(case=cases())
-@settings(deadline=None, max_examples=100)
 def test_the_noise_of_a_step_is_positive_semidefinite(model: MotionModel, case: tuple[FloatArray, float]) -> None:
     kinematic, dt_s = case
     Q = model.step(state_of(model, kinematic).tolist(), dt_s).Q

@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.tracking import StraightRoad, batch
 
@@ -70,7 +70,6 @@ def test_map_detections_need_no_ego() -> None:
     assert found.values == {"x_m": 10.0, "y_m": 3.0, "yaw_rad": 0.1}
 
 
-@settings(deadline=None, max_examples=30)
 @given(x=st.floats(-80, 80), y=st.floats(-80, 80), ego_yaw=st.floats(-3.1, 3.1), mount_yaw=st.floats(-3.1, 3.1))
 def test_a_polar_and_a_cartesian_detection_of_one_place_agree(
     x: float, y: float, ego_yaw: float, mount_yaw: float
@@ -191,7 +190,6 @@ def test_the_published_merge_makes_an_object_of_every_neighbourhood() -> None:
 
 
 @pytest.mark.parametrize("merge", [ConnectedMerge(), NeighbourhoodMerge(), NoMerge()])
-@settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 12))
 def test_every_detection_leads_or_is_merged_into_exactly_one_candidate(merge: Merge, seed: int, count: int) -> None:
     points = np.random.default_rng(seed).uniform(0.0, 15.0, size=(count, 2)).round(1)
@@ -201,7 +199,6 @@ def test_every_detection_leads_or_is_merged_into_exactly_one_candidate(merge: Me
     assert sorted(indices) == list(range(count))
 
 
-@settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 12))
 def test_connected_groups_are_those_of_a_search_by_hand(seed: int, count: int) -> None:
     points = np.random.default_rng(seed).uniform(0.0, 20.0, size=(count, 2))

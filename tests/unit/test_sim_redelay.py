@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 from support.messages import START_NS, drive, exact, message_lists
@@ -50,7 +50,6 @@ def delays_s(messages: list[Message], sensor: str) -> list[float]:
 
 
 @given(messages=message_lists(), seed=st.integers(0, 9))
-@settings(deadline=None)
 def test_messages_come_in_order_of_the_new_receipt_and_none_is_lost_or_changed(
     messages: list[Message], seed: int
 ) -> None:
@@ -65,7 +64,6 @@ def test_messages_come_in_order_of_the_new_receipt_and_none_is_lost_or_changed(
 
 
 @given(messages=message_lists())
-@settings(deadline=None)
 def test_without_any_sensor_named_everything_stays_to_the_bit(messages: list[Message]) -> None:
     assert exact(redelayed(messages)) == exact(messages)
     assert exact(list(redelay(lambda: messages, {OTHERS: SensorDelays()}, np.random.default_rng(0)))) == exact(messages)
@@ -173,7 +171,6 @@ def test_constant_delays_restore_what_other_delays_have_shuffled() -> None:
 
 
 @given(first=st.integers(0, 99), second=st.integers(0, 99))
-@settings(deadline=None)
 def test_the_delays_before_leave_no_trace(first: int, second: int) -> None:
     both = {"lidar": LATE, "radar": LATE}
     assert redelayed(redelayed(DRIVE, first, **both), second, **both) == redelayed(DRIVE, second, **both)

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -24,7 +24,6 @@ STILL = CTRV(0.0, 0.0, 0.0, 0.0)
 
 @given(st.lists(st.floats(0.01, 60.0), min_size=1, max_size=50))
 @example([34.89984906191907])
-@settings(deadline=None)
 def test_yaw_is_the_direction_of_travel_and_the_rates_are_derivatives(times: list[float]) -> None:
     trajectory = BUSY.trajectory(PATH)
     t, h = np.array(times), 1e-4

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.messages import drive, exact, message_lists, shared
 
@@ -32,7 +32,6 @@ def write_records(path: Path, *records: object) -> Path:
     return path
 
 
-@settings(deadline=None)
 @given(messages=message_lists(), suffix=st.sampled_from([".jsonl", ".jsonl.gz"]))
 def test_what_is_written_is_read_to_the_bit(tmp_path_factory, messages, suffix):
     path = tmp_path_factory.mktemp("stream") / f"a{suffix}"

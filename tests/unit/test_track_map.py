@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fgtrack.core.errors import DataError
@@ -56,7 +56,6 @@ def assert_round_trip(track: TrackMap, s: FloatArray, lateral: FloatArray) -> No
     st.lists(st.tuples(st.floats(-5000.0, 5000.0), st.floats(-20.0, 20.0)), min_size=1, max_size=20),
     st.sampled_from([OVAL, TrackMap(circle_table()), TrackMap(circle_table(direction=-1.0))]),
 )
-@settings(deadline=None)
 def test_a_place_goes_to_the_map_and_back(places: list[tuple[float, float]], track: TrackMap) -> None:
     s, lateral = np.array(places).T
     assert_round_trip(track, s, lateral)
@@ -169,7 +168,6 @@ def test_the_widths_are_those_of_the_rows_and_linear_between_them() -> None:
 
 
 @given(s=st.floats(0.0, 2400.0), inner=st.floats(-3.0, 3.0), outer=st.floats(-3.0, 3.0))
-@settings(deadline=None)
 def test_a_positive_buffer_lets_points_in_and_a_negative_one_shrinks(s: float, inner: float, outer: float) -> None:
     left, right = (float(width[0]) for width in OVAL.bounds(np.array([s])))
     lateral = np.array([left + inner - 1e-6, left + inner + 1e-6, -right - outer + 1e-6, -right - outer - 1e-6])
