@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from support.examples import few
 
 from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, TickReport, UpdateRecord
 from fgtrack.estimation.registry import ESTIMATORS
@@ -130,7 +131,7 @@ def streams(draw: st.DrawFn) -> list[Delivered]:
     receipt_ns = START_NS
     messages: list[Delivered] = []
     ego_from = draw(st.sampled_from([0, 0, 0, 5, 1000]))
-    for number in range(draw(st.integers(1, 25))):
+    for number in range(draw(st.integers(1, 15))):
         receipt_ns += draw(st.sampled_from([0, 1, 5 * MS, 20 * MS, 50 * MS, 50 * MS, 300 * MS, 2500 * MS]))
         if number >= ego_from:
             speed = draw(st.sampled_from([0.0, 30.0, 30.0, 30.0]))
@@ -153,7 +154,7 @@ def streams(draw: st.DrawFn) -> list[Delivered]:
                 sensor,
                 receipt_ns + 10**14 if far_future else receipt_ns - delay_ns,
                 receipt_ns,
-                tuple(draw(st.lists(detections(), max_size=5))),
+                tuple(draw(st.lists(detections(), max_size=4))),
                 draw(st.sampled_from(["ego", "ego", "ego", "sensor", "map"])),
             )
         )
@@ -188,6 +189,7 @@ FUSED = (Disposition.IN_SEQUENCE, Disposition.OUT_OF_SEQUENCE, Disposition.BEYON
 
 
 @pytest.mark.parametrize("name", CONFIGS)
+@few
 @given(messages=streams())
 def test_every_detection_ends_in_exactly_one_row_and_every_state_is_sound(name: str, messages: list[Delivered]) -> None:
     config = CONFIGS[name]
@@ -225,7 +227,7 @@ def test_a_detection_stamped_ahead_of_the_clock_starts_a_track_at_once(estimator
     assert track.state.mean[:2] == pytest.approx([20.0, 1.0])
 
 
-@settings(max_examples=15)
+@few
 @given(messages=streams(), name=st.sampled_from(list(CONFIGS)))
 def test_the_same_input_gives_the_same_bits(messages: list[Delivered], name: str) -> None:
     config = CONFIGS[name]
