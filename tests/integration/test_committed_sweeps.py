@@ -12,7 +12,7 @@ from fgtrack.pipeline.sweep_plan import Job, Plan, load_plan
 
 FOLDER = Path(__file__).parents[2] / "configs/sweeps"
 FILES = sorted(FOLDER.glob("*.yaml"))
-DURATION_S = 3.0
+DURATION_S = 1.5
 
 
 def shortened(job: Job) -> Job:

@@ -15,7 +15,7 @@ SENSORS = ("lidar", "lidar_cluster", "radar")
 class Situation:
     """What a stream is like; `_p` are probabilities per message or per object."""
 
-    duration_s: float = 1.5
+    duration_s: float = 1.0
     epoch_ns: int = 1_000_000_000_000
     clock: str = "node"  # node, jitter, gaps
     start: str = "anywhere"  # anywhere, closing (point of the lap), jump (of the heading), jump_rep103
@@ -71,18 +71,16 @@ SITUATIONS = {
     ),
     "standing_ego": Situation(ego_speed_mps=(0.0,), ego_noise=0.0, spread_m=30.0),
     "standing_noisy_ego": Situation(ego_speed_mps=(0.0,), ego_noise=3.0),
-    "stalled_ego": Situation(duration_s=3.0, ego_silent_s=(0.6, 2.5), ego_bias=0.3),
+    "stalled_ego": Situation(duration_s=2.6, ego_silent_s=(0.4, 2.3), ego_bias=0.3),
     "ego_repeats_itself": Situation(ego_repeated_p=0.3, ego_noise=3.0),
     "ego_resends_old_records": Situation(ego_resent_p=0.3, ego_hz=40.0),
     "rare_ego": Situation(ego_hz=7.0, ego_bias=0.5),
     "nan_ego": Situation(ego_nan_p=0.3),
     "late_first_ego": Situation(duration_s=2.0, ego_silent_s=(0.0, 1.0)),
-    "dense": Situation(duration_s=1.5, num_objects=(10, 25), spread_m=25.0),
-    "dense_and_noisy": Situation(duration_s=1.5, num_objects=(10, 25), spread_m=40.0, noise_m=1.5, seen_p=0.7),
+    "dense": Situation(num_objects=(8, 16), spread_m=25.0),
+    "dense_and_noisy": Situation(num_objects=(8, 16), spread_m=40.0, noise_m=1.5, seen_p=0.7),
     "today": Situation(epoch_ns=TODAY_NS, object_stamps=True),
-    "today_dense": Situation(
-        duration_s=1.5, epoch_ns=TODAY_NS, object_stamps=True, num_objects=(10, 25), sensors=("radar",)
-    ),
+    "today_dense": Situation(epoch_ns=TODAY_NS, object_stamps=True, num_objects=(8, 16), sensors=("radar",)),
     "no_delay": Situation(delay="none"),
     "no_delay_on_grid": Situation(delay="none", stamp_grid_ns=5_000_000),
     "tiny_delay": Situation(delay="tiny"),
@@ -118,7 +116,7 @@ SITUATIONS = {
     "clock_with_gaps": Situation(duration_s=16.0, clock="gaps", sensors_hz=5.0, ego_hz=20.0),
     "rare_lists_and_gaps": Situation(duration_s=16.0, clock="gaps", sensors_hz=0.5, ego_hz=20.0),
     "old_lists_after_gaps": Situation(
-        duration_s=60.0, clock="gaps", sensors_hz=0.25, ego_hz=10.0, empty_p=0.2, num_objects=(5, 10)
+        duration_s=40.0, clock="gaps", sensors_hz=0.25, ego_hz=10.0, empty_p=0.2, num_objects=(5, 10)
     ),
     "wound_up_yaw": Situation(
         duration_s=9.0,
@@ -133,9 +131,9 @@ SITUATIONS = {
     ),
     "closing_point": Situation(start="closing"),
     "heading_jump": Situation(start="jump"),
-    "heading_jump_dense": Situation(duration_s=1.5, start="jump", num_objects=(8, 14), spread_m=30.0),
+    "heading_jump_dense": Situation(start="jump", num_objects=(8, 14), spread_m=30.0),
     "heading_jump_slow": Situation(start="jump", ego_speed_mps=(6.0,), num_objects=(5, 9), spread_m=30.0),
-    "rep103_jump_dense": Situation(duration_s=1.5, start="jump_rep103", num_objects=(8, 14), spread_m=30.0),
+    "rep103_jump_dense": Situation(start="jump_rep103", num_objects=(8, 14), spread_m=30.0),
 }
 
 

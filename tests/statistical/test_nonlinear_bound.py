@@ -29,7 +29,7 @@ PRIOR = Start(
 PAPER = CTRV()
 LOOSE_TIES = CTRV(position_density_m2ps=0.05)  # headings matter less, so their spread does not spoil the bound
 NUM_STEPS = 50
-NUM_RUNS = 60
+NUM_RUNS = 40
 NOWS_NS = [START_NS + k * STEP_NS + STEP_NS // 2 for k in (30, 40, 50)]
 NAMES = ("ekf-replay", "smoother")
 

@@ -18,7 +18,7 @@ CONSISTENT = ("ekf-replay", "rts", "zlz", "asd", "drop", "delayed-horizon", "reo
 script = load("ladder")
 
 
-@pytest.fixture(scope="module", params=[60, pytest.param(400, marks=pytest.mark.slow)], ids=lambda runs: f"{runs} runs")
+@pytest.fixture(scope="module", params=[24, pytest.param(400, marks=pytest.mark.slow)], ids=lambda runs: f"{runs} runs")
 def ladder(request: pytest.FixtureRequest) -> dict[int, dict[str, Any]]:
     """Samples by lag and method."""
     return {lag: script.measured(lag, request.param, SEED) for lag in script.REFERENCE_LAGS}

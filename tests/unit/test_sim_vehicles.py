@@ -82,11 +82,11 @@ def test_a_drawn_vehicle_without_noise_drives_the_exact_arc() -> None:
     assert (states[:, ACCEL] == 0.0).all()
 
 
-@pytest.mark.parametrize(("start_s", "step_s"), [(0.0, 0.05), (0.0037, 0.05), (0.0, 0.4)])
+@pytest.mark.parametrize(("start_s", "step_s"), [(0.0, 0.05), (0.0037, 0.4)])
 def test_a_drawn_vehicle_moves_as_its_motion_model_says(start_s: float, step_s: float) -> None:
     motion = CTRV()
     vehicle = DrawnVehicle(0.0, 0.0, 1.0, 60.0, 0.2, motion=motion)
-    states = vehicle.trajectory(np.random.default_rng(2), 80.0).states(np.arange(start_s, 80.0, step_s))
+    states = vehicle.trajectory(np.random.default_rng(2), 20.0).states(np.arange(start_s, 20.0, step_s))
     x = states[:, : motion.dim]
     error = x[1:] - motion.predict(x[:-1], step_s)
     error[:, YAW] = wrap_angles(error[:, YAW])
