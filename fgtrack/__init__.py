@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from fgtrack.estimation.base import UpdateResult as UpdateResult
     from fgtrack.estimation.base import UpdateStatus as UpdateStatus
     from fgtrack.estimation.registry import estimator as estimator
+    from fgtrack.evaluation import plot as plot
     from fgtrack.evaluation.comparison import compare as compare
     from fgtrack.evaluation.tables import Tables as Tables
     from fgtrack.io.run import Run as Run
