@@ -20,13 +20,14 @@ include_patterns = ["CHANGELOG.md", "docs/**.md", "docs/generated/**.rst", "expe
 exclude_patterns = [".venv", ".git", "out", "build", "tests", "fgtrack", "docs/tutorials"]
 html_theme = "furo"
 html_title = "fgtrack"
-nitpicky = False
 default_role = "literal"
 
 myst_heading_anchors = 4
 myst_enable_extensions = ["colon_fence"]
 
+napoleon_google_docstring = False
 autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented_params"
 autodoc_member_order = "bysource"
 
 sphinx_gallery_conf = {

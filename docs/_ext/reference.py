@@ -9,6 +9,7 @@ import inspect
 import textwrap
 import types
 from collections.abc import Callable, Iterator, Mapping
+from enum import Enum
 from functools import cache
 from importlib import import_module
 from itertools import pairwise
@@ -169,17 +170,44 @@ def estimators_page() -> str:
     return "\n".join(lines)
 
 
+_GROUPS = {
+    "Runs, tables, live use": ("pipeline", "io", "evaluation", "plot"),
+    "Messages, reports, errors": ("core", "types"),
+    "Estimators of one object": ("estimation",),
+    "Motion, measurement and sensor models": ("models",),
+}
+
+
 def public_names() -> str:
     """Autodoc directives of what `import fgtrack` offers."""
     import fgtrack
 
+    values = {name: getattr(fgtrack, name) for name in dir(fgtrack) if not name.startswith("_")}
     lines = []
-    for name in getattr(fgtrack, "__all__", ()):
-        value = getattr(fgtrack, name)
-        kind = "autoclass" if isinstance(value, type) else "autofunction" if callable(value) else "automodule"
-        members = [] if kind == "autofunction" else ["   :members:"]
-        lines += [f"```{{eval-rst}}\n.. {kind}:: fgtrack.{name}", *members, "```", ""]
+    for title, packages in _GROUPS.items():
+        lines += [f"## {title}", ""]
+        for name, value in values.items():
+            home = getattr(value, "__module__", None) or value.__name__
+            if home.removeprefix("fgtrack.").split(".")[0] in packages:
+                lines += ["```{eval-rst}", _autodoc(name, value), "```", ""]
     return "\n".join(lines)
+
+
+def _autodoc(name: str, value: Any) -> str:
+    if isinstance(value, type):
+        return f".. autoclass:: fgtrack.{name}\n   :members:" + "\n   :undoc-members:" * issubclass(value, Enum)
+    if isinstance(value, types.ModuleType):
+        return f".. automodule:: {value.__name__}\n   :members:"
+    if callable(value):
+        return f".. autofunction:: fgtrack.{name}"
+    return f".. py:data:: fgtrack.{name}\n\n   " + " or ".join(f"`{one.__name__}`" for one in get_args(value))
+
+
+def _whole_sentences(app: Any, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
+    """Break the line behind a colon: what stands before it is no type, as Napoleon has it for an attribute."""
+    if what in ("attribute", "property") and lines:
+        before, colon, behind = lines[0].partition(": ")
+        lines[:1] = [before + colon.strip(), behind] if colon else [before]
 
 
 def setup(app: Any) -> dict[str, bool]:
@@ -199,4 +227,5 @@ def setup(app: Any) -> dict[str, bool]:
     app.add_directive("settings", directive(settings_page, 1))
     app.add_directive("estimators", directive(estimators_page, 0))
     app.add_directive("public-names", directive(public_names, 0))
+    app.connect("autodoc-process-docstring", _whole_sentences, priority=100)  # before Napoleon
     return {"parallel_read_safe": True}
