@@ -103,7 +103,7 @@ class MotionModel(ABC):
 
         m is 6 of a model with an acceleration, else 5; an entry that the state lacks is 0 with variance 0. Of a
         Cartesian state the yaw is 0 at speed 0; its variance there is that of the velocity across over
-        `MIN_SPEED_MPS` squared, large but finite: nobody knows the heading of an object that stands still.
+        `MIN_SPEED_MPS` squared, large but finite: the heading of an object at rest is unknown.
         """
         if self._leads:
             return x, P

@@ -39,7 +39,7 @@ class SensorModel:
     std: Mapping[str, float]
     """Standard deviation of each measured component; the keys say what the sensor measures."""
     yaw_from_map_std_rad: float | None = None
-    """Where the sensor measures no yaw: take the map heading as a yaw measurement with this deviation."""
+    """Where the sensor measures no yaw: take the map heading as a yaw measurement with this standard deviation."""
     max_delay_s: float | None = None
     """A message that arrives later than this is refused as too old."""
     counter_init: int = 3

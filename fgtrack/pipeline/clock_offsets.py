@@ -31,7 +31,7 @@ class OffsetRules:
     min_track_s: float = 2.0
     """Shorter tracks are left out."""
     min_detections: int = 10
-    """Of a sensor on a track, for the track to tell something of the sensor."""
+    """Of a sensor on a track, for the track to be used for the sensor."""
     max_detections: int = 10_000
     """Tracks with the most detections come first; what exceeds this is left out."""
     ego_cutoff_hz: float = 2.0
@@ -46,7 +46,7 @@ class OffsetRules:
 
     @property
     def needed_information(self) -> float:
-        """What detections must tell for that, in 1 / s^2, besides the prior."""
+        """Information that the detections must give for that, in 1 / s^2, besides the prior."""
         return self.needed_std_s**-2 - self.solver.prior_std_s**-2
 
 
@@ -148,7 +148,7 @@ def _lists(heard: Iterable[EgoState | DetectionList], config: Config) -> list[De
 def _path(
     heard: Iterable[EgoState | DetectionList], raw: Iterable[DetectionList], rules: OffsetRules
 ) -> EgoPath | None:
-    """The path of the ego; None where nobody needs it."""
+    """The path of the ego; None where it is not needed."""
     if all(one.frame == "map" for one in raw):
         return None
     return EgoPath((message for message in heard if isinstance(message, EgoState)), rules.ego_cutoff_hz)

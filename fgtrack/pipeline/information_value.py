@@ -1,4 +1,4 @@
-"""What a detection that arrives late still tells about the present."""
+"""The information of a late detection about the present."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class ReceivedMeasurement:
 
 @dataclass(frozen=True, slots=True)
 class InformationValue:
-    """What one measurement told about the state at its receipt."""
+    """The information of one measurement about the state at its receipt."""
 
     sensor: str
     stamp_ns: int
@@ -49,7 +49,7 @@ def information_values(
 
     The gain is in the whole state. In a linear model with an exact method it is the mutual information of the
     measurement and the present state given all that had arrived before. An error may well change for the worse by
-    chance; its mean over many detections tells.
+    chance; its mean over many detections counts.
 
     Parameters
     ----------

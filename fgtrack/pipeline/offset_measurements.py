@@ -17,8 +17,8 @@ from fgtrack.pipeline.ego_path import EgoPath
 from fgtrack.tracking.inbox import Batch, stamps
 from fgtrack.tracking.preprocess import Preprocess
 
-#: Components that a wrong stamp moves by metres. Speed and yaw would add little, and as much error as their deviations
-#: are wrong by.
+#: Components that a wrong stamp moves by metres. Speed and yaw would add little, and as much error as their standard
+#: deviations are wrong by.
 _POSITION = ("x_m", "y_m", "range_m", "bearing_rad")
 _OF_A_TRACK = (
     Disposition.BIRTH,
@@ -97,7 +97,7 @@ def measurements_by_track(
     return [sorted(tracks[track_id], key=lambda item: item.stamp_ns) for track_id in sorted(tracks)]
 
 
-#: What tells a detection from all others in a run: columns of its updates.
+#: What identifies a detection in a run: columns of its updates.
 _DETECTION = ("sensor", "stamp_ns", "receipt_ns", "index")
 _Detection = tuple[str, int, int, int]
 

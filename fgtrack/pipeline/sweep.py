@@ -31,7 +31,7 @@ from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate
 
 _SCHEDULER_TIMEOUT_S = 10
-_WATCH_S = 1.0  # how often a process looks whether its sweep still lives
+_WATCH_S = 1.0  # how often a process checks that its sweep still runs
 _HANDED_OUT = 2  # jobs per process that are handed out at a time
 
 
@@ -137,7 +137,7 @@ def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
         config = validate(Config, recipe.config, "configuration")
         messages = read_messages(recipe, config)
     except Exception as error:  # one job out of hundreds must not end the sweep, whatever is wrong with it
-        return key, [Cell(name, {}, {}, _told(error)) for name in recipe.estimators]
+        return key, [Cell(name, {}, {}, _reason(error)) for name in recipe.estimators]
     source_s = time.perf_counter() - started
     return key, [_cell(messages, replace(config, estimator=name), score, source_s) for name in recipe.estimators]
 
@@ -162,12 +162,12 @@ def _cell(messages: Sequence[Message], config: Config, score: Score, source_s: f
         replayed = time.perf_counter()
         scores = score(run)
     except Exception as error:  # as in `run_job`
-        return Cell(config.estimator, {}, {}, _told(error))
+        return Cell(config.estimator, {}, {}, _reason(error))
     times = {"source_s": source_s, "replay_s": replayed - started, "score_s": time.perf_counter() - replayed}
     return Cell(config.estimator, scores.values, {**times, **scores.times})
 
 
-def _told(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     """What went wrong, in a line; of a bug also what it is."""
     text = " ".join(str(error).split())
     return text if isinstance(error, FgtrackError) else f"{type(error).__name__}: {text}"
@@ -207,7 +207,7 @@ def _alone(key: str, recipe: Recipe, score: Score) -> Cell:
 
 
 def _in_processes(tasks: Sequence[_Task], score: Score, count: int) -> Iterator[_Result]:
-    # With several jobs at once, threads of BLAS would only stand in each other's way.
+    # With several jobs at once, threads of BLAS would only wait for each other.
     settings = {"inner_max_num_threads": 1, "initializer": _leave_with, "initargs": (os.getpid(),)}
     with joblib.parallel_config("loky", n_jobs=count, **settings):
         yield from _results(tasks, score)
@@ -239,9 +239,9 @@ def _on_cluster(tasks: Sequence[_Task], score: Score, address: str) -> Iterator[
     with client, joblib.parallel_config("dask", wait_for_workers_timeout=_SCHEDULER_TIMEOUT_S):
         try:
             yield from _results(tasks, score)
-        except Exception as error:  # whatever a scheduler or a network may do; the jobs tell their own errors
-            told = _told(error)
-            raise DataError(f"{address}: the cluster failed ({told}), start the sweep again to go on") from error
+        except Exception as error:  # whatever a scheduler or a network may do; the jobs report their own errors
+            reason = _reason(error)
+            raise DataError(f"{address}: the cluster failed ({reason}), start the sweep again to go on") from error
 
 
 def _results(tasks: Sequence[_Task], score: Score) -> Iterator[_Result]:

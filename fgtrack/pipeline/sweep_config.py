@@ -54,7 +54,7 @@ class SweepConfig:
     vary: Mapping[str, Value] = field(default_factory=lambda: MappingProxyType({}))
     """Axes of the grid: a key and its values, or a name and a group of keys with equally many values each."""
     metrics: tuple[str, ...] = ()
-    """Columns of metrics, `*` stands for anything; all of them where none is named."""
+    """Columns of metrics, `*` matches anything; all of them where none is named."""
 
     def __post_init__(self) -> None:
         if (self.scenario is None) == (self.input is None):
@@ -63,7 +63,7 @@ class SweepConfig:
             raise ValueError("estimators: name at least one")
         for name, values in (("estimators", self.estimators), ("seeds", self.seeds)):
             if len(set(values)) < len(values):
-                raise ValueError(f"{name}: one stands there twice")
+                raise ValueError(f"{name}: one is named twice")
         if not self.seeds or min(self.seeds) < 0:
             raise ValueError("seeds: a positive number of them, or a list of numbers that are not negative")
         if self.input is not None and self.duration_s is not None:
@@ -84,7 +84,7 @@ class SweepConfig:
         columns = [*KEY_COLUMNS, *(column for axis in axes for column in axis.columns)]
         for column in columns:
             if columns.count(column) > 1:
-                raise ValueError(f"vary: {column!r} stands there twice, or is a column that every table has")
+                raise ValueError(f"vary: {column!r} is named twice, or is a column that every table has")
         for where, keys in (("set", self.set), *((f"vary.{axis.name}", axis.keys) for axis in axes)):
             for key in keys:
                 self._check_key(where, key)
@@ -112,14 +112,14 @@ class Axis:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Columns of the tables that tell the step."""
+        """Columns of the tables that identify the step."""
         return self.keys if self.labels is None else (self.name, *self.keys)
 
     def cells(self, step: int) -> tuple[Value, ...]:
         """Content of `columns` at a step."""
         return self.steps[step] if self.labels is None else (self.labels[step], *self.steps[step])
 
-    def told(self, step: int) -> str:
+    def described(self, step: int) -> str:
         """The step in a few words."""
         columns = self.columns if self.labels is None else self.columns[:1]
         return ", ".join(f"{name}={_short(cell)}" for name, cell in zip(columns, self.cells(step), strict=False))
@@ -134,8 +134,8 @@ def _axis(name: str, given: Value) -> Axis:
     lists = {key: _values(f"vary.{name}.{key}", values) for key, values in given.items()}
     lengths = {key: len(values) for key, values in lists.items()}
     if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{key} has {length}" for key, length in lengths.items())
-        raise ValueError(f"vary.{name}: its keys change together and need equally many values, {told}")
+        lengths_text = ", ".join(f"{key} has {length}" for key, length in lengths.items())
+        raise ValueError(f"vary.{name}: its keys change together and need equally many values, {lengths_text}")
     labels = lists.pop(LABEL, None)
     return Axis(name, tuple(lists), tuple(zip(*lists.values(), strict=True)), labels)
 

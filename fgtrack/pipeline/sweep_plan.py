@@ -101,7 +101,7 @@ class _Point:
     """Content of the axes' columns."""
     changes: Mapping[str, Value]
     """Changed keys."""
-    told: str
+    description: str
     """The point in a few words."""
 
 
@@ -111,7 +111,7 @@ def _grid(axes: Sequence[Axis]) -> Iterator[_Point]:
         yield _Point(
             cells=tuple(cell for axis, step in at for cell in axis.cells(step)),
             changes={key: value for axis, step in at for key, value in zip(axis.keys, axis.steps[step], strict=True)},
-            told=", ".join(axis.told(step) for axis, step in at),
+            description=", ".join(axis.described(step) for axis, step in at),
         )
 
 
@@ -138,7 +138,7 @@ def _jobs(sweep: SweepConfig, base: Mapping[str, Value], point: _Point, recordin
         delays = plain(validate(dict[str, SensorDelays], values[DELAYS], DELAYS))
         scenario = plain(validate(Scenario, values[SCENARIO], SCENARIO)) if SCENARIO in values else None
     except CallError as error:
-        problem = f"{point.told}: {error}" if point.told else str(error)
+        problem = f"{point.description}: {error}" if point.description else str(error)
         yield from (Job(point.cells, seed, "", None, problem) for seed in sweep.seeds)
         return
     files = _fingerprints(recording, scenario, config)

@@ -90,7 +90,7 @@ class QuantisedClock:
 
 @dataclass(frozen=True)
 class ArrivalClock:
-    """The sensor gives no stamp: the time of receipt stands in. An offset after it is a guess of the delay."""
+    """The sensor gives no stamp: its receipt is used instead. An offset after it is a guess of the delay."""
 
     kind: Literal["arrival"] = "arrival"
 
@@ -99,7 +99,7 @@ class ArrivalClock:
         return receipts_ns.copy()
 
 
-#: Every clock model, told apart by `kind`.
+#: Every clock model, chosen by `kind`.
 AnyClock = Annotated[
     OffsetClock | DriftClock | JitterClock | QuantisedClock | ArrivalClock,
     Discriminator("kind"),

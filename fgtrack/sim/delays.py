@@ -242,7 +242,7 @@ class MarkovTimeDelay:
         return _either(rng, stamps_s, bad, self.good, self.bad)
 
 
-#: Every delay model, told apart by `kind`.
+#: Every delay model, chosen by `kind`.
 AnyDelay = Annotated[
     NoDelay
     | ConstantDelay

@@ -22,8 +22,8 @@ class Clutter:
     """Detections of nothing: each scan has a Poisson number of them, uniform over a region."""
 
     mean_per_scan: float = 0.0
-    """Between the ranges and bearings of the sensor or, for `track`, on the stretch of track no further off than the
-    maximum range; of these a sensor reports the ones that it can see."""
+    """Between the ranges and bearings of the sensor or, for `track`, on the track up to the maximum range;
+    of these a sensor reports the ones that it can see."""
     region: Literal["field_of_view", "track"] = "field_of_view"
     speed_mps: tuple[float, float] = (0.0, 0.0)
     """Range of the speed that clutter seems to have, along the track or in any direction."""

@@ -1,4 +1,4 @@
-"""Where the vehicles are: driving along a track as told, or drawn from the motion model itself."""
+"""Where the vehicles are: driving along a track as given, or drawn from the motion model itself."""
 
 import math
 from dataclasses import dataclass, field
@@ -196,5 +196,5 @@ class DrawnTrajectory:
         return states
 
 
-#: Every kind of vehicle, told apart by `kind`.
+#: Every kind of vehicle, chosen by `kind`.
 AnyVehicle = Annotated[TrackVehicle | DrawnVehicle, Discriminator("kind")]

@@ -31,7 +31,7 @@ class Deviations(NamedTuple):
 
 @dataclass(frozen=True)
 class Assumptions:
-    """What stands in for the components that a detection does not measure; deviations beside them."""
+    """What is assumed of the components that a detection does not measure, with standard deviations."""
 
     ego_speed_factor: float = 0.8
     """An object is assumed as fast as the ego times this; 0 for traffic that has nothing to do with the ego."""
@@ -77,7 +77,7 @@ class Assumptions:
 
 @dataclass(frozen=True)
 class MeasuredBirth(Assumptions):
-    """A measured component starts with its own deviation, the others with the one assumed."""
+    """A measured component starts with its own standard deviation, the others with the one assumed."""
 
     kind: Literal["measured"] = "measured"
 

@@ -46,7 +46,7 @@ def is_finite(ego: EgoState) -> bool:
 
 
 def extrapolated(ego: EgoState, stamp_ns: int) -> EgoPose:
-    """Pose of `ego` moved along its heading to `stamp_ns`, with the yaw turned on (not wrapped)."""
+    """Pose of `ego` moved along its heading to `stamp_ns`, with the yaw extrapolated (not wrapped)."""
     dt_s = seconds(stamp_ns - ego.stamp_ns)
     travelled_m = ego.speed_mps * dt_s
     return EgoPose(
@@ -77,7 +77,7 @@ def low_passed(
 class EgoTrajectory:
     """Low-passed ego states, each filtered once, and interpolated between their stamps.
 
-    The low-pass pulls towards the previous state *turned on to the new stamp*, so a steady turn is not delayed.
+    The low-pass pulls towards the previous state *extrapolated to the new stamp*, so a steady turn is not delayed.
     """
 
     def __init__(self, yaw_weight: float, yaw_rate_weight: float, memory_s: float, max_extrapolation_s: float) -> None:

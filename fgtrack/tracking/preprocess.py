@@ -292,7 +292,7 @@ def _covariance(
 ) -> FloatArray:
     """Covariance of `names` in the map: the detection's own where it has one, else the sensor's R.
 
-    A yaw that the map gave has the sensor's deviation for it and is not correlated with the rest.
+    A yaw that the map gave has the sensor's standard deviation for it and is not correlated with the rest.
     """
     if detection.covariance is None or not sensor.message_covariance:
         if "x_m" in names and item.point_m is not None and sensor.std["x_m"] != sensor.std["y_m"]:

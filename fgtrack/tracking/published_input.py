@@ -119,7 +119,7 @@ class SlotInbox:
         return [batch.record(index, Disposition.SUPERSEDED) for index in batch.indices]
 
     def collect(self) -> list[Batch]:
-        """See `Inbox.collect`; equal stamps stand in the order of the sensors."""
+        """See `Inbox.collect`; equal stamps keep the order of the sensors."""
         batches = [self._slots[name] for name in self._sensors if name in self._slots]
         self._slots = {}
         return sorted(batches, key=lambda batch: batch.stamp_ns)

@@ -197,7 +197,7 @@ class Tracker:
     def _count(self, batch: Batch, assignment: Assignment, states: StatesAt, ego: EgoPose | None) -> None:
         """Status counters of matched and missed tracks; tracks that run out end here.
 
-        A track is missed by a message as a whole, so only its last batch tells.
+        A track is missed by a message as a whole, so only its last batch counts.
         """
         lifecycle = self._parts.lifecycle
         seen = self._seen[id(batch.message)]

@@ -242,7 +242,7 @@ def test_processes_have_one_thread_each_and_leave_ctrl_c_to_the_first(tmp_path: 
 # --- what goes wrong
 
 
-def test_bad_cells_are_told_and_the_rest_is_done(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_cells_are_reported_and_the_rest_is_done(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One point that does not fit, one whose map is missing, and one that only one estimator cannot do."""
     sweep = write_sweep(
         tmp_path,
@@ -318,14 +318,14 @@ vary: {evaluation.gate_m: [5.0, 3.0, 4.0, 6.0, 7.0, 8.0]}
         (["--jobs", "2", "--dask", "tcp://127.0.0.1:1"], "give one of them"),
     ],
 )
-def test_a_bad_call_is_told(
+def test_a_bad_call_is_reported(
     smoke: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], extra: Sequence[str], said: str
 ) -> None:
     assert run(["sweep", str(smoke), "-o", str(tmp_path / "out"), *extra]) == 2
     assert said in capsys.readouterr().err
 
 
-def test_metrics_that_do_not_exist_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_metrics_that_do_not_exist_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = "duration_s: 0.5\nestimators: [ekf-replay]\nmetrics: [num_tracks, truth.positon]\n"
     assert run(["sweep", str(write_sweep(tmp_path, text)), "-o", str(tmp_path / "out"), "--jobs", "1"]) == 1
     assert "metrics: no column fits truth.positon" in capsys.readouterr().err

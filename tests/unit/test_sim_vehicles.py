@@ -48,7 +48,7 @@ def test_the_yaw_stays_in_its_range_over_several_laps() -> None:
     assert yaw.min() < -3.1
 
 
-def test_a_vehicle_starts_where_it_is_told_and_covers_the_distance_of_its_speed() -> None:
+def test_a_vehicle_starts_where_it_should_and_covers_the_distance_of_its_speed() -> None:
     start, end = OVAL.frenet(BUSY.trajectory(PATH).states(np.array([0.0, 10.0]))[:, :2])[0]
     assert start == pytest.approx(2350.0, abs=1e-3)
     # The ramp from 60 to 75 m/s is symmetric: 67.5 m/s on average.

@@ -60,7 +60,7 @@ def test_jobs_that_are_not_finished_have_no_row(tmp_path: Path) -> None:
     assert (result.num_good, result.num_bad) == (2, 2)
 
 
-def test_metrics_are_chosen_by_name_or_pattern_and_unknown_ones_told(tmp_path: Path) -> None:
+def test_metrics_are_chosen_by_name_or_pattern_and_unknown_ones_reported(tmp_path: Path) -> None:
     plan = Plan(PLAN.columns, PLAN.jobs, PLAN.estimators, ("n", "[xz]", "n*", "missing", "m.*"))
     result = write_tables(tmp_path, plan, DONE)
     assert lines(tmp_path / "sweep.csv")[0] == "rate_hz,delay,seed,estimator,n,x"
@@ -86,7 +86,7 @@ def test_a_half_written_part_is_none(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text", ['{"format": "fgtrack-sw', "[]", '{"format": "x"}', '{"format": "fgtrack-sweep-part/1", "cells": [{}]}']
 )
-def test_a_damaged_part_is_told(tmp_path: Path, text: str) -> None:
+def test_a_damaged_part_is_reported(tmp_path: Path, text: str) -> None:
     store = PartStore(tmp_path)
     (tmp_path / "parts/key.json").write_text(text)
     with pytest.raises(DataError, match=r"key\.json: .*, delete it"):
