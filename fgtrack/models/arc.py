@@ -123,7 +123,7 @@ class _Product(NamedTuple):
 def small_turn_noise(
     arc: SmallTurn, t: float, densities: Sequence[float], speed: float, accel: float | None = None
 ) -> FloatArray:
-    """Covariance Q of the noise accumulated on the arc, in x, y, yaw, speed, yaw rate and, if there is one, acceleration.
+    """Covariance Q of the noise accumulated on the arc, in x, y, yaw, speed, yaw rate and, if any, acceleration.
 
     Q = integral over s in [0, t] of Phi(t, s) D Phi(t, s)', exact to rounding, shape (5, 5) or (6, 6). The diagonal D
     has the `densities` of position (each axis), yaw, speed, yaw rate and acceleration. What the position p shares with
