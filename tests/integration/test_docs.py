@@ -97,7 +97,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_python_blocks_run_and_print_what_they_show(
     page: Path, drive: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if not hasattr(fgtrack, "replay") and "fgtrack.replay(" in (ROOT / page).read_text(encoding="utf-8"):
+    if not hasattr(fgtrack, "plot") and "fgtrack.plot." in (ROOT / page).read_text(encoding="utf-8"):
         pytest.skip("the public names are not there yet")
     monkeypatch.chdir(drive)
     names: dict[str, Any] = {}
@@ -124,8 +124,6 @@ def assert_same_output(found: str, shown: str, where: str) -> None:
 def test_the_first_tutorial_is_a_plot_from_a_recording_in_twelve_lines(
     drive: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if not hasattr(fgtrack, "replay"):
-        pytest.skip("the public names are not there yet")
     code = TUTORIALS[0].read_text(encoding="utf-8")
     lines = {node.lineno for node in ast.walk(ast.parse(code)) if isinstance(node, ast.stmt)} - {1}
     assert len(lines) <= 12
