@@ -150,7 +150,7 @@ def normalised_squares(states: Table, errors: FloatArray) -> FloatArray:
     names = _COMPONENTS[: errors.shape[1]]
     e = list(errors.T)
     P = [[states[f"p_{a}_{b}"] for b in names[i:]] for i, a in enumerate(names)]
-    total = np.zeros(len(states))
+    total = np.zeros(len(errors))
     # One component after the other is taken out of all rows at once: what is left of the others is their error and
     # covariance given this one (Schur complement), so the squares add up.
     while P:
@@ -173,7 +173,7 @@ def _nees(matching: Matching, size: int) -> Nees:
         stamps_ns=tracks["stamp_ns"],
         object_ids=np.array(matching.object_ids)[matching.object_index[matching.paired]],
         values=normalised_squares(tracks, errors[:, :size]),
-        dof=np.full(len(tracks), size),
+        dof=np.full(tracks.num_rows, size),
     )
 
 

@@ -70,8 +70,8 @@ def with_disposition(updates: Table, dispositions: tuple[Disposition, ...]) -> B
 
 def _published(tracks: Table, updates: Table) -> IntArray:
     """The row of `tracks` with tick and track of each of `updates`, shape (updates,); -1 where there is none."""
-    if not len(tracks):
-        return np.full(len(updates), -1)
+    if not tracks.num_rows:
+        return np.full(updates.num_rows, -1)
     step = 1 + max(int(tracks["track_id"].max()), int(updates["track_id"].max(initial=0)))
     keys = tracks["tick"] * step + tracks["track_id"]
     wanted = updates["tick"] * step + updates["track_id"]

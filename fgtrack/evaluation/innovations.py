@@ -118,7 +118,7 @@ def _track_yaw(run: Run, wanted: BoolArray) -> FloatArray:
     Linear between the published rows of the track, constant before the first and after the last one; NaN for
     a track that was never published.
     """
-    yaw_rad = np.full(len(run.updates), np.nan)
+    yaw_rad = np.full(run.updates.num_rows, np.nan)
     order = np.lexsort((run.tracks["stamp_ns"], run.tracks["track_id"]))
     ids = run.tracks["track_id"][order]
     for track_id in np.unique(run.updates["track_id"][wanted]).tolist():

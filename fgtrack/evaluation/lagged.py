@@ -61,7 +61,7 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
         if lag_s > 0.0
     ]
     final = run.smoothed.where(run.smoothed["kind"] == "final")
-    if len(final):
+    if final.num_rows:
         parts.append((WINDOW, final))
     paths = true_paths(run.truth)
     return (_present(matching), *(_judged(matching, paths, lag_s, states) for lag_s, states in parts))
@@ -79,13 +79,13 @@ def _judged(
     rows = _rows_at(matching, states)
     alive = rows != _NO_ROW
     states, rows = states.where(alive), rows[alive]
-    truth = np.full((len(states), len(TRUE_STATE)), np.nan)
+    truth = np.full((len(rows), len(TRUE_STATE)), np.nan)
     for index, path in enumerate(paths):
         mine = matching.object_index[rows] == index
         truth[mine] = path.at(states["stamp_ns"][mine])
     known = np.isfinite(truth[:, 0]) & np.isfinite(states["x_m"])  # no truth is known of a row without a pair
     states, truth, rows = states.where(known), truth[known], rows[known]
-    present = Table({name: column[rows] for name, column in matching.tracks.columns.items()})
+    present = Table({name: column[rows] for name, column in matching.tracks.items()})
     return LagMetrics(
         lag_s,
         _moments(states, truth),
@@ -96,7 +96,7 @@ def _judged(
 
 def _rows_at(matching: Matching, states: Table) -> IntArray:
     """The judged row of each state's track that is nearest in stamp, shape (n,); `_NO_ROW` outside of its life."""
-    found = np.full(len(states), _NO_ROW)
+    found = np.full(states.num_rows, _NO_ROW)
     tracks, track_ids = matching.tracks, states["track_id"]
     order = np.lexsort((tracks["stamp_ns"], tracks["track_id"]))
     ids = tracks["track_id"][order]

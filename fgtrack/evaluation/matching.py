@@ -113,7 +113,7 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     paired = np.flatnonzero(object_index != NO_OBJECT)
     track_ids = np.full((len(ticks), len(paths)), NO_TRACK)
     track_ids[tick_index[paired], object_index[paired]] = tracks["track_id"][paired]
-    true_states = np.full((len(tracks), len(TRUE_STATE)), np.nan)
+    true_states = np.full((tracks.num_rows, len(TRUE_STATE)), np.nan)
     true_states[paired] = candidates[paired, object_index[paired]]
     return Matching(
         object_ids=tuple(path.object_id for path in paths),

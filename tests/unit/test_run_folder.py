@@ -2,6 +2,7 @@ import dataclasses
 import hashlib
 import json
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 
 import numpy as np
@@ -18,7 +19,7 @@ from fgtrack.core.types import (
     TruthState,
     UpdateRecord,
 )
-from fgtrack.io.run import NO_TRACK, RunWriter, load_run
+from fgtrack.io.run import NO_TRACK, RunWriter, Table, load_run
 
 
 def track(track_id: int = 1, size: int = 5, stamp_ns: int = 990) -> TrackReport:
@@ -104,7 +105,7 @@ def test_updates_truth_smoothed_and_timing_come_back(tmp_path):
     assert run.smoothed["kind"].tolist() == ["final"]
     assert run.timing["process_ns"].tolist() == [5, 6]
     assert run.timing["num_tracks"].tolist() == [2, 0]
-    assert len(run.tracks.where(run.tracks["track_id"] == 2)) == 1
+    assert run.tracks.where(run.tracks["track_id"] == 2).num_rows == 1
 
 
 @pytest.mark.parametrize("size", [4, 5, 6])
@@ -175,7 +176,7 @@ def test_there_is_no_smoothed_lagged_or_truth_file_without_a_row(tmp_path):
     assert not (tmp_path / "run/smoothed.csv").exists()
     assert not (tmp_path / "run/lagged.csv").exists()
     run = load_run(tmp_path / "run")
-    assert len(run.smoothed) == len(run.lagged) == len(run.truth) == 0
+    assert run.smoothed.num_rows == run.lagged.num_rows == run.truth.num_rows == 0
     assert run.truth["object_id"].dtype == np.int64
 
 
@@ -188,8 +189,8 @@ def test_a_killed_run_is_readable_up_to_its_last_whole_row(tmp_path):
     (path / "tracks.csv").write_bytes(data[:-30])
     run = load_run(path)
     assert run.meta["complete"] is False
-    assert len(run.tracks) == 5
-    assert len(run.timing) == 3
+    assert run.tracks.num_rows == 5
+    assert run.timing.num_rows == 3
     writer.close()
 
 
@@ -221,6 +222,49 @@ def test_a_folder_with_something_else_in_it_is_refused_and_left_alone(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["letter.txt"]
     with pytest.raises(CallError, match="cannot be made a folder"):
         RunWriter(tmp_path / "letter.txt")
+
+
+def test_a_table_is_a_data_frame(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    write(tmp_path / "run", report())
+    run = load_run(tmp_path / "run")
+    for table in (run.tracks, run.updates, run.truth):
+        frame = pandas.DataFrame(table)
+        assert list(frame.columns) == list(table)
+        assert frame.shape == (table.num_rows, len(table))
+        for name, values in table.items():
+            assert frame[name].to_numpy(values.dtype.type if values.dtype.kind != "U" else object).tolist() == (
+                pytest.approx(values.tolist(), nan_ok=True) if values.dtype.kind == "f" else values.tolist()
+            )
+
+
+def test_a_table_is_a_mapping_of_columns_that_cannot_be_changed(tmp_path):
+    write(tmp_path / "run", report())
+    run = load_run(tmp_path / "run")
+    table = run.updates
+    assert isinstance(table, Mapping)
+    assert (len(table), table.num_rows, dict(table)["tick"].tolist()) == (len(list(table)), 2, [0, 0])
+    assert repr(table).startswith("<Table of 2 rows: tick, sensor, stamp_ns, ")
+    for part in (table, table.where(table["tick"] == 0)):
+        with pytest.raises(ValueError, match="read-only"):
+            part["stamp_ns"][0] = 1
+    mine = np.arange(2)
+    Table({"mine": mine})
+    mine[0] = 5  # what it was made from is not its own
+    assert table == load_run(tmp_path / "run").updates
+    assert table != table.where(table["index"] == 0)
+    assert table != run.tracks
+
+
+def test_the_configuration_of_a_run_is_a_mapping(tmp_path):
+    write(tmp_path / "run", report())
+    run = load_run(tmp_path / "run")
+    assert run.config == {"seed": 1}
+    assert dataclasses.replace(run, config_text="").config == {}
+    for text in ("- 1", "a: [", "1"):
+        with pytest.raises(DataError, match=r"run/config\.yaml: "):
+            _ = dataclasses.replace(run, config_text=text).config
+    assert dataclasses.replace(run, path=None).path is None
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
-
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
 from fgtrack.core.errors import DataError
 from fgtrack.io.run.reader import Run
@@ -52,7 +47,7 @@ def evaluation_config(run: Run) -> EvaluationConfig:
     try:
         return EvaluationConfig(**known)
     except (TypeError, ValueError) as error:
-        raise DataError(f"{_origin(run)}: evaluation: {error}") from error
+        raise DataError(f"{run.config_path}: evaluation: {error}") from error
 
 
 def section(run: Run, name: str) -> Mapping[str, Any]:
@@ -63,19 +58,5 @@ def section(run: Run, name: str) -> Mapping[str, Any]:
     DataError
         config.yaml is not YAML.
     """
-    try:
-        config = _load(run.config_text)
-    except YAMLError as error:
-        raise DataError(f"{_origin(run)}: is not YAML, repeat the run") from error
-    found = config.get(name) if isinstance(config, dict) else None
+    found = run.config.get(name)
     return found if isinstance(found, dict) else {}
-
-
-def _origin(run: Run) -> str:
-    return str(Path(run.path or "") / "config.yaml")
-
-
-@lru_cache(maxsize=64)
-def _load(text: str) -> Any:
-    """The YAML values of `text`. Cached: parsing takes longer than evaluating a run of 20 s, and sweeps repeat it."""
-    return YAML(typ="safe", pure=True).load(text)

@@ -3,13 +3,16 @@
 import csv
 import io
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import BoolArray
@@ -30,27 +33,37 @@ NO_TRACK = -1
 """Track id of an update that belongs to no track."""
 
 
-@dataclass(frozen=True)
-class Table:
-    """Columns of one CSV file by name, each of shape (rows,).
+class Table(dict[str, Column]):
+    """Columns by name, each of shape (rows,) and read-only: `pandas.DataFrame(table)` is the table.
 
-    An empty cell is NaN in a float column and `NO_TRACK` in an integer one.
+    An empty cell is NaN in a float column and `NO_TRACK` in an integer one. `len` is the number of columns.
     """
 
-    columns: Mapping[str, Column]
+    def __init__(self, columns: Mapping[str, Column]) -> None:
+        super().__init__({name: values.view() for name, values in columns.items()})
+        for values in self.values():
+            values.flags.writeable = False
 
-    def __getitem__(self, name: str) -> Column:
-        return self.columns[name]
-
-    def __len__(self) -> int:
-        return len(next(iter(self.columns.values())))
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.columns)
+    @property
+    def num_rows(self) -> int:
+        """Length of every column."""
+        return len(next(iter(self.values()), ()))
 
     def where(self, mask: BoolArray) -> "Table":
         """The rows where `mask`, shape (rows,), is true."""
-        return Table({name: column[mask] for name, column in self.columns.items()})
+        return Table({name: values[mask] for name, values in self.items()})
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Table) or list(self) != list(other):
+            return False
+        pairs = zip(self.values(), other.values(), strict=True)
+        return all(mine.dtype == its.dtype and mine.tobytes() == its.tobytes() for mine, its in pairs)
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
+
+    def __repr__(self) -> str:
+        return f"<Table of {self.num_rows} rows: {', '.join(self)}>"
 
 
 @dataclass(frozen=True)
@@ -68,6 +81,28 @@ class Run:
     lagged: Table
     timing: Table
     truth: Table
+
+    @property
+    def config(self) -> Mapping[str, Any]:
+        """Values of config.yaml. Raises `DataError` where it is no YAML mapping."""
+        try:
+            config = _parsed(self.config_text)
+        except YAMLError as error:
+            raise DataError(f"{self.config_path}: is not YAML, repeat the run") from error
+        if not isinstance(config, dict | None):
+            raise DataError(f"{self.config_path}: holds no settings, repeat the run")
+        return config or {}
+
+    @property
+    def config_path(self) -> Path:
+        """Where the configuration is, for messages."""
+        return Path(self.path or "") / "config.yaml"
+
+
+@lru_cache(maxsize=64)
+def _parsed(text: str) -> Any:
+    """The YAML values of `text`. Cached: parsing takes longer than evaluating a run of 20 s, and sweeps repeat it."""
+    return YAML(typ="safe", pure=True).load(text)
 
 
 def load_run(path: Path | str) -> Run:
@@ -127,16 +162,23 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
             raise DataError(f"{path}:{line}: {len(row)} cells instead of {len(names)}, repeat the run")
     cells = zip(*rows[1:], strict=True) if len(rows) > 1 else ((),) * len(names)
     try:
-        return Table({name: column(name, values) for name, values in zip(names, cells, strict=True)})
+        return Table({name: column(name, _values(name, of)) for name, of in zip(names, cells, strict=True)})
     except (ValueError, OverflowError) as error:
         raise DataError(f"{path}: holds a bad cell ({error}), repeat the run") from error
 
 
 def column(name: str, cells: Sequence[str | int | float | None]) -> Column:
-    """The column `name` from its cells, values or their text, shape (rows,); None and "" are empty."""
+    """The column `name` from its cells, shape (rows,); None is empty."""
     if name in _TEXT_COLUMNS:
         return np.array(cells, dtype=np.str_)
-    convert: Callable[[str | int | float], float] = int if name in _INTEGER_COLUMNS else float
-    empty = NO_TRACK if name in _INTEGER_COLUMNS else np.nan
-    dtype = np.int64 if name in _INTEGER_COLUMNS else np.float64
-    return np.array([empty if cell is None or cell == "" else convert(cell) for cell in cells], dtype=dtype)
+    if name in _INTEGER_COLUMNS:
+        return np.array([NO_TRACK if cell is None else cell for cell in cells], dtype=np.int64)
+    return np.array(cells, dtype=np.float64)
+
+
+def _values(name: str, cells: Sequence[str]) -> Sequence[str | int | float | None]:
+    """The cells of the column `name` from their text."""
+    if name in _TEXT_COLUMNS:
+        return cells
+    convert: Callable[[str], float] = int if name in _INTEGER_COLUMNS else float
+    return [convert(cell) if cell else None for cell in cells]

@@ -1,0 +1,121 @@
+"""The cells of every table of a run, and their text; None where a cell is empty."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import lru_cache
+from operator import attrgetter, itemgetter
+from typing import Any
+
+from fgtrack.core.types import (
+    MEASURABLE,
+    STATE_NAMES,
+    SmoothedReport,
+    TickReport,
+    TrackReport,
+    TrackState,
+    TruthState,
+    UpdateRecord,
+)
+from fgtrack.io.run.schema import COVARIANCE_STATES
+
+Cell = str | int | float | None
+Row = tuple[Cell, ...]
+
+
+def rows(
+    report: TickReport, process_ns: int, num_detections: int, smoothed_lag_s: float | None
+) -> Iterator[tuple[str, list[Row]]]:
+    """The rows of one tick by table; lagged states only of the tracks that the tick reports.
+
+    Parameters
+    ----------
+    report
+        What the tracker gave.
+    process_ns
+        Wall time of the tick.
+    num_detections
+        Detections that the tick received.
+    smoothed_lag_s
+        The lag whose states are in `smoothed` beside the final ones; those of every lag are in `lagged`.
+    """
+    tick = (report.tick, report.now_ns)
+    yield "tracks", [_track_row(tick, track) for track in report.tracks]
+    yield "updates", [_update_row(report.tick, update) for update in report.updates]
+    tracked = {track.track_id for track in report.tracks}
+    kept = [row for row in report.smoothed if row.lag_s is None or row.track_id in tracked]
+    yield "lagged", [_lagged_row(tick, row) for row in kept if row.lag_s is not None]
+    yield "smoothed", smoothed_rows(row for row in kept if row.lag_s in (None, smoothed_lag_s))
+    yield "timing", [(*tick, process_ns, len(report.tracks), num_detections)]
+
+
+def _track_row(tick: tuple[int, int], track: TrackReport) -> Row:
+    mean, covariance = _state_cells(track.state)
+    ids = (track.state.stamp_ns, track.track_id, track.status.value)
+    return (*tick, *ids, *mean, track.num_measured, *covariance)
+
+
+def _update_row(tick: int, update: UpdateRecord) -> Row:
+    ids = (tick, update.sensor, update.stamp_ns, update.receipt_ns, update.index, update.disposition.value)
+    return (*ids, update.track_id, update.nis, *map(update.innovation.get, MEASURABLE))
+
+
+def _lagged_row(tick: tuple[int, int], row: SmoothedReport) -> Row:
+    mean, covariance = _state_cells(row.state)
+    return (*tick, row.lag_s, row.track_id, row.state.stamp_ns, *mean, *covariance)
+
+
+def smoothed_rows(reports: Iterable[SmoothedReport]) -> list[Row]:
+    """Rows of `smoothed`."""
+    found = []
+    for row in reports:
+        mean, covariance = _state_cells(row.state)
+        kind = "final" if row.lag_s is None else "lagged"
+        found.append((row.track_id, row.state.stamp_ns, kind, *mean, *covariance))
+    return found
+
+
+def truth_row(truth: TruthState) -> Row:
+    """A row of `truth`."""
+    return (truth.stamp_ns, truth.object_id, *_truth_state(truth))
+
+
+def text(table: str, found: Sequence[Row]) -> str:
+    """Rows as lines of the CSV file of `table`, floats with 17 significant digits."""
+    if table == "updates":
+        found = [(row[0], _quoted(str(row[1])), *row[2:]) for row in found]
+    return "".join([_line(tuple(map(type, row))) % row for row in found])
+
+
+@lru_cache
+def _line(kinds: tuple[type, ...]) -> str:
+    return ",".join(map(_format, kinds)) + "\n"
+
+
+def _format(kind: type) -> str:
+    if issubclass(kind, float):
+        return "%.17g"
+    return "%.0s" if kind is type(None) else "%s" if issubclass(kind, str) else "%d"
+
+
+@lru_cache
+def _quoted(name: str) -> str:
+    """`name` as a CSV cell."""
+    return '"' + name.replace('"', '""') + '"' if set(name) & set(',"\r\n') else name
+
+
+def _state_cells(state: TrackState) -> tuple[Row, Row]:
+    """Mean and upper triangle of the covariance; None where the model has no such state."""
+    mean = state.mean.tolist()
+    entries: list[Cell] = [*state.covariance.ravel().tolist(), None]
+    return (*mean, *(None,) * (len(STATE_NAMES) - len(mean))), _upper_triangle(len(mean))(entries)
+
+
+@lru_cache
+def _upper_triangle(size: int) -> Callable[[list[Cell]], Row]:
+    """What picks the cells of the covariance of `size` states from its entries, row by row, and a None behind them."""
+    kept = range(len(COVARIANCE_STATES))
+    places = [i * size + j if j < size else -1 for i in kept for j in kept[i:]]
+    picked: Callable[[list[Cell]], Any] = itemgetter(*places)  # Any: a tuple, as there are several places
+    return picked
+
+
+_truth_state = attrgetter(*STATE_NAMES)

@@ -1,0 +1,66 @@
+"""What takes a run as it goes: rows of the tables, counts of the dispositions, the meta data."""
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+from fgtrack.core.types import Disposition, SmoothedReport, TickReport, TruthState
+from fgtrack.io.run.rows import Row, rows, smoothed_rows, truth_row
+from fgtrack.io.run.schema import RUN_FORMAT
+
+
+class RunSink(ABC):
+    """Takes a run tick by tick; where the rows go, its subclasses decide.
+
+    Parameters
+    ----------
+    config_text
+        Text of `config.yaml`, the resolved configuration.
+    meta
+        What `meta.json` says from the start on.
+    smoothed_lag_s
+        The lag whose states go to `smoothed` beside the final ones; `lagged` gets those of every lag.
+    """
+
+    def __init__(self, config_text: str, meta: Mapping[str, object] | None, smoothed_lag_s: float | None) -> None:
+        self._config_text = config_text
+        self._meta: dict[str, object] = {"format": RUN_FORMAT, **(meta or {}), "complete": False}
+        self._smoothed_lag_s = smoothed_lag_s
+        self._counts: dict[str, Counter[Disposition]] = {}
+
+    def write_tick(self, report: TickReport, process_ns: int, num_detections: int) -> None:
+        """Take all rows of one tick, see `rows`."""
+        for record in report.updates:
+            self._counts.setdefault(record.sensor, Counter())[record.disposition] += 1
+        for table, found in rows(report, process_ns, num_detections, self._smoothed_lag_s):
+            if found:
+                self._append(table, found)
+
+    def write_smoothed(self, reports: Sequence[SmoothedReport]) -> None:
+        """Take rows of `smoothed`."""
+        if reports:
+            self._append("smoothed", smoothed_rows(reports))
+
+    def write_truth(self, truth: TruthState) -> None:
+        """Take a row of `truth`."""
+        self._append("truth", [truth_row(truth)])
+
+    def finish(self, meta: Mapping[str, object]) -> dict[str, object]:
+        """Complete the run with `meta`, the counts and the digest; gives the content of `meta.json`.
+
+        `counts` holds, per sensor, the number of detections of every disposition.
+        """
+        counts = {
+            sensor: {disposition.value: counter[disposition] for disposition in Disposition}
+            for sensor, counter in sorted(self._counts.items())
+        }
+        self._meta |= {**meta, "counts": counts, "digest": self._digest(), "complete": True}
+        return dict(self._meta)
+
+    @abstractmethod
+    def _append(self, table: str, found: Sequence[Row]) -> None:
+        """Put rows at the end of `table`."""
+
+    @abstractmethod
+    def _digest(self) -> str:
+        """SHA-256 of the bytes of tracks.csv and then updates.csv, in hex."""
