@@ -139,8 +139,10 @@ class OneObject:
         stamp_ns = measurement.stamp_ns
         if stamp_ns < self.window_ns[0]:
             return UpdateResult(UpdateStatus.TOO_OLD)
+        if not (np.isfinite(measurement.z).all() and np.isfinite(measurement.R).all()):
+            return UpdateResult(UpdateStatus.FAILED)  # before the clock moves
         self.advance(stamp_ns)
-        result = self._bank.update(stamp_ns, [0], [measurement])[0]
+        result = self._bank.update(stamp_ns, [0], [measurement.seen_by(self._motion)])[0]
         if result.status is not UpdateStatus.FAILED:
             self._newest_ns = max(self._newest_ns, stamp_ns)
         return result

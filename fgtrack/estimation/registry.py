@@ -74,6 +74,8 @@ class Claims:
     """Largest difference to the dense joint posterior, in standard deviations."""
     rounding: float = 0.0
     """Where stamps nearly coincide, the tolerance grows to this many times `dense_joint.rounding_bound`."""
+    held_s: float = 0.0
+    """How long a measurement waits before it counts."""
     bank: bool = False
     """Whether the entry makes the estimators of all objects together."""
 
@@ -107,7 +109,13 @@ def estimator(name: str, motion: MotionModel, start: Start, *, lag_s: float = 1.
 
     Raises `CallError` for an unknown name and for options that the estimator does not take.
     """
-    factory = ESTIMATORS.load(name)
+    return start_estimator(name, ESTIMATORS.load(name), motion, start, lag_s, options)
+
+
+def start_estimator(
+    name: str, factory: Factory, motion: MotionModel, start: Start, lag_s: float, options: Mapping[str, Any]
+) -> Estimator:
+    """`estimator` of a factory that need not be registered; `name` stands in errors."""
     if Claims.of(factory).bank:
         return OneObject(motion, _made(name, factory, motion, lag_s, **options), start)
     return _checked(name, _made(name, factory, motion, start, lag_s, **options))

@@ -79,6 +79,7 @@ class DelayedHorizon(HeldEkf):
     """
 
     exact = "up to now - D: any lag, any number"
+    held_s = 0.2
 
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float, horizon_s: float = 0.2) -> None:
         super().__init__(motion, prior, lag_s, horizon_s)
@@ -107,6 +108,7 @@ class ReorderBuffer(HeldEkf):
     """
 
     exact = "up to D before the newest stamp: any lag, any number"
+    held_s = 0.1
 
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float, hold_s: float = 0.1) -> None:
         super().__init__(motion, prior, lag_s, hold_s)

@@ -1,0 +1,117 @@
+"""Random streams of measurements in random orders of arrival."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.time import NS_PER_S, seconds
+from fgtrack.core.types import YAW
+from fgtrack.estimation.base import Measurement, Start
+from fgtrack.models.measurement import measurement_model
+from fgtrack.models.motion import CTRV, CV, MotionModel
+
+MS, US = 1_000_000, 1_000
+LAG_S = 1.0
+START = Start(
+    stamp_ns=1_790_000_000 * NS_PER_S,
+    position_m=(3.0, -2.0),
+    position_std_m=0.7,
+    yaw_rad=0.4,
+    yaw_std_rad=0.3,
+    speed_mps=20.0,
+    speed_std_mps=3.0,
+    yaw_rate_radps=0.1,
+)
+TURN_RADPS = 0.2
+LINEAR, NONLINEAR = CV(velocity_density_m2ps3=5.0), CTRV()
+_POSITION = ("x_m", "y_m")
+_OTHERS = (_POSITION, (*_POSITION, "speed_mps"), (*_POSITION, "yaw_rad"), (*_POSITION, "range_m"))
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Measurements of one object in the order of their arrival."""
+
+    motion: MotionModel
+    measurements: tuple[Measurement, ...]
+    start: Start = START
+
+    @property
+    def stamps_ns(self) -> list[int]:
+        """Stamps of the start and of the measurements, each once, in order."""
+        return sorted({self.start.stamp_ns, *(m.stamp_ns for m in self.measurements)})
+
+    @property
+    def newest_ns(self) -> int:
+        """The newest stamp."""
+        return self.stamps_ns[-1]
+
+    @property
+    def in_order(self) -> "Stream":
+        """By stamp; those of one stamp the other way round, because their order must not matter either."""
+        order = sorted(range(len(self.measurements)), key=lambda k: (self.measurements[k].stamp_ns, -k))
+        return replace(self, measurements=tuple(self.measurements[k] for k in order))
+
+    def without(self, place: int) -> "Stream":
+        """All but one measurement."""
+        return replace(self, measurements=self.measurements[:place] + self.measurements[place + 1 :])
+
+    def __str__(self) -> str:
+        lines = [f"{type(self.motion).__name__}, measurements in the order of arrival (stamp after the start):"]
+        for m in self.measurements:
+            values = zip(m.model.components, m.z.tolist(), np.sqrt(np.diag(m.R)).tolist(), strict=True)
+            text = ", ".join(f"{name} = {value!r} (std {std:g})" for name, value, std in values)
+            lines.append(f"  {seconds(m.stamp_ns - self.start.stamp_ns):.9f} s: {text}")
+        return "\n".join(lines)
+
+
+def measured(
+    rng: np.random.Generator, motion: MotionModel, offset_ns: int, names: Sequence[str] = _POSITION
+) -> Measurement:
+    """`names` of an object that drives straight on, `offset_ns` after the start."""
+    travelled_m = 20.0 * seconds(offset_ns)
+    x_m, y_m = 3.0 + travelled_m * np.cos(0.4), -2.0 + travelled_m * np.sin(0.4)
+    truth = {"x_m": x_m, "y_m": y_m, "yaw_rad": 0.4, "speed_mps": 20.0, "range_m": np.hypot(x_m, y_m)}
+    std = np.array([0.1 if name == "yaw_rad" else 0.5 for name in names])
+    z = np.array([truth[name] for name in names]) + std * rng.standard_normal(len(names))
+    return Measurement(START.stamp_ns + offset_ns, measurement_model(tuple(names), motion), z, np.diag(std**2))
+
+
+def regular(motion: MotionModel, rng: np.random.Generator, num: int = 12) -> Stream:
+    """In time order, every 50 ms; in a nonlinear model now and then with yaw, speed or range."""
+    return Stream(motion, tuple(measured(rng, motion, k * 50 * MS, _names(rng, motion)) for k in range(1, num + 1)))
+
+
+def shuffled(motion: MotionModel, rng: np.random.Generator, span_s: float = 0.95 * LAG_S) -> Stream:
+    """3 to 12 measurements in any order within `span_s` after the start; some stamps equal, some 1 us apart."""
+    num = int(rng.integers(2, 8))
+    offsets = 2 * MS * rng.integers(1, round(span_s * NS_PER_S) // (2 * MS), num)
+    again, close = offsets[rng.random(num) < 0.25], offsets[rng.random(num) < 0.25] + US
+    all_ns = rng.permutation(np.concatenate([offsets, again, close, offsets[:1] + US]))
+    return Stream(motion, tuple(measured(rng, motion, int(ns), _names(rng, motion)) for ns in all_ns))
+
+
+def one_late(steps: int, rng: np.random.Generator) -> Stream:
+    """In time order, every 100 ms, and then one measurement from between two stamps, `steps` of them late."""
+    stamps_ns = [k * 100 * MS for k in range(1, 10)]
+    late_ns = stamps_ns[-1] - steps * 100 * MS + int(rng.integers(20, 80)) * MS
+    return Stream(LINEAR, tuple(measured(rng, LINEAR, ns) for ns in (*stamps_ns, late_ns)))
+
+
+def across_pi(rng: np.random.Generator) -> Stream:
+    """Positions and yaws of an object that turns through a yaw of pi."""
+    truth = np.array([3.0, -2.0, np.pi - 0.05, 20.0, TURN_RADPS])
+    start = replace(START, yaw_rad=truth[YAW], yaw_std_rad=0.1, yaw_rate_radps=TURN_RADPS)
+    model = measurement_model((*_POSITION, "yaw_rad"), NONLINEAR)
+    measurements = []
+    for ms in (50, 100, 150, 200, 250, 300, 350, 400, 450, 500, 420, 280):
+        z = model.predict(NONLINEAR.predict(truth, ms / 1e3)) + 0.05 * rng.standard_normal(3)
+        z[YAW] = wrap_angle(z[YAW])
+        measurements.append(Measurement(start.stamp_ns + ms * MS, model, z, 0.05**2 * np.eye(3)))
+    return Stream(NONLINEAR, tuple(measurements), start)
+
+
+def _names(rng: np.random.Generator, motion: MotionModel) -> tuple[str, ...]:
+    return _POSITION if motion.linear else _OTHERS[rng.integers(len(_OTHERS))]
