@@ -11,7 +11,7 @@ import numpy as np
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
-from fgtrack.estimation.base import Estimator, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import Estimator, Measurement, UpdateResult, UpdateStatus
 from fgtrack.estimation.dense_joint import dense_joint, difference, rounding_bound
 from fgtrack.estimation.registry import ESTIMATORS, EXACT, Claims, Factory, start_estimator
 from fgtrack.models.motion import MotionModel
@@ -158,6 +158,25 @@ def _gives_the_dense_joint_posterior_in_any_order(subject: _Subject, stream: Str
     for at_ns in _probes_ns(stream):
         expected = _joint(subject, stream, at_ns)
         _close(estimator.state_at(at_ns), expected, _tolerance(subject, stream), stream, "the dense joint posterior")
+
+
+def _keeps_all_that_it_accepts_and_nothing_else(subject: _Subject, stream: Stream) -> None:
+    """The clock runs ahead of the stamps, and the window is shorter than the stream."""
+    estimator, accepted, newest_ns = subject.start(stream), list[Measurement](), stream.start.stamp_ns
+    for place, measurement in enumerate(stream.measurements):
+        oldest_ns = estimator.window_ns[0]
+        status = estimator.update(measurement).status
+        inside = measurement.stamp_ns >= oldest_ns
+        _require((status in FUSED) == inside, f"place {place}: {status}, the window begins at {oldest_ns}")
+        if inside:
+            accepted.append(measurement)
+            newest_ns = max(newest_ns, measurement.stamp_ns)
+        estimator.advance(newest_ns + round(0.3e9 * LAG_S))
+    known, oldest_ns = replace(stream, measurements=tuple(accepted)), estimator.window_ns[0]
+    for at_ns in (oldest_ns, *_probes_ns(known)) if subject.claims.smooths else (newest_ns, newest_ns + 100 * MS):
+        if at_ns >= oldest_ns:
+            expected = _joint(subject, known, at_ns)
+            _close(estimator.state_at(at_ns), expected, _tolerance(subject, stream), stream, "that of these")
 
 
 def _gives_the_estimate_of_the_time_order_in_any_order(subject: _Subject, stream: Stream) -> None:
@@ -321,6 +340,12 @@ _PROMISES = (
     _Promise(
         _gives_the_dense_joint_posterior_in_any_order,
         _drawn(shuffled, LINEAR),
+        lambda claims: claims.exact == EXACT,
+        repeats=True,
+    ),
+    _Promise(
+        _keeps_all_that_it_accepts_and_nothing_else,
+        (partial(shuffled, LINEAR, span_s=4.0 * LAG_S),),
         lambda claims: claims.exact == EXACT,
         repeats=True,
     ),

@@ -1,6 +1,7 @@
 """The out-of-sequence methods: which are exact when, and what the others forget or assume."""
 
 import itertools
+import pickle
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from support.oosm import (
     FUSING,
     LAG_S,
     LINEAR,
+    MOTIONS,
     NUM_STEPS,
     ONE_LAG,
     START_NS,
@@ -270,3 +272,26 @@ def test_covariance_intersection_weighs_where_neither_estimate_is_better_in_all(
     assert 0.01 < best < 0.99
     np.testing.assert_allclose(np.trace(found), np.trace(mixed(best)), rtol=1e-6)
     assert np.trace(found) <= np.trace(mixed(best))
+
+
+@pytest.mark.parametrize("name", FUSING)
+def test_in_a_bend_a_late_measurement_is_worth_as_much_as_in_a_replay(name: str) -> None:
+    """One lag of one degree of turn: linearisation costs little, so what is exact in a linear model is close."""
+    motion, rng = MOTIONS["ctra"], np.random.default_rng(12)
+    measurements = [*in_sequence(rng, motion), late(rng, 1, motion=motion)]
+    estimator, reference = fed(started(name, motion), measurements), replayed(measurements, motion)
+    expected, found = last(reference), last(estimator)
+    apart = np.abs(found.mean - expected.mean) / np.sqrt(np.diag(expected.covariance))
+    close = apart.max() < 0.05
+    assert close == (name in (*ONE_LAG, "b1", "bl1", "c"))
+
+
+@pytest.mark.parametrize("name", FUSING)
+def test_only_the_window_is_remembered(name: str) -> None:
+    rng = np.random.default_rng(18)
+    estimator = started(name, lag_s=0.5)
+    sizes = []
+    for k in range(1, 100):
+        fed(estimator, [measured(rng, k * STEP_S), measured(rng, (k - 1.7) * STEP_S)])
+        sizes.append(len(pickle.dumps(estimator)))
+    assert max(sizes[50:]) <= max(sizes[15:50])

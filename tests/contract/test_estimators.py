@@ -1,0 +1,34 @@
+"""Every registered estimator keeps the contract of `fgtrack.testing`."""
+
+from typing import Any
+
+import pytest
+
+from fgtrack.estimation.registry import ESTIMATORS, EXACT, Claims
+from fgtrack.testing import check_estimator
+
+SMOOTHERS = ("smoother", "smoother-batch")
+#: Estimators whose options change what they promise nothing of.
+VARIANTS: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("smoother", {"late": "drop"}),
+    ("smoother", {"ring_s": 0.4}),
+    ("smoother", {"max_iterations": 3}),
+    ("delayed-horizon", {"horizon_s": 0.2}),
+    ("ekf-backward-forward", {"frequency_hz": 1000.0}),
+)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_every_estimator_keeps_the_contract(name: str) -> None:
+    check_estimator(name, num_streams=4 if name == "smoother-batch" else 10)
+
+
+@pytest.mark.parametrize(("name", "options"), VARIANTS, ids=str)
+def test_so_it_does_with_other_options(name: str, options: dict[str, Any]) -> None:
+    check_estimator(name, seed=1, num_streams=5, **options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in ESTIMATORS if Claims.of(ESTIMATORS.load(name)).exact == EXACT])
+def test_exact_estimators_keep_it_on_many_streams(name: str) -> None:
+    check_estimator(name, seed=2, num_streams=100 if name == "smoother-batch" else 500)
