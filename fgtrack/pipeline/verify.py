@@ -5,9 +5,8 @@ own answer in the order of the stamps.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -18,16 +17,15 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
 from fgtrack.estimation.dense_joint import Difference, dense_joint, difference, rounding_bound
-from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, SmootherSettings
-from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.registry import ESTIMATORS, EXACT, Claims, Factory, start_estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
 from fgtrack.pipeline.config import PAPER_SENSORS
 from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY
 
-ORDER_BAR = 1e-9
+ORDER_TOLERANCE = 1e-9
 #: At convergence, where nothing has left the window, and where what has left keeps its linearisation.
-WHOLE_BAR, MARGINALISED_BAR = 1e-5, 1e-3
+WHOLE_TOLERANCE, MARGINALISED_TOLERANCE = 1e-5, 1e-3
 _RING_S = 10.0
 _START_NS = NS_PER_S
 _RADAR_PHASE_S = 0.023
@@ -41,20 +39,16 @@ _TINY = MappingProxyType({"yaw_rad": 1e-7, "speed_mps": 1e-7, "yaw_rate_radps": 
 
 @dataclass(frozen=True)
 class Subject:
-    """An estimator that promises to be exact."""
+    """An estimator that claims to be exact."""
 
-    start: Callable[[MotionModel, Start, float], Estimator]
-    """Makes one, with a window of that many seconds."""
-    linear_bar: float
-    """Largest difference to the dense joint in a linear model."""
-    smooths: bool = False
-    """Whether a state of the past knows later measurements."""
-    beyond: bool = False
-    """Whether it fuses what is older than its window."""
-    rounding: float = 0.0
-    """How many times the `rounding_bound` it may be off where stamps nearly coincide."""
-    converge: Callable[[Any], None] | None = None
-    """Lets it converge in a nonlinear model; None of an estimator that needs no convergence. Any: its own type."""
+    factory: Factory
+    claims: Claims
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def start(self, stream: "_Stream") -> Estimator:
+        """One for the object of `stream`."""
+        name = getattr(self.factory, "__name__", "estimator")
+        return start_estimator(name, self.factory, stream.motion, stream.prior, stream.lag_s, self.options)
 
 
 @dataclass(frozen=True)
@@ -71,15 +65,15 @@ class Check:
     """Largest difference of a covariance, relative to the standard deviations."""
     num_refused: int
     """Measurements that were not fused; each voids the check."""
-    bar: float | None
+    tolerance: float | None
     """What both differences must stay below; None where nothing is promised."""
 
     @property
     def met(self) -> bool:
         """Whether it keeps the promise."""
-        if self.bar is None:
+        if self.tolerance is None:
             return True
-        return self.mean_sigma < self.bar and self.covariance < self.bar and not self.num_refused
+        return self.mean_sigma < self.tolerance and self.covariance < self.tolerance and not self.num_refused
 
 
 @dataclass(frozen=True)
@@ -90,12 +84,12 @@ class Certificate:
 
     @property
     def num_promises(self) -> int:
-        """Checks with a bar."""
-        return sum(check.bar is not None for check in self.checks)
+        """Checks with a tolerance."""
+        return sum(check.tolerance is not None for check in self.checks)
 
     @property
     def missed(self) -> tuple[Check, ...]:
-        """Checks that miss their bar."""
+        """Checks that miss their tolerance."""
         return tuple(check for check in self.checks if not check.met)
 
     def as_dict(self) -> dict[str, Any]:
@@ -111,7 +105,7 @@ class Certificate:
                     "mean_sigma": _finite(check.mean_sigma),
                     "covariance": _finite(check.covariance),
                     "num_refused": check.num_refused,
-                    "bar": check.bar,
+                    "tolerance": check.tolerance,
                     "met": check.met,
                 }
                 for check in self.checks
@@ -143,55 +137,47 @@ class _Stream:
         return sorted({*past[:: max(len(past) // 5, 1)], (past[0] + self.newest_ns) // 2})
 
 
-def _start_replay(motion: MotionModel, prior: Start, lag_s: float) -> ReplayEkf:
-    return ReplayEkf(motion, prior, lag_s)
+#: Options with which the smoothers are exact: a ring as long as the stream, and small thresholds.
+_OPTIONS: Mapping[str, Mapping[str, Any]] = {
+    "smoother": {"ring_s": _RING_S, "relinearise": _TINY},
+    "smoother-batch": {"ring_s": _RING_S},
+}
 
 
-def _start_incremental(
-    relinearise: Mapping[str, float], motion: MotionModel, prior: Start, lag_s: float
-) -> FixedLagSmoother:
-    settings = SmootherSettings(lag_s=lag_s, ring_s=_RING_S, relinearise=relinearise, lagged_s=())
-    return FixedLagSmoother(motion, prior, settings)
-
-
-def _start_batch(motion: MotionModel, prior: Start, lag_s: float) -> FixedLagSmoother:
-    settings = SmootherSettings(lag_s=lag_s, ring_s=_RING_S, lagged_s=())
-    return FixedLagSmoother(motion, prior, settings, BatchBackend)
-
-
-def _converge(smoother: FixedLagSmoother) -> None:
-    smoother.converge(_ITERATIONS)
-
-
-#: The estimators that promise to be exact.
-EXACT: Mapping[str, Subject] = MappingProxyType(
-    {
-        "ekf-replay": Subject(_start_replay, 1e-9),
-        "smoother": Subject(
-            partial(_start_incremental, _TINY), 1e-9, smooths=True, beyond=True, rounding=1.0, converge=_converge
-        ),
-        # Levenberg-Marquardt compares errors at absolute positions: eps W of 50 m instead of the deviation, 0.5 m.
-        "smoother-batch": Subject(_start_batch, 1e-6, smooths=True, beyond=True, rounding=100.0, converge=_converge),
+def exact_estimators() -> dict[str, Subject]:
+    """The estimators that claim to be exact for any late measurements, plug-ins included, by name."""
+    subjects = {
+        name: Subject(factory, Claims.of(factory), _OPTIONS.get(name, {}))
+        for name, factory in ESTIMATORS.loaded().items()
     }
-)
-
-#: What the default thresholds cost: no promise, a number.
-_AS_CONFIGURED = Subject(partial(_start_incremental, SmootherSettings().relinearise), math.inf)
+    return {name: subject for name, subject in subjects.items() if subject.claims.exact == EXACT}
 
 
-def verify(rng: np.random.Generator, subjects: Mapping[str, Subject] = EXACT) -> Certificate:
+def verify(rng: np.random.Generator, subjects: Mapping[str, Subject]) -> Certificate:
     """Run every one of `subjects` on every stream, in every order of arrival."""
     checks: list[Check] = []
     for stream in (_linear(rng), _close(rng), _late(rng)):
-        able = {name: subject for name, subject in subjects.items() if subject.beyond or not stream.late}
+        able = {name: subject for name, subject in subjects.items() if not stream.late or _reaches(subject, stream)}
         for order, places in stream.orders.items():
             checks += _against_dense_joint(stream, order, places, able)
-    for stream, converged_bar in ((_whole(rng), WHOLE_BAR), (_turning(rng), MARGINALISED_BAR)):
+    for stream, converged in ((_whole(rng), WHOLE_TOLERANCE), (_turning(rng), MARGINALISED_TOLERANCE)):
         for name, subject in subjects.items():
-            bar = ORDER_BAR if subject.converge is None else converged_bar
-            checks += _against_time_order(stream, name, subject, bar)
-        checks += _against_time_order(stream, "smoother (defaults)", _AS_CONFIGURED, None)
+            if subject.claims.nonlinear != "never":
+                tolerance = ORDER_TOLERANCE if subject.claims.nonlinear == "at once" else converged
+                checks += _against_time_order(stream, name, subject, tolerance)
+        if "smoother" in subjects:  # what the default thresholds cost: no promise, a number
+            claims = replace(subjects["smoother"].claims, nonlinear="at once")
+            configured = replace(subjects["smoother"], claims=claims, options={"ring_s": _RING_S})
+            checks += _against_time_order(stream, "smoother (defaults)", configured, None)
     return Certificate(tuple(checks))
+
+
+def _reaches(subject: Subject, stream: "_Stream") -> bool:
+    """Whether the estimator fuses all that comes later than the length of its window."""
+    estimator = subject.start(stream)
+    for measurement in stream.measurements:
+        estimator.update(measurement)
+    return estimator.window_ns[0] <= stream.measurements[0].stamp_ns
 
 
 def _against_dense_joint(
@@ -199,7 +185,7 @@ def _against_dense_joint(
 ) -> list[Check]:
     """All of `subjects` beside each other: at some moments the present, at the end the past as well."""
     motion, prior = stream.motion, stream.prior
-    running = {name: subject.start(motion, prior, stream.lag_s) for name, subject in subjects.items()}
+    running = {name: subject.start(stream) for name, subject in subjects.items()}
     largest = dict.fromkeys(subjects, Difference(0.0, 0.0))
     refused = dict.fromkeys(subjects, 0)
     arrived: list[Measurement] = []
@@ -217,19 +203,20 @@ def _against_dense_joint(
                 largest[name] = _largest([largest[name], *_differences(estimator, joint)])
     smoothed = dense_joint(motion, prior, arrived, stream.probes_ns())
     for name, estimator in running.items():
-        if subjects[name].smooths:
+        if subjects[name].claims.smooths:
             largest[name] = _largest([largest[name], *_differences(estimator, smoothed)])
     stamps_ns = [prior.stamp_ns, *(m.stamp_ns for m in stream.measurements)]
-    bars = {
-        name: max(subject.linear_bar, subject.rounding * rounding_bound(motion, stamps_ns))
+    tolerances = {
+        name: max(subject.claims.tolerance, subject.claims.rounding * rounding_bound(motion, stamps_ns))
         for name, subject in subjects.items()
     }
     return [
-        Check(stream.name, name, order, "dense joint", *largest[name], refused[name], bars[name]) for name in subjects
+        Check(stream.name, name, order, "dense joint", *largest[name], refused[name], tolerances[name])
+        for name in subjects
     ]
 
 
-def _against_time_order(stream: _Stream, name: str, subject: Subject, bar: float | None) -> list[Check]:
+def _against_time_order(stream: _Stream, name: str, subject: Subject, tolerance: float | None) -> list[Check]:
     expected, _ = _states(stream, subject, stream.orders["time"])
     checks = []
     for order, places in stream.orders.items():
@@ -237,18 +224,18 @@ def _against_time_order(stream: _Stream, name: str, subject: Subject, bar: float
             continue
         found, num_refused = _states(stream, subject, places)
         apart = _largest(difference(found[at], state) for at, state in expected.items())
-        checks.append(Check(stream.name, name, order, "time order", *apart, num_refused, bar))
+        checks.append(Check(stream.name, name, order, "time order", *apart, num_refused, tolerance))
     return checks
 
 
 def _states(stream: _Stream, subject: Subject, places: Iterable[int]) -> tuple[dict[int, TrackState], int]:
     """States of the present and the past after the whole stream, and how many measurements were refused."""
-    estimator = subject.start(stream.motion, stream.prior, stream.lag_s)
+    estimator = subject.start(stream)
     num_refused = 0
     for place in places:
         num_refused += estimator.update(stream.measurements[place]).status in _NOT_FUSED
-    if subject.converge is not None:
-        subject.converge(estimator)
+    if subject.claims.nonlinear == "at convergence":
+        estimator.converge(_ITERATIONS)  # type: ignore[attr-defined]  # the claim says that it has it
     stamps_ns = [*stream.probes_ns(), stream.newest_ns, stream.newest_ns + NS_PER_S // 10]
     return {at: estimator.state_at(at) for at in stamps_ns}, num_refused
 

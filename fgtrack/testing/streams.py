@@ -27,7 +27,7 @@ START = Start(
 TURN_RADPS = 0.2
 LINEAR, NONLINEAR = CV(velocity_density_m2ps3=5.0), CTRV()
 _POSITION = ("x_m", "y_m")
-_OTHERS = (_POSITION, (*_POSITION, "speed_mps"), (*_POSITION, "yaw_rad"), (*_POSITION, "range_m"))
+COMPONENTS = (_POSITION, (*_POSITION, "speed_mps"), (*_POSITION, "yaw_rad"), (*_POSITION, "range_m"))
 
 
 @dataclass(frozen=True)
@@ -114,4 +114,4 @@ def across_pi(rng: np.random.Generator) -> Stream:
 
 
 def _names(rng: np.random.Generator, motion: MotionModel) -> tuple[str, ...]:
-    return _POSITION if motion.linear else _OTHERS[rng.integers(len(_OTHERS))]
+    return _POSITION if motion.linear else COMPONENTS[rng.integers(len(COMPONENTS))]

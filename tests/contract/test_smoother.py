@@ -14,7 +14,7 @@ from fgtrack.estimation.dense_joint import dense_joint, difference
 from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherSettings
 from fgtrack.estimation.factor_graph.backends.base import Backend, Change
 from fgtrack.models.motion import CTRV, CV, MotionModel
-from fgtrack.testing.streams import MS, START, US, Stream, measured, shuffled
+from fgtrack.testing.streams import COMPONENTS, MS, START, US, Stream, measured, shuffled
 
 START_NS = START.stamp_ns
 LAG_S = 0.3
@@ -198,7 +198,8 @@ def test_several_at_once_are_the_same_as_one_by_one_in_a_linear_model(name: str)
 def test_states_between_which_gauss_newton_oscillates_converge(name: str) -> None:
     """Two clusters of positions: the noise of the motion between them follows the state before it, and so on."""
     motion, rng = CTRV(), np.random.default_rng(295)
-    measurements = [measured(rng, motion, ns) for ns in (1422 * MS, 1422 * MS + US, 2 * MS, 2 * MS + US)]
+    offsets_ns = (1422 * MS, 1422 * MS + US, 2 * MS, 2 * MS + US)
+    measurements = [measured(rng, motion, ns, COMPONENTS[rng.integers(4)]) for ns in offsets_ns]
     shuffled_one, in_order = (smoother(motion, BACKENDS[name], lag_s=2.0) for _ in range(2))
     for place in range(4):
         shuffled_one.update(measurements[place])

@@ -7,12 +7,16 @@ import numpy as np
 import pytest
 
 from fgtrack.cli.main import run
+from fgtrack.cli.verify import _verdict
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateResult, UpdateStatus
+from fgtrack.estimation.registry import EXACT, Claims
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.motion import MotionModel
 from fgtrack.pipeline import verify as pipeline
-from fgtrack.pipeline.verify import EXACT, Certificate, Subject, verify
+from fgtrack.pipeline.verify import Certificate, Subject, exact_estimators, verify
+
+SUBJECTS = exact_estimators()
 
 
 class Careless:
@@ -59,7 +63,7 @@ def subject(kind: Kind) -> Mapping[str, Subject]:
     def start(motion: MotionModel, prior: Start, lag_s: float) -> Estimator:
         return kind(ReplayEkf(motion, prior, lag_s))
 
-    return {"broken": Subject(start, 1e-9)}
+    return {"broken": Subject(start, Claims(exact=EXACT))}
 
 
 def checks(certificate: Certificate, order: str) -> list[bool]:
@@ -68,32 +72,32 @@ def checks(certificate: Certificate, order: str) -> list[bool]:
 
 @pytest.fixture(scope="module")
 def certificate() -> Certificate:
-    return verify(np.random.default_rng(1))
+    return verify(np.random.default_rng(1), SUBJECTS)
 
 
 def test_every_exact_estimator_keeps_its_promise_on_every_stream_in_every_order(certificate: Certificate) -> None:
     assert certificate.missed == ()
-    by_estimator = {name: [c for c in certificate.checks if c.estimator == name] for name in EXACT}
+    assert set(SUBJECTS) == {"ekf-replay", "smoother", "smoother-batch", "asd"}
+    by_estimator = {name: [c for c in certificate.checks if c.estimator == name] for name in SUBJECTS}
     for name, found in by_estimator.items():
         linear = {(c.stream, c.order) for c in found if c.against == "dense joint"}
-        streams = {"CV, paper's delays", "CV, stamps 1 us apart"} | (
-            {"CV, lag 0.05 s"} if EXACT[name].beyond else set()
-        )
+        beyond = {"CV, lag 0.05 s"} if name.startswith("smoother") else set()
+        streams = {"CV, paper's delays", "CV, stamps 1 us apart"} | beyond
         assert linear == {(stream, order) for stream in streams for order in ("time", "arrival", "random")}
         nonlinear = {(c.stream, c.order) for c in found if c.against == "time order"}
-        streams = {"CTRV, all in the window", "CTRV, paper's delays"}
+        streams = set() if name == "asd" else {"CTRV, all in the window", "CTRV, paper's delays"}
         assert nonlinear == {(stream, order) for stream in streams for order in ("arrival", "random")}
 
 
-def test_the_bars_are_those_of_the_promise(certificate: Certificate) -> None:
-    bars = {(c.stream, c.estimator): c.bar for c in certificate.checks}
-    assert bars["CV, paper's delays", "ekf-replay"] == bars["CV, paper's delays", "smoother"] == 1e-9
-    assert bars["CV, paper's delays", "smoother-batch"] == 1e-6
-    assert bars["CV, lag 0.05 s", "smoother"] == 1e-9
-    assert bars["CV, stamps 1 us apart", "ekf-replay"] == bars["CTRV, paper's delays", "ekf-replay"] == 1e-9
-    assert bars["CV, stamps 1 us apart", "smoother"] < 1e-4
-    assert bars["CTRV, paper's delays", "smoother"] == 1e-3
-    assert bars["CTRV, paper's delays", "smoother (defaults)"] is None
+def test_the_tolerances_are_those_of_the_promise(certificate: Certificate) -> None:
+    tolerances = {(c.stream, c.estimator): c.tolerance for c in certificate.checks}
+    assert tolerances["CV, paper's delays", "ekf-replay"] == tolerances["CV, paper's delays", "smoother"] == 1e-9
+    assert tolerances["CV, paper's delays", "smoother-batch"] == 1e-6
+    assert tolerances["CV, lag 0.05 s", "smoother"] == 1e-9
+    assert tolerances["CV, stamps 1 us apart", "ekf-replay"] == tolerances["CTRV, paper's delays", "ekf-replay"] == 1e-9
+    assert tolerances["CV, stamps 1 us apart", "smoother"] < 1e-4
+    assert tolerances["CTRV, paper's delays", "smoother"] == 1e-3
+    assert tolerances["CTRV, paper's delays", "smoother (defaults)"] is None
 
 
 def test_the_streams_arrive_out_of_order_and_some_of_them_older_than_the_window(certificate: Certificate) -> None:
@@ -113,7 +117,7 @@ def test_the_streams_arrive_out_of_order_and_some_of_them_older_than_the_window(
 
 
 def test_the_same_seed_gives_the_same_certificate() -> None:
-    only = {"ekf-replay": EXACT["ekf-replay"]}
+    only = {"ekf-replay": SUBJECTS["ekf-replay"]}
     assert verify(np.random.default_rng(5), only) == verify(np.random.default_rng(5), only)
 
 
@@ -134,35 +138,39 @@ def test_refusing_late_data_or_giving_no_number_keeps_no_promise(kind: Kind) -> 
 Capture = pytest.CaptureFixture[str]
 
 
-def test_the_command_prints_json_and_nothing_else(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    only = {"ekf-replay": EXACT["ekf-replay"]}
-    monkeypatch.setattr(pipeline, "EXACT", only)
-    assert run(["verify", "--json"]) == 0
+def test_the_command_prints_json_and_nothing_else(capsys: Capture) -> None:
+    only = {"ekf-replay": SUBJECTS["ekf-replay"]}
+    assert run(["verify", "--json", "--estimator", "ekf-replay"]) == 0
     out, err = capsys.readouterr()
     found = json.loads(out)
     assert err == ""
     assert found["met"] is True
     assert found == verify(np.random.default_rng(1), only).as_dict()
-    assert all(one["mean_sigma"] < one["bar"] for one in found["checks"] if one["bar"] is not None)
+    assert all(one["mean_sigma"] < one["tolerance"] for one in found["checks"] if one["tolerance"] is not None)
 
 
-def test_the_command_prints_a_table_and_a_closing_line(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline, "EXACT", {"ekf-replay": EXACT["ekf-replay"]})
-    assert run(["verify"]) == 0
+def test_the_command_prints_a_table_and_a_closing_line(capsys: Capture, certificate: Certificate) -> None:
+    assert run(["verify", "-e", "ekf-replay"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[-1] == "all 10 bars met: the order of arrival does not change the answer"
+    assert lines[-1] == "all 10 tolerances met: the order of arrival does not change the answer"
     assert any(
         "CV, paper's delays" in line and "random" in line and "1e-09" in line and "met" in line for line in lines
     )
-    assert any("smoother (defaults)" in line and "no promise" in line for line in lines)
+    shown = [check for check in certificate.checks if check.estimator == "smoother (defaults)"]
+    assert {_verdict(check) for check in shown} == {"no promise"}
 
 
-def test_the_command_fails_where_a_bar_is_missed(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline, "EXACT", subject(Careless))
+def test_the_command_fails_where_a_tolerance_is_missed(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline, "exact_estimators", lambda: subject(Careless))
     assert run(["verify"]) == 1
     out, err = capsys.readouterr()
-    assert out.splitlines()[-1] == "8 of 10 bars missed: the order of arrival changes the answer"
+    assert out.splitlines()[-1] == "8 of 10 tolerances missed: the order of arrival changes the answer"
     assert err == ""
-    monkeypatch.setattr(pipeline, "EXACT", subject(Refusing))
+    monkeypatch.setattr(pipeline, "exact_estimators", lambda: subject(Refusing))
     assert run(["verify"]) == 1
     assert "not fused" in capsys.readouterr().out
+
+
+def test_only_an_exact_estimator_can_be_verified(capsys: Capture) -> None:
+    assert run(["verify", "-e", "drop"]) == 2
+    assert "estimator 'drop' does not claim to be exact: there are ekf-replay, smoother" in capsys.readouterr().err
