@@ -267,3 +267,24 @@ def test_every_delay_and_clock_model_has_a_row_with_its_parameters(model: Any) -
 def test_every_estimator_is_on_the_page_of_estimators() -> None:
     page = (ROOT / "docs/estimators.md").read_text(encoding="utf-8")
     assert [name for name in ESTIMATORS if name not in ESTIMATORS.plugins() and f"`{name}`" not in page] == []
+
+
+def test_every_section_of_the_configuration_is_on_its_page() -> None:
+    page = (ROOT / "docs/configuration.md").read_text(encoding="utf-8")
+    assert [field.name for field in fields(Config) if f"| `{field.name}` |" not in page] == []
+
+
+def test_the_metrics_that_are_explained_exist() -> None:
+    run = fgtrack.replay(fgtrack.simulate("single_opponent", duration_s=2.0), "smoother", map="oval")
+    paths = list(leaves(fgtrack.compare(run).to_dict()["runs"]))
+    cells = re.findall(r"^\| (`.+?) \|", prose(Path("docs/metrics.md")), re.MULTILINE)
+    for name in re.findall(r"`([^`]+)`", " ".join(cells)):
+        pattern = re.sub(r"[A-Z]+", r"[^.]+", name.strip("."))
+        assert any(re.search(rf"(^|\.){pattern}(\.|$)", path) for path in paths), name
+
+
+def leaves(value: Any, path: str = "") -> Iterator[str]:
+    """Paths of all values of nested mappings and lists."""
+    for key, inner in value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ():
+        yield from leaves(inner, f"{path}.{key}")
+    yield path
