@@ -35,6 +35,7 @@ sphinx_gallery_conf = {
     "gallery_dirs": "docs/generated/tutorials",
     "within_subsection_order": "FileNameSortKey",
     "abort_on_example_error": True,
+    "capture_repr": ("_repr_html_",),
     "download_all_examples": False,
     "show_memory": False,
     "write_computation_times": False,

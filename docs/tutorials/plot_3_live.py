@@ -13,7 +13,7 @@ import fgtrack
 
 # %%
 # In a node, the subscriptions call `receive`. Here a simulated drive gives the messages, in the order of their receipt.
-messages = fgtrack.simulate("single_opponent", seed=1, duration_s=6.0)
+messages = fgtrack.simulate("single_opponent", seed=1, duration_s=5.0)
 tracker = fgtrack.Tracker.from_config("smoother", map="oval")
 
 PERIOD_NS = 20_000_000  # 50 Hz
