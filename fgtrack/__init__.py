@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 __version__ = "0.2.0.dev0"
 
 if TYPE_CHECKING:
+    from fgtrack import testing as testing
     from fgtrack.core.errors import CallError as CallError
     from fgtrack.core.errors import DataError as DataError
     from fgtrack.core.errors import FgtrackError as FgtrackError

@@ -1,0 +1,106 @@
+"""The public names of `import fgtrack`: what the commands do, in a few lines, without importing more than is used."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fgtrack
+
+DESIGN = Path(__file__).parents[3] / "shared" / "DESIGN.md"
+MS = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a recording of 3 s, the map it was driven on, and a run of it."""
+    folder = tmp_path_factory.mktemp("drive")
+    bag = fgtrack.simulate("single_opponent", seed=1, duration_s=3.0, out=folder / "bag")
+    next(bag.glob("*.mcap")).rename(folder / "drive.mcap")
+    from fgtrack.models.oval import make_oval
+
+    make_oval().write(folder / "track.csv")
+    fgtrack.replay(folder / "drive.mcap", "smoother", map=folder / "track.csv", out=folder / "runs/x")
+    return folder
+
+
+def test_importing_the_package_imports_nothing_heavy_and_a_name_only_what_it_needs() -> None:
+    code = (
+        "import sys, fgtrack\n"
+        "heavy = {'gtsam', 'matplotlib', 'scipy', 'numpy', 'rosbags', 'pydantic', 'joblib'}\n"
+        "print(sorted(heavy & set(sys.modules)))\n"
+        "fgtrack.CTRV, fgtrack.Detection\n"
+        "print(sorted(heavy & set(sys.modules)))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["[]", "['numpy', 'scipy']"]
+
+
+def test_every_public_name_is_there_and_documented() -> None:
+    names = [name for name in dir(fgtrack) if not name.startswith("_")]
+    assert {"replay", "simulate", "load_run", "compare", "Tracker", "estimator", "plot", "testing"} <= set(names)
+    for name in names:
+        assert getattr(fgtrack, name).__doc__, name
+    with pytest.raises(AttributeError, match="no attribute 'reply'"):
+        _ = fgtrack.reply
+
+
+def test_a_run_in_memory_a_run_folder_and_the_command_give_the_same_run(drive: Path, tmp_path: Path) -> None:
+    from fgtrack.cli.main import run as command
+
+    kept = fgtrack.replay(drive / "drive.mcap", "smoother", map=drive / "track.csv")
+    arguments = ("replay", drive / "drive.mcap", "-c", "smoother", "--map", drive / "track.csv", "-o", tmp_path / "run")
+    assert command([str(argument) for argument in arguments]) == 0
+    for other in (fgtrack.load_run(drive / "runs/x"), fgtrack.load_run(tmp_path / "run")):
+        assert kept.meta["digest"] == other.meta["digest"]
+        for table in ("tracks", "updates", "smoothed", "lagged", "truth"):
+            mine, theirs = getattr(kept, table), getattr(other, table)
+            assert list(mine) == list(theirs)
+            for column in mine:
+                np.testing.assert_array_equal(mine[column], theirs[column], err_msg=f"{table}.{column}")
+
+
+def test_settings_estimator_and_messages_can_be_given(drive: Path) -> None:
+    messages = list(fgtrack.simulate("single_opponent", seed=1, duration_s=1.0))
+    run = fgtrack.replay(messages, "smoother", estimator="ekf-replay", set={"filter.storage_s": 2.0}, map="oval")
+    assert run.meta["estimator"] == "ekf-replay"
+    assert run.config["filter"]["storage_s"] == 2.0
+    again = fgtrack.replay(iter(messages), fgtrack.Config(), set={"association.gate_m": 3.0})
+    assert again.config["association"]["gate_m"] == 3.0
+    with pytest.raises(fgtrack.CallError, match=r"filter\.storage"):
+        fgtrack.replay(messages, "smoother", set={"filter.storage": 2.0})
+
+
+def test_what_is_there_is_not_replaced_without_overwrite(drive: Path) -> None:
+    before = fgtrack.load_run(drive / "runs/x").meta["digest"]
+    with pytest.raises(fgtrack.CallError, match="exists"):
+        fgtrack.replay(drive / "drive.mcap", "karle2023", out=drive / "runs/x")
+    assert fgtrack.load_run(drive / "runs/x").meta["digest"] == before
+    with pytest.raises(fgtrack.CallError, match=r"drive\.mcap"):
+        fgtrack.simulate("default", out=drive / "drive.mcap", duration_s=1.0)
+
+
+def test_an_input_that_breaks_off_is_a_warning(drive: Path, tmp_path: Path) -> None:
+    path = fgtrack.simulate("single_opponent", duration_s=1.0, out=tmp_path / "drive.jsonl")
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.warns(UserWarning, match="broke off"):
+        run = fgtrack.replay(path, "smoother")
+    assert run.meta["broken_off"]
+    assert run.tracks.num_rows
+
+
+@pytest.mark.skipif(not DESIGN.exists(), reason="the design, which has the snippet, is not beside the repository")
+def test_the_snippet_of_the_design_runs_as_written(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    section = DESIGN.read_text().partition("## 12.")[2].partition("## 13.")[0]
+    snippet = section.partition("```python\n")[2].partition("```")[0]
+    monkeypatch.chdir(drive)
+    stamp_ns = 1_600_000_000_000_000_000
+    known = {"stamp_ns": stamp_ns, "receipt_ns": stamp_ns + 60 * MS, "now_ns": stamp_ns + 60 * MS, "track_id": 0}
+    scope = known | {"x_m": 0.0, "y_m": 0.0, "yaw_rad": 0.0, "speed_mps": 60.0}
+    exec(compile(snippet, str(DESIGN), "exec"), scope)
+    assert scope["report"].tracks[0].track_id == 0
+    assert Path("errors.pdf").read_bytes().startswith(b"%PDF")
+    assert "tracking" in str(scope["tables"]).lower()
+    assert Path("drive.jsonl").exists()
