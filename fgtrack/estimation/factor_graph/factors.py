@@ -36,15 +36,22 @@ def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float, at: F
     `at`, shape (n,), is the linearisation point of `left`. No derivative of Q is taken: where the factor is replaced
     when that point moves, this is Gauss-Newton with reweighting.
     """
-    still = identity(motion.dim)
+    place = at.tolist()
+    step = motion.step(place, dt_s)
+    mean_there, gradient_there, still = step.mean, -step.F, identity(motion.dim)
 
     def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
-        mean, F = motion.flow(values.atVector(left).tolist(), dt_s)
+        x = values.atVector(left).tolist()
+        if x == place:  # as in nearly every call
+            mean, gradient = mean_there, gradient_there
+        else:
+            mean, F = motion.flow(x, dt_s)
+            gradient = -F
         if jacobians is not None:
-            jacobians[0], jacobians[1] = -F, still
-        return values.atVector(right) - mean
+            jacobians[0], jacobians[1] = gradient, still
+        return np.subtract(values.atVector(right), mean)
 
-    return gtsam.CustomFactor(_gaussian(motion.step(at.tolist(), dt_s).Q), [left, right], error)
+    return gtsam.CustomFactor(_gaussian(step.Q), [left, right], error)
 
 
 def measurement_factor(key: int, term: MeasurementTerm, mean: FloatArray) -> gtsam.NonlinearFactor:

@@ -1,6 +1,6 @@
 """The graph of one object's window: nodes, segments and measurement terms, and the solver behind them."""
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 
 import gtsam
@@ -94,6 +94,7 @@ class Window:
         anchor = chain.nodes[len(leaving)]
         new: dict[int, FloatArray] = {}
         try:
+            moved = self._moved()
             for node, right in zip(leaving, chain.nodes[1:], strict=False):
                 past.pass_node(node.terms, self._mean(node), right.stamp_ns, self._mean(right))
             left = self._states_behind(past, anchor, leaving) if self._settings.final else []
@@ -107,7 +108,7 @@ class Window:
                     at = chain.insert(item.stamp_ns, guesses[item.stamp_ns])
                     new[at.key] = at.origin
                 added.append((at, item))
-            self._solve(added, new, leaving, past.prior)
+            self._solve(moved, added, new, leaving, past.prior)
         except _BROKEN as error:
             chain.remove(new)
             self._rebuild(self._estimates())
@@ -149,9 +150,10 @@ class Window:
     def iterate(self, max_iterations: int) -> None:
         """Take Gauss-Newton steps while a state is further than a threshold from its linearisation point."""
         for _ in range(max_iterations):
-            if not self._moved():
+            moved = self._moved()
+            if not moved:
                 return
-            self._solve([], {}, [], self._past.prior)
+            self._solve(moved, [], {}, [], self._past.prior)
 
     def converge(self, max_iterations: int) -> None:
         """Solve again, with all states linearised where the last step led, until none moves by more than rounding.
@@ -217,6 +219,7 @@ class Window:
 
     def _solve(
         self,
+        moved: Sequence[tuple[Node, FloatArray]],
         added: Sequence[tuple[Node, MeasurementTerm]],
         new: dict[int, FloatArray],
         leaving: Sequence[Node],
@@ -224,8 +227,8 @@ class Window:
     ) -> None:
         """Update the backend, and note the slots of the new segments and of those whose noise follows a moved node."""
         nodes, changed = self._chain.nodes, set(new)
-        for node in self._moved(new):
-            node.origin = self._mean(node)
+        for node, mean in moved:
+            node.origin = mean
             changed.add(node.key)
         segments = [pair for pair in pairwise(nodes) if pair[0].key in changed or pair[1].key in new]
         removed = [left.slot for left, _ in segments if left.slot is not None]
@@ -248,13 +251,14 @@ class Window:
         self._anchored |= bool(leaving)
         self._forget_estimates()
 
-    def _moved(self, new: Container[int] = ()) -> list[Node]:
-        """The nodes, but for the `new` ones, that the next update of the backend relinearises."""
-        free = [node for node in self._chain.nodes[self._anchored :] if node.key not in new]
+    def _moved(self) -> list[tuple[Node, FloatArray]]:
+        """The nodes that the next update of the backend relinearises, and where."""
+        free = self._chain.nodes[self._anchored :]
         if not free:
             return []
-        far = (np.abs(self._backend.moves([node.key for node in free])) > self._thresholds).any(axis=1)
-        return [free[place] for place in np.flatnonzero(far)]
+        moves = self._backend.moves([node.key for node in free])
+        far = np.flatnonzero((np.abs(moves) > self._thresholds).any(axis=1))
+        return [(free[place], free[place].origin + moves[place]) for place in far]
 
     def _segment(self, left: Node, right: Node) -> gtsam.NonlinearFactor:
         dt_s = seconds(right.stamp_ns - left.stamp_ns)
