@@ -7,20 +7,12 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, BinaryIO, get_args
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.types import (
-    MEASURABLE,
-    STATE_NAMES,
-    Detection,
-    DetectionList,
-    EgoState,
-    Frame,
-    Message,
-    TruthState,
-)
+from fgtrack.core.types import Detection, DetectionList, EgoState, Frame, Message, TruthState
 from fgtrack.io.config import InputConfig
 from fgtrack.io.errors import TruncatedInput, UntilBreak
 from fgtrack.io.output import Kind, new_file
@@ -31,17 +23,7 @@ GZIP_MAGIC = b"\x1f\x8b"
 
 _logger = logging.getLogger(__name__)
 _INT64_LIMIT = 1 << 63
-_TIMES = ("stamp_ns", "receipt_ns")
-_EGO_REQUIRED = ("x_m", "y_m", "yaw_rad", "speed_mps")
-_EGO_OPTIONAL = ("yaw_rate_radps", "accel_mps2")
-_TRUTH_REQUIRED = ("x_m", "y_m")
-_TRUTH_OPTIONAL = tuple(name for name in STATE_NAMES if name not in _TRUTH_REQUIRED)
-_DETECTION_KEYS = {*MEASURABLE, "covariance", "stamp_ns", "object_id"}
-_KEYS = {
-    "ego": {"type", *_TIMES, *_EGO_REQUIRED, *_EGO_OPTIONAL, "in_pit"},
-    "detections": {"type", *_TIMES, "sensor", "frame", "objects"},
-    "truth": {"type", *_TIMES, "object_id", *STATE_NAMES},
-}
+_KINDS: dict[str, type[Message]] = {"ego": EgoState, "detections": DetectionList, "truth": TruthState}
 
 # A parsed JSON object: its values are checked one by one below.
 Record = dict[str, Any]
@@ -171,27 +153,16 @@ def _plain(value: Any) -> object:  # a NumPy scalar, which json does not know
     return value.item()
 
 
-def _given(value: object, names: Iterable[str]) -> Record:
-    return {name: field for name in names if (field := getattr(value, name)) is not None}
-
-
 def _record(message: Message) -> Record:
-    times = {"stamp_ns": message.stamp_ns, "receipt_ns": message.receipt_ns}
-    match message:
-        case EgoState():
-            return {"type": "ego", **times, **_given(message, (*STATE_NAMES, "in_pit"))}
-        case TruthState():
-            return {"type": "truth", **times, **_given(message, ("object_id", *STATE_NAMES))}
-        case DetectionList():
-            names = (*MEASURABLE, "covariance", "stamp_ns", "object_id")
-            objects = [_given(item, names) for item in message.objects]
-            return {
-                "type": "detections",
-                "sensor": message.sensor,
-                **times,
-                "frame": message.frame,
-                "objects": objects,
-            }
+    if isinstance(message, DetectionList):
+        times = {"stamp_ns": message.stamp_ns, "receipt_ns": message.receipt_ns}
+        objects = [_given(item) for item in message.objects]
+        return {"type": "detections", "sensor": message.sensor, **times, "frame": message.frame, "objects": objects}
+    return {"type": "ego" if isinstance(message, EgoState) else "truth", **_given(message)}
+
+
+def _given(value: EgoState | TruthState | Detection) -> Record:
+    return {name: field for name in _FIELDS[type(value)] if (field := getattr(value, name)) is not None}
 
 
 def _records(path: Path) -> Generator[tuple[int, Record], None, None]:
@@ -239,88 +210,51 @@ class _BadRecordError(Exception):
 
 
 def _message(record: Record, unknown: Counter[str]) -> Message:
-    kind = record.get("type")
-    keys = _KEYS.get(kind) if isinstance(kind, str) else None
-    if keys is None:
-        raise _BadRecordError(f"unknown record type {kind!r}, known are {', '.join(_KEYS)}")
-    if not record.keys() <= keys:
-        unknown.update(f"{kind}.{key}" for key in record.keys() - keys)
-    stamp_ns, receipt_ns = (_integer(record, name) for name in _TIMES)
-    if kind == "detections":
-        return _detection_list(record, stamp_ns, receipt_ns, unknown)
-    if kind == "ego":
-        required = {name: _number(record, name) for name in _EGO_REQUIRED}
-        optional = {name: _number(record, name) for name in _EGO_OPTIONAL if record.get(name) is not None}
-        in_pit = record.get("in_pit")
-        if not (in_pit is None or isinstance(in_pit, bool)):
-            raise _BadRecordError(f"in_pit: true or false expected, not {in_pit!r}")
-        return EgoState(stamp_ns, receipt_ns, **required, **optional, in_pit=in_pit)
-    return TruthState(
-        stamp_ns,
-        receipt_ns,
-        _integer(record, "object_id"),
-        **{name: _number(record, name) for name in _TRUTH_REQUIRED},
-        **{name: _number(record, name) for name in _TRUTH_OPTIONAL if record.get(name) is not None},
-    )
+    name = record.get("type")
+    kind = _KINDS.get(name) if isinstance(name, str) else None
+    if kind is None:
+        raise _BadRecordError(f"unknown record type {name!r}, known are {', '.join(_KINDS)}")
+    values = _values(kind, record)
+    if len(record) > len(values) + 1:
+        _count_unknown(name, kind, record, unknown)
+    if kind is DetectionList:
+        values["objects"] = [_detection(index, item, unknown) for index, item in enumerate(values["objects"])]
+    return kind(**values)
 
 
-def _detection_list(record: Record, stamp_ns: int, receipt_ns: int, unknown: Counter[str]) -> DetectionList:
-    sensor = _required(record, "sensor")
-    if not isinstance(sensor, str) or not sensor:
-        raise _BadRecordError(f"sensor: a name expected, not {sensor!r}")
-    frame = record.get("frame", "ego")
-    if frame not in get_args(Frame):
-        raise _BadRecordError(f"frame: one of {', '.join(get_args(Frame))} expected, not {frame!r}")
-    objects = _required(record, "objects")
-    if not isinstance(objects, list):
-        raise _BadRecordError(f"objects: a list expected, not {objects!r}")
-    detections = []
-    for index, item in enumerate(objects):
-        try:
-            detections.append(_detection(item, unknown))
-        except _BadRecordError as error:
-            raise _BadRecordError(f"objects[{index}]: {error}") from error
-    return DetectionList(sensor, stamp_ns, receipt_ns, tuple(detections), frame)
+def _detection(index: int, item: object, unknown: Counter[str]) -> Detection:
+    try:
+        if not isinstance(item, dict):
+            raise _BadRecordError(f"a JSON object expected, not {item!r}")
+        values = _values(Detection, item)
+        if len(item) > len(values):
+            _count_unknown("objects", Detection, item, unknown)
+        detection = Detection(**values)
+        size = len(detection.measured)
+        if detection.covariance is not None and len(detection.covariance) != size * size:
+            raise _BadRecordError(f"covariance: a list of {size} x {size} numbers expected")
+    except _BadRecordError as error:
+        raise _BadRecordError(f"objects[{index}]: {error}") from error
+    return detection
 
 
-def _detection(item: object, unknown: Counter[str]) -> Detection:
-    if not isinstance(item, dict):
-        raise _BadRecordError(f"a JSON object expected, not {item!r}")
-    if not item.keys() <= _DETECTION_KEYS:
-        unknown.update(f"objects.{key}" for key in item.keys() - _DETECTION_KEYS)
-    measured = {name: _number(item, name) for name in MEASURABLE if item.get(name) is not None}
-    return Detection(
-        **measured,
-        covariance=_covariance(item["covariance"], len(measured)) if item.get("covariance") is not None else None,
-        stamp_ns=_integer(item, "stamp_ns") if item.get("stamp_ns") is not None else None,
-        object_id=_integer(item, "object_id") if item.get("object_id") is not None else None,
-    )
+def _count_unknown(name: object, kind: type, record: Record, unknown: Counter[str]) -> None:
+    unknown.update(f"{name}.{key}" for key in record.keys() - _FIELDS[kind].keys() - {"type"})
 
 
-def _covariance(values: object, size: int) -> tuple[float, ...]:
-    if not isinstance(values, list) or len(values) != size * size:
-        raise _BadRecordError(f"covariance: a list of {size} x {size} numbers expected")
-    return tuple(_float("covariance", value) for value in values)
+def _values(kind: type, record: Record) -> Record:
+    """What `record` gives of the fields of `kind`; null is not given."""
+    values = {}
+    for name, (read, required) in _FIELDS[kind].items():
+        value = record.get(name)
+        if value is not None:
+            values[name] = read(name, value)
+        elif required:
+            raise _BadRecordError(f"{name}: is missing")
+    return values
 
 
-def _required(record: Record, name: str) -> object:
-    if name not in record:
-        raise _BadRecordError(f"{name}: is missing")
-    return record[name]
-
-
-def _integer(record: Record, name: str) -> int:
-    value = _required(record, name)
-    if type(value) is not int or not -_INT64_LIMIT <= value < _INT64_LIMIT:
-        raise _BadRecordError(f"{name}: a 64 bit integer expected, not {value!r}")
-    return value
-
-
-def _number(record: Record, name: str) -> float:
-    return _float(name, _required(record, name))
-
-
-def _float(name: str, value: object) -> float:
+def _number(name: str, value: object) -> float:
     if type(value) is float:
         return value
     if type(value) is not int:
@@ -329,3 +263,43 @@ def _float(name: str, value: object) -> float:
         return float(value)
     except OverflowError as error:
         raise _BadRecordError(f"{name}: {str(value)[:20]}... is too large for a number") from error
+
+
+def _integer(name: str, value: object) -> int:
+    if type(value) is not int or not -_INT64_LIMIT <= value < _INT64_LIMIT:
+        raise _BadRecordError(f"{name}: a 64 bit integer expected, not {value!r}")
+    return value
+
+
+def _checked(is_right: Callable[[Any], bool], what: str) -> Callable[[str, Any], Any]:
+    def read(name: str, value: Any) -> Any:
+        if not is_right(value):
+            raise _BadRecordError(f"{name}: {what} expected, not {value!r}")
+        return value
+
+    return read
+
+
+def _numbers(name: str, value: object) -> tuple[float, ...]:
+    if not isinstance(value, list):
+        raise _BadRecordError(f"{name}: a list of numbers expected, not {value!r}")
+    return tuple(_number(name, item) for item in value)
+
+
+# Any: JSON values. What is not here is a number.
+_READERS: dict[str, Callable[[str, Any], Any]] = {
+    "stamp_ns": _integer,
+    "receipt_ns": _integer,
+    "object_id": _integer,
+    "in_pit": _checked(lambda value: isinstance(value, bool), "true or false"),
+    "sensor": _checked(lambda value: isinstance(value, str) and value != "", "a name"),
+    "frame": _checked(lambda value: value in get_args(Frame), f"one of {', '.join(get_args(Frame))}"),
+    "objects": _checked(lambda value: isinstance(value, list), "a list"),
+    "covariance": _numbers,
+}
+
+#: Names of what a message or a detection holds; of each how to read it from JSON, and whether it has to be given.
+_FIELDS: dict[type, dict[str, tuple[Callable[[str, Any], Any], bool]]] = {
+    kind: {field.name: (_READERS.get(field.name, _number), field.default is MISSING) for field in fields(kind)}
+    for kind in (EgoState, DetectionList, TruthState, Detection)
+}
