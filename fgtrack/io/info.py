@@ -1,5 +1,6 @@
 """What is in an input: its topics or sensors with counts, rates and delays."""
 
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,10 +8,9 @@ import numpy as np
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import seconds
-from fgtrack.core.types import DetectionList, EgoState, Message
+from fgtrack.core.types import DetectionList, EgoState
 from fgtrack.io.adapters import ADAPTERS
 from fgtrack.io.adapters.ego import ODOMETRY
-from fgtrack.io.adapters.native import NATIVE_ADAPTERS
 from fgtrack.io.config import InputConfig
 from fgtrack.io.errors import TruncatedInput
 from fgtrack.io.ros.bag import Bag, BagTopic
@@ -74,7 +74,25 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
     """
     path = Path(path)
     kind = input_kind(path)
-    return _describe_bag(path, config) if kind == "recording" else _describe_messages(path, kind, config)
+    times: dict[_Key, _Times] = defaultdict(_Times)
+    read = _read_bag if kind == "recording" else _read_messages
+    used, notes, problem = read(path, config, times)
+    topics = tuple(
+        TopicInfo(
+            *(*key, len(times[key].receipts_ns), times[key].rate_hz(), times[key].delay()),
+            used_as=used.get(key),
+            note=notes.get(key),
+        )
+        for key in sorted(times)
+    )
+    receipts_ns = [receipt for item in times.values() for receipt in item.receipts_ns]
+    start_ns = min(receipts_ns, default=None)
+    duration_s = 0.0 if start_ns is None else seconds(max(receipts_ns) - start_ns)
+    return InputInfo(path, kind, start_ns, duration_s, topics, problem)
+
+
+_Key = tuple[str, str]  # name and type of a topic
+_Found = tuple[dict[_Key, str], dict[_Key, str | None], str | None]  # uses, notes, what is wrong with the input
 
 
 class _Times:
@@ -102,83 +120,48 @@ class _Times:
         p50, p90 = np.quantile(delays_s, [0.5, 0.9]).tolist()
         return DelayInfo(float(delays_s.mean()), p50, p90, float(delays_s.max()))
 
-    def clock_note(self) -> str | None:
-        delay = self.delay()
-        if delay and abs(delay.p50_s) > _OTHER_CLOCK_S:
-            return "its stamps are of another clock than the recorder's (simulated time?)"
-        return None
 
-
-def _describe_bag(path: Path, config: InputConfig | None) -> InputInfo:
+def _read_bag(path: Path, config: InputConfig | None, times: dict[_Key, _Times]) -> _Found:
     bag = Bag(path, config.message_definitions if config else ())
+    used: dict[_Key, str] = {}
     problem: str | None = None
-    used: dict[tuple[str, str], str] = {}
     try:
-        for use in topic_uses(bag, config or InputConfig()):
-            used[use.topic.name, use.topic.type] = use.role
+        used = {(use.topic.name, use.topic.type): use.role for use in topic_uses(bag, config or InputConfig())}
     except DataError as error:
         problem = str(error) if config else None
-    times = {(topic.name, topic.type): _Times() for topic in bag.topics}
+    for topic in bag.topics:
+        times[topic.name, topic.type] = _Times()
     try:
         for topic, log_ns, stamp_ns in bag.stamps():
             times[topic.name, topic.type].add(log_ns, stamp_ns)
     except TruncatedInput as error:
         problem = str(error)
-    topics = tuple(
-        TopicInfo(
-            topic.name,
-            topic.type,
-            len(of_topic.receipts_ns),
-            of_topic.rate_hz(),
-            of_topic.delay(),
-            used.get((topic.name, topic.type)),
-            topic.problem or of_topic.clock_note() or _possible_use(topic),
-        )
-        for topic in bag.topics
-        for of_topic in [times[topic.name, topic.type]]
-    )
-    return _info(path, "recording", topics, list(times.values()), problem)
+    return used, {(topic.name, topic.type): _note(topic, times) for topic in bag.topics}, problem
 
 
-def _possible_use(topic: BagTopic) -> str | None:
-    if topic.type in NATIVE_ADAPTERS:
-        return None
+def _note(topic: BagTopic, times: dict[_Key, _Times]) -> str | None:
+    delay = times[topic.name, topic.type].delay()
+    if topic.problem:
+        return topic.problem
+    if delay and abs(delay.p50_s) > _OTHER_CLOCK_S:
+        return "its stamps are of another clock than the recorder's (simulated time?)"
     if topic.type == ODOMETRY:
         return "could be the ego"
     return "could be detections or truth" if topic.type in ADAPTERS else None
 
 
-def _describe_messages(path: Path, kind: str, config: InputConfig | None) -> InputInfo:
+def _read_messages(path: Path, config: InputConfig | None, times: dict[_Key, _Times]) -> _Found:
+    used: dict[_Key, str] = {}
     problem: str | None = None
-    times: dict[tuple[str, str], _Times] = {}
     try:
         for message in open_input(path, config).messages():
-            times.setdefault(_name_and_type(message), _Times()).add(message.receipt_ns, message.stamp_ns)
+            if isinstance(message, DetectionList):
+                key, use = (message.sensor, "detections"), f"detections {message.sensor}"
+            else:
+                use = "ego" if isinstance(message, EgoState) else "truth"
+                key = (use, use)
+            used[key] = use
+            times[key].add(message.receipt_ns, message.stamp_ns)
     except TruncatedInput as error:
         problem = str(error)
-    topics = tuple(
-        TopicInfo(
-            name,
-            msgtype,
-            len(of_topic.receipts_ns),
-            of_topic.rate_hz(),
-            of_topic.delay(),
-            f"detections {name}" if msgtype == "detections" else name,
-            None,
-        )
-        for (name, msgtype), of_topic in sorted(times.items())
-    )
-    return _info(path, kind, topics, list(times.values()), problem)
-
-
-def _name_and_type(message: Message) -> tuple[str, str]:
-    if isinstance(message, DetectionList):
-        return message.sensor, "detections"
-    return ("ego", "ego") if isinstance(message, EgoState) else ("truth", "truth")
-
-
-def _info(path: Path, kind: str, topics: tuple[TopicInfo, ...], times: list[_Times], problem: str | None) -> InputInfo:
-    receipts_ns = [receipt for item in times for receipt in item.receipts_ns]
-    start_ns = min(receipts_ns, default=None)
-    duration_s = 0.0 if start_ns is None else seconds(max(receipts_ns) - start_ns)
-    return InputInfo(path, kind, start_ns, duration_s, topics, problem)
+    return used, {}, problem

@@ -67,7 +67,7 @@ def input_kind(path: Path) -> str:
                 return name
         for form in formats.values():
             if not path.is_dir() and form.recognises(path.parent):
-                raise CallError(f"{path}: is no input by itself, name its folder {path.parent} ({form.description})")
+                raise DataError(f"{path}: is no input by itself, name its folder {path.parent} ({form.description})")
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     known = ", ".join(form.description for form in reversed(formats.values()))

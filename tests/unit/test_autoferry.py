@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.messages import shared
 
-from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, TruthState
 from fgtrack.io.source import open_input
 
@@ -105,7 +105,7 @@ def test_a_damaged_scenario_is_one_line_that_names_the_file(tmp_path, text):
 
 def test_a_file_of_a_scenario_points_to_its_folder(tmp_path):
     scenario(tmp_path)
-    with pytest.raises(CallError, match="name its folder"):
+    with pytest.raises(DataError, match="name its folder"):
         open_input(tmp_path / "scenario9_detections.json")
 
 

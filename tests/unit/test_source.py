@@ -6,7 +6,7 @@ import pytest
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState
 from fgtrack.io.adapters import ADAPTERS, message_types
 from fgtrack.io.config import InputConfig, TopicInput
@@ -81,5 +81,5 @@ def test_a_part_of_a_folder_names_the_folder(tmp_path: Path, name: str) -> None:
     file = tmp_path / name
     file.parent.mkdir()
     file.write_text("x")
-    with pytest.raises(CallError, match=f"{file.name}: is no input by itself, name its folder .*{file.parent.name} "):
+    with pytest.raises(DataError, match=f"{file.name}: is no input by itself, name its folder .*{file.parent.name} "):
         open_input(file)

@@ -23,6 +23,8 @@ from fgtrack.io.ros.bag import Bag, BagTopic, is_bag, type_name
 from fgtrack.io.source import FileFormat
 
 Convert = Callable[[RosMessage, int], Iterator[Message]]
+FromObjects = Callable[[ObjectList, int, int], Iterator[Message]]
+"""Messages of an object list, its stamp (the receipt where it has none) and its receipt."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
         uses.append(TopicUse(topic, f"detections {sensor}", _detections(topic, item, sensor)))
     if config.truth:
         topic = _find(bag, config.truth)
-        uses.append(TopicUse(topic, "truth", _truth(topic, config.truth)))
+        uses.append(TopicUse(topic, "truth", _objects(topic, config.truth, _truth)))
     return tuple(uses)
 
 
@@ -141,27 +143,32 @@ def _check_fields(item: TopicInput, known: frozenset[str], needed: tuple[str, ..
 
 def _native(msgtype: str) -> Convert:
     adapter = NATIVE_ADAPTERS[msgtype]
-
-    def convert(message: RosMessage, receipt_ns: int) -> Iterator[Message]:
-        yield adapter(message, receipt_ns)
-
-    return convert
+    return lambda message, receipt_ns: iter((adapter(message, receipt_ns),))
 
 
 def _ego(topic: BagTopic, item: TopicInput) -> Convert:
     fields = item.fields
     if fields is not None:
         _check_fields(item, EGO_FIELDS, ("x_m", "y_m", "yaw_rad", "speed_mps"))
-    elif topic.type in NATIVE_ADAPTERS:
+        return lambda message, receipt_ns: iter((ego_by_fields(message, fields, receipt_ns),))
+    if topic.type in NATIVE_ADAPTERS:
         return _native(topic.type)
-    elif topic.type != ODOMETRY:
+    if topic.type != ODOMETRY:
         raise CallError(f"topic {topic.name}: an ego of type {topic.type} needs fields, known is {ODOMETRY}")
+    return lambda message, receipt_ns: iter((ego_from_odometry(message, receipt_ns),))
+
+
+def _objects(
+    topic: BagTopic, item: TopicInput, messages: Callable[[ObjectList, int, int], Iterator[Message]]
+) -> Convert:
+    """Makes `messages` of an object list, its stamp (without one the receipt) and its receipt."""
+    if topic.type in NATIVE_ADAPTERS:
+        return _native(topic.type)
+    read = _object_list(topic, item)
 
     def convert(message: RosMessage, receipt_ns: int) -> Iterator[Message]:
-        if fields is None:
-            yield ego_from_odometry(message, receipt_ns)
-        else:
-            yield ego_by_fields(message, fields, receipt_ns)
+        objects = read(message)
+        return messages(objects, receipt_ns if objects.stamp_ns is None else objects.stamp_ns, receipt_ns)
 
     return convert
 
@@ -179,39 +186,20 @@ def _object_list(topic: BagTopic, item: TopicInput) -> Callable[[RosMessage], Ob
 
 
 def _detections(topic: BagTopic, item: TopicInput, sensor: str) -> Convert:
-    if topic.type in NATIVE_ADAPTERS:
-        return _native(topic.type)
-    read = _object_list(topic, item)
+    def messages(objects: ObjectList, stamp_ns: int, receipt_ns: int) -> Iterator[Message]:
+        yield DetectionList(sensor, stamp_ns, receipt_ns, objects.objects, item.frame or objects.frame or "ego")
 
-    def convert(message: RosMessage, receipt_ns: int) -> Iterator[Message]:
-        objects = read(message)
-        stamp = receipt_ns if objects.stamp_ns is None else objects.stamp_ns
-        frame = item.frame or objects.frame or "ego"
-        yield DetectionList(sensor, stamp, receipt_ns, objects.objects, frame)
-
-    return convert
+    return _objects(topic, item, messages)
 
 
-def _truth(topic: BagTopic, item: TopicInput) -> Convert:
+def _truth(objects: ObjectList, stamp_ns: int, receipt_ns: int) -> Iterator[Message]:
     """One state per object; an object without an id is known by its place in the list."""
-    if topic.type in NATIVE_ADAPTERS:
-        return _native(topic.type)
-    read = _object_list(topic, item)
-
-    def convert(message: RosMessage, receipt_ns: int) -> Iterator[Message]:
-        objects = read(message)
-        stamp = receipt_ns if objects.stamp_ns is None else objects.stamp_ns
-        for index, state in enumerate(objects.objects):
-            if state.x_m is None or state.y_m is None:
-                raise FieldError("truth needs x_m and y_m")
-            yield TruthState(
-                stamp if state.stamp_ns is None else state.stamp_ns,
-                receipt_ns,
-                index if state.object_id is None else state.object_id,
-                state.x_m,
-                state.y_m,
-                state.yaw_rad,
-                state.speed_mps,
-            )
-
-    return convert
+    for index, state in enumerate(objects.objects):
+        if state.x_m is None or state.y_m is None:
+            raise FieldError("truth needs x_m and y_m")
+        yield TruthState(
+            stamp_ns if state.stamp_ns is None else state.stamp_ns,
+            receipt_ns,
+            index if state.object_id is None else state.object_id,
+            *(state.x_m, state.y_m, state.yaw_rad, state.speed_mps),
+        )
