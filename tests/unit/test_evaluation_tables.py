@@ -18,6 +18,7 @@ from fgtrack.core.types import Disposition
 from fgtrack.evaluation.comparison import BACKWARD_FORWARD_NOTE, compare, comparison
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.runs import labelled
+from fgtrack.evaluation.statistics import Distribution
 from fgtrack.evaluation.tables import Column, Table, Tables, short
 from fgtrack.io.run import Run
 
@@ -221,6 +222,17 @@ def test_the_tracking_table_has_errors_continuity_and_times(tables: Tables) -> N
     units = [column.heading.split("\n")[-1] for column in table.shown]
     assert units[1:7] == ["[m]", "[m]", "[m]", "[rad]", "[m/s]", "[%]"]
     assert "RMSE" in table.title
+
+
+def test_several_numbers_of_a_cell_stand_in_their_order(runs: dict[str, Run]) -> None:
+    metrics = evaluate(runs["smoother"])
+    assert metrics.truth is not None
+    west = replace(metrics.truth.objects[7], breaks=3, id_switches=2, late_id_switches=1)
+    truth = replace(metrics.truth, objects={7: west})
+    times = Distribution(9, mean=0.004, p50=0.001, p90=0.002, p99=0.003)
+    tables = comparison({"run": replace(metrics, truth=truth, num_tracks=5, time_per_tick_s=times)})
+    assert rows_of(tables["tracking"])[0].split()[-5:] == ["3/2", "0", "1.00", "5/2", "1.00/3.00"]
+    assert rows_of(tables["multi_object"])[0].split()[-2] == "2/1"
 
 
 def test_the_multi_object_table_has_gospa_scores_switches_and_the_time_to_confirm(tmp_path: Path) -> None:
