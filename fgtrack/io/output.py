@@ -1,8 +1,8 @@
-"""Outputs of commands: nothing foreign is removed or replaced, and nothing half-written has the name of an output.
+"""Safe outputs: nothing is removed or replaced that a command did not write, and no output is half-written.
 
-A file, or a folder that is written once, is made beside its place under a name that nobody can guess and is
-renamed when it is done; what a killed command leaves has that name and ends in `.part`. A folder that has to be
-readable at any time is claimed: made, and locked until the command ends.
+A file, or a folder that is written once, is made beside its destination under a random name that ends in `.part`, and
+renamed when it is complete; a killed command leaves the `.part`. A folder that must be readable at any time is claimed
+instead: created, and locked until the command ends.
 """
 
 import errno
@@ -23,18 +23,15 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of output, which replaces its like alone."""
+    """A kind of output; it replaces nothing but its own kind."""
 
     name: str
     recognises: Callable[[Path], bool]
-    """Whether an existing path holds this kind and nothing else."""
+    """Whether an existing path is of this kind and holds nothing else."""
 
 
 def check_output(path: Path, kind: Kind, overwrite: bool) -> None:
-    """Raise `CallError` where `path` must not be written: for something foreign, or without `overwrite` for its like.
-
-    An empty folder is in nobody's way.
-    """
+    """Raise `CallError` unless `path` is free, an empty folder or, with `overwrite`, of this kind."""
     try:
         if not os.path.lexists(path) or (path.is_dir() and not path.is_symlink() and not any(path.iterdir())):
             return
@@ -42,20 +39,20 @@ def check_output(path: Path, kind: Kind, overwrite: bool) -> None:
     except OSError as error:
         raise write_error(path, error) from error
     if not own:
-        raise CallError(f"{path}: is in the way and not {kind.name}, choose another name")
+        raise CallError(f"{path}: exists and is not {kind.name}, choose another name")
     if not overwrite:
-        raise CallError(f"{path}: exists, choose another name or replace it with --overwrite")
+        raise CallError(f"{path}: already exists, choose another name or replace it with --overwrite")
 
 
 def write_error(path: Path, error: OSError) -> FgtrackError:
-    """What a user is told when `path` cannot be written: a bad call, or a disk that is full or broken."""
+    """The error to raise where `path` cannot be written: `DataError` for a full or broken disk, else `CallError`."""
     if error.errno in _FULL:
         return DataError(f"{path}: cannot be written ({error.strerror}), free some space")
     return CallError(f"{path}: cannot be written ({error.strerror or error}), choose another place")
 
 
 def write_file(path: Path, text: str) -> None:
-    """Write the text file `path`, which is the caller's own, whole or not at all."""
+    """Write the text file `path` completely or not at all, replacing a former version."""
     part = _part_of(path)
     try:
         with _removed_on_error(part):
@@ -68,7 +65,7 @@ def write_file(path: Path, text: str) -> None:
 
 @contextmanager
 def new_file(path: Path, kind: Kind, overwrite: bool) -> Iterator[BinaryIO]:
-    """A file that gets the name `path` when the block is left; raises as `check_output` and `write_error`."""
+    """A file that is renamed to `path` when the block ends; raises as `check_output` and `write_error`."""
     check_output(path, kind, overwrite)
     part = _part_of(path)
     try:
@@ -76,15 +73,14 @@ def new_file(path: Path, kind: Kind, overwrite: bool) -> Iterator[BinaryIO]:
         with _removed_on_error(part):
             with part.open("xb") as file:
                 yield file
-            check_output(path, kind, overwrite)
-            _rename(part, path, overwrite)
+            _rename(part, path, kind, overwrite)
     except OSError as error:
         raise write_error(path, error) from error
 
 
 @contextmanager
 def new_folder(path: Path, kind: Kind, overwrite: bool) -> Iterator[Path]:
-    """Where to make the folder that gets the name `path` when the block is left; raises as `new_file`."""
+    """Path at which to make a folder that is renamed to `path` when the block ends; raises as `new_file`."""
     check_output(path, kind, overwrite)
     part = _part_of(path)
     new, old = part / Path(os.path.abspath(path)).name, part / ".replaced"
@@ -108,9 +104,9 @@ def new_folder(path: Path, kind: Kind, overwrite: bool) -> Iterator[Path]:
 
 @contextmanager
 def new_files(folder: Path, overwrite: bool) -> Iterator[Path]:
-    """A folder whose files go into `folder` when the block is left: all, or none where one must not be replaced.
+    """A folder whose files are moved to `folder` when the block ends: all, or none where one must not be replaced.
 
-    A file may replace one that starts with the same four bytes, and without `overwrite` one that is equal.
+    An existing file may be replaced with `overwrite` where it starts with the same four bytes, or if it is equal.
     """
     with claimed(folder):
         part = folder / f"{secrets.token_hex(6)}.part"
@@ -134,9 +130,9 @@ def new_files(folder: Path, overwrite: bool) -> Iterator[Path]:
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """Make `folder` and lock it while the block runs; what stayed empty of what was made is removed again.
+    """Create `folder` and lock it during the block; folders created that are still empty at its end are removed.
 
-    Raises `CallError` where it cannot be made, or another command holds it.
+    Raises `CallError` where it cannot be created, or another command has locked it.
     """
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
@@ -164,15 +160,13 @@ def _lock(descriptor: int, folder: Path) -> None:
         return
 
 
-def _rename(part: Path, path: Path, overwrite: bool) -> None:
+def _rename(part: Path, path: Path, kind: Kind, overwrite: bool) -> None:
     if not overwrite:
-        try:
-            os.link(part, path)  # unlike a renaming it never replaces what was made meanwhile
-        except PermissionError:  # a file system without links
-            pass
-        else:
+        with suppress(PermissionError):  # a file system without links
+            os.link(part, path)  # unlike a renaming this never replaces what was made meanwhile
             part.unlink()
             return
+    check_output(path, kind, overwrite)
     os.replace(part, path)
 
 
@@ -187,7 +181,7 @@ def _starting_with(start: bytes) -> Callable[[Path], bool]:
 
 @contextmanager
 def _removed_on_error(part: Path) -> Iterator[None]:
-    """Remove the file or folder `part` after an error; an interrupt leaves it, as a kill does."""
+    """Remove the file or folder `part` after an error; an interrupt keeps it, as a kill does."""
     try:
         yield
     except Exception:

@@ -8,12 +8,12 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import MISSING, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, get_args
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Frame, Message, TruthState
-from fgtrack.io.config import InputConfig
 from fgtrack.io.errors import TruncatedInput, UntilBreak
 from fgtrack.io.output import Kind, new_file
 from fgtrack.io.source import FileFormat
@@ -73,11 +73,9 @@ def _recognises(path: Path) -> bool:
     return start.startswith(GZIP_MAGIC) or start.lstrip().startswith(b"{")
 
 
-def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
-    return lambda: read_stream(path)
-
-
-FORMAT = FileFormat("an fgtrack stream (.jsonl, .jsonl.gz)", _recognises, _open)
+FORMAT = FileFormat(
+    "an fgtrack stream (.jsonl, .jsonl.gz)", _recognises, lambda path, config: partial(read_stream, path)
+)
 
 
 def read_header(path: Path | str) -> Mapping[str, Any]:

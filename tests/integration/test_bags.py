@@ -84,7 +84,7 @@ def test_a_folder_without_metadata_is_read(tmp_path):
 
 def test_an_existing_path_is_not_overwritten(tmp_path):
     write_bag(tmp_path / "bag", drive(5))
-    with pytest.raises(CallError, match="bag: exists"):
+    with pytest.raises(CallError, match="bag: already exists"):
         write_bag(tmp_path / "bag", drive())
     assert read(tmp_path / "bag") == drive(5)
 

@@ -12,6 +12,7 @@ from fgtrack.cli import demo
 from fgtrack.cli.main import run
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
+from fgtrack.io import output
 from fgtrack.io.output import claimed, new_file, write_file
 from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.run import RunWriter, load_run
@@ -209,7 +210,7 @@ def test_a_sweep_does_not_replace_a_table_that_it_did_not_make(here: Path, call:
     Path("swept", table).write_text("mine")
     code, error = call("sweep", "sweep.yaml", "-o", "swept")
     assert code == 2
-    assert f"swept/{table}: exists" in error
+    assert f"swept/{table}: already exists" in error
     assert [file.name for file in Path("swept").iterdir()] == [table]
     assert Path("swept", table).read_text() == "mine"
 
@@ -249,19 +250,38 @@ def test_part_files_of_others_stay(here: Path, call: Call) -> None:
         assert Path(name).read_text() == "mine"
 
 
-def test_what_appears_while_a_recording_is_written_is_not_replaced(here: Path) -> None:
-    def messages(path: Path) -> Iterator[Message]:
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_what_appears_while_a_recording_is_written_is_not_replaced(here: Path, overwrite: bool) -> None:
+    def messages(file: Path) -> Iterator[Message]:
         yield from drive(5)
-        path.mkdir() if path.suffix == "" else path.write_text("mine")
-        (path / "mine").write_text("mine") if path.is_dir() else None
+        file.parent.mkdir(exist_ok=True)
+        file.write_text("mine")
 
     with pytest.raises(CallError, match=r"new\.jsonl"):
-        write_stream("new.jsonl", messages(Path("new.jsonl")))
+        write_stream("new.jsonl", messages(Path("new.jsonl")), overwrite=overwrite)
     assert Path("new.jsonl").read_text() == "mine"
     with pytest.raises(CallError, match="newbag"):
-        write_bag("newbag", messages(Path("newbag")))
+        write_bag("newbag", messages(Path("newbag/mine")), overwrite=overwrite)
     assert os.listdir("newbag") == ["mine"]
     assert not list(here.glob("*.part"))
+
+
+@pytest.mark.parametrize(("write", "out"), [(write_stream, "other.jsonl"), (write_bag, "bag")])
+def test_no_message_is_read_for_an_output_that_is_refused(here: Path, write: Callable[..., int], out: str) -> None:
+    messages = iter(drive(5))
+    with pytest.raises(CallError, match=f"{out}: already exists"):
+        write(out, messages)
+    assert len(list(messages)) == 10
+
+
+def test_what_appears_at_the_last_moment_is_not_replaced(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(output, "check_output", lambda *_: None)
+    before = content(here)
+    with pytest.raises(CallError, match=r"other\.jsonl: cannot be written"):
+        write_stream("other.jsonl", drive(5))
+    with pytest.raises(CallError, match="bag: cannot be written"):
+        write_bag("bag", drive(5))
+    assert content(here) == before
 
 
 def test_an_error_while_writing_keeps_the_old_recording(here: Path) -> None:
@@ -293,7 +313,7 @@ def test_figures_are_replaced_all_or_none(here: Path, call: Call) -> None:
     before = content(Path("figures"))
     code, error = call("figure", "run", "-o", "figures")
     assert code == 2
-    assert f"{figures[-1]}: exists" in error
+    assert f"{figures[-1]}: already exists" in error
     assert content(Path("figures")) == before
     assert call("figure", "run", "-o", "figures", "--overwrite")[0] == 0
     assert sorted(Path("figures").iterdir()) == figures

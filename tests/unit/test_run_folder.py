@@ -217,7 +217,7 @@ def test_an_older_run_is_replaced_and_nothing_of_it_is_left(tmp_path):
 
 def test_a_folder_with_something_else_in_it_is_refused_and_left_alone(tmp_path):
     (tmp_path / "letter.txt").write_text("dear")
-    with pytest.raises(CallError, match="in the way and not a run folder"):
+    with pytest.raises(CallError, match="exists and is not a run folder"):
         RunWriter(tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["letter.txt"]
     with pytest.raises(CallError, match="cannot be made a folder"):

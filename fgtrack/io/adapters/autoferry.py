@@ -17,8 +17,9 @@ Choices that the data leave open:
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from decimal import Decimal
+from functools import partial
 from heapq import merge
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,6 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
-from fgtrack.io.config import InputConfig
 from fgtrack.io.source import FileFormat
 
 SENSORS = {1: "lidar", 2: "radar", 3: "infrared", 4: "daylight"}
@@ -40,17 +40,6 @@ Json = Any
 def detections_file(folder: Path) -> Path | None:
     """The file of detections of a scenario folder; None where `folder` is not one."""
     return next(iter(sorted(folder.glob("*_detections.json"))), None)
-
-
-def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
-    return lambda: read_scenario(path)
-
-
-FORMAT = FileFormat(
-    "an Autoferry scenario folder (*_detections.json)",
-    lambda path: path.is_dir() and detections_file(path) is not None,
-    _open,
-)
 
 
 def read_scenario(folder: Path) -> Iterator[Message]:
@@ -69,6 +58,13 @@ def read_scenario(folder: Path) -> Iterator[Message]:
     truth = file.with_name(file.name.replace("_detections", "_groundTruth"))
     states = _truth(truth) if truth.exists() else []
     return merge(states, _sensed(file), key=lambda message: message.receipt_ns)
+
+
+FORMAT = FileFormat(
+    "an Autoferry scenario folder (*_detections.json)",
+    lambda path: path.is_dir() and detections_file(path) is not None,
+    lambda path, config: partial(read_scenario, path),
+)
 
 
 def _sensed(file: Path) -> Iterator[EgoState | DetectionList]:

@@ -13,14 +13,14 @@ leave open:
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import Detection, DetectionList, EgoState, Frame, Message
-from fgtrack.io.config import InputConfig
 from fgtrack.io.errors import TruncatedInput
 from fgtrack.io.source import FileFormat
 
@@ -72,12 +72,13 @@ def read_log(folder: Path, frames: Mapping[str, Frame]) -> Iterator[Message]:
         raise DataError(f"{file}: cannot be read ({error.strerror})") from error
 
 
-def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
-    frames: dict[str, Frame] = {sensor: item.frame for sensor, item in config.detections.items() if item.frame}
-    return lambda: read_log(path, frames)
-
-
-FORMAT = FileFormat(f"a FusionTracking log folder ({LOG_NAME})", lambda path: (path / LOG_NAME).is_file(), _open)
+FORMAT = FileFormat(
+    f"a FusionTracking log folder ({LOG_NAME})",
+    lambda path: (path / LOG_NAME).is_file(),
+    lambda path, config: partial(
+        read_log, path, {sensor: item.frame for sensor, item in config.detections.items() if item.frame}
+    ),
+)
 
 
 def _ego(ego: Json, receipt_ns: int) -> EgoState:
