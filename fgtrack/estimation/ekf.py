@@ -4,12 +4,54 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dgesv, dgetrs
 
 from fgtrack.core.linalg import identity, psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import Measurement
 from fgtrack.models.measurement import MeasurementModel, SensorPose
 from fgtrack.models.motion import MotionModel
+
+
+def propagated(F: FloatArray, P: FloatArray, Q: FloatArray) -> FloatArray:
+    """Covariance F P F' + Q of F x + N(0, Q), shape (..., m, m)."""
+    return symmetrise(F @ P @ F.mT + Q)
+
+
+def kalman_gain(P: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gain K = P H' S^-1, shape (..., n, k), and covariance S = H P H' + R of the innovation, (..., k, k).
+
+    Raises `numpy.linalg.LinAlgError` for a singular S.
+    """
+    S, solved = _solved(P, H, R)
+    return solved.mT, S
+
+
+def _solved(P: FloatArray, H: FloatArray, R: FloatArray, *columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """S, and S^-1 times H P and further columns."""
+    HP = H @ P
+    S = HP @ H.mT + R
+    return S, psd_solve(S, np.concatenate([HP, *columns], axis=-1) if columns else HP)
+
+
+def joseph(P: FloatArray, K: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
+    """Covariance (I - K H) P (I - K H)' + K R K' after a measurement H x + N(0, R) with any gain K, (..., n, n)."""
+    A = identity(P.shape[-1]) - K @ H
+    return symmetrise(A @ P @ A.mT + K @ R @ K.mT)
+
+
+def linearised(
+    z: FloatArray,
+    x: FloatArray,
+    model: MeasurementModel,
+    pose: SensorPose,
+    residual: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Innovation y (..., k) of z (..., k) at the states x (..., n), and its Jacobian H (k, n) or (..., k, n).
+
+    `residual` may take the place of the model's own.
+    """
+    y = (residual or model.residual)(z, model.predict(x, pose))
+    return y, model.selection(x.shape[-1]) if model.linear else model.jacobian(x, pose)
 
 
 class Correction(NamedTuple):
@@ -33,8 +75,7 @@ def predict(
     Shapes (..., n) and (..., n, n); `dt_s` a number or of shape (...).
     """
     F = motion.jacobian(mean, dt_s)
-    spread = F @ covariance @ F.mT + motion.process_noise(mean, dt_s)
-    return motion.predict(mean, dt_s), symmetrise(spread)
+    return motion.predict(mean, dt_s), propagated(F, covariance, motion.process_noise(mean, dt_s))
 
 
 def correct(
@@ -51,8 +92,7 @@ def correct(
     `residual` may take the place of the model's own. The posterior covariance is in Joseph form. Raises
     `numpy.linalg.LinAlgError` for a singular S.
     """
-    y = (residual or model.residual)(z, model.predict(mean, pose))
-    H = model.selection(mean.shape[-1]) if model.linear else model.jacobian(mean, pose)
+    y, H = linearised(z, mean, model, pose, residual)
     return correct_with_innovation(mean, covariance, y, R, H)
 
 
@@ -60,14 +100,10 @@ def correct_with_innovation(
     mean: FloatArray, covariance: FloatArray, y: FloatArray, R: FloatArray, H: FloatArray
 ) -> Correction:
     """Fuse the innovations y (m, k) of measurements with Jacobians H (m, k, n) or (k, n)."""
-    HP = H @ covariance
-    S = HP @ H.mT + R
-    solved = psd_solve(S, np.concatenate([HP, y[..., None]], axis=-1))
+    _, solved = _solved(covariance, H, R, y[..., None])
     K = solved[..., :-1].mT
-    A = identity(mean.shape[-1]) - K @ H
-    posterior = A @ covariance @ A.mT + K @ R @ K.mT
     nis = np.vecdot(y, solved[..., -1])
-    return Correction(mean + np.vecdot(K, y[..., None, :]), symmetrise(posterior), y, np.asarray(nis))
+    return Correction(mean + np.vecdot(K, y[..., None, :]), joseph(covariance, K, H, R), y, np.asarray(nis))
 
 
 class OneCorrection(NamedTuple):
@@ -88,21 +124,11 @@ def predict_one(
 ) -> tuple[FloatArray, FloatArray]:
     """`predict` of one state, shapes (n,) and (n, n), without the price of a stack."""
     after, F, Q = motion.step(mean.tolist(), dt_s)
-    return np.array(after), symmetrise(F.dot(covariance).dot(F.T) + Q)
+    return np.array(after), propagated(F, covariance, Q)
 
 
-def correct_one(
-    mean: FloatArray, covariance: FloatArray, z: FloatArray, R: FloatArray, model: MeasurementModel, pose: SensorPose
-) -> OneCorrection:
-    """`correct` of one state, shapes (n,) and (n, n), by one z (k,) with R (k, k), without the price of a stack."""
-    y = model.residual(z, model.predict(mean, pose))
-    H = model.selection(len(mean)) if model.linear else model.jacobian(mean, pose)
-    HP = H.dot(covariance)
-    factors, pivots, solved, singular = dgesv(HP.dot(H.T) + R, HP)
-    if singular:
-        raise np.linalg.LinAlgError("singular matrix")
-    weighted, _ = dgetrs(factors, pivots, y)
-    K = solved.T
-    A = identity(len(mean)) - K.dot(H)
-    posterior = A.dot(covariance).dot(A.T) + K.dot(R).dot(K.T)
-    return OneCorrection(mean + K.dot(y), symmetrise(posterior), y, float(y.dot(weighted)))
+def correct_one(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
+    """`correct` of one state, shapes (n,) and (n, n), without the price of a stack."""
+    y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
+    K, S = kalman_gain(covariance, H, measurement.R)
+    return OneCorrection(mean + K.dot(y), joseph(covariance, K, H, measurement.R), y, float(y.dot(psd_solve(S, y))))

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.linalg import psd_solve
 from fgtrack.core.types import FloatArray
+from fgtrack.estimation.ekf import joseph, kalman_gain
 from fgtrack.models.motion import MotionModel
 
 
@@ -29,13 +29,13 @@ class Between(NamedTuple):
 def between(motion: MotionModel, left: Sequence[float], right: FloatArray, until_s: float, after_s: float) -> Between:
     """State `until_s` after a node with mean `left` (n,) and `after_s` before one with mean `right` (n,).
 
-    With F1, Q1 until the stamp and F2, Q2 after it: Psi = Q1 F2' (F2 Q1 F2' + Q2)^-1, Lambda = F1 - Psi F2 F1,
-    Sigma = Q1 - Psi F2 Q1. The motion is linearised at `left`.
+    With F1, Q1 until the stamp and F2, Q2 after it, the node on the right is a measurement F2 x + N(0, Q2) of a state
+    with covariance Q1, and Psi its gain; Lambda = F1 - Psi F2 F1, Sigma = Q1 - Psi F2 Q1. The motion is linearised at
+    `left`.
     """
     first = motion.step(left, until_s)
     second = motion.step(first.mean, after_s)
-    spread = second.F @ first.Q
-    Psi = psd_solve(spread @ second.F.T + second.Q, spread).T
-    kept = np.eye(len(right)) - Psi @ second.F
+    Psi, _ = kalman_gain(first.Q, second.F, second.Q)
     mean = np.asarray(first.mean) + Psi @ (right - np.asarray(second.mean))
-    return Between(mean, kept @ first.F, Psi, kept @ first.Q @ kept.T + Psi @ second.Q @ Psi.T)
+    Lambda = first.F - Psi @ (second.F @ first.F)
+    return Between(mean, Lambda, Psi, joseph(first.Q, Psi, second.F, second.Q))

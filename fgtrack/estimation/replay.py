@@ -96,7 +96,7 @@ class ReplayEkf:
     def _fused(self, before: _Stored, order: _Order, measurement: Measurement) -> tuple[_Stored, OneCorrection]:
         """The step after `before` with `measurement`; `numpy.linalg.LinAlgError` where it is not finite."""
         mean, covariance = self._predicted(before, measurement.stamp_ns)
-        corrected = correct_one(mean, covariance, measurement.z, measurement.R, measurement.model, measurement.pose)
+        corrected = correct_one(mean, covariance, measurement)
         mean, covariance = corrected.mean, corrected.covariance
         if not math.isfinite(mean.dot(mean) + np.vdot(covariance, covariance)):  # one number instead of a mask
             raise np.linalg.LinAlgError("posterior is not finite")

@@ -137,6 +137,23 @@ def _shared_model(components: tuple[str, ...], state_names: tuple[str, ...]) -> 
     return MeasurementModel(components, state_names)
 
 
+def measured_position(
+    components: tuple[str, ...], z: FloatArray, R: FloatArray, pose: SensorPose
+) -> tuple[FloatArray, FloatArray] | None:
+    """Position in the map, shape (2,), and its covariance, (2, 2), from x and y, or range and bearing to first order.
+
+    `z` (k,) and `R` (k, k) are those of `components`, in the order of `MEASURABLE`; None where these hold no position.
+    """
+    if components[:2] == ("x_m", "y_m"):
+        return z[:2], R[:2, :2]
+    if {"range_m", "bearing_rad"} <= set(components):
+        rows = [components.index("bearing_rad"), components.index("range_m")]
+        direction_range = z[rows] + np.array([pose.yaw_rad, 0.0])
+        G = cartesian_gradient(direction_range)
+        return np.array([pose.x_m, pose.y_m]) + cartesian(direction_range), G @ R[np.ix_(rows, rows)] @ G.T
+    return None
+
+
 class _Scene:
     """States and a sensor pose, and what several components derive from them.
 

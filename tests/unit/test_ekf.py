@@ -181,7 +181,7 @@ def test_the_correction_of_one_state_is_that_of_a_stack(
     z, R = rng.normal(size=k) * 3.0, positive_definite(rng, 1, k)[0]
     inputs = [array.copy() for array in (x, P, z, R)]
     pose = SensorPose(20.0, -3.0, 0.4, 5.0, 1.0)
-    one = correct_one(x, P, z, R, model, pose)
+    one = correct_one(x, P, Measurement(0, model, z, R, pose))
     stack = correct(x[None], P[None], z[None], R[None], model, pose)
     for found, expected in zip(one, stack, strict=True):
         np.testing.assert_allclose(found, expected[0], rtol=1e-12, atol=1e-12 * np.abs(stack.mean).max())
@@ -193,7 +193,7 @@ def test_the_correction_of_one_state_is_that_of_a_stack(
 def test_a_singular_innovation_covariance_of_one_state_is_an_error() -> None:
     model = measurement_model(("x_m", "y_m"), CTRV())
     with pytest.raises(np.linalg.LinAlgError):
-        correct_one(np.zeros(5), np.zeros((5, 5)), np.ones(2), np.zeros((2, 2)), model, SensorPose())
+        correct_one(np.zeros(5), np.zeros((5, 5)), Measurement(0, model, np.ones(2), np.zeros((2, 2))))
 
 
 def test_the_replaying_filter_keeps_the_yaw_in_its_range_through_full_turns() -> None:

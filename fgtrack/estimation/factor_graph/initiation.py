@@ -5,10 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.geometry import cartesian, cartesian_gradient, polar
+from fgtrack.core.geometry import polar
 from fgtrack.core.linalg import psd_solve
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
+from fgtrack.models.measurement import measured_position
 
 
 class Fix(NamedTuple):
@@ -36,19 +37,9 @@ class Line(NamedTuple):
 
 
 def fix_of(measurement: Measurement, time_s: float) -> Fix | None:
-    """The position that `measurement` gives, as x and y or as range and bearing; None where it gives none."""
-    names = measurement.model.components
-    for pair in (("x_m", "y_m"), ("bearing_rad", "range_m")):
-        if set(pair) <= set(names):
-            rows = [names.index(name) for name in pair]
-            z, R = measurement.z[rows], measurement.R[np.ix_(rows, rows)]
-            if pair[0] == "x_m":
-                return Fix(time_s, z, R)
-            pose = measurement.pose
-            direction_range = z + np.array([pose.yaw_rad, 0.0])
-            G = cartesian_gradient(direction_range)
-            return Fix(time_s, np.array([pose.x_m, pose.y_m]) + cartesian(direction_range), G @ R @ G.T)
-    return None
+    """The position that `measurement` gives; None where it gives none."""
+    found = measured_position(measurement.model.components, measurement.z, measurement.R, measurement.pose)
+    return None if found is None else Fix(time_s, *found)
 
 
 def straight_line(fixes: Sequence[Fix]) -> Line:

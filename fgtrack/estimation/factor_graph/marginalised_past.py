@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgtrack.core.linalg import psd_solve, symmetrise
+from fgtrack.core.linalg import mahalanobis_squared, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
+from fgtrack.estimation.ekf import joseph, kalman_gain, propagated
 from fgtrack.estimation.factor_graph.factors import weight
 from fgtrack.estimation.factor_graph.terms import EquivalentMeasurement, Linearised, MeasurementTerm, linearised
 from fgtrack.estimation.interpolation import between
@@ -75,21 +76,19 @@ class MarginalisedPast:
         filtered, P = self.prior.mean, self.prior.covariance
         for term in terms:
             y, H, R = _weighed(term, mean)
-            filtered, P = _corrected(filtered, P, y - H @ (filtered - mean), H, R)
+            K, _ = kalman_gain(P, H, R)
+            filtered, P = filtered + K @ (y - H @ (filtered - mean)), joseph(P, K, H, R)
         step = self._motion.step(mean.tolist(), seconds(next_ns - self._stamp_ns))
         predicted = np.asarray(step.mean) + step.F @ (filtered - mean)
-        FP = step.F @ P
-        P_next = symmetrise(FP @ step.F.T + step.Q)
-        A = psd_solve(P_next, FP).T
-        kept = np.eye(len(mean)) - A @ step.F
-        C = symmetrise(kept @ P @ kept.T + A @ step.Q @ A.T)
+        A, P_next = kalman_gain(P, step.F, step.Q)  # the next node measures F x + N(0, Q)
+        C = joseph(P, A, step.F, step.Q)
         b = filtered - mean + A @ (next_mean - predicted)
         if self._ring:
             left = self._ring[-1]
             self._ring[-1] = replace(left, b=left.b + left.A @ (mean - self._origin))
         self._ring.append(Conditional(self._stamp_ns, mean, A, b, C))
         self._stamp_ns, self._origin = next_ns, next_mean
-        self.prior = Prior(predicted, P_next)
+        self.prior = Prior(predicted, symmetrise(P_next))
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop the conditionals that are not needed for stamps from `stamp_ns` on."""
@@ -101,8 +100,8 @@ class MarginalisedPast:
         offset = mean - self._origin
         for conditional in reversed(path):
             offset = conditional.A @ offset + conditional.b
-            P = conditional.A @ P @ conditional.A.T + conditional.C
-        return path[0].mean + offset, symmetrise(P)
+            P = propagated(conditional.A, P, conditional.C)
+        return path[0].mean + offset, P
 
     def fuse(self, measurement: Measurement) -> EquivalentMeasurement:
         """Take a detection older than the window into the ring; gives what it says about the oldest node.
@@ -113,11 +112,11 @@ class MarginalisedPast:
         y, H, R = _weighed(measurement, path[0].mean)
         updated = []
         for at in path:
-            S = symmetrise(H @ at.C @ H.T + R)
-            b, C = _corrected(at.b, at.C, y - H @ at.b, H, R)
-            A = at.A - psd_solve(S, H @ at.C).T @ (H @ at.A)
-            updated.append(Conditional(at.stamp_ns, at.mean, A, b, C))
-            y, H, R = y - H @ at.b, H @ at.A, S
+            K, S = kalman_gain(at.C, H, R)
+            rest, through = y - H @ at.b, H @ at.A
+            C = joseph(at.C, K, H, R)
+            updated.append(Conditional(at.stamp_ns, at.mean, at.A - K @ through, at.b + K @ rest, C))
+            y, H, R = rest, through, symmetrise(S)
         self._ring = before + updated
         return EquivalentMeasurement(self._origin, H, y, R)
 
@@ -137,13 +136,12 @@ class MarginalisedPast:
         until_s, after_s = seconds(stamp_ns - left.stamp_ns), seconds(right_ns - stamp_ns)
         inner = between(self._motion, left.mean.tolist(), right, until_s, after_s)
         A = inner.Lambda @ left.A + inner.Psi
-        C = symmetrise(inner.Lambda @ left.C @ inner.Lambda.T + inner.Sigma)
+        C = propagated(inner.Lambda, left.C, inner.Sigma)
         b = inner.Lambda @ left.b
         # Given the state between them the left one no longer depends on the right one: left.A = gain A. Stamps close
         # together leave hardly a digit of the same gain as C_left Lambda' C^-1.
         gain = np.asarray(np.linalg.solve(A.T, left.A.T)).T
-        kept = np.eye(len(b)) - gain @ inner.Lambda
-        spread = symmetrise(kept @ left.C @ kept.T + gain @ inner.Sigma @ gain.T)
+        spread = joseph(left.C, gain, inner.Lambda, inner.Sigma)
         outer = Conditional(left.stamp_ns, left.mean, gain, left.b - gain @ b, spread)
         return [*self._ring[:place], outer], [Conditional(stamp_ns, inner.mean, A, b, C), *self._ring[place + 1 :]]
 
@@ -153,15 +151,5 @@ def _weighed(term: MeasurementTerm, x: FloatArray) -> Linearised:
     y, H, R = linearised(term, x)
     if isinstance(term, EquivalentMeasurement) or term.loss is None:
         return Linearised(y, H, R)
-    distance = math.sqrt(y @ psd_solve(R, y))
+    distance = math.sqrt(mahalanobis_squared(y, R))
     return Linearised(y, H, R / max(weight(term.loss, distance), _LEAST_WEIGHT))
-
-
-def _corrected(
-    mean: FloatArray, P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance after the innovation y (k,) of a linear measurement; the covariance in Joseph form."""
-    S = symmetrise(H @ P @ H.T + R)
-    K = psd_solve(S, H @ P).T
-    kept = np.eye(len(mean)) - K @ H
-    return mean + K @ y, symmetrise(kept @ P @ kept.T + K @ R @ K.T)

@@ -5,11 +5,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.linalg import psd_solve, symmetrise
+from fgtrack.core.linalg import mahalanobis_squared, symmetrise
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.birth import initial_state
+from fgtrack.estimation.ekf import propagated
 from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
 from fgtrack.estimation.factor_graph.initiation import straight_line
@@ -165,4 +166,4 @@ class FixedLagSmoother:
     def _innovation(self, measurement: Measurement) -> tuple[FloatArray, float]:
         mean, covariance = self._window.state_at(measurement.stamp_ns)
         y, H, R = linearised(measurement, mean)
-        return y, float(y @ psd_solve(H @ covariance @ H.T + R, y))
+        return y, float(mahalanobis_squared(y, propagated(H, covariance, R)))

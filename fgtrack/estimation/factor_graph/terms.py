@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from fgtrack.core.types import FloatArray
+from fgtrack.estimation import ekf
 from fgtrack.estimation.base import Measurement
 
 
@@ -41,7 +42,4 @@ def linearised(term: MeasurementTerm, x: FloatArray) -> Linearised:
     """`term` near the state `x`, shape (n,)."""
     if isinstance(term, EquivalentMeasurement):
         return Linearised(term.y - term.H @ (x - term.origin), term.H, term.R)
-    model = term.model
-    y = model.residual(term.z, model.predict(x, term.pose))
-    H = model.selection(len(x)) if model.linear else model.jacobian(x, term.pose)
-    return Linearised(y, H, term.R)
+    return Linearised(*ekf.linearised(term.z, x, term.model, term.pose), term.R)

@@ -9,6 +9,7 @@ import numpy as np
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement
+from fgtrack.estimation.ekf import predict_one, propagated
 from fgtrack.estimation.factor_graph.backends.base import Backend, Change, Marginalised
 from fgtrack.estimation.factor_graph.backends.incremental import FIRST_KEY
 from fgtrack.estimation.factor_graph.chain import Chain, Node
@@ -139,13 +140,12 @@ class Window:
             return mean, self._covariance(node)
         until_s = seconds(stamp_ns - node.stamp_ns)
         if node is self._chain.newest:
-            step = self._motion.step(mean.tolist(), until_s)
-            return np.asarray(step.mean), step.F @ self._covariance(node) @ step.F.T + step.Q
+            return predict_one(mean, self._covariance(node), self._motion, until_s)
         right = self._chain.nodes[place + 1]
         after_s = seconds(right.stamp_ns - stamp_ns)
         inner = between(self._motion, mean.tolist(), self._mean(right), until_s, after_s)
         weights = np.hstack([inner.Lambda, inner.Psi])
-        return inner.mean, weights @ self._covariance(node, right) @ weights.T + inner.Sigma
+        return inner.mean, propagated(weights, self._covariance(node, right), inner.Sigma)
 
     def iterate(self, max_iterations: int) -> None:
         """Take Gauss-Newton steps while a state is further than a threshold from its linearisation point."""

@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.geometry import wrap_angle
-from fgtrack.core.linalg import symmetrise
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.birth import initial_state
+from fgtrack.estimation.ekf import propagated
 from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.oosm.crossing import Past, fuse_across
 from fgtrack.models.motion import MotionModel
@@ -106,20 +106,19 @@ class AccumulatedStateDensity:
         place = max(bisect.bisect_right(stamps_ns, stamp_ns) - 1, 0)
         if stamps_ns[place] == stamp_ns:
             return self._stack, slice(place * n, place * n + n)
-        own, A, noise = self._told_by_neighbours(place, stamp_ns)
+        own, A, noise = self._given_neighbours(place, stamp_ns)
         neighbours, at = slice(place * n, place * n + A.shape[1]), place * n + n
         cross = A @ covariance[neighbours]
-        spread = cross[:, neighbours] @ A.T + noise
         grown = np.empty((len(mean) + n, len(mean) + n))
         others = np.delete(np.arange(len(grown)), np.s_[at : at + n])
         grown[np.ix_(others, others)] = covariance
         grown[at : at + n, others] = cross
         grown[others, at : at + n] = cross.T
-        grown[at : at + n, at : at + n] = symmetrise(spread)
+        grown[at : at + n, at : at + n] = propagated(A, covariance[neighbours, neighbours], noise)
         stamps_ns = (*stamps_ns[: place + 1], stamp_ns, *stamps_ns[place + 1 :])
         return _Stack(stamps_ns, np.insert(mean, at, own), grown), slice(at, at + n)
 
-    def _told_by_neighbours(self, place: int, stamp_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _given_neighbours(self, place: int, stamp_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Mean (n,), A and noise (n, n) of x = A [neighbours] + noise after the state at `place`.
 
         A is (n, n) after the newest state, and (n, 2 n) between two.

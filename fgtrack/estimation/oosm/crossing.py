@@ -7,8 +7,8 @@ import numpy as np
 from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.ekf import OneCorrection
-from fgtrack.estimation.oosm.history import linearised, require_finite
+from fgtrack.estimation.ekf import OneCorrection, linearised, propagated
+from fgtrack.estimation.oosm.history import require_finite
 
 
 class Past(NamedTuple):
@@ -29,8 +29,8 @@ def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measuremen
     2002, see `A1`). Raises `numpy.linalg.LinAlgError` where S is not
     positive definite or the result is not finite.
     """
-    y, H = linearised(measurement, past.mean)
-    S = symmetrise(H @ past.covariance @ H.T + measurement.R)
+    y, H = linearised(measurement.z, past.mean, measurement.model, measurement.pose)
+    S = propagated(H, past.covariance, measurement.R)
     np.linalg.cholesky(S)  # raises where S is not positive definite
     across = past.cross @ H.T
     weighted = psd_solve(S, np.column_stack((across.T, y)))

@@ -9,7 +9,7 @@ from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.ekf import OneCorrection, correct_one, predict_one
+from fgtrack.estimation.ekf import OneCorrection, correct_one, linearised, predict_one, propagated
 from fgtrack.models.motion import MotionModel
 
 
@@ -32,16 +32,9 @@ class FilterStep:
     """H' S^-1 H, shape (n, n); with it I - K H = I - P_{j|j-1} weight."""
 
 
-def linearised(measurement: Measurement, mean: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Innovation y (k,) and Jacobian H (k, n) of `measurement` at the state `mean` (n,)."""
-    model = measurement.model
-    y = model.residual(measurement.z, model.predict(mean, measurement.pose))
-    return y, model.selection(len(mean)) if model.linear else model.jacobian(mean, measurement.pose)
-
-
 def corrected(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
-    """`correct_one` with `measurement`; raises `numpy.linalg.LinAlgError` where the result is not finite."""
-    result = correct_one(mean, covariance, measurement.z, measurement.R, measurement.model, measurement.pose)
+    """`correct_one`, which raises `numpy.linalg.LinAlgError` where the result is not finite, too."""
+    result = correct_one(mean, covariance, measurement)
     require_finite(result)
     return result
 
@@ -103,8 +96,8 @@ class History:
         """
         mean, covariance = self.predicted(place, measurement.stamp_ns)
         result = corrected(mean, covariance, measurement)
-        _, H = linearised(measurement, mean)
-        weighted = psd_solve(H @ covariance @ H.T + measurement.R, np.column_stack((result.innovation, H)))
+        y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
+        weighted = psd_solve(propagated(H, covariance, measurement.R), np.column_stack((y, H)))
         score, weight = H.T @ weighted[:, 0], symmetrise(H.T @ weighted[:, 1:])
         return (
             FilterStep(measurement.stamp_ns, result.mean, result.covariance, mean, covariance, score, weight),
