@@ -1,9 +1,8 @@
 """Runs beside each other: what each table of a comparison shows."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Generic, TypeVar
 
 from fgtrack.core.errors import CallError
@@ -14,10 +13,10 @@ from fgtrack.evaluation.lagged import WINDOW, LagMetrics
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS
 from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics, ObjectMetrics, SensorMetrics, TruthMetrics
 from fgtrack.evaluation.multi_object import MultiObjectMetrics
-from fgtrack.evaluation.runs import judged
+from fgtrack.evaluation.runs import OneRun, judged
 from fgtrack.evaluation.statistics import ChiSquareMean
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
-from fgtrack.io.run import Run, write_metrics
+from fgtrack.io.run import write_metrics
 
 BACKWARD_FORWARD = "ekf-backward-forward"
 BACKWARD_FORWARD_NOTE = "backward-forward forgets what was fused after the stamp of a late detection"
@@ -50,7 +49,7 @@ class _Row(Generic[T]):
     """What tells it from the other rows of the run."""
 
 
-def compare(*runs: Run | Path | str) -> Tables:
+def compare(*runs: OneRun | Iterable[OneRun]) -> Tables:
     """Metrics of `runs` beside each other: tables `tracking`, `multi_object`, `lag`, `consistency`, `dispositions`
     and `residuals_SENSOR` of every sensor.
 
@@ -132,8 +131,8 @@ def _tracking(rows: Sequence[_Row[Metrics]], notes: Sequence[str]) -> Table:
     own = [f"{CONFIRMED_MEASUREMENTS}+: tracks with at least {CONFIRMED_MEASUREMENTS} measurements"]
     if with_truth:
         own += [
-            f"false: paired to a true object in less than {FALSE_TRACK_SHARE:.0%} of its life",
-            "breaks: tracked again after a loss, or by another track; switches: by another track",
+            f"false: paired with a true object in less than {FALSE_TRACK_SHARE:.0%} of its life",
+            "breaks: tracking resumed after a loss or with another track; switches: the latter",
             f"precision: true objects tracked / tracks with {CONFIRMED_MEASUREMENTS}+ measurements",
         ]
     title = "Tracking" + (" (errors: RMSE against truth)" if with_truth else "")
@@ -172,8 +171,8 @@ def _multi_object(rows: Sequence[_Row[Metrics]], notes: Sequence[str]) -> Table:
         Column("confirm\n[s]", ("time_to_confirm_s",), of_objects(lambda of: (of.time_to_confirm_s.mean,))),
     ]
     own = [
-        "GOSPA: root mean square over the ticks; the squares of its parts add up to its own",
-        "scores: 100 is perfect; docs/metrics.md tells what each of them counts",
+        "GOSPA: root mean square over the ticks; its square is the sum of the squares of its parts",
+        "scores: 100 is perfect; defined in docs/metrics.md",
         "late: switches soon after an out-of-sequence update of one of the two tracks",
         "confirm: from an object's first detection to its first confirmed track",
     ]
@@ -204,8 +203,8 @@ def _lag(rows: Sequence[_Row[Metrics]], notes: Sequence[str]) -> Table:
         Column("NEES\npos.", ("position_nees",), lambda row: (row.of.position_nees.mean,)),
     ]
     own = [
-        "lag 0: present states, as published; window: final states, which leave the window",
-        "below: by how much, than the present states of the same tracks at the same stamps",
+        "lag 0: present states as published; window: final states, as they leave the window",
+        "below: reduction against the present states of the same tracks at the same stamps",
         "NEES: of the position; 2 if consistent",
     ]
     if any(len(_shown_lags(row.of.lagged)) < len(row.of.lagged) for row in rows):
@@ -247,12 +246,12 @@ def _consistency(rows: Sequence[_Row[Metrics]], notes: Sequence[str]) -> Table:
         ),
     ]
     own = [
-        "band: of the mean of independent samples; errors along one run are not independent,",
-        "so NEES of a single run may leave it (several runs tell)",
-        f"correlation: of the innovations (position first), of tracks with {FEWEST}+; ± 95 % band if white",
-        f"outside: tracks and lags 1 to {LAGS} outside their own bands; 5 if white",
+        "band: of the mean of independent samples; errors along one run are correlated,",
+        "so the NEES of a single run may leave it (average over several runs)",
+        f"correlation: of the innovations, in tracks with {FEWEST}+ of them; ± 95 % band if white",
+        f"outside: share of tracks and lags 1 to {LAGS} outside their bands; 5 if white",
     ]
-    title = "Consistency (means of normalised squares, and what they must be)"
+    title = "Consistency (mean NEES and NIS, and their expected values)"
     return Table(title, columns, entries, row_keys=("run", "of"), notes=[*own, *notes])
 
 

@@ -1,4 +1,4 @@
-"""Whether the covariances tell the truth: NEES and NIS beside their chi-square bands."""
+"""Consistency of the covariances: NEES and NIS with their chi-square bands."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from fgtrack.core.types import YAW, FloatArray, IntArray
-from fgtrack.evaluation.innovations import Autocorrelation, autocorrelations
+from fgtrack.evaluation.innovations import Autocorrelation, autocorrelations, num_measured
 from fgtrack.evaluation.matching import Matching, state_errors
 from fgtrack.evaluation.statistics import ChiSquareMean, Moments, chi_square_band
 from fgtrack.evaluation.truth import TRUE_STATE
@@ -20,7 +20,7 @@ _POSITION, _POSE_AND_SPEED, _WITH_YAW_RATE = 2, 4, 5
 
 @dataclass(frozen=True)
 class Consistency:
-    """Normalised squared errors and innovations of one run, and how white the innovations are.
+    """Normalised squared errors and innovations of one run, and the whiteness of the innovations.
 
     The bands are those of independent samples. Innovations of a consistent estimator are independent, errors along a
     run are not: a single run may leave the band of its NEES, see `nees_over_runs`.
@@ -80,7 +80,7 @@ class NeesOverRuns:
 def consistency(run: Run, matching: Matching | None) -> Consistency:
     """NEES of the judged rows of `run`, NIS and whiteness of its innovations."""
     updates = run.updates
-    measured = np.sum([np.isfinite(updates[name]) for name in updates if name.startswith("res_")], axis=0)
+    measured = num_measured(updates)
     sensors = {name: updates["sensor"] == name for name in np.unique(updates["sensor"]).tolist()}
     return Consistency(
         position_nees=ChiSquareMean() if matching is None else _mean(position_nees(matching)),
@@ -98,7 +98,7 @@ def position_nees(matching: Matching) -> Nees:
 def state_nees(matching: Matching) -> Nees:
     """NEES of x, y, yaw, speed and yaw rate of every paired row with known true yaw and speed.
 
-    The yaw rate is left out where the truth does not tell it or the model has none (its variance is 0).
+    The yaw rate is left out where the truth or the model has none (its variance is 0).
     """
     with_yaw_rate, without = _nees(matching, _WITH_YAW_RATE), _nees(matching, _POSE_AND_SPEED)
     variance = matching.tracks["p_yaw_rate_yaw_rate"][matching.paired]

@@ -1,4 +1,4 @@
-"""When an object gets its first confirmed track, and identity switches that late measurements bring."""
+"""Time to the first confirmed track, and identity switches caused by late measurements."""
 
 import numpy as np
 
@@ -8,10 +8,10 @@ from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, Matching
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import NO_TRACK, Run, Table
 
-#: What became of a detection that was fused later than in order.
+#: Dispositions of detections that were fused out of sequence.
 LATE = (Disposition.OUT_OF_SEQUENCE, Disposition.BEYOND_WINDOW)
 
-#: What became of a detection that says something about its track.
+#: Dispositions of detections that were fused into a track.
 FUSED = (Disposition.BIRTH, Disposition.IN_SEQUENCE, *LATE)
 
 
@@ -39,7 +39,7 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
     """Time from the first detection of every object to its first confirmed track in s, shape (objects,).
 
     It begins at the stamp of the first detection that was fused into a track which then lies on the object (nearest
-    object within `gate_m`), and ends with the tick at which the object is first paired to a row with
+    object within `gate_m`), and ends with the tick at which the object is first paired with a row with
     `CONFIRMED_MEASUREMENTS` measurements. NaN where there is no such row.
     """
     count = len(matching.object_ids)

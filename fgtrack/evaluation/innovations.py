@@ -18,7 +18,7 @@ RESIDUAL_NAMES = ("along_m", "across_m", *MEASURABLE)
 ANGULAR = frozenset({"yaw_rad", "bearing_rad"})
 
 LAGS = 10
-"""Lags 1 to this many innovations are looked at."""
+"""Highest lag examined."""
 FEWEST = 20
 """A track with fewer innovations of the sensor is left out: the band is that of a large sample."""
 
@@ -31,7 +31,7 @@ _GROUPS: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Autocorrelation:
-    """Autocorrelation of the innovations of one sensor, over all tracks with at least `FEWEST` of them."""
+    """Autocorrelation of the innovations of one sensor, over all tracks that have at least `FEWEST` of them."""
 
     tracks: int
     count: int
@@ -39,7 +39,7 @@ class Autocorrelation:
     lag1: float
     """Normalised autocorrelation at lag 1, between -1 and 1; 0 on average for white innovations."""
     lag1_band: float
-    """White innovations stay within plus and minus this with 95 % probability."""
+    """Half-width of its 95 % interval for white innovations."""
     share_outside: float
     """Share of the tracks and lags 1 to `LAGS` outside their own bands; 0.05 on average for white innovations."""
 
@@ -56,6 +56,11 @@ def residuals(run: Run) -> Mapping[str, FloatArray]:
     along_m = c * values["x_m"] + s * values["y_m"]
     across_m = c * values["y_m"] - s * values["x_m"]
     return {"along_m": along_m, "across_m": across_m, **values}
+
+
+def num_measured(updates: Table) -> IntArray:
+    """Number of components of each innovation, the degrees of freedom of its NIS, shape (rows,)."""
+    return np.asarray(np.sum([np.isfinite(updates[f"res_{name}"]) for name in MEASURABLE], axis=0))
 
 
 def message_delays(updates: Table) -> tuple[IntArray, FloatArray]:

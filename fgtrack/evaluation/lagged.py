@@ -1,4 +1,4 @@
-"""How much better the past is known than the present: errors of lagged and final states."""
+"""Errors of lagged and final states, beside those of the present states at the same stamps."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ _NO_ROW = -1
 class LagMetrics:
     """The states of one lag, and the present states of the same tracks at the same stamps.
 
-    Both know the same truth, so their difference is what waiting for the lag brings.
+    Both are compared with the same truth, so their difference is the gain of waiting.
     """
 
     lag_s: float | Literal["window"]
@@ -42,7 +42,7 @@ class LagMetrics:
         return isinstance(self.lag_s, float) and self.lag_s > 0.0 and self.errors["position_m"].count > 0
 
     def gain(self, name: str) -> float:
-        """Share by which the RMSE of `name` lies below that of the present states; NaN where there is none."""
+        """Relative reduction of the RMSE of `name` against the present states; NaN where there is none."""
         present = self.present_errors[name].rmse
         return 1.0 - self.errors[name].rmse / present if present > 0.0 else math.nan
 
@@ -50,7 +50,7 @@ class LagMetrics:
 def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
     """Metrics of the present states, of every lag of lagged.csv by rising lag, and of the final states.
 
-    A lagged state belongs to the object that its track was paired to at the tick of the same stamp; where no tick
+    A lagged state belongs to the object that its track was paired with at the tick of the same stamp; where no tick
     has this stamp, at the one nearest to it. What has no such pair is not judged. Empty for a run without truth.
     """
     if matching is None:

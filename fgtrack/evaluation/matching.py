@@ -15,7 +15,7 @@ CONFIRMED_MEASUREMENTS = 3
 """Measurements from which on a track counts: the "valid" tracks of Karle et al. 2023."""
 
 NO_OBJECT = -1
-"""Object index of a track row that is paired to no true object."""
+"""Object index of a track row that is paired with no true object."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Matching:
     tracks: Table
     """The judged rows of tracks.csv: r rows with truth being recorded at their stamp."""
     object_index: IntArray
-    """Object that each row is paired to, shape (r,); `NO_OBJECT` where none."""
+    """Object that each row is paired with, shape (r,); `NO_OBJECT` where none."""
     true_states: FloatArray
     """x, y, yaw, speed, yaw rate of that object at the row's stamp, shape (r, 5); NaN where none."""
     distances_m: FloatArray
@@ -38,7 +38,7 @@ class Matching:
     present: BoolArray
     """Whether there is truth at the tick's `now_ns`, shape (ticks, objects)."""
     track_ids: IntArray
-    """Track paired to each object, shape (ticks, objects); `NO_TRACK` where none."""
+    """Track paired with each object, shape (ticks, objects); `NO_TRACK` where none."""
 
     @property
     def paired(self) -> BoolArray:
@@ -76,7 +76,7 @@ class Scenes:
 
 @dataclass(frozen=True)
 class TrackErrors:
-    """Track minus truth of every paired row, each of shape (p,); NaN where the truth does not say."""
+    """Track minus truth of every paired row, each of shape (p,); NaN where the truth has no value."""
 
     stamps_ns: IntArray
     object_index: IntArray
@@ -92,7 +92,7 @@ ERROR_NAMES = ("position_m", "along_m", "across_m", "yaw_rad", "speed_mps")
 def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     """Pair the tracks of `run` to its true objects at every tick; None for a run without truth.
 
-    Without `options` those that its configuration asks for.
+    Without `options` it is judged as its configuration says.
 
     As CLEAR does (Bernardin and Stiefelhagen 2008): a pair of the tick before stays while it lies inside the
     gate, the rest is assigned by the Hungarian method, first as many pairs as possible, then the least sum of

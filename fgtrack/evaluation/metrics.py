@@ -1,4 +1,4 @@
-"""What a run achieved, in numbers."""
+"""All metrics of a run."""
 
 import math
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, Disposition, IntArray
 from fgtrack.evaluation.consistency import Consistency, consistency
 from fgtrack.evaluation.continuity import late_switches, times_to_confirm
-from fgtrack.evaluation.innovations import ANGULAR, RESIDUAL_NAMES, message_delays, residuals
+from fgtrack.evaluation.innovations import ANGULAR, RESIDUAL_NAMES, message_delays, num_measured, residuals
 from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, ERROR_NAMES, Matching, match, track_errors
 from fgtrack.evaluation.multi_object import MultiObjectMetrics, multi_object_metrics
@@ -19,7 +19,7 @@ from fgtrack.evaluation.statistics import ChiSquareMean, Distribution, Moments
 from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, evaluation_config
 
 FALSE_TRACK_SHARE = 0.5
-"""A track that is paired to a true object in less than this share of its judged life is false."""
+"""A track that is paired with a true object in less than this share of its judged life is false."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class ObjectMetrics:
     """How one true object, or all of them together, was tracked."""
 
     errors: Mapping[str, Moments]
-    """Track minus truth by name of `ERROR_NAMES`; `position_m` is the distance."""
+    """Track minus truth, by name of `ERROR_NAMES`; `position_m` is the distance."""
     ticks_present: int
     """Ticks at which there is truth."""
     ticks_tracked: int
@@ -63,7 +63,7 @@ NOTHING_TRACKED = ObjectMetrics({name: Moments() for name in ERROR_NAMES}, 0, 0,
 
 @dataclass(frozen=True)
 class TruthMetrics:
-    """The part of the metrics that needs truth."""
+    """Metrics that need truth."""
 
     objects: Mapping[int, ObjectMetrics]
     """By object id."""
@@ -72,7 +72,7 @@ class TruthMetrics:
     false_tracks: int
     """Those of them paired in less than `FALSE_TRACK_SHARE` of their judged rows."""
     tracked_objects: int
-    """True objects that a confirmed track was ever paired to: the trackable ones, TP of the precision."""
+    """True objects that a confirmed track was ever paired with: the trackable ones, TP of the precision."""
 
     @property
     def overall(self) -> ObjectMetrics:
@@ -147,7 +147,7 @@ class Metrics:
 def evaluate(run: Run, options: EvaluationConfig | None = None) -> Metrics:
     """Metrics of `run`; without truth, those that need none.
 
-    Without `options` those that its configuration asks for.
+    Without `options` it is judged as its configuration says.
     """
     options = options or evaluation_config(run)
     matching = match(run, options)
@@ -205,7 +205,7 @@ def _object_metrics(
     late_id_switches: int,
     time_to_confirm_s: Moments,
 ) -> ObjectMetrics:
-    """Counts from the track paired to one object at every tick, shape (ticks,)."""
+    """Counts from the track paired with one object at every tick, shape (ticks,)."""
     track_ids = track_ids[present]
     tracked = track_ids != NO_TRACK
     before = np.concatenate([[NO_TRACK], track_ids])[:-1]
@@ -224,7 +224,7 @@ def _object_metrics(
 
 def _sensor_metrics(run: Run) -> dict[str, SensorMetrics]:
     updates, values = run.updates, residuals(run)
-    measured = np.sum([np.isfinite(updates[name]) for name in updates if name.startswith("res_")], axis=0)
+    measured = num_measured(updates)
     sensors = {}
     for sensor in np.unique(updates["sensor"]).tolist():
         mine = updates["sensor"] == sensor

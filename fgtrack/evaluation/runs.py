@@ -38,7 +38,7 @@ class JudgedRun:
 
 
 OneRun = Run | JudgedRun | Path | str
-Runs = OneRun | Iterable[OneRun]
+Runs = OneRun | Iterable[OneRun | Iterable[OneRun]]
 
 
 def judged(runs: Runs) -> list[JudgedRun]:
@@ -51,7 +51,8 @@ def judged(runs: Runs) -> list[JudgedRun]:
     DataError
         A run folder is damaged.
     """
-    every = [runs] if isinstance(runs, OneRun) else list(runs)
+    given = [runs] if isinstance(runs, OneRun) else runs
+    every = [one for entry in given for one in ([entry] if isinstance(entry, OneRun) else entry)]
     if every and all(isinstance(run, JudgedRun) for run in every):
         return [run for run in every if isinstance(run, JudgedRun)]
     plain = [run.run if isinstance(run, JudgedRun) else run for run in every]

@@ -11,7 +11,7 @@ from fgtrack.core.geometry import circular_mean, wrap_angle, wrap_angles
 from fgtrack.core.types import FloatArray, IntArray
 
 NORMAL_95 = 1.959963984540054
-"""A normal variable stays within as many standard deviations with 95 % probability."""
+"""Half-width of the 95 % interval of a normal variable, in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Moments:
 
     @classmethod
     def of(cls, values: FloatArray) -> Self:
-        """Moments of `values`, shape (n,), without the NaN among them."""
+        """Moments of `values`, shape (n,), ignoring NaN."""
         values = values[~np.isnan(values)]
         if not len(values):
             return cls()
@@ -34,9 +34,9 @@ class Moments:
 
     @classmethod
     def of_angles(cls, values_rad: FloatArray) -> Self:
-        """Moments of directions: deviations are the shorter way round from the circular mean.
+        """Moments of angles: deviations from the circular mean, wrapped to (-pi, pi].
 
-        For a sample that does not reach around to pi these are the ordinary moments.
+        Those of the plain values where these do not reach pi.
         """
         values_rad = values_rad[~np.isnan(values_rad)]
         if not len(values_rad):
@@ -90,7 +90,7 @@ class Distribution:
 
 @dataclass(frozen=True)
 class ChiSquareMean:
-    """Mean of independent normalised squares (NEES, NIS), and what it must be; those of two samples add up."""
+    """Mean of independent normalised squares (NEES, NIS) and its expected value; two samples add up."""
 
     count: int = 0
     mean: float = math.nan
@@ -99,7 +99,7 @@ class ChiSquareMean:
 
     @classmethod
     def of(cls, values: FloatArray, dof: IntArray) -> Self:
-        """Mean of `values` with `dof` degrees of freedom each, both of shape (n,), without the NaN among them."""
+        """Mean of `values` with `dof` degrees of freedom each, both of shape (n,), ignoring NaN."""
         known = ~np.isnan(values)
         if not known.any():
             return cls()
@@ -116,7 +116,7 @@ class ChiSquareMean:
 
     @property
     def band(self) -> tuple[float, float]:
-        """Where `mean` lies with 95 % probability, as much below as above; NaN of an empty sample."""
+        """Two-sided 95 % interval of `mean`; NaN of an empty sample."""
         if not self.count:
             return math.nan, math.nan
         low, high = chi_square_band(np.array([self.count * self.dof]), np.array([self.count]))

@@ -27,7 +27,7 @@ class TruePath:
     stamps_ns: IntArray
     """Shape (n,)."""
     states: FloatArray
-    """x, y, yaw, speed, yaw rate, shape (n, 5); NaN where the truth does not say."""
+    """x, y, yaw, speed, yaw rate, shape (n, 5); NaN where the truth has no value."""
 
     def at(self, stamps_ns: IntArray) -> FloatArray:
         """States at `stamps_ns`, shape (m,); shape (m, 5), NaN where there is no truth.

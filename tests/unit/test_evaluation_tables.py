@@ -342,7 +342,7 @@ def test_runs_are_compared_from_folders_and_from_memory(tmp_path: Path) -> None:
     assert new == {"all/ekf-replay/metrics.json"}
     written = json.loads((tmp_path / "all/ekf-replay/metrics.json").read_text())
     assert written == tables.to_dict()["runs"]["ekf-replay"]
-    assert str(compare(str(tmp_path / "all/ekf-replay"))) == str(compare(tmp_path / "all"))
+    assert str(compare(str(tmp_path / "all/ekf-replay"))) == str(compare([tmp_path / "all"]))
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
