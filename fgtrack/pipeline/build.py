@@ -27,11 +27,10 @@ from fgtrack.models.track_map import TrackMap
 from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
 from fgtrack.tracking.ego import EgoSource, EgoTrajectory
 from fgtrack.tracking.inbox import Inbox, QueueInbox
-from fgtrack.tracking.lifecycle import CountingLifecycle, Lifecycle
+from fgtrack.tracking.lifecycle import Lifecycle
 from fgtrack.tracking.preprocess import Preprocess
-from fgtrack.tracking.published_input import PublishedEgo, SlotInbox
-from fgtrack.tracking.published_objects import PublishedLifecycle
-from fgtrack.tracking.tracker import PublishedTracker, Tracker, TrackerParts
+from fgtrack.tracking.published import PublishedEgo, PublishedLifecycle, PublishedTracker, SlotInbox
+from fgtrack.tracking.tracker import Tracker, TrackerParts
 
 _EULER = {
     ("free", "none"): EulerCtrv,
@@ -53,9 +52,6 @@ def build_tracker(config: Config) -> Tracker:
     motion = config.motion.model()
     origin_m = (config.ego.detection_origin_x_m, config.ego.detection_origin_y_m)
     published_order = config.lifecycle.kind == "published"
-    lifecycle: Lifecycle = (PublishedLifecycle if published_order else CountingLifecycle)(
-        config.lifecycle, config.sensors
-    )
     parts = TrackerParts(
         sensors=config.sensors,
         ego=_build_ego(config),
@@ -64,7 +60,7 @@ def build_tracker(config: Config) -> Tracker:
         association=config.association,
         bank=build_bank(config),
         motion=motion,
-        lifecycle=lifecycle,
+        lifecycle=(PublishedLifecycle if published_order else Lifecycle)(config.lifecycle, config.sensors),
         claim_overtaken=config.lifecycle.claim_overtaken,
         birth=config.birth,
         road=road,

@@ -17,7 +17,7 @@ from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
 from fgtrack.tracking.lifecycle import LifecycleRules
 from fgtrack.tracking.preprocess import ConnectedMerge, NoMerge
-from fgtrack.tracking.published_objects import NeighbourhoodMerge, UngatedEuclidean
+from fgtrack.tracking.published import NeighbourhoodMerge, UngatedEuclidean
 
 MergeConfig = Annotated[ConnectedMerge | NoMerge | NeighbourhoodMerge, Discriminator("kind")]
 AssociationConfig = Annotated[GatedEuclidean | GatedMahalanobis | UngatedEuclidean, Discriminator("kind")]

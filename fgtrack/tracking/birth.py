@@ -1,9 +1,9 @@
 """What is assumed of a new object (Karle et al. 2023, section III-E)."""
 
 import math
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal
 
 import numpy as np
 
@@ -14,24 +14,9 @@ from fgtrack.models.road import Road
 from fgtrack.tracking.preprocess import Candidate
 
 
-class Birth(Protocol):
-    """Makes the first state of a track."""
-
-    def prior(self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool) -> Start | None:
-        """Prior at the candidate's stamp; None where it has no position to start from."""
-
-
-class Deviations(NamedTuple):
-    """How far off a first state may be."""
-
-    position_covariance: FloatArray
-    yaw_std_rad: float
-    speed_std_mps: float
-
-
 @dataclass(frozen=True)
-class Assumptions:
-    """What is assumed of the components that a detection does not measure, with standard deviations."""
+class Birth(ABC):
+    """The first state of a track: what is assumed of what a detection does not measure, with standard deviations."""
 
     ego_speed_factor: float = 0.8
     """An object is assumed as fast as the ego times this; 0 for traffic that has nothing to do with the ego."""
@@ -48,22 +33,30 @@ class Assumptions:
                 raise ValueError(f"{name}: must be positive, is {getattr(self, name)}")
 
     def prior(self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool) -> Start | None:
-        """See `Birth.prior`: what was measured, then map heading, road curvature and a share of the ego speed."""
+        """First state at the candidate's stamp; None where it has no position to start from.
+
+        What was measured comes first, then map heading, road curvature and a share of the ego speed.
+        """
         if candidate.position_m is None:
             return None
-        yaw_rad, curvature_radpm = heading_of(candidate, road)
+        yaw_rad, curvature_radpm = candidate.values.get("yaw_rad"), 0.0
+        if road.known:
+            view = road.view(candidate.position_m[None])
+            curvature_radpm = float(view.curvature_radpm[0])
+            if yaw_rad is None:
+                yaw_rad = float(view.yaw_rad[0])
         assumed_mps = 0.0 if ego is None or ego_in_pit else self.ego_speed_factor * ego.speed_mps
         speed_mps = candidate.values.get("speed_mps", assumed_mps)
         slow = ego is not None and ego.speed_mps < self.slow_ego_mps
-        deviations = self.deviations(candidate, yaw_rad or 0.0)
+        position_covariance, yaw_std_rad, speed_std_mps = self.spread(candidate, yaw_rad or 0.0)
         return Start(
             stamp_ns=candidate.measurement.stamp_ns,
             position_m=candidate.position_m,
-            position_covariance=deviations.position_covariance,
+            position_covariance=position_covariance,
             yaw_rad=yaw_rad,
-            yaw_std_rad=deviations.yaw_std_rad if yaw_rad is not None else None,
+            yaw_std_rad=yaw_std_rad if yaw_rad is not None else None,
             speed_mps=speed_mps,
-            speed_std_mps=deviations.speed_std_mps,
+            speed_std_mps=speed_std_mps,
             yaw_rate_radps=speed_mps * curvature_radpm,
             yaw_rate_std_radps=self.yaw_rate_std_radps,
             accel_mps2=ego.accel_mps2 if ego is not None and slow else 0.0,
@@ -71,46 +64,34 @@ class Assumptions:
         )
 
     @abstractmethod
-    def deviations(self, candidate: Candidate, yaw_rad: float) -> Deviations:
-        """Deviations of the first state of an object at `candidate` that heads for `yaw_rad`."""
+    def spread(self, candidate: Candidate, yaw_rad: float) -> tuple[FloatArray, float, float]:
+        """Covariance of the position, standard deviations of yaw and speed, of an object that heads for `yaw_rad`."""
 
 
 @dataclass(frozen=True)
-class MeasuredBirth(Assumptions):
+class MeasuredBirth(Birth):
     """A measured component starts with its own standard deviation, the others with the one assumed."""
 
     kind: Literal["measured"] = "measured"
 
-    def deviations(self, candidate: Candidate, yaw_rad: float) -> Deviations:
-        """See `Assumptions.deviations`."""
+    def spread(self, candidate: Candidate, yaw_rad: float) -> tuple[FloatArray, float, float]:
+        """See `Birth.spread`."""
         position = candidate.position_covariance
         own = dict(zip(candidate.values, np.sqrt(np.diag(candidate.measurement.R)).tolist(), strict=True))
-        return Deviations(
-            np.zeros((2, 2)) if position is None else position,
-            own.get("yaw_rad", self.yaw_std_rad),
-            own.get("speed_mps", self.speed_std_mps),
-        )
+        position = np.zeros((2, 2)) if position is None else position
+        return position, own.get("yaw_rad", self.yaw_std_rad), own.get("speed_mps", self.speed_std_mps)
 
 
 @dataclass(frozen=True)
-class FixedBirth(Assumptions):
+class FixedBirth(Birth):
     """Every object starts with the same covariance, whatever the sensor measured (as published)."""
 
     kind: Literal["fixed"] = "fixed"
     along_std_m: float = 0.1
     across_std_m: float = 0.1
 
-    def deviations(self, candidate: Candidate, yaw_rad: float) -> Deviations:
-        """See `Assumptions.deviations`."""
+    def spread(self, candidate: Candidate, yaw_rad: float) -> tuple[FloatArray, float, float]:
+        """See `Birth.spread`."""
         turn = rotation(yaw_rad)
         position = turn @ np.diag([self.along_std_m**2, self.across_std_m**2]) @ turn.T
-        return Deviations(position, self.yaw_std_rad, self.speed_std_mps)
-
-
-def heading_of(candidate: Candidate, road: Road) -> tuple[float | None, float]:
-    """Yaw (measured, else the map's, else None) and curvature of the road at the candidate."""
-    measured = candidate.values.get("yaw_rad")
-    if not road.known or candidate.position_m is None:
-        return measured, 0.0
-    view = road.view(candidate.position_m[None])
-    return (float(view.yaw_rad[0]) if measured is None else measured), float(view.curvature_radpm[0])
+        return position, self.yaw_std_rad, self.speed_std_mps

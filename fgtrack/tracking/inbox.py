@@ -5,11 +5,15 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Protocol
 
+import numpy as np
+
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Detection, DetectionList, Disposition, Frame, UpdateRecord
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.validity import is_covariance, is_number
 
+#: In any unit: beyond what is tracked, and its square is still far from the largest float.
+LARGEST = 1e9
+_ASYMMETRY = 1e-6  # of the standard deviations' product: what rounding to single precision may leave
 NO_INNOVATION: Mapping[str, float] = MappingProxyType({})
 
 
@@ -86,6 +90,33 @@ def is_usable(detection: Detection, sensor: SensorModel) -> bool:
     if "x_m" in measured or "y_m" in measured:
         return "x_m" in measured and "y_m" in measured
     return "bearing_rad" in measured
+
+
+def is_number(value: float) -> bool:
+    """Whether `value` is finite and at most `LARGEST`."""
+    return abs(value) <= LARGEST
+
+
+def is_covariance(detection: Detection, sensor: SensorModel) -> bool:
+    """Whether the covariance that `detection` carries, if it is used at all, is one: symmetric positive definite."""
+    if detection.covariance is None or not sensor.message_covariance:
+        return True
+    measured = detection.measured
+    if len(detection.covariance) != len(measured) ** 2:
+        return False
+    used = [i for i, name in enumerate(measured) if name in sensor.std]
+    own = np.array(detection.covariance).reshape(len(measured), len(measured))[np.ix_(used, used)]
+    variances = np.diag(own)
+    if not np.all((np.abs(own) <= LARGEST**2) & (variances[:, None] > 0.0)):
+        return False
+    deviations = np.sqrt(variances)
+    if not np.all(np.abs(own - own.T) <= _ASYMMETRY * np.outer(deviations, deviations)):
+        return False
+    try:
+        np.linalg.cholesky(own)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def stamps(message: DetectionList, sensor: SensorModel) -> list[int]:

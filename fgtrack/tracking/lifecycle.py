@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray, TrackStatus
@@ -49,58 +49,36 @@ class LifecycleRules:
             raise ValueError("forget_s must be positive and short_range_m not negative")
 
 
-class Lifecycle(Protocol):
-    """Counts matches and misses, and says which tracks end."""
+class Lifecycle:
+    """Counts matches and misses, and says which tracks end.
 
-    @property
-    def lives(self) -> Mapping[int, Life]:
-        """What is counted, by track."""
-
-    def born(self, track_id: int, sensor: str, stamp_ns: int, present_ns: int) -> None:
-        """A detection of `sensor` started a track."""
-
-    def matched(self, track_id: int, sensor: str, stamp_ns: int) -> None:
-        """A detection of `sensor` at `stamp_ns` was associated."""
-
-    def fused(self, track_id: int) -> None:
-        """The associated detection changed the state."""
-
-    def missed(self, track_ids: Sequence[int], sensor: str, ranges_m: FloatArray, present_ns: int) -> list[int]:
-        """These tracks, at these distances from the ego, were not seen; the ids of those that end."""
-
-    def expired(self, present_ns: int) -> list[int]:
-        """The ids of tracks that end because time has passed."""
-
-    def forget(self, track_id: int) -> None:
-        """The track has ended."""
-
-
-class CountingLifecycle:
-    """The status counter, aged by every sensor at the range it is responsible for, and by time alone as well."""
+    A track is aged by every sensor at the range it is responsible for, and by time alone as well.
+    """
 
     def __init__(self, rules: LifecycleRules, sensors: Mapping[str, SensorModel]) -> None:
         self._rules = rules
         self._sensors = sensors
         self._forget_ns = nanoseconds(rules.forget_s)
         self.lives: dict[int, Life] = {}
+        """What is counted, by track."""
 
     def born(self, track_id: int, sensor: str, stamp_ns: int, present_ns: int) -> None:
-        """See `Lifecycle.born`."""
+        """A detection of `sensor` started a track."""
         self.lives[track_id] = Life(self._sensors[sensor].counter_init, stamp_ns)
 
     def matched(self, track_id: int, sensor: str, stamp_ns: int) -> None:
-        """See `Lifecycle.matched`."""
+        """A detection of `sensor` at `stamp_ns` was associated."""
         life = self.lives[track_id]
         life.counter = min(life.counter + self._sensors[sensor].counter_add, self._rules.counter_cap)
         life.last_seen_ns = max(life.last_seen_ns, stamp_ns)
         life.misses = 0
 
     def fused(self, track_id: int) -> None:
-        """See `Lifecycle.fused`."""
+        """The associated detection changed the state."""
         self.lives[track_id].num_measured += 1
 
     def missed(self, track_ids: Sequence[int], sensor: str, ranges_m: FloatArray, present_ns: int) -> list[int]:
-        """See `Lifecycle.missed`."""
+        """These tracks, at these distances from the ego, were not seen; the ids of those that end."""
         ended = []
         for track_id, range_m in zip(track_ids, ranges_m.tolist(), strict=True):
             if ages_at(self._sensors[sensor].ages, range_m, self._rules.short_range_m):
@@ -116,11 +94,11 @@ class CountingLifecycle:
         return limit is not None and life.misses >= limit and life.num_measured < self._rules.confirm_count
 
     def expired(self, present_ns: int) -> list[int]:
-        """See `Lifecycle.expired`."""
+        """The ids of tracks that end because time has passed."""
         return [i for i, life in self.lives.items() if present_ns - life.last_seen_ns > self._forget_ns]
 
     def forget(self, track_id: int) -> None:
-        """See `Lifecycle.forget`."""
+        """The track has ended."""
         del self.lives[track_id]
 
 

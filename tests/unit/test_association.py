@@ -17,7 +17,7 @@ from fgtrack.tracking.association import (
     chi_square_quantile,
     euclidean_distances,
 )
-from fgtrack.tracking.published_objects import UngatedEuclidean
+from fgtrack.tracking.published import UngatedEuclidean
 
 ALL = [GatedEuclidean(), GatedEuclidean(max_nis=20.0), GatedMahalanobis(), UngatedEuclidean()]
 

@@ -12,7 +12,8 @@ from fgtrack.pipeline.load import dump, load, read_yaml, validate
 from fgtrack.pipeline.sweep_config import SweepConfig
 from fgtrack.sim.scenario import Scenario
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
-from fgtrack.tracking.tracker import PublishedTracker, Tracker
+from fgtrack.tracking.published import PublishedTracker
+from fgtrack.tracking.tracker import Tracker
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 FILES = sorted(CONFIGS.rglob("*.yaml"))

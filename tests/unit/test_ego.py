@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from support.tracking import START_NS, ms
 
 from fgtrack.core.types import EgoState
-from fgtrack.tracking.ego import EgoSource, EgoTrajectory, low_passed
-from fgtrack.tracking.published_input import PublishedEgo
+from fgtrack.tracking.ego import EgoSource, EgoTrajectory
+from fgtrack.tracking.published import PublishedEgo
 
 
 def ego(stamp_ms: float, x_m: float = 0.0, yaw_rad: float = 0.0, speed_mps: float = 10.0, **more) -> EgoState:
@@ -96,9 +96,11 @@ def test_a_low_pass_takes_its_share_of_the_new_value_once() -> None:
 
 
 def test_the_low_pass_wraps() -> None:
-    low = low_passed(math.pi - 0.1, 0.0, ego(0.0, yaw_rad=-math.pi + 0.1), 0.75, 1.0)
-    assert low.yaw_rad == pytest.approx(-math.pi + 0.05)
-    assert (low.x_m, low.speed_mps) == (0.0, 10.0)
+    source = trajectory(yaw_weight=0.75)
+    source.receive(ego(0.0, yaw_rad=math.pi - 0.1))
+    source.receive(ego(10.0, yaw_rad=-math.pi + 0.1))
+    assert source.current.yaw_rad == pytest.approx(-math.pi + 0.05)
+    assert (source.current.x_m, source.current.speed_mps) == (0.0, 10.0)
 
 
 def test_the_memory_keeps_what_it_promises_and_not_much_more() -> None:

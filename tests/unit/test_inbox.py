@@ -8,7 +8,7 @@ from support.tracking import START_NS, message, ms
 from fgtrack.core.types import Detection, DetectionList, UpdateRecord
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.inbox import QueueInbox, is_usable, stamps
-from fgtrack.tracking.published_input import SlotInbox
+from fgtrack.tracking.published import SlotInbox
 
 STD = {"x_m": 0.3, "y_m": 0.3}
 SENSORS = {

@@ -4,8 +4,8 @@ from support.tracking import START_NS, ms
 
 from fgtrack.core.types import TrackStatus
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.lifecycle import CountingLifecycle, Life, Lifecycle, LifecycleRules, ages_at
-from fgtrack.tracking.published_objects import PublishedLifecycle
+from fgtrack.tracking.lifecycle import Life, Lifecycle, LifecycleRules, ages_at
+from fgtrack.tracking.published import PublishedLifecycle
 
 STD = {"x_m": 0.3, "y_m": 0.3}
 SENSORS = {
@@ -14,10 +14,10 @@ SENSORS = {
     "both": SensorModel(std=STD, counter_init=2, counter_add=2, ages="always"),
     "blind": SensorModel(std=STD, counter_init=4, counter_add=0, ages="never"),
 }
-KINDS = [CountingLifecycle, PublishedLifecycle]
+KINDS = [Lifecycle, PublishedLifecycle]
 
 
-def lifecycle(kind=CountingLifecycle, **rules) -> Lifecycle:
+def lifecycle(kind=Lifecycle, **rules) -> Lifecycle:
     return kind(LifecycleRules(**rules), SENSORS)
 
 

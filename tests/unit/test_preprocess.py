@@ -14,7 +14,7 @@ from fgtrack.models.road import OpenSpace, Road
 from fgtrack.models.sensors import Mount, SensorModel
 from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.preprocess import Candidate, ConnectedMerge, Merge, NoMerge, Preprocess
-from fgtrack.tracking.published_objects import NeighbourhoodMerge
+from fgtrack.tracking.published import NeighbourhoodMerge
 
 LIDAR = SensorModel(std={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.4}, mount=Mount(2.0, 1.0, math.pi / 2))
 POINTS = SensorModel(std={"x_m": 0.3, "y_m": 0.3}, yaw_from_map_std_rad=0.35)

@@ -1,0 +1,256 @@
+"""What the published implementation of Karle et al. 2023 does in another way, each defect a component of its own."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+
+from fgtrack.core.time import nanoseconds
+from fgtrack.core.types import DetectionList, Disposition, EgoState, FloatArray, TickReport, UpdateRecord
+from fgtrack.estimation.base import StatesAt
+from fgtrack.estimation.published import published_yaw
+from fgtrack.models.sensors import SensorModel
+from fgtrack.tracking.association import Assignment, euclidean_distances
+from fgtrack.tracking.ego import EgoPose, EgoSource, extrapolated
+from fgtrack.tracking.inbox import Batch, is_covariance, is_number, record, records
+from fgtrack.tracking.lifecycle import Lifecycle
+from fgtrack.tracking.preprocess import Candidate, Group
+from fgtrack.tracking.tracker import Tracker, TrackerParts
+
+
+class PublishedEgo(EgoSource):
+    """Ego storage at the ticks, nearest entry instead of interpolation, and a low-pass that filters its own output
+    again on every tick without a new message (defect Q13)."""
+
+    def __init__(self, yaw_weight: float, yaw_rate_weight: float, step_ns: int, storage_ticks: int) -> None:
+        super().__init__(yaw_weight, yaw_rate_weight)
+        self._half_step_ns = step_ns / 2
+        self._length = storage_ticks
+        self._stored: list[EgoState] = []  # newest last
+
+    def _store(self, ego: EgoState) -> str | None:
+        """See `EgoSource._store`."""
+        if self.current is not None and ego.stamp_ns == self.current.stamp_ns:
+            return "repeated stamp"
+        self.current = ego
+        return None
+
+    def start_tick(self) -> None:
+        """Store the current state, low-passed against the entry before it; of a stamp that is stored already, its yaw
+        and yaw rate alone."""
+        if self.current is None:
+            return
+        newest = self._stored[-1] if self._stored else None
+        if newest is None or newest.stamp_ns != self.current.stamp_ns:
+            if newest is not None:
+                self.current = self._low_passed(self.current, newest.yaw_rad, newest.yaw_rate_radps)
+            self._stored.append(self.current)
+            del self._stored[: -self._length]
+        elif len(self._stored) > 1:
+            before = self._stored[-2]
+            filtered = self._low_passed(self.current, before.yaw_rad, before.yaw_rate_radps)
+            turned = replace(newest, yaw_rad=filtered.yaw_rad, yaw_rate_radps=filtered.yaw_rate_radps)
+            if newest is self.current:  # the stored entry and the current state are one object
+                self.current = turned
+            self._stored[-1] = turned
+
+    def pose_at(self, stamp_ns: int, present_ns: int) -> EgoPose | None:
+        """See `EgoSource.pose_at`; from the nearest entry, however far away it is."""
+        if self.current is None:
+            return None
+        if present_ns - stamp_ns <= self._half_step_ns:
+            return extrapolated(self.current, stamp_ns)
+        nearest = min(reversed(self._stored), key=lambda ego: abs(ego.stamp_ns - stamp_ns))
+        return extrapolated(nearest, stamp_ns)
+
+
+class SlotInbox:
+    """One slot per sensor: a second message within a tick overwrites the first, a repeated stamp empties the slot
+    (defect Q12). The mean of object stamps is taken in floating point."""
+
+    def __init__(self, sensors: Mapping[str, SensorModel]) -> None:
+        self._sensors = sensors
+        self._slots: dict[str, Batch] = {}
+        self._last_stamp_ns: dict[str, int] = {}
+
+    def put(self, message: DetectionList) -> list[UpdateRecord]:
+        """See `Inbox.put`."""
+        sensor = self._sensors[message.sensor]
+        stamp_ns = _float_stamp(message) if sensor.stamp_from == "objects_mean" else message.stamp_ns
+        if self._last_stamp_ns.get(message.sensor) == stamp_ns:
+            return self._superseded(message.sensor) + records(message, Disposition.DUPLICATE)
+        delay_ns = message.receipt_ns - stamp_ns
+        if sensor.max_delay_s is not None and delay_ns > nanoseconds(sensor.max_delay_s):
+            return records(message, Disposition.TOO_OLD)
+        kept, ended, broken = [], [], False
+        for index, detection in enumerate(message.objects):
+            values = [getattr(detection, name) for name in sensor.components]
+            if (detection.x_m or 0.0) == 0.0 and (detection.y_m or 0.0) == 0.0:
+                ended.append(record(message, index, Disposition.INVALID))
+            elif all(value is not None and is_number(value) for value in values) and is_covariance(detection, sensor):
+                kept.append(index)
+            else:
+                broken = True
+                ended.append(record(message, index, Disposition.INVALID))
+        superseded = self._superseded(message.sensor)
+        if kept or not broken:
+            self._slots[message.sensor] = Batch(message, stamp_ns, tuple(kept))
+            self._last_stamp_ns[message.sensor] = stamp_ns
+        return superseded + ended
+
+    def _superseded(self, sensor: str) -> list[UpdateRecord]:
+        batch = self._slots.pop(sensor, None)
+        if batch is None:
+            return []
+        return [batch.record(index, Disposition.SUPERSEDED) for index in batch.indices]
+
+    def collect(self) -> list[Batch]:
+        """See `Inbox.collect`; equal stamps keep the order of the sensors."""
+        batches = [self._slots[name] for name in self._sensors if name in self._slots]
+        self._slots = {}
+        return sorted(batches, key=lambda batch: batch.stamp_ns)
+
+
+def _float_stamp(message: DetectionList) -> int:
+    """Mean of the object stamps in float64, which at today's epoch is good to 256 ns."""
+    if not message.objects:
+        return message.stamp_ns
+    stamps = [message.stamp_ns if item.stamp_ns is None else item.stamp_ns for item in message.objects]
+    return int(np.mean(np.array(stamps, dtype=np.int64)))
+
+
+@dataclass(frozen=True)
+class NeighbourhoodMerge:
+    """Each distinct neighbourhood becomes one object: no transitive closure, and yaw averaged as a plain number,
+    across its jump (defect Q11)."""
+
+    kind: Literal["neighbourhood"] = "neighbourhood"
+    distance_m: float = 5.1
+
+    def groups(self, points_m: FloatArray) -> list[Group]:
+        """See `Merge.groups`; the merged ones first, in the order of a set of index tuples."""
+        if not len(points_m):
+            return []
+        tree = cKDTree(points_m)
+        neighbourhoods = [
+            tuple(int(i) for i in tree.query_ball_point(point, self.distance_m, return_sorted=True))
+            for point in points_m
+        ]
+        merged = {members for members in neighbourhoods if len(members) > 1}
+        groups = [Group(neighbourhoods.index(members), members) for members in merged]
+        return groups + [Group(i, members) for i, members in enumerate(neighbourhoods) if len(members) == 1]
+
+    def mean(self, name: str, values: FloatArray) -> float:
+        """See `Merge.mean`."""
+        if name == "yaw_rad":
+            values = published_yaw(values)
+        return float(values.sum() / len(values))
+
+
+@dataclass(frozen=True)
+class UngatedEuclidean:
+    """Hungarian assignment over all pairs; too distant pairs are torn up afterwards, and both partners are then
+    alone, even where one had a good second choice (defect Q10)."""
+
+    kind: Literal["ungated_euclidean"] = "ungated_euclidean"
+    gate_m: float = 5.0
+
+    def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
+        """See `Association`; torn pairs are born after the detections that had no partner."""
+        tracks = range(len(states.track_ids))
+        if not candidates or not tracks:
+            return Assignment([], list(range(len(candidates))), list(tracks))
+        cost = euclidean_distances(candidates, states.means)
+        rows, columns = linear_sum_assignment(cost)
+        pairs = list(zip(rows.tolist(), columns.tolist(), strict=True))
+        good = [(i, j) for i, j in pairs if not cost[i, j] > self.gate_m]
+        torn = [i for i, j in pairs if cost[i, j] > self.gate_m]
+        assigned = set(rows.tolist())
+        seen = {j for _, j in good}
+        alone = [i for i in range(len(candidates)) if i not in assigned]
+        return Assignment(good, alone + torn, [j for j in tracks if j not in seen])
+
+
+class PublishedLifecycle(Lifecycle):
+    """Only two sensors age a track, each at its range; time counts only where a list came in; the cap may be passed;
+    a birth is dated to the tick and a match to the sensor's stamp (defects Q9 and Q15).
+
+    The range is that of a state which is one batch old; see `PublishedTracker`.
+    """
+
+    def born(self, track_id: int, sensor: str, stamp_ns: int, present_ns: int) -> None:
+        """See `Lifecycle.born`."""
+        super().born(track_id, sensor, present_ns, present_ns)
+
+    def matched(self, track_id: int, sensor: str, stamp_ns: int) -> None:
+        """See `Lifecycle.matched`."""
+        life = self.lives[track_id]
+        if life.counter < self._rules.counter_cap:
+            life.counter += self._sensors[sensor].counter_add
+        life.last_seen_ns = stamp_ns
+        life.misses = 0
+
+    def missed(self, track_ids: Sequence[int], sensor: str, ranges_m: FloatArray, present_ns: int) -> list[int]:
+        """See `Lifecycle.missed`."""
+        ages = self._sensors[sensor].ages
+        ended = []
+        for track_id, range_m in zip(track_ids, ranges_m.tolist(), strict=True):
+            life = self.lives[track_id]
+            near = range_m <= self._rules.short_range_m
+            if (near and ages == "short_range") or (not near and ages == "long_range"):
+                life.counter -= 1
+                life.misses += 1
+            if present_ns - life.last_seen_ns > self._forget_ns:
+                life.counter = -1
+            if life.counter <= 0:
+                ended.append(track_id)
+        return ended
+
+    def expired(self, present_ns: int) -> list[int]:
+        """See `Lifecycle.expired`; never, without a list."""
+        return []
+
+
+class PublishedTracker(Tracker):
+    """The published implementation's order of things, where it differs (defects Q9 and Q22).
+
+    A list older than the storage still starts tracks, and an empty list ages every track. The range that ages a
+    track is measured from the present ego to where the track was after the batch before, or at the end of the tick
+    before.
+    """
+
+    def __init__(self, parts: TrackerParts) -> None:
+        super().__init__(parts)
+        self._last_known: dict[int, FloatArray] = {}
+
+    def tick(self, now_ns: int) -> TickReport:
+        """See `Tracker.tick`."""
+        report = super().tick(now_ns)
+        self._remember()
+        return report
+
+    def _process(self, batch: Batch) -> None:
+        super()._process(batch)
+        self._remember()
+
+    def _remember(self) -> None:
+        states = self._parts.bank.states_at(self._parts.bank.present_ns)
+        self._last_known = dict(zip(states.track_ids, states.means[:, :2], strict=True))
+
+    def _is_too_old(self, batch: Batch) -> bool:
+        return False
+
+    def _offered(self, batch: Batch) -> StatesAt:
+        if batch.indices:
+            return super()._offered(batch)
+        return self._parts.bank.states_at(self._parts.bank.present_ns)
+
+    def _ranges_m(self, track_ids: Sequence[int], positions_m: FloatArray, ego: EgoPose | None) -> FloatArray:
+        current = self._parts.ego.current
+        if current is None:
+            return np.zeros(len(track_ids))
+        known = np.array([self._last_known[track_id] for track_id in track_ids])
+        return np.asarray(np.hypot(known[:, 0] - current.x_m, known[:, 1] - current.y_m))
