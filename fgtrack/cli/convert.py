@@ -35,8 +35,8 @@ def convert(
     """Convert a recording into a stream or a rosbag2 folder."""
     if seed is not None and delays_file is None:
         raise CallError("--seed: only --delays draws random numbers, name its file")
-    if recording.exists() and out.exists() and recording.samefile(out):
-        raise CallError(f"{out}: is the input, choose another name")
+    if out.resolve() in (recording.resolve(), *recording.resolve().parents):
+        raise CallError(f"{out}: is the input or holds it, choose another name")
     check_recording(out, overwrite)
     source = open_input(recording, read_config(config_file).input)
     with progress("convert"):

@@ -1,4 +1,4 @@
-"""Which topics of a recording are what."""
+"""Which topics of a recording hold the ego, detections and truth."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -35,8 +35,3 @@ class InputConfig:
     truth: TopicInput | None = None
     message_definitions: tuple[str, ...] = ()
     """`.msg` files, or folders of them, of types that neither the recording nor fgtrack defines."""
-
-    @property
-    def names_topics(self) -> bool:
-        """Whether any topic is named."""
-        return bool(self.ego or self.detections or self.truth)

@@ -10,7 +10,7 @@ import numpy as np
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Message
-from fgtrack.io.recording import Storage, write_recording
+from fgtrack.io.recording import Storage, check_recording, write_recording
 from fgtrack.io.run import Run, load_run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline import replay as pipeline
@@ -127,6 +127,8 @@ def simulate(
     CallError
         The scenario or `out` does not fit.
     """
+    if out is not None:
+        check_recording(Path(out), overwrite)
     world = scenario if isinstance(scenario, Scenario) else read_scenario(scenario)
     if duration_s is not None:
         try:

@@ -218,10 +218,11 @@ def test_a_sweep_does_not_replace_a_table_that_it_did_not_make(here: Path, call:
 def test_the_input_of_a_conversion_is_never_its_output(here: Path, call: Call) -> None:
     Path("same").symlink_to("drive.jsonl")
     before = content(here)
-    for out in ("drive.jsonl", "./drive.jsonl", "same"):
-        code, error = call("convert", "drive.jsonl", out, "--overwrite")
+    (storage,) = (str(file) for file in Path("bag").glob("*.mcap"))
+    for recording, out in [("drive.jsonl", "./drive.jsonl"), ("drive.jsonl", "same"), ("bag", "bag"), (storage, "bag")]:
+        code, error = call("convert", recording, out, "--overwrite")
         assert code == 2
-        assert "is the input" in error
+        assert "is the input or holds it" in error
     assert content(here) == before
 
 

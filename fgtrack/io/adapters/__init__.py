@@ -1,4 +1,4 @@
-"""From foreign messages and data sets to fgtrack's own; the place where other conventions are converted.
+"""Converts messages and data sets of others to fgtrack's messages and conventions.
 
 A package adds an adapter by an entry point of the group `fgtrack.adapters`. Its name says what it is: a message type
 `package/msg/Type`, whose entry is a function from a message to an `ObjectList`, or a file format, whose entry is a

@@ -1,8 +1,4 @@
-"""Reads recordings: rosbag2 folders, single MCAP and SQLite files, ROS 1 bags; without ROS.
-
-This module and those behind it (`bag_files`, `mcap_file`, `sqlite3_file`, `rosbag1_file`, `typestore`), the writer
-(`bag_writer`, `ros_messages`) and nothing else import rosbags.
-"""
+"""Reads recordings without ROS: rosbag2 folders, single MCAP and SQLite files, ROS 1 bags."""
 
 import re
 import struct

@@ -1,4 +1,4 @@
-"""Writes rosbag2 recordings: fgtrack's own messages, exact to the bit, and twins that other tools show."""
+"""Writes rosbag2 recordings: fgtrack's own messages, exact to the bit, and twins in standard types for other tools."""
 
 import os
 import re

@@ -1,6 +1,6 @@
 """Message definitions of the types that rosbags does not ship: fields in the order in which CDR stores them.
 
-A definition that a recording carries, and one that the user names, goes before these.
+Definitions embedded in a recording and those of the user take precedence.
 """
 
 # Versions of the layouts below: vision_msgs 4, radar_msgs 0.2, tier4's autoware_auto_msgs, autoware_msgs 1.

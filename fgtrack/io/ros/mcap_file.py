@@ -1,4 +1,4 @@
-"""An MCAP file, also one that breaks off."""
+"""An MCAP file, including a truncated one."""
 
 from collections.abc import Collection, Generator
 from pathlib import Path
@@ -26,11 +26,11 @@ class McapFile(McapReader):
     def _open(self) -> None:
         try:
             super()._open()
-        except Exception:  # rosbags reads files with an end only; whatever it stumbles over, try from the start
+        except Exception:  # rosbags reads complete files only; whatever it raises, index from the start
             if not self.data_start:
                 raise
             self._index_by_walking()
-            self.break_off = self.break_off or "lacks its end"
+            self.break_off = self.break_off or "has no end record"
             return
         if any(not chunk.channel_count for chunk in self.chunks) or not self.chunks:
             self._index_by_walking()

@@ -1,4 +1,4 @@
-"""A ROS 1 bag, also one that breaks off."""
+"""A ROS 1 bag, including a truncated one."""
 
 from collections import defaultdict
 from io import BytesIO
@@ -24,7 +24,7 @@ class Rosbag1File(Reader):
         """Open the file and read which connections it holds."""
         try:
             super().open()
-        except Exception:  # rosbags reads indexed files only; whatever it stumbles over, try from the start
+        except Exception:  # rosbags reads indexed files only; whatever it raises, index from the start
             self._index_by_walking()
 
     def _index_by_walking(self) -> None:

@@ -1,4 +1,4 @@
-"""A SQLite file of a recording, also one that was not closed or breaks off."""
+"""A SQLite file of a recording, including one that was not closed or is truncated."""
 
 import shutil
 import tempfile
@@ -18,7 +18,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 
 class Sqlite3File(Sqlite3Reader):
-    """A SQLite file; one that was not closed is healed in a copy, a truncated one is read row by row."""
+    """A SQLite file; one that was not closed is recovered in a copy, a truncated one is read row by row."""
 
     path: Path
     break_off: str | None = None
@@ -33,7 +33,7 @@ class Sqlite3File(Sqlite3Reader):
         left = [journal for journal in journals if journal.exists() and journal.stat().st_size]
         if left:
             self.break_off = f"was not closed by its writer ({left[0].name} is left)"
-            self.path = self._healed_copy(left)
+            self.path = self._recovered_copy(left)
         try:
             super()._open()
             self._reconnect()
@@ -62,7 +62,7 @@ class Sqlite3File(Sqlite3Reader):
                 yield by_id[topic_id], log_ns, data
 
     def _reconnect(self) -> None:
-        """Connect anew: rosbags' `_open` uses a connection of its own, `open` made ours before healing."""
+        """Connect anew: rosbags' `_open` uses a connection of its own, `open` made ours before the recovery."""
         if self.dbconn:
             self.dbconn.close()
         flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
@@ -86,8 +86,8 @@ class Sqlite3File(Sqlite3Reader):
             file.truncate(size - size % page_size)
         return copy
 
-    def _healed_copy(self, journals: list[Path]) -> Path:
-        """A copy whose journals SQLite has played back."""
+    def _recovered_copy(self, journals: list[Path]) -> Path:
+        """A copy to which SQLite has applied the journals."""
         copy = self._copy(journals)
         connection = apsw.Connection(str(copy))
         connection.execute("SELECT count(*) FROM sqlite_master").fetchall()

@@ -1,4 +1,4 @@
-"""From the topics of a recording to fgtrack's messages, as the configuration says."""
+"""Converts the topics of a recording to fgtrack's messages, as configured."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -41,8 +41,8 @@ class TopicUse:
 def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
     """What the topics of `bag` are, as `config` names them.
 
-    A recording of fgtrack's own is known by its message types; `config` goes before where it names a topic of
-    the recording.
+    A recording that fgtrack wrote is recognised by its message types; `config` takes precedence where it names a
+    topic of the recording.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The message types of a recording: rosbags' own, ours, the user's and those that the recording carries."""
+"""The message types of a recording: rosbags', fgtrack's, the user's and those embedded in the recording."""
 
 from collections.abc import Iterable, Mapping
 from functools import cache
@@ -27,7 +27,7 @@ def build_typestore(
 ) -> tuple[Typestore, Mapping[str, str]]:
     """Types for messages of the types that are the keys of `definitions`, and of those which cannot be read why.
 
-    A definition that the recording carries goes before the user's, that before ours, that before rosbags'.
+    Precedence: definitions embedded in the recording, the user's, fgtrack's, rosbags'.
 
     Parameters
     ----------

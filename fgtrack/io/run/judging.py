@@ -1,4 +1,4 @@
-"""How a run is judged: what its configuration says to those who read it."""
+"""How a run is evaluated, as its configuration says."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
