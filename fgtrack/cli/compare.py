@@ -9,6 +9,10 @@ import typer
 from fgtrack.cli.arguments import Json, Runs
 from fgtrack.cli.show import console
 from fgtrack.evaluation.comparison import compare as tables_of
+from fgtrack.evaluation.runs import Runs as AnyRuns
+from fgtrack.evaluation.runs import judged
+from fgtrack.evaluation.tables import Tables
+from fgtrack.io.run import write_metrics
 
 
 class Form(StrEnum):
@@ -26,7 +30,7 @@ def compare(
     form: Annotated[Form | None, typer.Option("--format", help="Print this instead of tables for a terminal.")] = None,
 ) -> None:
     """Compare runs in tables, and write metrics.json into each."""
-    tables = tables_of(*runs)
+    tables = written_tables(runs)
     match Form.JSON if as_json else form:
         case Form.JSON:
             print(json.dumps(tables.to_dict(), indent=2, allow_nan=False))
@@ -38,3 +42,13 @@ def compare(
             print(tables.to_csv(), end="")
         case None:
             console().print(tables)
+
+
+def written_tables(runs: AnyRuns) -> Tables:
+    """The tables of `runs`; the metrics of each are written into its folder."""
+    every = judged(runs)
+    tables = tables_of(*every)
+    for one in every:
+        if one.run.path is not None:
+            write_metrics(one.run.path, one.metrics.as_dict())
+    return tables

@@ -7,8 +7,8 @@ import numpy as np
 import typer
 
 from fgtrack.cli.arguments import Overwrite
+from fgtrack.cli.compare import written_tables
 from fgtrack.cli.show import TickProgress, console, progress
-from fgtrack.evaluation.comparison import compare
 from fgtrack.evaluation.plot import save_figures
 from fgtrack.io.output import Kind, check_output, claimed, new_files
 from fgtrack.io.ros.bag_writer import RECORDING, write_bag
@@ -57,7 +57,7 @@ def _demo(out: Path, overwrite: bool) -> None:
             overwrite=overwrite,
         )
     runs = [load_run(result.path) for result in results]
-    console().print(compare(*runs))
+    console().print(written_tables(runs))
     with progress("draw"), new_files(figures, overwrite) as folder:
         files = save_figures(runs, folder)
     console().print(f"recording: {bag}\nruns: {out / 'runs'}", highlight=False, soft_wrap=True)

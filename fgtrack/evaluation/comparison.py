@@ -16,7 +16,6 @@ from fgtrack.evaluation.multi_object import MultiObjectMetrics
 from fgtrack.evaluation.runs import OneRun, judged
 from fgtrack.evaluation.statistics import ChiSquareMean
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
-from fgtrack.io.run import write_metrics
 
 BACKWARD_FORWARD = "ekf-backward-forward"
 BACKWARD_FORWARD_NOTE = "backward-forward forgets what was fused after the stamp of a late detection"
@@ -53,21 +52,18 @@ def compare(*runs: OneRun | Iterable[OneRun]) -> Tables:
     """Metrics of `runs` beside each other: tables `tracking`, `multi_object`, `lag`, `consistency`, `dispositions`
     and `residuals_SENSOR` of every sensor.
 
-    A path is a run folder, or a folder that holds run folders. Into the folder of a run its `metrics.json` is written.
+    A path is a run folder, or a folder that holds run folders.
 
     Raises
     ------
     CallError
         No run is given, one is given twice, or a path is no run folder.
     DataError
-        A run folder is damaged or cannot be written to.
+        A run folder is damaged.
     """
     every = judged(runs)
     if not every:
         raise CallError("compare: no run is given, name at least one")
-    for one in every:
-        if one.run.path is not None:
-            write_metrics(one.run.path, one.metrics.as_dict())
     return comparison({one.label: one.metrics for one in every})
 
 
