@@ -27,7 +27,7 @@ _Named = Iterator[tuple[str, Figure]]
 
 def _maps(runs: Sequence[JudgedRun]) -> _Named:
     for one in runs:
-        if len(one.run.tracks["tick"]):
+        if one.run.tracks.num_rows:
             yield f"map_{one.label}", map(one)
 
 
@@ -41,7 +41,7 @@ def _delays(runs: Sequence[JudgedRun]) -> _Named:
     """One for each recording: runs of the same have the same delays."""
     groups: dict[bytes, list[JudgedRun]] = {}
     for one in runs:
-        if len(one.run.updates["tick"]):
+        if one.run.updates.num_rows:
             content = b"".join(part.tobytes() for by in sensor_delays(one.run).values() for part in by)
             groups.setdefault(content, []).append(one)
     for group in groups.values():

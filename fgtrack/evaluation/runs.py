@@ -78,7 +78,7 @@ def one_judged(run: OneRun) -> JudgedRun:
 
 def start_ns(runs: Sequence[JudgedRun]) -> int:
     """Time of the first tick of `runs`; 0 where there is none."""
-    return min((int(one.run.timing["now_ns"][0]) for one in runs if len(one.run.timing["now_ns"])), default=0)
+    return min((int(one.run.timing["now_ns"][0]) for one in runs if one.run.timing.num_rows), default=0)
 
 
 def labelled(runs: Sequence[Run]) -> dict[str, Run]:

@@ -14,6 +14,8 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from fgtrack.io.run import Table as RunTable
+
 Row = TypeVar("Row")
 Value = str | int | float
 
@@ -69,7 +71,7 @@ class Shown:
     left: bool
 
 
-class Table(dict[str, npt.NDArray[Any]]):  # Any: a column holds floats, integers or text
+class Table(RunTable):
     """Columns by name, each of shape (rows,): SI units, NaN where there is no value. `str` shows it as text.
 
     Attributes
@@ -93,16 +95,17 @@ class Table(dict[str, npt.NDArray[Any]]):  # Any: a column holds floats, integer
         notes: Sequence[str] = (),
     ) -> None:
         self.title, self.row_keys, self.notes = title, row_keys, tuple(notes)
+        data: dict[str, npt.NDArray[Any]] = {}  # Any: a column holds floats, integers or text
         shown = []
         for column in columns:
             values = [column.of(row) for row in rows]
             for k, name in enumerate(column.names):
-                self[name] = np.array([math.nan if one is None else one[k] for one in values])
+                data[name] = np.array([math.nan if one is None else one[k] for one in values])
             cells = tuple(map(column.cell, values))
             if column.heading:
                 shown.append(Shown(column.heading, cells, column.left))
+        super().__init__(data)
         self.shown = tuple(shown)
-        self.num_rows = len(rows)
 
     def __str__(self) -> str:
         return _text(self.rich())
@@ -136,6 +139,8 @@ class Table(dict[str, npt.NDArray[Any]]):  # Any: a column holds floats, integer
         lines = [f"### {self.title}", "", *(f"| {' | '.join(row)} |" for row in rows), ""]
         return "\n".join([*lines, *(f"- {note}" for note in self.notes), *([""] if self.notes else [])])
 
+    _repr_markdown_ = to_markdown  # what a notebook shows
+
     def to_latex(self) -> str:
         """A table environment with the rules of the package booktabs; notes as comments."""
         head = [_latex(_one_line(column.heading)) for column in self.shown]
@@ -166,7 +171,7 @@ class Table(dict[str, npt.NDArray[Any]]):  # Any: a column holds floats, integer
             before = first
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Tables(Mapping[str, Table]):
     """Tables by name. `str` shows those that have rows as text, so `print(tables)` prints them."""
 
@@ -185,6 +190,12 @@ class Tables(Mapping[str, Table]):
 
     def __str__(self) -> str:
         return "\n".join(map(str, self._filled()))
+
+    def __repr__(self) -> str:
+        return f"<Tables: {', '.join(self)}>"
+
+    def _repr_markdown_(self) -> str:
+        return self.to_markdown()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for table in self._filled():

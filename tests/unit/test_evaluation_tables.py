@@ -166,6 +166,8 @@ def test_what_is_printed_is_what_the_console_shows(tables: Tables) -> None:
         console.print(tables)
     assert f"{tables}\n" == capture.get()
     assert str(tables["lag"]) in str(tables)
+    assert tables._repr_markdown_() == tables.to_markdown()
+    assert repr(tables) == f"<Tables: {', '.join(TABLES)}>"
 
 
 def test_json_has_the_metrics_the_notes_and_the_tables(tables: Tables) -> None:

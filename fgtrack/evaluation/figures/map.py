@@ -20,7 +20,6 @@ from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, Matching
 from fgtrack.evaluation.runs import OneRun, one_judged
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import Run, Table
-from fgtrack.io.run.judging import section
 from fgtrack.models.oval import OVAL, make_oval
 from fgtrack.models.track_map import TrackMap
 
@@ -44,7 +43,7 @@ def tracks_on_map(run: OneRun) -> Figure:
     title, matching = one.label, one.matching
     figure = StyledFigure(figsize=(8.0, 7.0))
     axes = figure.add_subplot()
-    name = section(one.run, "map").get("track")
+    name = (one.run.config.get("map") or {}).get("track")
     if name == OVAL:
         _draw_bounds(axes, make_oval())
     elif name and Path(str(name)).exists():

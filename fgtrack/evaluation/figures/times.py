@@ -25,7 +25,7 @@ def delays(run: OneRun) -> Figure:
         The run has no detections.
     """
     one = one_judged(run)
-    if not len(one.run.updates["stamp_ns"]):
+    if not one.run.updates.num_rows:
         raise DataError(f"{one.label}: has no detections, so there are no delays to draw")
     figure = StyledFigure(figsize=(10.0, 4.0))
     histogram, arrived = figure.subplots(1, 2)
@@ -75,7 +75,7 @@ def timing(runs: Runs) -> Figure:
     first_ns = start_ns(every)
     for k, one in enumerate(every):
         busy = one.run.timing.where(one.run.timing["num_detections"] > 0)
-        if not len(busy["tick"]):
+        if not busy.num_rows:
             continue
         time_ms = busy["process_ns"] / NS_PER_S * _MS
         spread = Distribution.of(time_ms)

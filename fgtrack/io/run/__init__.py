@@ -1,6 +1,6 @@
 """The run folder `fgtrack-run/1`, the interface of tracking and evaluation: writer, reader, layout; runs in memory."""
 
-from fgtrack.io.run.judging import EvaluationConfig, evaluation_config, section
+from fgtrack.io.run.judging import EvaluationConfig, evaluation_config
 from fgtrack.io.run.memory import MemoryRun
 from fgtrack.io.run.reader import NO_TRACK, Run, Table, load_run
 from fgtrack.io.run.schema import COLUMNS, COVARIANCE_COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
@@ -22,6 +22,5 @@ __all__ = [
     "evaluation_config",
     "is_run_folder",
     "load_run",
-    "section",
     "write_metrics",
 ]

@@ -1,8 +1,6 @@
 """How a run is evaluated, as its configuration says."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any
 
 from fgtrack.core.errors import DataError
 from fgtrack.io.run.reader import Run
@@ -42,21 +40,9 @@ def evaluation_config(run: Run) -> EvaluationConfig:
     DataError
         config.yaml is not YAML, or a value is out of range.
     """
-    found = section(run, "evaluation")
-    known = {entry.name: found[entry.name] for entry in fields(EvaluationConfig) if entry.name in found}
+    found = run.config.get("evaluation") or {}
     try:
+        known = {entry.name: found[entry.name] for entry in fields(EvaluationConfig) if entry.name in found}
         return EvaluationConfig(**known)
     except (TypeError, ValueError) as error:
         raise DataError(f"{run.config_path}: evaluation: {error}") from error
-
-
-def section(run: Run, name: str) -> Mapping[str, Any]:
-    """The section `name` of the run's config.yaml; empty where it has none.
-
-    Raises
-    ------
-    DataError
-        config.yaml is not YAML.
-    """
-    found = run.config.get(name)
-    return found if isinstance(found, dict) else {}
