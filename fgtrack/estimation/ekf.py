@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.linalg import identity, psd_solve, symmetrise
+from fgtrack.core.linalg import congruence, identity, product, psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.measurement import MeasurementModel, SensorPose
@@ -14,7 +14,7 @@ from fgtrack.models.motion import MotionModel
 
 def propagated(F: FloatArray, P: FloatArray, Q: FloatArray) -> FloatArray:
     """Covariance F P F' + Q of F x + N(0, Q), shape (..., m, m)."""
-    return symmetrise(F @ P @ F.mT + Q)
+    return symmetrise(congruence(F, P) + Q)
 
 
 def kalman_gain(P: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -28,15 +28,15 @@ def kalman_gain(P: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray
 
 def _solved(P: FloatArray, H: FloatArray, R: FloatArray, *columns: FloatArray) -> tuple[FloatArray, FloatArray]:
     """S, and S^-1 times H P and further columns."""
-    HP = H @ P
-    S = HP @ H.mT + R
+    HP = product(H, P)
+    S = product(HP, H.mT) + R
     return S, psd_solve(S, np.concatenate([HP, *columns], axis=-1) if columns else HP)
 
 
 def joseph(P: FloatArray, K: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
     """Covariance (I - K H) P (I - K H)' + K R K' after a measurement H x + N(0, R) with any gain K, (..., n, n)."""
-    A = identity(P.shape[-1]) - K @ H
-    return symmetrise(A @ P @ A.mT + K @ R @ K.mT)
+    A = identity(P.shape[-1]) - product(K, H)
+    return symmetrise(congruence(A, P) + congruence(K, R))
 
 
 def linearised(
