@@ -160,6 +160,10 @@ def test_links_have_targets(page: Path) -> None:
             assert target.fragment in anchors(path.resolve().relative_to(ROOT)), f"{page}: {link} has no such heading"
 
 
+def test_pictures_are_small() -> None:
+    assert all(picture.stat().st_size < 100_000 for picture in ROOT.glob("docs/*.png"))
+
+
 def test_pages_named_in_the_code_exist() -> None:
     files = chain(*(ROOT.glob(f"{folder}/**/*.{end}") for folder in ("fgtrack", "configs") for end in ("py", "yaml")))
     for file in files:
