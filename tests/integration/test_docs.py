@@ -25,7 +25,7 @@ from fgtrack.cli.main import run as run_command
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import validate
-from fgtrack.pipeline.shipped import shipped
+from fgtrack.pipeline.shipped import Kind, shipped
 from fgtrack.pipeline.sweep_config import SweepConfig
 from fgtrack.sim.clocks import AnyClock
 from fgtrack.sim.delays import AnyDelay
@@ -188,6 +188,10 @@ def command_lines() -> Iterator[tuple[str, str]]:
             yield str(file.relative_to(ROOT)), line
 
 
+#: Parameters that name a shipped file, and the kind of file.
+SHIPPED: dict[str, Kind] = {"config_file": "configuration", "scenario_file": "scenario", "sweep_name": "sweep"}
+
+
 @pytest.mark.parametrize(("where", "line"), list(command_lines()))
 def test_command_lines_can_be_parsed(where: str, line: str) -> None:
     words = shlex.split(re.sub(r"[\[\]]", "", line), comments=True)[1:]
@@ -198,17 +202,26 @@ def test_command_lines_can_be_parsed(where: str, line: str) -> None:
     assert words[0] in COMMANDS, where
     with group.make_context("fgtrack", list(words)) as context:
         command = group.resolve_command(context, words)[1]  # type: ignore[attr-defined]
-        with command.make_context(words[0], [], resilient_parsing=True) as inner:
-            options, _, _ = command.make_parser(inner).parse_args(list(words[1:]))
-    config = options.get("config")
-    if config is not None and re.fullmatch("[a-z0-9_]+", config):
-        assert config in shipped("configuration"), f"{where}: {line}"
-    for setting in options.get("settings") or []:
+        given, _, _ = command.make_parser(command.context_class(command)).parse_args(list(words[1:]))
+    for parameter, kind in SHIPPED.items():
+        name = given.get(parameter)
+        if isinstance(name, str) and re.fullmatch("[a-z0-9_]+", name):
+            assert name in shipped(kind), f"{where}: there is no shipped {kind} {name}"
+    for setting in given.get("settings") or []:
         key, equals, _ = setting.partition("=")
         assert equals
         assert key == "key" or is_key(Config, key.split(".")), f"{where}: there is no {key}"
-    for name in (options.get("estimators") or "NAME").split(","):
-        assert name in ESTIMATORS or name.isupper() or not name, f"{where}: {line}"
+    for name in (given.get("estimators") or "NAME").split(","):
+        assert name in ESTIMATORS or name.isupper() or not name.strip("."), f"{where}: there is no {name}"
+
+
+def test_what_names_a_shipped_file_is_still_called_so() -> None:
+    group = typer.main.get_command(app)
+    found = set()
+    for name in COMMANDS:
+        with group.make_context("fgtrack", [name]) as context:
+            found |= {parameter.name for parameter in group.resolve_command(context, [name])[1].params}  # type: ignore
+    assert {*SHIPPED, "settings", "estimators"} <= found
 
 
 @pytest.mark.parametrize("block", all_blocks("", "sh"), ids=lambda block: f"{block.page}:{block.line}")
