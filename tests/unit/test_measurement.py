@@ -206,16 +206,25 @@ def test_an_object_at_the_sensor_or_at_rest_gives_finite_numbers(motion: MotionM
 
 
 @pytest.mark.parametrize(
-    "components",
-    [(), ("y_m", "x_m"), ("x_m", "x_m"), ("x_m", "height_m"), ("vx_mps",)],
+    ("components", "named"),
+    [
+        ((), "nothing"),
+        (("y_m", "x_m"), "y_m, x_m"),
+        (("x_m", "x_m"), "x_m, x_m"),
+        (("x_m", "height_m"), "x_m, height_m"),
+        (("vx_mps",), "vx_mps"),
+    ],
 )
-def test_components_that_cannot_be_measured_are_refused(components: tuple[str, ...]) -> None:
-    with pytest.raises(CallError, match="give one or more of x_m, y_m, yaw_rad"):
-        measurement_model(components, CTRV())
+def test_components_that_cannot_be_measured_are_refused(components: tuple[str, ...], named: str) -> None:
+    with pytest.raises(CallError, match=rf"measurement of {named}: give one or more of x_m, y_m, yaw_rad"):
+        MeasurementModel(components, CTRV().state_names)
 
 
-def test_a_state_of_another_kind_is_refused() -> None:
-    with pytest.raises(CallError, match="state of x_m, y_m, z_m: must begin with"):
+@every_model
+def test_a_state_of_another_kind_is_refused(motion: MotionModel) -> None:
+    assert MeasurementModel(("x_m",), motion.state_names).components == ("x_m",)
+    begins = "must begin with x_m, y_m, yaw_rad, speed_mps or x_m, y_m, vx_mps, vy_mps$"
+    with pytest.raises(CallError, match=f"state of x_m, y_m, z_m: {begins}"):
         MeasurementModel(("x_m",), ("x_m", "y_m", "z_m"))
 
 

@@ -324,6 +324,14 @@ def test_a_birth_with_constant_velocity_has_the_spread_of_its_samples(yaw: float
     assert np.linalg.eigvalsh(P)[0] > 0.0
 
 
+def test_a_birth_at_rest_is_as_uncertain_across_its_heading_as_the_product_of_yaw_and_speed() -> None:
+    """E[(a b)^2] - E[a b]^2 = var(a) var(b) + cov(a, b)^2 of Gaussians."""
+    covariance = np.diag([1.0, 1.0, 0.05**2, 2.0**2, 1.0])
+    covariance[2, 3] = covariance[3, 2] = 0.06
+    P = CV().from_kinematic(np.zeros(5), covariance)[1]
+    assert_allclose(P[2:, 2:], np.diag([2.0**2, 0.05**2 * 2.0**2 + 0.06**2]), rtol=1e-14)
+
+
 def test_noise_grows_with_time_along_the_arc() -> None:
     x = np.array([0.0, 0.0, 0.3, 40.0, 0.2])
     noises = [CTRV().process_noise(x, dt_s) for dt_s in (0.1, 0.2, 0.5, 1.0, 2.0)]

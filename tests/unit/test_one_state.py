@@ -5,9 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.integrate import quad_vec
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import FloatArray
+from fgtrack.models import arc
 from fgtrack.models.arc import MAX_SMALL_TURN_RAD
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 
@@ -145,3 +147,29 @@ def test_the_position_noise_of_a_yaw_error_is_that_of_samples_along_the_arc(turn
     Phi = model.jacobian(model.predict(x, middles_s), dt_s - middles_s)
     total = (Phi * [0.0, 0.0, 0.3, 0.0, 0.2] @ Phi.mT).sum(axis=0) * dt_s / pieces
     assert_close(model.step(x.tolist(), dt_s).Q, np.asarray(total), rtol=1e-6)
+
+
+def kernel(order: int, ramp: int, w: float, R: float) -> complex:
+    """Integral over r in [0, R] of (R - r)^ramp r^order exp(i w r)."""
+    return complex(quad_vec(lambda r: (R - r) ** ramp * r**order * np.exp(1j * w * r), 0.0, R, epsrel=1e-13)[0])
+
+
+@pytest.mark.parametrize("ramp", [0, 1])
+def test_the_series_of_the_position_noise_are_their_integrals(ramp: int) -> None:
+    w = 0.47
+    square = w * w
+    for order in (0, 1, 4):
+        even, odd = arc._kernel(order, ramp)
+        found = complex(np.polyval(even[::-1], square), w * np.polyval(odd[::-1], square))
+        assert found == pytest.approx(kernel(order, ramp, w, 1.0), rel=1e-13)
+    for first, second in ((0, 0), (0, 1), (1, 1)):
+
+        def products(R: float, first: int = first, second: int = second) -> FloatArray:
+            a, b = kernel(first, ramp, w, R), kernel(second, ramp, w, R)
+            mixed = a.real * b.imag + a.imag * b.real
+            return np.array([a.real * b.real, -mixed / (2.0 * w), a.imag * b.imag / square])
+
+        expected = quad_vec(products, 0.0, 1.0, epsrel=1e-12)[0]
+        series = arc._product(first, second, ramp)
+        assert_allclose([np.polyval(part[::-1], square) for part in series], expected, rtol=1e-12)
+        assert all(len(part) == 9 for part in series)

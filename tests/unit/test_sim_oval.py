@@ -10,30 +10,41 @@ from fgtrack.models.path import Path as DrivenPath
 from fgtrack.models.track_map import COLUMNS, TrackMap
 
 MAPS = Path(__file__).resolve().parents[2] / "configs/maps"
-OVAL, PIT_LANE = make_oval(), make_pit_lane()
 COLUMN = {name: index for index, name in enumerate(COLUMNS)}
 
 
-@pytest.mark.parametrize(("name", "track"), [("oval_track", OVAL), ("oval_pitlane", PIT_LANE)])
-def test_the_committed_maps_are_what_the_functions_make(name: str, track: TrackMap) -> None:
+@pytest.fixture(scope="module")
+def oval() -> TrackMap:
+    return make_oval()
+
+
+@pytest.fixture(scope="module")
+def pit_lane() -> TrackMap:
+    return make_pit_lane()
+
+
+@pytest.mark.parametrize(("name", "lane"), [("oval_track", "oval"), ("oval_pitlane", "pit_lane")])
+def test_the_committed_maps_are_what_the_functions_make(request: pytest.FixtureRequest, name: str, lane: str) -> None:
+    track: TrackMap = request.getfixturevalue(lane)
     np.testing.assert_allclose(TrackMap.read(MAPS / f"{name}.csv").table, track.table, atol=1e-7)
 
 
-def test_the_oval_has_the_proportions_of_a_speedway() -> None:
-    curvature = OVAL.table[:, COLUMN["kappa_ref_radpm"]]
-    banking = np.degrees(-OVAL.table[:, COLUMN["banking_rad"]])
-    assert OVAL.length_m == pytest.approx(2400.0, abs=0.01)
-    assert OVAL.counter_clockwise
+def test_the_oval_has_the_proportions_of_a_speedway(oval: TrackMap) -> None:
+    curvature = oval.table[:, COLUMN["kappa_ref_radpm"]]
+    banking = np.degrees(-oval.table[:, COLUMN["banking_rad"]])
+    assert oval.length_m == pytest.approx(2400.0, abs=0.01)
+    assert oval.counter_clockwise
     assert 1.0 / curvature.max() == pytest.approx(220.0, abs=0.1)
     assert curvature.min() > -1e-6
     assert np.count_nonzero(curvature < 1e-6) * 2.0 > 500.0  # metres of straight
     assert (banking.min(), banking.max()) == pytest.approx((9.0, 20.0), abs=0.1)
-    left, right = OVAL.bounds(np.linspace(0.0, 2400.0, 100))
+    left, right = oval.bounds(np.linspace(0.0, 2400.0, 100))
     np.testing.assert_allclose(left + right, 15.0)
 
 
-@pytest.mark.parametrize("track", [OVAL, PIT_LANE])
-def test_the_columns_of_a_made_map_agree_with_each_other(track: TrackMap) -> None:
+@pytest.mark.parametrize("lane", ["oval", "pit_lane"])
+def test_the_columns_of_a_made_map_agree_with_each_other(request: pytest.FixtureRequest, lane: str) -> None:
+    track: TrackMap = request.getfixturevalue(lane)
     table = track.table
     s, heading, curvature = (table[:, COLUMN[n]] for n in ("s_ref_m", "psi_ref_rad", "kappa_ref_radpm"))
     chord = np.arctan2(*np.diff(table[:, :2], axis=0).T[::-1])
@@ -47,27 +58,26 @@ def test_the_columns_of_a_made_map_agree_with_each_other(track: TrackMap) -> Non
     np.testing.assert_allclose(table[0, :2], table[-1, :2], atol=1e-9)
 
 
-def test_the_curvature_of_the_oval_has_no_jump() -> None:
-    curvature = OVAL.table[:, COLUMN["kappa_ref_radpm"]]
+def test_the_curvature_of_the_oval_has_no_jump(oval: TrackMap) -> None:
+    curvature = oval.table[:, COLUMN["kappa_ref_radpm"]]
     assert np.abs(np.diff(curvature)).max() < 2.0 * 7e-5  # rows are 2 m apart
     assert curvature[0] == pytest.approx(curvature[-1], abs=1e-9)
 
 
-def test_the_pit_road_lies_left_of_the_front_straight_and_beside_the_track() -> None:
+def test_the_pit_road_lies_left_of_the_front_straight_and_beside_the_track(oval: TrackMap, pit_lane: TrackMap) -> None:
     s = np.linspace(-200.0, 200.0, 101)
-    points = OVAL.position(s, np.full(101, 24.0))
-    assert not PIT_LANE.outside(points, 0.0, 0.0).any()
-    assert OVAL.outside(points, 0.0, 0.0).all()
+    points = oval.position(s, np.full(101, 24.0))
+    assert not pit_lane.outside(points, 0.0, 0.0).any()
+    assert oval.outside(points, 0.0, 0.0).all()
 
 
 ANGLES = np.array([0.0, 0.4, 1.0, 1.3, 2.2, 3.0, 3.3, 4.4, 5.0, 5.8])
 COARSE = np.stack([300.0 * np.cos(ANGLES), 200.0 * np.sin(ANGLES)], axis=1)
 
 
-@pytest.mark.parametrize(
-    "path", [DrivenPath.along(OVAL), DrivenPath.through(np.vstack([COARSE, COARSE[:1]]))], ids=["fine", "coarse"]
-)
-def test_a_path_frame_holds_the_exact_derivatives(path: DrivenPath) -> None:
+@pytest.mark.parametrize("fine", [True, False])
+def test_a_path_frame_holds_the_exact_derivatives(oval: TrackMap, fine: bool) -> None:
+    path = DrivenPath.along(oval) if fine else DrivenPath.through(np.vstack([COARSE, COARSE[:1]]))
     u, h = np.linspace(-50.0, 2500.0, 997), 1e-4
     frame, ahead, behind = path.frame(u), path.frame(u + h), path.frame(u - h)
 

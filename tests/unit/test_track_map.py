@@ -210,6 +210,18 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     np.testing.assert_allclose(TrackMap.read(tmp_path / "map.csv").table, OVAL.table, atol=1e-9)
 
 
+def test_a_written_map_names_its_columns_and_has_nine_decimals(tmp_path: Path) -> None:
+    table = circle_table(num=4)
+    table[1, COLUMNS.index("alpha_m")] = -1e-10
+    TrackMap(table).write(tmp_path / "map.csv")
+    first, *rows = (tmp_path / "map.csv").read_text().splitlines()
+    assert first == "# " + "; ".join(COLUMNS)
+    cells = [cell for row in rows for cell in row.split("; ")]
+    assert len(cells) == 5 * len(COLUMNS)
+    assert all(cell == f"{float(cell):.9f}" for cell in cells)
+    assert "-0.000000000" not in cells
+
+
 def test_comments_blanks_and_whole_numbers_are_read(tmp_path: Path) -> None:
     table = circle_table()
     lines = [line.replace(";", " ; ") if index % 2 else line for index, line in enumerate(lines_of(table))]
