@@ -1,6 +1,5 @@
 """`fgtrack simulate`: a scenario to a stream or a bag."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +8,6 @@ import typer
 
 from fgtrack.cli.arguments import Overwrite, StorageOption
 from fgtrack.cli.show import console, progress
-from fgtrack.core.errors import CallError
 from fgtrack.io.recording import check_recording, write_recording
 from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.sim.simulate import simulate as simulated
@@ -30,12 +28,7 @@ def simulate(
 ) -> None:
     """Simulate a scenario into a stream or a rosbag2 folder."""
     check_recording(out, overwrite)
-    scenario = read_scenario(scenario_file)
-    if duration_s is not None:
-        try:
-            scenario = replace(scenario, duration_s=duration_s)
-        except ValueError as error:
-            raise CallError(f"--duration: {error}") from error
+    scenario = read_scenario(scenario_file, duration_s=duration_s)
     with progress("simulate"):
         count = write_recording(out, simulated(scenario, np.random.default_rng(seed)), storage, overwrite=overwrite)
     console().print(f"{out}: {count} messages", highlight=False, soft_wrap=True)

@@ -1,7 +1,6 @@
 """YAML files to validated dataclasses and back; every error names the file and the key."""
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
@@ -9,7 +8,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
@@ -101,19 +100,18 @@ def validate(kind: type[T], raw: Mapping[str, Any], origin: str) -> T:
     except (TypeError, ValueError) as error:
         raise CallError(f"{origin}: only plain YAML values and text keys are allowed ({error})") from error
     try:
-        value: T = _adapter(kind).validate_json(text, strict=True)  # type: ignore[arg-type]  # a class is hashable
+        # What is unknown is found below, which says what is known.
+        value: T = _adapter(kind).validate_json(text, strict=True, extra="ignore")  # type: ignore[arg-type]  # a class is hashable
     except ValidationError as error:
         raise CallError(f"{origin}: {_first(error)}") from error
     for where, name, known in _unknown(raw, value, ""):
         raise CallError(f"{origin}: {where}{name}: unknown key, known here: {', '.join(known)}")
-    for where in _not_finite(raw, ""):
-        raise CallError(f"{origin}: {where}: must be a finite number")
     return value
 
 
 @lru_cache
 def _adapter(kind: Any) -> TypeAdapter[Any]:  # Any: one for each dataclass, which takes pydantic a while to make
-    return TypeAdapter(kind)
+    return TypeAdapter(kind | None, config=ConfigDict(allow_inf_nan=False))  # a class by itself takes no `config`
 
 
 def _first(error: ValidationError) -> str:
@@ -150,13 +148,6 @@ def _unknown(raw: object, value: object, where: str) -> list[tuple[str, str, lis
         for index, (item, inner) in enumerate(zip(raw, value, strict=False)):
             found += _unknown(item, inner, f"{where}{index}.")
     return found
-
-
-def _not_finite(raw: object, where: str) -> list[str]:
-    if isinstance(raw, float) and not math.isfinite(raw):
-        return [where.removesuffix(".")]
-    inner = raw.items() if isinstance(raw, Mapping) else enumerate(raw) if isinstance(raw, list) else ()
-    return [found for name, item in inner for found in _not_finite(item, f"{where}{name}.")]
 
 
 def plain(value: object) -> Any:  # Any: JSON values, as `validate` takes them

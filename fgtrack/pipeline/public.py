@@ -2,13 +2,11 @@
 
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace as changed
 from pathlib import Path
 from typing import overload
 
 import numpy as np
 
-from fgtrack.core.errors import CallError
 from fgtrack.core.types import Message
 from fgtrack.io.recording import Storage, check_recording, write_recording
 from fgtrack.io.run import Run, load_run
@@ -129,13 +127,7 @@ def simulate(
     """
     if out is not None:
         check_recording(Path(out), overwrite)
-    world = scenario if isinstance(scenario, Scenario) else read_scenario(scenario)
-    if duration_s is not None:
-        try:
-            world = changed(world, duration_s=duration_s)
-        except ValueError as error:
-            raise CallError(f"duration_s: {error}") from error
-    messages = simulated(world, np.random.default_rng(seed))
+    messages = simulated(read_scenario(scenario, duration_s=duration_s), np.random.default_rng(seed))
     if out is None:
         return iter(messages)
     write_recording(Path(out), messages, storage, overwrite=overwrite)

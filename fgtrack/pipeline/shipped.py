@@ -9,7 +9,7 @@ from typing import Literal
 
 from fgtrack.core.errors import CallError
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import load, plain, with_settings
+from fgtrack.pipeline.load import load, plain, read_yaml, validate, with_settings
 from fgtrack.sim.scenario import Scenario
 
 Kind = Literal["configuration", "scenario", "sweep"]
@@ -86,6 +86,11 @@ def settings_of(values: Mapping[str, object] | None) -> list[str]:
     return [f"{key}={json.dumps(value)}" for key, value in (values or {}).items()]
 
 
-def read_scenario(name: str | Path, folder: Path | None = None) -> Scenario:
-    """The scenario of a file in `folder` or of that shipped name; raises as `read_config`."""
-    return load(Scenario, find_file("scenario", name, folder))
+def read_scenario(name: str | Path | Scenario, folder: Path | None = None, duration_s: float | None = None) -> Scenario:
+    """The scenario of a file in `folder` or of that shipped name, as long as `duration_s`; raises as `read_config`."""
+    if isinstance(name, Scenario):
+        raw, origin = plain(name), "the given scenario"
+    else:
+        path = find_file("scenario", name, folder)
+        raw, origin = read_yaml(path), str(path)
+    return validate(Scenario, raw if duration_s is None else {**raw, "duration_s": duration_s}, origin)

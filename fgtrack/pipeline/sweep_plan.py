@@ -124,9 +124,7 @@ def _base(sweep: SweepConfig, path: Path) -> dict[str, Value]:
     delays = {} if sweep.delays is None else read_yaml(folder / sweep.delays)
     base = {_CONFIG: plain(config), DELAYS: delays}
     if sweep.scenario is not None:
-        base[SCENARIO] = plain(read_scenario(sweep.scenario, folder))
-        if sweep.duration_s is not None:
-            base[SCENARIO]["duration_s"] = sweep.duration_s
+        base[SCENARIO] = plain(read_scenario(sweep.scenario, folder, sweep.duration_s))
     return base
 
 

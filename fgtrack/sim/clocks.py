@@ -5,17 +5,16 @@ sensor at once, in the order in which it sensed, and is an immutable value.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, Literal, Protocol
 
 import numpy as np
-from pydantic import Discriminator
+from pydantic import Discriminator, Field
 
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.sim.require import require
+from fgtrack.sim.settings import settings
 
-_LARGEST_ERROR_S = 86_400.0
+_LARGEST_ERROR_S = 86_400.0  # a day
 
 
 class ClockModel(Protocol):
@@ -25,32 +24,26 @@ class ClockModel(Protocol):
         """Stamps reported for `stamps_ns` of messages received at `receipts_ns`; all shapes (n,)."""
 
 
-@dataclass(frozen=True)
+@settings
 class OffsetClock:
     """Every stamp is off by the same duration: a clock that was never set, a latency that was left out."""
 
-    offset_s: float
+    offset_s: Annotated[float, Field(ge=-_LARGEST_ERROR_S, le=_LARGEST_ERROR_S)]
     """Positive: stamps are later than the world was sensed."""
     kind: Literal["offset"] = "offset"
-
-    def __post_init__(self) -> None:
-        require(abs(self.offset_s) <= _LARGEST_ERROR_S, "offset_s", "must be at most a day", self.offset_s)
 
     def read(self, rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray) -> IntArray:
         """See `ClockModel`."""
         return stamps_ns + nanoseconds(self.offset_s)
 
 
-@dataclass(frozen=True)
+@settings
 class DriftClock:
     """A clock that is right at the first message and runs too fast (or, below 0, too slow)."""
 
-    drift_ppm: float
+    drift_ppm: Annotated[float, Field(ge=-1e6, le=1e6)]
     """Microseconds gained per second; a quartz has some tens."""
     kind: Literal["drift"] = "drift"
-
-    def __post_init__(self) -> None:
-        require(abs(self.drift_ppm) <= 1e6, "drift_ppm", "must be at most a million", self.drift_ppm)
 
     def read(self, rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray) -> IntArray:
         """See `ClockModel`."""
@@ -58,37 +51,31 @@ class DriftClock:
         return stamps_ns + _whole(elapsed_ns * (self.drift_ppm * 1e-6))
 
 
-@dataclass(frozen=True)
+@settings
 class JitterClock:
     """Every stamp is off by a normal error of its own."""
 
-    std_s: float
+    std_s: Annotated[float, Field(ge=0.0, le=_LARGEST_ERROR_S)]
     kind: Literal["jitter"] = "jitter"
-
-    def __post_init__(self) -> None:
-        require(0.0 <= self.std_s <= _LARGEST_ERROR_S, "std_s", "must lie between 0 and a day", self.std_s)
 
     def read(self, rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray) -> IntArray:
         """See `ClockModel`."""
         return stamps_ns + _whole(rng.standard_normal(len(stamps_ns)) * (self.std_s * NS_PER_S))
 
 
-@dataclass(frozen=True)
+@settings
 class QuantisedClock:
     """A clock that moves in steps: a stamp is the last multiple of the step, up to a step too early."""
 
-    step_s: float
+    step_s: Annotated[float, Field(ge=1e-9, le=_LARGEST_ERROR_S)]
     kind: Literal["quantised"] = "quantised"
-
-    def __post_init__(self) -> None:
-        require(1e-9 <= self.step_s <= _LARGEST_ERROR_S, "step_s", "must lie between 1 ns and a day", self.step_s)
 
     def read(self, rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray) -> IntArray:
         """See `ClockModel`."""
         return stamps_ns - stamps_ns % nanoseconds(self.step_s)
 
 
-@dataclass(frozen=True)
+@settings
 class ArrivalClock:
     """The sensor gives no stamp: its receipt is used instead. An offset after it is a guess of the delay."""
 

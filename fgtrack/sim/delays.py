@@ -5,16 +5,16 @@ may have a memory (bursts) and still be an immutable value.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 from typing import Annotated, Literal, Protocol
 
 import numpy as np
-from pydantic import Discriminator
+from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat
 from scipy import optimize, special
 
 from fgtrack.core.types import BoolArray, FloatArray
-from fgtrack.sim.require import require
+from fgtrack.sim.settings import Probability, require, settings
 
 
 class DelayModel(Protocol):
@@ -24,7 +24,7 @@ class DelayModel(Protocol):
         """Delays in seconds of the messages stamped `stamps_s` (ascending), shape (n,); NaN is a lost one."""
 
 
-@dataclass(frozen=True)
+@settings
 class NoDelay:
     """Everything arrives at once."""
 
@@ -35,31 +35,27 @@ class NoDelay:
         return np.zeros(len(stamps_s))
 
 
-@dataclass(frozen=True)
+@settings
 class ConstantDelay:
     """Everything arrives equally late."""
 
-    delay_s: float
+    delay_s: NonNegativeFloat
     kind: Literal["constant"] = "constant"
-
-    def __post_init__(self) -> None:
-        require(self.delay_s >= 0.0, "delay_s", "must not be negative", self.delay_s)
 
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
         """See `DelayModel`."""
         return np.full(len(stamps_s), self.delay_s)
 
 
-@dataclass(frozen=True)
+@settings
 class UniformDelay:
     """Uniform between two delays."""
 
-    min_s: float
+    min_s: NonNegativeFloat
     max_s: float
     kind: Literal["uniform"] = "uniform"
 
     def __post_init__(self) -> None:
-        require(self.min_s >= 0.0, "min_s", "must not be negative", self.min_s)
         require(self.max_s >= self.min_s, "max_s", "must not be below min_s", self.max_s)
 
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
@@ -67,17 +63,13 @@ class UniformDelay:
         return rng.uniform(self.min_s, self.max_s, len(stamps_s))
 
 
-@dataclass(frozen=True)
+@settings
 class NormalDelay:
     """Normal, given that it is not negative; so its mean lies above `mean_s`."""
 
-    mean_s: float
-    std_s: float
+    mean_s: NonNegativeFloat
+    std_s: PositiveFloat
     kind: Literal["normal"] = "normal"
-
-    def __post_init__(self) -> None:
-        require(self.mean_s >= 0.0, "mean_s", "must not be negative", self.mean_s)
-        require(self.std_s > 0.0, "std_s", "must be positive", self.std_s)
 
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
         """See `DelayModel`. Inverts the distribution function."""
@@ -86,7 +78,7 @@ class NormalDelay:
         return np.maximum(self.mean_s - self.std_s * special.ndtri(tail), 0.0)
 
 
-@dataclass(frozen=True)
+@settings
 class GammaDelay:
     """`min_s` plus a gamma variable, with the mean and the 90 % quantile that were measured.
 
@@ -94,13 +86,12 @@ class GammaDelay:
     k = 1/2 to 1; a shape below 1/2 is not offered.
     """
 
-    min_s: float
+    min_s: NonNegativeFloat
     mean_s: float
     q90_s: float
     kind: Literal["gamma"] = "gamma"
 
     def __post_init__(self) -> None:
-        require(self.min_s >= 0.0, "min_s", "must not be negative", self.min_s)
         require(self.mean_s > self.min_s, "mean_s", "must be above min_s", self.mean_s)
         low, high = (_relative_q90(math.log(k)) for k in (_MAX_SHAPE, _MIN_SHAPE))
         ratio = (self.q90_s - self.min_s) / (self.mean_s - self.min_s)
@@ -130,7 +121,7 @@ class GammaDelay:
         return self.min_s + rng.gamma(self.shape, self.scale_s, len(stamps_s))
 
 
-@dataclass(frozen=True)
+@settings
 class BurstDelay:
     """Another model, and bursts in which everything takes longer.
 
@@ -138,16 +129,11 @@ class BurstDelay:
     after it are `extra_s` later, itself included.
     """
 
-    probability: float
-    duration_s: float
-    extra_s: float
+    probability: Probability
+    duration_s: PositiveFloat
+    extra_s: NonNegativeFloat
     base: "AnyDelay" = field(default_factory=NoDelay)
     kind: Literal["burst"] = "burst"
-
-    def __post_init__(self) -> None:
-        require(0.0 <= self.probability <= 1.0, "probability", "must lie in [0, 1]", self.probability)
-        require(self.duration_s > 0.0, "duration_s", "must be positive", self.duration_s)
-        require(self.extra_s >= 0.0, "extra_s", "must not be negative", self.extra_s)
 
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
         """See `DelayModel`."""
@@ -162,16 +148,13 @@ class BurstDelay:
         return delays
 
 
-@dataclass(frozen=True)
+@settings
 class LossyDelay:
     """Another model, and messages that never arrive, each with `probability`."""
 
-    probability: float
+    probability: Probability
     base: "AnyDelay" = field(default_factory=NoDelay)
     kind: Literal["loss"] = "loss"
-
-    def __post_init__(self) -> None:
-        require(0.0 <= self.probability <= 1.0, "probability", "must lie in [0, 1]", self.probability)
 
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
         """See `DelayModel`."""
@@ -180,7 +163,7 @@ class LossyDelay:
         return delays
 
 
-@dataclass(frozen=True)
+@settings
 class MarkovDelay:
     """A chain of two states, good and bad, each with a model of its own, that moves from message to message.
 
@@ -192,13 +175,9 @@ class MarkovDelay:
 
     good: "AnyDelay"
     bad: "AnyDelay"
-    to_bad: float
-    to_good: float
+    to_bad: Probability
+    to_good: Annotated[float, Field(gt=0.0, le=1.0)]
     kind: Literal["markov"] = "markov"
-
-    def __post_init__(self) -> None:
-        require(0.0 <= self.to_bad <= 1.0, "to_bad", "must lie in [0, 1]", self.to_bad)
-        require(0.0 < self.to_good <= 1.0, "to_good", "must lie in (0, 1]", self.to_good)
 
     @property
     def bad_share(self) -> float:
@@ -212,7 +191,7 @@ class MarkovDelay:
         return _either(rng, stamps_s, bad, self.good, self.bad)
 
 
-@dataclass(frozen=True)
+@settings
 class MarkovTimeDelay:
     """`MarkovDelay` in continuous time: the link itself is good or bad, whoever sends how often.
 
@@ -222,13 +201,9 @@ class MarkovTimeDelay:
 
     good: "AnyDelay"
     bad: "AnyDelay"
-    to_bad_per_s: float
-    to_good_per_s: float
+    to_bad_per_s: NonNegativeFloat
+    to_good_per_s: PositiveFloat
     kind: Literal["markov_time"] = "markov_time"
-
-    def __post_init__(self) -> None:
-        require(self.to_bad_per_s >= 0.0, "to_bad_per_s", "must not be negative", self.to_bad_per_s)
-        require(self.to_good_per_s > 0.0, "to_good_per_s", "must be positive", self.to_good_per_s)
 
     @property
     def bad_share(self) -> float:

@@ -14,13 +14,13 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, Detection, DetectionList, IntArray, Message
 from fgtrack.sim.clocks import AnyClock, reported_stamps
 from fgtrack.sim.delays import AnyDelay
-from fgtrack.sim.require import require
+from fgtrack.sim.settings import Probability, settings
 
 #: Stands for all sensors that are not named.
 OTHERS = "*"
 
 
-@dataclass(frozen=True)
+@settings
 class SensorDelays:
     """How the lists of one sensor arrive."""
 
@@ -28,11 +28,8 @@ class SensorDelays:
     """Delay behind the recorded stamp; null keeps the recorded receipt. Kind `none`: the stamp is the arrival."""
     clock: tuple[AnyClock, ...] = ()
     """What is wrong with the stamps that it reports; the delay is still that behind the recorded one."""
-    loss_probability: float = 0.0
+    loss_probability: Probability = 0.0
     """That a list never arrives, each by itself."""
-
-    def __post_init__(self) -> None:
-        require(0.0 <= self.loss_probability <= 1.0, "loss_probability", "must lie in [0, 1]", self.loss_probability)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,26 +2,27 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import field
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from fgtrack.core.types import MEASURABLE, BoolArray, FloatArray, Frame
 from fgtrack.models.sensors import Mount
 from fgtrack.sim.clocks import AnyClock
 from fgtrack.sim.delays import AnyDelay, NoDelay
-from fgtrack.sim.require import require
+from fgtrack.sim.settings import Probability, require, settings
 
 #: Components in the frame of the sensor, relative to it.
 POLAR = ("range_m", "bearing_rad", "range_rate_mps")
 
 
-@dataclass(frozen=True)
+@settings
 class Clutter:
     """Detections of nothing: each scan has a Poisson number of them, uniform over a region."""
 
-    mean_per_scan: float = 0.0
+    mean_per_scan: NonNegativeFloat = 0.0
     """Between the ranges and bearings of the sensor or, for `track`, on the track up to the maximum range;
     of these a sensor reports the ones that it can see."""
     region: Literal["field_of_view", "track"] = "field_of_view"
@@ -29,12 +30,11 @@ class Clutter:
     """Range of the speed that clutter seems to have, along the track or in any direction."""
 
     def __post_init__(self) -> None:
-        require(self.mean_per_scan >= 0.0, "mean_per_scan", "must not be negative", self.mean_per_scan)
         low, high = self.speed_mps
         require(low <= high, "speed_mps", "must be a range (low, high), high", high)
 
 
-@dataclass(frozen=True)
+@settings
 class SimulatedSensor:
     """One sensor on the ego vehicle.
 
@@ -42,37 +42,35 @@ class SimulatedSensor:
     Speed is over ground.
     """
 
-    name: str
-    std: Mapping[str, float]
+    name: Annotated[str, Field(min_length=1)]
+    std: Mapping[str, NonNegativeFloat]
     """Standard deviation of each measured component; x_m along, y_m across the line of sight."""
-    rate_hz: float = 20.0
-    phase_s: float = 0.0
+    rate_hz: PositiveFloat = 20.0
+    phase_s: NonNegativeFloat = 0.0
     """Time of the first scan."""
-    jitter_s: float = 0.0
+    jitter_s: NonNegativeFloat = 0.0
     """Each scan is up to this much late, uniformly."""
     delay: AnyDelay = field(default_factory=NoDelay)
     clock: tuple[AnyClock, ...] = ()
     mount: Mount = field(default_factory=Mount)
-    field_of_view_rad: float = math.tau
+    field_of_view_rad: Annotated[float, Field(gt=0.0, le=math.tau)] = math.tau
     """Full angle, centred on the axis of the sensor."""
-    min_range_m: float = 0.0
+    min_range_m: NonNegativeFloat = 0.0
     max_range_m: float = 100.0
     max_range_behind_m: float | None = None
     """Maximum range in the half behind the sensor, where it is shorter; null is `max_range_m`."""
-    detection_probability: float = 1.0
+    detection_probability: Probability = 1.0
     clutter: Clutter = field(default_factory=Clutter)
-    split_probability: float = 0.0
+    split_probability: Probability = 0.0
     """That a detected object gives two detections, one behind the other."""
-    split_distance_m: tuple[float, float] = (2.0, 4.0)
-    outlier_probability: float = 0.0
-    outlier_factor: float = 10.0
+    split_distance_m: tuple[NonNegativeFloat, NonNegativeFloat] = (2.0, 4.0)
+    outlier_probability: Probability = 0.0
+    outlier_factor: Annotated[float, Field(ge=1.0)] = 10.0
     """How many times larger the standard deviations of an outlier are."""
     drop_outs: tuple[tuple[float, float], ...] = ()
     """Intervals [start, end) in seconds in which the sensor is silent."""
 
     def __post_init__(self) -> None:
-        if not self.name:
-            raise ValueError("name: must not be empty")
         unknown = set(self.std) - set(MEASURABLE)
         if unknown or not self.std:
             raise ValueError(f"std: name components out of {', '.join(MEASURABLE)}, not {sorted(unknown)}")
@@ -80,29 +78,14 @@ class SimulatedSensor:
             raise ValueError("std: x_m and y_m are measured together")
         if "x_m" in self.std and not set(POLAR).isdisjoint(self.std):
             raise ValueError("std: measure x_m and y_m or range and bearing, not both")
-        for name, value in self.std.items():
-            require(value >= 0.0, f"std.{name}", "must not be negative", value)
-        require(self.rate_hz > 0.0, "rate_hz", "must be positive", self.rate_hz)
-        require(self.phase_s >= 0.0, "phase_s", "must not be negative", self.phase_s)
-        require(0.0 <= self.jitter_s < 1.0 / self.rate_hz, "jitter_s", "must be below a period", self.jitter_s)
-        require(
-            0.0 < self.field_of_view_rad <= math.tau,
-            "field_of_view_rad",
-            "must lie in (0, 2 pi]",
-            self.field_of_view_rad,
-        )
-        require(self.min_range_m >= 0.0, "min_range_m", "must not be negative", self.min_range_m)
+        require(self.jitter_s < 1.0 / self.rate_hz, "jitter_s", "must be below a period", self.jitter_s)
         require(self.max_range_m > self.min_range_m, "max_range_m", "must exceed min_range_m", self.max_range_m)
         if self.max_range_behind_m is not None:
             behind_m = self.max_range_behind_m
             inside = self.min_range_m < behind_m <= self.max_range_m
             require(inside, "max_range_behind_m", "must lie in (min_range_m, max_range_m]", behind_m)
-        for name in ("detection_probability", "split_probability", "outlier_probability"):
-            value = getattr(self, name)
-            require(0.0 <= value <= 1.0, name, "must lie in [0, 1]", value)
         low, high = self.split_distance_m
-        require(0.0 <= low <= high, "split_distance_m", "must be a range (low, high), high", high)
-        require(self.outlier_factor >= 1.0, "outlier_factor", "must be at least 1", self.outlier_factor)
+        require(low <= high, "split_distance_m", "must be a range (low, high), high", high)
         for start_s, end_s in self.drop_outs:
             require(start_s < end_s, "drop_outs", "must be intervals (start, end), end", end_s)
 

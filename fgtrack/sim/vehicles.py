@@ -6,14 +6,14 @@ from itertools import pairwise
 from typing import Annotated, Literal, Protocol
 
 import numpy as np
-from pydantic import Discriminator
+from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat
 from scipy.interpolate import CubicHermiteSpline
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import STATE_NAMES, YAW, FloatArray
 from fgtrack.models.motion import CTRV
 from fgtrack.models.path import Path
-from fgtrack.sim.require import require
+from fgtrack.sim.settings import require, settings
 
 
 class Trajectory(Protocol):
@@ -23,29 +23,24 @@ class Trajectory(Protocol):
         """States at `times_s`, shape (n,), from the start of the scenario: shape (n, 6), `STATE_NAMES`."""
 
 
-@dataclass(frozen=True)
+@settings
 class LaneChange:
     """A move to another lateral offset: a quintic, at rest across the track at both ends."""
 
-    start_s: float
+    start_s: NonNegativeFloat
     """Time at which it starts."""
-    duration_s: float
+    duration_s: PositiveFloat
     lateral_m: float
     """Lateral offset that it ends at, positive to the left of the reference line."""
 
-    def __post_init__(self) -> None:
-        require(self.start_s >= 0.0, "start_s", "must not be negative", self.start_s)
-        require(self.duration_s > 0.0, "duration_s", "must be positive", self.duration_s)
-        require(True, "lateral_m", "must be finite", self.lateral_m)
 
-
-@dataclass(frozen=True)
+@settings
 class TrackVehicle:
     """A vehicle that follows the track. Overtaking comes from speeds and lane changes."""
 
     arc_m: float
     """Arc length along the reference line at the start."""
-    speed: tuple[tuple[float, float], ...]
+    speed: Annotated[tuple[tuple[float, PositiveFloat], ...], Field(min_length=1)]
     """Knots (time [s], speed along the reference line [m/s]); smooth between them, constant outside."""
     lateral_m: float = 0.0
     """Lateral offset at the start, positive to the left."""
@@ -54,11 +49,6 @@ class TrackVehicle:
     kind: Literal["track"] = "track"
 
     def __post_init__(self) -> None:
-        require(True, "arc_m", "must be finite", self.arc_m)
-        require(True, "lateral_m", "must be finite", self.lateral_m)
-        require(len(self.speed) > 0, "speed", "must have at least one knot, number", len(self.speed))
-        for _, speed_mps in self.speed:
-            require(speed_mps > 0.0, "speed", "must be positive in every knot", speed_mps)
         for (before_s, _), (time_s, _) in pairwise(self.speed):
             require(time_s > before_s, "speed", "times of the knots must increase", time_s)
         for before, change in pairwise(self.lane_changes):
@@ -132,7 +122,7 @@ class TrackTrajectory:
         return d, d1, d2
 
 
-@dataclass(frozen=True)
+@settings
 class DrawnVehicle:
     """A vehicle whose motion is a draw from the CTRV model: a filter with this model is consistent."""
 
@@ -142,15 +132,10 @@ class DrawnVehicle:
     speed_mps: float
     yaw_rate_radps: float = 0.0
     motion: CTRV = field(default_factory=CTRV)
-    step_s: float = 0.01
+    step_s: PositiveFloat = 0.01
     """Time between two draws of the process noise. Within a step, the noise of one instant is a Brownian
     bridge; it is exact as long as all sensors together look at most once in a step."""
     kind: Literal["drawn"] = "drawn"
-
-    def __post_init__(self) -> None:
-        for name in STATE_NAMES[: self.motion.dim]:
-            require(True, name, "must be finite", getattr(self, name))
-        require(self.step_s > 0.0, "step_s", "must be positive", self.step_s)
 
     def trajectory(self, rng: np.random.Generator, duration_s: float) -> "DrawnTrajectory":
         """One draw of the motion of this vehicle over `duration_s`."""

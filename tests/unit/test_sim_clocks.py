@@ -107,12 +107,12 @@ def test_other_clocks_before_or_after_one_leave_its_errors() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: OffsetClock(1e6), r"offset_s: must be at most a day, is 1000000\.0"),
-        (lambda: OffsetClock(float("nan")), "offset_s"),
-        (lambda: DriftClock(2e6), "drift_ppm"),
-        (lambda: JitterClock(-0.1), "std_s"),
-        (lambda: QuantisedClock(0.0), "step_s"),
-        (lambda: QuantisedClock(1e-10), "step_s"),
+        (lambda: OffsetClock(offset_s=1e6), "offset_s"),
+        (lambda: OffsetClock(offset_s=float("nan")), "offset_s"),
+        (lambda: DriftClock(drift_ppm=2e6), "drift_ppm"),
+        (lambda: JitterClock(std_s=-0.1), "std_s"),
+        (lambda: QuantisedClock(step_s=0.0), "step_s"),
+        (lambda: QuantisedClock(step_s=1e-10), "step_s"),
     ],
 )
 def test_a_setting_that_makes_no_sense_is_named(make: object, message: str) -> None:

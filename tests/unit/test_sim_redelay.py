@@ -187,7 +187,7 @@ def test_at_the_same_receipt_what_keeps_it_comes_first_then_sensor_by_sensor() -
     assert found[-1] == replace(radar[0], receipt_ns=START_NS + 2)
 
 
-class AllAtOnce:
+class AllAtOnce(ConstantDelay):
     """Everything arrives when the last message does."""
 
     kind = "constant"
@@ -198,7 +198,7 @@ class AllAtOnce:
 
 def test_lists_of_one_sensor_at_the_same_receipt_come_in_the_order_of_their_stamps() -> None:
     lists = [DetectionList("lidar", START_NS + k * 50 * MS, START_NS + 200 * MS, ()) for k in (2, 0, 3, 1)]
-    found = redelayed(list(lists), lidar=SensorDelays(AllAtOnce()))  # type: ignore[arg-type]  # a model of our own
+    found = redelayed(list(lists), lidar=SensorDelays(AllAtOnce(0.0)))
     assert {m.receipt_ns for m in found} == {START_NS + 150 * MS}
     assert [(m.stamp_ns - START_NS) // (50 * MS) for m in found] == [0, 1, 2, 3]
 
@@ -247,5 +247,5 @@ def test_an_input_that_changes_meanwhile_is_an_error(count: int) -> None:
 def test_a_sensor_that_is_not_there_is_named() -> None:
     with pytest.raises(CallError, match="sensor 'sonar' is not in the input, whose sensors are: lidar, radar"):
         redelay(lambda: DRIVE, {"sonar": LATE}, np.random.default_rng(0))
-    with pytest.raises(ValueError, match="loss_probability: must lie in"):
+    with pytest.raises(ValueError, match="loss_probability"):
         SensorDelays(loss_probability=1.5)

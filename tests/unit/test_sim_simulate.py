@@ -71,7 +71,7 @@ def test_the_scenarios_are_the_ones_the_documents_name() -> None:
         ("sensors: [{name: a, std: {x_m: 1.0, y_m: 1.0}, colour: 3}]", "colour"),
         ("ego_messages: {delay: {kind: gamma, min_s: 0.0}}", "mean_s"),
         ("opponents: [{kind: boat}]", "boat"),
-        ("duration_s: -1.0", "duration_s: must lie in"),
+        ("duration_s: -1.0", "duration_s"),
     ],
 )
 def test_a_scenario_with_a_wrong_key_is_refused_with_its_name(text: str, key: str) -> None:
