@@ -41,7 +41,7 @@ EXPECTED: dict[str, tuple[bool, set[str], list[str]]] = {
     "errors": (
         True,
         {"position error [m]", "speed error [m/s]", "yaw error [rad]", "time [s]"},
-        ["smoother: RMSE 0.261 m", "ekf-replay: RMSE 0.523 m"],
+        ["smoother: RMSE 0.27 m", "ekf-replay: RMSE 0.54 m"],
     ),
     "lag": (
         True,
@@ -60,7 +60,7 @@ def a_run(folder: Path, *, along_m: float = 0.3, config_text: str = "") -> Run:
     """WEST and a false track all the time, ROUND at times; the smoother has lagged states."""
     tracks = [
         [WEST.track(k, 1, along_m=along_m), WEST.track(k, 3, across_m=50.0)]
-        + ([ROUND.track(k, 2)] if k < 10 or k > 50 else [])
+        + ([ROUND.track(k, 2)] if 5 <= k < 10 or k > 50 else [])
         for k in TICKS
     ]
     updates = {
@@ -135,6 +135,24 @@ def test_there_is_a_figure_of_what_runs_have_data_for(
     assert names([write_run(tmp_path / "empty", [[]])]) == []
 
 
+def test_delays_name_their_runs_where_there_are_several_recordings(
+    monkeypatch: pytest.MonkeyPatch, runs: list[Run], tmp_path: Path
+) -> None:
+    labels: list[str] = []
+    monkeypatch.setattr(plot, "delays", lambda one: labels.append(one.label))
+    other = write_run(tmp_path / "other", updates={0: [update(delay_ns=1_000_000)]})
+    for shown in (runs, [*runs, other]):
+        dict(plot.FIGURES["delays"](judged(shown)))
+    assert labels == ["", "smoother, ekf-replay", "other (smoother)"]
+
+
+@pytest.mark.usefixtures("names")
+def test_a_file_is_named_after_its_figure_and_run(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "a run", updates={0: [update(x_m=1.0, y_m=1.0)]})
+    files = plot.save_figures(run, tmp_path / "out", "svg")
+    assert [file.name for file in files] == ["residuals_a_run_smoother.svg", "delays.svg", "timing.svg"]
+
+
 @pytest.mark.parametrize("name", [name for name in plot.FIGURES if name != "map"])
 def test_without_data_there_is_one_clear_error(name: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="to draw"):
@@ -201,14 +219,14 @@ def test_the_error_figure_is_broken_where_the_object_was_not_tracked(runs: list[
     (line, *_) = plot.errors(runs, 8).axes[0].lines
     assert np.isnan(np.asarray(line.get_ydata(), dtype=float)).sum() == 1
     x = np.asarray(line.get_xdata(), dtype=float)
-    assert (np.nanmin(x), np.nanmax(x)) == pytest.approx((0.0, 59 * 0.02))
+    assert (np.nanmin(x), np.nanmax(x)) == pytest.approx((5 * 0.02, 59 * 0.02))  # from the start of the run
 
 
 def test_errors_of_several_objects_are_their_root_mean_square(runs: list[Run]) -> None:
     axes = plot.errors(runs[0]).axes[0]
     y = np.asarray(axes.lines[0].get_ydata(), dtype=float)
     assert y[[5, 30]] == pytest.approx([0.3 / np.sqrt(2.0), 0.3])  # both are tracked, WEST alone
-    assert legend(axes) == [f"smoother: RMSE {0.3 * np.sqrt(60 / 79):.3g} m"]
+    assert legend(axes) == [f"smoother: RMSE {0.3 * np.sqrt(60 / 74):.3g} m"]
     with pytest.raises(DataError, match="object 9: no run has truth of it, there are 7, 8"):
         plot.errors(runs, 9)
 
