@@ -19,7 +19,8 @@ from fgtrack.models.motion import CARTESIAN, MIN_SPEED_MPS, POLAR, MotionModel
 #: The gradient of a bearing by the position grows as 1 / range; below this range it stays as it is there.
 MIN_RANGE_M = 1e-6
 
-_ANGULAR = ("yaw_rad", "bearing_rad")
+#: Components that are angles.
+ANGULAR = ("yaw_rad", "bearing_rad")
 _NONE = np.zeros(2)
 
 
@@ -63,7 +64,7 @@ class MeasurementModel:
     @cached_property
     def angular(self) -> tuple[bool, ...]:
         """For each component, whether it is an angle."""
-        return tuple(name in _ANGULAR for name in self.components)
+        return tuple(name in ANGULAR for name in self.components)
 
     @cached_property
     def linear(self) -> bool:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -84,8 +85,16 @@ class SensorModel:
         return tuple(name for name in MEASURABLE if name in self.std)
 
     def noise(self, components: tuple[str, ...]) -> FloatArray:
-        """Diagonal covariance R of `components`, shape (k, k), in the sensor's own axes."""
-        return np.diag([self.component_std(name) ** 2 for name in components])
+        """Diagonal covariance R of `components`, shape (k, k), in the sensor's own axes; shared and read-only."""
+        if components not in self._noises:
+            R = np.diag([self.component_std(name) ** 2 for name in components])
+            R.flags.writeable = False
+            self._noises[components] = R
+        return self._noises[components]
+
+    @cached_property
+    def _noises(self) -> dict[tuple[str, ...], FloatArray]:
+        return {}
 
     def component_std(self, name: str) -> float:
         """Standard deviation of `name`; a yaw that the sensor does not measure comes from the map."""

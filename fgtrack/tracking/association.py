@@ -1,9 +1,9 @@
 """Which candidate belongs to which track (Karle et al. 2023, section III-D)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -31,17 +31,14 @@ class Assignment(NamedTuple):
     """Candidates that neither belong to a track nor may start one."""
 
 
-class Association(Protocol):
-    """Assigns candidates to tracks."""
-
-    def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
-        """Assignment of least cost; `states` are the tracks at the candidates' stamp."""
+#: Assigns candidates to tracks at least cost; the states are those of the tracks at the candidates' stamp.
+Association = Callable[[Sequence[Candidate], StatesAt], Assignment]
 
 
 def euclidean_distances(candidates: Sequence[Candidate], means: FloatArray) -> FloatArray:
     """Distances, shape (candidates, tracks), in the map; of a bearing, from the track to the line of sight."""
     points = [_NOWHERE if candidate.position_m is None else candidate.position_m for candidate in candidates]
-    offsets = np.array(points)[:, None] - means[:, :2]
+    offsets = np.array(points).reshape(-1, 1, 2) - means[:, :2]
     distances = np.sqrt(np.vecdot(offsets, offsets))
     for row, candidate in enumerate(candidates):
         if candidate.position_m is None:
@@ -79,13 +76,11 @@ class GatedEuclidean:
 
     def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
         """See `Association`."""
-        if not candidates or not states.track_ids:
-            return _unpaired(len(candidates), len(states.track_ids))
         cost = euclidean_distances(candidates, states.means)
         near = cost <= self.gate_m
         if self.max_nis is None:
             return _assigned(cost, near)
-        believed = near & (_innovations(candidates, states).nis <= self.max_nis)
+        believed = near & (_innovations(candidates, states)[0] <= self.max_nis)
         found = _assigned(cost, believed)
         refused = tuple(i for i in found.new if near[i].any())
         return found._replace(new=[i for i in found.new if not near[i].any()], refused=refused)
@@ -110,25 +105,15 @@ class GatedMahalanobis:
 
     def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
         """See `Association`; the cost adds log det S, so that a vague track does not win by being vague."""
-        if not candidates or not states.track_ids:
-            return _unpaired(len(candidates), len(states.track_ids))
-        innovations = _innovations(candidates, states)
+        nis, log_volume = _innovations(candidates, states)
         inside = euclidean_distances(candidates, states.means) <= self.max_distance_m
         for row, candidate in enumerate(candidates):
-            gate = chi_square_quantile(self.gate_probability, len(candidate.measurement.z))
-            inside[row] &= innovations.nis[row] <= gate
-        return _assigned(innovations.nis + innovations.log_volume, inside)
+            inside[row] &= nis[row] <= chi_square_quantile(self.gate_probability, len(candidate.measurement.z))
+        return _assigned(nis + log_volume, inside)
 
 
-class _Innovations(NamedTuple):
-    """Of every candidate and track, shape (candidates, tracks)."""
-
-    nis: FloatArray
-    log_volume: FloatArray
-    """log det S."""
-
-
-def _innovations(candidates: Sequence[Candidate], states: StatesAt) -> _Innovations:
+def _innovations(candidates: Sequence[Candidate], states: StatesAt) -> tuple[FloatArray, FloatArray]:
+    """NIS and log det S of every candidate and track, shape (candidates, tracks)."""
     nis, log_volume = np.empty((2, len(candidates), len(states.track_ids)))
     for row, candidate in enumerate(candidates):
         measurement = candidate.measurement
@@ -138,17 +123,13 @@ def _innovations(candidates: Sequence[Candidate], states: StatesAt) -> _Innovati
         S = H @ states.covariances @ H.mT + measurement.R
         nis[row] = mahalanobis_squared(y, S)
         log_volume[row] = np.linalg.slogdet(S)[1]
-    return _Innovations(nis, log_volume)
+    return nis, log_volume
 
 
 @cache
 def chi_square_quantile(probability: float, freedom: int) -> float:
     """Quantile of the chi-square distribution; `scipy.stats` says the same and takes a second to import."""
     return float(2.0 * gammaincinv(0.5 * freedom, probability))
-
-
-def _unpaired(candidates: int, tracks: int) -> Assignment:
-    return Assignment([], list(range(candidates)), list(range(tracks)))
 
 
 def _assigned(cost: FloatArray, inside: BoolArray) -> Assignment:

@@ -1,6 +1,6 @@
 """Detections on their way from receipt to the tick that processes them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Protocol
@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import Detection, DetectionList, Disposition, Frame, UpdateRecord
+from fgtrack.core.types import Detection, DetectionList, Disposition, FloatArray, Frame, UpdateRecord
 from fgtrack.models.sensors import SensorModel
 
 #: In any unit: beyond what is tracked, and its square is still far from the largest float.
@@ -37,10 +37,6 @@ class Batch:
     def frame(self) -> Frame:
         """Frame that the detections are given in."""
         return self.message.frame
-
-    def record(self, index: int, disposition: Disposition, track_id: int | None = None) -> UpdateRecord:
-        """Say what became of detection `index`, where nothing was fused."""
-        return record(self.message, index, disposition, track_id)
 
 
 def record(
@@ -97,6 +93,13 @@ def is_number(value: float) -> bool:
     return abs(value) <= LARGEST
 
 
+def own_covariance(detection: Detection, names: Sequence[str]) -> FloatArray:
+    """Covariance of the components `names` that `detection` carries, shape (k, k)."""
+    measured = detection.measured
+    places = [measured.index(name) for name in names]
+    return np.array(detection.covariance).reshape(len(measured), len(measured))[np.ix_(places, places)]
+
+
 def is_covariance(detection: Detection, sensor: SensorModel) -> bool:
     """Whether the covariance that `detection` carries, if it is used at all, is one: symmetric positive definite."""
     if detection.covariance is None or not sensor.message_covariance:
@@ -104,8 +107,7 @@ def is_covariance(detection: Detection, sensor: SensorModel) -> bool:
     measured = detection.measured
     if len(detection.covariance) != len(measured) ** 2:
         return False
-    used = [i for i, name in enumerate(measured) if name in sensor.std]
-    own = np.array(detection.covariance).reshape(len(measured), len(measured))[np.ix_(used, used)]
+    own = own_covariance(detection, [name for name in measured if name in sensor.std])
     variances = np.diag(own)
     if not np.all((np.abs(own) <= LARGEST**2) & (variances[:, None] > 0.0)):
         return False

@@ -17,7 +17,7 @@ from fgtrack.tracking.association import Assignment, euclidean_distances
 from fgtrack.tracking.ego import EgoPose, EgoSource, extrapolated
 from fgtrack.tracking.inbox import Batch, is_covariance, is_number, record, records
 from fgtrack.tracking.lifecycle import Lifecycle
-from fgtrack.tracking.preprocess import Candidate, Group
+from fgtrack.tracking.preprocess import Candidate, Merge
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
 
@@ -105,7 +105,7 @@ class SlotInbox:
         batch = self._slots.pop(sensor, None)
         if batch is None:
             return []
-        return [batch.record(index, Disposition.SUPERSEDED) for index in batch.indices]
+        return [record(batch.message, index, Disposition.SUPERSEDED) for index in batch.indices]
 
     def collect(self) -> list[Batch]:
         """See `Inbox.collect`; equal stamps keep the order of the sensors."""
@@ -123,25 +123,25 @@ def _float_stamp(message: DetectionList) -> int:
 
 
 @dataclass(frozen=True)
-class NeighbourhoodMerge:
+class NeighbourhoodMerge(Merge):
     """Each distinct neighbourhood becomes one object: no transitive closure, and yaw averaged as a plain number,
     across its jump (defect Q11)."""
 
     kind: Literal["neighbourhood"] = "neighbourhood"
     distance_m: float = 5.1
 
-    def groups(self, points_m: FloatArray) -> list[Group]:
+    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
         """See `Merge.groups`; the merged ones first, in the order of a set of index tuples."""
         if not len(points_m):
-            return []
+            return {}
         tree = cKDTree(points_m)
         neighbourhoods = [
             tuple(int(i) for i in tree.query_ball_point(point, self.distance_m, return_sorted=True))
             for point in points_m
         ]
         merged = {members for members in neighbourhoods if len(members) > 1}
-        groups = [Group(neighbourhoods.index(members), members) for members in merged]
-        return groups + [Group(i, members) for i, members in enumerate(neighbourhoods) if len(members) == 1]
+        groups = {neighbourhoods.index(members): members for members in merged}
+        return groups | {i: members for i, members in enumerate(neighbourhoods) if len(members) == 1}
 
     def mean(self, name: str, values: FloatArray) -> float:
         """See `Merge.mean`."""
@@ -160,9 +160,6 @@ class UngatedEuclidean:
 
     def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
         """See `Association`; torn pairs are born after the detections that had no partner."""
-        tracks = range(len(states.track_ids))
-        if not candidates or not tracks:
-            return Assignment([], list(range(len(candidates))), list(tracks))
         cost = euclidean_distances(candidates, states.means)
         rows, columns = linear_sum_assignment(cost)
         pairs = list(zip(rows.tolist(), columns.tolist(), strict=True))
@@ -171,7 +168,7 @@ class UngatedEuclidean:
         assigned = set(rows.tolist())
         seen = {j for _, j in good}
         alone = [i for i in range(len(candidates)) if i not in assigned]
-        return Assignment(good, alone + torn, [j for j in tracks if j not in seen])
+        return Assignment(good, alone + torn, [j for j in range(len(states.track_ids)) if j not in seen])
 
 
 class PublishedLifecycle(Lifecycle):

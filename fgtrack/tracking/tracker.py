@@ -129,7 +129,7 @@ class Tracker:
         sensor = parts.sensors[batch.sensor]
         ego = parts.ego.pose_at(batch.stamp_ns, parts.bank.present_ns)
         if ego is None and batch.frame != "map":
-            self._records += [batch.record(index, Disposition.FAILED) for index in batch.indices]
+            self._records += [record(batch.message, index, Disposition.FAILED) for index in batch.indices]
             return
         candidates, out_of_bounds = parts.preprocess(batch, sensor, ego)
         self._records += out_of_bounds
@@ -254,7 +254,7 @@ class Tracker:
             nis = result.nis
             innovation = MappingProxyType(dict(zip(names, result.innovation.tolist(), strict=True)))
         self._records.append(record(batch.message, candidate.index, disposition, track_id, nis, innovation))
-        self._records += [batch.record(index, Disposition.MERGED, track_id) for index in candidate.merged]
+        self._records += [record(batch.message, index, Disposition.MERGED, track_id) for index in candidate.merged]
 
     def _end(self, track_ids: Sequence[int]) -> None:
         for track_id in track_ids:

@@ -179,14 +179,13 @@ CHAIN = np.array([[0.0, 0.0], [4.0, 0.0], [8.0, 0.0], [50.0, 0.0], [50.0, 5.1]])
 
 def test_a_chain_of_neighbours_is_one_object() -> None:
     groups = ConnectedMerge().groups(CHAIN)
-    assert [(group.first, group.members) for group in groups] == [(0, (0, 1, 2)), (3, (3, 4))]
+    assert list(groups.items()) == [(0, (0, 1, 2)), (3, (3, 4))]
 
 
 def test_the_published_merge_makes_an_object_of_every_neighbourhood() -> None:
     groups = NeighbourhoodMerge().groups(np.vstack([CHAIN, [[90.0, 0.0]]]))
-    assert {group.members for group in groups[:-1]} == {(0, 1), (0, 1, 2), (1, 2), (3, 4)}
-    assert (groups[-1].first, groups[-1].members) == (5, (5,))
-    assert {group.members: group.first for group in groups[:-1]} == {(0, 1): 0, (0, 1, 2): 1, (1, 2): 2, (3, 4): 3}
+    assert groups == {0: (0, 1), 1: (0, 1, 2), 2: (1, 2), 3: (3, 4), 5: (5,)}
+    assert list(groups)[-1] == 5
 
 
 @pytest.mark.parametrize("merge", [ConnectedMerge(), NeighbourhoodMerge(), NoMerge()])
@@ -208,7 +207,7 @@ def test_connected_groups_are_those_of_a_search_by_hand(seed: int, count: int) -
             if math.dist(points[i], points[j]) <= 5.1:
                 a, b = (next(group for group in groups if k in group) for k in (i, j))
                 groups = groups - {a, b} | {a | b}
-    assert {frozenset(group.members) for group in ConnectedMerge().groups(points)} == groups
+    assert {frozenset(members) for members in ConnectedMerge().groups(points).values()} == groups
 
 
 def test_a_merged_yaw_is_the_mean_direction_and_the_published_one_is_not() -> None:
