@@ -66,7 +66,7 @@ class _Times(NamedTuple):
     """Until the end of the last step."""
     lasts_s: FloatArray
     """Duration of the step that begins there."""
-    gathered_s: FloatArray
+    noise_s: FloatArray
     """Duration of the step that ends there: its noise enters at its end."""
 
 
@@ -77,9 +77,9 @@ def _times(steps: tuple[int, ...], dt_s: float) -> _Times:
     at_s = np.minimum(np.arange(max(steps) + 1) * dt_s, end_s)
     left_s = end_s - at_s
     lasts_s = np.minimum(left_s, dt_s)
-    gathered_s = np.zeros(at_s.shape)
-    gathered_s[:, 1:] = lasts_s[:, :-1]
-    times = _Times(at_s, left_s, lasts_s, gathered_s)
+    noise_s = np.zeros(at_s.shape)
+    noise_s[:, 1:] = lasts_s[:, :-1]
+    times = _Times(at_s, left_s, lasts_s, noise_s)
     for array in times:
         array.flags.writeable = False
     return times
@@ -124,7 +124,7 @@ class EulerCtrv:
         after[:, :2] -= _QUARTER_TURN[:, 0] * start[:, 1::-1, YAW]  # turned back: the derivative of a way by yaw
         after[:, YAW], after[:, SPEED] = yaw[:, -1], speed[:, -1]
 
-        driven = Phi * (self._undirected * times.gathered_s[:, None, None])
+        driven = Phi * (self._undirected * times.noise_s[:, None, None])
         flat = (*mean.shape, -1)
         spread = start @ covariance @ start.mT + driven.reshape(flat) @ Phi.reshape(flat).mT
         if not self._isotropic:
@@ -176,6 +176,6 @@ def wrapped_yaw(mean: FloatArray) -> FloatArray:
     wrapped = wrap_angles(yaw)
     if wrapped is yaw:
         return mean
-    settled = mean.copy()
-    settled[..., YAW] = wrapped
-    return settled
+    found = mean.copy()
+    found[..., YAW] = wrapped
+    return found

@@ -21,7 +21,7 @@ _LOSSES: Mapping[str, Callable[[float], _Loss]] = {
     "cauchy": mEstimator.Cauchy.Create,
     "tukey": mEstimator.Tukey.Create,
     "geman_mcclure": mEstimator.GemanMcClure.Create,
-    "dcs": lambda width: mEstimator.DCS.Create(width * width),  # gtsam's is in squared deviations
+    "dcs": lambda width: mEstimator.DCS.Create(width * width),  # gtsam's is in squared standard deviations
 }
 
 

@@ -5,14 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.geometry import wrap_angle
-from fgtrack.core.time import nanoseconds, seconds
-from fgtrack.core.types import YAW, FloatArray, TrackState
-from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
+from fgtrack.core.time import seconds
+from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.ekf import propagated
+from fgtrack.estimation.ekf import OneCorrection, propagated
 from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.oosm.crossing import Past, fuse_across
+from fgtrack.estimation.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
 
 
@@ -26,7 +26,7 @@ class _Stack(NamedTuple):
     """Shape (N n, N n)."""
 
 
-class AccumulatedStateDensity:
+class AccumulatedStateDensity(WindowedFilter):
     """The Gaussian of all states in the window; a measurement at any of their stamps corrects them all.
 
     Koch and Govaers, On accumulated state densities with applications to out-of-sequence measurement processing, IEEE
@@ -41,7 +41,7 @@ class AccumulatedStateDensity:
     Parameters
     ----------
     motion, prior, lag_s
-        See `LateEkf`.
+        See `WindowedFilter`.
     """
 
     exact = "any lag, any number"
@@ -51,54 +51,27 @@ class AccumulatedStateDensity:
     """Splitting the state between two close neighbours off a joint covariance costs digits."""
 
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
-        self._motion = motion
-        self._yawed = "yaw_rad" in motion.state_names
-        self._lag_ns = nanoseconds(lag_s)
+        super().__init__(motion, prior, lag_s)
         self._stack = _Stack((prior.stamp_ns,), *initial_state(motion, prior))
-        self._start_ns = prior.stamp_ns
-
-    @property
-    def window_ns(self) -> tuple[int, int]:
-        """See `Estimator.window_ns`."""
-        return self._start_ns, self._newest_ns
-
-    @property
-    def _newest_ns(self) -> int:
-        return self._stack.stamps_ns[-1]
-
-    def advance(self, now_ns: int) -> None:
-        """See `Estimator.advance`: what leaves the window is marginalised."""
-        self._start_ns = max(self._start_ns, now_ns - self._lag_ns)
-        stamps_ns, mean, covariance = self._stack
-        gone = bisect.bisect_right(stamps_ns, self._start_ns) - 1
-        if gone > 0:
-            kept = slice(gone * self._motion.dim, None)
-            self._stack = _Stack(stamps_ns[gone:], mean[kept], covariance[kept, kept])
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: smoothed, from all measurements."""
         stack, block = self._with_state(stamp_ns)
-        mean = stack.mean[block].copy()
-        if self._yawed:
-            mean[YAW] = wrap_angle(mean[YAW])
-        return TrackState(stamp_ns, mean, stack.covariance[block, block].copy())
+        return TrackState(stamp_ns, self._wrapped(stack.mean[block]), stack.covariance[block, block].copy())
 
-    def update(self, measurement: Measurement) -> UpdateResult:
-        """See `Estimator.update`."""
-        if measurement.stamp_ns < self._start_ns:
-            return UpdateResult(UpdateStatus.TOO_OLD)
-        measurement = measurement.seen_by(self._motion)
-        late = measurement.stamp_ns < self._newest_ns
-        try:
-            stack, block = self._with_state(measurement.stamp_ns)
-            past = Past(stack.mean[block], stack.covariance[block, block], stack.covariance[:, block])
-            result = fuse_across(stack.mean, stack.covariance, past, measurement)
-        except np.linalg.LinAlgError:
-            return UpdateResult(UpdateStatus.FAILED)
+    def _forget_before(self, stamp_ns: int) -> None:
+        stamps_ns, mean, covariance = self._stack
+        gone = bisect.bisect_right(stamps_ns, stamp_ns) - 1
+        if gone > 0:
+            kept = slice(gone * self._motion.dim, None)
+            self._stack = _Stack(stamps_ns[gone:], mean[kept], covariance[kept, kept])
+
+    def _fuse(self, measurement: Measurement) -> OneCorrection:
+        stack, block = self._with_state(measurement.stamp_ns)
+        past = Past(stack.mean[block], stack.covariance[block, block], stack.covariance[:, block])
+        result = fuse_across(stack.mean, stack.covariance, past, measurement)
         self._stack = _Stack(stack.stamps_ns, result.mean, result.covariance)
-        self.advance(self._newest_ns)
-        status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
-        return UpdateResult(status, result.innovation, result.nis)
+        return result
 
     def _with_state(self, stamp_ns: int) -> tuple[_Stack, slice]:
         """The stack with a state at `stamp_ns`, and where it stands."""

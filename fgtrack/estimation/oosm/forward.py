@@ -97,7 +97,7 @@ class CovarianceIntersection(_ForwardEkf):
     Parameters
     ----------
     motion, prior, lag_s
-        See `LateEkf`.
+        See `WindowedFilter`.
     size
         What shall be small: `trace` or `determinant`.
     """

@@ -1,4 +1,4 @@
-"""Wait until what is late has come: the industrial answers."""
+"""Hold measurements back until the late ones have come, as in industry."""
 
 from abc import ABC, abstractmethod
 
@@ -73,7 +73,7 @@ class DelayedHorizon(HeldEkf):
     Parameters
     ----------
     motion, prior, lag_s
-        See `LateEkf`.
+        See `WindowedFilter`.
     horizon_s
         D, at most `lag_s`. Raises `CallError` otherwise.
     """
@@ -102,7 +102,7 @@ class ReorderBuffer(HeldEkf):
     Parameters
     ----------
     motion, prior, lag_s
-        See `LateEkf`.
+        See `WindowedFilter`.
     hold_s
         D, at most `lag_s`. Raises `CallError` otherwise.
     """

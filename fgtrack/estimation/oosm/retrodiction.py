@@ -1,4 +1,4 @@
-"""One-lag retrodiction: step back from the present to the late stamp with what the last step tells of the noise."""
+"""One-lag retrodiction: from the present back to the late stamp, with the process noise that the last step shows."""
 
 from typing import ClassVar
 
@@ -18,7 +18,7 @@ def retrodicted(
 ) -> Past:
     """The state `back_s` before `now`, from `now` and the state `before` the measurements that made it.
 
-    Mean (n,) and covariance (n, n) of `before` are x and P, those of `now` x_k and P_k; Q is the noise gathered since
+    Mean (n,) and covariance (n, n) of `before` are x and P, those of `now` x_k and P_k; Q is the process noise since
     tau, v its value. What was measured since enters as H' S^-1 y = P^-1 (x_k - x) and H' S^-1 H = P^-1 (P - P_k) P^-1:
 
         x_tau = F(tau, k) (x_k - Q H' S^-1 y)
@@ -54,7 +54,7 @@ class _OneLag(CrossingEkf):
 
 
 class A1(_OneLag):
-    """Algorithm A for one lag: retrodict the state with the process noise that the last innovation tells of.
+    """Algorithm A for one lag: retrodict the state with the process noise estimated from the last innovation.
 
     Bar-Shalom, Update with out-of-sequence measurements in tracking: exact solution, IEEE Transactions on Aerospace and
     Electronic Systems 38(3), 2002. The equations are those of `retrodicted`, with x and P = x_{k|k-1}, P_{k|k-1}, then

@@ -1,4 +1,4 @@
-"""Backward-forward: correct the past, predict to now."""
+"""Rewind to the late stamp, correct there, predict to now, and forget the rest."""
 
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.ekf import OneCorrection
@@ -12,7 +12,7 @@ class RewindForget(LateEkf):
     Transactions on Intelligent Vehicles, 2023, section III-G: x_1 = f(x_{tau|tau}), P_1 = F P_{tau|tau} F' + Q from tau
     to now. Here at the stamp itself; `fgtrack.estimation.backward_forward` has the paper's time grid.
 
-    Exact for: nothing. It is the answer of the time order for what it keeps, so it stays consistent, but all
+    Exact for: nothing. For what it keeps it is the filter in order of stamps, so it stays consistent, but all
     measurements between the late stamp and the present are lost.
     """
 

@@ -5,11 +5,11 @@ map twice: the object was elsewhere, and so was the ego. With T(t) = map_from_eg
 
     d/d offset of [p(stamp - offset) - T(stamp - offset) z] = -v_object + dT/dt z:
 
-what tells the offset is the velocity of the object in the (turning) ego frame, and a second sensor that saw it there.
+so an offset is observable through the velocity of the object in the (turning) ego frame and a second sensor.
 
-One sensor alone tells something too, if one believes the process noise: with wrong stamps its objects seem to move less
-smoothly. But how smoothly drivers drive is no white noise, and this pull is as strong as a weak second sensor. So it is
-left out: maximised is p(all | offsets) / product of p(one sensor | its offset), how well sensors agree with each other.
+One sensor alone carries information as well if the process noise is believed: with wrong stamps its objects seem to
+move less smoothly. Drivers are no white noise, and this bias is as strong as a weak second sensor. So it is left out:
+maximised is p(all | offsets) / product of p(one sensor | its offset), the agreement between sensors.
 """
 
 import bisect
@@ -37,7 +37,7 @@ from fgtrack.estimation.factor_graph.initiation import along, fix_of, straight_l
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.sensors import RobustLoss
 
-#: Nothing is known of an object before its first detection; deviations of its first state.
+#: Standard deviations of the first state of an object of which nothing is known.
 _WIDE = {
     "x_m": 1e3,
     "y_m": 1e3,

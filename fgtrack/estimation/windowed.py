@@ -1,0 +1,76 @@
+"""What the filters of one object share: a window behind the newest stamp, and the outcome of a measurement."""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.time import nanoseconds
+from fgtrack.core.types import YAW, FloatArray
+from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
+from fgtrack.estimation.ekf import OneCorrection
+from fgtrack.models.motion import MotionModel
+
+
+class WindowedFilter(ABC):
+    """An `Estimator` that refuses what is older than its window and fuses the rest by `_fuse`.
+
+    Parameters
+    ----------
+    motion
+        Motion model; its process noise composes, so a late measurement may split a stretch of time.
+    prior
+        First state; nothing older than it can be fused.
+    lag_s
+        Length of the window behind the newest stamp or the clock.
+    """
+
+    def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
+        self._motion = motion
+        self._yawed = "yaw_rad" in motion.state_names
+        self._lag_ns = nanoseconds(lag_s)
+        self._start_ns = self._newest_ns = prior.stamp_ns
+
+    @property
+    def window_ns(self) -> tuple[int, int]:
+        """See `Estimator.window_ns`."""
+        return self._start_ns, self._newest_ns
+
+    def advance(self, now_ns: int) -> None:
+        """See `Estimator.advance`."""
+        self._start_ns = max(self._start_ns, now_ns - self._lag_ns)
+        self._forget_before(self._start_ns)
+
+    def update(self, measurement: Measurement) -> UpdateResult:
+        """See `Estimator.update`."""
+        if measurement.stamp_ns < self._start_ns:
+            return UpdateResult(UpdateStatus.TOO_OLD)
+        late = measurement.stamp_ns < self._newest_ns
+        try:
+            result = self._fuse(measurement.seen_by(self._motion))
+        except np.linalg.LinAlgError:
+            return UpdateResult(UpdateStatus.FAILED)
+        if result is None:
+            return UpdateResult(UpdateStatus.TOO_OLD)
+        self._newest_ns = max(self._newest_ns, measurement.stamp_ns)
+        self.advance(self._newest_ns)
+        status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
+        return UpdateResult(status, result.innovation, result.nis)
+
+    @abstractmethod
+    def _fuse(self, measurement: Measurement) -> OneCorrection | None:
+        """Fuse a measurement of the window; None where the method ignores it.
+
+        Raises `numpy.linalg.LinAlgError`, with all as it was, for one that cannot be fused.
+        """
+
+    @abstractmethod
+    def _forget_before(self, stamp_ns: int) -> None:
+        """Drop what is not needed for stamps from `stamp_ns` on."""
+
+    def _wrapped(self, mean: FloatArray) -> FloatArray:
+        """A copy of `mean` (n,) with the yaw in (-pi, pi]."""
+        mean = mean.copy()
+        if self._yawed:
+            mean[YAW] = wrap_angle(mean[YAW])
+        return mean
