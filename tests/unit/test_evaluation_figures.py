@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.evaluation import plot
-from fgtrack.evaluation.figures.style import FORMATS, broken_line
+from fgtrack.evaluation.figures.style import FORMATS, WRONG, broken_line
 from fgtrack.evaluation.runs import judged
 from fgtrack.io.run import Run
 from fgtrack.models.track_map import COLUMNS, TrackMap
@@ -178,6 +178,8 @@ def test_the_map_shows_the_bounds_of_the_track(tmp_path: Path) -> None:
     (axes,) = plot.map(run).axes
     radii = [float(np.hypot(*np.asarray(line.get_data())).mean()) for line in axes.lines[:2]]
     assert radii == pytest.approx([292.5, 307.5], abs=0.5)
+    west, west_track, *_, wrong = [line.get_color() for line in axes.lines[2:]]
+    assert west == west_track != wrong == WRONG
 
 
 def test_a_map_that_is_gone_is_said_and_one_that_is_none_is_refused(tmp_path: Path, runs: list[Run]) -> None:
@@ -212,6 +214,7 @@ def test_outliers_do_not_widen_the_residual_figure_but_are_counted(tmp_path: Pat
     updates = {k: [update(tick=k, speed_mps=value)] for k, value in enumerate(values)}
     axes = plot.residuals(write_run(tmp_path / "run", updates=updates)).axes[0]
     assert axes.get_ylim()[1] < 5.0
+    assert np.asarray(axes.lines[0].get_xdata())[[0, -1]].tolist() == [0.0, 59 * 0.02]
     assert legend(axes)[0].endswith("n 60 (1 outside)")
 
 
@@ -241,6 +244,7 @@ def test_the_time_figure_leaves_out_ticks_without_detections(tmp_path: Path) -> 
     run = write_run(tmp_path / "run", process_ns=[1_000_000, 2_000_000, 4_000_000], num_detections=[0, 1, 1])
     (over_time, _) = plot.timing(run).axes
     assert np.asarray(over_time.lines[0].get_ydata()).tolist() == [2.0, 4.0]
+    assert np.asarray(over_time.lines[0].get_xdata()).tolist() == [0.02, 0.04]
 
 
 def test_a_line_is_not_drawn_across_a_pause() -> None:
