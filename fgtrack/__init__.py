@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from fgtrack.core.types import Disposition as Disposition
     from fgtrack.core.types import EgoState as EgoState
     from fgtrack.core.types import Message as Message
+    from fgtrack.core.types import SmoothedReport as SmoothedReport
     from fgtrack.core.types import TickReport as TickReport
     from fgtrack.core.types import TrackReport as TrackReport
     from fgtrack.core.types import TrackState as TrackState
@@ -28,12 +29,16 @@ if TYPE_CHECKING:
     from fgtrack.estimation.base import Estimator as Estimator
     from fgtrack.estimation.base import Measurement as Measurement
     from fgtrack.estimation.base import Start as Start
+    from fgtrack.estimation.base import StatesAt as StatesAt
+    from fgtrack.estimation.base import TrackBank as TrackBank
     from fgtrack.estimation.base import UpdateResult as UpdateResult
     from fgtrack.estimation.base import UpdateStatus as UpdateStatus
+    from fgtrack.estimation.birth import initial_state as initial_state
     from fgtrack.estimation.registry import estimator as estimator
     from fgtrack.evaluation import plot as plot
     from fgtrack.evaluation.comparison import compare as compare
     from fgtrack.evaluation.tables import Tables as Tables
+    from fgtrack.io.adapters.common import ObjectList as ObjectList
     from fgtrack.io.run import Run as Run
     from fgtrack.io.run import load_run as load_run
     from fgtrack.models.measurement import MeasurementModel as MeasurementModel

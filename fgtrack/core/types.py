@@ -4,8 +4,9 @@ Every message carries two times: `stamp_ns` (the world was sensed) and `receipt_
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
+from itertools import takewhile
 from types import MappingProxyType
 from typing import Literal
 
@@ -17,17 +18,6 @@ IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
 Frame = Literal["map", "ego", "sensor"]
-
-#: What a detection may measure, in the order of its covariance and of the residual columns of updates.csv.
-MEASURABLE = (
-    "x_m",
-    "y_m",
-    "yaw_rad",
-    "speed_mps",
-    "range_m",
-    "bearing_rad",
-    "range_rate_mps",
-)
 
 #: State columns of tracks.csv; a motion model's state is a leading part of them.
 STATE_NAMES = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2")
@@ -71,6 +61,11 @@ class Detection:
     def measured(self) -> tuple[str, ...]:
         """Names of the measured components, in the order of `MEASURABLE`."""
         return tuple(name for name in MEASURABLE if getattr(self, name) is not None)
+
+
+#: What a detection may measure, in the order of its covariance and of the residual columns: the fields of
+#: `Detection` before its covariance.
+MEASURABLE = tuple(takewhile(lambda name: name != "covariance", (each.name for each in fields(Detection))))
 
 
 @dataclass(frozen=True, slots=True)

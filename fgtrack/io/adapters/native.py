@@ -1,6 +1,7 @@
 """fgtrack's own messages in a recording: every field of the core types, to the bit."""
 
 from collections.abc import Callable
+from dataclasses import fields
 
 from fgtrack.core.types import (
     MEASURABLE,
@@ -25,8 +26,11 @@ def presence(value: Detection | TruthState, names: tuple[str, ...]) -> int:
     return sum(1 << bit for bit, name in enumerate(names) if getattr(value, name) is not None)
 
 
-def _given(message: RosMessage, names: tuple[str, ...]) -> dict[str, RosMessage]:
-    return {name: getattr(message, name) for bit, name in enumerate(names) if message.present >> bit & 1}
+def _given(message: RosMessage) -> dict[str, RosMessage]:
+    """The fields behind `present` that were given; their order is that of the recording, whatever wrote it."""
+    names = [field.name for field in fields(message)]
+    optional = names[names.index("present") + 1 :]
+    return {name: getattr(message, name) for bit, name in enumerate(optional) if message.present >> bit & 1}
 
 
 def ego(message: RosMessage, receipt_ns: int) -> EgoState:
@@ -43,7 +47,7 @@ def detections(message: RosMessage, receipt_ns: int) -> DetectionList:
     """The object list of a `fgtrack_msgs/DetectionList`."""
     objects = []
     for item in message.objects:
-        given = _given(item, DETECTION_OPTIONAL)
+        given = _given(item)
         if "covariance" in given:
             given["covariance"] = tuple(given["covariance"].tolist())
         objects.append(Detection(**given))
@@ -59,7 +63,7 @@ def truth(message: RosMessage, receipt_ns: int) -> TruthState:
         message.object_id,
         message.x_m,
         message.y_m,
-        **_given(message, TRUTH_OPTIONAL),
+        **_given(message),
     )
 
 

@@ -3,6 +3,8 @@
 Definitions embedded in a recording and those of the user take precedence.
 """
 
+from fgtrack.core.types import MEASURABLE
+
 # Versions of the layouts below: vision_msgs 4, radar_msgs 0.2, tier4's autoware_auto_msgs, autoware_msgs 1.
 _AUTOWARE_CLASSIFICATION = "uint8 label\nfloat32 probability\n"
 _AUTOWARE_SHAPE = "uint8 type\ngeometry_msgs/Polygon footprint\ngeometry_msgs/Vector3 dimensions\n"
@@ -31,6 +33,7 @@ _AUTOWARE = {
     "DetectedObjects": "std_msgs/Header header\nDetectedObject[] objects\n",
 }
 
+_COMPONENTS = "\n".join(f"float64 {name}" for name in MEASURABLE)
 FGTRACK_DEFINITIONS = {
     "fgtrack_msgs/msg/Ego": """\
 std_msgs/Header header
@@ -43,16 +46,10 @@ float64 accel_mps2
 bool has_in_pit
 bool in_pit
 """,
-    "fgtrack_msgs/msg/Detection": """\
+    "fgtrack_msgs/msg/Detection": f"""\
 # Bit i of `present` says that the i-th field below was given.
 uint16 present
-float64 x_m
-float64 y_m
-float64 yaw_rad
-float64 speed_mps
-float64 range_m
-float64 bearing_rad
-float64 range_rate_mps
+{_COMPONENTS}
 float64[] covariance
 int64 stamp_ns
 int64 object_id
