@@ -161,7 +161,7 @@ def _check_options(name: str, factory: Factory, num_arguments: int, options: Map
 
 
 def _checked(name: str, found: Estimator) -> Estimator:
-    lacking = [what for what in ("window_ns", "update", "state_at", "advance") if not hasattr(type(found), what)]
+    lacking = [what for what in ("window_ns", "update", "state_at", "advance") if not hasattr(found, what)]
     if lacking:
         raise CallError(f"estimator {name!r}: {type(found).__name__} lacks {', '.join(lacking)}, see Estimator")
     return found

@@ -82,8 +82,16 @@ class MotionModel(ABC):
         """Covariance Q of the noise accumulated over `dt_s`, shape (..., n, n).
 
         Composes: Q(x, a + b) = F(x_a, b) Q(x, a) F(x_a, b)' + Q(x_a, b) with x_a = predict(x, a), so a late
-        detection may split a segment. Raises `CallError` where `dt_s` is negative (see `forward`).
+        detection may split a segment. Raises `CallError` where `dt_s` is negative (let `forward` check it).
         """
+
+    @staticmethod
+    def forward(dt_s: float | FloatArray) -> FloatArray:
+        """`dt_s` as an array; raises `CallError` where it is negative, because noise accumulates forwards only."""
+        t = np.asarray(dt_s, dtype=np.float64)
+        if (t < 0.0).any():
+            raise _backwards(t.min())
+        return t
 
     def step(self, x: Sequence[float], dt_s: float) -> Prediction:
         """The one state `x` after `dt_s` >= 0; F and Q are new arrays. Raises `CallError` where `dt_s` is negative."""
@@ -193,11 +201,11 @@ class CTRV(WhiteNoise, MotionModel):
         while the object turns by less than 4 rad within `dt_s`, to 1e-8 relative up to 8 rad, worse beyond.
         Raises `CallError` where `dt_s` is negative.
         """
-        t = forward(dt_s)[..., None]
+        t = self.forward(dt_s)[..., None]
         states = self.predict(x[..., None, :], t * NODES)
         transitions = self.jacobian(states, t * (1.0 - NODES))
         roots = transitions * self._root_densities * np.sqrt(t * WEIGHTS)[..., None, None]
-        root = np.swapaxes(roots, -3, -2).reshape(*roots.shape[:-3], self.dim, -1)
+        root = np.swapaxes(roots, -3, -2).reshape(*roots.shape[:-3], self.dim, len(NODES) * self.dim)
         return symmetrise(root @ np.swapaxes(root, -1, -2))
 
     def step(self, x: Sequence[float], dt_s: float) -> Prediction:
@@ -317,7 +325,7 @@ class CV(WhiteNoise, MotionModel):
 
         Raises `CallError` where `dt_s` is negative.
         """
-        t = forward(dt_s)
+        t = self.forward(dt_s)
         Q = np.zeros((*np.broadcast_shapes(x.shape[:-1], t.shape), 4, 4))
         position, shared, velocity = self._axis_noise(t)
         Q[..., 0, 0] = Q[..., 1, 1] = position
@@ -364,14 +372,6 @@ def _broadcast_copy(x: FloatArray, t: FloatArray) -> FloatArray:
 def _identities(shape: tuple[int, ...], n: int) -> FloatArray:
     """Writable identity matrices, shape (*shape, n, n)."""
     return np.broadcast_to(np.eye(n), (*shape, n, n)).copy()
-
-
-def forward(dt_s: float | FloatArray) -> FloatArray:
-    """`dt_s` as an array; noise accumulates forwards only."""
-    t = np.asarray(dt_s, dtype=np.float64)
-    if (t < 0.0).any():
-        raise _backwards(t.min())
-    return t
 
 
 def _backwards(dt_s: float) -> CallError:

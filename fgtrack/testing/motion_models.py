@@ -108,7 +108,7 @@ def _refuses_noise_of_a_negative_duration(model: MotionModel, x: FloatArray, dt_
         model.process_noise(x, -0.1 - dt_s)
     except CallError:
         return None
-    return "process_noise accepts it; let fgtrack.models.motion.forward check dt_s"
+    return "process_noise accepts it; let self.forward(dt_s) check it"
 
 
 def _steps_one_state_as_it_predicts_arrays(model: MotionModel, x: FloatArray, dt_s: float) -> str | None:
@@ -127,8 +127,8 @@ def _takes_arrays_of_states_and_durations(model: MotionModel, x: FloatArray, dt_
     for function in (model.predict, model.jacobian, model.process_noise):
         one_by_one = np.array([[function(state, float(t)) for state in states] for t in durations_s[:, 0]])
         wrong = _apart(function(states, durations_s), one_by_one, 1e-12, f"{function.__name__} of an array")
-        if wrong:
-            return wrong
+        if wrong or function(states[:0], durations_s).shape != (2, 0, *one_by_one.shape[2:]):
+            return wrong or f"{function.__name__} of no state at all has the wrong shape"
     return None
 
 

@@ -10,7 +10,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel, forward
+from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Accelerating(MotionModel):
         return np.broadcast_to(F, (*np.broadcast_shapes(x.shape[:-1], np.shape(dt_s)), 6, 6))
 
     def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
-        t = forward(dt_s)[..., None, None]
+        t = self.forward(dt_s)[..., None, None]
         axis = [[t**5 / 20, t**4 / 8, t**3 / 6], [t**4 / 8, t**3 / 3, t**2 / 2], [t**3 / 6, t**2 / 2, t]]
         Q = self.jerk_density_m2ps5 * sum(
             np.kron(np.eye(3)[:, [i]] * np.eye(3)[j], np.eye(2)) * axis[i][j] for i in range(3) for j in range(3)

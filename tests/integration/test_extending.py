@@ -1,0 +1,225 @@
+"""docs/extending.md, followed word for word in a folder outside the repository."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
+FILES = {
+    match[1]: text
+    for _, text in BLOCKS
+    if (match := re.match(r"# ((?:fgtrack_example/)?[\w.]+)\n", text)) and "behind:" not in text
+}
+BLIPS = "example_msgs/msg/Blips"
+SWEEP = """
+format: fgtrack-sweep/1
+input: drive.jsonl
+estimators: [refilter, drop-bank]
+vary: {filter.storage_s: [0.5, 1.0]}
+"""
+CONFIG = """
+input:
+  ego: {topic: /ego}
+  detections: {camera: {topic: /blips}}
+sensors: {camera: {std: {range_m: 0.5, bearing_rad: 0.01}}}
+estimator: refilter
+motion: {kind: acceleration, parameters: {jerk_density_m2ps5: 2.0}}
+"""
+#: Commands of the page run in one interpreter; a worker of a sweep is another one.
+DRIVER = """
+import shlex, sys
+from fgtrack.cli.main import run
+for line in sys.stdin:
+    print("$", line, end="", flush=True)
+    code = run(shlex.split(line)[1:])
+    if code:
+        sys.exit(f"{line}: exit code {code}")
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The package of the page, installed for programs that `followed` starts."""
+    folder = tmp_path_factory.mktemp("extending")
+    for name, text in FILES.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(text, encoding="utf-8")
+    (folder / "sweep.yaml").write_text(SWEEP)
+    options = {"TARGET": str(folder / "site"), "NO_DEPS": "1", "NO_BUILD_ISOLATION": "0", "NO_INDEX": "1"}
+    env = {f"PIP_{name}": value for name, value in options.items()}
+    [line] = [line for line in commands() if line.startswith("pip ")]
+    followed(folder, ["-m", *line.split()], env=env)
+    return folder
+
+
+def commands() -> list[str]:
+    [text] = [text for language, text in BLOCKS if language == "sh"]
+    return text.splitlines()
+
+
+def followed(
+    folder: Path, arguments: list[str], given: str = "", env: dict[str, str] | None = None, code: int = 0
+) -> str:
+    """Output of a Python that knows the package and fgtrack, started in `folder`."""
+    paths = os.pathsep.join(map(str, (folder / "site", ROOT)))
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        cwd=folder,
+        input=given,
+        env={**os.environ, **(env or {}), "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == code, f"{done.stdout}\n{done.stderr}"
+    return done.stdout + done.stderr
+
+
+def test_the_commands_of_the_page_run_and_workers_load_the_package(folder: Path) -> None:
+    lines = [line for line in commands() if line.startswith("fgtrack ")]
+    lines.append("fgtrack sweep sweep.yaml -o sweep --jobs 2")
+    said = followed(folder, ["-c", DRIVER], "\n".join(lines) + "\n")
+    for name in ("refilter", "drop-bank", "smoother-dogleg", "ekf-replay"):
+        assert (folder / "runs" / name / "tracks.csv").stat().st_size > 2000
+    tracks = [(folder / "runs" / name / "tracks.csv").read_text() for name in ("refilter", "ekf-replay")]
+    assert abs(last_x_m(tracks[0]) - last_x_m(tracks[1])) < 1e-6
+    assert "all 10 tolerances met" in said
+    assert (folder / "other/tracks.csv").stat().st_size > 2000
+    assert (folder / "other/config.yaml").read_text().count("acceleration") >= 1
+    assert (folder / "sweep/sweep.csv").read_text().count("refilter") == 2
+    assert not (folder / "sweep/errors.csv").read_text().count("drop-bank")
+
+
+def last_x_m(tracks: str) -> float:
+    header, *rows = tracks.splitlines()
+    return float(rows[-1].split(",")[header.split(",").index("x_m")])
+
+
+def test_the_tests_of_the_page_pass(folder: Path) -> None:
+    said = followed(folder, ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", "/dev/null", "--rootdir", ".", "."])
+    assert re.search(r"\d\d passed", said)
+
+
+def test_a_copy_that_drops_late_data_breaks_the_contract(folder: Path) -> None:
+    script = """
+from fgtrack import UpdateResult
+from fgtrack.testing import check_estimator
+from fgtrack_example.refilter import Refilter
+
+class Drops(Refilter):
+    def update(self, measurement):
+        newest_ns, kept = self.window_ns[1], list(self.measurements)
+        result = super().update(measurement)
+        if measurement.stamp_ns < newest_ns:
+            self.measurements = kept
+        return result
+
+check_estimator(Drops, num_streams=2)
+"""
+    said = followed(folder, ["-c", script], code=1)
+    assert "BrokenPromiseError: Drops breaks gives the dense joint posterior in any order" in said
+    assert "measurements in the order of arrival" in said
+
+
+def test_the_ladder_has_the_method(folder: Path) -> None:
+    ladder = str(ROOT / "experiments/ladder/ladder.py")
+    said = followed(folder, [ladder, "-o", "ladder", "--runs", "2", "--lags", "3"])
+    rows = {line.split("|")[1].strip(): line.split("|")[2:] for line in said.splitlines() if line.startswith("| ")}
+    assert rows["refilter"][0].strip().startswith(rows["ekf-replay"][0].strip().partition(" (")[0])
+    assert rows["refilter"][1].strip() == "any lag, any number"
+
+
+def test_a_recording_with_the_message_type_is_replayed(folder: Path) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    text = "int64 stamp_ns\nfloat64[] ranges_m\nfloat64[] bearings_rad\n"
+    store.register(get_types_from_msg(text, BLIPS))
+    types = store.types
+    odometry = "nav_msgs/msg/Odometry"
+    with Writer(folder / "bag", version=9) as bag:
+        ego = bag.add_connection("/ego", odometry, typestore=store)
+        blips = bag.add_connection("/blips", BLIPS, typestore=store)
+        for k in range(60):
+            now_ns = 10**9 + k * 50_000_000
+            at = types["builtin_interfaces/msg/Time"](*divmod(now_ns, 10**9))
+            header = types["std_msgs/msg/Header"](at, "map")
+            zero = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+            pose = types["geometry_msgs/msg/Pose"](
+                types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0),
+                types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+            )
+            with_pose = types["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36))
+            twist = types["geometry_msgs/msg/TwistWithCovariance"](
+                types["geometry_msgs/msg/Twist"](zero, zero), np.zeros(36)
+            )
+            message = types[odometry](header, "base", with_pose, twist)
+            bag.write(ego, now_ns, store.serialize_cdr(message, odometry))
+            blip = types[BLIPS](now_ns - 20_000_000, np.array([20.0 + 0.5 * k]), np.array([0.1]))
+            bag.write(blips, now_ns + 1, store.serialize_cdr(blip, BLIPS))
+    (folder / "bag.yaml").write_text(CONFIG)
+    lines = ["fgtrack info bag -c bag.yaml", "fgtrack replay bag -c bag.yaml -o blips"]
+    said = followed(folder, ["-c", DRIVER], "\n".join(lines) + "\n")
+    assert "detections camera" in said
+    updates = (folder / "blips/updates.csv").read_text()
+    assert updates.count("in_sequence") > 50
+
+
+def test_a_new_measured_quantity_is_known_everywhere(tmp_path: Path) -> None:
+    """In a copy of the package, with the two changes of the page."""
+    simulate = "from fgtrack.cli.main import run; run(['simulate', 'single_opponent', '-o', 'old', '--duration', '1'])"
+    followed(tmp_path, ["-c", simulate])
+    for part in ("fgtrack", "configs"):
+        shutil.copytree(ROOT / part, tmp_path / part)
+    changes = [text for _, text in BLOCKS if "behind:" in text]
+    assert len(changes) == 2
+    for text in changes:
+        first, added = text.split("\n", 1)
+        path, _, anchor = first.removeprefix("# ").partition(", behind: ")
+        file = tmp_path / path
+        before = file.read_text()
+        assert before.count(f"{anchor}\n") == 1
+        file.write_text(before.replace(f"{anchor}\n", f"{anchor}\n{added}"))
+    script = """
+import numpy as np
+import fgtrack
+from dataclasses import replace
+from fgtrack.core.types import MEASURABLE
+from fgtrack.io.ros.bag_writer import write_bag
+from fgtrack.io.source import open_input
+
+assert "inverse_range_pm" in MEASURABLE
+model = fgtrack.measurement_model(("bearing_rad", "inverse_range_pm"), fgtrack.CTRV())
+x = np.array([30.0, 40.0, 0.1, 20.0, 0.0])
+assert abs(model.predict(x)[1] - 0.02) < 1e-15
+numeric = [(model.predict(x + h) - model.predict(x - h)) / 2e-4 for h in 1e-4 * np.eye(5)]
+assert np.allclose(model.jacobian(x), np.transpose(numeric), atol=1e-8)
+
+messages = list(fgtrack.simulate("single_opponent", duration_s=1.0))
+def seen(message):
+    if not isinstance(message, fgtrack.DetectionList) or message.frame != "ego":
+        return message
+    def inverse(item):
+        return replace(item, inverse_range_pm=float(1.0 / np.hypot(item.x_m, item.y_m)), covariance=None)
+    return replace(message, objects=tuple(inverse(item) for item in message.objects))
+messages = [seen(message) for message in messages]
+write_bag("bag", messages)
+again = list(open_input("bag").messages())
+assert [repr(m) for m in again] == [repr(m) for m in messages]
+old = next(m for m in open_input("old").messages() if isinstance(m, fgtrack.DetectionList) and m.objects)
+assert old.objects[0].inverse_range_pm is None
+assert old.objects[0].covariance is None and old.objects[0].object_id is None
+
+sensor = fgtrack.SensorModel(std={"x_m": 0.5, "y_m": 0.5, "inverse_range_pm": 0.001})
+config = fgtrack.Config(estimator="ekf-replay", sensors={"lidar": sensor, "lidar_cluster": sensor, "radar": sensor})
+run = fgtrack.replay("bag", config, out="run")
+assert np.isfinite(run.updates["res_inverse_range_pm"]).sum() > 20
+"""
+    followed(tmp_path, ["-c", script])
