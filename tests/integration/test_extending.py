@@ -63,7 +63,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def commands() -> list[str]:
-    [text] = [text for language, text in BLOCKS if language == "sh"]
+    [text] = [text for language, text in BLOCKS if language == "bash"]
     return text.splitlines()
 
 
