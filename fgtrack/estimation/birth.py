@@ -9,7 +9,7 @@ from fgtrack.models.motion import MotionModel
 
 
 def initial_state(motion: MotionModel, start: Start) -> tuple[FloatArray, FloatArray]:
-    """Mean (n,) and covariance (n, n), in the state of `motion`, of what `start` knows.
+    """Mean (n,) and covariance (n, n), in the state of `motion`, of `start`.
 
     Where the direction of travel is unknown, a Cartesian model starts with an isotropic velocity of mean zero; a
     model with a yaw starts at yaw 0 with its (wide) standard deviation.

@@ -1,7 +1,7 @@
 """The dense joint posterior of a linear chain: the oracle that exact estimators are held to.
 
-It knows all measurements at once, so there is no order of arrival in it; and it shares neither recursion nor graph
-with any estimator.
+It conditions on all measurements at once, so there is no order of arrival in it; it shares neither recursion nor
+graph with any estimator.
 """
 
 from collections.abc import Iterable, Sequence

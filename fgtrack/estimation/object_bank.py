@@ -1,4 +1,4 @@
-"""From estimators that know nothing of each other to a bank, and from a bank to the estimator of one object."""
+"""A bank of independent estimators, and the estimator of one object from a bank."""
 
 from collections.abc import Callable, Sequence
 

@@ -60,16 +60,16 @@ Factory = Callable[..., Any]  # Any: an estimator or a bank, see the module
 
 @dataclass(frozen=True)
 class Claims:
-    """What an estimator says of itself, in attributes of its class or function; a missing one is the default."""
+    """What an estimator claims, in attributes of its class or function; a missing one is the default."""
 
     exact: str = ""
     """For which late measurements a linear model gives the dense joint posterior of all accepted ones; empty for none.
     One that says `any lag, any number` is held to it by `fgtrack verify` and `check_estimator`."""
     nonlinear: Literal["at once", "at convergence", "never"] = "at once"
-    """When, in a nonlinear model, any order of arrival gives the estimate of the time order: by itself, after the
-    estimator's own method `converge()`, or never, where an estimate keeps its linearisation."""
+    """When, in a nonlinear model, estimates do not depend on the order of arrival: by themselves, after the estimator's
+    own method `converge()`, or never, where an estimate keeps its linearisation."""
     smooths: bool = False
-    """Whether a state of the past knows later measurements; a filter's does not."""
+    """Whether states of the past contain later measurements; a filter's do not."""
     tolerance: float = 1e-9
     """Largest difference to the dense joint posterior, in standard deviations."""
     rounding: float = 0.0
@@ -107,7 +107,10 @@ def estimator(name: str, motion: MotionModel, start: Start, *, lag_s: float = 1.
     options
         Keyword parameters of that estimator.
 
-    Raises `CallError` for an unknown name and for options that the estimator does not take.
+    Raises
+    ------
+    CallError
+        The name is unknown, or the estimator does not take the options.
     """
     return start_estimator(name, ESTIMATORS.load(name), motion, start, lag_s, options)
 

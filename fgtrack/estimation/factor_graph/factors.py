@@ -55,7 +55,7 @@ def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float, at: F
 
 
 def measurement_factor(key: int, term: MeasurementTerm, mean: FloatArray) -> gtsam.NonlinearFactor:
-    """What `term` says of the state at `key`, presently near `mean` (n,).
+    """The factor of `term` on the state at `key`, presently near `mean` (n,).
 
     A linear model with a Gaussian needs no callback; its angles are taken on the branch next to `mean`. Raises
     `numpy.linalg.LinAlgError` for a covariance that is not positive definite.

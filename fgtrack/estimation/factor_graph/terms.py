@@ -1,4 +1,4 @@
-"""What a node of the window knows besides its neighbours: measurements, and what older detections say about it."""
+"""Measurement terms of a node of the window: its own measurements, and the equivalent ones of older detections."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

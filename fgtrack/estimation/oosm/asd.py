@@ -36,7 +36,7 @@ class AccumulatedStateDensity(WindowedFilter):
     N(0, Sigma) (see `between`), with the cross-covariances [Lambda Psi] Cov([x_l; x_r], x_j). Every measurement, late
     or not, is `fuse_across` of the whole stack. There is no history that could be out of date.
 
-    Exact for: any lag, any number of late measurements in any order. Of a state in the past it knows the smoothed one.
+    Exact for: any lag, any number of late measurements in any order. States in the past are smoothed.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class AccumulatedStateDensity(WindowedFilter):
         return result
 
     def _with_state(self, stamp_ns: int) -> tuple[_Stack, slice]:
-        """The stack with a state at `stamp_ns`, and where it stands."""
+        """The stack with a state at `stamp_ns`, and its place in the stack."""
         n, (stamps_ns, mean, covariance) = self._motion.dim, self._stack
         place = max(bisect.bisect_right(stamps_ns, stamp_ns) - 1, 0)
         if stamps_ns[place] == stamp_ns:

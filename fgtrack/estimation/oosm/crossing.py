@@ -12,7 +12,7 @@ from fgtrack.estimation.oosm.history import require_finite
 
 
 class Past(NamedTuple):
-    """What a method knows of the state at the stamp tau of a late measurement."""
+    """A method's estimate of the state at the stamp tau of a late measurement."""
 
     mean: FloatArray
     """x_tau, shape (n,)."""

@@ -26,7 +26,7 @@ class Estimate(NamedTuple):
 
 
 class _ForwardEkf(LateEkf):
-    """Fuses the present x_k, P_k with the late estimate x_1, P_1, both of which know x_m.
+    """Fuses the present x_k, P_k with the late estimate x_1, P_1, both of which contain x_m.
 
     x_1 is step m predicted to tau, corrected there and predicted to now; x_0, P_0 is step m predicted to now. The steps
     are not repaired after a late measurement; x_k holds all that came since m, late or not.
@@ -46,11 +46,11 @@ class _ForwardEkf(LateEkf):
 
     @abstractmethod
     def _fused(self, now: Estimate, late: Estimate, common: Estimate) -> Estimate:
-        """One estimate from `now` and `late`, which share what `common` knows."""
+        """One estimate from `now` and `late`, which share the information of `common`."""
 
 
 class Fpfd(_ForwardEkf):
-    """Forward prediction, fusion, and decorrelation: fuse both estimates and take out once what both know.
+    """Forward prediction, fusion, and decorrelation: fuse both estimates and subtract their common information once.
 
     Rheaume and Benaskeur, Forward prediction-based approach to target-tracking with out-of-sequence measurements, IEEE
     Conference on Decision and Control, 2008:

@@ -16,7 +16,7 @@ class Larsen(CrossingEkf):
         x+ = x_k + M K_tau (z - h(x_{tau|m})),   P+ = P_k - M K_tau H P_{tau|m} M'
 
     that is `fuse_across` with x_{tau|m}, P_{tau|m} and P_k,tau = M P_{tau|m}. The gains since are those that were used,
-    for at tau nobody knew that a measurement would come. A late measurement stays in the history as an equivalent
+    for at tau the measurement was unknown. A late measurement stays in the history as an equivalent
     measurement of the step at which it was fused (see `CrossingEkf`).
 
     Exact for: nothing. It would be, had the covariance been updated at tau already, and all gains since with it. Else

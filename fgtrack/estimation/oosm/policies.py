@@ -1,4 +1,4 @@
-"""What is done where nobody fuses late measurements at their stamp: ignore them, or take them as current."""
+"""Without compensation: ignore late measurements, or take them as current."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ class AsCurrent(LateEkf):
     """Take a late measurement as if it had been made at the newest stamp fused.
 
     What a filter without stamps does (no source): x+ = x_k + K (z - h(x_k)). The object has moved on by speed times
-    lag since, of which the covariance knows nothing.
+    lag since, which the covariance leaves out.
 
     Exact for: nothing; overconfident.
     """

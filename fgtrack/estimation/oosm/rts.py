@@ -15,7 +15,7 @@ class RtsCrossCovariance(CrossingEkf):
         x_j = x_{j|j} + C_j (x_{j+1} - x_{j+1|j}),   P_j = P_{j|j} + C_j (P_{j+1} - P_{j+1|j}) C_j'
         P_k,tau = (C_tau C_{m+1} ... C_{k-1} P_k)'
 
-    where tau stands between the steps m and m + 1 with x_{tau|m}, P_{tau|m}. Then `fuse_across`. The history is not
+    where tau lies between the steps m and m + 1 with x_{tau|m}, P_{tau|m}. Then `fuse_across`. The history is not
     repaired after a late measurement: the next one starts from the corrected present.
 
     Exact for: any lag, the first late measurement since step m.
