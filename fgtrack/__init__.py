@@ -1,6 +1,6 @@
 """Track several objects from the delayed object lists of several sensors, and compare how delays are dealt with.
 
-Everything that a user imports stands here and is imported when it is first used; the subpackages are private.
+Everything that a user imports is here, loaded when it is first used; the subpackages are private.
 """
 
 import ast

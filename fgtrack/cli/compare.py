@@ -1,4 +1,4 @@
-"""`fgtrack compare`: runs beside each other."""
+"""`fgtrack compare`: tables of runs."""
 
 import json
 from enum import StrEnum

@@ -81,7 +81,7 @@ def score(run: Run) -> Scores:
 
 
 def _scalars(value: object, path: str) -> Iterator[tuple[str, Scalar]]:
-    """Path and value of every scalar; what is a list of entries with a lag is told apart by it."""
+    """Path and value of every scalar; entries of a list with a lag are named by it."""
     if isinstance(value, Mapping):
         for name, entry in value.items():
             yield from _scalars(entry, f"{path}.{name}" if path else name)

@@ -1,4 +1,4 @@
-"""Runs beside each other: what each table of a comparison shows."""
+"""Runs compared: what each table of a comparison shows."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -45,11 +45,11 @@ class _Row(Generic[T]):
     run: str
     of: T
     part: str = ""
-    """What tells it from the other rows of the run."""
+    """What distinguishes it from the other rows of the run."""
 
 
 def compare(*runs: OneRun | Iterable[OneRun]) -> Tables:
-    """Metrics of `runs` beside each other: tables `tracking`, `multi_object`, `lag`, `consistency`, `dispositions`
+    """Metrics of `runs` in comparison: tables `tracking`, `multi_object`, `lag`, `consistency`, `dispositions`
     and `residuals_SENSOR` of every sensor.
 
     A path is a run folder, or a folder that holds run folders.

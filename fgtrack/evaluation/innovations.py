@@ -22,7 +22,7 @@ LAGS = 10
 FEWEST = 20
 """A track with fewer innovations of the sensor is left out: the band is that of a large sample."""
 
-#: Innovations that are taken together, as a vector; the others stand alone.
+#: Innovations that are taken together, as a vector; the others are scalars.
 _GROUPS: Mapping[str, tuple[str, ...]] = {
     "position_m": ("x_m", "y_m"),
     **{name: (name,) for name in MEASURABLE if name not in ("x_m", "y_m")},

@@ -1,4 +1,4 @@
-"""Errors of lagged and final states, beside those of the present states at the same stamps."""
+"""Errors of lagged and final states, and those of the present states at the same stamps."""
 
 import math
 from collections.abc import Mapping, Sequence

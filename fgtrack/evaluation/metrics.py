@@ -19,7 +19,7 @@ from fgtrack.evaluation.statistics import ChiSquareMean, Distribution, Moments
 from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, evaluation_config
 
 FALSE_TRACK_SHARE = 0.5
-"""A track that is paired with a true object in less than this share of its judged life is false."""
+"""A track that is paired with a true object in less than this share of its rows is false."""
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ def _sensor_metrics(run: Run) -> dict[str, SensorMetrics]:
 
 
 def _plain(value: Any) -> Any:
-    """`value` as JSON: derived properties beside the fields, NaN as None, keys as text."""
+    """`value` as JSON: with derived properties, NaN as None, keys as text."""
     if isinstance(value, Moments | ChiSquareMean):
         return {name: _plain(number) for name, number in value.as_dict().items()}
     if is_dataclass(value):

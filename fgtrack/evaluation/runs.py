@@ -82,9 +82,9 @@ def start_ns(runs: Sequence[JudgedRun]) -> int:
 
 
 def labelled(runs: Sequence[Run]) -> dict[str, Run]:
-    """Runs by a label of their own: the end of their path, as long as it must be to tell them apart.
+    """Runs by a label of their own: the end of their path, as long as it must be to be unique.
 
-    The estimator stands behind it where the path does not name it, and alone for a run in memory.
+    The estimator follows where the path does not name it, and alone for a run in memory.
 
     Raises
     ------

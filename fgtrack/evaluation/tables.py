@@ -79,9 +79,9 @@ class Table(RunTable):
     title
         What it is.
     row_keys
-        Names of the columns that tell the rows apart; the first is the run.
+        Names of the columns that identify a row; the first is the run.
     notes
-        Lines that stand below.
+        Lines below the table.
     shown
         Columns as people read them: rounded, in handy units, some with several numbers in a cell.
     """
@@ -111,7 +111,7 @@ class Table(RunTable):
         return _text(self.rich())
 
     def rich(self) -> RichTable:
-        """The table for a terminal; the name of a run stands in its first row only."""
+        """The table for a terminal; the name of a run is in its first row only."""
         table = RichTable(
             title=Text(f"\n{self.title}"),
             caption=Text("\n".join(self.notes)),
@@ -177,7 +177,7 @@ class Tables(Mapping[str, Table]):
 
     tables: Mapping[str, Table]
     details: Mapping[str, Any] = field(default_factory=dict)  # Any: JSON values
-    """What stands beside the tables in JSON."""
+    """What JSON has besides the tables."""
 
     def __getitem__(self, name: str) -> Table:
         return self.tables[name]

@@ -99,7 +99,7 @@ def write_stream(
     Parameters
     ----------
     header
-        Entries of the header record beside `type` and `format`.
+        Entries of the header record besides `type` and `format`.
     overwrite
         Replace a stream at `path`.
 

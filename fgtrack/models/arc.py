@@ -89,7 +89,7 @@ def small_turn(yaw: float, yaw_rate: float, t: float) -> SmallTurn | None:
 def way(moments: Sequence[Complex], order: int, speed: Any, accel: Any = None) -> Complex:
     """Integral over s in [0, t] of s^order (speed + accel s) exp(i (yaw + yaw_rate s)); order 0 is the displacement.
 
-    Any: numbers beside the moments of one state, arrays beside those of many. Without `accel` the speed is constant.
+    Any: numbers with the moments of one state, arrays with those of many. Without `accel` the speed is constant.
     """
     constant: Complex = moments[order] * speed
     if accel is None:

@@ -285,7 +285,7 @@ def _fault(table: FloatArray) -> tuple[int, str] | None:
         return int(bad[0, 0]), f"{COLUMNS[bad[0, 1]]} is not finite"
     closed = _closed(table)
     if len(closed) < 5:
-        return len(table) - 1, "at least 4 rows beside the one that repeats the first are needed"
+        return len(table) - 1, "at least 4 rows besides the one that repeats the first are needed"
     steps = np.diff(closed[:, :2], axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
     if lengths.min() < _SAME_POINT_M:

@@ -213,7 +213,7 @@ class Config:
             raise ValueError("sensors: name at least one")
         both = set(self.sensors) & set(self.ignore_sensors)
         if both:
-            raise ValueError(f"ignore_sensors: {sorted(both)[0]!r} stands under sensors as well")
+            raise ValueError(f"ignore_sensors: {sorted(both)[0]!r} is under sensors as well")
         strangers = set(self.input.detections) - set(self.sensors) - set(self.ignore_sensors)
         if strangers:
             raise ValueError(f"input.detections: {sorted(strangers)[0]!r} has no model under sensors")

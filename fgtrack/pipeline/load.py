@@ -94,7 +94,7 @@ def _kept(default: object) -> dict[str, Any] | None:
 
 
 def validate(kind: type[T], raw: Mapping[str, Any], origin: str) -> T:
-    """`raw` as an instance of the dataclass `kind`; `origin` stands in the errors."""
+    """`raw` as an instance of the dataclass `kind`; `origin` is named in errors."""
     try:
         text = json.dumps(raw)
     except (TypeError, ValueError) as error:

@@ -131,7 +131,7 @@ class Sweep:
 
 
 def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
-    """The cells of a job, beside its key. Whatever goes wrong becomes the error of a cell."""
+    """The cells of a job, with its key. Whatever goes wrong becomes the error of a cell."""
     started = time.perf_counter()
     try:
         config = validate(Config, recipe.config, "configuration")

@@ -19,7 +19,7 @@ KEY_COLUMNS = ("seed", "estimator")
 #: Key of a group of keys that names its values, in a column of the group's own name.
 LABEL = "label"
 
-#: Roots of keys; those of the configuration stand without one.
+#: Roots of keys; those of the configuration have none.
 SCENARIO, DELAYS = "scenario", "delays"
 
 
@@ -126,7 +126,7 @@ class Axis:
 
 
 def _axis(name: str, given: Value) -> Axis:
-    """The axis that stands under `vary.name`; raises `ValueError` with the key's path."""
+    """The axis under `vary.name`; raises `ValueError` with the key's path."""
     if isinstance(given, (list, tuple)):
         return Axis(name, (name,), tuple((value,) for value in _values(f"vary.{name}", given)))
     if not isinstance(given, Mapping) or not set(given) - {LABEL}:

@@ -183,7 +183,7 @@ def _reaches(subject: Subject, stream: "_Stream") -> bool:
 def _against_dense_joint(
     stream: _Stream, order: str, places: Sequence[int], subjects: Mapping[str, Subject]
 ) -> list[Check]:
-    """All of `subjects` beside each other: at some moments the present, at the end the past as well."""
+    """All of `subjects` on the same stream: at some moments the present, at the end the past as well."""
     motion, prior = stream.motion, stream.prior
     running = {name: subject.start(stream) for name, subject in subjects.items()}
     largest = dict.fromkeys(subjects, Difference(0.0, 0.0))

@@ -115,7 +115,7 @@ class _Plan:
     """What becomes of each message of the input; all arrays of shape (n,)."""
 
     places: dict[str, IntArray]
-    """Where the lists of each sensor stand in the input."""
+    """Where the lists of each sensor are in the input."""
     receipts_ns: IntArray
     stamps_ns: IntArray
     reported_ns: IntArray

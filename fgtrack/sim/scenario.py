@@ -28,7 +28,7 @@ class EgoMessages:
 
 @settings
 class Scenario:
-    """All that `simulate` needs beside a random generator. Object i of the truth is opponent i."""
+    """All that `simulate` needs besides a random generator. Object i of the truth is opponent i."""
 
     ego: AnyVehicle
     opponents: tuple[AnyVehicle, ...] = ()

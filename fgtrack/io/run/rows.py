@@ -35,7 +35,7 @@ def rows(
     num_detections
         Detections that the tick received.
     smoothed_lag_s
-        The lag whose states are in `smoothed` beside the final ones; those of every lag are in `lagged`.
+        The lag whose states are in `smoothed` with the final ones; those of every lag are in `lagged`.
     """
     tick = (report.tick, report.now_ns)
     yield "tracks", [_track_row(tick, track) for track in report.tracks]

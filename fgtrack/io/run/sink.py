@@ -19,7 +19,7 @@ class RunSink(ABC):
     meta
         What `meta.json` says from the start on.
     smoothed_lag_s
-        The lag whose states go to `smoothed` beside the final ones; `lagged` gets those of every lag.
+        The lag whose states go to `smoothed` with the final ones; `lagged` gets those of every lag.
     """
 
     def __init__(self, config_text: str, meta: Mapping[str, object] | None, smoothed_lag_s: float | None) -> None:
