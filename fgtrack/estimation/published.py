@@ -55,7 +55,7 @@ class SaturatedYaw:
         for index, name in enumerate(model.components):
             if name == "yaw_rad":
                 y[..., index] = one_turn(published_yaw(z[..., index]) - z_predicted[..., index])
-            elif model.angular[index]:
+            elif index in model.angular:
                 y[..., index] = one_turn(y[..., index])
         return y
 

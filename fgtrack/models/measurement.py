@@ -62,9 +62,9 @@ class MeasurementModel:
             )
 
     @cached_property
-    def angular(self) -> tuple[bool, ...]:
-        """For each component, whether it is an angle."""
-        return tuple(name in ANGULAR for name in self.components)
+    def angular(self) -> tuple[int, ...]:
+        """Places of the components that are angles."""
+        return tuple(index for index, name in enumerate(self.components) if name in ANGULAR)
 
     @cached_property
     def linear(self) -> bool:
@@ -104,7 +104,7 @@ class MeasurementModel:
     def residual(self, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
         """Measured minus predicted, shape (..., k), with angles in (-pi, pi]; the only place that wraps."""
         y = np.asarray(z - z_predicted)
-        for index in self._angular_indices:
+        for index in self.angular:
             angles = y[..., index]
             wrapped = wrap_angles(angles)
             if wrapped is not angles:
@@ -122,10 +122,6 @@ class MeasurementModel:
     @cached_property
     def _selected(self) -> IntArray:
         return np.array([self.state_names.index(name) for name in self.components])
-
-    @cached_property
-    def _angular_indices(self) -> tuple[int, ...]:
-        return tuple(index for index, angular in enumerate(self.angular) if angular)
 
 
 def measurement_model(components: tuple[str, ...], motion_model: MotionModel) -> MeasurementModel:

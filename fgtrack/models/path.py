@@ -7,7 +7,6 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from fgtrack.core.types import FloatArray
-from fgtrack.models.track_map import TrackMap
 
 
 @dataclass(frozen=True)
@@ -40,11 +39,6 @@ class Path:
         chords = np.hypot(*np.diff(points_m, axis=0).T)
         u = np.concatenate([[0.0], np.cumsum(chords)])
         return cls(CubicSpline(u, points_m, bc_type="periodic"), float(u[-1]))
-
-    @classmethod
-    def along(cls, track: TrackMap) -> Self:
-        """Path along the reference line of `track`; its parameter is the arc length s of the map."""
-        return cls.through(track.table[:, :2])
 
     def frame(self, u_m: FloatArray) -> PathFrame:
         """Moving frame at `u_m`, shape (n,), of any lap."""

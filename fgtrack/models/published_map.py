@@ -9,8 +9,7 @@ import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.models.road import RoadView
-from fgtrack.models.track_map import COLUMNS, TrackMap
+from fgtrack.models.track_map import COLUMNS, RoadView, TrackMap
 
 _CLOSING = 0.999  # the closing point lies this share of the way from the last row to the first
 _FIELDS = (
@@ -87,31 +86,3 @@ class CircularHeadingMap(PublishedMap):
     def _heading_at(self, high: IntArray, weight: FloatArray) -> FloatArray:
         low_yaw, high_yaw = self._heading[high - 1], self._heading[high]
         return np.asarray(wrap_angles(high_yaw - low_yaw) * weight + low_yaw)
-
-
-class PublishedRoad:
-    """Published look-up on track and pit lane; negative buffers keep away from the wall."""
-
-    known = True
-
-    def __init__(
-        self,
-        track: PublishedMap,
-        pit: PublishedMap | None,
-        inner_buffer_m: float,
-        outer_buffer_m: float,
-        pit_buffer_m: float,
-    ) -> None:
-        self._track = track
-        self._pit = pit
-        self._inner_buffer_m = inner_buffer_m
-        self._outer_buffer_m = outer_buffer_m
-        self._pit_buffer_m = pit_buffer_m
-
-    def view(self, points_m: FloatArray) -> RoadView:
-        """See `fgtrack.models.road.Road.view`."""
-        track = self._track.view(points_m, self._inner_buffer_m, self._outer_buffer_m)
-        if self._pit is None or not track.outside.any():
-            return track
-        pit = self._pit.view(points_m, self._pit_buffer_m, self._pit_buffer_m)
-        return RoadView(track.yaw_rad, track.curvature_radpm, track.outside & pit.outside)

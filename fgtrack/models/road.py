@@ -1,23 +1,13 @@
 """What the map says about a place: the heading of the traffic, its curvature, and whether an object can be there."""
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 
-from fgtrack.core.types import BoolArray, FloatArray
-from fgtrack.models.track_map import TrackMap
-
-
-class RoadView(NamedTuple):
-    """The map at n places."""
-
-    yaw_rad: FloatArray
-    """Heading of the traffic, shape (n,)."""
-    curvature_radpm: FloatArray
-    """Left turn positive, shape (n,)."""
-    outside: BoolArray
-    """True where no object can be, shape (n,)."""
+from fgtrack.core.types import FloatArray
+from fgtrack.models.published_map import PublishedMap
+from fgtrack.models.track_map import RoadView, TrackMap
 
 
 class Road(Protocol):
@@ -42,14 +32,14 @@ class OpenSpace:
 
 
 @dataclass(frozen=True)
-class FrenetRoad:
-    """Track and pit lane by projection on their reference lines.
+class MappedRoad:
+    """Track and pit lane, by their maps.
 
     A buffer is how far (in metres) an object may lie beyond the bound; a negative one keeps away from the wall.
     """
 
-    track: TrackMap
-    pit: TrackMap | None
+    track: TrackMap | PublishedMap
+    pit: TrackMap | PublishedMap | None
     inner_buffer_m: float
     outer_buffer_m: float
     pit_buffer_m: float
@@ -57,10 +47,10 @@ class FrenetRoad:
 
     def view(self, points_m: FloatArray) -> RoadView:
         """See `Road.view`; outside is what lies on neither track nor pit lane."""
-        track = RoadView(*self.track.view(points_m, self.inner_buffer_m, self.outer_buffer_m))
+        track = self.track.view(points_m, self.inner_buffer_m, self.outer_buffer_m)
         if self.pit is None or not any(track.outside.tolist()):
             return track
         outside = track.outside.copy()
         strays = np.flatnonzero(outside)
-        outside[strays] = self.pit.outside(points_m[strays], self.pit_buffer_m, self.pit_buffer_m)
-        return RoadView(track.yaw_rad, track.curvature_radpm, outside)
+        outside[strays] = self.pit.view(points_m[strays], self.pit_buffer_m, self.pit_buffer_m).outside
+        return track._replace(outside=outside)

@@ -3,15 +3,15 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.models.arc import ComplexArray
 
 #: Columns of a map file, in order. The normal points to the right of the driving direction.
 COLUMNS = (
@@ -48,7 +48,16 @@ _POINT, _BACK, (_HEADING, _CURVATURE, _LEFT, _RIGHT, _ARC, _ALONG) = slice(0, 2)
 _QUANTITIES = 10
 _FEW_DISTANCES = 3000  # so many are calculated sooner than the tree is asked
 
-ComplexArray = npt.NDArray[np.complex128]
+
+class RoadView(NamedTuple):
+    """The map at n places."""
+
+    yaw_rad: FloatArray
+    """Heading of the traffic, shape (n,)."""
+    curvature_radpm: FloatArray
+    """Left turn positive, shape (n,)."""
+    outside: BoolArray
+    """True where no object can be, shape (n,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,11 +190,6 @@ class TrackMap:
         foot, _ = self._locate(points_m)
         return wrap_angles(foot[:, _HEADING])
 
-    def curvature(self, points_m: FloatArray) -> FloatArray:
-        """Curvature of the line beside `points_m` in rad/m, shape (n,), positive in a left turn."""
-        foot, _ = self._locate(points_m)
-        return foot[:, _CURVATURE]
-
     def bounds(self, s_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Widths (left, right) from the line to the bounds at arc length `s_m`, shapes (n,)."""
         foot = self._at(s_m)
@@ -197,18 +201,16 @@ class TrackMap:
         A positive buffer lets points in that lie up to that far beyond the bound; a negative one shrinks the
         track. The inner bound is the one that the lap encloses: the left one if driven counter-clockwise.
         """
-        return self.view(points_m, inner_buffer_m, outer_buffer_m)[2]
+        return self.view(points_m, inner_buffer_m, outer_buffer_m).outside
 
-    def view(
-        self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float
-    ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """`heading`, `curvature` and `outside` of `points_m` at the price of one look-up."""
+    def view(self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float) -> RoadView:
+        """Heading and curvature of the line beside `points_m`, shape (n, 2), and which of them are `outside`."""
         foot, lateral = self._locate(points_m)
         left_m, right_m = (
             (inner_buffer_m, outer_buffer_m) if self.counter_clockwise else (outer_buffer_m, inner_buffer_m)
         )
         outside = (lateral > foot[:, _LEFT] + left_m) | (-lateral > foot[:, _RIGHT] + right_m)
-        return wrap_angles(foot[:, _HEADING]), foot[:, _CURVATURE], outside
+        return RoadView(wrap_angles(foot[:, _HEADING]), foot[:, _CURVATURE], outside)
 
     def _at(self, s_m: FloatArray) -> FloatArray:
         """Quantities at arc length `s_m`, shape (n, 10)."""

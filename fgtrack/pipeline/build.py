@@ -21,8 +21,8 @@ from fgtrack.estimation.published import (
 )
 from fgtrack.estimation.registry import estimator_bank
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
-from fgtrack.models.published_map import CircularHeadingMap, PublishedMap, PublishedRoad
-from fgtrack.models.road import FrenetRoad, OpenSpace, Road
+from fgtrack.models.published_map import CircularHeadingMap, PublishedMap
+from fgtrack.models.road import MappedRoad, OpenSpace, Road
 from fgtrack.models.track_map import TrackMap
 from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
 from fgtrack.tracking.ego import EgoSource, EgoTrajectory
@@ -77,9 +77,9 @@ def build_road(config: MapConfig) -> Road:
     pit = None if config.pit is None else _read_map(config.pit, make_pit_lane)
     buffers = (config.inner_buffer_m, config.outer_buffer_m, config.pit_buffer_m)
     if config.lookup == "frenet":
-        return FrenetRoad(track, pit, *buffers)
+        return MappedRoad(track, pit, *buffers)
     lookup = PublishedMap if config.lookup == "published" else CircularHeadingMap
-    return PublishedRoad(lookup(track), None if pit is None else lookup(pit), *buffers)
+    return MappedRoad(lookup(track), None if pit is None else lookup(pit), *buffers)
 
 
 def _read_map(name: str, built_in: Callable[[], TrackMap]) -> TrackMap:

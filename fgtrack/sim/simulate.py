@@ -58,7 +58,7 @@ class _Simulation:
         self.scenario = scenario
         vehicles_rng, self.ego_rng, self.sensors_rng = rng.spawn(3)
         self.track = _track(scenario)
-        path = None if self.track is None else Path.along(self.track)
+        path = None if self.track is None else Path.through(self.track.table[:, :2])
         vehicles = (scenario.ego, *scenario.opponents)
         self.ego, *self.opponents = (
             self._trajectory(vehicle, path, child)

@@ -8,7 +8,7 @@ from fgtrack.core.types import Detection, DetectionList, FloatArray, Frame
 from fgtrack.estimation.base import Measurement, StatesAt
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV
-from fgtrack.models.road import RoadView
+from fgtrack.models.track_map import RoadView
 from fgtrack.tracking.inbox import Batch
 from fgtrack.tracking.preprocess import Candidate
 

@@ -12,7 +12,7 @@ from fgtrack.models.path import Path
 from fgtrack.sim.vehicles import DrawnVehicle, LaneChange, TrackTrajectory, TrackVehicle
 
 OVAL = make_oval()
-PATH = Path.along(OVAL)
+PATH = Path.through(OVAL.table[:, :2])
 BUSY = TrackVehicle(
     arc_m=2350.0,
     lateral_m=-4.0,

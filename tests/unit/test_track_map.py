@@ -152,7 +152,7 @@ def test_the_heading_in_the_cell_where_the_published_look_up_fails_is_right() ->
 def test_heading_and_curvature_at_a_row_are_the_row() -> None:
     rows = OVAL.table[:-1]
     np.testing.assert_allclose(OVAL.heading(rows[:, :2]), rows[:, HEADING], atol=1e-9)
-    np.testing.assert_allclose(OVAL.curvature(rows[:, :2]), rows[:, CURVATURE], atol=1e-12)
+    np.testing.assert_allclose(OVAL.view(rows[:, :2], 0.0, 0.0).curvature_radpm, rows[:, CURVATURE], atol=1e-12)
 
 
 # Bounds
@@ -187,11 +187,10 @@ def test_the_inner_bound_is_the_one_that_the_lap_encloses() -> None:
         assert track.outside(points, inner_buffer_m=0.0, outer_buffer_m=-1.0).tolist() == [False, True]
 
 
-def test_a_view_is_heading_curvature_and_outside_at_once() -> None:
+def test_a_view_is_heading_and_outside_at_once() -> None:
     points = np.random.default_rng(1).uniform(-700.0, 700.0, (300, 2))
-    heading, curvature, outside = OVAL.view(points, -0.5, -1.5)
+    heading, _, outside = OVAL.view(points, -0.5, -1.5)
     np.testing.assert_array_equal(heading, OVAL.heading(points))
-    np.testing.assert_array_equal(curvature, OVAL.curvature(points))
     np.testing.assert_array_equal(outside, OVAL.outside(points, -0.5, -1.5))
 
 
