@@ -8,6 +8,7 @@ import typer
 
 from fgtrack.cli.arguments import Json, Runs
 from fgtrack.cli.show import console
+from fgtrack.core.errors import CallError
 from fgtrack.evaluation.comparison import compare as tables_of
 from fgtrack.evaluation.runs import Runs as AnyRuns
 from fgtrack.evaluation.runs import judged
@@ -30,6 +31,8 @@ def compare(
     form: Annotated[Form | None, typer.Option("--format", help="Print this instead of tables for a terminal.")] = None,
 ) -> None:
     """Compare runs in tables, and write metrics.json into each."""
+    if as_json and form not in (None, Form.JSON):
+        raise CallError(f"--json, --format {form}: give one of them")
     tables = written_tables(runs)
     match Form.JSON if as_json else form:
         case Form.JSON:

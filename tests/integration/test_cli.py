@@ -210,6 +210,7 @@ def foreign_folder(path: Path) -> None:
         (("info", "missing"), "missing: there is no such file"),
         (("convert", "missing", "out.jsonl"), "missing: there is no such file"),
         (("compare", "missing"), "missing: no run folder"),
+        (("compare", "missing", "--json", "--format", "md"), "--json, --format md: give one of them"),
         (("compare", "drive.jsonl"), "drive.jsonl: no run folder"),
         (("figure", "missing", "-o", "figures"), "missing: no run folder"),
         (("simulate", "missing.yaml", "-o", "x.jsonl"), "missing.yaml: there is no such scenario file"),
