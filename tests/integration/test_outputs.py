@@ -148,7 +148,11 @@ def test_other_files_beside_a_run_stay(here: Path, call: Call) -> None:
     assert load_run("run").meta["input"]["path"] == "drive.jsonl"
 
 
-@pytest.mark.parametrize("text", ['{"type": "ego"}\n', "", '{"type": "header", "format": "fgtrack-stream/1"}\n{"ty'])
+HEADER = '{"type": "header", "format": "fgtrack-stream/1"}\n'
+TRUTH = '{"type": "truth", "stamp_ns": 1, "receipt_ns": 1, "object_id": 1, "x_m": 0, "y_m": 0}\n'
+
+
+@pytest.mark.parametrize("text", ['{"type": "ego"}\n', "", HEADER + '{"ty', HEADER + TRUTH, HEADER + TRUTH + "{}\n"])
 def test_an_input_that_gives_nothing_leaves_the_old_run(here: Path, call: Call, text: str) -> None:
     Path("bad.jsonl").write_text(text)
     before = content(here / "run")
