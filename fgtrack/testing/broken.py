@@ -7,7 +7,7 @@ class BrokenPromiseError(AssertionError):
     """A contract is broken: `promises` holds what is wrong by name of the promise."""
 
     def __init__(self, what: str, promises: Mapping[str, str]) -> None:
-        super().__init__("\n\n".join(f"{what} breaks {name}: {text}" for name, text in promises.items()))
+        super().__init__("\n\n".join(f"{what}: broken promise: it {name}\n{text}" for name, text in promises.items()))
         self.promises = dict(promises)
 
 
