@@ -47,7 +47,9 @@ def _sections(cls: type, path: str, kind: str | None, seen: set[type]) -> Iterat
     seen.add(cls)
     hints, docs = get_type_hints(cls, include_extras=True), _attribute_docs(cls)
     fields = [field for field in dataclasses.fields(cls) if field.name != "kind" or _kind(cls) is None]
-    settings = [Setting(f.name, _type(hints[f.name]), _default(f), docs.get(f.name, "")) for f in fields]
+    settings = [
+        Setting(f.name, _type(hints[f.name]), _default(f), docs.get(f.name) or _summary(hints[f.name])) for f in fields
+    ]
     yield Section(path, kind, inspect.getdoc(cls) or "", tuple(settings))
     for field in fields:
         inner = f"{path}.{field.name}" if path else field.name
@@ -68,6 +70,14 @@ def _dataclasses(hint: Any, named: str = "") -> Iterator[tuple[type, str | None,
     elif origin in (tuple, list, Mapping, dict) or (isinstance(origin, type) and issubclass(origin, Mapping)):
         for one in get_args(hint):
             yield from _dataclasses(one, "NAME" if origin not in (tuple, list) else "N")
+
+
+def _summary(hint: Any) -> str:
+    """The first line about a value that has keys of its own."""
+    found = list(_dataclasses(hint))
+    if len(found) > 1:
+        return "Keys of each kind below."
+    return _one_line((inspect.getdoc(found[0][0]) or "").partition("\n\n")[0]) if found else ""
 
 
 def _kind(cls: type) -> str | None:

@@ -12,6 +12,7 @@ class TopicInput:
     """One topic of a recording."""
 
     topic: str
+    """Name of the topic."""
     type: str | None = None
     """Message type, where the topic has several or must have this one."""
     frame: Frame | None = None

@@ -25,6 +25,7 @@ class RobustLoss:
     """A loss that grows slower than the square, so that an outlier pulls less; smoothers use it."""
 
     kind: Literal["huber", "cauchy", "tukey", "geman_mcclure", "dcs"]
+    """`tukey`, `geman_mcclure` and `dcs` are redescending: they can lose a track for good."""
     width: float
     """Where the loss leaves the square, in standard deviations (of the whole measurement)."""
 

@@ -72,9 +72,13 @@ class MapConfig:
     pit: str | None = None
     """CSV file of the pit lane, `oval` for the built-in one, or null."""
     lookup: Literal["frenet", "published", "published_circular_heading"] = "frenet"
+    """`frenet` projects on the reference line; the others are look-ups of the published implementation (Q3, Q4)."""
     inner_buffer_m: float = -0.5
+    """How far beyond the inner bound an object may be."""
     outer_buffer_m: float = -1.5
+    """The same for the outer bound."""
     pit_buffer_m: float = -1.5
+    """The same for both bounds of the pit lane."""
 
 
 @dataclass(frozen=True)
@@ -82,13 +86,17 @@ class EgoConfig:
     """What is done to the ego state, and where detections in the ego frame have their origin."""
 
     kind: Literal["low_pass", "published"] = "low_pass"
+    """`published` filters its own output again at every tick (Q13)."""
     yaw_weight: float = 0.9
     """Weight of the new yaw in the low-pass."""
     yaw_rate_weight: float = 0.4
+    """Weight of the new yaw rate."""
     detection_origin_x_m: float = -1.74
     """Origin of the detections' ego frame, ahead of the ego reference point (the paper's: the rear axle)."""
     detection_origin_y_m: float = 0.0
+    """The same to the left."""
     memory_s: float = 5.0
+    """How far back the ego pose is known."""
     max_extrapolation_s: float = 1.0
     """A detection whose stamp is further than this from any ego state cannot be placed."""
     storage_ticks: int = 350
@@ -108,6 +116,7 @@ class InboxConfig:
     """How detections wait for the tick."""
 
     kind: Literal["queue", "slot"] = "queue"
+    """`slot` keeps only the newest list of each sensor (Q12)."""
     max_future_s: float = 1.0
     """A detection stamped further than this ahead of its receipt is invalid."""
 
@@ -117,6 +126,7 @@ class LifecycleConfig(LifecycleRules):
     """When a track starts and ends."""
 
     kind: Literal["counting", "published"] = "counting"
+    """`published`: which sensor ages which track, and when, as published (Q9, Q15, Q22)."""
     claim_overtaken: bool = False
     """Whether a track claims a detection that the newer one which started it has overtaken. As in the paper it does
     not, and the detection starts a second track: with a fast and a slow sensor nearly every new object gets two."""
@@ -127,9 +137,11 @@ class FilterConfig:
     """Time grid of the backward-forward EKF."""
 
     frequency_hz: float = 100.0
+    """Frequency of the grid."""
     storage_s: float = 3.5
     """How far back states are kept."""
     clock: Literal["grid", "leading"] = "grid"
+    """`leading`: the tracking time leads the clock by up to a step (Q14)."""
     present: Literal["stored", "stale"] = "stored"
     """Whether an update without delay reaches the stored present state."""
 
@@ -154,11 +166,13 @@ class MotionConfig:
     """The paper's process noise: each step of 1 / noise_hz adds (std_per_s / noise_hz)^2, hence the density
     std_per_s^2 / noise_hz. `ctra` takes `accel` as well, `cv` takes `velocity` alone."""
     noise_hz: float = 100.0
+    """Frequency of the steps to which `std_per_s` belongs."""
     parameters: Mapping[str, float] = field(default_factory=dict)
     """Keyword parameters of a plug-in, which has no `std_per_s`."""
     noise: Literal["density", "per_step"] = "density"
     """`per_step`: (std_per_s dt)^2 in every step dt of the filter, whatever its frequency (`ctrv_euler`)."""
     yaw: Literal["free", "saturated"] = "free"
+    """`saturated`: the yaw sticks at its upper limit (Q2)."""
     acceleration: Literal["none", "driving"] = "none"
     """`driving`: an acceleration that drives the speed but is never estimated (`ctrv_euler`, takes `accel`)."""
 
@@ -185,6 +199,7 @@ class Config:
     """Everything that decides a run besides its input."""
 
     estimator: str = "ekf-backward-forward"
+    """Name of the estimator of all tracks."""
     sensors: Mapping[str, SensorModel] = field(default_factory=lambda: PAPER_SENSORS)
     ignore_sensors: tuple[str, ...] = ()
     """Sensors of the input that are left out on purpose."""

@@ -66,7 +66,9 @@ class GatedEuclidean:
 
     kind: Literal["euclidean"] = "euclidean"
     gate_m: float = 5.0
+    """Largest distance of a pair."""
     max_nis: float | None = None
+    """Largest NIS of a pair; null for no limit."""
 
     def __post_init__(self) -> None:
         if not self.gate_m > 0.0:
@@ -95,7 +97,9 @@ class GatedMahalanobis:
 
     kind: Literal["mahalanobis"] = "mahalanobis"
     gate_probability: float = 0.99
+    """Probability with which a true pair passes the gate."""
     max_distance_m: float = 50.0
+    """Largest distance of a pair."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.gate_probability < 1.0:

@@ -21,9 +21,13 @@ class Birth(ABC):
     ego_speed_factor: float = 0.8
     """An object is assumed as fast as the ego times this; 0 for traffic that has nothing to do with the ego."""
     yaw_std_rad: float = math.sqrt(0.3)
+    """Standard deviation of a yaw from the map."""
     speed_std_mps: float = 2.0
+    """Standard deviation of a speed that is not measured."""
     yaw_rate_std_radps: float = math.sqrt(0.3)
+    """Standard deviation of the yaw rate."""
     accel_std_mps2: float = 1.0
+    """Standard deviation of the acceleration."""
     slow_ego_mps: float = 10.0
     """Below this ego speed an object is assumed to accelerate as the ego does (models with acceleration)."""
 
@@ -88,7 +92,9 @@ class FixedBirth(Birth):
 
     kind: Literal["fixed"] = "fixed"
     along_std_m: float = 0.1
+    """Standard deviation of the position along the heading."""
     across_std_m: float = 0.1
+    """Standard deviation of the position across the heading."""
 
     def spread(self, candidate: Candidate, yaw_rad: float) -> tuple[FloatArray, float, float]:
         """See `Birth.spread`."""

@@ -31,6 +31,7 @@ class LifecycleRules:
     """When a track counts up, counts down, and ends."""
 
     counter_cap: int = 25
+    """Largest value of the status counter."""
     forget_s: float = 2.0
     """A track not measured for so long ends."""
     short_range_m: float = 60.0

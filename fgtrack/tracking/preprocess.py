@@ -69,6 +69,7 @@ class ConnectedMerge(Merge):
 
     kind: Literal["connected"] = "connected"
     distance_m: float = 5.1
+    """Detections at most this far apart are linked."""
 
     def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
         """See `Merge.groups`; in the order of their first members, which lead."""

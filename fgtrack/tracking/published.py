@@ -129,6 +129,7 @@ class NeighbourhoodMerge(Merge):
 
     kind: Literal["neighbourhood"] = "neighbourhood"
     distance_m: float = 5.1
+    """Detections at most this far apart are neighbours."""
 
     def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
         """See `Merge.groups`; the merged ones first, in the order of a set of index tuples."""
@@ -157,6 +158,7 @@ class UngatedEuclidean:
 
     kind: Literal["ungated_euclidean"] = "ungated_euclidean"
     gate_m: float = 5.0
+    """Largest distance of a pair that is kept."""
 
     def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
         """See `Association`; torn pairs are born after the detections that had no partner."""

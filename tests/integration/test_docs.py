@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache
+from importlib import import_module
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
@@ -292,6 +293,14 @@ def test_every_estimator_is_on_the_page_of_estimators() -> None:
 def test_every_section_of_the_configuration_is_on_its_page() -> None:
     page = (ROOT / "docs/configuration.md").read_text(encoding="utf-8")
     assert [field.name for field in fields(Config) if f"| `{field.name}` |" not in page] == []
+
+
+def test_every_setting_of_a_run_has_a_meaning_in_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs/_ext"))
+    found = list(import_module("reference").sections(Config))
+    assert len(found) > 20
+    lacking = [f"{section.path}.{one.name}" for section in found for one in section.settings if not one.doc]
+    assert [name for name in lacking if ".mount." not in name] == []
 
 
 def test_the_metrics_that_are_explained_exist() -> None:
