@@ -1,0 +1,84 @@
+"""How a smoother finds the direction of an object that starts with an unknown one."""
+
+import numpy as np
+import pytest
+
+from fgtrack.core.geometry import rotation
+from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
+from fgtrack.estimation.factor_graph.initiation import Fix, Line, straight_line
+from fgtrack.estimation.factor_graph.window import Window
+from fgtrack.models.motion import CTRV
+
+STD_M = 0.5
+PERIOD_NS = 20_000_000  # in which the object moves hardly further than a standard deviation
+EXACT = SmootherSettings(relinearise=dict.fromkeys(CTRV.state_names[2:], 1e-6))
+
+
+def start() -> Start:
+    return Start(position_std_m=STD_M, yaw_std_rad=np.pi, speed_std_mps=40.0)
+
+
+def fused(yaw_rad: float, num: int, seed: int = 0, settings: SmootherSettings = EXACT) -> FixedLagSmoother:
+    """A smoother after `num` positions of an object at 30 m/s; the same but for the direction."""
+    rng, smoother = np.random.default_rng(seed), FixedLagSmoother(CTRV(), start(), settings)
+    for k in range(1, num + 1):
+        along_across = np.array([30.0 * k * PERIOD_NS / 1e9, 0.0]) + STD_M * rng.standard_normal(2)
+        x_m, y_m = (rotation(yaw_rad) @ along_across).tolist()
+        smoother.update(Measurement.of(k * PERIOD_NS, x_m=x_m, y_m=y_m, std={"x_m": STD_M, "y_m": STD_M}))
+    return smoother
+
+
+@pytest.mark.parametrize("yaw_rad", [-2.5, -1.0, 1.5, 3.0])
+def test_no_direction_of_travel_is_preferred(yaw_rad: float) -> None:
+    """That at which the state began is none that was known."""
+    for num in (2, 4, 20):
+        ahead, turned = (fused(yaw, num).state_at(num * PERIOD_NS).mean for yaw in (0.0, yaw_rad))
+        ahead[:2] = rotation(yaw_rad) @ ahead[:2]
+        turn = np.array([0.0, 0.0, yaw_rad, 0.0, 0.0])
+        off = turned - ahead - turn
+        off[2] = np.angle(np.exp(1j * off[2]))
+        np.testing.assert_allclose(off, 0.0, atol=1e-3)
+    assert abs(turned[3] - 30.0) < 5.0
+    assert abs(np.angle(np.exp(1j * (turned[2] - yaw_rad)))) < 0.3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_while_the_direction_is_uncertain_every_measurement_is_solved_to_convergence(seed: int) -> None:
+    for num in (1, 2):
+        smoother = fused(-2.5, num, seed)
+        found = smoother.state_at(num * PERIOD_NS)
+        smoother.converge()
+        off = found.mean - smoother.state_at(num * PERIOD_NS).mean
+        assert np.abs(off / np.sqrt(np.diag(found.covariance))).max() < 1e-3
+
+
+def test_a_certain_direction_is_not_sought_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line is a poor guess of a bend, so it serves as long as it must and no longer."""
+    restarts: list[Line] = []
+    restart = Window.restart
+    monkeypatch.setattr(Window, "restart", lambda self, line: (restarts.append(line), restart(self, line)))
+    fused(1.0, 20)
+    assert restarts[-1].certain
+    assert not any(line.certain for line in restarts[:-1])
+    assert 1 < len(restarts) < 20
+    restarts.clear()
+    smoother = FixedLagSmoother(CTRV(), Start(yaw_rad=0.0))
+    smoother.update(Measurement.of(PERIOD_NS, x_m=1.0, y_m=0.0, std={"x_m": STD_M, "y_m": STD_M}))
+    assert not restarts
+
+
+def test_two_positions_give_their_difference_over_their_time() -> None:
+    R = np.diag([0.04, 0.09])
+    line = straight_line([Fix(0.5, np.array([1.0, 2.0]), R), Fix(1.0, np.array([4.0, 0.0]), 2.0 * R)])
+    np.testing.assert_allclose(line.velocity_mps, [6.0, -4.0], atol=1e-9)
+    np.testing.assert_allclose(line.position_m, [-2.0, 4.0], atol=1e-9)
+    np.testing.assert_allclose(line.covariance, 3.0 * R / 0.25, atol=1e-9)
+    with pytest.raises(np.linalg.LinAlgError):
+        straight_line([Fix(1.0, np.zeros(2), R), Fix(1.0, np.ones(2), R)])
+
+
+def test_a_direction_is_certain_from_three_standard_deviations_of_the_velocity_on() -> None:
+    for std, certain in ((2.9, False), (3.1, True)):
+        velocity = np.array([0.0, std * 2.0])
+        assert Line(np.zeros(2), velocity, np.diag([1.0, 4.0])).certain is certain

@@ -1,0 +1,150 @@
+"""What a smoother promises of its window, its relinearisation and its outputs."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import Measurement, SensorPose, Start, UpdateStatus
+from fgtrack.estimation.factor_graph import (
+    BatchBackend,
+    FixedLagSmoother,
+    IncrementalBackend,
+    SmootherBank,
+    SmootherSettings,
+)
+from fgtrack.estimation.factor_graph.backends.base import Backend, Change
+from fgtrack.models.motion import CTRV, CV
+
+MS = 1_000_000
+STD = {"x_m": 0.3, "y_m": 0.3}
+MakeBackend = Callable[[FloatArray], Backend]
+
+
+def at(ms: int, x_m: float, y_m: float = 0.0) -> Measurement:
+    return Measurement.of(ms * MS, x_m=x_m, y_m=y_m, std=STD)
+
+
+def largest_step_to_convergence(smoother: FixedLagSmoother, ms: int) -> float:
+    """How far the state at `ms` is from that of convergence, in standard deviations."""
+    found = smoother.state_at(ms * MS)
+    smoother.converge()
+    return float((np.abs(found.mean - smoother.state_at(ms * MS).mean) / np.sqrt(np.diag(found.covariance))).max())
+
+
+# --- relinearisation
+
+
+@pytest.mark.parametrize("make", [IncrementalBackend, BatchBackend])
+def test_the_process_noise_follows_the_states_that_move(make: MakeBackend) -> None:
+    """The speed starts far off, and with it the noise across the direction of travel."""
+    names, start = CTRV().state_names, Start(yaw_rad=0.4, yaw_std_rad=0.5, speed_mps=5.0, speed_std_mps=50.0)
+    apart = {}
+    for threshold in (1e-7, 1e9):
+        settings = SmootherSettings(lag_s=9.0, relinearise=dict.fromkeys(names, threshold), max_iterations=50)
+        smoother = FixedLagSmoother(CTRV(), start, settings, make)
+        for k in range(1, 6):
+            smoother.update(at(500 * k, 15.0 * k, 0.8 * k * k))
+        apart[threshold] = largest_step_to_convergence(smoother, 2500)
+    assert apart[1e-7] < 1e-5
+    assert apart[1e9] > 5e-3
+
+
+def test_a_sensor_that_is_not_linear_brings_the_thresholds_of_the_position() -> None:
+    """Bearings from the side, of an object that starts far from where it is."""
+    pose, start = SensorPose(0.0, -20.0), Start(position_m=(8.0, 6.0), position_std_m=10.0, speed_std_mps=1.0)
+    smoother = FixedLagSmoother(CV(), start, SmootherSettings(lag_s=9.0))
+    smoother.update(at(100, 7.0, 6.0))
+    for k in range(2, 8):
+        std = {"range_m": 0.2, "bearing_rad": 0.02}
+        smoother.update(Measurement.of(100 * k * MS, range_m=20.0, bearing_rad=np.pi / 2, std=std, pose=pose))
+    assert smoother.num_rebuilt == 0
+    assert largest_step_to_convergence(smoother, 700) < 0.1
+
+
+class Counted(IncrementalBackend):
+    num_updates = 0
+
+    def update(self, change: Change) -> list[int]:
+        Counted.num_updates += 1
+        return super().update(change)
+
+
+def test_further_iterations_are_taken_only_while_a_state_moves() -> None:
+    smoother = FixedLagSmoother(CV(), Start(), SmootherSettings(max_iterations=5), Counted)
+    Counted.num_updates = 0
+    smoother.update(at(100, 3.0))
+    assert Counted.num_updates == 1
+    settings = SmootherSettings(max_iterations=5, relinearise=dict.fromkeys(CTRV().state_names, 1e-9))
+    smoother = FixedLagSmoother(CTRV(), Start(yaw_rad=0.5, speed_mps=20.0), settings, Counted)
+    Counted.num_updates = 0
+    smoother.update(at(100, 3.0))
+    assert Counted.num_updates == 5
+
+
+def test_the_oldest_state_keeps_the_linearisation_point_of_its_prior() -> None:
+    """iSAM2 does not relinearise it, so it is no reason for further iterations."""
+    thresholds = dict.fromkeys(CTRV().state_names, 1e-3)
+    settings = SmootherSettings(lag_s=0.25, lagged_s=(), relinearise=thresholds, max_iterations=20)
+    smoother = FixedLagSmoother(CTRV(), Start(yaw_rad=0.5, speed_mps=20.0), settings, Counted)
+    for k in range(1, 12):
+        Counted.num_updates = 0
+        smoother.update(at(100 * k, 2.2 * k, 0.1 * k * k))
+        assert Counted.num_updates < 20
+
+
+# --- window
+
+
+def test_the_window_is_as_long_as_it_says() -> None:
+    smoother = FixedLagSmoother(CV(), Start(), SmootherSettings(lag_s=0.3, late="drop"))
+    for k in range(1, 11):
+        smoother.update(at(100 * k, 1.0 * k))
+    assert smoother.window_ns == (700 * MS, 1000 * MS)
+    assert smoother.update(at(699, 7.0)).status is UpdateStatus.TOO_OLD
+    assert smoother.update(at(700, 7.0)).status is UpdateStatus.OUT_OF_SEQUENCE
+    smoother.advance(1100 * MS)
+    smoother.advance(900 * MS)
+    assert smoother.window_ns[0] == 800 * MS
+    assert smoother.update(at(1000, 10.0)).status is UpdateStatus.IN_SEQUENCE
+
+
+def test_final_states_come_once_and_the_rest_when_the_track_ends() -> None:
+    smoother = FixedLagSmoother(CV(), Start(), SmootherSettings(lag_s=0.25, lagged_s=()))
+    for k in range(1, 7):
+        smoother.update(at(100 * k, 1.0 * k))
+    assert [state.stamp_ns for state in smoother.take_final()] == [k * 100 * MS for k in (0, 1)]
+    assert smoother.take_final() == []
+    assert [state.stamp_ns for state in smoother.take_rest()] == [k * 100 * MS for k in (2, 3, 4, 5, 6)]
+    silent = FixedLagSmoother(CV(), Start(), SmootherSettings(lag_s=0.25, lagged_s=(), final=False))
+    for k in range(1, 7):
+        silent.update(at(100 * k, 1.0 * k))
+    assert silent.take_rest() == []
+
+
+def test_a_bank_reports_lagged_and_final_states() -> None:
+    bank = SmootherBank(CV(), SmootherSettings(lag_s=0.3, ring_s=0.5, lagged_s=(0.2,)))
+    bank.advance(100 * MS)
+    bank.birth(7, Start(stamp_ns=100 * MS))
+    assert bank.smoothed() == []  # 0.2 s ago there was no track
+    for k in range(2, 6):
+        bank.advance(100 * k * MS)
+        bank.update(100 * k * MS, [7], [at(100 * k, 1.0 * k)])
+    assert bank.window_start_ns == -300 * MS
+    [lagged] = [report for report in bank.smoothed() if report.lag_s is not None]
+    assert (lagged.track_id, lagged.state.stamp_ns, lagged.lag_s) == (7, 300 * MS, 0.2)
+    bank.remove(7)
+    assert [report.state.stamp_ns for report in bank.smoothed()] == [100 * k * MS for k in (2, 3, 4, 5)]
+    assert bank.smoothed() == []
+
+
+def test_a_bank_refuses_late_data_where_that_is_an_error() -> None:
+    bank = SmootherBank(CV(), SmootherSettings(lag_s=0.3, late="raise"))
+    bank.birth(0, Start())
+    bank.advance(1000 * MS)
+    assert bank.window_start_ns == 0
+    assert bank.states_at(700 * MS).track_ids == (0,)
+    with pytest.raises(DataError, match=r"0\.4 s late.*smoother\.lag_s"):
+        bank.states_at(600 * MS)
