@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from fgtrack.core.types import ACCEL, SPEED, STATE_NAMES, YAW, YAW_RATE, FloatAr
 from fgtrack.models.arc import (
     NODES,
     WEIGHTS,
-    ComplexArray,
     heading_moments,
     small_turn,
     small_turn_noise,
@@ -177,7 +176,7 @@ class CTRV(WhiteNoise, MotionModel):
     def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """State after `dt_s` on the exact arc, shape (..., 5); the yaw is not wrapped."""
         t = np.asarray(dt_s, dtype=np.float64)
-        moved = way(heading_moments(x, t), 0, *self._drive(x))
+        moved = way(heading_moments(x, t), 0, *_drive(x))
         after = _broadcast_copy(x, t)
         after[..., X] += moved.real
         after[..., Y] += moved.imag
@@ -189,7 +188,8 @@ class CTRV(WhiteNoise, MotionModel):
         t = np.asarray(dt_s, dtype=np.float64)
         moments = heading_moments(x, t)
         F = _identities(moments[0].shape, self.dim)
-        _set_position_rows(F, way_gradient(moments, *self._drive(x)))
+        for column, derivative in enumerate(way_gradient(moments, *_drive(x)), start=YAW):
+            F[..., X, column], F[..., Y, column] = derivative.real, derivative.imag
         F[..., YAW, YAW_RATE] = t
         return F
 
@@ -214,43 +214,33 @@ class CTRV(WhiteNoise, MotionModel):
             raise _backwards(dt_s)
         arc = small_turn(x[YAW], x[YAW_RATE], dt_s)
         if arc is None:
-            return Prediction(*self.flow(x, dt_s), self.process_noise(np.array(x, dtype=np.float64), dt_s))
+            return super().step(x, dt_s)
         mean, F = self._along(x, dt_s, arc.moments)
         return Prediction(mean, F, small_turn_noise(arc, dt_s, self._densities, x[SPEED], *x[ACCEL:]))
 
     def flow(self, x: Sequence[float], dt_s: float) -> tuple[list[float], FloatArray]:
         """See `MotionModel.flow`; fast up to a turn of `MAX_SMALL_TURN_RAD`."""
         arc = small_turn(x[YAW], x[YAW_RATE], dt_s)
-        if arc is not None:
-            return self._along(x, dt_s, arc.moments)
-        moments = heading_moments(np.array(x, dtype=np.float64), np.array(dt_s))
-        return self._along(x, dt_s, [complex(moment) for moment in moments])
+        return super().flow(x, dt_s) if arc is None else self._along(x, dt_s, arc.moments)
 
     def _along(self, x: Sequence[float], t: float, moments: Sequence[complex]) -> tuple[list[float], FloatArray]:
         """`flow` with given heading moments."""
         drive = x[SPEED], *x[ACCEL:]
         moved = way(moments, 0, *drive)
         F = identity(len(x)).copy()
-        column = YAW
-        for derivative in way_gradient(moments, *drive):
+        for column, derivative in enumerate(way_gradient(moments, *drive), start=YAW):
             F[X, column], F[Y, column] = derivative.real, derivative.imag
-            column += 1
         F[YAW, YAW_RATE] = t
         return [x[X] + moved.real, x[Y] + moved.imag, x[YAW] + x[YAW_RATE] * t, *x[SPEED:]], F
 
     @cached_property
     def _root_densities(self) -> FloatArray:
-        position, *others = (getattr(self, name) for name in self.density_names())
-        return np.sqrt([position, position, *others])
+        return np.sqrt([self._densities[0], *self._densities])[: self.dim]
 
     @cached_property
     def _densities(self) -> tuple[float, ...]:
         """Of position, yaw, speed, yaw rate and acceleration; 0 where the state has none."""
         return (*(getattr(self, name) for name in self.density_names()), 0.0)[:5]
-
-    def _drive(self, x: FloatArray) -> tuple[FloatArray, ...]:
-        """Arguments of `way` from the speed on."""
-        return (x[..., SPEED],)
 
 
 @dataclass(frozen=True)
@@ -289,9 +279,6 @@ class CTRA(CTRV):
         F[SPEED, ACCEL] = t
         return mean, F
 
-    def _drive(self, x: FloatArray) -> tuple[FloatArray, ...]:
-        return x[..., SPEED], x[..., ACCEL]
-
 
 @dataclass(frozen=True)
 class CV(WhiteNoise, MotionModel):
@@ -326,23 +313,13 @@ class CV(WhiteNoise, MotionModel):
         Raises `CallError` where `dt_s` is negative.
         """
         t = self.forward(dt_s)
-        Q = np.zeros((*np.broadcast_shapes(x.shape[:-1], t.shape), 4, 4))
-        position, shared, velocity = self._axis_noise(t)
-        Q[..., 0, 0] = Q[..., 1, 1] = position
-        Q[..., 0, 2] = Q[..., 2, 0] = Q[..., 1, 3] = Q[..., 3, 1] = shared
-        Q[..., 2, 2] = Q[..., 3, 3] = velocity
-        return Q
+        return self._noise(np.broadcast_shapes(x.shape[:-1], t.shape), t)
 
     def step(self, x: Sequence[float], dt_s: float) -> Prediction:
         """See `MotionModel.step`."""
         if dt_s < 0.0:
             raise _backwards(dt_s)
-        Q = np.zeros((4, 4))
-        position, shared, velocity = self._axis_noise(dt_s)
-        Q[0, 0] = Q[1, 1] = position
-        Q[0, 2] = Q[2, 0] = Q[1, 3] = Q[3, 1] = shared
-        Q[2, 2] = Q[3, 3] = velocity
-        return Prediction(*self.flow(x, dt_s), Q)
+        return Prediction(*self.flow(x, dt_s), self._noise((), dt_s))
 
     def flow(self, x: Sequence[float], dt_s: float) -> tuple[list[float], FloatArray]:
         """See `MotionModel.flow`."""
@@ -351,17 +328,19 @@ class CV(WhiteNoise, MotionModel):
         F[0, 2] = F[1, 3] = dt_s
         return [x_m + vx * dt_s, y_m + vy * dt_s, vx, vy], F
 
-    def _axis_noise(self, t: Any) -> tuple[Any, Any, Any]:
-        """Variance of the position, covariance, variance of the velocity on one axis, of a number or an array."""
+    def _noise(self, shape: tuple[int, ...], t: FloatArray | float) -> FloatArray:
+        """Q over `t`, shape (*shape, 4, 4)."""
+        Q = np.zeros((*shape, 4, 4))
         q = self.velocity_density_m2ps3
-        return q * t**3 / 3.0, q * t**2 / 2.0, q * t
+        Q[..., 0, 0] = Q[..., 1, 1] = q * t**3 / 3.0
+        Q[..., 0, 2] = Q[..., 2, 0] = Q[..., 1, 3] = Q[..., 3, 1] = q * t**2 / 2.0
+        Q[..., 2, 2] = Q[..., 3, 3] = q * t
+        return Q
 
 
-def _set_position_rows(F: FloatArray, columns: tuple[ComplexArray, ...]) -> None:
-    """Write the derivatives of x (real) and y (imaginary) by yaw and the entries after it into `F`."""
-    for column, derivative in enumerate(columns, start=YAW):
-        F[..., X, column] = derivative.real
-        F[..., Y, column] = derivative.imag
+def _drive(x: FloatArray) -> tuple[FloatArray, ...]:
+    """Arguments of `way` from the speed on."""
+    return (x[..., SPEED], x[..., ACCEL]) if x.shape[-1] > ACCEL else (x[..., SPEED],)
 
 
 def _broadcast_copy(x: FloatArray, t: FloatArray) -> FloatArray:
