@@ -11,7 +11,7 @@ import pytest
 from fgtrack.cli import demo
 from fgtrack.cli.main import run
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.types import Detection, DetectionList, EgoState, Message
+from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TickReport
 from fgtrack.io import output
 from fgtrack.io.output import claimed, new_file, write_file
 from fgtrack.io.ros.bag_writer import write_bag
@@ -179,13 +179,21 @@ def test_nothing_is_replayed_where_one_of_several_folders_is_in_use(here: Path, 
 
 
 def test_two_runs_into_one_folder_do_not_mix(here: Path, call: Call) -> None:
-    write_stream("empty_run.jsonl", drive(5))
-    with RunWriter("run", overwrite=True):
+    with RunWriter("run", overwrite=True) as first:
         before = content(here / "run")
         code, error = call("replay", "drive.jsonl", "-o", "run", "--overwrite")
         assert (code, content(here / "run")) == (2, before)
         assert "another command is writing there" in error
-    assert call("replay", "drive.jsonl", "-o", "run", "--overwrite")[0] == 0
+    assert call("replay", "drive.jsonl", "-o", str(first.path), "--overwrite")[0] == 0  # it has let go
+
+
+def test_what_appears_in_the_folder_of_a_new_run_is_not_replaced(here: Path) -> None:
+    with RunWriter("new") as writer:
+        Path("new/tracks.csv").symlink_to(here / "drive.jsonl")
+        before = content(here)
+        with pytest.raises(CallError, match=r"new/tracks\.csv: cannot be written"):
+            writer.write_tick(TickReport(0, 1, (), ()), 1, 0)
+    assert {name: data for name, data in content(here).items() if name in before} == before
 
 
 def test_a_replay_that_is_under_way_holds_all_its_folders(here: Path) -> None:
