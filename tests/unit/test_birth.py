@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.models import MODELS
 from support.tracking import START_NS, StraightRoad, bearing
 
 from fgtrack.core.geometry import rotation
@@ -10,7 +11,7 @@ from fgtrack.core.types import EgoState
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.birth import initial_state
 from fgtrack.models.measurement import SensorPose, measurement_model
-from fgtrack.models.motion import CTRA, CTRV, CV
+from fgtrack.models.motion import CTRV
 from fgtrack.models.road import OpenSpace
 from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
 from fgtrack.tracking.preprocess import Candidate
@@ -89,7 +90,7 @@ def test_a_deviation_that_makes_no_sense_is_named(name: str) -> None:
         FixedBirth(**{name: 0.0})
 
 
-@pytest.mark.parametrize("motion", [CTRV(), CTRA(), CV()], ids=lambda motion: type(motion).__name__)
+@pytest.mark.parametrize("motion", MODELS, ids=lambda motion: type(motion).__name__)
 def test_the_first_state_of_every_motion_model_is_the_prior(motion) -> None:
     prior = MeasuredBirth().prior(seen(yaw_rad=1.0, speed_mps=20.0), ROAD, EGO, ego_in_pit=False)
     mean, P = initial_state(motion, prior)

@@ -2,13 +2,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.models import MODELS
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.ekf import correct, correct_one, correct_with_innovation, predict, predict_one
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import SensorPose, measurement_model
-from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
+from fgtrack.models.motion import CTRV, CV, MotionModel
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -124,7 +125,7 @@ def test_a_singular_innovation_covariance_is_an_error() -> None:
         correct(np.zeros((1, 5)), np.zeros((1, 5, 5)), np.ones((1, 2)), np.zeros((1, 2, 2)), model, SensorPose())
 
 
-@pytest.mark.parametrize("motion", [CTRV(), CTRA(), CV()])
+@pytest.mark.parametrize("motion", MODELS)
 def test_a_prediction_is_the_motion_model_with_its_noise_and_changes_no_input(motion: MotionModel) -> None:
     rng = np.random.default_rng(1)
     x, P = rng.normal(size=(3, motion.dim)), positive_definite(rng, 3, motion.dim)
@@ -150,7 +151,7 @@ def test_a_split_prediction_of_linear_motion_is_the_whole_one(seed: int, share: 
 
 
 @settings(deadline=None, max_examples=30)
-@given(seed=seeds, motion=st.sampled_from([CTRV(), CTRA(), CV()]), dt_s=st.sampled_from([0.0, 1e-6, 0.05, 3.0]))
+@given(seed=seeds, motion=st.sampled_from(MODELS), dt_s=st.sampled_from([0.0, 1e-6, 0.05, 3.0]))
 def test_the_prediction_of_one_state_is_that_of_a_stack(seed: int, motion: MotionModel, dt_s: float) -> None:
     rng = np.random.default_rng(seed)
     x, P = rng.normal(size=motion.dim) * 5.0, positive_definite(rng, 1, motion.dim)[0]
@@ -167,7 +168,7 @@ def test_the_prediction_of_one_state_is_that_of_a_stack(seed: int, motion: Motio
 @settings(deadline=None, max_examples=60)
 @given(
     seed=seeds,
-    motion=st.sampled_from([CTRV(), CTRA(), CV()]),
+    motion=st.sampled_from(MODELS),
     components=st.sampled_from(
         [("x_m", "y_m"), ("x_m", "y_m", "speed_mps"), ("yaw_rad",), ("range_m", "bearing_rad", "range_rate_mps")]
     ),

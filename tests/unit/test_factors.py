@@ -8,6 +8,7 @@ from itertools import product
 import gtsam
 import numpy as np
 import pytest
+from support.models import MOTIONS
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
@@ -15,10 +16,9 @@ from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, Incr
 from fgtrack.estimation.factor_graph.factors import measurement_factor, motion_factor, prior_factor, weight
 from fgtrack.estimation.factor_graph.terms import EquivalentMeasurement, MeasurementTerm
 from fgtrack.models.measurement import SensorPose, measurement_model
-from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
+from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.sensors import RobustLoss
 
-MOTIONS: dict[str, MotionModel] = {"cv": CV(), "ctrv": CTRV(), "ctra": CTRA()}
 LEFT, RIGHT = 3, 7
 POSE = SensorPose(2.0, -1.0, 0.3, 4.0, 1.0)
 COMPONENTS = {

@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from support.models import MODELS
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import MEASURABLE, FloatArray
 from fgtrack.models.measurement import MIN_RANGE_M, MeasurementModel, SensorPose, measurement_model
-from fgtrack.models.motion import CTRA, CTRV, CV, MIN_SPEED_MPS, MotionModel
+from fgtrack.models.motion import CTRV, CV, MIN_SPEED_MPS, MotionModel
 
-MODELS: tuple[MotionModel, ...] = (CTRV(), CTRA(), CV())
 every_model = pytest.mark.parametrize("motion", MODELS, ids=lambda model: type(model).__name__)
 SELECTION = ("x_m", "y_m", "yaw_rad", "speed_mps")
 DOPPLER = ("range_m", "bearing_rad", "range_rate_mps")

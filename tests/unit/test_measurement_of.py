@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.models import MODELS
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import TrackState
@@ -49,7 +50,7 @@ def test_what_makes_no_sense_is_one_line(given: dict, message: str) -> None:
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("motion", [CV(), CTRV(), CTRA()], ids=lambda motion: type(motion).__name__)
+@pytest.mark.parametrize("motion", MODELS, ids=lambda motion: type(motion).__name__)
 def test_every_kind_of_estimator_sees_it_in_its_own_state(motion) -> None:
     start, settings = Start(yaw_rad=0.5, speed_mps=20.0), SmootherSettings()
     values = {"x_m": 1.5, "y_m": 0.8, "yaw_rad": 0.5, "speed_mps": 21.0}

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.models import MODELS
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator
@@ -83,7 +84,7 @@ def test_all_euler_steps_at_once_are_the_steps_one_by_one(
         assert np.abs((covariances[i] - covariance) / scale).max() < 1e-11
 
 
-@pytest.mark.parametrize("motion", [CTRV(), CTRA(), CV()], ids=lambda motion: type(motion).__name__)
+@pytest.mark.parametrize("motion", MODELS, ids=lambda motion: type(motion).__name__)
 @settings(deadline=None, max_examples=10)
 @given(seed=seeds, steps=st.lists(st.integers(0, 60), min_size=1, max_size=3))
 def test_exact_steps_at_once_are_the_exact_steps_one_by_one(motion: MotionModel, seed: int, steps: list[int]) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.models import MODELS, MOTIONS
 
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
@@ -16,7 +17,7 @@ from fgtrack.estimation.factor_graph.chain import Chain, Node
 from fgtrack.estimation.factor_graph.marginalised_past import MarginalisedPast, Prior
 from fgtrack.estimation.interpolation import between
 from fgtrack.models.measurement import measurement_model
-from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
+from fgtrack.models.motion import CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
 
 MS, US = 1_000_000, 1_000
@@ -183,7 +184,7 @@ def test_an_outlier_weighs_as_little_behind_the_window_as_its_loss_says(kind: st
 
 @settings(deadline=None, max_examples=30)
 @given(
-    kind=st.sampled_from([CV(), CTRV(), CTRA()]),
+    kind=st.sampled_from(MODELS),
     until_ns=st.integers(50 * MS, 800 * MS),
     after_ns=st.integers(50 * MS, 800 * MS),
     seed=st.integers(0, 2**31),
@@ -213,7 +214,7 @@ def test_the_state_between_two_nodes_is_the_conditional_of_the_joint(
     np.testing.assert_allclose(found.mean, middle + moved, atol=1e-6 * max(1.0, np.abs(moved).max()))
 
 
-@pytest.mark.parametrize("kind", [CV(), CTRV(), CTRA()], ids=["cv", "ctrv", "ctra"])
+@pytest.mark.parametrize("kind", MODELS, ids=MOTIONS)
 def test_at_its_ends_the_state_between_two_nodes_is_theirs(kind: MotionModel) -> None:
     left = np.array([12.0, 7.0, 0.4, 20.0, 0.3, 1.5])[: kind.dim]
     right = kind.predict(left, 0.3) + 0.1
