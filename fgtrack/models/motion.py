@@ -89,7 +89,7 @@ class MotionModel(ABC):
         """`dt_s` as an array; raises `CallError` where it is negative, because noise accumulates forwards only."""
         t = np.asarray(dt_s, dtype=np.float64)
         if (t < 0.0).any():
-            raise _backwards(t.min())
+            raise CallError(f"process_noise: dt_s is {t.min()} s; noise needs a duration >= 0, swap the stamps")
         return t
 
     def step(self, x: Sequence[float], dt_s: float) -> Prediction:
@@ -210,10 +210,8 @@ class CTRV(WhiteNoise, MotionModel):
 
     def step(self, x: Sequence[float], dt_s: float) -> Prediction:
         """See `MotionModel.step`; fast up to a turn of `MAX_SMALL_TURN_RAD`."""
-        if dt_s < 0.0:
-            raise _backwards(dt_s)
         arc = small_turn(x[YAW], x[YAW_RATE], dt_s)
-        if arc is None:
+        if arc is None or dt_s < 0.0:
             return super().step(x, dt_s)
         mean, F = self._along(x, dt_s, arc.moments)
         return Prediction(mean, F, small_turn_noise(arc, dt_s, self._densities, x[SPEED], *x[ACCEL:]))
@@ -317,9 +315,7 @@ class CV(WhiteNoise, MotionModel):
 
     def step(self, x: Sequence[float], dt_s: float) -> Prediction:
         """See `MotionModel.step`."""
-        if dt_s < 0.0:
-            raise _backwards(dt_s)
-        return Prediction(*self.flow(x, dt_s), self._noise((), dt_s))
+        return Prediction(*self.flow(x, dt_s), self._noise((), dt_s)) if dt_s >= 0.0 else super().step(x, dt_s)
 
     def flow(self, x: Sequence[float], dt_s: float) -> tuple[list[float], FloatArray]:
         """See `MotionModel.flow`."""
@@ -351,7 +347,3 @@ def _broadcast_copy(x: FloatArray, t: FloatArray) -> FloatArray:
 def _identities(shape: tuple[int, ...], n: int) -> FloatArray:
     """Writable identity matrices, shape (*shape, n, n)."""
     return np.broadcast_to(np.eye(n), (*shape, n, n)).copy()
-
-
-def _backwards(dt_s: float) -> CallError:
-    return CallError(f"process_noise: dt_s is {dt_s} s; noise needs a duration >= 0, swap the stamps")

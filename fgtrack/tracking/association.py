@@ -81,9 +81,9 @@ class GatedEuclidean:
         cost = euclidean_distances(candidates, states.means)
         near = cost <= self.gate_m
         if self.max_nis is None:
-            return _assigned(cost, near)
+            return assigned(cost, near)
         believed = near & (_innovations(candidates, states)[0] <= self.max_nis)
-        found = _assigned(cost, believed)
+        found = assigned(cost, believed)
         refused = tuple(i for i in found.new if near[i].any())
         return found._replace(new=[i for i in found.new if not near[i].any()], refused=refused)
 
@@ -113,7 +113,7 @@ class GatedMahalanobis:
         inside = euclidean_distances(candidates, states.means) <= self.max_distance_m
         for row, candidate in enumerate(candidates):
             inside[row] &= nis[row] <= chi_square_quantile(self.gate_probability, len(candidate.measurement.z))
-        return _assigned(nis + log_volume, inside)
+        return assigned(nis + log_volume, inside)
 
 
 def _innovations(candidates: Sequence[Candidate], states: StatesAt) -> tuple[FloatArray, FloatArray]:
@@ -136,7 +136,8 @@ def chi_square_quantile(probability: float, freedom: int) -> float:
     return float(2.0 * gammaincinv(0.5 * freedom, probability))
 
 
-def _assigned(cost: FloatArray, inside: BoolArray) -> Assignment:
+def assigned(cost: FloatArray, inside: BoolArray) -> Assignment:
+    """Of all pairs `inside` their gates as many as possible, at least `cost`, both of shape (candidates, tracks)."""
     cost[~inside] = _REFUSED
     rows, columns = linear_sum_assignment(cost)
     pairs = [(i, j) for i, j in zip(rows.tolist(), columns.tolist(), strict=True) if inside[i, j]]

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray, TrackStatus
@@ -82,17 +81,24 @@ class Lifecycle:
         """These tracks, at these distances from the ego, were not seen; the ids of those that end."""
         ended = []
         for track_id, range_m in zip(track_ids, ranges_m.tolist(), strict=True):
-            if ages_at(self._sensors[sensor].ages, range_m, self._rules.short_range_m):
-                life = self.lives[track_id]
+            life = self.lives[track_id]
+            if self._ages(sensor, range_m):
                 life.counter -= 1
                 life.misses += 1
-                if life.counter <= 0 or self._unconfirmed_too_long(life):
-                    ended.append(track_id)
+            if self._ends(life, present_ns):
+                ended.append(track_id)
         return ended
 
-    def _unconfirmed_too_long(self, life: Life) -> bool:
+    def _ages(self, sensor: str, range_m: float) -> bool:
+        """Whether `sensor` counts down a track at `range_m` that it did not see."""
+        ages = self._sensors[sensor].ages
+        near = range_m <= self._rules.short_range_m
+        return ages == "always" or ages == ("short_range" if near else "long_range")
+
+    def _ends(self, life: Life, present_ns: int) -> bool:
         limit = self._rules.tentative_misses
-        return limit is not None and life.misses >= limit and life.num_measured < self._rules.confirm_count
+        unconfirmed = life.num_measured < self._rules.confirm_count
+        return life.counter <= 0 or (limit is not None and life.misses >= limit and unconfirmed)
 
     def expired(self, present_ns: int) -> list[int]:
         """The ids of tracks that end because time has passed."""
@@ -101,14 +107,3 @@ class Lifecycle:
     def forget(self, track_id: int) -> None:
         """The track has ended."""
         del self.lives[track_id]
-
-
-def ages_at(
-    ages: Literal["always", "short_range", "long_range", "never"], range_m: float, short_range_m: float
-) -> bool:
-    """Whether a sensor that `ages` so counts down a track at `range_m` that it did not see."""
-    if ages == "short_range":
-        return range_m <= short_range_m
-    if ages == "long_range":
-        return range_m > short_range_m
-    return ages == "always"

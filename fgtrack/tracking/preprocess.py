@@ -89,7 +89,7 @@ class ConnectedMerge(Merge):
 
 
 @dataclass(frozen=True, slots=True)
-class _Located:
+class _MapDetection:
     """A detection with its components in the map frame."""
 
     index: int
@@ -137,7 +137,7 @@ class Preprocess:
         vx_mps, vy_mps = ego.speed_mps * math.cos(ego.yaw_rad), ego.speed_mps * math.sin(ego.yaw_rad)
         return SensorPose(*_in_map(x_m, y_m, ego), yaw_rad, vx_mps, vy_mps)
 
-    def _off_road(self, located: list[_Located], sensor: SensorModel) -> list[int]:
+    def _off_road(self, located: list[_MapDetection], sensor: SensorModel) -> list[int]:
         """Indices of what lies outside the bounds; a yaw that was not measured becomes the map heading."""
         placed = [item for item in located if item.point_m is not None]
         if not self._road.known or not placed:
@@ -149,7 +149,7 @@ class Preprocess:
         return [item.index for item, out in zip(placed, view.outside.tolist(), strict=True) if out]
 
     def _candidates(
-        self, located: list[_Located], batch: Batch, sensor: SensorModel, pose: SensorPose
+        self, located: list[_MapDetection], batch: Batch, sensor: SensorModel, pose: SensorPose
     ) -> list[Candidate]:
         placed = [item for item in located if item.point_m is not None]
         groups = self._merge.groups(np.array([item.point_m for item in placed]).reshape(-1, 2))
@@ -166,9 +166,9 @@ class Preprocess:
 
     def _candidate(
         self,
-        leader: _Located,
+        leader: _MapDetection,
         merged: tuple[int, ...],
-        parts: Sequence[_Located],
+        parts: Sequence[_MapDetection],
         batch: Batch,
         sensor: SensorModel,
         pose: SensorPose,
@@ -198,7 +198,7 @@ class Preprocess:
         )
 
 
-def _located(index: int, batch: Batch, sensor: SensorModel, pose: SensorPose) -> _Located:
+def _located(index: int, batch: Batch, sensor: SensorModel, pose: SensorPose) -> _MapDetection:
     detection = batch.message.objects[index]
     values = {name: float(value) for name in sensor.std if (value := getattr(detection, name)) is not None}
     point_m = None
@@ -211,10 +211,10 @@ def _located(index: int, batch: Batch, sensor: SensorModel, pose: SensorPose) ->
     elif "range_m" in values:
         range_m, bearing_rad = values["range_m"], values["bearing_rad"]
         point_m = _in_map(range_m * math.cos(bearing_rad), range_m * math.sin(bearing_rad), pose)
-    return _Located(index, detection, values, point_m)
+    return _MapDetection(index, detection, values, point_m)
 
 
-def _out_of_range(located: list[_Located], sensor: SensorModel, pose: SensorPose) -> list[int]:
+def _out_of_range(located: list[_MapDetection], sensor: SensorModel, pose: SensorPose) -> list[int]:
     """Indices of what lies further from the sensor than it can be trusted."""
     limit_m = math.inf if sensor.max_range_m is None else sensor.max_range_m
     return [
@@ -224,7 +224,7 @@ def _out_of_range(located: list[_Located], sensor: SensorModel, pose: SensorPose
     ]
 
 
-def _common_names(parts: Sequence[_Located]) -> tuple[str, ...]:
+def _common_names(parts: Sequence[_MapDetection]) -> tuple[str, ...]:
     return _in_order(frozenset(parts[0].values).intersection(*[part.values for part in parts[1:]]))
 
 
@@ -240,7 +240,7 @@ def _in_map(x_m: float, y_m: float, pose: SensorPose | EgoPose) -> tuple[float, 
 
 
 def _covariance(
-    item: _Located, names: tuple[str, ...], batch: Batch, sensor: SensorModel, pose: SensorPose
+    item: _MapDetection, names: tuple[str, ...], batch: Batch, sensor: SensorModel, pose: SensorPose
 ) -> FloatArray:
     """Covariance of `names` in the map: the detection's own where it has one, else the sensor's R.
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from fgtrack.core.time import nanoseconds
@@ -13,10 +12,10 @@ from fgtrack.core.types import DetectionList, Disposition, EgoState, FloatArray,
 from fgtrack.estimation.base import StatesAt
 from fgtrack.estimation.published import published_yaw
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.association import Assignment, euclidean_distances
+from fgtrack.tracking.association import Assignment, assigned, euclidean_distances
 from fgtrack.tracking.ego import EgoPose, EgoSource, extrapolated
 from fgtrack.tracking.inbox import Batch, is_covariance, is_number, record, records
-from fgtrack.tracking.lifecycle import Lifecycle
+from fgtrack.tracking.lifecycle import Life, Lifecycle
 from fgtrack.tracking.preprocess import Candidate, Merge
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
@@ -163,14 +162,11 @@ class UngatedEuclidean:
     def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
         """See `Association`; torn pairs are born after the detections that had no partner."""
         cost = euclidean_distances(candidates, states.means)
-        rows, columns = linear_sum_assignment(cost)
-        pairs = list(zip(rows.tolist(), columns.tolist(), strict=True))
-        good = [(i, j) for i, j in pairs if not cost[i, j] > self.gate_m]
-        torn = [i for i, j in pairs if cost[i, j] > self.gate_m]
-        assigned = set(rows.tolist())
-        seen = {j for _, j in good}
-        alone = [i for i in range(len(candidates)) if i not in assigned]
-        return Assignment(good, alone + torn, [j for j in range(len(states.track_ids)) if j not in seen])
+        found = assigned(cost, np.ones(cost.shape, dtype=bool))
+        torn = [pair for pair in found.pairs if cost[pair] > self.gate_m]
+        good = [pair for pair in found.pairs if pair not in torn]
+        missed = sorted(found.missed + [j for _, j in torn])
+        return Assignment(good, found.new + [i for i, _ in torn], missed)
 
 
 class PublishedLifecycle(Lifecycle):
@@ -192,21 +188,11 @@ class PublishedLifecycle(Lifecycle):
         life.last_seen_ns = stamp_ns
         life.misses = 0
 
-    def missed(self, track_ids: Sequence[int], sensor: str, ranges_m: FloatArray, present_ns: int) -> list[int]:
-        """See `Lifecycle.missed`."""
-        ages = self._sensors[sensor].ages
-        ended = []
-        for track_id, range_m in zip(track_ids, ranges_m.tolist(), strict=True):
-            life = self.lives[track_id]
-            near = range_m <= self._rules.short_range_m
-            if (near and ages == "short_range") or (not near and ages == "long_range"):
-                life.counter -= 1
-                life.misses += 1
-            if present_ns - life.last_seen_ns > self._forget_ns:
-                life.counter = -1
-            if life.counter <= 0:
-                ended.append(track_id)
-        return ended
+    def _ages(self, sensor: str, range_m: float) -> bool:
+        return self._sensors[sensor].ages != "always" and super()._ages(sensor, range_m)
+
+    def _ends(self, life: Life, present_ns: int) -> bool:
+        return life.counter <= 0 or present_ns - life.last_seen_ns > self._forget_ns
 
     def expired(self, present_ns: int) -> list[int]:
         """See `Lifecycle.expired`; never, without a list."""

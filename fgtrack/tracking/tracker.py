@@ -20,7 +20,7 @@ from fgtrack.core.types import (
     TrackState,
     UpdateRecord,
 )
-from fgtrack.estimation.base import StatesAt, TrackBank, UpdateResult, UpdateStatus, no_states
+from fgtrack.estimation.base import StatesAt, TrackBank, UpdateResult, no_states
 from fgtrack.estimation.ekf import predict
 from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.models.motion import MotionModel
@@ -32,8 +32,6 @@ from fgtrack.tracking.ego import EgoPose, EgoSource
 from fgtrack.tracking.inbox import NO_INNOVATION, Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Lifecycle
 from fgtrack.tracking.preprocess import Candidate, Preprocess
-
-_DISPOSITIONS = {status: Disposition(status.value) for status in UpdateStatus}
 
 
 @dataclass(frozen=True)
@@ -96,7 +94,9 @@ class Tracker:
         for batch in batches:
             self._process(batch)
         updates, self._records = tuple(self._records), []
-        return TickReport(self._tick, now_ns, self._reports(), updates, tuple(self._parts.bank.smoothed()))
+        bank = self._parts.bank
+        tracks = tuple(self._report(*track) for track in zip(bank.track_ids, bank.present(), strict=True))
+        return TickReport(self._tick, now_ns, tracks, updates, tuple(bank.smoothed()))
 
     def finish(self) -> tuple[SmoothedReport, ...]:
         """End all tracks; gives the final smoothed states that were still inside a window."""
@@ -222,7 +222,7 @@ class Tracker:
         for candidate, track_id, result in zip(matched, track_ids, results, strict=True):
             if result.innovation is not None:
                 self._parts.lifecycle.fused(track_id)
-            self._conclude(batch, candidate, _DISPOSITIONS[result.status], track_id, result)
+            self._conclude(batch, candidate, Disposition(result.status.value), track_id, result)
 
     def _give_birth(self, batch: Batch, candidate: Candidate, sensor: SensorModel) -> None:
         parts = self._parts
@@ -260,12 +260,6 @@ class Tracker:
         for track_id in track_ids:
             self._parts.bank.remove(track_id)
             self._parts.lifecycle.forget(track_id)
-
-    def _reports(self) -> tuple[TrackReport, ...]:
-        bank = self._parts.bank
-        return tuple(
-            self._report(track_id, state) for track_id, state in zip(bank.track_ids, bank.present(), strict=True)
-        )
 
     def _report(self, track_id: int, state: TrackState) -> TrackReport:
         life = self._parts.lifecycle.lives[track_id]

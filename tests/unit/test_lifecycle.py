@@ -4,7 +4,7 @@ from support.tracking import START_NS, ms
 
 from fgtrack.core.types import TrackStatus
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.lifecycle import Life, Lifecycle, LifecycleRules, ages_at
+from fgtrack.tracking.lifecycle import Life, Lifecycle, LifecycleRules
 from fgtrack.tracking.published import PublishedLifecycle
 
 STD = {"x_m": 0.3, "y_m": 0.3}
@@ -40,7 +40,11 @@ def test_a_track_starts_with_the_counter_of_the_sensor_that_found_it(kind) -> No
     ],
 )
 def test_a_sensor_ages_only_what_it_is_responsible_for(ages, near: bool, at_limit: bool, far: bool) -> None:
-    assert [ages_at(ages, range_m, 60.0) for range_m in (10.0, 60.0, 60.1)] == [near, at_limit, far]
+    life = Lifecycle(LifecycleRules(short_range_m=60.0), {"one": SensorModel(std=STD, ages=ages)})
+    for track_id in range(3):
+        life.born(track_id, "one", START_NS, START_NS)
+    life.missed([0, 1, 2], "one", np.array([10.0, 60.0, 60.1]), START_NS)
+    assert [life.lives[i].misses == 1 for i in range(3)] == [near, at_limit, far]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -98,7 +102,6 @@ def test_time_alone_ends_a_track_but_the_published_one_needs_a_list() -> None:
     assert published.expired(late_ns) == []
     assert published.missed([0], "blind", np.array([10.0]), late_ns - 1) == []
     assert published.missed([0], "blind", np.array([10.0]), late_ns) == [0]
-    assert published.lives[0].counter == -1
 
 
 def test_the_status_tells_unconfirmed_from_seen_from_missed() -> None:
