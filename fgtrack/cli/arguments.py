@@ -15,6 +15,8 @@ ConfigFile = Annotated[
     str | None,
     typer.Option("-c", "--config", help="Configuration: a file (YAML) or a shipped name; without it the defaults."),
 ]
+TrackMap = Annotated[str | None, typer.Option("--map", help="Map of the track (CSV), or `oval` for the built-in one.")]
+PitMap = Annotated[str | None, typer.Option("--pit-map", help="Map of the pit lane (CSV), or `oval`.")]
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override one key of the configuration; may be repeated."),

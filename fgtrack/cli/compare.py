@@ -1,8 +1,7 @@
 """`fgtrack compare`: tables of runs."""
 
 import json
-from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -16,35 +15,24 @@ from fgtrack.evaluation.tables import Tables
 from fgtrack.io.run import write_metrics
 
 
-class Form(StrEnum):
-    """What the tables are printed as."""
-
-    MARKDOWN = "md"
-    CSV = "csv"
-    LATEX = "latex"
-    JSON = "json"
-
-
 def compare(
     runs: Runs,
     as_json: Json = False,
-    form: Annotated[Form | None, typer.Option("--format", help="Print this instead of tables for a terminal.")] = None,
+    form: Annotated[
+        Literal["md", "csv", "latex", "json"] | None,
+        typer.Option("--format", help="Print this instead of tables for a terminal."),
+    ] = None,
 ) -> None:
     """Compare runs in tables, and write metrics.json into each."""
     if as_json and form not in (None, Form.JSON):
         raise CallError(f"--json, --format {form}: give one of them")
     tables = written_tables(runs)
-    match Form.JSON if as_json else form:
-        case Form.JSON:
-            print(json.dumps(tables.to_dict(), indent=2, allow_nan=False))
-        case Form.MARKDOWN:
-            print(tables.to_markdown(), end="")
-        case Form.LATEX:
-            print(tables.to_latex(), end="")
-        case Form.CSV:
-            print(tables.to_csv(), end="")
-        case None:
-            console().print(tables)
+    if as_json or form == "json":
+        print(json.dumps(tables.to_dict(), indent=2, allow_nan=False))
+    elif form is None:
+        console().print(tables)
+    else:
+        print({"md": tables.to_markdown, "csv": tables.to_csv, "latex": tables.to_latex}[form](), end="")
 
 
 def written_tables(runs: AnyRuns) -> Tables:

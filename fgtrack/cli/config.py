@@ -5,7 +5,7 @@ from typing import Annotated, get_args
 import typer
 
 from fgtrack.cli.arguments import ConfigFile, Settings
-from fgtrack.cli.show import console
+from fgtrack.cli.show import say
 from fgtrack.pipeline.load import dump
 from fgtrack.pipeline.shipped import Kind, read_config, shipped, summary
 
@@ -22,6 +22,6 @@ def config(
         print(dump(read_config(config_file, settings or [])), end="")
         return
     for kind in get_args(Kind):
-        console().print(f"{kind}s")
+        say(f"{kind}s")
         for name, path in shipped(kind).items():
-            console().print(f"  {name:20} {summary(path)}", highlight=False, soft_wrap=True, markup=False)
+            say(f"  {name:20} {summary(path)}")

@@ -8,7 +8,7 @@ import numpy as np
 import typer
 
 from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, StorageOption
-from fgtrack.cli.show import console, progress
+from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Message
 from fgtrack.io.recording import check_recording, write_recording
@@ -40,12 +40,11 @@ def convert(
     check_recording(out, overwrite)
     source = open_input(recording, read_config(config_file).input)
     with progress("convert"):
-        if delays_file is None:
-            count, lost = write_recording(out, source.messages(), storage, overwrite=overwrite), ""
-        else:
-            redelayed = _redelayed(source.messages, delays_file, seed or 0)
-            count, lost = write_recording(out, redelayed, storage, overwrite=overwrite), _losses(redelayed)
-    console().print(f"{out}: {count} messages{lost}", highlight=False, soft_wrap=True)
+        messages = source.messages() if delays_file is None else _redelayed(source.messages, delays_file, seed or 0)
+        count = write_recording(out, messages, storage, overwrite=overwrite)
+    lost = messages.num_lost if isinstance(messages, Redelayed) else {}
+    losses = ", ".join(f"{number} of {sensor}" for sensor, number in lost.items() if number)
+    say(f"{out}: {count} messages{losses and f', lost {losses}'}")
 
 
 def _redelayed(read: Callable[[], Iterator[Message]], delays_file: Path, seed: int) -> Redelayed:
@@ -54,8 +53,3 @@ def _redelayed(read: Callable[[], Iterator[Message]], delays_file: Path, seed: i
         return redelay(read, delays, np.random.default_rng(seed))
     except CallError as error:
         raise CallError(f"{delays_file}: {error}") from error
-
-
-def _losses(redelayed: Redelayed) -> str:
-    lost = [f"{count} of {sensor}" for sensor, count in redelayed.num_lost.items() if count]
-    return f", lost {', '.join(lost)}" if lost else ""

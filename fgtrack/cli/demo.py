@@ -8,7 +8,7 @@ import typer
 
 from fgtrack.cli.arguments import Overwrite
 from fgtrack.cli.compare import written_tables
-from fgtrack.cli.show import TickProgress, console, progress
+from fgtrack.cli.show import TickProgress, console, progress, say
 from fgtrack.evaluation.plot import save_figures
 from fgtrack.io.output import Kind, check_output, claimed, new_files
 from fgtrack.io.ros.bag_writer import RECORDING, write_bag
@@ -32,34 +32,30 @@ def demo(
 ) -> None:
     """Simulate, record, replay with three estimators, compare, draw."""
     with claimed(out):
-        _demo(out, overwrite)
-
-
-def _demo(out: Path, overwrite: bool) -> None:
-    bag, figures = out / "recording", out / "figures"
-    folders = {name: out / "runs" / name for name in _ESTIMATORS}
-    check_output(bag, RECORDING, overwrite)
-    check_output(figures, Kind("a folder", Path.is_dir), overwrite)
-    for folder in folders.values():
-        check_output(folder, RUN, overwrite)
-    with progress("simulate"):
-        write_bag(bag, simulate(read_scenario("default"), np.random.default_rng(_SEED)), overwrite=overwrite)
-    config = read_config("smoother", [_LAGS], track_map=OVAL, pit_map=OVAL)
-    source = open_input(bag, config.input)
-    with progress("replay") as show:
-        results = replay_each(
-            source.messages,
-            config,
-            folders,
-            origin=str(bag),
-            kind=source.kind,
-            on_tick=TickProgress(show),
-            overwrite=overwrite,
-        )
-    runs = [load_run(result.path) for result in results]
-    console().print(written_tables(runs))
-    with progress("draw"), new_files(figures, overwrite) as folder:
-        files = save_figures(runs, folder)
-    console().print(f"recording: {bag}\nruns: {out / 'runs'}", highlight=False, soft_wrap=True)
-    for file in files:
-        console().print(f"figure: {figures / file.name}", highlight=False, soft_wrap=True)
+        bag, figures = out / "recording", out / "figures"
+        folders = {name: out / "runs" / name for name in _ESTIMATORS}
+        check_output(bag, RECORDING, overwrite)
+        check_output(figures, Kind("a folder", Path.is_dir), overwrite)
+        for folder in folders.values():
+            check_output(folder, RUN, overwrite)
+        with progress("simulate"):
+            write_bag(bag, simulate(read_scenario("default"), np.random.default_rng(_SEED)), overwrite=overwrite)
+        config = read_config("smoother", [_LAGS], track_map=OVAL, pit_map=OVAL)
+        source = open_input(bag, config.input)
+        with progress("replay") as show:
+            results = replay_each(
+                source.messages,
+                config,
+                folders,
+                origin=str(bag),
+                kind=source.kind,
+                on_tick=TickProgress(show),
+                overwrite=overwrite,
+            )
+        runs = [load_run(result.path) for result in results]
+        console().print(written_tables(runs))
+        with progress("draw"), new_files(figures, overwrite) as folder:
+            files = save_figures(runs, folder)
+        say(f"recording: {bag}\nruns: {out / 'runs'}")
+        for file in files:
+            say(f"figure: {figures / file.name}")

@@ -1,35 +1,32 @@
 """`fgtrack info`: what is in a recording."""
 
-import sys
 from datetime import UTC, datetime
 
-from rich import box
 from rich.table import Table
 
 from fgtrack.cli.arguments import ConfigFile, Input
-from fgtrack.cli.show import console
+from fgtrack.cli.show import console, say, table
+from fgtrack.core.errors import DataError
 from fgtrack.io.info import DelayInfo, InputInfo, describe
 from fgtrack.pipeline.shipped import read_config
 
 _OTHER_CLOCK_S = 3600.0  # nothing is that late: the stamps and the recorder have different clocks
 
 
-def info(recording: Input, config_file: ConfigFile = None) -> int:
+def info(recording: Input, config_file: ConfigFile = None) -> None:
     """Show topics, rates and delays of a recording.
 
     With a configuration also what it would take from them.
     """
     config = None if config_file is None else read_config(config_file).input
     found = describe(recording, config)
-    console().print(_heading(found), highlight=False, soft_wrap=True)
+    say(_heading(found))
     console().print(_table(found))
     for topic in found.topics:
         if topic.note is not None:
-            console().print(f"{topic.name}: {topic.note}", highlight=False, soft_wrap=True, markup=False)
-    if found.problem is None:
-        return 0
-    print(f"fgtrack: error: {' '.join(found.problem.split())}", file=sys.stderr)
-    return 1
+            say(f"{topic.name}: {topic.note}")
+    if found.problem is not None:
+        raise DataError(found.problem)
 
 
 def _heading(found: InputInfo) -> str:
@@ -41,17 +38,11 @@ def _heading(found: InputInfo) -> str:
 
 
 def _table(found: InputInfo) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False)
-    table.add_column("topic", overflow="fold")
-    table.add_column("type", overflow="fold")
-    table.add_column("taken as")
-    table.add_column("messages", justify="right")
-    table.add_column("rate [Hz]", justify="right")
-    table.add_column(r"delay \[ms] mean/p50/p90/max", justify="right")
+    rows = table("topic", "type", "taken as", ">messages", ">rate [Hz]", ">delay [ms] mean/p50/p90/max")
     for topic in found.topics:
         rate = "–" if topic.rate_hz is None else f"{topic.rate_hz:.1f}"
-        table.add_row(topic.name, topic.type, topic.used_as or "–", str(topic.count), rate, _delay(topic.delay))
-    return table
+        rows.add_row(topic.name, topic.type, topic.used_as or "–", str(topic.count), rate, _delay(topic.delay))
+    return rows
 
 
 def _delay(delay: DelayInfo | None) -> str:

@@ -1,17 +1,16 @@
 """`fgtrack offsets`: how wrong the clocks of a recording are."""
 
 import json
-import sys
 from typing import Annotated
 
 import typer
-from rich import box
 from rich.table import Table
 
-from fgtrack.cli.arguments import ConfigFile, Input, Json, Settings
-from fgtrack.cli.show import console, progress
+from fgtrack.cli.arguments import ConfigFile, Input, Json, PitMap, Settings, TrackMap
+from fgtrack.cli.show import console, progress, say, table
+from fgtrack.core.errors import DataError
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.clock_offsets import OffsetReport, SensorOffset, estimate_offsets
+from fgtrack.pipeline.clock_offsets import OffsetReport, estimate_offsets
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
 
@@ -22,13 +21,11 @@ def offsets(
     reference: Annotated[
         str | None, typer.Option("--reference", help="Sensor whose clock is right; else the one with most detections.")
     ] = None,
-    track_map: Annotated[
-        str | None, typer.Option("--map", help="Map of the track (CSV), or `oval` for the built-in one.")
-    ] = None,
-    pit_map: Annotated[str | None, typer.Option("--pit-map", help="Map of the pit lane (CSV), or `oval`.")] = None,
+    track_map: TrackMap = None,
+    pit_map: PitMap = None,
     settings: Settings = None,
     as_json: Json = False,
-) -> int:
+) -> None:
     """Estimate constant clock offsets of sensors.
 
     Says which ones are not identifiable.
@@ -40,35 +37,19 @@ def offsets(
     if as_json:
         print(json.dumps(report.as_dict(), indent=2, allow_nan=False))
     else:
-        console().print(_heading(report), highlight=False, soft_wrap=True)
+        say(f"{report.num_detections} detections of {report.num_tracks} tracks; offset = reported stamp - true time")
         console().print(_table(report))
-    if report.broken is None:
-        return 0
-    print(f"fgtrack: error: {located(report.broken, str(recording))}; used up to there", file=sys.stderr)
-    return 1
-
-
-def _heading(report: OffsetReport) -> str:
-    return f"{report.num_detections} detections of {report.num_tracks} tracks; offset = reported stamp - true time"
+    if report.broken is not None:
+        raise DataError(f"{located(report.broken, str(recording))}; used up to there")
 
 
 def _table(report: OffsetReport) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False)
-    table.add_column("sensor", overflow="fold")
-    for heading in (r"offset \[ms]", r"std \[ms]", "detections", r"residual \[sigma]"):
-        table.add_column(heading, justify="right")
-    table.add_column("known")
-    table.add_column("why", overflow="fold")
+    rows = table("sensor", ">offset [ms]", ">std [ms]", ">detections", ">residual [sigma]", "known", "why")
     for item in report.sensors:
         numbers = (_ms(item.offset_s), _ms(item.std_s), str(item.num_detections), _plain(item.residual))
-        table.add_row(item.sensor, *numbers, _known(item, report.reference), item.why)
-    return table
-
-
-def _known(item: SensorOffset, reference: str) -> str:
-    if item.sensor == reference:
-        return "reference"
-    return "yes" if item.identifiable else "no"
+        known = "reference" if item.sensor == report.reference else "yes" if item.identifiable else "no"
+        rows.add_row(item.sensor, *numbers, known, item.why)
+    return rows
 
 
 def _ms(value_s: float | None) -> str:

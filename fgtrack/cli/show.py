@@ -3,10 +3,22 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich import box
+from rich.console import Console, JustifyMethod
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+from rich.text import Text
 
 _WIDTH_WITHOUT_TERMINAL = 120
+_SPEED_PERIOD_S = 600.0  # over which the time of the rest is estimated: jobs differ
 
 
 def console() -> Console:
@@ -15,14 +27,35 @@ def console() -> Console:
     return probe if probe.is_terminal else Console(width=_WIDTH_WITHOUT_TERMINAL)
 
 
+def say(line: object) -> None:
+    """Print a line as it is, however long."""
+    console().print(str(line), highlight=False, soft_wrap=True, markup=False)
+
+
+def table(*headings: str) -> Table:
+    """A table without rows; a heading that begins with `>` stands above numbers, to the right."""
+    empty = Table(box=box.SIMPLE_HEAD, show_edge=False)
+    for heading in headings:
+        justify: JustifyMethod = "right" if heading.startswith(">") else "left"
+        empty.add_column(Text(heading.removeprefix(">")), justify=justify, overflow="fold")
+    return empty
+
+
 @contextmanager
-def progress(what: str) -> Iterator[Callable[[str], None]]:
-    """A bar that moves while the block runs; the function given sets the text beside it."""
+def progress(what: str, total: int | None = None) -> Iterator[Callable[[str], None]]:
+    """A bar that moves while the block runs; the function given sets the text beside it, after each of `total` steps.
+
+    With a total also the number of steps done, and the time that the rest will take.
+    """
     stderr = Console(stderr=True)
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=stderr, disable=not stderr.is_terminal, transient=True) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda text: bar.update(task, description=f"{what} {text}")
+    counted = () if total is None else (MofNCompleteColumn(), TextColumn("left"), TimeRemainingColumn())
+    hidden = not stderr.is_terminal
+    with Progress(
+        *columns, *counted, console=stderr, disable=hidden, transient=True, speed_estimate_period=_SPEED_PERIOD_S
+    ) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda text: bar.update(task, advance=1, description=f"{what} {text}")
 
 
 class TickProgress:

@@ -7,7 +7,7 @@ import numpy as np
 import typer
 
 from fgtrack.cli.arguments import Overwrite, StorageOption
-from fgtrack.cli.show import console, progress
+from fgtrack.cli.show import progress, say
 from fgtrack.io.recording import check_recording, write_recording
 from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.sim.simulate import simulate as simulated
@@ -31,4 +31,4 @@ def simulate(
     scenario = read_scenario(scenario_file, duration_s=duration_s)
     with progress("simulate"):
         count = write_recording(out, simulated(scenario, np.random.default_rng(seed)), storage, overwrite=overwrite)
-    console().print(f"{out}: {count} messages", highlight=False, soft_wrap=True)
+    say(f"{out}: {count} messages")

@@ -2,18 +2,15 @@
 
 import csv
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from fgtrack.cli.arguments import Overwrite
-from fgtrack.cli.show import console
+from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.io.run import Run
@@ -25,8 +22,6 @@ from fgtrack.pipeline.sweep_store import ERROR_TABLE, SWEEP_TABLE, Cell, Scalar,
 #: Wall times among the metrics; they have a table of their own.
 _TIMES = "time_per_"
 _NAMES = ("name", "estimator")
-
-_SPEED_PERIOD_S = 600.0  # over which the time of the rest is estimated: jobs differ
 
 
 def sweep(
@@ -50,12 +45,18 @@ def sweep(
     sweep_file = find_file("sweep", sweep_name)
     work = Sweep.open(load_plan(sweep_file), out, overwrite)
     left = len(work.todo)
-    _say(f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {left}")
+    say(f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {left}")
     if work.num_unused:
-        _say(f"{work.num_unused} parts in {out} belong to other settings, files or versions and stay unused")
-    with _counting(left) as count:
+        say(f"{work.num_unused} parts in {out} belong to other settings, files or versions and stay unused")
+    bad: list[Cell] = []
+    with progress("sweep", left) as show:
+
+        def count(cells: Sequence[Cell]) -> None:
+            bad.extend(cell for cell in cells if cell.error is not None)
+            show(f"{len(bad)} bad cells" if bad else "")
+
         result = work.run(score, jobs=jobs or -1, dask=dask, on_job=count)
-    _say(f"{out / SWEEP_TABLE}: {result.num_good} of {result.num_cells} cells")
+    say(f"{out / SWEEP_TABLE}: {result.num_good} of {result.num_cells} cells")
     return _complain(result, sweep_file, out)
 
 
@@ -104,32 +105,3 @@ def _complain(result: SweepResult, sweep_file: Path, out: Path) -> int:
     for problem in problems:
         print(f"fgtrack: error: {' '.join(problem.split())}", file=sys.stderr)
     return 1 if problems else 0
-
-
-def _say(line: str) -> None:
-    console().print(line, highlight=False, soft_wrap=True, markup=False)
-
-
-@contextmanager
-def _counting(total: int) -> Iterator[Callable[[Sequence[Cell]], None]]:
-    """A bar with the number of jobs done and the time that the rest will take; the function given counts a job."""
-    stderr = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(
-        *columns,
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=stderr,
-        disable=not stderr.is_terminal,
-        transient=True,
-        speed_estimate_period=_SPEED_PERIOD_S,
-    ) as bar:
-        task = bar.add_task("sweep", total=total)
-        bad = 0
-
-        def count(cells: Sequence[Cell]) -> None:
-            nonlocal bad
-            bad += sum(cell.error is not None for cell in cells)
-            bar.update(task, advance=1, description=f"sweep, {bad} bad cells" if bad else "sweep")
-
-        yield count

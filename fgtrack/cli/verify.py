@@ -5,11 +5,10 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich import box
 from rich.table import Table
 
 from fgtrack.cli.arguments import Json
-from fgtrack.cli.show import console, progress
+from fgtrack.cli.show import console, progress, say, table
 from fgtrack.core.errors import CallError
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.pipeline import verify as pipeline
@@ -40,26 +39,24 @@ def verify(
         print(json.dumps(certificate.as_dict(), indent=2, allow_nan=False))
     else:
         console().print(_table(certificate))
-        console().print(_closing(certificate), highlight=False, soft_wrap=True)
+        say(_closing(certificate))
     return _BAD if certificate.missed else 0
 
 
 def _table(certificate: Certificate) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False)
-    for heading in ("stream", "estimator", "order", "against"):
-        table.add_column(heading)
-    for heading in ("mean\n[sigma]", "covariance\n[relative]", "tolerance"):
-        table.add_column(heading, justify="right")
-    table.add_column("verdict")
+    numbers = (">mean\n[sigma]", ">covariance\n[relative]", ">tolerance")
+    rows = table("stream", "estimator", "order", "against", *numbers, "verdict")
     last = None
     for check in certificate.checks:
         if last not in (None, check.stream):
-            table.add_section()
+            rows.add_section()
         last = check.stream
         tolerance = "-" if check.tolerance is None else f"{check.tolerance:.0e}"
-        numbers = (f"{check.mean_sigma:.1e}", f"{check.covariance:.1e}", tolerance)
-        table.add_row(check.stream, check.estimator, check.order, check.against, *numbers, _verdict(check))
-    return table
+        differences = (f"{check.mean_sigma:.1e}", f"{check.covariance:.1e}")
+        rows.add_row(
+            check.stream, check.estimator, check.order, check.against, *differences, tolerance, _verdict(check)
+        )
+    return rows
 
 
 def _verdict(check: Check) -> str:

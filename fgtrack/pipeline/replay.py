@@ -3,7 +3,7 @@
 import importlib.metadata
 import platform
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -222,11 +222,6 @@ def located(problem: str, origin: str) -> str:
     """A line that says what is wrong with the input `origin`, and names it."""
     line = " ".join(problem.split())
     return line if origin in line else f"{origin}: {line}"
-
-
-def run_folders(estimators: Sequence[str], out: Path) -> dict[str, Path]:
-    """The folder of every run: `out`, or below it one by the name of each of several estimators."""
-    return {name: out / name for name in estimators} if len(estimators) > 1 else {estimators[0]: out}
 
 
 def _ticks(messages: Iterable[Delivered], clock: ClockConfig) -> Iterator[Tick]:
