@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Annotated, Literal
 
-from pydantic import Discriminator
+from pydantic import Discriminator, Field, PositiveFloat, PositiveInt
 
 from fgtrack.estimation.factor_graph.settings import SmootherSettings
 from fgtrack.estimation.registry import ESTIMATORS, motion_model
@@ -13,6 +13,7 @@ from fgtrack.io.config import InputConfig
 from fgtrack.io.run import EvaluationConfig
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import SensorModel
+from fgtrack.sim.settings import settings
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
 from fgtrack.tracking.lifecycle import LifecycleRules
@@ -22,6 +23,7 @@ from fgtrack.tracking.published import NeighbourhoodMerge, UngatedEuclidean
 MergeConfig = Annotated[ConnectedMerge | NoMerge | NeighbourhoodMerge, Discriminator("kind")]
 AssociationConfig = Annotated[GatedEuclidean | GatedMahalanobis | UngatedEuclidean, Discriminator("kind")]
 BirthConfig = Annotated[MeasuredBirth | FixedBirth, Discriminator("kind")]
+_Weight = Annotated[float, Field(gt=0.0, le=1.0)]
 
 #: The sensors of the paper, table II; LiDAR clusters and RADAR detections measure no yaw, the map gives it.
 PAPER_SENSORS: Mapping[str, SensorModel] = MappingProxyType(
@@ -49,18 +51,14 @@ PAPER_SENSORS: Mapping[str, SensorModel] = MappingProxyType(
 )
 
 
-@dataclass(frozen=True)
+@settings
 class ClockConfig:
     """When the tracker ticks."""
 
-    node_hz: float | None = 50.0
+    node_hz: Annotated[float, Field(ge=0.1, le=10_000.0)] | None = 50.0
     """Ticks lie on multiples of the node period; null ticks at every message instead."""
     ticks_file: str | None = None
     """Tick at the `now_ns` of the lines of this JSON-lines file instead (.jsonl or .jsonl.gz)."""
-
-    def __post_init__(self) -> None:
-        if self.node_hz is not None and not 0.1 <= self.node_hz <= 10_000.0:
-            raise ValueError(f"node_hz: must lie between 0.1 and 10000, is {self.node_hz}")
 
 
 @dataclass(frozen=True)
@@ -81,34 +79,26 @@ class MapConfig:
     """The same for both bounds of the pit lane."""
 
 
-@dataclass(frozen=True)
+@settings
 class EgoConfig:
     """What is done to the ego state, and where detections in the ego frame have their origin."""
 
     kind: Literal["low_pass", "published"] = "low_pass"
     """`published` filters its own output again at every tick (Q13)."""
-    yaw_weight: float = 0.9
+    yaw_weight: _Weight = 0.9
     """Weight of the new yaw in the low-pass."""
-    yaw_rate_weight: float = 0.4
+    yaw_rate_weight: _Weight = 0.4
     """Weight of the new yaw rate."""
     detection_origin_x_m: float = -1.74
     """Origin of the detections' ego frame, ahead of the ego reference point (the paper's: the rear axle)."""
     detection_origin_y_m: float = 0.0
     """The same to the left."""
-    memory_s: float = 5.0
+    memory_s: PositiveFloat = 5.0
     """How far back the ego pose is known."""
-    max_extrapolation_s: float = 1.0
+    max_extrapolation_s: PositiveFloat = 1.0
     """A detection whose stamp is further than this from any ego state cannot be placed."""
-    storage_ticks: int = 350
+    storage_ticks: PositiveInt = 350
     """Length of the ego storage of the published implementation."""
-
-    def __post_init__(self) -> None:
-        for name in ("yaw_weight", "yaw_rate_weight"):
-            if not 0.0 < getattr(self, name) <= 1.0:
-                raise ValueError(f"{name}: must lie in (0, 1], is {getattr(self, name)}")
-        for name in ("memory_s", "max_extrapolation_s", "storage_ticks"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: must be positive, is {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -132,11 +122,11 @@ class LifecycleConfig(LifecycleRules):
     not, and the detection starts a second track: with a fast and a slow sensor nearly every new object gets two."""
 
 
-@dataclass(frozen=True)
+@settings
 class FilterConfig:
     """Time grid of the backward-forward EKF."""
 
-    frequency_hz: float = 100.0
+    frequency_hz: Annotated[float, Field(ge=1.0, le=10_000.0)] = 100.0
     """Frequency of the grid."""
     storage_s: float = 3.5
     """How far back states are kept."""
@@ -146,8 +136,6 @@ class FilterConfig:
     """Whether an update without delay reaches the stored present state."""
 
     def __post_init__(self) -> None:
-        if not 1.0 <= self.frequency_hz <= 10_000.0:
-            raise ValueError(f"frequency_hz: must lie between 1 and 10000, is {self.frequency_hz}")
         if not 1.0 / self.frequency_hz <= self.storage_s <= 60.0:
             raise ValueError(f"storage_s: must lie between one step and 60 s, is {self.storage_s}")
 
