@@ -3,7 +3,7 @@
 import gzip
 import json
 from collections.abc import Iterable, Iterator
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,30 +27,18 @@ def node_ticks(messages: Iterable[Delivered], node_hz: float) -> Iterator[Tick]:
     What was received at or before a tick is delivered with it.
     """
     step_ns = period_ns(node_hz)
-    waiting: list[Delivered] = []
-    now_ns: int | None = None
-    for message in messages:
-        if now_ns is None:
-            now_ns = first_multiple(message.receipt_ns, step_ns)
-        while message.receipt_ns > now_ns:
-            yield Tick(now_ns, waiting)
-            waiting = []
-            now_ns += step_ns
-        waiting.append(message)
-    if now_ns is not None:
-        yield Tick(now_ns, waiting)
+    next_ns: int | None = None
+    for due_ns, delivered in groupby(messages, lambda message: first_multiple(message.receipt_ns, step_ns)):
+        for now_ns in range(due_ns if next_ns is None else next_ns, due_ns, step_ns):
+            yield Tick(now_ns, [])
+        yield Tick(due_ns, list(delivered))
+        next_ns = due_ns + step_ns
 
 
 def message_ticks(messages: Iterable[Delivered]) -> Iterator[Tick]:
     """A tick at every receipt; what was received at the same nanosecond shares one."""
-    waiting: list[Delivered] = []
-    for message in messages:
-        if waiting and message.receipt_ns > waiting[-1].receipt_ns:
-            yield Tick(waiting[-1].receipt_ns, waiting)
-            waiting = []
-        waiting.append(message)
-    if waiting:
-        yield Tick(waiting[-1].receipt_ns, waiting)
+    for now_ns, delivered in groupby(messages, lambda message: message.receipt_ns):
+        yield Tick(now_ns, list(delivered))
 
 
 def listed_ticks(messages: Iterable[Delivered], ticks_ns: Iterable[int]) -> Iterator[Tick]:

@@ -1,11 +1,15 @@
-"""From a sweep file to jobs: one for each point of the grid and each seed."""
+"""From a sweep file `fgtrack-sweep/1` to jobs: one for each point of the grid and each seed."""
 
 import hashlib
 import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator
 
 from fgtrack.core.errors import CallError
 from fgtrack.estimation.registry import ESTIMATORS
@@ -14,18 +18,196 @@ from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load, plain, read_yaml, validate
 from fgtrack.pipeline.replay import versions
 from fgtrack.pipeline.shipped import read_config, read_scenario
-from fgtrack.pipeline.sweep_config import (
-    DELAYS,
-    SCENARIO,
-    Axis,
-    SweepConfig,
-    Value,
-    with_value,
-)
 from fgtrack.sim.redelay import SensorDelays
 from fgtrack.sim.scenario import Scenario
 
-_CONFIG = "config"
+#: What a key may be set to: JSON, of which only the dataclass that has the key knows more.
+Value = Any
+
+#: Columns that every table of a sweep has behind those of its axes.
+KEY_COLUMNS = ("seed", "estimator")
+
+#: Key of a group of keys that names its values, in a column of the group's own name.
+LABEL = "label"
+
+#: Roots of keys; those of the configuration have none.
+CONFIG, SCENARIO, DELAYS = "config", "scenario", "delays"
+
+
+def _seeds(given: Value) -> Value:
+    """A number of seeds as 0, 1, 2, ...; anything else is left to the validation."""
+    if isinstance(given, int) and not isinstance(given, bool):
+        return tuple(range(given))
+    return tuple(given) if isinstance(given, list) else given
+
+
+@dataclass(frozen=True)
+class SweepConfig:
+    """The content of a sweep file. Paths are relative to its folder."""
+
+    format: Literal["fgtrack-sweep/1"]
+    estimators: tuple[str, ...]
+    """Run on the same stream each."""
+    scenario: str | None = None
+    """A scenario file or `default`; it or `input` is needed."""
+    input: str | None = None
+    """A recording, instead of a scenario."""
+    delays: str | None = None
+    """A file of delays by sensor that the recording is given (see `fgtrack convert --delays`)."""
+    config: str | None = None
+    """A configuration file; null for the defaults."""
+    duration_s: float | None = None
+    """Length of the simulated runs, instead of the scenario's."""
+    seeds: Annotated[tuple[int, ...], BeforeValidator(_seeds)] = (0,)
+    """Seeds, or how many from 0 on."""
+    set: Mapping[str, Value] = field(default_factory=lambda: MappingProxyType({}))
+    """Keys that are changed for all runs alike."""
+    vary: Mapping[str, Value] = field(default_factory=lambda: MappingProxyType({}))
+    """Axes of the grid: a key and its values, or a name and a group of keys with equally many values each."""
+    metrics: tuple[str, ...] = ()
+    """Columns of metrics, `*` matches anything; all of them where none is named."""
+
+    def __post_init__(self) -> None:
+        if (self.scenario is None) == (self.input is None):
+            raise ValueError("scenario, input: name one of them")
+        if not self.estimators:
+            raise ValueError("estimators: name at least one")
+        for name, values in (("estimators", self.estimators), ("seeds", self.seeds)):
+            if len(set(values)) < len(values):
+                raise ValueError(f"{name}: one is named twice")
+        if not self.seeds or min(self.seeds) < 0:
+            raise ValueError("seeds: a positive number of them, or a list of numbers that are not negative")
+        if self.input is not None and self.duration_s is not None:
+            raise ValueError("duration_s: a recording is as long as it is")
+        if self.scenario is not None and self.delays is not None:
+            raise ValueError("delays: a scenario has delays of its own, vary scenario.sensors.NAME.delay")
+        if self.input is not None and len(self.seeds) > 1 and not self._redelays:
+            raise ValueError("seeds: nothing is drawn where a recording keeps its delays, leave them out")
+        self.axes()
+
+    @property
+    def _redelays(self) -> bool:
+        return self.delays is not None or any(
+            key.startswith(f"{DELAYS}.") for axis in self.axes() for key in axis.points[0].changes
+        )
+
+    def axes(self) -> "tuple[Axis, ...]":
+        """The axes of the grid; raises `ValueError` with the key's path."""
+        axes = tuple(_axis(name, values) for name, values in self.vary.items())
+        columns = [*KEY_COLUMNS, *(column for axis in axes for column in axis.columns)]
+        for column in columns:
+            if columns.count(column) > 1:
+                raise ValueError(f"vary: {column!r} is named twice, or is a column that every table has")
+        for where, keys in (("set", self.set), *((f"vary.{axis.name}", axis.points[0].changes) for axis in axes)):
+            for key in keys:
+                self._check_key(where, key)
+        return axes
+
+    def grid(self) -> "Iterator[Point]":
+        """The points of the grid; the last axis changes fastest."""
+        for points in itertools.product(*(axis.points for axis in self.axes())):
+            yield Point(
+                cells=tuple(cell for point in points for cell in point.cells),
+                changes={key: value for point in points for key, value in point.changes.items()},
+                description=", ".join(point.description for point in points),
+            )
+
+    def _check_key(self, where: str, key: str) -> None:
+        root = key.split(".")[0]
+        if not all(key.split(".")):
+            raise ValueError(f"{where}: {key!r} is no key, write names with dots between them")
+        if root == "estimator":
+            raise ValueError(f"{where}: name estimators under `estimators`")
+        if (root == SCENARIO and self.scenario is None) or (root == DELAYS and self.input is None):
+            raise ValueError(f"{where}: {key} changes the {root}, of which this sweep has none")
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point of the grid, or of one of its axes."""
+
+    cells: tuple[Value, ...]
+    """Content of the columns."""
+    changes: Mapping[str, Value]
+    """Changed keys."""
+    description: str
+    """The point in a few words."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One direction of the grid."""
+
+    name: str
+    columns: tuple[str, ...]
+    """Columns of the tables that identify a point."""
+    points: tuple[Point, ...]
+
+
+def _axis(name: str, given: Value) -> Axis:
+    """The axis under `vary.name`; raises `ValueError` with the key's path."""
+    if isinstance(given, (list, tuple)):
+        lists = {name: _values(f"vary.{name}", given)}
+    elif isinstance(given, Mapping) and set(given) - {LABEL}:
+        lists = {key: _values(f"vary.{name}.{key}", values) for key, values in given.items()}
+    else:
+        raise ValueError(f"vary.{name}: a list of values is needed, or a mapping of keys to lists of values")
+    lengths = {key: len(values) for key, values in lists.items()}
+    if len(set(lengths.values())) > 1:
+        lengths_text = ", ".join(f"{key} has {length}" for key, length in lengths.items())
+        raise ValueError(f"vary.{name}: its keys change together and need equally many values, {lengths_text}")
+    labels = {name: lists.pop(LABEL)} if LABEL in lists else {}
+    points = []
+    for cells in zip(*labels.values(), *lists.values(), strict=True):
+        changes = dict(zip(lists, cells[len(labels) :], strict=True))
+        shown = dict(zip(labels or lists, cells, strict=False))
+        description = ", ".join(f"{column}={_short(cell)}" for column, cell in shown.items())
+        points.append(Point(cells, changes, description))
+    return Axis(name, (*labels, *lists), tuple(points))
+
+
+def _values(where: str, given: Value) -> tuple[Value, ...]:
+    if not isinstance(given, (list, tuple)) or not given:
+        raise ValueError(f"{where}: a list of at least one value is needed")
+    return tuple(given)
+
+
+def with_value(inside: Value, names: Sequence[str], value: Value) -> Value:
+    """A copy of `inside` in which the entry at the path `names` is `value`.
+
+    An entry of a list is addressed by its index or by its `name`. Raises `LookupError` where there is no such path;
+    what is left out of a mapping may be set, its reader knows the keys.
+    """
+    if not names:
+        return value
+    first, rest = names[0], names[1:]
+    if isinstance(inside, list):
+        place = _place(inside, first)
+        return [with_value(item, rest, value) if index == place else item for index, item in enumerate(inside)]
+    if not isinstance(inside, Mapping):
+        raise LookupError(f"there is no {first!r} in {compact(inside)}")
+    return {**inside, first: with_value(inside.get(first, {}) if rest else None, rest, value)}
+
+
+def _place(items: list[Value], name: str) -> int:
+    """Index of the item of this name, or index."""
+    named = [item.get("name") if isinstance(item, Mapping) else None for item in items]
+    if name in named:
+        return named.index(name)
+    if name.isdecimal() and int(name) < len(items):
+        return int(name)
+    known = ", ".join(str(one) for one in named if one is not None)
+    raise LookupError(f"there is no {name!r} among {len(items)} entries{f' ({known})' if known else ''}")
+
+
+def _short(value: Value) -> str:
+    text = value if isinstance(value, str) else compact(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def compact(value: Value) -> str:
+    """`value` as JSON without spaces."""
+    return json.dumps(value, separators=(",", ":"))
 
 
 @dataclass(frozen=True)
@@ -83,36 +265,13 @@ def load_plan(path: Path) -> Plan:
         sweep = replace(sweep, estimators=tuple(ESTIMATORS.resolve(name) for name in sweep.estimators))
     except CallError as error:
         raise CallError(f"{path}: estimators: {error}") from error
-    axes = sweep.axes()
     base = _with_keys(_base(sweep, path), sweep.set, f"{path}: set")
     recording = None if sweep.input is None else (path.parent / sweep.input).resolve()
-    jobs = tuple(job for point in _grid(axes) for job in _jobs(sweep, base, point, recording))
+    jobs = tuple(job for point in sweep.grid() for job in _jobs(sweep, base, point, recording))
     if all(job.recipe is None for job in jobs):
         raise CallError(f"{path}: {jobs[0].problem}")
-    columns = tuple(column for axis in axes for column in axis.columns)
+    columns = tuple(column for axis in sweep.axes() for column in axis.columns)
     return Plan(columns, jobs, sweep.estimators, sweep.metrics)
-
-
-@dataclass(frozen=True)
-class _Point:
-    """A point of the grid."""
-
-    cells: tuple[Value, ...]
-    """Content of the axes' columns."""
-    changes: Mapping[str, Value]
-    """Changed keys."""
-    description: str
-    """The point in a few words."""
-
-
-def _grid(axes: Sequence[Axis]) -> Iterator[_Point]:
-    for steps in itertools.product(*(range(len(axis.steps)) for axis in axes)):
-        at = list(zip(axes, steps, strict=True))
-        yield _Point(
-            cells=tuple(cell for axis, step in at for cell in axis.cells(step)),
-            changes={key: value for axis, step in at for key, value in zip(axis.keys, axis.steps[step], strict=True)},
-            description=", ".join(axis.described(step) for axis, step in at),
-        )
 
 
 def _base(sweep: SweepConfig, path: Path) -> dict[str, Value]:
@@ -122,17 +281,17 @@ def _base(sweep: SweepConfig, path: Path) -> dict[str, Value]:
     if sweep.input is not None:
         open_input(folder / sweep.input, config.input)  # raises where it is none
     delays = {} if sweep.delays is None else read_yaml(folder / sweep.delays)
-    base = {_CONFIG: plain(config), DELAYS: delays}
+    base = {CONFIG: plain(config), DELAYS: delays}
     if sweep.scenario is not None:
         base[SCENARIO] = plain(read_scenario(sweep.scenario, folder, sweep.duration_s))
     return base
 
 
-def _jobs(sweep: SweepConfig, base: Mapping[str, Value], point: _Point, recording: Path | None) -> Iterator[Job]:
+def _jobs(sweep: SweepConfig, base: Mapping[str, Value], point: Point, recording: Path | None) -> Iterator[Job]:
     """The jobs of one grid point, one for each seed."""
     try:
         values = _with_keys(base, point.changes, "vary")
-        config = plain(validate(Config, values[_CONFIG], "configuration"))
+        config = plain(validate(Config, values[CONFIG], "configuration"))
         delays = plain(validate(dict[str, SensorDelays], values[DELAYS], DELAYS))
         scenario = plain(validate(Scenario, values[SCENARIO], SCENARIO)) if SCENARIO in values else None
     except CallError as error:
@@ -173,7 +332,7 @@ def _with_keys(base: Mapping[str, Value], changes: Mapping[str, Value], where: s
     for key, value in changes.items():
         names = key.split(".")
         if names[0] not in (SCENARIO, DELAYS):
-            names = [_CONFIG, *names]
+            names = [CONFIG, *names]
         try:
             changed = with_value(changed, names, value)
         except LookupError as error:

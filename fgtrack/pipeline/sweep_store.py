@@ -10,8 +10,7 @@ from pathlib import Path
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.io.output import Kind, check_output, write_file
-from fgtrack.pipeline.sweep_config import KEY_COLUMNS, Value, compact
-from fgtrack.pipeline.sweep_plan import Job, Plan
+from fgtrack.pipeline.sweep_plan import KEY_COLUMNS, Job, Plan, Value, compact
 
 PART_FORMAT = "fgtrack-sweep-part/1"
 SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE = "sweep.csv", "timing.csv", "errors.csv"

@@ -27,7 +27,7 @@ from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import validate
 from fgtrack.pipeline.shipped import Kind, shipped
-from fgtrack.pipeline.sweep_config import SweepConfig
+from fgtrack.pipeline.sweep_plan import SweepConfig
 from fgtrack.sim.clocks import AnyClock
 from fgtrack.sim.delays import AnyDelay
 from fgtrack.sim.redelay import SensorDelays

@@ -9,7 +9,7 @@ from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.pipeline.build import build_bank, build_tracker
 from fgtrack.pipeline.config import PAPER_SENSORS, Config
 from fgtrack.pipeline.load import dump, load, read_yaml, validate
-from fgtrack.pipeline.sweep_config import SweepConfig
+from fgtrack.pipeline.sweep_plan import SweepConfig
 from fgtrack.sim.scenario import Scenario
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.published import PublishedTracker

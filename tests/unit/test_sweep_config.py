@@ -10,8 +10,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.load import dump, plain
 from fgtrack.pipeline.shipped import read_scenario
-from fgtrack.pipeline.sweep_config import with_value
-from fgtrack.pipeline.sweep_plan import Plan, load_plan
+from fgtrack.pipeline.sweep_plan import Plan, load_plan, with_value
 from fgtrack.sim.simulate import simulate
 
 CONFIGS = Path(__file__).parents[2] / "configs"
