@@ -24,7 +24,7 @@ def compare(
     ] = None,
 ) -> None:
     """Compare runs in tables, and write metrics.json into each."""
-    if as_json and form not in (None, Form.JSON):
+    if as_json and form not in (None, "json"):
         raise CallError(f"--json, --format {form}: give one of them")
     tables = written_tables(runs)
     if as_json or form == "json":
