@@ -1,4 +1,4 @@
-# Needs python3 (3.11 or newer), make and a C compiler; everything else is installed into .venv.
+# Needs python3 (3.11 or newer) and make; everything else is installed into .venv.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin

@@ -181,9 +181,9 @@ def estimators_page() -> str:
 
 
 _GROUPS = {
-    "Runs, tables, live use": ("pipeline", "io", "evaluation", "plot"),
+    "Runs, tables, live use": ("pipeline", "io", "evaluation"),
     "Messages, reports, errors": ("core", "types"),
-    "Estimators of one object": ("estimation",),
+    "Estimators": ("estimation", "testing"),
     "Motion, measurement and sensor models": ("models",),
 }
 
@@ -207,7 +207,8 @@ def _autodoc(name: str, value: Any) -> str:
     if isinstance(value, type):
         return f".. autoclass:: fgtrack.{name}\n   :members:" + "\n   :undoc-members:" * issubclass(value, Enum)
     if isinstance(value, types.ModuleType):
-        return f".. automodule:: {value.__name__}\n   :members:"
+        members = {one: getattr(value, one) for one in value.__all__}
+        return "\n\n".join(_autodoc(f"{name}.{one}", member) for one, member in members.items() if callable(member))
     if callable(value):
         return f".. autofunction:: fgtrack.{name}"
     return f".. py:data:: fgtrack.{name}\n\n   " + " or ".join(f"`{one.__name__}`" for one in get_args(value))

@@ -70,5 +70,5 @@ def _verdict(check: Check) -> str:
 def _closing(certificate: Certificate) -> str:
     num_missed = len(certificate.missed)
     if not num_missed:
-        return f"all {certificate.num_promises} tolerances met: the order of arrival does not change the answer"
-    return f"{num_missed} of {certificate.num_promises} tolerances missed: the order of arrival changes the answer"
+        return f"all {certificate.num_promises} tolerances met: estimates do not depend on the order of arrival"
+    return f"{num_missed} of {certificate.num_promises} tolerances missed: estimates depend on the order of arrival"

@@ -224,7 +224,7 @@ def _against_time_order(stream: _Stream, name: str, subject: Subject, tolerance:
             continue
         found, num_refused = _states(stream, subject, places)
         apart = _largest(difference(found[at], state) for at, state in expected.items())
-        checks.append(Check(stream.name, name, order, "time order", *apart, num_refused, tolerance))
+        checks.append(Check(stream.name, name, order, "order of stamps", *apart, num_refused, tolerance))
     return checks
 
 

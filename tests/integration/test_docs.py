@@ -290,6 +290,11 @@ def test_every_estimator_is_on_the_page_of_estimators() -> None:
     assert [name for name in ESTIMATORS if name not in ESTIMATORS.plugins() and f"`{name}`" not in page] == []
 
 
+def test_every_public_name_is_on_the_page_of_the_api() -> None:
+    page = (ROOT / "docs/api.md").read_text(encoding="utf-8")
+    assert [name for name in dir(fgtrack) if not name.startswith("_") and f"`{name}`" not in page] == []
+
+
 def test_every_section_of_the_configuration_is_on_its_page() -> None:
     page = (ROOT / "docs/configuration.md").read_text(encoding="utf-8")
     assert [field.name for field in fields(Config) if f"| `{field.name}` |" not in page] == []
