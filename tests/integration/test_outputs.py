@@ -134,8 +134,10 @@ def test_something_else_in_the_way_is_left_alone_even_with_overwrite(
         thesis.unlink()
 
 
-def test_a_recording_with_something_else_in_its_folder_is_not_replaced(here: Path, call: Call) -> None:
-    (here / "bag/notes.txt").write_text("why")
+@pytest.mark.parametrize("name", ["notes.txt", "more/notes.txt"])
+def test_a_recording_with_something_else_in_its_folder_is_not_replaced(here: Path, call: Call, name: str) -> None:
+    (here / "bag" / name).parent.mkdir(exist_ok=True)
+    (here / "bag" / name).write_text("why")
     before = content(here)
     assert call("convert", "drive.jsonl", "bag", "--overwrite")[0] == 2
     assert content(here) == before
