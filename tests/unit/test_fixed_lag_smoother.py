@@ -111,6 +111,16 @@ def test_the_window_is_as_long_as_it_says() -> None:
     assert smoother.update(at(1000, 10.0)).status is UpdateStatus.IN_SEQUENCE
 
 
+def test_what_lies_behind_the_ring_is_forgotten() -> None:
+    smoother = FixedLagSmoother(CV(), Start(), SmootherSettings(lag_s=0.3, ring_s=0.2))
+    for k in range(1, 31):
+        smoother.update(at(100 * k, 1.0 * k))
+    assert smoother.window_ns == (2500 * MS, 3000 * MS)
+    assert 2300 * MS <= smoother._window.reach_ns <= 2500 * MS
+    assert smoother.update(at(2500, 25.0)).status is UpdateStatus.BEYOND_WINDOW
+    assert smoother.update(at(2499, 25.0)).status is UpdateStatus.TOO_OLD
+
+
 def test_final_states_come_once_and_the_rest_when_the_track_ends() -> None:
     smoother = FixedLagSmoother(CV(), Start(), SmootherSettings(lag_s=0.25, lagged_s=()))
     for k in range(1, 7):
