@@ -34,9 +34,8 @@ LOSSES = ("huber", "cauchy", "tukey", "geman_mcclure", "dcs")
 
 def state(motion: MotionModel, seed: int) -> FloatArray:
     rng = np.random.default_rng(seed)
-    if motion.linear:
-        return np.array([12.0, 7.0, 18.0, 6.0]) + rng.standard_normal(4)
-    return (np.array([12.0, 7.0, 0.4, 20.0, 0.3, 1.5]) + 0.2 * rng.standard_normal(6))[: motion.dim]
+    kinematic = np.array([12.0, 7.0, 0.4, 20.0, 0.3, 1.5]) + 0.2 * rng.standard_normal(6)
+    return motion.from_kinematic(kinematic, np.eye(6))[0]
 
 
 def values(**states: FloatArray) -> gtsam.Values:
