@@ -12,16 +12,6 @@ from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.models.track_map import COLUMNS, RoadView, TrackMap
 
 _CLOSING = 0.999  # the closing point lies this share of the way from the last row to the first
-_FIELDS = (
-    "x_ref_m",
-    "y_ref_m",
-    "width_right_m",
-    "width_left_m",
-    "x_normvec_m",
-    "y_normvec_m",
-    "psi_ref_rad",
-    "kappa_ref_radpm",
-)
 
 
 class PublishedMap:
@@ -35,25 +25,23 @@ class PublishedMap:
     def __init__(self, track: TrackMap) -> None:
         column = dict(zip(COLUMNS, track.table.T, strict=True))
         column["psi_ref_rad"] = wrap_angles(column["psi_ref_rad"] - 0.5 * math.pi)
-        rows = np.array([column[name][:-1] for name in _FIELDS]).T
-        closing = _CLOSING * (rows[0] - rows[-1]) + rows[-1]
-        x, y, right, left, normal_x, normal_y, heading, curvature = np.vstack([rows, closing]).T
-        normal = np.stack([normal_x, normal_y], axis=-1)
-        self._line = np.stack([x, y], axis=-1)
-        self._x, self._y = np.ascontiguousarray(x), np.ascontiguousarray(y)
+
+        def closed(name: str) -> FloatArray:
+            """A column with the closing point in place of its last row."""
+            values = column[name][:-1]
+            return np.append(values, _CLOSING * (values[0] - values[-1]) + values[-1])
+
+        self._x, self._y = closed("x_ref_m"), closed("y_ref_m")
+        self._line = np.stack([self._x, self._y], axis=-1)
         self._arc = column["s_racetraj_m"]
         self._length_m = float(self._arc.max())
         self._segment = np.roll(self._line, -1, axis=0) - self._line
         self._segment_squared = np.sum(self._segment**2, axis=1)
-        self._heading = heading
-        self._table = np.column_stack(
-            [
-                self._line + normal * right[:, None],
-                self._line - normal * left[:, None],
-                right + left,
-                curvature,
-            ]
-        )
+        self._heading = closed("psi_ref_rad")
+        normal = np.stack([closed("x_normvec_m"), closed("y_normvec_m")], axis=-1)
+        right, left = closed("width_right_m")[:, None], closed("width_left_m")[:, None]
+        edges = self._line + normal * right, self._line - normal * left
+        self._table = np.column_stack([*edges, right + left, closed("kappa_ref_radpm")])
 
     def view(self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float) -> RoadView:
         """Heading, curvature and whether a place lies further outside than the buffers allow; points (n, 2)."""

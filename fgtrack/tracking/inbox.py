@@ -163,9 +163,7 @@ class QueueInbox:
         return ended
 
     def _refusal(self, message: DetectionList, sensor: SensorModel, index: int, stamp_ns: int) -> Disposition | None:
-        if not is_usable(message.objects[index], sensor):
-            return Disposition.INVALID
-        if stamp_ns - message.receipt_ns > self._max_future_ns:
+        if not is_usable(message.objects[index], sensor) or stamp_ns - message.receipt_ns > self._max_future_ns:
             return Disposition.INVALID
         limit_s = sensor.max_delay_s
         if limit_s is not None and message.receipt_ns - stamp_ns > nanoseconds(limit_s):
