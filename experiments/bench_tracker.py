@@ -25,7 +25,7 @@ from fgtrack.sim.vehicles import TrackVehicle
 
 PUBLISHED_MS = {1: 2.8, 10: 16.0, 50: 118.0}
 PUBLISHED_YARDSTICK_US = 3.8
-BAR = 5.0
+REQUIRED = 5.0
 
 
 def traffic(count: int) -> list[Tick]:
@@ -89,7 +89,7 @@ def test_tick_with_detections(benchmark, count):
     print(
         f"\n{count} objects: yardstick {yard_us:.2f} us; "
         f"published {PUBLISHED_MS[count]} ms, here {published_ms:.2f} ms; "
-        f"handling {handling_ms:.2f} ms, {published_ms / handling_ms:.1f} times as fast (bar {BAR:.0f}); "
+        f"handling {handling_ms:.2f} ms, {published_ms / handling_ms:.1f} times as fast (at least {REQUIRED:.0f}); "
         f"whole tick {whole_ms:.2f} ms, {published_ms / whole_ms:.1f} times"
     )
     assert median(tracks) >= count

@@ -4,7 +4,7 @@
 
 The scenario. An object moves by the linear model CV with white noise acceleration of density 5 m^2/s^3. Its first state
 is drawn from the prior: position N(0, (1 m)^2), velocity N(0, (10 m/s)^2) on each axis. Its position is measured every
-0.1 s, 40 times, with a deviation of 1 m on each axis and without delay: after that the prior is forgotten, and the
+0.1 s, 40 times, with standard deviation 1 m on each axis and without delay: after that the prior is forgotten, and the
 velocity is about 11 m/s. One more measurement, with 0.3 m, was made half way between two of those stamps and arrives
 just after the 40th: at lag l between the steps 40 - l and 41 - l, so (l - 1/2) 0.1 s late. The state at the 40th stamp
 is judged then. All methods see the same draws.
