@@ -2,7 +2,7 @@
 
     python experiments/outliers/outliers.py -o out/outliers
 
-One object drawn from the motion model; some of its detections have ten times the standard deviation that it assumes,
+One object drawn from the motion model; some of its detections have ten times the assumed standard deviation,
 and none is gated. Association is known.
 """
 

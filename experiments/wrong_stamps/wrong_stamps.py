@@ -121,8 +121,8 @@ def main(
         if rmse[RIGHT, name].mean() >= rmse[ARRIVAL, name].mean():
             print(f"{name}: right clocks are worse than receipts for stamps")
             continue
-        effects = ", ".join(f"{effect} {break_even(steps, rmse, name)}" for effect, steps in shown.items())
-        print(f"{name} is worse than with receipts for stamps from (root mean square error): {effects}")
+        limits = ", ".join(f"{effect} {break_even(steps, rmse, name)}" for effect, steps in shown.items())
+        print(f"{name} is worse than with receipts for stamps from (root mean square error): {limits}")
     print(f"figure: {out / 'stamps.png'}")
 
 
