@@ -6,16 +6,26 @@ STAMP := $(VENV)/.installed
 # The matrices are small; more threads only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo test test-slow check docs bench clean
+.PHONY: demo test test-slow coverage mutants check docs bench clean
 
 demo: $(STAMP)
 	$(BIN)/fgtrack demo -o out/demo --overwrite
 
 test: $(STAMP)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist worksteal
 
+# The tests marked slow, and the others with many more random examples.
 test-slow: $(STAMP)
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -n auto --dist worksteal -m slow
+	$(BIN)/python -m pytest -n auto --dist worksteal --hypothesis-profile=thorough
+
+coverage: $(STAMP)
+	$(BIN)/python -m pytest -n auto --dist worksteal --cov --cov-report=term-missing:skip-covered
+
+# Hours; docs/testing.md tells how to take a sample.
+mutants: $(STAMP)
+	$(BIN)/mutmut run
+	$(BIN)/mutmut results
 
 check: $(STAMP)
 	$(BIN)/ruff check fgtrack tests experiments
