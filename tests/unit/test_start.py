@@ -50,7 +50,7 @@ def test_of_an_unknown_direction_the_yaw_is_uniform_and_the_velocity_isotropic()
         {"yaw_rate_radps": math.nan},
         {"accel_std_mps2": math.inf},
     ],
-    ids=str,
+    ids=lambda wrong: next(iter(wrong)),
 )
 def test_a_value_that_makes_no_sense_is_named(wrong: dict) -> None:
     with pytest.raises(CallError, match=f"^Start: {next(iter(wrong))}: must be finite"):

@@ -9,6 +9,7 @@ from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config, LifecycleConfig
+from fgtrack.pipeline.load import load
 from fgtrack.tracking.association import GatedEuclidean
 from fgtrack.tracking.tracker import Tracker
 
@@ -42,9 +43,10 @@ def dispositions(report: TickReport) -> list[str]:
     return [record.disposition.value for record in report.updates]
 
 
-@pytest.mark.parametrize("stamp_from", ["message", "object"])
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_a_track_is_missed_by_a_message_as_a_whole_and_not_by_each_stamp_in_it(stamp_from, estimator: str) -> None:
+@pytest.mark.parametrize(
+    ("estimator", "stamp_from"), [*((name, "object") for name in ESTIMATORS), ("ekf-replay", "message")]
+)
+def test_a_track_is_missed_by_a_message_as_a_whole_and_not_by_each_stamp_in_it(estimator: str, stamp_from) -> None:
     sensor = replace(POINTS, stamp_from=stamp_from)
     one = build_tracker(replace(Config(), sensors={"lidar": sensor}, estimator=estimator))
     for k in range(10):
@@ -150,6 +152,27 @@ def test_without_an_ego_pose_only_map_detections_can_be_placed() -> None:
     assert sorted(dispositions(report)) == ["birth", "failed"]
     ego = EgoState(START_NS, START_NS, 0.0, 0.0, 0.0, 0.0)
     assert "failed" not in dispositions(tick(one, 50.0, ego, seen((10.0, 0.0), at_ms=50.0, frame="ego")))
+
+
+def test_a_late_detection_is_placed_by_where_the_ego_was_at_its_stamp() -> None:
+    """The ego has gone 5 m since, at 50 m/s, and the new object 4 m, at the speed that it starts with."""
+    ego = [EgoState(START_NS + ms(t), START_NS + ms(t), 0.05 * t, 0.0, 0.0, 50.0) for t in range(0, 201, 10)]
+    found = []
+    for late_ms in (0.0, 100.0):
+        report = tick(tracker(), 200.0, *ego, seen((20.0, 3.0), at_ms=200.0, late_ms=late_ms, frame="ego"))
+        found.append(report.tracks[0].state.mean)
+    assert found[1] - found[0] == pytest.approx([-5.0 + 0.1 * found[0][3], 0.0, 0.0, 0.0, 0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize(("late", "expected"), [("fuse", "beyond_window"), ("drop", "too_old")])
+def test_a_smoother_fuses_behind_its_window_as_far_as_its_ring(late: str, expected: str) -> None:
+    settings = [f"smoother={{lag_s: 0.3, ring_s: 0.3, late: {late}}}", "sensors={lidar: {std: {x_m: 0.3, y_m: 0.3}}}"]
+    one = build_tracker(replace(load(Config, None, settings), estimator="smoother"))
+    for k in range(21):
+        tick(one, 50.0 * k, seen((10.0, 0.0), at_ms=50.0 * k))
+    late_ms = (250.0, 450.0, 650.0)
+    report = tick(one, 1001.0, *(seen((10.0, 0.0), at_ms=1001.0, late_ms=ms_) for ms_ in late_ms))
+    assert sorted(dispositions(report)) == sorted(["out_of_sequence", expected, "too_old"])
 
 
 def test_what_is_older_than_the_storage_is_too_old() -> None:
