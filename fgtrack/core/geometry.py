@@ -40,11 +40,6 @@ def rotations(yaws_rad: FloatArray) -> FloatArray:
     return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
 
 
-def parent_from_child(points_m: FloatArray, origin_m: tuple[float, float], yaw_rad: float) -> FloatArray:
-    """Points, shape (n, 2), of a child frame at `origin_m`, `yaw_rad`, expressed in its parent."""
-    return np.asarray(points_m @ rotation(yaw_rad).T + np.asarray(origin_m))
-
-
 def circular_mean(angles_rad: FloatArray) -> float:
     """Mean direction of `angles_rad`, shape (n,), in (-pi, pi]."""
     return math.atan2(float(np.sin(angles_rad).sum()), float(np.cos(angles_rad).sum()))

@@ -15,7 +15,9 @@ from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.ego_path import EgoPath
 from fgtrack.pipeline.offset_measurements import Remeasure, measurements_by_track
 from fgtrack.pipeline.replay import replay_in_memory
+from fgtrack.sim.redelay import restamped
 
+_Heard = EgoState | DetectionList
 Track = Sequence[ShiftableMeasurement]
 
 
@@ -107,7 +109,7 @@ def estimate_offsets(
     """
     rules = rules or OffsetRules()
     config = replace(config, sensors={name: replace(one, max_delay_s=None) for name, one in config.sensors.items()})
-    heard: list[EgoState | DetectionList] = []
+    heard: list[_Heard] = []
     run, broken = replay_in_memory(_recorded(messages, heard), config)
     raw = _lists(heard, config)
     sensors = [name for name in config.sensors if any(one.sensor == name for one in raw)]
@@ -117,7 +119,7 @@ def estimate_offsets(
         raise CallError(f"reference {reference!r} is no sensor of the input, which has {', '.join(sensors)}")
     remeasure = Remeasure(config, _path(heard, raw, rules))
     tracks = measurements_by_track(run, raw, raw, config.sensors, remeasure)
-    reference = reference or _most_seen(tracks, sensors)
+    reference = reference or max(sensors, key=_counts(tracks).__getitem__)
     used = _chosen(tracks, reference, rules)
     solution = _solution(used, reference, config, rules, {})
     known_s = {} if solution is None else _known(solution, rules)
@@ -128,12 +130,12 @@ def estimate_offsets(
             measurements_by_track(run, _lists(corrected, config), raw, config.sensors, remeasure), reference, rules
         )
         solution = _solution(used, reference, config, rules, known_s)
-    counts = Counter(item.sensor for track in used for item in track)
+    counts = _counts(used)
     rows = tuple(_row(name, reference, counts[name], solution, len(sensors), rules) for name in sensors)
     return OffsetReport(reference, rows, len(used), counts.total(), broken)
 
 
-def _recorded(messages: Iterable[Message], heard: list[EgoState | DetectionList]) -> Iterator[Message]:
+def _recorded(messages: Iterable[Message], heard: list[_Heard]) -> Iterator[Message]:
     """The same messages; those that a tracker hears are kept in `heard` as well."""
     for message in messages:
         if isinstance(message, (EgoState, DetectionList)):
@@ -141,22 +143,20 @@ def _recorded(messages: Iterable[Message], heard: list[EgoState | DetectionList]
         yield message
 
 
-def _lists(heard: Iterable[EgoState | DetectionList], config: Config) -> list[DetectionList]:
+def _lists(heard: Iterable[_Heard], config: Config) -> list[DetectionList]:
     return [one for one in heard if isinstance(one, DetectionList) and one.sensor in config.sensors]
 
 
-def _path(
-    heard: Iterable[EgoState | DetectionList], raw: Iterable[DetectionList], rules: OffsetRules
-) -> EgoPath | None:
+def _path(heard: Iterable[_Heard], raw: Iterable[DetectionList], rules: OffsetRules) -> EgoPath | None:
     """The path of the ego; None where it is not needed."""
     if all(one.frame == "map" for one in raw):
         return None
     return EgoPath((message for message in heard if isinstance(message, EgoState)), rules.ego_cutoff_hz)
 
 
-def _most_seen(tracks: Sequence[Track], sensors: Sequence[str]) -> str:
-    counts = Counter(item.sensor for track in tracks for item in track)
-    return max(sensors, key=lambda name: counts[name])
+def _counts(tracks: Iterable[Track]) -> Counter[str]:
+    """Number of measurements by sensor."""
+    return Counter(item.sensor for track in tracks for item in track)
 
 
 def _chosen(tracks: Sequence[Track], reference: str, rules: OffsetRules) -> list[Track]:
@@ -164,7 +164,7 @@ def _chosen(tracks: Sequence[Track], reference: str, rules: OffsetRules) -> list
     chosen: list[Track] = []
     total = 0
     for track in sorted(tracks, key=len, reverse=True):
-        seen = _often_seen(track, rules)
+        seen = {name for name, count in _counts([track]).items() if count >= rules.min_detections}
         if reference not in seen or len(seen) == 1:
             continue
         if seconds(track[-1].stamp_ns - track[0].stamp_ns) < rules.min_track_s:
@@ -176,19 +176,13 @@ def _chosen(tracks: Sequence[Track], reference: str, rules: OffsetRules) -> list
     return chosen
 
 
-def _often_seen(track: Track, rules: OffsetRules) -> set[str]:
-    counts = Counter(item.sensor for item in track)
-    return {name for name, count in counts.items() if count >= rules.min_detections}
-
-
 def _solution(
     used: Sequence[Track], reference: str, config: Config, rules: OffsetRules, start_s: Mapping[str, float]
 ) -> OffsetSolution | None:
     """The offsets of all sensors of `used` but the reference; None where there are none."""
-    seen = dict.fromkeys(item.sensor for track in used for item in track)
-    if not seen:
+    if not used:
         return None
-    free_s = {name: start_s.get(name, 0.0) for name in seen if name != reference}
+    free_s = {name: start_s.get(name, 0.0) for name in _counts(used) if name != reference}
     return solve_offsets(config.motion.model(), used, free_s, rules.solver)
 
 
@@ -200,32 +194,28 @@ def _known(solution: OffsetSolution, rules: OffsetRules) -> dict[str, float]:
     return {name: offset_s for name, offset_s, std_s, converged in rows if converged and std_s < limit_s}
 
 
-def _restamped(message: EgoState | DetectionList, offsets_s: Mapping[str, float]) -> EgoState | DetectionList:
+def _restamped(message: _Heard, offsets_s: Mapping[str, float]) -> _Heard:
     """`message` with the stamps that a right clock would have given it."""
     if isinstance(message, EgoState) or message.sensor not in offsets_s:
         return message
-    offset_ns = nanoseconds(offsets_s[message.sensor])
-    objects = tuple(
-        item if item.stamp_ns is None else replace(item, stamp_ns=item.stamp_ns - offset_ns) for item in message.objects
-    )
-    return replace(message, stamp_ns=message.stamp_ns - offset_ns, objects=objects)
+    return restamped(message, message.stamp_ns - nanoseconds(offsets_s[message.sensor]))
 
 
 def _row(
     name: str, reference: str, count: int, solution: OffsetSolution | None, num_sensors: int, rules: OffsetRules
 ) -> SensorOffset:
+    residual = None if solution is None else solution.residuals.get(name)
     if num_sensors == 1:
         return SensorOffset(name, None, None, count, False, "the only modality: nothing to compare it with")
     if name == reference:
         why = "the reference: its clock is taken for that of the ego"
-        return SensorOffset(name, 0.0, 0.0, count, False, why, _residual(solution, name))
+        return SensorOffset(name, 0.0, 0.0, count, False, why, residual)
     if solution is None or name not in solution.sensors:
         why = (
             f"no track of {rules.min_track_s:g} s has {rules.min_detections} detections of it and of {reference}: "
             "nothing to compare"
         )
         return SensorOffset(name, None, None, count, False, why)
-    residual = _residual(solution, name)
     place = solution.sensors.index(name)
     speed = f"objects move {solution.speeds_mps[name]:.2g} m/s (rms) in its frame"
     if not solution.converged[place]:
@@ -234,7 +224,3 @@ def _row(
     information = max(std_s**-2 - rules.solver.prior_std_s**-2, 0.0)
     why = f"information {information:.3g} /s2, {rules.needed_information:.3g} /s2 needed: {speed}"
     return SensorOffset(name, offset_s, std_s, count, std_s < rules.needed_std_s, why, residual)
-
-
-def _residual(solution: OffsetSolution | None, name: str) -> float | None:
-    return None if solution is None else solution.residuals.get(name)

@@ -1,8 +1,8 @@
 """The information of a late detection about the present."""
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -60,26 +60,20 @@ def information_values(
         now_ns = arrival.receipt_ns
         estimator.advance(now_ns)
         position = None if true_position is None else true_position(now_ns)
-        before = _view(estimator.state_at(now_ns), position)
+        log_det_before, error_before_m = _spread_and_error(estimator.state_at(now_ns), position)
         status = estimator.update(arrival.measurement).status
-        after = _view(estimator.state_at(now_ns), position)
+        log_det, error_m = _spread_and_error(estimator.state_at(now_ns), position)
         yield InformationValue(
             arrival.sensor,
             arrival.measurement.stamp_ns,
             now_ns,
             status,
-            0.5 * (before.log_det - after.log_det),
-            None if before.error_m is None or after.error_m is None else after.error_m - before.error_m,
+            0.5 * (log_det_before - log_det),
+            None if position is None else error_m - error_before_m,
         )
 
 
-class _View(NamedTuple):
-    """How well a state is known, and how far off it is."""
-
-    log_det: float
-    error_m: float | None
-
-
-def _view(state: TrackState, position: FloatArray | None) -> _View:
-    error_m = None if position is None else float(np.linalg.norm(state.mean[:2] - position))
-    return _View(float(np.linalg.slogdet(state.covariance).logabsdet), error_m)
+def _spread_and_error(state: TrackState, position: FloatArray | None) -> tuple[float, float]:
+    """Logarithm of the determinant of the covariance, and the distance from `position`, NaN where unknown."""
+    error_m = math.nan if position is None else float(np.linalg.norm(state.mean[:2] - position))
+    return float(np.linalg.slogdet(state.covariance).logabsdet), error_m

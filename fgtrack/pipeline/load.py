@@ -41,19 +41,13 @@ def with_settings(kind: type[T], raw: dict[str, Any], settings: Sequence[str], o
 def read_yaml(path: Path) -> dict[str, Any]:  # Any: what YAML says is only known after validation
     """The mapping that the YAML 1.2 file `path` holds; empty for an empty file."""
     try:
-        return _mapping(path.read_text(encoding="utf-8"), str(path))
+        value = _parse(path.read_text(encoding="utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "is no text file"
         raise CallError(f"{path}: configuration cannot be read ({reason})") from error
-
-
-def _mapping(text: str, origin: str) -> dict[str, Any]:
-    value = _parse(text, origin)
-    if value is None:
-        return {}
-    if not isinstance(value, dict):
-        raise CallError(f"{origin}: a mapping of keys to values is needed, this is {_name(value)}")
-    return value
+    if not isinstance(value, dict | None):
+        raise CallError(f"{path}: a mapping of keys to values is needed, this is {_name(value)}")
+    return value or {}
 
 
 def _parse(text: str, origin: str) -> Any:

@@ -142,7 +142,7 @@ def replay_in_memory(
     Without files it takes less time; the digest, which is one of files, is missing. Raises as `replay`.
     """
     tracker = build_tracker(config)
-    memory = MemoryRun(dump(config), _start_meta(config, origin, kind), _smoothed_lag_s(config))
+    memory = MemoryRun(*_opening(config, origin, kind))
     _, broken = _drive(tracker, messages, config, memory, origin=origin)
     return memory.run, broken
 
@@ -164,7 +164,8 @@ def _drive(
             tracker.receive(message)
         report = tracker.tick(tick.now_ns)
         process_ns = time.perf_counter_ns() - before_ns
-        writer.write_tick(report, process_ns, _count(tick))
+        num_detections = sum(len(one.objects) for one in tick.messages if isinstance(one, DetectionList))
+        writer.write_tick(report, process_ns, num_detections)
         if on_tick is not None:
             on_tick(tick.now_ns, len(report.tracks))
     if feed.broken is not None and feed.is_empty:
@@ -180,17 +181,11 @@ def _drive(
     return writer.finish(meta), feed.broken
 
 
-def _start_meta(config: Config, origin: str, kind: str) -> dict[str, object]:
-    return {
-        "input": {"path": origin, "kind": kind},
-        "estimator": config.estimator,
-        "versions": versions(),
-        "seed": None,
-    }
-
-
-def _smoothed_lag_s(config: Config) -> float | None:
-    return next(iter(config.smoother.lagged_s), None)
+def _opening(config: Config, origin: str, kind: str) -> tuple[str, dict[str, object], float | None]:
+    """What a run begins with: text of its configuration, meta data, lag of its smoothed states."""
+    source = {"path": origin, "kind": kind}
+    meta: dict[str, object] = {"input": source, "estimator": config.estimator, "versions": versions(), "seed": None}
+    return dump(config), meta, next(iter(config.smoother.lagged_s), None)
 
 
 def replay_each(
@@ -209,8 +204,8 @@ def replay_each(
         runs = []
         for estimator, folder in folders.items():
             chosen = replace(config, estimator=estimator)
-            tracker, meta = build_tracker(chosen), _start_meta(chosen, origin, kind)
-            writer = RunWriter(folder, dump(chosen), meta, _smoothed_lag_s(chosen), overwrite)
+            tracker = build_tracker(chosen)
+            writer = RunWriter(folder, *_opening(chosen, origin, kind), overwrite)
             runs.append((chosen, tracker, claims.enter_context(writer)))
         for chosen, tracker, writer in runs:
             finished, broken = _drive(tracker, messages(), chosen, writer, on_tick, origin)
@@ -232,15 +227,7 @@ def _ticks(messages: Iterable[Delivered], clock: ClockConfig) -> Iterator[Tick]:
     return node_ticks(messages, clock.node_hz)
 
 
-def _count(tick: Tick) -> int:
-    return sum(len(message.objects) for message in tick.messages if isinstance(message, DetectionList))
-
-
+@cache
 def versions() -> dict[str, str]:
     """Versions of what a result depends on, by name."""
-    return {"python": platform.python_version(), **_packages()}
-
-
-@cache
-def _packages() -> dict[str, str]:
-    return {name: importlib.metadata.version(name) for name in _PACKAGES}
+    return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in _PACKAGES}

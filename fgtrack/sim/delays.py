@@ -188,7 +188,8 @@ class MarkovDelay:
         """See `DelayModel`."""
         moves = np.ones(len(stamps_s))
         bad = _two_states(rng, self.bad_share, self.to_bad * moves, self.to_good * moves)
-        return _either(rng, stamps_s, bad, self.good, self.bad)
+        good_s = self.good.draw(rng, stamps_s)  # both are drawn for all messages
+        return np.where(bad, self.bad.draw(rng, stamps_s), good_s)
 
 
 @settings
@@ -214,7 +215,8 @@ class MarkovTimeDelay:
         """See `DelayModel`."""
         forgotten = -np.expm1(-(self.to_bad_per_s + self.to_good_per_s) * np.diff(stamps_s, prepend=stamps_s[:1]))
         bad = _two_states(rng, self.bad_share, self.bad_share * forgotten, (1.0 - self.bad_share) * forgotten)
-        return _either(rng, stamps_s, bad, self.good, self.bad)
+        good_s = self.good.draw(rng, stamps_s)  # both are drawn for all messages
+        return np.where(bad, self.bad.draw(rng, stamps_s), good_s)
 
 
 #: Every delay model, chosen by `kind`.
@@ -258,11 +260,3 @@ def _two_states(rng: np.random.Generator, share: float, to_bad: FloatArray, to_g
 #: Delays of Karle et al. 2023, section IV-B: mean and 90 % quantile.
 LIDAR_DELAY = GammaDelay(min_s=0.09, mean_s=0.151, q90_s=0.191)
 RADAR_DELAY = GammaDelay(min_s=0.03, mean_s=0.062, q90_s=0.089)
-
-
-def _either(
-    rng: np.random.Generator, stamps_s: FloatArray, bad: BoolArray, if_good: DelayModel, if_bad: DelayModel
-) -> FloatArray:
-    """Delays of one model where the chain is good, of the other where it is bad; both are drawn for all messages."""
-    good_delays = if_good.draw(rng, stamps_s)
-    return np.where(bad, if_bad.draw(rng, stamps_s), good_delays)

@@ -11,7 +11,7 @@ import numpy as np
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import BoolArray, Detection, DetectionList, IntArray, Message
+from fgtrack.core.types import BoolArray, DetectionList, IntArray, Message
 from fgtrack.sim.clocks import AnyClock, reported_stamps
 from fgtrack.sim.delays import AnyDelay
 from fgtrack.sim.settings import Probability, settings
@@ -170,14 +170,18 @@ class _Plan:
 
 
 def _moved(message: Message, stamp_ns: int, receipt_ns: int) -> Message:
-    """`message` with another stamp and receipt; detections' own stamps move as their list's does."""
+    """`message` with another stamp and receipt."""
     if (message.stamp_ns, message.receipt_ns) == (stamp_ns, receipt_ns):
         return message
-    if not isinstance(message, DetectionList) or message.stamp_ns == stamp_ns:
-        return replace(message, receipt_ns=receipt_ns)
-    objects = tuple(_shifted(item, stamp_ns - message.stamp_ns) for item in message.objects)
-    return replace(message, stamp_ns=stamp_ns, receipt_ns=receipt_ns, objects=objects)
+    if isinstance(message, DetectionList):
+        message = restamped(message, stamp_ns)
+    return replace(message, receipt_ns=receipt_ns)
 
 
-def _shifted(detection: Detection, error_ns: int) -> Detection:
-    return detection if detection.stamp_ns is None else replace(detection, stamp_ns=detection.stamp_ns + error_ns)
+def restamped(message: DetectionList, stamp_ns: int) -> DetectionList:
+    """`message` with another stamp; detections' own stamps move as their list's does."""
+    error_ns = stamp_ns - message.stamp_ns
+    objects = tuple(
+        item if item.stamp_ns is None else replace(item, stamp_ns=item.stamp_ns + error_ns) for item in message.objects
+    )
+    return replace(message, stamp_ns=stamp_ns, objects=objects)

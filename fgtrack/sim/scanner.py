@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,8 +17,7 @@ from fgtrack.models.track_map import TrackMap
 from fgtrack.sim.sensor import POLAR, SimulatedSensor
 
 
-@dataclass(frozen=True, eq=False)
-class _Detected:
+class _Detected(NamedTuple):
     """m detections of one sensor: the scan of each, its values, and a random key that shuffles a scan."""
 
     scan: IntArray
@@ -27,11 +27,7 @@ class _Detected:
 
 def _joined(parts: Sequence[_Detected]) -> _Detected:
     """All detected of `parts`."""
-    return _Detected(
-        scan=np.concatenate([part.scan for part in parts]),
-        z=np.concatenate([part.z for part in parts]),
-        key=np.concatenate([part.key for part in parts]),
-    )
+    return _Detected(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,21 +7,7 @@ import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import nanoseconds, seconds
-from fgtrack.core.types import (
-    ACCEL,
-    SPEED,
-    STATE_NAMES,
-    YAW,
-    YAW_RATE,
-    DetectionList,
-    EgoState,
-    FloatArray,
-    IntArray,
-    Message,
-    TruthState,
-    X,
-    Y,
-)
+from fgtrack.core.types import YAW, DetectionList, EgoState, FloatArray, IntArray, Message, TruthState
 from fgtrack.models.oval import OVAL, make_oval
 from fgtrack.models.path import Path
 from fgtrack.models.track_map import TrackMap
@@ -81,8 +67,7 @@ class _Simulation:
         return vehicle.trajectory(path)
 
     def _truth(self) -> list[Message]:
-        stamps = self._stamps(self._times(self.scenario.truth_rate_hz))
-        times = self._seconds(stamps)
+        stamps, times = self._whole(self._times(self.scenario.truth_rate_hz))
         rows = [trajectory.states(times).tolist() for trajectory in (self.ego, *self.opponents)]
         return [
             TruthState(stamp, stamp, object_id, *states[index])
@@ -93,14 +78,11 @@ class _Simulation:
     def _ego_messages(self) -> list[Message]:
         settings = self.scenario.ego_messages
         noise_rng, delay_rng = self.ego_rng.spawn(2)
-        stamps = self._stamps(self._times(settings.rate_hz))
-        times = self._seconds(stamps)
-        std = np.empty(len(STATE_NAMES))
-        std[[X, Y]] = settings.position_std_m
-        std[[YAW, SPEED]] = settings.yaw_std_rad, settings.speed_std_mps
-        std[[YAW_RATE, ACCEL]] = settings.yaw_rate_std_radps, settings.accel_std_mps2
+        stamps, times = self._whole(self._times(settings.rate_hz))
+        std = [*[settings.position_std_m] * 2, settings.yaw_std_rad, settings.speed_std_mps]
+        std += [settings.yaw_rate_std_radps, settings.accel_std_mps2]
         states = self.ego.states(times)
-        states += std * noise_rng.standard_normal(states.shape)
+        states += np.array(std) * noise_rng.standard_normal(states.shape)
         states[:, YAW] = wrap_angles(states[:, YAW])
         receipts = _receipts(settings.delay, delay_rng, stamps, times)
         return [
@@ -111,8 +93,7 @@ class _Simulation:
 
     def _scans(self, sensor: SimulatedSensor, rng: np.random.Generator) -> list[Message]:
         times_rng, delay_rng, scanner_rng, clock_rng = rng.spawn(4)
-        stamps = self._stamps(sensor.scan_times(times_rng, self.scenario.duration_s))
-        times = self._seconds(stamps)
+        stamps, times = self._whole(sensor.scan_times(times_rng, self.scenario.duration_s))
         scanner = Scanner(sensor, self.ego.states(times), self.scenario.detection_origin_x_m)
         objects = [trajectory.states(times) for trajectory in self.opponents]
         scans = scanner.scans(scanner_rng, objects, self.track)
@@ -128,11 +109,11 @@ class _Simulation:
     def _times(self, rate_hz: float) -> FloatArray:
         return np.arange(math.floor(self.scenario.duration_s * rate_hz + 1e-9) + 1) / rate_hz
 
-    def _stamps(self, times_s: FloatArray) -> list[int]:
-        return [self.scenario.start_ns + nanoseconds(time_s) for time_s in times_s.tolist()]
-
-    def _seconds(self, stamps: list[int]) -> FloatArray:
-        return np.array([seconds(stamp - self.scenario.start_ns) for stamp in stamps])
+    def _whole(self, times_s: FloatArray) -> tuple[list[int], FloatArray]:
+        """The stamps of times since the start, and the times again, now of whole nanoseconds."""
+        since_start_ns = [nanoseconds(time_s) for time_s in times_s.tolist()]
+        stamps = [self.scenario.start_ns + time_ns for time_ns in since_start_ns]
+        return stamps, np.array([seconds(time_ns) for time_ns in since_start_ns])
 
 
 def _track(scenario: Scenario) -> TrackMap | None:
