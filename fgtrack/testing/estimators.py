@@ -1,7 +1,7 @@
 """What every estimator must do, in whatever order measurements arrive."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -11,11 +11,12 @@ import numpy as np
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
-from fgtrack.estimation.base import Estimator, Measurement, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import Estimator, Measurement, UpdateStatus
 from fgtrack.estimation.dense_joint import dense_joint, difference, rounding_bound
-from fgtrack.estimation.registry import ESTIMATORS, EXACT, Claims, Factory, start_estimator
+from fgtrack.estimation.registry import ESTIMATORS, EXACT, Claims, Factory
 from fgtrack.models.motion import MotionModel
-from fgtrack.testing.broken import BrokenPromiseError, run_all
+from fgtrack.testing.broken import run_all
+from fgtrack.testing.promise import Draw, Promise, Subject, require
 from fgtrack.testing.streams import (
     LAG_S,
     LINEAR,
@@ -36,93 +37,23 @@ _FIRST_LATE, _ONE_LAG = "any lag, first late measurement", "one lag, first late 
 _CONVERGED, _ORDER = 1e-5, 1e-9
 
 
-class _WrongError(Exception):
-    """What is wrong; the runner adds with which measurements."""
-
-
-def _require(condition: object, text: str) -> None:
-    if not condition:
-        raise _WrongError(text)
-
-
-@dataclass(frozen=True)
-class _Subject:
-    """An estimator under test."""
-
-    name: str
-    factory: Factory
-    claims: Claims
-    options: Mapping[str, Any]
-
-    def start(self, stream: Stream) -> Estimator:
-        return start_estimator(self.name, self.factory, stream.motion, stream.start, LAG_S, self.options)
-
-    def fed(self, stream: Stream) -> tuple[Estimator, list[UpdateResult]]:
-        estimator = self.start(stream)
-        return estimator, [estimator.update(measurement) for measurement in stream.measurements]
-
-
-Check = Callable[[_Subject, Stream], None]
-Draw = Callable[[np.random.Generator], Stream]
-
-
-@dataclass(frozen=True)
-class _Promise:
-    check: Check
-    draws: tuple[Draw, ...]
-    applies: Callable[[Claims], bool] = lambda claims: True
-    repeats: bool = False
-    """Whether it is checked on many streams."""
-
-    def run(self, subject: _Subject, seed: int, num_streams: int) -> None:
-        """Raise `BrokenPromiseError` with the smallest part of a stream that still breaks it."""
-        for kind, draw in enumerate(self.draws):
-            for number in range(num_streams if self.repeats else 1):
-                stream = draw(np.random.default_rng([seed, kind, number]))
-                wrong = self._wrong(subject, stream)
-                place = 0
-                while wrong and place < len(stream.measurements) > 1:
-                    smaller = stream.without(place)
-                    if still := self._wrong(subject, smaller):
-                        stream, wrong = smaller, still
-                    else:
-                        place += 1
-                if wrong:
-                    raise BrokenPromiseError(subject.name, {self.name: f"{wrong}\n{stream}"}) from None
-
-    @property
-    def name(self) -> str:
-        """Name of the promise: a sentence without its subject."""
-        return self.check.__name__.removeprefix("_").replace("_", " ")
-
-    def _wrong(self, subject: _Subject, stream: Stream) -> str:
-        """What is wrong, or nothing."""
-        try:
-            self.check(subject, stream)
-        except _WrongError as error:
-            return str(error)
-        except Exception as error:  # of a foreign estimator: anything
-            return f"{type(error).__name__}: {error}"
-        return ""
-
-
 def _close(found: TrackState, expected: TrackState, tolerance: float, stream: Stream, what: str) -> None:
     mean_sigma, covariance = difference(found, expected)
     at_s = (found.stamp_ns - stream.start.stamp_ns) / 1e9
-    _require(
+    require(
         mean_sigma < tolerance and covariance < tolerance,
         f"the state at {at_s:.9f} s differs from {what} by {mean_sigma:.1e} standard deviations in the mean and "
         f"{covariance:.1e} in the covariance (tolerance {tolerance:.1e})",
     )
 
 
-def _joint(subject: _Subject, stream: Stream, at_ns: int) -> TrackState:
+def _joint(subject: Subject, stream: Stream, at_ns: int) -> TrackState:
     """The dense joint posterior; of a filter, of what was measured up to that stamp."""
     known = [m for m in stream.measurements if subject.claims.smooths or m.stamp_ns <= at_ns]
     return dense_joint(stream.motion, stream.start, known, [at_ns])[at_ns]
 
 
-def _tolerance(subject: _Subject, stream: Stream) -> float:
+def _tolerance(subject: Subject, stream: Stream) -> float:
     return max(subject.claims.tolerance, subject.claims.rounding * rounding_bound(stream.motion, stream.stamps_ns))
 
 
@@ -141,33 +72,33 @@ def _bits(estimator: Estimator, stamps_ns: list[int]) -> list[bytes]:
 # --- the promises, each the rest of a sentence that begins with the estimator
 
 
-def _is_the_kalman_filter_in_sequence(subject: _Subject, stream: Stream) -> None:
+def _is_the_kalman_filter_in_sequence(subject: Subject, stream: Stream) -> None:
     estimator, results = subject.fed(stream)
     statuses = [result.status.value for result in results]
-    _require(statuses == ["in_sequence"] * len(results), f"statuses are {statuses}")
+    require(statuses == ["in_sequence"] * len(results), f"statuses are {statuses}")
     at_ns = stream.newest_ns - round(subject.claims.held_s * 1e9)
     known = [m for m in stream.measurements if subject.claims.smooths or m.stamp_ns <= at_ns]
     expected = dense_joint(stream.motion, stream.start, known, [at_ns])[at_ns]
     _close(estimator.state_at(at_ns), expected, max(1e-9, subject.claims.tolerance), stream, "the Kalman filter's")
 
 
-def _gives_the_dense_joint_posterior_in_any_order(subject: _Subject, stream: Stream) -> None:
+def _gives_the_dense_joint_posterior_in_any_order(subject: Subject, stream: Stream) -> None:
     estimator, results = subject.fed(stream)
     refused = [k for k, result in enumerate(results) if result.status not in FUSED]
-    _require(not refused, f"of the measurements inside the window the one at place {refused[:1]} is not fused")
+    require(not refused, f"of the measurements inside the window the one at place {refused[:1]} is not fused")
     for at_ns in _probes_ns(stream):
         expected = _joint(subject, stream, at_ns)
         _close(estimator.state_at(at_ns), expected, _tolerance(subject, stream), stream, "the dense joint posterior")
 
 
-def _keeps_all_that_it_accepts_and_nothing_else(subject: _Subject, stream: Stream) -> None:
+def _keeps_all_that_it_accepts_and_nothing_else(subject: Subject, stream: Stream) -> None:
     """The clock runs ahead of the stamps, and the window is shorter than the stream."""
     estimator, accepted, newest_ns = subject.start(stream), list[Measurement](), stream.start.stamp_ns
     for place, measurement in enumerate(stream.measurements):
         oldest_ns = estimator.window_ns[0]
         status = estimator.update(measurement).status
         inside = measurement.stamp_ns >= oldest_ns
-        _require((status in FUSED) == inside, f"place {place}: {status}, the window begins at {oldest_ns}")
+        require((status in FUSED) == inside, f"place {place}: {status}, the window begins at {oldest_ns}")
         if inside:
             accepted.append(measurement)
             newest_ns = max(newest_ns, measurement.stamp_ns)
@@ -179,7 +110,7 @@ def _keeps_all_that_it_accepts_and_nothing_else(subject: _Subject, stream: Strea
             _close(estimator.state_at(at_ns), expected, _tolerance(subject, stream), stream, "that of these")
 
 
-def _gives_the_estimate_of_the_time_order_in_any_order(subject: _Subject, stream: Stream) -> None:
+def _gives_the_estimate_of_the_time_order_in_any_order(subject: Subject, stream: Stream) -> None:
     found, expected = (subject.fed(each)[0] for each in (stream, stream.in_order))
     tolerance = _ORDER
     if subject.claims.nonlinear == "at convergence":
@@ -190,14 +121,14 @@ def _gives_the_estimate_of_the_time_order_in_any_order(subject: _Subject, stream
         _close(found.state_at(at_ns), expected.state_at(at_ns), tolerance, stream, "that of the time order")
 
 
-def _fuses_a_late_measurement_exactly(subject: _Subject, stream: Stream) -> None:
+def _fuses_a_late_measurement_exactly(subject: Subject, stream: Stream) -> None:
     estimator, results = subject.fed(stream)
-    _require(results[-1].status in FUSED, f"the last measurement is {results[-1].status}")
+    require(results[-1].status in FUSED, f"the last measurement is {results[-1].status}")
     at_ns = stream.newest_ns
     _close(estimator.state_at(at_ns), _joint(subject, stream, at_ns), 1e-9, stream, "the dense joint posterior")
 
 
-def _reports_the_innovation_against_the_state_before(subject: _Subject, stream: Stream) -> None:
+def _reports_the_innovation_against_the_state_before(subject: Subject, stream: Stream) -> None:
     estimator = subject.start(stream)
     fused_ns: set[int] = set()
     for measurement in stream.measurements:
@@ -210,47 +141,47 @@ def _reports_the_innovation_against_the_state_before(subject: _Subject, stream: 
         nis = float(y @ np.linalg.solve(H @ before.covariance @ H.T + measurement.R, y))
         result = estimator.update(measurement)
         right = result.innovation is not None and np.allclose(result.innovation, y, rtol=0.0, atol=1e-6)
-        _require(right, f"the innovation is {result.innovation}, expected {y}")
-        _require(result.nis is not None and abs(result.nis - nis) < 1e-6 * (1.0 + nis), f"NIS {result.nis}, not {nis}")
+        require(right, f"the innovation is {result.innovation}, expected {y}")
+        require(result.nis is not None and abs(result.nis - nis) < 1e-6 * (1.0 + nis), f"NIS {result.nis}, not {nis}")
 
 
-def _counts_each_measurement_as_what_it_is(subject: _Subject, stream: Stream) -> None:
+def _counts_each_measurement_as_what_it_is(subject: Subject, stream: Stream) -> None:
     estimator = subject.start(stream)
     newest_ns = stream.start.stamp_ns
     for place, measurement in enumerate(stream.measurements):
         result = estimator.update(measurement)
         late = measurement.stamp_ns < newest_ns
         allowed = (*_LATE, UpdateStatus.TOO_OLD, UpdateStatus.FAILED) if late else (UpdateStatus.IN_SEQUENCE,)
-        _require(result.status in allowed, f"place {place}: {'late' if late else 'in sequence'}, is {result.status}")
+        require(result.status in allowed, f"place {place}: {'late' if late else 'in sequence'}, is {result.status}")
         fused = result.status in FUSED
-        _require(fused == (result.innovation is not None), f"place {place}: innovation {result.innovation}")
-        _require(fused == (result.nis is not None), f"place {place}: {result.status} with NIS {result.nis}")
-        _require(not fused or 0.0 <= (result.nis or 0.0) < np.inf, f"place {place}: NIS is {result.nis}")
+        require(fused == (result.innovation is not None), f"place {place}: innovation {result.innovation}")
+        require(fused == (result.nis is not None), f"place {place}: {result.status} with NIS {result.nis}")
+        require(not fused or 0.0 <= (result.nis or 0.0) < np.inf, f"place {place}: NIS is {result.nis}")
         newest_ns = max(newest_ns, measurement.stamp_ns)
-    _require(estimator.window_ns[1] == newest_ns, f"window_ns ends at {estimator.window_ns[1]}, newest is {newest_ns}")
+    require(estimator.window_ns[1] == newest_ns, f"window_ns ends at {estimator.window_ns[1]}, newest is {newest_ns}")
 
 
-def _gives_symmetric_positive_definite_covariances(subject: _Subject, stream: Stream) -> None:
+def _gives_symmetric_positive_definite_covariances(subject: Subject, stream: Stream) -> None:
     estimator, _ = subject.fed(stream)
     for at_ns in _probes_ns(stream, estimator.window_ns[0]):
         state = estimator.state_at(at_ns)
-        _require(state.stamp_ns == at_ns, f"state_at({at_ns}) gives a state at {state.stamp_ns}")
-        _require(np.isfinite(state.mean).all(), f"the mean at {at_ns} is {state.mean}")
+        require(state.stamp_ns == at_ns, f"state_at({at_ns}) gives a state at {state.stamp_ns}")
+        require(np.isfinite(state.mean).all(), f"the mean at {at_ns} is {state.mean}")
         P = state.covariance
-        _require((P == P.T).all(), f"the covariance at {at_ns} is not symmetric")
+        require((P == P.T).all(), f"the covariance at {at_ns} is not symmetric")
         scale = np.sqrt(np.diag(P))
         least = np.linalg.eigvalsh(P / np.outer(scale, scale)).min() if (scale > 0.0).all() else -np.inf
-        _require(least > 0.0, f"the covariance at {at_ns} is not positive definite")
+        require(least > 0.0, f"the covariance at {at_ns} is not positive definite")
 
 
-def _gives_the_same_bits_for_the_same_input(subject: _Subject, stream: Stream) -> None:
+def _gives_the_same_bits_for_the_same_input(subject: Subject, stream: Stream) -> None:
     (first, said), (again, repeated) = subject.fed(stream), subject.fed(stream)
-    _require(repr(said) == repr(repeated), "results of update differ")
+    require(repr(said) == repr(repeated), "results of update differ")
     probes = _probes_ns(stream, first.window_ns[0])
-    _require(_bits(first, probes) == _bits(again, probes), "states differ")
+    require(_bits(first, probes) == _bits(again, probes), "states differ")
 
 
-def _changes_no_input_and_no_output_later(subject: _Subject, stream: Stream) -> None:
+def _changes_no_input_and_no_output_later(subject: Subject, stream: Stream) -> None:
     copies = [replace(m, z=m.z.copy(), R=m.R.copy()) for m in stream.measurements]
     estimator = subject.start(stream)
     given: list[tuple[FloatArray, FloatArray]] = []
@@ -261,11 +192,11 @@ def _changes_no_input_and_no_output_later(subject: _Subject, stream: Stream) -> 
         given += [(output, output.copy()) for output in outputs]
     for copy, measurement in zip(copies, stream.measurements, strict=True):
         same = (copy.z == measurement.z).all() and (copy.R == measurement.R).all()
-        _require(same, f"z or R of the measurement at {measurement.stamp_ns} is changed")
-    _require(all((now == then).all() for now, then in given), "a state or innovation that was given changes later")
+        require(same, f"z or R of the measurement at {measurement.stamp_ns} is changed")
+    require(all((now == then).all() for now, then in given), "a state or innovation that was given changes later")
 
 
-def _reports_what_is_too_old_and_stays_as_it_was(subject: _Subject, stream: Stream) -> None:
+def _reports_what_is_too_old_and_stays_as_it_was(subject: Subject, stream: Stream) -> None:
     estimator, _ = subject.fed(stream)
     estimator.advance(stream.newest_ns + round(0.5e9 * LAG_S))
     rng = np.random.default_rng(0)
@@ -273,13 +204,13 @@ def _reports_what_is_too_old_and_stays_as_it_was(subject: _Subject, stream: Stre
         probes = [stream.newest_ns, stream.newest_ns + 100 * MS]
         before, window_ns = _bits(estimator, probes), estimator.window_ns
         result = estimator.update(measured(rng, stream.motion, offset_ns))
-        _require(result.status is UpdateStatus.TOO_OLD, f"a stamp before {window_ns[0]} is {result.status}")
-        _require(result.nis is None and result.innovation is None, "what is too old has an innovation")
-        _require(_bits(estimator, probes) == before, "what is too old changes the state")
-        _require(estimator.window_ns == window_ns, "what is too old moves the window")
+        require(result.status is UpdateStatus.TOO_OLD, f"a stamp before {window_ns[0]} is {result.status}")
+        require(result.nis is None and result.innovation is None, "what is too old has an innovation")
+        require(_bits(estimator, probes) == before, "what is too old changes the state")
+        require(estimator.window_ns == window_ns, "what is too old moves the window")
 
 
-def _stays_as_it_was_after_a_failure_and_fuses_the_next(subject: _Subject, stream: Stream) -> None:
+def _stays_as_it_was_after_a_failure_and_fuses_the_next(subject: Subject, stream: Stream) -> None:
     estimator, _ = subject.fed(stream)
     rng, newest_ns = np.random.default_rng(1), stream.newest_ns
     for offset_ns in (-20 * MS, 0, 30 * MS):
@@ -289,32 +220,32 @@ def _stays_as_it_was_after_a_failure_and_fuses_the_next(subject: _Subject, strea
         for broken in (replace(good, z=good.z * np.nan), replace(good, R=good.R * np.nan)):
             status = estimator.update(broken).status
             allowed = (UpdateStatus.FAILED, UpdateStatus.TOO_OLD) if offset_ns < 0 else (UpdateStatus.FAILED,)
-            _require(status in allowed, f"a measurement that is not a number is {status}")
-            _require(_bits(estimator, probes) == before, "a measurement that is not a number changes the state")
-            _require(estimator.window_ns == window_ns, "a measurement that is not a number moves the window")
+            require(status in allowed, f"a measurement that is not a number is {status}")
+            require(_bits(estimator, probes) == before, "a measurement that is not a number changes the state")
+            require(estimator.window_ns == window_ns, "a measurement that is not a number moves the window")
     status = estimator.update(good).status
-    _require(status is UpdateStatus.IN_SEQUENCE, f"after the failure a good measurement is {status}")
+    require(status is UpdateStatus.IN_SEQUENCE, f"after the failure a good measurement is {status}")
 
 
-def _moves_only_the_window_with_the_clock(subject: _Subject, stream: Stream) -> None:
+def _moves_only_the_window_with_the_clock(subject: Subject, stream: Stream) -> None:
     estimator, _ = subject.fed(stream)
     newest_ns = stream.newest_ns
     probes = [newest_ns, newest_ns + 100 * MS]
     before, oldest_ns = [estimator.state_at(at_ns) for at_ns in probes], estimator.window_ns[0]
     estimator.advance(newest_ns + 300 * MS)
     moved = estimator.window_ns
-    _require(moved[1] == newest_ns, f"the clock moves the newest stamp to {moved[1]}")
-    _require(moved[0] >= oldest_ns, f"the clock moves the window back to {moved[0]}")
+    require(moved[1] == newest_ns, f"the clock moves the newest stamp to {moved[1]}")
+    require(moved[0] >= oldest_ns, f"the clock moves the window back to {moved[0]}")
     estimator.advance(newest_ns)
-    _require(estimator.window_ns == moved, "a clock that goes back moves the window")
+    require(estimator.window_ns == moved, "a clock that goes back moves the window")
     if not subject.claims.held_s:
         for state, at_ns in zip(before, probes, strict=True):
             _close(estimator.state_at(at_ns), state, _ORDER, stream, "that before the clock moved")
     estimator.advance(newest_ns + 20 * round(LAG_S * 1e9))
-    _require(estimator.window_ns[0] > newest_ns, "the window does not leave the past behind")
+    require(estimator.window_ns[0] > newest_ns, "the window does not leave the past behind")
 
 
-def _predicts_ahead_by_the_motion_model(subject: _Subject, stream: Stream) -> None:
+def _predicts_ahead_by_the_motion_model(subject: Subject, stream: Stream) -> None:
     estimator, _ = subject.fed(stream)
     now, ahead = estimator.state_at(stream.newest_ns), estimator.state_at(stream.newest_ns + 200 * MS)
     F, Q = stream.motion.jacobian(now.mean, 0.2), stream.motion.process_noise(now.mean, 0.2)
@@ -322,12 +253,12 @@ def _predicts_ahead_by_the_motion_model(subject: _Subject, stream: Stream) -> No
     _close(ahead, expected, 1e-6, stream, "the prediction of the newest one")
 
 
-def _keeps_a_heading_that_passes_half_a_turn(subject: _Subject, stream: Stream) -> None:
+def _keeps_a_heading_that_passes_half_a_turn(subject: Subject, stream: Stream) -> None:
     estimator, _ = subject.fed(stream)
     yaw_rad = estimator.state_at(stream.newest_ns).mean[YAW]
     expected_rad = (stream.start.yaw_rad or 0.0) + TURN_RADPS * seconds(stream.newest_ns - stream.start.stamp_ns)
     off_rad = abs(wrap_angle(yaw_rad - expected_rad))
-    _require(off_rad < 0.2, f"the yaw is {yaw_rad:.3f} rad, {off_rad:.3f} rad off")
+    require(off_rad < 0.2, f"the yaw is {yaw_rad:.3f} rad, {off_rad:.3f} rad off")
 
 
 def _drawn(make: Callable[..., Stream], *what: MotionModel | int) -> tuple[Draw, ...]:
@@ -336,41 +267,41 @@ def _drawn(make: Callable[..., Stream], *what: MotionModel | int) -> tuple[Draw,
 
 _BOTH = (LINEAR, NONLINEAR)
 _PROMISES = (
-    _Promise(_is_the_kalman_filter_in_sequence, _drawn(regular, LINEAR)),
-    _Promise(
+    Promise(_is_the_kalman_filter_in_sequence, _drawn(regular, LINEAR)),
+    Promise(
         _gives_the_dense_joint_posterior_in_any_order,
         _drawn(shuffled, LINEAR),
         lambda claims: claims.exact == EXACT,
         repeats=True,
     ),
-    _Promise(
+    Promise(
         _keeps_all_that_it_accepts_and_nothing_else,
         (partial(shuffled, LINEAR, span_s=4.0 * LAG_S),),
         lambda claims: claims.exact == EXACT,
         repeats=True,
     ),
-    _Promise(
+    Promise(
         _gives_the_estimate_of_the_time_order_in_any_order,
         _drawn(shuffled, NONLINEAR),
         lambda claims: claims.exact == EXACT and claims.nonlinear != "never",
         repeats=True,
     ),
-    _Promise(_fuses_a_late_measurement_exactly, _drawn(one_late, 1), lambda claims: claims.exact == _ONE_LAG),
-    _Promise(_fuses_a_late_measurement_exactly, _drawn(one_late, 1, 2, 6), lambda claims: claims.exact == _FIRST_LATE),
-    _Promise(
+    Promise(_fuses_a_late_measurement_exactly, _drawn(one_late, 1), lambda claims: claims.exact == _ONE_LAG),
+    Promise(_fuses_a_late_measurement_exactly, _drawn(one_late, 1, 2, 6), lambda claims: claims.exact == _FIRST_LATE),
+    Promise(
         _reports_the_innovation_against_the_state_before,
         _drawn(shuffled, *_BOTH),
         lambda claims: claims.exact == EXACT,
     ),
-    _Promise(_counts_each_measurement_as_what_it_is, _drawn(shuffled, *_BOTH)),
-    _Promise(_gives_symmetric_positive_definite_covariances, _drawn(shuffled, *_BOTH), repeats=True),
-    _Promise(_gives_the_same_bits_for_the_same_input, _drawn(shuffled, *_BOTH)),
-    _Promise(_changes_no_input_and_no_output_later, _drawn(shuffled, *_BOTH)),
-    _Promise(_reports_what_is_too_old_and_stays_as_it_was, _drawn(regular, *_BOTH)),
-    _Promise(_stays_as_it_was_after_a_failure_and_fuses_the_next, _drawn(regular, *_BOTH)),
-    _Promise(_moves_only_the_window_with_the_clock, _drawn(regular, *_BOTH)),
-    _Promise(_predicts_ahead_by_the_motion_model, _drawn(regular, *_BOTH)),
-    _Promise(_keeps_a_heading_that_passes_half_a_turn, (across_pi,)),
+    Promise(_counts_each_measurement_as_what_it_is, _drawn(shuffled, *_BOTH)),
+    Promise(_gives_symmetric_positive_definite_covariances, _drawn(shuffled, *_BOTH), repeats=True),
+    Promise(_gives_the_same_bits_for_the_same_input, _drawn(shuffled, *_BOTH)),
+    Promise(_changes_no_input_and_no_output_later, _drawn(shuffled, *_BOTH)),
+    Promise(_reports_what_is_too_old_and_stays_as_it_was, _drawn(regular, *_BOTH)),
+    Promise(_stays_as_it_was_after_a_failure_and_fuses_the_next, _drawn(regular, *_BOTH)),
+    Promise(_moves_only_the_window_with_the_clock, _drawn(regular, *_BOTH)),
+    Promise(_predicts_ahead_by_the_motion_model, _drawn(regular, *_BOTH)),
+    Promise(_keeps_a_heading_that_passes_half_a_turn, (across_pi,)),
 )
 
 
@@ -406,7 +337,7 @@ def estimator_checks(
     claims = Claims.of(made)
     if exact is not None:
         claims = replace(claims, exact=exact if isinstance(exact, str) else EXACT if exact else "")
-    subject = _Subject(_name(factory), made, claims, options)
+    subject = Subject(_name(factory), made, claims, options)
     promised = [promise for promise in _PROMISES if promise.applies(claims)]
     return {promise.name: partial(promise.run, subject, seed, num_streams) for promise in promised}
 

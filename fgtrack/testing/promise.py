@@ -1,0 +1,88 @@
+"""One promise of the contract of estimators, and how it is checked."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fgtrack.estimation.base import Estimator, UpdateResult
+from fgtrack.estimation.registry import Claims, Factory, start_estimator
+from fgtrack.testing.broken import BrokenPromiseError
+from fgtrack.testing.streams import LAG_S, Stream
+
+
+class WrongError(Exception):
+    """What is wrong; the runner adds with which measurements."""
+
+
+def require(condition: object, text: str) -> None:
+    """Raise `WrongError` with `text` unless `condition` holds."""
+    if not condition:
+        raise WrongError(text)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An estimator under test."""
+
+    name: str
+    factory: Factory
+    claims: Claims
+    options: Mapping[str, Any]
+
+    def start(self, stream: Stream) -> Estimator:
+        """A new one for the object of `stream`."""
+        return start_estimator(self.name, self.factory, stream.motion, stream.start, LAG_S, self.options)
+
+    def fed(self, stream: Stream) -> tuple[Estimator, list[UpdateResult]]:
+        """A new one that has taken all of `stream`, and what it said."""
+        estimator = self.start(stream)
+        return estimator, [estimator.update(measurement) for measurement in stream.measurements]
+
+
+Check = Callable[[Subject, Stream], None]
+Draw = Callable[[np.random.Generator], Stream]
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What an estimator promises on streams of one kind."""
+
+    check: Check
+    draws: tuple[Draw, ...]
+    applies: Callable[[Claims], bool] = lambda claims: True
+    """Whether an estimator with these claims promises it."""
+    repeats: bool = False
+    """Whether it is checked on many streams."""
+
+    def run(self, subject: Subject, seed: int, num_streams: int) -> None:
+        """Raise `BrokenPromiseError` with the smallest part of a stream that still breaks it."""
+        for kind, draw in enumerate(self.draws):
+            for number in range(num_streams if self.repeats else 1):
+                stream = draw(np.random.default_rng([seed, kind, number]))
+                wrong = self._wrong(subject, stream)
+                place = 0
+                while wrong and place < len(stream.measurements) > 1:
+                    smaller = stream.without(place)
+                    if still := self._wrong(subject, smaller):
+                        stream, wrong = smaller, still
+                    else:
+                        place += 1
+                if wrong:
+                    raise BrokenPromiseError(subject.name, {self.name: f"{wrong}\n{stream}"}) from None
+
+    @property
+    def name(self) -> str:
+        """Name of the promise: a sentence without its subject."""
+        return self.check.__name__.removeprefix("_").replace("_", " ")
+
+    def _wrong(self, subject: Subject, stream: Stream) -> str:
+        """What is wrong, or nothing."""
+        try:
+            self.check(subject, stream)
+        except WrongError as error:
+            return str(error)
+        except Exception as error:  # of a foreign estimator: anything
+            return f"{type(error).__name__}: {error}"
+        return ""
