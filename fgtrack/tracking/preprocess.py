@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from fgtrack.core.geometry import circular_mean, rotation, wrap_angle
 from fgtrack.core.types import MEASURABLE, Detection, Disposition, FloatArray, UpdateRecord
 from fgtrack.estimation.base import Measurement
-from fgtrack.models.measurement import ANGULAR, SensorPose, measurement_model
+from fgtrack.models.measurement import ANGULAR, SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
@@ -188,12 +188,13 @@ class Preprocess:
             point_m = (x_m, y_m)
         values = {name: values[name] for name in names}
         z = np.array(list(values.values()))
+        found = measured_position(names, z, R, pose)
         return Candidate(
             leader.index,
             merged,
             Measurement(batch.stamp_ns, measurement_model(names, self._motion), z, R, pose, sensor.loss),
             None if point_m is None else np.array(point_m),
-            None if point_m is None else _position_covariance(values, R, names, pose),
+            None if found is None else found[1],
             values,
         )
 
@@ -265,14 +266,3 @@ def _turned(R: FloatArray, yaw_rad: float) -> FloatArray:
     turn = np.eye(len(R))
     turn[:2, :2] = rotation(yaw_rad)
     return turn @ R @ turn.T
-
-
-def _position_covariance(
-    values: Mapping[str, float], R: FloatArray, names: tuple[str, ...], pose: SensorPose
-) -> FloatArray:
-    """Covariance of the position in the map, shape (2, 2); of range and bearing to first order."""
-    if "x_m" in names:
-        return R[:2, :2]
-    polar = [names.index("range_m"), names.index("bearing_rad")]
-    arm = rotation(pose.yaw_rad + values["bearing_rad"]) * np.array([1.0, values["range_m"]])
-    return np.asarray(arm @ R[np.ix_(polar, polar)] @ arm.T)
