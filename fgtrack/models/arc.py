@@ -138,39 +138,33 @@ def small_turn_noise(
     p_yaw = 1j * (q_yaw * way1 + q_rate * (0.5 * t * way2 - way3 / 6.0))
     p_rate = 0.5j * q_rate * way2
     p_speed = q_speed * moments[1]
-    yaw_yaw, yaw_rate, rate_rate = q_yaw * t + q_rate * t3 / 3.0, 0.5 * q_rate * t2, q_rate * t
-    white = q_position * t
     if accel is None:
         square = speed * speed
-        across = (yaw3 * square, rate5 * square)
-        xx, xy, yy = _position_block(_CONSTANT_SPEED, (q_speed * t3, 0.0), across, turn, end)
-        return np.array(
-            (
-                *(xx + white, xy, p_yaw.real, p_speed.real, p_rate.real),
-                *(xy, yy + white, p_yaw.imag, p_speed.imag, p_rate.imag),
-                *(p_yaw.real, p_yaw.imag, yaw_yaw, 0.0, yaw_rate),
-                *(p_speed.real, p_speed.imag, 0.0, q_speed * t, 0.0),
-                *(p_rate.real, p_rate.imag, yaw_rate, 0.0, rate_rate),
-            )
-        ).reshape(5, 5)
-    last, back = speed + accel * t, -accel * t  # at the end, and from there back to the start
-    of_yaw = (yaw3 * last * last, 2.0 * yaw3 * last * back, yaw3 * back * back)
-    of_rate = (rate5 * last * last, 2.0 * rate5 * last * back, rate5 * back * back)
-    along = (q_speed * t3, 0.0, 0.0, q_accel * t2 * t3, 0.0, 0.0)
-    xx, xy, yy = _position_block(_PRODUCTS, along, of_yaw + of_rate, turn, end)
-    p_speed += q_accel * (0.5 * t * moments[2] - moments[3] / 6.0)
-    p_accel = 0.5 * q_accel * moments[2]
-    speed_speed, speed_accel = q_speed * t + q_accel * t3 / 3.0, 0.5 * q_accel * t2
-    return np.array(
+        products, along = _CONSTANT_SPEED, [q_speed * t3, 0.0]
+        across = [yaw3 * square, rate5 * square]
+    else:
+        last, back = speed + accel * t, -accel * t  # at the end, and from there back to the start
+        products, along = _PRODUCTS, [q_speed * t3, 0.0, 0.0, q_accel * t2 * t3, 0.0, 0.0]
+        across = [part for q in (yaw3, rate5) for part in (q * last * last, 2.0 * q * last * back, q * back * back)]
+        p_speed += q_accel * (0.5 * t * moments[2] - moments[3] / 6.0)
+    xx, xy, yy = _position_block(products, along, across, turn, end)
+    yaw_yaw, yaw_rate, rate_rate = q_yaw * t + q_rate * t3 / 3.0, 0.5 * q_rate * t2, q_rate * t
+    white, speed_speed = q_position * t, q_speed * t + q_accel * t3 / 3.0
+    Q = np.array(
         (
-            *(xx + white, xy, p_yaw.real, p_speed.real, p_rate.real, p_accel.real),
-            *(xy, yy + white, p_yaw.imag, p_speed.imag, p_rate.imag, p_accel.imag),
-            *(p_yaw.real, p_yaw.imag, yaw_yaw, 0.0, yaw_rate, 0.0),
-            *(p_speed.real, p_speed.imag, 0.0, speed_speed, 0.0, speed_accel),
-            *(p_rate.real, p_rate.imag, yaw_rate, 0.0, rate_rate, 0.0),
-            *(p_accel.real, p_accel.imag, 0.0, speed_accel, 0.0, q_accel * t),
+            *(xx + white, xy, p_yaw.real, p_speed.real, p_rate.real),
+            *(xy, yy + white, p_yaw.imag, p_speed.imag, p_rate.imag),
+            *(p_yaw.real, p_yaw.imag, yaw_yaw, 0.0, yaw_rate),
+            *(p_speed.real, p_speed.imag, 0.0, speed_speed, 0.0),
+            *(p_rate.real, p_rate.imag, yaw_rate, 0.0, rate_rate),
         )
-    ).reshape(6, 6)
+    ).reshape(5, 5)
+    if accel is None:
+        return Q
+    p_accel, whole = 0.5 * q_accel * moments[2], np.zeros((6, 6))
+    whole[:5, :5] = Q
+    whole[5] = whole[:, 5] = p_accel.real, p_accel.imag, 0.0, 0.5 * q_accel * t2, 0.0, q_accel * t
+    return whole
 
 
 def _position_block(
