@@ -138,33 +138,31 @@ def small_turn_noise(
     p_yaw = 1j * (q_yaw * way1 + q_rate * (0.5 * t * way2 - way3 / 6.0))
     p_rate = 0.5j * q_rate * way2
     p_speed = q_speed * moments[1]
-    if accel is None:
-        square = speed * speed
-        products, along = _CONSTANT_SPEED, [q_speed * t3, 0.0]
-        across = [yaw3 * square, rate5 * square]
-    else:
+    speed_speed = q_speed * t
+    along: tuple[float, ...] = (q_speed * t3, 0.0)
+    across: tuple[float, ...] = (yaw3 * (speed * speed), rate5 * (speed * speed))
+    products = _CONSTANT_SPEED
+    if accel is not None:
         last, back = speed + accel * t, -accel * t  # at the end, and from there back to the start
-        products, along = _PRODUCTS, [q_speed * t3, 0.0, 0.0, q_accel * t2 * t3, 0.0, 0.0]
-        across = [part for q in (yaw3, rate5) for part in (q * last * last, 2.0 * q * last * back, q * back * back)]
+        of_yaw = (yaw3 * last * last, 2.0 * yaw3 * last * back, yaw3 * back * back)
+        of_rate = (rate5 * last * last, 2.0 * rate5 * last * back, rate5 * back * back)
+        products, across = _PRODUCTS, of_yaw + of_rate
+        along = (q_speed * t3, 0.0, 0.0, q_accel * t2 * t3, 0.0, 0.0)
+        speed_speed += q_accel * t3 / 3.0
         p_speed += q_accel * (0.5 * t * moments[2] - moments[3] / 6.0)
     xx, xy, yy = _position_block(products, along, across, turn, end)
     yaw_yaw, yaw_rate, rate_rate = q_yaw * t + q_rate * t3 / 3.0, 0.5 * q_rate * t2, q_rate * t
-    white, speed_speed = q_position * t, q_speed * t + q_accel * t3 / 3.0
-    Q = np.array(
-        (
-            *(xx + white, xy, p_yaw.real, p_speed.real, p_rate.real),
-            *(xy, yy + white, p_yaw.imag, p_speed.imag, p_rate.imag),
-            *(p_yaw.real, p_yaw.imag, yaw_yaw, 0.0, yaw_rate),
-            *(p_speed.real, p_speed.imag, 0.0, speed_speed, 0.0),
-            *(p_rate.real, p_rate.imag, yaw_rate, 0.0, rate_rate),
-        )
-    ).reshape(5, 5)
+    white = q_position * t
+    x_row = xx + white, xy, p_yaw.real, p_speed.real, p_rate.real
+    y_row = xy, yy + white, p_yaw.imag, p_speed.imag, p_rate.imag
+    yaw_row = p_yaw.real, p_yaw.imag, yaw_yaw, 0.0, yaw_rate
+    speed_row = p_speed.real, p_speed.imag, 0.0, speed_speed, 0.0
+    rate_row = p_rate.real, p_rate.imag, yaw_rate, 0.0, rate_rate
     if accel is None:
-        return Q
-    p_accel, whole = 0.5 * q_accel * moments[2], np.zeros((6, 6))
-    whole[:5, :5] = Q
-    whole[5] = whole[:, 5] = p_accel.real, p_accel.imag, 0.0, 0.5 * q_accel * t2, 0.0, q_accel * t
-    return whole
+        return np.array((*x_row, *y_row, *yaw_row, *speed_row, *rate_row)).reshape(5, 5)
+    p_accel, speed_accel = 0.5 * q_accel * moments[2], 0.5 * q_accel * t2
+    body = *x_row, p_accel.real, *y_row, p_accel.imag, *yaw_row, 0.0, *speed_row, speed_accel, *rate_row, 0.0
+    return np.array((*body, p_accel.real, p_accel.imag, 0.0, speed_accel, 0.0, q_accel * t)).reshape(6, 6)
 
 
 def _position_block(
