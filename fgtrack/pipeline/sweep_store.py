@@ -3,14 +3,14 @@
 import csv
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.io.output import Kind, check_output, write_file
-from fgtrack.pipeline.sweep_plan import KEY_COLUMNS, Job, Plan, Value, compact
+from fgtrack.pipeline.sweep_plan import KEY_COLUMNS, Plan, Value, compact
 
 PART_FORMAT = "fgtrack-sweep-part/1"
 SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE = "sweep.csv", "timing.csv", "errors.csv"
@@ -88,14 +88,9 @@ class PartStore:
 
 def write_tables(folder: Path, plan: Plan, done: Mapping[str, Sequence[Cell]]) -> SweepResult:
     """Write sweep.csv, timing.csv and errors.csv from the cells of the finished jobs, by key, in grid order."""
-    good: list[tuple[tuple[Value, ...], Cell]] = []
-    bad: list[tuple[tuple[Value, ...], dict[str, str]]] = []
-    for job, cell in _rows(plan, done):
-        keys = (*job.cells, job.seed, cell.estimator)
-        if cell.error is None:
-            good.append((keys, cell))
-        else:
-            bad.append((keys, {"error": cell.error}))
+    rows = list(_rows(plan, done))
+    good = [(keys, cell) for keys, cell in rows if cell.error is None]
+    bad = [(keys, {"error": cell.error}) for keys, cell in rows if cell.error is not None]
     names = (*plan.columns, *KEY_COLUMNS)
     columns = _columns([cell.values for _, cell in good])
     chosen, unknown = _chosen(columns, plan.metrics)
@@ -107,19 +102,16 @@ def write_tables(folder: Path, plan: Plan, done: Mapping[str, Sequence[Cell]]) -
         num_cells=len(plan.jobs) * len(plan.estimators),
         num_good=len(good),
         num_bad=len(bad),
-        first_error=next((values["error"] for _, values in bad), None),
+        first_error=bad[0][1]["error"] if bad else None,
         unknown_metrics=tuple(unknown) if good else (),
     )
 
 
-def _rows(plan: Plan, done: Mapping[str, Sequence[Cell]]) -> list[tuple[Job, Cell]]:
-    rows: list[tuple[Job, Cell]] = []
+def _rows(plan: Plan, done: Mapping[str, Sequence[Cell]]) -> Iterator[tuple[tuple[Value, ...], Cell]]:
     for job in plan.jobs:
-        if job.problem is not None:
-            rows += [(job, Cell(name, {}, {}, job.problem)) for name in plan.estimators]
-        else:
-            rows += [(job, cell) for cell in done.get(job.key, ())]
-    return rows
+        problems = [Cell(name, {}, {}, job.problem) for name in plan.estimators]
+        for cell in problems if job.problem is not None else done.get(job.key, ()):
+            yield (*job.cells, job.seed, cell.estimator), cell
 
 
 def _columns(rows: Sequence[Mapping[str, Scalar]]) -> list[str]:
