@@ -11,13 +11,13 @@ from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import DetectionList, EgoState, Message
 from fgtrack.estimation.factor_graph.clock_calibration.offsets import OffsetSettings, OffsetSolution, solve_offsets
 from fgtrack.estimation.factor_graph.clock_calibration.time_shift import ShiftableMeasurement
+from fgtrack.pipeline.clock import Delivered
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.ego_path import EgoPath
 from fgtrack.pipeline.offset_measurements import Remeasure, measurements_by_track
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.sim.redelay import restamped
 
-_Heard = EgoState | DetectionList
 Track = Sequence[ShiftableMeasurement]
 
 
@@ -109,7 +109,7 @@ def estimate_offsets(
     """
     rules = rules or OffsetRules()
     config = replace(config, sensors={name: replace(one, max_delay_s=None) for name, one in config.sensors.items()})
-    heard: list[_Heard] = []
+    heard: list[Delivered] = []
     run, broken = replay_in_memory(_recorded(messages, heard), config)
     raw = _lists(heard, config)
     sensors = [name for name in config.sensors if any(one.sensor == name for one in raw)]
@@ -135,7 +135,7 @@ def estimate_offsets(
     return OffsetReport(reference, rows, len(used), counts.total(), broken)
 
 
-def _recorded(messages: Iterable[Message], heard: list[_Heard]) -> Iterator[Message]:
+def _recorded(messages: Iterable[Message], heard: list[Delivered]) -> Iterator[Message]:
     """The same messages; those that a tracker hears are kept in `heard` as well."""
     for message in messages:
         if isinstance(message, (EgoState, DetectionList)):
@@ -143,11 +143,11 @@ def _recorded(messages: Iterable[Message], heard: list[_Heard]) -> Iterator[Mess
         yield message
 
 
-def _lists(heard: Iterable[_Heard], config: Config) -> list[DetectionList]:
+def _lists(heard: Iterable[Delivered], config: Config) -> list[DetectionList]:
     return [one for one in heard if isinstance(one, DetectionList) and one.sensor in config.sensors]
 
 
-def _path(heard: Iterable[_Heard], raw: Iterable[DetectionList], rules: OffsetRules) -> EgoPath | None:
+def _path(heard: Iterable[Delivered], raw: Iterable[DetectionList], rules: OffsetRules) -> EgoPath | None:
     """The path of the ego; None where it is not needed."""
     if all(one.frame == "map" for one in raw):
         return None
@@ -194,7 +194,7 @@ def _known(solution: OffsetSolution, rules: OffsetRules) -> dict[str, float]:
     return {name: offset_s for name, offset_s, std_s, converged in rows if converged and std_s < limit_s}
 
 
-def _restamped(message: _Heard, offsets_s: Mapping[str, float]) -> _Heard:
+def _restamped(message: Delivered, offsets_s: Mapping[str, float]) -> Delivered:
     """`message` with the stamps that a right clock would have given it."""
     if isinstance(message, EgoState) or message.sensor not in offsets_s:
         return message

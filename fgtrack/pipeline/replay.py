@@ -139,7 +139,7 @@ def replay_in_memory(
 ) -> tuple[Run, str | None]:
     """The run that `replay` would write and `load_run` read, and why the input broke off, where it did.
 
-    Without files it takes less time; the digest, which is one of files, is missing. Raises as `replay`.
+    Without files it takes less time. Raises as `replay`.
     """
     tracker = build_tracker(config)
     memory = MemoryRun(*_opening(config, origin, kind))
