@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 # The matrices are small; more threads only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
+# A file stays in one process, so what its tests share is made once.
+BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test test-slow coverage mutants check docs bench clean
 
@@ -12,15 +14,15 @@ demo: $(STAMP)
 	$(BIN)/fgtrack demo -o out/demo --overwrite
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n auto --dist worksteal
+	$(BIN)/python -m pytest -n auto $(BY_FILE)
 
 # The tests marked slow, and the others with many more random examples.
 test-slow: $(STAMP)
-	$(BIN)/python -m pytest -n auto --dist worksteal -m slow
-	$(BIN)/python -m pytest -n auto --dist worksteal --hypothesis-profile=thorough
+	$(BIN)/python -m pytest -n auto $(BY_FILE) -m slow
+	$(BIN)/python -m pytest -n auto $(BY_FILE) --hypothesis-profile=thorough
 
 coverage: $(STAMP)
-	$(BIN)/python -m pytest -n auto --dist worksteal --cov --cov-report=term-missing:skip-covered
+	$(BIN)/python -m pytest -n auto $(BY_FILE) --cov --cov-report=term-missing:skip-covered
 
 # Hours; docs/testing.md tells how to take a sample.
 mutants: $(STAMP)

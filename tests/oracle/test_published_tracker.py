@@ -139,7 +139,7 @@ def assert_same_run(situation: Situation, seed: int, track: Path, pit: Path, tur
             assert_same_object(got.objects[relabelling.ours[theirs]], state, tolerance)
 
 
-@pytest.mark.parametrize("name", ["short10", "lidar3_10", "jitter10", "full60"])
+@pytest.mark.parametrize("name", ["short10", "lidar3_10", "jitter10", pytest.param("full60", marks=pytest.mark.slow)])
 def test_the_oracle_reproduces_the_golden_runs(name: str) -> None:
     with gzip.open(shared(f"reference/{name}/expected.jsonl.gz")) as file:
         expected = [json.loads(line) for line in file]

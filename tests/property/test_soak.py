@@ -123,8 +123,8 @@ def check(done: Drive, num_detections: int) -> None:
     assert max(done.errors_m) < 3.0
 
 
-def test_two_thousand_detections_of_several_vehicles_are_all_accounted_for() -> None:
-    check(drive(2_000, 1), 2_000)
+def test_a_thousand_detections_of_several_vehicles_are_all_accounted_for() -> None:
+    check(drive(1_000, 1), 1_000)
 
 
 @pytest.mark.slow
