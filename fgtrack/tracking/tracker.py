@@ -178,7 +178,7 @@ class Tracker:
                 means.append(mean)
                 covariances.append(F @ P @ F.T + parts.motion.process_noise(x, back_s))
                 ids.append(track_id)
-        return StatesAt(tuple(ids), np.array(means), np.array(covariances))
+        return StatesAt(tuple(ids), np.array(means), np.array(covariances)) if ids else no_states(parts.motion.dim)
 
     def _is_too_old(self, batch: Batch) -> bool:
         """Whether no track could fuse anything of `batch`."""
