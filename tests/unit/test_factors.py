@@ -14,9 +14,9 @@ from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherSettings
 from fgtrack.estimation.factor_graph.factors import measurement_factor, motion_factor, prior_factor, weight
-from fgtrack.estimation.factor_graph.terms import EquivalentMeasurement, MeasurementTerm
+from fgtrack.estimation.factor_graph.terms import EquivalentMeasurement, MeasurementTerm, curved
 from fgtrack.models.measurement import SensorPose, measurement_model
-from fgtrack.models.motion import CTRV, MotionModel
+from fgtrack.models.motion import CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
 
 LEFT, RIGHT = 3, 7
@@ -243,3 +243,17 @@ def test_a_smoother_turns_through_pi_with_its_measurements(backend: str, sign: f
         smoother.update(Measurement(k * 100_000_000, model, z, np.diag([0.01, 0.01, 1e-4])))
     for k in range(11):
         np.testing.assert_allclose(smoother.state_at(k * 100_000_000).mean, motion.predict(start, 0.1 * k), atol=0.02)
+
+
+def test_a_term_is_curved_where_its_model_or_its_weight_depends_on_the_state() -> None:
+    def position(motion: MotionModel, what: str, loss: RobustLoss | None) -> bool:
+        model = measurement_model(COMPONENTS[what], motion)
+        k = len(COMPONENTS[what])
+        return curved(Measurement(0, model, np.zeros(k), np.eye(k), loss=loss))
+
+    assert not position(CTRV(), "position", None)
+    assert position(CTRV(), "position", RobustLoss("huber", 1.5))
+    assert position(CTRV(), "range, bearing", None)
+    assert not position(CV(), "position", None)
+    assert position(CV(), "position, speed", None)
+    assert not curved(EquivalentMeasurement(np.zeros(4), np.eye(1, 4), np.zeros(1), np.eye(1)))
