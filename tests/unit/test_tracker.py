@@ -118,6 +118,13 @@ def test_what_is_near_a_younger_track_but_not_believed_is_gated() -> None:
     assert dispositions(report) == ["gated"]
 
 
+def test_a_track_that_begins_ahead_of_the_clock_claims_nothing() -> None:
+    one = build_tracker(replace(Config(), sensors={"lidar": POINTS}, estimator="ekf-replay", lifecycle=CLAIMING))
+    tick(one, 100.0, seen((10.0, 0.0), at_ms=100.0, late_ms=-200.0))
+    report = tick(one, 120.0, seen((10.5, 0.0), at_ms=110.0, late_ms=10.0))
+    assert dispositions(report) == ["birth"]
+
+
 def test_where_a_track_was_before_it_began_follows_its_motion() -> None:
     """20 m/s along x, first seen at 0.1 s at x = 50: 0.5 s before it was at 40."""
     road_runner = SensorModel(std={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.1, "speed_mps": 0.2})
