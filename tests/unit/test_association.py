@@ -168,6 +168,12 @@ def test_a_bearing_takes_the_track_in_its_line_of_sight(association: Association
     assert association([bearing(0.0, pose)], tracks).pairs == [(0, 1)]
 
 
+def test_the_uncertainty_of_a_bearing_is_that_seen_from_the_sensor() -> None:
+    """A standard deviation of 1 m is 0.1 rad at 10 m, so 0.15 rad is inside; at 1 km it would be outside."""
+    tracks = states([(1010.0, 1.5)], variance_m2=1.0)
+    assert GatedMahalanobis()([bearing(0.0, SensorPose(1000.0, 0.0, 0.0))], tracks).pairs == [(0, 0)]
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
