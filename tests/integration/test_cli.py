@@ -151,14 +151,6 @@ def test_runs_are_compared_as_tables_and_as_json(fgtrack: Command, runs: dict[st
         assert told.out.startswith(start)
 
 
-def test_figures_are_drawn(fgtrack: Command, runs: dict[str, Path]) -> None:
-    drawn = fgtrack("figure", runs["mcap"], "-o", "figures")
-    assert drawn.code == 0
-    files = [Path(line) for line in drawn.out.splitlines()]
-    assert files
-    assert all(file.read_bytes().startswith(b"\x89PNG") for file in files)
-
-
 def test_info_tells_topics_and_delays(fgtrack: Command, recordings: dict[str, Path]) -> None:
     for path in recordings.values():
         told = fgtrack("info", path)

@@ -85,6 +85,7 @@ def test_a_wrong_lidar_clock_is_found_by_the_command(tmp_path: Path, capsys: Cap
     assert lidar["why"].startswith("information ")
 
 
+@pytest.mark.slow
 def test_a_wrong_radar_clock_is_found_against_the_sensor_that_sees_most() -> None:
     config = load(Config, CONFIG, [*OVAL, *NOISE])
     report = estimate_offsets(traffic("radar", -0.04, 5.0), config)

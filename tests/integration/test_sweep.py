@@ -140,12 +140,6 @@ def test_all_estimators_of_a_job_see_the_same_stream(done: Path) -> None:
 # --- the same bytes
 
 
-def test_two_processes_give_the_same_bytes_as_one(smoke: Path, done: Path, tmp_path: Path) -> None:
-    assert run(["sweep", str(smoke), "-o", str(tmp_path / "two"), "--jobs", "2"]) == 0
-    assert (tmp_path / "two/sweep.csv").read_bytes() == (done / "sweep.csv").read_bytes()
-    assert [path.name for path in parts(tmp_path / "two")] == [path.name for path in parts(done)]
-
-
 def wait_for_parts(out: Path, process: subprocess.Popen[str]) -> None:
     end = time.monotonic() + PATIENCE_S
     while not parts(out):
@@ -188,6 +182,7 @@ def test_a_killed_sweep_goes_on_where_it_was_and_gives_the_same_bytes(
     assert f"jobs: {total}, each of 2 estimators; to do: {total - len(kept)}" in capsys.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
     assert (out / "sweep.csv").read_bytes() == (done / "sweep.csv").read_bytes()
+    assert [path.name for path in parts(out)] == [path.name for path in parts(done)]
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -207,6 +202,7 @@ def test_ctrl_c_is_one_line_and_what_is_done_stays(smoke: Path, tmp_path: Path, 
     assert len(rows(out / "sweep.csv")) == 2 * len(parts(out))
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_gives_the_same_bytes(smoke: Path, done: Path, tmp_path: Path) -> None:
     if find_spec("distributed") is None:
         pytest.skip("distributed is not installed (extra `dask`)")
