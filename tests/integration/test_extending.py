@@ -86,7 +86,7 @@ def followed(
 
 def test_the_commands_of_the_page_run_and_workers_load_the_package(folder: Path) -> None:
     lines = [line for line in commands() if line.startswith("fgtrack ")]
-    lines.append("fgtrack sweep sweep.yaml -o sweep --jobs 2")
+    lines.append("fgtrack sweep sweep.yaml -o sweep --jobs 4")
     said = followed(folder, ["-c", DRIVER], "\n".join(lines) + "\n")
     for name in ("refilter", "drop-bank", "smoother-dogleg", "ekf-replay"):
         assert (folder / "runs" / name / "tracks.csv").stat().st_size > 2000
