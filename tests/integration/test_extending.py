@@ -47,6 +47,18 @@ for line in sys.stdin:
 """
 
 
+#: A sweep on a cluster whose workers are other processes.
+ON_CLUSTER = """
+import sys
+from distributed import LocalCluster
+from fgtrack.cli.main import run
+
+if __name__ == "__main__":
+    with LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster:
+        sys.exit(run(["sweep", "sweep.yaml", "-o", "cluster", "--dask", cluster.scheduler_address]))
+"""
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The package of the page, installed for programs that `followed` starts."""
@@ -97,6 +109,17 @@ def test_the_commands_of_the_page_run_and_workers_load_the_package(folder: Path)
     assert (folder / "other/config.yaml").read_text().count("acceleration") >= 1
     assert (folder / "sweep/sweep.csv").read_text().count("refilter") == 2
     assert (folder / "sweep/errors.csv").read_text().count("refilter") == 0
+
+
+@pytest.mark.slow
+def test_the_workers_of_a_cluster_load_the_package(folder: Path) -> None:
+    followed(
+        folder, ["-m", "fgtrack", "simulate", "single_opponent", "-o", "drive.jsonl", "--duration", "2", "--overwrite"]
+    )
+    (folder / "on_cluster.py").write_text(ON_CLUSTER)
+    followed(folder, ["on_cluster.py"])
+    assert (folder / "cluster/sweep.csv").read_text().count("refilter") == 2
+    assert (folder / "cluster/errors.csv").read_text().count("refilter") == 0
 
 
 def last_x_m(tracks: str) -> float:
