@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from fgtrack.core.errors import CallError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import (
@@ -149,9 +150,19 @@ class OneObject:
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`."""
-        known_ns = min(stamp_ns, self._bank.present_ns)
-        states = self._bank.states_at(known_ns)
-        mean, covariance = states.means[0], states.covariances[0]
-        if stamp_ns > known_ns:
-            mean, covariance = predict_one(mean, covariance, self._motion, seconds(stamp_ns - known_ns))
-        return TrackState(stamp_ns, mean, covariance)
+        return state_of(self._bank, self._motion, 0, stamp_ns)
+
+
+def state_of(bank: TrackBank, motion: MotionModel, track_id: int, stamp_ns: int) -> TrackState:
+    """State of a track of `bank` at any stamp, predicted ahead of the present, in the own form of `motion`.
+
+    Raises `CallError` for a stamp before the track's window.
+    """
+    states = bank.states_at(min(stamp_ns, bank.present_ns))
+    if track_id not in states.track_ids:
+        raise CallError(f"track {track_id} is not known at {stamp_ns} ns: that is before its window")
+    row = states.track_ids.index(track_id)
+    mean, covariance = states.means[row], states.covariances[row]
+    if stamp_ns > bank.present_ns:
+        mean, covariance = predict_one(mean, covariance, motion, seconds(stamp_ns - bank.present_ns))
+    return TrackState(stamp_ns, mean, covariance)

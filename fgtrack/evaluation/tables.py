@@ -173,7 +173,7 @@ class Table(RunTable):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tables(Mapping[str, Table]):
-    """Tables by name. `str` shows those that have rows as text, so `print(tables)` prints them."""
+    """Tables by name; `str` gives those that have rows as text."""
 
     tables: Mapping[str, Table]
     details: Mapping[str, Any] = field(default_factory=dict)  # Any: JSON values

@@ -15,7 +15,7 @@ import numpy as np
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import cartesian, cartesian_gradient, polar, polar_gradient
-from fgtrack.core.linalg import identity, symmetrise
+from fgtrack.core.linalg import congruence, identity, symmetrise
 from fgtrack.core.types import ACCEL, SPEED, STATE_NAMES, YAW, YAW_RATE, FloatArray, X, Y
 from fgtrack.models.arc import (
     NODES,
@@ -120,7 +120,7 @@ class MotionModel(ABC):
         if self.cartesian:
             mean[..., YAW:YAW_RATE] = polar(x[..., 2:4])
             J[..., YAW:YAW_RATE, 2:4] = polar_gradient(x[..., 2:4], MIN_SPEED_MPS)
-        return mean, symmetrise(J @ P @ np.swapaxes(J, -1, -2))
+        return mean, symmetrise(congruence(J, P))
 
     def from_kinematic(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """State and covariance P of this model from what `kinematic` of any model gives.
@@ -140,7 +140,7 @@ class MotionModel(ABC):
             unknown[2:4] = 0.0, 0.0
             yaw_speed = mean[..., YAW:YAW_RATE]
             x[..., 2:4], J[..., 2:4, YAW:YAW_RATE] = cartesian(yaw_speed), cartesian_gradient(yaw_speed)
-        P = symmetrise(J @ covariance @ np.swapaxes(J, -1, -2)) + np.diag(unknown)
+        P = symmetrise(congruence(J, covariance)) + np.diag(unknown)
         if self.cartesian:
             product = covariance[..., YAW, YAW] * covariance[..., SPEED, SPEED] + covariance[..., YAW, SPEED] ** 2
             across = np.stack([-np.sin(mean[..., YAW]), np.cos(mean[..., YAW])], axis=-1)

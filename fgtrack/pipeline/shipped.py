@@ -73,12 +73,9 @@ def read_config(
         config = with_settings(Config, plain(name), settings, "the given configuration") if settings else name
     else:
         config = load(Config, None if name is None else find_file("configuration", name, folder), settings)
-    maps = config.map
-    return replace(
-        config,
-        map=replace(maps, track=str(track_map or maps.track or "") or None, pit=str(pit_map or maps.pit or "") or None),
-        estimator=estimator or config.estimator,
-    )
+    track = str(track_map) if track_map else config.map.track
+    pit = str(pit_map) if pit_map else config.map.pit
+    return replace(config, map=replace(config.map, track=track, pit=pit), estimator=estimator or config.estimator)
 
 
 def settings_of(values: Mapping[str, object] | None) -> list[str]:

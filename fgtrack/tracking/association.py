@@ -9,9 +9,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.special import gammaincinv
 
-from fgtrack.core.linalg import mahalanobis_squared
+from fgtrack.core.linalg import congruence, mahalanobis_squared
 from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.estimation.base import StatesAt
+from fgtrack.estimation.ekf import linearised
 from fgtrack.tracking.preprocess import Candidate
 
 _NOWHERE = np.zeros(2)  # in place of a position that a bearing does not give
@@ -121,10 +122,8 @@ def _innovations(candidates: Sequence[Candidate], states: StatesAt) -> tuple[Flo
     nis, log_volume = np.empty((2, len(candidates), len(states.track_ids)))
     for row, candidate in enumerate(candidates):
         measurement = candidate.measurement
-        model = measurement.model
-        y = model.residual(measurement.z, model.predict(states.means, measurement.pose))
-        H = model.jacobian(states.means, measurement.pose)
-        S = H @ states.covariances @ H.mT + measurement.R
+        y, H = linearised(measurement.z, states.means, measurement.model, measurement.pose)
+        S = congruence(H, states.covariances) + measurement.R
         nis[row] = mahalanobis_squared(y, S)
         log_volume[row] = np.linalg.slogdet(S)[1]
     return nis, log_volume

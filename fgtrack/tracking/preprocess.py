@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from fgtrack.core.geometry import circular_mean, rotation, wrap_angle
+from fgtrack.core.linalg import congruence
 from fgtrack.core.types import MEASURABLE, Detection, Disposition, FloatArray, UpdateRecord
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.measurement import ANGULAR, SensorPose, measured_position, measurement_model
@@ -265,4 +266,4 @@ def _turned(R: FloatArray, yaw_rad: float) -> FloatArray:
     """R with its position block, and the correlations of the position with the rest, turned by `yaw_rad`."""
     turn = np.eye(len(R))
     turn[:2, :2] = rotation(yaw_rad)
-    return turn @ R @ turn.T
+    return congruence(turn, R)

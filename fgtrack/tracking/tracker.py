@@ -21,7 +21,8 @@ from fgtrack.core.types import (
     UpdateRecord,
 )
 from fgtrack.estimation.base import StatesAt, TrackBank, UpdateResult, no_states
-from fgtrack.estimation.ekf import predict
+from fgtrack.estimation.ekf import propagated
+from fgtrack.estimation.object_bank import state_of
 from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
@@ -113,14 +114,8 @@ class Tracker:
             raise CallError(
                 f"track {track_id} does not exist: there are {', '.join(map(str, bank.track_ids)) or 'none'}"
             )
-        states = bank.states_at(min(stamp_ns, bank.present_ns))
-        if track_id not in states.track_ids:
-            raise CallError(f"track {track_id} is not known at {stamp_ns} ns: that is before its window")
-        row = states.track_ids.index(track_id)
-        mean, covariance = states.means[row], states.covariances[row]
-        if stamp_ns > bank.present_ns:
-            mean, covariance = predict(mean, covariance, motion, seconds(stamp_ns - bank.present_ns))
-        mean, covariance = motion.kinematic(mean, covariance)
+        state = state_of(bank, motion, track_id, stamp_ns)
+        mean, covariance = motion.kinematic(state.mean, state.covariance)
         return self._report(track_id, TrackState(stamp_ns, wrapped_yaw(mean), covariance))
 
     def _process(self, batch: Batch) -> None:
@@ -165,20 +160,14 @@ class Tracker:
 
     def _younger(self, stamp_ns: int, states: StatesAt) -> StatesAt:
         """Tracks that are not among `states`: their present states, moved back to `stamp_ns`."""
-        parts = self._parts
-        known = set(states.track_ids)
-        if len(known) == len(parts.bank.track_ids):
-            return no_states(parts.motion.dim)
-        now = parts.bank.states_at(parts.bank.present_ns)
-        back_s = seconds(parts.bank.present_ns - stamp_ns)
-        means, covariances, ids = [], [], []
-        for track_id, x, P in zip(now.track_ids, now.means, now.covariances, strict=True):
-            if track_id not in known:
-                mean, F = parts.motion.flow(x.tolist(), -back_s)
-                means.append(mean)
-                covariances.append(F @ P @ F.T + parts.motion.process_noise(x, back_s))
-                ids.append(track_id)
-        return StatesAt(tuple(ids), np.array(means), np.array(covariances)) if ids else no_states(parts.motion.dim)
+        bank, motion = self._parts.bank, self._parts.motion
+        now, back_s = bank.states_at(bank.present_ns), seconds(bank.present_ns - stamp_ns)
+        rows = [row for row, track_id in enumerate(now.track_ids) if track_id not in states.track_ids]
+        if not rows:
+            return no_states(motion.dim)
+        x, F = now.means[rows], motion.jacobian(now.means[rows], -back_s)
+        P = propagated(F, now.covariances[rows], motion.process_noise(x, back_s))
+        return StatesAt(tuple(now.track_ids[row] for row in rows), motion.predict(x, -back_s), P)
 
     def _is_too_old(self, batch: Batch) -> bool:
         """Whether no track could fuse anything of `batch`."""

@@ -87,14 +87,14 @@ class Window:
         the states of the nodes that left, where the settings want them. Raises `RuntimeError` where it fails; all is as
         before then.
         """
-        if not self._curved and any(curved(item) for item in measurements):
-            self._curved, self._thresholds = True, self._settings.thresholds(self._motion, curved=True)
-            self._rebuild(self._estimates())
         chain, past = self._chain, self._past.copy()
         leaving = chain.nodes[: max(chain.place(start_ns), 0)]
         anchor = chain.nodes[len(leaving)]
         new: dict[int, FloatArray] = {}
         try:
+            if not self._curved and any(curved(item) for item in measurements):
+                self._curved, self._thresholds = True, self._settings.thresholds(self._motion, curved=True)
+                self._rebuild(self._estimates())
             moved = self._moved()
             for node, right in zip(leaving, chain.nodes[1:], strict=False):
                 past.pass_node(node.terms, self._mean(node), right.stamp_ns, self._mean(right))

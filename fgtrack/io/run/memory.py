@@ -7,7 +7,7 @@ from operator import itemgetter
 import numpy as np
 
 from fgtrack.io.run.reader import Column, Run, Table, column
-from fgtrack.io.run.rows import Row, text
+from fgtrack.io.run.rows import Row, text, text_header
 from fgtrack.io.run.schema import COLUMNS
 from fgtrack.io.run.sink import RunSink
 
@@ -28,7 +28,9 @@ class MemoryRun(RunSink):
         self._columns: dict[str, dict[str, list[Column]]] = {
             table: {name: [column(name, ())] for name in names} for table, names in COLUMNS.items()
         }
-        self._text = {table: bytearray((",".join(COLUMNS[table]) + "\n").encode()) for table in ("tracks", "updates")}
+        # The digest is that of tracks.csv and then updates.csv, so only the text of the second has to wait.
+        self._tracks = hashlib.sha256(text_header("tracks"))
+        self._updates = bytearray(text_header("updates"))
 
     @property
     def run(self) -> Run:
@@ -40,8 +42,10 @@ class MemoryRun(RunSink):
         return Run(None, dict(self._meta), self._config_text, **tables)
 
     def _append(self, table: str, found: Sequence[Row]) -> None:
-        if table in self._text:
-            self._text[table] += text(table, found).encode()
+        if table == "tracks":
+            self._tracks.update(text(table, found).encode())
+        elif table == "updates":
+            self._updates += text(table, found).encode()
         self._waiting[table] += found
         if len(self._waiting[table]) >= _CHUNK:
             self._pack(table)
@@ -54,4 +58,6 @@ class MemoryRun(RunSink):
             waiting.clear()
 
     def _digest(self) -> str:
-        return hashlib.sha256(self._text["tracks"] + self._text["updates"]).hexdigest()
+        sha = self._tracks.copy()
+        sha.update(self._updates)
+        return sha.hexdigest()

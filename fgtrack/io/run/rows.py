@@ -15,7 +15,7 @@ from fgtrack.core.types import (
     TruthState,
     UpdateRecord,
 )
-from fgtrack.io.run.schema import COVARIANCE_STATES
+from fgtrack.io.run.schema import COLUMNS, COVARIANCE_STATES
 
 Cell = str | int | float | None
 Row = tuple[Cell, ...]
@@ -83,6 +83,11 @@ def text(table: str, found: Sequence[Row]) -> str:
     if table == "updates":
         found = [(row[0], _quoted(str(row[1])), *row[2:]) for row in found]
     return "".join([_line(tuple(map(type, row))) % row for row in found])
+
+
+def text_header(table: str) -> bytes:
+    """First line of the CSV file of `table`."""
+    return (",".join(COLUMNS[table]) + "\n").encode()
 
 
 @lru_cache

@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import BinaryIO, Self
 
 from fgtrack.io.output import Kind, check_output, claimed, write_error, write_file
-from fgtrack.io.run.rows import Row, text
+from fgtrack.io.run.rows import Row, text, text_header
 from fgtrack.io.run.schema import COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
 from fgtrack.io.run.sink import RunSink
 
@@ -112,7 +112,7 @@ class RunWriter(RunSink):
         try:
             if file is None:
                 file = self._files[table] = path.open("xb", buffering=0)
-                lines = ",".join(COLUMNS[table]) + "\n" + lines
+                file.write(text_header(table))
             file.write(lines.encode())
         except OSError as error:
             raise write_error(path, error) from error

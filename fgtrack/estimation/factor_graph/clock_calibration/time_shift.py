@@ -14,6 +14,7 @@ import gtsam
 import numpy as np
 from gtsam.noiseModel import Gaussian, Robust, mEstimator
 
+from fgtrack.core.linalg import congruence
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
@@ -85,7 +86,7 @@ def pair_term(motion: MotionModel, nodes: Nodes, measurement: ShiftableMeasureme
     place = nodes.left_of(time_ns)
     state, measured = nodes.between(motion, place, time_ns), measurement.sensed_at(time_ns)
     H = measured.model.jacobian(state.mean, measured.pose)
-    R = measured.R + H @ state.Sigma @ H.T
+    R = measured.R + congruence(H, state.Sigma)
     return PairTerm(place, _error(state, measured), H @ state.Lambda, H @ state.Psi, R)
 
 
