@@ -119,12 +119,29 @@ class OneCorrection(NamedTuple):
     """Normalised innovation squared."""
 
 
+class Prediction(NamedTuple):
+    """One state after some time, and how it depends on that before."""
+
+    mean: FloatArray
+    """Shape (n,); angles are not wrapped."""
+    covariance: FloatArray
+    """Shape (n, n)."""
+    cross: FloatArray
+    """Covariance of the state after (rows) and before (columns), of first order F P; shape (n, n)."""
+
+
 def predict_one(
     mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: float
 ) -> tuple[FloatArray, FloatArray]:
     """`predict` of one state, shapes (n,) and (n, n), without the price of a stack."""
+    return predict_across(mean, covariance, motion, dt_s)[:2]
+
+
+def predict_across(mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: float) -> Prediction:
+    """`predict_one`, and the cross-covariance of both states, which is half way to the covariance."""
     after, F, Q = motion.step(mean.tolist(), dt_s)
-    return np.array(after), propagated(F, covariance, Q)
+    FP = product(F, covariance)
+    return Prediction(np.array(after), symmetrise(product(FP, F.T) + Q), FP)
 
 
 def correct_one(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:

@@ -1,7 +1,8 @@
-"""The replaying EKF: rewind to a late measurement, and apply again what came after it."""
+"""Filters that rewind to a late measurement, and apply again what came after it."""
 
 import bisect
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,8 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.ekf import OneCorrection, correct_one, predict_one
+from fgtrack.estimation.ekf import OneCorrection, Prediction
+from fgtrack.estimation.recursion import EkfRecursion, Recursion
 from fgtrack.estimation.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
 
@@ -29,7 +31,72 @@ class _Stored:
     covariance: FloatArray
 
 
-class ReplayEkf(WindowedFilter):
+class ReplayingFilter(WindowedFilter):
+    """A filter that keeps the measurements of a window; its estimates do not depend on the order of arrival.
+
+    Rewind and replay, as in robot_localization; see docs/baseline.md.
+
+    Parameters
+    ----------
+    motion, prior, lag_s
+        See `WindowedFilter`.
+    recursion
+        How one state is predicted and corrected.
+    """
+
+    exact = "any lag, any number"
+
+    def __init__(self, motion: MotionModel, prior: Start, lag_s: float, recursion: Recursion) -> None:
+        super().__init__(motion, prior, lag_s)
+        self._recursion = recursion
+        self._steps = [self._first(prior)]
+
+    def state_at(self, stamp_ns: int) -> TrackState:
+        """See `Estimator.state_at`: the filter's state, from the measurements up to that stamp."""
+        before = max(bisect.bisect_right(self._steps, stamp_ns, key=_stamp) - 1, 0)
+        predicted = self._predicted(self._steps[before], stamp_ns)
+        return TrackState(stamp_ns, predicted.mean, predicted.covariance)
+
+    def _first(self, prior: Start) -> _Stored:
+        """The state that everything is replayed from."""
+        return _Stored((prior.stamp_ns, (), ()), None, *initial_state(self._motion, prior))
+
+    def _forget_before(self, stamp_ns: int) -> None:
+        del self._steps[: max(bisect.bisect_right(self._steps, stamp_ns, key=_stamp) - 1, 0)]
+
+    def _fuse(self, measurement: Measurement) -> OneCorrection:
+        order = (measurement.stamp_ns, measurement.model.components, tuple(measurement.z.tolist()))
+        place = bisect.bisect_right(self._steps, order, lo=1, key=_order)
+        step, correction = self._fused(self._steps[place - 1], order, measurement)
+        self._steps[place:] = [step, *self._replayed(step, self._steps[place:])]
+        return correction
+
+    def _replayed(self, step: _Stored, later: Iterable[_Stored]) -> list[_Stored]:
+        """The measurements of `later` steps, in their order, applied to `step`."""
+        steps = []
+        for old in later:
+            if old.measurement is not None:
+                step, _ = self._fused(step, old.order, old.measurement)
+                steps.append(step)
+        return steps
+
+    def _fused(self, before: _Stored, order: _Order, measurement: Measurement) -> tuple[_Stored, OneCorrection]:
+        """The step after `before` with `measurement`; `numpy.linalg.LinAlgError` where it is not finite."""
+        predicted = self._predicted(before, measurement.stamp_ns)
+        corrected = self._recursion.correct(predicted.mean, predicted.covariance, measurement)
+        mean, covariance = corrected.mean, corrected.covariance
+        if not math.isfinite(mean.dot(mean) + np.vdot(covariance, covariance)):  # one number instead of a mask
+            raise np.linalg.LinAlgError("posterior is not finite")
+        return _Stored(order, measurement, self._wrapped(mean), covariance), corrected
+
+    def _predicted(self, before: _Stored, stamp_ns: int) -> Prediction:
+        """The state at `stamp_ns`, from the step before it."""
+        if stamp_ns == before.order[0]:
+            return Prediction(before.mean, before.covariance, before.covariance)
+        return self._recursion.predict(before.mean, before.covariance, seconds(stamp_ns - before.order[0]))
+
+
+class ReplayEkf(ReplayingFilter):
     """An EKF that keeps the measurements of a window; its estimates do not depend on the order of arrival.
 
     Rewind and replay, as in robot_localization; see docs/baseline.md.
@@ -40,46 +107,8 @@ class ReplayEkf(WindowedFilter):
         See `WindowedFilter`.
     """
 
-    exact = "any lag, any number"
-
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
-        super().__init__(motion, prior, lag_s)
-        self._steps = [_Stored((prior.stamp_ns, (), ()), None, *initial_state(motion, prior))]
-
-    def state_at(self, stamp_ns: int) -> TrackState:
-        """See `Estimator.state_at`: the filter's state, from the measurements up to that stamp."""
-        before = max(bisect.bisect_right(self._steps, stamp_ns, key=_stamp) - 1, 0)
-        mean, covariance = self._predicted(self._steps[before], stamp_ns)
-        return TrackState(stamp_ns, mean, covariance)
-
-    def _forget_before(self, stamp_ns: int) -> None:
-        del self._steps[: max(bisect.bisect_right(self._steps, stamp_ns, key=_stamp) - 1, 0)]
-
-    def _fuse(self, measurement: Measurement) -> OneCorrection:
-        order = (measurement.stamp_ns, measurement.model.components, tuple(measurement.z.tolist()))
-        place = bisect.bisect_right(self._steps, order, lo=1, key=_order)
-        step, correction = self._fused(self._steps[place - 1], order, measurement)
-        steps = [step]
-        for later in self._steps[place:]:
-            if later.measurement is not None:
-                steps.append(self._fused(steps[-1], later.order, later.measurement)[0])
-        self._steps[place:] = steps
-        return correction
-
-    def _fused(self, before: _Stored, order: _Order, measurement: Measurement) -> tuple[_Stored, OneCorrection]:
-        """The step after `before` with `measurement`; `numpy.linalg.LinAlgError` where it is not finite."""
-        mean, covariance = self._predicted(before, measurement.stamp_ns)
-        corrected = correct_one(mean, covariance, measurement)
-        mean, covariance = corrected.mean, corrected.covariance
-        if not math.isfinite(mean.dot(mean) + np.vdot(covariance, covariance)):  # one number instead of a mask
-            raise np.linalg.LinAlgError("posterior is not finite")
-        return _Stored(order, measurement, self._wrapped(mean), covariance), corrected
-
-    def _predicted(self, before: _Stored, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance at `stamp_ns`, from the step before it."""
-        if stamp_ns == before.order[0]:
-            return before.mean, before.covariance
-        return predict_one(before.mean, before.covariance, self._motion, seconds(stamp_ns - before.order[0]))
+        super().__init__(motion, prior, lag_s, EkfRecursion(motion))
 
 
 def _order(step: _Stored) -> _Order:
