@@ -1,0 +1,134 @@
+"""Differences and their confidence intervals: closed forms, coverage, the length of blocks."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import ttest_rel
+
+from fgtrack.core.types import FloatArray
+from fgtrack.evaluation.paired import Estimate, block_length, paired, within_run
+
+
+def mean(sums: FloatArray) -> FloatArray:
+    return sums[0] / sums[1]
+
+
+def rmse_difference(sums: FloatArray) -> FloatArray:
+    return np.sqrt(sums[0] / sums[2]) - np.sqrt(sums[1] / sums[2])
+
+
+def correlated(rng: np.random.Generator, n: int, correlation: float) -> FloatArray:
+    """A first-order autoregressive series with variance 1, shape (n,)."""
+    start = 20 * math.ceil(1.0 / (1.0 - correlation))
+    noise = rng.standard_normal(n + start)
+    return np.asarray(lfilter([math.sqrt(1.0 - correlation**2)], [1.0, -correlation], noise)[start:])
+
+
+def test_over_seeds_it_is_the_paired_t_interval() -> None:
+    rng = np.random.default_rng(1)
+    a, b = rng.normal(0.5, 0.1, 8), rng.normal(0.4, 0.1, 8)
+    found = paired(a, b)
+    expected = ttest_rel(a, b).confidence_interval(0.95)
+    np.testing.assert_allclose((found.mean, found.low, found.high), ((a - b).mean(), *expected), rtol=1e-12)
+    assert found.count == 8
+    assert (-found).low == -found.high
+
+
+def test_pairs_with_a_missing_value_are_left_out() -> None:
+    assert paired([1.0, math.nan, 3.0, 5.0], [0.0, 2.0, 1.0, math.nan]) == paired([1.0, 3.0], [0.0, 1.0])
+
+
+def test_the_same_values_differ_by_nothing_and_not_significantly() -> None:
+    same = paired([0.3, 0.4], [0.3, 0.4])
+    assert (same.mean, same.low, same.high, same.is_significant) == (0.0, 0.0, 0.0, False)
+
+
+def test_one_pair_has_no_interval_and_none_no_mean() -> None:
+    one, none = paired([2.0], [1.0]), paired([], [])
+    assert one.mean == 1.0
+    assert math.isnan(one.low)
+    assert not one.is_significant
+    assert math.isnan(none.mean)
+    assert none.count == 0
+
+
+def test_lists_of_different_length_are_refused() -> None:
+    with pytest.raises(ValueError, match="one length"):
+        paired([1.0, 2.0], [1.0])
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
+def test_the_interval_within_a_run_covers_the_truth_as_often_as_it_says(correlation: float) -> None:
+    rng = np.random.default_rng(2)
+    true_difference = math.sqrt(1.25) - math.sqrt(1.49)
+    runs, hits, naive = 120, 0, 0
+    for _ in range(runs):
+        common = correlated(rng, 400, correlation)
+        a, b = (common + scale * correlated(rng, 400, correlation) for scale in (0.5, 0.7))
+        ticks = np.stack([a**2, b**2, np.ones(400)], axis=-1)
+        found = within_run(ticks, rmse_difference, rng)
+        hits += found.low <= true_difference <= found.high
+        shuffled = within_run(rng.permutation(ticks), rmse_difference, rng)
+        naive += shuffled.low <= true_difference <= shuffled.high
+    assert 0.88 <= hits / runs <= 0.99  # 0.95 within two or three standard errors
+    if correlation:
+        assert naive / runs < 0.8  # as if the ticks were independent
+
+
+def test_without_correlation_the_standard_error_is_the_textbook_one() -> None:
+    values = np.random.default_rng(3).standard_normal(400)
+    found = within_run(np.stack([values, np.ones(400)], axis=-1), mean, np.random.default_rng(4))
+    assert found.mean == pytest.approx(values.mean())
+    assert (found.high - found.low) / 2.0 == pytest.approx(1.97 * values.std() / 20.0, rel=0.15)
+
+
+def test_the_same_generator_gives_the_same_interval() -> None:
+    ticks = np.stack([np.random.default_rng(3).random(100), np.ones(100)], axis=-1)
+    first, second = (within_run(ticks, mean, np.random.default_rng(5)) for _ in range(2))
+    assert first == second
+
+
+def test_a_faster_tick_rate_changes_the_interval_little() -> None:
+    slow = correlated(np.random.default_rng(6), 300, 0.7) ** 2
+    widths = []
+    for repeats in (1, 10):
+        ticks = np.stack([np.repeat(slow, repeats), np.ones(300 * repeats)], axis=-1)
+        found = within_run(ticks, mean, np.random.default_rng(7))
+        widths.append(found.high - found.low)
+    assert widths[1] == pytest.approx(widths[0], rel=0.1)
+
+
+def test_blocks_grow_with_the_correlation_as_the_rule_says() -> None:
+    rng = np.random.default_rng(8)
+    lengths = [np.mean([block_length(correlated(rng, 1000, rho)) for _ in range(20)]) for rho in (0.0, 0.5, 0.9)]
+    # of a first-order autoregression: G = 2 rho / (1 - rho)^2 and sum R = (1 + rho) / (1 - rho), both times R(0)
+    expected = [(1.5 * (2.0 * rho / (1.0 - rho**2)) ** 2 * 1000) ** (1.0 / 3.0) for rho in (0.5, 0.9)]
+    assert lengths[0] < 4.0
+    np.testing.assert_allclose(lengths[1:], expected, rtol=0.2)
+
+
+def test_blocks_are_never_longer_than_a_third_of_the_run() -> None:
+    assert block_length(np.linspace(0.0, 1.0, 90)) == 30
+    assert block_length(np.ones(90)) == 1
+
+
+def test_anticorrelation_gives_a_block_length_too() -> None:
+    rng = np.random.default_rng(13)
+    lengths = [block_length(np.diff(rng.standard_normal(200))) for _ in range(30)]  # sums of R near 0, some negative
+    assert 1 in lengths
+    assert all(1 <= length <= 66 for length in lengths)
+
+
+def test_what_never_varies_has_an_interval_of_no_width() -> None:
+    assert within_run(np.ones((100, 2)), mean, np.random.default_rng(9)) == Estimate(1.0, 1.0, 1.0, 100)
+
+
+def test_a_sum_of_zeros_and_a_short_run_do_no_harm() -> None:
+    zeros = np.stack([np.zeros(50), np.ones(50)], axis=-1)
+    assert within_run(zeros, mean, np.random.default_rng(10)).high == 0.0
+    short = within_run(np.ones((5, 2)), mean, np.random.default_rng(11))
+    assert short.mean == 1.0
+    assert not short.is_significant
+    assert math.isnan(within_run(np.zeros((0, 2)), mean, np.random.default_rng(12)).mean)
