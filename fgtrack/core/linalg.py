@@ -1,5 +1,6 @@
 """Small dense linear algebra on stacks of symmetric matrices."""
 
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
@@ -47,6 +48,13 @@ def psd_solve(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
     return np.asarray(solution)
 
 
-def mahalanobis_squared(residual: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Squared Mahalanobis distance y' S^-1 y; shapes (..., n) and (..., n, n), result (...)."""
+def mahalanobis_squared(
+    residual: FloatArray, covariance: FloatArray, entries: Sequence[int] | None = None
+) -> FloatArray:
+    """Squared Mahalanobis distance y' S^-1 y; shapes (..., n) and (..., n, n), result (...).
+
+    With `entries`, that of the marginal distribution of these entries.
+    """
+    if entries is not None:
+        residual, covariance = residual[..., entries], covariance[..., entries, :][..., entries]
     return np.asarray(np.vecdot(residual, psd_solve(covariance, residual[..., None])[..., 0]))

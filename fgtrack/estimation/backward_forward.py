@@ -169,9 +169,10 @@ class BackwardForwardBank:
         """Correct the stored states nearest to `stamp_ns`; the present is predicted from them."""
         states = self.states_at(stamp_ns)
         rows = {track_id: row for row, track_id in enumerate(states.track_ids)}
-        groups: dict[tuple[int, int], list[int]] = {}
+        groups: dict[tuple[int, int, tuple[str, ...]], list[int]] = {}
         for position, measurement in enumerate(measurements):
-            groups.setdefault((id(measurement.model), id(measurement.pose)), []).append(position)
+            alike = (id(measurement.model), id(measurement.pose), measurement.assumed)
+            groups.setdefault(alike, []).append(position)
         results: dict[int, UpdateResult] = {}
         for positions in groups.values():
             chosen = [rows[track_ids[position]] for position in positions]
@@ -194,13 +195,13 @@ class BackwardForwardBank:
         measurements: Sequence[Measurement],
         back: int,
     ) -> list[UpdateResult]:
-        """Update with measurements that share a model, a sensor pose and a stamp."""
+        """Update with measurements that share a model, a sensor pose, a stamp and what is assumed."""
         z = np.array([measurement.z for measurement in measurements])
         R = np.array([measurement.R for measurement in measurements])
-        model = measurements[0].model
+        model, pose, measured = measurements[0].model, measurements[0].pose, measurements[0].measured
         residual = partial(self._propagator.residual, model)
         try:
-            corrected = correct(means, covariances, z, R, model, measurements[0].pose, residual)
+            corrected = correct(means, covariances, z, R, model, pose, residual, measured)
         except np.linalg.LinAlgError:
             return self._update_one_by_one(track_ids, means, covariances, measurements, back)
         wrapped = self._propagator.wrap(corrected.mean)

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from fgtrack.core.errors import CallError
+from fgtrack.core.linalg import mahalanobis_squared
 from fgtrack.core.types import MEASURABLE, FloatArray, SmoothedReport, TrackState
 from fgtrack.models.measurement import MeasurementModel, SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
@@ -30,6 +31,8 @@ class Measurement:
     pose: SensorPose = _AT_ORIGIN
     loss: RobustLoss | None = None
     """Robust loss, for smoothers."""
+    assumed: tuple[str, ...] = ()
+    """Components that are prior knowledge, as a heading from the map: fused like the others, but not measured."""
 
     @classmethod
     def of(
@@ -40,6 +43,7 @@ class Measurement:
         covariance: FloatArray | None = None,
         pose: SensorPose = _AT_ORIGIN,
         loss: RobustLoss | None = None,
+        assumed: tuple[str, ...] = (),
         **values: float,
     ) -> "Measurement":
         """The measurement of `values`, by name of `MEASURABLE`, with a standard deviation each or a covariance.
@@ -51,6 +55,8 @@ class Measurement:
         if not names or len(names) < len(values):
             given = ", ".join(name for name in values if name not in MEASURABLE) or "nothing"
             raise CallError(f"measurement of {given}: give one or more of {', '.join(MEASURABLE)}")
+        if not set(assumed) < set(names):
+            raise CallError(f"measurement of {', '.join(names)}: assumed must name some of them, is {assumed!r}")
         if (std is None) == (covariance is None):
             raise CallError(f"measurement of {', '.join(names)}: give either std or covariance")
         if std is not None and std.keys() != values.keys():
@@ -63,7 +69,7 @@ class Measurement:
                 f"measurement of {', '.join(names)}: values must be finite, the covariance symmetric, positive "
                 f"definite and of shape {(len(z), len(z))}, are {z.tolist()} and {R.tolist()}"
             )
-        return cls(stamp_ns, measurement_model(names, CTRV()), z, R, pose, loss)
+        return cls(stamp_ns, measurement_model(names, CTRV()), z, R, pose, loss, assumed)
 
     def seen_by(self, motion: MotionModel) -> "Measurement":
         """This measurement with the model for the state of `motion`: itself where that is its model already."""
@@ -71,6 +77,21 @@ class Measurement:
         if names is motion.state_names or names[:4] == motion.state_names[:4]:
             return self
         return replace(self, model=measurement_model(self.model.components, motion))
+
+    @property
+    def measured(self) -> list[int] | None:
+        """Places of the components that were measured; None where all of them were."""
+        if not self.assumed:
+            return None
+        return [place for place, name in enumerate(self.model.components) if name not in self.assumed]
+
+    def nis(self, innovation: FloatArray, S: FloatArray) -> float:
+        """Normalised innovation squared y' S^-1 y of what was measured: components that are `assumed` are left out.
+
+        `innovation`, shape (k,), and its covariance `S`, shape (k, k), are those of all components. Raises
+        `numpy.linalg.LinAlgError` for a singular `S`.
+        """
+        return float(mahalanobis_squared(innovation, S, self.measured))
 
 
 class UpdateStatus(StrEnum):
@@ -89,9 +110,9 @@ class UpdateResult:
 
     status: UpdateStatus
     innovation: FloatArray | None = None
-    """Measured minus predicted at the measurement's own stamp, shape (k,)."""
+    """Measured (or assumed) minus predicted at the measurement's own stamp, shape (k,)."""
     nis: float | None = None
-    """Normalised innovation squared against the prior at that stamp."""
+    """Normalised innovation squared against the prior at that stamp, `Measurement.nis`."""
 
 
 #: Standard deviation of a direction of which nothing is known: that of the uniform distribution.

@@ -1,11 +1,11 @@
 """The extended Kalman filter's two steps, on stacks of independent states and on one state."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.linalg import congruence, identity, product, psd_solve, symmetrise
+from fgtrack.core.linalg import congruence, identity, mahalanobis_squared, product, psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.measurement import MeasurementModel, SensorPose
@@ -86,23 +86,29 @@ def correct(
     model: MeasurementModel,
     pose: SensorPose,
     residual: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
+    measured: Sequence[int] | None = None,
 ) -> Correction:
     """Fuse z (m, k) with covariance R (m, k, k) into m states (Karle et al. 2023, eqs. 5 to 9).
 
-    `residual` may take the place of the model's own. The posterior covariance is in Joseph form. Raises
-    `numpy.linalg.LinAlgError` for a singular S.
+    `residual` may take the place of the model's own; `measured` is `Measurement.measured`, for the NIS. The
+    posterior covariance is in Joseph form. Raises `numpy.linalg.LinAlgError` for a singular S.
     """
     y, H = linearised(z, mean, model, pose, residual)
-    return correct_with_innovation(mean, covariance, y, R, H)
+    return correct_with_innovation(mean, covariance, y, R, H, measured)
 
 
 def correct_with_innovation(
-    mean: FloatArray, covariance: FloatArray, y: FloatArray, R: FloatArray, H: FloatArray
+    mean: FloatArray,
+    covariance: FloatArray,
+    y: FloatArray,
+    R: FloatArray,
+    H: FloatArray,
+    measured: Sequence[int] | None = None,
 ) -> Correction:
     """Fuse the innovations y (m, k) of measurements with Jacobians H (m, k, n) or (k, n)."""
-    _, solved = _solved(covariance, H, R, y[..., None])
+    S, solved = _solved(covariance, H, R, y[..., None])
     K = solved[..., :-1].mT
-    nis = np.vecdot(y, solved[..., -1])
+    nis = np.vecdot(y, solved[..., -1]) if measured is None else mahalanobis_squared(y, S, measured)
     return Correction(mean + np.vecdot(K, y[..., None, :]), joseph(covariance, K, H, R), y, np.asarray(nis))
 
 
@@ -148,4 +154,4 @@ def correct_one(mean: FloatArray, covariance: FloatArray, measurement: Measureme
     """`correct` of one state, shapes (n,) and (n, n), without the price of a stack."""
     y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
     K, S = kalman_gain(covariance, H, measurement.R)
-    return OneCorrection(mean + K.dot(y), joseph(covariance, K, H, measurement.R), y, float(y.dot(psd_solve(S, y))))
+    return OneCorrection(mean + K.dot(y), joseph(covariance, K, H, measurement.R), y, measurement.nis(y, S))

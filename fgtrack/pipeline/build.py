@@ -29,7 +29,13 @@ from fgtrack.tracking.ego import EgoSource, EgoTrajectory
 from fgtrack.tracking.inbox import Inbox, QueueInbox
 from fgtrack.tracking.lifecycle import Lifecycle
 from fgtrack.tracking.preprocess import Preprocess
-from fgtrack.tracking.published import PublishedEgo, PublishedLifecycle, PublishedTracker, SlotInbox
+from fgtrack.tracking.published import (
+    PublishedEgo,
+    PublishedLifecycle,
+    PublishedPreprocess,
+    PublishedTracker,
+    SlotInbox,
+)
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
 _EULER = {
@@ -56,7 +62,7 @@ def build_tracker(config: Config) -> Tracker:
         sensors=config.sensors,
         ego=_build_ego(config),
         inbox=_build_inbox(config),
-        preprocess=Preprocess(road, config.merge, motion, origin_m),
+        preprocess=(PublishedPreprocess if published_order else Preprocess)(road, config.merge, motion, origin_m),
         association=config.association,
         bank=build_bank(config),
         motion=motion,

@@ -118,7 +118,10 @@ class GatedMahalanobis:
 
 
 def _innovations(candidates: Sequence[Candidate], states: StatesAt) -> tuple[FloatArray, FloatArray]:
-    """NIS and log det S of every candidate and track, shape (candidates, tracks)."""
+    """NIS and log det S of every candidate and track, shape (candidates, tracks).
+
+    Of all components, what is assumed too: a gate judges what would be done to the track.
+    """
     nis, log_volume = np.empty((2, len(candidates), len(states.track_ids)))
     for row, candidate in enumerate(candidates):
         measurement = candidate.measurement

@@ -90,7 +90,7 @@ class ConnectedMerge(Merge):
 
 
 @dataclass(frozen=True, slots=True)
-class _MapDetection:
+class MapDetection:
     """A detection with its components in the map frame."""
 
     index: int
@@ -138,7 +138,7 @@ class Preprocess:
         vx_mps, vy_mps = ego.speed_mps * math.cos(ego.yaw_rad), ego.speed_mps * math.sin(ego.yaw_rad)
         return SensorPose(*_in_map(x_m, y_m, ego), yaw_rad, vx_mps, vy_mps)
 
-    def _off_road(self, located: list[_MapDetection], sensor: SensorModel) -> list[int]:
+    def _off_road(self, located: list[MapDetection], sensor: SensorModel) -> list[int]:
         """Indices of what lies outside the bounds; a yaw that was not measured becomes the map heading."""
         placed = [item for item in located if item.point_m is not None]
         if not self._road.known or not placed:
@@ -150,7 +150,7 @@ class Preprocess:
         return [item.index for item, out in zip(placed, view.outside.tolist(), strict=True) if out]
 
     def _candidates(
-        self, located: list[_MapDetection], batch: Batch, sensor: SensorModel, pose: SensorPose
+        self, located: list[MapDetection], batch: Batch, sensor: SensorModel, pose: SensorPose
     ) -> list[Candidate]:
         placed = [item for item in located if item.point_m is not None]
         groups = self._merge.groups(np.array([item.point_m for item in placed]).reshape(-1, 2))
@@ -167,9 +167,9 @@ class Preprocess:
 
     def _candidate(
         self,
-        leader: _MapDetection,
+        leader: MapDetection,
         merged: tuple[int, ...],
-        parts: Sequence[_MapDetection],
+        parts: Sequence[MapDetection],
         batch: Batch,
         sensor: SensorModel,
         pose: SensorPose,
@@ -188,19 +188,27 @@ class Preprocess:
             x_m, y_m = np.mean([part.point_m for part in parts if part.point_m is not None], axis=0).tolist()
             point_m = (x_m, y_m)
         values = {name: values[name] for name in names}
+        assumed = self._assumed(parts, names, sensor)
         z = np.array(list(values.values()))
         found = measured_position(names, z, R, pose)
         return Candidate(
             leader.index,
             merged,
-            Measurement(batch.stamp_ns, measurement_model(names, self._motion), z, R, pose, sensor.loss),
+            Measurement(batch.stamp_ns, measurement_model(names, self._motion), z, R, pose, sensor.loss, assumed),
             None if point_m is None else np.array(point_m),
             None if found is None else found[1],
             values,
         )
 
+    def _assumed(self, parts: Sequence[MapDetection], names: tuple[str, ...], sensor: SensorModel) -> tuple[str, ...]:
+        """Those of `names` that not all `parts` measured: a yaw that the map gave."""
+        if sensor.yaw_from_map_std_rad is None or "yaw_rad" not in names:
+            return ()
+        measured = "yaw_rad" in sensor.std and all(part.detection.yaw_rad is not None for part in parts)
+        return () if measured else ("yaw_rad",)
 
-def _located(index: int, batch: Batch, sensor: SensorModel, pose: SensorPose) -> _MapDetection:
+
+def _located(index: int, batch: Batch, sensor: SensorModel, pose: SensorPose) -> MapDetection:
     detection = batch.message.objects[index]
     values = {name: float(value) for name in sensor.std if (value := getattr(detection, name)) is not None}
     point_m = None
@@ -213,10 +221,10 @@ def _located(index: int, batch: Batch, sensor: SensorModel, pose: SensorPose) ->
     elif "range_m" in values:
         range_m, bearing_rad = values["range_m"], values["bearing_rad"]
         point_m = _in_map(range_m * math.cos(bearing_rad), range_m * math.sin(bearing_rad), pose)
-    return _MapDetection(index, detection, values, point_m)
+    return MapDetection(index, detection, values, point_m)
 
 
-def _out_of_range(located: list[_MapDetection], sensor: SensorModel, pose: SensorPose) -> list[int]:
+def _out_of_range(located: list[MapDetection], sensor: SensorModel, pose: SensorPose) -> list[int]:
     """Indices of what lies further from the sensor than it can be trusted."""
     limit_m = math.inf if sensor.max_range_m is None else sensor.max_range_m
     return [
@@ -226,7 +234,7 @@ def _out_of_range(located: list[_MapDetection], sensor: SensorModel, pose: Senso
     ]
 
 
-def _common_names(parts: Sequence[_MapDetection]) -> tuple[str, ...]:
+def _common_names(parts: Sequence[MapDetection]) -> tuple[str, ...]:
     return _in_order(frozenset(parts[0].values).intersection(*[part.values for part in parts[1:]]))
 
 
@@ -242,7 +250,7 @@ def _in_map(x_m: float, y_m: float, pose: SensorPose | EgoPose) -> tuple[float, 
 
 
 def _covariance(
-    item: _MapDetection, names: tuple[str, ...], batch: Batch, sensor: SensorModel, pose: SensorPose
+    item: MapDetection, names: tuple[str, ...], batch: Batch, sensor: SensorModel, pose: SensorPose
 ) -> FloatArray:
     """Covariance of `names` in the map: the detection's own where it has one, else the sensor's R.
 

@@ -16,7 +16,7 @@ from fgtrack.tracking.association import Assignment, assigned, euclidean_distanc
 from fgtrack.tracking.ego import EgoPose, EgoSource, extrapolated
 from fgtrack.tracking.inbox import Batch, is_covariance, is_number, record, records
 from fgtrack.tracking.lifecycle import Life, Lifecycle
-from fgtrack.tracking.preprocess import Candidate, Merge
+from fgtrack.tracking.preprocess import Candidate, MapDetection, Merge, Preprocess
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
 
@@ -148,6 +148,13 @@ class NeighbourhoodMerge(Merge):
         if name == "yaw_rad":
             values = published_yaw(values)
         return float(values.sum() / len(values))
+
+
+class PublishedPreprocess(Preprocess):
+    """A heading that the map gave counts as measured, in the innovations and their NIS."""
+
+    def _assumed(self, parts: Sequence[MapDetection], names: tuple[str, ...], sensor: SensorModel) -> tuple[str, ...]:
+        return ()
 
 
 @dataclass(frozen=True)

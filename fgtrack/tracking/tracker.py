@@ -239,9 +239,9 @@ class Tracker:
         """Record the outcome of a candidate, and of the detections that were merged into it."""
         nis, innovation = None, NO_INNOVATION
         if result is not None and result.innovation is not None:
-            names = candidate.measurement.model.components
-            nis = result.nis
-            innovation = MappingProxyType(dict(zip(names, result.innovation.tolist(), strict=True)))
+            nis, measurement = result.nis, candidate.measurement
+            by_name = zip(measurement.model.components, result.innovation.tolist(), strict=True)
+            innovation = MappingProxyType({name: y for name, y in by_name if name not in measurement.assumed})
         self._records.append(record(batch.message, candidate.index, disposition, track_id, nis, innovation))
         self._records += [record(batch.message, index, Disposition.MERGED, track_id) for index in candidate.merged]
 

@@ -235,3 +235,18 @@ def test_detections_that_say_in_different_ways_where_they_are_merge_into_the_fir
     [found] = candidates(*items, sensor=both, merge=merge)
     assert (found.index, found.merged) == (0, (1,))
     assert found.values == {"range_m": 20.0, "bearing_rad": 0.0}
+
+
+# --- what is assumed
+
+
+def test_a_yaw_that_the_map_gave_is_assumed_and_one_that_was_measured_is_not() -> None:
+    point, known = Detection(x_m=10.0, y_m=3.0), Detection(x_m=10.0, y_m=3.0, yaw_rad=0.1)
+    both = replace(LIDAR, yaw_from_map_std_rad=0.35)
+    assert candidates(point, sensor=POINTS, road=StraightRoad())[0].measurement.assumed == ("yaw_rad",)
+    assert candidates(known, sensor=POINTS, road=StraightRoad())[0].measurement.assumed == ("yaw_rad",)
+    assert candidates(point, sensor=both, road=StraightRoad())[0].measurement.assumed == ("yaw_rad",)
+    assert candidates(known, sensor=both, road=StraightRoad())[0].measurement.assumed == ()
+    assert candidates(point, sensor=POINTS)[0].measurement.assumed == ()
+    [merged] = candidates(known, point, sensor=both, road=StraightRoad(), merge=ConnectedMerge())
+    assert merged.measurement.assumed == ("yaw_rad",)

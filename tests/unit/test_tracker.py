@@ -6,6 +6,7 @@ from support.tracking import START_NS, ms
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, TickReport, TrackStatus
 from fgtrack.estimation.registry import ESTIMATORS
+from fgtrack.models.oval import make_oval
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config, LifecycleConfig
@@ -227,3 +228,19 @@ def test_an_innovation_is_named_by_what_was_measured() -> None:
     [record] = tick(one, 10.0, seen((10.0, 0.5), at_ms=10.0)).updates
     assert record.innovation == pytest.approx({"x_m": 0.0, "y_m": 0.5}, abs=1e-9)
     assert record.nis > 0.0
+
+
+@pytest.mark.parametrize("published", [False, True])
+def test_a_heading_from_the_map_is_no_innovation_except_in_the_published_configuration(published: bool) -> None:
+    """NIS and innovation have the same degrees of freedom; the estimates do not differ."""
+    config = load(Config, None, ["map.track=oval", *(["lifecycle.kind=published"] if published else [])])
+    one = build_tracker(config)
+    x_m, y_m = make_oval().table[100, :2].tolist()
+    for at_ms in (0.0, 50.0):
+        stamp_ns = START_NS + ms(at_ms)
+        one.receive(EgoState(stamp_ns, stamp_ns, x_m - 30.0, y_m, 0.0, 20.0))
+        item = Detection(x_m=x_m + 0.02 * at_ms, y_m=y_m)
+        report = tick(one, at_ms, DetectionList("lidar_cluster", stamp_ns, stamp_ns, [item], "map"))
+    [update] = report.updates
+    assert update.nis is not None
+    assert set(update.innovation) == {"x_m", "y_m"} | ({"yaw_rad"} if published else set())

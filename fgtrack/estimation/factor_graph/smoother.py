@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.linalg import mahalanobis_squared, symmetrise
+from fgtrack.core.linalg import symmetrise
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
@@ -166,4 +166,4 @@ class FixedLagSmoother:
     def _innovation(self, measurement: Measurement) -> tuple[FloatArray, float]:
         mean, covariance = self._window.state_at(measurement.stamp_ns)
         y, H, R = linearised(measurement, mean)
-        return y, float(mahalanobis_squared(y, propagated(H, covariance, R)))
+        return y, measurement.nis(y, propagated(H, covariance, R))

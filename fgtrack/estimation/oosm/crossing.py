@@ -33,8 +33,7 @@ def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measuremen
     S = propagated(H, past.covariance, measurement.R)
     np.linalg.cholesky(S)  # raises where S is not positive definite
     across = past.cross @ H.T
-    weighted = psd_solve(S, np.column_stack((across.T, y)))
-    gain, nis = weighted[:, :-1].T, float(y @ weighted[:, -1])
-    result = OneCorrection(mean + gain @ y, symmetrise(covariance - gain @ across.T), y, nis)
+    gain = psd_solve(S, across.T).T
+    result = OneCorrection(mean + gain @ y, symmetrise(covariance - gain @ across.T), y, measurement.nis(y, S))
     require_finite(result)
     return result
