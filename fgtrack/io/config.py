@@ -1,4 +1,4 @@
-"""Which topics of a recording hold the ego, detections and truth."""
+"""What of an input is read: topics of a recording that hold the ego, detections and truth, parts of a data set."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,6 +27,18 @@ class TopicInput:
 
 
 @dataclass(frozen=True)
+class KittiInput:
+    """What is read of a folder of the KITTI tracking data set."""
+
+    sequence: int | str | None = None
+    """The sequence, where the input is a folder of several: `6` or `0006`."""
+    min_score: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    """By sensor, the folder of its detections: those of a lower score are left out."""
+    image_width_px: float = 1242.0
+    """A box in the image that touches the left or right border is left out: its middle is not that of the car."""
+
+
+@dataclass(frozen=True)
 class InputConfig:
     """The topics that a replay reads; a recording that fgtrack wrote needs none of it."""
 
@@ -36,3 +48,4 @@ class InputConfig:
     truth: TopicInput | None = None
     message_definitions: tuple[str, ...] = ()
     """`.msg` files, or folders of them, of types that neither the recording nor fgtrack defines."""
+    kitti: KittiInput = field(default_factory=KittiInput)

@@ -16,6 +16,7 @@ ADAPTERS = Registry(
             "recording": "fgtrack.io.ros.topics:FORMAT",
             "autoferry": "fgtrack.io.adapters.autoferry:FORMAT",
             "fusiontracking": "fgtrack.io.adapters.fusiontracking:FORMAT",
+            "kitti": "fgtrack.io.adapters.kitti:FORMAT",
             "autoware_auto_perception_msgs/msg/DetectedObjects": f"{_OBJECTS}:detected_objects",
             "autoware_perception_msgs/msg/DetectedObjects": f"{_OBJECTS}:detected_objects",
             "derived_object_msgs/msg/ObjectArray": f"{_OBJECTS}:object_array",

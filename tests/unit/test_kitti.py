@@ -1,0 +1,235 @@
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.messages import shared
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
+from fgtrack.io.config import InputConfig, KittiInput
+from fgtrack.io.source import open_input
+
+SEQUENCES = ("0004", "0006", "0008", "0010", "0018")
+
+#: A camera that looks ahead from 2 m ahead and 0.5 m to the left of the inertial unit, 0.1 m above it.
+RECTIFIED_FROM_IMU = np.array([[0.0, -1.0, 0.0, 0.5], [0.0, 0.0, -1.0, 0.1], [1.0, 0.0, 0.0, -2.0]])
+FOCAL_PX, CENTRE_PX = 700.0, (600.0, 180.0)
+
+
+def numbers(matrix: object) -> str:
+    return " ".join(str(float(value)) for value in np.ravel(matrix))
+
+
+def calibration(r_rect: str = "R_rect", velodyne: str = "Tr_velo_cam", imu: str = "Tr_imu_velo") -> str:
+    projection = [[FOCAL_PX, 0.0, CENTRE_PX[0], 0.0], [0.0, FOCAL_PX, CENTRE_PX[1], 0.0], [0.0, 0.0, 1.0, 0.0]]
+    lines = [f"P{k}: {numbers(projection)}" for k in range(4)]
+    lines += [f"{r_rect} {numbers(np.eye(3))}", f"{velodyne} {numbers(RECTIFIED_FROM_IMU)}"]
+    return "\n".join([*lines, f"{imu} {numbers(np.eye(3, 4))}"]) + "\n\n"
+
+
+def oxts(
+    north_deg: float = 0.0,
+    east_deg: float = 0.0,
+    roll_rad: float = 0.0,
+    pitch_rad: float = 0.0,
+    yaw_rad: float = 0.0,
+    speed_mps: float = 0.0,
+    yaw_rate_radps: float = 0.0,
+    accel_mps2: float = 0.0,
+) -> str:
+    values = np.zeros(30)
+    values[:6] = 49.0 + north_deg, 8.0 + east_deg, 110.0, roll_rad, pitch_rad, yaw_rad
+    values[8], values[14], values[22] = speed_mps, accel_mps2, yaw_rate_radps
+    return numbers(values)
+
+
+def label(frame: int, track: int, kind: str, ahead_m: float, aside_m: float, yaw_rad: float) -> str:
+    x_m, y_m, z_m = RECTIFIED_FROM_IMU @ [ahead_m, aside_m, -1.5, 1.0]
+    return f"{frame} {track} {kind} 0 0 0.0 1 2 3 4 1.5 1.6 4.0 {x_m} {y_m} {z_m} {-yaw_rad - 0.5 * math.pi}"
+
+
+def pose(frame: int, ahead_m: float, aside_m: float, yaw_rad: float, score: float = 9.0, kind: int = 2) -> str:
+    x_m, y_m, z_m = RECTIFIED_FROM_IMU @ [ahead_m, aside_m, -1.5, 1.0]
+    return f"{frame},{kind},1,2,3,4,{score},1.5,1.6,4.0,{x_m},{y_m},{z_m},{-yaw_rad - 0.5 * math.pi},0.0"
+
+
+def box(frame: int, left_px: float, right_px: float, score: float = 1.0) -> str:
+    return f"{frame},{left_px},{CENTRE_PX[1] - 10},{right_px},{CENTRE_PX[1] + 10},{score}"
+
+
+def folder(at: Path, sequence: str = "0001", **files: list[str]) -> Path:
+    given = {"oxts": [oxts()], "calib": [calibration()], **files}
+    for name, lines in given.items():
+        (at / name).mkdir(parents=True, exist_ok=True)
+        (at / name / f"{sequence}.txt").write_text("\n".join(lines))
+    return at
+
+
+def messages(path: Path, **settings: object) -> list[Message]:
+    return list(open_input(path, InputConfig(kitti=KittiInput(**settings))).messages())
+
+
+def lists(path: Path, **settings: object) -> list[DetectionList]:
+    return [item for item in messages(path, **settings) if isinstance(item, DetectionList)]
+
+
+def test_a_frame_gives_truth_ego_and_the_detections_of_every_folder(tmp_path):
+    drive = folder(
+        tmp_path,
+        oxts=[oxts(), oxts()],
+        label_02=[label(1, 5, "Car", 10.0, 0.0, 0.0)],
+        camera=[box(1, 590.0, 610.0)],
+        laser=[pose(0, 10.0, 0.0, 0.0)],
+    )
+    found = [(type(item).__name__, item.stamp_ns, getattr(item, "sensor", "")) for item in messages(drive)]
+    assert found == [
+        ("EgoState", 0, ""),
+        ("DetectionList", 0, "camera"),
+        ("DetectionList", 0, "laser"),
+        ("TruthState", 100_000_000, ""),
+        ("EgoState", 100_000_000, ""),
+        ("DetectionList", 100_000_000, "camera"),
+        ("DetectionList", 100_000_000, "laser"),
+    ]
+    assert [(item.frame, len(item.objects)) for item in lists(drive)] == [
+        ("sensor", 0),
+        ("ego", 1),
+        ("sensor", 1),
+        ("ego", 0),
+    ]
+    assert all(item.receipt_ns == item.stamp_ns for item in messages(drive))
+
+
+def test_a_box_in_space_is_a_position_and_a_yaw_in_the_ego_frame(tmp_path):
+    (found,) = lists(folder(tmp_path, laser=[pose(0, 20.0, 3.0, 0.4)]))
+    (detection,) = found.objects
+    assert detection.measured == ("x_m", "y_m", "yaw_rad")
+    assert (detection.x_m, detection.y_m, detection.yaw_rad) == pytest.approx((20.0, 3.0, 0.4))
+
+
+def test_a_box_in_the_image_is_the_bearing_of_its_middle_from_the_camera(tmp_path):
+    (found,) = lists(folder(tmp_path, camera=[box(0, 400.0, 460.0)]))
+    assert found.objects == (Detection(bearing_rad=pytest.approx(math.atan2(170.0, FOCAL_PX))),)
+
+
+def test_roll_and_pitch_are_taken_out(tmp_path):
+    """A point 10 m ahead of a unit that looks down by 0.1 rad is nearer; one to the left of a rolled unit too."""
+    tilted, laser = [oxts(pitch_rad=0.1), oxts(roll_rad=0.1)], [pose(0, 10.0, 0.0, 0.0), pose(1, 10.0, 4.0, 0.0)]
+    drive = folder(tmp_path, oxts=tilted, laser=laser)
+    (pitched,), (rolled,) = (item.objects for item in lists(drive))
+    assert (pitched.x_m, pitched.y_m) == pytest.approx((10.0 * math.cos(0.1) - 1.5 * math.sin(0.1), 0.0))
+    assert (rolled.x_m, rolled.y_m) == pytest.approx((10.0, 4.0 * math.cos(0.1) + 1.5 * math.sin(0.1)))
+
+
+def test_the_map_begins_at_the_first_frame_with_x_to_the_east(tmp_path):
+    metre_deg = math.degrees(1.0 / 6_378_137.0)
+    drive = folder(
+        tmp_path,
+        oxts=[
+            oxts(yaw_rad=3.0),
+            oxts(100.0 * metre_deg, 50.0 * metre_deg / math.cos(math.radians(49.0)), 0.0, 0.0, 3.5, 8.0, 0.2, -1.0),
+        ],
+        label_02=[label(1, 3, "Car", 10.0, 0.0, 0.3), label(1, 4, "Van", 10.0, 0.0, 0.3)],
+    )
+    first, truth, second = messages(drive)
+    assert first == EgoState(0, 0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0)
+    assert isinstance(second, EgoState)
+    assert (second.x_m, second.y_m) == pytest.approx((50.0, 100.0), abs=0.01)
+    assert second.yaw_rad == pytest.approx(3.5 - 2.0 * math.pi)
+    assert (second.speed_mps, second.yaw_rate_radps, second.accel_mps2) == (8.0, 0.2, -1.0)
+    assert isinstance(truth, TruthState)
+    assert truth.object_id == 3
+    offset_m = truth.x_m - second.x_m, truth.y_m - second.y_m
+    assert offset_m == pytest.approx((10.0 * math.cos(3.5), 10.0 * math.sin(3.5)))
+    assert truth.yaw_rad == pytest.approx(3.8 - 2.0 * math.pi)
+
+
+def test_other_classes_low_scores_and_boxes_cut_off_are_left_out(tmp_path):
+    drive = folder(
+        tmp_path,
+        laser=[pose(0, 10.0, 0.0, 0.0, kind=1), pose(0, 20.0, 0.0, 0.0, 1.0), pose(0, 30.0, 0.0, 0.0, 5.0)],
+        camera=[box(0, 0.5, 60.0), box(0, 1100.0, 1240.5), box(0, 300.0, 360.0, 0.5), box(0, 300.0, 360.0, 0.9)],
+    )
+    camera, laser = lists(drive, min_score={"laser": 3.0, "camera": 0.9})
+    assert [round(item.x_m) for item in laser.objects] == [30]
+    assert len(camera.objects) == 1
+    camera, laser = lists(drive, image_width_px=1300.0)
+    assert (len(camera.objects), len(laser.objects)) == (3, 2)
+
+
+def test_the_other_spellings_of_a_calibration_say_the_same(tmp_path):
+    files = {"laser": [pose(0, 20.0, 3.0, 0.4)]}
+    one = folder(tmp_path / "one", **files)
+    spelt = calibration("R0_rect:", "Tr_velo_to_cam:", "Tr_imu_to_velo:")
+    assert lists(folder(tmp_path / "other", calib=[spelt], **files)) == lists(one)
+
+
+def test_an_input_is_a_folder_of_one_sequence_a_file_or_a_sequence_by_name(tmp_path):
+    folder(tmp_path, "0001", laser=[pose(0, 10.0, 0.0, 0.0)])
+    assert len(lists(tmp_path)) == 1
+    folder(tmp_path, "0012", laser=[pose(0, 30.0, 0.0, 0.0)])
+    assert lists(tmp_path / "oxts/0012.txt") == lists(tmp_path, sequence=12) == lists(tmp_path, sequence="0012")
+    with pytest.raises(CallError, match=r"holds 2 sequences, name one by its file: .*oxts/0001\.txt"):
+        open_input(tmp_path)
+    with pytest.raises(CallError, match="holds no sequence 0007, but 0001, 0012"):
+        messages(tmp_path, sequence=7)
+
+
+@pytest.mark.parametrize(
+    ("files", "where"),
+    [
+        ({"oxts": ["1 2 3"]}, r"oxts/0001\.txt:1: "),
+        ({"calib": ["P2: 1 2 x"]}, r"calib/0001\.txt:1: "),
+        ({"calib": ["P2: 1 2 3"]}, r"calib/0001\.txt: "),
+        ({"laser": [pose(0, 1.0, 2.0, 0.0), "0,2,3"]}, r"laser/0001\.txt:2: .*3 fields"),
+        ({"laser": ["car"]}, r"laser/0001\.txt:1: "),
+        ({"laser": [pose(7, 1.0, 2.0, 0.0)]}, r"laser/0001\.txt:1: is of frame 7"),
+        ({"label_02": ["0 1 Car 0 0"]}, r"label_02/0001\.txt:1: "),
+    ],
+)
+def test_a_damaged_file_is_one_line_that_names_it(tmp_path, files, where):
+    drive = folder(tmp_path, **files)
+    with pytest.raises(DataError, match=where) as caught:
+        messages(drive)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_sequence_without_a_calibration_is_one_line(tmp_path):
+    drive = folder(tmp_path)
+    (drive / "calib/0001.txt").unlink()
+    with pytest.raises(DataError, match=r"calib/0001\.txt: cannot be read"):
+        messages(drive)
+
+
+@pytest.mark.parametrize("sequence", SEQUENCES)
+def test_every_line_of_the_data_set_is_read_and_lies_at_the_labelled_cars(sequence):
+    root = shared("data/kitti")
+    found = messages(root, sequence=sequence, min_score={"pointrcnn_car": 3.0})
+    assert all(a.receipt_ns <= b.receipt_ns for a, b in pairwise(found))
+    count = {name: len((root / name / f"{sequence}.txt").read_text().split("\n")) - 1 for name in ("oxts", "rrc_car")}
+    egos = {item.stamp_ns: item for item in found if isinstance(item, EgoState)}
+    assert len(egos) == count["oxts"]
+    truth: dict[int, list[TruthState]] = {}
+    for item in found:
+        if isinstance(item, TruthState):
+            truth.setdefault(item.stamp_ns, []).append(item)
+    labels = (root / "label_02" / f"{sequence}.txt").read_text().splitlines()
+    assert sum(map(len, truth.values())) == sum(line.split()[2] == "Car" for line in labels)
+    misses_m, misses_rad = [], []
+    for item in found:
+        if not isinstance(item, DetectionList) or item.stamp_ns not in truth:
+            continue
+        ego = egos[item.stamp_ns]
+        offsets = np.array([(car.x_m - ego.x_m, car.y_m - ego.y_m) for car in truth[item.stamp_ns]])
+        c, s = math.cos(ego.yaw_rad), math.sin(ego.yaw_rad)
+        cars = offsets @ np.array([[c, -s], [s, c]])
+        for detection in item.objects:
+            if detection.x_m is not None:
+                misses_m.append(np.hypot(cars[:, 0] - detection.x_m, cars[:, 1] - detection.y_m).min())
+            elif detection.bearing_rad is not None:
+                bearings = np.arctan2(cars[:, 1] + 0.26, cars[:, 0] - 1.08)
+                misses_rad.append(np.abs(bearings - detection.bearing_rad).min())
+    assert np.quantile(misses_m, 0.3) < 0.4
+    assert np.quantile(misses_rad, 0.3) < 0.003
