@@ -155,3 +155,9 @@ def correct_one(mean: FloatArray, covariance: FloatArray, measurement: Measureme
     y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
     K, S = kalman_gain(covariance, H, measurement.R)
     return OneCorrection(mean + K.dot(y), joseph(covariance, K, H, measurement.R), y, measurement.nis(y, S))
+
+
+def innovation_one(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> tuple[FloatArray, float]:
+    """Innovation (k,) and NIS of `measurement` at one state, shapes (n,) and (n, n), which stays as it is."""
+    y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
+    return y, measurement.nis(y, congruence(H, covariance) + measurement.R)

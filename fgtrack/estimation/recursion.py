@@ -4,14 +4,14 @@ from typing import Protocol
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.ekf import OneCorrection, Prediction, correct_one, predict_across
+from fgtrack.estimation.ekf import OneCorrection, Prediction, correct_one, innovation_one, predict_across
 from fgtrack.models.motion import MotionModel
 
 
 class Recursion(Protocol):
     """The two steps of a filter; it remembers nothing, so that a filter may rewind and replay them.
 
-    Both raise `numpy.linalg.LinAlgError` for a state or measurement that they cannot take.
+    All raise `numpy.linalg.LinAlgError` for a state or measurement that they cannot take.
     """
 
     def predict(self, mean: FloatArray, covariance: FloatArray, dt_s: float) -> Prediction:
@@ -19,6 +19,11 @@ class Recursion(Protocol):
 
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
         """The state after `measurement`, made at the stamp of `mean` (n,) and `covariance` (n, n)."""
+
+    def innovation(
+        self, mean: FloatArray, covariance: FloatArray, measurement: Measurement
+    ) -> tuple[FloatArray, float]:
+        """Those of `correct`, shape (k,) and NIS, without the correction."""
 
 
 class EkfRecursion:
@@ -40,3 +45,9 @@ class EkfRecursion:
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
         """See `Recursion.correct`."""
         return correct_one(mean, covariance, measurement)
+
+    def innovation(
+        self, mean: FloatArray, covariance: FloatArray, measurement: Measurement
+    ) -> tuple[FloatArray, float]:
+        """See `Recursion.innovation`."""
+        return innovation_one(mean, covariance, measurement)

@@ -2,7 +2,7 @@
 
 import bisect
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import OneCorrection, Prediction
 from fgtrack.estimation.recursion import EkfRecursion, Recursion
+from fgtrack.estimation.rts import smoothed_one
 from fgtrack.estimation.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
 
@@ -29,6 +30,8 @@ class _Stored:
     """None of the oldest step, which is the prior."""
     mean: FloatArray
     covariance: FloatArray
+    predicted: Prediction
+    """The state before it, predicted from the step before."""
 
 
 class ReplayingFilter(WindowedFilter):
@@ -59,7 +62,8 @@ class ReplayingFilter(WindowedFilter):
 
     def _first(self, prior: Start) -> _Stored:
         """The state that everything is replayed from."""
-        return _Stored((prior.stamp_ns, (), ()), None, *initial_state(self._motion, prior))
+        mean, covariance = initial_state(self._motion, prior)
+        return _Stored((prior.stamp_ns, (), ()), None, mean, covariance, Prediction(mean, covariance, covariance))
 
     def _forget_before(self, stamp_ns: int) -> None:
         del self._steps[: max(bisect.bisect_right(self._steps, stamp_ns, key=_stamp) - 1, 0)]
@@ -68,8 +72,31 @@ class ReplayingFilter(WindowedFilter):
         order = (measurement.stamp_ns, measurement.model.components, tuple(measurement.z.tolist()))
         place = bisect.bisect_right(self._steps, order, lo=1, key=_order)
         step, correction = self._fused(self._steps[place - 1], order, measurement)
-        self._steps[place:] = [step, *self._replayed(step, self._steps[place:])]
+        later = self._steps[place:]
+        if later:
+            innovation, nis = self._recursion.innovation(*self._retrodicted(step, later), measurement)
+            correction = correction._replace(innovation=innovation, nis=nis)
+        self._steps[place:] = [step, *self._replayed(step, later)]
         return correction
+
+    def _retrodicted(self, step: _Stored, later: Sequence[_Stored]) -> tuple[FloatArray, FloatArray]:
+        """The state that the measurement of `step` finds, given all that was fused, the `later` steps included.
+
+        From the newest step back (see `smoothed_one`), each as it was when the measurement of `step` was unknown.
+        """
+        mean, covariance = later[-1].mean, later[-1].covariance
+        for place in range(len(later) - 1, -1, -1):
+            before, after = later[place - 1] if place else step, later[place]
+            if before.order[0] == after.order[0]:
+                continue  # the same state
+            x, P, predicted = before.mean, before.covariance, after.predicted
+            if not place:
+                x, P, _ = before.predicted
+                on = self._recursion.predict(x, P, seconds(after.order[0] - before.order[0]))
+                predicted = predicted._replace(cross=on.cross)
+            shift = self._wrapped(mean - predicted.mean)
+            mean, covariance, _ = smoothed_one(x, P, predicted, shift, covariance)
+        return mean, covariance
 
     def _replayed(self, step: _Stored, later: Iterable[_Stored]) -> list[_Stored]:
         """The measurements of `later` steps, in their order, applied to `step`."""
@@ -87,7 +114,7 @@ class ReplayingFilter(WindowedFilter):
         mean, covariance = corrected.mean, corrected.covariance
         if not math.isfinite(mean.dot(mean) + np.vdot(covariance, covariance)):  # one number instead of a mask
             raise np.linalg.LinAlgError("posterior is not finite")
-        return _Stored(order, measurement, self._wrapped(mean), covariance), corrected
+        return _Stored(order, measurement, self._wrapped(mean), covariance, predicted), corrected
 
     def _predicted(self, before: _Stored, stamp_ns: int) -> Prediction:
         """The state at `stamp_ns`, from the step before it."""

@@ -1,8 +1,9 @@
 """Smoother gains from the present back to the late stamp."""
 
-from fgtrack.core.linalg import psd_solve, symmetrise
+from fgtrack.estimation.ekf import Prediction
 from fgtrack.estimation.oosm.crossing import Past
 from fgtrack.estimation.oosm.late import CrossingEkf
+from fgtrack.estimation.rts import smoothed_one
 
 
 class RtsCrossCovariance(CrossingEkf):
@@ -32,8 +33,7 @@ class RtsCrossCovariance(CrossingEkf):
             at_tau = place == left + 1
             x, P_x = (mean, covariance) if at_tau else (before.mean, before.covariance)
             transition = F if at_tau else self._history.transition_to(place)
-            gain = psd_solve(after.predicted_covariance, transition @ P_x).T
-            smoothed = x + gain @ (smoothed - after.predicted_mean)
-            P = symmetrise(P_x + gain @ (P - after.predicted_covariance) @ gain.T)
+            predicted = Prediction(after.predicted_mean, after.predicted_covariance, transition @ P_x)
+            smoothed, P, gain = smoothed_one(x, P_x, predicted, smoothed - after.predicted_mean, P)
             path = gain @ path
         return Past(smoothed, P, path.T)
