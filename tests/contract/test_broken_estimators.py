@@ -141,7 +141,7 @@ class TurnsTheLongWay(Sound):
         (ForgetsEqualStamps, "gives the dense joint posterior in any order"),
         (RoundsToMilliseconds, "gives the dense joint posterior in any order"),
         (DoublesTheNoise, "is the kalman filter in sequence"),
-        (DoublesTheNoise, "reports the innovation against the state before"),
+        (DoublesTheNoise, "reports the innovation against all that it has fused"),
         (SaysNothing, "counts each measurement as what it is"),
         (SaysInSequence, "counts each measurement as what it is"),
         (Lopsided, "gives symmetric positive definite covariances"),
