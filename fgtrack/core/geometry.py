@@ -1,12 +1,15 @@
 """Angles and planar transforms in REP-103 (yaw 0 along +x, counter-clockwise)."""
 
 import math
+from typing import TypeVar
 
 import numpy as np
 
 from fgtrack.core.types import FloatArray
 
 TWO_PI = 2.0 * math.pi
+
+Real = TypeVar("Real", float, FloatArray)
 
 
 def wrap_angle(angle_rad: float) -> float:
@@ -73,3 +76,17 @@ def cartesian_gradient(direction_length: FloatArray) -> FloatArray:
     direction, length = direction_length[..., 0], direction_length[..., 1]
     c, s = np.cos(direction), np.sin(direction)
     return np.stack([np.stack([-length * s, c], axis=-1), np.stack([length * c, s], axis=-1)], axis=-2)
+
+
+def body_point(
+    x_m: Real, y_m: Real, yaw_rad: Real, speed_mps: Real, yaw_rate_radps: Real, ahead_m: float, left_m: float
+) -> tuple[Real, Real, Real, Real]:
+    """Position x, y and velocity vx, vy = v + w x r, in the map, of a point that is fixed to a moving body.
+
+    The body's reference point is at x, y and moves along the yaw; the point is `ahead_m` and to the `left_m` of it,
+    which is the lever arm r. Floats, or arrays of any one shape.
+    """
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    arm_x_m, arm_y_m = c * ahead_m - s * left_m, s * ahead_m + c * left_m
+    vx_mps, vy_mps = speed_mps * c - yaw_rate_radps * arm_y_m, speed_mps * s + yaw_rate_radps * arm_x_m
+    return x_m + arm_x_m, y_m + arm_y_m, vx_mps, vy_mps

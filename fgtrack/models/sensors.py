@@ -8,7 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from fgtrack.core.types import MEASURABLE, FloatArray
+from fgtrack.core.geometry import body_point, polar, wrap_angles
+from fgtrack.core.types import MEASURABLE, BoolArray, FloatArray
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,10 @@ class SensorModel:
     """Use a detection's own covariance where the message carries one."""
     max_range_m: float | None = None
     """A detection further from the sensor than this is out of bounds: beyond it clutter outweighs objects."""
+    max_range_behind_m: float | None = None
+    """How far it sees in the half behind it, where that is less; the evaluation alone asks."""
+    field_of_view_rad: float = math.tau
+    """Full angle that it sees, centred on its axis; the evaluation alone asks, no detection is out of bounds by it."""
     births: bool = True
     """Whether an unmatched detection of this sensor starts a track."""
     loss: RobustLoss | None = None
@@ -73,10 +78,12 @@ class SensorModel:
                 raise ValueError(f"std.{name}: must be positive and finite, is {value}")
         if ("x_m" in self.std) != ("y_m" in self.std):
             raise ValueError("std: x_m and y_m are measured together")
-        for name in ("yaw_from_map_std_rad", "max_delay_s", "max_range_m"):
+        for name in ("yaw_from_map_std_rad", "max_delay_s", "max_range_m", "max_range_behind_m"):
             value = getattr(self, name)
             if value is not None and not value > 0.0:
                 raise ValueError(f"{name}: must be positive, is {value}")
+        if not 0.0 < self.field_of_view_rad <= math.tau:
+            raise ValueError(f"field_of_view_rad: must lie in (0, 2 pi], is {self.field_of_view_rad}")
         if self.counter_init < 1 or self.counter_add < 0:
             raise ValueError("counter_init must be at least 1 and counter_add not negative")
 
@@ -84,6 +91,26 @@ class SensorModel:
     def components(self) -> tuple[str, ...]:
         """Measured components in the order of `MEASURABLE`."""
         return tuple(name for name in MEASURABLE if name in self.std)
+
+    def sees(self, positions_m: FloatArray, ego_poses: FloatArray, origin_m: tuple[float, float]) -> BoolArray:
+        """Whether an object there is in range and in the field of view, shape (...); nothing hides it.
+
+        `positions_m` (..., 2) are in the map, `ego_poses` (..., 3) are x, y and yaw of the ego there at the same times,
+        `origin_m` is the origin of the detection frame seen from the ego (`ego.detection_origin_*`).
+        """
+        x_m, y_m, yaw_rad = np.moveaxis(ego_poses, -1, 0)
+        still, mount = np.zeros_like(x_m), self.mount
+        at_x_m, at_y_m, _, _ = body_point(
+            x_m, y_m, yaw_rad, still, still, origin_m[0] + mount.x_m, origin_m[1] + mount.y_m
+        )
+        direction_range = polar(positions_m - np.stack([at_x_m, at_y_m], axis=-1))
+        return in_view(
+            direction_range[..., 1],
+            direction_range[..., 0] - yaw_rad - mount.yaw_rad,
+            self.field_of_view_rad,
+            max_range_m=math.inf if self.max_range_m is None else self.max_range_m,
+            max_range_behind_m=self.max_range_behind_m,
+        )
 
     def noise(self, components: tuple[str, ...]) -> FloatArray:
         """Diagonal covariance R of `components`, shape (k, k), in the sensor's own axes; shared and read-only."""
@@ -102,3 +129,24 @@ class SensorModel:
         if name == "yaw_rad" and name not in self.std and self.yaw_from_map_std_rad is not None:
             return self.yaw_from_map_std_rad
         return self.std[name]
+
+
+def in_view(
+    range_m: FloatArray,
+    bearing_rad: FloatArray,
+    field_of_view_rad: float,
+    *,
+    min_range_m: float = 0.0,
+    max_range_m: float = math.inf,
+    max_range_behind_m: float | None = None,
+) -> BoolArray:
+    """Which objects at these ranges and bearings (0 on the sensor's axis), any one shape, a sensor can see.
+
+    `field_of_view_rad` is the full angle, centred on the axis; `max_range_behind_m`, if given, takes the place of
+    `max_range_m` in the half behind the sensor.
+    """
+    off_axis_rad = np.abs(wrap_angles(bearing_rad))
+    behind_m = max_range_m if max_range_behind_m is None else min(max_range_behind_m, max_range_m)
+    limit_m = np.where(off_axis_rad > math.pi / 2.0, behind_m, max_range_m)
+    in_range = (range_m >= min_range_m) & (range_m <= limit_m)
+    return np.asarray(in_range & (off_axis_rad <= field_of_view_rad / 2.0))

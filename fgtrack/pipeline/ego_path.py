@@ -56,4 +56,4 @@ class EgoPath:
         rate = self._rate(inside_s)
         x_m, y_m, yaw_rad = (self._spline(inside_s) + (time_s - inside_s) * rate).tolist()
         along_mps = float(np.cos(yaw_rad) * rate[0] + np.sin(yaw_rad) * rate[1])
-        return EgoPose(x_m, y_m, yaw_rad, along_mps)
+        return EgoPose(x_m, y_m, yaw_rad, along_mps, float(rate[2]))

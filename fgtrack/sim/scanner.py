@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.geometry import cartesian, rotations, wrap_angles
+from fgtrack.core.geometry import body_point, cartesian, rotations, wrap_angles
 from fgtrack.core.types import SPEED, YAW, YAW_RATE, BoolArray, Detection, FloatArray, IntArray, X, Y
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
-from fgtrack.models.sensors import Mount
+from fgtrack.models.sensors import Mount, in_view
 from fgtrack.models.track_map import TrackMap
 from fgtrack.sim.sensor import POLAR, SimulatedSensor
 
@@ -87,7 +87,7 @@ class Scanner:
             # Uniform over the area of a ring: the square of the range is uniform.
             distance = np.sqrt(rng.uniform(sensor.min_range_m**2, sensor.max_range_m**2, m))
             half = sensor.field_of_view_rad / 2.0
-            origin, yaw = self._pose(scan, sensor.mount)
+            origin, _, yaw = self._carried(scan, sensor.mount)
             direction = yaw + rng.uniform(-half, half, m)
             ghosts[:, X] = origin[:, X] + distance * np.cos(direction)
             ghosts[:, Y] = origin[:, Y] + distance * np.sin(direction)
@@ -115,7 +115,7 @@ class Scanner:
     def _measure(self, scan: IntArray, states: FloatArray) -> FloatArray:
         """Measurements without noise, shape (m, k), of `states`, shape (m, 6), in the scans `scan`."""
         mount = Mount() if self.sensor.frame == "ego" else self.sensor.mount
-        origin, yaw = self._pose(scan, mount)
+        origin, _, yaw = self._carried(scan, mount)
         values = {"yaw_rad": states[:, YAW] - yaw, "speed_mps": states[:, SPEED]}
         values["x_m"], values["y_m"] = _rotated(states[:, :2] - origin, -yaw).T
         values.update(zip(POLAR, self._relative(scan, states).T, strict=True))
@@ -125,19 +125,18 @@ class Scanner:
         """Which of `states` lie in the field of view, shape (m,)."""
         sensor = self.sensor
         distance, bearing, _ = self._relative(scan, states).T
-        off_axis = np.abs(bearing)
-        behind_m = sensor.max_range_m if sensor.max_range_behind_m is None else sensor.max_range_behind_m
-        limit = np.where(off_axis > math.pi / 2.0, behind_m, sensor.max_range_m)
-        in_range = (distance >= sensor.min_range_m) & (distance <= limit)
-        return np.asarray(in_range & (off_axis <= sensor.field_of_view_rad / 2.0))
+        return in_view(
+            distance,
+            bearing,
+            sensor.field_of_view_rad,
+            min_range_m=sensor.min_range_m,
+            max_range_m=sensor.max_range_m,
+            max_range_behind_m=sensor.max_range_behind_m,
+        )
 
     def _relative(self, scan: IntArray, states: FloatArray) -> FloatArray:
         """Range, bearing and range rate of `states` from the sensor, shape (m, 3), with its own motion."""
-        mount, ego = self.sensor.mount, self.ego[scan]
-        origin, yaw = self._pose(scan, mount)
-        lever = origin - ego[:, :2]
-        velocity = cartesian(ego[:, [YAW, SPEED]])
-        velocity += ego[:, YAW_RATE, None] * np.stack([-lever[:, 1], lever[:, 0]], axis=1)
+        origin, velocity, yaw = self._carried(scan, self.sensor.mount)
         relative = np.concatenate(
             [
                 _rotated(states[:, :2] - origin, -yaw),
@@ -147,11 +146,12 @@ class Scanner:
         )
         return measurement_model(POLAR, CV()).predict(relative)
 
-    def _pose(self, scan: IntArray, mount: Mount) -> tuple[FloatArray, FloatArray]:
-        """Origin, shape (m, 2), and yaw, shape (m,), in the map of a frame mounted in the detection frame."""
-        ego = self.ego[scan]
-        offset = np.broadcast_to([self.detection_origin_x_m + mount.x_m, mount.y_m], (len(scan), 2))
-        return ego[:, :2] + _rotated(offset, ego[:, YAW]), ego[:, YAW] + mount.yaw_rad
+    def _carried(self, scan: IntArray, mount: Mount) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of a frame mounted in the detection frame, in the map: origin, its velocity, (m, 2), and yaw, (m,)."""
+        x, y, yaw, speed, yaw_rate = self.ego[scan, : YAW_RATE + 1].T
+        ahead_m = self.detection_origin_x_m + mount.x_m
+        x, y, vx, vy = body_point(x, y, yaw, speed, yaw_rate, ahead_m, mount.y_m)
+        return np.stack([x, y], axis=1), np.stack([vx, vy], axis=1), yaw + mount.yaw_rad
 
 
 def _rotated(vectors: FloatArray, angles_rad: FloatArray) -> FloatArray:

@@ -13,12 +13,13 @@ from fgtrack.tracking.inbox import is_number
 
 
 class EgoPose(NamedTuple):
-    """Pose of the ego reference point in the map."""
+    """Pose of the ego reference point in the map, and how it moves."""
 
     x_m: float
     y_m: float
     yaw_rad: float
     speed_mps: float
+    yaw_rate_radps: float = 0.0
 
 
 def is_finite(ego: EgoState) -> bool:
@@ -35,6 +36,7 @@ def extrapolated(ego: EgoState, stamp_ns: int) -> EgoPose:
         ego.y_m + travelled_m * math.sin(ego.yaw_rad),
         ego.yaw_rad + ego.yaw_rate_radps * dt_s,
         ego.speed_mps,
+        ego.yaw_rate_radps,
     )
 
 
@@ -129,4 +131,5 @@ def _interpolated(before: EgoState, after: EgoState, stamp_ns: int) -> EgoPose:
         before.y_m + share * (after.y_m - before.y_m),
         before.yaw_rad + share * wrap_angle(after.yaw_rad - before.yaw_rad),
         before.speed_mps + share * (after.speed_mps - before.speed_mps),
+        before.yaw_rate_radps + share * (after.yaw_rate_radps - before.yaw_rate_radps),
     )

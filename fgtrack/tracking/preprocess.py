@@ -12,7 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from fgtrack.core.geometry import circular_mean, rotation, wrap_angle
+from fgtrack.core.geometry import body_point, circular_mean, rotation, wrap_angle
 from fgtrack.core.linalg import congruence
 from fgtrack.core.types import MEASURABLE, Detection, Disposition, FloatArray, UpdateRecord
 from fgtrack.estimation.base import Measurement
@@ -127,7 +127,7 @@ class Preprocess:
         return self._candidates(located, batch, sensor, pose), records
 
     def _sensor_pose(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> SensorPose:
-        """Pose of the frame that the detections are given in."""
+        """Pose of the frame that the detections are given in, and the velocity of its origin."""
         if ego is None:
             return SensorPose()
         yaw_rad = ego.yaw_rad
@@ -135,8 +135,8 @@ class Preprocess:
         if batch.frame == "sensor":
             x_m, y_m = x_m + sensor.mount.x_m, y_m + sensor.mount.y_m
             yaw_rad += sensor.mount.yaw_rad
-        vx_mps, vy_mps = ego.speed_mps * math.cos(ego.yaw_rad), ego.speed_mps * math.sin(ego.yaw_rad)
-        return SensorPose(*_in_map(x_m, y_m, ego), yaw_rad, vx_mps, vy_mps)
+        x_m, y_m, vx_mps, vy_mps = body_point(*ego, x_m, y_m)
+        return SensorPose(float(x_m), float(y_m), yaw_rad, float(vx_mps), float(vy_mps))
 
     def _off_road(self, located: list[MapDetection], sensor: SensorModel) -> list[int]:
         """Indices of what lies outside the bounds; a yaw that was not measured becomes the map heading."""
@@ -244,7 +244,7 @@ def _in_order(names: frozenset[str]) -> tuple[str, ...]:
     return tuple(name for name in MEASURABLE if name in names)
 
 
-def _in_map(x_m: float, y_m: float, pose: SensorPose | EgoPose) -> tuple[float, float]:
+def _in_map(x_m: float, y_m: float, pose: SensorPose) -> tuple[float, float]:
     c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
     return pose.x_m + c * x_m - s * y_m, pose.y_m + s * x_m + c * y_m
 

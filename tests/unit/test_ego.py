@@ -28,12 +28,13 @@ def pose(source: EgoSource, stamp_ms: float):
 
 def test_between_two_states_the_pose_is_interpolated_the_short_way_round() -> None:
     source = trajectory()
-    source.receive(EgoState(START_NS, START_NS, 10.0, 2.0, 3.1, 20.0))
-    source.receive(EgoState(START_NS + ms(100), START_NS, 14.0, 4.0, -3.1, 40.0))
+    source.receive(EgoState(START_NS, START_NS, 10.0, 2.0, 3.1, 20.0, 0.1))
+    source.receive(EgoState(START_NS + ms(100), START_NS, 14.0, 4.0, -3.1, 40.0, 0.5))
     found = pose(source, 25.0)
     turned = 2 * math.pi - 6.2
     assert (found.x_m, found.y_m, found.speed_mps) == pytest.approx((11.0, 2.5, 25.0))
     assert found.yaw_rad == pytest.approx(3.1 + 0.25 * turned)
+    assert found.yaw_rate_radps == pytest.approx(0.2)
     assert pose(source, 100.0).x_m == 14.0
     assert pose(source, 0.0).x_m == 10.0
 
@@ -49,6 +50,7 @@ def test_beyond_its_ends_the_trajectory_goes_straight_on_for_a_limited_time(stam
     else:
         assert found.x_m == pytest.approx(x_m)
         assert found.yaw_rad == pytest.approx(0.5 if stamp_ms > 0 else 0.0)
+        assert found.yaw_rate_radps == (0.5 if stamp_ms > 0 else 0.0)
 
 
 def test_without_any_state_there_is_no_pose() -> None:

@@ -250,3 +250,13 @@ def test_a_yaw_that_the_map_gave_is_assumed_and_one_that_was_measured_is_not() -
     assert candidates(point, sensor=POINTS)[0].measurement.assumed == ()
     [merged] = candidates(known, point, sensor=both, road=StraightRoad(), merge=ConnectedMerge())
     assert merged.measurement.assumed == ("yaw_rad",)
+
+
+@pytest.mark.parametrize("frame", ["sensor", "ego"])
+def test_a_sensor_of_a_turning_ego_moves_with_its_lever_arm(frame: Frame) -> None:
+    """v + w x r, with the arm from the ego reference point to the origin of the frame."""
+    turning = EGO._replace(yaw_rate_radps=0.5)
+    [found] = candidates(Detection(range_m=10.0, bearing_rad=0.1), sensor=POLAR, frame=frame, ego=turning)
+    pose = found.measurement.pose
+    arm_m = np.array([pose.x_m, pose.y_m]) - [EGO.x_m, EGO.y_m]
+    assert (pose.vx_mps, pose.vy_mps) == pytest.approx((-0.5 * arm_m[1], 20.0 + 0.5 * arm_m[0]))

@@ -1,9 +1,13 @@
-"""What a sensor model says of its noise."""
+"""What a sensor model says of its noise, and of what it can see."""
+
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from fgtrack.models.sensors import SensorModel
+from fgtrack.core.geometry import rotation
+from fgtrack.models.sensors import Mount, SensorModel
 
 POSITION = {"x_m": 0.3, "y_m": 0.4}
 
@@ -16,3 +20,40 @@ def test_a_yaw_that_is_not_measured_is_as_uncertain_as_the_heading_of_the_map() 
     for sensor, name in ((SensorModel(std=POSITION), "yaw_rad"), (taken, "speed_mps")):
         with pytest.raises(KeyError, match=name):
             sensor.component_std(name)
+
+
+ORIGIN_M = (-1.74, 0.0)
+AHEAD = SensorModel(std=POSITION, mount=Mount(3.74, 1.0, 0.0), max_range_m=50.0, field_of_view_rad=math.pi / 2.0)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "place", "seen"),
+    [
+        (AHEAD, (51.9, 1.0), True),  # from (2, 1)
+        (AHEAD, (52.1, 1.0), False),
+        (AHEAD, (12.0, 10.9), True),
+        (AHEAD, (12.0, 11.1), False),
+        (AHEAD, (-5.0, 1.0), False),
+        (replace(AHEAD, mount=Mount(3.74, 1.0, math.pi)), (-5.0, 1.0), True),
+        (replace(AHEAD, field_of_view_rad=math.tau), (-5.0, 1.0), True),
+        (replace(AHEAD, field_of_view_rad=math.tau, max_range_behind_m=6.0), (-5.0, 1.0), False),
+        (replace(AHEAD, field_of_view_rad=math.tau, max_range_behind_m=80.0), (-68.0, 1.0), False),
+        (SensorModel(std=POSITION), (-5e6, 1.0), True),
+    ],
+)
+def test_a_sensor_sees_what_is_in_range_and_in_its_field_of_view(
+    sensor: SensorModel, place: tuple[float, float], seen: bool
+) -> None:
+    """Wherever the ego is and heads, and for any number of places."""
+    poses = np.array([[0.0, 0.0, 0.0], [100.0, -40.0, 2.5], [-7.0, 3.0, -3.0]])
+    places = np.array([pose[:2] + rotation(pose[2]) @ place for pose in poses])
+    assert sensor.sees(places, poses, ORIGIN_M).tolist() == [seen] * 3
+    assert bool(sensor.sees(places[1], poses[1], ORIGIN_M)) is seen
+
+
+@pytest.mark.parametrize(
+    "setting", [{"field_of_view_rad": 0.0}, {"field_of_view_rad": 7.0}, {"max_range_behind_m": 0.0}]
+)
+def test_a_field_of_view_must_make_sense(setting: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(setting))):
+        SensorModel(std=POSITION, **setting)

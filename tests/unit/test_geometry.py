@@ -1,0 +1,39 @@
+"""A point that is fixed to a moving body."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fgtrack.core.geometry import body_point
+
+metres = st.floats(-10.0, 10.0)
+
+
+@given(yaw=st.floats(-3.1, 3.1), speed=st.floats(-30.0, 60.0), rate=st.floats(-1.0, 1.0), ahead=metres, left=metres)
+def test_its_velocity_is_the_derivative_of_its_position(
+    yaw: float, speed: float, rate: float, ahead: float, left: float
+) -> None:
+    def place(dt_s: float) -> np.ndarray:
+        """Of a body that moves on its arc for a moment."""
+        middle = yaw + 0.5 * rate * dt_s
+        moved = 5.0 + speed * dt_s * math.cos(middle), -2.0 + speed * dt_s * math.sin(middle)
+        return np.array(body_point(*moved, yaw + rate * dt_s, speed, rate, ahead, left)[:2])
+
+    step_s = 1e-5
+    found = body_point(5.0, -2.0, yaw, speed, rate, ahead, left)[2:]
+    assert found == pytest.approx((place(step_s) - place(-step_s)) / (2.0 * step_s), abs=1e-6)
+
+
+def test_a_standing_body_that_turns_carries_it_round_a_circle() -> None:
+    x_m, y_m, vx_mps, vy_mps = body_point(1.0, 2.0, math.pi / 2.0, 0.0, 0.5, 3.0, 1.0)
+    assert (x_m, y_m) == pytest.approx((0.0, 5.0))
+    assert (vx_mps, vy_mps) == pytest.approx((-1.5, -0.5))
+
+
+def test_arrays_give_what_single_numbers_give() -> None:
+    bodies = np.random.default_rng(0).normal(size=(7, 5))
+    found = np.stack(body_point(*bodies.T, 2.0, -1.0), axis=1)
+    np.testing.assert_allclose(found, [body_point(*body.tolist(), 2.0, -1.0) for body in bodies], rtol=1e-15)
