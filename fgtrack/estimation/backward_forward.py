@@ -201,7 +201,8 @@ class BackwardForwardBank:
         model, pose, measured = measurements[0].model, measurements[0].pose, measurements[0].measured
         residual = partial(self._propagator.residual, model)
         try:
-            corrected = correct(means, covariances, z, R, model, pose, residual, measured)
+            losses = [measurement.loss for measurement in measurements]
+            corrected = correct(means, covariances, z, R, model, pose, residual, measured, losses)
         except np.linalg.LinAlgError:
             return self._update_one_by_one(track_ids, means, covariances, measurements, back)
         wrapped = self._propagator.wrap(corrected.mean)

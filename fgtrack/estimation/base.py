@@ -30,7 +30,7 @@ class Measurement:
     """Covariance, shape (k, k)."""
     pose: SensorPose = _AT_ORIGIN
     loss: RobustLoss | None = None
-    """Robust loss, for smoothers."""
+    """Robust loss; None is the Gaussian."""
     assumed: tuple[str, ...] = ()
     """Components that are prior knowledge, as a heading from the map: fused like the others, but not measured."""
 

@@ -1,5 +1,6 @@
 """The extended Kalman filter's two steps, on stacks of independent states and on one state."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -10,6 +11,11 @@ from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.measurement import MeasurementModel, SensorPose
 from fgtrack.models.motion import MotionModel
+from fgtrack.models.robust import weight
+from fgtrack.models.sensors import RobustLoss
+
+_MAX_REWEIGHTINGS = 50
+_REWEIGHTING_TOLERANCE = 1e-9
 
 
 def propagated(F: FloatArray, P: FloatArray, Q: FloatArray) -> FloatArray:
@@ -54,6 +60,26 @@ def linearised(
     return y, model.selection(x.shape[-1]) if model.linear else model.jacobian(x, pose)
 
 
+def robust_weight(loss: RobustLoss | None, y: FloatArray, spread: FloatArray, R: FloatArray) -> float:
+    """Weight w of an innovation y (k,) with covariance `spread` + R, both (k, k), under a robust loss.
+
+    At w the correction with R / w minimises prior plus loss of the residual r that is left of y: r = R / w S^-1 y with
+    S = `spread` + R / w, and w is the loss's weight at sqrt(r' R^-1 r). Reweighting from w = 1 on never lets w grow, so
+    it ends at the largest such weight: the minimum that is reached from the estimate without a loss. 1 without a
+    `loss`. Raises `numpy.linalg.LinAlgError` for a singular S.
+    """
+    w = 1.0
+    if loss is None:
+        return w
+    for _ in range(_MAX_REWEIGHTINGS):
+        solved = psd_solve(spread + R / w, y)
+        new = weight(loss, math.sqrt(max(float(solved.dot(R.dot(solved))), 0.0)) / w)
+        if not new < w * (1.0 - _REWEIGHTING_TOLERANCE):
+            break
+        w = new
+    return w
+
+
 class Correction(NamedTuple):
     """Result of `correct` for m independent states."""
 
@@ -87,14 +113,21 @@ def correct(
     pose: SensorPose,
     residual: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
     measured: Sequence[int] | None = None,
+    losses: Sequence[RobustLoss | None] = (),
 ) -> Correction:
     """Fuse z (m, k) with covariance R (m, k, k) into m states (Karle et al. 2023, eqs. 5 to 9).
 
-    `residual` may take the place of the model's own; `measured` is `Measurement.measured`, for the NIS. The
-    posterior covariance is in Joseph form. Raises `numpy.linalg.LinAlgError` for a singular S.
+    `residual` may take the place of the model's own; `measured` is `Measurement.measured`, for the NIS; `losses`, none
+    or m of them, are those of the measurements (see `robust_weight`). The posterior covariance is in Joseph form.
+    Raises `numpy.linalg.LinAlgError` for a singular S.
     """
     y, H = linearised(z, mean, model, pose, residual)
-    return correct_with_innovation(mean, covariance, y, R, H, measured)
+    found = correct_with_innovation(mean, covariance, y, R, H, measured)
+    if not any(losses):
+        return found
+    parts = zip(losses, y, congruence(H, covariance), R, strict=True)
+    w = np.array([robust_weight(*part) for part in parts])
+    return correct_with_innovation(mean, covariance, y, R / w[:, None, None], H)._replace(nis=found.nis)
 
 
 def correct_with_innovation(
@@ -123,6 +156,8 @@ class OneCorrection(NamedTuple):
     """Shape (k,)."""
     nis: float
     """Normalised innovation squared."""
+    weight: float = 1.0
+    """What the measurement counted under its loss; 1 for all of it."""
 
 
 class Prediction(NamedTuple):
@@ -153,8 +188,14 @@ def predict_across(mean: FloatArray, covariance: FloatArray, motion: MotionModel
 def correct_one(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
     """`correct` of one state, shapes (n,) and (n, n), without the price of a stack."""
     y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
-    K, S = kalman_gain(covariance, H, measurement.R)
-    return OneCorrection(mean + K.dot(y), joseph(covariance, K, H, measurement.R), y, measurement.nis(y, S))
+    R, w = measurement.R, 1.0
+    K, S = kalman_gain(covariance, H, R)
+    nis = measurement.nis(y, S)
+    if measurement.loss is not None:
+        w = robust_weight(measurement.loss, y, congruence(H, covariance), R)
+        R = R / w
+        K, _ = kalman_gain(covariance, H, R)
+    return OneCorrection(mean + K.dot(y), joseph(covariance, K, H, R), y, nis, w)
 
 
 def innovation_one(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> tuple[FloatArray, float]:

@@ -23,7 +23,7 @@ class Mount:
 
 @dataclass(frozen=True)
 class RobustLoss:
-    """A loss that grows slower than the square, so that an outlier pulls less; smoothers use it."""
+    """A loss that grows slower than the square, so that an outlier pulls less."""
 
     kind: Literal["huber", "cauchy", "tukey", "geman_mcclure", "dcs"]
     """`tukey`, `geman_mcclure` and `dcs` are redescending: they can lose a track for good."""
@@ -64,7 +64,8 @@ class SensorModel:
     births: bool = True
     """Whether an unmatched detection of this sensor starts a track."""
     loss: RobustLoss | None = None
-    """Robust loss of its measurement factors; null is the Gaussian. A filter has no use for it."""
+    """Robust loss of its measurements; null is the Gaussian. A smoother weighs them anew while they are in its
+    window, a filter once, at the state that the update gives."""
     mount: Mount = field(default_factory=Mount)
 
     def __post_init__(self) -> None:

@@ -13,10 +13,11 @@ from support.models import MOTIONS
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherSettings
-from fgtrack.estimation.factor_graph.factors import measurement_factor, motion_factor, prior_factor, weight
+from fgtrack.estimation.factor_graph.factors import measurement_factor, motion_factor, prior_factor
 from fgtrack.estimation.factor_graph.terms import EquivalentMeasurement, MeasurementTerm, curved
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
+from fgtrack.models.robust import penalty, weight
 from fgtrack.models.sensors import RobustLoss
 
 LEFT, RIGHT = 3, 7
@@ -169,7 +170,8 @@ def test_a_robust_loss_is_its_formula(kind: str, width: float, off: float) -> No
     factor = measurement_factor(LEFT, item, x)
     loss, expected_weight = loss_and_weight(kind, width, off)
     assert factor.error(values(left=x)) == pytest.approx(loss, rel=1e-9)
-    assert weight(RobustLoss(kind, width), off) == pytest.approx(expected_weight, rel=1e-9, abs=1e-12)
+    assert penalty(RobustLoss(kind, width), off) == pytest.approx(loss, rel=1e-12)
+    assert weight(RobustLoss(kind, width), off) == pytest.approx(expected_weight, rel=1e-12, abs=1e-12)
     step = 1e-6
     slope = (loss_and_weight(kind, width, off + step)[0] - loss_and_weight(kind, width, off - step)[0]) / (2 * step)
     assert slope == pytest.approx(expected_weight * off, rel=1e-5, abs=1e-6)

@@ -12,7 +12,6 @@ from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.factor_graph.terms import EquivalentMeasurement, Linearised, MeasurementTerm, linearised
 from fgtrack.models.motion import MotionModel
-from fgtrack.models.sensors import RobustLoss
 
 _Loss = mEstimator.Huber | mEstimator.Cauchy | mEstimator.Tukey | mEstimator.GemanMcClure | mEstimator.DCS
 
@@ -86,11 +85,6 @@ def _callback_factor(key: int, measurement: Measurement) -> gtsam.NonlinearFacto
     if loss is not None:
         noise = gtsam.noiseModel.Robust.Create(_LOSSES[loss.kind](loss.width), noise)
     return gtsam.CustomFactor(noise, [key], error)
-
-
-def weight(loss: RobustLoss, distance: float) -> float:
-    """What a measurement counts under `loss`, 1 for all of it, at a whitened residual of length `distance`."""
-    return _LOSSES[loss.kind](loss.width).weight(distance)
 
 
 def _gaussian(covariance: FloatArray) -> gtsam.noiseModel.Base:

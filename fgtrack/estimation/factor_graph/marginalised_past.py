@@ -12,13 +12,10 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.ekf import joseph, kalman_gain, propagated
-from fgtrack.estimation.factor_graph.factors import weight
 from fgtrack.estimation.factor_graph.terms import EquivalentMeasurement, Linearised, MeasurementTerm, linearised
 from fgtrack.estimation.interpolation import between
 from fgtrack.models.motion import MotionModel
-
-#: An outlier that a loss ignores altogether still has a finite covariance.
-_LEAST_WEIGHT = 1e-12
+from fgtrack.models.robust import weight
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,4 +149,4 @@ def _weighed(term: MeasurementTerm, x: FloatArray) -> Linearised:
     if isinstance(term, EquivalentMeasurement) or term.loss is None:
         return Linearised(y, H, R)
     distance = math.sqrt(mahalanobis_squared(y, R))
-    return Linearised(y, H, R / max(weight(term.loss, distance), _LEAST_WEIGHT))
+    return Linearised(y, H, R / weight(term.loss, distance))

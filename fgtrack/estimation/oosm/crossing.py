@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.linalg import psd_solve, symmetrise
+from fgtrack.core.linalg import congruence, psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.ekf import OneCorrection, linearised, propagated
+from fgtrack.estimation.ekf import OneCorrection, linearised, propagated, robust_weight
 from fgtrack.estimation.oosm.history import require_finite
 
 
@@ -26,14 +26,18 @@ def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measuremen
     """The state x, `mean` (m,) and `covariance` (m, m), after a measurement of the state `past`.
 
     S = H P_tau H' + R, x+ = x + C H' S^-1 (z - h(x_tau)), P+ = P - C H' S^-1 H C' with C = Cov(x, x_tau) (Bar-Shalom
-    2002, see `A1`). Raises `numpy.linalg.LinAlgError` where S is not
-    positive definite or the result is not finite.
+    2002, see `A1`), with the weight that a robust loss gives R (see `robust_weight`). Raises
+    `numpy.linalg.LinAlgError` where S is not positive definite or the result is not finite.
     """
     y, H = linearised(measurement.z, past.mean, measurement.model, measurement.pose)
     S = propagated(H, past.covariance, measurement.R)
     np.linalg.cholesky(S)  # raises where S is not positive definite
+    nis = measurement.nis(y, S)
+    w = robust_weight(measurement.loss, y, congruence(H, past.covariance), measurement.R)
+    if w < 1.0:
+        S = propagated(H, past.covariance, measurement.R / w)
     across = past.cross @ H.T
     gain = psd_solve(S, across.T).T
-    result = OneCorrection(mean + gain @ y, symmetrise(covariance - gain @ across.T), y, measurement.nis(y, S))
+    result = OneCorrection(mean + gain @ y, symmetrise(covariance - gain @ across.T), y, nis, w)
     require_finite(result)
     return result

@@ -97,7 +97,7 @@ class History:
         mean, covariance = self.predicted(place, measurement.stamp_ns)
         result = corrected(mean, covariance, measurement)
         y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
-        weighted = psd_solve(propagated(H, covariance, measurement.R), np.column_stack((y, H)))
+        weighted = psd_solve(propagated(H, covariance, measurement.R / result.weight), np.column_stack((y, H)))
         score, weight = H.T @ weighted[:, 0], symmetrise(H.T @ weighted[:, 1:])
         return (
             FilterStep(measurement.stamp_ns, result.mean, result.covariance, mean, covariance, score, weight),

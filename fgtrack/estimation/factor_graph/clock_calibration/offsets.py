@@ -32,9 +32,10 @@ from fgtrack.estimation.factor_graph.clock_calibration.time_shift import (
     pair_term,
     rates,
 )
-from fgtrack.estimation.factor_graph.factors import motion_factor, prior_factor, weight
+from fgtrack.estimation.factor_graph.factors import motion_factor, prior_factor
 from fgtrack.estimation.factor_graph.initiation import along, fix_of, straight_line
 from fgtrack.models.motion import MotionModel
+from fgtrack.models.robust import weight
 from fgtrack.models.sensors import RobustLoss
 
 #: Standard deviations of the first state of an object of which nothing is known.

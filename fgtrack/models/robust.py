@@ -1,0 +1,64 @@
+"""What a measurement counts under a robust loss: the M-estimators' weights of iteratively reweighted least squares.
+
+The weight at a whitened residual of length d is rho'(d) / d of the loss rho, which begins as d^2 / 2; c is the width.
+Names and forms are those of GTSAM's `noiseModel.mEstimator`. All weights begin at 1 and never grow with d, so each
+reweighting lowers prior plus loss (Huber and Ronchetti, Robust Statistics, 2009, section 7.8).
+"""
+
+import math
+from collections.abc import Callable, Mapping
+
+from fgtrack.models.sensors import RobustLoss
+
+#: An outlier that a loss ignores altogether still has a finite covariance.
+LEAST_WEIGHT = 1e-12
+
+
+def _huber(d: float, c: float) -> tuple[float, float]:
+    return (0.5 * d * d, 1.0) if d <= c else (c * (d - 0.5 * c), c / d)
+
+
+def _cauchy(d: float, c: float) -> tuple[float, float]:
+    return 0.5 * c * c * math.log1p((d / c) ** 2), c * c / (c * c + d * d)
+
+
+def _tukey(d: float, c: float) -> tuple[float, float]:
+    left = max(1.0 - (d / c) ** 2, 0.0)
+    return c * c / 6.0 * (1.0 - left**3), left**2
+
+
+def _geman_mcclure(d: float, c: float) -> tuple[float, float]:
+    left = c * c / (c * c + d * d)
+    return 0.5 * d * d * left, left**2
+
+
+def _dcs(d: float, c: float) -> tuple[float, float]:
+    """Dynamic covariance scaling (Agarwal et al. 2013), whose square ends at c."""
+    if d <= c:
+        return 0.5 * d * d, 1.0
+    left = 2.0 * c * c / (c * c + d * d)
+    return c * c * (1.5 - left), left**2
+
+
+_LOSSES: Mapping[str, Callable[[float, float], tuple[float, float]]] = {
+    "huber": _huber,
+    "cauchy": _cauchy,
+    "tukey": _tukey,
+    "geman_mcclure": _geman_mcclure,
+    "dcs": _dcs,
+}
+
+
+def weight(loss: RobustLoss, distance: float) -> float:
+    """What a measurement counts under `loss`, 1 for all of it, at a whitened residual of length `distance`.
+
+    Never less than `LEAST_WEIGHT`, which stands for a distance without bounds, too.
+    """
+    if not math.isfinite(distance):
+        return LEAST_WEIGHT
+    return max(_LOSSES[loss.kind](distance, loss.width)[1], LEAST_WEIGHT)
+
+
+def penalty(loss: RobustLoss | None, distance: float) -> float:
+    """The loss rho itself; without a `loss` the square, d^2 / 2."""
+    return 0.5 * distance * distance if loss is None else _LOSSES[loss.kind](distance, loss.width)[0]

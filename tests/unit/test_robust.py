@@ -1,0 +1,139 @@
+"""Robust losses outside the graph: the weights, and the filters that use them."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.noiseModel import mEstimator
+from scipy.optimize import minimize
+
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import Estimator, Measurement, Start
+from fgtrack.estimation.ekf import correct, correct_one, robust_weight
+from fgtrack.estimation.registry import ESTIMATORS, Claims, estimator
+from fgtrack.models.measurement import measurement_model
+from fgtrack.models.motion import CV
+from fgtrack.models.robust import LEAST_WEIGHT, penalty, weight
+from fgtrack.models.sensors import RobustLoss
+from fgtrack.testing.streams import LINEAR, MS, START, measured
+
+KINDS = ("huber", "cauchy", "tukey", "geman_mcclure", "dcs")
+OF_GTSAM: dict[str, Callable[[float], gtsam.noiseModel.mEstimator.Base]] = {
+    "huber": mEstimator.Huber.Create,
+    "cauchy": mEstimator.Cauchy.Create,
+    "tukey": mEstimator.Tukey.Create,
+    "geman_mcclure": mEstimator.GemanMcClure.Create,
+    "dcs": lambda width: mEstimator.DCS.Create(width * width),
+}
+MOTION = CV()
+POSITION = measurement_model(("x_m", "y_m"), MOTION)
+MEAN = np.array([1.0, -2.0, 3.0, 0.5])
+P = np.array([[0.5, 0.1, 0.2, 0.0], [0.1, 0.4, 0.0, 0.1], [0.2, 0.0, 2.0, 0.3], [0.0, 0.1, 0.3, 1.5]])
+R = np.array([[0.3, 0.1], [0.1, 0.2]])
+
+
+def seen(off: float, loss: RobustLoss | None) -> Measurement:
+    return Measurement(0, POSITION, MEAN[:2] + off * np.array([1.0, -0.7]), R, loss=loss)
+
+
+@pytest.mark.parametrize("width", [0.5, 1.5, 4.7])
+@pytest.mark.parametrize("kind", KINDS)
+def test_weights_and_losses_are_those_of_the_graph(kind: str, width: float) -> None:
+    loss, other = RobustLoss(kind, width), OF_GTSAM[kind](width)
+    for d in np.linspace(0.0, 20.0, 201).tolist():
+        assert weight(loss, d) == pytest.approx(max(other.weight(d), LEAST_WEIGHT), rel=1e-12, abs=1e-12)
+        assert penalty(loss, d) == pytest.approx(other.loss(d), rel=1e-12, abs=1e-12)
+    assert penalty(None, 3.0) == 4.5
+    assert weight(loss, float("inf")) == LEAST_WEIGHT
+
+
+def objective(x: FloatArray, measurement: Measurement) -> float:
+    r = measurement.z - x[:2]
+    distance = float(np.sqrt(r @ np.linalg.solve(R, r)))
+    return float(0.5 * (x - MEAN) @ np.linalg.solve(P, x - MEAN) + penalty(measurement.loss, distance))
+
+
+@pytest.mark.parametrize("off", [0.3, 1.5, 3.0, 8.0])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_update_is_a_minimum_of_prior_plus_loss(kind: str, off: float) -> None:
+    measurement = seen(off, RobustLoss(kind, 1.5))
+    found = correct_one(MEAN, P, measurement)
+    best = minimize(objective, found.mean, args=(measurement,), method="BFGS", options={"gtol": 1e-9})
+    np.testing.assert_allclose(found.mean, best.x, atol=1e-5)
+    assert objective(found.mean, measurement) <= objective(correct_one(MEAN, P, seen(off, None)).mean, measurement)
+    information = np.linalg.inv(P)
+    information[:2, :2] += found.weight * np.linalg.inv(R)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(information), rtol=1e-9, atol=1e-12)
+
+
+def test_an_inlier_counts_in_full_and_the_nis_is_that_without_a_loss() -> None:
+    inlier = correct_one(MEAN, P, seen(0.2, RobustLoss("huber", 1.5)))
+    plain = correct_one(MEAN, P, seen(0.2, None))
+    assert inlier.weight == 1.0
+    np.testing.assert_array_equal(inlier.mean, plain.mean)
+    far, plain = correct_one(MEAN, P, seen(9.0, RobustLoss("cauchy", 1.5))), correct_one(MEAN, P, seen(9.0, None))
+    assert far.weight < 0.1
+    assert far.nis == plain.nis
+
+
+def test_a_redescending_loss_ignores_what_is_hopeless() -> None:
+    found = correct_one(MEAN, P, seen(1e4, RobustLoss("tukey", 4.7)))
+    assert found.weight == LEAST_WEIGHT
+    np.testing.assert_allclose(found.mean, MEAN, atol=1e-6)
+    np.testing.assert_allclose(found.covariance, P, rtol=1e-6, atol=1e-9)
+
+
+def test_a_stack_of_states_is_weighted_one_by_one() -> None:
+    items = [seen(0.2, RobustLoss("huber", 1.0)), seen(6.0, RobustLoss("huber", 1.0)), seen(6.0, None)]
+    stacked = correct(
+        np.array([MEAN] * 3),
+        np.array([P] * 3),
+        np.array([item.z for item in items]),
+        np.array([item.R for item in items]),
+        POSITION,
+        items[0].pose,
+        losses=[item.loss for item in items],
+    )
+    for row, item in enumerate(items):
+        one = correct_one(MEAN, P, item)
+        np.testing.assert_allclose(stacked.mean[row], one.mean, rtol=1e-12)
+        np.testing.assert_allclose(stacked.covariance[row], one.covariance, rtol=1e-12)
+        assert stacked.nis[row] == pytest.approx(one.nis, rel=1e-12)
+
+
+def test_the_weight_is_a_fixed_point() -> None:
+    loss, y, spread = RobustLoss("huber", 1.5), np.array([4.0, -3.0]), P[:2, :2]
+    w = robust_weight(loss, y, spread, R)
+    rest = R / w @ np.linalg.solve(spread + R / w, y)
+    assert w == pytest.approx(weight(loss, float(np.sqrt(rest @ np.linalg.solve(R, rest)))), rel=1e-8)
+
+
+def fed(name: str, loss: RobustLoss | None) -> Estimator:
+    """Forty positions in sequence, then some late ones; each tenth is 8 m off."""
+    rng, found = np.random.default_rng(5), estimator(name, LINEAR, replace(START, speed_mps=20.0), lag_s=3.0)
+    order = [*range(1, 31), *range(33, 41), 31, 32]
+    for k in order:
+        item = measured(rng, LINEAR, k * 50 * MS)
+        off = 8.0 if k % 10 == 9 or k == 32 else 0.0
+        found.update(replace(item, z=item.z + off, loss=loss))
+    return found
+
+
+FILTERS = [name for name in ESTIMATORS if not Claims.of(ESTIMATORS.load(name)).held_s]
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_every_estimator_is_pulled_less_by_outliers_with_a_loss(name: str) -> None:
+    at_ns = START.stamp_ns + 40 * 50 * MS
+    truth = np.array([3.0, -2.0]) + 40.0 * np.array([np.cos(0.4), np.sin(0.4)])
+    plain, robust = (fed(name, loss).state_at(at_ns).mean[:2] for loss in (None, RobustLoss("huber", 1.0)))
+    assert np.linalg.norm(robust - truth) < 0.6 * np.linalg.norm(plain - truth)
+
+
+def test_a_start_is_enough() -> None:
+    found = estimator("ekf-replay", MOTION, Start())
+    for k in range(1, 5):
+        found.update(replace(seen(0.1, RobustLoss("cauchy", 1.0)), stamp_ns=k * 10**8))
+    assert np.isfinite(found.state_at(4 * 10**8).mean).all()
