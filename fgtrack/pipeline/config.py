@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, PositiveFloat, PositiveInt
 
-from fgtrack.estimation.factor_graph.settings import SmootherSettings
 from fgtrack.estimation.registry import ESTIMATORS, motion_model
+from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.io.config import InputConfig
 from fgtrack.io.run import EvaluationConfig
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel

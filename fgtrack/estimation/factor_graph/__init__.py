@@ -6,8 +6,8 @@ detection splits the motion factor that it falls into; nodes that leave the wind
 
 from fgtrack.estimation.factor_graph.backends.batch import BatchBackend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
-from fgtrack.estimation.factor_graph.settings import SmootherSettings
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
 from fgtrack.estimation.factor_graph.smoother_bank import SmootherBank
+from fgtrack.estimation.smoother_settings import SmootherSettings
 
 __all__ = ["BatchBackend", "FixedLagSmoother", "IncrementalBackend", "SmootherBank", "SmootherSettings"]

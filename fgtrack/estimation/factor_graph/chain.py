@@ -5,7 +5,7 @@ from collections.abc import Container
 from dataclasses import dataclass, field
 
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.factor_graph.terms import MeasurementTerm
+from fgtrack.estimation.terms import MeasurementTerm
 
 
 @dataclass(slots=True)

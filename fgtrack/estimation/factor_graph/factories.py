@@ -7,8 +7,8 @@ from typing import Any
 from fgtrack.core.errors import CallError
 from fgtrack.estimation.base import Start
 from fgtrack.estimation.factor_graph.backends.batch import BatchBackend
-from fgtrack.estimation.factor_graph.settings import SmootherSettings
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
+from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
 
 _OPTIONS = tuple(field.name for field in fields(SmootherSettings) if field.name != "lag_s")

@@ -10,7 +10,7 @@ from scipy.linalg.lapack import dpotrf, dtrtri
 from fgtrack.core.linalg import identity
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.factor_graph.terms import EquivalentMeasurement, Linearised, MeasurementTerm, linearised
+from fgtrack.estimation.terms import EquivalentMeasurement, Linearised, MeasurementTerm, linearised
 from fgtrack.models.motion import MotionModel
 
 _Loss = mEstimator.Huber | mEstimator.Cauchy | mEstimator.Tukey | mEstimator.GemanMcClure | mEstimator.DCS

@@ -12,8 +12,8 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.ekf import joseph, kalman_gain, propagated
-from fgtrack.estimation.factor_graph.terms import EquivalentMeasurement, Linearised, MeasurementTerm, linearised
 from fgtrack.estimation.interpolation import between
+from fgtrack.estimation.terms import EquivalentMeasurement, Linearised, MeasurementTerm, linearised
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import weight
 

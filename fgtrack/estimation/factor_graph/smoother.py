@@ -15,9 +15,9 @@ from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
 from fgtrack.estimation.factor_graph.initiation import straight_line
 from fgtrack.estimation.factor_graph.marginalised_past import Prior
-from fgtrack.estimation.factor_graph.settings import SmootherSettings
-from fgtrack.estimation.factor_graph.terms import linearised
 from fgtrack.estimation.factor_graph.window import Window
+from fgtrack.estimation.smoother_settings import SmootherSettings
+from fgtrack.estimation.terms import linearised
 from fgtrack.models.motion import MotionModel
 
 _DEFAULT = SmootherSettings()

@@ -10,10 +10,10 @@ from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Start, StatesAt
 from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
-from fgtrack.estimation.factor_graph.settings import SmootherSettings
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.propagation import wrapped_yaw
+from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
 
 

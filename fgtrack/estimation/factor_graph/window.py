@@ -16,9 +16,9 @@ from fgtrack.estimation.factor_graph.chain import Chain, Node
 from fgtrack.estimation.factor_graph.factors import measurement_factor, motion_factor, prior_factor
 from fgtrack.estimation.factor_graph.initiation import Fix, Line, along, fix_of
 from fgtrack.estimation.factor_graph.marginalised_past import MarginalisedPast, Prior
-from fgtrack.estimation.factor_graph.settings import SmootherSettings
-from fgtrack.estimation.factor_graph.terms import MeasurementTerm, curved
 from fgtrack.estimation.interpolation import between
+from fgtrack.estimation.smoother_settings import SmootherSettings
+from fgtrack.estimation.terms import MeasurementTerm, curved
 from fgtrack.models.motion import MotionModel
 
 #: A step of a state, in m, rad, m/s or rad/s, that is rounding.

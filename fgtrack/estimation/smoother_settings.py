@@ -1,4 +1,4 @@
-"""Settings of the smoother."""
+"""Settings of the fixed-lag smoothers."""
 
 import math
 from collections.abc import Mapping
