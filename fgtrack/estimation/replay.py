@@ -12,6 +12,8 @@ from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import OneCorrection, Prediction
+from fgtrack.estimation.initiation import checked_initiation
+from fgtrack.estimation.opening import Opening
 from fgtrack.estimation.recursion import EkfRecursion, Recursion
 from fgtrack.estimation.rts import smoothed_one
 from fgtrack.estimation.windowed import WindowedFilter
@@ -32,6 +34,13 @@ class _Stored:
     covariance: FloatArray
     predicted: Prediction
     """The state before it, predicted from the step before."""
+    opening: Opening | None = None
+    """What had been measured up to here, where the direction of travel was sought."""
+
+    @property
+    def along(self) -> bool:
+        """Whether the state comes from all that had been measured, along a line, and not from the step before."""
+        return self.opening is not None and self.opening.line is not None
 
 
 class ReplayingFilter(WindowedFilter):
@@ -45,13 +54,18 @@ class ReplayingFilter(WindowedFilter):
         See `WindowedFilter`.
     recursion
         How one state is predicted and corrected.
+    initiation
+        How the direction of travel is found where `prior` gives none, see `Initiation`.
     """
 
     exact = "any lag, any number"
 
-    def __init__(self, motion: MotionModel, prior: Start, lag_s: float, recursion: Recursion) -> None:
+    def __init__(
+        self, motion: MotionModel, prior: Start, lag_s: float, recursion: Recursion, initiation: str = "regression"
+    ) -> None:
         super().__init__(motion, prior, lag_s)
         self._recursion = recursion
+        self._initiation = checked_initiation(initiation)
         self._steps = [self._first(prior)]
 
     def state_at(self, stamp_ns: int) -> TrackState:
@@ -63,7 +77,8 @@ class ReplayingFilter(WindowedFilter):
     def _first(self, prior: Start) -> _Stored:
         """The state that everything is replayed from."""
         mean, covariance = initial_state(self._motion, prior)
-        return _Stored((prior.stamp_ns, (), ()), None, mean, covariance, Prediction(mean, covariance, covariance))
+        opening, predicted = Opening.of(self._motion, prior, self._initiation), Prediction(mean, covariance, covariance)
+        return _Stored((prior.stamp_ns, (), ()), None, mean, covariance, predicted, opening)
 
     def _forget_before(self, stamp_ns: int) -> None:
         del self._steps[: max(bisect.bisect_right(self._steps, stamp_ns, key=_stamp) - 1, 0)]
@@ -85,7 +100,8 @@ class ReplayingFilter(WindowedFilter):
         From the newest step back (see `smoothed_one`), each as it was when the measurement of `step` was unknown.
         """
         mean, covariance = later[-1].mean, later[-1].covariance
-        for place in range(len(later) - 1, -1, -1):
+        first = max((place for place, each in enumerate(later) if each.along), default=-1)
+        for place in range(len(later) - 1, first, -1):
             before, after = later[place - 1] if place else step, later[place]
             if before.order[0] == after.order[0]:
                 continue  # the same state
@@ -96,7 +112,8 @@ class ReplayingFilter(WindowedFilter):
                 predicted = predicted._replace(cross=on.cross)
             shift = self._wrapped(mean - predicted.mean)
             mean, covariance, _ = smoothed_one(x, P, predicted, shift, covariance)
-        return mean, covariance
+        opening = None if first < 0 else later[first].opening
+        return (mean, covariance) if opening is None else opening.retrodicted(step.order[0], mean, covariance)
 
     def _replayed(self, step: _Stored, later: Iterable[_Stored]) -> list[_Stored]:
         """The measurements of `later` steps, in their order, applied to `step`."""
@@ -112,9 +129,13 @@ class ReplayingFilter(WindowedFilter):
         predicted = self._predicted(before, measurement.stamp_ns)
         corrected = self._recursion.correct(predicted.mean, predicted.covariance, measurement)
         mean, covariance = corrected.mean, corrected.covariance
+        opening = None if before.opening is None else before.opening.with_measurement(measurement)
+        if opening is not None and opening.line is not None:
+            mean, covariance = opening.state()
+            corrected = corrected._replace(mean=mean, covariance=covariance)
         if not math.isfinite(mean.dot(mean) + np.vdot(covariance, covariance)):  # one number instead of a mask
             raise np.linalg.LinAlgError("posterior is not finite")
-        return _Stored(order, measurement, self._wrapped(mean), covariance, predicted), corrected
+        return _Stored(order, measurement, self._wrapped(mean), covariance, predicted, opening), corrected
 
     def _predicted(self, before: _Stored, stamp_ns: int) -> Prediction:
         """The state at `stamp_ns`, from the step before it."""
@@ -132,10 +153,12 @@ class ReplayEkf(ReplayingFilter):
     ----------
     motion, prior, lag_s
         See `WindowedFilter`.
+    initiation
+        See `ReplayingFilter`.
     """
 
-    def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
-        super().__init__(motion, prior, lag_s, EkfRecursion(motion))
+    def __init__(self, motion: MotionModel, prior: Start, lag_s: float, initiation: str = "regression") -> None:
+        super().__init__(motion, prior, lag_s, EkfRecursion(motion), initiation)
 
 
 def _order(step: _Stored) -> _Order:

@@ -6,8 +6,8 @@ import pytest
 from fgtrack.core.geometry import rotation
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
-from fgtrack.estimation.factor_graph.initiation import Fix, Line, straight_line
 from fgtrack.estimation.factor_graph.window import Window
+from fgtrack.estimation.initiation import Fix, Line, over, straight_line
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import RobustLoss
 
@@ -64,8 +64,8 @@ def test_a_certain_direction_is_not_sought_again(monkeypatch: pytest.MonkeyPatch
     restart = Window.restart
     monkeypatch.setattr(Window, "restart", lambda self, line: (restarts.append(line), restart(self, line)))
     fused(1.0, 20)
-    assert restarts[-1].certain
-    assert not any(line.certain for line in restarts[:-1])
+    assert restarts[-1].certainty > 3.0
+    assert not any(line.certainty > 3.0 for line in restarts[:-1])
     assert 1 < len(restarts) < 20
     restarts.clear()
     standing = FixedLagSmoother(CTRV(), start(), SmootherSettings(lag_s=0.1, lagged_s=()))
@@ -88,7 +88,9 @@ def test_two_positions_give_their_difference_over_their_time() -> None:
         straight_line([Fix(1.0, np.zeros(2), R), Fix(1.0, np.ones(2), R)])
 
 
-def test_a_direction_is_certain_from_three_standard_deviations_of_the_velocity_on() -> None:
-    for std, certain in ((2.9, False), (3.1, True)):
-        velocity = np.array([0.0, std * 2.0])
-        assert Line(np.zeros(2), velocity, np.diag([1.0, 4.0])).certain is certain
+def test_certainty_counts_standard_deviations_of_the_velocity() -> None:
+    assert Line(np.zeros(2), np.array([0.0, 5.8]), np.diag([1.0, 4.0])).certainty == pytest.approx(2.9)
+    line = Line(np.zeros(2), np.array([0.0, 6.2]), np.diag([1.0, 4.0]))
+    assert over(line, "regression", 3.0)
+    assert not over(line, "regression", 3.2)
+    assert over(line, "two-point", 3.2)

@@ -11,18 +11,22 @@ from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
 
-_OPTIONS = tuple(field.name for field in fields(SmootherSettings) if field.name != "lag_s")
+_OPTIONS = ("initiation", *(field.name for field in fields(SmootherSettings) if field.name != "lag_s"))
 
 
 # Any: an option may be any value that `SmootherSettings` takes.
-def smoother(motion: MotionModel, start: Start, lag_s: float, **options: Any) -> FixedLagSmoother:
+def smoother(
+    motion: MotionModel, start: Start, lag_s: float, initiation: str = "regression", **options: Any
+) -> FixedLagSmoother:
     """Fixed-lag smoother, a factor graph that iSAM2 solves incrementally."""
-    return FixedLagSmoother(motion, start, _settings(lag_s, options))
+    return FixedLagSmoother(motion, start, _settings(lag_s, options), initiation=initiation)
 
 
-def smoother_batch(motion: MotionModel, start: Start, lag_s: float, **options: Any) -> FixedLagSmoother:
+def smoother_batch(
+    motion: MotionModel, start: Start, lag_s: float, initiation: str = "regression", **options: Any
+) -> FixedLagSmoother:
     """Fixed-lag smoother, a factor graph that Levenberg-Marquardt solves anew at every update: slow, for checks."""
-    return FixedLagSmoother(motion, start, _settings(lag_s, options), BatchBackend)
+    return FixedLagSmoother(motion, start, _settings(lag_s, options), BatchBackend, initiation)
 
 
 def _settings(lag_s: float, options: dict[str, Any]) -> SmootherSettings:

@@ -13,15 +13,17 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import propagated
 from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
-from fgtrack.estimation.factor_graph.initiation import straight_line
 from fgtrack.estimation.factor_graph.marginalised_past import Prior
 from fgtrack.estimation.factor_graph.window import Window
+from fgtrack.estimation.initiation import checked_initiation, over, sought, straight_line
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.estimation.terms import linearised
 from fgtrack.models.motion import MotionModel
 
 _DEFAULT = SmootherSettings()
 _INITIATION_ITERATIONS = 10
+#: A line that is so many standard deviations from standing still is the last one: the solver finds the rest.
+_CERTAIN = 3.0
 
 
 class FixedLagSmoother:
@@ -41,6 +43,8 @@ class FixedLagSmoother:
     make_backend
         Makes an empty backend with given relinearisation thresholds, shape (n,): `IncrementalBackend` or
         `BatchBackend`.
+    initiation
+        How the direction of travel is found where `prior` gives none, see `Initiation`.
     """
 
     def __init__(
@@ -49,13 +53,15 @@ class FixedLagSmoother:
         prior: Start,
         settings: SmootherSettings = _DEFAULT,
         make_backend: Callable[[FloatArray], Backend] = IncrementalBackend,
+        initiation: str = "regression",
     ) -> None:
         self._motion = motion
         self._settings = settings
         self._lag_ns, self._ring_ns = nanoseconds(settings.lag_s), nanoseconds(settings.ring_s)
         self._first_ns = self._clock_ns = prior.stamp_ns
         self._window = Window(motion, prior.stamp_ns, Prior(*initial_state(motion, prior)), settings, make_backend)
-        self._initiated = prior.yaw_rad is not None or motion.linear
+        self._initiation = checked_initiation(initiation)
+        self._initiated = not sought(motion, prior, self._initiation)
         self._final: list[TrackState] = []
 
     @property
@@ -127,7 +133,7 @@ class FixedLagSmoother:
             line = straight_line(self._window.fixes())
         except np.linalg.LinAlgError:
             return
-        self._initiated = line.certain
+        self._initiated = over(line, self._initiation, _CERTAIN)
         self._window.restart(line)
         self._window.iterate(_INITIATION_ITERATIONS)
 

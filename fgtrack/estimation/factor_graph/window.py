@@ -14,8 +14,8 @@ from fgtrack.estimation.factor_graph.backends.base import Backend, Change, Margi
 from fgtrack.estimation.factor_graph.backends.incremental import FIRST_KEY
 from fgtrack.estimation.factor_graph.chain import Chain, Node
 from fgtrack.estimation.factor_graph.factors import measurement_factor, motion_factor, prior_factor
-from fgtrack.estimation.factor_graph.initiation import Fix, Line, along, fix_of
 from fgtrack.estimation.factor_graph.marginalised_past import MarginalisedPast, Prior
+from fgtrack.estimation.initiation import Fix, Line, along, fix_of
 from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.estimation.terms import MeasurementTerm, curved
@@ -191,7 +191,8 @@ class Window:
         nodes, prior = self._chain.nodes, self._past.prior
         means = {node.key: along(line, self._seconds(node.stamp_ns), self._motion.state_names) for node in nodes}
         mean = prior.mean.copy()
-        mean[YAW] = means[nodes[0].key][YAW]
+        if not self._motion.cartesian:
+            mean[YAW] = means[nodes[0].key][YAW]
         self._past = MarginalisedPast(self._motion, self._first_ns, Prior(mean, prior.covariance))
         self._rebuild(means)
 

@@ -33,7 +33,7 @@ from fgtrack.estimation.factor_graph.clock_calibration.time_shift import (
     rates,
 )
 from fgtrack.estimation.factor_graph.factors import motion_factor, prior_factor
-from fgtrack.estimation.factor_graph.initiation import along, fix_of, straight_line
+from fgtrack.estimation.initiation import along, fix_of, straight_line
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import weight
 from fgtrack.models.sensors import RobustLoss

@@ -18,7 +18,7 @@ from fgtrack.core.linalg import congruence
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.factor_graph.initiation import fix_of
+from fgtrack.estimation.initiation import fix_of
 from fgtrack.estimation.interpolation import Between, between
 from fgtrack.models.motion import MotionModel
 

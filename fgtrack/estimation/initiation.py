@@ -1,15 +1,36 @@
-"""Where a new object heads and how fast, from the positions and stamps of its first measurements."""
+"""Where a new object heads and how fast, from its first positions: one component for smoothers and filters."""
 
+import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
+from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import polar
 from fgtrack.core.linalg import psd_solve
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Measurement
+from fgtrack.estimation.base import Measurement, Start
 from fgtrack.models.measurement import measured_position
+from fgtrack.models.motion import MotionModel
+
+Initiation = Literal["one-point", "two-point", "regression"]
+"""How the direction of travel of a new object is found where neither map nor sensor gives one.
+
+- `one-point`: it is not sought: the state starts at yaw 0 with a wide standard deviation.
+- `two-point`: from the first two positions (Bar-Shalom, Li and Kirubarajan 2001, section 5.5.3).
+- `regression`: from a straight line through the first positions, by weighted least squares (the same, section 3.5),
+  until the velocity is so many standard deviations from zero that its direction is certain: three for a smoother,
+  which goes on relinearising, ten for a filter, which does not (0.1 rad, as well as a direction that is known).
+"""
+
+
+def checked_initiation(method: str) -> Initiation:
+    """`method`; raises `CallError` for one that does not exist."""
+    for known in get_args(Initiation):
+        if method == known:
+            return known  # type: ignore[no-any-return]  # a value of the Literal
+    raise CallError(f"initiation: must be {', '.join(get_args(Initiation))}, is {method!r}")
 
 
 class Fix(NamedTuple):
@@ -31,13 +52,13 @@ class Line(NamedTuple):
     """Of the velocity, shape (2, 2)."""
 
     @property
-    def certain(self) -> bool:
-        """Whether the velocity is more than three standard deviations from zero."""
-        return bool(self.velocity_mps @ psd_solve(self.covariance, self.velocity_mps) > 9.0)
+    def certainty(self) -> float:
+        """How many standard deviations the velocity is from zero."""
+        return math.sqrt(self.velocity_mps @ psd_solve(self.covariance, self.velocity_mps))
 
 
 def fix_of(measurement: Measurement, time_s: float) -> Fix | None:
-    """The position that `measurement` gives; None where it gives none."""
+    """The position that `measurement` gives; None where it gives none: a bearing alone, a range alone."""
     found = measured_position(measurement.model.components, measurement.z, measurement.R, measurement.pose)
     return None if found is None else Fix(time_s, *found)
 
@@ -66,3 +87,13 @@ def along(line: Line, time_s: float, state_names: Sequence[str]) -> FloatArray:
     x_m, y_m = (line.position_m + time_s * line.velocity_mps).tolist()
     known = {"x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad, "speed_mps": speed_mps, "vx_mps": vx_mps, "vy_mps": vy_mps}
     return np.array([known.get(name, 0.0) for name in state_names])
+
+
+def sought(motion: MotionModel, start: Start, method: Initiation) -> bool:
+    """Whether the direction of travel is to be sought at all: it is unknown, and `motion` has to be linearised."""
+    return method != "one-point" and start.yaw_rad is None and not motion.linear
+
+
+def over(line: Line, method: Initiation, certain: float) -> bool:
+    """Whether `line`, through two fixes or more, is the last one that `method` asks for."""
+    return method == "two-point" or line.certainty > certain

@@ -1,0 +1,162 @@
+"""The first measurements of a filter whose object starts with an unknown direction of travel."""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.geometry import cartesian, polar, wrap_angle
+from fgtrack.core.linalg import product
+from fgtrack.core.time import seconds
+from fgtrack.core.types import YAW, FloatArray
+from fgtrack.estimation.base import KNOWN_YAW_STD_RAD, Measurement, Start
+from fgtrack.estimation.birth import initial_state
+from fgtrack.estimation.ekf import Prediction, correct_one, propagated
+from fgtrack.estimation.initiation import Fix, Initiation, Line, fix_of, over, sought, straight_line
+from fgtrack.estimation.rts import smoothed_one
+from fgtrack.models.motion import MotionModel
+
+#: What a filter linearises in this direction stays good.
+CERTAIN = 1.0 / KNOWN_YAW_STD_RAD
+
+#: After this time, and after so many measurements, a filter does not seek the direction any more: the object may be at
+#: rest, and each further measurement costs as much as all before it.
+LONGEST_S, MOST_MEASUREMENTS = 2.0, 25
+
+
+class _Link(NamedTuple):
+    """One stamp of the first measurements."""
+
+    stamp_ns: int
+    mean: FloatArray
+    covariance: FloatArray
+    predicted: Prediction
+    """From the link before, or what it was before where that has the same stamp."""
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What has been measured of a new object while its direction of travel is sought, in order of the stamps.
+
+    A value: `with_measurement` gives another one, so a filter may keep one at each step and go back to it.
+    """
+
+    motion: MotionModel
+    start: Start
+    method: Initiation
+    measurements: tuple[Measurement, ...] = ()
+    fixes: tuple[Fix, ...] = ()
+    """With that of the start."""
+    line: Line | None = None
+    """Through the fixes; None where they are of one time."""
+
+    @classmethod
+    def of(cls, motion: MotionModel, start: Start, method: Initiation) -> "Opening | None":
+        """Before the first measurement; None where no direction is sought."""
+        if not sought(motion, start, method):
+            return None
+        x, P = initial_state(motion, start)
+        return cls(motion, start, method, fixes=(Fix(0.0, x[:2], P[:2, :2]),))
+
+    def with_measurement(self, measurement: Measurement) -> "Opening | None":
+        """With one more measurement, the newest; None where the direction is known, or sought no more."""
+        time_s = seconds(measurement.stamp_ns - self.start.stamp_ns)
+        if self.over or time_s > LONGEST_S or len(self.measurements) == MOST_MEASUREMENTS:
+            return None
+        fix = fix_of(measurement, time_s)
+        fixes = self.fixes if fix is None else (*self.fixes, fix)
+        line = self.line
+        if fix is not None and time_s > 0.0:
+            try:
+                line = straight_line(fixes)
+            except np.linalg.LinAlgError:  # of a position that is known without error, no line can be weighted
+                line = None
+        return replace(self, measurements=(*self.measurements, measurement), fixes=fixes, line=line)
+
+    @property
+    def over(self) -> bool:
+        """Whether the direction is known: what comes next is fused by the filter itself."""
+        return self.line is not None and over(self.line, self.method, CERTAIN)
+
+    def state(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (n,) and covariance (n, n) after the newest measurement: all of them filtered along the line.
+
+        A Kalman filter linearised at a nominal trajectory that starts on the line, instead of at its own estimates
+        (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 10.3):
+
+            x' = f(x_n) + F (x - x_n),   P' = F P F' + Q,   F = df/dx at x_n
+
+        Each measurement counts once: the line gives the trajectory and the direction about which nothing was known,
+        with the wide standard deviation of `start`. Speed, yaw rate and process noise are those of `start` and
+        `motion`, so without process noise and with a vague speed the result is the covariance of the fit, turned into
+        yaw and speed to first order.
+
+        Raises `numpy.linalg.LinAlgError` where it is not finite, and where there is no line.
+        """
+        last = self._filtered()[-1]
+        if not (np.isfinite(last.mean).all() and np.isfinite(last.covariance).all()):
+            raise np.linalg.LinAlgError("the state of a new object is not finite")
+        return last.mean, last.covariance
+
+    def retrodicted(self, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The state at `stamp_ns`, between the start and the newest measurement, given all that came after.
+
+        `mean` (n,) and `covariance` (n, n) are those at the newest measurement, given the same. Raises as `state`.
+        """
+        links = self._filtered(stamp_ns)
+        for before, after in zip(reversed(links[:-1]), reversed(links), strict=False):
+            if after.stamp_ns == stamp_ns:
+                break
+            if before.stamp_ns < after.stamp_ns:
+                shift = mean - after.predicted.mean
+                if not self.motion.cartesian:
+                    shift[YAW] = wrap_angle(shift[YAW])
+                mean, covariance, _ = smoothed_one(before.mean, before.covariance, after.predicted, shift, covariance)
+        return mean, covariance
+
+    def _filtered(self, extra_ns: int | None = None) -> list[_Link]:
+        """The start, and the state after each measurement; with one at `extra_ns`, where nothing is measured."""
+        x, P = initial_state(self.motion, self.start)
+        nominal = self._nominal(x)
+        if not self.motion.cartesian:
+            x = x.copy()
+            x[YAW] = nominal[YAW]
+        at_ns = self.start.stamp_ns
+        links = [_Link(at_ns, x, P, Prediction(x, P, P))]
+        wanted: list[tuple[int, Measurement | None]] = [(each.stamp_ns, each) for each in self.measurements]
+        if extra_ns is not None:
+            wanted.append((extra_ns, None))
+            wanted.sort(key=lambda each: each[0])
+        for stamp_ns, measurement in wanted:
+            predicted = Prediction(x, P, P)
+            if stamp_ns > at_ns:
+                step = self.motion.step(nominal.tolist(), seconds(stamp_ns - at_ns))
+                moved = np.array(step.mean)
+                predicted = Prediction(
+                    moved + step.F @ (x - nominal), propagated(step.F, P, step.Q), product(step.F, P)
+                )
+                nominal, at_ns = moved, stamp_ns
+            x, P = predicted.mean, predicted.covariance
+            if measurement is not None:
+                x, P = correct_one(x, P, measurement)[:2]
+            links.append(_Link(stamp_ns, x, P, predicted))
+        return links
+
+    def _nominal(self, x: FloatArray) -> FloatArray:
+        """State (n,) on `line` at the start; its speed is weighed with that of `start`, other entries are those of x.
+
+        A line through fixes close together in time may be far too fast, and what is known of the speed says so.
+        """
+        line = self.line
+        if line is None:
+            raise np.linalg.LinAlgError("no line leads through the first positions")
+        direction = line.velocity_mps / max(float(np.hypot(*line.velocity_mps)), np.finfo(np.float64).tiny)
+        known, found = self.start.speed_std_mps**2, float(direction @ line.covariance @ direction)
+        speed_mps = self.start.speed_mps + known / (known + found) * (
+            float(direction @ line.velocity_mps) - self.start.speed_mps
+        )
+        nominal = x.copy()
+        yaw_rad = polar(direction)[0]
+        nominal[:2] = line.position_m
+        nominal[2:4] = cartesian(np.array([yaw_rad, speed_mps])) if self.motion.cartesian else (yaw_rad, speed_mps)
+        return nominal
