@@ -8,6 +8,8 @@ from typing import Generic, TypeVar
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Disposition
 from fgtrack.evaluation.consistency import Consistency
+from fgtrack.evaluation.contest import Contest, contests
+from fgtrack.evaluation.differences import differences
 from fgtrack.evaluation.innovations import FEWEST, LAGS, RESIDUAL_NAMES, Autocorrelation
 from fgtrack.evaluation.lagged import WINDOW, LagMetrics
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS
@@ -16,6 +18,7 @@ from fgtrack.evaluation.multi_object import MultiObjectMetrics
 from fgtrack.evaluation.runs import OneRun, judged
 from fgtrack.evaluation.statistics import ChiSquareMean
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
+from fgtrack.evaluation.verdict import verdict
 
 BACKWARD_FORWARD = "ekf-backward-forward"
 BACKWARD_FORWARD_NOTE = "backward-forward forgets what was fused after the stamp of a late detection"
@@ -49,10 +52,11 @@ class _Row(Generic[T]):
 
 
 def compare(*runs: OneRun | Iterable[OneRun]) -> Tables:
-    """Metrics of `runs` in comparison: tables `tracking`, `multi_object`, `lag`, `consistency`, `dispositions`
-    and `residuals_SENSOR` of every sensor.
+    """Metrics of `runs` in comparison: the `verdict`, and tables `differences`, `tracking`, `multi_object`, `lag`,
+    `consistency`, `dispositions` and `residuals_SENSOR` of every sensor.
 
-    A path is a run folder, or a folder that holds run folders.
+    Runs of the same recording are compared sample by sample. A path is a run folder, or a folder that holds run
+    folders.
 
     Raises
     ------
@@ -64,15 +68,16 @@ def compare(*runs: OneRun | Iterable[OneRun]) -> Tables:
     every = judged(runs)
     if not every:
         raise CallError("compare: no run is given, name at least one")
-    return comparison({one.label: one.metrics for one in every})
+    return comparison({one.label: one.metrics for one in every}, contests(every))
 
 
-def comparison(metrics: Mapping[str, Metrics]) -> Tables:
-    """The tables of `metrics`, by label."""
+def comparison(metrics: Mapping[str, Metrics], found: Sequence[Contest] = ()) -> Tables:
+    """The tables of `metrics`, by label, and what the contests among these runs `found`."""
     notes = [BACKWARD_FORWARD_NOTE] if any(one.estimator == BACKWARD_FORWARD for one in metrics.values()) else []
     rows = [_Row(label, one) for label, one in metrics.items()]
     of_sensors = [_Row(row.run, sensor, name) for row in rows for name, sensor in row.of.sensors.items()]
     tables = {
+        "differences": differences(found),
         "tracking": _tracking(rows, notes),
         "multi_object": _multi_object(rows, notes),
         "lag": _lag(rows, notes),
@@ -81,7 +86,8 @@ def comparison(metrics: Mapping[str, Metrics]) -> Tables:
     for sensor in dict.fromkeys(row.part for row in of_sensors):
         tables[f"residuals_{sensor}"] = _residuals(sensor, [row for row in of_sensors if row.part == sensor], notes)
     tables["dispositions"] = _dispositions(of_sensors, notes)
-    return Tables(tables, {"runs": {label: one.as_dict() for label, one in metrics.items()}, "notes": notes})
+    details = {"runs": {label: one.as_dict() for label, one in metrics.items()}, "notes": notes}
+    return Tables(tables, details, verdict(metrics, found))
 
 
 def _tracking(rows: Sequence[_Row[Metrics]], notes: Sequence[str]) -> Table:
@@ -185,10 +191,23 @@ def _lag(rows: Sequence[_Row[Metrics]], notes: Sequence[str]) -> Table:
     def reduction(name: str) -> Callable[[_Row[LagMetrics]], _Values]:
         return lambda row: (math.nan if row.of.lag_s == 0.0 else row.of.gain(name),)
 
+    def interval(row: _Row[LagMetrics]) -> _Values:
+        return row.of.position_reduction.low, row.of.position_reduction.high
+
     errors: list[Column[_Row[LagMetrics]]] = []
     for name in _LAG_ERRORS:
         errors.append(Column(_ERRORS[name], (_named(name, "rmse"),), rmse(name)))
         errors.append(Column("below\n[%]", (f"{name.rpartition('_')[0]}_reduction",), reduction(name), scale=_PERCENT))
+        if name == "position_m":
+            errors.append(
+                Column(
+                    "95 %\ninterval",
+                    ("position_reduction_low", "position_reduction_high"),
+                    interval,
+                    "{} to {}",
+                    _PERCENT,
+                )
+            )
     entries = [_Row(row.run, one) for row in rows for one in _shown_lags(row.of.lagged)]
     columns: list[Column[_Row[LagMetrics]]] = [
         _run_column(entries),

@@ -8,12 +8,15 @@ import numpy as np
 from fgtrack.core.types import YAW, FloatArray, IntArray
 from fgtrack.evaluation.innovations import Autocorrelation, autocorrelations, num_measured
 from fgtrack.evaluation.matching import Matching, state_errors
+from fgtrack.evaluation.paired import UNKNOWN, Estimate, by_stamp, within_run
 from fgtrack.evaluation.statistics import ChiSquareMean, Moments, chi_square_band
 from fgtrack.evaluation.truth import TRUE_STATE
 from fgtrack.io.run import Run, Table
 
 #: Components of a state in the order of the covariance columns; a part of them is always a leading one.
 _COMPONENTS = ("x", "y", "yaw", "speed", "yaw_rate")
+
+_SEED = 1  # of the bootstrap: the same run gives the same interval
 
 _POSITION, _POSE_AND_SPEED, _WITH_YAW_RATE = 2, 4, 5
 
@@ -34,6 +37,10 @@ class Consistency:
     """By sensor."""
     autocorrelation: Mapping[str, Mapping[str, Autocorrelation]]
     """By sensor and innovation, see `autocorrelations`."""
+    position_nees_interval: Estimate = UNKNOWN
+    """Mean of `position_nees` with the interval of correlated errors, see `within_run`."""
+    state_nees_interval: Estimate = UNKNOWN
+    """Likewise of `state_nees`."""
 
 
 @dataclass(frozen=True)
@@ -82,9 +89,13 @@ def consistency(run: Run, matching: Matching | None) -> Consistency:
     updates = run.updates
     measured = num_measured(updates)
     sensors = {name: updates["sensor"] == name for name in np.unique(updates["sensor"]).tolist()}
+    of_position = None if matching is None else position_nees(matching)
+    of_state = None if matching is None else state_nees(matching)
     return Consistency(
-        position_nees=ChiSquareMean() if matching is None else _mean(position_nees(matching)),
-        state_nees=ChiSquareMean() if matching is None else _mean(state_nees(matching)),
+        position_nees=_mean(of_position),
+        state_nees=_mean(of_state),
+        position_nees_interval=_interval(of_position),
+        state_nees_interval=_interval(of_state),
         nis={name: ChiSquareMean.of(updates["nis"][mine], measured[mine]) for name, mine in sensors.items()},
         autocorrelation={name: autocorrelations(updates.where(mine)) for name, mine in sensors.items()},
     )
@@ -177,8 +188,15 @@ def _nees(matching: Matching, size: int) -> Nees:
     )
 
 
-def _mean(nees: Nees) -> ChiSquareMean:
-    return ChiSquareMean.of(nees.values, nees.dof)
+def _mean(nees: Nees | None) -> ChiSquareMean:
+    return ChiSquareMean() if nees is None else ChiSquareMean.of(nees.values, nees.dof)
+
+
+def _interval(nees: Nees | None) -> Estimate:
+    if nees is None or not len(nees.values):
+        return UNKNOWN
+    ticks = by_stamp(nees.stamps_ns, nees.values[:, None])
+    return within_run(ticks, lambda S: S[0] / S[1], np.random.default_rng(_SEED))
 
 
 def _one_each(nees: Nees) -> Nees:

@@ -10,6 +10,7 @@ import numpy as np
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.consistency import normalised_squares
 from fgtrack.evaluation.matching import Matching, state_errors
+from fgtrack.evaluation.paired import UNKNOWN, Estimate, by_stamp, within_run
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.evaluation.truth import TRUE_STATE, TruePath, true_paths
 from fgtrack.io.run import Run, Table
@@ -18,6 +19,7 @@ WINDOW: Literal["window"] = "window"
 """The lag of a final state: the window's length, or less where the track ended before."""
 
 _NO_ROW = -1
+_SEED = 1  # of the bootstrap: the same run gives the same interval
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,8 @@ class LagMetrics:
     """Normalised error squared of x and y: a consistent estimator has a mean of 2."""
     present_errors: Mapping[str, Moments]
     """Those of the present states that were published for these stamps."""
+    position_reduction: Estimate = UNKNOWN
+    """Relative reduction of the position RMSE against the present states, with its interval."""
 
     @property
     def is_lagged(self) -> bool:
@@ -69,7 +73,7 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
 
 def _present(matching: Matching) -> LagMetrics:
     tracks, truth = matching.tracks.where(matching.paired), matching.true_states[matching.paired]
-    errors = _moments(tracks, truth)
+    errors = _moments(state_errors(tracks, truth))
     return LagMetrics(0.0, errors, Moments.of(_position_nees(tracks, truth)), errors)
 
 
@@ -86,12 +90,20 @@ def _judged(
     known = np.isfinite(truth[:, 0]) & np.isfinite(states["x_m"])  # no truth is known of a row without a pair
     states, truth, rows = states.where(known), truth[known], rows[known]
     present = Table({name: column[rows] for name, column in matching.tracks.items()})
+    errors, present_errors = state_errors(states, truth), state_errors(present, matching.true_states[rows])
     return LagMetrics(
         lag_s,
-        _moments(states, truth),
+        _moments(errors),
         Moments.of(_position_nees(states, truth)),
-        _moments(present, matching.true_states[rows]),
+        _moments(present_errors),
+        _reduction(states["stamp_ns"], errors["position_m"], present_errors["position_m"]),
     )
+
+
+def _reduction(stamps_ns: IntArray, errors: FloatArray, present_errors: FloatArray) -> Estimate:
+    """Relative reduction of the root mean square of `errors` against `present_errors`, shape (n,) each."""
+    ticks = by_stamp(stamps_ns, np.square(np.stack([errors, present_errors], axis=-1)))
+    return within_run(ticks, lambda S: 1.0 - np.sqrt(S[0] / S[1]), np.random.default_rng(_SEED))
 
 
 def _rows_at(matching: Matching, states: Table) -> IntArray:
@@ -114,8 +126,8 @@ def _rows_at(matching: Matching, states: Table) -> IntArray:
     return found
 
 
-def _moments(states: Table, truth: FloatArray) -> dict[str, Moments]:
-    return {name: Moments.of(values) for name, values in state_errors(states, truth).items()}
+def _moments(errors: Mapping[str, FloatArray]) -> dict[str, Moments]:
+    return {name: Moments.of(values) for name, values in errors.items()}
 
 
 def _position_nees(states: Table, truth: FloatArray) -> FloatArray:

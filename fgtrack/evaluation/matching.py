@@ -174,15 +174,20 @@ def scenes(run: Run, matching: Matching) -> Scenes:
 
     An object is there where its truth is known at the tick. A row is as far from it as it is at the row's own stamp.
     """
-    truth_ns = run.truth["stamp_ns"]
-    recorded = (matching.now_ns >= truth_ns.min()) & (matching.now_ns <= truth_ns.max())
-    number = np.cumsum(recorded) - 1
-    rows = np.flatnonzero(recorded[matching.tick_index])
+    scored = recorded(run, matching)
+    number = np.cumsum(scored) - 1
+    rows = np.flatnonzero(scored[matching.tick_index])
     rows = rows[np.argsort(matching.tick_index[rows], kind="stable")]
-    tick_index, present = number[matching.tick_index[rows]], matching.present[recorded]
+    tick_index, present = number[matching.tick_index[rows]], matching.present[scored]
     distances_m = matching.distances_m[rows]
     known = present[tick_index] & np.isfinite(distances_m)
     return Scenes(tick_index, matching.tracks["track_id"][rows], np.where(known, distances_m, np.inf), present)
+
+
+def recorded(run: Run, matching: Matching) -> BoolArray:
+    """Whether each tick of `matching` lies between the first and the last stamp of the truth, shape (ticks,)."""
+    truth_ns = run.truth["stamp_ns"]
+    return np.asarray((matching.now_ns >= truth_ns.min()) & (matching.now_ns <= truth_ns.max()))
 
 
 def _judged(run: Run, options: EvaluationConfig) -> BoolArray:

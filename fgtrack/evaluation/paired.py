@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from fgtrack.core.types import FloatArray
+from fgtrack.core.types import FloatArray, IntArray
 
 _UPPER = 0.975  # quantile of a two-sided 95 % interval
 _DRAWS = 1000
@@ -41,8 +41,17 @@ class Estimate:
         """Whether the interval excludes 0; not where it is unknown."""
         return self.low > 0.0 or self.high < 0.0
 
+    @property
+    def is_known(self) -> bool:
+        """Whether there is an interval."""
+        return math.isfinite(self.low) and math.isfinite(self.high)
+
     def __neg__(self) -> "Estimate":
         return Estimate(-self.mean, -self.high, -self.low, self.count)
+
+
+UNKNOWN = Estimate(math.nan, math.nan, math.nan, 0)
+"""Of nothing."""
 
 
 def paired(values_a: Sequence[float] | FloatArray, values_b: Sequence[float] | FloatArray) -> Estimate:
@@ -64,7 +73,7 @@ def paired(values_a: Sequence[float] | FloatArray, values_b: Sequence[float] | F
     differences = (a - b)[np.isfinite(a) & np.isfinite(b)]
     count = len(differences)
     if not count:
-        return Estimate(math.nan, math.nan, math.nan, 0)
+        return UNKNOWN
     mean = float(differences.mean())
     error = float(differences.std(ddof=1)) / math.sqrt(count) if count > 1 else math.nan
     return _around(mean, error, count)
@@ -107,6 +116,17 @@ def within_run(ticks: FloatArray, statistic: Statistic, rng: np.random.Generator
     blocks = n / length
     error = float(np.nanstd(drawn)) * math.sqrt(blocks / (blocks - 1.0))
     return _around(value, error, blocks)
+
+
+def by_stamp(stamps_ns: IntArray, samples: FloatArray) -> FloatArray:
+    """Sums of `samples`, shape (n, k), over those of each stamp in rising order, and their number: the last column.
+
+    Rows with a NaN are left out.
+    """
+    known = np.isfinite(samples).all(axis=1)
+    distinct, index = np.unique(stamps_ns, return_inverse=True)
+    columns = [*samples[known].T, np.ones(int(known.sum()))]
+    return np.stack([np.bincount(index[known], column, len(distinct)) for column in columns], axis=-1)
 
 
 def block_length(values: FloatArray) -> int:

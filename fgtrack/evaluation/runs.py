@@ -6,11 +6,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from fgtrack.core.errors import CallError
+from fgtrack.core.types import IntArray
 from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
-from fgtrack.evaluation.matching import Matching, match
+from fgtrack.evaluation.matching import Matching, match, recorded, scenes
 from fgtrack.evaluation.metrics import Metrics, evaluate
-from fgtrack.io.run import Run, is_run_folder, load_run
+from fgtrack.evaluation.multi_object import GospaParts, gospa
+from fgtrack.io.run import EvaluationConfig, Run, evaluation_config, is_run_folder, load_run
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +29,25 @@ class JudgedRun:
     def matching(self) -> Matching | None:
         """Pairs of tracks and true objects; None for a run without truth."""
         return match(self.run)
+
+    @cached_property
+    def options(self) -> EvaluationConfig:
+        """How the run is judged."""
+        return evaluation_config(self.run)
+
+    @cached_property
+    def scored_ticks_ns(self) -> IntArray:
+        """Times of the ticks that scores over all objects are made of, shape (t,); none without truth."""
+        if self.matching is None:
+            return np.zeros(0, dtype=np.int64)
+        return self.matching.now_ns[recorded(self.run, self.matching)]
+
+    @cached_property
+    def gospa(self) -> GospaParts | None:
+        """GOSPA at `scored_ticks_ns`; None without truth, and where it is not asked for."""
+        if self.matching is None or not self.options.multi_object:
+            return None
+        return gospa(scenes(self.run, self.matching), self.options.gospa_cut_off_m)
 
     @cached_property
     def lagged(self) -> tuple[LagMetrics, ...]:

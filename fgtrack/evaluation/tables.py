@@ -5,6 +5,7 @@ import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -17,12 +18,12 @@ from rich.text import Text
 from fgtrack.io.run import Table as RunTable
 
 Row = TypeVar("Row")
+Cell = TypeVar("Cell")
 Value = str | int | float
 
 NO_VALUE = "-"
 
 _WIDTH = 120  # of a table as text
-_NOTE_WIDTH = 86  # so that no note is broken
 _LATEX = {char: f"\\{char}" for char in "&%$#_{}"} | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _LATEX |= {"\\": r"\textbackslash{}", "±": r"$\pm$", "<": r"$<$", ">": r"$>$"}
 
@@ -55,6 +56,8 @@ class Column(Generic[Row]):
     text: Callable[[Value], str] = short
     left: bool = False
     """Whether cells are aligned left, for text; else right."""
+    bold: Callable[[Row], bool] | None = None
+    """Which rows have the best value; none without it."""
 
     def cell(self, values: tuple[Value, ...] | None) -> str:
         """What is shown; a dash where no number is known."""
@@ -69,6 +72,12 @@ class Shown:
     heading: str
     cells: tuple[str, ...]
     left: bool
+    bold: tuple[bool, ...]
+
+    @property
+    def width(self) -> int:
+        """Of the column in a terminal, without the space beside it."""
+        return max(map(len, (*self.heading.split("\n"), *self.cells)), default=0)
 
 
 class Table(RunTable):
@@ -103,39 +112,41 @@ class Table(RunTable):
                 data[name] = np.array([math.nan if one is None else one[k] for one in values])
             cells = tuple(map(column.cell, values))
             if column.heading:
-                shown.append(Shown(column.heading, cells, column.left))
+                bold = tuple(column.bold is not None and column.bold(row) for row in rows)
+                shown.append(Shown(column.heading, cells, column.left, bold))
         super().__init__(data)
         self.shown = tuple(shown)
 
     def __str__(self) -> str:
-        return _text(self.rich())
+        return _text(self)
 
-    def rich(self) -> RichTable:
-        """The table for a terminal; the name of a run is in its first row only."""
-        table = RichTable(
-            title=Text(f"\n{self.title}"),
-            caption=Text("\n".join(self.notes)),
-            box=box.SIMPLE_HEAD,
-            show_edge=False,
-            padding=(0, 0, 0, 1),
-            min_width=_NOTE_WIDTH,
-            title_justify="left",
-            caption_justify="left",
-        )
-        for column in self.shown:
-            if column.left:
-                table.add_column(Text(column.heading), overflow="fold")
-            else:
-                table.add_column(Text(column.heading), justify="right", no_wrap=True)
-        for cells in self._rows():
-            table.add_row(*map(Text, cells))
-        return table
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """The table; where the terminal is narrower, the columns that fit, and the others below."""
+        yield Text(f"\n{self.title}")
+        for number, columns in enumerate(self._parts(options.max_width)):
+            if number:
+                yield Text("continued:")
+            yield _grid(columns)
+        if self.notes:
+            yield Text("\n".join(self.notes))
+
+    def _parts(self, width: int) -> Iterator[list[Shown]]:
+        """The columns in parts that are not wider than `width`; the names of the rows stand in each of them."""
+        names = list(takewhile(lambda column: column.left, self.shown))
+        part = list(names)
+        for column in self.shown[len(names) :]:
+            if len(part) > len(names) and sum(one.width + 2 for one in (*part, column)) - 1 > width:
+                yield part
+                part = list(names)
+            part.append(column)
+        yield part
 
     def to_markdown(self) -> str:
         """A table of GitHub Markdown under a heading, the notes below."""
         head = [_one_line(column.heading) for column in self.shown]
         rule = [":---" if column.left else "---:" for column in self.shown]
-        rows = [[cell.replace("|", r"\|") for cell in row] for row in (head, rule, *self._rows())]
+        cells = _rows(self.shown, lambda cell, bold: f"**{cell}**" if bold else cell)
+        rows = [[cell.replace("|", r"\|") for cell in row] for row in (head, rule, *cells)]
         lines = [f"### {self.title}", "", *(f"| {' | '.join(row)} |" for row in rows), ""]
         return "\n".join([*lines, *(f"- {note}" for note in self.notes), *([""] if self.notes else [])])
 
@@ -144,7 +155,7 @@ class Table(RunTable):
     def to_latex(self) -> str:
         """A table environment with the rules of the package booktabs; notes as comments."""
         head = [_latex(_one_line(column.heading)) for column in self.shown]
-        rows = [[_latex(cell) for cell in row] for row in self._rows()]
+        rows = _rows(self.shown, lambda cell, bold: f"\\textbf{{{_latex(cell)}}}" if bold else _latex(cell))
         body = [f"{' & '.join(row)} \\\\" for row in rows]
         spec = "".join("l" if column.left else "r" for column in self.shown)
         return "\n".join(
@@ -164,20 +175,16 @@ class Table(RunTable):
         columns = [[_plain(value) for value in column.tolist()] for column in self.values()]
         return [dict(zip(self, row, strict=True)) for row in zip(*columns, strict=True)]
 
-    def _rows(self) -> Iterator[tuple[str, ...]]:
-        before = ""
-        for first, *cells in zip(*(column.cells for column in self.shown), strict=True):
-            yield ("" if first == before else first), *cells
-            before = first
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tables(Mapping[str, Table]):
-    """Tables by name; `str` gives those that have rows as text."""
+    """Tables by name; `str` gives the verdict and the tables that have rows as text."""
 
     tables: Mapping[str, Table]
     details: Mapping[str, Any] = field(default_factory=dict)  # Any: JSON values
     """What JSON has besides the tables."""
+    verdict: tuple[str, ...] = ()
+    """Sentences that say what the tables amount to."""
 
     def __getitem__(self, name: str) -> Table:
         return self.tables[name]
@@ -189,7 +196,7 @@ class Tables(Mapping[str, Table]):
         return len(self.tables)
 
     def __str__(self) -> str:
-        return "\n".join(map(str, self._filled()))
+        return "\n".join([*(_text(Text(line)) for line in self.verdict), *map(str, self._filled())])
 
     def __repr__(self) -> str:
         return f"<Tables: {', '.join(self)}>"
@@ -198,16 +205,18 @@ class Tables(Mapping[str, Table]):
         return self.to_markdown()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        for table in self._filled():
-            yield table.rich()
+        yield from map(Text, self.verdict)
+        yield from self._filled()
 
     def to_markdown(self, name: str | None = None) -> str:
         """The table `name`, or all that have rows."""
-        return "\n".join(table.to_markdown() for table in self._filled(name))
+        lines = "" if name or not self.verdict else "\n".join([*(f"- {line}" for line in self.verdict), "", ""])
+        return lines + "\n".join(table.to_markdown() for table in self._filled(name))
 
     def to_latex(self, name: str | None = None) -> str:
         """The table `name`, or all that have rows."""
-        return "\n".join(table.to_latex() for table in self._filled(name))
+        lines = "" if name else "".join(f"% {line}\n" for line in self.verdict)
+        return lines + "\n".join(table.to_latex() for table in self._filled(name))
 
     def to_csv(self, name: str | None = None) -> str:
         """The table `name`, or all numbers in one of five columns: table, run, part (sensor, lag), quantity, value."""
@@ -221,18 +230,52 @@ class Tables(Mapping[str, Table]):
         return _csv(rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON values: the details, and the tables as lists of rows."""
-        return {**self.details, "tables": {name: table.records() for name, table in self.tables.items()}}
+        """JSON values: the verdict, the details, and the tables as lists of rows."""
+        return {
+            "verdict": list(self.verdict),
+            **self.details,
+            "tables": {name: table.records() for name, table in self.tables.items()},
+        }
 
     def _filled(self, name: str | None = None) -> list[Table]:
         return [self[name]] if name else [table for table in self.tables.values() if table.num_rows]
 
 
-def _text(table: RichTable) -> str:
+def _text(shown: Table | Text) -> str:
     console = Console(file=io.StringIO(), width=_WIDTH, color_system=None, force_terminal=False)
     with console.capture() as capture:
-        console.print(table)
+        console.print(shown)
     return capture.get().removesuffix("\n")
+
+
+def _grid(columns: Sequence[Shown]) -> RichTable:
+    """Columns for a terminal; the name of a run is in its first row only."""
+    table = RichTable(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 0, 0, 1))
+    for column in columns:
+        if column.left:
+            table.add_column(Text(column.heading), overflow="fold")
+        else:
+            table.add_column(Text(column.heading), justify="right", no_wrap=True)
+    for cells in _rows(columns, _as_text):
+        table.add_row(*cells)
+    return table
+
+
+def _as_text(cell: str, bold: bool) -> Text:
+    return Text(cell, "bold" if bold else "")
+
+
+def _rows(columns: Sequence[Shown], form: Callable[[str, bool], Cell]) -> Iterator[list[Cell]]:
+    """Rows of cells as `form` makes them of the text and whether it is bold; the first cell only where it changes."""
+    before = ""
+    for marks, (first, *cells) in zip(
+        zip(*(column.bold for column in columns), strict=True),
+        zip(*(column.cells for column in columns), strict=True),
+        strict=True,
+    ):
+        texts = ("" if first == before else first, *cells)
+        yield [form(text, mark) for text, mark in zip(texts, marks, strict=True)]
+        before = first
 
 
 def _one_line(heading: str) -> str:

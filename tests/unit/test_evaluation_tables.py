@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.types import Disposition
 from fgtrack.evaluation.comparison import BACKWARD_FORWARD_NOTE, compare, comparison
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.runs import labelled
+from fgtrack.evaluation.runs import JudgedRun, labelled
 from fgtrack.evaluation.statistics import Distribution
 from fgtrack.evaluation.tables import Column, Table, Tables, short
 from fgtrack.io.run import Run
@@ -27,6 +28,7 @@ SENSORS = ("lidar_cluster", "radar_long_range")
 
 #: Every table of a comparison of runs with truth, and the column beside `run` that tells its rows apart.
 TABLES = {
+    "differences": "quantity",
     "tracking": None,
     "multi_object": None,
     "lag": "lag",
@@ -59,7 +61,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
 
 @pytest.fixture(scope="module")
 def tables(runs: dict[str, Run]) -> Tables:
-    return comparison({label: evaluate(run) for label, run in runs.items()})
+    return compare(*runs.values())
 
 
 def rows_of(table: Table) -> list[str]:
@@ -106,7 +108,7 @@ def test_markdown_has_the_cells_that_are_shown(tables: Tables, name: str) -> Non
     assert len(head) == len(rule) == len(tables[name].shown)
     shown = [list(cells) for cells in zip(*(column.cells for column in tables[name].shown), strict=True)]
     assert [row[1:] for row in rows] == [row[1:] for row in shown]
-    assert [row[0] for row in rows if row[0]] == list(ESTIMATORS)
+    assert [row[0] for row in rows if row[0]] == [name for name, _ in groupby(row[0] for row in shown)]
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -148,16 +150,54 @@ def test_a_table_is_a_data_frame(tables: Tables) -> None:
     for table in tables.values():
         frame = pandas.DataFrame(table)
         assert frame.shape == (table.num_rows, len(table))
-        numbers = [column for column in frame if column not in (*table.row_keys, "estimator")]
+        numbers = [column for column in frame if column not in (*table.row_keys, "estimator", "standing")]
         assert all(frame[column].dtype.kind in "if" for column in numbers)
 
 
 def test_tables_fit_a_terminal_of_120_columns(runs: dict[str, Run], tables: Tables) -> None:
-    wide = comparison({f"race/{label}": evaluate(run) for label, run in runs.items()})
+    wide = compare([JudgedRun(f"race/{label}", run) for label, run in runs.items()])
     for shown in (str(tables), str(wide)):
         assert max(map(len, shown.splitlines())) <= 120
         assert "…" not in shown
     assert all(f"race/{estimator} " in str(wide["tracking"]) for estimator in ESTIMATORS)
+
+
+def test_on_a_narrow_terminal_the_columns_that_do_not_fit_stand_below(tables: Tables) -> None:
+    console = Console(width=80, file=io.StringIO(), color_system=None)
+    with console.capture() as capture:
+        console.print(tables["tracking"])
+    first, second = capture.get().split("continued:\n")
+    assert max(map(len, (first + second).splitlines())) <= 80
+    assert "…" not in first + second
+    for part in (first, second):
+        assert all(part.count(f" {estimator} ") == 1 for estimator in ESTIMATORS)
+    headings = [column.heading.split("\n")[0] for column in tables["tracking"].shown]
+    assert [(first + second).count(heading) for heading in headings[1:5]] == [1, 1, 1, 1]
+    assert "continued" not in str(tables)
+
+
+def test_the_best_value_is_bold_in_every_form_that_knows_bold() -> None:
+    rows = [("a", 1.0), ("b", 2.0)]
+    columns: list[Column[tuple[str, float]]] = [
+        Column("run", ("run",), lambda row: row[:1], left=True),
+        Column("value", ("value",), lambda row: row[1:], bold=lambda row: row[1] < 2.0),
+    ]
+    table = Table("errors", columns, rows)
+    assert "| a | **1.00** |\n| b | 2.00 |" in table.to_markdown()
+    assert "a & \\textbf{1.00} \\\\\nb & 2.00" in table.to_latex()
+    console = Console(width=80, file=io.StringIO(), force_terminal=True, color_system="standard")
+    with console.capture() as capture:
+        console.print(table)
+    assert "\x1b[1m 1.00" in capture.get()
+    assert "\x1b[1m 2.00" not in capture.get()
+
+
+def test_the_verdict_stands_first_in_every_form(tables: Tables) -> None:
+    assert tables.verdict
+    for text in (str(tables), tables.to_markdown(), tables.to_latex()):
+        assert text.lstrip("-% ").startswith(tables.verdict[0].split(" (")[0])
+    assert tables.to_dict()["verdict"] == list(tables.verdict)
+    assert tables.verdict[0] not in tables.to_markdown("tracking")
 
 
 def test_what_is_printed_is_what_the_console_shows(tables: Tables) -> None:
@@ -255,8 +295,8 @@ def test_the_multi_object_table_has_gospa_scores_switches_and_the_time_to_confir
 def test_the_lag_table_says_what_waiting_brings(tables: Tables) -> None:
     table = tables["lag"]
     assert rows_of(table)[2:] == [
-        "smoother 0 8 0.354 - 0.000 - 0.000 - 0.125",
-        "smoother window 2 0.100 80.0 0.000 - 0.000 - 0.010",
+        "smoother 0 8 0.354 - - 0.000 - 0.000 - 0.125",
+        "smoother window 2 0.100 80.0 - 0.000 - 0.000 - 0.010",  # too short for an interval
     ]
     assert table["lag"].tolist() == ["0", "0", "0", "window"]
     np.testing.assert_array_equal(table["lag_s"], [0.0, 0.0, 0.0, math.nan])
@@ -301,7 +341,7 @@ def test_the_disposition_table_sums_up_and_names_what_never_occurred(tables: Tab
 
 
 def test_the_note_on_backward_forward_stands_where_it_is_shown_only(runs: dict[str, Run], tables: Tables) -> None:
-    assert all(table.notes[-1] == BACKWARD_FORWARD_NOTE for table in tables.values())
+    assert all(table.notes[-1] == BACKWARD_FORWARD_NOTE for name, table in tables.items() if name != "differences")
     others = comparison({"smoother": evaluate(runs["smoother"])})
     assert BACKWARD_FORWARD_NOTE not in str(others)
     assert others.to_dict()["notes"] == []

@@ -23,6 +23,11 @@ class EvaluationConfig:
     late_switch_s: float = 0.5
     """An identity switch within this time after an out-of-sequence update counts as late."""
 
+    @property
+    def gospa_cut_off_m(self) -> float:
+        """Cut-off distance c of GOSPA, the gate where none is given."""
+        return self.gate_m if self.gospa_c_m is None else self.gospa_c_m
+
     def __post_init__(self) -> None:
         for name in ("gate_m", "gospa_c_m"):
             value = getattr(self, name)

@@ -1,0 +1,182 @@
+"""Runs of one recording against each other: paired differences of their errors, at the same objects and stamps.
+
+The sums behind a value are kept for every stamp, so that the difference of two runs has the interval of a block
+bootstrap over time (`fgtrack.evaluation.paired`).
+"""
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.evaluation.consistency import position_nees
+from fgtrack.evaluation.matching import track_errors
+from fgtrack.evaluation.paired import Estimate, by_stamp, within_run
+from fgtrack.evaluation.runs import JudgedRun
+
+_SEED = 20040101  # of the bootstrap: the same runs give the same intervals
+
+#: Quantities that are root mean squares, and the errors that they are made of.
+_ERRORS = {"position_rmse_m": "position_m", "speed_rmse_mps": "speed_mps", "yaw_rmse_rad": "yaw_rad"}
+POSITION_NEES = "position_nees"
+"""The quantity that is the better the nearer it is to 2."""
+
+Standing = Literal["best", "tie", "worse"]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One run in one quantity."""
+
+    run: str
+    value: float
+    worse_by: Estimate | None
+    """How much worse than the best run; None of the best run itself."""
+    standing: Standing
+    """`tie` where the interval of the difference to the best run has 0 inside; `best` only without any tie."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What runs are compared in; less is better, but for the NEES."""
+
+    name: str
+    """With its unit: `position_rmse_m`."""
+    entries: tuple[Entry, ...]
+    """From the best run to the worst."""
+
+    @property
+    def ties(self) -> tuple[str, ...]:
+        """The best run and those that tie with it."""
+        return tuple(entry.run for entry in self.entries if entry.standing != "worse")
+
+
+@dataclass(frozen=True)
+class Contest:
+    """Runs of one recording."""
+
+    runs: tuple[str, ...]
+    samples: int
+    """Objects and stamps at which all runs have a paired track."""
+    most_samples: int
+    """Those of the run with most of them."""
+    quantities: tuple[Quantity, ...]
+    """Those that all runs have."""
+
+
+def contests(runs: Sequence[JudgedRun]) -> list[Contest]:
+    """A contest for every recording of which there are several runs; runs without truth take no part."""
+    groups: list[list[JudgedRun]] = []
+    for one in runs:
+        if one.matching is not None:
+            group = next((group for group in groups if same_recording(group[0], one)), None)
+            if group is None:
+                groups.append([one])
+            else:
+                group.append(one)
+    return [_contest(group) for group in groups if len(group) > 1]
+
+
+def same_recording(one: JudgedRun, other: JudgedRun) -> bool:
+    """Whether two runs are of the same scene and judged alike, so that their errors can be paired.
+
+    The truth is the same, and of every sensor that both have the detections are as many and have the same stamps (a
+    recording with other delays) or the same receipts (a configuration with other stamps).
+    """
+    if one.run.truth != other.run.truth or one.options != other.options:
+        return False
+    mine, its = one.run.updates, other.run.updates
+    return all(
+        any(
+            np.array_equal(np.sort(mine[name][mine["sensor"] == sensor]), np.sort(its[name][its["sensor"] == sensor]))
+            for name in ("stamp_ns", "receipt_ns")
+        )
+        for sensor in np.intersect1d(mine["sensor"], its["sensor"]).tolist()
+    )
+
+
+def _contest(group: Sequence[JudgedRun]) -> Contest:
+    codes, stamps_ns, values = _samples(group)
+    common = functools.reduce(np.intersect1d, codes)
+    rows = [np.searchsorted(code, common) for code in codes]
+    at_ns = stamps_ns[common % len(stamps_ns)]
+    sums: dict[str, FloatArray] = {}
+    for name in values[0] if len(common) else ():
+        sums[name] = by_stamp(at_ns, np.stack([value[name][row] for value, row in zip(values, rows, strict=True)], -1))
+    gospa = _gospa_sums(group)
+    if gospa is not None:
+        sums["gospa_rms_m"] = gospa
+    labels = tuple(one.label for one in group)
+    return Contest(
+        labels,
+        samples=len(common),
+        most_samples=max(map(len, codes)),
+        quantities=tuple(_quantity(name, labels, ticks) for name, ticks in sums.items() if ticks[:, -1].any()),
+    )
+
+
+def _samples(group: Sequence[JudgedRun]) -> tuple[list[IntArray], IntArray, list[dict[str, FloatArray]]]:
+    """Of every run the rising codes of its objects and stamps, and what is averaged there; all stamps.
+
+    A code is the number of the object times the number of stamps, plus the number of the stamp.
+    """
+    matchings = [one.matching for one in group if one.matching is not None]
+    errors, nees = [track_errors(one) for one in matchings], [position_nees(one).values for one in matchings]
+    stamps_ns = np.unique(np.concatenate([one.stamps_ns for one in errors]))
+    codes, values = [], []
+    for one, squares in zip(errors, nees, strict=True):
+        every = one.object_index * len(stamps_ns) + np.searchsorted(stamps_ns, one.stamps_ns)
+        code, rows = np.unique(every, return_index=True)
+        codes.append(code)
+        of_errors = {name: np.square(one.values[error][rows]) for name, error in _ERRORS.items()}
+        values.append({**of_errors, POSITION_NEES: squares[rows]})
+    return codes, stamps_ns, values
+
+
+def _gospa_sums(group: Sequence[JudgedRun]) -> FloatArray | None:
+    """Squared GOSPA of every run, and 1, at the ticks that all of them have; None where it is not asked for."""
+    found = [one.gospa for one in group]
+    squares = [np.square(parts.total_m) for parts in found if parts is not None]
+    if len(squares) < len(group):
+        return None
+    ticks_ns = [one.scored_ticks_ns for one in group]
+    common_ns = functools.reduce(np.intersect1d, ticks_ns)
+    columns = [square[np.searchsorted(ns, common_ns)] for square, ns in zip(squares, ticks_ns, strict=True)]
+    return np.stack([*columns, np.ones(len(common_ns))], axis=-1)
+
+
+def _quantity(name: str, labels: Sequence[str], ticks: FloatArray) -> Quantity:
+    """The runs by rising cost, and how much worse than the best they are.
+
+    `ticks` has a column of sums for each run and one of counts, shape (n, runs + 1).
+    """
+    value_of, cost_of = (_plain, _from_two) if name == POSITION_NEES else (np.sqrt, np.sqrt)
+    *numerators, count = ticks.sum(axis=0).tolist()
+    means = np.array(numerators) / count
+    best, *others = np.argsort(cost_of(means), kind="stable").tolist()
+
+    def worse_by(one: int) -> Estimate:
+        def statistic(S: FloatArray) -> FloatArray:
+            return cost_of(S[0] / S[2]) - cost_of(S[1] / S[2])
+
+        return within_run(ticks[:, [one, best, -1]], statistic, np.random.default_rng(_SEED))
+
+    differences = {one: worse_by(one) for one in others}
+    ties = {one for one, difference in differences.items() if not difference.is_significant}
+    values = value_of(means).tolist()
+    entries = [Entry(labels[best], values[best], None, "tie" if ties else "best")]
+    for one, difference in differences.items():
+        entries.append(Entry(labels[one], values[one], difference, "tie" if one in ties else "worse"))
+    return Quantity(name, tuple(entries))
+
+
+def _plain(mean: FloatArray) -> FloatArray:
+    return mean
+
+
+def _from_two(mean: FloatArray) -> FloatArray:
+    """Distance of a mean NEES of the position from what a consistent estimator has."""
+    return np.abs(mean - 2.0)

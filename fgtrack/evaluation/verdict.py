@@ -1,0 +1,163 @@
+"""What a comparison says, in plain sentences with their intervals: the best run, the noise, the worth of waiting."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from fgtrack.evaluation.contest import Contest, Entry, Quantity
+from fgtrack.evaluation.differences import two_digits
+from fgtrack.evaluation.lagged import WINDOW
+from fgtrack.evaluation.metrics import Metrics
+from fgtrack.evaluation.paired import Estimate
+from fgtrack.evaluation.statistics import ChiSquareMean
+from fgtrack.evaluation.tables import short
+
+FAR_OFF = 1.5
+"""A mean NEES or NIS farther from its expected value than by this factor says that the noise does not fit."""
+
+_FEWEST = 30  # updates of a sensor whose NIS says something
+_MOST_NAMED = 3
+_MM = 1e3
+_CM_M = 0.01
+_PERCENT = 100.0
+
+
+@dataclass(frozen=True)
+class _Square:
+    """A mean NEES or NIS."""
+
+    name: str
+    mean: float
+    expected: float
+    is_far_off: bool
+
+
+def verdict(metrics: Mapping[str, Metrics], contests: Sequence[Contest]) -> tuple[str, ...]:
+    """Sentences on the runs of `metrics`, by label; nothing on runs without errors and innovations."""
+    sentences = [found for contest in contests for found in _positions(contest)]
+    alone = [label for label in metrics if not any(label in contest.runs for contest in contests)]
+    if len(metrics) > 1 and (len(contests) > 1 or alone):
+        sentences.append(_unpaired(metrics, contests, alone))
+    for contest in contests:
+        sentences += _noise({label: metrics[label] for label in _ranked(contest)})
+    for label in alone:
+        sentences += _noise({label: metrics[label]})
+    sentences += [found for label, one in metrics.items() for found in _waiting(label, one)]
+    return tuple(sentences)
+
+
+def _positions(contest: Contest) -> Iterator[str]:
+    """Who is best at the newest stamp."""
+    quantity = _position(contest)
+    if quantity is None:
+        yield f"{_listed(contest.runs)} never track the same object at the same stamp: there is nothing to pair."
+        return
+    best, *others = quantity.entries
+    ties = [entry for entry in others if entry.standing == "tie"]
+    worse = [entry for entry in others if entry.standing == "worse"]
+    value = f"position RMSE {short(best.value)} m"
+    if ties:
+        last = ties[-1]
+        difference = f"{'difference' if len(ties) == 1 else 'largest difference'} {_metres(last)}"
+        names = _listed([best.run, *(one.run for one in ties)])
+        first = f"{names} tie at the newest stamp ({value}, {difference})"
+    else:
+        first = f"{best.run} is best at the newest stamp ({value})"
+    yield f"{first}{'; ' if worse else ''}{_worse(worse)}."
+
+
+def _worse(entries: Sequence[Entry]) -> str:
+    named = [f"{entry.run} is {_metres(entry, ' worse')}" for entry in entries[:_MOST_NAMED]]
+    left = len(entries) - len(named)
+    return ", ".join([*named, *([f"{left} more are worse"] if left else [])])
+
+
+def _metres(entry: Entry, what: str = "") -> str:
+    """How much worse `entry` is, with the interval and `what` behind the unit."""
+    found = entry.worse_by
+    assert found is not None
+    scale, unit = (_MM, "mm") if abs(found.mean) < _CM_M else (1.0, "m")
+    amount = f"{two_digits(scale * found.mean)} {unit}{what}"
+    if not found.is_known:
+        return f"{amount}, too short a run for an interval"
+    interval = f"{two_digits(scale * found.low)} to {two_digits(scale * found.high)}"
+    return f"{amount} ({interval})" if what else f"{amount}, 95 % interval {interval}"
+
+
+def _unpaired(metrics: Mapping[str, Metrics], contests: Sequence[Contest], alone: Sequence[str]) -> str:
+    without = [label for label in alone if metrics[label].truth is None]
+    if len(without) == len(metrics):
+        return "Without truth there are no errors to compare."
+    return (
+        "Not all runs are of the same recording with truth (or they are judged by different settings): "
+        "only those that are can be told apart by their differences."
+    )
+
+
+def _noise(metrics: Mapping[str, Metrics]) -> Iterator[str]:
+    """Whether the covariances of the first run, the best one, fit what happened; who else's do not."""
+    (label, one), *others = metrics.items()
+    found = list(_squares(one))
+    if not found:
+        return
+    off = [square for square in found if square.is_far_off]
+    if off:
+        small = [square.mean > square.expected for square in off]
+        size = "too small" if all(small) else "partly too small, partly too large" if any(small) else "too large"
+        yield (
+            f"The configured noise is {size}: {_named(off)} ({label}). "
+            "Fit it with `fgtrack tune` and compare again; the order of the runs may change."
+        )
+        return
+    yield f"The noise fits: {_named(found)} ({label})."
+    for other, its in others:
+        wrong = [square for square in _squares(its) if square.is_far_off]
+        if wrong:
+            yield f"Not so of {other}: {_named(wrong)}."
+
+
+def _named(squares: Sequence[_Square]) -> str:
+    return ", ".join(f"{one.name} {short(one.mean)} (expected {one.expected:.3g})" for one in squares)
+
+
+def _squares(one: Metrics) -> Iterator[_Square]:
+    """NEES of the position, and NIS of every sensor with enough of them."""
+    nees, interval = one.consistency.position_nees, one.consistency.position_nees_interval
+    if nees.count:
+        outside = interval.low > nees.dof or interval.high < nees.dof
+        yield _Square("NEES of the position", nees.mean, nees.dof, outside and _is_far(nees))
+    for sensor, nis in one.consistency.nis.items():
+        if nis.count >= _FEWEST:
+            yield _Square(f"NIS of {sensor}", nis.mean, nis.dof, _is_far(nis))
+
+
+def _is_far(square: ChiSquareMean) -> bool:
+    return not square.dof / FAR_OFF <= square.mean <= square.dof * FAR_OFF
+
+
+def _waiting(label: str, one: Metrics) -> Iterator[str]:
+    """What the first and the last lag bring."""
+    lags = [
+        entry for entry in one.lagged if entry.is_lagged and entry.lag_s != WINDOW and entry.position_reduction.is_known
+    ]
+    if lags:
+        ends = lags if len(lags) == 1 else [lags[0], lags[-1]]
+        parts = [f"{entry.lag_s:g} s by {_percent(entry.position_reduction)}" for entry in ends]
+        yield f"Waiting lowers the position RMSE of {label}: {', '.join(parts)}."
+
+
+def _percent(share: Estimate) -> str:
+    return f"{_PERCENT * share.mean:.0f} % ({_PERCENT * share.low:.0f} to {_PERCENT * share.high:.0f})"
+
+
+def _position(contest: Contest) -> Quantity | None:
+    return next((one for one in contest.quantities if one.name == "position_rmse_m"), None)
+
+
+def _ranked(contest: Contest) -> Sequence[str]:
+    """The runs, the best one first."""
+    quantity = _position(contest)
+    return contest.runs if quantity is None else [entry.run for entry in quantity.entries]
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))

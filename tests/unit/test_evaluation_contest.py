@@ -1,0 +1,156 @@
+"""Runs of one recording against each other: which are paired, at which samples, and who is better."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluation_runs import ROUND, WEST, update, write_run
+
+from fgtrack.core.types import FloatArray
+from fgtrack.evaluation.comparison import compare
+from fgtrack.evaluation.contest import Contest, Quantity, contests, same_recording
+from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.io.run import Run
+
+TICKS = 200
+NOISE_M = np.random.default_rng(1).normal(0.0, 0.3, TICKS)
+
+
+def a_run(folder: Path, across_m: FloatArray, *, first: int = 0, config_text: str = "", stamps_late: int = 0) -> Run:
+    """A car tracked from tick `first` on with the errors `across_m`; another one that is missed."""
+    tracks = [[WEST.track(k, 1, across_m=float(across_m[k]))] if k >= first else [] for k in range(TICKS)]
+    updates = {k: [update(tick=k - stamps_late, delay_ns=stamps_late * 20_000_000)] for k in range(first, TICKS, 5)}
+    truth = [*WEST.truth(range(TICKS)), *ROUND.truth(range(TICKS))]
+    return write_run(folder, tracks, truth=truth, updates=updates, config_text=config_text)
+
+
+def judged(runs: Sequence[Run]) -> list[JudgedRun]:
+    return [JudgedRun(str(number), run) for number, run in enumerate(runs)]
+
+
+def contest_of(runs: Sequence[Run]) -> Contest:
+    (found,) = contests(judged(runs))
+    return found
+
+
+def quantities_of(contest: Contest) -> dict[str, Quantity]:
+    return {one.name: one for one in contest.quantities}
+
+
+def rms(values: FloatArray) -> float:
+    return math.sqrt(float(np.square(values).mean()))
+
+
+@pytest.fixture(scope="module")
+def trio(tmp_path_factory: pytest.TempPathFactory) -> list[Run]:
+    """Errors doubled, plain, and plain but for what changes its sign from tick to tick."""
+    folder = tmp_path_factory.mktemp("trio")
+    flips = 0.001 * (-1.0) ** np.arange(TICKS)
+    return [a_run(folder / str(k), across) for k, across in enumerate((2.0 * NOISE_M, NOISE_M, NOISE_M + flips))]
+
+
+def test_the_best_run_and_those_that_tie_with_it_and_how_much_worse_the_others_are(trio: list[Run]) -> None:
+    found = quantities_of(contest_of(trio))["position_rmse_m"]
+    assert [(entry.run, entry.standing) for entry in found.entries] in (
+        [("1", "tie"), ("2", "tie"), ("0", "worse")],
+        [("2", "tie"), ("1", "tie"), ("0", "worse")],
+    )
+    values = {entry.run: entry.value for entry in found.entries}
+    assert values["1"] == pytest.approx(rms(NOISE_M), rel=1e-9)
+    worse = found.entries[2].worse_by
+    assert worse is not None
+    assert worse.mean == pytest.approx(values["0"] - found.entries[0].value)
+    assert worse.low < rms(NOISE_M) < worse.high
+    assert found.entries[0].worse_by is None
+    assert set(found.ties) == {"1", "2"}
+
+
+def test_without_the_tie_the_best_is_best(trio: list[Run]) -> None:
+    found = quantities_of(contest_of(trio[:2]))["position_rmse_m"]
+    assert [(entry.run, entry.standing) for entry in found.entries] == [("1", "best"), ("0", "worse")]
+
+
+def test_gospa_is_that_of_the_metrics(trio: list[Run]) -> None:
+    found = quantities_of(contest_of(trio))["gospa_rms_m"]
+    expected = {one.label: one.metrics.multi_object.gospa.rms_m for one in judged(trio) if one.metrics.multi_object}
+    assert {entry.run: entry.value for entry in found.entries} == pytest.approx(expected)
+    assert found.entries[-1].run == "0"
+
+
+def test_of_the_nees_the_nearest_to_two_is_best(tmp_path: Path) -> None:
+    """The covariance of a track is the identity, so its NEES is its squared error."""
+    noise = np.random.default_rng(2).normal(0.0, 0.2, TICKS)
+    near, cautious = a_run(tmp_path / "a", math.sqrt(1.8) + noise), a_run(tmp_path / "b", 0.2 + noise)
+    found = quantities_of(contest_of([cautious, near]))
+    assert [entry.run for entry in found["position_nees"].entries] == ["1", "0"]
+    assert found["position_nees"].entries[0].standing == "best"
+    assert found["position_nees"].entries[0].value == pytest.approx(1.8, rel=0.1)
+    assert [entry.run for entry in found["position_rmse_m"].entries] == ["0", "1"]
+
+
+def test_only_samples_that_all_runs_have_are_compared(tmp_path: Path) -> None:
+    """The second run begins late; before that the first one is far off."""
+    early = np.where(np.arange(TICKS) < 50, 4.0, NOISE_M)
+    runs = [a_run(tmp_path / "a", early), a_run(tmp_path / "b", NOISE_M, first=50)]
+    # the detections of the first 50 ticks are in one run alone
+    runs[1] = replace(runs[1], updates=runs[0].updates)
+    found = contest_of(runs)
+    assert (found.samples, found.most_samples) == (150, 200)
+    entries = quantities_of(found)["position_rmse_m"].entries
+    assert [entry.value for entry in entries] == pytest.approx([rms(NOISE_M[50:])] * 2)
+    assert {entry.standing for entry in entries} == {"tie"}
+    assert any("150 samples in common, of up to 200" in note for note in compare(runs)["differences"].notes)
+
+
+def test_nothing_in_common_is_said(tmp_path: Path) -> None:
+    tracks = [[WEST.track(k, 1)] if k < 100 else [] for k in range(TICKS)]
+    truth = [*WEST.truth(range(TICKS)), *ROUND.truth(range(TICKS))]
+    first = write_run(tmp_path / "first", tracks, truth=truth)
+    found = compare([first, a_run(tmp_path / "last", NOISE_M, first=100)])
+    assert "never track the same object at the same stamp" in found.verdict[0]
+    assert set(found["differences"]["quantity"].tolist()) == {"gospa_rms_m"}
+
+
+def test_the_same_runs_give_the_same_bits(trio: list[Run]) -> None:
+    assert contest_of(trio) == contest_of(trio)
+
+
+def test_runs_of_other_recordings_or_judged_otherwise_are_not_paired(tmp_path: Path, trio: list[Run]) -> None:
+    one = JudgedRun("one", trio[0])
+    other_truth = write_run(tmp_path / "truth", [[WEST.track(0, 1)]], truth=WEST.truth(range(9)))
+    other_gate = a_run(tmp_path / "gate", NOISE_M, config_text="evaluation: {gate_m: 3.0}")
+    more_detections = replace(trio[1], updates=write_run(tmp_path / "more", updates={0: [update(), update()]}).updates)
+    for other in (other_truth, other_gate, more_detections):
+        assert not same_recording(one, JudgedRun("other", other))
+        assert contests([one, JudgedRun("other", other)]) == []
+
+
+def test_the_same_detections_with_other_delays_or_other_stamps_are_paired(tmp_path: Path, trio: list[Run]) -> None:
+    one = JudgedRun("one", trio[0])
+    later = write_run(tmp_path / "later", updates={k: [update(tick=k, delay_ns=7)] for k in range(0, TICKS, 5)})
+    restamped = a_run(tmp_path / "restamped", NOISE_M, stamps_late=1)
+    assert same_recording(one, JudgedRun("later", replace(trio[1], updates=later.updates)))
+    assert same_recording(one, JudgedRun("restamped", restamped))
+
+
+def test_each_recording_has_a_contest_of_its_own(tmp_path: Path, trio: list[Run]) -> None:
+    tracks = [[ROUND.track(k, 1, across_m=0.1 * (k % 3))] for k in range(50)]
+    pair = [write_run(tmp_path / name, tracks, truth=ROUND.truth(range(50))) for name in "ab"]
+    without = write_run(tmp_path / "without", tracks)
+    found = contests(judged([trio[0], pair[0], without, trio[1], pair[1]]))
+    assert [one.runs for one in found] == [("0", "3"), ("1", "4")]
+
+
+def test_the_table_has_all_numbers_and_says_best_tie_or_worse(trio: list[Run]) -> None:
+    table = compare(trio)["differences"]
+    mine = table.where(table["quantity"] == "position_rmse_m")
+    assert mine["standing"].tolist() == ["tie", "tie", "worse"]
+    assert np.isnan(mine["worse_by"][0])
+    assert mine["low"][2] < mine["worse_by"][2] < mine["high"][2]
+    assert mine["blocks"][2] > 20
+    shown = next(column for column in compare(trio[:2])["differences"].shown if column.heading == "value")
+    assert shown.bold[:2] == (True, False)
+    assert "**" in compare(trio[:2])["differences"].to_markdown()

@@ -1,0 +1,160 @@
+"""The sentences that a comparison begins with."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluation_runs import WEST, update, write_run
+
+from fgtrack.evaluation.consistency import Consistency
+from fgtrack.evaluation.contest import Contest, Entry, Quantity
+from fgtrack.evaluation.differences import two_digits
+from fgtrack.evaluation.metrics import Metrics, evaluate
+from fgtrack.evaluation.paired import Estimate
+from fgtrack.evaluation.statistics import ChiSquareMean, Moments
+from fgtrack.evaluation.verdict import verdict
+
+FITS = Consistency(
+    position_nees=ChiSquareMean(1000, 2.1, 2.0),
+    state_nees=ChiSquareMean(),
+    nis={"radar": ChiSquareMean(500, 4.2, 4.0), "camera": ChiSquareMean(5, 40.0, 1.0)},
+    autocorrelation={},
+    position_nees_interval=Estimate(2.1, 1.8, 2.4, 20),
+)
+TOO_SMALL = replace(
+    FITS,
+    position_nees=ChiSquareMean(1000, 13.4, 2.0),
+    position_nees_interval=Estimate(13.4, 9.0, 17.8, 20),
+    nis={"radar": ChiSquareMean(500, 26.5, 4.0)},
+)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Metrics:
+    """Metrics of a run with truth, to put numbers into."""
+    tracks = [[WEST.track(k, 1)] for k in range(4)]
+    return evaluate(write_run(tmp_path_factory.mktemp("run") / "run", tracks, truth=WEST.truth(range(4))))
+
+
+def metrics_of(plain: Metrics, **consistency: Consistency) -> dict[str, Metrics]:
+    return {name: replace(plain, consistency=found) for name, found in consistency.items()}
+
+
+def contest(**differences: Estimate | None) -> Contest:
+    entries = [
+        Entry(name, 0.4, worse, "worse" if worse is not None and worse.is_significant else "tie")
+        for name, worse in differences.items()
+    ]
+    if sum(entry.standing == "tie" for entry in entries) == 1:
+        entries[0] = replace(entries[0], standing="best")
+    return Contest(tuple(differences), 10, 10, (Quantity("position_rmse_m", tuple(entries)),))
+
+
+def first(plain: Metrics, found: Contest) -> str:
+    return verdict(dict.fromkeys(found.runs, plain), [found])[0]
+
+
+def test_a_tie_and_a_worse_run_are_told_with_their_intervals(plain: Metrics) -> None:
+    found = contest(a=None, b=Estimate(0.0001, -0.0004, 0.0005, 9), c=Estimate(0.18, 0.15, 0.21, 9))
+    assert first(plain, found) == (
+        "a and b tie at the newest stamp (position RMSE 0.400 m, difference 0.10 mm, 95 % interval -0.40 to 0.50); "
+        "c is 0.18 m worse (0.15 to 0.21)."
+    )
+
+
+def test_of_several_ties_the_largest_difference_is_told(plain: Metrics) -> None:
+    found = contest(a=None, b=Estimate(0.0, -0.1, 0.1, 9), c=Estimate(0.02, -0.01, 0.05, 9))
+    assert first(plain, found) == (
+        "a, b and c tie at the newest stamp (position RMSE 0.400 m, largest difference 0.020 m, "
+        "95 % interval -0.010 to 0.050)."
+    )
+
+
+def test_a_best_run_and_no_more_than_three_worse_ones_are_named(plain: Metrics) -> None:
+    worse = {name: Estimate(0.1, 0.05, 0.15, 9) for name in "bcdef"}
+    assert first(plain, contest(a=None, **worse)) == (
+        "a is best at the newest stamp (position RMSE 0.400 m); b is 0.10 m worse (0.050 to 0.15), "
+        "c is 0.10 m worse (0.050 to 0.15), d is 0.10 m worse (0.050 to 0.15), 2 more are worse."
+    )
+
+
+def test_a_run_too_short_for_an_interval_says_so(plain: Metrics) -> None:
+    assert "difference 0.10 m, too short a run for an interval" in first(
+        plain, contest(a=None, b=Estimate(0.1, math.nan, math.nan, 3))
+    )
+
+
+def test_noise_that_does_not_fit_is_named_with_its_cure(plain: Metrics) -> None:
+    found = contest(a=None, b=Estimate(0.2, 0.1, 0.3, 9))
+    (_, noise) = verdict(metrics_of(plain, a=TOO_SMALL, b=TOO_SMALL), [found])
+    assert noise == (
+        "The configured noise is too small: NEES of the position 13.4 (expected 2), NIS of radar 26.5 (expected 4) "
+        "(a). Fit it with `fgtrack tune` and compare again; the order of the runs may change."
+    )
+    large = replace(FITS, nis={"radar": ChiSquareMean(500, 1.0, 4.0)})
+    both = replace(TOO_SMALL, nis=large.nis)
+    assert "too large: NIS of radar" in verdict(metrics_of(plain, a=large), [])[0]
+    assert "partly too small, partly too large" in verdict(metrics_of(plain, a=both), [])[0]
+
+
+def test_noise_that_fits_is_said_too_and_who_does_not_fit_it(plain: Metrics) -> None:
+    found = contest(b=None, a=Estimate(0.2, 0.1, 0.3, 9))
+    _, fits, not_so = verdict(metrics_of(plain, a=TOO_SMALL, b=FITS), [found])
+    assert fits == "The noise fits: NEES of the position 2.10 (expected 2), NIS of radar 4.20 (expected 4) (b)."
+    assert not_so == "Not so of a: NEES of the position 13.4 (expected 2), NIS of radar 26.5 (expected 4)."
+
+
+def test_a_large_nees_that_may_be_chance_is_no_reason_to_tune(plain: Metrics) -> None:
+    chance = replace(FITS, position_nees=ChiSquareMean(99, 5.0, 2.0), position_nees_interval=Estimate(5.0, 1.0, 9.0, 3))
+    assert verdict(metrics_of(plain, a=chance), [])[0].startswith("The noise fits")
+
+
+def test_runs_that_cannot_be_paired_are_told_in_one_line(plain: Metrics) -> None:
+    (line, *noise) = verdict(metrics_of(plain, a=FITS, b=FITS), [])
+    assert "Not all runs are of the same recording" in line
+    assert len(noise) == 2
+    without: Mapping[str, Metrics] = {name: replace(plain, truth=None) for name in "ab"}
+    assert verdict(without, [])[0] == "Without truth there are no errors to compare."
+
+
+def test_what_waiting_brings_is_told_of_the_first_and_the_last_lag(plain: Metrics) -> None:
+    (present,) = plain.lagged
+    some = {"position_m": Moments(9, 0.0, 1.0)}
+    lags = [
+        replace(present, lag_s=lag_s, errors=some, position_reduction=Estimate(share, share - 0.1, share + 0.1, 9))
+        for lag_s, share in ((0.1, 0.2), (0.3, 0.5), (0.9, 0.7))
+    ]
+    window = replace(lags[-1], lag_s="window")
+    lines = verdict({"a": replace(plain, lagged=(present, *lags, window))}, [])
+    assert lines[-1] == "Waiting lowers the position RMSE of a: 0.1 s by 20 % (10 to 30), 0.9 s by 70 % (60 to 80)."
+    assert verdict({"a": replace(plain, lagged=(present, lags[0]))}, [])[-1].endswith("a: 0.1 s by 20 % (10 to 30).")
+
+
+def test_a_run_without_truth_and_innovations_has_no_verdict(tmp_path: Path) -> None:
+    assert verdict({"a": evaluate(write_run(tmp_path / "run", [[]]))}, []) == ()
+
+
+def test_the_interval_of_the_nees_is_wider_where_errors_are_correlated(tmp_path: Path) -> None:
+    slow = np.repeat(np.random.default_rng(1).normal(0.0, 1.0, 20), 20)
+    tracks = [[WEST.track(k, 1, across_m=float(error))] for k, error in enumerate(slow)]
+    updates = {k: [update(tick=k)] for k in range(400)}
+    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(400)), updates=updates)
+    found = evaluate(run).consistency
+    interval = found.position_nees_interval
+    assert interval.mean == pytest.approx(found.position_nees.mean)
+    independent = 2.0 * 1.96 * np.square(slow).std() / 20.0
+    assert interval.high - interval.low > 3.0 * independent
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        *[(0.184, "0.18"), (4.831, "4.8"), (103.4, "103"), (-0.000123, "-0.00012"), (9.96, "10"), (0.0996, "0.10")],
+        *[(1e-7, "0"), (0.0, "0"), (math.nan, "-"), (3, "3")],
+    ],
+)
+def test_differences_have_two_significant_digits(value: float, text: str) -> None:
+    assert two_digits(value) == text
