@@ -36,6 +36,9 @@ class KittiInput:
     """By sensor, the folder of its detections: those of a lower score are left out."""
     image_width_px: float = 1242.0
     """A box in the image that touches the left or right border is left out: its middle is not that of the car."""
+    box_std: float | None = None
+    """Standard deviation of the bearing of a box, in widths of the box: nearer is less certain. Null for the `std` of
+    the sensor."""
 
 
 @dataclass(frozen=True)

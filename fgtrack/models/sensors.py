@@ -36,6 +36,22 @@ class RobustLoss:
 
 
 @dataclass(frozen=True)
+class Correlation:
+    """How the errors of an object's successive detections resemble each other."""
+
+    share: float = 0.8
+    """Share of the variance that lasts; the rest is new in every detection."""
+    time_s: float = 1.0
+    """After this time the lasting part has fallen to 1/e: what the autocorrelation of the errors shows."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.share < 1.0:
+            raise ValueError(f"share: must lie between 0 and 1, is {self.share}")
+        if not (math.isfinite(self.time_s) and self.time_s > 0.0):
+            raise ValueError(f"time_s: must be positive and finite, is {self.time_s}")
+
+
+@dataclass(frozen=True)
 class SensorModel:
     """One modality. Positions have their standard deviations along and across the line of sight."""
 
@@ -67,6 +83,8 @@ class SensorModel:
     """Robust loss of its measurements; null is the Gaussian. A smoother weighs them anew while they are in its
     window, a filter once, at the state that the update gives."""
     mount: Mount = field(default_factory=Mount)
+    correlation: Correlation | None = None
+    """Errors that are correlated in time, estimated with each object; null: every detection errs anew."""
 
     def __post_init__(self) -> None:
         unknown = set(self.std) - set(MEASURABLE)

@@ -55,7 +55,7 @@ _STORAGE = {
 def build_tracker(config: Config) -> Tracker:
     """The tracker that `config` describes. Raises `CallError` for an estimator that does not exist."""
     road = build_road(config.map)
-    motion = config.motion.model()
+    motion = config.motion_model()
     origin_m = (config.ego.detection_origin_x_m, config.ego.detection_origin_y_m)
     published_order = config.lifecycle.kind == "published"
     parts = TrackerParts(
@@ -100,15 +100,15 @@ def _build_backward_forward(config: Config) -> TrackBank:
     step_ns = period_ns(config.filter.frequency_hz)
     storage = _STORAGE[config.filter.clock, config.filter.present]
     steps = round(config.filter.storage_s * config.filter.frequency_hz)
-    return storage(build_propagator(config.motion, seconds(step_ns)), step_ns, steps)
+    return storage(build_propagator(config, seconds(step_ns)), step_ns, steps)
 
 
 def _build_incremental(config: Config) -> TrackBank:
-    return SmootherBank(config.motion.model(), config.smoother)
+    return SmootherBank(config.motion_model(), config.smoother)
 
 
 def _build_batch(config: Config) -> TrackBank:
-    return SmootherBank(config.motion.model(), config.smoother, BatchBackend)
+    return SmootherBank(config.motion_model(), config.smoother, BatchBackend)
 
 
 #: Banks that are built from settings of their own.
@@ -123,21 +123,21 @@ def build_bank(config: Config) -> TrackBank:
     """The estimators of all objects. Raises `CallError` for options that the estimator does not take."""
     build, options = _BANKS.get(config.estimator), config.options.get(config.estimator, {})
     if build is None:
-        return estimator_bank(config.estimator, config.motion.model(), config.filter.storage_s, options)
+        return estimator_bank(config.estimator, config.motion_model(), config.filter.storage_s, options)
     if options:
         raise CallError(f"options.{config.estimator}: set the keys of smoother or filter instead")
     return build(config)
 
 
-def build_propagator(config: MotionConfig, step_s: float) -> Propagator:
+def build_propagator(config: Config, step_s: float) -> Propagator:
     """The motion model in steps of `step_s`."""
-    motion = config.model()
-    if config.kind != "ctrv_euler":
+    motion, noise = config.motion_model(), config.motion
+    if noise.kind != "ctrv_euler":
         return ExactPropagator(motion)
-    density = np.array([config.std_per_s[name] ** 2 / config.noise_hz for name in _noise_names(config)])
-    if config.noise == "per_step":
-        density *= config.noise_hz * step_s
-    return _EULER[config.yaw, config.acceleration](motion, density)
+    density = np.array([noise.std_per_s[name] ** 2 / noise.noise_hz for name in _noise_names(noise)])
+    if noise.noise == "per_step":
+        density *= noise.noise_hz * step_s
+    return _EULER[noise.yaw, noise.acceleration](motion, density)
 
 
 def _noise_names(config: MotionConfig) -> list[str]:

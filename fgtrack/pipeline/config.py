@@ -11,6 +11,7 @@ from fgtrack.estimation.registry import ESTIMATORS, motion_model
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.io.config import InputConfig
 from fgtrack.io.run import EvaluationConfig
+from fgtrack.models.correlated_errors import with_correlated_errors
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import SensorModel
 from fgtrack.sim.settings import settings
@@ -220,3 +221,10 @@ class Config:
         strangers = set(self.input.detections) - set(self.sensors) - set(self.ignore_sensors)
         if strangers:
             raise ValueError(f"input.detections: {sorted(strangers)[0]!r} has no model under sensors")
+        erring = [name for name, sensor in self.sensors.items() if sensor.correlation is not None]
+        if erring and self.motion.kind == "ctrv_euler":
+            raise ValueError(f"sensors.{erring[0]}.correlation: needs motion.kind ctrv, ctra or cv")
+
+    def motion_model(self) -> MotionModel:
+        """The motion model of the tracks, with the errors of sensors that are correlated in time."""
+        return with_correlated_errors(self.motion.model(), self.sensors)

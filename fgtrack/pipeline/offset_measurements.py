@@ -61,7 +61,7 @@ def _is_position(names: Set[str]) -> bool:
 
 def _position_only(sensor: SensorModel) -> SensorModel:
     std = {name: value for name, value in sensor.std.items() if name in _POSITION}
-    return replace(sensor, std=std, yaw_from_map_std_rad=None, max_range_m=None)
+    return replace(sensor, std=std, yaw_from_map_std_rad=None, max_range_m=None, correlation=None)
 
 
 def measurements_by_track(

@@ -10,6 +10,7 @@ import numpy as np
 from fgtrack.core.geometry import rotation
 from fgtrack.core.types import EgoState, FloatArray
 from fgtrack.estimation.base import Start
+from fgtrack.models.correlated_errors import whole_error
 from fgtrack.models.road import Road
 from fgtrack.tracking.preprocess import Candidate
 
@@ -81,7 +82,9 @@ class MeasuredBirth(Birth):
     def spread(self, candidate: Candidate, yaw_rad: float) -> tuple[FloatArray, float, float]:
         """See `Birth.spread`."""
         position = candidate.position_covariance
-        own = dict(zip(candidate.values, np.sqrt(np.diag(candidate.measurement.R)).tolist(), strict=True))
+        measurement = candidate.measurement
+        R = whole_error(measurement.model, measurement.R)
+        own = dict(zip(candidate.values, np.sqrt(np.diag(R)).tolist(), strict=True))
         position = np.zeros((2, 2)) if position is None else position
         return position, own.get("yaw_rad", self.yaw_std_rad), own.get("speed_mps", self.speed_std_mps)
 

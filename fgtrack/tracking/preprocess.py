@@ -16,6 +16,7 @@ from fgtrack.core.geometry import body_point, circular_mean, rotation, wrap_angl
 from fgtrack.core.linalg import congruence
 from fgtrack.core.types import MEASURABLE, Detection, Disposition, FloatArray, UpdateRecord
 from fgtrack.estimation.base import Measurement
+from fgtrack.models.correlated_errors import split_error
 from fgtrack.models.measurement import ANGULAR, SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
@@ -191,10 +192,12 @@ class Preprocess:
         assumed = self._assumed(parts, names, sensor)
         z = np.array(list(values.values()))
         found = measured_position(names, z, R, pose)
+        model = measurement_model(names, self._motion)
+        model, white = split_error(batch.sensor, sensor, model, R, self._motion.state_names)
         return Candidate(
             leader.index,
             merged,
-            Measurement(batch.stamp_ns, measurement_model(names, self._motion), z, R, pose, sensor.loss, assumed),
+            Measurement(batch.stamp_ns, model, z, white, pose, sensor.loss, assumed),
             None if point_m is None else np.array(point_m),
             None if found is None else found[1],
             values,

@@ -202,7 +202,7 @@ def test_fgtrack_predicts_as_the_oracle_does(yaw_range_rad: tuple[float, float],
     )
     roots = rng.normal(0.0, 1.0, (20, 6, 6))
     covariances = roots @ roots.transpose(0, 2, 1)
-    propagator = build_propagator(load(Config, REFERENCE_CONFIG).motion, DT)
+    propagator = build_propagator(load(Config, REFERENCE_CONFIG), DT)
     to_rep103 = np.array([0.0, 0.0, np.pi / 2.0, 0.0, 0.0, 0.0])
     means, spreads = propagator.propagate(states.T + to_rep103, covariances, np.full(20, num_steps), DT)
     for i in range(20):

@@ -114,6 +114,13 @@ def test_a_box_in_the_image_is_the_bearing_of_its_middle_from_the_camera(tmp_pat
     assert found.objects == (Detection(bearing_rad=pytest.approx(math.atan2(170.0, FOCAL_PX))),)
 
 
+def test_the_bearing_of_a_wide_box_is_less_certain(tmp_path):
+    drive = folder(tmp_path, camera=[box(0, 590.0, 610.0), box(0, 550.0, 650.0)])
+    (found,) = lists(drive, box_std=0.1)
+    far, near = (math.sqrt(item.covariance[0]) for item in found.objects)
+    assert (far, near) == pytest.approx((0.1 * 2.0 * math.atan(10 / FOCAL_PX), 0.1 * 2.0 * math.atan(50 / FOCAL_PX)))
+
+
 def test_roll_and_pitch_are_taken_out(tmp_path):
     """A point 10 m ahead of a unit that looks down by 0.1 rad is nearer; one to the left of a rolled unit too."""
     tilted, laser = [oxts(pitch_rad=0.1), oxts(roll_rad=0.1)], [pose(0, 10.0, 0.0, 0.0), pose(1, 10.0, 4.0, 0.0)]

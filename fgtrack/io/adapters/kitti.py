@@ -119,7 +119,7 @@ def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator
         for file, rows in detections:
             sensor = file.parent.name
             least = settings.min_score.get(sensor, -math.inf)
-            objects = _read(file, rows.get(frame, []), partial(_detection, view, least, settings.image_width_px))
+            objects = _read(file, rows.get(frame, []), partial(_detection, view, least, settings))
             yield DetectionList(sensor, view.ego.stamp_ns, view.ego.receipt_ns, list(objects), _frame(rows))
 
 
@@ -222,7 +222,7 @@ def _truth(view: View, fields: list[str]) -> TruthState | None:
     return TruthState(ego.stamp_ns, ego.receipt_ns, int(fields[1]), x_m, y_m, wrap_angle(yaw_rad + ego.yaw_rad))
 
 
-def _detection(view: View, min_score: float, image_width_px: float, fields: list[str]) -> Detection | None:
+def _detection(view: View, min_score: float, settings: KittiInput, fields: list[str]) -> Detection | None:
     """The car of a line; None for another class, one below the score, and a box that the image cuts off."""
     if len(fields) == _POSE_FIELDS:
         if int(fields[1]) != _CAR or float(fields[6]) < min_score:
@@ -232,10 +232,15 @@ def _detection(view: View, min_score: float, image_width_px: float, fields: list
         return Detection(x_m=float(position_m[0]), y_m=float(position_m[1]), yaw_rad=yaw_rad)
     if len(fields) == _BOX_FIELDS:
         left_px, top_px, right_px, bottom_px, score = map(float, fields[1:])
-        cut_off = left_px < _BORDER_PX or right_px > image_width_px - 1.0 - _BORDER_PX
+        cut_off = left_px < _BORDER_PX or right_px > settings.image_width_px - 1.0 - _BORDER_PX
         if cut_off or score < min_score:
             return None
-        return Detection(bearing_rad=view.bearing_rad(0.5 * (left_px + right_px), 0.5 * (top_px + bottom_px)))
+        v_px = 0.5 * (top_px + bottom_px)
+        covariance = None
+        if settings.box_std is not None:
+            width_rad = view.bearing_rad(left_px, v_px) - view.bearing_rad(right_px, v_px)
+            covariance = ((settings.box_std * width_rad) ** 2,)
+        return Detection(bearing_rad=view.bearing_rad(0.5 * (left_px + right_px), v_px), covariance=covariance)
     raise ValueError(f"{len(fields)} fields in place of {_POSE_FIELDS}, a box in space, or {_BOX_FIELDS}, in the image")
 
 

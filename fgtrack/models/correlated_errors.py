@@ -1,0 +1,161 @@
+"""Errors of a sensor that are correlated in time, estimated with the state of the object.
+
+Where the errors of successive detections resemble each other, as those of a box around a car seen from one side,
+an estimator that takes them for white believes them too much: a smoother, which averages over its window, most of all.
+The remedy is as old as the filter: the part of the error that lasts is a first-order Gauss-Markov process and a state
+(Bryson and Henrikson, "Estimation using sampled data containing sequentially correlated noise", 1968; Bar-Shalom, Li,
+Kirubarajan 2001, section 8.3). Every estimator does it alike, because motion and measurement models bring the state.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from fgtrack.core.linalg import symmetrise
+from fgtrack.core.types import FloatArray
+from fgtrack.models.measurement import MeasurementModel, SensorPose
+from fgtrack.models.motion import MotionModel
+from fgtrack.models.sensors import SensorModel
+
+_AT_ORIGIN = SensorPose()
+
+
+@dataclass(frozen=True)
+class CorrelatedErrors(MotionModel):
+    """A motion model whose state also has, of one object, the lasting errors of sensors.
+
+    Each is a stationary first-order Gauss-Markov process of mean 0 and variance 1,
+    e(t + dt) = exp(-dt / T) e(t) + N(0, 1 - exp(-2 dt / T)), in standard deviations of the lasting part.
+    """
+
+    base: MotionModel
+    """How the object moves."""
+    times_s: tuple[tuple[str, float], ...]
+    """Name `sensor.component` and correlation time T of every error, in the order of the state behind `base`."""
+
+    def __post_init__(self) -> None:
+        names = (*self.base.state_names, *(name for name, _ in self.times_s))
+        object.__setattr__(self, "state_names", names)  # of the object: class variables where a model has no parts
+        object.__setattr__(self, "linear", self.base.linear)
+
+    def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
+        """See `MotionModel.predict`."""
+        moved = self.base.predict(x[..., : self._n], dt_s)
+        return np.concatenate([moved, x[..., self._n :] * self._decay(dt_s)], axis=-1)
+
+    def jacobian(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
+        """See `MotionModel.jacobian`."""
+        return self._beside(self.base.jacobian(x[..., : self._n], dt_s), self._decay(dt_s))
+
+    def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
+        """See `MotionModel.process_noise`."""
+        Q = self.base.process_noise(x[..., : self._n], dt_s)
+        return self._beside(Q, -np.expm1(2.0 * self._exponents(dt_s)))
+
+    def start_variance(self, name: str) -> float:
+        """See `MotionModel.start_variance`; an error is in its stationary state."""
+        return self.base.start_variance(name) if name in self.base.state_names else 1.0
+
+    @cached_property
+    def _n(self) -> int:
+        return self.base.dim
+
+    @cached_property
+    def _rates_hz(self) -> FloatArray:
+        return np.array([1.0 / time_s for _, time_s in self.times_s])
+
+    def _exponents(self, dt_s: float | FloatArray) -> FloatArray:
+        return -np.asarray(dt_s, dtype=np.float64)[..., None] * self._rates_hz
+
+    def _decay(self, dt_s: float | FloatArray) -> FloatArray:
+        """Shape (..., errors)."""
+        return np.asarray(np.exp(self._exponents(dt_s)))
+
+    def _beside(self, block: FloatArray, diagonal: FloatArray) -> FloatArray:
+        """Block-diagonal matrix (..., n, n) of `block` and of `diagonal` (..., errors)."""
+        found = np.zeros((*block.shape[:-2], self.dim, self.dim))
+        found[..., : self._n, : self._n] = block
+        places = np.arange(self._n, self.dim)
+        found[..., places, places] = diagonal
+        return found
+
+
+@dataclass(frozen=True)
+class ErringMeasurement(MeasurementModel):
+    """A measurement of which a part of the error is in the state: z = h(x, pose) + gain e + noise."""
+
+    columns: tuple[int, ...]
+    """Where the errors e are in the state."""
+    gain: FloatArray
+    """Shape (k, number of errors)."""
+
+    def predict(self, x: FloatArray, pose: SensorPose = _AT_ORIGIN) -> FloatArray:
+        """See `MeasurementModel.predict`."""
+        return np.asarray(super().predict(x, pose) + x.take(self.columns, axis=-1) @ self.gain.T)
+
+    def jacobian(self, x: FloatArray, pose: SensorPose = _AT_ORIGIN) -> FloatArray:
+        """See `MeasurementModel.jacobian`."""
+        H = super().jacobian(x, pose)  # that of a linear model is `selection`
+        if not self.linear:
+            H[..., self.columns] = self.gain
+        return H
+
+    def selection(self, n: int) -> FloatArray:
+        """See `MeasurementModel.selection`."""
+        H = super().selection(n).copy()
+        H[:, self.columns] = self.gain
+        H.flags.writeable = False
+        return H
+
+
+def with_correlated_errors(motion: MotionModel, sensors: Mapping[str, SensorModel]) -> MotionModel:
+    """`motion` with a state for every component of the sensors whose errors last; itself where there is none."""
+    times_s = [
+        (_name(sensor, component), model.correlation.time_s)
+        for sensor, model in sensors.items()
+        if model.correlation is not None
+        for component in model.components
+    ]
+    return CorrelatedErrors(motion, tuple(times_s)) if times_s else motion
+
+
+def split_error(
+    sensor: str, model: SensorModel, measurement: MeasurementModel, R: FloatArray, state_names: Sequence[str]
+) -> tuple[MeasurementModel, FloatArray]:
+    """The measurement model with the lasting part of the error, and the covariance (k, k) of the rest.
+
+    Of the covariance R (k, k) of the components that the sensor measures, the share s = `model.correlation.share`
+    lasts: z = h(x) + (s R)^1/2 e + N(0, (1 - s) R), so that a detection alone is as uncertain as R says. `state_names`
+    are those of the motion model. Both come back as they are where no error lasts.
+    """
+    if model.correlation is None:
+        return measurement, R
+    own = [row for row, name in enumerate(measurement.components) if name in model.std]
+    block = np.ix_(own, own)
+    share = model.correlation.share
+    lasting = share * R[block]
+    white = R.copy()
+    white[block] -= lasting
+    gain = np.zeros((len(R), len(own)))
+    gain[own] = _root(lasting)
+    columns = tuple(state_names.index(_name(sensor, measurement.components[row])) for row in own)
+    return ErringMeasurement(measurement.components, measurement.state_names, columns, gain), symmetrise(white)
+
+
+def whole_error(measurement: MeasurementModel, white: FloatArray) -> FloatArray:
+    """Covariance R, shape (k, k), of the lasting error and the rest `white`: the inverse of `split_error`."""
+    if not isinstance(measurement, ErringMeasurement):
+        return white
+    return white + measurement.gain @ measurement.gain.T
+
+
+def _name(sensor: str, component: str) -> str:
+    return f"{sensor}.{component}"
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """The symmetric root, shape (k, k): its axes turn with those of the covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)

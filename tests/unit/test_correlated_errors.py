@@ -1,0 +1,146 @@
+"""Errors of a sensor that last: their states, and that the estimators are consistent with them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fgtrack.core.errors import CallError
+from fgtrack.core.time import NS_PER_S
+from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.registry import estimator
+from fgtrack.models.correlated_errors import CorrelatedErrors, split_error, whole_error, with_correlated_errors
+from fgtrack.models.measurement import SensorPose, measurement_model
+from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
+from fgtrack.models.sensors import Correlation, SensorModel
+from fgtrack.pipeline.build import build_tracker
+from fgtrack.pipeline.config import Config, MotionConfig
+from fgtrack.pipeline.load import load
+from fgtrack.testing import check_motion_model
+
+WHITE = SensorModel({"x_m": 1.0, "y_m": 1.0})
+CAMERA = SensorModel({"bearing_rad": 0.02}, correlation=Correlation(0.8, 2.0))
+LIDAR = SensorModel({"x_m": 0.5, "y_m": 0.5, "yaw_rad": 0.1}, correlation=Correlation(0.5, 1.0))
+SENSORS = {"white": WHITE, "camera": CAMERA, "lidar": LIDAR}
+
+
+@pytest.mark.parametrize("base", [CTRV(), CTRA(), CV()], ids=lambda base: type(base).__name__)
+def test_it_keeps_the_contract_of_a_motion_model(base: MotionModel) -> None:
+    check_motion_model(with_correlated_errors(base, SENSORS))
+
+
+def test_there_is_a_state_for_every_component_of_a_sensor_whose_errors_last() -> None:
+    motion = with_correlated_errors(CTRV(), SENSORS)
+    added = "camera.bearing_rad", "lidar.x_m", "lidar.y_m", "lidar.yaw_rad"
+    assert motion.state_names == (*CTRV.state_names, *added)
+    assert (motion.dim, motion.linear) == (9, False)
+    assert with_correlated_errors(CV(), SENSORS).linear
+    assert with_correlated_errors(CTRV(), {"white": WHITE}) == CTRV()
+
+
+def test_an_error_is_stationary_and_falls_to_its_e_th_part_after_its_time() -> None:
+    motion = CorrelatedErrors(CV(), (("a.x_m", 2.0), ("a.y_m", 0.5)))
+    F, Q = motion.jacobian(np.zeros(6), 2.0), motion.process_noise(np.zeros(6), 2.0)
+    assert np.diag(F)[4:] == pytest.approx([np.exp(-1.0), np.exp(-4.0)])
+    assert np.diag(F @ np.eye(6) @ F.T + Q)[4:] == pytest.approx([1.0, 1.0])
+    assert not Q[:4, 4:].any()
+    assert [motion.start_variance(name) for name in motion.state_names[4:]] == [1.0, 1.0]
+
+
+@pytest.mark.parametrize("name", ["camera", "lidar"])
+def test_one_detection_is_as_uncertain_as_its_covariance_says(name: str) -> None:
+    sensor, motion = SENSORS[name], with_correlated_errors(CTRV(), SENSORS)
+    x = np.array([30.0, 10.0, 0.3, 5.0, 0.1, 0.7, -0.4, 0.2, 1.1])
+    plain, pose = measurement_model(sensor.components, motion), SensorPose(1.0, 2.0, 0.2)
+    k = len(sensor.components)
+    R = np.diag([0.04, 0.09, 0.01])[:k, :k] + (0.01 if k > 1 else 0.0)
+    model, white = split_error(name, sensor, plain, R, motion.state_names)
+    H = model.jacobian(x, pose)
+    assert H[:, 5:] @ H[:, 5:].T + white == pytest.approx(R)
+    assert whole_error(model, white) == pytest.approx(R)
+    assert white == pytest.approx((1.0 - sensor.correlation.share) * R)  # type: ignore[union-attr]  # both have one
+    assert model.predict(x, pose) == pytest.approx(plain.predict(x, pose) + H[:, 5:] @ x[5:])
+    numeric = np.stack([(model.predict(x + d, pose) - model.predict(x - d, pose)) / 2e-6 for d in 1e-6 * np.eye(9)]).T
+    np.testing.assert_allclose(H, numeric, atol=1e-7)
+    assert model.linear == (name == "lidar")
+
+
+def test_a_yaw_from_the_map_stays_as_it_is() -> None:
+    sensor = replace(LIDAR, std={"x_m": 0.5, "y_m": 0.5}, yaw_from_map_std_rad=0.3)
+    motion = with_correlated_errors(CTRV(), {"lidar": sensor})
+    plain = measurement_model(("x_m", "y_m", "yaw_rad"), motion)
+    model, white = split_error("lidar", sensor, plain, np.diag([1.0, 1.0, 0.09]), motion.state_names)
+    assert np.diag(white) == pytest.approx([0.5, 0.5, 0.09])
+    assert not model.jacobian(np.zeros(7))[2, 5:].any()
+
+
+def test_a_sensor_without_it_measures_as_before() -> None:
+    plain, R = measurement_model(("x_m", "y_m"), CTRV()), np.eye(2)
+    assert split_error("white", WHITE, plain, R, CTRV.state_names) == (plain, R)
+    assert whole_error(plain, R) is R
+
+
+@pytest.mark.parametrize(("share", "time_s"), [(0.0, 1.0), (1.0, 1.0), (0.5, 0.0), (0.5, np.inf)])
+def test_a_correlation_that_makes_no_sense_is_refused(share: float, time_s: float) -> None:
+    with pytest.raises(ValueError, match="must"):
+        Correlation(share, time_s)
+
+
+def test_the_steps_of_the_paper_have_no_such_state(tmp_path) -> None:
+    config = load(Config, None, ["motion.kind=ctrv"])
+    erring = replace(config, sensors={"radar": replace(WHITE, correlation=Correlation())})
+    build_tracker(erring)
+    build_tracker(replace(erring, estimator="ekf-backward-forward"))
+    with pytest.raises(ValueError, match=r"sensors.radar.correlation: needs motion.kind ctrv, ctra or cv"):
+        replace(erring, motion=MotionConfig())
+
+
+def nees(name: str, modelled: bool, lag_s: float, num_runs: int = 40) -> float:
+    """NEES of the position `lag_s` ago of an object with positions whose errors last for a second."""
+    correlation, step_s, found = Correlation(0.8, 1.0), 0.1, []
+    sensor = SensorModel({"x_m": 1.0, "y_m": 1.0}, correlation=correlation)
+    base = CV(velocity_density_m2ps3=0.5)
+    motion = with_correlated_errors(base, {"lidar": sensor}) if modelled else base
+    rng = np.random.default_rng(5)
+    for _ in range(num_runs):
+        x = np.array([0.0, 0.0, 5.0, 0.0])
+        start = x + np.sqrt([100.0, 100.0, 4.0, 4.0]) * rng.standard_normal(4)
+        first = Start(position_m=start[:2], position_std_m=10.0, yaw_rad=0.0, speed_mps=0.0, speed_std_mps=10.0)
+        one = estimator(name, motion, first, lag_s=2.0)
+        e, states = rng.standard_normal(2), []
+        for k in range(1, 31):
+            x = base.predict(x, step_s) + rng.multivariate_normal(np.zeros(4), base.process_noise(x, step_s))
+            decay = np.exp(-step_s / correlation.time_s)
+            e = decay * e + np.sqrt(1.0 - decay**2) * rng.standard_normal(2)
+            share = correlation.share
+            z = x[:2] + np.sqrt(share) * e + np.sqrt(1.0 - share) * rng.standard_normal(2)
+            model, R = measurement_model(("x_m", "y_m"), motion), np.eye(2)
+            if modelled:
+                model, R = split_error("lidar", sensor, model, R, motion.state_names)
+            states.append(x)
+            one.update(Measurement(round(k * step_s * NS_PER_S), model, z, R))
+        behind = round(lag_s / step_s)
+        state = one.state_at(round((30 - behind) * step_s * NS_PER_S))
+        d = state.mean[:2] - states[-1 - behind][:2]
+        found.append(float(d @ np.linalg.solve(state.covariance[:2, :2], d)))
+    return float(np.mean(found))
+
+
+@pytest.mark.parametrize("name", ["ekf-replay", "smoother"])
+@pytest.mark.parametrize("lag_s", [0.0, 0.5])
+def test_estimators_are_consistent_where_the_errors_have_a_state(name: str, lag_s: float) -> None:
+    """The mean of 40 values of chi-square 2 has a standard deviation of 2 / sqrt(40) = 0.32."""
+    assert abs(nees(name, True, lag_s) - 2.0) < 0.95
+
+
+def test_without_it_a_smoother_believes_its_past_too_much() -> None:
+    assert nees("smoother", False, 0.5) > 5.0
+
+
+def test_both_estimators_agree_where_all_is_linear() -> None:
+    assert nees("ekf-replay", True, 0.0, 3) == pytest.approx(nees("smoother", True, 0.0, 3), rel=1e-6)
+
+
+def test_a_bad_share_in_a_configuration_is_one_line() -> None:
+    with pytest.raises(CallError, match=r"sensors\.a\.correlation.*share"):
+        load(Config, None, ["sensors={a: {std: {x_m: 1.0, y_m: 1.0}, correlation: {share: 2.0}}}"])
