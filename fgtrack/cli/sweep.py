@@ -10,14 +10,16 @@ from typing import Annotated
 import typer
 
 from fgtrack.cli.arguments import Overwrite
-from fgtrack.cli.show import progress, say
+from fgtrack.cli.show import console, progress, say
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.metrics import evaluate
+from fgtrack.evaluation.over_seeds import seed_contests, shown_tables, to_csv
+from fgtrack.io.output import write_file
 from fgtrack.io.run import Run
 from fgtrack.pipeline.shipped import find_file
 from fgtrack.pipeline.sweep import Scores, Sweep
 from fgtrack.pipeline.sweep_plan import load_plan
-from fgtrack.pipeline.sweep_store import ERROR_TABLE, SWEEP_TABLE, Cell, Scalar, SweepResult
+from fgtrack.pipeline.sweep_store import ERROR_TABLE, PAIRED_TABLE, SWEEP_TABLE, Cell, Scalar, SweepResult
 
 #: Wall times among the metrics; they have a table of their own.
 _TIMES = "time_per_"
@@ -57,6 +59,7 @@ def sweep(
 
         result = work.run(score, jobs=jobs or -1, dask=dask, on_job=count)
     say(f"{out / SWEEP_TABLE}: {result.num_good} of {result.num_cells} cells")
+    _compare(out, work.plan.columns)
     return _complain(result, sweep_file, out)
 
 
@@ -70,8 +73,21 @@ def swept(sweep_file: Path, out: Path, num_seeds: int | None = None) -> list[dic
         plan = load_plan(sweep_file)
         jobs = tuple(job for job in plan.jobs if num_seeds is None or job.seed < num_seeds)
         Sweep.open(replace(plan, jobs=jobs), out).run(score)
-    with (out / SWEEP_TABLE).open(newline="") as file:
+    return _read(out / SWEEP_TABLE)
+
+
+def _read(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
         return list(csv.DictReader(file))
+
+
+def _compare(out: Path, axes: Sequence[str]) -> None:
+    """Write the paired differences between the estimators, and show those of the first metric."""
+    contests = seed_contests(_read(out / SWEEP_TABLE), axes)
+    write_file(out / PAIRED_TABLE, to_csv(contests, axes))
+    for shown in shown_tables(contests, axes):
+        console().print(shown)
+        say(f"all points and metrics: {out / PAIRED_TABLE}")
 
 
 def score(run: Run) -> Scores:

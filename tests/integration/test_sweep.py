@@ -97,6 +97,20 @@ def test_the_committed_smoke_sweep_has_a_row_for_every_cell(done: Path) -> None:
     assert all(0.0 < float(row["truth.overall.errors.position_m.rmse"]) < 3.0 for row in table)
 
 
+def test_estimators_are_compared_over_the_seeds(done: Path) -> None:
+    cells = {(*map(row.get, POINT), row["estimator"]): row for row in rows(done / "sweep.csv")}
+    metric = "truth.overall.errors.position_m.rmse"
+    compared = [row for row in rows(done / "paired.csv") if row["metric"] == metric]
+    assert len(compared) == 8  # four points and two estimators
+    for row in compared:
+        mine = [float(cells[(*map(row.get, POINT[:2]), str(seed), row["estimator"])][metric]) for seed in range(3)]
+        assert float(row["mean"]) == pytest.approx(np.mean(mine))
+        assert row["seeds"] == "3"
+    for best, other in zip(compared[::2], compared[1::2], strict=True):
+        assert float(other["worse_by"]) == pytest.approx(float(other["mean"]) - float(best["mean"]))
+        assert (float(other["low"]) > 0.0) == (other["standing"] == "worse") == (best["standing"] == "best")
+
+
 def test_wall_times_have_a_table_of_their_own(done: Path) -> None:
     table, timing = rows(done / "sweep.csv"), rows(done / "timing.csv")
     assert len(timing) == len(table)

@@ -1,0 +1,235 @@
+"""Estimators of a sweep against each other at every point of its grid: paired differences over the seeds."""
+
+import csv
+import io
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Literal
+
+import numpy as np
+
+from fgtrack.core.types import FloatArray
+from fgtrack.evaluation.contest import Standing
+from fgtrack.evaluation.differences import two_digits
+from fgtrack.evaluation.paired import Estimate, paired
+from fgtrack.evaluation.tables import Column, Table, Value
+
+#: Metrics that have a better and a worse, in the order in which they are asked for; the first is shown.
+_BETTER: Mapping[str, Literal["less", "more", "nearer"]] = {
+    "truth.overall.errors.*.rmse": "less",
+    "multi_object.gospa.rms_m": "less",
+    "consistency.position_nees.mean": "nearer",
+    "consistency.state_nees.mean": "nearer",
+    "consistency.nis.*.mean": "nearer",
+    "lagged.*.errors.*.rmse": "less",
+    "truth.overall.tracked_share": "more",
+    "truth.overall.breaks": "less",
+    "truth.overall.id_switches": "less",
+    "truth.overall.time_to_confirm_s.mean": "less",
+    "truth.false_tracks": "less",
+    "multi_object.clear.mota": "more",
+    "multi_object.identity.idf1": "more",
+    "multi_object.hota.hota": "more",
+}
+
+_INTERVALS = "t intervals of the paired differences over the seeds; tie: 0 is inside, against the best"
+_MOST_ROWS = 40
+_NAMES = ("metric", "estimator", "seeds", "mean", "worse_by", "low", "high", "standing")
+_POSITION_DOF = 2.0
+
+
+@dataclass(frozen=True)
+class SeedEntry:
+    """One estimator in one metric at one point."""
+
+    estimator: str
+    mean: float
+    """Of the metric, over the seeds."""
+    worse_by: Estimate | None
+    """How much worse than the best estimator, with the t interval over the seeds; None of the best itself."""
+    standing: Standing
+    """`tie` where the interval of the difference to the best has 0 inside; `best` only without any tie."""
+
+
+@dataclass(frozen=True)
+class SeedContest:
+    """The estimators in one metric at one point of the grid."""
+
+    point: tuple[str, ...]
+    """Cells of the axes."""
+    metric: str
+    seeds: int
+    """Seeds that all estimators have a value of."""
+    entries: tuple[SeedEntry, ...]
+    """From the best estimator to the worst."""
+
+    @property
+    def ties(self) -> tuple[str, ...]:
+        """The best estimator and those that tie with it."""
+        return tuple(entry.estimator for entry in self.entries if entry.standing != "worse")
+
+
+def seed_contests(rows: Sequence[Mapping[str, str]], axes: Sequence[str]) -> list[SeedContest]:
+    """A contest for every metric with a better and a worse, and every point with several estimators.
+
+    Parameters
+    ----------
+    rows
+        Those of sweep.csv, by column.
+    axes
+        Columns that make a point.
+    """
+    points: dict[tuple[str, ...], list[Mapping[str, str]]] = {}
+    for row in rows:
+        points.setdefault(tuple(row[axis] for axis in axes), []).append(row)
+    columns = list(rows[0]) if rows else []
+    metrics = [name for pattern in _BETTER for name in columns if fnmatchcase(name, pattern)]
+    found = []
+    for metric in metrics:
+        for point, mine in points.items():
+            contest = _contest(point, metric, mine)
+            if contest is not None:
+                found.append(contest)
+    return found
+
+
+def to_csv(contests: Sequence[SeedContest], axes: Sequence[str]) -> str:
+    """A row for every contest and estimator; floats with all digits, an empty cell where there is none."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*axes, *_NAMES])
+    for contest in contests:
+        for entry in contest.entries:
+            worse = entry.worse_by
+            numbers = (entry.mean, *((worse.mean, worse.low, worse.high) if worse else (math.nan,) * 3))
+            cells = (contest.metric, entry.estimator, contest.seeds, *map(_cell, numbers), entry.standing)
+            writer.writerow([*contest.point, *cells])
+    return text.getvalue()
+
+
+def shown_tables(contests: Sequence[SeedContest], axes: Sequence[str]) -> list[Table]:
+    """The first metric of `contests` for people: every point where these are few, else how often who is best.
+
+    Nothing where no point has several seeds.
+    """
+    mine = [one for one in contests if one.metric == contests[0].metric]
+    if not any(one.seeds > 1 for one in mine):
+        return []
+    metric, points = mine[0].metric, _point_texts(mine, axes)
+    rows = [_Row(text, one.seeds, entry) for text, one in zip(points, mine, strict=True) for entry in one.entries]
+    if len(rows) <= _MOST_ROWS:
+        return [_every_point(metric, rows, _heading(mine, axes))]
+    return [_counts(metric, len(mine), rows)]
+
+
+@dataclass(frozen=True)
+class _Row:
+    point: str
+    seeds: int
+    entry: SeedEntry
+
+
+def _every_point(metric: str, rows: Sequence[_Row], heading: str) -> Table:
+    def interval(row: _Row) -> tuple[Value, ...] | None:
+        found = row.entry.worse_by
+        return (found.low, found.high) if found is not None and found.is_known else None
+
+    def mean(row: _Row) -> tuple[Value, ...] | None:
+        return None if row.entry.worse_by is None else (row.entry.worse_by.mean,)
+
+    columns: list[Column[_Row]] = [
+        Column(heading, ("point",), lambda row: (row.point,), left=True),
+        Column("estimator", ("estimator",), lambda row: (row.entry.estimator,), left=True),
+        Column("mean", ("mean",), lambda row: (row.entry.mean,), bold=lambda row: row.entry.standing == "best"),
+        Column("worse\nby", ("worse_by",), mean, text=two_digits),
+        Column("95 % interval", ("low", "high"), interval, "{} to {}", text=two_digits),
+        Column("seeds", ("seeds",), lambda row: (row.seeds,)),
+        Column("is", ("standing",), lambda row: (row.entry.standing,), left=True),
+    ]
+    return Table(metric, columns, rows, row_keys=("point", "estimator"), notes=[_INTERVALS])
+
+
+def _counts(metric: str, num_points: int, rows: Sequence[_Row]) -> Table:
+    estimators = list(dict.fromkeys(row.entry.estimator for row in rows))
+    standings = Counter((row.entry.estimator, row.entry.standing) for row in rows)
+
+    def count(standing: Standing) -> Callable[[str], tuple[Value, ...]]:
+        return lambda name: (standings[name, standing],)
+
+    columns: list[Column[str]] = [
+        Column("estimator", ("estimator",), lambda name: (name,), left=True),
+        Column("best", ("best",), count("best")),
+        Column("tie", ("tie",), count("tie")),
+        Column("worse", ("worse",), count("worse")),
+    ]
+    title = f"{metric}: how often which estimator is best, at {num_points} points"
+    return Table(title, columns, estimators, row_keys=("estimator",), notes=[_INTERVALS])
+
+
+def _point_texts(contests: Sequence[SeedContest], axes: Sequence[str]) -> list[str]:
+    places = _places(contests, axes)
+    return [", ".join(one.point[place] for place in places) for one in contests]
+
+
+def _heading(contests: Sequence[SeedContest], axes: Sequence[str]) -> str:
+    """The last parts of the names of the axes shown."""
+    return ",\n".join(axes[place].rpartition(".")[2] for place in _places(contests, axes)) or "point"
+
+
+def _places(contests: Sequence[SeedContest], axes: Sequence[str]) -> list[int]:
+    """Axes that tell the points apart, without those of whole mappings where labels do it."""
+    plain = [k for k in range(len(axes)) if not any(one.point[k].startswith(("{", "[")) for one in contests)]
+    points = {tuple(one.point[k] for k in plain) for one in contests}
+    return plain if len(points) == len(contests) else list(range(len(axes)))
+
+
+def _contest(point: tuple[str, ...], metric: str, rows: Sequence[Mapping[str, str]]) -> SeedContest | None:
+    """The estimators over the seeds that all of them have; None of fewer than two, or without such a seed."""
+    costs_of = _cost_of(metric)
+    values: dict[str, dict[str, tuple[float, float]]] = {}
+    for row in rows:
+        value, cost = _number(row[metric]), costs_of(row)
+        if math.isfinite(cost):
+            values.setdefault(row["estimator"], {})[row["seed"]] = (value, cost)
+    if len(values) < 2:
+        return None
+    seeds = sorted(set.intersection(*map(set, values.values())), key=int)
+    if not seeds:
+        return None
+    means, costs = _columns(values, seeds, 0), _columns(values, seeds, 1)
+    best, *others = sorted(costs, key=lambda name: float(costs[name].mean()))
+    differences = {name: paired(costs[name], costs[best]) for name in others}
+    ties = {name for name, difference in differences.items() if not difference.is_significant}
+    entries = [SeedEntry(best, float(means[best].mean()), None, "tie" if ties else "best")]
+    for name, difference in differences.items():
+        standing: Standing = "tie" if name in ties else "worse"
+        entries.append(SeedEntry(name, float(means[name].mean()), difference, standing))
+    return SeedContest(point, metric, len(seeds), tuple(entries))
+
+
+def _columns(
+    values: Mapping[str, Mapping[str, tuple[float, float]]], seeds: Sequence[str], which: int
+) -> dict[str, FloatArray]:
+    return {name: np.array([of[seed][which] for seed in seeds]) for name, of in values.items()}
+
+
+def _cost_of(metric: str) -> Callable[[Mapping[str, str]], float]:
+    """What is to be small in a row: the metric, its negative, or its distance from the expected value."""
+    better = next(better for pattern, better in _BETTER.items() if fnmatchcase(metric, pattern))
+    if better == "nearer":
+        dof = metric.removesuffix("mean") + "dof"
+        default = str(_POSITION_DOF) if "position_nees" in metric else ""
+        return lambda row: abs(_number(row[metric]) - _number(row.get(dof, default)))
+    sign = 1.0 if better == "less" else -1.0
+    return lambda row: sign * _number(row[metric])
+
+
+def _number(cell: str) -> float:
+    return float(cell) if cell else math.nan
+
+
+def _cell(value: float) -> str:
+    return repr(value) if math.isfinite(value) else ""

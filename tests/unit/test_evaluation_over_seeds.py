@@ -1,0 +1,122 @@
+"""Estimators of a sweep against each other, over the seeds."""
+
+import csv
+import io
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from fgtrack.evaluation.over_seeds import SeedContest, seed_contests, shown_tables, to_csv
+from fgtrack.evaluation.paired import paired
+
+RMSE = "truth.overall.errors.position_m.rmse"
+SEEDS = 6
+
+
+def rows_of(values: dict[str, Sequence[float | None]], metric: str = RMSE, **cells: str) -> list[dict[str, str]]:
+    """Rows of sweep.csv at one point: the metric of each estimator and seed."""
+    return [
+        {**cells, "seed": str(seed), "estimator": name, metric: "" if value is None else repr(float(value))}
+        for name, of in values.items()
+        for seed, value in enumerate(of)
+    ]
+
+
+def noisy(seed: int, mean: float) -> list[float]:
+    return list(np.random.default_rng(seed).normal(mean, 0.01, SEEDS))
+
+
+def only(rows: list[dict[str, str]], axes: Sequence[str] = ()) -> SeedContest:
+    (found,) = seed_contests(rows, axes)
+    return found
+
+
+def test_differences_are_paired_by_seed_and_the_standing_follows_from_the_interval() -> None:
+    common = np.random.default_rng(1).normal(0.5, 0.2, SEEDS)
+    small = np.random.default_rng(2).normal(0.0, 0.001, SEEDS)
+    values = {"worse": list(common + 0.02 + small), "good": list(common), "same": list(common + small - small.mean())}
+    found = only(rows_of(values))
+    assert {entry.estimator: entry.standing for entry in found.entries} == {
+        "good": "tie",
+        "same": "tie",
+        "worse": "worse",
+    }
+    assert set(found.ties) == {"good", "same"}
+    last = found.entries[-1]
+    assert last.worse_by == paired(values["worse"], values[found.entries[0].estimator])
+    assert last.mean == pytest.approx(np.mean(values["worse"]))
+    assert [entry.standing for entry in only(rows_of({k: values[k] for k in ("worse", "good")})).entries] == [
+        "best",
+        "worse",
+    ]
+
+
+def test_of_shares_more_is_better_and_of_the_nees_the_expected_value() -> None:
+    share = only(rows_of({"a": noisy(1, 0.7), "b": noisy(2, 0.9)}, "truth.overall.tracked_share"))
+    assert [entry.estimator for entry in share.entries] == ["b", "a"]
+    assert share.entries[1].worse_by is not None
+    assert share.entries[1].worse_by.mean == pytest.approx(0.2, abs=0.02)
+    nees = only(rows_of({"a": noisy(1, 1.0), "b": noisy(2, 2.4)}, "consistency.position_nees.mean"))
+    assert [entry.estimator for entry in nees.entries] == ["b", "a"]
+    rows = rows_of({"a": noisy(1, 3.0), "b": noisy(2, 4.1)}, "consistency.nis.radar.mean")
+    nis = only([{**row, "consistency.nis.radar.dof": "4.0"} for row in rows])
+    assert [entry.estimator for entry in nis.entries] == ["b", "a"]
+    assert nis.entries[0].mean == pytest.approx(4.1, abs=0.02), "the mean is that of the metric, not of the distance"
+
+
+def test_only_seeds_that_all_estimators_have_count() -> None:
+    found = only(rows_of({"a": [None, 1.0, 1.1, 1.2], "b": [0.1, 2.0, 2.1, 2.2]}))
+    assert found.seeds == 3
+    assert [entry.mean for entry in found.entries] == pytest.approx([1.1, 2.1])
+
+
+def test_one_estimator_no_common_seed_or_an_unknown_metric_make_no_contest() -> None:
+    assert seed_contests(rows_of({"a": [1.0, 2.0]}), ()) == []
+    assert seed_contests(rows_of({"a": [1.0, None], "b": [None, 1.0]}), ()) == []
+    assert seed_contests(rows_of({"a": [1.0, 2.0], "b": [1.0, 2.0]}, "num_tracks"), ()) == []
+    assert seed_contests([], ()) == []
+
+
+def test_every_point_is_a_contest_and_csv_gives_the_numbers_back() -> None:
+    rows = [
+        row
+        for delay in ("0.1", "0.2")
+        for row in rows_of({"a": noisy(1, 0.4), "b": noisy(2, 0.5 + float(delay))}, delay_s=delay)
+    ]
+    found = seed_contests(rows, ("delay_s",))
+    read = list(csv.DictReader(io.StringIO(to_csv(found, ("delay_s",)))))
+    assert [(row["delay_s"], row["estimator"], row["standing"], row["seeds"]) for row in read] == [
+        *(("0.1", "a", "best", "6"), ("0.1", "b", "worse", "6")),
+        *(("0.2", "a", "best", "6"), ("0.2", "b", "worse", "6")),
+    ]
+    worse_by = found[1].entries[1].worse_by
+    assert worse_by is not None
+    assert (float(read[3]["worse_by"]), float(read[3]["low"])) == (worse_by.mean, worse_by.low)
+    assert read[0]["worse_by"] == ""
+
+
+def test_few_points_are_shown_in_full_under_the_labels_of_their_axes() -> None:
+    cells = {"late": "much", "sensors.radar.delay": '{"kind": "constant"}', "association.gate_m": "5.0"}
+    rows = rows_of({"a": noisy(1, 0.4), "b": noisy(2, 0.5)}, **cells)
+    (table,) = shown_tables(seed_contests(rows, tuple(cells)), tuple(cells))
+    assert table["point"].tolist() == ["much, 5.0"] * 2
+    assert table.shown[0].heading == "late,\ngate_m"
+    assert table["standing"].tolist() == ["best", "worse"]
+    assert max(map(len, str(table).splitlines())) <= 100
+
+
+def test_of_many_points_it_is_shown_how_often_who_is_best() -> None:
+    rows = [
+        row
+        for k in range(30)
+        for row in rows_of({"a": noisy(k, 0.4), "b": noisy(k, 0.4 if k < 10 else 0.5)}, delay_s=str(k))
+    ]
+    (table,) = shown_tables(seed_contests(rows, ("delay_s",)), ("delay_s",))
+    assert table["estimator"].tolist() == ["a", "b"]
+    assert (table["best"].tolist(), table["tie"].tolist(), table["worse"].tolist()) == ([20, 0], [10, 10], [0, 20])
+
+
+def test_a_single_seed_shows_nothing() -> None:
+    assert shown_tables(seed_contests(rows_of({"a": [1.0], "b": [2.0]}), ()), ()) == []
+    assert shown_tables([], ()) == []
