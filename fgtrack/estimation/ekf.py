@@ -185,17 +185,45 @@ def predict_across(mean: FloatArray, covariance: FloatArray, motion: MotionModel
     return Prediction(np.array(after), symmetrise(product(FP, F.T) + Q), FP)
 
 
+class Update(NamedTuple):
+    """Result of `updated_one`."""
+
+    mean: FloatArray
+    """Posterior mean, shape (n,); angles are not wrapped."""
+    covariance: FloatArray
+    """Posterior covariance, shape (n, n)."""
+    S: FloatArray
+    """Covariance of the innovation without a loss, shape (k, k)."""
+    weight: float
+    """See `robust_weight`."""
+
+
+def updated_one(
+    mean: FloatArray,
+    covariance: FloatArray,
+    y: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+    loss: RobustLoss | None = None,
+) -> Update:
+    """One state, (n,) and (n, n), after the innovation y (k,) of a measurement with Jacobian H (k, n), noise R (k, k).
+
+    Raises `numpy.linalg.LinAlgError` for a singular S.
+    """
+    K, S = kalman_gain(covariance, H, R)
+    w = 1.0
+    if loss is not None:
+        w = robust_weight(loss, y, congruence(H, covariance), R)
+        R = R / w
+        K, _ = kalman_gain(covariance, H, R)
+    return Update(mean + K.dot(y), joseph(covariance, K, H, R), S, w)
+
+
 def correct_one(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
     """`correct` of one state, shapes (n,) and (n, n), without the price of a stack."""
     y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
-    R, w = measurement.R, 1.0
-    K, S = kalman_gain(covariance, H, R)
-    nis = measurement.nis(y, S)
-    if measurement.loss is not None:
-        w = robust_weight(measurement.loss, y, congruence(H, covariance), R)
-        R = R / w
-        K, _ = kalman_gain(covariance, H, R)
-    return OneCorrection(mean + K.dot(y), joseph(covariance, K, H, R), y, nis, w)
+    after, P, S, w = updated_one(mean, covariance, y, H, measurement.R, measurement.loss)
+    return OneCorrection(after, P, y, measurement.nis(y, S), w)
 
 
 def innovation_one(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> tuple[FloatArray, float]:

@@ -26,8 +26,11 @@ ESTIMATORS = Registry(
         "fgtrack.estimators": {
             "ekf-backward-forward": "fgtrack.estimation.backward_forward:backward_forward",
             "ekf-replay": "fgtrack.estimation.replay:ReplayEkf",
+            "iekf-replay": "fgtrack.estimation.iterated:IekfReplay",
+            "iplf-replay": "fgtrack.estimation.posterior_linearisation:IplfReplay",
             "smoother": "fgtrack.estimation.factor_graph.factories:smoother",
             "smoother-batch": "fgtrack.estimation.factor_graph.factories:smoother_batch",
+            "ukf-replay": "fgtrack.estimation.unscented:UkfReplay",
         },
         OOSM_GROUP: {
             "drop": f"{_OOSM}:Drop",
@@ -74,6 +77,8 @@ class Claims:
     """Largest difference to the dense joint posterior, in standard deviations."""
     rounding: float = 0.0
     """Where stamps nearly coincide, the tolerance grows to this many times `dense_joint.rounding_bound`."""
+    spreads: bool = False
+    """Whether predictions of a nonlinear model are averages over the spread of the state, not values at its mean."""
     held_s: float = 0.0
     """How long a measurement waits before it counts."""
     bank: bool = False

@@ -3,7 +3,7 @@
 import bisect
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -86,34 +86,38 @@ class ReplayingFilter(WindowedFilter):
     def _fuse(self, measurement: Measurement) -> OneCorrection:
         order = (measurement.stamp_ns, measurement.model.components, tuple(measurement.z.tolist()))
         place = bisect.bisect_right(self._steps, order, lo=1, key=_order)
-        step, correction = self._fused(self._steps[place - 1], order, measurement)
-        later = self._steps[place:]
+        before, later = self._steps[place - 1], self._steps[place:]
+        step, correction = self._fused(before, order, measurement)
         if later:
-            innovation, nis = self._recursion.innovation(*self._retrodicted(step, later), measurement)
+            state = self._retrodicted(before.opening, step, later)
+            innovation, nis = self._recursion.innovation(*state, measurement)
             correction = correction._replace(innovation=innovation, nis=nis)
         self._steps[place:] = [step, *self._replayed(step, later)]
         return correction
 
-    def _retrodicted(self, step: _Stored, later: Sequence[_Stored]) -> tuple[FloatArray, FloatArray]:
+    def _retrodicted(
+        self, opening: Opening | None, step: _Stored, later: Sequence[_Stored]
+    ) -> tuple[FloatArray, FloatArray]:
         """The state that the measurement of `step` finds, given all that was fused, the `later` steps included.
 
-        From the newest step back (see `smoothed_one`), each as it was when the measurement of `step` was unknown.
+        From the newest step back (see `smoothed_one`), each as it was when the measurement of `step` was unknown; what
+        had been measured up to `step` without it is `opening`.
         """
+        blank = _Stored(step.order, None, step.predicted.mean, step.predicted.covariance, step.predicted, opening)
+        if self._recursion.composes:
+            first = later[0]
+            cross = self._predicted(blank, first.order[0]).cross
+            later = [replace(first, predicted=first.predicted._replace(cross=cross)), *later[1:]]
+        else:
+            later = self._replayed(blank, later)
         mean, covariance = later[-1].mean, later[-1].covariance
-        first = max((place for place, each in enumerate(later) if each.along), default=-1)
-        for place in range(len(later) - 1, first, -1):
-            before, after = later[place - 1] if place else step, later[place]
-            if before.order[0] == after.order[0]:
-                continue  # the same state
-            x, P, predicted = before.mean, before.covariance, after.predicted
-            if not place:
-                x, P, _ = before.predicted
-                on = self._recursion.predict(x, P, seconds(after.order[0] - before.order[0]))
-                predicted = predicted._replace(cross=on.cross)
-            shift = self._wrapped(mean - predicted.mean)
-            mean, covariance, _ = smoothed_one(x, P, predicted, shift, covariance)
-        opening = None if first < 0 else later[first].opening
-        return (mean, covariance) if opening is None else opening.retrodicted(step.order[0], mean, covariance)
+        for before, after in zip([*later[-2::-1], blank], later[::-1], strict=True):
+            if after.along and after.opening is not None:
+                return after.opening.retrodicted(step.order[0], mean, covariance)
+            if before.order[0] != after.order[0]:  # else it is the same state
+                shift = self._wrapped(mean - after.predicted.mean)
+                mean, covariance, _ = smoothed_one(before.mean, before.covariance, after.predicted, shift, covariance)
+        return mean, covariance
 
     def _replayed(self, step: _Stored, later: Iterable[_Stored]) -> list[_Stored]:
         """The measurements of `later` steps, in their order, applied to `step`."""

@@ -1,0 +1,101 @@
+"""The iterated posterior linearisation filter."""
+
+from functools import partial
+
+import numpy as np
+
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.ekf import OneCorrection
+from fgtrack.estimation.iteration import Iteration, largest_move, negative_log_posterior, reweighted
+from fgtrack.estimation.replay import ReplayingFilter
+from fgtrack.estimation.sigma_points import SigmaPoints, measurement_regression
+from fgtrack.estimation.unscented import UkfRecursion
+from fgtrack.models.motion import MotionModel
+
+
+class IplfRecursion(UkfRecursion):
+    """An unscented filter whose update takes the measurement as what it is over the spread of the posterior.
+
+    Garcia-Fernandez, Svensson, Morelande and Sarkka, Posterior linearization filter: principles and implementation
+    using sigma points, IEEE Transactions on Signal Processing 63(20), 2015. The regression is done again over each
+    posterior that the prior and the last regression give. With the spread and noise of a regression held, a step of
+    the mean that does not lower prior plus loss is halved (Raitoharju et al., Damped posterior linearization filter,
+    IEEE Signal Processing Letters 25(4), 2018).
+
+    Parameters
+    ----------
+    motion, points
+        See `UkfRecursion`.
+    iteration
+        When it ends.
+    """
+
+    def __init__(self, motion: MotionModel, points: SigmaPoints, iteration: Iteration) -> None:
+        super().__init__(motion, points)
+        self._iteration = iteration
+
+    def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
+        """See `Recursion.correct`."""
+        if measurement.model.linear:
+            return super().correct(mean, covariance, measurement)
+        x, P = mean, covariance
+        for _ in range(self._iteration.max_iterations):
+            last, spread = x, P
+            z, A, noise = measurement_regression(measurement, x, P, self._points)
+            y, R = measurement.model.residual(measurement.z, z), measurement.R + noise
+            update = reweighted(mean, covariance, y, A, R, measurement.loss, x - mean)
+            cost = partial(self._cost, (mean, covariance), measurement, spread, R)
+            x, P = self._iteration.descended(cost, last, update.mean), update.covariance
+            narrowed = np.abs(1.0 - spread.diagonal() / P.diagonal()).max()
+            if max(largest_move(x - last, P), narrowed) < self._iteration.tolerance:
+                break
+        innovation, nis = self.innovation(mean, covariance, measurement)
+        return OneCorrection(x, P, innovation, nis, update.weight)
+
+    def _cost(
+        self,
+        prior: tuple[FloatArray, FloatArray],
+        measurement: Measurement,
+        spread: FloatArray,
+        R: FloatArray,
+        x: FloatArray,
+    ) -> float:
+        """What a step lowers: the negative logarithm of the posterior at a state `x` (n,) of `spread` (n, n)."""
+        z = measurement_regression(measurement, x, spread, self._points).mean
+        residual = measurement.model.residual(measurement.z, z)
+        return negative_log_posterior(x - prior[0], prior[1], residual, R, measurement.loss)
+
+
+class IplfReplay(ReplayingFilter):
+    """Iterated posterior linearisation filter that rewinds and replays: averages over the spread of the posterior.
+
+    Garcia-Fernandez et al. 2015, see `IplfRecursion`. What is linear it does as `ReplayEkf`.
+
+    Parameters
+    ----------
+    motion, prior, lag_s
+        See `WindowedFilter`.
+    max_iterations
+        Regressions per update; 1 is the unscented filter.
+    tolerance
+        Where mean and standard deviations change by less than this many standard deviations, the iteration ends.
+    alpha, beta, kappa
+        See `SigmaPoints`.
+    """
+
+    spreads = True
+
+    def __init__(
+        self,
+        motion: MotionModel,
+        prior: Start,
+        lag_s: float,
+        max_iterations: int = 10,
+        tolerance: float = 1e-3,
+        alpha: float = 1.0,
+        beta: float = 0.0,
+        kappa: float = 0.0,
+    ) -> None:
+        points, iteration = SigmaPoints(alpha, beta, kappa), Iteration(max_iterations, tolerance)
+        super().__init__(motion, prior, lag_s, IplfRecursion(motion, points, iteration))

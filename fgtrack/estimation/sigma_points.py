@@ -1,0 +1,130 @@
+"""Statistical linear regression: the affine map that fits a function best over a Gaussian, by sigma points."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.errors import CallError
+from fgtrack.core.linalg import identity, symmetrise
+from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.estimation.base import Measurement
+from fgtrack.models.measurement import MeasurementModel
+from fgtrack.models.motion import MotionModel
+
+_JITTER = 1e-12
+
+
+@dataclass(frozen=True)
+class SigmaPoints:
+    """2 n + 1 points of the scaled unscented transform (Julier and Uhlmann 2004; Julier 2002).
+
+    The mean and, along the columns of the covariance's root, points c = alpha sqrt(n + kappa) standard deviations to
+    both sides. The defaults put no weight on the mean, which keeps every covariance positive semidefinite (the cubature
+    rule of Arasaratnam and Haykin 2009). Raises `ValueError` for parameters that make no points.
+    """
+
+    alpha: float = 1.0
+    """Scale of the points' distance."""
+    beta: float = 0.0
+    """What is added to the weight of the mean in a covariance."""
+    kappa: float = 0.0
+    """What is added to n in the points' distance; more than -n."""
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.alpha < np.inf and np.isfinite(self.beta) and np.isfinite(self.kappa)):
+            raise ValueError(
+                f"alpha must be positive, all finite; are alpha={self.alpha}, beta={self.beta}, kappa={self.kappa}"
+            )
+
+    def squared_distance(self, n: int) -> float:
+        """c^2, for a state of `n` entries. Raises `CallError` where it is not positive."""
+        if n + self.kappa <= 0.0:
+            raise CallError(f"kappa: must be more than {-n} for a state of {n} entries, is {self.kappa}")
+        return self.alpha**2 * (n + self.kappa)
+
+
+class Regression(NamedTuple):
+    """g(x) = mean + A (x - m) + e for x ~ N(m, P), with the least mean square of e, which is uncorrelated with x."""
+
+    mean: FloatArray
+    """E[g(x)], shape (..., k)."""
+    A: FloatArray
+    """Shape (..., k, n)."""
+    noise: FloatArray
+    """Covariance of e, shape (..., k, k)."""
+
+
+def regression(
+    g: Callable[[FloatArray], FloatArray],
+    mean: FloatArray,
+    covariance: FloatArray,
+    points: SigmaPoints,
+    difference: Callable[[FloatArray, FloatArray], FloatArray] = np.subtract,
+) -> Regression:
+    """Statistical linear regression of `g`, (..., n) -> (..., k), over N(mean, covariance), (..., n) and (..., n, n).
+
+    See Arasaratnam, Haykin and Elliott 2007; Garcia-Fernandez et al. 2015, eqs. 9 to 11. With the points m +- c L_i of
+    the root P = L L', and what g differs there from g(m), d+ and d-: A L_i = (d+ - d-) / 2c, and the noise comes from
+    the bends (d+ + d-) / 2, so that it is zero of a linear g. `difference` may bring angles to their range. Raises
+    `numpy.linalg.LinAlgError` for a covariance that is not positive semidefinite.
+    """
+    n = mean.shape[-1]
+    squared = points.squared_distance(n)
+    distance = squared**0.5
+    L = _root(covariance)
+    centre, offsets = mean[..., None, :], distance * L.mT
+    values = g(np.concatenate([centre, centre + offsets, centre - offsets], axis=-2))
+    d = difference(values[..., 1:, :], values[..., :1, :])
+    ahead, behind = d[..., :n, :], d[..., n:, :]
+    bends, slopes = 0.5 * (ahead + behind), (ahead - behind) / (2.0 * distance)
+    shift = bends.sum(axis=-2) / squared
+    noise = bends.mT @ bends / squared + (points.beta - points.alpha**2) * shift[..., :, None] * shift[..., None, :]
+    return Regression(values[..., 0, :] + shift, np.linalg.solve(L.mT, slopes).mT, symmetrise(noise))
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """L with L L' = covariance; of one that is only semidefinite after a tiny increase."""
+    try:
+        return np.asarray(np.linalg.cholesky(covariance))
+    except np.linalg.LinAlgError:
+        n = covariance.shape[-1]
+        scale = np.maximum(np.trace(covariance, axis1=-2, axis2=-1) / n, _JITTER)
+        return np.asarray(np.linalg.cholesky(covariance + _JITTER * scale[..., None, None] * identity(n)))
+
+
+def motion_regression(
+    motion: MotionModel, mean: FloatArray, covariance: FloatArray, dt_s: float | FloatArray, points: SigmaPoints
+) -> Regression:
+    """Regression of the flow over `dt_s`, a number or of shape (...), without process noise; yaws are not wrapped."""
+    if motion.linear:
+        A = motion.jacobian(mean, dt_s)
+        return Regression(motion.predict(mean, dt_s), A, np.zeros_like(A))
+    each_s = np.asarray(dt_s, dtype=np.float64)[..., None]
+    return regression(lambda x: motion.predict(x, each_s), mean, covariance, points)
+
+
+def measurement_regression(
+    measurement: Measurement, mean: FloatArray, covariance: FloatArray, points: SigmaPoints
+) -> Regression:
+    """Regression of what `measurement` measures. Angles are averaged on the circle, but for entries of the state."""
+    model, pose = measurement.model, measurement.pose
+    if model.linear:
+        k = len(model.components)
+        return Regression(model.predict(mean, pose), model.selection(mean.shape[-1]), np.zeros((k, k)))
+    direct = _direct(model)
+
+    def difference(z: FloatArray, centre: FloatArray) -> FloatArray:
+        y = model.residual(z, centre)
+        y[..., direct] = z[..., direct] - centre[..., direct]
+        return y
+
+    return regression(lambda x: model.predict(x, pose), mean, covariance, points, difference)
+
+
+@cache
+def _direct(model: MeasurementModel) -> IntArray:
+    """Places of the components that are entries of the state."""
+    return np.array([k for k, name in enumerate(model.components) if name in model.state_names], dtype=np.int64)

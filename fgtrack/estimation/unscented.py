@@ -1,0 +1,94 @@
+"""The unscented Kalman filter."""
+
+from typing import ClassVar
+
+from fgtrack.core.linalg import congruence, product, symmetrise
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.ekf import (
+    OneCorrection,
+    Prediction,
+    correct_one,
+    innovation_one,
+    predict_across,
+    updated_one,
+)
+from fgtrack.estimation.replay import ReplayingFilter
+from fgtrack.estimation.sigma_points import SigmaPoints, measurement_regression, motion_regression
+from fgtrack.models.motion import MotionModel
+
+
+class UkfRecursion:
+    """A filter that takes motion and measurement as what they are on average over the spread of the state.
+
+    Julier and Uhlmann, Unscented filtering and nonlinear estimation, Proceedings of the IEEE 92(3), 2004, written as
+    the statistical linear regression that it is (see `regression`). The process noise, that of the mean, is added.
+
+    Parameters
+    ----------
+    motion
+        Motion model.
+    points
+        Where functions are evaluated.
+    """
+
+    composes: ClassVar[bool] = False
+
+    def __init__(self, motion: MotionModel, points: SigmaPoints) -> None:
+        points.squared_distance(motion.dim)
+        self._motion, self._points = motion, points
+
+    def predict(self, mean: FloatArray, covariance: FloatArray, dt_s: float) -> Prediction:
+        """See `Recursion.predict`."""
+        if self._motion.linear:
+            return predict_across(mean, covariance, self._motion, dt_s)
+        after, A, noise = motion_regression(self._motion, mean, covariance, dt_s, self._points)
+        AP = product(A, covariance)
+        Q = self._motion.step(mean.tolist(), dt_s).Q
+        return Prediction(after, symmetrise(product(AP, A.T) + noise + Q), AP)
+
+    def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
+        """See `Recursion.correct`."""
+        if measurement.model.linear:
+            return correct_one(mean, covariance, measurement)
+        z, A, noise = measurement_regression(measurement, mean, covariance, self._points)
+        y = measurement.model.residual(measurement.z, z)
+        after, P, S, w = updated_one(mean, covariance, y, A, measurement.R + noise, measurement.loss)
+        return OneCorrection(after, P, y, measurement.nis(y, S), w)
+
+    def innovation(
+        self, mean: FloatArray, covariance: FloatArray, measurement: Measurement
+    ) -> tuple[FloatArray, float]:
+        """See `Recursion.innovation`."""
+        if measurement.model.linear:
+            return innovation_one(mean, covariance, measurement)
+        z, A, noise = measurement_regression(measurement, mean, covariance, self._points)
+        y = measurement.model.residual(measurement.z, z)
+        return y, measurement.nis(y, congruence(A, covariance) + noise + measurement.R)
+
+
+class UkfReplay(ReplayingFilter):
+    """Unscented Kalman filter that rewinds and replays: means over the spread of the state in place of derivatives.
+
+    Julier and Uhlmann 2004, see `UkfRecursion`. What is linear it does as `ReplayEkf`.
+
+    Parameters
+    ----------
+    motion, prior, lag_s
+        See `WindowedFilter`.
+    alpha, beta, kappa
+        See `SigmaPoints`.
+    """
+
+    spreads = True
+
+    def __init__(
+        self,
+        motion: MotionModel,
+        prior: Start,
+        lag_s: float,
+        alpha: float = 1.0,
+        beta: float = 0.0,
+        kappa: float = 0.0,
+    ) -> None:
+        super().__init__(motion, prior, lag_s, UkfRecursion(motion, SigmaPoints(alpha, beta, kappa)))
