@@ -62,9 +62,18 @@ class IekfReplay(ReplayingFilter):
         Linearisations per update; 1 is the EKF.
     tolerance
         A step below this many standard deviations of the prediction ends the iteration.
+    initiation
+        See `ReplayingFilter`.
     """
 
     def __init__(
-        self, motion: MotionModel, prior: Start, lag_s: float, max_iterations: int = 10, tolerance: float = 1e-6
+        self,
+        motion: MotionModel,
+        prior: Start,
+        lag_s: float,
+        max_iterations: int = 10,
+        tolerance: float = 1e-6,
+        initiation: str = "regression",
     ) -> None:
-        super().__init__(motion, prior, lag_s, IekfRecursion(motion, Iteration(max_iterations, tolerance)))
+        recursion = IekfRecursion(motion, Iteration(max_iterations, tolerance))
+        super().__init__(motion, prior, lag_s, recursion, initiation)

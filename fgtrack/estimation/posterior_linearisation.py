@@ -82,6 +82,8 @@ class IplfReplay(ReplayingFilter):
         Where mean and standard deviations change by less than this many standard deviations, the iteration ends.
     alpha, beta, kappa
         See `SigmaPoints`.
+    initiation
+        See `ReplayingFilter`.
     """
 
     spreads = True
@@ -96,6 +98,7 @@ class IplfReplay(ReplayingFilter):
         alpha: float = 1.0,
         beta: float = 0.0,
         kappa: float = 0.0,
+        initiation: str = "regression",
     ) -> None:
         points, iteration = SigmaPoints(alpha, beta, kappa), Iteration(max_iterations, tolerance)
-        super().__init__(motion, prior, lag_s, IplfRecursion(motion, points, iteration))
+        super().__init__(motion, prior, lag_s, IplfRecursion(motion, points, iteration), initiation)

@@ -78,6 +78,8 @@ class UkfReplay(ReplayingFilter):
         See `WindowedFilter`.
     alpha, beta, kappa
         See `SigmaPoints`.
+    initiation
+        See `ReplayingFilter`.
     """
 
     spreads = True
@@ -90,5 +92,6 @@ class UkfReplay(ReplayingFilter):
         alpha: float = 1.0,
         beta: float = 0.0,
         kappa: float = 0.0,
+        initiation: str = "regression",
     ) -> None:
-        super().__init__(motion, prior, lag_s, UkfRecursion(motion, SigmaPoints(alpha, beta, kappa)))
+        super().__init__(motion, prior, lag_s, UkfRecursion(motion, SigmaPoints(alpha, beta, kappa)), initiation)

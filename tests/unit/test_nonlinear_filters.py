@@ -147,7 +147,7 @@ def test_one_iteration_is_the_filter_without_any() -> None:
         ("iplf-replay", {"tolerance": -1.0}, "tolerance: must be finite"),
         ("ukf-replay", {"alpha": -1.0}, "alpha must be positive"),
         ("ukf-replay", {"kappa": -9.0}, "kappa: must be more than -4"),
-        ("ukf-replay", {"width": 1.0}, "its options are alpha, beta, kappa"),
+        ("ukf-replay", {"width": 1.0}, "its options are alpha, beta, kappa, initiation"),
     ],
 )
 def test_bad_options_are_one_clear_line(name: str, options: dict[str, float], text: str) -> None:
