@@ -54,6 +54,8 @@ if TYPE_CHECKING:
     from fgtrack.pipeline.live import Tracker as Tracker
     from fgtrack.pipeline.public import replay as replay
     from fgtrack.pipeline.public import simulate as simulate
+    from fgtrack.pipeline.tune import tune as tune
+    from fgtrack.pipeline.tune_report import TuneReport as TuneReport
 
 # The imports above are for type checkers and are the one list of public names: where each name is at home.
 _HOMES = {

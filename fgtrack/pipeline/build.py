@@ -52,8 +52,11 @@ _STORAGE = {
 }
 
 
-def build_tracker(config: Config) -> Tracker:
-    """The tracker that `config` describes. Raises `CallError` for an estimator that does not exist."""
+def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerParts] | None = None) -> Tracker:
+    """The tracker that `config` describes. Raises `CallError` for an estimator that does not exist.
+
+    `observed` may put its own parts, which watch the others, in their place.
+    """
     road = build_road(config.map)
     motion = config.motion_model()
     origin_m = (config.ego.detection_origin_x_m, config.ego.detection_origin_y_m)
@@ -72,7 +75,7 @@ def build_tracker(config: Config) -> Tracker:
         road=road,
         confirm_count=config.lifecycle.confirm_count,
     )
-    return (PublishedTracker if published_order else Tracker)(parts)
+    return (PublishedTracker if published_order else Tracker)(parts if observed is None else observed(parts))
 
 
 def build_road(config: MapConfig) -> Road:

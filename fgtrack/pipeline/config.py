@@ -175,9 +175,14 @@ class MotionConfig:
             raise ValueError(f"std_per_s: is that of the built-in models, give parameters for kind {self.kind}")
         self.model()
 
+    @property
+    def is_plug_in(self) -> bool:
+        """Whether the model takes `parameters` and no `std_per_s`."""
+        return self.kind not in _BUILT_IN_MOTION
+
     def model(self) -> MotionModel:
         """The motion model, with the densities; raises `ValueError` where `std_per_s` does not fit it."""
-        if self.kind not in _BUILT_IN_MOTION:
+        if self.is_plug_in:
             return motion_model(self.kind, self.parameters)
         model = CTRA if self.acceleration == "driving" else _BUILT_IN_MOTION[self.kind]
         return model.from_std_per_step(self.std_per_s, self.noise_hz)

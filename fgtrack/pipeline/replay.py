@@ -17,7 +17,7 @@ from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, Tick, listed_ticks, message_ticks, node_ticks, read_ticks
 from fgtrack.pipeline.config import ClockConfig, Config
 from fgtrack.pipeline.load import dump
-from fgtrack.tracking.tracker import Tracker
+from fgtrack.tracking.tracker import Tracker, TrackerParts
 
 _LARGEST_STEP_BACK_S = 1.0
 _LONGEST_GAP_S = 3600.0
@@ -135,13 +135,18 @@ def replay(
 
 
 def replay_in_memory(
-    messages: Iterable[Message], config: Config, *, origin: str = "", kind: str = ""
+    messages: Iterable[Message],
+    config: Config,
+    *,
+    origin: str = "",
+    kind: str = "",
+    observed: Callable[[TrackerParts], TrackerParts] | None = None,
 ) -> tuple[Run, str | None]:
     """The run that `replay` would write and `load_run` read, and why the input broke off, where it did.
 
-    Without files it takes less time. Raises as `replay`.
+    Without files it takes less time. `observed` is that of `build_tracker`. Raises as `replay`.
     """
-    tracker = build_tracker(config)
+    tracker = build_tracker(config, observed)
     memory = MemoryRun(*_opening(config, origin, kind))
     _, broken = _drive(tracker, messages, config, memory, origin=origin)
     return memory.run, broken

@@ -1,0 +1,80 @@
+"""The contaminated normal distribution: most errors have the nominal covariance, a few are several times as large."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.linalg import symmetrise
+from fgtrack.core.types import FloatArray
+
+#: How many times as large as nominal the standard deviations of the classes of errors are: nominal, outliers, and what
+#: belongs to another object.
+SCALES = np.array([1.0, 4.0, 40.0])
+#: Largest share of outliers: beyond it the names of the classes would change places.
+MAX_SHARE = 0.15
+#: Of the outliers, the share of each class.
+PARTS = np.array([0.9, 0.1])
+
+
+class Update(NamedTuple):
+    """A state after a measurement whose error is contaminated."""
+
+    step: FloatArray
+    """Posterior minus prior mean, shape (..., n)."""
+    covariance: FloatArray
+    """Posterior covariance, shape (..., n, n)."""
+    S: FloatArray
+    """Covariance of the innovation where the error is nominal, shape (..., k, k)."""
+    log_likelihood: FloatArray
+    """Log density of the innovation, shape (...)."""
+    outlier: FloatArray
+    """Probability that the error was not nominal, shape (...)."""
+
+
+def update(P: FloatArray, H: FloatArray, y: FloatArray, R: FloatArray, foreign: FloatArray, odds: FloatArray) -> Update:
+    """Fuse innovations y (..., k) of measurements with Jacobians H (..., k, n).
+
+    The error has the covariance c^2 R + `foreign`, shape (..., k, k), with c = 1 or, with the probability
+    `outlier_share(odds)`, another one of `SCALES`. With p(y) the mixture of the normal densities of covariances
+    S_i = H P H' + c_i^2 R + foreign,
+    w_i the probability of class i given y, g = sum w_i S_i^-1 y and
+    G = sum w_i (S_i^-1 - S_i^-1 y y' S_i^-1) + g g', the posterior has the mean x + P H' g and the covariance
+    P - P H' G H P, its exact moments (Masreliez 1975, "Approximate non-Gaussian filtering with linear state and
+    observation relations", IEEE Transactions on Automatic Control 20(1), eqs. 8 to 12). At odds 0 this is the Kalman
+    filter.
+    """
+    HP = H @ P
+    scales = np.square(SCALES).reshape(-1, *[1] * R.ndim)
+    S = (HP @ H.mT + foreign) + scales * R
+    inverse = np.linalg.inv(S)
+    solved = (inverse @ y[..., None])[..., 0]
+    squares = np.vecdot(y, solved)
+    log_density = _log_shares(odds) - 0.5 * (squares + np.linalg.slogdet(S)[1])
+    highest = log_density.max(axis=0)
+    weights = np.exp(log_density - highest)
+    total = weights.sum(axis=0)
+    weights /= total
+    g = (weights[..., None] * solved).sum(axis=0)
+    weighted = weights[..., None] * solved
+    G = (weights[..., None, None] * inverse).sum(axis=0) - (weighted[..., :, None] * solved[..., None, :]).sum(axis=0)
+    G += g[..., :, None] * g[..., None, :]
+    return Update(
+        (g[..., None, :] @ HP)[..., 0, :],
+        symmetrise(P - HP.mT @ G @ HP),
+        S[0],
+        highest + np.log(total) - 0.5 * y.shape[-1] * math.log(math.tau),
+        1.0 - weights[0],
+    )
+
+
+def outlier_share(odds: FloatArray) -> FloatArray:
+    """Share of outliers, below `MAX_SHARE`, from a positive number that is about the share where it is small."""
+    return np.asarray(MAX_SHARE * odds / (MAX_SHARE + odds))
+
+
+def _log_shares(odds: FloatArray) -> FloatArray:
+    """Log probabilities of the classes, shape (3, ...)."""
+    share = outlier_share(odds)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(np.stack([1.0 - share, *(part * share for part in PARTS)])))

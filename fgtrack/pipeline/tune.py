@@ -1,0 +1,391 @@
+"""Noise from recordings: process and measurement noise by maximum likelihood of the innovations, without truth."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.types import BoolArray, FloatArray, Message
+from fgtrack.estimation.likelihood.contaminated import outlier_share
+from fgtrack.estimation.likelihood.fit import FitSettings, Likelihood, Problem
+from fgtrack.estimation.likelihood.reference import filtered
+from fgtrack.estimation.likelihood.series import Series
+from fgtrack.io.run import Run
+from fgtrack.io.source import open_input
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.replay import located
+from fgtrack.pipeline.shipped import read_config, settings_of
+from fgtrack.pipeline.tune_measurements import recorded
+from fgtrack.pipeline.tune_report import HeldOut, InnovationFit, Known, SensorNoise, TunedParameter, TuneReport
+from fgtrack.pipeline.tune_space import ConfigNoise
+from fgtrack.tracking.association import GatedMahalanobis
+
+
+@dataclass(frozen=True)
+class TuneRules:
+    """Which tracks count, and when a parameter is known."""
+
+    fit: FitSettings = field(default_factory=FitSettings)
+    train_share: float = 0.7
+    """Part of the time of each recording, from its start, that the noise which is judged is fitted to."""
+    max_rounds: int = 4
+    """How often detections are associated at most."""
+    settled: float = 0.2
+    """Rounds end where no parameter moves by more than this share of its standard deviation."""
+    min_observations: int = 20
+    """Shorter tracks are left out: most of them are clutter."""
+    min_count: int = 30
+    """Measured components that a parameter needs at least."""
+    known_std_error: float = 0.05
+    """A parameter is known where its standard error is below this share of it: three of them are 15 %, ..."""
+    rough_std_error: float = 0.5
+    """... and not known where it is above this."""
+    rejected: float = 1.92
+    """A value is rejected by the data where the log-likelihood is lower by this: a 95 % interval."""
+    gate_probability: float = 0.9999
+    """A narrower chi-square gate is opened to this: what it cuts off would be missing in the noise."""
+    start_factor: float = 5.0
+    """Further starts have a motion noise larger, and smaller, by this."""
+    start_observations: int = 200
+    """Part of a track that is used to compare starts."""
+    start_tracks: int = 3
+    """The number of these tracks."""
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """Messages in memory, and how they ended."""
+
+    name: str
+    messages: tuple[Message, ...]
+    broken: str | None
+
+    @classmethod
+    def read(cls, name: str, messages: Iterable[Message]) -> "_Recording":
+        kept: list[Message] = []
+        try:
+            kept.extend(messages)
+        except DataError as error:
+            if not kept:
+                raise
+            return cls(name, tuple(kept), str(error))
+        return cls(name, tuple(kept), None)
+
+
+def tune(
+    recordings: str | Path | Sequence[str | Path],
+    config: str | Path | Config | None = None,
+    *,
+    map: str | Path | None = None,  # noqa: A002 - the name of the option
+    pit_map: str | Path | None = None,
+    set: Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
+) -> TuneReport:
+    """Fit process and measurement noise to recordings; `report.config` is the tuned configuration.
+
+    Parameters
+    ----------
+    recordings
+        Path of anything that fgtrack reads, or several of them.
+    config
+        Name of a shipped configuration, path of a YAML file, or a `Config`; None for the defaults.
+    map, pit_map
+        CSV files of the track and of the pit lane, or `oval`; in place of those of the configuration.
+    set
+        Values of single settings: `{"motion.kind": "ctra"}`.
+
+    Raises
+    ------
+    CallError
+        The configuration does not fit.
+    DataError
+        A recording cannot be read, a sensor of it has no model, or nothing can be fitted to it.
+    """
+    resolved = read_config(config, settings_of(set), track_map=map, pit_map=pit_map)
+    paths = [recordings] if isinstance(recordings, (str, Path)) else list(recordings)
+    return tuned({str(path): open_input(path, resolved.input).messages for path in paths}, resolved)
+
+
+def tuned(
+    sources: Mapping[str, Callable[[], Iterator[Message]]],
+    config: Config,
+    rules: TuneRules | None = None,
+    on_step: Callable[[str], None] = lambda text: None,
+) -> TuneReport:
+    """`tune` of messages in receipt order, by name of their recording; `on_step` is told what comes next."""
+    rules = rules or TuneRules()
+    noise = ConfigNoise(_for_tuning(config, rules))
+    recordings = [_Recording.read(name, messages()) for name, messages in sources.items()]
+    return _Tuning(noise, recordings, rules, on_step).report(config)
+
+
+def _for_tuning(config: Config, rules: TuneRules) -> Config:
+    """The configuration with an estimator that keeps late data, and a gate that does not cut off the noise."""
+    association = config.association
+    if isinstance(association, GatedMahalanobis):
+        probability = max(association.gate_probability, rules.gate_probability)
+        association = replace(association, gate_probability=probability)
+    return replace(config, estimator="ekf-replay", association=association)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Parameters and what is known of them."""
+
+    values: FloatArray
+    free: BoolArray
+    """Which of them were fitted."""
+    known: tuple[Known, ...]
+    """Of these, `roughly`: how well is not looked at here."""
+    why: tuple[str, ...]
+    likelihood: Likelihood
+
+
+class _Tuning:
+    """The steps of `tuned`."""
+
+    def __init__(
+        self,
+        noise: ConfigNoise,
+        recordings: Sequence[_Recording],
+        rules: TuneRules,
+        on_step: Callable[[str], None],
+    ) -> None:
+        self._noise = noise
+        self._space = noise.space
+        self._configured = noise.values
+        self._recordings = recordings
+        self._rules = rules
+        self._on_step = on_step
+
+    def report(self, config: Config) -> TuneReport:
+        """Rounds of association and fit to the first part, the judgement of the rest, and the fit to everything."""
+        series, runs = self._associated(self._configured)
+        splits = [self._split_ns(tracks) for tracks in series]
+        runs_before = runs
+        values, optima, rounds, settled = self._configured, 0, 0, False
+        while not settled and rounds < self._rules.max_rounds:
+            if rounds:
+                self._on_step(f"association {rounds + 1}")
+                series, runs = self._associated(values)
+            rounds += 1
+            problem = self._problem(_until(series, splits))
+            free = self._free(problem)
+            if rounds == 1:
+                values, optima = self._best_start(problem, free)
+            self._on_step(f"fit {rounds}")
+            before = values
+            values, likelihood = problem.maximum(values, free)
+            moved = np.abs(np.log(values[free] / before[free]))
+            settled = bool((moved <= self._rules.settled * likelihood.spread(np.log(values[free]))).all())
+        trained = self._found(problem, values, free)
+        held_out = self._held_out(trained.values, series, splits, runs_before)
+        self._on_step("fit to everything")
+        everything = self._problem([one for tracks in series for one in tracks])
+        found = self._found(everything, trained.values, self._free(everything))
+        return self._made(config, everything, found, held_out, rounds, optima, settled)
+
+    def _associated(self, values: FloatArray) -> tuple[list[list[Series]], list[Run]]:
+        """The series of long tracks and the run of each recording, with the noise of `values`."""
+        config = self._noise.config_with(values)
+        all_series, runs = [], []
+        for recording in self._recordings:
+            series, run, _ = recorded(recording.messages, config, recording.name)
+            all_series.append([one for one in series if len(one.observations) >= self._rules.min_observations])
+            runs.append(run)
+        return all_series, runs
+
+    def _split_ns(self, tracks: Sequence[Series]) -> int:
+        """The stamp at which the held-out part of a recording begins."""
+        stamps_ns = [one.measurement.stamp_ns for track in tracks for one in track.observations]
+        if not stamps_ns:
+            return 0
+        return min(stamps_ns) + round(self._rules.train_share * (max(stamps_ns) - min(stamps_ns)))
+
+    def _problem(self, series: Sequence[Series]) -> Problem:
+        problem = Problem(series, self._space, self._configured, self._rules.fit)
+        if not problem.counts()[: self._space.num_motion].any():
+            names = ", ".join(recording.name for recording in self._recordings)
+            raise DataError(
+                f"{names}: nothing to fit noise to: no track has {self._rules.min_observations} measurements; "
+                "look at `fgtrack info` for sensors without a model, and at the gate"
+            )
+        return problem
+
+    def _free(self, problem: Problem) -> BoolArray:
+        """Which parameters have enough measurements."""
+        return np.asarray(problem.counts() >= self._rules.min_count)
+
+    def _best_start(self, problem: Problem, free: BoolArray) -> tuple[FloatArray, int]:
+        """The start, of three, from which the highest maximum is reached on a part of the data; how many there are."""
+        self._on_step("starts")
+        longest = sorted(problem.series, key=lambda one: -len(one.observations))[: self._rules.start_tracks]
+        some = [replace(one, observations=one.observations[: self._rules.start_observations]) for one in longest]
+        part = replace(problem, series=some)
+        free = free & (part.counts() >= self._rules.min_count)
+        reached: list[tuple[float, FloatArray]] = []
+        for factor in (1.0, self._rules.start_factor, 1.0 / self._rules.start_factor):
+            start = self._configured.copy()
+            start[: self._space.num_motion] *= factor
+            values, likelihood = part.maximum(start, free)
+            reached.append((-likelihood.objective(np.log(values[free])), values))
+        reached.sort(key=lambda one: -one[0])
+        heights = [height for height, _ in reached]
+        optima = 1 + sum(upper - lower > 1.0 for upper, lower in pairwise(heights))
+        return reached[0][1], optima
+
+    def _found(self, problem: Problem, start: FloatArray, free: BoolArray) -> _Found:
+        """The maximum with what is not known taken out, and fitted again without it."""
+        count = len(start)
+        known: list[Known] = ["no"] * count
+        why = [f"fewer than {self._rules.min_count} measurements on tracks"] * count
+        values, free = start.copy(), free.copy()
+        shares = np.array([not name for _, name in self._space.names])
+        while True:
+            values, likelihood = problem.maximum(values, free)
+            spread = np.full(count, math.inf)
+            spread[free] = likelihood.spread(np.log(values[free]))
+            vague = free & ~shares & (spread > self._rules.rough_std_error)
+            if not vague.any():
+                break
+            limits = {place: self._limit(likelihood, values, place) for place in np.flatnonzero(vague).tolist()}
+            for place, limit in limits.items():
+                kept = limit == self._configured[place]
+                known[place] = "no" if kept else "limit"
+                why[place] = (
+                    f"flat: standard error {100.0 * spread[place]:.0f} %"
+                    if kept
+                    else f"only bounded: {'below' if values[place] < limit else 'above'} {limit:.3g} at 95 %"
+                )
+                values[place], free[place] = limit, False
+            if not free.any():
+                raise DataError("nothing to fit noise to: no parameter is identifiable in so few measurements")
+        for place in np.flatnonzero(free).tolist():
+            known[place], why[place] = "roughly", ""
+        return _Found(values, free, tuple(known), tuple(why), likelihood)
+
+    def _limit(self, likelihood: Likelihood, values: FloatArray, place: int) -> float:
+        """The value nearest to the configured one that the data do not reject, the other parameters given."""
+        shares = np.linspace(0.0, 1.0, 41)
+        rows = np.broadcast_to(values, (len(shares), len(values))).copy()
+        rows[:, place] = values[place] * (self._configured[place] / values[place]) ** shares
+        heights = likelihood.totals(rows)
+        rejected = np.flatnonzero(heights < heights[0] - self._rules.rejected)
+        if not len(rejected):
+            return float(self._configured[place])
+        return float(rows[max(int(rejected[0]) - 1, 0), place])
+
+    def _held_out(
+        self,
+        trained: FloatArray,
+        series: Sequence[Sequence[Series]],
+        splits: Sequence[int],
+        runs_before: Sequence[Run],
+    ) -> HeldOut | None:
+        """How the noise fitted to the first part does in the rest; None where nothing counts there."""
+        rest = [replace(one, from_ns=at_ns) for tracks, at_ns in zip(series, splits, strict=True) for one in tracks]
+        before = trained.copy()  # shares of outliers are not configured: they are the same in both
+        configured = np.array([bool(name) for _, name in self._space.names])
+        before[configured] = self._configured[configured]
+        judged = [self._judged(rest, values) for values in (before, trained)]
+        count = len(judged[0][0])
+        if not count:
+            return None
+        squares_before, squares_after = (squares for _, squares in judged)
+        innovations = tuple(
+            InnovationFit(
+                sensor,
+                component,
+                len(squares),
+                float(np.mean(squares)),
+                float(np.mean(squares_after[sensor, component])),
+                1.96 * math.sqrt(2.0 / len(squares)),
+            )
+            for (sensor, component), squares in sorted(squares_before.items())
+        )
+        self._on_step("held-out time")
+        _, runs_after = self._associated(trained)
+        return HeldOut(
+            1.0 - self._rules.train_share,
+            count,
+            float(np.mean(judged[0][0])),
+            float(np.mean(judged[1][0])),
+            innovations,
+            tuple(splits),
+            tuple(runs_before),
+            tuple(runs_after),
+        )
+
+    def _judged(
+        self, series: Sequence[Series], values: FloatArray
+    ) -> tuple[list[float], dict[tuple[str, str], list[float]]]:
+        """Log-likelihoods of the innovations that count, and squares over variances by sensor and component."""
+        terms: list[float] = []
+        squares: dict[tuple[str, str], list[float]] = {}
+        for one in series:
+            for place, step in enumerate(filtered(one, self._space, values)):
+                if self._rules.fit.counts(one, place):
+                    terms.append(step.log_likelihood)
+                    observation = step.observation
+                    names = [observation.measurement.model.components[i] for i in observation.measured]
+                    for name, square in zip(names, np.square(step.y) / np.diag(step.S), strict=True):
+                        squares.setdefault((observation.sensor, name), []).append(float(square))
+        return terms, squares
+
+    def _made(
+        self,
+        config: Config,
+        problem: Problem,
+        found: _Found,
+        held_out: HeldOut | None,
+        rounds: int,
+        optima: int,
+        settled: bool,
+    ) -> TuneReport:
+        tuned_config = ConfigNoise(config).config_with(found.values)
+        self._on_step("standard errors")
+        std_error = np.full(len(found.values), math.nan)
+        std_error[found.free] = found.likelihood.log_std(np.log(found.values[found.free]))
+        known = [
+            "yes" if error <= self._rules.known_std_error else one
+            for one, error in zip(found.known, std_error.tolist(), strict=True)
+        ]
+        columns = self._noise.keys, self._noise.shown, ConfigNoise(tuned_config).shown, std_error.tolist(), known
+        parameters = tuple(
+            TunedParameter(key, was, value, None if math.isnan(error) else error, one, why)
+            for key, was, value, error, one, why in zip(*columns, found.why, strict=True)
+            if key
+        )
+        total = float(found.likelihood.totals(found.values[None])[0])
+        count = int(problem.counts()[self._space.num_motion :][-len(self._space.sensors) :].sum())
+        return TuneReport(
+            tuned_config,
+            parameters,
+            tuple(self._sensor(name, problem, found) for name in self._space.sensors),
+            held_out,
+            total / count,
+            count,
+            len(problem.series),
+            rounds,
+            optima,
+            settled,
+            {one.name: located(one.broken, one.name) for one in self._recordings if one.broken is not None},
+        )
+
+    def _sensor(self, name: str, problem: Problem, found: _Found) -> SensorNoise:
+        places = {parameter: place for place, parameter in enumerate(self._space.names)}
+        count = int(problem.counts()[places[name, ""]])
+        own = sum(
+            observation.sensor == name and not observation.tuned
+            for one in problem.series
+            for observation in one.observations
+        )
+        share = float(outlier_share(found.values[places[name, ""]])) if count else None
+        return SensorNoise(name, count, own, share)
+
+
+def _until(series: Sequence[Sequence[Series]], splits: Sequence[int]) -> list[Series]:
+    return [replace(one, until_ns=at_ns) for tracks, at_ns in zip(series, splits, strict=True) for one in tracks]

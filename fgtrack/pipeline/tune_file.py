@@ -1,0 +1,94 @@
+"""A tuned configuration as a file: that of the configuration, comments and all, with other numbers."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass, replace
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap
+
+from fgtrack.io.output import Kind, new_file
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.load import plain, validate
+from fgtrack.pipeline.shipped import find_file
+
+_MARK = "(fgtrack tune)"
+
+
+def _is_tuned(path: Path) -> bool:
+    return path.is_file() and _MARK in path.read_text(encoding="utf-8", errors="replace").partition("\n")[0]
+
+
+#: A file that `fgtrack tune` has written.
+TUNED = Kind("a tuned configuration", _is_tuned)
+
+
+def write_tuned(path: Path, base: str | Path | None, config: Config, comments: Sequence[str], overwrite: bool) -> None:
+    """Write `config` to `path` as changes of the configuration file `base` (or shipped name, or None for the defaults).
+
+    The maps of `config` are left out: they belong to a recording. `comments` are put before the rest. Raises
+    `CallError` where `path` exists and must not be replaced, or cannot be written.
+    """
+    text = tuned_text(base, config, comments)
+    with new_file(path, TUNED, overwrite) as file:
+        file.write(text.encode())
+
+
+def tuned_text(base: str | Path | None, config: Config, comments: Sequence[str]) -> str:
+    """The text that `write_tuned` writes."""
+    yaml = YAML()
+    yaml.preserve_quotes = True
+    yaml.width = 120
+    document, name = CommentedMap(), "the defaults"
+    if base is not None:
+        source = find_file("configuration", base)
+        name = source.stem
+        document = yaml.load(source.read_text(encoding="utf-8")) or document
+    origin = validate(Config, document, name)
+    wanted = replace(config, map=origin.map)
+    _change(document, origin, wanted)
+    text = StringIO()
+    yaml.dump(document, text)
+    head = [f"# The noise of {name}, fitted to recordings {_MARK}.", "#", *(f"# {line}".rstrip() for line in comments)]
+    return "\n".join([*head, "#", text.getvalue()])
+
+
+def _change(document: Any, origin: object, wanted: object) -> None:  # Any: a mapping of ruamel's
+    """Set in `document`, which was read as `origin`, what is different in `wanted`."""
+    for name, before, after in _entries(origin, wanted):
+        if plain(before) == plain(after):
+            continue
+        inner = document.get(name)
+        if isinstance(inner, Mapping) and type(before) is type(after) and not isinstance(after, (list, tuple)):
+            _change(inner, before, after)
+        else:
+            document[name] = _short(after)
+
+
+def _entries(origin: object, wanted: object) -> list[tuple[str, object, object]]:
+    if isinstance(wanted, Mapping):
+        before = origin if isinstance(origin, Mapping) else {}
+        return [(name, before.get(name), value) for name, value in wanted.items()]
+    return [(one.name, getattr(origin, one.name), getattr(wanted, one.name)) for one in fields(wanted)]  # type: ignore[arg-type]  # a dataclass
+
+
+def _short(value: object) -> Any:  # Any: JSON values
+    """`plain` without the fields that are at their defaults; `kind` stays, it says which form is meant."""
+    if is_dataclass(value):
+        kept = {one.name: getattr(value, one.name) for one in fields(value) if not _is_default(one, value)}
+        return {name: _short(item) for name, item in kept.items()}
+    if isinstance(value, Mapping):
+        inner = CommentedMap((name, _short(item)) for name, item in value.items())
+        if not any(isinstance(item, Mapping) for item in inner.values()):
+            inner.fa.set_flow_style()
+        return inner
+    return plain(value)
+
+
+def _is_default(one: Any, value: object) -> bool:  # Any: a field of any type
+    if one.name == "kind":
+        return False
+    default = one.default_factory() if one.default_factory is not MISSING else one.default
+    return default is not MISSING and plain(getattr(value, one.name)) == plain(default)

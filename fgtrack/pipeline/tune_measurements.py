@@ -1,0 +1,146 @@
+"""The measurements that a tracker gives to each of its tracks, taken from a replay in memory."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from fgtrack.core.geometry import rotation
+from fgtrack.core.linalg import congruence
+from fgtrack.core.types import Message, SmoothedReport, TrackState, UpdateRecord
+from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult
+from fgtrack.estimation.likelihood.series import Observation, Series, positive_part
+from fgtrack.io.run import Run
+from fgtrack.models.sensors import SensorModel
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.replay import replay_in_memory
+from fgtrack.tracking.ego import EgoPose
+from fgtrack.tracking.inbox import Batch
+from fgtrack.tracking.preprocess import Candidate, Preprocess
+from fgtrack.tracking.tracker import TrackerParts
+
+
+def recorded(messages: Iterable[Message], config: Config, origin: str = "") -> tuple[list[Series], Run, str | None]:
+    """The series of all tracks, the run, and why the input broke off, where it did. Raises as `replay`."""
+    banks: list[_RecordingBank] = []
+
+    def observed(parts: TrackerParts) -> TrackerParts:
+        preprocess = _WatchedPreprocess(parts.preprocess)
+        banks.append(_RecordingBank(parts.bank, preprocess))
+        return replace(parts, preprocess=preprocess, bank=banks[0])
+
+    run, broken = replay_in_memory(messages, config, origin=origin, observed=observed)
+    return banks[0].series(), run, broken
+
+
+class _WatchedPreprocess(Preprocess):
+    """Another `Preprocess`; remembers what the measurements of the newest batch are made of."""
+
+    def __init__(self, watched: Preprocess) -> None:
+        self._watched = watched
+        self._sensor: tuple[str, SensorModel] | None = None
+        self._own: dict[int, bool] = {}
+
+    def __call__(
+        self, batch: Batch, sensor: SensorModel, ego: EgoPose | None
+    ) -> tuple[list[Candidate], list[UpdateRecord]]:
+        candidates, records = self._watched(batch, sensor, ego)
+        objects = batch.message.objects
+        self._sensor = batch.sensor, sensor
+        self._own = {
+            id(one.measurement): sensor.message_covariance
+            and any(objects[index].covariance is not None for index in (one.index, *one.merged))
+            for one in candidates
+        }
+        return candidates, records
+
+    def observation(self, measurement: Measurement) -> Observation:
+        """A measurement of the newest batch with its noise in parts."""
+        assert self._sensor is not None  # a batch is preprocessed before anything of it is fused
+        name, sensor = self._sensor
+        return observation(name, sensor, measurement, self._own[id(measurement)])
+
+
+def observation(name: str, sensor: SensorModel, measurement: Measurement, own: bool) -> Observation:
+    """`measurement` of the sensor `name`, whose detections came with a covariance of their `own` or did not."""
+    components = measurement.model.components
+    measured = tuple(place for place, component in enumerate(components) if component in sensor.std)
+    assumed = tuple(place for place in range(len(components)) if place not in measured)
+    R = measurement.R[np.ix_(measured, measured)]
+    T = np.eye(len(measured))
+    if own:
+        return Observation(name, measurement, measured, assumed, T, R, np.zeros_like(R))
+    if "x_m" in components:
+        (x_m, y_m), pose = measurement.z[:2].tolist(), measurement.pose
+        T[:2, :2] = rotation(math.atan2(y_m - pose.y_m, x_m - pose.x_m))
+    known = congruence(T, np.diag([sensor.std[components[place]] ** 2 for place in measured]))
+    return Observation(name, measurement, measured, assumed, T, np.zeros_like(R), positive_part(R - known))
+
+
+class _RecordingBank:
+    """Another `TrackBank`; keeps the first state and the fused measurements of every track."""
+
+    def __init__(self, bank: TrackBank, preprocess: _WatchedPreprocess) -> None:
+        self._bank = bank
+        self._preprocess = preprocess
+        self._starts: dict[int, Start] = {}
+        self._fused: dict[int, list[Observation]] = {}
+
+    def series(self) -> list[Series]:
+        """What each track has fused, by rising stamp, in order of birth."""
+        return [
+            Series(start, sorted(self._fused[track_id], key=lambda one: one.measurement.stamp_ns))
+            for track_id, start in self._starts.items()
+        ]
+
+    @property
+    def present_ns(self) -> int:
+        """See `TrackBank.present_ns`."""
+        return self._bank.present_ns
+
+    @property
+    def window_start_ns(self) -> int:
+        """See `TrackBank.window_start_ns`."""
+        return self._bank.window_start_ns
+
+    @property
+    def track_ids(self) -> tuple[int, ...]:
+        """See `TrackBank.track_ids`."""
+        return self._bank.track_ids
+
+    def advance(self, now_ns: int) -> None:
+        """See `TrackBank.advance`."""
+        self._bank.advance(now_ns)
+
+    def states_at(self, stamp_ns: int) -> StatesAt:
+        """See `TrackBank.states_at`."""
+        return self._bank.states_at(stamp_ns)
+
+    def update(
+        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+    ) -> list[UpdateResult]:
+        """See `TrackBank.update`."""
+        results = self._bank.update(stamp_ns, track_ids, measurements)
+        for track_id, measurement, result in zip(track_ids, measurements, results, strict=True):
+            if result.innovation is not None:
+                self._fused[track_id].append(self._preprocess.observation(measurement))
+        return results
+
+    def birth(self, track_id: int, prior: Start) -> None:
+        """See `TrackBank.birth`."""
+        self._bank.birth(track_id, prior)
+        self._starts[track_id] = prior
+        self._fused[track_id] = []
+
+    def remove(self, track_id: int) -> None:
+        """See `TrackBank.remove`."""
+        self._bank.remove(track_id)
+
+    def present(self) -> list[TrackState]:
+        """See `TrackBank.present`."""
+        return self._bank.present()
+
+    def smoothed(self) -> list[SmoothedReport]:
+        """See `TrackBank.smoothed`."""
+        return self._bank.smoothed()

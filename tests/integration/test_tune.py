@@ -1,0 +1,99 @@
+"""`fgtrack tune`: from recordings of known noise to a configuration with that noise."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fgtrack.cli.main import run
+from fgtrack.core.types import EgoState
+from fgtrack.io.run import load_run
+from fgtrack.io.stream import write_stream
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.load import load
+from fgtrack.pipeline.shipped import read_config, read_scenario
+from fgtrack.pipeline.tune_file import tuned_text
+from fgtrack.sim.simulate import simulate
+
+Capture = pytest.CaptureFixture[str]
+SECONDS = 10.0
+
+
+@pytest.fixture(scope="module")
+def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten seconds of one object that moves as the model says, seen by two sensors with other noise than configured."""
+    scenario = read_scenario("drawn_ctrv", duration_s=SECONDS)
+    lidar, radar = scenario.sensors
+    sensors = replace(lidar, std={"x_m": 0.6, "y_m": 0.15}, rate_hz=10.0), replace(radar, rate_hz=10.0)
+    scenario = replace(scenario, opponents=scenario.opponents[:1], sensors=sensors)
+    path = tmp_path_factory.mktemp("tune") / "drive.jsonl"
+    write_stream(path, simulate(scenario, np.random.default_rng(3)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def written(stream: Path) -> Path:
+    """What `fgtrack tune` makes of it."""
+    out = stream.with_name("tuned.yaml")
+    assert run(["tune", str(stream), "-c", "open_space", "-o", str(out), "--set", "birth.speed_std_mps=30"]) == 0
+    return out
+
+
+def test_the_file_repeats_the_configuration_with_other_noise(written: Path) -> None:
+    config, before = load(Config, written), read_config("open_space", ["birth.speed_std_mps=30"])
+    assert config.sensors["lidar_cluster"].std == pytest.approx({"x_m": 0.6, "y_m": 0.15}, rel=0.3)
+    assert replace(config, sensors=before.sensors, motion=before.motion) == before
+    text = written.read_text(encoding="utf-8")
+    assert "# where the first detection has no speed" in text
+    assert "lidar_cluster: {std: {x_m: 0." in text
+    assert "NIS lidar_cluster x_m" in text
+    assert "NEES of the position" in text
+    lines = [line for line in text.splitlines() if not line.startswith("#   fgtrack")]
+    assert max(map(len, lines)) <= 120
+
+
+def test_a_tuned_file_is_replayed_and_not_replaced_without_being_asked(
+    written: Path, stream: Path, capsys: Capture
+) -> None:
+    text = written.read_text(encoding="utf-8")
+    assert run(["replay", str(stream), "-c", str(written), "-o", str(written.with_name("run"))]) == 0
+    assert load_run(written.with_name("run")).meta["estimator"] == "smoother"
+    assert run(["tune", str(stream), "-c", "open_space", "-o", str(written)]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert run(["tune", str(stream), "-c", "open_space", "-o", str(stream), "--overwrite"]) == 2
+    assert "not a tuned configuration" in capsys.readouterr().err
+    assert written.read_text(encoding="utf-8") == text
+
+
+def test_json_says_the_same_and_every_parameter_has_a_row(stream: Path, capsys: Capture, tmp_path: Path) -> None:
+    out = tmp_path / "tuned.yaml"
+    assert run(["tune", str(stream), "-c", "open_space", "-o", str(out), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    config = load(Config, out)
+    values = {one["key"]: one["tuned"] for one in found["parameters"]}
+    assert values["sensors.radar.std.speed_mps"] == config.sensors["radar"].std["speed_mps"]
+    assert values["motion.std_per_s.yaw"] == config.motion.std_per_s["yaw"]
+    assert len(values) == 4 + 2 + 3
+    assert all(one["why"] for one in found["parameters"] if one["known"] in ("no", "limit"))
+    assert all(one["tuned"] == one["configured"] for one in found["parameters"] if one["known"] == "no")
+    assert found["held_out"]["after"] > found["held_out"]["before"]
+    assert found["nees"]["after"] > 0.0
+
+
+def test_a_recording_of_nothing_is_one_line(tmp_path: Path, capsys: Capture) -> None:
+    path = tmp_path / "drive.jsonl"
+    write_stream(path, [EgoState(k * 10_000_000, k * 10_000_000, 0.0, 0.0, 0.0, 0.0) for k in range(50)])
+    assert run(["tune", str(path), "-c", "smoother", "-o", str(tmp_path / "tuned.yaml")]) == 1
+    [line] = capsys.readouterr().err.splitlines()
+    assert "nothing to fit noise to" in line
+    assert not (tmp_path / "tuned.yaml").exists()
+
+
+def test_without_a_file_the_text_holds_what_is_no_default() -> None:
+    config = read_config(None, ["sensors.radar.std.x_m=1.5", "motion.std_per_s.yaw=0.1"])
+    text = tuned_text(None, config, ["why"])
+    assert text.startswith("# The noise of the defaults, fitted to recordings (fgtrack tune).\n#\n# why\n")
+    assert "estimator" not in text
+    assert "    std: {x_m: 1.5, y_m: 3.0, speed_mps: 0.2}\n" in text

@@ -1,0 +1,150 @@
+"""The likelihood of noise against a dense joint Gaussian, the contaminated update against quadrature, and a fit."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from fgtrack.core.time import NS_PER_S, nanoseconds
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.birth import initial_state
+from fgtrack.estimation.likelihood import contaminated
+from fgtrack.estimation.likelihood.fit import FitSettings, Problem
+from fgtrack.estimation.likelihood.noise import NoiseSpace
+from fgtrack.estimation.likelihood.reference import filtered
+from fgtrack.estimation.likelihood.series import Observation, Series
+from fgtrack.models.motion import CTRV, CV
+
+START = Start(position_m=(3.0, -2.0), yaw_rad=0.3, yaw_std_rad=0.2, speed_mps=8.0, speed_std_mps=2.0)
+SPACE = NoiseSpace(
+    ("velocity",), lambda std: CV.from_std_per_step(std, 1.0), {"lidar": ("x_m", "y_m"), "radar": ("x_m", "y_m")}
+)
+#: Of the velocity, of x and y of each sensor, and odds of outliers too small to count.
+VALUES = np.array([0.8, 0.5, 0.3, 1.5, 1.0, 1e-60, 1e-60])
+EVERYTHING = FitSettings(settle_s=0.0, settle_steps=0)
+
+
+def observed(sensor: str, stamp_s: float, z: Sequence[float], turn_rad: float = 0.0) -> Observation:
+    """x and y of a sensor whose axes are turned."""
+    c, s = np.cos(turn_rad), np.sin(turn_rad)
+    measurement = Measurement.of(nanoseconds(stamp_s), x_m=z[0], y_m=z[1], std={"x_m": 1.0, "y_m": 1.0})
+    measurement = measurement.seen_by(SPACE.motion_model(VALUES))
+    nothing = np.zeros((2, 2))
+    return Observation(sensor, measurement, (0, 1), (), np.array([[c, -s], [s, c]]), nothing, nothing)
+
+
+def drawn(rng: np.random.Generator, values: FloatArray, num: int, outliers: float = 0.0) -> Series:
+    """A track drawn from the model, seen by both sensors in turn, at equal stamps now and then."""
+    motion = SPACE.motion_model(values)
+    x, P = initial_state(motion, START)
+    x = rng.multivariate_normal(x, P)
+    before_s, seen = 0.0, []
+    for k in range(num):
+        stamp_s = 0.1 * (k - k % 7 % 2)
+        x = rng.multivariate_normal(motion.predict(x, stamp_s - before_s), motion.process_noise(x, stamp_s - before_s))
+        before_s, sensor, turn_rad = stamp_s, k % 2, 0.01 * k
+        std = values[1 + 2 * sensor : 3 + 2 * sensor] * (5.0 if rng.random() < outliers else 1.0)
+        along, across = std * rng.standard_normal(2)
+        c, s = np.cos(turn_rad), np.sin(turn_rad)
+        z = x[:2] + np.array([c * along - s * across, s * along + c * across])
+        seen.append(observed(("lidar", "radar")[sensor], stamp_s, z.tolist(), turn_rad))
+    return Series(START, seen)
+
+
+def dense(series: Series, values: FloatArray) -> float:
+    """Log density of all measurements together: joint Gaussian, built state by state."""
+    motion = SPACE.motion_model(values)
+    mean, P = initial_state(motion, START)
+    means, F_all = [], []
+    before_s = 0.0
+    blocks: list[FloatArray] = []
+    for one in series.observations:
+        stamp_s = one.measurement.stamp_ns / NS_PER_S
+        F = motion.jacobian(mean, stamp_s - before_s)
+        P = F @ P @ F.T + motion.process_noise(mean, stamp_s - before_s)
+        mean, before_s = F @ mean, stamp_s
+        means.append(mean[:2])
+        F_all.append(F)
+        blocks.append(P)
+    n = len(means)
+    joint = np.zeros((2 * n, 2 * n))
+    for i in range(n):
+        across = blocks[i]
+        for j in range(i, n):
+            across = across if j == i else F_all[j] @ across
+            joint[2 * j : 2 * j + 2, 2 * i : 2 * i + 2] = across[:2, :2]
+            joint[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] = across[:2, :2].T
+    for i, one in enumerate(series.observations):
+        std = values[1:3] if one.sensor == "lidar" else values[3:5]
+        joint[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += one.axes @ np.diag(std**2) @ one.axes.T
+    z = np.concatenate([one.measurement.z for one in series.observations])
+    return float(multivariate_normal(np.concatenate(means), joint).logpdf(z))
+
+
+def test_the_likelihood_of_a_linear_model_is_that_of_the_joint_gaussian_at_any_parameters() -> None:
+    rng = np.random.default_rng(0)
+    tracks = [drawn(rng, VALUES, 30), drawn(rng, VALUES, 17)]
+    problem = Problem(tracks, SPACE, VALUES, EVERYTHING)
+    likelihood = problem.likelihood(VALUES, np.ones(7, dtype=bool))
+    rows = VALUES * np.exp(0.5 * rng.standard_normal((4, 7)))
+    rows[:, 5:] = 1e-60
+    expected = [sum(dense(track, row) for track in tracks) for row in rows]
+    assert likelihood.totals(rows) == pytest.approx(expected, abs=1e-6)
+
+
+def test_what_has_settled_counts_and_what_lies_in_the_limits() -> None:
+    track = drawn(np.random.default_rng(1), VALUES, 30)
+    settings = FitSettings(settle_s=0.5, settle_steps=8)
+    stamps_s = [one.measurement.stamp_ns / NS_PER_S for one in track.observations]
+    assert [k for k in range(30) if settings.counts(track, k)] == [k for k in range(8, 30) if stamps_s[k] >= 0.5]
+    inside = replace(track, from_ns=nanoseconds(1.0), until_ns=nanoseconds(2.0))
+    assert {stamps_s[k] >= 1.0 and stamps_s[k] < 2.0 for k in range(30) if settings.counts(inside, k)} == {True}
+
+
+def test_the_contaminated_update_has_the_moments_of_the_exact_posterior() -> None:
+    P, H, R, y, odds = np.array([[2.0]]), np.array([[1.0]]), np.array([[0.25]]), np.array([2.6]), 0.1
+    found = contaminated.update(P, H, y, R, np.zeros((1, 1)), np.array(odds))
+    x = np.linspace(-60.0, 60.0, 400_001)
+    share = float(contaminated.outlier_share(np.array(odds)))
+    weights = np.array([1.0 - share, *(share * contaminated.PARTS)])
+    sigmas = np.sqrt(R[0, 0]) * contaminated.SCALES
+    density = (weights / sigmas * np.exp(-0.5 * ((y - x[:, None]) / sigmas) ** 2)).sum(axis=1) / np.sqrt(2.0 * np.pi)
+    density *= np.exp(-0.5 * x * x / P[0, 0]) / np.sqrt(2.0 * np.pi * P[0, 0])
+    step = x[1] - x[0]
+    evidence = density.sum() * step
+    mean = (x * density).sum() * step / evidence
+    assert found.log_likelihood == pytest.approx(np.log(evidence), abs=1e-6)
+    assert found.step[0] == pytest.approx(mean, abs=1e-6)
+    assert found.covariance[0, 0] == pytest.approx(((x - mean) ** 2 * density).sum() * step / evidence, abs=1e-6)
+    assert 0.0 < found.outlier < 1.0
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.03])
+def test_the_maximum_is_near_the_truth_whatever_the_outliers(outliers: float) -> None:
+    rng = np.random.default_rng(2)
+    tracks = [drawn(rng, VALUES, 120, outliers) for _ in range(8)]
+    start = np.array([2.0, 1.0, 1.0, 1.0, 1.0, 0.01, 0.01])
+    problem = Problem(tracks, SPACE, start)
+    values, likelihood = problem.maximum(start, np.ones(7, dtype=bool))
+    errors = np.log(values[:5] / VALUES[:5])
+    std = likelihood.log_std(np.log(values))[:5]
+    assert (np.abs(errors) < 3.0 * std).all(), (errors, std)
+    assert (np.abs(errors) < 0.15).all()
+    assert (std < 0.1).all()
+    assert contaminated.outlier_share(values[5:]) == pytest.approx([outliers] * 2, abs=0.03)
+
+
+def test_a_nonlinear_model_is_linearised_about_the_filter() -> None:
+    """At the parameters of the trajectory the likelihood is that of the filter itself."""
+    names = "position", "yaw", "speed", "yaw_rate"
+    space = replace(SPACE, motion_names=names, motion=lambda std: CTRV.from_std_per_step(std, 1.0))
+    track = drawn(np.random.default_rng(3), VALUES, 40)
+    seen = [replace(one, measurement=one.measurement.seen_by(CTRV())) for one in track.observations]
+    values = np.array([0.1, 0.1, 0.5, 0.2, *VALUES[1:5], 0.01, 0.01])
+    problem = Problem([replace(track, observations=seen)], space, values, EVERYTHING)
+    likelihood = problem.likelihood(values, np.ones(10, dtype=bool))
+    steps = filtered(problem.series[0], space, values)
+    assert likelihood.totals(values[None])[0] == pytest.approx(sum(step.log_likelihood for step in steps), abs=1e-8)
