@@ -41,6 +41,7 @@ class _Feed:
     messages: Iterable[Message]
     ignored_sensors: frozenset[str]
     on_truth: Callable[[TruthState], None]
+    on_ego: Callable[[EgoState], None]
     broken: str | None = None
     ignored_detections: int = 0
     received_detections: int = 0
@@ -58,6 +59,8 @@ class _Feed:
                     self._check_time(message)
                     if isinstance(message, DetectionList):
                         self.received_detections += len(message.objects)
+                    else:
+                        self.on_ego(message)
                     yield message
         except DataError as error:
             self.broken = str(error)
@@ -162,7 +165,7 @@ def _drive(
 ) -> tuple[dict[str, object], str | None]:
     """Run `tracker` over `messages` into `writer`; gives the finished meta and why the input broke off."""
     started = time.perf_counter()
-    feed = _Feed(messages, frozenset(config.ignore_sensors), writer.write_truth)
+    feed = _Feed(messages, frozenset(config.ignore_sensors), writer.write_truth, writer.write_ego)
     for tick in _ticks(feed, config.clock):
         before_ns = time.perf_counter_ns()
         for message in tick.messages:

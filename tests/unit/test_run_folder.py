@@ -11,6 +11,7 @@ import pytest
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import (
     Disposition,
+    EgoState,
     SmoothedReport,
     TickReport,
     TrackReport,
@@ -19,7 +20,7 @@ from fgtrack.core.types import (
     TruthState,
     UpdateRecord,
 )
-from fgtrack.io.run import NO_TRACK, RunWriter, Table, load_run
+from fgtrack.io.run import NO_TRACK, RunWriter, Table, digest, load_run
 
 
 def track(track_id: int = 1, size: int = 5, stamp_ns: int = 990) -> TrackReport:
@@ -66,6 +67,7 @@ def test_the_header_lines_are_those_of_the_contract(tmp_path):
     path = tmp_path / "run"
     with RunWriter(path) as writer:
         writer.write_truth(TruthState(1, 1, -1, 0.0, 0.0))
+        writer.write_ego(EgoState(1, 2, 0.0, 0.0, 0.0, 0.0))
         writer.write_tick(TickReport(0, 1, (track(),), (), (SmoothedReport(1, track().state, 0.3),)), 1, 0)
         writer.write_smoothed([SmoothedReport(1, track().state)])
     header = {file.stem: file.read_text().splitlines()[0] for file in path.glob("*.csv")}
@@ -82,7 +84,26 @@ def test_the_header_lines_are_those_of_the_contract(tmp_path):
         "lagged": f"tick,now_ns,lag_s,track_id,stamp_ns,{state},{covariance}",
         "timing": "tick,now_ns,process_ns,num_tracks,num_detections",
         "truth": f"stamp_ns,object_id,{state}",
+        "ego": f"stamp_ns,receipt_ns,{state}",
     }
+
+
+def test_the_ego_is_in_the_files_with_the_next_tick_and_not_in_the_digest(tmp_path):
+    path = tmp_path / "run"
+    with RunWriter(path) as writer:
+        writer.write_ego(EgoState(1, 2, 0.1, 0.2, 0.3, 0.4))
+        assert not path.exists() or not (path / "ego.csv").exists()
+        writer.write_tick(report(), 5, 2)
+        assert load_run(path).ego["receipt_ns"].tolist() == [2]
+        writer.write_ego(EgoState(3, 4, 1.1, 0.2, 0.3, 0.4, yaw_rate_radps=0.5, accel_mps2=0.6))
+        finished = writer.finish({})
+    ego = load_run(path).ego
+    assert ego["stamp_ns"].tolist() == [1, 3]
+    assert ego["x_m"].tolist() == [0.1, 1.1]
+    assert ego["accel_mps2"].tolist() == [0.0, 0.6]
+    write(tmp_path / "without", report())
+    assert finished["digest"] == digest(tmp_path / "without")
+    assert load_run(tmp_path / "without").ego.num_rows == 0  # as a run folder of an older version
 
 
 def test_updates_truth_smoothed_and_timing_come_back(tmp_path):
@@ -205,6 +226,7 @@ def test_an_older_run_is_replaced_and_nothing_of_it_is_left(tmp_path):
     path = tmp_path / "run"
     with RunWriter(path) as writer:
         writer.write_truth(TruthState(1, 1, -1, 0.0, 0.0))
+        writer.write_ego(EgoState(1, 2, 0.0, 0.0, 0.0, 0.0))
         writer.write_tick(TickReport(0, 1, (track(),), (), (SmoothedReport(1, track().state, 0.3),)), 1, 0)
         writer.finish({})
     (path / "metrics.json").write_text("{}")

@@ -64,6 +64,7 @@ def test_replays_are_the_same_in_memory_and_written(estimator: str, messages: li
     memory, broken = replay_in_memory(messages, config)
     assert broken is None
     assert memory.tracks.num_rows > 100
+    assert memory.ego.num_rows == sum(isinstance(message, EgoState) for message in messages)
     assert (memory.lagged.num_rows > 100) == (memory.smoothed.num_rows > 100) == (estimator == "smoother")
     assert_same(memory, written)
     kept, read = (evaluate(run).as_dict() for run in (memory, written))
@@ -100,11 +101,14 @@ def test_every_kind_of_row_is_the_same(size: int, tmp_path: Path) -> None:
             for row in truth:
                 sink.write_truth(row)
             for report in reports:
+                sink.write_ego(EgoState(report.now_ns, report.now_ns + 3, 0.1, 1e300, -0.0, 4.0))
                 sink.write_tick(report, 17, 2)
+            sink.write_ego(EgoState(9, 9, 0.0, 0.0, 0.0, 0.0, 0.1, 0.2))
             sink.write_smoothed([SmoothedReport(7, reports[1].tracks[0].state)])
             sink.finish({"broken_off": None})
     assert_same(memory.run, load_run(tmp_path / "run"))
     assert memory.run.smoothed.num_rows == 4
+    assert memory.run.ego.num_rows == 3
 
 
 def test_states_are_kept_as_they_were_when_they_came() -> None:

@@ -81,6 +81,8 @@ class Run:
     lagged: Table
     timing: Table
     truth: Table
+    ego: Table
+    """What was told of the ego, in order of receipt."""
 
     @property
     def config(self) -> Mapping[str, Any]:

@@ -8,6 +8,7 @@ from typing import Any
 from fgtrack.core.types import (
     MEASURABLE,
     STATE_NAMES,
+    EgoState,
     SmoothedReport,
     TickReport,
     TrackReport,
@@ -78,6 +79,11 @@ def truth_row(truth: TruthState) -> Row:
     return (truth.stamp_ns, truth.object_id, *_truth_state(truth))
 
 
+def ego_row(ego: EgoState) -> Row:
+    """A row of `ego`."""
+    return (ego.stamp_ns, ego.receipt_ns, *_ego_state(ego))
+
+
 def text(table: str, found: Sequence[Row]) -> str:
     """Rows as lines of the CSV file of `table`, floats with 17 significant digits."""
     if table == "updates":
@@ -124,3 +130,4 @@ def _upper_triangle(size: int) -> Callable[[list[Cell]], Row]:
 
 
 _truth_state = attrgetter(*STATE_NAMES)
+_ego_state = attrgetter(*STATE_NAMES)

@@ -28,7 +28,8 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "smoothed": ("track_id", "stamp_ns", "kind", *STATE_NAMES, *COVARIANCE_COLUMNS),
     "lagged": ("tick", "now_ns", "lag_s", "track_id", "stamp_ns", *STATE_NAMES, *COVARIANCE_COLUMNS),
     "truth": ("stamp_ns", "object_id", *STATE_NAMES),
+    "ego": ("stamp_ns", "receipt_ns", *STATE_NAMES),
 }
 
 #: Tables that are written only when there is something to write.
-OPTIONAL_TABLES = ("smoothed", "lagged", "truth")
+OPTIONAL_TABLES = ("smoothed", "lagged", "truth", "ego")
