@@ -1,7 +1,7 @@
 """Where a new object heads and how fast, from its first positions: one component for smoothers and filters."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -23,6 +23,7 @@ Initiation = Literal["one-point", "two-point", "regression"]
   until the velocity is so many standard deviations from zero that its direction is certain: three for a smoother,
   which goes on relinearising, ten for a filter, which does not (0.1 rad, as well as a direction that is known).
 """
+DEFAULT: Initiation = "regression"
 
 
 def checked_initiation(method: str) -> Initiation:
@@ -63,21 +64,62 @@ def fix_of(measurement: Measurement, time_s: float) -> Fix | None:
     return None if found is None else Fix(time_s, *found)
 
 
-def straight_line(fixes: Sequence[Fix]) -> Line:
+class _Sums:
+    """Normal equations of a straight line at constant velocity, x = (position at time 0, velocity)."""
+
+    def __init__(self) -> None:
+        self._information, self._vector = np.zeros((4, 4)), np.zeros(4)
+
+    def add(self, fix: Fix) -> None:
+        H = np.hstack([np.eye(2), fix.time_s * np.eye(2)])
+        weighted = psd_solve(fix.covariance, H).T
+        self._information += weighted @ H
+        self._vector += weighted @ fix.position_m
+
+    def line(self) -> Line:
+        spread = psd_solve(self._information, np.eye(4))
+        solution = spread @ self._vector
+        return Line(solution[:2], solution[2:], spread[2:, 2:])
+
+
+def straight_line(fixes: Iterable[Fix]) -> Line:
     """Weighted least squares of a straight line at constant velocity through at least two fixes at different times.
 
     With two fixes this is two-point initiation: the velocity is their difference over their time. Raises
     `numpy.linalg.LinAlgError` where all are of one time.
     """
-    information, vector = np.zeros((4, 4)), np.zeros(4)
-    for time_s, position_m, covariance in fixes:
-        H = np.hstack([np.eye(2), time_s * np.eye(2)])
-        weighted = psd_solve(covariance, H).T
-        information += weighted @ H
-        vector += weighted @ position_m
-    spread = psd_solve(information, np.eye(4))
-    solution = spread @ vector
-    return Line(solution[:2], solution[2:], spread[2:, 2:])
+    sums = _Sums()
+    for fix in fixes:
+        sums.add(fix)
+    return sums.line()
+
+
+class FirstLine(NamedTuple):
+    """A line through the first fixes."""
+
+    line: Line
+    until_s: float
+    """Time of the last of them."""
+    over: bool
+    """Whether it is the last line that is asked for."""
+
+
+def first_line(fixes: Iterable[Fix], method: Initiation, certain: float) -> FirstLine | None:
+    """The line through so many of `fixes` as `method` asks for; None where all are of the first one's time.
+
+    It depends on the first fixes only, in order of their times, and not on the order in which they came. Raises
+    `numpy.linalg.LinAlgError` for a fix without uncertainty.
+    """
+    sums, found = _Sums(), None
+    ordered = sorted(fixes, key=lambda fix: (fix.time_s, *fix.position_m.tolist()))
+    for fix in ordered:
+        sums.add(fix)
+        if fix.time_s > ordered[0].time_s:
+            line = sums.line()
+            found = FirstLine(line, fix.time_s, over(line, method, certain))
+            if found.over:
+                break
+    return found
 
 
 def along(line: Line, time_s: float, state_names: Sequence[str]) -> FloatArray:

@@ -1,5 +1,6 @@
 """The first measurements of a filter whose object starts with an unknown direction of travel."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ from fgtrack.core.geometry import cartesian, polar, wrap_angle
 from fgtrack.core.linalg import product
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray
-from fgtrack.estimation.base import KNOWN_YAW_STD_RAD, Measurement, Start
+from fgtrack.estimation.base import KNOWN_YAW_STD_RAD, UNKNOWN_YAW_STD_RAD, Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import Prediction, correct_one, propagated
 from fgtrack.estimation.initiation import Fix, Initiation, Line, fix_of, over, sought, straight_line
@@ -98,6 +99,17 @@ class Opening:
             raise np.linalg.LinAlgError("the state of a new object is not finite")
         return last.mean, last.covariance
 
+    def turned(self) -> Start:
+        """The start, turned along the line and as fast, but as uncertain as before: the measurements count from there.
+
+        For an estimator that is linearised at its own estimates. What is known of the speed counts a little more than
+        once where the line knows it as well as the start does, and once where either knows it much better. Raises as
+        `state`.
+        """
+        yaw_rad, speed_mps = self._course()
+        std_rad = UNKNOWN_YAW_STD_RAD if self.start.yaw_std_rad is None else self.start.yaw_std_rad
+        return replace(self.start, yaw_rad=yaw_rad, yaw_std_rad=std_rad, speed_mps=speed_mps)
+
     def retrodicted(self, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The state at `stamp_ns`, between the start and the newest measurement, given all that came after.
 
@@ -143,20 +155,23 @@ class Opening:
         return links
 
     def _nominal(self, x: FloatArray) -> FloatArray:
-        """State (n,) on `line` at the start; its speed is weighed with that of `start`, other entries are those of x.
-
-        A line through fixes close together in time may be far too fast, and what is known of the speed says so.
-        """
-        line = self.line
-        if line is None:
-            raise np.linalg.LinAlgError("no line leads through the first positions")
-        direction = line.velocity_mps / max(float(np.hypot(*line.velocity_mps)), np.finfo(np.float64).tiny)
-        known, found = self.start.speed_std_mps**2, float(direction @ line.covariance @ direction)
-        speed_mps = self.start.speed_mps + known / (known + found) * (
-            float(direction @ line.velocity_mps) - self.start.speed_mps
-        )
+        """State (n,) on the line at the start; entries that the line does not give are those of x (n,)."""
+        yaw_rad, speed_mps = self._course()
+        motion = cartesian(np.array([yaw_rad, speed_mps])) if self.motion.cartesian else (yaw_rad, speed_mps)
         nominal = x.copy()
-        yaw_rad = polar(direction)[0]
-        nominal[:2] = line.position_m
-        nominal[2:4] = cartesian(np.array([yaw_rad, speed_mps])) if self.motion.cartesian else (yaw_rad, speed_mps)
+        if self.line is not None:
+            nominal[:2] = self.line.position_m
+        nominal[2:4] = motion
         return nominal
+
+    def _course(self) -> tuple[float, float]:
+        """Direction of the line, and the speed along it, weighed with what the start knows of the speed.
+
+        A line through fixes close together in time may be far too fast.
+        """
+        if self.line is None:
+            raise np.linalg.LinAlgError("no line leads through the first positions")
+        yaw_rad, speed_mps = polar(self.line.velocity_mps).tolist()
+        along = np.array([math.cos(yaw_rad), math.sin(yaw_rad)])
+        known, found = self.start.speed_std_mps**2, float(along @ self.line.covariance @ along)
+        return yaw_rad, self.start.speed_mps + known / (known + found) * (speed_mps - self.start.speed_mps)

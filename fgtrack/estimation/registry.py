@@ -13,6 +13,8 @@ from typing import Any, Literal
 from fgtrack.core.errors import CallError
 from fgtrack.core.plugins import Registry
 from fgtrack.estimation.base import Estimator, Start, TrackBank
+from fgtrack.estimation.initiated import initiated
+from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.models.motion import MotionModel
 
@@ -81,6 +83,9 @@ class Claims:
     """Whether predictions of a nonlinear model are averages over the spread of the state, not values at its mean."""
     held_s: float = 0.0
     """How long a measurement waits before it counts."""
+    initiates: bool = False
+    """Whether it finds an unknown direction of travel by itself, and takes `initiation` as an option. Another one is
+    made again, along its first positions, until their direction is certain (see `Initiated`)."""
     bank: bool = False
     """Whether the entry makes the estimators of all objects together."""
 
@@ -110,7 +115,7 @@ def estimator(name: str, motion: MotionModel, start: Start, *, lag_s: float = 1.
     lag_s
         Length of the window behind the newest stamp or the clock.
     options
-        Keyword parameters of that estimator.
+        Keyword parameters of that estimator; and of every estimator `initiation`, see `Initiation`.
 
     Raises
     ------
@@ -124,23 +129,26 @@ def start_estimator(
     name: str, factory: Factory, motion: MotionModel, start: Start, lag_s: float, options: Mapping[str, Any]
 ) -> Estimator:
     """`estimator` of a factory that need not be registered; `name` stands in errors."""
-    if Claims.of(factory).bank:
-        return OneObject(motion, _made(name, factory, motion, lag_s, **options), start)
-    return _checked(name, _made(name, factory, motion, start, lag_s, **options))
+    claims, own = Claims.of(factory), dict(options)
+
+    def made(start: Start) -> Estimator:
+        if claims.bank:
+            return OneObject(motion, _made(name, factory, motion, lag_s, **own), start)
+        return _checked(name, _made(name, factory, motion, start, lag_s, **own))
+
+    return made(start) if claims.initiates else initiated(motion, start, own.pop("initiation", DEFAULT), made)
 
 
 def estimator_bank(name: str, motion: MotionModel, lag_s: float, options: Mapping[str, Any]) -> TrackBank:
-    """The estimators `name` of all objects; raises as `estimator`."""
+    """The estimators `name` of all objects; raises as `estimator`. One that is a bank itself takes no `initiation`."""
     factory = ESTIMATORS.load(name)
-    if Claims.of(factory).bank:
-        bank: TrackBank = _made(name, factory, motion, lag_s, **options)
+    claims = Claims.of(factory)
+    own = options if claims.initiates else {key: options[key] for key in options if key != "initiation"}
+    if claims.bank:
+        bank: TrackBank = _made(name, factory, motion, lag_s, **own)
         return bank
-    _check_options(name, factory, 3, options)
-
-    def start_one(start: Start) -> Estimator:
-        return _checked(name, _made(name, factory, motion, start, lag_s, **options))
-
-    return ObjectBank(motion, start_one, lag_s)
+    _check_options(name, factory, 3, own)
+    return ObjectBank(motion, lambda start: start_estimator(name, factory, motion, start, lag_s, options), lag_s)
 
 
 def motion_model(name: str, parameters: Mapping[str, Any]) -> MotionModel:

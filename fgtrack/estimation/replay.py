@@ -12,7 +12,7 @@ from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import OneCorrection, Prediction
-from fgtrack.estimation.initiation import checked_initiation
+from fgtrack.estimation.initiation import DEFAULT, checked_initiation
 from fgtrack.estimation.opening import Opening
 from fgtrack.estimation.recursion import EkfRecursion, Recursion
 from fgtrack.estimation.rts import smoothed_one
@@ -59,9 +59,10 @@ class ReplayingFilter(WindowedFilter):
     """
 
     exact = "any lag, any number"
+    initiates = True
 
     def __init__(
-        self, motion: MotionModel, prior: Start, lag_s: float, recursion: Recursion, initiation: str = "regression"
+        self, motion: MotionModel, prior: Start, lag_s: float, recursion: Recursion, initiation: str = DEFAULT
     ) -> None:
         super().__init__(motion, prior, lag_s)
         self._recursion = recursion
@@ -161,7 +162,7 @@ class ReplayEkf(ReplayingFilter):
         See `ReplayingFilter`.
     """
 
-    def __init__(self, motion: MotionModel, prior: Start, lag_s: float, initiation: str = "regression") -> None:
+    def __init__(self, motion: MotionModel, prior: Start, lag_s: float, initiation: str = DEFAULT) -> None:
         super().__init__(motion, prior, lag_s, EkfRecursion(motion), initiation)
 
 

@@ -8,8 +8,10 @@ import numpy as np
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import period_ns, seconds
 from fgtrack.estimation.backward_forward import BackwardForwardBank
-from fgtrack.estimation.base import TrackBank
+from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.factor_graph import BatchBackend, SmootherBank
+from fgtrack.estimation.initiated import initiated
+from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator, Propagator
 from fgtrack.estimation.published import (
     AcceleratedEulerCtrv,
@@ -103,15 +105,26 @@ def _build_backward_forward(config: Config) -> TrackBank:
     step_ns = period_ns(config.filter.frequency_hz)
     storage = _STORAGE[config.filter.clock, config.filter.present]
     steps = round(config.filter.storage_s * config.filter.frequency_hz)
-    return storage(build_propagator(config, seconds(step_ns)), step_ns, steps)
+
+    def bank() -> TrackBank:
+        return storage(build_propagator(config, seconds(step_ns)), step_ns, steps)
+
+    if config.map.track is not None or storage is not BackwardForwardBank:
+        return bank()
+    motion = config.motion_model()  # without a map a track may begin in any direction, each at its own time
+
+    def start_one(start: Start) -> Estimator:
+        return initiated(motion, start, config.initiation.method, lambda turned: OneObject(motion, bank(), turned))
+
+    return ObjectBank(motion, start_one, config.filter.storage_s)
 
 
 def _build_incremental(config: Config) -> TrackBank:
-    return SmootherBank(config.motion_model(), config.smoother)
+    return SmootherBank(config.motion_model(), config.smoother, initiation=config.initiation.method)
 
 
 def _build_batch(config: Config) -> TrackBank:
-    return SmootherBank(config.motion_model(), config.smoother, BatchBackend)
+    return SmootherBank(config.motion_model(), config.smoother, BatchBackend, config.initiation.method)
 
 
 #: Banks that are built from settings of their own.
@@ -126,6 +139,7 @@ def build_bank(config: Config) -> TrackBank:
     """The estimators of all objects. Raises `CallError` for options that the estimator does not take."""
     build, options = _BANKS.get(config.estimator), config.options.get(config.estimator, {})
     if build is None:
+        options = {"initiation": config.initiation.method, **options}
         return estimator_bank(config.estimator, config.motion_model(), config.filter.storage_s, options)
     if options:
         raise CallError(f"options.{config.estimator}: set the keys of smoother or filter instead")

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, PositiveFloat, PositiveInt
 
+from fgtrack.estimation.initiation import DEFAULT, Initiation
 from fgtrack.estimation.registry import ESTIMATORS, motion_model
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.io.config import InputConfig
@@ -141,6 +142,15 @@ class FilterConfig:
             raise ValueError(f"storage_s: must lie between one step and 60 s, is {self.storage_s}")
 
 
+@dataclass(frozen=True)
+class InitiationConfig:
+    """How a track starts whose direction of travel neither the map nor the sensor gives."""
+
+    method: Initiation = DEFAULT
+    """`one-point`: at the first position, heading along x; `two-point`: along the first two; `regression`: along a line
+    through the first ones, until its direction is certain."""
+
+
 _PAPER_STD_PER_S = MappingProxyType({"position": 0.2, "yaw": 0.3, "speed": 1.0, "yaw_rate": 0.5})
 _BUILT_IN_MOTION: Mapping[str, type[CTRV | CV]] = {"ctrv_euler": CTRV, "ctrv": CTRV, "ctra": CTRA, "cv": CV}
 
@@ -206,6 +216,7 @@ class Config:
     association: AssociationConfig = field(default_factory=GatedEuclidean)
     lifecycle: LifecycleConfig = field(default_factory=LifecycleConfig)
     birth: BirthConfig = field(default_factory=FixedBirth)
+    initiation: InitiationConfig = field(default_factory=InitiationConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
     filter: FilterConfig = field(default_factory=FilterConfig)
     smoother: SmootherSettings = field(default_factory=SmootherSettings)

@@ -8,6 +8,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.estimation.base import Start
 from fgtrack.estimation.factor_graph.backends.batch import BatchBackend
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
+from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
 
@@ -16,14 +17,14 @@ _OPTIONS = ("initiation", *(field.name for field in fields(SmootherSettings) if 
 
 # Any: an option may be any value that `SmootherSettings` takes.
 def smoother(
-    motion: MotionModel, start: Start, lag_s: float, initiation: str = "regression", **options: Any
+    motion: MotionModel, start: Start, lag_s: float, initiation: str = DEFAULT, **options: Any
 ) -> FixedLagSmoother:
     """Fixed-lag smoother, a factor graph that iSAM2 solves incrementally."""
     return FixedLagSmoother(motion, start, _settings(lag_s, options), initiation=initiation)
 
 
 def smoother_batch(
-    motion: MotionModel, start: Start, lag_s: float, initiation: str = "regression", **options: Any
+    motion: MotionModel, start: Start, lag_s: float, initiation: str = DEFAULT, **options: Any
 ) -> FixedLagSmoother:
     """Fixed-lag smoother, a factor graph that Levenberg-Marquardt solves anew at every update: slow, for checks."""
     return FixedLagSmoother(motion, start, _settings(lag_s, options), BatchBackend, initiation)
@@ -42,6 +43,7 @@ def _claim(factory: Callable[..., FixedLagSmoother], rounding: float, tolerance:
         exact="any lag, any number",
         nonlinear="at convergence",
         smooths=True,
+        initiates=True,
         tolerance=tolerance,
         rounding=rounding,
     )

@@ -15,7 +15,7 @@ from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
 from fgtrack.estimation.factor_graph.marginalised_past import Prior
 from fgtrack.estimation.factor_graph.window import Window
-from fgtrack.estimation.initiation import checked_initiation, over, sought, straight_line
+from fgtrack.estimation.initiation import DEFAULT, checked_initiation, first_line, sought
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.estimation.terms import linearised
 from fgtrack.models.motion import MotionModel
@@ -53,7 +53,7 @@ class FixedLagSmoother:
         prior: Start,
         settings: SmootherSettings = _DEFAULT,
         make_backend: Callable[[FloatArray], Backend] = IncrementalBackend,
-        initiation: str = "regression",
+        initiation: str = DEFAULT,
     ) -> None:
         self._motion = motion
         self._settings = settings
@@ -61,7 +61,8 @@ class FixedLagSmoother:
         self._first_ns = self._clock_ns = prior.stamp_ns
         self._window = Window(motion, prior.stamp_ns, Prior(*initial_state(motion, prior)), settings, make_backend)
         self._initiation = checked_initiation(initiation)
-        self._initiated = not sought(motion, prior, self._initiation)
+        self._sought = sought(motion, prior, self._initiation)
+        self._sought_until_ns: int | None = None
         self._final: list[TrackState] = []
 
     @property
@@ -96,8 +97,8 @@ class FixedLagSmoother:
             self._final += self._window.update(fusible, self._start_ns, self._reach_ns)
         except RuntimeError:
             return [r if r.innovation is None else UpdateResult(UpdateStatus.FAILED) for r in results]
-        if not self._initiated:
-            self._initiate()
+        if self._sought:
+            self._initiate(min(measurement.stamp_ns for measurement in fusible))
         self._window.iterate(self._settings.max_iterations - 1)
         return results
 
@@ -120,21 +121,25 @@ class FixedLagSmoother:
         """Relinearise until nothing moves; for comparisons."""
         self._window.converge(max_iterations)
 
-    def _initiate(self) -> None:
-        """Begin again from a straight line through the positions so far, until their direction is certain.
+    def _initiate(self, oldest_ns: int) -> None:
+        """Begin again from a straight line through the first positions, until their direction is certain.
 
         A state that started with an unknown heading was linearised at a wrong one; from there the solver may not find
-        the right one.
+        the right one. `oldest_ns` is the oldest new stamp: one that is late may change a line that was certain.
         """
         if not self._window.whole:
-            self._initiated = True
+            self._sought = False
+            return
+        if self._sought_until_ns is not None and oldest_ns > self._sought_until_ns:
             return
         try:
-            line = straight_line(self._window.fixes())
+            found = first_line(self._window.fixes(), self._initiation, _CERTAIN)
         except np.linalg.LinAlgError:
             return
-        self._initiated = over(line, self._initiation, _CERTAIN)
-        self._window.restart(line)
+        if found is None:
+            return
+        self._sought_until_ns = self._first_ns + nanoseconds(found.until_s) if found.over else None
+        self._window.restart(found.line)
         self._window.iterate(_INITIATION_ITERATIONS)
 
     @property

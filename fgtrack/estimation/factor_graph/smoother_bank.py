@@ -11,6 +11,7 @@ from fgtrack.estimation.base import Start, StatesAt
 from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
+from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.estimation.smoother_settings import SmootherSettings
@@ -24,7 +25,7 @@ class SmootherBank(ObjectBank):
     ----------
     motion
         The motion model of all smoothers.
-    settings, make_backend
+    settings, make_backend, initiation
         See `FixedLagSmoother`.
     """
 
@@ -33,9 +34,10 @@ class SmootherBank(ObjectBank):
         motion: MotionModel,
         settings: SmootherSettings,
         make_backend: Callable[[FloatArray], Backend] = IncrementalBackend,
+        initiation: str = DEFAULT,
     ) -> None:
         def start(prior: Start) -> FixedLagSmoother:
-            return FixedLagSmoother(motion, prior, settings, make_backend)
+            return FixedLagSmoother(motion, prior, settings, make_backend, initiation)
 
         super().__init__(motion, start, settings.lag_s + (settings.ring_s if settings.late == "fuse" else 0.0))
         self._smoothers: dict[int, FixedLagSmoother] = {}

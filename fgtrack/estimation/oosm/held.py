@@ -7,6 +7,7 @@ from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.ekf import predict_one
+from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.motion import MotionModel
 
@@ -19,13 +20,15 @@ class HeldEkf(ABC):
     everything that was known of that stamp when the measurement came, held measurements included.
     """
 
-    def __init__(self, motion: MotionModel, prior: Start, lag_s: float, hold_s: float) -> None:
+    initiates = True
+
+    def __init__(self, motion: MotionModel, prior: Start, lag_s: float, hold_s: float, initiation: str) -> None:
         if not 0.0 <= hold_s <= lag_s:
             raise CallError(f"measurements held for {hold_s} s: give a time from 0 to the window's {lag_s} s")
         self._motion = motion
         self._hold_ns = nanoseconds(hold_s)
         self._now_ns = prior.stamp_ns
-        self._ordered = ReplayEkf(motion, prior, lag_s)
+        self._ordered = ReplayEkf(motion, prior, lag_s, initiation)
 
     @property
     def window_ns(self) -> tuple[int, int]:
@@ -76,13 +79,17 @@ class DelayedHorizon(HeldEkf):
         See `WindowedFilter`.
     horizon_s
         D, at most `lag_s`. Raises `CallError` otherwise.
+    initiation
+        See `ReplayingFilter`.
     """
 
     exact = "up to now - D: any lag, any number"
     held_s = 0.2
 
-    def __init__(self, motion: MotionModel, prior: Start, lag_s: float, horizon_s: float = 0.2) -> None:
-        super().__init__(motion, prior, lag_s, horizon_s)
+    def __init__(
+        self, motion: MotionModel, prior: Start, lag_s: float, horizon_s: float = 0.2, initiation: str = DEFAULT
+    ) -> None:
+        super().__init__(motion, prior, lag_s, horizon_s, initiation)
 
     @property
     def _front_ns(self) -> int:
@@ -105,13 +112,17 @@ class ReorderBuffer(HeldEkf):
         See `WindowedFilter`.
     hold_s
         D, at most `lag_s`. Raises `CallError` otherwise.
+    initiation
+        See `ReplayingFilter`.
     """
 
     exact = "up to D before the newest stamp: any lag, any number"
     held_s = 0.1
 
-    def __init__(self, motion: MotionModel, prior: Start, lag_s: float, hold_s: float = 0.1) -> None:
-        super().__init__(motion, prior, lag_s, hold_s)
+    def __init__(
+        self, motion: MotionModel, prior: Start, lag_s: float, hold_s: float = 0.1, initiation: str = DEFAULT
+    ) -> None:
+        super().__init__(motion, prior, lag_s, hold_s, initiation)
 
     @property
     def _front_ns(self) -> int:

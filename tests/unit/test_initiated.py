@@ -1,0 +1,130 @@
+"""Initiation around estimators that know nothing of it, and its setting in a configuration."""
+
+from dataclasses import replace
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+import fgtrack
+from fgtrack.core.geometry import rotation, wrap_angle
+from fgtrack.core.types import YAW
+from fgtrack.estimation.base import Estimator, Measurement, Start
+from fgtrack.estimation.initiated import Initiated
+from fgtrack.estimation.opening import MOST_MEASUREMENTS
+from fgtrack.estimation.registry import ESTIMATORS, Claims, start_estimator
+from fgtrack.models.motion import CTRV, MotionModel
+from fgtrack.pipeline.build import build_bank
+from fgtrack.pipeline.config import Config, InitiationConfig, MapConfig, MotionConfig
+from fgtrack.testing import check_estimator
+
+PERIOD_NS, STD = 50_000_000, {"x_m": 0.3, "y_m": 0.3}
+START = Start(position_std_m=0.3, speed_std_mps=40.0)
+UNAWARE = [name for name in ESTIMATORS if not Claims.of(ESTIMATORS.load(name)).initiates]
+#: One measurement in ten is late by two steps.
+CTRV_FILTERS = [name for name in ESTIMATORS if name not in ("smoother-batch", "as-current", "drop")]
+
+
+def positions(yaw_rad: float, num: int, speed_mps: float = 30.0) -> list[Measurement]:
+    rng, found = np.random.default_rng(3), []
+    for k in range(1, num + 1):
+        offset = np.array([speed_mps * k * PERIOD_NS / 1e9, 0.0]) + 0.3 * rng.standard_normal(2)
+        x_m, y_m = (rotation(yaw_rad) @ offset).tolist()
+        found.append(Measurement.of(k * PERIOD_NS, x_m=x_m, y_m=y_m, std=STD))
+    return found
+
+
+@pytest.mark.parametrize("name", CTRV_FILTERS)
+def test_every_estimator_finds_the_direction(name: str) -> None:
+    """Against yaw 0, where one-point initiation leaves a filter linearised."""
+    order = [0, 2, 1, *range(3, 12)]
+    measurements = [positions(3.0, 12)[k] for k in order]
+    off_rad = {}
+    for method in ("one-point", "two-point", "regression"):
+        estimator = fgtrack.estimator(name, CTRV(), START, initiation=method)
+        for measurement in measurements:
+            estimator.update(measurement)
+        off_rad[method] = abs(wrap_angle(estimator.state_at(12 * PERIOD_NS).mean[YAW] - 3.0))
+    assert max(off_rad["two-point"], off_rad["regression"]) < 0.15, off_rad
+
+
+@pytest.mark.parametrize("name", ["zlz", "rewind-forget", "ekf-backward-forward"])
+def test_while_the_direction_is_sought_the_order_of_arrival_does_not_matter(name: str) -> None:
+    measurements = positions(2.0, 4, speed_mps=2.0)
+    found = []
+    for order in permutations(measurements):
+        estimator = fgtrack.estimator(name, CTRV(), START)
+        for measurement in order:
+            estimator.update(measurement)
+        found.append(estimator.state_at(4 * PERIOD_NS))
+    for state in found[1:]:
+        np.testing.assert_array_equal(state.mean, found[0].mean)
+        np.testing.assert_array_equal(state.covariance, found[0].covariance)
+
+
+def test_it_begins_again_until_the_direction_is_certain_and_then_no_more() -> None:
+    starts: list[Start] = []
+
+    def make(start: Start) -> Estimator:
+        starts.append(start)
+        return fgtrack.estimator("ekf-replay", CTRV(), start)
+
+    start_estimator_of(make, positions(2.0, 20))
+    assert starts[0].yaw_rad is None
+    assert 2 < len(starts) < 15
+    assert all(abs(wrap_angle((start.yaw_rad or 0.0) - 2.0)) < 0.5 for start in starts[1:])
+    assert starts[-1].yaw_std_rad == pytest.approx(np.pi / np.sqrt(3.0))  # the measurements say it once more
+    starts.clear()
+    start_estimator_of(make, positions(2.0, 60, speed_mps=0.0))
+    assert len(starts) == MOST_MEASUREMENTS + 2  # the first one, and after the last that takes part
+
+
+def start_estimator_of(make: object, measurements: list[Measurement]) -> None:
+    def factory(motion: MotionModel, start: Start, lag_s: float) -> Estimator:
+        return make(start)  # type: ignore[operator, no-any-return]
+
+    estimator = start_estimator("made", factory, CTRV(), START, 1.0, {})
+    assert isinstance(estimator, Initiated)
+    for measurement in measurements:
+        estimator.update(measurement)
+
+
+def test_a_window_that_moves_on_ends_it() -> None:
+    estimator = fgtrack.estimator("rts", CTRV(), START, lag_s=0.2)
+    for measurement in positions(2.0, 12, speed_mps=0.5):
+        assert estimator.update(measurement).nis is not None
+    state = estimator.state_at(12 * PERIOD_NS)
+    assert np.isfinite(state.mean).all()
+
+
+@pytest.mark.parametrize("name", ["ekf-replay", "smoother", "reorder-buffer", "al1", "ekf-backward-forward"])
+def test_the_contract_holds_with_an_unknown_direction(name: str) -> None:
+    made = ESTIMATORS.load(name)
+
+    def unknown(motion: MotionModel, start: Start, lag_s: float) -> Estimator:
+        if not motion.linear:
+            start = replace(start, yaw_rad=None, yaw_std_rad=None)
+        return start_estimator(name, made, motion, start, lag_s, {})
+
+    vars(unknown).update({**vars(Claims.of(made)), "bank": False, "initiates": True})
+    check_estimator(unknown, seed=3, num_streams=3)
+
+
+@pytest.mark.parametrize("name", ["ekf-replay", "smoother", "rts", "ekf-backward-forward"])
+@pytest.mark.parametrize("method", ["one-point", "two-point", "regression"])
+def test_the_configuration_says_it_for_all_tracks(name: str, method: str) -> None:
+    motion = MotionConfig(kind="ctrv")
+    config = Config(estimator=name, motion=motion, initiation=InitiationConfig(method=method))  # type: ignore[arg-type]
+    bank = build_bank(config)
+    one = fgtrack.estimator(name, config.motion.model(), START, lag_s=3.5, initiation=method)
+    bank.birth(1, START)
+    for measurement in positions(2.0, 4):
+        bank.advance(measurement.stamp_ns)
+        bank.update(measurement.stamp_ns, [1], [measurement])
+        one.update(measurement)
+    states = bank.states_at(4 * PERIOD_NS)
+    np.testing.assert_allclose(states.means[0], one.state_at(4 * PERIOD_NS).mean, atol=1e-9)
+
+
+def test_on_a_map_backward_forward_stays_one_bank_for_all_objects() -> None:
+    assert type(build_bank(Config(map=MapConfig(track="oval")))).__name__ == "BackwardForwardBank"
