@@ -93,7 +93,7 @@ def test_a_former_name_is_understood_and_replaced() -> None:
 
 
 def test_an_unknown_estimator_is_a_bad_call() -> None:
-    with pytest.raises(CallError, match=r"'replay' is unknown, did you mean 'ekf-replay': there are ekf"):
+    with pytest.raises(CallError, match=r"'replay' is unknown, did you mean 'ukf-replay': there are ekf"):
         build_tracker(replace(Config(), estimator="replay"))
 
 
