@@ -100,7 +100,7 @@ def test_the_paper_s_bank_is_an_estimator_of_one_object() -> None:
 
 def test_options_that_an_estimator_does_not_take_are_refused() -> None:
     start = Start()
-    with pytest.raises(CallError, match=r"^ekf-replay: .*'hold_s'; its options are none$"):
+    with pytest.raises(CallError, match=r"^ekf-replay: .*'hold_s'; its options are initiation$"):
         estimator("ekf-replay", CV(), start, hold_s=0.1)
     with pytest.raises(CallError, match="unknown option 'ring'; its options are late, ring_s"):
         estimator("smoother", CV(), start, ring=0.1)
