@@ -12,7 +12,7 @@ from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
 
-_OPTIONS = ("initiation", *(field.name for field in fields(SmootherSettings) if field.name != "lag_s"))
+_OPTIONS = (*(field.name for field in fields(SmootherSettings) if field.name != "lag_s"), "initiation")
 
 
 # Any: an option may be any value that `SmootherSettings` takes.
