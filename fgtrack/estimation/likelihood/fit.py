@@ -32,8 +32,10 @@ class FitSettings:
     """Nor do as many of the first innovations."""
     block_s: float = 2.0
     """Scores are taken as independent between blocks of this length of a track."""
-    difference: float = 0.02
-    """Step of the differences, in the logarithm."""
+    difference: float = 1e-4
+    """Step of the differences for scores, in the logarithm."""
+    curvature_difference: float = 0.05
+    """The same for second derivatives."""
     max_linearisations: int = 6
     flat: float = 0.002
     """The maximum is found where the next step promises to gain less than this in the log-likelihood."""
@@ -65,7 +67,7 @@ class Likelihood:
         self._start = start
         self._free = free
         self._prior_log, self._prior_log_std = prior_log[free], prior_log_std[free]
-        self._h = settings.difference
+        self._h, self._curvature_h = settings.difference, settings.curvature_difference
         self._shares = np.flatnonzero([not name for (_, name), one in zip(names, free, strict=True) if one])
         self._flat = settings.flat
         self._groups = _groups(innovations, settings.block_s)
@@ -126,15 +128,14 @@ class Likelihood:
         return self._memory
 
     def _differentiated(self, logs: FloatArray) -> tuple[Evaluation, FloatArray]:
-        """The innovations at `logs`, then above and below in every direction; the scores (f, N) by differences."""
-        shift = self._h * np.eye(len(logs))
-        found = self._innovations.evaluate(self.values(np.concatenate([logs[None], logs + shift, logs - shift])))
+        """The innovations at `logs`, then a little further in every direction; the scores (f, N) by differences."""
+        rows = np.concatenate([logs[None], logs + self._h * np.eye(len(logs))])
+        found = self._innovations.evaluate(self.values(rows))
         return found, self._difference(found.log_likelihoods)
 
     def _difference(self, values: FloatArray) -> FloatArray:
-        """Derivatives (f, ...) of the values (2 f + 1, ...) of `_differentiated`."""
-        up, down = np.split(values[1:], 2)
-        return np.asarray((up - down) / (2.0 * self._h))
+        """Derivatives (f, ...) of the values (f + 1, ...) of `_differentiated`."""
+        return np.asarray((values[1:] - values[0]) / self._h)
 
     def _expected(self, found: Evaluation) -> FloatArray:
         """Information expected of normal innovations, shape (f, f)."""
@@ -166,7 +167,7 @@ class Likelihood:
 
     def _curvature(self, logs: FloatArray) -> FloatArray:
         """Minus the second derivatives of the log-likelihood, shape (f, f)."""
-        f, h = len(logs), 2.5 * self._h
+        f, h = len(logs), self._curvature_h
         one = h * np.eye(f)
         first, second = np.triu_indices(f)
         rows = np.concatenate([logs[None], logs + one, logs - one])

@@ -1,0 +1,136 @@
+"""`tune` finds the noise that a recording was drawn with, in scenarios of different kinds."""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.time import nanoseconds
+from fgtrack.core.types import Detection, DetectionList, EgoState, Message
+from fgtrack.models.motion import CTRV, CV
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.shipped import read_config, read_scenario
+from fgtrack.pipeline.tune import tuned
+from fgtrack.pipeline.tune_report import TuneReport
+from fgtrack.sim.scenario import Scenario
+from fgtrack.sim.sensor import Clutter
+from fgtrack.sim.simulate import simulate
+
+Truth = dict[str, float]
+
+
+def by_model(**changes: float) -> Scenario:
+    """Three objects drawn from CTRV, with these standard deviations per second at 100 Hz."""
+    std = {"position": 0.2, "yaw": 0.3, "speed": 1.0, "yaw_rate": 0.5} | changes
+    scenario = read_scenario("drawn_ctrv")
+    motion = CTRV.from_std_per_step(std, 100.0)
+    return replace(scenario, opponents=tuple(replace(one, motion=motion) for one in scenario.opponents))
+
+
+def ctrv(seed: int) -> tuple[Iterator[Message], Config, Truth]:
+    """Late positions with outliers, lost detections and clutter; LiDAR and RADAR differ along and across."""
+    scenario = by_model(speed=3.0, yaw_rate=1.0, yaw=0.1)
+    lidar, radar = scenario.sensors
+    lidar = replace(lidar, std={"x_m": 0.5, "y_m": 0.2}, outlier_probability=0.02, outlier_factor=5.0)
+    radar = replace(radar, std={"x_m": 1.5, "y_m": 0.6, "speed_mps": 0.5}, outlier_probability=0.01)
+    radar = replace(radar, detection_probability=0.8, clutter=Clutter(0.5))
+    truth = {f"sensors.{one.name}.std.{name}": value for one in (lidar, radar) for name, value in one.std.items()}
+    truth |= {"motion.std_per_s.speed": 3.0, "motion.std_per_s.yaw_rate": 1.0, "motion.std_per_s.yaw": 0.1}
+    truth["motion.std_per_s.position"] = 0.2
+    messages = simulate(replace(scenario, sensors=(lidar, radar)), np.random.default_rng(seed))
+    return iter(messages), read_config("open_space"), truth
+
+
+def polar(seed: int) -> tuple[Iterator[Message], Config, Truth]:
+    """Range, bearing and range rate beside positions."""
+    scenario = by_model(speed=2.0)
+    lidar, radar = scenario.sensors
+    polar_std = {"range_m": 0.8, "bearing_rad": 0.002, "range_rate_mps": 0.3}
+    radar = replace(radar, std=polar_std, outlier_probability=0.02, outlier_factor=4.0)
+    config = read_config(
+        "open_space",
+        [
+            "sensors.radar.std={range_m: 2.0, bearing_rad: 0.001, range_rate_mps: 1.0}",
+            "sensors.radar.births=false",
+            "sensors.lidar_cluster.std.x_m=0.6",
+        ],
+    )
+    truth = {f"sensors.radar.std.{name}": value for name, value in polar_std.items()}
+    truth |= {"sensors.lidar_cluster.std.x_m": 0.3, "sensors.lidar_cluster.std.y_m": 0.3}
+    truth |= {"motion.std_per_s.speed": 2.0, "motion.std_per_s.yaw_rate": 0.5, "motion.std_per_s.yaw": 0.3}
+    truth["motion.std_per_s.position"] = 0.2
+    return iter(simulate(replace(scenario, sensors=(lidar, radar)), np.random.default_rng(seed))), config, truth
+
+
+def straight(seed: int) -> tuple[Iterator[Message], Config, Truth]:
+    """Eight objects of constant velocity but for white acceleration, seen from an ego at rest; both sensors late."""
+    rng = np.random.default_rng(seed)
+    motion = CV.from_std_per_step({"velocity": 6.0}, 100.0)
+    stds = {"lidar": (0.4, 0.1), "radar": (1.2, 2.4)}
+    messages: list[Message] = []
+    states = rng.normal(size=(8, 4)) * (3.0, 3.0, 8.0, 8.0) + [(400.0 * i - 1400.0, 300.0, 0.0, 0.0) for i in range(8)]
+    for k in range(1200):
+        stamp_s = 10.0 + 0.05 * k
+        Q = motion.process_noise(states, 0.05)
+        states = motion.predict(states, 0.05) + np.array([rng.multivariate_normal(np.zeros(4), one) for one in Q])
+        name, delay_s = ("lidar", 0.15) if k % 2 else ("radar", 0.05)
+        std = np.array(stds[name])
+        seen = []
+        for x, y, *_ in states.tolist():
+            noise = std * rng.standard_normal(2) * (5.0 if rng.random() < 0.01 else 1.0)
+            sight = math.atan2(y, x)
+            c, s = math.cos(sight), math.sin(sight)
+            seen.append(Detection(x_m=x + c * noise[0] - s * noise[1], y_m=y + s * noise[0] + c * noise[1]))
+        stamp_ns = nanoseconds(stamp_s)
+        messages.append(EgoState(stamp_ns, stamp_ns, 0.0, 0.0, wrap_angle(0.0), 0.0))
+        late_ns = nanoseconds(stamp_s + delay_s + 0.02 * rng.random())
+        messages.append(DetectionList(name, stamp_ns, late_ns, tuple(seen)))
+    config = read_config(
+        None,
+        [
+            "estimator=smoother",
+            "motion={kind: cv, std_per_s: {velocity: 2.0}}",
+            "sensors={lidar: {std: {x_m: 1.0, y_m: 1.0}}, radar: {std: {x_m: 1.0, y_m: 1.0}}}",
+            "birth={kind: measured, ego_speed_factor: 0.0, speed_std_mps: 12.0}",
+            "ego.detection_origin_x_m=0.0",
+            "lifecycle.claim_overtaken=true",
+        ],
+    )
+    truth = {
+        f"sensors.{sensor}.std.{name}": std
+        for sensor, pair in stds.items()
+        for name, std in zip(("x_m", "y_m"), pair, strict=True)
+    }
+    return iter(sorted(messages, key=lambda one: one.receipt_ns)), config, truth | {"motion.std_per_s.velocity": 6.0}
+
+
+def wrong(report: TuneReport, truth: Truth) -> list[str]:
+    """What is identifiable and further than 15 % or three standard errors from the truth."""
+    found = []
+    for one in report.parameters:
+        if one.identifiable:
+            assert one.std_error is not None
+            error = math.log(one.tuned / truth[one.key])
+            if abs(error) > min(math.log(1.15), 3.0 * one.std_error):
+                found.append(f"{one.key}: {one.tuned}, true is {truth[one.key]}, standard error {one.std_error:.3f}")
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize("scene", [ctrv, polar, straight])
+def test_every_identifiable_standard_deviation_is_found(
+    scene: Callable[[int], tuple[Iterator[Message], Config, Truth]], seed: int
+) -> None:
+    messages, config, truth = scene(seed)
+    report = tuned({"scene": lambda: messages}, config)
+    assert wrong(report, truth) == []
+    measured = [one for one in report.parameters if one.key.startswith("sensors")]
+    assert all(one.identifiable for one in measured), [one.key for one in measured if not one.identifiable]
+    assert report.held_out is not None
+    assert report.held_out.after > report.held_out.before
+    for one in report.held_out.innovations:
+        assert 0.8 < one.after < 1.8  # outliers count
