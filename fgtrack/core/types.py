@@ -23,6 +23,9 @@ Frame = Literal["map", "ego", "sensor"]
 STATE_NAMES = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2")
 X, Y, YAW, SPEED, YAW_RATE, ACCEL = range(6)
 
+#: What the covariance of an `EgoState` is of: x, y, yaw, speed and yaw rate.
+EGO_COVARIANCE_STATES = STATE_NAMES[:5]
+
 
 @dataclass(frozen=True, slots=True)
 class EgoState:
@@ -38,6 +41,11 @@ class EgoState:
     accel_mps2: float = 0.0
     in_pit: bool | None = None
     """True while the ego drives in the pit lane; None when the source does not say."""
+    covariance: tuple[float, ...] | None = None
+    """Row-major 5 x 5, of x, y, yaw, speed and yaw rate (`EGO_COVARIANCE_STATES`); None when the source does not say.
+
+    A variance of 0 says the same of one of them.
+    """
 
 
 @dataclass(frozen=True, slots=True)

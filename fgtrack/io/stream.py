@@ -13,7 +13,15 @@ from pathlib import Path
 from typing import Any, BinaryIO, get_args
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.types import Detection, DetectionList, EgoState, Frame, Message, TruthState
+from fgtrack.core.types import (
+    EGO_COVARIANCE_STATES,
+    Detection,
+    DetectionList,
+    EgoState,
+    Frame,
+    Message,
+    TruthState,
+)
 from fgtrack.io.errors import TruncatedInput, UntilBreak
 from fgtrack.io.output import Kind, new_file
 from fgtrack.io.source import FileFormat
@@ -217,7 +225,15 @@ def _message(record: Record, unknown: Counter[str]) -> Message:
         _count_unknown(name, kind, record, unknown)
     if kind is DetectionList:
         values["objects"] = [_detection(index, item, unknown) for index, item in enumerate(values["objects"])]
-    return kind(**values)
+    message = kind(**values)
+    if isinstance(message, EgoState) and message.covariance is not None:
+        _check_size(message.covariance, len(EGO_COVARIANCE_STATES))
+    return message
+
+
+def _check_size(covariance: tuple[float, ...], size: int) -> None:
+    if len(covariance) != size * size:
+        raise _BadRecordError(f"covariance: a list of {size} x {size} numbers expected")
 
 
 def _detection(index: int, item: object, unknown: Counter[str]) -> Detection:
@@ -228,9 +244,8 @@ def _detection(index: int, item: object, unknown: Counter[str]) -> Detection:
         if len(item) > len(values):
             _count_unknown("objects", Detection, item, unknown)
         detection = Detection(**values)
-        size = len(detection.measured)
-        if detection.covariance is not None and len(detection.covariance) != size * size:
-            raise _BadRecordError(f"covariance: a list of {size} x {size} numbers expected")
+        if detection.covariance is not None:
+            _check_size(detection.covariance, len(detection.measured))
     except _BadRecordError as error:
         raise _BadRecordError(f"objects[{index}]: {error}") from error
     return detection

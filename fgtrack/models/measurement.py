@@ -21,6 +21,8 @@ MIN_RANGE_M = 1e-6
 
 #: Components that are angles.
 ANGULAR = ("yaw_rad", "bearing_rad")
+#: Components that are relative to the sensor.
+RELATIVE = ("range_m", "bearing_rad", "range_rate_mps")
 _NONE = np.zeros(2)
 
 
@@ -67,6 +69,11 @@ class MeasurementModel:
         return tuple(index for index, name in enumerate(self.components) if name in ANGULAR)
 
     @cached_property
+    def relative(self) -> tuple[int, ...]:
+        """Places of the components that are relative to the sensor."""
+        return tuple(index for index, name in enumerate(self.components) if name in RELATIVE)
+
+    @cached_property
     def linear(self) -> bool:
         """Whether the measurement selects entries of the state, whatever the sensor pose."""
         return set(self.components) <= set(self.state_names)
@@ -92,6 +99,21 @@ class MeasurementModel:
         for row, name in enumerate(self.components):
             H[..., row, :2], H[..., row, 2:4] = _COMPONENTS[name].gradient(scene)
         return H
+
+    def pose_jacobian(self, x: FloatArray, pose: SensorPose) -> FloatArray:
+        """Derivative of `predict` by the entries of `pose`, shape (..., k, 5); finite as `jacobian` is."""
+        D = np.zeros((*x.shape[:-1], len(self.components), len(pose)))
+        if not self.relative:
+            return D
+        scene = _Scene(x, pose, self._cartesian)
+        for row in self.relative:
+            name = self.components[row]
+            D[..., row, :2] = -_COMPONENTS[name].gradient(scene)[0]  # the offset alone counts
+            if name == "bearing_rad":
+                D[..., row, 2] = -1.0
+            elif name == "range_rate_mps":
+                D[..., row, 3:] = -scene.line_of_sight
+        return D
 
     def selection(self, n: int) -> FloatArray:
         """`jacobian` of a linear model at any state of `n` entries, shape (k, n), read-only."""

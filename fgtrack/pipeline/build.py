@@ -27,7 +27,8 @@ from fgtrack.models.published_map import CircularHeadingMap, PublishedMap
 from fgtrack.models.road import MappedRoad, OpenSpace, Road
 from fgtrack.models.track_map import TrackMap
 from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
-from fgtrack.tracking.ego import EgoSource, EgoTrajectory
+from fgtrack.tracking.ego import EgoSource, EgoStd, EgoTrajectory
+from fgtrack.tracking.ego_error import independent, shared
 from fgtrack.tracking.inbox import Inbox, QueueInbox
 from fgtrack.tracking.lifecycle import Lifecycle
 from fgtrack.tracking.preprocess import Preprocess
@@ -76,6 +77,7 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
         birth=config.birth,
         road=road,
         confirm_count=config.lifecycle.confirm_count,
+        ego_errors=shared if config.ego.uncertainty == "shared" else independent,
     )
     return (PublishedTracker if published_order else Tracker)(parts if observed is None else observed(parts))
 
@@ -164,10 +166,12 @@ def _noise_names(config: MotionConfig) -> list[str]:
 
 def _build_ego(config: Config) -> EgoSource:
     ego = config.ego
+    std = EgoStd(ego.position_std_m, ego.yaw_std_rad, ego.speed_std_mps, ego.yaw_rate_std_radps)
+    known = None if ego.uncertainty == "none" else std
     if ego.kind == "published":
         step_ns = period_ns(config.filter.frequency_hz)
-        return PublishedEgo(ego.yaw_weight, ego.yaw_rate_weight, step_ns, ego.storage_ticks)
-    return EgoTrajectory(ego.yaw_weight, ego.yaw_rate_weight, ego.memory_s, ego.max_extrapolation_s)
+        return PublishedEgo(ego.yaw_weight, ego.yaw_rate_weight, step_ns, ego.storage_ticks, known)
+    return EgoTrajectory(ego.yaw_weight, ego.yaw_rate_weight, ego.memory_s, ego.max_extrapolation_s, known)
 
 
 def _build_inbox(config: Config) -> Inbox:

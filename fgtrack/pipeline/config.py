@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Annotated, Literal
 
-from pydantic import Discriminator, Field, PositiveFloat, PositiveInt
+from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from fgtrack.estimation.initiation import DEFAULT, Initiation
 from fgtrack.estimation.registry import ESTIMATORS, motion_model
@@ -101,6 +101,17 @@ class EgoConfig:
     """A detection whose stamp is further than this from any ego state cannot be placed."""
     storage_ticks: PositiveInt = 350
     """Length of the ego storage of the published implementation."""
+    uncertainty: Literal["none", "independent", "shared"] = "independent"
+    """What the ego's covariance does: nothing (as in the paper), widen every detection as if each had an error of its
+    own, or be estimated from all matched detections of a scan, whose common error it is."""
+    position_std_m: NonNegativeFloat = 0.0
+    """Standard deviation of the ego's x and y where the recording gives no covariance of them."""
+    yaw_std_rad: NonNegativeFloat = 0.0
+    """The same of its yaw."""
+    speed_std_mps: NonNegativeFloat = 0.0
+    """The same of its speed."""
+    yaw_rate_std_radps: NonNegativeFloat = 0.0
+    """The same of its yaw rate."""
 
 
 @dataclass(frozen=True)

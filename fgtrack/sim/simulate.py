@@ -7,7 +7,16 @@ import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import nanoseconds, seconds
-from fgtrack.core.types import YAW, DetectionList, EgoState, FloatArray, IntArray, Message, TruthState
+from fgtrack.core.types import (
+    EGO_COVARIANCE_STATES,
+    YAW,
+    DetectionList,
+    EgoState,
+    FloatArray,
+    IntArray,
+    Message,
+    TruthState,
+)
 from fgtrack.models.oval import OVAL, make_oval
 from fgtrack.models.path import Path
 from fgtrack.models.track_map import TrackMap
@@ -85,9 +94,12 @@ class _Simulation:
         states += np.array(std) * noise_rng.standard_normal(states.shape)
         states[:, YAW] = wrap_angles(states[:, YAW])
         receipts = _receipts(settings.delay, delay_rng, stamps, times)
+        variances = np.square(std[: len(EGO_COVARIANCE_STATES)])
+        covariance = tuple(np.diag(variances).ravel().tolist()) if variances.any() else None
+        columns = zip(stamps, receipts, *states.T.tolist(), strict=True)
         return [
-            EgoState(stamp, receipt, *row)
-            for stamp, receipt, row in zip(stamps, receipts, states.tolist(), strict=True)
+            EgoState(stamp, receipt, x, y, yaw, speed, yaw_rate, accel, covariance=covariance)
+            for stamp, receipt, x, y, yaw, speed, yaw_rate, accel in columns
             if receipt is not None
         ]
 

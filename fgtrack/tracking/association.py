@@ -126,7 +126,7 @@ def _innovations(candidates: Sequence[Candidate], states: StatesAt) -> tuple[Flo
     for row, candidate in enumerate(candidates):
         measurement = candidate.measurement
         y, H = linearised(measurement.z, states.means, measurement.model, measurement.pose)
-        S = congruence(H, states.covariances) + measurement.R
+        S = congruence(H, states.covariances) + candidate.noise_at(states.means)
         nis[row] = mahalanobis_squared(y, S)
         log_volume[row] = np.linalg.slogdet(S)[1]
     return nis, log_volume

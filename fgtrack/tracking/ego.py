@@ -3,13 +3,17 @@
 import bisect
 import math
 from abc import ABC, abstractmethod
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
+
 from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.linalg import congruence, symmetrise
 from fgtrack.core.time import nanoseconds, seconds
-from fgtrack.core.types import EgoState
-from fgtrack.tracking.inbox import is_number
+from fgtrack.core.types import EgoState, FloatArray
+from fgtrack.tracking.inbox import ASYMMETRY, LARGEST, is_number
 
 
 class EgoPose(NamedTuple):
@@ -20,6 +24,8 @@ class EgoPose(NamedTuple):
     yaw_rad: float
     speed_mps: float
     yaw_rate_radps: float = 0.0
+    covariance: FloatArray | None = None
+    """Of the five above, shape (5, 5), read-only; None where it is not known or not asked for."""
 
 
 def is_finite(ego: EgoState) -> bool:
@@ -27,23 +33,75 @@ def is_finite(ego: EgoState) -> bool:
     return all(map(is_number, (ego.x_m, ego.y_m, ego.yaw_rad, ego.speed_mps, ego.yaw_rate_radps, ego.accel_mps2)))
 
 
-def extrapolated(ego: EgoState, stamp_ns: int) -> EgoPose:
-    """Pose of `ego` moved along its heading to `stamp_ns`, with the yaw extrapolated (not wrapped)."""
+def extrapolated(ego: EgoState, stamp_ns: int, covariance: FloatArray | None = None) -> EgoPose:
+    """Pose of `ego` moved along its heading to `stamp_ns`, with the yaw extrapolated (not wrapped).
+
+    `covariance`, shape (5, 5), is that of `ego`; what the ego does meanwhile besides is not added to it.
+    """
     dt_s = seconds(stamp_ns - ego.stamp_ns)
-    travelled_m = ego.speed_mps * dt_s
+    travelled_m, c, s = ego.speed_mps * dt_s, math.cos(ego.yaw_rad), math.sin(ego.yaw_rad)
+    if covariance is not None and dt_s:
+        F = np.eye(5)
+        F[:2, 2:4] = [[-travelled_m * s, c * dt_s], [travelled_m * c, s * dt_s]]
+        F[2, 4] = dt_s
+        covariance = congruence(F, covariance)
     return EgoPose(
-        ego.x_m + travelled_m * math.cos(ego.yaw_rad),
-        ego.y_m + travelled_m * math.sin(ego.yaw_rad),
+        ego.x_m + travelled_m * c,
+        ego.y_m + travelled_m * s,
         ego.yaw_rad + ego.yaw_rate_radps * dt_s,
         ego.speed_mps,
         ego.yaw_rate_radps,
+        covariance,
     )
 
 
-class EgoSource(ABC):
-    """Holds the ego's past; the weights of its low-pass are those of new values."""
+@dataclass(frozen=True)
+class EgoStd:
+    """Standard deviations of an ego state that are taken where it does not say; 0 for exactly known."""
 
-    def __init__(self, yaw_weight: float, yaw_rate_weight: float) -> None:
+    position_m: float = 0.0
+    yaw_rad: float = 0.0
+    speed_mps: float = 0.0
+    yaw_rate_radps: float = 0.0
+
+    def covariance(self, given: tuple[float, ...] | None) -> FloatArray | None:
+        """The covariance `given`, shape (5, 5), read-only, with these in place of variances of 0; None for all zero."""
+        return _covariance(given, (self.position_m, self.position_m, self.yaw_rad, self.speed_mps, self.yaw_rate_radps))
+
+
+@lru_cache(maxsize=1024)  # one localisation often says the same of all its states
+def _covariance(given: tuple[float, ...] | None, std: tuple[float, ...]) -> FloatArray | None:
+    P = np.zeros((5, 5)) if given is None else symmetrise(np.array(given).reshape(5, 5))
+    P += np.diag(np.where(np.diag(P) > 0.0, 0.0, np.square(std)))
+    P.flags.writeable = False
+    return P if P.any() else None
+
+
+@lru_cache(maxsize=1024)
+def is_ego_covariance(given: tuple[float, ...]) -> bool:
+    """Whether these are the 25 entries of a symmetric positive semidefinite matrix."""
+    if len(given) != 25 or not all(abs(entry) <= LARGEST**2 for entry in given):
+        return False
+    P = np.array(given).reshape(5, 5)
+    variances = np.diag(P)
+    if (variances < 0.0).any():
+        return False
+    scale = np.sqrt(np.where(variances > 0.0, variances, 1.0))
+    correlation = P / np.outer(scale, scale)
+    symmetric = np.abs(correlation - correlation.T).max() <= ASYMMETRY
+    return bool(symmetric and np.linalg.eigvalsh(symmetrise(correlation))[0] >= -ASYMMETRY)
+
+
+class EgoSource(ABC):
+    """Holds the ego's past; the weights of its low-pass are those of new values.
+
+    With `std`, poses have a covariance. It is what the states say of themselves, and `std` where they say nothing. The
+    low-pass leaves it as it is: how much a low-pass takes off depends on how fast the error changes, which no state
+    says.
+    """
+
+    def __init__(self, yaw_weight: float, yaw_rate_weight: float, std: EgoStd | None = None) -> None:
+        self._std = std
         self.current: EgoState | None = None
         """Newest known state."""
         self.in_pit = False
@@ -55,7 +113,11 @@ class EgoSource(ABC):
         """Take a message; the reason, where it is refused."""
         if ego.in_pit is not None:
             self.in_pit = ego.in_pit
-        return self._store(ego) if is_finite(ego) else "not finite"
+        if not is_finite(ego):
+            return "not finite"
+        if self._std is not None and ego.covariance is not None and not is_ego_covariance(ego.covariance):
+            return "not a covariance"
+        return self._store(ego)
 
     @abstractmethod
     def _store(self, ego: EgoState) -> str | None:
@@ -68,6 +130,12 @@ class EgoSource(ABC):
     @abstractmethod
     def pose_at(self, stamp_ns: int, present_ns: int) -> EgoPose | None:
         """Pose at `stamp_ns`, or None where it is not known; `present_ns` is the tracking time."""
+
+    def _extrapolated(self, ego: EgoState, stamp_ns: int) -> EgoPose:
+        return extrapolated(ego, stamp_ns, self._covariance(ego))
+
+    def _covariance(self, ego: EgoState) -> FloatArray | None:
+        return None if self._std is None else self._std.covariance(ego.covariance)
 
     def _low_passed(self, ego: EgoState, yaw_rad: float, yaw_rate_radps: float) -> EgoState:
         """`ego` with its yaw and yaw rate drawn towards the given ones."""
@@ -84,8 +152,15 @@ class EgoTrajectory(EgoSource):
     The low-pass pulls towards the previous state *extrapolated to the new stamp*, so a steady turn is not delayed.
     """
 
-    def __init__(self, yaw_weight: float, yaw_rate_weight: float, memory_s: float, max_extrapolation_s: float) -> None:
-        super().__init__(yaw_weight, yaw_rate_weight)
+    def __init__(
+        self,
+        yaw_weight: float,
+        yaw_rate_weight: float,
+        memory_s: float,
+        max_extrapolation_s: float,
+        std: EgoStd | None = None,
+    ) -> None:
+        super().__init__(yaw_weight, yaw_rate_weight, std)
         self._memory_ns = nanoseconds(memory_s)
         self._max_extrapolation_ns = nanoseconds(max_extrapolation_s)
         self._states: list[EgoState] = []
@@ -117,19 +192,36 @@ class EgoTrajectory(EgoSource):
             return None
         place = bisect.bisect_left(self._stamps, stamp_ns)
         if 0 < place < len(self._stamps):
-            return _interpolated(self._states[place - 1], self._states[place], stamp_ns)
+            return self._interpolated(self._states[place - 1], self._states[place], stamp_ns)
         end = self._states[min(place, len(self._states) - 1)]
         if abs(stamp_ns - end.stamp_ns) > self._max_extrapolation_ns:
             return None
-        return extrapolated(end, stamp_ns)
+        return self._extrapolated(end, stamp_ns)
+
+    def _interpolated(self, before: EgoState, after: EgoState, stamp_ns: int) -> EgoPose:
+        share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
+        return interpolated(before, after, share, mixed(self._covariance(before), self._covariance(after), share))
 
 
-def _interpolated(before: EgoState, after: EgoState, stamp_ns: int) -> EgoPose:
-    share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
+def mixed(before: FloatArray | None, after: FloatArray | None, share: float) -> FloatArray | None:
+    """Covariance, shape (5, 5), of the error between two states, at a `share` of the way; of None as of zero.
+
+    The mean of both: the error of (1 - share) a + share b has at most this covariance, and just this where the two
+    errors are the same, as those of a localisation within a moment nearly are.
+    """
+    if before is after:
+        return before
+    none = np.zeros((5, 5))
+    return (1.0 - share) * (none if before is None else before) + share * (none if after is None else after)
+
+
+def interpolated(before: EgoState, after: EgoState, share: float, covariance: FloatArray | None = None) -> EgoPose:
+    """Pose at a `share` of the way between two states, the short way round."""
     return EgoPose(
         before.x_m + share * (after.x_m - before.x_m),
         before.y_m + share * (after.y_m - before.y_m),
         before.yaw_rad + share * wrap_angle(after.yaw_rad - before.yaw_rad),
         before.speed_mps + share * (after.speed_mps - before.speed_mps),
         before.yaw_rate_radps + share * (after.yaw_rate_radps - before.yaw_rate_radps),
+        covariance,
     )

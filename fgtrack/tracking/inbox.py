@@ -13,7 +13,8 @@ from fgtrack.models.sensors import SensorModel
 
 #: In any unit: beyond what is tracked, and its square is still far from the largest float.
 LARGEST = 1e9
-_ASYMMETRY = 1e-6  # of the standard deviations' product: what rounding to single precision may leave
+#: Of the standard deviations' product: what rounding a covariance to single precision may leave.
+ASYMMETRY = 1e-6
 NO_INNOVATION: Mapping[str, float] = MappingProxyType({})
 
 
@@ -112,7 +113,7 @@ def is_covariance(detection: Detection, sensor: SensorModel) -> bool:
     if not np.all((np.abs(own) <= LARGEST**2) & (variances[:, None] > 0.0)):
         return False
     deviations = np.sqrt(variances)
-    if not np.all(np.abs(own - own.T) <= _ASYMMETRY * np.outer(deviations, deviations)):
+    if not np.all(np.abs(own - own.T) <= ASYMMETRY * np.outer(deviations, deviations)):
         return False
     try:
         np.linalg.cholesky(own)

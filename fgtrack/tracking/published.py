@@ -13,7 +13,7 @@ from fgtrack.estimation.base import StatesAt
 from fgtrack.estimation.published import published_yaw
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, assigned, euclidean_distances
-from fgtrack.tracking.ego import EgoPose, EgoSource, extrapolated
+from fgtrack.tracking.ego import EgoPose, EgoSource, EgoStd
 from fgtrack.tracking.inbox import Batch, is_covariance, is_number, record, records
 from fgtrack.tracking.lifecycle import Life, Lifecycle
 from fgtrack.tracking.preprocess import Candidate, MapDetection, Merge, Preprocess
@@ -24,8 +24,15 @@ class PublishedEgo(EgoSource):
     """Ego storage at the ticks, nearest entry instead of interpolation, and a low-pass that filters its own output
     again on every tick without a new message (defect Q13)."""
 
-    def __init__(self, yaw_weight: float, yaw_rate_weight: float, step_ns: int, storage_ticks: int) -> None:
-        super().__init__(yaw_weight, yaw_rate_weight)
+    def __init__(
+        self,
+        yaw_weight: float,
+        yaw_rate_weight: float,
+        step_ns: int,
+        storage_ticks: int,
+        std: EgoStd | None = None,
+    ) -> None:
+        super().__init__(yaw_weight, yaw_rate_weight, std)
         self._half_step_ns = step_ns / 2
         self._length = storage_ticks
         self._stored: list[EgoState] = []  # newest last
@@ -61,9 +68,9 @@ class PublishedEgo(EgoSource):
         if self.current is None:
             return None
         if present_ns - stamp_ns <= self._half_step_ns:
-            return extrapolated(self.current, stamp_ns)
+            return self._extrapolated(self.current, stamp_ns)
         nearest = min(reversed(self._stored), key=lambda ego: abs(ego.stamp_ns - stamp_ns))
-        return extrapolated(nearest, stamp_ns)
+        return self._extrapolated(nearest, stamp_ns)
 
 
 class SlotInbox:

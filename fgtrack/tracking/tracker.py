@@ -30,6 +30,7 @@ from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, Association
 from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.ego import EgoPose, EgoSource
+from fgtrack.tracking.ego_error import EgoErrors, independent
 from fgtrack.tracking.inbox import NO_INNOVATION, Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Lifecycle
 from fgtrack.tracking.preprocess import Candidate, Preprocess
@@ -51,6 +52,7 @@ class TrackerParts:
     birth: Birth
     road: Road
     confirm_count: int
+    ego_errors: EgoErrors = independent
 
 
 class Tracker:
@@ -207,7 +209,9 @@ class Tracker:
             return
         matched = [candidates[position] for position, _ in assignment.pairs]
         track_ids = [states.track_ids[track] for _, track in assignment.pairs]
-        results = self._parts.bank.update(batch.stamp_ns, track_ids, [candidate.measurement for candidate in matched])
+        rows = [track for _, track in assignment.pairs]
+        fused = self._parts.ego_errors(matched, states.means[rows], states.covariances[rows])
+        results = self._parts.bank.update(batch.stamp_ns, track_ids, fused)
         for candidate, track_id, result in zip(matched, track_ids, results, strict=True):
             if result.innovation is not None:
                 self._parts.lifecycle.fused(track_id)

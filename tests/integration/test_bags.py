@@ -94,6 +94,17 @@ def test_a_stamp_that_ros_cannot_hold_is_one_line(tmp_path):
         write_bag(tmp_path / "bag", [EgoState(1 << 62, 0, 0.0, 0.0, 0.0, 0.0)])
 
 
+def test_the_twin_of_the_ego_says_how_sure_it_is(tmp_path):
+    root = np.tril(np.arange(1.0, 26.0).reshape(5, 5) / 10.0)
+    covariance = root @ root.T
+    covariance[:3, 3:] = covariance[3:, :3] = 0.0  # odometry holds pose and twist apart
+    state = EgoState(START_NS, START_NS, 1.0, 2.0, 0.5, 20.0, 0.1, covariance=tuple(covariance.ravel().tolist()))
+    write_bag(tmp_path / "bag", [state])
+    [found] = read(tmp_path / "bag", InputConfig(ego=TopicInput("/ego/odometry")))
+    np.testing.assert_allclose(np.reshape(found.covariance, (5, 5)), covariance)
+    assert read(tmp_path / "bag") == [state]
+
+
 def test_the_twins_say_what_other_tools_can_show(tmp_path):
     write_bag(tmp_path / "bag", drive())
     types = {topic.name: (topic.type, topic.count) for topic in Bag(tmp_path / "bag").topics}

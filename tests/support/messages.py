@@ -50,7 +50,8 @@ def message_lists(draw: st.DrawFn) -> list[Message]:
         match draw(st.integers(0, 2)):
             case 0:
                 state = [draw(numbers) for _ in range(6)]
-                messages.append(EgoState(*times, *state, in_pit=draw(st.none() | st.booleans())))
+                covariance = draw(st.none() | st.lists(numbers, min_size=25, max_size=25).map(tuple))
+                messages.append(EgoState(*times, *state, draw(st.none() | st.booleans()), covariance))
             case 1:
                 optional = [draw(st.none() | numbers) for _ in range(4)]
                 messages.append(TruthState(*times, draw(ids), draw(numbers), draw(numbers), *optional))

@@ -1,6 +1,7 @@
 import math
 from types import SimpleNamespace as Message
 
+import numpy as np
 import pytest
 
 from fgtrack.core.types import Detection
@@ -204,3 +205,51 @@ def test_the_ego_is_read_by_paths():
     state = ego_by_fields(Message(x=1, y=2, q=quaternion(), v=3, pit=1, ns=5), fields, 9)
     assert (state.stamp_ns, state.receipt_ns, state.in_pit) == (5, 9, True)
     assert math.isnan(state.yaw_rad)
+
+
+# --- the covariance of odometry
+
+
+def uncertain_odometry(vx=3.0, vy=0.0, pose_covariance=(0.0,) * 36, twist_covariance=(0.0,) * 36):
+    return Message(
+        header=header(),
+        pose=Message(pose=pose(1.0, 2.0, 0.5), covariance=pose_covariance),
+        twist=Message(twist=Message(linear=xyz(vx, vy), angular=xyz(z=0.2)), covariance=twist_covariance),
+    )
+
+
+def covariance_of(message):
+    return np.reshape(ego_from_odometry(message, 7).covariance, (5, 5))
+
+
+TWIST_COVARIANCE = square(6, c00=0.25, c11=0.16, c55=0.01, c05=0.02)
+
+
+def test_odometry_gives_the_covariance_of_pose_speed_and_yaw_rate():
+    found = covariance_of(uncertain_odometry(0.0, 0.0, POSE_COVARIANCE, TWIST_COVARIANCE))
+    expected = np.zeros((5, 5))
+    expected[:3, :3] = [[1.0, 0.1, 0.2], [0.1, 2.0, 0.3], [0.2, 0.3, 3.0]]
+    expected[3:, 3:] = [[0.25, 0.02], [0.02, 0.01]]
+    np.testing.assert_allclose(found, expected)
+
+
+@pytest.mark.parametrize(("vx", "vy"), [(3.0, 4.0), (-3.0, 4.0)])
+def test_the_variance_of_the_speed_is_that_along_the_velocity(vx, vy):
+    found = np.reshape(
+        ego_from_odometry(uncertain_odometry(vx, vy, POSE_COVARIANCE, TWIST_COVARIANCE), 7).covariance, (5, 5)
+    )
+    assert found[3, 3] == pytest.approx(0.36 * 0.25 + 0.64 * 0.16)
+    assert found[3, 4] == pytest.approx(0.6 * 0.02)  # backwards, both the speed and vx are negative
+
+
+@pytest.mark.parametrize(
+    "unknown", [(0.0,) * 36, (-1.0, *(0.0,) * 35), (math.nan, *(1.0,) * 35), square(6, c00=1.0, c11=1.0, c55=1e3)]
+)
+def test_a_part_that_is_not_known_is_zero_and_nothing_at_all_is_none(unknown):
+    both = ego_from_odometry(uncertain_odometry(pose_covariance=unknown, twist_covariance=unknown), 7)
+    assert both.covariance is None
+    pose_alone = np.reshape(
+        ego_from_odometry(uncertain_odometry(3.0, 0.0, POSE_COVARIANCE, unknown), 7).covariance, (5, 5)
+    )
+    assert pose_alone[0, 0] == 1.0
+    assert not pose_alone[3:].any()

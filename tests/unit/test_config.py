@@ -52,8 +52,11 @@ def test_there_are_files_of_every_kind() -> None:
     assert {"karle2023", "karle2023_reference", "autoferry"} <= {path.stem for path in FILES}
 
 
-def test_the_clean_method_is_the_default() -> None:
-    assert load(Config, CONFIGS / "karle2023.yaml") == load(Config, None) == Config()
+def test_the_clean_method_is_the_default_but_for_the_uncertainty_of_the_ego() -> None:
+    clean = load(Config, CONFIGS / "karle2023.yaml")
+    assert clean.ego.uncertainty == "none"
+    with_uncertainty = replace(clean, ego=replace(clean.ego, uncertainty="independent"))
+    assert with_uncertainty == load(Config, None) == Config()
 
 
 def test_a_dump_writes_every_key_out() -> None:

@@ -1,13 +1,14 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.tracking import START_NS, ms
 
 from fgtrack.core.types import EgoState
-from fgtrack.tracking.ego import EgoSource, EgoTrajectory
+from fgtrack.tracking.ego import EgoSource, EgoStd, EgoTrajectory, extrapolated
 from fgtrack.tracking.published import PublishedEgo
 
 
@@ -178,3 +179,83 @@ def test_the_published_storage_has_a_length_in_ticks() -> None:
         source.receive(ego(20.0 * k, x_m=float(k), speed_mps=0.0))
         source.start_tick()
     assert source.pose_at(START_NS, START_NS + ms(100)).x_m == 3.0
+
+
+# --- its covariance
+
+COVARIANCE = np.diag([0.04, 0.01, 1e-4, 0.25, 1e-4])
+COVARIANCE[0, 2] = COVARIANCE[2, 0] = 1e-3
+
+
+def flat(matrix: np.ndarray) -> tuple[float, ...]:
+    return tuple(matrix.ravel().tolist())
+
+
+def uncertain(**std: float) -> EgoTrajectory:
+    return EgoTrajectory(1.0, 1.0, 5.0, max_extrapolation_s=1.0, std=EgoStd(**std))
+
+
+def test_the_pose_is_as_uncertain_as_its_states_and_in_between_as_their_mean() -> None:
+    source = uncertain()
+    source.receive(ego(0.0, covariance=flat(COVARIANCE)))
+    source.receive(ego(100.0, x_m=1.0, covariance=flat(3.0 * COVARIANCE)))
+    for stamp_ms, factor in ((0.0, 1.0), (25.0, 1.5), (100.0, 3.0)):
+        np.testing.assert_allclose(pose(source, stamp_ms).covariance, factor * COVARIANCE, rtol=1e-12)
+
+
+@pytest.mark.parametrize("source", [uncertain(), PublishedEgo(1.0, 1.0, ms(10), 350, EgoStd())])
+def test_ahead_of_the_states_it_grows_by_the_numeric_derivative(source: EgoSource) -> None:
+    entries = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
+    state = EgoState(START_NS, START_NS, 3.0, -2.0, 0.7, 20.0, 0.3, covariance=flat(COVARIANCE))
+    source.receive(state)
+    source.start_tick()
+    stamp_ns, columns = START_NS + ms(400), []
+    for name in entries:
+        ends = [extrapolated(replace(state, **{name: getattr(state, name) + step}), stamp_ns) for step in (1e-6, -1e-6)]
+        columns.append((np.array(ends[0][:5]) - np.array(ends[1][:5])) / 2e-6)
+    F = np.stack(columns, axis=1)
+    found = source.pose_at(stamp_ns, stamp_ns)
+    assert found is not None
+    np.testing.assert_allclose(found.covariance, F @ COVARIANCE @ F.T, rtol=1e-6, atol=1e-9)
+
+
+def test_what_a_state_does_not_say_the_configuration_says() -> None:
+    source = uncertain(position_m=0.5, yaw_rad=0.02, speed_mps=0.3)
+    source.receive(ego(0.0))
+    np.testing.assert_allclose(pose(source, 0.0).covariance, np.diag([0.25, 0.25, 4e-4, 0.09, 0.0]))
+    known = np.zeros((5, 5))
+    known[:3, :3] = COVARIANCE[:3, :3]
+    source.receive(ego(100.0, covariance=flat(known)))
+    found = pose(source, 100.0).covariance
+    np.testing.assert_allclose(found[:3, :3], COVARIANCE[:3, :3])
+    np.testing.assert_allclose(found[3:, 3:], np.diag([0.09, 0.0]))
+
+
+@pytest.mark.parametrize("source", [trajectory(), uncertain()])
+def test_where_nobody_says_anything_or_nobody_asks_there_is_no_covariance(source: EgoTrajectory) -> None:
+    asked = source._std is not None
+    source.receive(ego(0.0, covariance=None if asked else flat(COVARIANCE)))
+    assert pose(source, 0.0).covariance is None
+    source.receive(ego(50.0, covariance=flat(COVARIANCE)))
+    halfway = pose(source, 25.0).covariance
+    if asked:
+        np.testing.assert_allclose(halfway, 0.5 * COVARIANCE)
+    else:
+        assert halfway is None
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        (1.0,) * 4,
+        flat(COVARIANCE * math.nan),
+        flat(-COVARIANCE),
+        flat(COVARIANCE + np.eye(5, k=1)),
+        flat(np.ones((5, 5)) - 0.5 * np.eye(5)),
+        flat(COVARIANCE * 1e30),
+    ],
+)
+def test_a_covariance_that_is_none_is_refused_where_it_is_asked_for(given: tuple[float, ...]) -> None:
+    assert uncertain().receive(ego(0.0, covariance=given)) == "not a covariance"
+    assert trajectory().receive(ego(0.0, covariance=given)) is None
+    assert uncertain().receive(ego(0.0, covariance=flat(np.ones((5, 5))))) is None  # singular

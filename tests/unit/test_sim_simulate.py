@@ -143,6 +143,11 @@ def test_ego_messages_are_truth_with_noise_and_delay() -> None:
         chi2 = stats.chi2(len(error))
         assert chi2.ppf(1e-4) < np.sum(error**2) / std**2 < chi2.ppf(1.0 - 1e-4)
     assert {m.receipt_ns - m.stamp_ns for m in ego} == {2_000_000}
+    variances = [0.02**2, 0.02**2, 0.001**2, 0.05**2, 0.002**2]
+    assert {m.covariance for m in ego} == {tuple(np.diag(variances).ravel().tolist())}
+    exact = replace(settings, **dict.fromkeys([name for name in vars(settings) if "_std_" in name], 0.0))
+    silent = run(replace(DEFAULT, ego_messages=exact, duration_s=0.1))
+    assert {m.covariance for m in silent if isinstance(m, EgoState)} == {None}
 
 
 def test_delays_of_the_default_scenario_are_those_of_the_paper() -> None:

@@ -10,6 +10,9 @@ import numpy as np
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import MEASURABLE, Detection, FloatArray, Frame
 
+#: Places of x, y and the rotation about z in a covariance of ROS.
+PLANAR = [0, 1, 5]
+
 # A message is known by its attributes only: its class is made when a recording is read.
 RosMessage = Any
 
@@ -101,8 +104,8 @@ def covariance(
 
 
 def planar(covariance36: Sequence[float]) -> FloatArray:
-    """Covariance of x, y and yaw, shape (3, 3), from the 36 values of a `PoseWithCovariance`."""
-    return np.asarray(covariance36, dtype=float).reshape(6, 6)[np.ix_([0, 1, 5], [0, 1, 5])]
+    """Covariance of x, y and their rotation, shape (3, 3), from the 36 values of a pose's or twist's covariance."""
+    return np.asarray(covariance36, dtype=float).reshape(6, 6)[np.ix_(PLANAR, PLANAR)]
 
 
 def measured(values: Mapping[str, float | None]) -> tuple[str, ...]:

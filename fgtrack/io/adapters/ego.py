@@ -2,10 +2,14 @@
 
 import math
 
-from fgtrack.core.types import EgoState
-from fgtrack.io.adapters.common import RosMessage, signed_speed_mps, stamp_ns, yaw_rad
+import numpy as np
+
+from fgtrack.core.types import EgoState, FloatArray
+from fgtrack.io.adapters.common import RosMessage, planar, signed_speed_mps, stamp_ns, yaw_rad
 
 ODOMETRY = "nav_msgs/msg/Odometry"
+
+_UNKNOWN = 1e3
 
 
 def ego_from_odometry(message: RosMessage, receipt_ns: int) -> EgoState:
@@ -20,4 +24,33 @@ def ego_from_odometry(message: RosMessage, receipt_ns: int) -> EgoState:
         yaw_rad=math.nan if yaw is None else yaw,
         speed_mps=signed_speed_mps(twist.linear.x, twist.linear.y, 0.0),
         yaw_rate_radps=twist.angular.z,
+        covariance=_covariance(message),
     )
+
+
+def _covariance(message: RosMessage) -> tuple[float, ...] | None:
+    """Covariance of x, y, yaw, speed and yaw rate, row-major; of pose and twist each, zero where it is not known."""
+    full = np.zeros((5, 5))
+    pose = planar(message.pose.covariance)
+    if _is_known(pose):
+        full[:3, :3] = pose
+    twist = planar(message.twist.covariance)
+    velocity = message.twist.twist.linear
+    along = _direction(signed_speed_mps(velocity.x, velocity.y, 0.0), velocity.x, velocity.y)
+    turned = along @ twist @ along.T
+    if _is_known(turned):
+        full[3:, 3:] = turned
+    return tuple(full.ravel().tolist()) if full.any() else None
+
+
+def _direction(speed_mps: float, vx_mps: float, vy_mps: float) -> FloatArray:
+    """Derivative, shape (2, 3), of the signed speed and the yaw rate by vx, vy and the yaw rate."""
+    standing = not abs(speed_mps) > 0.0
+    ahead, left = (1.0, 0.0) if standing else (vx_mps / speed_mps, vy_mps / speed_mps)
+    return np.array([[ahead, left, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _is_known(covariance: FloatArray) -> bool:
+    """Whether all is finite and every variance in use: ROS says "not known" by 0 or -1, many drivers by 1e3 or more."""
+    variances = np.diag(covariance)
+    return bool(np.isfinite(covariance).all() and (variances > 0.0).all() and (variances < _UNKNOWN).all())

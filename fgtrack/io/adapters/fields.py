@@ -44,6 +44,7 @@ def ego_by_fields(message: RosMessage, fields: Mapping[str, Path], receipt_ns: i
         receipt_ns,
         **values,
         in_pit=None if in_pit is None else bool(in_pit),
+        covariance=None,
     )
 
 

@@ -35,11 +35,13 @@ def _given(message: RosMessage) -> dict[str, RosMessage]:
 
 def ego(message: RosMessage, receipt_ns: int) -> EgoState:
     """The ego's state of a `fgtrack_msgs/Ego`."""
+    covariance: RosMessage = getattr(message, "covariance", ())  # recordings of 0.1.0 have none
     return EgoState(
         stamp_ns(message.header.stamp),
         receipt_ns,
         **{name: getattr(message, name) for name in STATE_NAMES},
         in_pit=message.in_pit if message.has_in_pit else None,
+        covariance=tuple(covariance.tolist()) if len(covariance) else None,
     )
 
 

@@ -45,6 +45,8 @@ float64 yaw_rate_radps
 float64 accel_mps2
 bool has_in_pit
 bool in_pit
+# Of x, y, yaw, speed and yaw rate, row-major; empty where it was not given.
+float64[] covariance
 """,
     "fgtrack_msgs/msg/Detection": f"""\
 # Bit i of `present` says that the i-th field below was given.

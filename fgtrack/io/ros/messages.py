@@ -9,7 +9,7 @@ from rosbags.typesys.store import Typestore
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import STATE_NAMES, Detection, DetectionList, EgoState, FloatArray, Frame, TruthState
-from fgtrack.io.adapters.common import RosMessage
+from fgtrack.io.adapters.common import PLANAR, RosMessage
 from fgtrack.io.adapters.native import DETECTION_OPTIONAL, DETECTIONS, EGO, TRUTH, TRUTH_OPTIONAL, presence
 from fgtrack.io.ros.typestore import build_typestore
 
@@ -46,6 +46,7 @@ class MessageFactory:
             **{name: getattr(state, name) for name in STATE_NAMES},
             has_in_pit=state.in_pit is not None,
             in_pit=bool(state.in_pit),
+            covariance=np.array(state.covariance or (), dtype=np.float64),
         )
 
     def detections(self, message: DetectionList) -> RosMessage:
@@ -71,12 +72,13 @@ class MessageFactory:
 
     def odometry(self, state: EgoState) -> RosMessage:
         """`nav_msgs/Odometry` in the frame `map`."""
+        pose, twist = _odometry_covariances(state)
         return self._make(
             ODOMETRY,
             header=self._header(state.stamp_ns, "map"),
             child_frame_id=_FRAME_IDS["ego"],
-            pose=self._with_covariance("Pose", self._pose(state.x_m, state.y_m, state.yaw_rad), None),
-            twist=self._with_covariance("Twist", self._twist(state.speed_mps, state.yaw_rate_radps), None),
+            pose=self._with_covariance("Pose", self._pose(state.x_m, state.y_m, state.yaw_rad), pose),
+            twist=self._with_covariance("Twist", self._twist(state.speed_mps, state.yaw_rate_radps), twist),
         )
 
     def detection3d_array(self, message: DetectionList) -> RosMessage:
@@ -194,6 +196,15 @@ def _or_zero(value: float | None) -> float:
 
 def _has_position(item: Detection) -> bool:
     return item.x_m is not None and item.y_m is not None
+
+
+def _odometry_covariances(state: EgoState) -> tuple[FloatArray, FloatArray] | tuple[None, None]:
+    """Covariances, shape (6, 6), of pose and twist; None where the state has none."""
+    if state.covariance is None:
+        return None, None
+    given, pose, twist = np.reshape(state.covariance, (5, 5)), np.zeros((6, 6)), np.zeros((6, 6))
+    pose[np.ix_(PLANAR, PLANAR)], twist[np.ix_([0, 5], [0, 5])] = given[:3, :3], given[3:, 3:]
+    return pose, twist
 
 
 def _full_covariance(item: Detection) -> tuple[FloatArray, FloatArray] | None:

@@ -1,0 +1,51 @@
+"""How an error of the ego's pose and motion enters the innovations of one detection."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgtrack.core.linalg import congruence, symmetrise
+from fgtrack.core.types import FloatArray
+from fgtrack.models.measurement import MeasurementModel, SensorPose
+
+
+@dataclass(frozen=True, slots=True)
+class PoseError:
+    """The error e of a sensor pose in the innovation z - h(x, pose) = ... + G e of a detection.
+
+    e is the believed pose minus the true one, of x, y, yaw, vx and vy of the sensor, the same for all detections of a
+    batch. It enters z where the detection was placed in the map by the pose, and h where it is relative to the sensor.
+    """
+
+    covariance: FloatArray
+    """Of e, shape (5, 5)."""
+    placement: FloatArray
+    """Derivative of z by the pose, shape (k, 5)."""
+    R: FloatArray
+    """Covariance of the detection itself, without e, shape (k, k)."""
+
+    def gain(self, model: MeasurementModel, pose: SensorPose, x: FloatArray) -> FloatArray:
+        """G at the states `x` (..., n) of the object, shape (..., k, 5), or (k, 5) where it is the same at all."""
+        return self.placement - model.pose_jacobian(x, pose) if model.relative else self.placement
+
+    def noise(self, model: MeasurementModel, pose: SensorPose, x: FloatArray) -> FloatArray:
+        """R + G P_e G' at the states `x` (..., n), shape (..., k, k), or (k, k) where it is the same at all."""
+        return self.R + symmetrise(congruence(self.gain(model, pose, x), self.covariance))
+
+
+def placement(components: tuple[str, ...], offset_m: tuple[float, float], assumed: tuple[str, ...] = ()) -> FloatArray:
+    """Derivative, shape (k, 5), of a detection that a pose placed in the map, by the x, y, yaw, vx, vy of this pose.
+
+    `offset_m` is where the detection lies in the map, seen from the pose. What is `assumed`, as a heading from the map,
+    was not turned by the pose; a speed is over ground, whatever the ego does.
+    """
+    D = np.zeros((len(components), 5))
+    dx_m, dy_m = offset_m
+    for row, name in enumerate(components):
+        if name == "x_m":
+            D[row, 0], D[row, 2] = 1.0, -dy_m
+        elif name == "y_m":
+            D[row, 1], D[row, 2] = 1.0, dx_m
+        elif name == "yaw_rad" and name not in assumed:
+            D[row, 2] = 1.0
+    return D
