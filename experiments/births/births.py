@@ -6,20 +6,19 @@ One object at a time drives off in a random direction; only its position is meas
 """
 
 import csv
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import matplotlib.pyplot as plt
 import numpy as np
 import typer
+from joblib import Parallel, delayed
 from matplotlib.ticker import LogFormatter
 
+import fgtrack
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
-from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.base import Measurement, Start
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
 
@@ -28,39 +27,36 @@ STEP_S = 0.05
 STD_M = 0.3
 NUM_STEPS = 40
 GOOD_M, GOOD_MPS = 0.5, 2.0
+DRAWS = 1000
 TRUTH = CTRV()
 
 
-def smoother(prior: Start) -> Estimator:
-    settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)
-    return FixedLagSmoother(TRUTH, prior, settings)
-
-
-#: By name: the motion model of the estimator, and how it starts. The last one shows what a linear model does.
-ESTIMATORS: dict[str, tuple[MotionModel, Callable[[Start], Estimator]]] = {
-    "smoother (CTRV)": (TRUTH, smoother),
-    "ekf-replay (CTRV)": (TRUTH, lambda prior: ReplayEkf(TRUTH, prior, 1.0)),
-    "ekf-replay (CV)": (CV(25.0), lambda prior: ReplayEkf(CV(25.0), prior, 1.0)),
+#: By label: name of the estimator, its motion model and its options. The last one shows what a linear model does.
+ESTIMATORS: dict[str, tuple[str, MotionModel, dict[str, str]]] = {
+    "smoother, regression": ("smoother", TRUTH, {"initiation": "regression"}),
+    "smoother, one-point": ("smoother", TRUTH, {"initiation": "one-point"}),
+    "ekf-replay, one-point": ("ekf-replay", TRUTH, {"initiation": "one-point"}),
+    "ekf-replay, two-point": ("ekf-replay", TRUTH, {"initiation": "two-point"}),
+    "ekf-replay, regression": ("ekf-replay", TRUTH, {"initiation": "regression"}),
+    "ekf-replay, CV": ("ekf-replay", CV(25.0), {}),
 }
 
 
-def errors(motion: MotionModel, start: Callable[[Start], Estimator], rng: np.random.Generator) -> FloatArray:
+def errors(label: str, rng: np.random.Generator) -> FloatArray:
     """Errors of position and velocity after each detection of one object, shape (NUM_STEPS, 2)."""
+    name, motion, options = ESTIMATORS[label]
     x = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi), rng.uniform(20.0, 70.0), rng.uniform(-0.1, 0.1)])
     z = x[:2] + STD_M * rng.standard_normal(2)
     R = STD_M**2 * np.eye(2)
-    estimator = start(
-        Start(
-            stamp_ns=START_NS,
-            position_m=z,
-            position_covariance=R,
-            yaw_rad=None,
-            yaw_std_rad=np.pi,
-            speed_mps=0.0,
-            speed_std_mps=40.0,
-            yaw_rate_std_radps=0.3,
-        )
+    start = Start(
+        stamp_ns=START_NS,
+        position_m=z,
+        position_covariance=R,
+        yaw_std_rad=np.pi,
+        speed_std_mps=40.0,
+        yaw_rate_std_radps=0.3,
     )
+    estimator = fgtrack.estimator(name, motion, start, lag_s=1.0, **options)
     model = measurement_model(("x_m", "y_m"), motion)
     found = []
     for k in range(1, NUM_STEPS + 1):
@@ -110,26 +106,56 @@ def draw(results: dict[str, FloatArray], file: Path) -> None:
     plt.close(figure)
 
 
+def with_interval(values: FloatArray, share: float, rng: np.random.Generator) -> tuple[float, float, float]:
+    """The quantile `share` of `values` (n,), and its 95 % interval, by a bootstrap over the objects."""
+    drawn = rng.choice(values, (DRAWS, len(values)))
+    found = np.quantile(drawn, share, axis=1, method="higher")
+    low, high = np.quantile(found, [0.025, 0.975], method="nearest").tolist()
+    return float(np.quantile(values, share, method="higher")), low, high
+
+
+def mean_with_interval(values: FloatArray, rng: np.random.Generator) -> tuple[float, float, float]:
+    """Root of the mean of `values` (n,), which are squares, and its 95 % interval, by the same bootstrap."""
+    found = np.sqrt(rng.choice(values, (DRAWS, len(values))).mean(axis=1))
+    return (float(np.sqrt(values.mean())), *np.quantile(found, [0.025, 0.975]).tolist())
+
+
+def table(results: dict[str, FloatArray], rng: np.random.Generator) -> str:
+    """Times until heading and speed are good, and the errors 0.2 s and 2 s after birth, as Markdown."""
+    lines = [
+        "| | good after, median [s] | 90 % [s] | stays good after, median [s] "
+        "| velocity RMSE after 0.2 s [m/s] | after 2 s [m/s] |",
+        "|---|---|---|---|---|---|",
+    ]
+    for label, found in results.items():
+        first_s, settled_s = np.array([reached_s(error) for error in found]).T
+        cells = [with_interval(first_s, 0.5, rng), with_interval(first_s, 0.9, rng), with_interval(settled_s, 0.5, rng)]
+        cells += [mean_with_interval(found[:, round(at_s / STEP_S) - 1, 1] ** 2, rng) for at_s in (0.2, 2.0)]
+        lines.append(
+            f"| {label} | " + " | ".join(f"{v:.2f} ({low:.2f} to {high:.2f})" for v, low, high in cells) + " |"
+        )
+    return "\n".join(lines) + "\n"
+
+
 def main(
     out: Annotated[Path, typer.Option("-o", help="Folder for the table and the figure.")] = Path("out/births"),
-    objects: Annotated[int, typer.Option(help="Number of objects.")] = 200,
+    objects: Annotated[int, typer.Option(help="Number of objects.")] = 400,
     seed: int = 0,
+    jobs: Annotated[int, typer.Option(help="Processes.")] = 1,
 ) -> None:
-    """Draw objects, track each with every estimator, write births.csv and births.png."""
+    """Draw objects, track each with every estimator, write births.csv, births.md and births.png."""
     out.mkdir(parents=True, exist_ok=True)
-    results = {
-        name: np.array([errors(motion, start, np.random.default_rng([seed, i])) for i in range(objects)])
-        for name, (motion, start) in ESTIMATORS.items()
-    }
+    cases = [(label, np.random.default_rng([seed, i])) for label in ESTIMATORS for i in range(objects)]
+    found = iter(Parallel(n_jobs=jobs)(delayed(errors)(*case) for case in cases))
+    results = {label: np.array([next(found) for _ in range(objects)]) for label in ESTIMATORS}
     with (out / "births.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["estimator", "first_median_s", "first_q90_s", "stays_median_s", "stays_q90_s"])
-        for name, found in results.items():
-            times_s = np.array([reached_s(error) for error in found])
-            quantiles_s = np.quantile(times_s, [0.5, 0.9], axis=0, method="higher").T.ravel()
-            writer.writerow([name, *(f"{value:.2f}" for value in quantiles_s)])
+        writer.writerow(["estimator", "object", "first_s", "stays_s"])
+        for label, each in results.items():
+            writer.writerows([label, number, *reached_s(error)] for number, error in enumerate(each))
+    (out / "births.md").write_text(table(results, np.random.default_rng(seed)))
     draw(results, out / "births.png")
-    print((out / "births.csv").read_text() + f"figure: {out / 'births.png'}")
+    print((out / "births.md").read_text() + f"figure: {out / 'births.png'}")
 
 
 if __name__ == "__main__":
