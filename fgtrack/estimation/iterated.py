@@ -3,6 +3,7 @@
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.ekf import OneCorrection, linearised
+from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.iteration import Iteration, largest_move, negative_log_posterior, reweighted
 from fgtrack.estimation.recursion import EkfRecursion
 from fgtrack.estimation.replay import ReplayingFilter
@@ -73,7 +74,7 @@ class IekfReplay(ReplayingFilter):
         lag_s: float,
         max_iterations: int = 10,
         tolerance: float = 1e-6,
-        initiation: str = "regression",
+        initiation: str = DEFAULT,
     ) -> None:
         recursion = IekfRecursion(motion, Iteration(max_iterations, tolerance))
         super().__init__(motion, prior, lag_s, recursion, initiation)

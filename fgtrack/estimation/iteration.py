@@ -46,8 +46,8 @@ class Iteration:
 
 def largest_move(step: FloatArray, covariance: FloatArray) -> float:
     """The largest entry of `step` (n,) in standard deviations of `covariance` (n, n)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return float(np.nanmax(np.abs(step) / np.sqrt(covariance.diagonal())))
+    sigma = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
+    return float(np.divide(np.abs(step), sigma, out=np.zeros(len(step)), where=sigma > 0.0).max())
 
 
 def negative_log_posterior(

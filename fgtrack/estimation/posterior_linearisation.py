@@ -7,6 +7,7 @@ import numpy as np
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.ekf import OneCorrection
+from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.iteration import Iteration, largest_move, negative_log_posterior, reweighted
 from fgtrack.estimation.replay import ReplayingFilter
 from fgtrack.estimation.sigma_points import SigmaPoints, measurement_regression
@@ -98,7 +99,7 @@ class IplfReplay(ReplayingFilter):
         alpha: float = 1.0,
         beta: float = 0.0,
         kappa: float = 0.0,
-        initiation: str = "regression",
+        initiation: str = DEFAULT,
     ) -> None:
         points, iteration = SigmaPoints(alpha, beta, kappa), Iteration(max_iterations, tolerance)
         super().__init__(motion, prior, lag_s, IplfRecursion(motion, points, iteration), initiation)

@@ -1,6 +1,6 @@
 """What a recursive filter does with one state: predict it, and correct it by a measurement."""
 
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
@@ -13,9 +13,6 @@ class Recursion(Protocol):
 
     All raise `numpy.linalg.LinAlgError` for a state or measurement that they cannot take.
     """
-
-    composes: ClassVar[bool]
-    """Whether two predictions, one after the other, give what one over the whole time gives."""
 
     def predict(self, mean: FloatArray, covariance: FloatArray, dt_s: float) -> Prediction:
         """The state `mean` (n,), `covariance` (n, n) after `dt_s` > 0."""
@@ -37,8 +34,6 @@ class EkfRecursion:
     motion
         Motion model.
     """
-
-    composes: ClassVar[bool] = True
 
     def __init__(self, motion: MotionModel) -> None:
         self._motion = motion

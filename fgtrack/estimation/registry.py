@@ -6,7 +6,7 @@ function `(**parameters) -> MotionModel`.
 """
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
@@ -16,6 +16,7 @@ from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.initiated import initiated
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
+from fgtrack.estimation.smoothing_bank import Smoother, SmoothingBank
 from fgtrack.models.motion import MotionModel
 
 OOSM_GROUP = "fgtrack.oosm"
@@ -29,6 +30,7 @@ ESTIMATORS = Registry(
             "ekf-backward-forward": "fgtrack.estimation.backward_forward:backward_forward",
             "ekf-replay": "fgtrack.estimation.replay:ReplayEkf",
             "iekf-replay": "fgtrack.estimation.iterated:IekfReplay",
+            "ipls": "fgtrack.estimation.ipls:PosteriorLinearisationSmoother",
             "iplf-replay": "fgtrack.estimation.posterior_linearisation:IplfReplay",
             "smoother": "fgtrack.estimation.factor_graph.factories:smoother",
             "smoother-batch": "fgtrack.estimation.factor_graph.factories:smoother_batch",
@@ -86,6 +88,9 @@ class Claims:
     initiates: bool = False
     """Whether it finds an unknown direction of travel by itself, and takes `initiation` as an option. Another one is
     made again, along its first positions, until their direction is certain (see `Initiated`)."""
+    reports: bool = False
+    """Whether it hands out what it has smoothed, by `take_final` and `take_rest` of `Smoother`;
+    one that does has to initiate, too."""
     bank: bool = False
     """Whether the entry makes the estimators of all objects together."""
 
@@ -139,8 +144,13 @@ def start_estimator(
     return made(start) if claims.initiates else initiated(motion, start, own.pop("initiation", DEFAULT), made)
 
 
-def estimator_bank(name: str, motion: MotionModel, lag_s: float, options: Mapping[str, Any]) -> TrackBank:
-    """The estimators `name` of all objects; raises as `estimator`. One that is a bank itself takes no `initiation`."""
+def estimator_bank(
+    name: str, motion: MotionModel, lag_s: float, options: Mapping[str, Any], lagged_s: Sequence[float] = ()
+) -> TrackBank:
+    """The estimators `name` of all objects; raises as `estimator`. One that is a bank itself takes no `initiation`.
+
+    Of one that hands out smoothed states, `lagged_s` says at which lags behind the present.
+    """
     factory = ESTIMATORS.load(name)
     claims = Claims.of(factory)
     own = options if claims.initiates else {key: options[key] for key in options if key != "initiation"}
@@ -148,6 +158,13 @@ def estimator_bank(name: str, motion: MotionModel, lag_s: float, options: Mappin
         bank: TrackBank = _made(name, factory, motion, lag_s, **own)
         return bank
     _check_options(name, factory, 3, own)
+    if claims.reports:
+
+        def start_smoother(start: Start) -> Smoother:
+            smoother: Smoother = _made(name, factory, motion, start, lag_s, **own)
+            return smoother
+
+        return SmoothingBank(motion, start_smoother, lag_s, lagged_s)
     return ObjectBank(motion, lambda start: start_estimator(name, factory, motion, start, lag_s, options), lag_s)
 
 

@@ -87,30 +87,22 @@ class ReplayingFilter(WindowedFilter):
     def _fuse(self, measurement: Measurement) -> OneCorrection:
         order = (measurement.stamp_ns, measurement.model.components, tuple(measurement.z.tolist()))
         place = bisect.bisect_right(self._steps, order, lo=1, key=_order)
-        before, later = self._steps[place - 1], self._steps[place:]
-        step, correction = self._fused(before, order, measurement)
+        step, correction = self._fused(self._steps[place - 1], order, measurement)
+        later = self._steps[place:]
         if later:
-            state = self._retrodicted(before.opening, step, later)
-            innovation, nis = self._recursion.innovation(*state, measurement)
+            innovation, nis = self._recursion.innovation(*self._retrodicted(step, later), measurement)
             correction = correction._replace(innovation=innovation, nis=nis)
         self._steps[place:] = [step, *self._replayed(step, later)]
         return correction
 
-    def _retrodicted(
-        self, opening: Opening | None, step: _Stored, later: Sequence[_Stored]
-    ) -> tuple[FloatArray, FloatArray]:
+    def _retrodicted(self, step: _Stored, later: Sequence[_Stored]) -> tuple[FloatArray, FloatArray]:
         """The state that the measurement of `step` finds, given all that was fused, the `later` steps included.
 
-        From the newest step back (see `smoothed_one`), each as it was when the measurement of `step` was unknown; what
-        had been measured up to `step` without it is `opening`.
+        From the newest step back (see `smoothed_one`), each as it was when the measurement of `step` was unknown.
         """
-        blank = _Stored(step.order, None, step.predicted.mean, step.predicted.covariance, step.predicted, opening)
-        if self._recursion.composes:
-            first = later[0]
-            cross = self._predicted(blank, first.order[0]).cross
-            later = [replace(first, predicted=first.predicted._replace(cross=cross)), *later[1:]]
-        else:
-            later = self._replayed(blank, later)
+        blank = replace(step, mean=step.predicted.mean, covariance=step.predicted.covariance)
+        first = later[0]
+        later = [replace(first, predicted=self._predicted(blank, first.order[0])), *later[1:]]
         mean, covariance = later[-1].mean, later[-1].covariance
         for before, after in zip([*later[-2::-1], blank], later[::-1], strict=True):
             if after.along and after.opening is not None:

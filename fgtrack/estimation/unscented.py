@@ -1,7 +1,5 @@
 """The unscented Kalman filter."""
 
-from typing import ClassVar
-
 from fgtrack.core.linalg import congruence, product, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
@@ -13,6 +11,7 @@ from fgtrack.estimation.ekf import (
     predict_across,
     updated_one,
 )
+from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.replay import ReplayingFilter
 from fgtrack.estimation.sigma_points import SigmaPoints, measurement_regression, motion_regression
 from fgtrack.models.motion import MotionModel
@@ -31,8 +30,6 @@ class UkfRecursion:
     points
         Where functions are evaluated.
     """
-
-    composes: ClassVar[bool] = False
 
     def __init__(self, motion: MotionModel, points: SigmaPoints) -> None:
         points.squared_distance(motion.dim)
@@ -92,6 +89,6 @@ class UkfReplay(ReplayingFilter):
         alpha: float = 1.0,
         beta: float = 0.0,
         kappa: float = 0.0,
-        initiation: str = "regression",
+        initiation: str = DEFAULT,
     ) -> None:
         super().__init__(motion, prior, lag_s, UkfRecursion(motion, SigmaPoints(alpha, beta, kappa)), initiation)

@@ -21,7 +21,7 @@ from fgtrack.estimation.published import (
     SaturatedEulerCtrv,
     StalePresent,
 )
-from fgtrack.estimation.registry import estimator_bank
+from fgtrack.estimation.registry import ESTIMATORS, Claims, estimator_bank
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.published_map import CircularHeadingMap, PublishedMap
 from fgtrack.models.road import MappedRoad, OpenSpace, Road
@@ -142,7 +142,9 @@ def build_bank(config: Config) -> TrackBank:
     build, options = _BANKS.get(config.estimator), config.options.get(config.estimator, {})
     if build is None:
         options = {"initiation": config.initiation.method, **options}
-        return estimator_bank(config.estimator, config.motion_model(), config.filter.storage_s, options)
+        reports = Claims.of(ESTIMATORS.load(config.estimator)).reports
+        lag_s = config.smoother.lag_s if reports else config.filter.storage_s
+        return estimator_bank(config.estimator, config.motion_model(), lag_s, options, config.smoother.lagged_s)
     if options:
         raise CallError(f"options.{config.estimator}: set the keys of smoother or filter instead")
     return build(config)

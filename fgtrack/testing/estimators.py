@@ -143,7 +143,7 @@ def _reports_the_innovation_against_all_that_it_has_fused(subject: Subject, stre
         S = H @ before.covariance @ H.T + measurement.R
         result = estimator.update(measurement)
         fused.append(measurement)
-        known = subject.claims.smooths or (at_ns > newest_ns and not subject.claims.spreads)
+        known = (subject.claims.smooths or at_ns > newest_ns) and not subject.claims.spreads
         if not (stream.motion.linear or known):
             continue
         nis = float(y @ np.linalg.solve(S, y))
