@@ -102,7 +102,13 @@ def _tracking(rows: Sequence[_Row[Metrics]], notes: Sequence[str]) -> Table:
     with_truth = any(row.of.truth for row in rows)
     truth: list[Column[_Row[Metrics]]] = [
         *(Column(heading, (_named(name, "rmse"),), of_truth(rmse(name))) for name, heading in _ERRORS.items()),
-        Column("tracked\n[%]", ("tracked_share",), of_truth(lambda of: (of.overall.tracked_share,)), scale=_PERCENT),
+        Column("", ("tracked_share",), of_truth(lambda of: (of.overall.tracked_share,))),
+        Column(
+            "tracked\n[%]",
+            ("tracked_share_in_sight",),
+            of_truth(lambda of: (of.overall.tracked_share_in_sight,)),
+            scale=_PERCENT,
+        ),
         Column(
             "breaks/\nswitches",
             ("breaks", "id_switches"),
@@ -133,8 +139,9 @@ def _tracking(rows: Sequence[_Row[Metrics]], notes: Sequence[str]) -> Table:
     own = [f"{CONFIRMED_MEASUREMENTS}+: tracks with at least {CONFIRMED_MEASUREMENTS} measurements"]
     if with_truth:
         own += [
+            "tracked: share of the ticks at which some sensor could see the object",
             f"false: paired with a true object in less than {FALSE_TRACK_SHARE:.0%} of its life",
-            "breaks: tracking resumed after a loss or with another track; switches: the latter",
+            "breaks: resumed after a loss or with another track; switches: the latter",
             f"precision: true objects tracked / tracks with {CONFIRMED_MEASUREMENTS}+ measurements",
         ]
     title = "Tracking" + (" (errors: RMSE against truth)" if with_truth else "")
@@ -159,10 +166,13 @@ def _multi_object(rows: Sequence[_Row[Metrics]], notes: Sequence[str]) -> Table:
     }
     columns: list[Column[_Row[Metrics]]] = [
         _run_column(rows),
-        Column("GOSPA\n[m]", ("gospa_rms_m",), score(lambda of: of.gospa.rms_m)),
+        Column("GOSPA\n[m]", ("gospa_in_sight_rms_m",), score(lambda of: of.gospa.in_sight_rms_m)),
         Column("local.\n[m]", ("gospa_localisation_m",), score(lambda of: math.sqrt(of.gospa.localisation_m2))),
-        Column("missed\n[m]", ("gospa_missed_m",), score(lambda of: math.sqrt(of.gospa.missed_m2))),
+        Column("missed\n[m]", ("gospa_missed_in_sight_m",), score(_missed_in_sight_m)),
         Column("false\n[m]", ("gospa_false_m",), score(lambda of: math.sqrt(of.gospa.false_m2))),
+        Column("unseen\n[m]", ("gospa_out_of_sight_m",), score(lambda of: math.sqrt(of.gospa.out_of_sight_m2))),
+        Column("with\nunseen", ("gospa_rms_m",), score(lambda of: of.gospa.rms_m)),
+        Column("", ("gospa_missed_m",), score(lambda of: math.sqrt(of.gospa.missed_m2))),
         *(Column(f"{k}\n[%]", (k.lower(),), score(get), scale=_PERCENT) for k, get in scores.items()),
         Column(
             "switches/\nlate",
@@ -173,13 +183,18 @@ def _multi_object(rows: Sequence[_Row[Metrics]], notes: Sequence[str]) -> Table:
         Column("confirm\n[s]", ("time_to_confirm_s",), of_objects(lambda of: (of.time_to_confirm_s.mean,))),
     ]
     own = [
-        "GOSPA: root mean square over the ticks; its square is the sum of the squares of its parts",
+        "GOSPA: root mean square over ticks; the squares of its parts add up to its own",
+        "unseen: missed where no sensor could see; the scores in % count it too",
         "scores: 100 is perfect; defined in docs/metrics.md",
         "late: switches soon after an out-of-sequence update of one of the two tracks",
         "confirm: from an object's first detection to its first confirmed track",
     ]
     rows = rows if any(row.of.multi_object for row in rows) else []
     return Table("Multi-object metrics", columns, rows, notes=[*own, *notes])
+
+
+def _missed_in_sight_m(of: MultiObjectMetrics) -> float:
+    return math.sqrt(max(of.gospa.missed_m2 - of.gospa.out_of_sight_m2, 0.0))
 
 
 def _lag(rows: Sequence[_Row[Metrics]], notes: Sequence[str]) -> Table:
@@ -218,8 +233,8 @@ def _lag(rows: Sequence[_Row[Metrics]], notes: Sequence[str]) -> Table:
         Column("NEES\npos.", ("position_nees",), lambda row: (row.of.position_nees.mean,)),
     ]
     own = [
-        "lag 0: present states as published; window: final states, as they leave the window",
-        "below: reduction against the present states of the same tracks at the same stamps",
+        "lag 0: states as published; window: final states, as they leave the window",
+        "below: reduction against the present states of the same tracks and stamps",
         "NEES: of the position; 2 if consistent",
     ]
     if any(len(_shown_lags(row.of.lagged)) < len(row.of.lagged) for row in rows):
@@ -263,7 +278,7 @@ def _consistency(rows: Sequence[_Row[Metrics]], notes: Sequence[str]) -> Table:
     own = [
         "band: of the mean of independent samples; errors along one run are correlated,",
         "so the NEES of a single run may leave it (average over several runs)",
-        f"correlation: of the innovations, in tracks with {FEWEST}+ of them; ± 95 % band if white",
+        f"correlation: of innovations, tracks with {FEWEST}+ of them; ± 95 % band if white",
         f"outside: share of tracks and lags 1 to {LAGS} outside their bands; 5 if white",
     ]
     title = "Consistency (mean NEES and NIS, and their expected values)"

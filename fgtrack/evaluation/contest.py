@@ -108,7 +108,7 @@ def _contest(group: Sequence[JudgedRun]) -> Contest:
         sums[name] = by_stamp(at_ns, np.stack([value[name][row] for value, row in zip(values, rows, strict=True)], -1))
     gospa = _gospa_sums(group)
     if gospa is not None:
-        sums["gospa_rms_m"] = gospa
+        sums["gospa_in_sight_rms_m"] = gospa
     labels = tuple(one.label for one in group)
     return Contest(
         labels,
@@ -137,9 +137,9 @@ def _samples(group: Sequence[JudgedRun]) -> tuple[list[IntArray], IntArray, list
 
 
 def _gospa_sums(group: Sequence[JudgedRun]) -> FloatArray | None:
-    """Squared GOSPA of every run, and 1, at the ticks that all of them have; None where it is not asked for."""
+    """Squared GOSPA in sight of every run, and 1, at the ticks that all have; None where it is not asked for."""
     found = [one.gospa for one in group]
-    squares = [np.square(parts.total_m) for parts in found if parts is not None]
+    squares = [np.square(parts.in_sight_m) for parts in found if parts is not None]
     if len(squares) < len(group):
         return None
     ticks_ns = [one.scored_ticks_ns for one in group]

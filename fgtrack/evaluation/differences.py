@@ -13,7 +13,7 @@ _HEADINGS = {
     "speed_rmse_mps": "speed [m/s]",
     "yaw_rmse_rad": "yaw [rad]",
     "position_nees": "NEES pos.",
-    "gospa_rms_m": "GOSPA [m]",
+    "gospa_in_sight_rms_m": "GOSPA [m]",
 }
 _MOST_DECIMALS = 5
 _LARGE_SHARE = 0.9  # of the samples that all runs have in common; below it the note says how many
@@ -50,7 +50,7 @@ def differences(contests: Sequence[Contest]) -> Table:
         Column("is", (), lambda row: (row.entry.standing,), left=True),
     ]
     notes = [
-        "RMSE at the objects and stamps that all runs track; NEES: worse is farther from 2",
+        "RMSE where all runs track the object; NEES: worse is farther from 2",
         "tie: the interval of the difference to the best has 0 inside (block bootstrap)",
     ]
     for contest in contests:

@@ -8,6 +8,7 @@ from scipy.optimize import linear_sum_assignment
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.evaluation.sight import in_sight
 from fgtrack.evaluation.truth import TRUE_STATE, TruePath, true_paths
 from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, Table, evaluation_config
 
@@ -39,6 +40,8 @@ class Matching:
     """Whether there is truth at the tick's `now_ns`, shape (ticks, objects)."""
     track_ids: IntArray
     """Track paired with each object, shape (ticks, objects); `NO_TRACK` where none."""
+    in_sight: BoolArray
+    """Whether some sensor could see each object there, shape (ticks, objects), see `in_sight`."""
 
     @property
     def paired(self) -> BoolArray:
@@ -58,6 +61,8 @@ class Scenes:
     """Distance of each row from every object, shape (r, objects); infinite from what is not there."""
     present: BoolArray
     """Whether an object is there, shape (t, objects)."""
+    in_sight: BoolArray
+    """Whether it is there and some sensor could see it, shape (t, objects)."""
 
     @property
     def num_ticks(self) -> int:
@@ -125,6 +130,7 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
         tick_index=tick_index,
         present=_present(paths, now_ns),
         track_ids=track_ids,
+        in_sight=in_sight(run, paths, now_ns),
     )
 
 
@@ -181,7 +187,8 @@ def scenes(run: Run, matching: Matching) -> Scenes:
     tick_index, present = number[matching.tick_index[rows]], matching.present[scored]
     distances_m = matching.distances_m[rows]
     known = present[tick_index] & np.isfinite(distances_m)
-    return Scenes(tick_index, matching.tracks["track_id"][rows], np.where(known, distances_m, np.inf), present)
+    distances_m = np.where(known, distances_m, np.inf)
+    return Scenes(tick_index, matching.tracks["track_id"][rows], distances_m, present, matching.in_sight[scored])
 
 
 def recorded(run: Run, matching: Matching) -> BoolArray:

@@ -40,11 +40,20 @@ class ObjectMetrics:
     """Those that follow on an out-of-sequence update, see `late_switches`."""
     time_to_confirm_s: Moments
     """From the first detection to the first confirmed track, a sample for each object, see `times_to_confirm`."""
+    ticks_in_sight: int
+    """Ticks at which there is truth and some sensor could see it, see `in_sight`."""
+    ticks_tracked_in_sight: int
+    """Ticks among them at which a track was paired."""
 
     @property
     def tracked_share(self) -> float:
         """Share of the ticks at which the object was tracked."""
         return self.ticks_tracked / self.ticks_present if self.ticks_present else math.nan
+
+    @property
+    def tracked_share_in_sight(self) -> float:
+        """Share of the ticks in sight at which the object was tracked."""
+        return self.ticks_tracked_in_sight / self.ticks_in_sight if self.ticks_in_sight else math.nan
 
     def __add__(self, other: "ObjectMetrics") -> "ObjectMetrics":
         return ObjectMetrics(
@@ -55,10 +64,12 @@ class ObjectMetrics:
             self.id_switches + other.id_switches,
             self.late_id_switches + other.late_id_switches,
             self.time_to_confirm_s + other.time_to_confirm_s,
+            self.ticks_in_sight + other.ticks_in_sight,
+            self.ticks_tracked_in_sight + other.ticks_tracked_in_sight,
         )
 
 
-NOTHING_TRACKED = ObjectMetrics({name: Moments() for name in ERROR_NAMES}, 0, 0, 0, 0, 0, Moments())
+NOTHING_TRACKED = ObjectMetrics({name: Moments() for name in ERROR_NAMES}, 0, 0, 0, 0, 0, Moments(), 0, 0)
 
 
 @dataclass(frozen=True)
@@ -181,6 +192,7 @@ def _truth_metrics(run: Run, matching: Matching, options: EvaluationConfig) -> T
         objects[object_id] = _object_metrics(
             {name: Moments.of(values[mine]) for name, values in errors.values.items()},
             matching.present[:, index],
+            matching.in_sight[:, index],
             matching.track_ids[:, index],
             int(late[index]),
             Moments.of(confirm_s[index : index + 1]),
@@ -201,12 +213,13 @@ def _truth_metrics(run: Run, matching: Matching, options: EvaluationConfig) -> T
 def _object_metrics(
     errors: Mapping[str, Moments],
     present: BoolArray,
+    in_sight: BoolArray,
     track_ids: IntArray,
     late_id_switches: int,
     time_to_confirm_s: Moments,
 ) -> ObjectMetrics:
     """Counts from the track paired with one object at every tick, shape (ticks,)."""
-    track_ids = track_ids[present]
+    track_ids, seen = track_ids[present], in_sight[present]
     tracked = track_ids != NO_TRACK
     before = np.concatenate([[NO_TRACK], track_ids])[:-1]
     stretches = int((tracked & (track_ids != before)).sum())
@@ -219,6 +232,8 @@ def _object_metrics(
         id_switches=int((sequence[1:] != sequence[:-1]).sum()),
         late_id_switches=late_id_switches,
         time_to_confirm_s=time_to_confirm_s,
+        ticks_in_sight=int(seen.sum()),
+        ticks_tracked_in_sight=int((seen & tracked).sum()),
     )
 
 
@@ -251,6 +266,7 @@ def _plain(value: Any) -> Any:
         plain = {entry.name: _plain(getattr(value, entry.name)) for entry in fields(value)}
         if isinstance(value, ObjectMetrics):
             plain["tracked_share"] = _plain(value.tracked_share)
+            plain["tracked_share_in_sight"] = _plain(value.tracked_share_in_sight)
         return plain
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}

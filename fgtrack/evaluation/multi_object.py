@@ -6,6 +6,8 @@ assignment of tracks to objects nearer than c,
 
     GOSPA^2 = sum of squared distances of the pairs + c^2 / 2 (number of missed objects + number of false tracks).
 
+Of the missed objects those are told apart that no sensor could see: no tracker can do better there.
+
 CLEAR (Bernardin and Stiefelhagen 2008) counts as TrackEval does. motrics 0.3 has it, too, but otherwise: it charges
 1e18 for a pair outside the gate, in whose rounding the similarities of the other pairs are lost, and it keeps to the
 last track that an object ever had.
@@ -40,11 +42,18 @@ class GospaParts:
     localisation_m2: FloatArray
     missed_m2: FloatArray
     false_m2: FloatArray
+    out_of_sight_m2: FloatArray
+    """The part of `missed_m2` that no sensor could see."""
 
     @property
     def total_m(self) -> FloatArray:
         """GOSPA at every tick, shape (t,)."""
         return np.sqrt(self.localisation_m2 + self.missed_m2 + self.false_m2)
+
+    @property
+    def in_sight_m(self) -> FloatArray:
+        """GOSPA at every tick without the missed objects out of sight, shape (t,)."""
+        return np.sqrt(self.localisation_m2 + (self.missed_m2 - self.out_of_sight_m2) + self.false_m2)
 
 
 @dataclass(frozen=True)
@@ -62,16 +71,29 @@ class Gospa:
     """Mean squared part of the pairs."""
     missed_m2: float
     false_m2: float
+    in_sight_rms_m: float
+    """As `rms_m`, without the missed objects that no sensor could see."""
+    out_of_sight_m2: float
+    """Mean squared part of these objects, a part of `missed_m2`."""
 
     @classmethod
     def of(cls, parts: GospaParts, c_m: float) -> Self:
         """Averages of `parts` over the ticks."""
         total_m, ticks = parts.total_m, len(parts.total_m)
         if not ticks:
-            return cls(c_m, 0, *[np.nan] * 5)
-        squares = (parts.localisation_m2, parts.missed_m2, parts.false_m2)
-        rms_m = float(np.sqrt(np.square(total_m).mean()))
-        return cls(c_m, ticks, float(total_m.mean()), rms_m, *(float(part.mean()) for part in squares))
+            return cls(c_m, 0, *[np.nan] * 7)
+        rms_m, in_sight_m = (float(np.sqrt(np.square(of).mean())) for of in (total_m, parts.in_sight_m))
+        return cls(
+            c_m=c_m,
+            ticks=ticks,
+            mean_m=float(total_m.mean()),
+            rms_m=rms_m,
+            localisation_m2=float(parts.localisation_m2.mean()),
+            missed_m2=float(parts.missed_m2.mean()),
+            false_m2=float(parts.false_m2.mean()),
+            in_sight_rms_m=in_sight_m,
+            out_of_sight_m2=float(parts.out_of_sight_m2.mean()),
+        )
 
 
 @dataclass(frozen=True)
@@ -204,19 +226,22 @@ def gospa(scenes: Scenes, c_m: float) -> GospaParts:
     unclear = contested(inside, scenes.tick_index, scenes.num_ticks)
     clear = inside & ~unclear[scenes.tick_index, None]
     localisation_m2 = scenes.per_tick(np.where(clear, squares, 0.0).sum(axis=1))
-    pairs = scenes.per_tick(clear.sum(axis=1))
+    paired = np.zeros_like(scenes.present)
+    clear_rows, clear_columns = np.nonzero(clear)
+    paired[scenes.tick_index[clear_rows], clear_columns] = True
     rows_of = list(scenes)
     for tick in np.flatnonzero(unclear).tolist():
         cost = squares[rows_of[tick]]
         rows, columns = linear_sum_assignment(cost)
         chosen = inside[rows_of[tick]][rows, columns]
         localisation_m2[tick] = cost[rows, columns][chosen].sum()
-        pairs[tick] = chosen.sum()
-    single_m2 = c_m**2 / 2.0
+        paired[tick, columns[chosen]] = True
+    single_m2, pairs, missed = c_m**2 / 2.0, paired.sum(axis=1), scenes.present & ~paired
     return GospaParts(
         localisation_m2=localisation_m2,
-        missed_m2=single_m2 * (scenes.present.sum(axis=1) - pairs),
+        missed_m2=single_m2 * missed.sum(axis=1),
         false_m2=single_m2 * (scenes.per_tick(np.ones(len(squares))) - pairs),
+        out_of_sight_m2=single_m2 * (missed & ~scenes.in_sight).sum(axis=1),
     )
 
 

@@ -20,11 +20,13 @@ from fgtrack.evaluation.tables import Column, Table, Value
 #: Metrics that have a better and a worse, in the order in which they are asked for; the first is shown.
 _BETTER: Mapping[str, Literal["less", "more", "nearer"]] = {
     "truth.overall.errors.*.rmse": "less",
+    "multi_object.gospa.in_sight_rms_m": "less",
     "multi_object.gospa.rms_m": "less",
     "consistency.position_nees.mean": "nearer",
     "consistency.state_nees.mean": "nearer",
     "consistency.nis.*.mean": "nearer",
     "lagged.*.errors.*.rmse": "less",
+    "truth.overall.tracked_share_in_sight": "more",
     "truth.overall.tracked_share": "more",
     "truth.overall.breaks": "less",
     "truth.overall.id_switches": "less",
@@ -35,7 +37,7 @@ _BETTER: Mapping[str, Literal["less", "more", "nearer"]] = {
     "multi_object.hota.hota": "more",
 }
 
-_INTERVALS = "t intervals of the paired differences over the seeds; tie: 0 is inside, against the best"
+_INTERVALS = "t intervals of paired differences over seeds; tie with the best: 0 is inside"
 _MOST_ROWS = 40
 _NAMES = ("metric", "estimator", "seeds", "mean", "worse_by", "low", "high", "standing")
 _POSITION_DOF = 2.0

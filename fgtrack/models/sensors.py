@@ -73,6 +73,9 @@ class SensorModel:
     """Use a detection's own covariance where the message carries one."""
     max_range_m: float | None = None
     """A detection further from the sensor than this is out of bounds: beyond it clutter outweighs objects."""
+    view_range_m: float | None = None
+    """How far it sees, where that is less than `max_range_m`; the evaluation alone asks, no detection is out of bounds
+    by it."""
     max_range_behind_m: float | None = None
     """How far it sees in the half behind it, where that is less; the evaluation alone asks."""
     field_of_view_rad: float = math.tau
@@ -97,7 +100,7 @@ class SensorModel:
                 raise ValueError(f"std.{name}: must be positive and finite, is {value}")
         if ("x_m" in self.std) != ("y_m" in self.std):
             raise ValueError("std: x_m and y_m are measured together")
-        for name in ("yaw_from_map_std_rad", "max_delay_s", "max_range_m", "max_range_behind_m"):
+        for name in ("yaw_from_map_std_rad", "max_delay_s", "max_range_m", "view_range_m", "max_range_behind_m"):
             value = getattr(self, name)
             if value is not None and not value > 0.0:
                 raise ValueError(f"{name}: must be positive, is {value}")
@@ -127,7 +130,7 @@ class SensorModel:
             direction_range[..., 1],
             direction_range[..., 0] - yaw_rad - mount.yaw_rad,
             self.field_of_view_rad,
-            max_range_m=math.inf if self.max_range_m is None else self.max_range_m,
+            max_range_m=min((m for m in (self.max_range_m, self.view_range_m) if m is not None), default=math.inf),
             max_range_behind_m=self.max_range_behind_m,
         )
 

@@ -27,7 +27,8 @@ AssociationConfig = Annotated[GatedEuclidean | GatedMahalanobis | UngatedEuclide
 BirthConfig = Annotated[MeasuredBirth | FixedBirth, Discriminator("kind")]
 _Weight = Annotated[float, Field(gt=0.0, le=1.0)]
 
-#: The sensors of the paper, table II; LiDAR clusters and RADAR detections measure no yaw, the map gives it.
+#: The sensors of the paper, table II; LiDAR clusters and RADAR detections measure no yaw, the map gives it. Their
+#: ranges are those of section III-H; the paper has one RADAR, in front, and does not give its field of view.
 PAPER_SENSORS: Mapping[str, SensorModel] = MappingProxyType(
     {
         "lidar": SensorModel(
@@ -36,9 +37,16 @@ PAPER_SENSORS: Mapping[str, SensorModel] = MappingProxyType(
             counter_init=5,
             counter_add=2,
             ages="short_range",
+            view_range_m=98.0,
+            max_range_behind_m=57.0,
         ),
         "lidar_cluster": SensorModel(
-            std={"x_m": 0.3, "y_m": 0.3}, yaw_from_map_std_rad=0.35, max_delay_s=0.4, ages="short_range"
+            std={"x_m": 0.3, "y_m": 0.3},
+            yaw_from_map_std_rad=0.35,
+            max_delay_s=0.4,
+            ages="short_range",
+            view_range_m=98.0,
+            max_range_behind_m=57.0,
         ),
         "radar": SensorModel(
             std={"x_m": 3.0, "y_m": 3.0, "speed_mps": 0.2},
@@ -48,6 +56,8 @@ PAPER_SENSORS: Mapping[str, SensorModel] = MappingProxyType(
             counter_add=2,
             ages="long_range",
             stamp_from="objects_mean",
+            view_range_m=105.0,
+            field_of_view_rad=1.57,
         ),
     }
 )

@@ -55,4 +55,4 @@ def as_scenes(objects: Positions, tracks: Positions, count: int) -> Scenes:
         block[:, ids] = np.linalg.norm(tracks.xy[tick][:, None] - xy, axis=-1)
         blocks.append(block)
     tick_index = np.repeat(np.arange(len(blocks)), [len(block) for block in blocks])
-    return Scenes(tick_index, np.concatenate(tracks.ids), np.concatenate(blocks), present)
+    return Scenes(tick_index, np.concatenate(tracks.ids), np.concatenate(blocks), present, present)

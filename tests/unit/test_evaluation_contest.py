@@ -74,8 +74,10 @@ def test_without_the_tie_the_best_is_best(trio: list[Run]) -> None:
 
 
 def test_gospa_is_that_of_the_metrics(trio: list[Run]) -> None:
-    found = quantities_of(contest_of(trio))["gospa_rms_m"]
-    expected = {one.label: one.metrics.multi_object.gospa.rms_m for one in judged(trio) if one.metrics.multi_object}
+    found = quantities_of(contest_of(trio))["gospa_in_sight_rms_m"]
+    expected = {
+        one.label: one.metrics.multi_object.gospa.in_sight_rms_m for one in judged(trio) if one.metrics.multi_object
+    }
     assert {entry.run: entry.value for entry in found.entries} == pytest.approx(expected)
     assert found.entries[-1].run == "0"
 
@@ -111,7 +113,7 @@ def test_nothing_in_common_is_said(tmp_path: Path) -> None:
     first = write_run(tmp_path / "first", tracks, truth=truth)
     found = compare([first, a_run(tmp_path / "last", NOISE_M, first=100)])
     assert "never track the same object at the same stamp" in found.verdict[0]
-    assert set(found["differences"]["quantity"].tolist()) == {"gospa_rms_m"}
+    assert set(found["differences"]["quantity"].tolist()) == {"gospa_in_sight_rms_m"}
 
 
 def test_the_same_runs_give_the_same_bits(trio: list[Run]) -> None:

@@ -93,14 +93,14 @@ def test_the_cut_off_is_the_gate_unless_it_is_set(story: Run) -> None:
 
 
 def test_a_pair_at_the_cut_off_is_a_miss_and_a_false_track() -> None:
-    there = Scenes(np.array([0]), np.array([1]), np.array([[2.0]]), np.array([[True]]))
+    there = Scenes(np.array([0]), np.array([1]), np.array([[2.0]]), np.array([[True]]), np.array([[True]]))
     at, inside = gospa(there, 2.0), gospa(there, 2.0 + 1e-9)
     assert (at.localisation_m2[0], at.missed_m2[0], at.false_m2[0]) == (0.0, 2.0, 2.0)
     assert (inside.localisation_m2[0], inside.missed_m2[0], inside.false_m2[0]) == (4.0, 0.0, 0.0)
 
 
 def test_without_a_tick_gospa_is_no_number() -> None:
-    empty = Scenes(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 1)), np.zeros((0, 1), bool))
+    empty = Scenes(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 1)), *[np.zeros((0, 1), bool)] * 2)
     assert math.isnan(Gospa.of(gospa(empty, C_M), C_M).rms_m)
 
 
@@ -175,13 +175,13 @@ def test_identity_and_hota_of_a_run_are_what_can_be_counted(story: Run) -> None:
 
 def test_a_pair_at_the_gate_counts_and_one_beyond_it_does_not() -> None:
     for distance_m, pairs in ((GATE_M, 1), (GATE_M + 1e-6, 0)):
-        there = Scenes(np.array([0]), np.array([1]), np.array([[distance_m]]), np.array([[True]]))
+        there = Scenes(np.array([0]), np.array([1]), np.array([[distance_m]]), np.array([[True]]), np.array([[True]]))
         assert Clear.of(there, GATE_M).pairs == pairs
         assert Identity.of(Frames.of(there, GATE_M)).idf1 == pairs
 
 
 def test_without_any_object_scores_are_no_numbers() -> None:
-    there = Scenes(np.array([0]), np.array([1]), np.array([[np.inf]]), np.array([[False]]))
+    there = Scenes(np.array([0]), np.array([1]), np.array([[np.inf]]), np.array([[False]]), np.array([[False]]))
     frames = Frames.of(there, GATE_M)
     scores = [
         Clear.of(there, GATE_M).mota,

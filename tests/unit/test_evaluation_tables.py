@@ -253,7 +253,7 @@ def test_the_tracking_table_has_errors_continuity_and_times(tables: Tables) -> N
             "along_rmse_m": 0.3 / math.sqrt(2.0),
             "across_rmse_m": 0.4 / math.sqrt(2.0),
             **dict.fromkeys(("yaw_rmse_rad", "speed_rmse_mps", "breaks", "id_switches", "false_tracks"), 0.0),
-            "tracked_share": 1.0,
+            **dict.fromkeys(("tracked_share", "tracked_share_in_sight"), 1.0),
             "precision": 1.0,
             "num_tracks": 2,
             "num_confirmed": 2,
@@ -288,7 +288,10 @@ def test_the_multi_object_table_has_gospa_scores_switches_and_the_time_to_confir
     table = comparison({"run": evaluate(run), "plain": evaluate(write_run(tmp_path / "plain", tracks))})["multi_object"]
     # GOSPA^2 = 2.75^2 + 12.5 + 12.5 at every tick; MOTA 1 - (4 + 4 + 1) / 8; IDF1 2 * 2 / (8 + 8)
     # a similarity of 0.725 passes 14 of 19 bounds: DetA 14/19 * 4/12, AssA 14/19 * 1/2, HOTA 14/19 sqrt(1/6)
-    assert rows_of(table) == ["run 5.71 2.75 3.54 3.54 -12.5 25.0 30.1 24.6 36.8 1/1 0.060", f"plain{' -' * 11}"]
+    assert rows_of(table) == [
+        "run 5.71 2.75 3.54 3.54 0.000 5.71 -12.5 25.0 30.1 24.6 36.8 1/1 0.060",
+        f"plain{' -' * 13}",
+    ]
     assert (table["mota"][0], table["assa"][0]) == pytest.approx((-0.125, 7 / 19))
 
 

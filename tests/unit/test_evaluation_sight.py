@@ -1,0 +1,156 @@
+"""What some sensor could have seen, and that only this counts as missed."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluation_runs import START_NS, TICK_NS, update
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.types import EgoState, TickReport, TrackReport, TrackState, TrackStatus, TruthState
+from fgtrack.evaluation.comparison import compare
+from fgtrack.evaluation.matching import match
+from fgtrack.evaluation.metrics import evaluate
+from fgtrack.evaluation.sight import ego_poses, in_sight
+from fgtrack.evaluation.truth import true_paths
+from fgtrack.io.run import Run, RunWriter, load_run
+from fgtrack.pipeline.replay import replay_in_memory
+from fgtrack.pipeline.shipped import read_config, read_scenario
+from fgtrack.sim.simulate import simulate
+
+#: Front RADAR: 90 degrees, 100 m; LiDAR: all around, 50 m ahead, 20 m behind, mounted 2 m ahead of the frame.
+CONFIG = """
+sensors:
+  radar: {std: {x_m: 1.0, y_m: 1.0}, view_range_m: 100.0, field_of_view_rad: 1.5707963267948966}
+  lidar: {std: {x_m: 1.0, y_m: 1.0}, max_range_m: 50.0, max_range_behind_m: 20.0, mount: {x_m: 2.0}}
+  camera: {std: {bearing_rad: 0.1}}
+ego: {detection_origin_x_m: -1.0}
+"""
+
+#: Where the objects stand, relative to an ego that drives along +y.
+AHEAD_LEFT = {1: (90.0, 5.0), 2: (40.0, 30.0), 3: (20.0, 40.0), 4: (0.0, 60.0), 5: (-17.0, 0.0), 6: (-21.0, 0.0)}
+TICKS = 5
+
+
+def a_run(
+    folder: Path, sensors: Sequence[str] = ("radar", "lidar"), *, ego: bool = True, config_text: str = CONFIG
+) -> Run:
+    """Object 1 is tracked, the others are not; the ego moves by 1 m at every tick, and they with it."""
+    with RunWriter(folder, config_text) as writer:
+        for tick in range(TICKS):
+            now_ns = START_NS + tick * TICK_NS
+            if ego:
+                writer.write_ego(EgoState(now_ns, now_ns, 7.0, 1.0 * tick, math.pi / 2.0, 50.0))
+            for object_id, (ahead_m, left_m) in AHEAD_LEFT.items():
+                writer.write_truth(TruthState(now_ns, now_ns, object_id, 7.0 - left_m, tick + ahead_m))
+            state = TrackState(now_ns, np.array([2.0, tick + 90.0, math.pi / 2, 50.0, 0.0]), np.eye(5))
+            records = tuple(update(sensor, tick=tick) for sensor in sensors)
+            writer.write_tick(
+                TickReport(tick, now_ns, (TrackReport(1, TrackStatus.CONFIRMED, state, 9),), records), 1, 1
+            )
+        writer.finish({"estimator": "smoother"})
+    return load_run(folder)
+
+
+def seen(run: Run) -> list[int]:
+    """Objects in sight, which are the same at every tick."""
+    paths = true_paths(run.truth)
+    found = in_sight(run, paths, run.timing["now_ns"])
+    assert (found == found[0]).all()
+    return [path.object_id for path, is_seen in zip(paths, found[0], strict=True) if is_seen]
+
+
+def test_an_object_is_in_sight_of_the_sensors_that_were_heard(tmp_path: Path) -> None:
+    assert seen(a_run(tmp_path / "both")) == [1, 2, 3, 5]  # 5 is 18 m behind the LiDAR, 6 is 22 m
+    assert seen(a_run(tmp_path / "radar", ["radar"])) == [1, 2]  # 3 is 63 degrees to the left
+    assert seen(a_run(tmp_path / "lidar", ["lidar"])) == [2, 3, 5]
+
+
+def test_what_is_not_known_hides_nothing(tmp_path: Path) -> None:
+    everything = list(AHEAD_LEFT)
+    assert seen(a_run(tmp_path / "camera", ["radar", "camera"])) == everything
+    assert seen(a_run(tmp_path / "old", ego=False)) == everything
+    assert seen(a_run(tmp_path / "stranger", ["radar", "sonar"])) == everything
+    assert seen(a_run(tmp_path / "plain", config_text="")) == everything
+
+
+def test_a_damaged_configuration_is_told(tmp_path: Path) -> None:
+    damaged = CONFIG.replace("100.0", "far")
+    with pytest.raises(DataError, match=r"config\.yaml: sensors\.radar\.view_range_m"):
+        evaluate(a_run(tmp_path / "run", config_text=damaged))
+
+
+def test_only_objects_in_sight_count_as_missed(tmp_path: Path) -> None:
+    metrics = evaluate(a_run(tmp_path / "run"))
+    assert metrics.multi_object is not None
+    assert metrics.truth is not None
+    found, overall = metrics.multi_object.gospa, metrics.truth.overall
+    # c = 5: five objects are missed, three of them in sight; the pair is exact
+    assert found.missed_m2 == pytest.approx(5 * 12.5)
+    assert found.out_of_sight_m2 == pytest.approx(2 * 12.5)
+    assert found.in_sight_rms_m == pytest.approx(math.sqrt(3 * 12.5))
+    assert found.rms_m == pytest.approx(math.sqrt(5 * 12.5))
+    assert (overall.ticks_present, overall.ticks_in_sight, overall.ticks_tracked_in_sight) == (30, 20, 5)
+    assert metrics.as_dict()["truth"]["overall"]["tracked_share_in_sight"] == 0.25
+    table = compare(a_run(tmp_path / "again"))["multi_object"]
+    shown = {column.heading.split("\n")[0]: column.cells[0] for column in table.shown}
+    assert [shown[name] for name in ("GOSPA", "missed", "unseen", "with")] == ["6.12", "6.12", "5.00", "7.91"]
+
+
+def test_a_track_of_an_object_out_of_sight_is_no_false_one(tmp_path: Path) -> None:
+    run = a_run(tmp_path / "lidar", ["lidar"])  # object 1 is tracked and out of its sight
+    metrics = evaluate(run)
+    assert metrics.multi_object is not None
+    assert metrics.multi_object.gospa.false_m2 == 0.0
+    assert metrics.multi_object.gospa.out_of_sight_m2 == pytest.approx(2 * 12.5)
+
+
+def test_where_nothing_is_hidden_all_of_gospa_is_in_sight(tmp_path: Path) -> None:
+    found = evaluate(a_run(tmp_path / "old", ego=False)).multi_object
+    assert found is not None
+    assert found.gospa.in_sight_rms_m == found.gospa.rms_m
+    assert found.gospa.out_of_sight_m2 == 0.0
+
+
+def test_the_path_of_the_ego_is_linear_between_its_stamps_in_any_order_and_turns_the_short_way(tmp_path: Path) -> None:
+    with RunWriter(tmp_path / "run") as writer:
+        for stamp_ns, x_m, yaw_rad in [(20, 2.0, -3.1), (0, 0.0, 3.1), (10, math.nan, 0.0), (20, 9.0, 0.0)]:
+            writer.write_ego(EgoState(stamp_ns, 30, x_m, 5.0, yaw_rad, 0.0))
+        writer.finish({})
+    poses = ego_poses(load_run(tmp_path / "run").ego, np.array([-5, 0, 10, 20, 99]))
+    assert poses is not None
+    assert poses[:, 0].tolist() == pytest.approx([0.0, 0.0, 1.0, 2.0, 2.0])
+    assert poses[2, 2] == pytest.approx(math.pi)
+    assert ego_poses(load_run(tmp_path / "run").ego.where(np.zeros(4, bool)), np.array([0])) is None
+
+
+def test_the_shipped_configuration_sees_what_the_sensors_of_the_default_scenario_see() -> None:
+    """Simulated sensors that never miss: what they detect is in sight, and what is in sight they detect."""
+    scenario = read_scenario("default", duration_s=12.0)
+    perfect = [
+        replace(
+            sensor,
+            **dict.fromkeys(("outlier_probability", "split_probability", "jitter_s"), 0.0),
+            detection_probability=1.0,
+            std=dict.fromkeys(sensor.std, 0.0),
+            clutter=replace(sensor.clutter, mean_per_scan=0.0),
+            drop_outs=(),
+        )
+        for sensor in scenario.sensors
+    ]
+    messages = simulate(replace(scenario, sensors=tuple(perfect)), np.random.default_rng(1))
+    run, _ = replay_in_memory(messages, read_config("smoother", track_map="oval", estimator="ekf-replay"))
+    paths = true_paths(run.truth)
+    matching = match(run)
+    assert matching is not None
+    for sensor in perfect:
+        scans = [message for message in messages if getattr(message, "sensor", "") == sensor.name]
+        stamps_ns = np.array([scan.stamp_ns for scan in scans])
+        counts = [len(scan.objects) for scan in scans]
+        only = replace(run, updates=run.updates.where(run.updates["sensor"] == sensor.name))
+        found = in_sight(only, paths, stamps_ns)
+        assert (found.sum(axis=1) == counts).mean() > 0.97, sensor.name  # they may differ at the edges of the view
+        assert 0 < found.sum() < found.size
