@@ -93,6 +93,10 @@ class Claims:
     one that does has to initiate, too."""
     bank: bool = False
     """Whether the entry makes the estimators of all objects together."""
+    solves: Literal["", "ekf", "least squares"] = ""
+    """Of which equations an estimate in a nonlinear model is the solution: those of the extended Kalman filter in the
+    order of the stamps, or, at convergence, those of least squares over all states. `fgtrack verify` holds it to
+    them; empty for others."""
 
     @classmethod
     def of(cls, factory: Factory) -> "Claims":

@@ -42,6 +42,7 @@ def _claim(factory: Callable[..., FixedLagSmoother], rounding: float, tolerance:
     vars(factory).update(
         exact="any lag, any number",
         nonlinear="at convergence",
+        solves="least squares",
         smooths=True,
         initiates=True,
         tolerance=tolerance,
