@@ -75,6 +75,11 @@ class FixedLagSmoother:
         """How often the graph was built anew after a failed update."""
         return self._window.num_rebuilt
 
+    @property
+    def num_damped(self) -> int:
+        """How often a step went too far and was taken again with damping."""
+        return self._window.num_damped
+
     def advance(self, now_ns: int) -> None:
         """See `Estimator.advance`; the nodes that leave are marginalised at the next update."""
         self._clock_ns = max(self._clock_ns, now_ns)
@@ -99,6 +104,7 @@ class FixedLagSmoother:
             return [r if r.innovation is None else UpdateResult(UpdateStatus.FAILED) for r in results]
         if self._sought:
             self._initiate(min(measurement.stamp_ns for measurement in fusible))
+        self._window.damp()
         self._window.iterate(self._settings.max_iterations - 1)
         return results
 

@@ -1,16 +1,19 @@
 """The graph of one object's window: nodes, segments and measurement terms, and the solver behind them."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from itertools import pairwise
 
 import gtsam
 import numpy as np
 
+from fgtrack.core.linalg import mahalanobis_squared
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.ekf import predict_one, propagated
 from fgtrack.estimation.factor_graph.backends.base import Backend, Change, Marginalised
+from fgtrack.estimation.factor_graph.backends.batch import BatchBackend
 from fgtrack.estimation.factor_graph.backends.incremental import FIRST_KEY
 from fgtrack.estimation.factor_graph.chain import Chain, Node
 from fgtrack.estimation.factor_graph.factors import measurement_factor, motion_factor, prior_factor
@@ -18,11 +21,13 @@ from fgtrack.estimation.factor_graph.marginalised_past import MarginalisedPast, 
 from fgtrack.estimation.initiation import Fix, Line, along, fix_of
 from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.smoother_settings import SmootherSettings
-from fgtrack.estimation.terms import MeasurementTerm, curved
+from fgtrack.estimation.terms import MeasurementTerm, curved, linearised
 from fgtrack.models.motion import MotionModel
 
 #: A step of a state, in m, rad, m/s or rad/s, that is rounding.
 _AT_REST = 1e-7
+#: A step that linearisation mistakes by more than this many standard deviations of a measurement went too far.
+_LINEAR_STD = 1.0
 _BROKEN = (RuntimeError, ValueError, IndexError, np.linalg.LinAlgError)
 
 
@@ -63,6 +68,8 @@ class Window:
         self._states: dict[int, tuple[FloatArray, FloatArray]] = {}
         self.num_rebuilt = 0
         """How often the graph was built anew after a failed update."""
+        self.num_damped = 0
+        """How often a step went too far and was taken again with damping."""
         self._rebuild({FIRST_KEY: prior.mean})
 
     @property
@@ -147,6 +154,20 @@ class Window:
         weights = np.hstack([inner.Lambda, inner.Psi])
         return inner.mean, propagated(weights, self._covariance(node, right), inner.Sigma)
 
+    def damp(self) -> None:
+        """Solve again by Levenberg-Marquardt where the last step went beyond what its linearisation is good for.
+
+        A Gauss-Newton step has no limit: while bearings hardly show the range, it can send an object kilometres away,
+        where their gradient vanishes and no further step leads back.
+        """
+        if not self._curved or self._backend.damped or not any(_overshot(*move) for move in self._moved()):
+            return
+        origins = {node.key: node.origin for node in self._chain.nodes}
+        with suppress(*_BROKEN):  # then the origins remain
+            self._rebuild(origins, BatchBackend)
+        self._rebuild(self._estimates())
+        self.num_damped += 1
+
     def iterate(self, max_iterations: int) -> None:
         """Take Gauss-Newton steps while a state is further than a threshold from its linearisation point."""
         for _ in range(max_iterations):
@@ -196,10 +217,12 @@ class Window:
         self._past = MarginalisedPast(self._motion, self._first_ns, Prior(mean, prior.covariance))
         self._rebuild(means)
 
-    def _rebuild(self, means: Mapping[int, FloatArray]) -> None:
-        """Build the graph anew from the window's own records, near `means` by key."""
+    def _rebuild(
+        self, means: Mapping[int, FloatArray], make_backend: Callable[[FloatArray], Backend] | None = None
+    ) -> None:
+        """Build the graph anew from the window's own records, near `means` by key, if wanted in another backend."""
         nodes = self._chain.nodes
-        self._backend, self._anchored = self._make_backend(self._thresholds), False
+        self._backend, self._anchored = (make_backend or self._make_backend)(self._thresholds), False
         segments = list(pairwise(nodes))
         for node in nodes:
             node.origin = means[node.key]
@@ -296,3 +319,14 @@ class Window:
         self._means.clear()
         self._covariances.clear()
         self._states.clear()
+
+
+def _overshot(node: Node, mean: FloatArray) -> bool:
+    """Whether the step of `node` from its linearisation point to `mean` left a measurement's linear range."""
+    for term in node.terms:
+        if isinstance(term, Measurement) and not term.model.linear:
+            y, H, R = linearised(term, node.origin)
+            missed = term.model.residual(linearised(term, mean).y, y - H @ (mean - node.origin))
+            if mahalanobis_squared(missed, R) > _LINEAR_STD**2:
+                return True
+    return False

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import gtsam
 
@@ -41,6 +41,9 @@ class Backend(Protocol):
     A variable whose estimate is further than a threshold from its linearisation point is relinearised there at the
     next update, until it takes part in the prior of what was marginalised.
     """
+
+    damped: ClassVar[bool]
+    """Whether no step makes the fit worse."""
 
     def update(self, change: Change) -> list[int]:
         """Apply `change` and solve; gives the slots of `change.factors`, in order.

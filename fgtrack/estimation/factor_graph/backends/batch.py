@@ -1,6 +1,7 @@
 """The slow check: Levenberg-Marquardt on the whole window at every update."""
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import gtsam
 import numpy as np
@@ -19,6 +20,8 @@ class BatchBackend:
         An entry of a state that moves further than this is relinearised, shape (n,); see `SmootherSettings`. It is the
         process noise that follows these points: all else is linearised at every step.
     """
+
+    damped: ClassVar[bool] = True
 
     def __init__(self, thresholds: FloatArray) -> None:
         self._thresholds = thresholds

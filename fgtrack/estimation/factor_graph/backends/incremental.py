@@ -1,7 +1,7 @@
 """The default backend: gtsam's incremental fixed-lag smoother on iSAM2."""
 
 from collections.abc import Sequence
-from typing import SupportsFloat, SupportsIndex, SupportsInt
+from typing import ClassVar, SupportsFloat, SupportsIndex, SupportsInt
 
 import gtsam
 
@@ -26,6 +26,8 @@ class IncrementalBackend:
     thresholds
         An entry of a state that moves further than this is relinearised, shape (n,); see `SmootherSettings`.
     """
+
+    damped: ClassVar[bool] = False
 
     def __init__(self, thresholds: FloatArray) -> None:
         params = gtsam.ISAM2Params()

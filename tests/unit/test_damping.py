@@ -1,0 +1,72 @@
+"""Steps of the smoother that go further than their linearisation holds are taken again with damping."""
+
+import numpy as np
+import pytest
+
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother
+from fgtrack.estimation.factor_graph.window import Window
+from fgtrack.estimation.smoother_settings import SmootherSettings
+from fgtrack.models.measurement import SensorPose, measurement_model
+from fgtrack.models.motion import CV
+
+STD_RAD, RANGE_STD_M, STEP_S = np.deg2rad(0.1), 60.0, 0.2
+MOTION = CV(velocity_density_m2ps3=0.05)
+MODEL = measurement_model(("bearing_rad",), MOTION)
+SETTINGS = SmootherSettings(lag_s=20.0, lagged_s=(), final=False)
+
+
+def heard(rng: np.random.Generator) -> tuple[list[Measurement], FloatArray]:
+    """Bearings of an object 100 m away, give or take 60 m, from an observer that turns after 5 s; where it is last."""
+    x = np.array([max(100.0 + RANGE_STD_M * rng.standard_normal(), 10.0), 0.0, *(10.0 * rng.standard_normal(2))])
+    place, found = np.zeros(2), []
+    for k in range(51):
+        pose = SensorPose(float(place[0]), float(place[1]))
+        z = MODEL.predict(x, pose) + STD_RAD * rng.standard_normal(1)
+        found.append(Measurement(round(k * STEP_S * NS_PER_S), MODEL, z, np.array([[STD_RAD**2]]), pose))
+        last, x = x, MOTION.predict(x, STEP_S)
+        course_rad = np.interp(k * STEP_S, [5.0, 7.0], [0.0, 0.5 * np.pi])
+        place = place + 20.0 * STEP_S * np.array([np.cos(course_rad), np.sin(course_rad)])
+    return found, last
+
+
+def tracked(measurements: list[Measurement], **backend: object) -> FixedLagSmoother:
+    spread = np.diag([RANGE_STD_M**2, (100.0 * STD_RAD) ** 2])
+    start = Start(position_m=(100.0, 0.0), position_covariance=spread, speed_std_mps=10.0)
+    one = FixedLagSmoother(MOTION, start, SETTINGS, **backend)  # type: ignore[arg-type]  # nothing or a factory
+    for measurement in measurements[1:]:
+        one.update(measurement)
+    return one
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_bearings_alone_lead_where_levenberg_marquardt_does(seed: int) -> None:
+    measurements, truth = heard(np.random.default_rng(seed))
+    one, other = tracked(measurements), tracked(measurements, make_backend=BatchBackend)
+    state, slow = (it.state_at(measurements[-1].stamp_ns) for it in (one, other))
+    std = np.sqrt(np.diag(slow.covariance))
+    assert np.abs((state.mean - slow.mean) / std).max() < 0.1
+    d = state.mean - truth
+    assert d @ np.linalg.solve(state.covariance, d) < 23.5  # one in ten thousand
+    assert other.num_damped == 0
+
+
+def test_without_damping_some_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    def worst_m() -> float:
+        return max(
+            float(np.hypot(*(tracked(measurements).state_at(measurements[-1].stamp_ns).mean - truth)[:2]))
+            for measurements, truth in (heard(np.random.default_rng(seed)) for seed in range(4))
+        )
+
+    damped_m = worst_m()
+    monkeypatch.setattr(Window, "damp", lambda self: None)
+    assert worst_m() > 1000.0 > 20.0 > damped_m
+
+
+def test_positions_need_none() -> None:
+    model = measurement_model(("x_m", "y_m"), MOTION)
+    fixes = [Measurement(k * NS_PER_S, model, np.array([5.0 * k, 1.0]), np.eye(2)) for k in range(5)]
+    assert tracked(fixes).num_damped == 0
+    assert sum(tracked(heard(np.random.default_rng(seed))[0]).num_damped for seed in range(4)) > 0
