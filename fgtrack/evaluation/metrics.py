@@ -161,7 +161,11 @@ def evaluate(run: Run, options: EvaluationConfig | None = None) -> Metrics:
     Without `options` it is judged as its configuration says.
     """
     options = options or evaluation_config(run)
-    matching = match(run, options)
+    return evaluate_matched(run, match(run, options), options)
+
+
+def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationConfig) -> Metrics:
+    """Metrics of `run`, whose `match` by these `options` is known."""
     ids = run.tracks["track_id"]
     confirmed = run.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS
     busy = run.timing["num_detections"] > 0

@@ -12,7 +12,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.types import IntArray
 from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
 from fgtrack.evaluation.matching import Matching, match, recorded, scenes
-from fgtrack.evaluation.metrics import Metrics, evaluate
+from fgtrack.evaluation.metrics import Metrics, evaluate_matched
 from fgtrack.evaluation.multi_object import GospaParts, gospa
 from fgtrack.io.run import EvaluationConfig, Run, evaluation_config, is_run_folder, load_run
 
@@ -28,7 +28,7 @@ class JudgedRun:
     @cached_property
     def matching(self) -> Matching | None:
         """Pairs of tracks and true objects; None for a run without truth."""
-        return match(self.run)
+        return match(self.run, self.options)
 
     @cached_property
     def options(self) -> EvaluationConfig:
@@ -57,7 +57,7 @@ class JudgedRun:
     @cached_property
     def metrics(self) -> Metrics:
         """All metrics, judged as the run's configuration says."""
-        return evaluate(self.run)
+        return evaluate_matched(self.run, self.matching, self.options)
 
 
 OneRun = Run | JudgedRun | Path | str

@@ -7,7 +7,7 @@ from fgtrack.evaluation.contest import Contest, Entry, Quantity
 from fgtrack.evaluation.differences import two_digits
 from fgtrack.evaluation.lagged import WINDOW
 from fgtrack.evaluation.metrics import Metrics
-from fgtrack.evaluation.paired import Estimate
+from fgtrack.evaluation.paired import UNKNOWN, Estimate
 from fgtrack.evaluation.statistics import ChiSquareMean
 from fgtrack.evaluation.tables import short
 
@@ -29,6 +29,8 @@ class _Square:
     mean: float
     expected: float
     is_far_off: bool
+    interval: Estimate = UNKNOWN
+    """Of the mean, where the values are correlated."""
 
 
 def verdict(metrics: Mapping[str, Metrics], contests: Sequence[Contest]) -> tuple[str, ...]:
@@ -104,11 +106,11 @@ def _noise(metrics: Mapping[str, Metrics]) -> Iterator[str]:
         small = [square.mean > square.expected for square in off]
         size = "too small" if all(small) else "partly too small, partly too large" if any(small) else "too large"
         yield (
-            f"The configured noise is {size}: {_named(off)} ({label}). "
+            f"The configured noise is {size} (judged by {label}): {_named(off)}. "
             "Fit it with `fgtrack tune` and compare again; the order of the runs may change."
         )
         return
-    yield f"The noise fits: {_named(found)} ({label})."
+    yield f"The noise fits (judged by {label}): {_named(found)}."
     for other, its in others:
         wrong = [square for square in _squares(its) if square.is_far_off]
         if wrong:
@@ -116,7 +118,13 @@ def _noise(metrics: Mapping[str, Metrics]) -> Iterator[str]:
 
 
 def _named(squares: Sequence[_Square]) -> str:
-    return ", ".join(f"{one.name} {short(one.mean)} (expected {one.expected:.3g})" for one in squares)
+    return ", ".join(map(_text, squares))
+
+
+def _text(square: _Square) -> str:
+    interval = square.interval
+    known = f", 95 % interval {two_digits(interval.low)} to {two_digits(interval.high)}" if interval.is_known else ""
+    return f"{square.name} {short(square.mean)} (expected {square.expected:.3g}{known})"
 
 
 def _squares(one: Metrics) -> Iterator[_Square]:
@@ -124,7 +132,7 @@ def _squares(one: Metrics) -> Iterator[_Square]:
     nees, interval = one.consistency.position_nees, one.consistency.position_nees_interval
     if nees.count:
         outside = interval.low > nees.dof or interval.high < nees.dof
-        yield _Square("NEES of the position", nees.mean, nees.dof, outside and _is_far(nees))
+        yield _Square("NEES of the position", nees.mean, nees.dof, outside and _is_far(nees), interval)
     for sensor, nis in one.consistency.nis.items():
         if nis.count >= _FEWEST:
             yield _Square(f"NIS of {sensor}", nis.mean, nis.dof, _is_far(nis))

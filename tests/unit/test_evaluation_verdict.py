@@ -91,20 +91,26 @@ def test_noise_that_does_not_fit_is_named_with_its_cure(plain: Metrics) -> None:
     found = contest(a=None, b=Estimate(0.2, 0.1, 0.3, 9))
     (_, noise) = verdict(metrics_of(plain, a=TOO_SMALL, b=TOO_SMALL), [found])
     assert noise == (
-        "The configured noise is too small: NEES of the position 13.4 (expected 2), NIS of radar 26.5 (expected 4) "
-        "(a). Fit it with `fgtrack tune` and compare again; the order of the runs may change."
+        "The configured noise is too small (judged by a): NEES of the position 13.4 "
+        "(expected 2, 95 % interval 9.0 to 18), NIS of radar 26.5 (expected 4). "
+        "Fit it with `fgtrack tune` and compare again; the order of the runs may change."
     )
     large = replace(FITS, nis={"radar": ChiSquareMean(500, 1.0, 4.0)})
     both = replace(TOO_SMALL, nis=large.nis)
-    assert "too large: NIS of radar" in verdict(metrics_of(plain, a=large), [])[0]
+    assert "too large (judged by a): NIS of radar" in verdict(metrics_of(plain, a=large), [])[0]
     assert "partly too small, partly too large" in verdict(metrics_of(plain, a=both), [])[0]
 
 
 def test_noise_that_fits_is_said_too_and_who_does_not_fit_it(plain: Metrics) -> None:
     found = contest(b=None, a=Estimate(0.2, 0.1, 0.3, 9))
     _, fits, not_so = verdict(metrics_of(plain, a=TOO_SMALL, b=FITS), [found])
-    assert fits == "The noise fits: NEES of the position 2.10 (expected 2), NIS of radar 4.20 (expected 4) (b)."
-    assert not_so == "Not so of a: NEES of the position 13.4 (expected 2), NIS of radar 26.5 (expected 4)."
+    assert fits == (
+        "The noise fits (judged by b): NEES of the position 2.10 (expected 2, 95 % interval 1.8 to 2.4), "
+        "NIS of radar 4.20 (expected 4)."
+    )
+    assert not_so.startswith(
+        "Not so of a: NEES of the position 13.4 (expected 2, 95 % interval 9.0 to 18), NIS of radar"
+    )
 
 
 def test_a_large_nees_that_may_be_chance_is_no_reason_to_tune(plain: Metrics) -> None:
