@@ -49,7 +49,7 @@ _ONE_POINT = {"initiation": "one-point"}
 
 #: From the published way to the smoother; the same words in every table.
 CONTESTANTS: Mapping[str, Contestant] = {
-    "forgets": Contestant("rewind-forget"),
+    "forgets": Contestant("rewind-forget", options=_ONE_POINT),
     "EKF": Contestant("ekf-replay", options=_ONE_POINT),
     "EKF, initiated": Contestant("ekf-replay", options=_REGRESSION),
     "EKF, initiated, robust": Contestant("ekf-replay", HUBER, _REGRESSION),
