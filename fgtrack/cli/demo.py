@@ -21,7 +21,12 @@ from fgtrack.sim.simulate import simulate
 
 _SEED = 1
 _ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
-_LAGS = "smoother.lagged_s=[0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 0.9]"
+#: By what is added to the name of an estimator: the paper's noise, and noise that fits the simulation. With the lags
+#: of the lagged output; those of the last one are drawn.
+_SETTINGS = {
+    "": ("smoother", "smoother.lagged_s=[0.3, 0.5]"),
+    "-tuned": ("tuned", "smoother.lagged_s=[0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 0.9]"),
+}
 
 
 def demo(
@@ -30,32 +35,38 @@ def demo(
     ),
     overwrite: Overwrite = False,
 ) -> None:
-    """Simulate, record, replay with three estimators, compare, draw."""
+    """Simulate, record, replay with three estimators and two settings of the noise, compare, draw."""
     with claimed(out):
         bag, figures = out / "recording", out / "figures"
-        folders = {name: out / "runs" / name for name in _ESTIMATORS}
+        folders = {
+            setting: {name: out / "runs" / f"{name}{ending}" for name in _ESTIMATORS}
+            for ending, setting in _SETTINGS.items()
+        }
         check_output(bag, RECORDING, overwrite)
         check_output(figures, Kind("a folder", Path.is_dir), overwrite)
-        for folder in folders.values():
-            check_output(folder, RUN, overwrite)
+        for named in folders.values():
+            for folder in named.values():
+                check_output(folder, RUN, overwrite)
         with progress("simulate"):
             write_bag(bag, simulate(read_scenario("default"), np.random.default_rng(_SEED)), overwrite=overwrite)
-        config = read_config("smoother", [_LAGS], track_map=OVAL, pit_map=OVAL)
-        source = open_input(bag, config.input)
-        with progress("replay") as show:
-            results = replay_each(
-                source.messages,
-                config,
-                folders,
-                origin=str(bag),
-                kind=source.kind,
-                on_tick=TickProgress(show),
-                overwrite=overwrite,
-            )
-        runs = [load_run(result.path) for result in results]
+        runs = []
+        for (name, lags), named in folders.items():
+            config = read_config(name, [lags], track_map=OVAL, pit_map=OVAL)
+            source = open_input(bag, config.input)
+            with progress(f"replay, {name}") as show:
+                results = replay_each(
+                    source.messages,
+                    config,
+                    named,
+                    origin=str(bag),
+                    kind=source.kind,
+                    on_tick=TickProgress(show),
+                    overwrite=overwrite,
+                )
+            runs += [load_run(result.path) for result in results]
         console().print(written_tables(runs))
         with progress("draw"), new_files(figures, overwrite) as folder:
-            files = save_figures(runs, folder)
+            files = save_figures(runs[-len(_ESTIMATORS) :], folder)
         say(f"recording: {bag}\nruns: {out / 'runs'}")
         for file in files:
             say(f"figure: {figures / file.name}")
