@@ -1,5 +1,6 @@
 """`fgtrack demo`: the whole chain in a minute."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +10,9 @@ import typer
 from fgtrack.cli.arguments import Overwrite
 from fgtrack.cli.compare import written_tables
 from fgtrack.cli.show import TickProgress, console, progress, say
+from fgtrack.evaluation.comparison import compare
 from fgtrack.evaluation.plot import save_figures
+from fgtrack.evaluation.runs import judged
 from fgtrack.io.output import Kind, check_output, claimed, new_files
 from fgtrack.io.ros.bag_writer import RECORDING, write_bag
 from fgtrack.io.run import RUN, load_run
@@ -64,7 +67,15 @@ def demo(
                     overwrite=overwrite,
                 )
             runs += [load_run(result.path) for result in results]
-        console().print(written_tables(runs))
+        every = judged(runs)
+        for title, part in (
+            ("With the paper's noise", every[: len(_ESTIMATORS)]),
+            ("With fitted noise", every[-len(_ESTIMATORS) :]),
+        ):
+            say(f"{title}:")
+            for sentence in compare(*part).verdict:
+                say(f"  {sentence}")
+        console().print(replace(written_tables(every), verdict=()))
         with progress("draw"), new_files(figures, overwrite) as folder:
             files = save_figures(runs[-len(_ESTIMATORS) :], folder)
         say(f"recording: {bag}\nruns: {out / 'runs'}")

@@ -175,18 +175,22 @@ def test_the_demo_goes_from_scenario_to_figures(
     shown = fgtrack("demo", "-o", "demo")
     assert (shown.code, shown.err) == (0, "")
     assert (tmp_path / "demo/recording/metadata.yaml").exists()
-    names = ["smoother", "ekf-replay", "ekf-backward-forward"]
+    estimators = ["smoother", "ekf-replay", "ekf-backward-forward"]
+    names = [*estimators, *(f"{name}-tuned" for name in estimators)]
     found = {name: load_run(tmp_path / "demo/runs" / name) for name in names}
     assert {path.name for path in (tmp_path / "demo/runs").iterdir()} == set(names)
-    assert [one.meta["estimator"] for one in found.values()] == names
+    assert [one.meta["estimator"] for one in found.values()] == 2 * estimators
+    stds_mps = [one.config["sensors"]["radar"]["std"]["speed_mps"] for one in found.values()]
+    assert stds_mps[:3] == 3 * [0.2]
+    assert stds_mps[3:] == 3 * [pytest.approx(1.0, rel=0.1)]
     verdict, tables = shown.out.split("Tracking (errors")
-    assert "at the newest stamp" in verdict.split("Differences of runs")[0]
+    assert "at the newest stamp" in " ".join(verdict.split())
     for text in tables.split("Error against lag"):
         assert sorted(names, key=lambda name: text.index(f" {name} ")) == names
-    lags_s = found["smoother"].lagged["lag_s"].tolist()
+    lags_s = found["smoother-tuned"].lagged["lag_s"].tolist()
     assert sorted(set(lags_s)) == [0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 0.9]
-    assert found["smoother"].smoothed["kind"].tolist().count("lagged") == lags_s.count(0.1)
-    assert "final" in found["smoother"].smoothed["kind"]
+    assert found["smoother-tuned"].smoothed["kind"].tolist().count("lagged") == lags_s.count(0.1)
+    assert "final" in found["smoother-tuned"].smoothed["kind"]
     assert {path.name for path in (tmp_path / "demo/figures").iterdir()} >= {"error_against_lag.png", "timing.png"}
 
 
