@@ -20,6 +20,7 @@ from fgtrack.estimation.dense_joint import Difference, dense_joint, difference, 
 from fgtrack.estimation.registry import ESTIMATORS, EXACT, Claims, Factory, start_estimator
 from fgtrack.pipeline import verify_streams as streams
 from fgtrack.pipeline.oracle.estimates import Estimate
+from fgtrack.pipeline.oracle.posterior import most_probable
 from fgtrack.pipeline.verify_models import MODEL_TOLERANCE, model_differences
 from fgtrack.pipeline.verify_streams import Stream
 
@@ -175,6 +176,8 @@ def verify(rng: np.random.Generator, subjects: Mapping[str, Subject]) -> Certifi
             claims = replace(subjects["smoother"].claims, nonlinear="at once")
             configured = replace(subjects["smoother"], claims=claims, options={"ring_s": _RING_S})
             checks += _nonlinear(stream, "smoother (defaults)", configured, None)
+        if "smoother" in subjects and draw is streams.whole:
+            checks.append(_most_probable(stream, subjects["smoother"]))
     return Certificate(tuple(checks))
 
 
@@ -292,6 +295,17 @@ def _nonlinear(stream: Stream, name: str, subject: Subject, converged: float | N
             if not at_once:
                 add(order, "SciPy, as it grew", _from_oracle(run.before, oracle), GROWN_TOLERANCE)
     return checks
+
+
+def _most_probable(stream: Stream, smoother: Subject) -> Check:
+    """The smoother with objective `map`, at the nodes; means only, because a minimum has no covariance."""
+    subject = replace(smoother, options={**smoother.options, "objective": "map"})
+    estimator, sigma = subject.start(stream), np.sqrt(np.diag(stream.solution.covariance))
+    for place in stream.orders["random"]:
+        estimator.update(stream.measurements[place])
+    found = [estimator.state_at(stamp_ns).mean for stamp_ns in stream.problem.stamps_ns]
+    apart = np.abs(np.array(found) - most_probable(stream.problem)).ravel() / sigma
+    return Check(stream.name, "smoother (map)", "random", "SciPy", float(apart.max()), 0.0, 0, WHOLE_TOLERANCE)
 
 
 _Oracle = Callable[[int], Estimate | None]

@@ -12,6 +12,7 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.ekf import joseph, kalman_gain, propagated
+from fgtrack.estimation.factor_graph.following_noise import log_determinant, segment_rows
 from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.terms import EquivalentMeasurement, Linearised, MeasurementTerm, linearised
 from fgtrack.models.motion import MotionModel
@@ -44,10 +45,18 @@ class MarginalisedPast:
     When the oldest node leaves, its filtered state splits into the prior of the next node and a conditional
     p(x | x_right, everything up to x), as in smoothing. Both are exact in a linear model; else they are linearised
     at the node's mean when it left.
+
+    Parameters
+    ----------
+    motion, stamp_ns, prior
+        Motion model, and the first node.
+    follows
+        Whether the process noise counts as a function of the state (objective `map`).
     """
 
-    def __init__(self, motion: MotionModel, stamp_ns: int, prior: Prior) -> None:
+    def __init__(self, motion: MotionModel, stamp_ns: int, prior: Prior, follows: bool = False) -> None:
         self._motion = motion
+        self._follows = follows
         self._ring: list[Conditional] = []
         self._stamp_ns = stamp_ns
         self._origin = prior.mean
@@ -55,7 +64,7 @@ class MarginalisedPast:
 
     def copy(self) -> "MarginalisedPast":
         """An independent copy."""
-        other = MarginalisedPast(self._motion, self._stamp_ns, self.prior)
+        other = MarginalisedPast(self._motion, self._stamp_ns, self.prior, self._follows)
         other._ring, other._origin = list(self._ring), self._origin
         return other
 
@@ -70,15 +79,19 @@ class MarginalisedPast:
         `mean` and `next_mean`, shape (n,), are the two nodes' present estimates. Raises `numpy.linalg.LinAlgError` for
         a term that cannot be fused.
         """
+        dt_s = seconds(next_ns - self._stamp_ns)
+        step = self._motion.step(mean.tolist(), dt_s)
+        F, weighed = step.F, [_weighed(term, mean) for term in terms]
+        if self._follows:
+            F, noise = _following(self._motion, mean, next_mean, dt_s)
+            weighed.append(noise)
         filtered, P = self.prior.mean, self.prior.covariance
-        for term in terms:
-            y, H, R = _weighed(term, mean)
+        for y, H, R in weighed:
             K, _ = kalman_gain(P, H, R)
             filtered, P = filtered + K @ (y - H @ (filtered - mean)), joseph(P, K, H, R)
-        step = self._motion.step(mean.tolist(), seconds(next_ns - self._stamp_ns))
-        predicted = np.asarray(step.mean) + step.F @ (filtered - mean)
-        A, P_next = kalman_gain(P, step.F, step.Q)  # the next node measures F x + N(0, Q)
-        C = joseph(P, A, step.F, step.Q)
+        predicted = np.asarray(step.mean) + F @ (filtered - mean)
+        A, P_next = kalman_gain(P, F, step.Q)  # the next node measures F x + N(0, Q)
+        C = joseph(P, A, F, step.Q)
         b = filtered - mean + A @ (next_mean - predicted)
         if self._ring:
             left = self._ring[-1]
@@ -141,6 +154,15 @@ class MarginalisedPast:
         spread = joseph(left.C, gain, inner.Lambda, inner.Sigma)
         outer = Conditional(left.stamp_ns, left.mean, gain, left.b - gain @ b, spread)
         return [*self._ring[:place], outer], [Conditional(stamp_ns, inner.mean, A, b, C), *self._ring[place + 1 :]]
+
+
+def _following(
+    motion: MotionModel, mean: FloatArray, next_mean: FloatArray, dt_s: float
+) -> tuple[FloatArray, Linearised]:
+    """F of a segment whose noise follows its start, and what log det Q says about that start; see `segment_rows`."""
+    rows = segment_rows(motion, mean, next_mean, dt_s, log_determinant(motion, mean, dt_s))
+    noise = Linearised(-rows.value[-1:], rows.by_left[-1:], np.eye(1))
+    return -rows.root @ rows.by_left[:-1], noise
 
 
 def _weighed(term: MeasurementTerm, x: FloatArray) -> Linearised:

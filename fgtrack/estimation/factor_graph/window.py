@@ -16,7 +16,7 @@ from fgtrack.estimation.factor_graph.backends.base import Backend, Change, Margi
 from fgtrack.estimation.factor_graph.backends.batch import BatchBackend
 from fgtrack.estimation.factor_graph.backends.incremental import FIRST_KEY
 from fgtrack.estimation.factor_graph.chain import Chain, Node
-from fgtrack.estimation.factor_graph.factors import measurement_factor, motion_factor, prior_factor
+from fgtrack.estimation.factor_graph.factors import map_motion_factor, measurement_factor, motion_factor, prior_factor
 from fgtrack.estimation.factor_graph.marginalised_past import MarginalisedPast, Prior
 from fgtrack.estimation.initiation import Fix, Line, along, fix_of
 from fgtrack.estimation.interpolation import between
@@ -58,11 +58,12 @@ class Window:
         self._motion = motion
         self._settings = settings
         self._make_backend = make_backend
+        self._follows = settings.objective == "map" and not motion.linear
         self._thresholds = settings.thresholds(motion, curved=False)
         self._curved = False
         self._first_ns = stamp_ns
         self._chain = Chain(Node(stamp_ns, FIRST_KEY, prior.mean))
-        self._past = MarginalisedPast(motion, stamp_ns, prior)
+        self._past = MarginalisedPast(motion, stamp_ns, prior, self._follows)
         self._means: dict[int, FloatArray] = {}
         self._covariances: dict[tuple[int, ...], FloatArray] = {}
         self._states: dict[int, tuple[FloatArray, FloatArray]] = {}
@@ -214,7 +215,7 @@ class Window:
         mean = prior.mean.copy()
         if not self._motion.cartesian:
             mean[YAW] = means[nodes[0].key][YAW]
-        self._past = MarginalisedPast(self._motion, self._first_ns, Prior(mean, prior.covariance))
+        self._past = MarginalisedPast(self._motion, self._first_ns, Prior(mean, prior.covariance), self._follows)
         self._rebuild(means)
 
     def _rebuild(
@@ -286,7 +287,8 @@ class Window:
 
     def _segment(self, left: Node, right: Node) -> gtsam.NonlinearFactor:
         dt_s = seconds(right.stamp_ns - left.stamp_ns)
-        return motion_factor(self._motion, left.key, right.key, dt_s, left.origin)
+        make = map_motion_factor if self._follows else motion_factor
+        return make(self._motion, left.key, right.key, dt_s, left.origin)
 
     def _seconds(self, stamp_ns: int) -> float:
         return seconds(stamp_ns - self._first_ns)
