@@ -6,14 +6,15 @@ bootstrap over time (`fgtrack.evaluation.paired`).
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.consistency import position_nees
-from fgtrack.evaluation.matching import track_errors
+from fgtrack.evaluation.matching import scenes, track_errors
+from fgtrack.evaluation.multi_object import gospa
 from fgtrack.evaluation.paired import Estimate, by_stamp, within_run
 from fgtrack.evaluation.runs import JudgedRun
 
@@ -106,9 +107,9 @@ def _contest(group: Sequence[JudgedRun]) -> Contest:
     sums: dict[str, FloatArray] = {}
     for name in values[0] if len(common) else ():
         sums[name] = by_stamp(at_ns, np.stack([value[name][row] for value, row in zip(values, rows, strict=True)], -1))
-    gospa = _gospa_sums(group)
-    if gospa is not None:
-        sums["gospa_in_sight_rms_m"] = gospa
+    of_gospa = _gospa_sums(group)
+    if of_gospa is not None:
+        sums["gospa_in_sight_rms_m"] = of_gospa
     labels = tuple(one.label for one in group)
     return Contest(
         labels,
@@ -137,14 +138,25 @@ def _samples(group: Sequence[JudgedRun]) -> tuple[list[IntArray], IntArray, list
 
 
 def _gospa_sums(group: Sequence[JudgedRun]) -> FloatArray | None:
-    """Squared GOSPA in sight of every run, and 1, at the ticks that all have; None where it is not asked for."""
-    found = [one.gospa for one in group]
-    squares = [np.square(parts.in_sight_m) for parts in found if parts is not None]
-    if len(squares) < len(group):
+    """Squared GOSPA in sight of every run, and 1, at the ticks that all have; None where it is not asked for.
+
+    In sight is what a sensor of any run could see, so that all are measured alike; runs that do not know it are not
+    asked, unless none does.
+    """
+    matchings = [one.matching for one in group if one.matching is not None and one.options.multi_object]
+    if len(matchings) < len(group):
         return None
-    ticks_ns = [one.scored_ticks_ns for one in group]
-    common_ns = functools.reduce(np.intersect1d, ticks_ns)
-    columns = [square[np.searchsorted(ns, common_ns)] for square, ns in zip(squares, ticks_ns, strict=True)]
+    common_ns = functools.reduce(np.intersect1d, [one.scored_ticks_ns for one in group])
+    rows = [np.searchsorted(one.scored_ticks_ns, common_ns) for one in group]
+    there = [scenes(one.run, matching) for one, matching in zip(group, matchings, strict=True)]
+    asked = [k for k, matching in enumerate(matchings) if matching.is_sight_known] or list(range(len(group)))
+    seen = np.any([there[k].in_sight[rows[k]] for k in asked], axis=0)
+    columns = []
+    for one, scene, mine in zip(group, there, rows, strict=True):
+        in_sight = scene.in_sight.copy()
+        in_sight[mine] = seen
+        parts = gospa(replace(scene, in_sight=in_sight), one.options.gospa_cut_off_m)
+        columns.append(np.square(parts.in_sight_m[mine]))
     return np.stack([*columns, np.ones(len(common_ns))], axis=-1)
 
 

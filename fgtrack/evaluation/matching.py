@@ -42,6 +42,8 @@ class Matching:
     """Track paired with each object, shape (ticks, objects); `NO_TRACK` where none."""
     in_sight: BoolArray
     """Whether some sensor could see each object there, shape (ticks, objects), see `in_sight`."""
+    is_sight_known: bool
+    """Whether the sensors and the ego's path are known; else every object counts as seen."""
 
     @property
     def paired(self) -> BoolArray:
@@ -120,6 +122,7 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     track_ids[tick_index[paired], object_index[paired]] = tracks["track_id"][paired]
     true_states = np.full((tracks.num_rows, len(TRUE_STATE)), np.nan)
     true_states[paired] = candidates[paired, object_index[paired]]
+    seen, is_known = in_sight(run, paths, now_ns)
     return Matching(
         object_ids=tuple(path.object_id for path in paths),
         tracks=tracks,
@@ -130,7 +133,8 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
         tick_index=tick_index,
         present=_present(paths, now_ns),
         track_ids=track_ids,
-        in_sight=in_sight(run, paths, now_ns),
+        in_sight=seen,
+        is_sight_known=is_known,
     )
 
 

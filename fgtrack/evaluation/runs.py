@@ -11,9 +11,8 @@ import numpy as np
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import IntArray
 from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
-from fgtrack.evaluation.matching import Matching, match, recorded, scenes
+from fgtrack.evaluation.matching import Matching, match, recorded
 from fgtrack.evaluation.metrics import Metrics, evaluate_matched
-from fgtrack.evaluation.multi_object import GospaParts, gospa
 from fgtrack.io.run import EvaluationConfig, Run, evaluation_config, is_run_folder, load_run
 
 
@@ -41,13 +40,6 @@ class JudgedRun:
         if self.matching is None:
             return np.zeros(0, dtype=np.int64)
         return self.matching.now_ns[recorded(self.run, self.matching)]
-
-    @cached_property
-    def gospa(self) -> GospaParts | None:
-        """GOSPA at `scored_ticks_ns`; None without truth, and where it is not asked for."""
-        if self.matching is None or not self.options.multi_object:
-            return None
-        return gospa(scenes(self.run, self.matching), self.options.gospa_cut_off_m)
 
     @cached_property
     def lagged(self) -> tuple[LagMetrics, ...]:

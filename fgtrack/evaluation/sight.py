@@ -1,5 +1,6 @@
 """Which true objects some sensor could have seen, so that only these count as missed."""
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
@@ -19,12 +20,13 @@ def _models() -> TypeAdapter[dict[str, SensorModel]]:
     return TypeAdapter(dict[str, SensorModel])
 
 
-def in_sight(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
-    """Whether each object of `paths` is in range and in the field of view of a sensor at `now_ns`; shape (n, objects).
+def in_sight(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> tuple[BoolArray, bool]:
+    """Whether each object of `paths` is in range and in the field of view of a sensor at `now_ns`, shape (n, objects).
 
     Asked are the sensors that the run had detections of, as its configuration describes them, from the pose of the ego
-    that ego.csv gives (linear between its stamps). Nothing hides an object. Where the ego's path or the sensors are
-    not known, every object counts as seen; an object without truth is not seen.
+    that ego.csv gives (linear between its stamps). Nothing hides an object. Where the ego's path, a sensor or its range
+    and field of view are not known, every object counts as seen, and the second value is false; an object without
+    truth is not seen.
 
     Raises
     ------
@@ -35,13 +37,13 @@ def in_sight(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray
     present = np.asarray(np.isfinite(positions_m).all(axis=-1))
     sensors, poses = _sensors(run), ego_poses(run.ego, now_ns)
     if poses is None or not sensors:
-        return present
+        return present, False
     ego = run.config.get("ego") or {}
     origin_m = (float(ego.get("detection_origin_x_m", 0.0)), float(ego.get("detection_origin_y_m", 0.0)))
     positions_m[~present] = 0.0
     everywhere = np.broadcast_to(poses[:, None], (*present.shape, 3))
     seen = np.stack([sensor.sees(positions_m, everywhere, origin_m) for sensor in sensors])
-    return present & np.asarray(seen.any(axis=0))
+    return present & np.asarray(seen.any(axis=0)), all(map(_is_limited, sensors))
 
 
 def ego_poses(ego: Table, stamps_ns: IntArray) -> FloatArray | None:
@@ -55,6 +57,11 @@ def ego_poses(ego: Table, stamps_ns: IntArray) -> FloatArray | None:
     rows[:, 2] = np.unwrap(rows[:, 2])
     times, wanted = ((ns - at_ns[0]).astype(np.float64) for ns in (at_ns, stamps_ns))
     return np.stack([np.interp(wanted, times, column) for column in rows.T], axis=-1)
+
+
+def _is_limited(sensor: SensorModel) -> bool:
+    limits_m = (sensor.max_range_m, sensor.view_range_m, sensor.max_range_behind_m)
+    return any(limit_m is not None for limit_m in limits_m) or sensor.field_of_view_rad < math.tau
 
 
 def _sensors(run: Run) -> list[SensorModel]:

@@ -111,14 +111,24 @@ def _noise(metrics: Mapping[str, Metrics]) -> Iterator[str]:
         )
         return
     yield f"The noise fits (judged by {label}): {_named(found)}."
-    for other, its in others:
-        wrong = [square for square in _squares(its) if square.is_far_off]
-        if wrong:
-            yield f"Not so of {other}: {_named(wrong)}."
+    wrong = {other: [square for square in _squares(its) if square.is_far_off] for other, its in others}
+    runs = [other for other, squares in wrong.items() if squares]
+    if runs:
+        yield f"Not so of {_listed(runs)}: {_ranges([square for other in runs for square in wrong[other]])}."
 
 
 def _named(squares: Sequence[_Square]) -> str:
     return ", ".join(map(_text, squares))
+
+
+def _ranges(squares: Sequence[_Square]) -> str:
+    """The names of `squares`, each with its lowest and highest mean."""
+    texts = []
+    for name in dict.fromkeys(one.name for one in squares):
+        mine = [one for one in squares if one.name == name]
+        means = dict.fromkeys(short(of(one.mean for one in mine)) for of in (min, max))
+        texts.append(f"{name} {' to '.join(means)} (expected {mine[0].expected:.3g})")
+    return ", ".join(texts)
 
 
 def _text(square: _Square) -> str:

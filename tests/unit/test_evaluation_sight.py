@@ -58,7 +58,7 @@ def a_run(
 def seen(run: Run) -> list[int]:
     """Objects in sight, which are the same at every tick."""
     paths = true_paths(run.truth)
-    found = in_sight(run, paths, run.timing["now_ns"])
+    found, _ = in_sight(run, paths, run.timing["now_ns"])
     assert (found == found[0]).all()
     return [path.object_id for path, is_seen in zip(paths, found[0], strict=True) if is_seen]
 
@@ -108,6 +108,16 @@ def test_a_track_of_an_object_out_of_sight_is_no_false_one(tmp_path: Path) -> No
     assert metrics.multi_object.gospa.out_of_sight_m2 == pytest.approx(2 * 12.5)
 
 
+def test_runs_of_one_recording_are_measured_by_one_sight(tmp_path: Path) -> None:
+    """Where a run does not know what its sensors see, that of the other counts; else what any of them sees."""
+    knows, plain = a_run(tmp_path / "knows"), a_run(tmp_path / "plain", config_text="")
+    radar = replace(knows, updates=knows.updates.where(knows.updates["sensor"] == "radar"))
+    for other in (plain, radar):
+        table = compare([knows, replace(other, path=None)])["differences"]
+        mine = table.where(table["quantity"] == "gospa_in_sight_rms_m")
+        assert mine["value"].tolist() == pytest.approx([math.sqrt(3 * 12.5)] * 2)
+
+
 def test_where_nothing_is_hidden_all_of_gospa_is_in_sight(tmp_path: Path) -> None:
     found = evaluate(a_run(tmp_path / "old", ego=False)).multi_object
     assert found is not None
@@ -151,6 +161,7 @@ def test_the_shipped_configuration_sees_what_the_sensors_of_the_default_scenario
         stamps_ns = np.array([scan.stamp_ns for scan in scans])
         counts = [len(scan.objects) for scan in scans]
         only = replace(run, updates=run.updates.where(run.updates["sensor"] == sensor.name))
-        found = in_sight(only, paths, stamps_ns)
+        found, is_known = in_sight(only, paths, stamps_ns)
+        assert is_known
         assert (found.sum(axis=1) == counts).mean() > 0.97, sensor.name  # they may differ at the edges of the view
         assert 0 < found.sum() < found.size

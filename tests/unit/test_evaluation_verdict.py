@@ -102,14 +102,15 @@ def test_noise_that_does_not_fit_is_named_with_its_cure(plain: Metrics) -> None:
 
 
 def test_noise_that_fits_is_said_too_and_who_does_not_fit_it(plain: Metrics) -> None:
-    found = contest(b=None, a=Estimate(0.2, 0.1, 0.3, 9))
-    _, fits, not_so = verdict(metrics_of(plain, a=TOO_SMALL, b=FITS), [found])
+    found = contest(b=None, a=Estimate(0.2, 0.1, 0.3, 9), c=Estimate(0.3, 0.2, 0.4, 9))
+    worse = replace(TOO_SMALL, position_nees=ChiSquareMean(1000, 17.0, 2.0))
+    _, fits, not_so = verdict(metrics_of(plain, a=TOO_SMALL, b=FITS, c=worse), [found])
     assert fits == (
         "The noise fits (judged by b): NEES of the position 2.10 (expected 2, 95 % interval 1.8 to 2.4), "
         "NIS of radar 4.20 (expected 4)."
     )
-    assert not_so.startswith(
-        "Not so of a: NEES of the position 13.4 (expected 2, 95 % interval 9.0 to 18), NIS of radar"
+    assert not_so == (
+        "Not so of a and c: NEES of the position 13.4 to 17.0 (expected 2), NIS of radar 26.5 (expected 4)."
     )
 
 
