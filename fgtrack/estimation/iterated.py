@@ -43,7 +43,8 @@ class IekfRecursion(EkfRecursion):
             last = x
             y, H = linearised(measurement.z, x, measurement.model, measurement.pose)
             update = reweighted(mean, covariance, y, H, measurement.R, measurement.loss, x - mean)
-            x = self._iteration.descended(cost, last, update.mean)
+            limit = negative_log_posterior(x - mean, covariance, y, measurement.R, measurement.loss)
+            x = self._iteration.descended(cost, limit, last, update.mean)
             if largest_move(x - last, covariance) < self._iteration.tolerance:
                 break
         innovation, nis = self.innovation(mean, covariance, measurement)

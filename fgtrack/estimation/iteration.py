@@ -29,14 +29,16 @@ class Iteration:
         if not 0.0 <= self.tolerance < np.inf:
             raise ValueError(f"tolerance: must be finite and not negative, is {self.tolerance}")
 
-    def descended(self, cost: Callable[[FloatArray], float], start: FloatArray, end: FloatArray) -> FloatArray:
-        """The farthest point from `start` (n,) to `end` (n,), halving the way, at which `cost` is no higher.
+    def descended(
+        self, cost: Callable[[FloatArray], float], limit: float, start: FloatArray, end: FloatArray
+    ) -> FloatArray:
+        """The farthest point from `start` (n,) to `end` (n,), halving the way, at which `cost` is at most `limit`.
 
-        `start` where there is none.
+        `start`, where it is that, if there is none.
         """
         if self.max_iterations == 1:
             return end
-        limit, step = cost(start), end - start
+        step = end - start
         for _ in range(_MAX_HALVINGS):
             if cost(start + step) <= limit:
                 return start + step

@@ -10,7 +10,7 @@ from fgtrack.estimation.ekf import OneCorrection
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.iteration import Iteration, largest_move, negative_log_posterior, reweighted
 from fgtrack.estimation.replay import ReplayingFilter
-from fgtrack.estimation.sigma_points import SigmaPoints, measurement_regression
+from fgtrack.estimation.sigma_points import SigmaPoints, expected_measurement, measurement_regression
 from fgtrack.estimation.unscented import UkfRecursion
 from fgtrack.models.motion import MotionModel
 
@@ -47,7 +47,8 @@ class IplfRecursion(UkfRecursion):
             y, R = measurement.model.residual(measurement.z, z), measurement.R + noise
             update = reweighted(mean, covariance, y, A, R, measurement.loss, x - mean)
             cost = partial(self._cost, (mean, covariance), measurement, spread, R)
-            x, P = self._iteration.descended(cost, last, update.mean), update.covariance
+            limit = negative_log_posterior(x - mean, covariance, y, R, measurement.loss)
+            x, P = self._iteration.descended(cost, limit, last, update.mean), update.covariance
             narrowed = np.abs(1.0 - spread.diagonal() / P.diagonal()).max()
             if max(largest_move(x - last, P), narrowed) < self._iteration.tolerance:
                 break
@@ -63,7 +64,7 @@ class IplfRecursion(UkfRecursion):
         x: FloatArray,
     ) -> float:
         """What a step lowers: the negative logarithm of the posterior at a state `x` (n,) of `spread` (n, n)."""
-        z = measurement_regression(measurement, x, spread, self._points).mean
+        z = expected_measurement(measurement, x, spread, self._points)
         residual = measurement.model.residual(measurement.z, z)
         return negative_log_posterior(x - prior[0], prior[1], residual, R, measurement.loss)
 
@@ -95,7 +96,7 @@ class IplfReplay(ReplayingFilter):
         prior: Start,
         lag_s: float,
         max_iterations: int = 10,
-        tolerance: float = 1e-3,
+        tolerance: float = 1e-2,
         alpha: float = 1.0,
         beta: float = 0.0,
         kappa: float = 0.0,

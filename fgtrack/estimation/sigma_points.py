@@ -9,7 +9,7 @@ import numpy as np
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.linalg import identity, symmetrise
-from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.measurement import MeasurementModel
 from fgtrack.models.motion import MotionModel
@@ -71,18 +71,25 @@ def regression(
     the bends (d+ + d-) / 2, so that it is zero of a linear g. `difference` may bring angles to their range. Raises
     `numpy.linalg.LinAlgError` for a covariance that is not positive semidefinite.
     """
-    n = mean.shape[-1]
-    squared = points.squared_distance(n)
-    distance = squared**0.5
-    L = _root(covariance)
-    centre, offsets = mean[..., None, :], distance * L.mT
-    values = g(np.concatenate([centre, centre + offsets, centre - offsets], axis=-2))
-    d = difference(values[..., 1:, :], values[..., :1, :])
-    ahead, behind = d[..., :n, :], d[..., n:, :]
-    bends, slopes = 0.5 * (ahead + behind), (ahead - behind) / (2.0 * distance)
+    squared, L = points.squared_distance(mean.shape[-1]), _root(covariance)
+    centre, ahead, behind = _around(g, mean, squared**0.5 * L, difference)
+    bends, slopes = 0.5 * (ahead + behind), (ahead - behind) / (2.0 * squared**0.5)
     shift = bends.sum(axis=-2) / squared
     noise = bends.mT @ bends / squared + (points.beta - points.alpha**2) * shift[..., :, None] * shift[..., None, :]
-    return Regression(values[..., 0, :] + shift, np.linalg.solve(L.mT, slopes).mT, symmetrise(noise))
+    return Regression(centre + shift, np.linalg.solve(L.mT, slopes).mT, symmetrise(noise))
+
+
+def _around(
+    g: Callable[[FloatArray], FloatArray],
+    mean: FloatArray,
+    offsets: FloatArray,
+    difference: Callable[[FloatArray, FloatArray], FloatArray],
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """`g` at `mean`, (..., k), and how it differs from that at mean + and - the columns of `offsets`, (..., n, k)."""
+    n, centre, rows = mean.shape[-1], mean[..., None, :], offsets.mT
+    values = g(np.concatenate([centre, centre + rows, centre - rows], axis=-2))
+    d = difference(values[..., 1:, :], values[..., :1, :])
+    return values[..., 0, :], d[..., :n, :], d[..., n:, :]
 
 
 def _root(covariance: FloatArray) -> FloatArray:
@@ -114,17 +121,28 @@ def measurement_regression(
     if model.linear:
         k = len(model.components)
         return Regression(model.predict(mean, pose), model.selection(mean.shape[-1]), np.zeros((k, k)))
-    direct = _direct(model)
+    return regression(lambda x: model.predict(x, pose), mean, covariance, points, _difference(model))
+
+
+def expected_measurement(
+    measurement: Measurement, mean: FloatArray, covariance: FloatArray, points: SigmaPoints
+) -> FloatArray:
+    """The mean of `measurement_regression` of a model that is not linear, alone."""
+    model, pose = measurement.model, measurement.pose
+    squared = points.squared_distance(len(mean))
+    offsets = squared**0.5 * _root(covariance)
+    centre, ahead, behind = _around(lambda x: model.predict(x, pose), mean, offsets, _difference(model))
+    return np.asarray(centre + 0.5 * (ahead + behind).sum(axis=-2) / squared)
+
+
+@cache
+def _difference(model: MeasurementModel) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    """What differs between measurements, angles in their range, but for entries of the state."""
+    direct = np.array([k for k, name in enumerate(model.components) if name in model.state_names], dtype=np.int64)
 
     def difference(z: FloatArray, centre: FloatArray) -> FloatArray:
         y = model.residual(z, centre)
         y[..., direct] = z[..., direct] - centre[..., direct]
         return y
 
-    return regression(lambda x: model.predict(x, pose), mean, covariance, points, difference)
-
-
-@cache
-def _direct(model: MeasurementModel) -> IntArray:
-    """Places of the components that are entries of the state."""
-    return np.array([k for k, name in enumerate(model.components) if name in model.state_names], dtype=np.int64)
+    return difference
