@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from fgtrack.core.types import TrackState as TrackState
     from fgtrack.core.types import TruthState as TruthState
     from fgtrack.core.types import UpdateRecord as UpdateRecord
+    from fgtrack.estimation import starts as starts
     from fgtrack.estimation.base import Estimator as Estimator
     from fgtrack.estimation.base import Measurement as Measurement
     from fgtrack.estimation.base import Start as Start

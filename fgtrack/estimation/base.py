@@ -113,6 +113,8 @@ class UpdateResult:
     """Measured (or assumed) minus predicted at the measurement's own stamp, shape (k,)."""
     nis: float | None = None
     """Normalised innovation squared against the prior at that stamp, `Measurement.nis`."""
+    innovation_covariance: FloatArray | None = None
+    """Covariance S of the innovation, shape (k, k), of estimators that say it."""
 
 
 #: Standard deviation of a direction of which nothing is known: that of the uniform distribution.

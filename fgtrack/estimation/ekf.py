@@ -158,6 +158,8 @@ class OneCorrection(NamedTuple):
     """Normalised innovation squared."""
     weight: float = 1.0
     """What the measurement counted under its loss; 1 for all of it."""
+    S: FloatArray | None = None
+    """Covariance of the innovation, shape (k, k), before any loss."""
 
 
 class Prediction(NamedTuple):
@@ -223,10 +225,21 @@ def correct_one(mean: FloatArray, covariance: FloatArray, measurement: Measureme
     """`correct` of one state, shapes (n,) and (n, n), without the price of a stack."""
     y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
     after, P, S, w = updated_one(mean, covariance, y, H, measurement.R, measurement.loss)
-    return OneCorrection(after, P, y, measurement.nis(y, S), w)
+    return OneCorrection(after, P, y, measurement.nis(y, S), w, S)
 
 
-def innovation_one(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> tuple[FloatArray, float]:
-    """Innovation (k,) and NIS of `measurement` at one state, shapes (n,) and (n, n), which stays as it is."""
+class Innovation(NamedTuple):
+    """What a measurement says that was not expected."""
+
+    innovation: FloatArray
+    """Shape (k,)."""
+    nis: float
+    S: FloatArray
+    """Covariance of the innovation, shape (k, k)."""
+
+
+def innovation_one(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> Innovation:
+    """The innovation of `measurement` at one state, shapes (n,) and (n, n), which stays as it is."""
     y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
-    return y, measurement.nis(y, congruence(H, covariance) + measurement.R)
+    S = congruence(H, covariance) + measurement.R
+    return Innovation(y, measurement.nis(y, S), S)

@@ -123,7 +123,7 @@ class PosteriorLinearisationSmoother(WindowedFilter):
 
     def _fuse(self, measurement: Measurement) -> OneCorrection:
         mean, covariance = self._state(measurement.stamp_ns)
-        innovation, nis = self._recursion.innovation(mean, covariance, measurement)
+        found = self._recursion.innovation(mean, covariance, measurement)
         nodes = self._with(measurement, mean, covariance)
         initiated = self._initiated
         if not initiated:
@@ -132,7 +132,7 @@ class PosteriorLinearisationSmoother(WindowedFilter):
         if not all(np.isfinite(node.mean.dot(node.mean) + np.vdot(node.covariance, node.covariance)) for node in nodes):
             raise np.linalg.LinAlgError("smoothed state is not finite")
         self._nodes, self._initiated = nodes, initiated
-        return OneCorrection(mean, covariance, innovation, nis)
+        return OneCorrection(mean, covariance, found.innovation, found.nis, S=found.S)
 
     def _forget_before(self, stamp_ns: int) -> None:
         gone = self._place(stamp_ns)

@@ -47,8 +47,8 @@ class IekfRecursion(EkfRecursion):
             x = self._iteration.descended(cost, limit, last, update.mean)
             if largest_move(x - last, covariance) < self._iteration.tolerance:
                 break
-        innovation, nis = self.innovation(mean, covariance, measurement)
-        return OneCorrection(x, update.covariance, innovation, nis, update.weight)
+        found = self.innovation(mean, covariance, measurement)
+        return OneCorrection(x, update.covariance, found.innovation, found.nis, update.weight, found.S)
 
 
 class IekfReplay(ReplayingFilter):

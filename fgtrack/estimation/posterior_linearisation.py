@@ -52,8 +52,8 @@ class IplfRecursion(UkfRecursion):
             narrowed = np.abs(1.0 - spread.diagonal() / P.diagonal()).max()
             if max(largest_move(x - last, P), narrowed) < self._iteration.tolerance:
                 break
-        innovation, nis = self.innovation(mean, covariance, measurement)
-        return OneCorrection(x, P, innovation, nis, update.weight)
+        found = self.innovation(mean, covariance, measurement)
+        return OneCorrection(x, P, found.innovation, found.nis, update.weight, found.S)
 
     def _cost(
         self,

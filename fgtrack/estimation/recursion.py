@@ -4,7 +4,7 @@ from typing import Protocol
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.ekf import OneCorrection, Prediction, correct_one, innovation_one, predict_across
+from fgtrack.estimation.ekf import Innovation, OneCorrection, Prediction, correct_one, innovation_one, predict_across
 from fgtrack.models.motion import MotionModel
 
 
@@ -20,9 +20,7 @@ class Recursion(Protocol):
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
         """The state after `measurement`, made at the stamp of `mean` (n,) and `covariance` (n, n)."""
 
-    def innovation(
-        self, mean: FloatArray, covariance: FloatArray, measurement: Measurement
-    ) -> tuple[FloatArray, float]:
+    def innovation(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> Innovation:
         """Those of `correct`, shape (k,) and NIS, without the correction."""
 
 
@@ -46,8 +44,6 @@ class EkfRecursion:
         """See `Recursion.correct`."""
         return correct_one(mean, covariance, measurement)
 
-    def innovation(
-        self, mean: FloatArray, covariance: FloatArray, measurement: Measurement
-    ) -> tuple[FloatArray, float]:
+    def innovation(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> Innovation:
         """See `Recursion.innovation`."""
         return innovation_one(mean, covariance, measurement)

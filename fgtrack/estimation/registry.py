@@ -13,6 +13,7 @@ from typing import Any, Literal
 from fgtrack.core.errors import CallError
 from fgtrack.core.plugins import Registry
 from fgtrack.estimation.base import Estimator, Start, TrackBank
+from fgtrack.estimation.hypotheses import hypotheses, smoother_hypotheses
 from fgtrack.estimation.initiated import initiated
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
@@ -124,7 +125,8 @@ def estimator(name: str, motion: MotionModel, start: Start, *, lag_s: float = 1.
     lag_s
         Length of the window behind the newest stamp or the clock.
     options
-        Keyword parameters of that estimator; and of every estimator `initiation`, see `Initiation`.
+        Keyword parameters of that estimator; and of every estimator `initiation`, see `Initiation`, and `hypotheses`:
+        as many headings, where `start` has none, or starts such as those of `fgtrack.starts`, of which one is right.
 
     Raises
     ------
@@ -139,34 +141,43 @@ def start_estimator(
 ) -> Estimator:
     """`estimator` of a factory that need not be registered; `name` stands in errors."""
     claims, own = Claims.of(factory), dict(options)
+    wanted, method = own.pop("hypotheses", 1), DEFAULT if claims.initiates else own.pop("initiation", DEFAULT)
 
-    def made(start: Start) -> Estimator:
+    def plain(start: Start) -> Estimator:
         if claims.bank:
             return OneObject(motion, _made(name, factory, motion, lag_s, **own), start)
         return _checked(name, _made(name, factory, motion, start, lag_s, **own))
 
-    return made(start) if claims.initiates else initiated(motion, start, own.pop("initiation", DEFAULT), made)
+    def made(start: Start) -> Estimator:
+        return plain(start) if claims.initiates else initiated(motion, start, method, plain)
+
+    return hypotheses(motion, start, wanted, made)
 
 
 def estimator_bank(
     name: str, motion: MotionModel, lag_s: float, options: Mapping[str, Any], lagged_s: Sequence[float] = ()
 ) -> TrackBank:
-    """The estimators `name` of all objects; raises as `estimator`. One that is a bank itself takes no `initiation`.
+    """The estimators `name` of all objects; raises as `estimator`. One that is a bank itself takes no `initiation`
+    and no `hypotheses`.
 
     Of one that hands out smoothed states, `lagged_s` says at which lags behind the present.
     """
     factory = ESTIMATORS.load(name)
     claims = Claims.of(factory)
-    own = options if claims.initiates else {key: options[key] for key in options if key != "initiation"}
+    common = {"hypotheses"} if claims.initiates else {"hypotheses", "initiation"}
+    own = {key: options[key] for key in options if key not in common}
     if claims.bank:
         bank: TrackBank = _made(name, factory, motion, lag_s, **own)
         return bank
     _check_options(name, factory, 3, own)
     if claims.reports:
 
-        def start_smoother(start: Start) -> Smoother:
+        def one(start: Start) -> Smoother:
             smoother: Smoother = _made(name, factory, motion, start, lag_s, **own)
             return smoother
+
+        def start_smoother(start: Start) -> Smoother:
+            return smoother_hypotheses(motion, start, options.get("hypotheses", 1), one)
 
         return SmoothingBank(motion, start_smoother, lag_s, lagged_s)
     return ObjectBank(motion, lambda start: start_estimator(name, factory, motion, start, lag_s, options), lag_s)

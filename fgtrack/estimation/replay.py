@@ -90,8 +90,8 @@ class ReplayingFilter(WindowedFilter):
         step, correction = self._fused(self._steps[place - 1], order, measurement)
         later = self._steps[place:]
         if later:
-            innovation, nis = self._recursion.innovation(*self._retrodicted(step, later), measurement)
-            correction = correction._replace(innovation=innovation, nis=nis)
+            found = self._recursion.innovation(*self._retrodicted(step, later), measurement)
+            correction = correction._replace(**found._asdict())
         self._steps[place:] = [step, *self._replayed(step, later)]
         return correction
 

@@ -4,6 +4,7 @@ from fgtrack.core.linalg import congruence, product, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.ekf import (
+    Innovation,
     OneCorrection,
     Prediction,
     correct_one,
@@ -51,17 +52,16 @@ class UkfRecursion:
         z, A, noise = measurement_regression(measurement, mean, covariance, self._points)
         y = measurement.model.residual(measurement.z, z)
         after, P, S, w = updated_one(mean, covariance, y, A, measurement.R + noise, measurement.loss)
-        return OneCorrection(after, P, y, measurement.nis(y, S), w)
+        return OneCorrection(after, P, y, measurement.nis(y, S), w, S)
 
-    def innovation(
-        self, mean: FloatArray, covariance: FloatArray, measurement: Measurement
-    ) -> tuple[FloatArray, float]:
+    def innovation(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> Innovation:
         """See `Recursion.innovation`."""
         if measurement.model.linear:
             return innovation_one(mean, covariance, measurement)
         z, A, noise = measurement_regression(measurement, mean, covariance, self._points)
         y = measurement.model.residual(measurement.z, z)
-        return y, measurement.nis(y, congruence(A, covariance) + noise + measurement.R)
+        S = congruence(A, covariance) + noise + measurement.R
+        return Innovation(y, measurement.nis(y, S), S)
 
 
 class UkfReplay(ReplayingFilter):

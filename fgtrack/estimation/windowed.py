@@ -55,7 +55,7 @@ class WindowedFilter(ABC):
         self._newest_ns = max(self._newest_ns, measurement.stamp_ns)
         self.advance(self._newest_ns)
         status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
-        return UpdateResult(status, result.innovation, result.nis)
+        return UpdateResult(status, result.innovation, result.nis, result.S)
 
     @abstractmethod
     def _fuse(self, measurement: Measurement) -> OneCorrection | None:

@@ -9,7 +9,8 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.time import period_ns, seconds
 from fgtrack.estimation.backward_forward import BackwardForwardBank
 from fgtrack.estimation.base import Estimator, Start, TrackBank
-from fgtrack.estimation.factor_graph import BatchBackend, SmootherBank
+from fgtrack.estimation.factor_graph import BatchBackend, IncrementalBackend, SmootherBank
+from fgtrack.estimation.hypotheses import hypotheses
 from fgtrack.estimation.initiated import initiated
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator, Propagator
@@ -116,17 +117,27 @@ def _build_backward_forward(config: Config) -> TrackBank:
     motion = config.motion_model()  # without a map a track may begin in any direction, each at its own time
 
     def start_one(start: Start) -> Estimator:
-        return initiated(motion, start, config.initiation.method, lambda turned: OneObject(motion, bank(), turned))
+        def one(turned: Start) -> Estimator:
+            return OneObject(motion, bank(), turned)
+
+        def begun(each: Start) -> Estimator:
+            return initiated(motion, each, config.initiation.method, one)
+
+        return hypotheses(motion, start, config.initiation.hypotheses, begun)
 
     return ObjectBank(motion, start_one, config.filter.storage_s)
 
 
 def _build_incremental(config: Config) -> TrackBank:
-    return SmootherBank(config.motion_model(), config.smoother, initiation=config.initiation.method)
+    return SmootherBank(config.motion_model(), config.smoother, IncrementalBackend, *_beginning(config))
 
 
 def _build_batch(config: Config) -> TrackBank:
-    return SmootherBank(config.motion_model(), config.smoother, BatchBackend, config.initiation.method)
+    return SmootherBank(config.motion_model(), config.smoother, BatchBackend, *_beginning(config))
+
+
+def _beginning(config: Config) -> tuple[str, int]:
+    return config.initiation.method, config.initiation.hypotheses
 
 
 #: Banks that are built from settings of their own.
@@ -141,7 +152,7 @@ def build_bank(config: Config) -> TrackBank:
     """The estimators of all objects. Raises `CallError` for options that the estimator does not take."""
     build, options = _BANKS.get(config.estimator), config.options.get(config.estimator, {})
     if build is None:
-        options = {"initiation": config.initiation.method, **options}
+        options = {"initiation": config.initiation.method, "hypotheses": config.initiation.hypotheses, **options}
         reports = Claims.of(ESTIMATORS.load(config.estimator)).reports
         lag_s = config.smoother.lag_s if reports else config.filter.storage_s
         return estimator_bank(config.estimator, config.motion_model(), lag_s, options, config.smoother.lagged_s)

@@ -10,7 +10,7 @@ from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.ekf import propagated
+from fgtrack.estimation.ekf import Innovation, propagated
 from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
 from fgtrack.estimation.factor_graph.marginalised_past import Prior
@@ -170,17 +170,18 @@ class FixedLagSmoother:
         if stamp_ns < self.window_ns[0]:
             return UpdateResult(UpdateStatus.TOO_OLD)
         try:
-            innovation, nis = self._innovation(measurement)
+            innovation, nis, S = self._innovation(measurement)
         except np.linalg.LinAlgError:
             return UpdateResult(UpdateStatus.FAILED)
         if not np.isfinite(nis):
             return UpdateResult(UpdateStatus.FAILED)
         if stamp_ns < start_ns:
-            return UpdateResult(UpdateStatus.BEYOND_WINDOW, innovation, nis)
+            return UpdateResult(UpdateStatus.BEYOND_WINDOW, innovation, nis, S)
         late = stamp_ns < self._window.newest_ns
-        return UpdateResult(UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE, innovation, nis)
+        return UpdateResult(UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE, innovation, nis, S)
 
-    def _innovation(self, measurement: Measurement) -> tuple[FloatArray, float]:
+    def _innovation(self, measurement: Measurement) -> Innovation:
         mean, covariance = self._window.state_at(measurement.stamp_ns)
         y, H, R = linearised(measurement, mean)
-        return y, measurement.nis(y, propagated(H, covariance, R))
+        S = propagated(H, covariance, R)
+        return Innovation(y, measurement.nis(y, S), S)

@@ -9,9 +9,10 @@ from fgtrack.estimation.base import Start, StatesAt
 from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
+from fgtrack.estimation.hypotheses import smoother_hypotheses
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.smoother_settings import SmootherSettings
-from fgtrack.estimation.smoothing_bank import SmoothingBank
+from fgtrack.estimation.smoothing_bank import Smoother, SmoothingBank
 from fgtrack.models.motion import MotionModel
 
 
@@ -24,6 +25,8 @@ class SmootherBank(SmoothingBank):
         The motion model of all smoothers.
     settings, make_backend, initiation
         See `FixedLagSmoother`.
+    num_headings
+        See `hypotheses`.
     """
 
     def __init__(
@@ -32,9 +35,13 @@ class SmootherBank(SmoothingBank):
         settings: SmootherSettings,
         make_backend: Callable[[FloatArray], Backend] = IncrementalBackend,
         initiation: str = DEFAULT,
+        num_headings: int = 1,
     ) -> None:
-        def start(prior: Start) -> FixedLagSmoother:
+        def one(prior: Start) -> FixedLagSmoother:
             return FixedLagSmoother(motion, prior, settings, make_backend, initiation)
+
+        def start(prior: Start) -> Smoother:
+            return smoother_hypotheses(motion, prior, num_headings, one)
 
         lag_s = settings.lag_s + (settings.ring_s if settings.late == "fuse" else 0.0)
         super().__init__(motion, start, lag_s, settings.lagged_s)

@@ -32,12 +32,12 @@ def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measuremen
     y, H = linearised(measurement.z, past.mean, measurement.model, measurement.pose)
     S = propagated(H, past.covariance, measurement.R)
     np.linalg.cholesky(S)  # raises where S is not positive definite
-    nis = measurement.nis(y, S)
+    expected, nis = S, measurement.nis(y, S)
     w = robust_weight(measurement.loss, y, congruence(H, past.covariance), measurement.R)
     if w < 1.0:
         S = propagated(H, past.covariance, measurement.R / w)
     across = past.cross @ H.T
     gain = psd_solve(S, across.T).T
-    result = OneCorrection(mean + gain @ y, symmetrise(covariance - gain @ across.T), y, nis, w)
+    result = OneCorrection(mean + gain @ y, symmetrise(covariance - gain @ across.T), y, nis, w, expected)
     require_finite(result)
     return result

@@ -42,7 +42,7 @@ class _ForwardEkf(LateEkf):
         fused = self._fused(Estimate(now.mean, now.covariance), late, common)
         np.linalg.cholesky(fused.covariance)
         history.absorb(*fused)
-        return OneCorrection(*fused, at_tau.innovation, at_tau.nis)
+        return OneCorrection(*fused, at_tau.innovation, at_tau.nis, S=at_tau.S)
 
     @abstractmethod
     def _fused(self, now: Estimate, late: Estimate, common: Estimate) -> Estimate:
