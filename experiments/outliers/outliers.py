@@ -1,24 +1,25 @@
-"""What do outliers cost a Gaussian estimator, and what does each robust loss save?
+"""What do outliers cost, and what do a robust loss and a larger covariance save, in a filter and in a smoother?
 
     python experiments/outliers/outliers.py -o out/outliers
 
 One object drawn from the motion model; some of its detections have ten times the assumed standard deviation,
-and none is gated. Association is known.
+and none is gated. Association is known. Every estimator sees the same detections in the same order.
 """
 
 import csv
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 import typer
+from joblib import Parallel, delayed
 
+import fgtrack
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
-from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.base import Measurement, Start
+from fgtrack.evaluation.paired import Estimate, paired
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import RobustLoss
@@ -27,30 +28,47 @@ START_NS = 1_790_000_000 * NS_PER_S
 STEP_S = 0.05
 STD_M = 0.3
 FACTOR = 10.0
-NUM_STEPS = 300
-SHARES = (0.0, 0.05, 0.1, 0.2)
+NUM_STEPS = 200
+SHARES = (0.0, 0.1, 0.2)
+LATEST_S = {"in time": 0.0, "late": 0.3}
+LOST_M = 3.0
 MOTION = CTRV()
 MODEL = measurement_model(("x_m", "y_m"), MOTION)
+HUBER, CAUCHY = RobustLoss("huber", 1.5), RobustLoss("cauchy", 2.0)
 
-LOSSES: dict[str, RobustLoss | None] = {
-    "ekf-replay": None,
-    "smoother, Gaussian": None,
-    "smoother, Huber 1.5": RobustLoss("huber", 1.5),
-    "smoother, Cauchy 2": RobustLoss("cauchy", 2.0),
-    "smoother, Geman-McClure 2": RobustLoss("geman_mcclure", 2.0),
-    "smoother, DCS 2": RobustLoss("dcs", 2.0),
-    "smoother, Tukey 4.7": RobustLoss("tukey", 4.7),
+
+class Variant(NamedTuple):
+    """An estimator, and what it does about outliers."""
+
+    name: str
+    loss: RobustLoss | None = None
+    inflated: bool = False
+    """Whether R is the covariance of all detections, outliers included: their share is known."""
+
+
+VARIANTS = {
+    "ekf-replay, Gaussian": Variant("ekf-replay"),
+    "ekf-replay, inflated R": Variant("ekf-replay", inflated=True),
+    "ekf-replay, Huber 1.5": Variant("ekf-replay", HUBER),
+    "ekf-replay, Cauchy 2": Variant("ekf-replay", CAUCHY),
+    "smoother, Gaussian": Variant("smoother"),
+    "smoother, inflated R": Variant("smoother", inflated=True),
+    "smoother, Huber 1.5": Variant("smoother", HUBER),
+    "smoother, Cauchy 2": Variant("smoother", CAUCHY),
+    "ekf-replay, Tukey 4.7": Variant("ekf-replay", RobustLoss("tukey", 4.7)),
+    "smoother, Tukey 4.7": Variant("smoother", RobustLoss("tukey", 4.7)),
+    "smoother, Geman-McClure 2": Variant("smoother", RobustLoss("geman_mcclure", 2.0)),
+    "smoother, DCS 2": Variant("smoother", RobustLoss("dcs", 2.0)),
 }
 
 
-def start(name: str, loss: RobustLoss | None, x: FloatArray) -> Estimator:
-    """The estimator `name` of an object that starts at `x`."""
+def start(x: FloatArray) -> Start:
+    """What is known of an object that starts at `x`."""
     x_m, y_m, yaw_rad, speed_mps, yaw_rate_radps = x.tolist()
-    position, R = np.array([x_m, y_m]), STD_M**2 * np.eye(2)
-    prior = Start(
+    return Start(
         stamp_ns=START_NS,
-        position_m=position,
-        position_covariance=R,
+        position_m=(x_m, y_m),
+        position_std_m=STD_M,
         yaw_rad=yaw_rad,
         yaw_std_rad=0.3,
         speed_mps=speed_mps,
@@ -58,56 +76,91 @@ def start(name: str, loss: RobustLoss | None, x: FloatArray) -> Estimator:
         yaw_rate_radps=yaw_rate_radps,
         yaw_rate_std_radps=0.1,
     )
-    if name == "ekf-replay":
-        return ReplayEkf(MOTION, prior, 1.0)
-    settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)
-    return FixedLagSmoother(MOTION, prior, settings)
 
 
-def squared_errors(name: str, share: float, rng: np.random.Generator) -> FloatArray:
-    """Squared position errors of the present state along one run, shape (NUM_STEPS,)."""
+def rmse_m(label: str, share: float, latest_s: float, seed: int, run: int) -> float:
+    """RMSE of the present position along one run: at each stamp, from what has arrived by then."""
+    rng, variant = np.random.default_rng([seed, run]), VARIANTS[label]
     x = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi), 60.0, 0.03])
-    loss = LOSSES[name]
-    estimator = start(name, loss, x)
-    found = np.empty(NUM_STEPS)
+    options = {"lagged_s": (), "final": False} if variant.name == "smoother" else {}
+    estimator = fgtrack.estimator(variant.name, MOTION, start(x), lag_s=1.0, **options)
+    variance = STD_M**2 * (1.0 + share * (FACTOR**2 - 1.0) if variant.inflated else 1.0)
+    waiting: list[tuple[int, Measurement]] = []
+    squared_m2 = np.empty(NUM_STEPS)
     for k in range(NUM_STEPS):
-        Q = MOTION.process_noise(x, STEP_S)
-        x = MOTION.predict(x, STEP_S) + np.linalg.cholesky(Q) @ rng.standard_normal(5)
+        x = MOTION.predict(x, STEP_S) + np.linalg.cholesky(MOTION.process_noise(x, STEP_S)) @ rng.standard_normal(5)
         std_m = STD_M * (FACTOR if rng.random() < share else 1.0)
         z = x[:2] + std_m * rng.standard_normal(2)
-        stamp_ns = START_NS + round((k + 1) * STEP_S * NS_PER_S)
-        estimator.update(Measurement(stamp_ns, MODEL, z, STD_M**2 * np.eye(2), loss=loss))
-        found[k] = np.sum((estimator.state_at(stamp_ns).mean[:2] - x[:2]) ** 2)
-    return found
+        now_ns = START_NS + round((k + 1) * STEP_S * NS_PER_S)
+        receipt_ns = now_ns + round(latest_s * rng.random() * NS_PER_S)
+        waiting.append((receipt_ns, Measurement(now_ns, MODEL, z, variance * np.eye(2), loss=variant.loss)))
+        waiting.sort(key=lambda each: each[0])
+        while waiting and waiting[0][0] <= now_ns:
+            estimator.update(waiting.pop(0)[1])
+        squared_m2[k] = np.sum((estimator.state_at(now_ns).mean[:2] - x[:2]) ** 2)
+    return float(np.sqrt(squared_m2.mean()))
+
+
+def table(rmse: dict[tuple[str, str, float], FloatArray]) -> str:
+    """Mean RMSE over the runs, and its paired difference to the Gaussian EKF, as Markdown."""
+    columns = [(delay, share) for delay in LATEST_S for share in SHARES]
+    lines = ["| | " + " | ".join(f"{delay}, {share:.0%} outliers" for delay, share in columns) + " |"]
+    lines.append("|---" * (1 + len(columns)) + "|")
+    reference = next(iter(VARIANTS))
+    for label in VARIANTS:
+        cells = []
+        for delay, share in columns:
+            found = rmse[label, delay, share]
+            lost = int((found > LOST_M).sum())
+            difference = "" if label == reference else shown(paired(found, rmse[reference, delay, share]))
+            cells.append(f"lost in {lost} of {len(found)}" if lost else f"{found.mean():.3f}{difference}")
+        lines.append(f"| {label} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def shown(difference: Estimate) -> str:
+    return f" ({difference.mean:+.3f}, {difference.low:+.3f} to {difference.high:+.3f})"
+
+
+def draw(rmse: dict[tuple[str, str, float], FloatArray], file: Path) -> None:
+    """Mean RMSE over the share of outliers, in time and late."""
+    figure, axes = plt.subplots(1, 2, figsize=(10.0, 4.0), sharey=True, layout="constrained")
+    for axis, delay in zip(axes, LATEST_S, strict=True):
+        for index, label in enumerate(VARIANTS):
+            values = [rmse[label, delay, share].mean() for share in SHARES]
+            style = "-" if label.startswith("smoother") else "--"
+            axis.plot([100.0 * share for share in SHARES], values, style, marker="os^vDPX*<>hd"[index], label=label)
+        axis.set(xlabel="share of outliers [%]", yscale="log", title=delay)
+        axis.grid(alpha=0.3, which="both")
+    axes[0].set_ylabel("position RMSE of the present state [m]")
+    axes[1].legend(fontsize=7)
+    figure.savefig(file, dpi=150)
+    plt.close(figure)
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder for the table and the figure.")] = Path("out/outliers"),
+    out: Annotated[Path, typer.Option("-o", help="Folder for the tables and the figure.")] = Path("out/outliers"),
     runs: Annotated[int, typer.Option(help="Runs per share of outliers.")] = 20,
     seed: int = 0,
+    jobs: Annotated[int, typer.Option(help="Processes.")] = 1,
 ) -> None:
-    """Run every loss over every share of outliers, write outliers.csv and outliers.png."""
+    """Run every variant over every share of outliers, write outliers.csv, outliers.md and outliers.png."""
     out.mkdir(parents=True, exist_ok=True)
-    rmse = {
-        name: [
-            np.sqrt(np.mean([squared_errors(name, share, np.random.default_rng([seed, run])) for run in range(runs)]))
-            for share in SHARES
-        ]
-        for name in LOSSES
-    }
+    cases = [(label, delay, share) for label in VARIANTS for delay in LATEST_S for share in SHARES]
+    found = Parallel(n_jobs=jobs)(
+        delayed(rmse_m)(label, share, LATEST_S[delay], seed, run)
+        for label, delay, share in cases
+        for run in range(runs)
+    )
+    rmse = dict(zip(cases, np.reshape(found, (len(cases), runs)), strict=True))
     with (out / "outliers.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["estimator", *(f"rmse_m_{share:g}" for share in SHARES)])
-        writer.writerows([name, *(f"{value:.3f}" for value in values)] for name, values in rmse.items())
-    figure, axis = plt.subplots(figsize=(6.5, 4.0), layout="constrained")
-    for index, (name, values) in enumerate(rmse.items()):
-        axis.plot([100.0 * share for share in SHARES], values, marker="os^vDPX"[index], label=name)
-    axis.set(xlabel="share of outliers [%]", ylabel="position RMSE of the present state [m]", yscale="log")
-    axis.grid(alpha=0.3, which="both")
-    axis.legend(fontsize=8)
-    figure.savefig(out / "outliers.png", dpi=150)
-    plt.close(figure)
-    print((out / "outliers.csv").read_text() + f"figure: {out / 'outliers.png'}")
+        writer.writerow(["estimator", "arrival", "share", "run", "rmse_m"])
+        for case, values in rmse.items():
+            writer.writerows([*case, run, f"{value:.4f}"] for run, value in enumerate(values.tolist()))
+    (out / "outliers.md").write_text(table(rmse))
+    draw(rmse, out / "outliers.png")
+    print((out / "outliers.md").read_text() + f"figure: {out / 'outliers.png'}")
 
 
 if __name__ == "__main__":
