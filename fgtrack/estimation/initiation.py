@@ -26,6 +26,11 @@ Initiation = Literal["one-point", "two-point", "regression"]
 DEFAULT: Initiation = "regression"
 
 
+#: For a smoother, a line that is so many standard deviations from standing still is the last one: the solver finds the
+#: rest, in so many Gauss-Newton steps at most.
+CERTAIN_TO_SMOOTHER, SMOOTHER_ITERATIONS = 3.0, 10
+
+
 def checked_initiation(method: str) -> Initiation:
     """`method`; raises `CallError` for one that does not exist."""
     for known in get_args(Initiation):

@@ -35,7 +35,28 @@ def between(motion: MotionModel, left: Sequence[float], right: FloatArray, until
     """
     first = motion.step(left, until_s)
     second = motion.step(first.mean, after_s)
-    Psi, _ = kalman_gain(first.Q, second.F, second.Q)
-    mean = np.asarray(first.mean) + Psi @ (right - np.asarray(second.mean))
-    Lambda = first.F - Psi @ (second.F @ first.F)
-    return Between(mean, Lambda, Psi, joseph(first.Q, Psi, second.F, second.Q))
+    return _given(np.asarray(first.mean), first.F, first.Q, np.asarray(second.mean), second.F, second.Q, right)
+
+
+def between_all(
+    motion: MotionModel, left: FloatArray, right: FloatArray, until_s: FloatArray, after_s: FloatArray
+) -> Between:
+    """`between` of m pairs of neighbours, shapes (m, n) and (m,): stacks of its arrays."""
+    first = motion.steps(left, until_s)
+    second = motion.steps(first.mean, after_s)
+    return _given(*first, *second, right)
+
+
+def _given(
+    first: FloatArray,
+    F1: FloatArray,
+    Q1: FloatArray,
+    second: FloatArray,
+    F2: FloatArray,
+    Q2: FloatArray,
+    right: FloatArray,
+) -> Between:
+    """See `between`."""
+    Psi, _ = kalman_gain(Q1, F2, Q2)
+    mean = first + np.vecdot(Psi, (right - second)[..., None, :])
+    return Between(mean, F1 - Psi @ (F2 @ F1), Psi, joseph(Q1, Psi, F2, Q2))

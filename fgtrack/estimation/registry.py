@@ -35,6 +35,7 @@ ESTIMATORS = Registry(
             "iplf-replay": "fgtrack.estimation.posterior_linearisation:IplfReplay",
             "smoother": "fgtrack.estimation.factor_graph.factories:smoother",
             "smoother-batch": "fgtrack.estimation.factor_graph.factories:smoother_batch",
+            "smoother-banded": "fgtrack.estimation.banded.smoother:BandedSmoother",
             "ukf-replay": "fgtrack.estimation.unscented:UkfReplay",
         },
         OOSM_GROUP: {

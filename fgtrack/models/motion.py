@@ -46,6 +46,17 @@ class Prediction(NamedTuple):
     """Covariance of the accumulated noise, shape (n, n)."""
 
 
+class Predictions(NamedTuple):
+    """`Prediction` of many states."""
+
+    mean: FloatArray
+    """Shape (..., n)."""
+    F: FloatArray
+    """Shape (..., n, n)."""
+    Q: FloatArray
+    """Shape (..., n, n)."""
+
+
 class MotionModel(ABC):
     """How an object moves between two stamps, and how uncertain that is.
 
@@ -95,6 +106,10 @@ class MotionModel(ABC):
     def step(self, x: Sequence[float], dt_s: float) -> Prediction:
         """The one state `x` after `dt_s` >= 0; F and Q are new arrays. Raises `CallError` where `dt_s` is negative."""
         return Prediction(*self.flow(x, dt_s), self.process_noise(np.array(x, dtype=np.float64), dt_s))
+
+    def steps(self, x: FloatArray, dt_s: FloatArray) -> Predictions:
+        """`step` of many states: what `predict`, `jacobian` and `process_noise` give."""
+        return Predictions(self.predict(x, dt_s), self.jacobian(x, dt_s), self.process_noise(x, dt_s))
 
     def flow(self, x: Sequence[float], dt_s: float) -> tuple[list[float], FloatArray]:
         """Mean and F of `step`, of any duration."""

@@ -8,6 +8,7 @@ import numpy as np
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import period_ns, seconds
 from fgtrack.estimation.backward_forward import BackwardForwardBank
+from fgtrack.estimation.banded.bank import BandedBank
 from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.factor_graph import BatchBackend, IncrementalBackend, SmootherBank
 from fgtrack.estimation.hypotheses import hypotheses
@@ -140,11 +141,16 @@ def _beginning(config: Config) -> tuple[str, int]:
     return config.initiation.method, config.initiation.hypotheses
 
 
+def _build_banded(config: Config) -> TrackBank:
+    return BandedBank(config.motion_model(), config.smoother, config.initiation.method)
+
+
 #: Banks that are built from settings of their own.
 _BANKS: Mapping[str, Callable[[Config], TrackBank]] = {
     "ekf-backward-forward": _build_backward_forward,
     "smoother": _build_incremental,
     "smoother-batch": _build_batch,
+    "smoother-banded": _build_banded,
 }
 
 

@@ -126,6 +126,7 @@ class Certificate:
 _OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "smoother": {"ring_s": _RING_S, "relinearise": _TINY, "max_iterations": 20},
     "smoother-batch": {"ring_s": _RING_S, "relinearise": _TINY},
+    "smoother-banded": {"ring_s": _RING_S, "relinearise": _TINY, "max_iterations": 20},
 }
 
 

@@ -13,6 +13,9 @@ VARIANTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("smoother", {"late": "drop"}),
     ("smoother", {"ring_s": 0.4}),
     ("smoother", {"max_iterations": 3}),
+    ("smoother-banded", {"late": "drop"}),
+    ("smoother-banded", {"ring_s": 0.4}),
+    ("smoother-banded", {"max_iterations": 3}),
     ("delayed-horizon", {"horizon_s": 0.2}),
     ("ekf-backward-forward", {"frequency_hz": 1000.0}),
 )

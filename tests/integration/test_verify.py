@@ -103,7 +103,7 @@ def test_every_exact_estimator_keeps_its_promise_on_every_stream_in_every_order(
             against: {(c.stream, c.order) for c in found if c.against == against}
             for against in ("dense joint", "innovations", "order of stamps", "SciPy", "SciPy, as it grew")
         }
-        is_smoother = name in ("smoother", "smoother-batch")
+        is_smoother = name in ("smoother", "smoother-batch", "smoother-banded")
         linear = LINEAR | ({"CV, lag 0.05 s"} if is_smoother else set())
         assert by_reference["dense joint"] == {(stream, order) for stream in linear for order in ORDERS}
         assert by_reference["innovations"] == by_reference["dense joint"]

@@ -8,8 +8,8 @@ import pytest
 from scipy import optimize
 
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.factor_graph.following_noise import log_determinant, segment_rows
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
+from fgtrack.estimation.following_noise import log_determinant, segment_rows
 from fgtrack.models.motion import CTRA, CTRV, MotionModel
 from fgtrack.pipeline import verify_streams
 from fgtrack.pipeline.oracle.posterior import most_probable

@@ -14,8 +14,8 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.dense_joint import dense_joint, difference
 from fgtrack.estimation.factor_graph.chain import Chain, Node
-from fgtrack.estimation.factor_graph.marginalised_past import MarginalisedPast, Prior
 from fgtrack.estimation.interpolation import between
+from fgtrack.estimation.marginalised_past import MarginalisedPast, Prior
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV, MotionModel
 from fgtrack.models.sensors import RobustLoss

@@ -10,7 +10,7 @@ from scipy.linalg.lapack import dpotrf, dtrtri
 from fgtrack.core.linalg import identity
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.factor_graph.following_noise import log_determinant, segment_rows
+from fgtrack.estimation.following_noise import log_determinant, segment_rows
 from fgtrack.estimation.terms import EquivalentMeasurement, Linearised, MeasurementTerm, linearised
 from fgtrack.models.motion import MotionModel
 

@@ -13,17 +13,21 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import Innovation, propagated
 from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
-from fgtrack.estimation.factor_graph.marginalised_past import Prior
 from fgtrack.estimation.factor_graph.window import Window
-from fgtrack.estimation.initiation import DEFAULT, checked_initiation, first_line, sought
+from fgtrack.estimation.initiation import (
+    CERTAIN_TO_SMOOTHER,
+    DEFAULT,
+    SMOOTHER_ITERATIONS,
+    checked_initiation,
+    first_line,
+    sought,
+)
+from fgtrack.estimation.marginalised_past import Prior
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.estimation.terms import linearised
 from fgtrack.models.motion import MotionModel
 
 _DEFAULT = SmootherSettings()
-_INITIATION_ITERATIONS = 10
-#: A line that is so many standard deviations from standing still is the last one: the solver finds the rest.
-_CERTAIN = 3.0
 
 
 class FixedLagSmoother:
@@ -139,14 +143,14 @@ class FixedLagSmoother:
         if self._sought_until_ns is not None and oldest_ns > self._sought_until_ns:
             return
         try:
-            found = first_line(self._window.fixes(), self._initiation, _CERTAIN)
+            found = first_line(self._window.fixes(), self._initiation, CERTAIN_TO_SMOOTHER)
         except np.linalg.LinAlgError:
             return
         if found is None:
             return
         self._sought_until_ns = self._first_ns + nanoseconds(found.until_s) if found.over else None
         self._window.restart(found.line)
-        self._window.iterate(_INITIATION_ITERATIONS)
+        self._window.iterate(SMOOTHER_ITERATIONS)
 
     @property
     def _start_ns(self) -> int:

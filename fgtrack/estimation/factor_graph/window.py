@@ -17,9 +17,9 @@ from fgtrack.estimation.factor_graph.backends.batch import BatchBackend
 from fgtrack.estimation.factor_graph.backends.incremental import FIRST_KEY
 from fgtrack.estimation.factor_graph.chain import Chain, Node
 from fgtrack.estimation.factor_graph.factors import map_motion_factor, measurement_factor, motion_factor, prior_factor
-from fgtrack.estimation.factor_graph.marginalised_past import MarginalisedPast, Prior
 from fgtrack.estimation.initiation import Fix, Line, along, fix_of
 from fgtrack.estimation.interpolation import between
+from fgtrack.estimation.marginalised_past import MarginalisedPast, Prior
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.estimation.terms import MeasurementTerm, curved, linearised
 from fgtrack.models.motion import MotionModel

@@ -3,6 +3,7 @@ older than the window."""
 
 import bisect
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.ekf import joseph, kalman_gain, propagated
-from fgtrack.estimation.factor_graph.following_noise import log_determinant, segment_rows
+from fgtrack.estimation.following_noise import log_determinant, segment_rows
 from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.terms import EquivalentMeasurement, Linearised, MeasurementTerm, linearised
 from fgtrack.models.motion import MotionModel
@@ -62,11 +63,28 @@ class MarginalisedPast:
         self._origin = prior.mean
         self.prior = prior
 
+    @classmethod
+    def resumed(
+        cls, motion: MotionModel, ring: Iterable[Conditional], stamp_ns: int, origin: FloatArray, prior: Prior
+    ) -> "MarginalisedPast":
+        """The past of an oldest node at `stamp_ns` from what is known of it.
+
+        `ring` holds the conditionals, oldest first, the last one relative to the oldest node at `origin` (n,).
+        """
+        past = cls(motion, stamp_ns, prior)
+        past._ring, past._origin = list(ring), origin
+        return past
+
     def copy(self) -> "MarginalisedPast":
         """An independent copy."""
-        other = MarginalisedPast(self._motion, self._stamp_ns, self.prior, self._follows)
-        other._ring, other._origin = list(self._ring), self._origin
+        other = self.resumed(self._motion, self._ring, self._stamp_ns, self._origin, self.prior)
+        other._follows = self._follows
         return other
+
+    @property
+    def ring(self) -> tuple[Conditional, ...]:
+        """The conditionals, oldest first."""
+        return tuple(self._ring)
 
     @property
     def start_ns(self) -> int:
