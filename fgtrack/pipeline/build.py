@@ -30,7 +30,7 @@ from fgtrack.models.road import MappedRoad, OpenSpace, Road
 from fgtrack.models.track_map import TrackMap
 from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
 from fgtrack.tracking.ego import EgoSource, EgoStd, EgoTrajectory
-from fgtrack.tracking.ego_error import independent, shared
+from fgtrack.tracking.ego_error import IndependentErrors, SharedErrors
 from fgtrack.tracking.inbox import Inbox, QueueInbox
 from fgtrack.tracking.lifecycle import Lifecycle
 from fgtrack.tracking.preprocess import Preprocess
@@ -79,7 +79,7 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
         birth=config.birth,
         road=road,
         confirm_count=config.lifecycle.confirm_count,
-        ego_errors=shared if config.ego.uncertainty == "shared" else independent,
+        ego_errors=SharedErrors(motion) if config.ego.uncertainty == "shared" else IndependentErrors(),
     )
     return (PublishedTracker if published_order else Tracker)(parts if observed is None else observed(parts))
 

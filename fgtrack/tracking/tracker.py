@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
@@ -30,7 +30,7 @@ from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, Association
 from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.ego import EgoPose, EgoSource
-from fgtrack.tracking.ego_error import EgoErrors, independent
+from fgtrack.tracking.ego_error import EgoErrors, IndependentErrors
 from fgtrack.tracking.inbox import NO_INNOVATION, Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Lifecycle
 from fgtrack.tracking.preprocess import Candidate, Preprocess
@@ -52,7 +52,7 @@ class TrackerParts:
     birth: Birth
     road: Road
     confirm_count: int
-    ego_errors: EgoErrors = independent
+    ego_errors: EgoErrors = field(default_factory=IndependentErrors)
 
 
 class Tracker:
@@ -205,12 +205,12 @@ class Tracker:
     def _estimate(
         self, batch: Batch, candidates: Sequence[Candidate], assignment: Assignment, states: StatesAt
     ) -> None:
-        if not assignment.pairs:
-            return
         matched = [candidates[position] for position, _ in assignment.pairs]
-        track_ids = [states.track_ids[track] for _, track in assignment.pairs]
         rows = [track for _, track in assignment.pairs]
-        fused = self._parts.ego_errors(matched, states.means[rows], states.covariances[rows])
+        fused = self._parts.ego_errors.measurements(batch.stamp_ns, matched, rows, states)
+        if not fused:
+            return
+        track_ids = [states.track_ids[row] for row in rows]
         results = self._parts.bank.update(batch.stamp_ns, track_ids, fused)
         for candidate, track_id, result in zip(matched, track_ids, results, strict=True):
             if result.innovation is not None:
@@ -228,6 +228,7 @@ class Tracker:
         track_id = self._next_id
         self._next_id += 1
         parts.bank.birth(track_id, prior)
+        parts.ego_errors.born(track_id, candidate, prior)
         self._seen[id(batch.message)].add(track_id)
         parts.lifecycle.born(track_id, batch.sensor, batch.stamp_ns, parts.bank.present_ns)
         self._conclude(batch, candidate, Disposition.BIRTH, track_id)
@@ -252,6 +253,7 @@ class Tracker:
     def _end(self, track_ids: Sequence[int]) -> None:
         for track_id in track_ids:
             self._parts.bank.remove(track_id)
+            self._parts.ego_errors.ended(track_id)
             self._parts.lifecycle.forget(track_id)
 
     def _report(self, track_id: int, state: TrackState) -> TrackReport:
