@@ -353,7 +353,9 @@ class _Tuning:
             "yes" if error <= self._rules.known_std_error else one
             for one, error in zip(found.known, std_error.tolist(), strict=True)
         ]
-        columns = self._noise.keys, self._noise.shown, ConfigNoise(tuned_config).shown, std_error.tolist(), known
+        was, _ = self._noise.shown(self._configured, std_error)
+        now, errors = self._noise.shown(ConfigNoise(tuned_config).values, std_error)
+        columns = self._noise.keys, was, now, errors, known
         parameters = tuple(
             TunedParameter(key, was, value, None if math.isnan(error) else error, one, why)
             for key, was, value, error, one, why in zip(*columns, found.why, strict=True)

@@ -12,6 +12,7 @@ from fgtrack.core.types import Message, SmoothedReport, TrackState, UpdateRecord
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult
 from fgtrack.estimation.likelihood.series import Observation, Series, positive_part
 from fgtrack.io.run import Run
+from fgtrack.models.correlated_errors import whole_error
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_in_memory
@@ -67,9 +68,10 @@ def observation(name: str, sensor: SensorModel, measurement: Measurement, own: b
     components = measurement.model.components
     measured = tuple(place for place, component in enumerate(components) if component in sensor.std)
     assumed = tuple(place for place in range(len(components)) if place not in measured)
-    R = measurement.R[np.ix_(measured, measured)]
+    R = whole_error(measurement.model, measurement.R)[np.ix_(measured, measured)]
     T = np.eye(len(measured))
     if own:
+        R = measurement.R[np.ix_(measured, measured)]
         return Observation(name, measurement, measured, assumed, T, R, np.zeros_like(R))
     if "x_m" in components:
         (x_m, y_m), pose = measurement.z[:2].tolist(), measurement.pose

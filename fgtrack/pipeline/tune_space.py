@@ -8,18 +8,23 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.likelihood.noise import NoiseSpace
+from fgtrack.models.correlated_errors import with_correlated_errors
 from fgtrack.models.motion import MotionModel
+from fgtrack.models.sensors import Correlation
 from fgtrack.pipeline.config import Config, MotionConfig
 
 _FIRST_SHARE = 0.01
 _DIGITS = 4
+_TIME = " time_s"  # behind the name of a sensor: how long its errors last, of the motion as the likelihood sees it
+_MAX_SHARE = 0.9999
 
 
 @dataclass(frozen=True)
 class ConfigNoise:
     """What of a configuration is tuned.
 
-    Process noise, and the standard deviation of every component of every sensor. Of a plug-in's motion model those
+    Process noise, and the standard deviation of every component of every sensor; where its errors are correlated in
+    time, also the share that lasts, and how long. Of a plug-in's motion model those
     parameters whose name holds `_density_` (a variance grows with it) or `std`. A heading taken from a map
     (`yaw_from_map_std_rad`) is no measurement and is left alone.
     """
@@ -29,30 +34,47 @@ class ConfigNoise:
     @property
     def keys(self) -> tuple[str, ...]:
         """Keys of the configuration, in the order of the parameters; empty for the shares of outliers."""
-        return tuple(
-            f"{self._motion_section}.{name}" if not sensor else f"sensors.{sensor}.std.{name}" if name else ""
-            for sensor, name in self.space.names
-        )
+        return tuple(self._key(sensor, name) for sensor, name in self.space.names)
+
+    def _key(self, sensor: str, name: str) -> str:
+        if name.endswith(_TIME):
+            return f"sensors.{name.removesuffix(_TIME)}.correlation.time_s"
+        if not sensor:
+            return f"{self._motion_section}.{name}"
+        if name == "share":
+            return f"sensors.{sensor}.correlation.share"
+        return f"sensors.{sensor}.std.{name}" if name else ""
 
     @property
     def space(self) -> NoiseSpace:
         """The parameters as the likelihood needs them."""
         sensors = {name: sensor.components for name, sensor in self.config.sensors.items()}
-        return NoiseSpace(tuple(self._motion_stds), self._motion_model, sensors)
+        times = [name + _TIME for name in self._correlations]
+        return NoiseSpace((*self._motion_stds, *times), self._motion_model, sensors, tuple(self._correlations))
 
     @property
     def values(self) -> FloatArray:
         """The configured parameters, shape (p,)."""
+        lasting = self._correlations.values()
         stds = [sensor.std[name] for sensor in self.config.sensors.values() for name in sensor.components]
-        return np.array([*self._motion_stds.values(), *stds, *[_FIRST_SHARE] * len(self.config.sensors)])
+        motion = [*self._motion_stds.values(), *(one.time_s for one in lasting)]
+        odds = [one.share / (1.0 - one.share) for one in lasting]
+        return np.array([*motion, *stds, *odds, *[_FIRST_SHARE] * len(self.config.sensors)])
 
-    @property
-    def shown(self) -> list[float]:
-        """The configured parameters as the configuration has them, a density as such, in the order of `keys`."""
-        return [
-            value if sensor or self._built_in else _power(name, value)
-            for (sensor, name), value in zip(self.space.names, self.values.tolist(), strict=True)
-        ]
+    def shown(self, values: FloatArray, log_std: FloatArray) -> tuple[list[float], list[float]]:
+        """Parameters as the configuration has them, and standard errors as shares of these, in the order of `keys`.
+
+        `log_std`, shape (p,), are those of the logarithms.
+        """
+        shown, errors = [], []
+        for (sensor, name), value, error in zip(self.space.names, values.tolist(), log_std.tolist(), strict=True):
+            if name == "share":
+                value, error = value / (1.0 + value), error / (1.0 + value)
+            elif not sensor and not self._built_in and "_density_" in name:
+                value, error = value * value, 2.0 * error
+            shown.append(value)
+            errors.append(error)
+        return shown, errors
 
     def config_with(self, values: Sequence[float] | FloatArray) -> Config:
         """The configuration with `values`, shape (p,), to four digits; what is as configured stays to the bit."""
@@ -64,8 +86,21 @@ class ConfigNoise:
             sensor: replace(model, std={name: found[sensor, name] for name in model.std})
             for sensor, model in self.config.sensors.items()
         }
+        for sensor, was in self._correlations.items():
+            odds = found[sensor, "share"]
+            kept = odds == was.share / (1.0 - was.share)
+            share = was.share if kept else _rounded(odds / (1.0 + odds))
+            sensors[sensor] = replace(
+                sensors[sensor], correlation=Correlation(min(share, _MAX_SHARE), found["", sensor + _TIME])
+            )
         motion = self._motion_with({n: found["", n] for n in self._motion_stds})
         return replace(self.config, motion=motion, sensors=sensors)
+
+    @property
+    def _correlations(self) -> dict[str, Correlation]:
+        """Those of the sensors whose errors last, by sensor."""
+        found = {name: sensor.correlation for name, sensor in self.config.sensors.items()}
+        return {name: one for name, one in found.items() if one is not None}
 
     @property
     def _built_in(self) -> bool:
@@ -97,8 +132,14 @@ class ConfigNoise:
             motion, parameters={**motion.parameters, **{name: _power(name, std) for name, std in stds.items()}}
         )
 
-    def _motion_model(self, stds: Mapping[str, float]) -> MotionModel:
-        return self._motion_with(stds).model()
+    def _motion_model(self, values: Mapping[str, float]) -> MotionModel:
+        motion = self._motion_with({name: value for name, value in values.items() if not name.endswith(_TIME)}).model()
+        times = {name.removesuffix(_TIME): value for name, value in values.items() if name.endswith(_TIME)}
+        sensors = {
+            name: replace(self.config.sensors[name], correlation=replace(one, time_s=times[name]))
+            for name, one in self._correlations.items()
+        }
+        return with_correlated_errors(motion, sensors)
 
 
 def _root(name: str, value: float) -> float:

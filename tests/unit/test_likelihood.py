@@ -1,5 +1,6 @@
 """The likelihood of noise against a dense joint Gaussian, the contaminated update against quadrature, and a fit."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from fgtrack.core.geometry import rotation
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
@@ -16,7 +18,12 @@ from fgtrack.estimation.likelihood.fit import FitSettings, Problem
 from fgtrack.estimation.likelihood.noise import NoiseSpace
 from fgtrack.estimation.likelihood.reference import filtered
 from fgtrack.estimation.likelihood.series import Observation, Series
+from fgtrack.models.correlated_errors import split_error
+from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, CV
+from fgtrack.pipeline.shipped import read_config
+from fgtrack.pipeline.tune_measurements import observation
+from fgtrack.pipeline.tune_space import ConfigNoise
 
 START = Start(position_m=(3.0, -2.0), yaw_rad=0.3, yaw_std_rad=0.2, speed_mps=8.0, speed_std_mps=2.0)
 SPACE = NoiseSpace(
@@ -148,3 +155,45 @@ def test_a_nonlinear_model_is_linearised_about_the_filter() -> None:
     likelihood = problem.likelihood(values, np.ones(10, dtype=bool))
     steps = filtered(problem.series[0], space, values)
     assert likelihood.totals(values[None])[0] == pytest.approx(sum(step.log_likelihood for step in steps), abs=1e-8)
+
+
+def test_errors_that_last_are_parameters_too() -> None:
+    """In a linear model the likelihood at any parameters is that of a filter with these."""
+    noise = ConfigNoise(
+        read_config(
+            None,
+            [
+                "estimator=ekf-replay",
+                "motion={kind: cv, std_per_s: {velocity: 0.8}}",
+                "sensors.lidar={std: {x_m: 0.5, y_m: 0.3}, correlation: {share: 0.7, time_s: 2.0}}",
+                "sensors.radar={std: {x_m: 1.5, y_m: 1.0}}",
+                "sensors.lidar_cluster={std: {x_m: 1.5, y_m: 1.0}}",
+            ],
+        )
+    )
+    config, rng = noise.config, np.random.default_rng(4)
+    model = config.motion_model()
+    seen = []
+    for one in drawn(rng, VALUES, 40).observations:
+        sensor, pose = config.sensors[one.sensor], SensorPose(-20.0, 5.0)
+        x_m, y_m = one.measurement.z - [pose.x_m, pose.y_m]
+        turn = np.eye(2) if sensor.std["x_m"] == sensor.std["y_m"] else rotation(math.atan2(y_m, x_m))
+        R = turn @ sensor.noise(("x_m", "y_m")) @ turn.T
+        plain = measurement_model(("x_m", "y_m"), model)
+        erring, white = split_error(one.sensor, sensor, plain, R, model.state_names)
+        measurement = replace(one.measurement, model=erring, R=white, pose=pose)
+        seen.append(observation(one.sensor, sensor, measurement, own=False))
+        assert seen[-1].foreign == pytest.approx(np.zeros((2, 2)), abs=1e-9)
+    problem = Problem([Series(START, seen)], noise.space, noise.values, EVERYTHING)
+    likelihood = problem.likelihood(noise.values, np.ones(len(noise.values), dtype=bool))
+    rows = noise.values * np.exp(0.4 * rng.standard_normal((3, len(noise.values))))
+    rows[:, -3:] = 1e-60
+    expected = [sum(step.log_likelihood for step in filtered(problem.series[0], noise.space, row)) for row in rows]
+    assert likelihood.totals(rows) == pytest.approx(expected, abs=1e-7)
+    assert "sensors.lidar.correlation.time_s" in noise.keys
+    tuned = noise.config_with(rows[0]).sensors["lidar"].correlation
+    assert tuned is not None
+    shown, errors = noise.shown(rows[0], np.full(len(rows[0]), 0.1))
+    place = noise.keys.index("sensors.lidar.correlation.share")
+    assert tuned.share == pytest.approx(shown[place], rel=1e-3)
+    assert errors[place] == pytest.approx(0.1 * (1.0 - shown[place]))

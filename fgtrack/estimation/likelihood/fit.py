@@ -215,6 +215,8 @@ class Problem:
                     if observation.tuned:
                         components = observation.measurement.model.components
                         found[[names[observation.sensor, components[i]] for i in observation.measured]] += 1
+                        if observation.sensor in self.space.lasting:
+                            found[names[observation.sensor, "share"]] += 1
         return found
 
     def likelihood(self, values: FloatArray, free: BoolArray) -> Likelihood:

@@ -19,6 +19,7 @@ from fgtrack.estimation.likelihood.contaminated import update
 from fgtrack.estimation.likelihood.noise import NoiseSpace
 from fgtrack.estimation.likelihood.reference import Step
 from fgtrack.estimation.likelihood.series import Series
+from fgtrack.models.correlated_errors import ErringMeasurement
 
 
 class Evaluation(NamedTuple):
@@ -72,6 +73,8 @@ class Innovations:
         self._own, self._foreign = np.zeros((*shape, d, d)), np.broadcast_to(np.eye(d), (*shape, d, d)).copy()
         self._std: IntArray = np.full((*shape, d), none)
         self._odds: IntArray = np.full(shape, none)
+        self._lasting: IntArray = np.full(shape, none)
+        self._errors = np.zeros((*shape, d, n))  # 1 where an error that lasts is in the state
         self._padding = np.full(shape, d)
         self._assumed_innovation, self._assumed_jacobian = np.zeros((*shape, a)), np.zeros((*shape, a, n))
         self._assumed_covariance = np.broadcast_to(np.eye(a), (*shape, a, a)).copy()
@@ -89,6 +92,10 @@ class Innovations:
                 self._foreign[k, t, :size, :size] = observation.foreign
                 if observation.tuned:
                     self._axes[k, t, :size, :size] = observation.axes
+                    model = observation.measurement.model
+                    if isinstance(model, ErringMeasurement):
+                        self._lasting[k, t] = names[sensor, "share"]
+                        self._errors[k, t, range(size), model.columns] = 1.0
                     self._std[k, t, :size] = [names[sensor, components[place]] for place in observation.measured]
                 self._own[k, t, :size, :size] = observation.own
                 self._odds[k, t] = names[sensor, ""]
@@ -99,6 +106,9 @@ class Innovations:
                     step.assumed_jacobian,
                 )
                 self._assumed_covariance[k, t, :size, :size] = step.assumed_covariance
+        fixed = 1.0 - self._errors.any(axis=-2, keepdims=True)
+        self._H_fixed = self._H * fixed
+        self._any_lasts: bool = np.any(self._errors).item()
         self._F = motion.jacobian(self._before, self._since_s)
         self._parts = space.noise_parts(self._before, self._since_s)
         self._has_assumed: list[bool] = np.any(self._assumed_jacobian, axis=(1, 2, 3)).tolist()
@@ -120,13 +130,21 @@ class Innovations:
                 F, drift, Q = self._transitions(values, block)
                 stds = extended[:, self._std[block]]
                 rooted = self._axes[block] * stds[..., None, :]
-                R = rooted @ rooted.mT + self._own[block]
+                lasting = extended[:, self._lasting[block]][..., None, None]
+                R = rooted @ rooted.mT / (1.0 + lasting) + self._own[block]
+                if self._any_lasts:
+                    gain = np.sqrt(lasting / (1.0 + lasting)) * rooted @ self._axes[block].mT
+                    H_all = self._H_fixed[block] + gain @ self._errors[block]
                 odds = extended[:, self._odds[block]]
             j = k % span
             x = (F[:, j] @ x[..., None])[..., 0] + drift[:, j]
             P = propagated(F[:, j], P, Q[:, j])
             H = self._H[k]
             y = self._y[k] - (H @ x[..., None])[..., 0]
+            if self._any_lasts:
+                H = H_all[:, j]
+                at = x + self._predicted[k]
+                y = self._y[k] - (H @ at[..., None] - self._H[k] @ self._predicted[k][..., None])[..., 0]
             one = update(P, H, y, R[:, j], self._foreign[k], odds[:, j])
             x, P = x + one.step, one.covariance
             found[k], ys[k], Ss[k] = one.log_likelihood, y, one.S

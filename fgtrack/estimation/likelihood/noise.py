@@ -12,21 +12,30 @@ from fgtrack.models.white_noise import WhiteNoise
 
 @dataclass(frozen=True)
 class NoiseSpace:
-    """The parameters in one vector: noise of the motion, then of each sensor, then the share of its outliers."""
+    """The parameters in one vector: noise of the motion, then of each sensor, then the share of its outliers.
+
+    All are positive. The share of an error that lasts is given by its odds, share / (1 - share).
+    """
 
     motion_names: tuple[str, ...]
     motion: Callable[[Mapping[str, float]], MotionModel]
-    """The motion model with these standard deviations, by name of `motion_names`; its variances grow with their
-    squares."""
+    """The motion model with these parameters, by name of `motion_names`; where its noise is white they are standard
+    deviations."""
     sensors: Mapping[str, tuple[str, ...]]
     """Components by sensor."""
+    lasting: tuple[str, ...] = ()
+    """Sensors whose errors are correlated in time."""
 
     @property
     def names(self) -> tuple[tuple[str, str], ...]:
-        """(sensor, component) of each parameter, ("", name) for the motion, (sensor, "") for its share of outliers."""
+        """(sensor, component) of each standard deviation.
+
+        ("", name) for the motion, (sensor, "share") for what lasts of its errors, (sensor, "") for its outliers.
+        """
         motion = [("", name) for name in self.motion_names]
         stds = [(sensor, name) for sensor, components in self.sensors.items() for name in components]
-        return (*motion, *stds, *((sensor, "") for sensor in self.sensors))
+        shares = [(sensor, "share") for sensor in self.lasting]
+        return (*motion, *stds, *shares, *((sensor, "") for sensor in self.sensors))
 
     @property
     def num_motion(self) -> int:

@@ -1,7 +1,8 @@
 """An EKF along each series at one vector of parameters: the trajectory about which the likelihood is linearised."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from fgtrack.estimation.ekf import joseph, kalman_gain, linearised, predict_one
 from fgtrack.estimation.likelihood.contaminated import update
 from fgtrack.estimation.likelihood.noise import NoiseSpace
 from fgtrack.estimation.likelihood.series import Observation, Series
+from fgtrack.models.correlated_errors import ErringMeasurement
+from fgtrack.models.measurement import MeasurementModel
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +54,20 @@ class Step:
         return float(mahalanobis_squared(self.y, self.S))
 
 
-def covariance(observation: Observation, stds: FloatArray) -> FloatArray:
-    """Covariance of the sensor's own error with its standard deviations `stds`, shape (d, d)."""
+def errors(observation: Observation, stds: FloatArray, odds: float) -> tuple[MeasurementModel, FloatArray]:
+    """The measurement model, and the covariance (d, d) of the part of the sensor's own error that is new.
+
+    `odds` are those of the part that lasts; see `split_error`.
+    """
+    model = observation.measurement.model
     if not observation.tuned:
-        return observation.own
-    return congruence(observation.axes, np.diag(np.square(stds)))
+        return model, observation.own
+    R, share = congruence(observation.axes, np.diag(np.square(stds))), odds / (1.0 + odds)
+    if not isinstance(model, ErringMeasurement):
+        return model, R
+    gain = np.zeros_like(model.gain)
+    gain[list(observation.measured)] = congruence(observation.axes, np.diag(math.sqrt(share) * stds))
+    return replace(model, gain=gain), (1.0 - share) * R
 
 
 def filtered(series: Series, space: NoiseSpace, values: Sequence[float] | FloatArray) -> list[Step]:
@@ -70,11 +82,11 @@ def filtered(series: Series, space: NoiseSpace, values: Sequence[float] | FloatA
         measurement = observation.measurement
         since_s = seconds(measurement.stamp_ns - stamp_ns)
         predicted, P = predict_one(x, P, motion, since_s)
-        y, H = linearised(measurement.z, predicted, measurement.model, measurement.pose)
         here, there = list(observation.measured), list(observation.assumed)
         sensor = observation.sensor
         stds = np.array([by_name[sensor, measurement.model.components[place]] for place in here])
-        R = covariance(observation, stds)
+        model, R = errors(observation, stds, by_name.get((sensor, "share"), 0.0))
+        y, H = linearised(measurement.z, predicted, model, measurement.pose)
         found = update(P, H[here], y[here], R, observation.foreign, np.array(by_name[sensor, ""]))
         after, P = predicted + found.step, found.covariance
         R_assumed = measurement.R[np.ix_(there, there)]
