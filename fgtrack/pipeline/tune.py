@@ -22,7 +22,9 @@ from fgtrack.pipeline.shipped import read_config, settings_of
 from fgtrack.pipeline.tune_measurements import recorded
 from fgtrack.pipeline.tune_report import HeldOut, InnovationFit, Known, SensorNoise, TunedParameter, TuneReport
 from fgtrack.pipeline.tune_space import ConfigNoise
-from fgtrack.tracking.association import GatedMahalanobis
+from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
+
+_LASTING = "an error that lasts looks like motion: only the part that does not is fitted, by the share"
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,8 @@ class TuneRules:
     """A value is rejected by the data where the log-likelihood is lower by this: a 95 % interval."""
     gate_probability: float = 0.9999
     """A narrower chi-square gate is opened to this: what it cuts off would be missing in the noise."""
+    gate_stds: float = 4.0
+    """A gate in metres is opened to so many standard deviations, for the same reason."""
     start_factor: float = 5.0
     """Further starts have a motion noise larger, and smaller, by this."""
     start_observations: int = 200
@@ -131,6 +135,21 @@ def _for_tuning(config: Config, rules: TuneRules) -> Config:
     return replace(config, estimator="ekf-replay", association=association)
 
 
+def _widened(config: Config, rules: TuneRules) -> Config:
+    """The configuration with a gate of so many standard deviations of the position of the least precise sensor."""
+    axes = ("x_m", "y_m", "range_m")
+    needed_m = rules.gate_stds * max(
+        [0.0, *(one.std[name] for one in config.sensors.values() for name in axes if name in one.std)]
+    )
+    association = config.association
+    if isinstance(association, GatedEuclidean):
+        return replace(config, association=replace(association, gate_m=max(association.gate_m, needed_m)))
+    if isinstance(association, GatedMahalanobis):
+        limit_m = max(association.max_distance_m, needed_m)
+        return replace(config, association=replace(association, max_distance_m=limit_m))
+    return config
+
+
 @dataclass(frozen=True)
 class _Found:
     """Parameters and what is known of them."""
@@ -157,6 +176,10 @@ class _Tuning:
         self._noise = noise
         self._space = noise.space
         self._configured = noise.values
+        # A lasting error looks like motion: the likelihood knows the part that is new, which the share gives.
+        self._lasting = np.array(
+            [name not in ("", "share") and one in self._space.lasting for one, name in self._space.names]
+        )
         self._recordings = recordings
         self._rules = rules
         self._on_step = on_step
@@ -190,7 +213,7 @@ class _Tuning:
 
     def _associated(self, values: FloatArray) -> tuple[list[list[Series]], list[Run]]:
         """The series of long tracks and the run of each recording, with the noise of `values`."""
-        config = self._noise.config_with(values)
+        config = _widened(self._noise.config_with(values), self._rules)
         all_series, runs = [], []
         for recording in self._recordings:
             series, run, _ = recorded(recording.messages, config, recording.name)
@@ -216,8 +239,8 @@ class _Tuning:
         return problem
 
     def _free(self, problem: Problem) -> BoolArray:
-        """Which parameters have enough measurements."""
-        return np.asarray(problem.counts() >= self._rules.min_count)
+        """Which parameters have enough measurements and can be told from others."""
+        return np.asarray((problem.counts() >= self._rules.min_count) & ~self._lasting)
 
     def _best_start(self, problem: Problem, free: BoolArray) -> tuple[FloatArray, int]:
         """The start, of three, from which the highest maximum is reached on a part of the data; how many there are."""
@@ -241,7 +264,8 @@ class _Tuning:
         """The maximum with what is not known taken out, and fitted again without it."""
         count = len(start)
         known: list[Known] = ["no"] * count
-        why = [f"fewer than {self._rules.min_count} measurements on tracks"] * count
+        few = f"fewer than {self._rules.min_count} measurements on tracks"
+        why = [_LASTING if lasting else few for lasting in self._lasting.tolist()]
         values, free = start.copy(), free.copy()
         shares = np.array([not name for _, name in self._space.names])
         while True:

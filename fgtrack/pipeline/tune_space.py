@@ -15,7 +15,6 @@ from fgtrack.pipeline.config import Config, MotionConfig
 
 _FIRST_SHARE = 0.01
 _DIGITS = 4
-_TIME = " time_s"  # behind the name of a sensor: how long its errors last, of the motion as the likelihood sees it
 _MAX_SHARE = 0.9999
 
 
@@ -24,7 +23,7 @@ class ConfigNoise:
     """What of a configuration is tuned.
 
     Process noise, and the standard deviation of every component of every sensor; where its errors are correlated in
-    time, also the share that lasts, and how long. Of a plug-in's motion model those
+    time, the share that lasts instead, but not how long. Of a plug-in's motion model those
     parameters whose name holds `_density_` (a variance grows with it) or `std`. A heading taken from a map
     (`yaw_from_map_std_rad`) is no measurement and is left alone.
     """
@@ -37,8 +36,6 @@ class ConfigNoise:
         return tuple(self._key(sensor, name) for sensor, name in self.space.names)
 
     def _key(self, sensor: str, name: str) -> str:
-        if name.endswith(_TIME):
-            return f"sensors.{name.removesuffix(_TIME)}.correlation.time_s"
         if not sensor:
             return f"{self._motion_section}.{name}"
         if name == "share":
@@ -49,17 +46,15 @@ class ConfigNoise:
     def space(self) -> NoiseSpace:
         """The parameters as the likelihood needs them."""
         sensors = {name: sensor.components for name, sensor in self.config.sensors.items()}
-        times = [name + _TIME for name in self._correlations]
-        return NoiseSpace((*self._motion_stds, *times), self._motion_model, sensors, tuple(self._correlations))
+        return NoiseSpace(tuple(self._motion_stds), self._motion_model, sensors, tuple(self._correlations))
 
     @property
     def values(self) -> FloatArray:
         """The configured parameters, shape (p,)."""
         lasting = self._correlations.values()
         stds = [sensor.std[name] for sensor in self.config.sensors.values() for name in sensor.components]
-        motion = [*self._motion_stds.values(), *(one.time_s for one in lasting)]
         odds = [one.share / (1.0 - one.share) for one in lasting]
-        return np.array([*motion, *stds, *odds, *[_FIRST_SHARE] * len(self.config.sensors)])
+        return np.array([*self._motion_stds.values(), *stds, *odds, *[_FIRST_SHARE] * len(self.config.sensors)])
 
     def shown(self, values: FloatArray, log_std: FloatArray) -> tuple[list[float], list[float]]:
         """Parameters as the configuration has them, and standard errors as shares of these, in the order of `keys`.
@@ -90,9 +85,7 @@ class ConfigNoise:
             odds = found[sensor, "share"]
             kept = odds == was.share / (1.0 - was.share)
             share = was.share if kept else _rounded(odds / (1.0 + odds))
-            sensors[sensor] = replace(
-                sensors[sensor], correlation=Correlation(min(share, _MAX_SHARE), found["", sensor + _TIME])
-            )
+            sensors[sensor] = replace(sensors[sensor], correlation=replace(was, share=min(share, _MAX_SHARE)))
         motion = self._motion_with({n: found["", n] for n in self._motion_stds})
         return replace(self.config, motion=motion, sensors=sensors)
 
@@ -132,14 +125,8 @@ class ConfigNoise:
             motion, parameters={**motion.parameters, **{name: _power(name, std) for name, std in stds.items()}}
         )
 
-    def _motion_model(self, values: Mapping[str, float]) -> MotionModel:
-        motion = self._motion_with({name: value for name, value in values.items() if not name.endswith(_TIME)}).model()
-        times = {name.removesuffix(_TIME): value for name, value in values.items() if name.endswith(_TIME)}
-        sensors = {
-            name: replace(self.config.sensors[name], correlation=replace(one, time_s=times[name]))
-            for name, one in self._correlations.items()
-        }
-        return with_correlated_errors(motion, sensors)
+    def _motion_model(self, stds: Mapping[str, float]) -> MotionModel:
+        return with_correlated_errors(self._motion_with(stds).model(), self.config.sensors)
 
 
 def _root(name: str, value: float) -> float:

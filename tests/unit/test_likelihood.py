@@ -190,7 +190,7 @@ def test_errors_that_last_are_parameters_too() -> None:
     rows[:, -3:] = 1e-60
     expected = [sum(step.log_likelihood for step in filtered(problem.series[0], noise.space, row)) for row in rows]
     assert likelihood.totals(rows) == pytest.approx(expected, abs=1e-7)
-    assert "sensors.lidar.correlation.time_s" in noise.keys
+    assert "sensors.lidar.correlation.time_s" not in noise.keys
     tuned = noise.config_with(rows[0]).sensors["lidar"].correlation
     assert tuned is not None
     shown, errors = noise.shown(rows[0], np.full(len(rows[0]), 0.1))

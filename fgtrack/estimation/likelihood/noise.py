@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgtrack.core.types import FloatArray
+from fgtrack.models.correlated_errors import CorrelatedErrors
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.white_noise import WhiteNoise
 
@@ -51,7 +52,8 @@ class NoiseSpace:
 
         Q = rest + sum of value_i^2 part_i: rest of shape (..., n, n), part of shape (q, ..., n, n).
         """
-        if not isinstance(self.motion_model(np.ones(self.num_motion)), WhiteNoise):
+        model = self.motion_model(np.ones(self.num_motion))
+        if not isinstance(model.base if isinstance(model, CorrelatedErrors) else model, WhiteNoise):
             return None
         rest = self.motion_model(np.zeros(self.num_motion)).process_noise(x, dt_s)
         units = np.eye(self.num_motion)
