@@ -37,9 +37,9 @@ class FitSettings:
     curvature_difference: float = 0.05
     """The same for second derivatives."""
     max_linearisations: int = 6
-    flat: float = 0.002
+    flat: float = 0.01
     """The maximum is found where the next step promises to gain less than this in the log-likelihood."""
-    tolerance: float = 0.05
+    tolerance: float = 0.1
     """Linearised again until no parameter changes by more than this share of its standard error."""
 
     def counts(self, series: Series, place: int) -> bool:
