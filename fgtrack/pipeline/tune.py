@@ -132,7 +132,10 @@ def _for_tuning(config: Config, rules: TuneRules) -> Config:
     if isinstance(association, GatedMahalanobis):
         probability = max(association.gate_probability, rules.gate_probability)
         association = replace(association, gate_probability=probability)
-    return replace(config, estimator="ekf-replay", association=association)
+    ego = config.ego
+    if ego.uncertainty == "shared":  # which replaces what a track would be given
+        ego = replace(ego, uncertainty="independent")
+    return replace(config, estimator="ekf-replay", association=association, ego=ego)
 
 
 def _widened(config: Config, rules: TuneRules) -> Config:
