@@ -65,6 +65,8 @@ def test_every_lag_has_its_known_errors_at_its_own_stamps(tmp_path: Path) -> Non
         assert entry.present_errors["position_m"].rmse == pytest.approx(2.5)
         for name in ("position_m", "speed_mps", "yaw_rad"):
             assert entry.gain(name) == pytest.approx(1.0 - share, abs=1e-4)
+        if lag_s != 0.0:
+            assert entry.position_reduction.mean == pytest.approx(entry.gain("position_m"))
 
 
 def test_the_present_beside_a_lag_is_that_of_the_same_stamps(tmp_path: Path) -> None:

@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from scipy.special import stdtrit
 from scipy.stats import ttest_rel
 
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.paired import Estimate, block_length, paired, within_run
+from fgtrack.evaluation.paired import Estimate, block_length, by_stamp, paired, within_run
 
 
 def mean(sums: FloatArray) -> FloatArray:
@@ -82,6 +83,25 @@ def test_without_correlation_the_standard_error_is_the_textbook_one() -> None:
     found = within_run(np.stack([values, np.ones(400)], axis=-1), mean, np.random.default_rng(4))
     assert found.mean == pytest.approx(values.mean())
     assert (found.high - found.low) / 2.0 == pytest.approx(1.97 * values.std() / 20.0, rel=0.15)
+
+
+def test_with_few_blocks_the_interval_is_that_of_a_mean_of_few() -> None:
+    values = np.linspace(0.0, 1.0, 90)
+    found = within_run(np.stack([values, np.ones(90)], axis=-1), mean, np.random.default_rng(4))
+    means = [np.roll(values, -start)[:30].mean() for start in range(90)]  # of all blocks, a third of the run long
+    error = math.sqrt(np.var(means) / 3.0) * math.sqrt(3.0 / 2.0)
+    assert (found.high - found.low) / 2.0 == pytest.approx(stdtrit(2.0, 0.975) * error, rel=0.1)
+    assert found.count == 3
+
+
+def test_sums_are_those_of_each_stamp_without_what_is_not_known() -> None:
+    samples = np.array([[1.0, 10.0], [2.0, np.nan], [4.0, 40.0], [8.0, 80.0]])
+    assert by_stamp(np.array([7, 7, 3, 7]), samples).tolist() == [[4.0, 40.0, 1.0], [9.0, 90.0, 2.0]]
+
+
+def test_an_interval_on_either_side_of_zero_is_significant() -> None:
+    intervals = [(0.1, 0.3), (-0.3, -0.1), (-0.1, 0.3), (0.0, 0.2), (math.nan, math.nan)]
+    assert [Estimate(0.1, *one, 9).is_significant for one in intervals] == [True, True, False, False, False]
 
 
 def test_the_same_generator_gives_the_same_interval() -> None:
