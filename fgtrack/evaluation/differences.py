@@ -1,12 +1,12 @@
 """The table of paired differences between runs of one recording."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from fgtrack.evaluation.contest import Contest, Entry
 from fgtrack.evaluation.paired import UNKNOWN
-from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value
+from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value, short
 
 _HEADINGS = {
     "position_rmse_m": "pos. [m]",
@@ -15,6 +15,7 @@ _HEADINGS = {
     "position_nees": "NEES pos.",
     "gospa_in_sight_rms_m": "GOSPA [m]",
 }
+_MARKS: Mapping[Value, str] = {"best": "+", "tie": "=", "worse": " "}
 _MOST_DECIMALS = 5
 _LARGE_SHARE = 0.9  # of the samples that all runs have in common; below it the note says how many
 
@@ -37,7 +38,14 @@ def differences(contests: Sequence[Contest]) -> Table:
         Column("", ("quantity",), lambda row: (row.quantity,)),
         Column("quantity", (), lambda row: (_HEADINGS[row.quantity],), left=True),
         Column("run", ("run",), lambda row: (row.entry.run,), left=True),
-        Column("value", ("value",), lambda row: (row.entry.value,), bold=lambda row: row.entry.standing == "best"),
+        Column(
+            "value  ",
+            ("value", "standing"),
+            lambda row: (row.entry.value, row.entry.standing),
+            "{} {}",
+            text=lambda value: _MARKS.get(value, "") or short(value),
+            bold=lambda row: row.entry.standing == "best",
+        ),
         Column(
             "worse\nby",
             ("worse_by",),
@@ -46,12 +54,10 @@ def differences(contests: Sequence[Contest]) -> Table:
         ),
         Column("95 % interval", ("low", "high"), interval, "{} to {}", text=two_digits),
         Column("", ("blocks",), lambda row: ((row.entry.worse_by or UNKNOWN).count,)),
-        Column("", ("standing",), lambda row: (row.entry.standing,)),
-        Column("is", (), lambda row: (row.entry.standing,), left=True),
     ]
     notes = [
         "RMSE where all runs track the object; NEES: worse is farther from 2",
-        "tie: the interval of the difference to the best has 0 inside (block bootstrap)",
+        "+: best; =: ties with the best, as the interval has 0 inside (block bootstrap)",
     ]
     for contest in contests:
         if contest.samples < _LARGE_SHARE * contest.most_samples:

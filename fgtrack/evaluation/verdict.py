@@ -68,7 +68,8 @@ def _positions(contest: Contest) -> Iterator[str]:
 
 
 def _worse(entries: Sequence[Entry]) -> str:
-    named = [f"{entry.run} is {_metres(entry, ' worse')}" for entry in entries[:_MOST_NAMED]]
+    most = _MOST_NAMED if len(entries) > _MOST_NAMED + 1 else len(entries)
+    named = [f"{entry.run} is {_metres(entry, ' worse')}" for entry in entries[:most]]
     left = len(entries) - len(named)
     return ", ".join([*named, *([f"{left} more are worse"] if left else [])])
 

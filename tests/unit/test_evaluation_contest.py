@@ -153,6 +153,7 @@ def test_the_table_has_all_numbers_and_says_best_tie_or_worse(trio: list[Run]) -
     assert np.isnan(mine["worse_by"][0])
     assert mine["low"][2] < mine["worse_by"][2] < mine["high"][2]
     assert mine["blocks"][2] > 20
-    shown = next(column for column in compare(trio[:2])["differences"].shown if column.heading == "value")
+    shown = next(column for column in compare(trio[:2])["differences"].shown if column.heading.strip() == "value")
     assert shown.bold[:2] == (True, False)
+    assert [cell[-2:] for cell in shown.cells[:2]] == [" +", "  "]
     assert "**" in compare(trio[:2])["differences"].to_markdown()
