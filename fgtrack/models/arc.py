@@ -52,12 +52,12 @@ def heading_moments(x: FloatArray, t: FloatArray) -> tuple[ComplexArray, Complex
 
 
 class SmallTurn(NamedTuple):
-    """Heading moments of one state that turns little."""
+    """Heading moments of one state that turns little, or of many: arrays instead of numbers."""
 
-    turn: float
-    end: complex
+    turn: Any
+    end: Any
     """exp(i yaw) after the turn."""
-    moments: tuple[complex, complex, complex, complex, complex]
+    moments: tuple[Any, Any, Any, Any, Any]
     """m_0 to m_4."""
 
 
@@ -71,14 +71,26 @@ def small_turn(yaw: float, yaw_rate: float, t: float) -> SmallTurn | None:
     if not (-MAX_SMALL_TURN_RAD <= turn <= MAX_SMALL_TURN_RAD and -math.inf < yaw < math.inf):
         return None
     square = turn * turn
-    iw = complex(0.0, turn)
-    bend = cmath.rect(1.0, turn)
     e4 = complex(_horner(_E4_EVEN, square), turn * _horner(_E4_ODD, square))
+    return _small_turn(turn, complex(0.0, turn), cmath.rect(1.0, turn), cmath.rect(1.0, yaw), e4, t)
+
+
+def small_turns(yaw: FloatArray, yaw_rate: FloatArray, t: FloatArray) -> SmallTurn | None:
+    """`small_turn` of many states, shapes (m,); None where it is None for one of them."""
+    turn = yaw_rate * t
+    if not (np.abs(turn).max(initial=0.0) <= MAX_SMALL_TURN_RAD and np.isfinite(yaw).all()):
+        return None
+    even, odd = _polynomials(_E4, turn * turn)
+    iw = 1j * turn
+    return _small_turn(turn, iw, np.exp(iw), np.exp(1j * yaw), even + odd * iw, t)
+
+
+def _small_turn(turn: Any, iw: Any, bend: Any, start: Any, e4: Any, t: Any) -> SmallTurn:
+    """From E_4, exp(i turn) and exp(i yaw)."""
     e3 = (bend - iw * e4) / 4.0
     e2 = (bend - iw * e3) / 3.0
     e1 = (bend - iw * e2) / 2.0
     e0 = bend - iw * e1
-    start = cmath.rect(1.0, yaw)
     t0 = t * start
     t1 = t * t0
     t2 = t * t1
@@ -129,6 +141,33 @@ def small_turn_noise(
     has the `densities` of position (each axis), yaw, speed, yaw rate and acceleration. What the position p shares with
     another entry is a sum of heading moments; its own block, of products of two of them (see `_PRODUCTS`).
     """
+    y = arc.turn * arc.turn
+    kinds = _CONSTANT_SPEED if accel is None else _PRODUCTS
+    products = [(_horner(even, y), _horner(mixed, y), _horner(odd, y)) for even, mixed, odd in kinds]
+    entries = _noise_entries(arc, t, densities, products, speed, accel)
+    n = 5 if accel is None else 6
+    return np.array(entries).reshape(n, n)
+
+
+def small_turns_noise(
+    arc: SmallTurn, t: FloatArray, densities: Sequence[float], speed: FloatArray, accel: FloatArray | None = None
+) -> FloatArray:
+    """`small_turn_noise` of many states, shape (m, 5, 5) or (m, 6, 6); the arguments of shape (m,)."""
+    table = _CONSTANT_SPEED_TABLE if accel is None else _PRODUCTS_TABLE
+    values = _polynomials(table, arc.turn * arc.turn)
+    products = [(values[k], values[k + 1], values[k + 2]) for k in range(0, len(values), 3)]
+    entries = _noise_entries(arc, t, densities, products, speed, accel)
+    n = 5 if accel is None else 6
+    rows = np.empty((n * n, len(t)))
+    for k, entry in enumerate(entries):
+        rows[k] = entry
+    return np.ascontiguousarray(rows.T).reshape(len(t), n, n)
+
+
+def _noise_entries(
+    arc: SmallTurn, t: Any, densities: Sequence[float], products: Sequence[tuple[Any, Any, Any]], speed: Any, accel: Any
+) -> tuple[Any, ...]:
+    """All entries of Q, row by row, from the values of the `products`: numbers, or arrays of many states."""
     turn, end, moments = arc
     q_position, q_yaw, q_speed, q_rate, q_accel = densities
     t2 = t * t
@@ -139,14 +178,13 @@ def small_turn_noise(
     p_rate = 0.5j * q_rate * way2
     p_speed = q_speed * moments[1]
     speed_speed = q_speed * t
-    along: tuple[float, ...] = (q_speed * t3, 0.0)
-    across: tuple[float, ...] = (yaw3 * (speed * speed), rate5 * (speed * speed))
-    products = _CONSTANT_SPEED
+    along: tuple[Any, ...] = (q_speed * t3, 0.0)
+    across: tuple[Any, ...] = (yaw3 * (speed * speed), rate5 * (speed * speed))
     if accel is not None:
         last, back = speed + accel * t, -accel * t  # at the end, and from there back to the start
         of_yaw = (yaw3 * last * last, 2.0 * yaw3 * last * back, yaw3 * back * back)
         of_rate = (rate5 * last * last, 2.0 * rate5 * last * back, rate5 * back * back)
-        products, across = _PRODUCTS, of_yaw + of_rate
+        across = of_yaw + of_rate
         along = (q_speed * t3, 0.0, 0.0, q_accel * t2 * t3, 0.0, 0.0)
         speed_speed += q_accel * t3 / 3.0
         p_speed += q_accel * (0.5 * t * moments[2] - moments[3] / 6.0)
@@ -159,15 +197,15 @@ def small_turn_noise(
     speed_row = p_speed.real, p_speed.imag, 0.0, speed_speed, 0.0
     rate_row = p_rate.real, p_rate.imag, yaw_rate, 0.0, rate_rate
     if accel is None:
-        return np.array((*x_row, *y_row, *yaw_row, *speed_row, *rate_row)).reshape(5, 5)
+        return (*x_row, *y_row, *yaw_row, *speed_row, *rate_row)
     p_accel, speed_accel = 0.5 * q_accel * moments[2], 0.5 * q_accel * t2
     body = *x_row, p_accel.real, *y_row, p_accel.imag, *yaw_row, 0.0, *speed_row, speed_accel, *rate_row, 0.0
-    return np.array((*body, p_accel.real, p_accel.imag, 0.0, speed_accel, 0.0, q_accel * t)).reshape(6, 6)
+    return (*body, p_accel.real, p_accel.imag, 0.0, speed_accel, 0.0, q_accel * t)
 
 
 def _position_block(
-    products: Sequence[_Product], along: Sequence[float], across: Sequence[float], turn: float, end: complex
-) -> tuple[float, float, float]:
+    products: Sequence[tuple[Any, Any, Any]], along: Sequence[Any], across: Sequence[Any], turn: Any, end: Any
+) -> tuple[Any, Any, Any]:
     """Covariance of x and x, x and y, y and y: the `products`, weighted by what drives them.
 
     In the frame of the last heading, what moves the position `along` the heading (speed, acceleration) enters as it is,
@@ -175,15 +213,24 @@ def _position_block(
     """
     y = turn * turn
     aa = ac = cc = 0.0
-    for a, c, (even, mixed, odd) in zip(along, across, products, strict=True):
-        e, o = _horner(even, y), y * _horner(odd, y)
+    for a, c, (e, mixed, odd) in zip(along, across, products, strict=True):
+        o = y * odd
         aa += a * e + c * o
-        ac += (a - c) * _horner(mixed, y)
+        ac += (a - c) * mixed
         cc += a * o + c * e
     ac *= turn
     u, v = end.real, end.imag
     uu, uv, vv = u * u, u * v, v * v
     return uu * aa - 2.0 * uv * ac + vv * cc, uv * (aa - cc) + (uu - vv) * ac, vv * aa + 2.0 * uv * ac + uu * cc
+
+
+def _polynomials(table: FloatArray, y: FloatArray) -> FloatArray:
+    """Values of K polynomials with the coefficients `table` (K, 9) at y (m,), shape (K, m)."""
+    powers = np.empty((_NUM_POWERS, len(y)))
+    powers[0] = 1.0
+    for k in range(1, _NUM_POWERS):
+        np.multiply(powers[k - 1], y, out=powers[k])
+    return np.asarray(table @ powers)
 
 
 def _horner(c: tuple[float, ...], y: float) -> float:
@@ -218,3 +265,7 @@ _E4_EVEN, _E4_ODD = (tuple(half.tolist()) for half in _kernel(4, 0))
 # yaw or speed, with ramp of one in their rates. Order 1 is the part that an acceleration adds.
 _PRODUCTS = [_product(first, second, ramp) for ramp in (0, 1) for first, second in ((0, 0), (0, 1), (1, 1))]
 _CONSTANT_SPEED = [_PRODUCTS[0], _PRODUCTS[3]]
+_E4 = np.array([_E4_EVEN, _E4_ODD])
+_PRODUCTS_TABLE, _CONSTANT_SPEED_TABLE = (
+    np.array(kinds).reshape(-1, _NUM_POWERS) for kinds in (_PRODUCTS, _CONSTANT_SPEED)
+)

@@ -15,7 +15,7 @@ from fgtrack.estimation.banded.ring import fuse_behind
 from fgtrack.estimation.banded.undo import Undo
 from fgtrack.estimation.banded.whitening import Innovations, whitened
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.ekf import predict
+from fgtrack.estimation.ekf import propagated
 from fgtrack.estimation.initiation import Fix, Line, along, fix_of
 from fgtrack.estimation.interpolation import between_all
 from fgtrack.estimation.smoother_settings import SmootherSettings
@@ -104,8 +104,8 @@ class Windows:
         newest = places == nodes.count[tracks] - 1
         ahead = np.flatnonzero(newest & (until_ns > 0))
         if ahead.size:
-            dt_s = until_ns[ahead] / NS_PER_S
-            means[ahead], covariances[ahead] = predict(means[ahead], covariances[ahead], self._motion, dt_s)
+            means[ahead], F, Q = self._motion.steps(means[ahead], until_ns[ahead] / NS_PER_S)
+            covariances[ahead] = propagated(F, covariances[ahead], Q)
         inner = np.flatnonzero(~newest & (until_ns > 0))
         if inner.size:
             means[inner], covariances[inner] = self._between(
