@@ -66,6 +66,8 @@ class Windows:
         self._curved: BoolArray = np.zeros(0, dtype=bool)
         self._anchored: IntArray = np.zeros(0, dtype=np.int64)
         """1 where the oldest node of the window keeps its linearisation, because it has a marginalised past."""
+        self._far: BoolArray = np.zeros(0, dtype=bool)
+        """Whether a node is too far from its linearisation point."""
         self._known: IntArray = np.zeros(0, dtype=np.int64)
         """From this place on smoothed means and covariances are known."""
 
@@ -75,12 +77,15 @@ class Windows:
         more = len(self.nodes.first) - len(self._known)
         if more:
             self._thresholds = np.concatenate([self._thresholds, np.zeros((more, self._motion.dim))])
-            self._curved = np.concatenate([self._curved, np.zeros(more, dtype=bool)])
+            self._curved, self._far = (
+                np.concatenate([values, np.zeros(more, dtype=bool)]) for values in (self._curved, self._far)
+            )
             self._anchored, self._known = (
                 np.concatenate([values, np.zeros(more, dtype=np.int64)]) for values in (self._anchored, self._known)
             )
         self._thresholds[track] = self._settings.thresholds(self._motion, curved=False)
-        self._curved[track], self._anchored[track], self._known[track] = False, 0, 1
+        self._curved[track] = self._far[track] = False
+        self._anchored[track], self._known[track] = 0, 1
         eliminate(self.nodes, np.array([track]), np.array([0]))
 
     # --- states
@@ -191,7 +196,8 @@ class Windows:
             self._solved(tracks)
 
     def _solved(self, tracks: IntArray) -> None:
-        substitute_means(self.nodes, tracks)
+        self._far[tracks] = False
+        self._far[substitute_means(self.nodes, tracks, self._thresholds, self._anchored)] = True
         self._known[tracks] = self.nodes.count[tracks]
 
     def _leaving(self, tracks: IntArray, anchors: IntArray) -> Leaving:
@@ -213,6 +219,8 @@ class Windows:
         """Move the linearisation points that are too far from their states; gives their first places, or `count`."""
         nodes = self.nodes
         starts = nodes.count[tracks].copy()
+        if not self._far[tracks].any():
+            return starts
         free = nodes.first[tracks] + self._anchored[tracks]
         places = free[:, None] + np.arange(max(int((starts - free).max()), 0))
         slots = nodes.slots[tracks[:, None], np.minimum(places, starts[:, None] - 1)]
