@@ -148,7 +148,8 @@ class BandedBank:
 
     def remove(self, track_id: int) -> None:
         """See `TrackBank.remove`; what was still inside the window becomes final."""
-        self._ended += self._reports(track_id, self.take_rest(track_id))
+        rest = self.take_rest(track_id)
+        self._ended += self._reports([track_id] * len(rest), rest)
         self._free.append(self._numbers.pop(track_id))
         self._states.clear()
 
@@ -165,16 +166,13 @@ class BandedBank:
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`."""
         reports, self._ended = self._ended, []
-        for track_id in self._numbers:
-            if track_id in self._final:
-                reports += self._reports(track_id, self._final.pop(track_id))
+        final = [(track_id, state) for track_id in self._numbers for state in self._final.pop(track_id, ())]
+        reports += self._reports([track_id for track_id, _ in final], [state for _, state in final])
         for lag_s in self._settings.lagged_s:
             stamp_ns = self.present_ns - nanoseconds(lag_s)
             track_ids, _, states = self._known_at(stamp_ns)
             if track_ids:
-                means, covariances = self._motion.kinematic(*states)
-                for track_id, mean, covariance in zip(track_ids, wrapped_yaw(means), covariances, strict=True):
-                    reports.append(SmoothedReport(track_id, TrackState(stamp_ns, mean, covariance), lag_s))
+                reports += self._reported(track_ids, [stamp_ns] * len(track_ids), states, lag_s)
         return reports
 
     # --- one track
@@ -195,8 +193,10 @@ class BandedBank:
 
     def take_rest(self, track_id: int) -> list[TrackState]:
         """Like `take_final`, and of the nodes that are still inside."""
-        inside = self.windows.stamps_ns(self._numbers[track_id]) if self._settings.final else []
-        return self.take_final(track_id) + [self.state_at(track_id, stamp_ns) for stamp_ns in inside]
+        if not self._settings.final:
+            return self.take_final(track_id)
+        stamps_ns = self.windows.stamps_ns(self._numbers[track_id])
+        return self.take_final(track_id) + [self.state_at(track_id, stamp_ns) for stamp_ns in stamps_ns]
 
     def converge(self, track_id: int, max_iterations: int) -> None:
         """Relinearise a track until nothing moves; for comparisons."""
@@ -307,13 +307,20 @@ class BandedBank:
         chosen = [rows[track] for track in tracks.tolist()]
         return States(states.means[chosen], states.covariances[chosen])
 
-    def _reports(self, track_id: int, states: list[TrackState]) -> list[SmoothedReport]:
+    def _reports(self, track_ids: Sequence[int], states: Sequence[TrackState]) -> list[SmoothedReport]:
+        """Final states, one of each of `track_ids`."""
         if not states:
             return []
-        means, covariances = self._motion.kinematic(
-            np.array([state.mean for state in states]), np.array([state.covariance for state in states])
-        )
+        stack = States(np.array([state.mean for state in states]), np.array([state.covariance for state in states]))
+        return self._reported(track_ids, [state.stamp_ns for state in states], stack)
+
+    def _reported(
+        self, track_ids: Sequence[int], stamps_ns: Sequence[int], states: States, lag_s: float | None = None
+    ) -> list[SmoothedReport]:
+        means, covariances = self._motion.kinematic(*states)
         return [
-            SmoothedReport(track_id, TrackState(state.stamp_ns, mean, covariance))
-            for state, mean, covariance in zip(states, wrapped_yaw(means), covariances, strict=True)
+            SmoothedReport(track_id, TrackState(stamp_ns, mean, covariance), lag_s)
+            for track_id, stamp_ns, mean, covariance in zip(
+                track_ids, stamps_ns, wrapped_yaw(means), covariances, strict=True
+            )
         ]
