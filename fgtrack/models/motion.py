@@ -37,8 +37,7 @@ POLAR, CARTESIAN = STATE_NAMES[:4], ("x_m", "y_m", "vx_mps", "vy_mps")
 #: The gradient of a heading by the velocity grows as 1 / speed; below this speed it stays as it is there.
 MIN_SPEED_MPS = 1e-3
 
-#: So many states are faster one by one than as an array.
-_FEW = 6
+_FEW = 6  # so many states are faster one by one than as an array
 
 
 class Prediction(NamedTuple):
@@ -241,8 +240,8 @@ class CTRV(WhiteNoise, MotionModel):
         arc = small_turns(x[:, YAW], x[:, YAW_RATE], dt_s) if x.ndim == 2 and (dt_s >= 0.0).all() else None
         if arc is None:
             return super().steps(x, dt_s)
-        Q = small_turns_noise(arc, dt_s, self._densities, *_drive(x))
-        return Predictions(*self._all_along(x, dt_s, arc.moments), Q)
+        mean, F = self._all_along(x, dt_s, arc.moments)
+        return Predictions(mean, F, small_turns_noise(arc, dt_s, self._densities, *_drive(x)))
 
     def _all_along(
         self, x: FloatArray, t: FloatArray, moments: Sequence[ComplexArray]

@@ -173,3 +173,26 @@ def test_the_series_of_the_position_noise_are_their_integrals(ramp: int) -> None
         series = arc._product(first, second, ramp)
         assert_allclose([np.polyval(part[::-1], square) for part in series], expected, rtol=1e-12)
         assert all(len(part) == 9 for part in series)
+
+
+@every_model
+@pytest.mark.parametrize("num", [1, 6, 7, 40])
+@pytest.mark.parametrize("largest_rad", [0.4, 3.0])
+def test_steps_of_many_states_are_the_steps_of_each(model: MotionModel, num: int, largest_rad: float) -> None:
+    rng = np.random.default_rng([num, int(largest_rad)])
+    dt_s = rng.choice([0.0, 1e-6, 0.05, 1.0], num)
+    turn = rng.uniform(-largest_rad, largest_rad, num)
+    kinematic = rng.normal(size=(num, 6)) * [500.0, 500.0, 2.0, 40.0, 1.0, 8.0]
+    kinematic[:, 4] = np.where(dt_s > 1e-3, turn / np.maximum(dt_s, 1e-3), turn)
+    states = np.array([state_of(model, row) for row in kinematic])
+    found = model.steps(states, dt_s)
+    for k in range(num):
+        expected = model.step(states[k].tolist(), float(dt_s[k]))
+        assert_allclose(found.mean[k], expected.mean, rtol=1e-12, atol=1e-9)
+        assert_allclose(found.F[k], expected.F, rtol=1e-12, atol=1e-12)
+        assert_close(found.Q[k], expected.Q)
+
+
+def test_steps_go_forwards_only() -> None:
+    with pytest.raises(CallError, match=r"dt_s is -0\.1 s"):
+        CTRV().steps(np.zeros((10, 5)), np.full(10, -0.1))
