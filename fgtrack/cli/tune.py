@@ -21,7 +21,7 @@ from fgtrack.io.output import check_output
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.shipped import read_config
-from fgtrack.pipeline.tune import tuned
+from fgtrack.pipeline.tune import TuneRules, tuned
 from fgtrack.pipeline.tune_file import TUNED, write_tuned
 from fgtrack.pipeline.tune_report import HeldOut, TunedParameter, TuneReport
 
@@ -36,6 +36,9 @@ def tune(
     track_map: TrackMap = None,
     pit_map: PitMap = None,
     settings: Settings = None,
+    keep: Annotated[
+        list[str] | None, typer.Option("--keep", metavar="KEY", help="Leave this key as configured; may be repeated.")
+    ] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
@@ -47,9 +50,10 @@ def tune(
     config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
     sources = {str(path): open_input(path, config.input).messages for path in recordings}
     with progress("tune") as show:
-        report = tuned(sources, config, on_step=show)
+        report = tuned(sources, config, TuneRules(keep=tuple(keep or ())), show)
     tables = _tables(report)
-    lines = [_command(recordings, out, config_file, track_map, pit_map, settings or []), ""]
+    options = [*(f"--set '{setting}'" for setting in settings or []), *(f"--keep {key}" for key in keep or [])]
+    lines = [_command(recordings, out, config_file, track_map, pit_map, options), ""]
     lines += _text(tables)
     write_tuned(out, config_file, report.config, lines, overwrite)
     if as_json:
@@ -71,12 +75,12 @@ def _command(
     config_file: str | None,
     track_map: str | None,
     pit_map: str | None,
-    settings: Sequence[str],
+    options: Sequence[str],
 ) -> str:
     words = ["  fgtrack tune", *map(str, recordings)]
     for flag, value in (("-c", config_file), ("-o", out), ("--map", track_map), ("--pit-map", pit_map)):
         words += [] if value is None else [flag, str(value)]
-    return " ".join([*words, *(f"--set {setting}" for setting in settings)])
+    return " ".join([*words, *options])
 
 
 def _tables(report: TuneReport) -> list[Table | str]:

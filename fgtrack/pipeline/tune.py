@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgtrack.core.errors import DataError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import BoolArray, FloatArray, Message
 from fgtrack.estimation.likelihood.contaminated import outlier_share
 from fgtrack.estimation.likelihood.fit import FitSettings, Likelihood, Problem
@@ -32,6 +32,8 @@ class TuneRules:
     """Which tracks count, and when a parameter is known."""
 
     fit: FitSettings = field(default_factory=FitSettings)
+    keep: tuple[str, ...] = ()
+    """Keys of the configuration that stay as they are."""
     train_share: float = 0.7
     """Part of the time of each recording, from its start, that the noise which is judged is fitted to."""
     max_rounds: int = 4
@@ -87,6 +89,7 @@ def tune(
     map: str | Path | None = None,  # noqa: A002 - the name of the option
     pit_map: str | Path | None = None,
     set: Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
+    keep: Sequence[str] = (),
 ) -> TuneReport:
     """Fit process and measurement noise to recordings; `report.config` is the tuned configuration.
 
@@ -100,6 +103,8 @@ def tune(
         CSV files of the track and of the pit lane, or `oval`; in place of those of the configuration.
     set
         Values of single settings: `{"motion.kind": "ctra"}`.
+    keep
+        Keys that stay as configured: `["motion.std_per_s.speed"]`.
 
     Raises
     ------
@@ -110,7 +115,9 @@ def tune(
     """
     resolved = read_config(config, settings_of(set), track_map=map, pit_map=pit_map)
     paths = [recordings] if isinstance(recordings, (str, Path)) else list(recordings)
-    return tuned({str(path): open_input(path, resolved.input).messages for path in paths}, resolved)
+    return tuned(
+        {str(path): open_input(path, resolved.input).messages for path in paths}, resolved, TuneRules(keep=tuple(keep))
+    )
 
 
 def tuned(
@@ -183,6 +190,12 @@ class _Tuning:
         self._lasting = np.array(
             [name not in ("", "share") and one in self._space.lasting for one, name in self._space.names]
         )
+        self._kept = np.isin(noise.keys, rules.keep)
+        for key in rules.keep:
+            if key not in noise.keys:
+                raise CallError(
+                    f"keep {key}: is no noise of the configuration, which has {', '.join(filter(None, noise.keys))}"
+                )
         self._recordings = recordings
         self._rules = rules
         self._on_step = on_step
@@ -243,7 +256,7 @@ class _Tuning:
 
     def _free(self, problem: Problem) -> BoolArray:
         """Which parameters have enough measurements and can be told from others."""
-        return np.asarray((problem.counts() >= self._rules.min_count) & ~self._lasting)
+        return np.asarray((problem.counts() >= self._rules.min_count) & ~self._lasting & ~self._kept)
 
     def _best_start(self, problem: Problem, free: BoolArray) -> tuple[FloatArray, int]:
         """The start, of three, from which the highest maximum is reached on a part of the data; how many there are."""
@@ -268,7 +281,10 @@ class _Tuning:
         count = len(start)
         known: list[Known] = ["no"] * count
         few = f"fewer than {self._rules.min_count} measurements on tracks"
-        why = [_LASTING if lasting else few for lasting in self._lasting.tolist()]
+        why = [
+            "kept as asked" if kept else _LASTING if lasting else few
+            for kept, lasting in zip(self._kept.tolist(), self._lasting.tolist(), strict=True)
+        ]
         values, free = start.copy(), free.copy()
         shares = np.array([not name for _, name in self._space.names])
         while True:

@@ -68,18 +68,26 @@ def test_a_tuned_file_is_replayed_and_not_replaced_without_being_asked(
 
 
 def test_json_says_the_same_and_every_parameter_has_a_row(stream: Path, capsys: Capture, tmp_path: Path) -> None:
-    out = tmp_path / "tuned.yaml"
-    assert run(["tune", str(stream), "-c", "open_space", "-o", str(out), "--json"]) == 0
+    out, kept = tmp_path / "tuned.yaml", "motion.std_per_s.speed"
+    assert run(["tune", str(stream), "-c", "open_space", "-o", str(out), "--json", "--keep", kept]) == 0
     found = json.loads(capsys.readouterr().out)
     config = load(Config, out)
     values = {one["key"]: one["tuned"] for one in found["parameters"]}
     assert values["sensors.radar.std.speed_mps"] == config.sensors["radar"].std["speed_mps"]
     assert values["motion.std_per_s.yaw"] == config.motion.std_per_s["yaw"]
     assert len(values) == 4 + 2 + 3
+    assert [one["key"] for one in found["parameters"] if one["why"] == "kept as asked"] == [kept]
+    assert values[kept] == 1.0
     assert all(one["why"] for one in found["parameters"] if one["known"] in ("no", "limit"))
     assert all(one["tuned"] == one["configured"] for one in found["parameters"] if one["known"] == "no")
     assert found["held_out"]["after"] > found["held_out"]["before"]
     assert found["nees"]["after"] > 0.0
+
+
+def test_a_key_to_keep_must_be_noise(stream: Path, capsys: Capture, tmp_path: Path) -> None:
+    out = str(tmp_path / "tuned.yaml")
+    assert run(["tune", str(stream), "-c", "open_space", "-o", out, "--keep", "motion.kind"]) == 2
+    assert "keep motion.kind: is no noise of the configuration" in capsys.readouterr().err
 
 
 def test_a_recording_of_nothing_is_one_line(tmp_path: Path, capsys: Capture) -> None:
