@@ -83,6 +83,9 @@ class Claims:
     """Largest difference to the dense joint posterior, in standard deviations."""
     rounding: float = 0.0
     """Where stamps nearly coincide, the tolerance grows to this many times `dense_joint.rounding_bound`."""
+    retrodicts: bool = False
+    """Whether a filter predicts the innovation of a late measurement from everything that has been fused, also what was
+    sensed after it. One that smooths does so anyway."""
     spreads: bool = False
     """Whether predictions of a nonlinear model are averages over the spread of the state, not values at its mean."""
     held_s: float = 0.0

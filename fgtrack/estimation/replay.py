@@ -59,6 +59,7 @@ class ReplayingFilter(WindowedFilter):
     """
 
     exact = "any lag, any number"
+    retrodicts = True
     initiates = True
 
     def __init__(

@@ -247,10 +247,16 @@ def _against_dense_joint(
         for name, subject in subjects.items()
         if subject.exact or order == "time"
     }
+    told = {
+        name: tolerance
+        for name, tolerance in tolerances.items()
+        if order == "time" or subjects[name].claims.smooths or subjects[name].claims.retrodicts
+    }
+    parts = ("dense joint", largest, tolerances), ("innovations", innovations, told)
     return [
-        Check(stream.name, name, order, against, *found[name], refused[name], tolerances.get(name))
+        Check(stream.name, name, order, against, *found[name], refused[name], allowed.get(name))
         for name in subjects
-        for against, found in (("dense joint", largest), ("innovations", innovations))
+        for against, found, allowed in parts
     ]
 
 

@@ -129,8 +129,8 @@ def _fuses_a_late_measurement_exactly(subject: Subject, stream: Stream) -> None:
 
 
 def _reports_the_innovation_against_all_that_it_has_fused(subject: Subject, stream: Stream) -> None:
-    """A filter predicts from later stamps too; of a nonlinear one it is known for what comes in sequence."""
-    estimator = subject.start(stream)
+    """From later stamps too, where it says so; of a nonlinear filter it is known for what comes in sequence."""
+    estimator, claims = subject.start(stream), subject.claims
     fused: list[Measurement] = []
     for measurement in stream.measurements:
         at_ns, newest_ns = measurement.stamp_ns, estimator.window_ns[1]
@@ -143,8 +143,8 @@ def _reports_the_innovation_against_all_that_it_has_fused(subject: Subject, stre
         S = H @ before.covariance @ H.T + measurement.R
         result = estimator.update(measurement)
         fused.append(measurement)
-        known = (subject.claims.smooths or at_ns > newest_ns) and not subject.claims.spreads
-        if not (stream.motion.linear or known):
+        known = claims.smooths or at_ns > newest_ns
+        if not (known or claims.retrodicts if stream.motion.linear else known and not claims.spreads):
             continue
         nis = float(y @ np.linalg.solve(S, y))
         given = np.full(len(y), np.nan) if result.innovation is None else result.innovation
