@@ -35,7 +35,7 @@ _RING_S = 10.0
 _NOT_FUSED = (UpdateStatus.TOO_OLD, UpdateStatus.FAILED)
 _CHECKPOINTS = 4
 _EVERY = 6
-_ITERATIONS = 10
+_ITERATIONS = 30
 
 #: Thresholds at which a smoother follows every move, so that it converges to rounding.
 _TINY = MappingProxyType({"yaw_rad": 1e-7, "speed_mps": 1e-7, "yaw_rate_radps": 1e-7, "accel_mps2": 1e-7})

@@ -111,7 +111,7 @@ _Plan = tuple[FloatArray, npt.NDArray[np.str_]]
 
 def linear(rng: np.random.Generator) -> Stream:
     """Positions of the paper's LiDAR and RADAR in a linear model, with the paper's delays."""
-    return _drawn(rng, "CV, paper's delays", CV(), _paper_stamps(1.5), lag_s=1.0, reach_s=0.95)
+    return _drawn(rng, "CV, paper's delays", CV(), _paper_stamps(1.2), lag_s=1.0, reach_s=0.95)
 
 
 def close(rng: np.random.Generator) -> Stream:
@@ -124,12 +124,12 @@ def close(rng: np.random.Generator) -> Stream:
 
 def late(rng: np.random.Generator) -> Stream:
     """A window shorter than the delays: most of it arrives when it is older than the window."""
-    return _drawn(rng, "CV, lag 0.05 s", CV(), _paper_stamps(1.5), lag_s=0.05, reach_s=0.5, late=True)
+    return _drawn(rng, "CV, lag 0.05 s", CV(), _paper_stamps(1.0), lag_s=0.05, reach_s=0.5, late=True)
 
 
 def whole(rng: np.random.Generator) -> Stream:
     """A car at 65 m/s in a bend, the RADAR with its speed; shorter than the window."""
-    return _drawn(rng, "CTRV, all in the window", CTRV(), _paper_stamps(1.0), lag_s=2.0, reach_s=1.9)
+    return _drawn(rng, "CTRV, all in the window", CTRV(), _paper_stamps(0.7), lag_s=2.0, reach_s=1.9)
 
 
 def observed(rng: np.random.Generator) -> Stream:
@@ -145,7 +145,7 @@ def observed(rng: np.random.Generator) -> Stream:
 
 def robust(rng: np.random.Generator) -> Stream:
     """Outliers among the positions, and a Huber loss."""
-    return _drawn(rng, "CTRV, Huber loss", CTRV(), _paper_stamps(0.6), lag_s=2.0, reach_s=1.9, sense=_with_outliers)
+    return _drawn(rng, "CTRV, Huber loss", CTRV(), _paper_stamps(0.45), lag_s=2.0, reach_s=1.9, sense=_with_outliers)
 
 
 def accelerated(rng: np.random.Generator) -> Stream:
@@ -155,12 +155,12 @@ def accelerated(rng: np.random.Generator) -> Stream:
 
 def leaving(rng: np.random.Generator) -> Stream:
     """As `whole`, longer than the window."""
-    return _drawn(rng, "CTRV, lag 1 s", CTRV(), _paper_stamps(1.5), lag_s=1.0, reach_s=0.4)
+    return _drawn(rng, "CTRV, lag 1 s", CTRV(), _paper_stamps(1.25), lag_s=1.0, reach_s=0.4)
 
 
 def short(rng: np.random.Generator) -> Stream:
     """As `whole`, in a window as long as the delays: some arrives when it is older than the window."""
-    return _drawn(rng, "CTRV, lag 0.3 s", CTRV(), _paper_stamps(1.2), lag_s=0.3, reach_s=0.4, late=True)
+    return _drawn(rng, "CTRV, lag 0.3 s", CTRV(), _paper_stamps(0.9), lag_s=0.3, reach_s=0.4, late=True)
 
 
 def _paper_stamps(duration_s: float) -> _Plan:

@@ -11,7 +11,7 @@ from fgtrack.pipeline.oracle.dynamics import Dynamics, FloatArray, Flow
 from fgtrack.pipeline.oracle.sightings import Sighting
 
 _NS_PER_S = 1e9
-_MAX_STEPS = 60
+_MAX_STEPS = 500
 #: A step of a state, in m, rad, m/s or rad/s, that is rounding.
 _AT_REST = 1e-9
 
@@ -114,7 +114,7 @@ def smoothed(problem: Problem) -> Solution:
         Q, R = np.linalg.qr(A)
         step = np.asarray(linalg.solve_triangular(R, Q.T @ b)).reshape(means.shape)
         longest = float(np.abs(step).max())
-        share = 1.0 if longest < 0.5 * last else 0.5
+        share = 1.0 if longest < 0.95 * last else 0.5
         means, last = means + share * step, longest
         if longest < _AT_REST:
             break
