@@ -67,10 +67,10 @@ def inverse_roots(S: FloatArray) -> FloatArray:
     `numpy.linalg.LinAlgError` where S is not positive definite.
     """
     L = np.linalg.cholesky(S)
-    W = np.zeros_like(L)
-    for i in range(L.shape[-1]):
-        pivot = 1.0 / L[..., i, i]
-        W[..., i, i] = pivot
-        if i:
-            W[..., i, :i] = (L[..., i, None, :i] @ W[..., :i, :i])[..., 0, :] * -pivot[..., None]
+    W = np.zeros(L.shape)
+    n = L.shape[-1]
+    pivots = 1.0 / np.diagonal(L, axis1=-2, axis2=-1)
+    W[..., range(n), range(n)] = pivots
+    for i in range(1, n):
+        W[..., i : i + 1, :i] = (L[..., i : i + 1, :i] @ W[..., :i, :i]) * -pivots[..., i, None, None]
     return W

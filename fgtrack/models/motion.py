@@ -397,4 +397,4 @@ def _broadcast_copy(x: FloatArray, t: FloatArray) -> FloatArray:
 
 def _identities(shape: tuple[int, ...], n: int) -> FloatArray:
     """Writable identity matrices, shape (*shape, n, n)."""
-    return np.broadcast_to(np.eye(n), (*shape, n, n)).copy()
+    return np.array(np.broadcast_to(identity(n), (*shape, n, n)))

@@ -86,6 +86,7 @@ class BandedBank:
         """See `TrackBank.advance`."""
         self._now_ns = now_ns
         self._clock_ns = np.maximum(self._clock_ns, now_ns)
+        self._states.clear()  # which tracks are known at a stamp depends on the clock
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`. Raises `DataError` for a stamp before the window where the policy is `raise`."""

@@ -134,15 +134,16 @@ def substitute_means(nodes: Nodes, tracks: IntArray, thresholds: FloatArray, anc
 
 
 def substitute(nodes: Nodes, tracks: IntArray, known: IntArray, places: IntArray) -> None:
-    """Find means and covariances of the nodes of `tracks` from `known` - 1 back to `places`, one each.
+    """Find the covariances of the nodes of `tracks` from `known` - 1 back to `places`, one each.
 
-    Those from `known` on are found already; it is the number of nodes where none is.
+    Those from `known` on are found already; it is the number of nodes where none is. Behind the windows, find the means
+    as well.
     """
     tracks_all = tracks
     newest = known == nodes.count[tracks]
     if newest.any():
         end = nodes.at(tracks[newest], known[newest] - 1)
-        nodes.step[end], nodes.P[end] = nodes.filtered[end], nodes.P_filtered[end]
+        nodes.P[end] = nodes.P_filtered[end]
         known = known - newest
     lengths = known - places
     if not (lengths > 0).any():
@@ -156,11 +157,15 @@ def substitute(nodes: Nodes, tracks: IntArray, known: IntArray, places: IntArray
     A, b, C = nodes.A[tracks, slots], nodes.b[tracks, slots], nodes.C[tracks, slots]
     A_t = _transposed(A)
     steps, covariances = np.empty(b.shape), np.empty(C.shape)
+    behind = bool((places[lengths - 1, np.arange(len(tracks))] < nodes.first[tracks]).any())
     step, P = nodes.step[at_right], nodes.P[at_right]
     for t in range(longest):
         m = int(np.searchsorted(-lengths, -t, side="left"))
-        step = steps[t, :m] = np.vecdot(A[t, :m], step[:m, None]) + b[t, :m]
+        if behind:
+            step = steps[t, :m] = np.vecdot(A[t, :m], step[:m, None]) + b[t, :m]
         P = covariances[t, :m] = A[t, :m] @ P[:m] @ A_t[t, :m] + C[t, :m]
     done = np.arange(longest)[:, None] < lengths
     at = np.broadcast_to(tracks, done.shape)[done], slots[done]
-    nodes.step[at], nodes.P[at] = steps[done], symmetrise(covariances[done])
+    nodes.P[at] = symmetrise(covariances[done])
+    if behind:
+        nodes.step[at] = steps[done]

@@ -86,7 +86,6 @@ class Windows:
         self._thresholds[track] = self._settings.thresholds(self._motion, curved=False)
         self._curved[track] = self._far[track] = False
         self._anchored[track], self._known[track] = 0, 1
-        eliminate(self.nodes, np.array([track]), np.array([0]))
 
     # --- states
 
