@@ -265,10 +265,11 @@ class _Tuning:
         some = [replace(one, observations=one.observations[: self._rules.start_observations]) for one in longest]
         part = replace(problem, series=some)
         free = free & (part.counts() >= self._rules.min_count)
+        moving = np.flatnonzero(free[: self._space.num_motion])
         reached: list[tuple[float, FloatArray]] = []
         for factor in (1.0, self._rules.start_factor, 1.0 / self._rules.start_factor):
             start = self._configured.copy()
-            start[: self._space.num_motion] *= factor
+            start[moving] *= factor
             values, likelihood = part.maximum(start, free)
             reached.append((-likelihood.objective(np.log(values[free])), values))
         reached.sort(key=lambda one: -one[0])
@@ -392,12 +393,12 @@ class _Tuning:
         self._on_step("standard errors")
         std_error = np.full(len(found.values), math.nan)
         std_error[found.free] = found.likelihood.log_std(np.log(found.values[found.free]))
-        known = [
-            "yes" if error <= self._rules.known_std_error else one
-            for one, error in zip(found.known, std_error.tolist(), strict=True)
-        ]
         was, _ = self._noise.shown(self._configured, std_error)
         now, errors = self._noise.shown(ConfigNoise(tuned_config).values, std_error)
+        known = [
+            "yes" if error <= self._rules.known_std_error else one
+            for one, error in zip(found.known, errors, strict=True)
+        ]
         columns = self._noise.keys, was, now, errors, known
         parameters = tuple(
             TunedParameter(key, was, value, None if math.isnan(error) else error, one, why)
