@@ -339,3 +339,24 @@ def test_sensors_at_two_poses_in_one_list_are_told_apart() -> None:
         bank.update(START.stamp_ns + 50 * MS, [0, 1], measurements)
     for before, after in zip(expected.present(), found.present(), strict=True):
         assert max(apart(after, before)) < 1e-9
+
+
+def test_the_arrays_stay_as_small_as_window_and_ring_need() -> None:
+    motion, rng = CTRV(), np.random.default_rng(4)
+    bank = BandedBank(motion, SmootherSettings(lag_s=0.3, ring_s=0.3))
+    for k in range(1, 301):
+        stamp_ns = START.stamp_ns + 25 * k * MS
+        bank.advance(stamp_ns)
+        if k % 30 == 1:  # one after the other, and one that stays
+            for track_id in bank.track_ids[1:]:
+                bank.remove(track_id)
+            bank.birth(k, replace(START, stamp_ns=stamp_ns))
+        seen = [track_id for track_id in bank.track_ids if rng.random() < 0.9]
+        bank.states_at(stamp_ns)
+        bank.update(stamp_ns, seen, [measured(rng, motion, 25 * k * MS) for _ in seen])
+        bank.smoothed()
+    nodes = bank.windows.nodes
+    assert nodes.stamps_ns.shape == (4, 64)
+    assert nodes.y.shape[-1] == 4
+    assert max(len(terms) for row in nodes.terms for terms in row) <= 1
+    assert len(bank._states) <= 2

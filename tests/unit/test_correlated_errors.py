@@ -126,7 +126,7 @@ def nees(name: str, modelled: bool, lag_s: float, num_runs: int = 40) -> float:
     return float(np.mean(found))
 
 
-@pytest.mark.parametrize("name", ["ekf-replay", "smoother"])
+@pytest.mark.parametrize("name", ["ekf-replay", "smoother", "smoother-banded"])
 @pytest.mark.parametrize("lag_s", [0.0, 0.5])
 def test_estimators_are_consistent_where_the_errors_have_a_state(name: str, lag_s: float) -> None:
     """The mean of 40 values of chi-square 2 has a standard deviation of 2 / sqrt(40) = 0.32."""

@@ -104,6 +104,8 @@ class BandedBank:
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
+        if not track_ids:
+            return []
         tracks = np.array([self._numbers[track_id] for track_id in track_ids])
         measurements = [measurement.seen_by(self._motion) for measurement in measurements]
         start_ns, newest_ns = self._start_ns(tracks), self.windows.newest_ns(tracks)
