@@ -129,7 +129,7 @@ class Opening:
     def _filtered(self, extra_ns: int | None = None) -> list[_Link]:
         """The start, and the state after each measurement; with one at `extra_ns`, where nothing is measured."""
         x, P = initial_state(self.motion, self.start)
-        nominal = self._nominal(x)
+        nominal = self.nominal(x)
         if not self.motion.cartesian:
             x = x.copy()
             x[YAW] = nominal[YAW]
@@ -154,8 +154,11 @@ class Opening:
             links.append(_Link(stamp_ns, x, P, predicted))
         return links
 
-    def _nominal(self, x: FloatArray) -> FloatArray:
-        """State (n,) on the line at the start; entries that the line does not give are those of x (n,)."""
+    def nominal(self, x: FloatArray) -> FloatArray:
+        """State (n,) on the line at the start; entries that the line does not give are those of x (n,).
+
+        Raises `numpy.linalg.LinAlgError` where there is no line.
+        """
         yaw_rad, speed_mps = self._course()
         motion = cartesian(np.array([yaw_rad, speed_mps])) if self.motion.cartesian else (yaw_rad, speed_mps)
         nominal = x.copy()

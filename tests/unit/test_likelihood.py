@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from fgtrack.core.geometry import rotation
+from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
@@ -155,6 +155,53 @@ def test_a_nonlinear_model_is_linearised_about_the_filter() -> None:
     likelihood = problem.likelihood(values, np.ones(10, dtype=bool))
     steps = filtered(problem.series[0], space, values)
     assert likelihood.totals(values[None])[0] == pytest.approx(sum(step.log_likelihood for step in steps), abs=1e-8)
+
+
+def turning(seed: int, num: int) -> tuple[NoiseSpace, FloatArray, Series]:
+    """A track of CTRV that heads away from the direction that its start has, which is none."""
+    names = "position", "yaw", "speed", "yaw_rate"
+    space = replace(SPACE, motion_names=names, motion=lambda std: CTRV.from_std_per_step(std, 1.0))
+    values, rng = np.array([0.1, 0.05, 0.5, 0.1, *VALUES[1:5], 0.01, 0.01]), np.random.default_rng(seed)
+    motion = space.motion_model(values)
+    x, seen = np.array([3.0, -2.0, 2.5, 20.0, 0.1]), []
+    for k in range(num):
+        sensor = ("lidar", "radar")[k % 2]
+        z = x[:2] + values[4 + 2 * (k % 2) : 6 + 2 * (k % 2)] * rng.standard_normal(2)
+        one = observed(sensor, 0.05 * k, z.tolist())
+        seen.append(replace(one, measurement=one.measurement.seen_by(motion)))
+        x = rng.multivariate_normal(motion.predict(x, 0.05), motion.process_noise(x, 0.05))
+    start = Start(position_m=seen[0].measurement.z, position_std_m=1.5, speed_std_mps=30.0)
+    return space, values, Series(start, seen[1:])
+
+
+def test_a_track_of_unknown_direction_is_linearised_along_its_first_positions() -> None:
+    space, values, track = turning(5, 200)
+    opened = track.opened(space.motion_model(values), "regression")
+    assert 3 < opened.num_opening < 30
+    steps = filtered(opened, space, values)
+    for step, about in zip(steps, opened.nominal[:-1], strict=False):
+        assert np.array_equal(step.about, about)
+    assert abs(wrap_angle(steps[opened.num_opening].after[2] - 2.5)) < 0.3
+    counted = [step for place, step in enumerate(steps) if FitSettings().counts(opened, place)]
+    assert len(counted) > 150
+    assert np.mean([step.nis for step in counted]) == pytest.approx(2.0, abs=0.4)
+    assert track.opened(space.motion_model(values), "one-point") is track
+    likelihood = Problem([opened], space, values, EVERYTHING).likelihood(values, np.ones(10, dtype=bool))
+    place = opened.num_opening
+    assert likelihood.totals(values[None])[0] == pytest.approx(
+        sum(step.log_likelihood for step in steps[place:]), abs=1e-8
+    )
+
+
+def test_innovations_count_from_where_the_direction_is_known() -> None:
+    space, values, track = turning(6, 100)
+    opened = track.opened(space.motion_model(values), "regression")
+    settings = FitSettings(settle_s=1.0, settle_steps=5)
+    first = next(place for place in range(100) if settings.counts(opened, place))
+    since_s = (opened.observations[first].measurement.stamp_ns - opened.opened_ns) / NS_PER_S
+    assert opened.opened_ns == opened.observations[opened.num_opening - 1].measurement.stamp_ns
+    assert first >= opened.num_opening + 5
+    assert 1.0 <= since_s < 1.05
 
 
 def test_errors_that_last_are_parameters_too() -> None:

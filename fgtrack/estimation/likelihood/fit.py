@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -27,7 +27,8 @@ class FitSettings:
     share_log_std: float = 1.5
     """The same for the share of outliers."""
     settle_s: float = 1.0
-    """Innovations in the first seconds of a track do not count: they are those of its first state."""
+    """Innovations in the first seconds of a track do not count: they are those of its first state. These seconds begin
+    where its direction of travel is known."""
     settle_steps: int = 5
     """Nor do as many of the first innovations."""
     block_s: float = 2.0
@@ -45,9 +46,19 @@ class FitSettings:
     def counts(self, series: Series, place: int) -> bool:
         """Whether the observation at `place` has a part in the likelihood: late enough in its track, in its limits."""
         stamp_ns = series.observations[place].measurement.stamp_ns
-        settled = place >= self.settle_steps and stamp_ns - series.start.stamp_ns >= NS_PER_S * self.settle_s
+        settled = place >= series.num_opening + self.settle_steps
+        settled &= stamp_ns - series.opened_ns >= NS_PER_S * self.settle_s
         after, before = series.from_ns, series.until_ns
         return settled and (after is None or stamp_ns >= after) and (before is None or stamp_ns < before)
+
+
+class _Evaluated(NamedTuple):
+    """What is minimised, at one place."""
+
+    logs: FloatArray
+    objective: float
+    gradient: FloatArray
+    information: FloatArray
 
 
 class Likelihood:
@@ -71,7 +82,7 @@ class Likelihood:
         self._shares = np.flatnonzero([not name for (_, name), one in zip(names, free, strict=True) if one])
         self._flat = settings.flat
         self._groups = _groups(innovations, settings.block_s)
-        self._memory: tuple[FloatArray, float, FloatArray, FloatArray] | None = None
+        self._memory: list[_Evaluated] = []  # the last two: after a step that was none the one before is asked again
 
     def values(self, logs: FloatArray) -> FloatArray:
         """Rows of parameters (..., p) of the free logarithms (..., f)."""
@@ -89,11 +100,11 @@ class Likelihood:
 
     def objective(self, logs: FloatArray) -> float:
         """What is minimised: minus the log-likelihood, and the weak prior."""
-        return self._evaluated(logs)[1]
+        return self._evaluated(logs).objective
 
     def gradient(self, logs: FloatArray) -> FloatArray:
         """Its gradient, shape (f,)."""
-        return self._evaluated(logs)[2]
+        return self._evaluated(logs).gradient
 
     def information(self, logs: FloatArray) -> FloatArray:
         """Information that is expected of the innovations, and that of the prior, shape (f, f): positive definite.
@@ -101,7 +112,7 @@ class Likelihood:
         Of normal innovations, sum of tr(S^-1 dS S^-1 dS) / 2 + dy' S^-1 dy; of the shares of outliers, which change
         neither y nor S, the squared scores.
         """
-        return self._evaluated(logs)[3]
+        return self._evaluated(logs).information
 
     def stop_where_flat(self, logs: FloatArray) -> None:
         """Raise `StopIteration` where the next step would gain next to nothing."""
@@ -113,19 +124,24 @@ class Likelihood:
         """Standard deviations of the free logarithms where the model is right, and the prior, shape (f,)."""
         return np.sqrt(np.diag(psd_solve(self.information(logs), np.eye(len(logs)))))
 
-    def _evaluated(self, logs: FloatArray) -> tuple[FloatArray, float, FloatArray, FloatArray]:
-        if self._memory is None or not np.array_equal(self._memory[0], logs):
-            found, scores = self._differentiated(logs)
-            middle = found.log_likelihoods[0]
-            if not np.isfinite(middle).all():
-                return logs, math.inf, np.zeros_like(logs), np.eye(len(logs))
-            off = (logs - self._prior_log) / self._prior_log_std
-            objective = 0.5 * float(off @ off) - float(middle.sum())
-            gradient = off / self._prior_log_std - scores.sum(axis=1)
-            information = self._expected(found) + np.diag(self._prior_log_std**-2)
-            information[self._shares, self._shares] += np.square(scores[self._shares]).sum(axis=1)
-            self._memory = logs.copy(), objective, gradient, information
-        return self._memory
+    def _evaluated(self, logs: FloatArray) -> _Evaluated:
+        found = next((one for one in self._memory if np.array_equal(one.logs, logs)), None)
+        if found is None:
+            found = self._evaluate(logs)
+        self._memory = [found, *(one for one in self._memory[:2] if one is not found)][:2]
+        return found
+
+    def _evaluate(self, logs: FloatArray) -> _Evaluated:
+        found, scores = self._differentiated(logs)
+        middle = found.log_likelihoods[0]
+        if not np.isfinite(middle).all():
+            return _Evaluated(logs.copy(), math.inf, np.zeros_like(logs), np.eye(len(logs)))
+        off = (logs - self._prior_log) / self._prior_log_std
+        objective = 0.5 * float(off @ off) - float(middle.sum())
+        gradient = off / self._prior_log_std - scores.sum(axis=1)
+        information = self._expected(found) + np.diag(self._prior_log_std**-2)
+        information[self._shares, self._shares] += np.square(scores[self._shares]).sum(axis=1)
+        return _Evaluated(logs.copy(), objective, gradient, information)
 
     def _differentiated(self, logs: FloatArray) -> tuple[Evaluation, FloatArray]:
         """The innovations at `logs`, then a little further in every direction; the scores (f, N) by differences."""

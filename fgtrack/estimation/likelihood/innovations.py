@@ -66,8 +66,8 @@ class Innovations:
         self.since_start_s = np.zeros(shape)
         """Time of each step since the first state, shape (k, t)."""
         self._since_s = np.zeros(shape)
-        self._before, self._after = np.zeros((*shape, n)), np.zeros((*shape, n))
-        self._predicted = np.zeros((*shape, n))
+        self._about, self._offset = np.zeros((*shape, n)), np.zeros((*shape, n))
+        self._predicted, self._after = np.zeros((*shape, n)), np.zeros((*shape, n))
         self._y, self._H = np.zeros((*shape, d)), np.zeros((*shape, d, n))
         self._axes = np.zeros((*shape, d, d))
         self._own, self._foreign = np.zeros((*shape, d, d)), np.broadcast_to(np.eye(d), (*shape, d, d)).copy()
@@ -87,7 +87,8 @@ class Innovations:
                 self.sensors[k, t] = sensors.index(sensor)
                 self.since_start_s[k, t] = (observation.measurement.stamp_ns - one.start.stamp_ns) / 1e9
                 self._since_s[k, t] = step.since_s
-                self._before[k, t], self._predicted[k, t], self._after[k, t] = step.before, step.predicted, step.after
+                self._about[k, t], self._offset[k, t] = step.about, step.before - step.about
+                self._predicted[k, t], self._after[k, t] = step.predicted, step.after
                 self._y[k, t, :size], self._H[k, t, :size] = step.y, step.H
                 self._foreign[k, t, :size, :size] = observation.foreign
                 if observation.tuned:
@@ -109,14 +110,14 @@ class Innovations:
         fixed = 1.0 - self._errors.any(axis=-2, keepdims=True)
         self._H_fixed = self._H * fixed
         self._any_lasts: bool = np.any(self._errors).item()
-        self._F = motion.jacobian(self._before, self._since_s)
-        self._parts = space.noise_parts(self._before, self._since_s)
+        self._F = motion.jacobian(self._about, self._since_s)
+        self._parts = space.noise_parts(self._about, self._since_s)
         self._has_assumed: list[bool] = np.any(self._assumed_jacobian, axis=(1, 2, 3)).tolist()
 
     def evaluate(self, values: FloatArray) -> Evaluation:
         """The N innovations that count, at each row of `values`, (b, p)."""
         num_steps, num_series = self._there.shape
-        b, n = len(values), self._before.shape[-1]
+        b, n = len(values), self._about.shape[-1]
         extended = np.concatenate([values, np.zeros((b, 1))], axis=1)
         d = self._y.shape[-1]
         found = np.empty((num_steps, b, num_series))
@@ -166,10 +167,11 @@ class Innovations:
             rest, parts = self._parts
             weights = np.square(values[:, : len(parts)])
             Q = rest[block] + np.tensordot(weights, parts[:, block], axes=1)
-            return self._F[None, block], np.zeros((1, *self._before[block].shape)), Q
-        x, dt_s, there = self._before[block], self._since_s[block], self._there[block]
+            return self._F[None, block], np.zeros((1, *self._about[block].shape)), Q
+        x, dt_s, there = self._about[block], self._since_s[block], self._there[block]
         models = [self._space.motion_model(row) for row in values]
         moved = np.array([model.predict(x, dt_s) for model in models])
         F = np.array([model.jacobian(x, dt_s) for model in models])
         Q = np.array([model.process_noise(x, dt_s) for model in models])
+        moved = moved + (F @ self._offset[block][..., None])[..., 0]
         return F, np.where(there[..., None], moved - self._predicted[block], 0.0), Q

@@ -11,7 +11,7 @@ from fgtrack.core.linalg import congruence, mahalanobis_squared
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.ekf import joseph, kalman_gain, linearised, predict_one
+from fgtrack.estimation.ekf import joseph, kalman_gain, linearised, propagated
 from fgtrack.estimation.likelihood.contaminated import update
 from fgtrack.estimation.likelihood.noise import NoiseSpace
 from fgtrack.estimation.likelihood.series import Observation, Series
@@ -28,6 +28,8 @@ class Step:
     """Since the observation before, or the first state."""
     before: FloatArray
     """State after the observation before, shape (n,)."""
+    about: FloatArray
+    """State about which the motion from there is linearised, shape (n,): `before`, or the nominal one."""
     predicted: FloatArray
     """State predicted from there, shape (n,)."""
     after: FloatArray
@@ -78,15 +80,21 @@ def filtered(series: Series, space: NoiseSpace, values: Sequence[float] | FloatA
     x, P = initial_state(motion, series.start)
     stamp_ns = series.start.stamp_ns
     steps = []
-    for observation in series.observations:
+    for place, observation in enumerate(series.observations):
         measurement = observation.measurement
         since_s = seconds(measurement.stamp_ns - stamp_ns)
-        predicted, P = predict_one(x, P, motion, since_s)
+        opening = place < series.num_opening
+        about = series.nominal[place] if opening else x
+        moved, F, Q = motion.step(about.tolist(), since_s)
+        predicted = np.array(moved) + F @ (x - about)
+        P = propagated(F, P, Q)
         here, there = list(observation.measured), list(observation.assumed)
         sensor = observation.sensor
         stds = np.array([by_name[sensor, measurement.model.components[place]] for place in here])
         model, R = errors(observation, stds, by_name.get((sensor, "share"), 0.0))
-        y, H = linearised(measurement.z, predicted, model, measurement.pose)
+        seen_from = series.nominal[place + 1] if opening else predicted
+        y, H = linearised(measurement.z, seen_from, model, measurement.pose)
+        y = y - H @ (predicted - seen_from)
         found = update(P, H[here], y[here], R, observation.foreign, np.array(by_name[sensor, ""]))
         after, P = predicted + found.step, found.covariance
         R_assumed = measurement.R[np.ix_(there, there)]
@@ -99,6 +107,7 @@ def filtered(series: Series, space: NoiseSpace, values: Sequence[float] | FloatA
                 observation,
                 since_s,
                 x,
+                about,
                 predicted,
                 after,
                 y[here],
@@ -112,6 +121,6 @@ def filtered(series: Series, space: NoiseSpace, values: Sequence[float] | FloatA
             )
         )
         x, stamp_ns = after.copy(), measurement.stamp_ns
-        if yawed:
+        if yawed and place + 1 >= series.num_opening:  # until then it belongs to the nominal trajectory
             x[YAW] = wrap_angle(x[YAW])
     return steps

@@ -1,13 +1,18 @@
 """What was measured of one object, with the noise of each measurement in parts: what is sought, and what is not."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fgtrack.core.linalg import congruence, symmetrise
-from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Measurement, Start
+from fgtrack.core.time import seconds
+from fgtrack.core.types import YAW, FloatArray
+from fgtrack.estimation.base import UNKNOWN_YAW_STD_RAD, Measurement, Start
+from fgtrack.estimation.birth import initial_state
+from fgtrack.estimation.initiation import Initiation
+from fgtrack.estimation.opening import Opening
+from fgtrack.models.motion import MotionModel
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +52,47 @@ class Series:
     """Innovations before this stamp have no part in the likelihood; None for no limit."""
     until_ns: int | None = None
     """Nor have those from this stamp on."""
+    nominal: tuple[FloatArray, ...] = ()
+    """States (n,) of a nominal trajectory at the start and at each of the first observations, about which these are
+    linearised; empty where the filter is linearised at its own estimates from the start."""
+
+    @property
+    def num_opening(self) -> int:
+        """Number of the first observations that are linearised about `nominal`."""
+        return max(len(self.nominal) - 1, 0)
+
+    @property
+    def opened_ns(self) -> int:
+        """Stamp of the last of these, or of the start where there are none."""
+        return self.observations[self.num_opening - 1].measurement.stamp_ns if self.nominal else self.start.stamp_ns
+
+    def opened(self, motion: MotionModel, method: Initiation) -> "Series":
+        """With a nominal trajectory along the first positions, where `start` does not know the direction of travel.
+
+        As in the tracker (see `Opening`): an EKF that starts in a wrong direction takes many seconds to turn, in which
+        its innovations say nothing of the noise. Unchanged where no line leads through the positions.
+        """
+        opening, count = Opening.of(motion, self.start, method), 0
+        if opening is None:
+            return self
+        for observation in self.observations:
+            longer = opening.with_measurement(observation.measurement)
+            if longer is None:
+                break
+            opening, count = longer, count + 1
+        try:
+            states = [opening.nominal(initial_state(motion, self.start)[0])]
+        except np.linalg.LinAlgError:
+            return self
+        stamp_ns, start = self.start.stamp_ns, self.start
+        for observation in self.observations[:count]:
+            after_ns = observation.measurement.stamp_ns
+            states.append(motion.predict(states[-1], seconds(after_ns - stamp_ns)))
+            stamp_ns = after_ns
+        if not motion.cartesian:
+            std_rad = UNKNOWN_YAW_STD_RAD if start.yaw_std_rad is None else start.yaw_std_rad
+            start = replace(start, yaw_rad=float(states[0][YAW]), yaw_std_rad=std_rad)
+        return replace(self, start=start, nominal=tuple(states))
 
 
 def positive_part(matrix: FloatArray) -> FloatArray:
