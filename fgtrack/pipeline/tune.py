@@ -232,7 +232,7 @@ class _Tuning:
         config = _widened(self._noise.config_with(values), self._rules)
         all_series, runs = [], []
         for recording in self._recordings:
-            series, run, _ = recorded(recording.messages, config, recording.name)
+            series, run, _ = recorded(recording.messages, config, recording.name, self._rules.gate_stds)
             all_series.append([one for one in series if len(one.observations) >= self._rules.min_observations])
             runs.append(run)
         return all_series, runs

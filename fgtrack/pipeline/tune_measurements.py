@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fgtrack.core.geometry import rotation
 from fgtrack.core.linalg import congruence
-from fgtrack.core.types import Message, SmoothedReport, TrackState, UpdateRecord
+from fgtrack.core.types import FloatArray, Message, SmoothedReport, TrackState, UpdateRecord
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult
 from fgtrack.estimation.likelihood.series import Observation, Series, positive_part
 from fgtrack.io.run import Run
@@ -16,23 +16,60 @@ from fgtrack.models.correlated_errors import whole_error
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_in_memory
+from fgtrack.tracking.association import Assignment, GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.inbox import Batch
 from fgtrack.tracking.preprocess import Candidate, Preprocess
 from fgtrack.tracking.tracker import TrackerParts
 
 
-def recorded(messages: Iterable[Message], config: Config, origin: str = "") -> tuple[list[Series], Run, str | None]:
-    """The series of all tracks, the run, and why the input broke off, where it did. Raises as `replay`."""
+def recorded(
+    messages: Iterable[Message], config: Config, origin: str = "", gate_stds: float = 0.0
+) -> tuple[list[Series], Run, str | None]:
+    """The series of all tracks, the run, and why the input broke off, where it did. Raises as `replay`.
+
+    A gate in metres is opened to `gate_stds` standard deviations of the position of each detection.
+    """
     banks: list[_RecordingBank] = []
 
     def observed(parts: TrackerParts) -> TrackerParts:
         preprocess = _WatchedPreprocess(parts.preprocess)
         banks.append(_RecordingBank(parts.bank, preprocess))
-        return replace(parts, preprocess=preprocess, bank=banks[0])
+        association = parts.association
+        if isinstance(association, GatedEuclidean | GatedMahalanobis):
+            association = _OpenedGate(association, gate_stds)
+        return replace(parts, preprocess=preprocess, bank=banks[0], association=association)
 
     run, broken = replay_in_memory(messages, config, origin=origin, observed=observed)
-    return banks[0].series(), run, broken
+    motion, method = config.motion_model(), config.initiation.method
+    return [series.opened(motion, method) for series in banks[0].series()], run, broken
+
+
+@dataclass(frozen=True)
+class _OpenedGate:
+    """An `Association` whose gate in metres is opened to so many standard deviations of each detection."""
+
+    association: GatedEuclidean | GatedMahalanobis
+    stds: float
+
+    def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
+        needed_m = self.stds * np.array([self._stds_m(candidate, states.means) for candidate in candidates])
+        needed_m = needed_m.reshape(len(candidates), len(states.means))
+        if isinstance(self.association, GatedEuclidean):
+            return self.association.within(np.maximum(self.association.gate_m, needed_m), candidates, states)
+        limit_m = float(needed_m.max(initial=self.association.max_distance_m))
+        return replace(self.association, max_distance_m=limit_m)(candidates, states)
+
+    def _stds_m(self, candidate: Candidate, means: FloatArray) -> FloatArray:
+        """Largest standard deviation of the position; of a bearing alone, across the line of sight at each track."""
+        if candidate.position_covariance is not None:
+            return np.full(len(means), math.sqrt(np.linalg.eigvalsh(candidate.position_covariance)[-1]))
+        measurement = candidate.measurement
+        if "bearing_rad" not in measurement.model.components:
+            return np.zeros(len(means))
+        place = measurement.model.components.index("bearing_rad")
+        away_m = np.hypot(means[:, 0] - measurement.pose.x_m, means[:, 1] - measurement.pose.y_m)
+        return np.asarray(away_m * math.sqrt(measurement.R[place, place]))
 
 
 class _WatchedPreprocess(Preprocess):

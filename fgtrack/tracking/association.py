@@ -79,8 +79,12 @@ class GatedEuclidean:
 
     def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
         """See `Association`."""
+        return self.within(self.gate_m, candidates, states)
+
+    def within(self, gates_m: float | FloatArray, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
+        """The same with other gates; `gates_m` has a shape that goes with (candidates, tracks)."""
         cost = euclidean_distances(candidates, states.means)
-        near = cost <= self.gate_m
+        near = cost <= gates_m
         if self.max_nis is None:
             return assigned(cost, near)
         believed = near & (_innovations(candidates, states)[0] <= self.max_nis)

@@ -15,6 +15,7 @@ from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
 from fgtrack.pipeline.shipped import read_config, read_scenario
 from fgtrack.pipeline.tune_file import tuned_text
+from fgtrack.pipeline.tune_measurements import recorded
 from fgtrack.sim.simulate import simulate
 
 Capture = pytest.CaptureFixture[str]
@@ -52,6 +53,32 @@ def test_the_file_repeats_the_configuration_with_other_noise(written: Path) -> N
     assert "NEES of the position" in text
     lines = [line for line in text.splitlines() if not line.startswith("#   fgtrack")]
     assert max(map(len, lines)) <= 120
+
+
+@pytest.mark.parametrize("association", ["euclidean", "mahalanobis"])
+def test_a_gate_is_opened_to_the_uncertainty_of_a_bearing_far_away(association: str) -> None:
+    scenario = read_scenario("drawn_ctrv", duration_s=5.0)
+    lidar, radar = scenario.sensors
+    polar_std = {"range_m": 0.5, "bearing_rad": 0.003}  # 9 m at 3 km
+    scenario = replace(scenario, opponents=scenario.opponents[1:2], sensors=(lidar, replace(radar, std=polar_std)))
+    messages = list(simulate(scenario, np.random.default_rng(5)))
+    limit = {"euclidean": "gate_m: 5.0", "mahalanobis": "max_distance_m: 5.0"}[association]
+    config = read_config(
+        "open_space",
+        [
+            "estimator=ekf-replay",
+            f"association={{kind: {association}, {limit}}}",
+            "sensors.radar={std: {range_m: 0.5, bearing_rad: 0.003}, births: false}",
+        ],
+    )
+
+    def radar_count(gate_stds: float) -> int:
+        series, _, _ = recorded(messages, config, gate_stds=gate_stds)
+        longest = max(series, key=lambda one: len(one.observations))
+        return sum(one.sensor == "radar" for one in longest.observations)
+
+    assert radar_count(0.0) < 60
+    assert radar_count(4.0) > 70
 
 
 def test_a_tuned_file_is_replayed_and_not_replaced_without_being_asked(
