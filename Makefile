@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # A file stays in one process, so what its tests share is made once.
 BY_FILE := --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-slow coverage mutants check docs bench clean
+.PHONY: demo test test-slow coverage mutants check docs bench contest clean
 
 demo: $(STAMP)
 	$(BIN)/fgtrack demo -o out/demo --overwrite
@@ -39,6 +39,9 @@ docs: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
 	$(BIN)/python -m sphinx -W --keep-going -q -c docs . out/docs
 	$(BIN)/python -m pytest tests/integration/test_docs.py
+
+contest: $(STAMP)
+	$(BIN)/python experiments/contest.py -o out/contest --jobs 2
 
 bench: $(STAMP)
 	$(BIN)/python -m pytest experiments/bench_*.py -o addopts= -p no:warnings --benchmark-only -q -s
