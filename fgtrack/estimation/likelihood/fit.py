@@ -267,6 +267,8 @@ class Problem:
                 options=_TRUST_REGION,
             )
             moved = np.abs(found.x - logs)
+            if not moved.any():
+                break
             values = likelihood.values(found.x)
             settled = (moved <= self.settings.tolerance * likelihood.spread(found.x)).all()
             likelihood = self.likelihood(values, free)
