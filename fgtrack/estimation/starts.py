@@ -11,6 +11,8 @@ from fgtrack.core.geometry import TWO_PI, cartesian, cartesian_gradient, wrap_an
 from fgtrack.core.linalg import congruence, identity, psd_solve, symmetrise
 from fgtrack.estimation.base import Start
 
+__all__ = ["distances", "headings", "intersections"]
+
 
 def headings(start: Start, count: int) -> list[Start]:
     """`count` starts that head for equal sectors of the circle, each as uncertain as its sector is wide.
