@@ -17,8 +17,8 @@ __all__ = ["distances", "headings", "intersections"]
 def headings(start: Start, count: int) -> list[Start]:
     """`count` starts that head for equal sectors of the circle, each as uncertain as its sector is wide.
 
-    The direction holds the sign of the speed, so the speed is that of |N(mean, std^2)| (the folded normal
-    distribution). Raises `CallError` for fewer than two.
+    The direction holds the sign of the speed, so the speed is that of the absolute value of a normal variable (the
+    folded normal distribution). Raises `CallError` for fewer than two.
     """
     if count < 2:
         raise CallError(f"headings: give at least 2, is {count}")
