@@ -160,7 +160,7 @@ def leaving(rng: np.random.Generator) -> Stream:
 
 def short(rng: np.random.Generator) -> Stream:
     """As `whole`, in a window as long as the delays: some arrives when it is older than the window."""
-    return _drawn(rng, "CTRV, lag 0.3 s", CTRV(), _paper_stamps(0.9), lag_s=0.3, reach_s=0.4, late=True)
+    return _drawn(rng, "CTRV, lag 0.3 s", CTRV(), _paper_stamps(0.9), lag_s=0.3, reach_s=0.6, late=True)
 
 
 def _paper_stamps(duration_s: float) -> _Plan:
