@@ -21,9 +21,10 @@ from fgtrack.io.output import check_output
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.shipped import read_config
-from fgtrack.pipeline.tune import TuneRules, tuned
+from fgtrack.pipeline.tune import tuned
 from fgtrack.pipeline.tune_file import TUNED, write_tuned
 from fgtrack.pipeline.tune_report import HeldOut, TunedParameter, TuneReport
+from fgtrack.pipeline.tune_rules import TuneRules
 
 _KNOWN = {"yes": "yes", "roughly": "roughly", "limit": "a limit", "no": "not identifiable"}
 _WIDTH = 78

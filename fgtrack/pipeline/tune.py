@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import BoolArray, FloatArray, Message
 from fgtrack.estimation.likelihood.contaminated import outlier_share
-from fgtrack.estimation.likelihood.fit import FitSettings, Likelihood, Problem
+from fgtrack.estimation.likelihood.fit import Likelihood, Problem
 from fgtrack.estimation.likelihood.reference import filtered
 from fgtrack.estimation.likelihood.series import Series
 from fgtrack.io.run import Run
@@ -21,45 +21,10 @@ from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config, settings_of
 from fgtrack.pipeline.tune_measurements import recorded
 from fgtrack.pipeline.tune_report import HeldOut, InnovationFit, Known, SensorNoise, TunedParameter, TuneReport
+from fgtrack.pipeline.tune_rules import TuneRules, for_tuning, widened
 from fgtrack.pipeline.tune_space import ConfigNoise
-from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 
 _LASTING = "an error that lasts looks like motion: only the part that does not is fitted, by the share"
-
-
-@dataclass(frozen=True)
-class TuneRules:
-    """Which tracks count, and when a parameter is known."""
-
-    fit: FitSettings = field(default_factory=FitSettings)
-    keep: tuple[str, ...] = ()
-    """Keys of the configuration that stay as they are."""
-    train_share: float = 0.7
-    """Part of the time of each recording, from its start, that the noise which is judged is fitted to."""
-    max_rounds: int = 4
-    """How often detections are associated at most."""
-    settled: float = 0.2
-    """Rounds end where no parameter moves by more than this share of its standard deviation."""
-    min_observations: int = 20
-    """Shorter tracks are left out: most of them are clutter."""
-    min_count: int = 30
-    """Measured components that a parameter needs at least."""
-    known_std_error: float = 0.05
-    """A parameter is known where its standard error is below this share of it: three of them are 15 %, ..."""
-    rough_std_error: float = 0.5
-    """... and not known where it is above this."""
-    rejected: float = 1.92
-    """A value is rejected by the data where the log-likelihood is lower by this: a 95 % interval."""
-    gate_probability: float = 0.9999
-    """A narrower chi-square gate is opened to this: what it cuts off would be missing in the noise."""
-    gate_stds: float = 4.0
-    """A gate in metres is opened to so many standard deviations, for the same reason."""
-    start_factor: float = 5.0
-    """Further starts have a motion noise larger, and smaller, by this."""
-    start_observations: int = 200
-    """Part of a track that is used to compare starts."""
-    start_tracks: int = 3
-    """The number of these tracks."""
 
 
 @dataclass(frozen=True)
@@ -128,36 +93,9 @@ def tuned(
 ) -> TuneReport:
     """`tune` of messages in receipt order, by name of their recording; `on_step` is told what comes next."""
     rules = rules or TuneRules()
-    noise = ConfigNoise(_for_tuning(config, rules))
+    noise = ConfigNoise(for_tuning(config, rules))
     recordings = [_Recording.read(name, messages()) for name, messages in sources.items()]
     return _Tuning(noise, recordings, rules, on_step).report(config)
-
-
-def _for_tuning(config: Config, rules: TuneRules) -> Config:
-    """The configuration with an estimator that keeps late data, and a gate that does not cut off the noise."""
-    association = config.association
-    if isinstance(association, GatedMahalanobis):
-        probability = max(association.gate_probability, rules.gate_probability)
-        association = replace(association, gate_probability=probability)
-    ego = config.ego
-    if ego.uncertainty == "shared":  # which replaces what a track would be given
-        ego = replace(ego, uncertainty="independent")
-    return replace(config, estimator="ekf-replay", association=association, ego=ego)
-
-
-def _widened(config: Config, rules: TuneRules) -> Config:
-    """The configuration with a gate of so many standard deviations of the position of the least precise sensor."""
-    axes = ("x_m", "y_m", "range_m")
-    needed_m = rules.gate_stds * max(
-        [0.0, *(one.std[name] for one in config.sensors.values() for name in axes if name in one.std)]
-    )
-    association = config.association
-    if isinstance(association, GatedEuclidean):
-        return replace(config, association=replace(association, gate_m=max(association.gate_m, needed_m)))
-    if isinstance(association, GatedMahalanobis):
-        limit_m = max(association.max_distance_m, needed_m)
-        return replace(config, association=replace(association, max_distance_m=limit_m))
-    return config
 
 
 @dataclass(frozen=True)
@@ -229,7 +167,7 @@ class _Tuning:
 
     def _associated(self, values: FloatArray) -> tuple[list[list[Series]], list[Run]]:
         """The series of long tracks and the run of each recording, with the noise of `values`."""
-        config = _widened(self._noise.config_with(values), self._rules)
+        config = widened(self._noise.config_with(values), self._rules)
         all_series, runs = [], []
         for recording in self._recordings:
             series, run, _ = recorded(recording.messages, config, recording.name, self._rules.gate_stds)
