@@ -38,7 +38,7 @@ def demo(
     ),
     overwrite: Overwrite = False,
 ) -> None:
-    """Simulate, record, replay with three estimators and two noises, compare, draw."""
+    """Simulate, record, replay with two noises, compare, draw."""
     with claimed(out):
         bag, figures = out / "recording", out / "figures"
         folders = {

@@ -20,7 +20,7 @@ def verify(
     as_json: Json = False,
     name: Annotated[str | None, typer.Option("-e", "--estimator", help="This one, exact or not.")] = None,
 ) -> int:
-    """Certify that estimates are right, and do not depend on the order of arrival.
+    """Certify that estimates are right in any order of arrival.
 
     Of all estimators that claim to be exact, plug-ins included, against a calculation that shares no code with them.
     Exit code 1 where one is not.
