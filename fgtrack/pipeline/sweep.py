@@ -6,7 +6,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from multiprocessing import resource_tracker
@@ -248,8 +249,13 @@ def _results(tasks: Sequence[_Task], score: Score) -> Iterator[_Result]:
     """Results of the tasks in the backend of joblib that is set, as they come."""
     parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch=f"{_HANDED_OUT}*n_jobs")
     with _interrupts_held():
-        results: Iterator[_Result] = parallel(joblib.delayed(run_job)(*task, score) for task in tasks)
-    return results
+        results: Generator[_Result] = parallel(joblib.delayed(run_job)(*task, score) for task in tasks)
+    try:
+        yield from results
+    finally:
+        with warnings.catch_warnings():  # an interrupt is said once, in one line
+            warnings.filterwarnings("ignore", "[0-9]+ tasks (have|which)", UserWarning)
+            results.close()
 
 
 @contextmanager
