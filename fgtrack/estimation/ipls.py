@@ -25,7 +25,7 @@ from fgtrack.estimation.initiation import (
 )
 from fgtrack.estimation.iteration import Iteration, reweighted
 from fgtrack.estimation.rts import smoothed_one
-from fgtrack.estimation.sigma_points import Regression, SigmaPoints, measurement_regression, motion_regression
+from fgtrack.estimation.sigma_points import Regression, measurement_regression, motion_regression
 from fgtrack.estimation.unscented import UkfRecursion
 from fgtrack.estimation.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
@@ -73,8 +73,6 @@ class PosteriorLinearisationSmoother(WindowedFilter):
         Passes per update.
     tolerance
         Where all states move by less than this many standard deviations, the passes end.
-    alpha, beta, kappa
-        See `SigmaPoints`.
     initiation
         How the direction of travel is found where `prior` gives none, see `Initiation`.
     """
@@ -93,14 +91,10 @@ class PosteriorLinearisationSmoother(WindowedFilter):
         lag_s: float,
         max_iterations: int = 2,
         tolerance: float = 1e-3,
-        alpha: float = 1.0,
-        beta: float = 0.0,
-        kappa: float = 0.0,
         initiation: str = DEFAULT,
     ) -> None:
         super().__init__(motion, prior, lag_s)
-        self._points, self._iteration = SigmaPoints(alpha, beta, kappa), Iteration(max_iterations, tolerance)
-        self._recursion = UkfRecursion(motion, self._points)
+        self._iteration, self._recursion = Iteration(max_iterations, tolerance), UkfRecursion(motion)
         x, P = initial_state(motion, prior)
         self._nodes = [_Node(prior.stamp_ns, (), x, P, Prediction(x, P, P), (x, P), None)]
         self._first_ns, self._fix = prior.stamp_ns, Fix(0.0, x[:2], P[:2, :2])
@@ -180,7 +174,7 @@ class PosteriorLinearisationSmoother(WindowedFilter):
         self, state: tuple[FloatArray, FloatArray], over: tuple[FloatArray, FloatArray], dt_s: float
     ) -> Prediction:
         """`state` after `dt_s`, under the motion as it is on average over another state."""
-        regressed = motion_regression(self._motion, *over, dt_s, self._points)
+        regressed = motion_regression(self._motion, *over, dt_s)
         return _through(state, over[0], regressed, self._motion.process_noise(over[0], dt_s))
 
     def _iterated(self, nodes: list[_Node], iteration: Iteration, still: float = _STILL) -> list[_Node]:
@@ -211,7 +205,7 @@ class PosteriorLinearisationSmoother(WindowedFilter):
         means, covariances = np.array([node.mean for node in rest]), np.array([node.covariance for node in rest])
         gaps_s = np.diff([node.stamp_ns for node in rest]) * 1e-9
         if len(rest) > 1:
-            steps = motion_regression(self._motion, means[:-1], covariances[:-1], gaps_s, self._points)
+            steps = motion_regression(self._motion, means[:-1], covariances[:-1], gaps_s)
             Q = self._motion.process_noise(means[:-1], gaps_s)
         for place, node in enumerate(rest):
             predicted = node.predicted
@@ -240,7 +234,7 @@ class PosteriorLinearisationSmoother(WindowedFilter):
         self, state: tuple[FloatArray, FloatArray], node: _Node, measurement: Measurement
     ) -> tuple[FloatArray, FloatArray]:
         """`state` after `measurement`, as that is on average over the smoothed state of its node."""
-        z, A, noise = measurement_regression(measurement, node.mean, node.covariance, self._points)
+        z, A, noise = measurement_regression(measurement, node.mean, node.covariance)
         residual, R = measurement.model.residual(measurement.z, z), measurement.R + noise
         return reweighted(*state, residual, A, R, measurement.loss, node.mean - state[0])[:2]
 

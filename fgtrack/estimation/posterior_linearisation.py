@@ -10,7 +10,7 @@ from fgtrack.estimation.ekf import OneCorrection
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.iteration import Iteration, largest_move, negative_log_posterior, reweighted
 from fgtrack.estimation.replay import ReplayingFilter
-from fgtrack.estimation.sigma_points import SigmaPoints, expected_measurement, measurement_regression
+from fgtrack.estimation.sigma_points import expected_measurement, measurement_regression
 from fgtrack.estimation.unscented import UkfRecursion
 from fgtrack.models.motion import MotionModel
 
@@ -26,14 +26,14 @@ class IplfRecursion(UkfRecursion):
 
     Parameters
     ----------
-    motion, points
+    motion
         See `UkfRecursion`.
     iteration
         When it ends.
     """
 
-    def __init__(self, motion: MotionModel, points: SigmaPoints, iteration: Iteration) -> None:
-        super().__init__(motion, points)
+    def __init__(self, motion: MotionModel, iteration: Iteration) -> None:
+        super().__init__(motion)
         self._iteration = iteration
 
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
@@ -43,7 +43,7 @@ class IplfRecursion(UkfRecursion):
         x, P = mean, covariance
         for _ in range(self._iteration.max_iterations):
             last, spread = x, P
-            z, A, noise = measurement_regression(measurement, x, P, self._points)
+            z, A, noise = measurement_regression(measurement, x, P)
             y, R = measurement.model.residual(measurement.z, z), measurement.R + noise
             update = reweighted(mean, covariance, y, A, R, measurement.loss, x - mean)
             cost = partial(self._cost, (mean, covariance), measurement, spread, R)
@@ -64,7 +64,7 @@ class IplfRecursion(UkfRecursion):
         x: FloatArray,
     ) -> float:
         """What a step lowers: the negative logarithm of the posterior at a state `x` (n,) of `spread` (n, n)."""
-        z = expected_measurement(measurement, x, spread, self._points)
+        z = expected_measurement(measurement, x, spread)
         residual = measurement.model.residual(measurement.z, z)
         return negative_log_posterior(x - prior[0], prior[1], residual, R, measurement.loss)
 
@@ -82,8 +82,6 @@ class IplfReplay(ReplayingFilter):
         Regressions per update; 1 is the unscented filter.
     tolerance
         Where mean and standard deviations change by less than this many standard deviations, the iteration ends.
-    alpha, beta, kappa
-        See `SigmaPoints`.
     initiation
         See `ReplayingFilter`.
     """
@@ -97,10 +95,7 @@ class IplfReplay(ReplayingFilter):
         lag_s: float,
         max_iterations: int = 10,
         tolerance: float = 1e-2,
-        alpha: float = 1.0,
-        beta: float = 0.0,
-        kappa: float = 0.0,
         initiation: str = DEFAULT,
     ) -> None:
-        points, iteration = SigmaPoints(alpha, beta, kappa), Iteration(max_iterations, tolerance)
-        super().__init__(motion, prior, lag_s, IplfRecursion(motion, points, iteration), initiation)
+        recursion = IplfRecursion(motion, Iteration(max_iterations, tolerance))
+        super().__init__(motion, prior, lag_s, recursion, initiation)

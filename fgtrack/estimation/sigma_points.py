@@ -1,13 +1,16 @@
-"""Statistical linear regression: the affine map that fits a function best over a Gaussian, by sigma points."""
+"""Statistical linear regression: the affine map that fits a function best over a Gaussian, by sigma points.
+
+The points are those of the cubature rule of third degree (Arasaratnam and Haykin, Cubature Kalman filters, IEEE
+Transactions on Automatic Control 54(6), 2009): 2 n of equal weight, sqrt(n) standard deviations to both sides along the
+columns of the covariance's root. They give no weight to the mean, so every covariance stays positive semidefinite.
+"""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.errors import CallError
 from fgtrack.core.linalg import identity, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
@@ -15,35 +18,6 @@ from fgtrack.models.measurement import MeasurementModel
 from fgtrack.models.motion import MotionModel
 
 _JITTER = 1e-12
-
-
-@dataclass(frozen=True)
-class SigmaPoints:
-    """2 n + 1 points of the scaled unscented transform (Julier and Uhlmann 2004; Julier 2002).
-
-    The mean and, along the columns of the covariance's root, points c = alpha sqrt(n + kappa) standard deviations to
-    both sides. The defaults put no weight on the mean, which keeps every covariance positive semidefinite (the cubature
-    rule of Arasaratnam and Haykin 2009). Raises `ValueError` for parameters that make no points.
-    """
-
-    alpha: float = 1.0
-    """Scale of the points' distance."""
-    beta: float = 0.0
-    """What is added to the weight of the mean in a covariance."""
-    kappa: float = 0.0
-    """What is added to n in the points' distance; more than -n."""
-
-    def __post_init__(self) -> None:
-        if not (0.0 < self.alpha < np.inf and np.isfinite(self.beta) and np.isfinite(self.kappa)):
-            raise ValueError(
-                f"alpha must be positive, all finite; are alpha={self.alpha}, beta={self.beta}, kappa={self.kappa}"
-            )
-
-    def squared_distance(self, n: int) -> float:
-        """c^2, for a state of `n` entries. Raises `CallError` where it is not positive."""
-        if n + self.kappa <= 0.0:
-            raise CallError(f"kappa: must be more than {-n} for a state of {n} entries, is {self.kappa}")
-        return self.alpha**2 * (n + self.kappa)
 
 
 class Regression(NamedTuple):
@@ -61,32 +35,32 @@ def regression(
     g: Callable[[FloatArray], FloatArray],
     mean: FloatArray,
     covariance: FloatArray,
-    points: SigmaPoints,
     difference: Callable[[FloatArray, FloatArray], FloatArray] = np.subtract,
 ) -> Regression:
     """Statistical linear regression of `g`, (..., n) -> (..., k), over N(mean, covariance), (..., n) and (..., n, n).
 
     See Arasaratnam, Haykin and Elliott 2007; Garcia-Fernandez et al. 2015, eqs. 9 to 11. With the points m +- c L_i of
-    the root P = L L', and what g differs there from g(m), d+ and d-: A L_i = (d+ - d-) / 2c, and the noise comes from
-    the bends (d+ + d-) / 2, so that it is zero of a linear g. `difference` may bring angles to their range. Raises
-    `numpy.linalg.LinAlgError` for a covariance that is not positive semidefinite.
+    the root P = L L', c^2 = n, and what g differs there from g(m), d+ and d-: A L_i = (d+ - d-) / 2c, and the noise
+    comes from the bends (d+ + d-) / 2, so that it is zero of a linear g. `difference` may bring angles to their range.
+    Raises `numpy.linalg.LinAlgError` for a covariance that is not positive semidefinite.
     """
-    squared, L = points.squared_distance(mean.shape[-1]), _root(covariance)
-    centre, ahead, behind = _around(g, mean, squared**0.5 * L, difference)
-    bends, slopes = 0.5 * (ahead + behind), (ahead - behind) / (2.0 * squared**0.5)
-    shift = bends.sum(axis=-2) / squared
-    noise = bends.mT @ bends / squared + (points.beta - points.alpha**2) * shift[..., :, None] * shift[..., None, :]
+    n, L = mean.shape[-1], _root(covariance)
+    centre, ahead, behind = _around(g, mean, L, difference)
+    bends, slopes = 0.5 * (ahead + behind), (ahead - behind) / (2.0 * n**0.5)
+    shift = bends.sum(axis=-2) / n
+    noise = bends.mT @ bends / n - shift[..., :, None] * shift[..., None, :]
     return Regression(centre + shift, np.linalg.solve(L.mT, slopes).mT, symmetrise(noise))
 
 
 def _around(
     g: Callable[[FloatArray], FloatArray],
     mean: FloatArray,
-    offsets: FloatArray,
+    L: FloatArray,
     difference: Callable[[FloatArray, FloatArray], FloatArray],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """`g` at `mean`, (..., k), and how it differs from that at mean + and - the columns of `offsets`, (..., n, k)."""
-    n, centre, rows = mean.shape[-1], mean[..., None, :], offsets.mT
+    """`g` at `mean`, (..., k), and how it differs from that ahead and behind along the root `L`, (..., n, k) each."""
+    n, centre = mean.shape[-1], mean[..., None, :]
+    rows = n**0.5 * L.mT
     values = g(np.concatenate([centre, centre + rows, centre - rows], axis=-2))
     d = difference(values[..., 1:, :], values[..., :1, :])
     return values[..., 0, :], d[..., :n, :], d[..., n:, :]
@@ -103,36 +77,30 @@ def _root(covariance: FloatArray) -> FloatArray:
 
 
 def motion_regression(
-    motion: MotionModel, mean: FloatArray, covariance: FloatArray, dt_s: float | FloatArray, points: SigmaPoints
+    motion: MotionModel, mean: FloatArray, covariance: FloatArray, dt_s: float | FloatArray
 ) -> Regression:
     """Regression of the flow over `dt_s`, a number or of shape (...), without process noise; yaws are not wrapped."""
     if motion.linear:
         A = motion.jacobian(mean, dt_s)
         return Regression(motion.predict(mean, dt_s), A, np.zeros_like(A))
     each_s = np.asarray(dt_s, dtype=np.float64)[..., None]
-    return regression(lambda x: motion.predict(x, each_s), mean, covariance, points)
+    return regression(lambda x: motion.predict(x, each_s), mean, covariance)
 
 
-def measurement_regression(
-    measurement: Measurement, mean: FloatArray, covariance: FloatArray, points: SigmaPoints
-) -> Regression:
+def measurement_regression(measurement: Measurement, mean: FloatArray, covariance: FloatArray) -> Regression:
     """Regression of what `measurement` measures. Angles are averaged on the circle, but for entries of the state."""
     model, pose = measurement.model, measurement.pose
     if model.linear:
         k = len(model.components)
         return Regression(model.predict(mean, pose), model.selection(mean.shape[-1]), np.zeros((k, k)))
-    return regression(lambda x: model.predict(x, pose), mean, covariance, points, _difference(model))
+    return regression(lambda x: model.predict(x, pose), mean, covariance, _difference(model))
 
 
-def expected_measurement(
-    measurement: Measurement, mean: FloatArray, covariance: FloatArray, points: SigmaPoints
-) -> FloatArray:
+def expected_measurement(measurement: Measurement, mean: FloatArray, covariance: FloatArray) -> FloatArray:
     """The mean of `measurement_regression` of a model that is not linear, alone."""
     model, pose = measurement.model, measurement.pose
-    squared = points.squared_distance(len(mean))
-    offsets = squared**0.5 * _root(covariance)
-    centre, ahead, behind = _around(lambda x: model.predict(x, pose), mean, offsets, _difference(model))
-    return np.asarray(centre + 0.5 * (ahead + behind).sum(axis=-2) / squared)
+    centre, ahead, behind = _around(lambda x: model.predict(x, pose), mean, _root(covariance), _difference(model))
+    return np.asarray(centre + 0.5 * (ahead + behind).sum(axis=-2) / len(mean))
 
 
 @cache

@@ -14,7 +14,7 @@ from fgtrack.estimation.ekf import (
 )
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.replay import ReplayingFilter
-from fgtrack.estimation.sigma_points import SigmaPoints, measurement_regression, motion_regression
+from fgtrack.estimation.sigma_points import measurement_regression, motion_regression
 from fgtrack.models.motion import MotionModel
 
 
@@ -28,19 +28,16 @@ class UkfRecursion:
     ----------
     motion
         Motion model.
-    points
-        Where functions are evaluated.
     """
 
-    def __init__(self, motion: MotionModel, points: SigmaPoints) -> None:
-        points.squared_distance(motion.dim)
-        self._motion, self._points = motion, points
+    def __init__(self, motion: MotionModel) -> None:
+        self._motion = motion
 
     def predict(self, mean: FloatArray, covariance: FloatArray, dt_s: float) -> Prediction:
         """See `Recursion.predict`."""
         if self._motion.linear:
             return predict_across(mean, covariance, self._motion, dt_s)
-        after, A, noise = motion_regression(self._motion, mean, covariance, dt_s, self._points)
+        after, A, noise = motion_regression(self._motion, mean, covariance, dt_s)
         AP = product(A, covariance)
         Q = self._motion.step(mean.tolist(), dt_s).Q
         return Prediction(after, symmetrise(product(AP, A.T) + noise + Q), AP)
@@ -49,7 +46,7 @@ class UkfRecursion:
         """See `Recursion.correct`."""
         if measurement.model.linear:
             return correct_one(mean, covariance, measurement)
-        z, A, noise = measurement_regression(measurement, mean, covariance, self._points)
+        z, A, noise = measurement_regression(measurement, mean, covariance)
         y = measurement.model.residual(measurement.z, z)
         after, P, S, w = updated_one(mean, covariance, y, A, measurement.R + noise, measurement.loss)
         return OneCorrection(after, P, y, measurement.nis(y, S), w, S)
@@ -58,7 +55,7 @@ class UkfRecursion:
         """See `Recursion.innovation`."""
         if measurement.model.linear:
             return innovation_one(mean, covariance, measurement)
-        z, A, noise = measurement_regression(measurement, mean, covariance, self._points)
+        z, A, noise = measurement_regression(measurement, mean, covariance)
         y = measurement.model.residual(measurement.z, z)
         S = congruence(A, covariance) + noise + measurement.R
         return Innovation(y, measurement.nis(y, S), S)
@@ -73,8 +70,6 @@ class UkfReplay(ReplayingFilter):
     ----------
     motion, prior, lag_s
         See `WindowedFilter`.
-    alpha, beta, kappa
-        See `SigmaPoints`.
     initiation
         See `ReplayingFilter`.
     """
@@ -86,9 +81,6 @@ class UkfReplay(ReplayingFilter):
         motion: MotionModel,
         prior: Start,
         lag_s: float,
-        alpha: float = 1.0,
-        beta: float = 0.0,
-        kappa: float = 0.0,
         initiation: str = DEFAULT,
     ) -> None:
-        super().__init__(motion, prior, lag_s, UkfRecursion(motion, SigmaPoints(alpha, beta, kappa)), initiation)
+        super().__init__(motion, prior, lag_s, UkfRecursion(motion), initiation)

@@ -3,36 +3,39 @@
 import numpy as np
 import pytest
 
-from fgtrack.core.errors import CallError
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.sigma_points import SigmaPoints, measurement_regression, motion_regression, regression
-from fgtrack.models.motion import CTRV, CV
+from fgtrack.estimation.sigma_points import measurement_regression, motion_regression, regression
+from fgtrack.models.motion import CTRV
 
-RULES = (SigmaPoints(), SigmaPoints(alpha=0.1, beta=2.0), SigmaPoints(kappa=1.0))
 MEAN = np.array([1.0, -2.0, 0.5])
 ROOT = np.array([[0.7, 0.0, 0.0], [0.2, 0.5, 0.0], [-0.1, 0.3, 0.4]])
 P = ROOT @ ROOT.T
 
 
-@pytest.mark.parametrize("points", RULES)
-def test_an_affine_function_is_its_own_regression(points: SigmaPoints) -> None:
+def test_an_affine_function_is_its_own_regression() -> None:
     A, b = np.array([[1.0, 2.0, -1.0], [0.5, 0.0, 3.0]]), np.array([4.0, -1.0])
-    found = regression(lambda x: x @ A.T + b, MEAN, P, points)
+    found = regression(lambda x: x @ A.T + b, MEAN, P)
     np.testing.assert_allclose(found.mean, A @ MEAN + b, rtol=1e-12)
     np.testing.assert_allclose(found.A, A, rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(found.noise, 0.0, atol=1e-20)
 
 
-@pytest.mark.parametrize("points", [SigmaPoints(), SigmaPoints(kappa=2.0), SigmaPoints(alpha=1e-2, beta=2.0)])
-def test_a_quadratic_has_its_mean_and_slope_exactly_and_with_the_textbook_parameters_its_variance(
-    points: SigmaPoints,
-) -> None:
-    m, s = 3.0, 0.5  # E[x^2] = m^2 + s^2, Cov(x, x^2) = 2 m s^2, Var(x^2) = 4 m^2 s^2 + 2 s^4
-    found = regression(lambda x: x**2, np.array([m]), np.array([[s * s]]), points)
+def test_a_quadratic_has_its_mean_and_slope_exactly() -> None:
+    m, s = 3.0, 0.5  # E[x^2] = m^2 + s^2, Cov(x, x^2) = 2 m s^2
+    found = regression(lambda x: x**2, np.array([m]), np.array([[s * s]]))
     assert found.mean[0] == pytest.approx(m * m + s * s, rel=1e-9)
     assert found.A[0, 0] == pytest.approx(2.0 * m, rel=1e-9)
-    if points != SigmaPoints():
-        assert found.noise[0, 0] == pytest.approx(2.0 * s**4, rel=1e-3)
+
+
+def test_the_noise_is_that_of_the_cubature_points() -> None:
+    def g(x: np.ndarray) -> np.ndarray:
+        return x[..., :1] ** 2 + x[..., 1:2] * x[..., 2:]
+
+    points = MEAN + np.sqrt(3.0) * np.vstack([ROOT.T, -ROOT.T])
+    found = regression(g, MEAN, P)
+    left = g(points) - found.mean - (points - MEAN) @ found.A.T
+    np.testing.assert_allclose(found.noise, left.T @ left / 6.0, rtol=1e-9)
+    assert found.noise[0, 0] > 0.01
 
 
 def test_the_regression_is_that_of_many_samples() -> None:
@@ -43,7 +46,7 @@ def test_the_regression_is_that_of_many_samples() -> None:
     samples = mean + np.random.default_rng(0).standard_normal((400_000, 3)) @ ROOT.T
     centred, values = samples - samples.mean(axis=0), g(samples)
     A = np.linalg.lstsq(centred, values - values.mean(axis=0), rcond=None)[0].T
-    found = regression(g, mean, P, SigmaPoints())
+    found = regression(g, mean, P)
     np.testing.assert_allclose(found.mean, values.mean(axis=0), atol=5e-3)
     np.testing.assert_allclose(found.A, A, atol=6e-3)
 
@@ -53,16 +56,16 @@ def test_a_stack_is_taken_one_by_one() -> None:
     x, dt_s = rng.normal(size=(4, 5)), np.array([0.1, 0.0, 0.3, 0.05])
     roots = 0.1 * rng.normal(size=(4, 5, 5))
     covariances = roots @ roots.mT + 0.01 * np.eye(5)
-    stack = motion_regression(motion, x, covariances, dt_s, SigmaPoints())
+    stack = motion_regression(motion, x, covariances, dt_s)
     for k in range(4):
-        one = motion_regression(motion, x[k], covariances[k], float(dt_s[k]), SigmaPoints())
+        one = motion_regression(motion, x[k], covariances[k], float(dt_s[k]))
         for found, expected in zip(stack, one, strict=True):
             np.testing.assert_allclose(found[k], expected, rtol=1e-9, atol=1e-12)
 
 
 def test_a_narrow_spread_gives_the_derivative() -> None:
     motion, x = CTRV(), np.array([3.0, 1.0, 0.4, 20.0, 0.3])
-    found = motion_regression(motion, x, 1e-8 * np.eye(5), 0.2, SigmaPoints())
+    found = motion_regression(motion, x, 1e-8 * np.eye(5), 0.2)
     np.testing.assert_allclose(found.A, motion.jacobian(x, 0.2), atol=1e-6)
     np.testing.assert_allclose(found.mean, motion.predict(x, 0.2), atol=1e-6)
 
@@ -70,7 +73,7 @@ def test_a_narrow_spread_gives_the_derivative() -> None:
 def test_bearings_are_averaged_across_half_a_turn() -> None:
     measurement = Measurement.of(0, bearing_rad=3.1, std={"bearing_rad": 0.1})
     x = np.array([-10.0, 0.0, 0.0, 1.0, 0.0])  # straight behind
-    found = measurement_regression(measurement, x, np.eye(5), SigmaPoints())
+    found = measurement_regression(measurement, x, np.eye(5))
     assert abs(abs(found.mean[0]) - np.pi) < 1e-9
     np.testing.assert_allclose(found.A[0], [0.0, -0.1, 0.0, 0.0, 0.0], atol=0.01)
     assert found.noise[0, 0] < 1e-3
@@ -79,21 +82,14 @@ def test_bearings_are_averaged_across_half_a_turn() -> None:
 def test_a_yaw_is_an_entry_of_the_state_however_wide_it_is() -> None:
     measurement = Measurement.of(0, yaw_rad=3.0, range_m=9.0, std={"yaw_rad": 0.1, "range_m": 1.0})
     wide = np.diag([1.0, 1.0, 4.0, 1.0, 1.0])
-    found = measurement_regression(measurement, np.array([10.0, 0.0, 1.0, 1.0, 0.0]), wide, SigmaPoints())
+    found = measurement_regression(measurement, np.array([10.0, 0.0, 1.0, 1.0, 0.0]), wide)
     np.testing.assert_allclose(found.A[0], [0.0, 0.0, 1.0, 0.0, 0.0], atol=1e-12)
     assert found.mean[0] == pytest.approx(1.0)
 
 
 def test_a_semidefinite_covariance_is_taken() -> None:
     motion = CTRV()
-    found = motion_regression(motion, np.zeros(5), np.diag([1.0, 1.0, 0.0, 1.0, 0.0]), 0.1, SigmaPoints())
+    found = motion_regression(motion, np.zeros(5), np.diag([1.0, 1.0, 0.0, 1.0, 0.0]), 0.1)
     assert np.isfinite(found.A).all()
     with pytest.raises(np.linalg.LinAlgError):
-        motion_regression(motion, np.zeros(5), np.diag([1.0, 1.0, -1.0, 1.0, 1.0]), 0.1, SigmaPoints())
-
-
-def test_parameters_that_make_no_points_are_errors() -> None:
-    with pytest.raises(ValueError, match="alpha must be positive"):
-        SigmaPoints(alpha=0.0)
-    with pytest.raises(CallError, match="kappa: must be more than -4"):
-        SigmaPoints(kappa=-4.0).squared_distance(CV().dim)
+        motion_regression(motion, np.zeros(5), np.diag([1.0, 1.0, -1.0, 1.0, 1.0]), 0.1)
