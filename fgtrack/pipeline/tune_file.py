@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
-from ruamel.yaml.comments import CommentedMap
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.error import CommentMark
+from ruamel.yaml.tokens import CommentToken
 
 from fgtrack.io.output import Kind, new_file
 from fgtrack.pipeline.config import Config
@@ -64,7 +66,42 @@ def _change(document: Any, origin: object, wanted: object) -> None:  # Any: a ma
         if isinstance(inner, Mapping) and type(before) is type(after) and not isinstance(after, (list, tuple)):
             _change(inner, before, after)
         else:
-            document[name] = _short(after)
+            _put(document, name, _short(after))
+
+
+def _put(document: CommentedMap, name: str, value: object) -> None:
+    """Set `name` in `document`; what is written between it and the next key stays in front of that.
+
+    ruamel.yaml knows the lines before a key as the end of the comment on the value before it, however deep that stands.
+    """
+    follows = name if name in document else next(reversed(document), None)
+    lines = "" if follows is None else _cut_lines_after(document, follows)
+    document[name] = value
+    if lines:
+        inner, key = _last_value(document, name)
+        token = inner.ca.items.setdefault(key, [None] * 4)
+        on_line = "\n" if token[2] is None else token[2].value
+        token[2] = CommentToken(on_line + lines, CommentMark(0), None)
+
+
+def _cut_lines_after(document: CommentedMap, name: str) -> str:
+    """Take off the comment lines after the value of `name`; a comment on its own line stays."""
+    inner, key = _last_value(document, name)
+    place = 2 if isinstance(inner, CommentedMap) else 0
+    token = inner.ca.items.get(key, [None] * 4)[place]
+    if token is None:
+        return ""
+    on_line, _, lines = token.value.partition("\n")
+    token.value = f"{on_line}\n"
+    return str(lines)
+
+
+def _last_value(document: Any, name: Any) -> tuple[Any, Any]:  # Any: collections of ruamel's and their keys
+    """The collection and the key in it of what is written last of the value of `name` in `document`."""
+    inner = document[name]
+    if isinstance(inner, (CommentedMap, CommentedSeq)) and len(inner) and not inner.fa.flow_style():
+        return _last_value(inner, next(reversed(inner)) if isinstance(inner, CommentedMap) else len(inner) - 1)
+    return document, name
 
 
 def _entries(origin: object, wanted: object) -> list[tuple[str, object, object]]:
@@ -77,14 +114,17 @@ def _entries(origin: object, wanted: object) -> list[tuple[str, object, object]]
 def _short(value: object) -> Any:  # Any: JSON values
     """`plain` without the fields that are at their defaults; `kind` stays, it says which form is meant."""
     if is_dataclass(value):
-        kept = {one.name: getattr(value, one.name) for one in fields(value) if not _is_default(one, value)}
-        return {name: _short(item) for name, item in kept.items()}
+        value = {one.name: getattr(value, one.name) for one in fields(value) if not _is_default(one, value)}
     if isinstance(value, Mapping):
         inner = CommentedMap((name, _short(item)) for name, item in value.items())
         if not any(isinstance(item, Mapping) for item in inner.values()):
             inner.fa.set_flow_style()
         return inner
-    return plain(value)
+    items = plain(value)
+    if isinstance(items, list):
+        items = CommentedSeq(items)
+        items.fa.set_flow_style()
+    return items
 
 
 def _is_default(one: Any, value: object) -> bool:  # Any: a field of any type
