@@ -132,3 +132,73 @@ def test_without_a_file_the_text_holds_what_is_no_default() -> None:
     assert text.startswith("# The noise of the defaults, fitted to recordings (fgtrack tune).\n#\n# why\n")
     assert "estimator" not in text
     assert "    std: {x_m: 1.5, y_m: 3.0, speed_mps: 0.2}\n" in text
+
+
+COMMENTED = """\
+sensors:
+  # of the LiDAR
+  lidar:
+    # its errors
+    std: {x_m: 1.0, y_m: 1.0}  # metres
+    births: true
+
+  # of the RADAR
+  radar:
+    std:
+      x_m: 1.0  # along
+      # across
+      y_m: 1.0
+# what is near
+association:
+  kind: euclidean
+  gate_m: 4.0
+# left out
+ignore_sensors:
+  - camera  # infrared
+
+# how objects move
+motion: {kind: cv, std_per_s: {velocity: 3.0}}
+# the end
+"""
+CHANGED = """\
+sensors:
+  # of the LiDAR
+  lidar:
+    # its errors
+    std: {x_m: 1.0, y_m: 1.0}  # metres
+    births: true
+    correlation: {share: 0.6, time_s: 40.0}
+
+  # of the RADAR
+  radar:
+    std:
+      x_m: 1.0  # along
+      # across
+      y_m: 2.5
+    correlation: {share: 0.5, time_s: 60.0}
+# what is near
+association: {kind: mahalanobis}
+# left out
+ignore_sensors: [lamp]
+
+# how objects move
+motion: {kind: cv, std_per_s: {velocity: 4.0}}
+birth: {speed_std_mps: 3.0, kind: fixed}
+# the end
+"""
+
+
+def test_comments_stay_with_what_they_are_about(tmp_path: Path) -> None:
+    path = tmp_path / "commented.yaml"
+    path.write_text(COMMENTED, encoding="utf-8")
+    settings = [
+        "sensors.lidar.correlation={share: 0.6, time_s: 40.0}",
+        "sensors.radar.correlation={share: 0.5, time_s: 60.0}",
+        "sensors.radar.std.y_m=2.5",
+        "association={kind: mahalanobis}",
+        "ignore_sensors=[lamp]",
+        "motion.std_per_s.velocity=4",
+        "birth.speed_std_mps=3.0",
+    ]
+    text = tuned_text(path, read_config(path, settings), [])
+    assert text.partition("#\n#\n")[2] == CHANGED
