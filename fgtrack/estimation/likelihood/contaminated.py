@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.linalg import symmetrise
+from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
 
 #: How many times as large as nominal the standard deviations of the classes of errors are: nominal, outliers, and what
@@ -38,30 +38,29 @@ def update(P: FloatArray, H: FloatArray, y: FloatArray, R: FloatArray, foreign: 
     The error has the covariance c^2 R + `foreign`, shape (..., k, k), with c = 1 or, with the probability
     `outlier_share(odds)`, another one of `SCALES`. With p(y) the mixture of the normal densities of covariances
     S_i = H P H' + c_i^2 R + foreign,
-    w_i the probability of class i given y, g = sum w_i S_i^-1 y and
-    G = sum w_i (S_i^-1 - S_i^-1 y y' S_i^-1) + g g', the posterior has the mean x + P H' g and the covariance
-    P - P H' G H P, its exact moments (Masreliez 1975, "Approximate non-Gaussian filtering with linear state and
-    observation relations", IEEE Transactions on Automatic Control 20(1), eqs. 8 to 12). At odds 0 this is the Kalman
-    filter.
+    w_i the probability of class i given y and s_i = P H' S_i^-1 y the step of the Kalman filter for class i, the
+    posterior has the mean x + s, s = sum w_i s_i, and the covariance
+    P - sum w_i P H' S_i^-1 H P + sum w_i (s_i - s) (s_i - s)': the moments of a mixture of the posteriors of the
+    classes, which are exact (Alspach and Sorenson 1972, "Nonlinear Bayesian estimation using Gaussian sum
+    approximations", IEEE Transactions on Automatic Control 17(4)). At odds 0 this is the Kalman filter.
     """
     HP = H @ P
     scales = np.square(SCALES).reshape(-1, *[1] * R.ndim)
     S = (HP @ H.mT + foreign) + scales * R
-    inverse = np.linalg.inv(S)
-    solved = (inverse @ y[..., None])[..., 0]
-    squares = np.vecdot(y, solved)
-    log_density = _log_shares(odds) - 0.5 * (squares + np.linalg.slogdet(S)[1])
+    columns = np.concatenate([HP, y[..., None]], axis=-1)
+    solved = psd_solve(S, columns)
+    log_density = _log_shares(odds) - 0.5 * (np.vecdot(y, solved[..., -1]) + np.linalg.slogdet(S)[1])
     highest = log_density.max(axis=0)
     weights = np.exp(log_density - highest)
     total = weights.sum(axis=0)
     weights /= total
-    g = (weights[..., None] * solved).sum(axis=0)
-    weighted = weights[..., None] * solved
-    G = (weights[..., None, None] * inverse).sum(axis=0) - (weighted[..., :, None] * solved[..., None, :]).sum(axis=0)
-    G += g[..., :, None] * g[..., None, :]
+    steps = (solved[..., None, :, -1] @ HP)[..., 0, :]
+    step = (weights[..., None] * steps).sum(axis=0)
+    apart = np.sqrt(weights)[..., None] * (steps - step)
+    reduced = HP.mT @ (weights[..., None, None] * solved[..., :-1]).sum(axis=0)
     return Update(
-        (g[..., None, :] @ HP)[..., 0, :],
-        symmetrise(P - HP.mT @ G @ HP),
+        step,
+        symmetrise(P - reduced + (apart[..., :, None] * apart[..., None, :]).sum(axis=0)),
         S[0],
         highest + np.log(total) - 0.5 * y.shape[-1] * math.log(math.tau),
         1.0 - weights[0],

@@ -156,9 +156,8 @@ class Likelihood:
     def _expected(self, found: Evaluation) -> FloatArray:
         """Information expected of normal innovations, shape (f, f)."""
         dy, dS = self._difference(found.y), self._difference(found.S)
-        inverse = np.linalg.inv(found.S[0])
-        A = inverse @ dS
-        weighted = (inverse @ dy[..., None])[..., 0]
+        solved = psd_solve(found.S[:1], np.concatenate([dS, dy[..., None]], axis=-1))
+        A, weighted = solved[..., :-1], solved[..., -1]
         f = len(dy)
         curved = A.reshape(f, -1) @ A.mT.reshape(f, -1).T
         return symmetrise(0.5 * curved + weighted.reshape(f, -1) @ dy.reshape(f, -1).T)
