@@ -59,9 +59,8 @@ def filtered(problem: Problem) -> dict[int, Estimate]:
         if here:
             H = np.vstack([one.slope(mean, names) for one in here])
             y = np.concatenate([one.residual(mean, names) for one in here])
-            information = linalg.inv(P)
-            P = linalg.inv(information + H.T @ H)
-            mean = mean + P @ (H.T @ y)
+            K, P = _conditioned(P, H, np.eye(len(y)))
+            mean = mean + K @ y
         estimates[stamp_ns] = Estimate(mean, P)
     return estimates
 
@@ -92,10 +91,8 @@ class Solution:
         return self._between(slice(place * n, (place + 2) * n), until, after, self.means[place + 1])
 
     def _between(self, both: slice, until: Flow, after: Flow, right: FloatArray) -> Estimate:
-        """Condition N(until.mean, until.Q), given the left state, on the right one, in information form."""
-        onwards = linalg.inv(after.Q)
-        C = linalg.inv(linalg.inv(until.Q) + after.F.T @ onwards @ after.F)
-        by_right = C @ after.F.T @ onwards
+        """Condition N(until.mean, until.Q), given the left state, on the right one."""
+        by_right, C = _conditioned(until.Q, after.F, after.Q)
         by_left = until.F - by_right @ after.F @ until.F
         T = np.hstack([by_left, by_right])
         return Estimate(until.mean + by_right @ (right - after.mean), C + T @ self.covariance[both, both] @ T.T)
@@ -150,6 +147,13 @@ def _rows(problem: Problem, means: FloatArray) -> tuple[FloatArray, FloatArray]:
         root = np.sqrt(one.weight(y))
         add([(k, root * H)], root * y)
     return np.vstack(rows), np.concatenate(rhs)
+
+
+def _conditioned(P: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gain K (n, k) of H x + N(0, R) on x of covariance P (n, n), and the covariance that it leaves."""
+    K = linalg.solve(H @ P @ H.T + R, H @ P, assume_a="pos").T
+    A = np.eye(len(P)) - K @ H
+    return K, A @ P @ A.T + K @ R @ K.T
 
 
 def _whitening(covariance: FloatArray) -> FloatArray:
