@@ -8,8 +8,7 @@ from typing import Generic, TypeVar
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Disposition
 from fgtrack.evaluation.consistency import Consistency
-from fgtrack.evaluation.contest import Contest, contests
-from fgtrack.evaluation.differences import differences
+from fgtrack.evaluation.contest import Contest, contests, differences
 from fgtrack.evaluation.innovations import FEWEST, LAGS, RESIDUAL_NAMES, Autocorrelation
 from fgtrack.evaluation.lagged import WINDOW, LagMetrics
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS

@@ -5,9 +5,8 @@ bootstrap over time (`fgtrack.evaluation.paired`).
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -15,8 +14,10 @@ from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.consistency import position_nees
 from fgtrack.evaluation.matching import scenes, track_errors
 from fgtrack.evaluation.multi_object import gospa
-from fgtrack.evaluation.paired import Estimate, by_stamp, within_run
+from fgtrack.evaluation.paired import UNKNOWN, Estimate, by_stamp, within_run
+from fgtrack.evaluation.ranking import Entry, ranked, worse_columns
 from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.tables import Column, Table, Value, short
 
 _SEED = 20040101  # of the bootstrap: the same runs give the same intervals
 
@@ -25,19 +26,15 @@ _ERRORS = {"position_rmse_m": "position_m", "speed_rmse_mps": "speed_mps", "yaw_
 POSITION_NEES = "position_nees"
 """The quantity that is the better the nearer it is to 2."""
 
-Standing = Literal["best", "tie", "worse"]
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One run in one quantity."""
-
-    run: str
-    value: float
-    worse_by: Estimate | None
-    """How much worse than the best run; None of the best run itself."""
-    standing: Standing
-    """`tie` where the interval of the difference to the best run has 0 inside; `best` only without any tie."""
+_HEADINGS = {
+    "position_rmse_m": "pos. [m]",
+    "speed_rmse_mps": "speed [m/s]",
+    "yaw_rmse_rad": "yaw [rad]",
+    "position_nees": "NEES pos.",
+    "gospa_in_sight_rms_m": "GOSPA [m]",
+}
+_MARKS: Mapping[Value, str] = {"best": "+", "tie": "=", "worse": " "}
+_LARGE_SHARE = 0.9  # of the samples that all runs have in common; below it the note says how many
 
 
 @dataclass(frozen=True)
@@ -48,11 +45,6 @@ class Quantity:
     """With its unit: `position_rmse_m`."""
     entries: tuple[Entry, ...]
     """From the best run to the worst."""
-
-    @property
-    def ties(self) -> tuple[str, ...]:
-        """The best run and those that tie with it."""
-        return tuple(entry.run for entry in self.entries if entry.standing != "worse")
 
 
 @dataclass(frozen=True)
@@ -68,6 +60,12 @@ class Contest:
     """Those that all runs have."""
 
 
+@dataclass(frozen=True)
+class _Row:
+    quantity: str
+    entry: Entry
+
+
 def contests(runs: Sequence[JudgedRun]) -> list[Contest]:
     """A contest for every recording of which there are several runs; runs without truth take no part."""
     groups: list[list[JudgedRun]] = []
@@ -79,6 +77,36 @@ def contests(runs: Sequence[JudgedRun]) -> list[Contest]:
             else:
                 group.append(one)
     return [_contest(group) for group in groups if len(group) > 1]
+
+
+def differences(found: Sequence[Contest]) -> Table:
+    """A row for each contest, quantity and run: its value, and how much worse than the best it is."""
+    rows = [_Row(q.name, entry) for contest in found for q in contest.quantities for entry in q.entries]
+    columns: list[Column[_Row]] = [
+        Column("", ("quantity",), lambda row: (row.quantity,)),
+        Column("quantity", (), lambda row: (_HEADINGS[row.quantity],), left=True),
+        Column("run", ("run",), lambda row: (row.entry.name,), left=True),
+        Column(
+            "value  ",
+            ("value", "standing"),
+            lambda row: (row.entry.value, row.entry.standing),
+            "{} {}",
+            text=lambda value: _MARKS.get(value, "") or short(value),
+            bold=lambda row: row.entry.standing == "best",
+        ),
+        *worse_columns(lambda row: row.entry),
+        Column("", ("blocks",), lambda row: ((row.entry.worse_by or UNKNOWN).count,)),
+    ]
+    notes = [
+        "RMSE where all runs track the object; NEES: worse is farther from 2",
+        "+: best; =: ties with the best, as the interval has 0 inside (block bootstrap)",
+    ]
+    for contest in found:
+        if contest.samples < _LARGE_SHARE * contest.most_samples:
+            notes.append(
+                f"{', '.join(contest.runs)}: {contest.samples} samples in common, of up to {contest.most_samples}"
+            )
+    return Table("Differences of runs of the same recording", columns, rows, row_keys=("run", "quantity"), notes=notes)
 
 
 def same_recording(one: JudgedRun, other: JudgedRun) -> bool:
@@ -168,21 +196,14 @@ def _quantity(name: str, labels: Sequence[str], ticks: FloatArray) -> Quantity:
     value_of, cost_of = (_plain, _from_two) if name == POSITION_NEES else (np.sqrt, np.sqrt)
     *numerators, count = ticks.sum(axis=0).tolist()
     means = np.array(numerators) / count
-    best, *others = np.argsort(cost_of(means), kind="stable").tolist()
 
-    def worse_by(one: int) -> Estimate:
+    def worse_by(one: int, best: int) -> Estimate:
         def statistic(S: FloatArray) -> FloatArray:
             return cost_of(S[0] / S[2]) - cost_of(S[1] / S[2])
 
         return within_run(ticks[:, [one, best, -1]], statistic, np.random.default_rng(_SEED))
 
-    differences = {one: worse_by(one) for one in others}
-    ties = {one for one, difference in differences.items() if not difference.is_significant}
-    values = value_of(means).tolist()
-    entries = [Entry(labels[best], values[best], None, "tie" if ties else "best")]
-    for one, difference in differences.items():
-        entries.append(Entry(labels[one], values[one], difference, "tie" if one in ties else "worse"))
-    return Quantity(name, tuple(entries))
+    return Quantity(name, ranked(labels, value_of(means), cost_of(means), worse_by))
 
 
 def _plain(mean: FloatArray) -> FloatArray:

@@ -11,10 +11,8 @@ from typing import Literal
 
 import numpy as np
 
-from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.contest import Standing
-from fgtrack.evaluation.differences import two_digits
 from fgtrack.evaluation.paired import Estimate, paired
+from fgtrack.evaluation.ranking import Entry, Standing, ranked, worse_columns
 from fgtrack.evaluation.tables import Column, Table, Value
 
 #: Metrics that have a better and a worse, in the order in which they are asked for; the first is shown.
@@ -44,19 +42,6 @@ _POSITION_DOF = 2.0
 
 
 @dataclass(frozen=True)
-class SeedEntry:
-    """One estimator in one metric at one point."""
-
-    estimator: str
-    mean: float
-    """Of the metric, over the seeds."""
-    worse_by: Estimate | None
-    """How much worse than the best estimator, with the t interval over the seeds; None of the best itself."""
-    standing: Standing
-    """`tie` where the interval of the difference to the best has 0 inside; `best` only without any tie."""
-
-
-@dataclass(frozen=True)
 class SeedContest:
     """The estimators in one metric at one point of the grid."""
 
@@ -65,13 +50,8 @@ class SeedContest:
     metric: str
     seeds: int
     """Seeds that all estimators have a value of."""
-    entries: tuple[SeedEntry, ...]
-    """From the best estimator to the worst."""
-
-    @property
-    def ties(self) -> tuple[str, ...]:
-        """The best estimator and those that tie with it."""
-        return tuple(entry.estimator for entry in self.entries if entry.standing != "worse")
+    entries: tuple[Entry, ...]
+    """From the best estimator to the worst; the values are means over the seeds."""
 
 
 def seed_contests(rows: Sequence[Mapping[str, str]], axes: Sequence[str]) -> list[SeedContest]:
@@ -106,8 +86,8 @@ def to_csv(contests: Sequence[SeedContest], axes: Sequence[str]) -> str:
     for contest in contests:
         for entry in contest.entries:
             worse = entry.worse_by
-            numbers = (entry.mean, *((worse.mean, worse.low, worse.high) if worse else (math.nan,) * 3))
-            cells = (contest.metric, entry.estimator, contest.seeds, *map(_cell, numbers), entry.standing)
+            numbers = (entry.value, *((worse.mean, worse.low, worse.high) if worse else (math.nan,) * 3))
+            cells = (contest.metric, entry.name, contest.seeds, *map(_cell, numbers), entry.standing)
             writer.writerow([*contest.point, *cells])
     return text.getvalue()
 
@@ -131,23 +111,15 @@ def shown_tables(contests: Sequence[SeedContest], axes: Sequence[str]) -> list[T
 class _Row:
     point: str
     seeds: int
-    entry: SeedEntry
+    entry: Entry
 
 
 def _every_point(metric: str, rows: Sequence[_Row], heading: str) -> Table:
-    def interval(row: _Row) -> tuple[Value, ...] | None:
-        found = row.entry.worse_by
-        return (found.low, found.high) if found is not None and found.is_known else None
-
-    def mean(row: _Row) -> tuple[Value, ...] | None:
-        return None if row.entry.worse_by is None else (row.entry.worse_by.mean,)
-
     columns: list[Column[_Row]] = [
         Column(heading, ("point",), lambda row: (row.point,), left=True),
-        Column("estimator", ("estimator",), lambda row: (row.entry.estimator,), left=True),
-        Column("mean", ("mean",), lambda row: (row.entry.mean,), bold=lambda row: row.entry.standing == "best"),
-        Column("worse\nby", ("worse_by",), mean, text=two_digits),
-        Column("95 % interval", ("low", "high"), interval, "{} to {}", text=two_digits),
+        Column("estimator", ("estimator",), lambda row: (row.entry.name,), left=True),
+        Column("mean", ("mean",), lambda row: (row.entry.value,), bold=lambda row: row.entry.standing == "best"),
+        *worse_columns(lambda row: row.entry),
         Column("seeds", ("seeds",), lambda row: (row.seeds,)),
         Column("is", ("standing",), lambda row: (row.entry.standing,), left=True),
     ]
@@ -155,8 +127,8 @@ def _every_point(metric: str, rows: Sequence[_Row], heading: str) -> Table:
 
 
 def _counts(metric: str, num_points: int, rows: Sequence[_Row]) -> Table:
-    estimators = list(dict.fromkeys(row.entry.estimator for row in rows))
-    standings = Counter((row.entry.estimator, row.entry.standing) for row in rows)
+    estimators = list(dict.fromkeys(row.entry.name for row in rows))
+    standings = Counter((row.entry.name, row.entry.standing) for row in rows)
 
     def count(standing: Standing) -> Callable[[str], tuple[Value, ...]]:
         return lambda name: (standings[name, standing],)
@@ -201,21 +173,13 @@ def _contest(point: tuple[str, ...], metric: str, rows: Sequence[Mapping[str, st
     seeds = sorted(set.intersection(*map(set, values.values())), key=int)
     if not seeds:
         return None
-    means, costs = _columns(values, seeds, 0), _columns(values, seeds, 1)
-    best, *others = sorted(costs, key=lambda name: float(costs[name].mean()))
-    differences = {name: paired(costs[name], costs[best]) for name in others}
-    ties = {name for name, difference in differences.items() if not difference.is_significant}
-    entries = [SeedEntry(best, float(means[best].mean()), None, "tie" if ties else "best")]
-    for name, difference in differences.items():
-        standing: Standing = "tie" if name in ties else "worse"
-        entries.append(SeedEntry(name, float(means[name].mean()), difference, standing))
-    return SeedContest(point, metric, len(seeds), tuple(entries))
+    found = np.array([[of[seed] for seed in seeds] for of in values.values()])
+    means, costs = found[..., 0].mean(axis=1), found[..., 1]
 
+    def worse_by(one: int, best: int) -> Estimate:
+        return paired(costs[one], costs[best])
 
-def _columns(
-    values: Mapping[str, Mapping[str, tuple[float, float]]], seeds: Sequence[str], which: int
-) -> dict[str, FloatArray]:
-    return {name: np.array([of[seed][which] for seed in seeds]) for name, of in values.items()}
+    return SeedContest(point, metric, len(seeds), ranked(list(values), means, costs.mean(axis=1), worse_by))
 
 
 def _cost_of(metric: str) -> Callable[[Mapping[str, str]], float]:

@@ -23,6 +23,7 @@ Value = str | int | float
 
 NO_VALUE = "-"
 
+_MOST_DECIMALS = 5
 _WIDTH = 120  # of a table as text
 _LATEX = {char: f"\\{char}" for char in "&%$#_{}"} | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _LATEX |= {"\\": r"\textbackslash{}", "±": r"$\pm$", "<": r"$<$", ">": r"$>$"}
@@ -37,6 +38,19 @@ def short(value: Value) -> str:
     size = abs(float(f"{value:.2e}"))
     decimals = 0 if size >= 100.0 else 1 if size >= 10.0 else 2 if size >= 1.0 else 3
     return f"{round(value, decimals) + 0.0:.{decimals}f}"  # no negative zero
+
+
+def two_digits(value: Value) -> str:
+    """`value` with two significant digits and at most five decimals, whole numbers in full; a dash for NaN."""
+    if isinstance(value, str | int):
+        return str(value)
+    if not math.isfinite(value):
+        return NO_VALUE
+    size = abs(float(f"{value:.1e}"))
+    if round(size, _MOST_DECIMALS) == 0.0:
+        return "0"
+    decimals = min(max(0, 1 - math.floor(math.log10(size))), _MOST_DECIMALS)
+    return f"{value:.{decimals}f}"
 
 
 @dataclass(frozen=True)

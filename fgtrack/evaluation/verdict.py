@@ -3,13 +3,13 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from fgtrack.evaluation.contest import Contest, Entry, Quantity
-from fgtrack.evaluation.differences import two_digits
+from fgtrack.evaluation.contest import Contest, Quantity
 from fgtrack.evaluation.lagged import WINDOW
 from fgtrack.evaluation.metrics import Metrics
 from fgtrack.evaluation.paired import UNKNOWN, Estimate
+from fgtrack.evaluation.ranking import Entry
 from fgtrack.evaluation.statistics import ChiSquareMean
-from fgtrack.evaluation.tables import short
+from fgtrack.evaluation.tables import short, two_digits
 
 FAR_OFF = 1.5
 """A mean NEES or NIS farther from its expected value than by this factor says that the noise does not fit."""
@@ -60,16 +60,16 @@ def _positions(contest: Contest) -> Iterator[str]:
     if ties:
         last = ties[-1]
         difference = f"{'difference' if len(ties) == 1 else 'largest difference'} {_metres(last)}"
-        names = _listed([best.run, *(one.run for one in ties)])
+        names = _listed([best.name, *(one.name for one in ties)])
         first = f"{names} tie at the newest stamp ({value}, {difference})"
     else:
-        first = f"{best.run} is best at the newest stamp ({value})"
+        first = f"{best.name} is best at the newest stamp ({value})"
     yield f"{first}{'; ' if worse else ''}{_worse(worse)}."
 
 
 def _worse(entries: Sequence[Entry]) -> str:
     most = _MOST_NAMED if len(entries) > _MOST_NAMED + 1 else len(entries)
-    named = [f"{entry.run} is {_metres(entry, ' worse')}" for entry in entries[:most]]
+    named = [f"{entry.name} is {_metres(entry, ' worse')}" for entry in entries[:most]]
     left = len(entries) - len(named)
     return ", ".join([*named, *([f"{left} more are worse"] if left else [])])
 
@@ -175,7 +175,7 @@ def _position(contest: Contest) -> Quantity | None:
 def _ranked(contest: Contest) -> Sequence[str]:
     """The runs, the best one first."""
     quantity = _position(contest)
-    return contest.runs if quantity is None else [entry.run for entry in quantity.entries]
+    return contest.runs if quantity is None else [entry.name for entry in quantity.entries]
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -54,23 +54,23 @@ def trio(tmp_path_factory: pytest.TempPathFactory) -> list[Run]:
 
 def test_the_best_run_and_those_that_tie_with_it_and_how_much_worse_the_others_are(trio: list[Run]) -> None:
     found = quantities_of(contest_of(trio))["position_rmse_m"]
-    assert [(entry.run, entry.standing) for entry in found.entries] in (
+    assert [(entry.name, entry.standing) for entry in found.entries] in (
         [("1", "tie"), ("2", "tie"), ("0", "worse")],
         [("2", "tie"), ("1", "tie"), ("0", "worse")],
     )
-    values = {entry.run: entry.value for entry in found.entries}
+    values = {entry.name: entry.value for entry in found.entries}
     assert values["1"] == pytest.approx(rms(NOISE_M), rel=1e-9)
     worse = found.entries[2].worse_by
     assert worse is not None
     assert worse.mean == pytest.approx(values["0"] - found.entries[0].value)
     assert worse.low < rms(NOISE_M) < worse.high
     assert found.entries[0].worse_by is None
-    assert set(found.ties) == {"1", "2"}
+    assert {entry.name for entry in found.entries if entry.standing == "tie"} == {"1", "2"}
 
 
 def test_without_the_tie_the_best_is_best(trio: list[Run]) -> None:
     found = quantities_of(contest_of(trio[:2]))["position_rmse_m"]
-    assert [(entry.run, entry.standing) for entry in found.entries] == [("1", "best"), ("0", "worse")]
+    assert [(entry.name, entry.standing) for entry in found.entries] == [("1", "best"), ("0", "worse")]
 
 
 def test_gospa_is_that_of_the_metrics(trio: list[Run]) -> None:
@@ -78,8 +78,8 @@ def test_gospa_is_that_of_the_metrics(trio: list[Run]) -> None:
     expected = {
         one.label: one.metrics.multi_object.gospa.in_sight_rms_m for one in judged(trio) if one.metrics.multi_object
     }
-    assert {entry.run: entry.value for entry in found.entries} == pytest.approx(expected)
-    assert found.entries[-1].run == "0"
+    assert {entry.name: entry.value for entry in found.entries} == pytest.approx(expected)
+    assert found.entries[-1].name == "0"
 
 
 def test_of_the_nees_the_nearest_to_two_is_best(tmp_path: Path) -> None:
@@ -87,10 +87,10 @@ def test_of_the_nees_the_nearest_to_two_is_best(tmp_path: Path) -> None:
     noise = np.random.default_rng(2).normal(0.0, 0.2, TICKS)
     near, cautious = a_run(tmp_path / "a", math.sqrt(1.8) + noise), a_run(tmp_path / "b", 0.2 + noise)
     found = quantities_of(contest_of([cautious, near]))
-    assert [entry.run for entry in found["position_nees"].entries] == ["1", "0"]
+    assert [entry.name for entry in found["position_nees"].entries] == ["1", "0"]
     assert found["position_nees"].entries[0].standing == "best"
     assert found["position_nees"].entries[0].value == pytest.approx(1.8, rel=0.1)
-    assert [entry.run for entry in found["position_rmse_m"].entries] == ["0", "1"]
+    assert [entry.name for entry in found["position_rmse_m"].entries] == ["0", "1"]
 
 
 def test_only_samples_that_all_runs_have_are_compared(tmp_path: Path) -> None:

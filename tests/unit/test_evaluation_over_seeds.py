@@ -37,15 +37,14 @@ def test_differences_are_paired_by_seed_and_the_standing_follows_from_the_interv
     small = np.random.default_rng(2).normal(0.0, 0.001, SEEDS)
     values = {"worse": list(common + 0.02 + small), "good": list(common), "same": list(common + small - small.mean())}
     found = only(rows_of(values))
-    assert {entry.estimator: entry.standing for entry in found.entries} == {
+    assert {entry.name: entry.standing for entry in found.entries} == {
         "good": "tie",
         "same": "tie",
         "worse": "worse",
     }
-    assert set(found.ties) == {"good", "same"}
     last = found.entries[-1]
-    assert last.worse_by == paired(values["worse"], values[found.entries[0].estimator])
-    assert last.mean == pytest.approx(np.mean(values["worse"]))
+    assert last.worse_by == paired(values["worse"], values[found.entries[0].name])
+    assert last.value == pytest.approx(np.mean(values["worse"]))
     assert [entry.standing for entry in only(rows_of({k: values[k] for k in ("worse", "good")})).entries] == [
         "best",
         "worse",
@@ -54,21 +53,21 @@ def test_differences_are_paired_by_seed_and_the_standing_follows_from_the_interv
 
 def test_of_shares_more_is_better_and_of_the_nees_the_expected_value() -> None:
     share = only(rows_of({"a": noisy(1, 0.7), "b": noisy(2, 0.9)}, "truth.overall.tracked_share"))
-    assert [entry.estimator for entry in share.entries] == ["b", "a"]
+    assert [entry.name for entry in share.entries] == ["b", "a"]
     assert share.entries[1].worse_by is not None
     assert share.entries[1].worse_by.mean == pytest.approx(0.2, abs=0.02)
     nees = only(rows_of({"a": noisy(1, 1.0), "b": noisy(2, 2.4)}, "consistency.position_nees.mean"))
-    assert [entry.estimator for entry in nees.entries] == ["b", "a"]
+    assert [entry.name for entry in nees.entries] == ["b", "a"]
     rows = rows_of({"a": noisy(1, 3.0), "b": noisy(2, 4.1)}, "consistency.nis.radar.mean")
     nis = only([{**row, "consistency.nis.radar.dof": "4.0"} for row in rows])
-    assert [entry.estimator for entry in nis.entries] == ["b", "a"]
-    assert nis.entries[0].mean == pytest.approx(4.1, abs=0.02), "the mean is that of the metric, not of the distance"
+    assert [entry.name for entry in nis.entries] == ["b", "a"]
+    assert nis.entries[0].value == pytest.approx(4.1, abs=0.02), "the mean is that of the metric, not of the distance"
 
 
 def test_only_seeds_that_all_estimators_have_count() -> None:
     found = only(rows_of({"a": [None, 1.0, 1.1, 1.2], "b": [0.1, 2.0, 2.1, 2.2]}))
     assert found.seeds == 3
-    assert [entry.mean for entry in found.entries] == pytest.approx([1.1, 2.1])
+    assert [entry.value for entry in found.entries] == pytest.approx([1.1, 2.1])
 
 
 def test_one_estimator_no_common_seed_or_an_unknown_metric_make_no_contest() -> None:

@@ -10,11 +10,12 @@ import pytest
 from evaluation_runs import WEST, update, write_run
 
 from fgtrack.evaluation.consistency import Consistency
-from fgtrack.evaluation.contest import Contest, Entry, Quantity
-from fgtrack.evaluation.differences import two_digits
+from fgtrack.evaluation.contest import Contest, Quantity
 from fgtrack.evaluation.metrics import Metrics, evaluate
 from fgtrack.evaluation.paired import Estimate
+from fgtrack.evaluation.ranking import Entry
 from fgtrack.evaluation.statistics import ChiSquareMean, Moments
+from fgtrack.evaluation.tables import two_digits
 from fgtrack.evaluation.verdict import verdict
 
 FITS = Consistency(
