@@ -13,13 +13,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 import fgtrack
 from fgtrack.evaluation.consistency import Consistency
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.paired import Estimate, paired
+from fgtrack.evaluation.paired import average
 from fgtrack.pipeline.load import validate
 from fgtrack.sim.scenario import Scenario
 
@@ -94,7 +93,7 @@ def lever_arm(seeds: int, duration_s: float) -> str:
         rmse_m = [one.truth.overall.errors["position_m"].rmse for one in found if one.truth]
         nees = [one.consistency.position_nees.mean for one in found]
         nis = [one.consistency.nis["radar"].mean for one in found]
-        lines.append(f"| {name} | {' | '.join(shown(over_seeds(values)) for values in (rmse_m, nees, nis))} |")
+        lines.append(f"| {name} | {' | '.join(f'{average(values):.3g}' for values in (rmse_m, nees, nis))} |")
     return "\n".join(lines) + "\n"
 
 
@@ -110,26 +109,14 @@ def whiteness(seeds: int, duration_s: float) -> str:
         for sensor in ("lidar_cluster", "radar"):
             found = [run.autocorrelation[sensor]["position_m"] for run in runs]
             inside = sum(abs(one.lag1) <= one.lag1_band for one in found)
-            correlation = shown(over_seeds([one.lag1 for one in found]))
-            lines.append(f"| {estimator} | {sensor} | {correlation} | {inside} of {seeds} |")
+            correlation = average([one.lag1 for one in found])
+            lines.append(f"| {estimator} | {sensor} | {correlation:.3g} | {inside} of {seeds} |")
     return "\n".join(lines) + "\n"
-
-
-def over_seeds(values: Sequence[float]) -> Estimate:
-    """Mean and interval."""
-    return paired(values, np.zeros(len(values)))
-
-
-def shown(value: Estimate) -> str:
-    """Mean and interval."""
-    return f"{value.mean:.3g} ({value.low:.3g} to {value.high:.3g})"
 
 
 def printed(script: str, out: Path, jobs: int, options: Sequence[str]) -> str:
     """What an experiment prints; raises `subprocess.CalledProcessError` where it fails."""
-    command = [sys.executable, str(HERE / script), "-o", str(out), *options]
-    if "--jobs" in (HERE / script).read_text(encoding="utf-8"):
-        command += ["--jobs", str(jobs)]
+    command = [sys.executable, str(HERE / script), "-o", str(out), "--jobs", str(jobs), *options]
     return subprocess.run(command, check=True, text=True, stdout=subprocess.PIPE).stdout
 
 

@@ -42,6 +42,7 @@ from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.evaluation.figures.style import colour, log_axis, save, styled
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
+from fgtrack.sim.draw import drawn
 from fgtrack.tracking.association import Association, GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.preprocess import Candidate
 
@@ -149,9 +150,7 @@ def _drawn(priors: Sequence[Start], stamps_ns: IntArray, rng: np.random.Generato
     starts = [initial_state(MOTION, prior) for prior in priors]
     states = [np.array([rng.multivariate_normal(*start) for start in starts])]
     for step_ns in np.diff(stamps_ns).tolist():
-        roots = np.linalg.cholesky(MOTION.process_noise(states[-1], seconds(step_ns)))
-        noise = (roots @ rng.standard_normal((len(priors), MOTION.dim, 1)))[..., 0]
-        states.append(MOTION.predict(states[-1], seconds(step_ns)) + noise)
+        states.append(drawn(MOTION, states[-1], seconds(step_ns), rng))
     return np.array(states)
 
 

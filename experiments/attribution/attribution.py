@@ -22,10 +22,11 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.registry import estimator
-from fgtrack.evaluation.paired import Estimate, paired
+from fgtrack.evaluation.paired import Estimate, average, paired
 from fgtrack.models.measurement import SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import RobustLoss
+from fgtrack.sim.draw import drawn
 
 START_NS = 1_790_000_000 * NS_PER_S
 HUBER = RobustLoss("huber", 1.5)
@@ -151,7 +152,7 @@ class Drawn:
     """By stamp."""
 
 
-def drawn(world: World, rng: np.random.Generator) -> Drawn:
+def scene(world: World, rng: np.random.Generator) -> Drawn:
     """Truth with the motion model's noise, and what the sensors measure of it."""
     plan: list[tuple[int, Sensor | None]] = []
     for sensor in world.sensors:
@@ -176,8 +177,7 @@ def drawn(world: World, rng: np.random.Generator) -> Drawn:
     for since_ns, sensor in plan:
         dt_s = (since_ns - last_ns) / NS_PER_S
         if dt_s > 0.0:
-            Q = world.motion.process_noise(x, dt_s)
-            x = world.motion.predict(x, dt_s) + np.linalg.cholesky(Q) @ rng.standard_normal(5)
+            x = drawn(world.motion, x, dt_s, rng)
             last_ns = since_ns
         truth[since_ns] = x
         if sensor is not None:
@@ -264,7 +264,7 @@ class Score:
 
 def scores(world: str, seed: int) -> dict[str, Score]:
     """All contestants on one run of `world`."""
-    run = drawn(WORLDS[world], np.random.default_rng([list(WORLDS).index(world), seed]))
+    run = scene(WORLDS[world], np.random.default_rng([list(WORLDS).index(world), seed]))
     return {name: score(contestant, run) for name, contestant in CONTESTANTS.items()}
 
 
@@ -286,12 +286,11 @@ def table_of_errors(found: Scores) -> list[list[str]]:
         for name in CONTESTANTS:
             of = [run[name] for run in runs]
             kept = [one for one in of if one.rmse_m < LOST_M]
-            zeros = [0.0] * len(kept)
             rmse, waited, nees = (
-                paired([getattr(one, what) for one in kept], zeros) for what in ("rmse_m", "waited_rmse_m", "nees")
+                f"{average([getattr(one, what) for one in kept]):.3g}" for what in ("rmse_m", "waited_rmse_m", "nees")
             )
             lost = len(of) - len(kept)
-            rows.append([world, name, shown(rmse), shown(waited), shown(nees), f"{lost} of {len(of)}"])
+            rows.append([world, name, rmse, waited, nees, f"{lost} of {len(of)}"])
     return rows
 
 
@@ -308,11 +307,6 @@ def table_of_steps(found: Scores) -> list[list[str]]:
         for runs in found.values()
     ]
     return [*rows, [f"waiting {WAIT_S:g} s", *(marked(one) for one in waiting)]]
-
-
-def shown(value: Estimate) -> str:
-    """Mean and interval."""
-    return f"{value.mean:.3g} ({value.low:.3g} to {value.high:.3g})"
 
 
 def marked(value: Estimate) -> str:

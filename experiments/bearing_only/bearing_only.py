@@ -25,9 +25,10 @@ from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.registry import ESTIMATORS, estimator
 from fgtrack.estimation.starts import distances
-from fgtrack.evaluation.paired import Estimate, paired
+from fgtrack.evaluation.paired import average, paired
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CV
+from fgtrack.sim.draw import drawn
 
 START_NS = 1_790_000_000 * NS_PER_S
 FIRST_BEARING_RAD = np.deg2rad(10.0)
@@ -134,9 +135,8 @@ def pursuit(world: World, rng: np.random.Generator, last_s: float) -> Pursuit:
         range_m = world.range_m + world.range_std_m * rng.standard_normal()
     position = range_m * np.array([np.cos(FIRST_BEARING_RAD), np.sin(FIRST_BEARING_RAD)])
     truth = [np.concatenate([position, world.velocity_std_mps * rng.standard_normal(2)])]
-    root = np.linalg.cholesky(world.motion.process_noise(truth[0], world.step_s))
     for _ in range(steps - 1):
-        truth.append(world.motion.predict(truth[-1], world.step_s) + root @ rng.standard_normal(4))
+        truth.append(drawn(world.motion, truth[-1], world.step_s, rng))
     R = np.array([[world.bearing_std_rad**2]])
     measurements = []
     for k, (place, state) in enumerate(zip(world.observer(steps), truth, strict=True)):
@@ -184,11 +184,6 @@ def chosen(names: str | None) -> list[str]:
     return there if names is None else [name.strip() for name in names.split(";")]
 
 
-def shown(value: Estimate) -> str:
-    """The mean and its interval."""
-    return f"{value.mean:.3g} ({value.low:.3g} to {value.high:.3g})"
-
-
 def row(name: str, found: list[Errors], reference: list[Errors]) -> list[str]:
     """The case's errors at the last step, and in pairs those less than of the reference."""
     last, base = (np.array([one.distance_m[-1] for one in runs]) for runs in (found, reference))
@@ -198,8 +193,8 @@ def row(name: str, found: list[Errors], reference: list[Errors]) -> list[str]:
         f"{np.median(last):.3g}",
         f"{np.quantile(last, 0.9):.3g}",
         f"{np.sqrt(np.mean(last**2)):.3g}",
-        shown(paired(last, base)) if found is not reference else "",
-        shown(paired(nees, np.zeros_like(nees))),
+        f"{paired(last, base):.3g}" if found is not reference else "",
+        f"{average(nees):.3g}",
         f"{np.median(nees):.2f}",
         f"{100.0 * np.mean(nees > 13.8):.0f}",  # one in a thousand of a consistent estimator
     ]

@@ -20,14 +20,15 @@ from joblib import Parallel, delayed
 import fgtrack
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray, Message, TruthState
+from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.evaluation.lagged import lag_metrics
 from fgtrack.evaluation.matching import match
-from fgtrack.evaluation.paired import Estimate, paired
+from fgtrack.evaluation.paired import average, paired
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import Correlation, Mount, SensorModel
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
+from fgtrack.sim.draw import drawn
 
 MOTION = CTRV(0.01, 0.001, 0.5, 0.01)
 STARTS = np.array(
@@ -82,8 +83,7 @@ def _sensed(errors: str, duration_s: float, rng: np.random.Generator) -> Iterato
             noise = np.sqrt(share) * lasting[name] + np.sqrt(1.0 - share) * rng.standard_normal(len(states))
             bearings = np.arctan2(rays[:, 1], rays[:, 0]) + BEARING_STD_RAD * noise
             yield _list(name, stamp_ns, [Detection(bearing_rad=value) for value in bearings.tolist()], "sensor")
-        noise_roots = np.linalg.cholesky(MOTION.process_noise(states, PERIOD_S))
-        states = MOTION.predict(states, PERIOD_S) + np.vecdot(noise_roots, rng.standard_normal((len(states), 1, 5)))
+        states = drawn(MOTION, states, PERIOD_S, rng)
 
 
 def _list(sensor: str, stamp_ns: int, objects: list[Detection], frame: fgtrack.core.types.Frame) -> DetectionList:
@@ -122,16 +122,6 @@ def result(errors: str, modelled: str, name: str, duration_s: float, seed: int) 
     )
 
 
-def shown(value: Estimate, digits: int = 2) -> str:
-    """The mean and its interval."""
-    return f"{value.mean:.{digits}f} ({value.low:.{digits}f} to {value.high:.{digits}f})"
-
-
-def of(values: FloatArray) -> Estimate:
-    """Mean over the seeds."""
-    return paired(values, np.zeros_like(values))
-
-
 def main(
     out: Annotated[Path, typer.Option("-o", help="Folder for the table.")] = Path("out/cameras"),
     runs: Annotated[int, typer.Option(help="Seeds.")] = 20,
@@ -151,8 +141,8 @@ def main(
         for case, by_estimator in zip(cases, values, strict=True):
             for name, found in zip(ESTIMATORS, by_estimator, strict=True):
                 gain = paired(100.0 * np.log(found[:, 0]), 100.0 * np.log(by_estimator[0, :, 0]))
-                columns = [shown(of(column), 3 - index % 2) for index, column in enumerate(found.T)]
-                writer.writerow([*case, name, *columns, shown(gain) if name != ESTIMATORS[0] else ""])
+                columns = [f"{average(column):.{3 - index % 2}f}" for index, column in enumerate(found.T)]
+                writer.writerow([*case, name, *columns, f"{gain:.2f}" if name != ESTIMATORS[0] else ""])
     print((out / "cameras.csv").read_text())
 
 

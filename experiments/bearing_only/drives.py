@@ -230,7 +230,7 @@ def _difference(ekf: Matching | None, smoother: Matching | None) -> str:
     samples = np.array([[square[key] for square in squares] for key in common])
     ticks = by_stamp(np.array([key[0] for key in common]), samples)
     found = within_run(ticks, lambda S: np.sqrt(S[1] / S[2]) - np.sqrt(S[0] / S[2]), np.random.default_rng(0))
-    return f"{found.mean:+.4f} ({found.low:+.4f} to {found.high:+.4f})"
+    return f"{found:+.4f}"
 
 
 def _squares(matching: Matching) -> dict[tuple[int, int], float]:

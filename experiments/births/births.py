@@ -19,8 +19,10 @@ import fgtrack
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
+from fgtrack.evaluation.paired import Estimate
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
+from fgtrack.sim.draw import drawn
 
 START_NS = 1_790_000_000 * NS_PER_S
 STEP_S = 0.05
@@ -61,8 +63,7 @@ def errors(label: str, rng: np.random.Generator) -> FloatArray:
     found = []
     for k in range(1, NUM_STEPS + 1):
         stamp_ns = START_NS + round(k * STEP_S * NS_PER_S)
-        Q = TRUTH.process_noise(x, STEP_S)
-        x = TRUTH.predict(x, STEP_S) + np.linalg.cholesky(Q) @ rng.standard_normal(5)
+        x = drawn(TRUTH, x, STEP_S, rng)
         estimator.update(Measurement(stamp_ns, model, x[:2] + STD_M * rng.standard_normal(2), R))
         state = estimator.state_at(stamp_ns)
         mean = motion.kinematic(state.mean, state.covariance)[0]
@@ -106,18 +107,18 @@ def draw(results: dict[str, FloatArray], file: Path) -> None:
     plt.close(figure)
 
 
-def with_interval(values: FloatArray, share: float, rng: np.random.Generator) -> tuple[float, float, float]:
+def quantile(values: FloatArray, share: float, rng: np.random.Generator) -> Estimate:
     """The quantile `share` of `values` (n,), and its 95 % interval, by a bootstrap over the objects."""
-    drawn = rng.choice(values, (DRAWS, len(values)))
-    found = np.quantile(drawn, share, axis=1, method="higher")
+    resampled = rng.choice(values, (DRAWS, len(values)))
+    found = np.quantile(resampled, share, axis=1, method="higher")
     low, high = np.quantile(found, [0.025, 0.975], method="nearest").tolist()
-    return float(np.quantile(values, share, method="higher")), low, high
+    return Estimate(float(np.quantile(values, share, method="higher")), low, high, len(values))
 
 
-def mean_with_interval(values: FloatArray, rng: np.random.Generator) -> tuple[float, float, float]:
+def root_mean(values: FloatArray, rng: np.random.Generator) -> Estimate:
     """Root of the mean of `values` (n,), which are squares, and its 95 % interval, by the same bootstrap."""
     found = np.sqrt(rng.choice(values, (DRAWS, len(values))).mean(axis=1))
-    return (float(np.sqrt(values.mean())), *np.quantile(found, [0.025, 0.975]).tolist())
+    return Estimate(float(np.sqrt(values.mean())), *np.quantile(found, [0.025, 0.975]).tolist(), len(values))
 
 
 def table(results: dict[str, FloatArray], rng: np.random.Generator) -> str:
@@ -129,11 +130,9 @@ def table(results: dict[str, FloatArray], rng: np.random.Generator) -> str:
     ]
     for label, found in results.items():
         first_s, settled_s = np.array([reached_s(error) for error in found]).T
-        cells = [with_interval(first_s, 0.5, rng), with_interval(first_s, 0.9, rng), with_interval(settled_s, 0.5, rng)]
-        cells += [mean_with_interval(found[:, round(at_s / STEP_S) - 1, 1] ** 2, rng) for at_s in (0.2, 2.0)]
-        lines.append(
-            f"| {label} | " + " | ".join(f"{v:.2f} ({low:.2f} to {high:.2f})" for v, low, high in cells) + " |"
-        )
+        cells = [quantile(first_s, 0.5, rng), quantile(first_s, 0.9, rng), quantile(settled_s, 0.5, rng)]
+        cells += [root_mean(found[:, round(at_s / STEP_S) - 1, 1] ** 2, rng) for at_s in (0.2, 2.0)]
+        lines.append(f"| {label} | " + " | ".join(f"{cell:.2f}" for cell in cells) + " |")
     return "\n".join(lines) + "\n"
 
 

@@ -34,6 +34,7 @@ from fgtrack.evaluation.bounds import ScheduledMeasurement, bounds, bounds_along
 from fgtrack.evaluation.figures.style import GREY, WRONG, colour, save, styled
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
+from fgtrack.sim.draw import drawn
 
 START_NS = 1_790_000_000 * NS_PER_S
 POOR_PERIOD_S, GOOD_PERIOD_S, GOOD_PHASE_S = 0.05, 0.1, 0.025
@@ -98,7 +99,7 @@ class Case:
         self.poor_ns = grid_ns(POOR_PERIOD_S, POOR_PERIOD_S, duration_s)
         self.now_ns = grid_ns(SETTLED_S, NOW_PERIOD_S, duration_s)
         self._stamps_ns = np.unique([START_NS, *self.good_ns, *self.poor_ns, *self.now_ns])
-        self._states = drawn(world.motion, self._stamps_ns, runs, rng)
+        self._states = chains(world.motion, self._stamps_ns, runs, rng)
         self.good = self._measured(self.good_ns, world.good_std, rng)
         self.poor = self._measured(self.poor_ns, world.poor_std, rng)
 
@@ -131,14 +132,12 @@ def grid_ns(first_s: float, period_s: float, last_s: float) -> IntArray:
     return START_NS + np.array([nanoseconds(first_s + i * period_s) for i in range(count)])
 
 
-def drawn(motion: MotionModel, stamps_ns: IntArray, runs: int, rng: np.random.Generator) -> FloatArray:
+def chains(motion: MotionModel, stamps_ns: IntArray, runs: int, rng: np.random.Generator) -> FloatArray:
     """States of objects that move as `motion` says, shape (runs, s, n)."""
     mean, covariance = initial_state(motion, PRIOR)
     states = [mean + rng.standard_normal((runs, motion.dim)) @ np.linalg.cholesky(covariance).T]
     for step_ns in np.diff(stamps_ns).tolist():
-        roots = np.linalg.cholesky(motion.process_noise(states[-1], seconds(step_ns)))
-        noise = rng.standard_normal((runs, motion.dim, 1))
-        states.append(motion.predict(states[-1], seconds(step_ns)) + (roots @ noise)[..., 0])
+        states.append(drawn(motion, states[-1], seconds(step_ns), rng))
     return np.stack(states, axis=1)
 
 

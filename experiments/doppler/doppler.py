@@ -22,6 +22,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.evaluation.paired import Estimate, paired
 from fgtrack.models.measurement import SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import CTRV
+from fgtrack.sim.draw import drawn
 
 MOTION = CTRV()
 STEP_S, DURATION_S, SETTLED_S = 0.1, 5.0, 1.0
@@ -50,7 +51,7 @@ def driven(x: FloatArray, rng: np.random.Generator) -> Iterator[tuple[int, Float
     """Stamps and true states of an object that starts at `x` (5,)."""
     for k in range(round(DURATION_S / STEP_S)):
         if k:
-            x = MOTION.predict(x, STEP_S) + np.linalg.cholesky(MOTION.process_noise(x, STEP_S)) @ rng.standard_normal(5)
+            x = drawn(MOTION, x, STEP_S, rng)
         yield round(k * STEP_S * 1e9), x
 
 
@@ -137,14 +138,10 @@ def rmse_m(errors: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.mean(errors[:, round(SETTLED_S / STEP_S) :] ** 2, axis=1)))
 
 
-def with_interval(values: FloatArray, rng: np.random.Generator) -> tuple[float, float, float]:
+def over_runs(values: FloatArray, rng: np.random.Generator) -> Estimate:
     """Root of the mean square of `values` (runs,), and its 95 % interval by a bootstrap over the runs."""
-    drawn = np.sqrt((rng.choice(values, (2000, len(values))) ** 2).mean(axis=1))
-    return (float(np.sqrt((values**2).mean())), *np.quantile(drawn, [0.025, 0.975]).tolist())
-
-
-def shown(difference: Estimate) -> str:
-    return f"{difference.mean:+.2f} ({difference.low:+.2f} to {difference.high:+.2f})"
+    resampled = np.sqrt((rng.choice(values, (2000, len(values))) ** 2).mean(axis=1))
+    return Estimate(float(np.sqrt((values**2).mean())), *np.quantile(resampled, [0.025, 0.975]).tolist(), len(values))
 
 
 def table(scene: str, found: dict[tuple[str, str], FloatArray], rng: np.random.Generator) -> str:
@@ -156,10 +153,9 @@ def table(scene: str, found: dict[tuple[str, str], FloatArray], rng: np.random.G
     ]
     for (name, how), errors in found.items():
         values, reference = rmse_m(errors), rmse_m(found["smoother", how])
-        mean, low, high = with_interval(values, rng)
-        difference = "" if name == "smoother" else shown(paired(values, reference))
+        difference = "" if name == "smoother" else f"{paired(values, reference):+.2f}"
         far = f"{int((values > FAR_M).sum())} of {len(values)}"
-        cells = f"{mean:.2f} ({low:.2f} to {high:.2f}) | {np.median(values):.2f} | {far} | {difference}"
+        cells = f"{over_runs(values, rng):.2f} | {np.median(values):.2f} | {far} | {difference}"
         lines.append(f"| {name} | {how} | {cells} |")
     return "\n".join(lines) + "\n"
 

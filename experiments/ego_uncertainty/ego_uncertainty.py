@@ -26,7 +26,7 @@ from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import EgoState, Message
 from fgtrack.evaluation.consistency import position_nees
 from fgtrack.evaluation.matching import match
-from fgtrack.evaluation.paired import paired
+from fgtrack.evaluation.paired import average, paired
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config, EgoConfig, MotionConfig
 from fgtrack.pipeline.public import replay
@@ -126,7 +126,7 @@ def rows(count: int, time_s: float, found: Sequence[dict[str, Result]]) -> Itera
     """A row for each mode: RMSE, its change to `independent` in per cent, NEES; with 95 % intervals over the drives."""
     for mode in (*MODES, EXACT):
         own, other = ([one[each].squared_m2 for one in found] for each in (mode, "independent"))
-        nees = paired([one[mode].nees for one in found], np.zeros(len(found)))
+        nees = average([one[mode].nees for one in found])
         change = paired(0.5 * np.log(own), 0.5 * np.log(other))
         yield {
             "objects": count,

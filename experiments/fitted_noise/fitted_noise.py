@@ -17,7 +17,7 @@ import typer
 
 import fgtrack
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.paired import Estimate, paired
+from fgtrack.evaluation.paired import average, paired
 
 PAPER, FITTED = "smoother", "tuned"
 ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
@@ -74,29 +74,14 @@ def rows(results: Sequence[Result]) -> list[list[str]]:
         for estimator in ESTIMATORS:
             mine = [one for one in results if (one.config, one.estimator) == (config, estimator)]
             rmse_m = [one.rmse_m for one in mine]
-            against = "" if estimator == ESTIMATORS[0] else shown(paired(rmse_m, best), "{:+.4f}")
+            against = "" if estimator == ESTIMATORS[0] else f"{paired(rmse_m, best):+.4f}"
             gain = [100.0 * one.waiting_gain for one in mine]
-            columns = [
-                shown(over_seeds(values), text)
-                for values, text in (
-                    ([one.nees for one in mine], "{:.2f}"),
-                    ([one.lidar_nis for one in mine], "{:.2f}"),
-                    ([one.radar_nis for one in mine], "{:.2f}"),
-                )
+            ratios = [
+                f"{average([getattr(one, name) for one in mine]):.2f}" for name in ("nees", "lidar_nis", "radar_nis")
             ]
-            waiting = "" if math.isnan(gain[0]) else shown(over_seeds(gain), "{:.0f}")
-            found.append([config, estimator, shown(over_seeds(rmse_m), "{:.3f}"), against, *columns, waiting])
+            waiting = "" if math.isnan(gain[0]) else f"{average(gain):.0f}"
+            found.append([config, estimator, f"{average(rmse_m):.3f}", against, *ratios, waiting])
     return found
-
-
-def over_seeds(values: Sequence[float]) -> Estimate:
-    """Mean over the seeds and its interval."""
-    return paired(values, [0.0] * len(values))
-
-
-def shown(value: Estimate, text: str) -> str:
-    """Mean and interval."""
-    return f"{text} ({text} to {text})".format(value.mean, value.low, value.high)
 
 
 def main(

@@ -38,6 +38,7 @@ from fgtrack.estimation.registry import ESTIMATORS, EXACT, OOSM_GROUP, Claims, e
 from fgtrack.evaluation.figures.style import WRONG, colour, line_style, log_axis, save, styled
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
+from fgtrack.sim.draw import drawn
 
 MOTION = CV(velocity_density_m2ps3=5.0)
 POSITION = measurement_model(("x_m", "y_m"), MOTION)
@@ -98,15 +99,14 @@ def starts(lag: int) -> dict[str, Callable[[], Estimator]]:
     }
 
 
-def drawn(rng: np.random.Generator, lag: int) -> tuple[list[Measurement], FloatArray]:
+def arrivals(rng: np.random.Generator, lag: int) -> tuple[list[Measurement], FloatArray]:
     """Measurements of one run in order of arrival, and the true last state."""
     x = np.concatenate([rng.standard_normal(2), SPEED_STD_MPS * rng.standard_normal(2)])
     stamps_s = {k * STEP_S: STD_M for k in range(1, NUM_STEPS + 1)}
     late_s = NUM_STEPS * STEP_S - delay_s(lag)
     now_s, measurements, late = 0.0, [], None
     for stamp_s, std_m in sorted((stamps_s | {late_s: LATE_STD_M}).items()):
-        root = np.linalg.cholesky(MOTION.process_noise(x, stamp_s - now_s))
-        x = MOTION.predict(x, stamp_s - now_s) + root @ rng.standard_normal(4)
+        x = drawn(MOTION, x, stamp_s - now_s, rng)
         z = x[:2] + std_m * rng.standard_normal(2)
         measurement = Measurement(nanoseconds(stamp_s), POSITION, z, std_m**2 * np.eye(2))
         if stamp_s == late_s:
@@ -151,7 +151,7 @@ class Samples:
 def measured(lag: int, num_runs: int, seed: int) -> dict[str, Samples]:
     """Samples of every method at `lag`."""
     rng = np.random.default_rng([seed, lag])
-    runs = [drawn(rng, lag) for _ in range(num_runs)]
+    runs = [arrivals(rng, lag) for _ in range(num_runs)]
     found = {}
     for name, start in starts(lag).items():
         squared, nees, fused = [], [], []

@@ -21,6 +21,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
+from fgtrack.sim.draw import drawn
 
 START_NS = 1_790_000_000 * NS_PER_S
 STEP_S = 0.025
@@ -39,8 +40,7 @@ class Run:
         states = [self.start + PRIOR_STD * rng.standard_normal(5)]
         received: list[tuple[float, int, Measurement]] = []
         for k in range(1, round(duration_s / STEP_S) + 1):
-            Q = MOTION.process_noise(states[-1], STEP_S)
-            states.append(MOTION.predict(states[-1], STEP_S) + np.linalg.cholesky(Q) @ rng.standard_normal(5))
+            states.append(drawn(MOTION, states[-1], STEP_S, rng))
             phase, delay_s, std = SENSORS[k % 2]
             model = measurement_model(tuple(std), MOTION)
             stds = np.array(list(std.values()))

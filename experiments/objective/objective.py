@@ -22,8 +22,10 @@ from fgtrack.core.types import SPEED, YAW, FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
+from fgtrack.evaluation.paired import average
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
+from fgtrack.sim.draw import drawn
 
 START_NS = 1_790_000_000 * NS_PER_S
 STD_M = 0.3
@@ -73,8 +75,7 @@ def track(noise: str, speed_mps: float, rate_hz: float, seed: int) -> dict[str, 
     x = mean + np.linalg.cholesky(covariance) @ rng.standard_normal(5)
     model, R, truth, measurements = measurement_model(("x_m", "y_m"), motion), STD_M**2 * np.eye(2), [], []
     for k in range(1, NUM_STAMPS + 1):
-        Q = motion.process_noise(x, 1.0 / rate_hz)
-        x = motion.predict(x, 1.0 / rate_hz) + np.linalg.cholesky(Q) @ rng.standard_normal(5)
+        x = drawn(motion, x, 1.0 / rate_hz, rng)
         truth.append(x)
         stamp_ns = START_NS + round(k * NS_PER_S / rate_hz)
         measurements.append(Measurement(stamp_ns, model, x[:2] + STD_M * rng.standard_normal(2), R))
@@ -98,7 +99,8 @@ def _outcome(motion: CTRV, objective: str, start: Start, measurements: list[Meas
 
 def interval(values: FloatArray) -> tuple[float, float]:
     """Mean of `values` (runs,) and half of its 95 % interval."""
-    return float(values.mean()), float(1.96 * values.std(ddof=1) / np.sqrt(len(values)))
+    found = average(values)
+    return found.mean, found.high - found.mean
 
 
 def summary(speed_mps: float, rate_hz: float, runs: list[dict[str, Outcome]]) -> dict[str, float]:

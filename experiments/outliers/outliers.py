@@ -19,10 +19,11 @@ import fgtrack
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.evaluation.paired import Estimate, paired
+from fgtrack.evaluation.paired import paired
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import RobustLoss
+from fgtrack.sim.draw import drawn
 
 START_NS = 1_790_000_000 * NS_PER_S
 STEP_S = 0.05
@@ -88,7 +89,7 @@ def rmse_m(label: str, share: float, latest_s: float, seed: int, run: int) -> fl
     waiting: list[tuple[int, Measurement]] = []
     squared_m2 = np.empty(NUM_STEPS)
     for k in range(NUM_STEPS):
-        x = MOTION.predict(x, STEP_S) + np.linalg.cholesky(MOTION.process_noise(x, STEP_S)) @ rng.standard_normal(5)
+        x = drawn(MOTION, x, STEP_S, rng)
         std_m = STD_M * (FACTOR if rng.random() < share else 1.0)
         z = x[:2] + std_m * rng.standard_normal(2)
         now_ns = START_NS + round((k + 1) * STEP_S * NS_PER_S)
@@ -112,14 +113,10 @@ def table(rmse: dict[tuple[str, str, float], FloatArray]) -> str:
         for delay, share in columns:
             found = rmse[label, delay, share]
             lost = int((found > LOST_M).sum())
-            difference = "" if label == reference else shown(paired(found, rmse[reference, delay, share]))
-            cells.append(f"lost in {lost} of {len(found)}" if lost else f"{found.mean():.3f}{difference}")
+            gain = "" if label == reference else f"; {paired(found, rmse[reference, delay, share]):+.3f}"
+            cells.append(f"lost in {lost} of {len(found)}" if lost else f"{found.mean():.3f}{gain}")
         lines.append(f"| {label} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
-
-
-def shown(difference: Estimate) -> str:
-    return f" ({difference.mean:+.3f}, {difference.low:+.3f} to {difference.high:+.3f})"
 
 
 def draw(rmse: dict[tuple[str, str, float], FloatArray], file: Path) -> None:

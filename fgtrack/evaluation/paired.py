@@ -49,6 +49,10 @@ class Estimate:
     def __neg__(self) -> "Estimate":
         return Estimate(-self.mean, -self.high, -self.low, self.count)
 
+    def __format__(self, spec: str) -> str:
+        """The mean and in brackets the interval, each number by `spec`."""
+        return f"{self.mean:{spec}} ({self.low:{spec}} to {self.high:{spec}})"
+
 
 UNKNOWN = Estimate(math.nan, math.nan, math.nan, 0)
 """Of nothing."""
@@ -57,10 +61,7 @@ UNKNOWN = Estimate(math.nan, math.nan, math.nan, 0)
 def paired(values_a: Sequence[float] | FloatArray, values_b: Sequence[float] | FloatArray) -> Estimate:
     """Mean of `values_a` minus `values_b` and its 95 % interval; entry k of both is of the same seed.
 
-    The t interval of the differences: mean +- t(n - 1) std / sqrt(n). It needs no random draws and keeps its promise
-    with few seeds, where a bootstrap over seeds is too narrow. Pairs with a NaN are left out (`count` says how many
-    are left); with one pair the interval is unknown. A relative difference comes from logarithms:
-    `exp(paired(log(a), log(b)).mean) - 1`.
+    `average` of the differences. A relative difference comes from logarithms: `exp(paired(log(a), log(b)).mean) - 1`.
 
     Raises
     ------
@@ -70,13 +71,23 @@ def paired(values_a: Sequence[float] | FloatArray, values_b: Sequence[float] | F
     a, b = np.asarray(values_a, dtype=np.float64), np.asarray(values_b, dtype=np.float64)
     if a.ndim != 1 or a.shape != b.shape:
         raise ValueError(f"paired values must be two lists of one length, are of shape {a.shape} and {b.shape}")
-    differences = (a - b)[np.isfinite(a) & np.isfinite(b)]
-    count = len(differences)
+    return average((a - b)[np.isfinite(a) & np.isfinite(b)])
+
+
+def average(values: Sequence[float] | FloatArray) -> Estimate:
+    """Mean of `values`, one of each seed, and its 95 % interval.
+
+    The t interval: mean +- t(n - 1) std / sqrt(n). It needs no random draws and keeps its promise with few seeds, where
+    a bootstrap over seeds is too narrow. A NaN is left out (`count` says how many are left); of one value the interval
+    is unknown.
+    """
+    known = np.asarray(values, dtype=np.float64)
+    known = known[~np.isnan(known)]
+    count = len(known)
     if not count:
         return UNKNOWN
-    mean = float(differences.mean())
-    error = float(differences.std(ddof=1)) / math.sqrt(count) if count > 1 else math.nan
-    return _around(mean, error, count)
+    error = float(known.std(ddof=1)) / math.sqrt(count) if count > 1 else math.nan
+    return _around(float(known.mean()), error, count)
 
 
 def within_run(ticks: FloatArray, statistic: Statistic, rng: np.random.Generator) -> Estimate:

@@ -37,7 +37,7 @@ def test_the_script_writes_a_row_for_every_contestant_and_step(
 
 def test_every_contestant_gets_the_same_measurements_and_the_same_start(short: dict[str, object]) -> None:
     world = script.WORLDS[next(iter(short))]
-    one, other = (script.drawn(world, np.random.default_rng(3)) for _ in range(2))
+    one, other = (script.scene(world, np.random.default_rng(3)) for _ in range(2))
     assert [m.z.tolist() for _, m in one.received] == [m.z.tolist() for _, m in other.received]
     receipts = [receipt for receipt, _ in one.received]
     assert receipts == sorted(receipts)
@@ -48,7 +48,7 @@ def test_every_contestant_gets_the_same_measurements_and_the_same_start(short: d
 
 def test_in_a_world_without_outliers_a_loss_of_great_width_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     world = replace(script.WORLDS["race: LiDAR and RADAR, late"], duration_s=1.5, judged_from_s=0.5)
-    run = script.drawn(world, np.random.default_rng(4))
+    run = script.scene(world, np.random.default_rng(4))
     wide = script.Contestant("ekf-replay", script.RobustLoss("huber", 1e3))
     plain = script.Contestant("ekf-replay")
     assert script.score(wide, run).rmse_m == pytest.approx(script.score(plain, run).rmse_m, rel=1e-9)

@@ -28,6 +28,6 @@ def test_the_same_start_makes_the_filter_as_good_as_the_smoother() -> None:
 
 
 def test_a_quantile_has_an_interval_around_it() -> None:
-    found = script.with_interval(np.arange(100.0), 0.5, np.random.default_rng(0))
-    assert found[0] == 50.0
-    assert 35.0 < found[1] < 45.0 < 55.0 < found[2] < 65.0
+    found = script.quantile(np.arange(100.0), 0.5, np.random.default_rng(0))
+    assert found.mean == 50.0
+    assert 35.0 < found.low < 45.0 < 55.0 < found.high < 65.0

@@ -13,6 +13,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.registry import estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
+from fgtrack.sim.draw import drawn
 
 MOTION = CTRV(
     position_density_m2ps=0.001, yaw_density_rad2ps=0.002, speed_density_m2ps3=0.2, yaw_rate_density_rad2ps3=0.01
@@ -41,8 +42,7 @@ def errors(
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
     x = mean + spread * rng.standard_normal(5)
     for k in range(1, num_steps + 1):
-        noise: FloatArray = np.linalg.cholesky(MOTION.process_noise(x, STEP_S)) @ rng.standard_normal(5)
-        x = MOTION.predict(x, STEP_S) + noise
+        x = drawn(MOTION, x, STEP_S, rng)
         z = MODEL.predict(x) + std * rng.standard_normal(2)
         measurement = Measurement(nanoseconds(k * STEP_S), MODEL, z, np.diag(std**2))
         for name, one in each.items():

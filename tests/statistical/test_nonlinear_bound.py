@@ -14,6 +14,7 @@ from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.evaluation.bounds import Bounds, ScheduledMeasurement, bounds, bounds_along
 from fgtrack.models.motion import CTRV, MotionModel
+from fgtrack.sim.draw import drawn
 
 START_NS = 1_790_000_000 * NS_PER_S
 PRIOR = Start(
@@ -55,8 +56,7 @@ def tried(motion: MotionModel) -> Trial:
     x0, P0 = initial_state(motion, PRIOR)
     states = [x0 + rng.standard_normal((NUM_RUNS, 5)) @ np.linalg.cholesky(P0).T]
     for dt_s in (np.diff(stamps_ns) / NS_PER_S).tolist():
-        roots = np.linalg.cholesky(motion.process_noise(states[-1], dt_s))
-        states.append(motion.predict(states[-1], dt_s) + np.vecdot(roots, rng.standard_normal((NUM_RUNS, 1, 5))))
+        states.append(drawn(motion, states[-1], dt_s, rng))
     chain = np.stack(states, axis=1)
 
     def truth(wanted_ns: IntArray) -> FloatArray:

@@ -14,6 +14,7 @@ from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.sensors import RobustLoss
+from fgtrack.sim.draw import drawn
 
 START_NS = 1_790_000_000_000_000_000
 MOTION = CTRV(yaw_density_rad2ps=0.002, yaw_rate_density_rad2ps3=0.02, speed_density_m2ps3=0.5)
@@ -52,8 +53,7 @@ def replay(motion: MotionModel, start: Start) -> ReplayEkf:
 def drawn_truth(rng: np.random.Generator, start: FloatArray) -> list[FloatArray]:
     states = [start + np.linalg.cholesky(np.diag([0.09, 0.09, 0.01, 4.0, 0.01])) @ rng.standard_normal(5)]
     for _ in range(NUM_STEPS):
-        Q = MOTION.process_noise(states[-1], STEP_S)
-        states.append(MOTION.predict(states[-1], STEP_S) + np.linalg.cholesky(Q) @ rng.standard_normal(5))
+        states.append(drawn(MOTION, states[-1], STEP_S, rng))
     return states
 
 

@@ -10,6 +10,7 @@ from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.evaluation.innovations import Autocorrelation, autocorrelations
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
+from fgtrack.sim.draw import drawn
 
 MOTION = CTRV()
 SENSORS = {"lidar": ({"x_m": 0.3, "y_m": 0.3}, 0.151), "radar": ({"x_m": 1.0, "y_m": 1.0, "speed_mps": 0.2}, 0.062)}
@@ -23,8 +24,7 @@ def stream(rng: np.random.Generator) -> list[tuple[str, Measurement]]:
     x = np.array([0.0, 0.0, 0.4, 60.0, 0.1]) + std * rng.standard_normal(5)
     found = []
     for k in range(1, NUM_STEPS + 1):
-        noise: FloatArray = np.linalg.cholesky(MOTION.process_noise(x, STEP_S)) @ rng.standard_normal(5)
-        x = MOTION.predict(x, STEP_S) + noise
+        x = drawn(MOTION, x, STEP_S, rng)
         name = "lidar" if k % 2 else "radar"
         components, delay_s = SENSORS[name]
         model, sigma = measurement_model(tuple(components), MOTION), np.array(list(components.values()))

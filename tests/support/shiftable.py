@@ -13,6 +13,7 @@ from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.factor_graph.clock_calibration.time_shift import ShiftableMeasurement
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV
+from fgtrack.sim.draw import drawn
 
 START_NS = 1_790_000_000_000_000_000
 MOTION = CTRV(yaw_density_rad2ps=0.002, yaw_rate_density_rad2ps3=0.02, speed_density_m2ps3=0.5)
@@ -73,8 +74,7 @@ class World:
             if self.frozen:
                 x = MOTION.predict(x, time_s - before_s)
             elif time_s > before_s:
-                noise = np.linalg.cholesky(MOTION.process_noise(x, time_s - before_s)) @ rng.standard_normal(5)
-                x = MOTION.predict(x, time_s - before_s) + noise
+                x = drawn(MOTION, x, time_s - before_s, rng)
             before_s = time_s
             found.append(self._seen(rng, name, x, START_NS + nanoseconds(time_s)))
         return found

@@ -9,7 +9,7 @@ from scipy.special import stdtrit
 from scipy.stats import ttest_rel
 
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.paired import Estimate, block_length, by_stamp, paired, within_run
+from fgtrack.evaluation.paired import Estimate, average, block_length, by_stamp, paired, within_run
 
 
 def mean(sums: FloatArray) -> FloatArray:
@@ -39,6 +39,12 @@ def test_over_seeds_it_is_the_paired_t_interval() -> None:
 
 def test_pairs_with_a_missing_value_are_left_out() -> None:
     assert paired([1.0, math.nan, 3.0, 5.0], [0.0, 2.0, 1.0, math.nan]) == paired([1.0, 3.0], [0.0, 1.0])
+
+
+def test_an_average_is_the_difference_to_nothing_and_shows_its_interval() -> None:
+    found = average([0.3, math.nan, 0.5, 0.4])
+    assert found == paired([0.3, 0.5, 0.4], [0.0, 0.0, 0.0])
+    assert f"{found:.2f}" == "0.40 (0.15 to 0.65)"
 
 
 def test_the_same_values_differ_by_nothing_and_not_significantly() -> None:

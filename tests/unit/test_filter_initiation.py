@@ -15,6 +15,7 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.opening import LONGEST_S, MOST_MEASUREMENTS, Opening
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRA, CTRV, CV
+from fgtrack.sim.draw import drawn
 
 STD_M, PERIOD_NS = 0.3, 50_000_000
 STD = {"x_m": STD_M, "y_m": STD_M}
@@ -177,8 +178,7 @@ def test_the_state_is_consistent_where_the_direction_is_found(method: str, slowe
         start = Start(position_m=STD_M * rng.standard_normal(2), position_std_m=STD_M, speed_std_mps=150.0)
         estimator = fgtrack.estimator("ekf-replay", motion, start, initiation=method)
         for k in range(1, 7):
-            Q = motion.process_noise(x, 0.05)
-            x = motion.predict(x, 0.05) + np.linalg.cholesky(Q) @ rng.standard_normal(5)
+            x = drawn(motion, x, 0.05, rng)
             estimator.update(position(k, *(x[:2] + STD_M * rng.standard_normal(2)).tolist()))
             state = estimator.state_at(k * PERIOD_NS)
             off = state.mean - x
