@@ -1,7 +1,8 @@
 """Where a new object heads and how fast, from its first positions: one component for smoothers and filters."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import polar
 from fgtrack.core.linalg import psd_solve
+from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.models.measurement import measured_position
@@ -24,7 +26,6 @@ Initiation = Literal["one-point", "two-point", "regression"]
   which goes on relinearising, ten for a filter, which does not (0.1 rad, as well as a direction that is known).
 """
 DEFAULT: Initiation = "regression"
-
 
 #: For a smoother, a line that is so many standard deviations from standing still is the last one: the solver finds the
 #: rest, in so many Gauss-Newton steps at most.
@@ -69,6 +70,12 @@ def fix_of(measurement: Measurement, time_s: float) -> Fix | None:
     return None if found is None else Fix(time_s, *found)
 
 
+def fixes_of(mean: FloatArray, covariance: FloatArray, later: Iterable[tuple[float, Measurement]]) -> list[Fix]:
+    """The position of a first state, (n,) and (n, n), at time 0, and those of the measurements `later` with times."""
+    found = [fix_of(measurement, time_s) for time_s, measurement in later]
+    return [Fix(0.0, mean[:2], covariance[:2, :2]), *(fix for fix in found if fix is not None)]
+
+
 class _Sums:
     """Normal equations of a straight line at constant velocity, x = (position at time 0, velocity)."""
 
@@ -99,32 +106,48 @@ def straight_line(fixes: Iterable[Fix]) -> Line:
     return sums.line()
 
 
-class FirstLine(NamedTuple):
-    """A line through the first fixes."""
+@dataclass(frozen=True)
+class Search:
+    """How long a smoother begins again from a straight line through the first positions of an object.
 
-    line: Line
-    until_s: float
-    """Time of the last of them."""
-    over: bool
-    """Whether it is the last line that is asked for."""
-
-
-def first_line(fixes: Iterable[Fix], method: Initiation, certain: float) -> FirstLine | None:
-    """The line through so many of `fixes` as `method` asks for; None where all are of the first one's time.
-
-    It depends on the first fixes only, in order of their times, and not on the order in which they came. Raises
-    `numpy.linalg.LinAlgError` for a fix without uncertainty.
+    A state that started with an unknown heading was linearised at a wrong one; from there the solver may not find the
+    right one. A value: `next_line` gives the line and another search.
     """
-    sums, found = _Sums(), None
-    ordered = sorted(fixes, key=lambda fix: (fix.time_s, *fix.position_m.tolist()))
-    for fix in ordered:
-        sums.add(fix)
-        if fix.time_s > ordered[0].time_s:
-            line = sums.line()
-            found = FirstLine(line, fix.time_s, over(line, method, certain))
-            if found.over:
-                break
-    return found
+
+    first_ns: int
+    """Stamp of the start, at which the time of a fix is 0."""
+    method: Initiation
+    until_ns: int | None = None
+    """Stamp of the last fix of a line that is certain: what is newer does not change it."""
+
+    @classmethod
+    def of(cls, motion: MotionModel, start: Start, method: str) -> "Search | None":
+        """Before the first measurement; None where no direction is sought. Raises `CallError` for another `method`."""
+        checked = checked_initiation(method)
+        return cls(start.stamp_ns, checked) if sought(motion, start, checked) else None
+
+    def next_line(self, fixes: Callable[[], Iterable[Fix]], oldest_ns: int) -> "tuple[Line, Search] | None":
+        """The line to begin again from after measurements of which the oldest has the stamp `oldest_ns`.
+
+        Through so many of `fixes` as the method asks for: the first ones in order of their times, whatever the order in
+        which they came. None where the last line stays, where all fixes are of one time, and where one has no
+        uncertainty.
+        """
+        if self.until_ns is not None and oldest_ns > self.until_ns:
+            return None
+        sums, line, until_ns = _Sums(), None, None
+        ordered = sorted(fixes(), key=lambda fix: (fix.time_s, *fix.position_m.tolist()))
+        try:
+            for fix in ordered:
+                sums.add(fix)
+                if fix.time_s > ordered[0].time_s:
+                    line = sums.line()
+                    if over(line, self.method, CERTAIN_TO_SMOOTHER):
+                        until_ns = self.first_ns + nanoseconds(fix.time_s)
+                        break
+        except np.linalg.LinAlgError:
+            return None
+        return None if line is None else (line, replace(self, until_ns=until_ns))
 
 
 def along(line: Line, time_s: float, state_names: Sequence[str]) -> FloatArray:

@@ -12,17 +12,7 @@ from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import OneCorrection, Prediction
-from fgtrack.estimation.initiation import (
-    DEFAULT,
-    Fix,
-    Line,
-    along,
-    checked_initiation,
-    fix_of,
-    over,
-    sought,
-    straight_line,
-)
+from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Line, Search, along, fixes_of
 from fgtrack.estimation.iteration import Iteration, reweighted
 from fgtrack.estimation.rts import smoothed_one
 from fgtrack.estimation.sigma_points import Regression, measurement_regression, motion_regression
@@ -30,9 +20,7 @@ from fgtrack.estimation.unscented import UkfRecursion
 from fgtrack.estimation.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
 
-_INITIATION = Iteration(10, 1e-3)
-#: As in `FixedLagSmoother`: a line that is so many standard deviations from standing still is the last one.
-_CERTAIN = 3.0
+_INITIATION = Iteration(SMOOTHER_ITERATIONS, 1e-3)
 #: In standard deviations of the mean, and as a share of a variance: what has changed by less is not regressed again.
 _STILL = 0.01
 _NOTHING = -1.0
@@ -97,9 +85,8 @@ class PosteriorLinearisationSmoother(WindowedFilter):
         self._iteration, self._recursion = Iteration(max_iterations, tolerance), UkfRecursion(motion)
         x, P = initial_state(motion, prior)
         self._nodes = [_Node(prior.stamp_ns, (), x, P, Prediction(x, P, P), (x, P), None)]
-        self._first_ns, self._fix = prior.stamp_ns, Fix(0.0, x[:2], P[:2, :2])
-        self._initiation = checked_initiation(initiation)
-        self._initiated = not sought(motion, prior, self._initiation)
+        self._first = prior.stamp_ns, x, P
+        self._search = Search.of(motion, prior, initiation)
         self._final: list[TrackState] = []
 
     def state_at(self, stamp_ns: int) -> TrackState:
@@ -124,13 +111,13 @@ class PosteriorLinearisationSmoother(WindowedFilter):
         mean, covariance = self._state(measurement.stamp_ns)
         found = self._recursion.innovation(mean, covariance, measurement)
         nodes = self._with(measurement, mean, covariance)
-        initiated = self._initiated
-        if not initiated:
-            nodes, initiated = self._begun(nodes)
+        search = self._search
+        if search is not None:
+            nodes, search = self._begun(nodes, search, measurement.stamp_ns)
         nodes = self._iterated(nodes, self._iteration)
         if not all(np.isfinite(node.mean.dot(node.mean) + np.vdot(node.covariance, node.covariance)) for node in nodes):
             raise np.linalg.LinAlgError("smoothed state is not finite")
-        self._nodes, self._initiated = nodes, initiated
+        self._nodes, self._search = nodes, search
         return OneCorrection(mean, covariance, found.innovation, found.nis, S=found.S)
 
     def _forget_before(self, stamp_ns: int) -> None:
@@ -238,25 +225,23 @@ class PosteriorLinearisationSmoother(WindowedFilter):
         residual, R = measurement.model.residual(measurement.z, z), measurement.R + noise
         return reweighted(*state, residual, A, R, measurement.loss, node.mean - state[0])[:2]
 
-    def _begun(self, nodes: list[_Node]) -> tuple[list[_Node], bool]:
-        """The nodes begun again along a straight line through the positions so far, and whether it is the last one."""
-        if nodes[0].stamp_ns != self._first_ns:
-            return nodes, True
-        fixes = [self._fix]
-        for node in nodes:
-            time_s = seconds(node.stamp_ns - self._first_ns)
-            fixes += [fix for fix in (fix_of(item, time_s) for item in node.measurements) if fix is not None]
-        try:
-            line = straight_line(fixes)
-        except np.linalg.LinAlgError:
-            return nodes, False
-        return self._iterated(self._along(line, nodes), _INITIATION), over(line, self._initiation, _CERTAIN)
+    def _begun(self, nodes: list[_Node], search: Search, new_ns: int) -> tuple[list[_Node], Search | None]:
+        """The nodes, begun again along a straight line where the new stamp asks for it, and how the search goes on."""
+        first_ns, mean, covariance = self._first
+        if nodes[0].stamp_ns != first_ns:
+            return nodes, None
+        later = [(seconds(node.stamp_ns - first_ns), each) for node in nodes for each in node.measurements]
+        found = search.next_line(lambda: fixes_of(mean, covariance, later), new_ns)
+        if found is None:
+            return nodes, search
+        line, search = found
+        return self._iterated(self._along(line, nodes), _INITIATION), search
 
     def _along(self, line: Line, nodes: Sequence[_Node]) -> list[_Node]:
         """The nodes on `line`; the prior's heading, which must be vague, is turned there."""
         found = []
         for node in nodes:
-            mean = along(line, seconds(node.stamp_ns - self._first_ns), self._motion.state_names)
+            mean = along(line, seconds(node.stamp_ns - self._first[0]), self._motion.state_names)
             found.append(replace(node, mean=mean, covariance=_NARROW * node.covariance, at=None))
         prior = nodes[0].predicted.mean.copy()
         if not self._motion.cartesian:

@@ -1,6 +1,7 @@
 """The smoothers of all objects, solved together."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -11,14 +12,7 @@ from fgtrack.estimation.banded.whitening import Innovations, innovations
 from fgtrack.estimation.banded.windows import States, Windows
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.initiation import (
-    CERTAIN_TO_SMOOTHER,
-    DEFAULT,
-    SMOOTHER_ITERATIONS,
-    checked_initiation,
-    first_line,
-    sought,
-)
+from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
 from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
@@ -54,8 +48,8 @@ class BandedBank:
         self._clock_ns: IntArray = np.zeros(0, dtype=np.int64)
         self._first_ns: IntArray = np.zeros(0, dtype=np.int64)
         self._initiation = checked_initiation(initiation)
-        self._sought_until_ns: dict[int, int | None] = {}
-        """Tracks whose direction is sought: up to which stamp it is decided, None while it is open."""
+        self._searches: dict[int, Search] = {}
+        """Of the tracks whose direction is sought."""
         self._states: dict[int, tuple[tuple[int, ...], dict[int, int], States]] = {}
         """States by stamp, and the row of each track in them."""
         self._final: dict[int, list[TrackState]] = {}
@@ -143,9 +137,10 @@ class BandedBank:
         if track == len(self._clock_ns):
             self._clock_ns, self._first_ns = (np.append(values, 0) for values in (self._clock_ns, self._first_ns))
         self._clock_ns[track] = self._first_ns[track] = prior.stamp_ns
-        self._sought_until_ns.pop(track, None)
-        if sought(self._motion, prior, self._initiation):
-            self._sought_until_ns[track] = None
+        self._searches.pop(track, None)
+        search = Search.of(self._motion, prior, self._initiation)
+        if search is not None:
+            self._searches[track] = search
         self._numbers[track_id] = track
         self._states.clear()
 
@@ -247,32 +242,22 @@ class BandedBank:
             left.tracks.tolist(), left.stamps_ns.tolist(), *left.states, strict=True
         ):
             self._final.setdefault(by_number[number], []).append(TrackState(at_ns, mean, covariance))
-        for track in self._sought_until_ns.keys() & set(chosen.tolist()):
+        for track in self._searches.keys() & set(chosen.tolist()):
             self._initiate(track, stamp_ns)
         self.windows.iterate(chosen, self._settings.max_iterations - 1)
         return []
 
     def _initiate(self, track: int, oldest_ns: int) -> None:
-        """Begin again from a straight line through the first positions, until their direction is certain.
-
-        See `FixedLagSmoother`.
-        """
+        """Begin again from a straight line, where the oldest new stamp asks for it, as long as nothing has left."""
+        search = self._searches.pop(track)
         if not self.windows.whole(track):
-            del self._sought_until_ns[track]
             return
-        until_ns = self._sought_until_ns[track]
-        if until_ns is not None and oldest_ns > until_ns:
-            return
-        try:
-            found = first_line(self.windows.fixes(track), self._initiation, CERTAIN_TO_SMOOTHER)
-        except np.linalg.LinAlgError:
-            return
-        if found is None:
-            return
-        until_ns = int(self._first_ns[track]) + nanoseconds(found.until_s)
-        self._sought_until_ns[track] = until_ns if found.over else None
-        self.windows.restart(track, found.line)
-        self.windows.iterate(np.array([track]), SMOOTHER_ITERATIONS)
+        self._searches[track] = search
+        found = search.next_line(partial(self.windows.fixes, track), oldest_ns)
+        if found is not None:
+            line, self._searches[track] = found
+            self.windows.restart(track, line)
+            self.windows.iterate(np.array([track]), SMOOTHER_ITERATIONS)
 
     def _tracks(self) -> IntArray:
         return np.fromiter(self._numbers.values(), dtype=np.int64, count=len(self._numbers))

@@ -16,7 +16,7 @@ from fgtrack.estimation.banded.undo import Undo
 from fgtrack.estimation.banded.whitening import Innovations, whitened
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.ekf import propagated
-from fgtrack.estimation.initiation import Fix, Line, along, fix_of
+from fgtrack.estimation.initiation import Fix, Line, along, fixes_of
 from fgtrack.estimation.interpolation import between_all
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.estimation.terms import EquivalentMeasurement, curved
@@ -330,12 +330,13 @@ class Windows:
         nodes, at = self.nodes, self._window(track)
         stamps_ns = self.stamps_ns(track)
         mean, covariance = (nodes.origin[at] + nodes.predicted[at])[0], nodes.P_predicted[at][0]
-        fixes = [Fix(0.0, mean[:2], covariance[:2, :2])]
-        for slot, stamp_ns in zip(at.slots.tolist(), stamps_ns, strict=True):
-            time_s = seconds(stamp_ns - stamps_ns[0])
-            terms = (term for term in nodes.terms[track][slot] if isinstance(term, Measurement))
-            fixes += [fix for fix in (fix_of(term, time_s) for term in terms) if fix is not None]
-        return fixes
+        later = (
+            (seconds(stamp_ns - stamps_ns[0]), term)
+            for slot, stamp_ns in zip(at.slots.tolist(), stamps_ns, strict=True)
+            for term in nodes.terms[track][slot]
+            if isinstance(term, Measurement)
+        )
+        return fixes_of(mean, covariance, later)
 
     def restart(self, track: int, line: Line) -> None:
         """Solve again from states along `line`, with the prior's heading, which must be vague, turned there."""

@@ -14,14 +14,7 @@ from fgtrack.estimation.ekf import Innovation, propagated
 from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
 from fgtrack.estimation.factor_graph.window import Window
-from fgtrack.estimation.initiation import (
-    CERTAIN_TO_SMOOTHER,
-    DEFAULT,
-    SMOOTHER_ITERATIONS,
-    checked_initiation,
-    first_line,
-    sought,
-)
+from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search
 from fgtrack.estimation.marginalised_past import Prior
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.estimation.terms import linearised
@@ -64,9 +57,7 @@ class FixedLagSmoother:
         self._lag_ns, self._ring_ns = nanoseconds(settings.lag_s), nanoseconds(settings.ring_s)
         self._first_ns = self._clock_ns = prior.stamp_ns
         self._window = Window(motion, prior.stamp_ns, Prior(*initial_state(motion, prior)), settings, make_backend)
-        self._initiation = checked_initiation(initiation)
-        self._sought = sought(motion, prior, self._initiation)
-        self._sought_until_ns: int | None = None
+        self._search = Search.of(motion, prior, initiation)
         self._final: list[TrackState] = []
 
     @property
@@ -106,8 +97,8 @@ class FixedLagSmoother:
             self._final += self._window.update(fusible, self._start_ns, self._reach_ns)
         except RuntimeError:
             return [r if r.innovation is None else UpdateResult(UpdateStatus.FAILED) for r in results]
-        if self._sought:
-            self._initiate(min(measurement.stamp_ns for measurement in fusible))
+        if self._search is not None:
+            self._search = self._initiated(self._search, min(measurement.stamp_ns for measurement in fusible))
         self._window.damp()
         self._window.iterate(self._settings.max_iterations - 1)
         return results
@@ -131,26 +122,17 @@ class FixedLagSmoother:
         """Relinearise until nothing moves; for comparisons."""
         self._window.converge(max_iterations)
 
-    def _initiate(self, oldest_ns: int) -> None:
-        """Begin again from a straight line through the first positions, until their direction is certain.
-
-        A state that started with an unknown heading was linearised at a wrong one; from there the solver may not find
-        the right one. `oldest_ns` is the oldest new stamp: one that is late may change a line that was certain.
-        """
+    def _initiated(self, search: Search, oldest_ns: int) -> Search | None:
+        """Begin again from a straight line, where the oldest new stamp asks for it, as long as nothing has left."""
         if not self._window.whole:
-            self._sought = False
-            return
-        if self._sought_until_ns is not None and oldest_ns > self._sought_until_ns:
-            return
-        try:
-            found = first_line(self._window.fixes(), self._initiation, CERTAIN_TO_SMOOTHER)
-        except np.linalg.LinAlgError:
-            return
+            return None
+        found = search.next_line(self._window.fixes, oldest_ns)
         if found is None:
-            return
-        self._sought_until_ns = self._first_ns + nanoseconds(found.until_s) if found.over else None
-        self._window.restart(found.line)
+            return search
+        line, search = found
+        self._window.restart(line)
         self._window.iterate(SMOOTHER_ITERATIONS)
+        return search
 
     @property
     def _start_ns(self) -> int:

@@ -17,7 +17,7 @@ from fgtrack.estimation.factor_graph.backends.batch import BatchBackend
 from fgtrack.estimation.factor_graph.backends.incremental import FIRST_KEY
 from fgtrack.estimation.factor_graph.chain import Chain, Node
 from fgtrack.estimation.factor_graph.factors import map_motion_factor, measurement_factor, motion_factor, prior_factor
-from fgtrack.estimation.initiation import Fix, Line, along, fix_of
+from fgtrack.estimation.initiation import Fix, Line, along, fixes_of
 from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.marginalised_past import MarginalisedPast, Prior
 from fgtrack.estimation.smoother_settings import SmootherSettings
@@ -201,12 +201,13 @@ class Window:
     def fixes(self) -> list[Fix]:
         """The positions measured at the nodes, after that of the prior."""
         prior = self._past.prior
-        fixes = [Fix(0.0, prior.mean[:2], prior.covariance[:2, :2])]
-        for node in self._chain.nodes:
-            time_s = self._seconds(node.stamp_ns)
-            found = [fix_of(item, time_s) for item in node.terms if isinstance(item, Measurement)]
-            fixes += [fix for fix in found if fix is not None]
-        return fixes
+        later = (
+            (self._seconds(node.stamp_ns), term)
+            for node in self._chain.nodes
+            for term in node.terms
+            if isinstance(term, Measurement)
+        )
+        return fixes_of(prior.mean, prior.covariance, later)
 
     def restart(self, line: Line) -> None:
         """Solve again from states along `line`, with the prior's heading, which must be vague, turned there."""
