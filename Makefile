@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # A file stays in one process, so what its tests share is made once.
 BY_FILE := --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-slow coverage mutants check docs bench contest clean
+.PHONY: demo test test-slow coverage mutants check docs bench bench-full contest clean
 
 demo: $(STAMP)
 	$(BIN)/fgtrack demo -o out/demo --overwrite
@@ -43,8 +43,13 @@ docs: $(STAMP)
 contest: $(STAMP)
 	$(BIN)/python experiments/contest.py -o out/contest --jobs 2
 
+# Some 5 minutes; docs/speed.md tells how to read it. OLDER=CHECKOUT compares gtsam's smoother with that of a checkout.
 bench: $(STAMP)
-	$(BIN)/python -m pytest experiments/bench_*.py -o addopts= -p no:warnings --benchmark-only -q -s
+	$(BIN)/python experiments/bench_speed.py -o out/speed $(if $(OLDER),--against $(OLDER))
+
+# Every estimator, number of objects, lag and delay, memory: an hour.
+bench-full: $(STAMP)
+	$(BIN)/python experiments/bench_speed.py -o out/speed --full $(if $(OLDER),--against $(OLDER))
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fgtrack needs Python 3.11 or newer")'

@@ -1,0 +1,107 @@
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from support.scripts import EXPERIMENTS
+
+sys.path.insert(0, str(EXPERIMENTS))
+import bench_estimators
+import bench_report
+import bench_speed
+import bench_tracker
+
+CHECKOUT = EXPERIMENTS.parent
+SMALL = {"rounds": 1, "duration_s": 1.6}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out: Path = tmp_path_factory.mktemp("speed")
+    (out / "page.md").write_text("# Speed\n<!-- begin speed -->\nold\n<!-- end speed -->\nMore.\n")
+    options = {"figure": out / "again.png", "page": out / "page.md"}
+    bench_speed.main(out, objects="1,2", against=CHECKOUT, **options, **SMALL)
+    return out
+
+
+def test_the_table_has_a_row_for_every_cell_and_every_promise(folder: Path) -> None:
+    found = json.loads((folder / "speed.json").read_text())
+    assert [(row["cell"]["label"], row["cell"]["count"]) for row in found["ticks"]] == [
+        (label, 1) for label in bench_report.MAIN
+    ]
+    assert all(0.0 < row["median_ms"] <= row["p99_ms"] <= row["largest_ms"] * 1.001 for row in found["ticks"])
+    text = (folder / "speed.md").read_text()
+    assert all(bar["what"] in text for bar in found["bars"])
+    assert [bar["verdict"] for bar in found["bars"]].count("not measured") == 8 + 1
+    assert [one["count"] for one in found["against"]] == [1]
+    assert found["machine"]["python"] in text
+
+
+def test_stone_soup_stands_beside_the_estimators_of_one_object(folder: Path) -> None:
+    found = json.loads((folder / "speed.json").read_text())
+    names = [one["name"] for one in found["per_detection"]]
+    assert {"smoother", "smoother-banded", "ekf-replay", "ekf-backward-forward"} < set(names)
+    assert sum("Stone Soup" in name for name in names) == 2
+    assert found["stone_soup_us"] > 0.0
+    assert max(one["error_m"] for one in found["per_detection"]) < 5.0
+
+
+def test_the_tables_replace_those_of_the_page(folder: Path) -> None:
+    page, text = (folder / "page.md").read_text(), (folder / "speed.md").read_text()
+    assert page == f"# Speed\n<!-- begin speed -->\n\n{text}\n<!-- end speed -->\nMore.\n"
+    (folder / "other.md").write_text("# Speed\n")
+    with pytest.raises(ValueError, match="has no marks"):
+        bench_report.put_into(folder / "other.md", "speed", text)
+
+
+def test_the_figure_is_drawn_twice(folder: Path) -> None:
+    pictures = [(folder / name).read_bytes() for name in ("speed.png", "again.png")]
+    assert all(picture.startswith(b"\x89PNG") for picture in pictures)
+
+
+def test_without_stone_soup_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench_speed.importlib.util, "find_spec", lambda name: None)
+    results = bench_report.Results()
+    bench_speed.measure_single(results, ["ekf-replay"], 1, 0.5, cpu=True)
+    assert "pip install fgtrack[bench]" in bench_report.tables(results)
+    assert [one["name"] for one in results.per_detection] == ["ekf-replay"]
+
+
+def test_the_full_run_takes_every_estimator_number_lag_and_delay_once() -> None:
+    cells = bench_speed.full_cells(bench_report.ALL_OBJECTS, 8.0)
+    assert len(set(cells)) == len(cells)
+    assert {one.count for one in cells} == set(bench_report.ALL_OBJECTS)
+    assert {one.lag_s for one in cells} == {0.5, 1.0, 3.0}
+    assert {one.delay_s for one in cells} == {None, 0.0, 0.06, 0.15, 0.4}
+    assert {one.label for one in cells} == {*bench_speed.ESTIMATORS, bench_report.PAPER}
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.4])
+def test_every_detection_counts_however_late(delay_s: float) -> None:
+    found = bench_tracker.measure(bench_tracker.Cell("x", "smoother", 2, "ekf-replay", delay_s=delay_s, duration_s=2.0))
+    assert found.tracks == 2
+
+
+def test_two_hundred_objects_are_all_tracked() -> None:
+    found = bench_tracker.measure(bench_tracker.Cell("x", "smoother", 200, "smoother-banded", duration_s=1.0))
+    assert found.tracks >= 200
+
+
+def test_missing_tracks_are_no_measurement() -> None:
+    one = bench_tracker.Measured(1.0, [1.0], 1.0, 1.0, tracks=9.0, memory_mb=0.0)
+    with pytest.raises(ValueError, match="9 tracks of 10 objects"):
+        bench_report.Row.of(bench_tracker.Cell("x", "smoother", 10), [one])
+
+
+@pytest.mark.parametrize(
+    ("measured", "at_most", "verdict"), [(2.0, False, "yes"), (2.0, True, "NO"), (1.0, True, "yes")]
+)
+def test_a_promise_holds_or_not(measured: float, at_most: bool, verdict: str) -> None:
+    assert bench_report.Bar("x", measured, 1.5, at_most).verdict == verdict
+
+
+def test_the_floor_has_the_rows_behind_a_late_detection_and_a_whole_window() -> None:
+    assert bench_estimators.num_applied(bench_estimators.stream(1.0))[5:15] == [1, 3] * 5
+    found = bench_speed.measure_floor([1])
+    assert [one["rows"] for one in found] == [3, 40]
+    assert all(one["lapack_us"] > 0.0 and one["gtsam_us"] > 0.0 for one in found)
