@@ -260,7 +260,7 @@ def draw(results: Results, path: Path) -> None:
     axes.set(xlabel="objects", ylabel="tick with detections [ms] (dotted: 99 % quantile)")
     axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize=8)
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=90, pil_kwargs={"optimize": True})
     plt.close(figure)
 
 
