@@ -12,9 +12,8 @@ from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.linalg import congruence, mahalanobis_squared, symmetrise
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation import starts
-from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateResult
+from fgtrack.estimation.base import Estimator, Measurement, Smoother, Start, UpdateResult
 from fgtrack.estimation.ekf import linearised
-from fgtrack.estimation.smoothing_bank import Smoother
 from fgtrack.models.motion import MotionModel
 
 #: A hypothesis is dropped once it is so much less likely than the best.

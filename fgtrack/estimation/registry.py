@@ -12,12 +12,12 @@ from typing import Any, Literal
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.plugins import Registry
-from fgtrack.estimation.base import Estimator, Start, TrackBank
-from fgtrack.estimation.hypotheses import hypotheses, smoother_hypotheses
-from fgtrack.estimation.initiated import initiated
+from fgtrack.estimation.base import Estimator, Smoother, Start, TrackBank
+from fgtrack.estimation.hypotheses import Wanted, hypotheses
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
-from fgtrack.estimation.smoothing_bank import Smoother, SmoothingBank
+from fgtrack.estimation.opening import initiated
+from fgtrack.estimation.smoothing_bank import SmoothingBank
 from fgtrack.models.motion import MotionModel
 
 OOSM_GROUP = "fgtrack.oosm"
@@ -152,10 +152,14 @@ def start_estimator(
             return OneObject(motion, _made(name, factory, motion, lag_s, **own), start)
         return _checked(name, _made(name, factory, motion, start, lag_s, **own))
 
-    def made(start: Start) -> Estimator:
-        return plain(start) if claims.initiates else initiated(motion, start, method, plain)
+    return hypotheses(motion, start, wanted, plain) if claims.initiates else begun(motion, start, plain, method, wanted)
 
-    return hypotheses(motion, start, wanted, made)
+
+def begun(
+    motion: MotionModel, start: Start, make: Callable[[Start], Estimator], method: str, wanted: Wanted
+) -> Estimator:
+    """What `make` gives, which knows nothing of `initiation` and `hypotheses`, with both of them."""
+    return hypotheses(motion, start, wanted, lambda each: initiated(motion, each, method, make))
 
 
 def estimator_bank(
@@ -180,10 +184,7 @@ def estimator_bank(
             smoother: Smoother = _made(name, factory, motion, start, lag_s, **own)
             return smoother
 
-        def start_smoother(start: Start) -> Smoother:
-            return smoother_hypotheses(motion, start, options.get("hypotheses", 1), one)
-
-        return SmoothingBank(motion, start_smoother, lag_s, lagged_s)
+        return SmoothingBank(motion, one, lag_s, lagged_s, options.get("hypotheses", 1))
     return ObjectBank(motion, lambda start: start_estimator(name, factory, motion, start, lag_s, options), lag_s)
 
 

@@ -1,26 +1,16 @@
-"""A bank of smoothers of one object each, and what they smooth."""
+"""A bank of smoothers, and what they smooth."""
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 import numpy as np
 
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import SmoothedReport, TrackState
-from fgtrack.estimation.base import Estimator, Start
+from fgtrack.estimation.base import Smoother, Start
+from fgtrack.estimation.hypotheses import Wanted, smoother_hypotheses
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.models.motion import MotionModel
-
-
-class Smoother(Estimator, Protocol):
-    """An `Estimator` whose states of the past contain what was measured later."""
-
-    def take_final(self) -> list[TrackState]:
-        """Smoothed states that have left the window since the last call, in order."""
-
-    def take_rest(self) -> list[TrackState]:
-        """Like `take_final`, and those that are still inside: for when the track ends."""
 
 
 class SmoothingBank(ObjectBank):
@@ -28,28 +18,31 @@ class SmoothingBank(ObjectBank):
 
     Parameters
     ----------
-    motion
-        The motion model of all smoothers.
-    start
-        Makes the smoother of a new object.
-    lag_s
-        How far back measurements can be fused.
+    motion, start, lag_s
+        See `ObjectBank`.
     lagged_s
         Lags of the lagged output.
+    wanted
+        See `hypotheses`.
     """
 
     def __init__(
-        self, motion: MotionModel, start: Callable[[Start], Smoother], lag_s: float, lagged_s: Sequence[float]
+        self,
+        motion: MotionModel,
+        start: Callable[[Start], Smoother],
+        lag_s: float,
+        lagged_s: Sequence[float],
+        wanted: Wanted = 1,
     ) -> None:
         super().__init__(motion, start, lag_s)
         self._smoothers: dict[int, Smoother] = {}
-        self._start_smoother = start
+        self._start_smoother, self._wanted = start, wanted
         self._lagged_s = tuple(lagged_s)
         self._ended: list[SmoothedReport] = []
 
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
-        smoother = self._start_smoother(prior)
+        smoother = smoother_hypotheses(self._motion, prior, self._wanted, self._start_smoother)
         self._smoothers[track_id] = self._estimators[track_id] = smoother
 
     def remove(self, track_id: int) -> None:

@@ -11,8 +11,6 @@ from fgtrack.estimation.backward_forward import BackwardForwardBank
 from fgtrack.estimation.banded.bank import BandedBank
 from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.factor_graph import BatchBackend, IncrementalBackend, SmootherBank
-from fgtrack.estimation.hypotheses import hypotheses
-from fgtrack.estimation.initiated import initiated
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator, Propagator
 from fgtrack.estimation.published import (
@@ -23,7 +21,7 @@ from fgtrack.estimation.published import (
     SaturatedEulerCtrv,
     StalePresent,
 )
-from fgtrack.estimation.registry import ESTIMATORS, Claims, estimator_bank
+from fgtrack.estimation.registry import ESTIMATORS, Claims, begun, estimator_bank
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.published_map import CircularHeadingMap, PublishedMap
 from fgtrack.models.road import MappedRoad, OpenSpace, Road
@@ -117,16 +115,10 @@ def _build_backward_forward(config: Config) -> TrackBank:
         return bank()
     motion = config.motion_model()  # without a map a track may begin in any direction, each at its own time
 
-    def start_one(start: Start) -> Estimator:
-        def one(turned: Start) -> Estimator:
-            return OneObject(motion, bank(), turned)
+    def one(start: Start) -> Estimator:
+        return begun(motion, start, lambda each: OneObject(motion, bank(), each), *_beginning(config))
 
-        def begun(each: Start) -> Estimator:
-            return initiated(motion, each, config.initiation.method, one)
-
-        return hypotheses(motion, start, config.initiation.hypotheses, begun)
-
-    return ObjectBank(motion, start_one, config.filter.storage_s)
+    return ObjectBank(motion, one, config.filter.storage_s)
 
 
 def _build_incremental(config: Config) -> TrackBank:

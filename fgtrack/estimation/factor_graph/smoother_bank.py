@@ -9,10 +9,9 @@ from fgtrack.estimation.base import Start, StatesAt
 from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
-from fgtrack.estimation.hypotheses import smoother_hypotheses
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.smoother_settings import SmootherSettings
-from fgtrack.estimation.smoothing_bank import Smoother, SmoothingBank
+from fgtrack.estimation.smoothing_bank import SmoothingBank
 from fgtrack.models.motion import MotionModel
 
 
@@ -40,11 +39,8 @@ class SmootherBank(SmoothingBank):
         def one(prior: Start) -> FixedLagSmoother:
             return FixedLagSmoother(motion, prior, settings, make_backend, initiation)
 
-        def start(prior: Start) -> Smoother:
-            return smoother_hypotheses(motion, prior, num_headings, one)
-
         lag_s = settings.lag_s + (settings.ring_s if settings.late == "fuse" else 0.0)
-        super().__init__(motion, start, lag_s, settings.lagged_s)
+        super().__init__(motion, one, lag_s, settings.lagged_s, num_headings)
         self._settings = settings
 
     @property
