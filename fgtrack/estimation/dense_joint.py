@@ -4,6 +4,7 @@ It conditions on all measurements at once, so there is no order of arrival in it
 graph with any estimator.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ import numpy as np
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.base import Measurement, Start, UpdateResult
 from fgtrack.estimation.birth import initial_state
 from fgtrack.models.motion import MotionModel
 
@@ -86,6 +87,22 @@ def difference(found: TrackState, expected: TrackState) -> Difference:
     mean = np.abs(found.mean - expected.mean) / sigma
     covariance = np.abs(found.covariance - expected.covariance) / np.outer(sigma, sigma)
     return Difference(float(mean.max()), float(covariance.max()))
+
+
+def innovation_difference(result: UpdateResult, measurement: Measurement, before: TrackState) -> Difference:
+    """How far the innovation of `result` is from that of the state `before` the measurement, and its NIS, over 1 + NIS.
+
+    Infinite where there is none.
+    """
+    if result.innovation is None or result.nis is None:
+        return Difference(math.inf, math.inf)
+    model, mean = measurement.model, before.mean
+    H = model.jacobian(mean, measurement.pose)
+    S = H @ before.covariance @ H.T + measurement.R
+    y = model.residual(measurement.z, model.predict(mean, measurement.pose))
+    nis = float(y @ np.linalg.solve(S, y))
+    apart = np.abs(result.innovation - y) / np.sqrt(np.diag(S))
+    return Difference(float(apart.max()), abs(result.nis - nis) / (1.0 + nis))
 
 
 def rounding_bound(motion: MotionModel, stamps_ns: Iterable[int], sigma_m: float = 0.5) -> float:

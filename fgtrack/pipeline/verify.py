@@ -7,7 +7,7 @@ them (`fgtrack.pipeline.oracle`). So are the models and the dense joint.
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -15,8 +15,8 @@ import numpy as np
 
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import YAW, TrackState
-from fgtrack.estimation.base import Estimator, Measurement, UpdateResult, UpdateStatus
-from fgtrack.estimation.dense_joint import Difference, dense_joint, difference, rounding_bound
+from fgtrack.estimation.base import Estimator, Measurement, UpdateStatus
+from fgtrack.estimation.dense_joint import Difference, dense_joint, difference, innovation_difference, rounding_bound
 from fgtrack.estimation.registry import ESTIMATORS, EXACT, Claims, Factory, start_estimator
 from fgtrack.pipeline import verify_streams as streams
 from fgtrack.pipeline.oracle.estimates import Estimate
@@ -106,17 +106,7 @@ class Certificate:
         return {
             "met": not self.missed,
             "checks": [
-                {
-                    "stream": check.stream,
-                    "estimator": check.estimator,
-                    "order": check.order,
-                    "against": check.against,
-                    "mean_sigma": _finite(check.mean_sigma),
-                    "covariance": _finite(check.covariance),
-                    "num_refused": check.num_refused,
-                    "tolerance": check.tolerance,
-                    "met": check.met,
-                }
+                {**{name: _finite(value) for name, value in asdict(check).items()}, "met": check.met}
                 for check in self.checks
             ],
         }
@@ -229,7 +219,7 @@ def _against_dense_joint(
             result = estimator.update(measurement)
             refused[name] += result.status in _NOT_FUSED
             if sampled:
-                apart = _innovation(result, measurement, before[measurement.stamp_ns])
+                apart = innovation_difference(result, measurement, before[measurement.stamp_ns])
                 innovations[name] = _largest([innovations[name], apart])
         if len(arrived) in moments:
             newest_ns = max(m.stamp_ns for m in arrived)
@@ -258,18 +248,6 @@ def _against_dense_joint(
         for name in subjects
         for against, found, allowed in parts
     ]
-
-
-def _innovation(result: UpdateResult, measurement: Measurement, before: TrackState) -> Difference:
-    """Innovation, in standard deviations, and NIS against those of the state before the measurement."""
-    H, z = measurement.model.selection(len(before.mean)), measurement.z
-    S = H @ before.covariance @ H.T + measurement.R
-    y = measurement.model.residual(z, H @ before.mean)
-    if result.innovation is None or result.nis is None:
-        return Difference(math.inf, math.inf)
-    nis = float(y @ np.linalg.solve(S, y))
-    apart = np.abs(result.innovation - y) / np.sqrt(np.diag(S))
-    return Difference(float(apart.max()), abs(result.nis - nis) / (1.0 + nis))
 
 
 def _held_back(
@@ -373,5 +351,5 @@ def _largest(differences: Iterable[Difference]) -> Difference:
     return Difference(float(means.max()), float(covariances.max()))
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _finite(value: object) -> object:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
