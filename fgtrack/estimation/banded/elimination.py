@@ -1,39 +1,21 @@
-"""Solving the linearised windows of many tracks together: elimination forwards, back-substitution backwards.
+"""Eliminating the nodes of the linearised windows of many tracks together, from the oldest on.
 
-The windows are block-tridiagonal. Eliminating the nodes from the oldest on is the Kalman filter in Joseph's form; what
-it leaves of each node, given the next one, is the gain and the covariance of the Rauch-Tung-Striebel smoother. They are
-sums of positive semi-definite matrices throughout, and no process noise is divided by, which vanishes between stamps
-1 us apart.
-
-Tracks have windows of different lengths. All end at the same step, so those that take part are the first ones once they
-are sorted by the length of what has to be done, longest first.
+The windows are block-tridiagonal. Elimination is the Kalman filter; what it leaves of each node, given the next one, is
+the gain and the covariance of the Rauch-Tung-Striebel smoother. No process noise is divided by, which vanishes between
+stamps 1 us apart.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
 
 import numpy as np
 
-from fgtrack.core.linalg import identity, inverse_roots, symmetrise
+from fgtrack.core.linalg import eliminated, identity, inverse_roots, symmetrise
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.banded.nodes import Nodes
+from fgtrack.estimation.banded.steps import Steps, forwards
 
-
-class _Sorted(NamedTuple):
-    tracks: IntArray
-    """Longest first."""
-    lengths: IntArray
-    active: list[int]
-    """How many tracks take part, by step from the one after which one step is left."""
-
-
-def _sorted(tracks: IntArray, lengths: IntArray) -> _Sorted:
-    if len(lengths) == 1 or (lengths == lengths[0]).all():
-        return _Sorted(tracks, lengths, [len(tracks)] * int(lengths[0]))
-    order = np.argsort(-lengths, kind="stable")
-    order = order[lengths[order] > 0]
-    lengths = lengths[order]
-    active = np.searchsorted(-lengths, -np.arange(1, lengths[0] + 1), side="right")
-    return _Sorted(tracks[order], lengths, active.tolist())
+#: Where a measurement leaves less than this of a variance, the short form of its update keeps too few digits.
+_LEAST_SHARE = 1e-6
 
 
 def eliminate(nodes: Nodes, tracks: IntArray, places: IntArray) -> None:
@@ -41,131 +23,104 @@ def eliminate(nodes: Nodes, tracks: IntArray, places: IntArray) -> None:
 
     Raises `numpy.linalg.LinAlgError` where it fails.
     """
-    tracks, lengths, active = _sorted(tracks, nodes.count[tracks] - places)
-    longest, n = len(active), nodes.dim
-    if not longest:
+    steps = forwards(tracks, places, nodes.count[tracks])
+    if not steps.ends:
         return
-    ends, first = nodes.count[tracks], nodes.first[tracks]
-    at_places = ends - longest + np.arange(longest)[:, None]
-    slots = nodes.slots[tracks, np.maximum(at_places, 0)]
-    befores = nodes.slots[tracks, np.maximum(at_places - 1, 0)]
-    F, Q = nodes.F[tracks, befores], nodes.Q[tracks, befores]
-    misses = nodes.ahead[tracks, befores] - nodes.origin[tracks, slots]
-    k = int(nodes.num_rows[tracks, slots].max())
-    G, y = nodes.G[tracks, slots, :k], nodes.y[tracks, slots, :k]
-    F_t, G_t, unit = _transposed(F), _transposed(G), identity(k)
+    n = nodes.dim
+    numbers = nodes.at(steps.tracks, steps.places)
+    befores = nodes.at(steps.tracks, np.maximum(steps.places - 1, 0))
+    inner = steps.places > nodes.first[steps.tracks]
+    segment = nodes.segment.take(befores, axis=0)
+    F, driven = segment[..., :n], segment[..., n:]  # the noise and the mean that F does not make
+    driven[..., n] -= nodes.origin.take(numbers, axis=0)
+    if not inner.all():  # the prior of the oldest node in the window, which follows from nothing
+        oldest = ~inner
+        F[oldest], driven[oldest] = 0.0, nodes.predicted[numbers[oldest]]
+    rows = nodes.rows.take(numbers, axis=0)[:, : int(nodes.num_rows.take(numbers).max())]
+    chosen = steps.order
+    start = nodes.filtered[nodes.at(tracks[chosen], np.maximum(places[chosen] - 1, 0))]
 
-    begins = longest - lengths
-    before = tracks, befores[begins, np.arange(len(tracks))]
-    x, P = nodes.filtered[before], nodes.P_filtered[before]
-    oldest = ends - lengths == first
-    has_oldest = bool(oldest.any())
-    shape = longest, len(tracks), n
-    predicted, filtered = np.zeros(shape), np.zeros(shape)
-    P_predicted, P_filtered = np.zeros((*shape, n)), np.zeros((*shape, n))
-    left, P_left = np.zeros(shape), np.zeros((*shape, n))
-    for t in range(longest):
-        m = active[longest - 1 - t]
-        left[t, :m], P_left[t, :m] = x[:m], P[:m]
-        x_next = np.vecdot(F[t, :m], x[:m, None]) + misses[t, :m]
-        P_next = symmetrise(F[t, :m] @ P[:m] @ F_t[t, :m] + Q[t, :m])
-        if has_oldest:
-            starts = oldest[:m] & (begins[:m] == t)
-            here = tracks[:m][starts], slots[t, :m][starts]
-            x_next[starts], P_next[starts] = nodes.predicted[here], nodes.P_predicted[here]
-        predicted[t, :m], P_predicted[t, :m] = x_next, P_next
-        if k:
-            GP = G[t, :m] @ P_next
-            W = inverse_roots(GP @ G_t[t, :m] + unit)
-            K = _transposed(W.mT @ (W @ GP))
-            x_next = x_next + np.vecdot(K, (y[t, :m] - np.vecdot(G[t, :m], x_next[:, None]))[:, None])
-            P_next = _joseph(P_next, K, G[t, :m])
-        x[:m], P[:m] = x_next, P_next
-        filtered[t, :m], P_filtered[t, :m] = x_next, P_next
-
-    if not (np.isfinite(x).all() and np.isfinite(P).all()):
+    left, moved, predicted, filtered = _filtered(steps, start, F, driven.copy(), rows, _corrected)
+    shares = _variances(filtered) < _LEAST_SHARE * _variances(predicted)
+    if shares.any():
+        left, moved, predicted, filtered = _filtered(steps, start, F, driven.copy(), rows, _corrected_joseph)
+    if not np.isfinite(filtered).all():
         raise np.linalg.LinAlgError("a state is not finite")
-    done = at_places >= ends - lengths
-    at = np.broadcast_to(tracks, done.shape)[done], slots[done]
-    nodes.predicted[at], nodes.P_predicted[at] = predicted[done], P_predicted[done]
-    nodes.filtered[at], nodes.P_filtered[at] = filtered[done], P_filtered[done]
-    done &= at_places > first
-    if done.any():
-        at = np.broadcast_to(tracks, done.shape)[done], befores[done]
-        f, left, P = F[done], left[done], P_left[done]
-        W = inverse_roots(P_predicted[done])
-        A = _transposed(W.mT @ (W @ (f @ P)))
-        nodes.A[at], nodes.C[at] = A, _joseph(P, A, f, Q[done])
-        nodes.b[at] = left - np.vecdot(A, predicted[done][:, None])
+    for values in (predicted, filtered):
+        values[..., :n] = symmetrise(values[..., :n])
+    nodes.predicted[numbers], nodes.filtered[numbers] = predicted, filtered
+    if not inner.all():
+        befores, F, left, moved = befores[inner], F[inner], left[inner], moved[inner]
+        predicted, segment = predicted[inner], segment[inner]
+    if len(befores):
+        nodes.back[befores], nodes.C[befores] = _conditionals(left, F, segment[..., n : 2 * n], moved, predicted)
 
 
-def _transposed(matrices: FloatArray) -> FloatArray:
-    """A copy: products of many small matrices are faster than with a transposed view."""
-    return np.ascontiguousarray(matrices.mT)
+def _variances(states: FloatArray) -> FloatArray:
+    return np.diagonal(states, axis1=-2, axis2=-1)
 
 
-def _joseph(P: FloatArray, K: FloatArray, H: FloatArray, R: FloatArray | None = None) -> FloatArray:
-    """`ekf.joseph` of stacks, without R for R = I, in half of the time."""
-    E = identity(P.shape[-1]) - K @ H
-    KR = K if R is None else K @ R
-    return symmetrise(E @ P @ _transposed(E) + KR @ _transposed(K))
+def _filtered(
+    steps: Steps,
+    start: FloatArray,
+    F: FloatArray,
+    driven: FloatArray,
+    rows: FloatArray,
+    correct: Callable[[FloatArray, FloatArray], FloatArray],
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """States [P | x] before each step, F times them, predicted (in the place of `driven`), and corrected."""
+    n = F.shape[-1]
+    left, moved, filtered = (np.empty(driven.shape) for _ in range(3))
+    state = start.copy()
+    measured = rows.shape[1] > 0
+    for begin, end in steps.slices():
+        at, m = slice(begin, end), end - begin
+        before = left[at] = state[:m]
+        F_at, predicted = F[at], driven[at]
+        along = np.matmul(F_at, before, out=moved[at])
+        predicted[..., :n] += along[..., :n] @ F_at.mT
+        predicted[..., n] += along[..., n]
+        state[:m] = filtered[at] = correct(predicted, rows[at]) if measured else predicted
+    return left, moved, driven, filtered
 
 
-def substitute_means(nodes: Nodes, tracks: IntArray, thresholds: FloatArray, anchored: IntArray) -> IntArray:
-    """Find the steps of the means of all nodes in the windows of `tracks`, from the newest back.
-
-    Gives the tracks of which a node, after the first `anchored` ones of the window, is further than its `thresholds`
-    from its linearisation point; shapes (tracks,) and (tracks, n) of all tracks.
-    """
-    tracks, _, active = _sorted(tracks, nodes.count[tracks] - nodes.first[tracks])
-    longest = len(active)
-    places = nodes.count[tracks] - longest + np.arange(longest)[:, None]
-    slots = nodes.slots[tracks, np.maximum(places, 0)]
-    A, b = nodes.A[tracks, slots], nodes.b[tracks, slots]
-    steps = np.zeros((longest, len(tracks), nodes.dim))
-    step = steps[-1] = nodes.filtered[tracks, slots[-1]]
-    for t in range(longest - 2, -1, -1):
-        m = active[longest - 1 - t]
-        step = steps[t, :m] = np.vecdot(A[t, :m], step[:m, None]) + b[t, :m]
-    done = places >= nodes.first[tracks]
-    nodes.step[np.broadcast_to(tracks, done.shape)[done], slots[done]] = steps[done]
-    far = (np.abs(steps) > thresholds[tracks]).any(axis=-1) & (places >= nodes.first[tracks] + anchored[tracks])
-    return np.asarray(tracks[far.any(axis=0)])
+def _corrected(state: FloatArray, rows: FloatArray) -> FloatArray:
+    """States [P | x] after measurements [G | y] with noise I: P - P G' S^-1 G P with S = G P G' + I, and the mean."""
+    n = state.shape[-2]
+    G = rows[..., :n]
+    seen = G @ state
+    seen[..., n] -= rows[..., n]
+    S = seen[..., :n] @ G.mT
+    S += identity(S.shape[-1])
+    return np.asarray(state - seen[..., :n].mT @ eliminated(S, seen))
 
 
-def substitute(nodes: Nodes, tracks: IntArray, known: IntArray, places: IntArray) -> None:
-    """Find the covariances of the nodes of `tracks` from `known` - 1 back to `places`, one each.
+def _corrected_joseph(state: FloatArray, rows: FloatArray) -> FloatArray:
+    """`_corrected` in Joseph's form, which keeps all digits of what a precise measurement leaves of a vague state."""
+    n = state.shape[-2]
+    G = rows[..., :n]
+    seen = G @ state[..., :n]
+    K = eliminated(symmetrise(seen @ G.mT) + identity(G.shape[-2]), seen).mT
+    E = identity(n) - K @ G
+    after = np.empty(state.shape)
+    after[..., :n] = E @ state[..., :n] @ E.mT + K @ K.mT
+    after[..., n] = state[..., n] + np.matvec(K, rows[..., n] - np.matvec(G, state[..., n]))
+    return after
 
-    Those from `known` on are found already; it is the number of nodes where none is. Behind the windows, find the means
-    as well.
-    """
-    tracks_all = tracks
-    newest = known == nodes.count[tracks]
-    if newest.any():
-        end = nodes.at(tracks[newest], known[newest] - 1)
-        nodes.P[end] = nodes.P_filtered[end]
-        known = known - newest
-    lengths = known - places
-    if not (lengths > 0).any():
-        return
-    order = np.argsort(-lengths, kind="stable")
-    tracks, lengths, known = tracks_all[order], lengths[order], known[order]
-    longest = int(lengths[0])
-    at_right = nodes.at(tracks, known)
-    places = known - 1 - np.arange(longest)[:, None]
-    slots = nodes.slots[tracks, np.maximum(places, 0)]
-    A, b, C = nodes.A[tracks, slots], nodes.b[tracks, slots], nodes.C[tracks, slots]
-    A_t = _transposed(A)
-    steps, covariances = np.empty(b.shape), np.empty(C.shape)
-    behind = bool((places[lengths - 1, np.arange(len(tracks))] < nodes.first[tracks]).any())
-    step, P = nodes.step[at_right], nodes.P[at_right]
-    for t in range(longest):
-        m = int(np.searchsorted(-lengths, -t, side="left"))
-        if behind:
-            step = steps[t, :m] = np.vecdot(A[t, :m], step[:m, None]) + b[t, :m]
-        P = covariances[t, :m] = A[t, :m] @ P[:m] @ A_t[t, :m] + C[t, :m]
-    done = np.arange(longest)[:, None] < lengths
-    at = np.broadcast_to(tracks, done.shape)[done], slots[done]
-    nodes.P[at] = symmetrise(covariances[done])
-    if behind:
-        nodes.step[at] = steps[done]
+
+def _conditionals(
+    left: FloatArray, F: FloatArray, Q: FloatArray, moved: FloatArray, predicted: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """[A | b] and C of nodes filtered to `left` = [P | x], given the next ones: A = P F' (F P F' + Q)^-1."""
+    n = F.shape[-1]
+    if len(F) < 8:
+        A = np.linalg.solve(predicted[..., :n], moved[..., :n]).mT
+    else:
+        W = inverse_roots(predicted[..., :n])
+        A = (W.mT @ (W @ moved[..., :n])).mT
+    P = left[..., :n]
+    E = identity(n) - A @ F
+    back = np.empty(left.shape)
+    back[..., :n] = A
+    back[..., n] = left[..., n] - np.matvec(A, predicted[..., n])
+    return back, symmetrise(E @ P @ E.mT + A @ Q @ A.mT)

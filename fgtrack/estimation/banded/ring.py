@@ -15,16 +15,22 @@ def fuse_behind(nodes: Nodes, motion: MotionModel, track: int, measurement: Meas
     It adds a node at a stamp of its own. Raises `numpy.linalg.LinAlgError` for one that cannot be fused; all is as it
     was then.
     """
-    first = int(nodes.first[track])
-    slots = nodes.slots[track, : first + 1]
+    first, n = int(nodes.first[track]), nodes.dim
+    numbers = nodes.numbers[track, : first + 1]
     stamps_ns = nodes.stamps_ns[track, : first + 1].tolist()
     ring = [
-        Conditional(stamp_ns, *(values[track, slot].copy() for values in (nodes.origin, nodes.A, nodes.b, nodes.C)))
-        for stamp_ns, slot in zip(stamps_ns[:first], slots[:first].tolist(), strict=True)
+        Conditional(
+            stamp_ns,
+            nodes.origin[number].copy(),
+            nodes.back[number, :, :n].copy(),
+            nodes.back[number, :, n].copy(),
+            nodes.C[number].copy(),
+        )
+        for stamp_ns, number in zip(stamps_ns[:first], numbers[:first].tolist(), strict=True)
     ]
-    at = track, slots[first]
-    origin = nodes.origin[at].copy()
-    prior = Prior(origin + nodes.predicted[at], nodes.P_predicted[at].copy())
+    oldest = numbers[first]
+    origin, known = nodes.origin[oldest].copy(), nodes.predicted[oldest]
+    prior = Prior(origin + known[:, n], known[:, :n].copy())
     past = MarginalisedPast.resumed(motion, ring, stamps_ns[first], origin, prior)
     found = past.fuse(measurement)
     for place, conditional in enumerate(past.ring):
@@ -32,6 +38,7 @@ def fuse_behind(nodes: Nodes, motion: MotionModel, track: int, measurement: Meas
             stamp_ns = np.array([conditional.stamp_ns])
             nodes.insert(np.array([track]), np.array([place]), stamp_ns, conditional.mean[None])
             nodes.first[track] += 1
-        at = track, nodes.slots[track, place]
-        nodes.A[at], nodes.b[at], nodes.C[at] = conditional.A, conditional.b, conditional.C
+        number = nodes.numbers[track, place]
+        nodes.back[number, :, :n], nodes.back[number, :, n] = conditional.A, conditional.b
+        nodes.C[number] = conditional.C
     return found

@@ -3,7 +3,7 @@
 import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.banded.nodes import Nodes, Place
+from fgtrack.estimation.banded.nodes import Nodes
 
 
 class Undo:
@@ -11,36 +11,37 @@ class Undo:
 
     def __init__(self, nodes: Nodes, tracks: IntArray) -> None:
         self._nodes, self._tracks = nodes, tracks
+        nodes.reserve(int(nodes.count[tracks].max()))
         self._order = nodes.snapshot(tracks)
-        self.first = nodes.first[tracks].copy()
+        self.first = nodes.first[tracks]
         self._oldest = nodes.at(tracks, self.first)
         self._behind = nodes.at(tracks, np.maximum(self.first - 1, 0))
-        self._predicted, self._b_behind = nodes.predicted[self._oldest], nodes.b[self._behind]
-        self._moved: tuple[Place, FloatArray] | None = None
-        self._rings: list[tuple[Place, list[FloatArray]]] = []
-        self.added: list[tuple[int, int]] = []
-        """Track and slot of each term that was added."""
+        self._predicted = nodes.predicted[self._oldest, :, -1]
+        self._b_behind = nodes.back[self._behind, :, -1]
+        self._moved: tuple[IntArray, FloatArray] | None = None
+        self._rings: list[tuple[IntArray, FloatArray, FloatArray]] = []
+        self.added: list[int] = []
+        """Nodes to which a term was added."""
 
-    def keep_origins(self, at: Place) -> None:
+    def keep_origins(self, numbers: IntArray) -> None:
         """These linearisation points will move."""
-        self._moved = at, self._nodes.origin[at]
+        self._moved = numbers, self._nodes.origin[numbers]
 
     def keep_ring(self, track: int) -> None:
         """What is behind the window of `track` will change."""
         nodes = self._nodes
-        at = Place(np.full(nodes.first[track], track), nodes.slots[track, : nodes.first[track]])
-        self._rings.append((at, [values[at] for values in (nodes.A, nodes.b, nodes.C)]))
+        numbers = nodes.numbers[track, : nodes.first[track]].copy()
+        self._rings.append((numbers, nodes.back[numbers], nodes.C[numbers]))
 
     def __call__(self) -> None:
         """Take the changes back."""
         nodes = self._nodes
         nodes.restore(self._tracks, self._order)
-        for at, saved in self._rings:
-            for values, old in zip((nodes.A, nodes.b, nodes.C), saved, strict=True):
-                values[at] = old
+        for numbers, back, C in self._rings:
+            nodes.back[numbers], nodes.C[numbers] = back, C
         if self._moved is not None:
-            at, origins = self._moved
-            nodes.origin[at] = origins
-        nodes.predicted[self._oldest], nodes.b[self._behind] = self._predicted, self._b_behind
-        for track, slot in self.added:
-            nodes.terms[track][slot].pop()
+            numbers, origins = self._moved
+            nodes.origin[numbers] = origins
+        nodes.predicted[self._oldest, :, -1], nodes.back[self._behind, :, -1] = self._predicted, self._b_behind
+        for number in self.added:
+            nodes.terms[number].pop()

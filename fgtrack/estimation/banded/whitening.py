@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.linalg import congruence, mahalanobis_squared
+from fgtrack.core.linalg import congruence, inverse_roots, mahalanobis_squared
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation import ekf
 from fgtrack.estimation.base import Measurement
@@ -71,19 +71,18 @@ def _alike(measurements: Sequence[Measurement]) -> list[list[int]]:
     return list(groups.values())
 
 
-def whitened(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """R^(-1/2) y and R^(-1/2) H, shapes (..., k) and (..., k, n).
+def whitened(y: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
+    """R^(-1/2) [H | y], shape (..., k, n + 1).
 
     Raises `numpy.linalg.LinAlgError` for a covariance R that is not positive definite.
     """
-    rows = np.linalg.solve(np.linalg.cholesky(R), np.concatenate([H, y[..., None]], axis=-1))
-    return rows[..., -1], rows[..., :-1]
+    return np.asarray(inverse_roots(R) @ np.concatenate([H, y[..., None]], axis=-1))
 
 
-def whitened_term(term: MeasurementTerm, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """`term` linearised at `x` (n,), weighted by its loss there: y (k,) and G (k, n). Raises as `whitened`."""
-    y, G = whitened(*linearised(term, x))
+def whitened_term(term: MeasurementTerm, x: FloatArray) -> FloatArray:
+    """`term` linearised at `x` (n,), weighted by its loss there: [G | y], shape (k, n + 1). Raises as `whitened`."""
+    rows = whitened(*linearised(term, x))
     if isinstance(term, Measurement) and term.loss is not None:
-        root = np.sqrt(weight(term.loss, float(np.sqrt(y @ y))))
-        y, G = root * y, root * G
-    return y, G
+        y = rows[:, -1]
+        rows *= np.sqrt(weight(term.loss, float(np.sqrt(y @ y))))
+    return rows

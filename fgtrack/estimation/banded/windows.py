@@ -8,10 +8,11 @@ import numpy as np
 from fgtrack.core.linalg import congruence, symmetrise
 from fgtrack.core.time import NS_PER_S, seconds
 from fgtrack.core.types import YAW, BoolArray, FloatArray, IntArray
-from fgtrack.estimation.banded.elimination import eliminate, substitute, substitute_means
+from fgtrack.estimation.banded.elimination import eliminate
 from fgtrack.estimation.banded.linearisation import linearise_segments, linearise_terms, move
-from fgtrack.estimation.banded.nodes import Nodes, Place
+from fgtrack.estimation.banded.nodes import Nodes
 from fgtrack.estimation.banded.ring import fuse_behind
+from fgtrack.estimation.banded.substitution import Blocks
 from fgtrack.estimation.banded.undo import Undo
 from fgtrack.estimation.banded.whitening import Innovations, whitened
 from fgtrack.estimation.base import Measurement
@@ -62,30 +63,23 @@ class Windows:
         self._motion = motion
         self._settings = settings
         self.nodes = Nodes(motion.dim)
+        self._blocks = Blocks(self.nodes)
         self._thresholds = np.empty((0, motion.dim))
         self._curved: BoolArray = np.zeros(0, dtype=bool)
         self._anchored: IntArray = np.zeros(0, dtype=np.int64)
         """1 where the oldest node of the window keeps its linearisation, because it has a marginalised past."""
-        self._far: BoolArray = np.zeros(0, dtype=bool)
-        """Whether a node is too far from its linearisation point."""
-        self._known: IntArray = np.zeros(0, dtype=np.int64)
-        """From this place on smoothed means and covariances are known."""
 
     def begin(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
         """Start the window of a track with its first node."""
         self.nodes.begin(track, stamp_ns, mean, covariance)
-        more = len(self.nodes.first) - len(self._known)
+        self._blocks.begin(track)
+        more = len(self.nodes.first) - len(self._curved)
         if more:
             self._thresholds = np.concatenate([self._thresholds, np.zeros((more, self._motion.dim))])
-            self._curved, self._far = (
-                np.concatenate([values, np.zeros(more, dtype=bool)]) for values in (self._curved, self._far)
-            )
-            self._anchored, self._known = (
-                np.concatenate([values, np.zeros(more, dtype=np.int64)]) for values in (self._anchored, self._known)
-            )
+            self._curved = np.concatenate([self._curved, np.zeros(more, dtype=bool)])
+            self._anchored = np.concatenate([self._anchored, np.zeros(more, dtype=np.int64)])
         self._thresholds[track] = self._settings.thresholds(self._motion, curved=False)
-        self._curved[track] = self._far[track] = False
-        self._anchored[track], self._known[track] = 0, 1
+        self._curved[track], self._anchored[track] = False, 0
 
     # --- states
 
@@ -101,41 +95,42 @@ class Windows:
         """States of `tracks` at `stamps_ns`, not older than `oldest_ns`: interpolated, or predicted ahead."""
         nodes = self.nodes
         places = nodes.place_before(tracks, stamps_ns)
-        self._substitute(tracks, places)
-        left = nodes.at(tracks, places)
-        means, covariances = nodes.origin[left] + nodes.step[left], nodes.P[left]
         until_ns = stamps_ns - nodes.stamps_ns[tracks, places]
-        newest = places == nodes.count[tracks] - 1
-        ahead = np.flatnonzero(newest & (until_ns > 0))
+        between = (until_ns > 0) & (places < nodes.count[tracks] - 1)
+        known = places + between
+        steps, covariances = self._blocks.smoothed(tracks, known)
+        means = nodes.origin[nodes.at(tracks, known)] + steps
+        inner = np.flatnonzero(between)
+        if inner.size:
+            means[inner], covariances[inner] = self._between(
+                tracks[inner], known[inner], stamps_ns[inner], steps[inner], means[inner], covariances[inner]
+            )
+        ahead = np.flatnonzero((until_ns > 0) & ~between)
         if ahead.size:
             means[ahead], F, Q = self._motion.steps(means[ahead], until_ns[ahead] / NS_PER_S)
             covariances[ahead] = propagated(F, covariances[ahead], Q)
-        inner = np.flatnonzero(~newest & (until_ns > 0))
-        if inner.size:
-            means[inner], covariances[inner] = self._between(
-                tracks[inner], places[inner], stamps_ns[inner], means[inner]
-            )
         return States(means, covariances)
 
-    def _between(self, tracks: IntArray, places: IntArray, stamps_ns: IntArray, left: FloatArray) -> States:
-        """States between the nodes at `places`, with means `left`, and the next ones."""
-        nodes = self.nodes
-        at, after = nodes.at(tracks, places), nodes.at(tracks, places + 1)
-        until_s = (stamps_ns - nodes.stamps_ns[tracks, places]) / NS_PER_S
-        after_s = (nodes.stamps_ns[tracks, places + 1] - stamps_ns) / NS_PER_S
-        right = nodes.origin[after] + nodes.step[after]
+    def _between(
+        self,
+        tracks: IntArray,
+        places: IntArray,
+        stamps_ns: IntArray,
+        steps: FloatArray,
+        right: FloatArray,
+        P_right: FloatArray,
+    ) -> States:
+        """States before the nodes at `places`, with these steps, means and covariances, and after those before them."""
+        nodes, n = self.nodes, self._motion.dim
+        at = nodes.at(tracks, places - 1)
+        A, b = nodes.back[at, :, :n], nodes.back[at, :, n]
+        until_s = (stamps_ns - nodes.stamps_ns[tracks, places - 1]) / NS_PER_S
+        after_s = (nodes.stamps_ns[tracks, places] - stamps_ns) / NS_PER_S
+        left = nodes.origin[at] + np.matvec(A, steps) + b
         inner = between_all(self._motion, left, right, until_s, after_s)
-        by_right = inner.Lambda @ nodes.A[at] + inner.Psi
+        by_right = inner.Lambda @ A + inner.Psi
         given = congruence(inner.Lambda, nodes.C[at]) + inner.Sigma
-        return States(inner.mean, symmetrise(congruence(by_right, nodes.P[after]) + given))
-
-    def _substitute(self, tracks: IntArray, places: IntArray) -> None:
-        """Make means and covariances known from `places` on."""
-        known = self._known[tracks]
-        short = places < known
-        if short.any():
-            substitute(self.nodes, tracks[short], known[short], places[short])
-            self._known[tracks] = np.minimum(known, places)
+        return States(inner.mean, symmetrise(congruence(by_right, P_right) + given))
 
     # --- updates
 
@@ -164,16 +159,16 @@ class Windows:
             starts = self._relinearise(tracks, undo)
             old = stamp_ns < nodes.stamps_ns[tracks, anchors]
             if old.any():
-                eliminate(nodes, tracks[old], starts[old])
+                self._eliminate(tracks[old], starts[old])
                 for row in np.flatnonzero(old).tolist():
                     nodes.first[tracks[row]] = anchors[row]
                     undo.keep_ring(int(tracks[row]))
                     term = fuse_behind(nodes, self._motion, int(tracks[row]), measurements[row])
                     starts[row] = anchors[row] = nodes.first[tracks[row]]
                     self._add(int(tracks[row]), int(starts[row]), term, undo)
-            starts = self._insert(tracks, stamp_ns, ~old, guesses, starts)
-            self._measure(tracks, stamp_ns, measurements, groups, guesses, ~old, undo)
-            eliminate(nodes, tracks, starts)
+            numbers = self._insert(tracks, stamp_ns, ~old, guesses, starts)
+            self._measure(numbers, measurements, groups, guesses, ~old, undo)
+            self._eliminate(tracks, starts)
         except np.linalg.LinAlgError:
             undo()
             self._rebuild(tracks)
@@ -188,104 +183,106 @@ class Windows:
         """Take Gauss-Newton steps while a state is further than a threshold from its linearisation point."""
         for _ in range(max_iterations):
             starts = self._relinearise(tracks)
-            tracks, starts = tracks[starts < self.nodes.count[tracks]], starts[starts < self.nodes.count[tracks]]
+            moved = starts < self.nodes.count[tracks]
+            tracks, starts = tracks[moved], starts[moved]
             if not tracks.size:
                 return
-            eliminate(self.nodes, tracks, starts)
+            self._eliminate(tracks, starts)
             self._solved(tracks)
 
+    def _eliminate(self, tracks: IntArray, places: IntArray) -> None:
+        self._blocks.cut(tracks, places)
+        eliminate(self.nodes, tracks, places)
+
     def _solved(self, tracks: IntArray) -> None:
-        self._far[tracks] = False
-        self._far[substitute_means(self.nodes, tracks, self._thresholds, self._anchored)] = True
-        self._known[tracks] = self.nodes.count[tracks]
+        self._blocks.solve_means(tracks, self._thresholds, self._anchored)
 
     def _leaving(self, tracks: IntArray, anchors: IntArray) -> Leaving:
         nodes = self.nodes
-        going = anchors > nodes.first[tracks]
+        going = anchors - nodes.first[tracks]
         if not self._settings.final or not going.any():
             n = nodes.dim
             return Leaving(np.empty(0, np.int64), np.empty(0, np.int64), States(np.empty((0, n)), np.empty((0, n, n))))
-        tracks, anchors = tracks[going], anchors[going]
-        self._substitute(tracks, nodes.first[tracks])
-        places = nodes.first[tracks, None] + np.arange(int((anchors - nodes.first[tracks]).max()))
-        rows, columns = np.nonzero(places < anchors[:, None])
-        tracks, places = tracks[rows], places[rows, columns]
-        at = nodes.at(tracks, places)
-        states = States(nodes.origin[at] + nodes.step[at], nodes.P[at])
-        return Leaving(tracks, nodes.stamps_ns[tracks, places], states)
+        rows, columns = np.nonzero(np.arange(int(going.max())) < going[:, None])
+        tracks, places = tracks[rows], (nodes.first[tracks[rows]] + columns)
+        steps, covariances = self._blocks.smoothed(tracks, places)
+        means = nodes.origin[nodes.at(tracks, places)] + steps
+        return Leaving(tracks, nodes.stamps_ns[tracks, places], States(means, covariances))
 
     def _relinearise(self, tracks: IntArray, undo: Undo | None = None) -> IntArray:
         """Move the linearisation points that are too far from their states; gives their first places, or `count`."""
         nodes = self.nodes
-        starts = nodes.count[tracks].copy()
-        if not self._far[tracks].any():
+        starts = nodes.count[tracks]
+        some = np.flatnonzero(self._blocks.any_far[tracks])
+        if not some.size:
             return starts
-        free = nodes.first[tracks] + self._anchored[tracks]
-        places = free[:, None] + np.arange(max(int((starts - free).max()), 0))
-        slots = nodes.slots[tracks[:, None], np.minimum(places, starts[:, None] - 1)]
-        far = (np.abs(nodes.step[tracks[:, None], slots]) > self._thresholds[tracks, None]).any(axis=-1)
-        far &= places < starts[:, None]
-        if far.any():
-            rows, columns = np.nonzero(far)
-            places = places[rows, columns]
-            at = Place(tracks[rows], slots[rows, columns])
+        free = (nodes.first + self._anchored)[tracks[some]]
+        places = free[:, None] + np.arange(max(int((starts[some] - free).max()), 0))
+        numbers = nodes.numbers[tracks[some, None], np.minimum(places, starts[some, None] - 1)]
+        rows, columns = np.nonzero(nodes.far[numbers] & (places < starts[some, None]))
+        if rows.size:
+            moved, of, places = numbers[rows, columns], tracks[some[rows]], places[rows, columns]
             if undo is not None:
-                undo.keep_origins(at)
-            move(nodes, at, nodes.step[at])
-            linearise_segments(nodes, self._motion, at.tracks, places)
-            np.minimum.at(starts, rows, places)
+                undo.keep_origins(moved)
+            move(nodes, of, moved, nodes.step[moved])
+            nodes.far[moved] = False
+            linearise_segments(nodes, self._motion, of, places)
+            np.minimum.at(starts, some[rows], places)
         return starts
 
     def _insert(
         self, tracks: IntArray, stamp_ns: int, live: BoolArray, guesses: FloatArray, starts: IntArray
     ) -> IntArray:
-        """Make nodes at `stamp_ns` where there are none; gives the places from which on to eliminate."""
+        """Make nodes at `stamp_ns` where there are none; gives the numbers of the nodes there.
+
+        The windows are eliminated from there on: `starts` becomes smaller.
+        """
         nodes = self.nodes
-        places = nodes.place_before(tracks, np.full(len(tracks), stamp_ns))
+        stamps_ns = np.full(len(tracks), stamp_ns)
+        places = nodes.place_before(tracks, stamps_ns)
         new = live & (nodes.stamps_ns[tracks, places] != stamp_ns)
         places = places + new
         if new.any():
             to, at = tracks[new], places[new]
-            nodes.insert(to, at, np.full(len(to), stamp_ns), guesses[new])
+            nodes.insert(to, at, stamps_ns[new], guesses[new])
             linearise_segments(nodes, self._motion, np.concatenate([to, to]), np.concatenate([at - 1, at]))
-        return np.where(live, np.minimum(starts, places), starts)
+        np.minimum(starts, places, out=starts, where=live)
+        return nodes.at(tracks, places)
 
     def _measure(
         self,
-        tracks: IntArray,
-        stamp_ns: int,
+        numbers: IntArray,
         measurements: Sequence[Measurement],
         groups: Sequence[Innovations],
         guesses: FloatArray,
         live: BoolArray,
         undo: Undo,
     ) -> None:
+        """What is measured at the nodes `numbers`, where `live`."""
         nodes = self.nodes
-        places = nodes.place_before(tracks, np.full(len(tracks), stamp_ns))
+        all_live = bool(live.all())
         for group in groups:
-            rows = group.positions[live[group.positions]]
+            chosen = slice(None) if all_live else live[group.positions]
+            rows = group.positions[chosen]
             if not rows.size:
                 continue
-            at = nodes.at(tracks[rows], places[rows])
-            for row, slot in zip(rows.tolist(), at.slots.tolist(), strict=True):
-                nodes.terms[tracks[row]][slot].append(measurements[row])
-                undo.added.append((int(tracks[row]), slot))
+            at = numbers[rows]
+            for row, number in zip(rows.tolist(), at.tolist(), strict=True):
+                nodes.terms[number].append(measurements[row])
+            undo.added += at.tolist()
             if curved(measurements[rows[0]]):
-                for track, slot in zip(at.tracks.tolist(), at.slots.tolist(), strict=True):
-                    linearise_terms(nodes, track, slot)
+                for number in at.tolist():
+                    linearise_terms(nodes, number)
                 continue
-            y, G = whitened(group.y, group.H, group.R)
-            if len(rows) < len(group.positions):
-                chosen = live[group.positions]
-                y, G = y[chosen], G[chosen]
-            nodes.measure(at, G, y + np.vecdot(G, (guesses[rows] - nodes.origin[at])[:, None]))
+            measured = whitened(group.y, group.H, group.R)[chosen]
+            measured[..., -1] += np.matvec(measured[..., :-1], guesses[rows] - nodes.origin[at])
+            nodes.measure(at, measured)
 
     def _add(self, track: int, place: int, term: EquivalentMeasurement, undo: Undo) -> None:
-        nodes = self.nodes
-        slot = int(nodes.slots[track, place])
-        nodes.terms[track][slot].append(term)
-        undo.added.append((track, slot))
-        linearise_terms(nodes, track, slot)
+        number = int(self.nodes.numbers[track, place])
+        self.nodes.terms[number].append(term)
+        undo.added.append(number)
+        linearise_terms(self.nodes, number)
 
     def _bend(
         self, tracks: IntArray, stamp_ns: int, measurements: Sequence[Measurement], guesses: FloatArray
@@ -307,11 +304,14 @@ class Windows:
 
     def _forget_before(self, tracks: IntArray, stamps_ns: IntArray) -> None:
         nodes = self.nodes
-        numbers = np.minimum(nodes.place_before(tracks, stamps_ns), nodes.first[tracks] - 1)
+        most = nodes.first[tracks] - 1
+        if (most < _MANY).all():
+            return
+        numbers = np.minimum(nodes.place_before(tracks, stamps_ns), most)
         many = numbers >= _MANY
         if many.any():
             nodes.drop(tracks[many], numbers[many])
-            self._known[tracks[many]] -= numbers[many]
+            self._blocks.moved(tracks[many], -numbers[many])
 
     # --- one track
 
@@ -329,14 +329,14 @@ class Windows:
         """The positions measured at the nodes, after that of the prior, of a window that nothing has left yet."""
         nodes, at = self.nodes, self._window(track)
         stamps_ns = self.stamps_ns(track)
-        mean, covariance = (nodes.origin[at] + nodes.predicted[at])[0], nodes.P_predicted[at][0]
+        known = nodes.predicted[at[0]]
         later = (
             (seconds(stamp_ns - stamps_ns[0]), term)
-            for slot, stamp_ns in zip(at.slots.tolist(), stamps_ns, strict=True)
-            for term in nodes.terms[track][slot]
+            for number, stamp_ns in zip(at.tolist(), stamps_ns, strict=True)
+            for term in nodes.terms[number]
             if isinstance(term, Measurement)
         )
-        return fixes_of(mean, covariance, later)
+        return fixes_of(nodes.origin[at[0]] + known[:, -1], known[:, :-1].copy(), later)
 
     def restart(self, track: int, line: Line) -> None:
         """Solve again from states along `line`, with the prior's heading, which must be vague, turned there."""
@@ -344,8 +344,7 @@ class Windows:
         times_s = (np.array(self.stamps_ns(track)) - self.stamps_ns(track)[0]) / NS_PER_S
         means = np.array([along(line, time_s, self._motion.state_names) for time_s in times_s.tolist()])
         if not self._motion.cartesian:
-            first = track, at.slots[0]
-            nodes.predicted[first][YAW] = means[0, YAW] - nodes.origin[first][YAW]
+            nodes.predicted[at[0], YAW, -1] = means[0, YAW] - nodes.origin[at[0], YAW]
         self._to(track, means)
 
     def converge(self, track: int, max_iterations: int) -> None:
@@ -365,18 +364,18 @@ class Windows:
             means, last = means + share * steps, longest
 
     def _estimates(self, track: int) -> FloatArray:
-        at = self._window(track)
-        return np.asarray(self.nodes.origin[at] + self.nodes.step[at])
+        places = np.arange(int(self.nodes.first[track]), int(self.nodes.count[track]))
+        steps = self._blocks.steps(np.full(len(places), track), places)
+        return np.asarray(self.nodes.origin[self._window(track)] + steps)
 
-    def _window(self, track: int) -> Place:
-        """All nodes of the window."""
-        first, count = int(self.nodes.first[track]), int(self.nodes.count[track])
-        return Place(np.full(count - first, track), self.nodes.slots[track, first:count])
+    def _window(self, track: int) -> IntArray:
+        """Numbers of all nodes of the window."""
+        return self.nodes.numbers[track, self.nodes.first[track] : self.nodes.count[track]].copy()
 
     def _to(self, track: int, means: FloatArray) -> None:
         """Linearise the whole window at `means`, and solve it."""
         nodes, at = self.nodes, self._window(track)
-        move(nodes, at, means - nodes.origin[at])
+        move(nodes, np.full(len(at), track), at, means - nodes.origin[at])
         self._rebuild(np.array([track]))
 
     def _rebuild(self, tracks: IntArray) -> None:
@@ -384,9 +383,8 @@ class Windows:
         nodes = self.nodes
         for track in tracks.tolist():
             at = self._window(track)
-            first = nodes.first[track]
-            linearise_segments(nodes, self._motion, at.tracks, first + np.arange(len(at.slots)))
-            for slot in at.slots.tolist():
-                linearise_terms(nodes, track, slot)
-        eliminate(nodes, tracks, nodes.first[tracks])
+            linearise_segments(nodes, self._motion, np.full(len(at), track), nodes.first[track] + np.arange(len(at)))
+            for number in at.tolist():
+                linearise_terms(nodes, number)
+        self._eliminate(tracks, nodes.first[tracks])
         self._solved(tracks)
