@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
 from fgtrack.estimation.banded import windows
 from fgtrack.estimation.banded.bank import BandedBank
@@ -39,7 +40,12 @@ def arriving(
 
 
 def largest_difference(
-    motion: MotionModel, measurements: Sequence[Measurement], start: Start = START, lag_s: float = 0.7, **options: Any
+    motion: MotionModel,
+    measurements: Sequence[Measurement],
+    start: Start = START,
+    lag_s: float = 0.7,
+    past_s: float = 0.13,
+    **options: Any,
 ) -> float:
     """Between `smoother` and `smoother-banded`, after each measurement: present, a state of the past, and NIS."""
     expected, found = (
@@ -53,7 +59,7 @@ def largest_difference(
         if before.nis is not None and after.nis is not None:
             largest = max(largest, abs(after.nis - before.nis) / (1.0 + before.nis))
         oldest_ns, newest_ns = expected.window_ns
-        for at_ns in (newest_ns + 50 * MS, max(oldest_ns, newest_ns - 130 * MS)):
+        for at_ns in (newest_ns + 50 * MS, max(oldest_ns, newest_ns - nanoseconds(past_s))):
             largest = max(largest, *difference(found.state_at(at_ns), expected.state_at(at_ns)))
     return largest
 
@@ -69,6 +75,12 @@ def test_at_any_thresholds_the_states_are_those_of_the_incremental_smoother(
     for seed in range(2):
         assert largest_difference(motion, arriving(motion, seed, names)) < 1e-9
     assert largest_difference(motion, arriving(motion, 7, names), max_iterations=4) < 1e-9
+
+
+def test_so_they_are_in_windows_of_many_blocks() -> None:
+    for motion in (CTRV(), CV()):
+        measurements = arriving(motion, 8, LINEAR if motion == CTRV() else LINEAR[:1], delay_s=0.3, num=110)
+        assert largest_difference(motion, measurements, past_s=1.1, lag_s=1.5) < 1e-9
 
 
 def test_so_they_are_with_robust_losses_and_an_unknown_heading() -> None:
