@@ -28,5 +28,5 @@ def test_elimination_solves_a_stack_of_systems(shape: tuple[int, ...]) -> None:
     rhs = rng.normal(size=(*shape[:-1], 4))
     kept = S.copy(), rhs.copy()
     np.testing.assert_allclose(eliminated(S, rhs), np.linalg.solve(S, rhs), rtol=1e-9, atol=1e-9)
-    assert (S == kept[0]).all()
-    assert (rhs == kept[1]).all()
+    np.testing.assert_array_equal(S, kept[0])
+    np.testing.assert_array_equal(rhs, kept[1])
