@@ -42,6 +42,7 @@ class _Feed:
     ignored_sensors: frozenset[str]
     on_truth: Callable[[TruthState], None]
     on_ego: Callable[[EgoState], None]
+    on_detections: Callable[[DetectionList], None]
     broken: str | None = None
     ignored_detections: int = 0
     received_detections: int = 0
@@ -59,6 +60,7 @@ class _Feed:
                     self._check_time(message)
                     if isinstance(message, DetectionList):
                         self.received_detections += len(message.objects)
+                        self.on_detections(message)
                     else:
                         self.on_ego(message)
                     yield message
@@ -165,7 +167,8 @@ def _drive(
 ) -> tuple[dict[str, object], str | None]:
     """Run `tracker` over `messages` into `writer`; gives the finished meta and why the input broke off."""
     started = time.perf_counter()
-    feed = _Feed(messages, frozenset(config.ignore_sensors), writer.write_truth, writer.write_ego)
+    ignored = frozenset(config.ignore_sensors)
+    feed = _Feed(messages, ignored, writer.write_truth, writer.write_ego, writer.write_detections)
     for tick in _ticks(feed, config.clock):
         before_ns = time.perf_counter_ns()
         for message in tick.messages:

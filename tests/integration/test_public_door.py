@@ -55,7 +55,7 @@ def test_a_run_in_memory_a_run_folder_and_the_command_give_the_same_run(drive: P
     assert command([str(argument) for argument in arguments]) == 0
     for other in (fgtrack.load_run(drive / "runs/x"), fgtrack.load_run(tmp_path / "run")):
         assert kept.meta["digest"] == other.meta["digest"]
-        for table in ("tracks", "updates", "smoothed", "lagged", "truth", "ego"):
+        for table in ("tracks", "updates", "smoothed", "lagged", "truth", "ego", "detections"):
             mine, theirs = getattr(kept, table), getattr(other, table)
             assert list(mine) == list(theirs)
             for column in mine:

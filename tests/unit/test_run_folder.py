@@ -1,6 +1,7 @@
 import dataclasses
 import hashlib
 import json
+import math
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -10,6 +11,8 @@ import pytest
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import (
+    Detection,
+    DetectionList,
     Disposition,
     EgoState,
     SmoothedReport,
@@ -68,6 +71,7 @@ def test_the_header_lines_are_those_of_the_contract(tmp_path):
     with RunWriter(path) as writer:
         writer.write_truth(TruthState(1, 1, -1, 0.0, 0.0))
         writer.write_ego(EgoState(1, 2, 0.0, 0.0, 0.0, 0.0))
+        writer.write_detections(DetectionList("lidar", 1, 2, [Detection(x_m=1.0, y_m=2.0)]))
         writer.write_tick(TickReport(0, 1, (track(),), (), (SmoothedReport(1, track().state, 0.3),)), 1, 0)
         writer.write_smoothed([SmoothedReport(1, track().state)])
     header = {file.stem: file.read_text().splitlines()[0] for file in path.glob("*.csv")}
@@ -85,6 +89,8 @@ def test_the_header_lines_are_those_of_the_contract(tmp_path):
         "timing": "tick,now_ns,process_ns,num_tracks,num_detections",
         "truth": f"stamp_ns,object_id,{state}",
         "ego": f"stamp_ns,receipt_ns,{state}",
+        "detections": "sensor,stamp_ns,receipt_ns,index,frame,"
+        "x_m,y_m,yaw_rad,speed_mps,range_m,bearing_rad,range_rate_mps",
     }
 
 
@@ -104,6 +110,28 @@ def test_the_ego_is_in_the_files_with_the_next_tick_and_not_in_the_digest(tmp_pa
     write(tmp_path / "without", report())
     assert finished["digest"] == digest(tmp_path / "without")
     assert load_run(tmp_path / "without").ego.num_rows == 0  # as a run folder of an older version
+
+
+def test_what_the_sensors_said_comes_back_and_is_not_in_the_digest(tmp_path):
+    path = tmp_path / "run"
+    box = Detection(x_m=np.float32(0.1), y_m=-2, covariance=(1.0, 0.0, 0.0, 1.0), object_id=7)
+    with RunWriter(path) as writer:
+        writer.write_detections(DetectionList("a,b", 5, 9, [box, Detection(bearing_rad=0.3, stamp_ns=6)], "sensor"))
+        writer.write_tick(report(), 5, 2)
+        writer.write_detections(DetectionList("radar", 7, 10, [Detection(x_m=math.nan, y_m=1.0)], "map"))
+        writer.write_detections(DetectionList("radar", 8, 11, []))
+        finished = writer.finish({})
+    found = load_run(path).detections
+    assert found["sensor"].tolist() == ["a,b", "a,b", "radar"]
+    assert found["frame"].tolist() == ["sensor", "sensor", "map"]
+    assert found["stamp_ns"].tolist() == [5, 6, 7]
+    assert found["receipt_ns"].tolist() == [9, 9, 10]
+    assert found["index"].tolist() == [0, 1, 0]
+    np.testing.assert_array_equal(found["x_m"], [float(np.float32(0.1)), math.nan, math.nan])
+    np.testing.assert_array_equal(found["y_m"], [-2.0, math.nan, 1.0])
+    np.testing.assert_array_equal(found["bearing_rad"], [math.nan, 0.3, math.nan])
+    write(tmp_path / "without", report())
+    assert finished["digest"] == digest(tmp_path / "without")
 
 
 def test_updates_truth_smoothed_and_timing_come_back(tmp_path):

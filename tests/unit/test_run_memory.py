@@ -65,6 +65,11 @@ def test_replays_are_the_same_in_memory_and_written(estimator: str, messages: li
     assert broken is None
     assert memory.tracks.num_rows > 100
     assert memory.ego.num_rows == sum(isinstance(message, EgoState) for message in messages)
+    said, ended = (
+        sorted(zip(*(table[name].tolist() for name in ("sensor", "stamp_ns", "receipt_ns", "index")), strict=True))
+        for table in (memory.detections, memory.updates)
+    )
+    assert said == ended
     assert (memory.lagged.num_rows > 100) == (memory.smoothed.num_rows > 100) == (estimator == "smoother")
     assert_same(memory, written)
     kept, read = (evaluate(run).as_dict() for run in (memory, written))

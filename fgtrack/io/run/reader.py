@@ -21,7 +21,7 @@ from fgtrack.io.run.schema import COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
 # A column holds floats, integers or strings, as its name says; the reader of it knows which.
 Column = npt.NDArray[Any]
 
-_TEXT_COLUMNS = frozenset({"status", "sensor", "disposition", "kind"})
+_TEXT_COLUMNS = frozenset({"status", "sensor", "disposition", "kind", "frame"})
 _INTEGER_COLUMNS = frozenset(
     {
         *("tick", "now_ns", "stamp_ns", "receipt_ns", "process_ns", "track_id", "object_id"),
@@ -83,6 +83,8 @@ class Run:
     truth: Table
     ego: Table
     """What was told of the ego, in order of receipt."""
+    detections: Table
+    """What the sensors said, in order of receipt; a row for each of `updates`. Of runs of fgtrack 0.1 it is empty."""
 
     @property
     def config(self) -> Mapping[str, Any]:

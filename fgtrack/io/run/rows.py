@@ -8,6 +8,7 @@ from typing import Any
 from fgtrack.core.types import (
     MEASURABLE,
     STATE_NAMES,
+    DetectionList,
     EgoState,
     SmoothedReport,
     TickReport,
@@ -84,10 +85,21 @@ def ego_row(ego: EgoState) -> Row:
     return (ego.stamp_ns, ego.receipt_ns, *_ego_state(ego))
 
 
+def detection_rows(message: DetectionList) -> list[Row]:
+    """Rows of `detections`: what `message` says of every object, in its own frame."""
+    found: list[Row] = []
+    for index, one in enumerate(message.objects):
+        stamp_ns = message.stamp_ns if one.stamp_ns is None else one.stamp_ns
+        said = (None if value is None else float(value) for value in _measured(one))
+        found.append((message.sensor, stamp_ns, message.receipt_ns, index, message.frame, *said))
+    return found
+
+
 def text(table: str, found: Sequence[Row]) -> str:
     """Rows as lines of the CSV file of `table`, floats with 17 significant digits."""
-    if table == "updates":
-        found = [(row[0], _quoted(str(row[1])), *row[2:]) for row in found]
+    if "sensor" in COLUMNS[table]:
+        place = COLUMNS[table].index("sensor")
+        found = [(*row[:place], _quoted(str(row[place])), *row[place + 1 :]) for row in found]
     return "".join([_line(tuple(map(type, row))) % row for row in found])
 
 
@@ -131,3 +143,4 @@ def _upper_triangle(size: int) -> Callable[[list[Cell]], Row]:
 
 _truth_state = attrgetter(*STATE_NAMES)
 _ego_state = attrgetter(*STATE_NAMES)
+_measured = attrgetter(*MEASURABLE)

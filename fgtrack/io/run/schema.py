@@ -29,7 +29,8 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "lagged": ("tick", "now_ns", "lag_s", "track_id", "stamp_ns", *STATE_NAMES, *COVARIANCE_COLUMNS),
     "truth": ("stamp_ns", "object_id", *STATE_NAMES),
     "ego": ("stamp_ns", "receipt_ns", *STATE_NAMES),
+    "detections": ("sensor", "stamp_ns", "receipt_ns", "index", "frame", *MEASURABLE),
 }
 
 #: Tables that are written only when there is something to write.
-OPTIONAL_TABLES = ("smoothed", "lagged", "truth", "ego")
+OPTIONAL_TABLES = ("smoothed", "lagged", "truth", "ego", "detections")

@@ -4,8 +4,8 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from fgtrack.core.types import Disposition, EgoState, SmoothedReport, TickReport, TruthState
-from fgtrack.io.run.rows import Row, ego_row, rows, smoothed_rows, truth_row
+from fgtrack.core.types import DetectionList, Disposition, EgoState, SmoothedReport, TickReport, TruthState
+from fgtrack.io.run.rows import Row, detection_rows, ego_row, rows, smoothed_rows, truth_row
 from fgtrack.io.run.schema import RUN_FORMAT
 
 
@@ -27,11 +27,11 @@ class RunSink(ABC):
         self._meta: dict[str, object] = {"format": RUN_FORMAT, **(meta or {}), "complete": False}
         self._smoothed_lag_s = smoothed_lag_s
         self._counts: dict[str, Counter[Disposition]] = {}
-        self._ego: list[Row] = []  # since the last tick
+        self._received: dict[str, list[Row]] = {"ego": [], "detections": []}  # since the last tick
 
     def write_tick(self, report: TickReport, process_ns: int, num_detections: int) -> None:
-        """Take all rows of one tick, see `rows`, and the ego states before it."""
-        self._append_ego()
+        """Take all rows of one tick, see `rows`, and what was received before it."""
+        self._append_received()
         for record in report.updates:
             self._counts.setdefault(record.sensor, Counter())[record.disposition] += 1
         for table, found in rows(report, process_ns, num_detections, self._smoothed_lag_s):
@@ -49,14 +49,18 @@ class RunSink(ABC):
 
     def write_ego(self, ego: EgoState) -> None:
         """Take a row of `ego`; the next tick puts it behind the others."""
-        self._ego.append(ego_row(ego))
+        self._received["ego"].append(ego_row(ego))
+
+    def write_detections(self, message: DetectionList) -> None:
+        """Take the rows of `detections`; the next tick puts them behind the others."""
+        self._received["detections"] += detection_rows(message)
 
     def finish(self, meta: Mapping[str, object]) -> dict[str, object]:
         """Complete the run with `meta`, the counts and the digest; gives the content of `meta.json`.
 
         `counts` holds, per sensor, the number of detections of every disposition.
         """
-        self._append_ego()
+        self._append_received()
         counts = {
             sensor: {disposition.value: counter[disposition] for disposition in Disposition}
             for sensor, counter in sorted(self._counts.items())
@@ -64,10 +68,11 @@ class RunSink(ABC):
         self._meta |= {**meta, "counts": counts, "digest": self._digest(), "complete": True}
         return dict(self._meta)
 
-    def _append_ego(self) -> None:
-        if self._ego:
-            self._append("ego", self._ego)
-            self._ego = []
+    def _append_received(self) -> None:
+        for table, found in self._received.items():
+            if found:
+                self._append(table, found)
+                self._received[table] = []
 
     @abstractmethod
     def _append(self, table: str, found: Sequence[Row]) -> None:
