@@ -100,8 +100,8 @@ def predict(
 
     Shapes (..., n) and (..., n, n); `dt_s` a number or of shape (...).
     """
-    F = motion.jacobian(mean, dt_s)
-    return motion.predict(mean, dt_s), propagated(F, covariance, motion.process_noise(mean, dt_s))
+    after, F, Q = motion.steps(mean, np.broadcast_to(np.float64(dt_s), mean.shape[:-1]))
+    return after, propagated(F, covariance, Q)
 
 
 def correct(

@@ -19,7 +19,7 @@ from fgtrack.sim.settings import settings
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
 from fgtrack.tracking.lifecycle import LifecycleRules
-from fgtrack.tracking.preprocess import ConnectedMerge, NoMerge
+from fgtrack.tracking.merge import ConnectedMerge, NoMerge
 from fgtrack.tracking.published import NeighbourhoodMerge, UngatedEuclidean
 
 MergeConfig = Annotated[ConnectedMerge | NoMerge | NeighbourhoodMerge, Discriminator("kind")]

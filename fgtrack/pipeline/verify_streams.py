@@ -22,7 +22,8 @@ from fgtrack.pipeline.oracle.sightings import Eye, Sighting, Vehicle, mounted, s
 from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY
 from fgtrack.tracking.ego import EgoTrajectory
 from fgtrack.tracking.inbox import Batch
-from fgtrack.tracking.preprocess import NoMerge, Preprocess
+from fgtrack.tracking.merge import NoMerge
+from fgtrack.tracking.preprocess import Preprocess
 
 _START_NS = NS_PER_S
 _RADAR_PHASE_S = 0.023

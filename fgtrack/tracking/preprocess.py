@@ -1,28 +1,25 @@
 """From the detections of one batch to what can be associated: map frame, on the road, merged."""
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
-from fgtrack.core.geometry import body_point, body_point_jacobian, circular_mean, rotation, wrap_angle
+from fgtrack.core.geometry import body_point, body_point_jacobian, rotation, wrap_angle
 from fgtrack.core.linalg import congruence
 from fgtrack.core.types import MEASURABLE, Detection, Disposition, FloatArray, UpdateRecord
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.correlated_errors import split_error
-from fgtrack.models.measurement import ANGULAR, RELATIVE, SensorPose, measured_position, measurement_model
+from fgtrack.models.measurement import RELATIVE, SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.inbox import Batch, own_covariance, record
+from fgtrack.tracking.merge import Merge
 from fgtrack.tracking.pose_error import PoseError, placement
 
 _FAR_M = 1e6
@@ -58,54 +55,6 @@ class Candidate:
         """The measurement of an object at the state `x`, shape (n,)."""
         R = self.noise_at(x)
         return self.measurement if R is self.measurement.R else replace(self.measurement, R=R)
-
-
-class Merge(ABC):
-    """Finds detections of one list that are the same object, and averages them."""
-
-    @abstractmethod
-    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
-        """Members of all groups of `points_m` (n, 2), by the point that leads it; one alone is a group of its own."""
-
-    def mean(self, name: str, values: FloatArray) -> float:
-        """Average of component `name`; of angles on the circle."""
-        return circular_mean(values) if name in ANGULAR else float(values.sum() / len(values))
-
-
-@dataclass(frozen=True)
-class NoMerge(Merge):
-    """Every detection stands for itself."""
-
-    kind: Literal["none"] = "none"
-
-    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
-        """See `Merge.groups`."""
-        return {i: (i,) for i in range(len(points_m))}
-
-
-@dataclass(frozen=True)
-class ConnectedMerge(Merge):
-    """Joins detections that are linked by steps of at most a distance."""
-
-    kind: Literal["connected"] = "connected"
-    distance_m: float = 5.1
-    """Detections at most this far apart are linked."""
-
-    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
-        """See `Merge.groups`; in the order of their first members, which lead."""
-        count = len(points_m)
-        alone = NoMerge().groups(points_m)
-        if count < 2:
-            return alone
-        pairs = cKDTree(points_m).query_pairs(self.distance_m, output_type="ndarray")
-        if not len(pairs):
-            return alone
-        links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-        _, labels = connected_components(links, directed=False)
-        members: dict[int, list[int]] = {}
-        for index, label in enumerate(labels.tolist()):
-            members.setdefault(label, []).append(index)
-        return {group[0]: tuple(group) for group in members.values()}
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,11 +12,13 @@ from fgtrack.core.types import DetectionList, Disposition, EgoState, FloatArray,
 from fgtrack.estimation.base import StatesAt
 from fgtrack.estimation.published import published_yaw
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.association import Assignment, assigned, euclidean_distances
+from fgtrack.tracking.assignment import Assignment, assigned_densely
 from fgtrack.tracking.ego import EgoPose, EgoSource, EgoStd
+from fgtrack.tracking.gating import euclidean_distances
 from fgtrack.tracking.inbox import Batch, is_covariance, is_number, record, records
 from fgtrack.tracking.lifecycle import Life, Lifecycle
-from fgtrack.tracking.preprocess import Candidate, MapDetection, Merge, Preprocess
+from fgtrack.tracking.merge import Merge
+from fgtrack.tracking.preprocess import Candidate, MapDetection, Preprocess
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
 
@@ -176,7 +178,7 @@ class UngatedEuclidean:
     def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
         """See `Association`; torn pairs are born after the detections that had no partner."""
         cost = euclidean_distances(candidates, states.means)
-        found = assigned(cost, np.ones(cost.shape, dtype=bool))
+        found = assigned_densely(cost, np.ones(cost.shape, dtype=bool))
         torn = [pair for pair in found.pairs if cost[pair] > self.gate_m]
         good = [pair for pair in found.pairs if pair not in torn]
         missed = sorted(found.missed + [j for _, j in torn])

@@ -27,7 +27,8 @@ from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.association import Assignment, Association
+from fgtrack.tracking.assignment import Assignment
+from fgtrack.tracking.association import Association
 from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.ego import EgoPose, EgoSource
 from fgtrack.tracking.ego_error import EgoErrors, IndependentErrors

@@ -9,14 +9,9 @@ from scipy.stats import chi2
 from support.tracking import bearing, candidate, states
 
 from fgtrack.models.measurement import SensorPose
-from fgtrack.tracking.association import (
-    Assignment,
-    Association,
-    GatedEuclidean,
-    GatedMahalanobis,
-    chi_square_quantile,
-    euclidean_distances,
-)
+from fgtrack.tracking.assignment import Assignment
+from fgtrack.tracking.association import Association, GatedEuclidean, GatedMahalanobis, chi_square_quantile
+from fgtrack.tracking.gating import euclidean_distances
 from fgtrack.tracking.published import UngatedEuclidean
 
 ALL = [GatedEuclidean(), GatedEuclidean(max_nis=20.0), GatedMahalanobis(), UngatedEuclidean()]

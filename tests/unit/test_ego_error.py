@@ -20,7 +20,8 @@ from fgtrack.models.road import OpenSpace
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.ego_error import EgoErrors, IndependentErrors, SharedErrors
-from fgtrack.tracking.preprocess import Candidate, NoMerge, Preprocess
+from fgtrack.tracking.merge import NoMerge
+from fgtrack.tracking.preprocess import Candidate, Preprocess
 
 STD = {"x_m": 0.3, "y_m": 0.3, "speed_mps": 0.5}
 PLACES = ((60.0, 5.0), (40.0, -30.0), (-20.0, 50.0), (70.0, 20.0))

@@ -131,7 +131,7 @@ def test_a_prediction_is_the_motion_model_with_its_noise_and_changes_no_input(mo
     x, P = rng.normal(size=(3, motion.dim)), positive_definite(rng, 3, motion.dim)
     before = x.copy(), P.copy()
     mean, covariance = predict(x, P, motion, 0.25)
-    np.testing.assert_array_equal(mean, motion.predict(x, 0.25))
+    np.testing.assert_allclose(mean, motion.predict(x, 0.25), rtol=1e-12)
     F, Q = motion.jacobian(x, 0.25), motion.process_noise(x, 0.25)
     for i in range(3):
         np.testing.assert_allclose(covariance[i], F[i] @ P[i] @ F[i].T + Q[i], atol=1e-12)

@@ -17,7 +17,8 @@ from fgtrack.models.motion import CTRV, CV, MotionModel
 from fgtrack.models.road import OpenSpace, Road
 from fgtrack.models.sensors import Correlation, Mount, SensorModel
 from fgtrack.tracking.ego import EgoPose
-from fgtrack.tracking.preprocess import Candidate, ConnectedMerge, NoMerge, Preprocess
+from fgtrack.tracking.merge import ConnectedMerge, NoMerge
+from fgtrack.tracking.preprocess import Candidate, Preprocess
 
 MOUNT = Mount(2.0, 1.0, 0.7)
 ORIGIN_M = (-1.74, 0.3)

@@ -13,7 +13,8 @@ from fgtrack.models.motion import CTRV
 from fgtrack.models.road import OpenSpace, Road
 from fgtrack.models.sensors import Mount, SensorModel
 from fgtrack.tracking.ego import EgoPose
-from fgtrack.tracking.preprocess import Candidate, ConnectedMerge, Merge, NoMerge, Preprocess
+from fgtrack.tracking.merge import ConnectedMerge, Merge, NoMerge
+from fgtrack.tracking.preprocess import Candidate, Preprocess
 from fgtrack.tracking.published import NeighbourhoodMerge
 
 LIDAR = SensorModel(std={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.4}, mount=Mount(2.0, 1.0, math.pi / 2))

@@ -1,0 +1,121 @@
+"""The assignment problem of candidates and tracks, solved where they are linked by pairs inside their gates."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.tracking.gating import MOST_PAIRS, Pairs
+
+_REFUSED = 1e9  # cost of a pair outside its gate: any number of good pairs is cheaper
+
+
+class Assignment(NamedTuple):
+    """Outcome of an association."""
+
+    pairs: list[tuple[int, int]]
+    """(candidate, track) as positions in the lists that were associated, candidates ascending."""
+    new: list[int]
+    """Candidates without a track, in the order of their birth."""
+    missed: list[int]
+    """Tracks without a candidate, ascending."""
+    refused: tuple[int, ...] = ()
+    """Candidates that neither belong to a track nor may start one."""
+
+
+def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:
+    """Of `pairs`, whose values are costs, as many as possible at least cost; each candidate and track once.
+
+    Those linked by pairs are a problem of their own: its size is what memory and time depend on, not that of all.
+    """
+    rows, columns = _solved(pairs, num_candidates, num_tracks)
+    order = np.argsort(rows)
+    new, missed = np.ones(num_candidates, dtype=bool), np.ones(num_tracks, dtype=bool)
+    new[rows], missed[columns] = False, False
+    return Assignment(
+        list(zip(rows[order].tolist(), columns[order].tolist(), strict=True)),
+        np.flatnonzero(new).tolist(),
+        np.flatnonzero(missed).tolist(),
+    )
+
+
+def assigned_densely(cost: FloatArray, inside: BoolArray) -> Assignment:
+    """`assigned` of all pairs `inside` their gates, both arguments of shape (candidates, tracks)."""
+    rows, columns = _least_cost(np.where(inside, cost, _REFUSED))
+    good = inside[rows, columns]
+    new, missed = np.ones(cost.shape[0], dtype=bool), np.ones(cost.shape[1], dtype=bool)
+    rows, columns = rows[good], columns[good]
+    new[rows], missed[columns] = False, False
+    return Assignment(
+        list(zip(rows.tolist(), columns.tolist(), strict=True)),
+        np.flatnonzero(new).tolist(),
+        np.flatnonzero(missed).tolist(),
+    )
+
+
+def cheapest(pairs: Pairs, numbers: IntArray) -> Pairs:
+    """Of each track the so many pairs of least cost, `numbers` of shape (tracks,); of equal ones the first candidates.
+
+    So many as there are tracks to compete for the same candidates, itself included, are enough: where a track has a
+    dearer one, one of these is free.
+    """
+    counts = np.bincount(pairs.columns, minlength=len(numbers))
+    if not (counts > numbers).any():
+        return pairs
+    order = np.lexsort((pairs.rows, pairs.values, pairs.columns))
+    columns = pairs.columns[order]
+    rank = np.arange(len(columns)) - (np.cumsum(counts) - counts)[columns]
+    return pairs.at(np.sort(order[rank < numbers[columns]]))
+
+
+def _solved(pairs: Pairs, num_candidates: int, num_tracks: int) -> tuple[IntArray, IntArray]:
+    """Candidates and tracks of the best pairs."""
+    alone = np.bincount(pairs.rows, minlength=num_candidates)[pairs.rows] == 1
+    alone &= np.bincount(pairs.columns, minlength=num_tracks)[pairs.columns] == 1
+    if alone.all():
+        return pairs.rows, pairs.columns
+    rows, columns = [pairs.rows[alone]], [pairs.columns[alone]]
+    pairs = pairs.at(~alone)
+    for part in _components(pairs, num_candidates, num_tracks):
+        here, i = np.unique(part.rows, return_inverse=True)
+        there, j = np.unique(part.columns, return_inverse=True)
+        if len(here) * len(there) > MOST_PAIRS:
+            smaller = cheapest(part, _rivals(part, num_candidates, num_tracks))
+            if len(smaller.rows) < len(part.rows):
+                found = _solved(smaller, num_candidates, num_tracks)
+                rows.append(found[0])
+                columns.append(found[1])
+                continue
+        cost = np.full((len(here), len(there)), _REFUSED)
+        inside = np.zeros(cost.shape, dtype=bool)
+        cost[i, j], inside[i, j] = part.values, True
+        first, second = _least_cost(cost)
+        good = inside[first, second]
+        rows.append(here[first[good]])
+        columns.append(there[second[good]])
+    return np.concatenate(rows), np.concatenate(columns)
+
+
+def _least_cost(cost: FloatArray) -> tuple[IntArray, IntArray]:
+    rows, columns = linear_sum_assignment(cost)
+    return np.asarray(rows), np.asarray(columns)
+
+
+def _components(pairs: Pairs, num_candidates: int, num_tracks: int) -> list[Pairs]:
+    """`pairs` in groups that share neither candidates nor tracks."""
+    count = num_candidates + num_tracks
+    graph = csr_array((np.ones(len(pairs.rows), np.int8), (pairs.rows, pairs.columns + num_candidates)), (count, count))
+    _, labels = connected_components(graph, directed=False)
+    of_pair = labels[pairs.rows]
+    order = np.argsort(of_pair, kind="stable")
+    starts = np.flatnonzero(np.diff(of_pair[order], prepend=-1))
+    return [pairs.at(part) for part in np.split(order, starts[1:])]
+
+
+def _rivals(pairs: Pairs, num_candidates: int, num_tracks: int) -> IntArray:
+    """How many tracks share a candidate with each track, itself included, shape (tracks,); 0 of one without pairs."""
+    links = csr_array((np.ones(len(pairs.rows), np.int32), (pairs.rows, pairs.columns)), (num_candidates, num_tracks))
+    return np.diff((links.T @ links).tocsr().indptr).astype(np.int64)
