@@ -79,6 +79,11 @@ class Measurement:
         return replace(self, model=measurement_model(self.model.components, motion))
 
     @property
+    def order(self) -> tuple[int, tuple[str, ...], tuple[float, ...]]:
+        """Place among measurements: by stamp, and at one stamp by content, so that arrival does not matter."""
+        return self.stamp_ns, self.model.components, tuple(self.z.tolist())
+
+    @property
     def measured(self) -> list[int] | None:
         """Places of the components that were measured; None where all of them were."""
         if not self.assumed:

@@ -138,8 +138,8 @@ class PosteriorLinearisationSmoother(WindowedFilter):
             node = _Node(measurement.stamp_ns, (), mean, covariance, predicted, (mean, covariance), None)
             place += 1
             nodes.insert(place, node)
-        found = sorted((*node.measurements, measurement), key=lambda item: (item.model.components, item.z.tolist()))
-        nodes[place] = replace(node, measurements=tuple(found), at=None)
+        found = tuple(sorted((*node.measurements, measurement), key=lambda each: each.order))
+        nodes[place] = replace(node, measurements=found, at=None)
         return nodes
 
     def _state(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:

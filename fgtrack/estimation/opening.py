@@ -218,8 +218,7 @@ class Initiated:
         """See `Estimator.update`; the innovation is that before it begins again."""
         result = self._inner.update(measurement)
         if self._nothing is not None and result.innovation is not None:
-            place = bisect.bisect_right(self._fused, _order(measurement), key=_order)
-            self._fused.insert(place, measurement.seen_by(self._nothing.motion))
+            bisect.insort(self._fused, measurement.seen_by(self._nothing.motion), key=lambda each: each.order)
             self._begin_again(self._nothing)
         return result
 
@@ -251,7 +250,3 @@ class Initiated:
         if ended:
             self._nothing = None
             self._fused.clear()
-
-
-def _order(measurement: Measurement) -> tuple[int, tuple[str, ...], tuple[float, ...]]:
-    return measurement.stamp_ns, measurement.model.components, tuple(measurement.z.tolist())
