@@ -46,9 +46,6 @@ class Estimate:
         """Whether there is an interval."""
         return math.isfinite(self.low) and math.isfinite(self.high)
 
-    def __neg__(self) -> "Estimate":
-        return Estimate(-self.mean, -self.high, -self.low, self.count)
-
     def __format__(self, spec: str) -> str:
         """The mean and in brackets the interval, each number by `spec`."""
         return f"{self.mean:{spec}} ({self.low:{spec}} to {self.high:{spec}})"

@@ -38,7 +38,7 @@ def verdict(metrics: Mapping[str, Metrics], contests: Sequence[Contest]) -> tupl
     sentences = [found for contest in contests for found in _positions(contest)]
     alone = [label for label in metrics if not any(label in contest.runs for contest in contests)]
     if len(metrics) > 1 and (len(contests) > 1 or alone):
-        sentences.append(_unpaired(metrics, contests, alone))
+        sentences.append(_unpaired(metrics, alone))
     for contest in contests:
         sentences += _noise({label: metrics[label] for label in _ranked(contest)})
     for label in alone:
@@ -86,7 +86,7 @@ def _metres(entry: Entry, what: str = "") -> str:
     return f"{amount} ({interval})" if what else f"{amount}, 95 % interval {interval}"
 
 
-def _unpaired(metrics: Mapping[str, Metrics], contests: Sequence[Contest], alone: Sequence[str]) -> str:
+def _unpaired(metrics: Mapping[str, Metrics], alone: Sequence[str]) -> str:
     without = [label for label in alone if metrics[label].truth is None]
     if len(without) == len(metrics):
         return "Without truth there are no errors to compare."

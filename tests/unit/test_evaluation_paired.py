@@ -34,7 +34,6 @@ def test_over_seeds_it_is_the_paired_t_interval() -> None:
     expected = ttest_rel(a, b).confidence_interval(0.95)
     np.testing.assert_allclose((found.mean, found.low, found.high), ((a - b).mean(), *expected), rtol=1e-12)
     assert found.count == 8
-    assert (-found).low == -found.high
 
 
 def test_pairs_with_a_missing_value_are_left_out() -> None:

@@ -23,8 +23,6 @@ from fgtrack.io.ros.bag import Bag, BagTopic, is_bag, type_name
 from fgtrack.io.source import FileFormat
 
 Convert = Callable[[RosMessage, int], Iterator[Message]]
-FromObjects = Callable[[ObjectList, int, int], Iterator[Message]]
-"""Messages of an object list, its stamp (the receipt where it has none) and its receipt."""
 
 
 @dataclass(frozen=True)
