@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from fgtrack.models.motion import MotionModel as MotionModel
     from fgtrack.models.sensors import RobustLoss as RobustLoss
     from fgtrack.models.sensors import SensorModel as SensorModel
+    from fgtrack.pipeline.close_up import close_ups as close_ups
     from fgtrack.pipeline.config import Config as Config
     from fgtrack.pipeline.live import Tracker as Tracker
     from fgtrack.pipeline.public import replay as replay

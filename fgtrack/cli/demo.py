@@ -9,6 +9,7 @@ import typer
 
 from fgtrack.cli.arguments import Overwrite
 from fgtrack.cli.compare import written_tables
+from fgtrack.cli.figure import save_close_up
 from fgtrack.cli.show import TickProgress, console, progress, say
 from fgtrack.evaluation.comparison import compare
 from fgtrack.evaluation.plot import save_figures
@@ -77,7 +78,8 @@ def demo(
                 say(f"  {sentence}")
         console().print(replace(written_tables(every), verdict=()))
         with progress("draw"), new_files(figures, overwrite) as folder:
-            files = save_figures(runs[-len(_ESTIMATORS) :], folder)
+            files, _ = save_close_up(every[-len(_ESTIMATORS) :], folder, "png")
+            files += save_figures(every[-len(_ESTIMATORS) :], folder)
         say(f"recording: {bag}\nruns: {out / 'runs'}")
         for file in files:
             say(f"figure: {figures / file.name}")

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation import innovations
+from fgtrack.evaluation.figures.close_up import close_up
 from fgtrack.evaluation.figures.errors import errors, lag
 from fgtrack.evaluation.figures.map import tracks_on_map as map  # noqa: A004  # the name that users know
 from fgtrack.evaluation.figures.residuals import residuals
@@ -20,7 +21,7 @@ from fgtrack.evaluation.figures.style import save
 from fgtrack.evaluation.figures.times import delays, sensor_delays, timing
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged
 
-__all__ = ["FIGURES", "delays", "errors", "lag", "map", "residuals", "save", "save_figures", "timing"]
+__all__ = ["FIGURES", "close_up", "delays", "errors", "lag", "map", "residuals", "save", "save_figures", "timing"]
 
 _Named = Iterator[tuple[str, Figure]]
 

@@ -230,6 +230,12 @@ def located(problem: str, origin: str) -> str:
     return line if origin in line else f"{origin}: {line}"
 
 
+def delivered(messages: Iterable[Message], config: Config) -> Iterator[Tick]:
+    """The ticks of a replay of `messages` with `config`, and what the tracker gets at each."""
+    feed = _Feed(messages, frozenset(config.ignore_sensors), lambda _: None, lambda _: None)
+    return _ticks(feed, config.clock)
+
+
 def _ticks(messages: Iterable[Delivered], clock: ClockConfig) -> Iterator[Tick]:
     if clock.ticks_file is not None:
         return listed_ticks(messages, read_ticks(Path(clock.ticks_file)))
