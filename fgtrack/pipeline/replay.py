@@ -232,7 +232,7 @@ def located(problem: str, origin: str) -> str:
 
 def delivered(messages: Iterable[Message], config: Config) -> Iterator[Tick]:
     """The ticks of a replay of `messages` with `config`, and what the tracker gets at each."""
-    feed = _Feed(messages, frozenset(config.ignore_sensors), lambda _: None, lambda _: None)
+    feed = _Feed(messages, frozenset(config.ignore_sensors), *3 * (lambda _: None,))
     return _ticks(feed, config.clock)
 
 

@@ -144,9 +144,9 @@ def _draw_fused(axes: Axes, view: _View, run: JudgedRun, one: CloseUp) -> None:
         return
     places = [one.before.at(record.stamp_ns) for record in since]
     points = view.seen(one.before.means[places, :2]).T
-    axes.plot(*points, "^", color=PALETTE[3], ms=7, label=_SINCE, zorder=4)
+    axes.plot(*points, "^", color=PALETTE[3], ms=8, label=_SINCE, zorder=5)
     if run.run.meta.get("estimator") in _FORGET:
-        axes.plot(*points, "x", color="black", ms=11, mew=1.4, label="... and forgotten by this method", zorder=4)
+        axes.plot(*points, "x", color="black", ms=14, mew=1.2, label="... and forgotten by this method", zorder=4)
 
 
 def _true_m(run: JudgedRun, one: CloseUp) -> Callable[[IntArray], FloatArray] | None:
