@@ -3,6 +3,7 @@
 import importlib.metadata
 import os
 import platform
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -162,12 +163,18 @@ def machine() -> dict[str, str]:
     }
 
 
+def short_machine(yardsticks_us: Sequence[float]) -> str:
+    """What the numbers belong to, in a line."""
+    text = ", ".join(f"{name} {value}" for name, value in machine().items())
+    if not yardsticks_us:
+        return text
+    return f"{text}; yardstick {median(yardsticks_us):.2f} us ({min(yardsticks_us):.2f} to {max(yardsticks_us):.2f})"
+
+
 def tables(results: Results) -> str:
     """All tables as Markdown."""
-    every = [row.yardstick_us for row in results.rows]
     parts = [
-        ", ".join(f"{name} {value}" for name, value in machine().items())
-        + (f"; yardstick {median(every):.2f} us ({min(every):.2f} to {max(every):.2f})" if every else ""),
+        short_machine([row.yardstick_us for row in results.rows]),
         _table(
             ["what", "measured", "required", "holds"],
             [
@@ -262,6 +269,11 @@ def draw(results: Results, path: Path) -> None:
     axes.legend(fontsize=8)
     figure.savefig(path, dpi=90, pil_kwargs={"optimize": True})
     plt.close(figure)
+
+
+def progress(line: str) -> None:
+    """Say what is being measured."""
+    print(line, file=sys.stderr, flush=True)
 
 
 def put_into(page: Path, name: str, text: str) -> None:

@@ -24,7 +24,20 @@ from typing import Annotated, Any
 import bench_estimators as single
 import numpy as np
 import typer
-from bench_report import ALL_OBJECTS, BANDED, MAIN, PAPER, SMOOTHER, Results, Row, draw, finite, put_into, tables
+from bench_report import (
+    ALL_OBJECTS,
+    BANDED,
+    MAIN,
+    PAPER,
+    SMOOTHER,
+    Results,
+    Row,
+    draw,
+    finite,
+    progress,
+    put_into,
+    tables,
+)
 from bench_tracker import PUBLISHED_MS_PER_US, Cell, Measured, measure, traffic
 
 from fgtrack.estimation.registry import ESTIMATORS
@@ -160,11 +173,6 @@ def measure_floor(objects: Iterable[int]) -> list[dict[str, float]]:
         for n in counts
         for rows in (behind, 40)
     ]
-
-
-def progress(line: str) -> None:
-    """Say what is being measured."""
-    print(line, file=sys.stderr, flush=True)
 
 
 def numbers(text: str) -> list[int]:

@@ -22,11 +22,14 @@ def compare(
         Literal["md", "csv", "latex", "json"] | None,
         typer.Option("--format", help="Print this instead of tables for a terminal."),
     ] = None,
+    streaming: Annotated[
+        bool, typer.Option("--streaming", help="Judge what was published when it was ready, too.")
+    ] = False,
 ) -> None:
     """Compare runs in tables, and write metrics.json into each."""
     if as_json and form not in (None, "json"):
         raise CallError(f"--json, --format {form}: give one of them")
-    tables = written_tables(runs)
+    tables = written_tables(runs, streaming)
     if as_json or form == "json":
         print(json.dumps(tables.to_dict(), indent=2, allow_nan=False))
     elif form is None:
@@ -35,10 +38,10 @@ def compare(
         print({"md": tables.to_markdown, "csv": tables.to_csv, "latex": tables.to_latex}[form](), end="")
 
 
-def written_tables(runs: AnyRuns) -> Tables:
+def written_tables(runs: AnyRuns, streaming: bool = False) -> Tables:
     """The tables of `runs`; the metrics of each are written into its folder."""
     every = judged(runs)
-    tables = tables_of(*every)
+    tables = tables_of(*every, streaming=streaming)
     for one in every:
         if one.run.path is not None:
             write_metrics(one.run.path, one.metrics.as_dict())

@@ -24,6 +24,9 @@ def replay(
     track_map: TrackMap = None,
     pit_map: PitMap = None,
     settings: Settings = None,
+    realtime: Annotated[
+        bool, typer.Option("--realtime", help="As fast as it was recorded: every tick waits until it is due.")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Replay a recording through the tracker."""
@@ -43,9 +46,11 @@ def replay(
             kind=source.kind,
             on_tick=TickProgress(show),
             overwrite=overwrite,
+            realtime=realtime,
         )
     for result in results:
         what = "{estimator}, {detections_received} detections, {wall_s:.1f} s, digest {digest:.12}"
-        say(f"{result.path}: {what.format_map(result.meta)}")
+        missed = f", {result.deadline_misses} deadlines missed" if result.deadline_misses else ""
+        say(f"{result.path}: {what.format_map(result.meta)}{missed}")
     if results[0].broken is not None:  # the others break off at the same place
         raise DataError(f"{located(results[0].broken, str(recording))}; replayed up to there")

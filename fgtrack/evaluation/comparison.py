@@ -16,6 +16,7 @@ from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics, ObjectMetrics
 from fgtrack.evaluation.multi_object import MultiObjectMetrics
 from fgtrack.evaluation.runs import OneRun, judged
 from fgtrack.evaluation.statistics import ChiSquareMean
+from fgtrack.evaluation.streaming import with_streaming
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
 from fgtrack.evaluation.verdict import verdict
 
@@ -50,12 +51,13 @@ class _Row(Generic[T]):
     """What distinguishes it from the other rows of the run."""
 
 
-def compare(*runs: OneRun | Iterable[OneRun]) -> Tables:
+def compare(*runs: OneRun | Iterable[OneRun], streaming: bool = False) -> Tables:
     """Metrics of `runs` in comparison: the `verdict`, and tables `differences`, `tracking`, `multi_object`, `lag`,
     `consistency`, `dispositions` and `residuals_SENSOR` of every sensor.
 
     Runs of the same recording are compared sample by sample. A path is a run folder, or a folder that holds run
-    folders.
+    folders. With `streaming` a table of that name judges what was published when it was ready, and the verdict says who
+    is best then.
 
     Raises
     ------
@@ -67,7 +69,8 @@ def compare(*runs: OneRun | Iterable[OneRun]) -> Tables:
     every = judged(runs)
     if not every:
         raise CallError("compare: no run is given, name at least one")
-    return comparison({one.label: one.metrics for one in every}, contests(every))
+    tables = comparison({one.label: one.metrics for one in every}, contests(every))
+    return with_streaming(tables, every) if streaming else tables
 
 
 def comparison(metrics: Mapping[str, Metrics], found: Sequence[Contest] = ()) -> Tables:
@@ -136,6 +139,12 @@ def _tracking(rows: Sequence[_Row[Metrics]], notes: Sequence[str]) -> Table:
         ),
     ]
     own = [f"{CONFIRMED_MEASUREMENTS}+: tracks with at least {CONFIRMED_MEASUREMENTS} measurements"]
+    known = [row for row in rows if row.of.deadlines.are_known]
+    if known:
+        late = [
+            f"{row.run} {row.of.deadlines.misses}/{row.of.deadlines.ticks}" for row in known if row.of.deadlines.misses
+        ]
+        own.append(f"deadlines missed (ticks not done when the next one was due): {', '.join(late) or 'none'}")
     if with_truth:
         own += [
             "tracked: share of the ticks at which some sensor could see the object",

@@ -68,6 +68,11 @@ class _Row:
 
 def contests(runs: Sequence[JudgedRun]) -> list[Contest]:
     """A contest for every recording of which there are several runs; runs without truth take no part."""
+    return [_contest(group) for group in by_recording(runs) if len(group) > 1]
+
+
+def by_recording(runs: Sequence[JudgedRun]) -> list[list[JudgedRun]]:
+    """The runs with truth, those of the same recording together."""
     groups: list[list[JudgedRun]] = []
     for one in runs:
         if one.matching is not None:
@@ -76,7 +81,7 @@ def contests(runs: Sequence[JudgedRun]) -> list[Contest]:
                 groups.append([one])
             else:
                 group.append(one)
-    return [_contest(group) for group in groups if len(group) > 1]
+    return groups
 
 
 def differences(found: Sequence[Contest]) -> Table:
@@ -143,7 +148,7 @@ def _contest(group: Sequence[JudgedRun]) -> Contest:
         labels,
         samples=len(common),
         most_samples=max(map(len, codes)),
-        quantities=tuple(_quantity(name, labels, ticks) for name, ticks in sums.items() if ticks[:, -1].any()),
+        quantities=tuple(quantity(name, labels, ticks) for name, ticks in sums.items() if ticks[:, -1].any()),
     )
 
 
@@ -188,7 +193,7 @@ def _gospa_sums(group: Sequence[JudgedRun]) -> FloatArray | None:
     return np.stack([*columns, np.ones(len(common_ns))], axis=-1)
 
 
-def _quantity(name: str, labels: Sequence[str], ticks: FloatArray) -> Quantity:
+def quantity(name: str, labels: Sequence[str], ticks: FloatArray) -> Quantity:
     """The runs by rising cost, and how much worse than the best they are.
 
     `ticks` has a column of sums for each run and one of counts, shape (n, runs + 1).

@@ -11,6 +11,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, Disposition, IntArray
 from fgtrack.evaluation.consistency import Consistency, consistency
 from fgtrack.evaluation.continuity import late_switches, times_to_confirm
+from fgtrack.evaluation.deadlines import Deadlines
 from fgtrack.evaluation.innovations import ANGULAR, RESIDUAL_NAMES, message_delays, num_measured, residuals
 from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, ERROR_NAMES, Matching, match, track_errors
@@ -130,6 +131,7 @@ class Metrics:
     time_per_detection_s: float
     """Wall time of these ticks per detection received; NaN without any."""
     consistency: Consistency
+    deadlines: Deadlines
     truth: TruthMetrics | None = field(default=None)
     """None for a run without truth."""
     lagged: tuple[LagMetrics, ...] = ()
@@ -180,6 +182,7 @@ def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationCon
         time_per_tick_s=Distribution.of(time_s),
         time_per_detection_s=float(time_s.sum() / detections.sum()) if len(time_s) else math.nan,
         consistency=consistency(run, matching),
+        deadlines=Deadlines.of(run),
         truth=None if matching is None else _truth_metrics(run, matching, options),
         lagged=lag_metrics(run, matching),
         multi_object=multi_object_metrics(run, matching, options),

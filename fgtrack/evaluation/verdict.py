@@ -53,7 +53,12 @@ def _positions(contest: Contest) -> Iterator[str]:
     if quantity is None:
         yield f"{_listed(contest.runs)} never track the same object at the same stamp: there is nothing to pair."
         return
-    best, *others = quantity.entries
+    yield who_is_best(quantity.entries, "at the newest stamp")
+
+
+def who_is_best(entries: Sequence[Entry], when: str) -> str:
+    """A sentence on a position RMSE: who is best or ties `when`, and how much worse the others are."""
+    best, *others = entries
     ties = [entry for entry in others if entry.standing == "tie"]
     worse = [entry for entry in others if entry.standing == "worse"]
     value = f"position RMSE {short(best.value)} m"
@@ -61,10 +66,10 @@ def _positions(contest: Contest) -> Iterator[str]:
         last = ties[-1]
         difference = f"{'difference' if len(ties) == 1 else 'largest difference'} {_metres(last)}"
         names = _listed([best.name, *(one.name for one in ties)])
-        first = f"{names} tie at the newest stamp ({value}, {difference})"
+        first = f"{names} tie {when} ({value}, {difference})"
     else:
-        first = f"{best.name} is best at the newest stamp ({value})"
-    yield f"{first}{'; ' if worse else ''}{_worse(worse)}."
+        first = f"{best.name} is best {when} ({value})"
+    return f"{first}{'; ' if worse else ''}{_worse(worse)}."
 
 
 def _worse(entries: Sequence[Entry]) -> str:

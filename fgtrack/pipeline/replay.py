@@ -2,7 +2,6 @@
 
 import importlib.metadata
 import platform
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -10,13 +9,14 @@ from functools import cache
 from pathlib import Path
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.time import seconds
+from fgtrack.core.time import NS_PER_S, period_ns, seconds
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
-from fgtrack.io.run import MemoryRun, Run, RunWriter
+from fgtrack.io.run import MemoryRun, Node, Run, RunWriter
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, Tick, listed_ticks, message_ticks, node_ticks, read_ticks
 from fgtrack.pipeline.config import ClockConfig, Config
 from fgtrack.pipeline.load import dump
+from fgtrack.pipeline.pace import Clock, Pace, WallClock
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
 _LARGEST_STEP_BACK_S = 1.0
@@ -32,6 +32,8 @@ class ReplayResult:
     meta: dict[str, object]
     broken: str | None
     """Why the input broke off, where it did; the run holds everything before."""
+    deadline_misses: int | None = None
+    """Ticks that were not done when the next one was due; None where every message ticks."""
 
 
 @dataclass
@@ -153,7 +155,7 @@ def replay_in_memory(
     """
     tracker = build_tracker(config, observed)
     memory = MemoryRun(*_opening(config, origin, kind))
-    _, broken = _drive(tracker, messages, config, memory, origin=origin)
+    _, broken, _ = _drive(tracker, messages, config, memory, origin=origin)
     return memory.run, broken
 
 
@@ -164,17 +166,27 @@ def _drive(
     writer: RunWriter | MemoryRun,
     on_tick: Callable[[int, int], None] | None = None,
     origin: str = "",
-) -> tuple[dict[str, object], str | None]:
-    """Run `tracker` over `messages` into `writer`; gives the finished meta and why the input broke off."""
-    started = time.perf_counter()
+    clock: Clock | None = None,
+    realtime: bool = False,
+) -> tuple[dict[str, object], str | None, int | None]:
+    """Run `tracker` over `messages` into `writer`; gives meta, why the input broke off, and missed deadlines.
+
+    Only here the wall clock is read: the ticks are those of the recording, however long they take.
+    """
+    clock = clock or WallClock()
+    started_ns, pace = clock.now_ns(), Pace(clock)
+    node = Node(None if config.clock.node_hz is None else period_ns(config.clock.node_hz))
     ignored = frozenset(config.ignore_sensors)
     feed = _Feed(messages, ignored, writer.write_truth, writer.write_ego, writer.write_detections)
     for tick in _ticks(feed, config.clock):
-        before_ns = time.perf_counter_ns()
+        if realtime:
+            pace.wait_for(tick.now_ns)
+        before_ns = clock.now_ns()
         for message in tick.messages:
             tracker.receive(message)
         report = tracker.tick(tick.now_ns)
-        process_ns = time.perf_counter_ns() - before_ns
+        process_ns = clock.now_ns() - before_ns
+        node.done_ns(tick.now_ns, process_ns)
         num_detections = sum(len(one.objects) for one in tick.messages if isinstance(one, DetectionList))
         writer.write_tick(report, process_ns, num_detections)
         if on_tick is not None:
@@ -183,13 +195,13 @@ def _drive(
         raise DataError(located(feed.broken, origin))
     writer.write_smoothed(tracker.finish())
     meta = {
-        "wall_s": time.perf_counter() - started,
+        "wall_s": (clock.now_ns() - started_ns) / NS_PER_S,
         "detections_received": feed.received_detections,
         "detections_ignored": feed.ignored_detections,
         "ego_refused": dict(tracker.refused_ego),
         "broken_off": feed.broken,
     }
-    return writer.finish(meta), feed.broken
+    return writer.finish(meta), feed.broken, None if node.period_ns is None else node.misses
 
 
 def _opening(config: Config, origin: str, kind: str) -> tuple[str, dict[str, object], float | None]:
@@ -208,8 +220,12 @@ def replay_each(
     kind: str = "",
     on_tick: Callable[[int, int], None] | None = None,
     overwrite: bool = False,
+    realtime: bool = False,
 ) -> list[ReplayResult]:
-    """A `replay` for every estimator of `folders` into its folder; all are built and claimed before the first one."""
+    """A `replay` for every estimator of `folders` into its folder; all are built and claimed before the first one.
+
+    In real time each tick waits until it is due; the runs are the same.
+    """
     results = []
     with ExitStack() as claims:
         runs = []
@@ -219,8 +235,8 @@ def replay_each(
             writer = RunWriter(folder, *_opening(chosen, origin, kind), overwrite)
             runs.append((chosen, tracker, claims.enter_context(writer)))
         for chosen, tracker, writer in runs:
-            finished, broken = _drive(tracker, messages(), chosen, writer, on_tick, origin)
-            results.append(ReplayResult(writer.path, finished, broken))
+            finished = _drive(tracker, messages(), chosen, writer, on_tick, origin, realtime=realtime)
+            results.append(ReplayResult(writer.path, *finished))
     return results
 
 

@@ -1,6 +1,7 @@
 """The command line in-process: exit codes, one line for every error, and the chain from scenario to figure."""
 
 import json
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -150,6 +151,26 @@ def test_runs_are_compared_as_tables_and_as_json(fgtrack: Command, runs: dict[st
         assert (told.code, told.err) == (0, "")
         assert start in told.out
         assert told.out.startswith({"md": "- The configured noise", "latex": "% The configured noise"}.get(form, start))
+
+
+def test_streaming_is_compared_when_it_is_asked_for(fgtrack: Command, runs: dict[str, Path]) -> None:
+    plain, told = (fgtrack("compare", runs["mcap"], "--json", *more) for more in ((), ("--streaming",)))
+    assert (told.code, told.err) == (0, "")
+    tables = json.loads(told.out)["tables"]
+    assert [row["judged"] for row in tables["streaming"]] == ["asked", "ready", "predicted"]
+    assert tables["load"][0]["load"] > 0.0
+    assert "streaming" not in json.loads(plain.out)["tables"]
+
+
+def test_a_replay_in_real_time_takes_as_long_and_gives_the_same(
+    fgtrack: Command, recordings: dict[str, Path], runs: dict[str, Path]
+) -> None:
+    began_s = time.monotonic()
+    assert fgtrack("replay", recordings["mcap"], "-c", "smoother", "--realtime", "-o", "paced").code == 0
+    timing = load_run("paced").timing["now_ns"]
+    assert time.monotonic() - began_s >= (timing[-1] - timing[0]) / 1e9
+    assert fgtrack("replay", recordings["mcap"], "-c", "smoother", "-o", "fast").code == 0
+    assert load_run("paced").meta["digest"] == load_run("fast").meta["digest"]
 
 
 def test_info_tells_topics_and_delays(fgtrack: Command, recordings: dict[str, Path]) -> None:

@@ -9,6 +9,7 @@ sys.path.insert(0, str(EXPERIMENTS))
 import bench_estimators
 import bench_report
 import bench_speed
+import bench_streaming
 import bench_tracker
 
 CHECKOUT = EXPERIMENTS.parent
@@ -105,3 +106,22 @@ def test_the_floor_has_the_rows_behind_a_late_detection_and_a_whole_window() -> 
     found = bench_speed.measure_floor([1])
     assert [one["rows"] for one in found] == [3, 40]
     assert all(one["lapack_us"] > 0.0 and one["gtsam_us"] > 0.0 for one in found)
+
+
+def test_the_streaming_table_has_both_streams_and_every_method(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("<!-- begin streaming -->\n<!-- end streaming -->\n")
+    bench_streaming.main(
+        tmp_path, duration_s=2.5, objects=3, rounds=2, methods="ekf-replay,ekf-backward-forward", page=page
+    )
+    text = (tmp_path / "streaming.md").read_text()
+    assert capsys.readouterr().out == text
+    assert text in page.read_text()
+    for title in ("the demo", "3 objects"):
+        rows = text[text.index(f"| {title} |") :].splitlines()[2:4]
+        assert [row.split("|")[1].strip() for row in rows] == ["ekf-replay", "ekf-backward-forward"]
+        asked_m, ready_m = ([float(row.split("|")[k].split()[0]) for row in rows] for k in (2, 3))
+        assert max(asked_m) < 2.0
+        assert asked_m != ready_m

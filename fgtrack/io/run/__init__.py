@@ -4,6 +4,7 @@ from fgtrack.io.run.judging import EvaluationConfig, evaluation_config
 from fgtrack.io.run.memory import MemoryRun
 from fgtrack.io.run.reader import NO_TRACK, Run, Table, load_run
 from fgtrack.io.run.schema import COLUMNS, COVARIANCE_COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
+from fgtrack.io.run.timing import Node, ready_times
 from fgtrack.io.run.writer import RUN, RunWriter, digest, is_run_folder, write_metrics
 
 __all__ = [
@@ -12,6 +13,7 @@ __all__ = [
     "EvaluationConfig",
     "MemoryRun",
     "NO_TRACK",
+    "Node",
     "OPTIONAL_TABLES",
     "RUN",
     "RUN_FORMAT",
@@ -22,5 +24,6 @@ __all__ = [
     "evaluation_config",
     "is_run_folder",
     "load_run",
+    "ready_times",
     "write_metrics",
 ]

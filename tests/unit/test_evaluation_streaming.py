@@ -1,0 +1,126 @@
+"""Runs judged when they were ready, by timings made by hand."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluation_runs import ROUND, WEST, write_run
+
+from fgtrack.evaluation.comparison import compare
+from fgtrack.evaluation.deadlines import Deadlines
+from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.streaming import ASKED, PREDICTED, READY, streamed
+from fgtrack.evaluation.tables import Table
+from fgtrack.io.run import Run
+
+MS = 1_000_000
+TICKS = range(60)
+AT_50_HZ = "clock: {node_hz: 50.0}\n"
+
+
+def made(path: Path, times_ms: Sequence[int], config: str = AT_50_HZ, **errors: float) -> Run:
+    """A run of a car that drives straight on at 20 m/s; every tick takes its time, the last ones are repeated."""
+    tracks = [[WEST.track(tick, 1, **errors)] for tick in TICKS]
+    truth = WEST.truth(range(-1, len(TICKS) + 40))
+    took_ns = [times_ms[min(tick, len(times_ms) - 1)] * MS for tick in TICKS]
+    return write_run(path, tracks, truth=truth, config_text=config, process_ns=took_ns)
+
+
+def rmse(tables: dict[str, Table], judged: str) -> dict[str, float]:
+    table = tables["streaming"]
+    mine = table["judged"] == judged
+    return dict(zip(table["run"][mine].tolist(), table["position_rmse_m"][mine].tolist(), strict=True))
+
+
+def test_what_took_30_ms_is_judged_30_ms_later(tmp_path: Path) -> None:
+    found = streamed(JudgedRun("a", made(tmp_path / "run", [30, 0])))
+    assert found.errors_m[ASKED] == pytest.approx(0.0, abs=1e-6)
+    assert found.errors_m[READY][:3].tolist() == pytest.approx([20.0 * 0.03, 20.0 * 0.01, 0.0], abs=1e-6)
+
+
+def test_a_tick_that_takes_longer_than_the_period_makes_the_next_ones_late(tmp_path: Path) -> None:
+    found = streamed(JudgedRun("a", made(tmp_path / "run", [50, 10, 10, 0])))
+    later_s = np.array([0.05, 0.04, 0.03, 0.01, 0.0])
+    assert found.errors_m[READY][:5].tolist() == pytest.approx((20.0 * later_s).tolist(), abs=1e-6)
+
+
+def test_a_user_who_predicts_pays_for_what_its_speed_does_not_tell(tmp_path: Path) -> None:
+    straight = streamed(JudgedRun("a", made(tmp_path / "run", [10], speed_mps=3.0)))
+    assert straight.errors_m[READY] == pytest.approx(0.2, abs=1e-6)
+    assert straight.errors_m[PREDICTED] == pytest.approx(0.03, abs=1e-6)
+    truth = ROUND.truth(range(-1, 100))
+    tracks = [[ROUND.track(tick, 1)] for tick in TICKS]
+    run = write_run(tmp_path / "round", tracks, truth=truth, process_ns=[19 * MS] * len(TICKS))
+    turning = streamed(JudgedRun("b", run))
+    expected_m = 0.5 * 30.0 * 0.5 * 0.019**2  # half of v omega t^2
+    assert turning.errors_m[PREDICTED] == pytest.approx(expected_m, rel=0.05)
+
+
+def test_a_track_without_yaw_and_speed_stays_where_it_was_published(tmp_path: Path) -> None:
+    run = made(tmp_path / "run", [10], yaw_rad=np.nan, speed_mps=np.nan)
+    found = streamed(JudgedRun("a", run))
+    np.testing.assert_array_equal(found.errors_m[PREDICTED], found.errors_m[READY])
+
+
+def test_what_is_ready_after_the_truth_has_ended_is_not_judged_of_any_run(tmp_path: Path) -> None:
+    truth = WEST.truth(TICKS)
+    tracks = [[WEST.track(tick, 1)] for tick in TICKS]
+    runs = [
+        write_run(tmp_path / name, tracks, truth=truth, config_text=AT_50_HZ, process_ns=[took * MS] * len(TICKS))
+        for name, took in (("fast", 1), ("slow", 30))
+    ]
+    tables = compare(*runs, streaming=True)
+    assert rmse(tables, ASKED)["fast (smoother)"] == pytest.approx(0.0, abs=1e-6)
+    judged = [tick for tick in TICKS if 30 * (tick + 1) <= 20 * TICKS[-1]]
+    later_s = np.array([0.03 + 0.01 * tick for tick in judged])
+    assert rmse(tables, READY)["slow (smoother)"] == pytest.approx(20.0 * np.sqrt(np.mean(later_s**2)), rel=1e-6)
+    assert any(f"{len(judged) / len(TICKS):.0%} of the samples" in note for note in tables["streaming"].notes)
+
+
+def test_a_slow_method_loses_what_it_wins_by_being_exact(tmp_path: Path) -> None:
+    exact = made(tmp_path / "exact", [15], across_m=0.1)
+    rough = made(tmp_path / "rough", [1], across_m=0.2)
+    tables = compare(exact, rough, streaming=True)
+    assert "exact (smoother) is best at the newest stamp" in tables.verdict[0]
+    assert "rough (smoother) is best where each is judged when it is ready" in tables.verdict[-2]
+    assert "exact (smoother) is best where users also predict" in tables.verdict[-1]
+    assert rmse(tables, READY) == pytest.approx(
+        {"rough (smoother)": np.hypot(0.2, 0.02), "exact (smoother)": np.hypot(0.1, 0.3)}, rel=1e-6
+    )
+    load = tables["load"]
+    assert load["ready_after_p50_s"].tolist() == pytest.approx([0.015, 0.001])
+
+
+def test_without_truth_there_is_the_load_alone(tmp_path: Path) -> None:
+    tables = compare(write_run(tmp_path / "run", [[WEST.track(0, 1)]], process_ns=[MS]), streaming=True)
+    assert tables["streaming"].num_rows == 0
+    assert tables["load"].num_rows == 1
+
+
+def test_streaming_is_asked_for(tmp_path: Path) -> None:
+    assert "streaming" not in compare(made(tmp_path / "run", [1]))
+
+
+def test_deadlines_and_load_come_from_the_times_and_the_node_period(tmp_path: Path) -> None:
+    found = Deadlines.of(made(tmp_path / "run", [50, 10, 10, 0]))
+    assert (found.period_s, found.ticks, found.misses) == (0.02, 60, 3)
+    line = "deadlines missed (ticks not done when the next one was due): "
+    missing, keeping = made(tmp_path / "late", [50, 10, 10, 0]), made(tmp_path / "timely", [1])
+    assert f"{line}late (smoother) 3/60" in compare(missing, keeping)["tracking"].notes
+    assert f"{line}none" in compare(keeping)["tracking"].notes
+    assert found.load == pytest.approx(0.07 / (59 * 0.02))
+    assert found.latest_s == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("config", ["", "clock: {node_hz: null}\n"])
+def test_without_a_period_there_are_no_deadlines(config: str, tmp_path: Path) -> None:
+    run = made(tmp_path / "run", [50], config)
+    assert not Deadlines.of(run).are_known
+    assert not any("deadlines" in note for note in compare(run)["tracking"].notes)
+
+
+def test_a_run_without_ticks_has_no_load(tmp_path: Path) -> None:
+    found = Deadlines.of(write_run(tmp_path / "run"))
+    assert (found.ticks, found.misses) == (0, 0)
+    assert np.isnan([found.load, found.latest_s]).all()
