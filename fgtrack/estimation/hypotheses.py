@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.linalg import congruence, mahalanobis_squared, symmetrise
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation import starts
-from fgtrack.estimation.base import Estimator, Measurement, Smoother, Start, UpdateResult
+from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateResult
 from fgtrack.estimation.ekf import linearised
 from fgtrack.models.motion import MotionModel
 
@@ -22,16 +21,13 @@ LEAST_WEIGHT = 1e-4
 SAME = 1.0
 
 
-Kind = TypeVar("Kind", bound=Estimator)
-
-
 @dataclass(slots=True)
-class _Hypothesis(Generic[Kind]):
-    estimator: Kind
+class _Hypothesis:
+    estimator: Estimator
     log_weight: float
 
 
-class Hypotheses(Generic[Kind]):
+class Hypotheses:
     """An `Estimator` that runs one for each of several starts, weighs them by the likelihood of their innovations, and
     drops those that have become unlikely, until one is left.
 
@@ -48,7 +44,7 @@ class Hypotheses(Generic[Kind]):
         One for each hypothesis, all equally likely. Raises `CallError` for none.
     """
 
-    def __init__(self, motion: MotionModel, estimators: Sequence[Kind]) -> None:
+    def __init__(self, motion: MotionModel, estimators: Sequence[Estimator]) -> None:
         if not estimators:
             raise CallError("hypotheses: give at least one start")
         self._motion = motion
@@ -60,12 +56,12 @@ class Hypotheses(Generic[Kind]):
         return self.best.window_ns
 
     @property
-    def best(self) -> Kind:
+    def best(self) -> Estimator:
         """That of the likeliest hypothesis; the first one of several."""
         return max(self._alive, key=lambda each: each.log_weight).estimator
 
     @property
-    def estimators(self) -> list[Kind]:
+    def estimators(self) -> list[Estimator]:
         """Those of the hypotheses that are left."""
         return [each.estimator for each in self._alive]
 
@@ -85,7 +81,7 @@ class Hypotheses(Generic[Kind]):
         """See `Estimator.update`; the innovation is that of the hypothesis that was the likeliest before."""
         if len(self._alive) == 1:
             return self.best.update(measurement)
-        best, fused, found = self.best, list[_Hypothesis[Kind]](), dict[int, UpdateResult]()
+        best, fused, found = self.best, list[_Hypothesis](), dict[int, UpdateResult]()
         for each in self._alive:
             expected = self._expected(each.estimator, measurement)
             result = found[id(each.estimator)] = each.estimator.update(measurement)
@@ -127,7 +123,7 @@ class Hypotheses(Generic[Kind]):
     def _prune(self) -> None:
         """Drop what has become unlikely, and the less likely of two that have become the same."""
         best = max(each.log_weight for each in self._alive)
-        left: list[_Hypothesis[Kind]] = []
+        left: list[_Hypothesis] = []
         at_ns = self._alive[0].estimator.window_ns[1]
         for each in sorted(self._alive, key=lambda each: -each.log_weight):
             if each.log_weight < best + math.log(LEAST_WEIGHT):
@@ -149,22 +145,6 @@ class Hypotheses(Generic[Kind]):
         return off
 
 
-class SmootherHypotheses(Hypotheses[Smoother]):
-    """`Hypotheses` of smoothers: what has left the window is that of the likeliest one, each stamp once."""
-
-    def take_final(self) -> list[TrackState]:
-        """See `Smoother.take_final`."""
-        best = self.best
-        for other in self.estimators:
-            if other is not best:
-                other.take_final()
-        return best.take_final()
-
-    def take_rest(self) -> list[TrackState]:
-        """See `Smoother.take_rest`."""
-        return self.best.take_rest()
-
-
 Wanted = int | Sequence[Start]
 """Several starts, or a number of headings."""
 
@@ -177,14 +157,6 @@ def hypotheses(motion: MotionModel, start: Start, wanted: Wanted, make: Callable
     """
     given = _given(motion, start, wanted)
     return make(start) if given is None else Hypotheses(motion, [make(each) for each in given])
-
-
-def smoother_hypotheses(
-    motion: MotionModel, start: Start, wanted: Wanted, make: Callable[[Start], Smoother]
-) -> Smoother:
-    """`hypotheses` of smoothers."""
-    given = _given(motion, start, wanted)
-    return make(start) if given is None else SmootherHypotheses(motion, [make(each) for each in given])
 
 
 def _given(motion: MotionModel, start: Start, wanted: Wanted) -> Sequence[Start] | None:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 from fgtrack.core.errors import CallError
 from fgtrack.core.plugins import Registry
 from fgtrack.estimation.base import Estimator, Smoother, Start, TrackBank
-from fgtrack.estimation.hypotheses import Wanted, hypotheses
+from fgtrack.estimation.hypotheses import hypotheses
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.opening import initiated
@@ -152,28 +152,22 @@ def start_estimator(
             return OneObject(motion, _made(name, factory, motion, lag_s, **own), start)
         return _checked(name, _made(name, factory, motion, start, lag_s, **own))
 
-    return hypotheses(motion, start, wanted, plain) if claims.initiates else begun(motion, start, plain, method, wanted)
+    def made(start: Start) -> Estimator:
+        return plain(start) if claims.initiates else initiated(motion, start, method, plain)
 
-
-def begun(
-    motion: MotionModel, start: Start, make: Callable[[Start], Estimator], method: str, wanted: Wanted
-) -> Estimator:
-    """What `make` gives, which knows nothing of `initiation` and `hypotheses`, with both of them."""
-    return hypotheses(motion, start, wanted, lambda each: initiated(motion, each, method, make))
+    return hypotheses(motion, start, wanted, made)
 
 
 def estimator_bank(
     name: str, motion: MotionModel, lag_s: float, options: Mapping[str, Any], lagged_s: Sequence[float] = ()
 ) -> TrackBank:
-    """The estimators `name` of all objects; raises as `estimator`. One that is a bank itself takes no `initiation`
-    and no `hypotheses`.
+    """The estimators `name` of all objects; raises as `estimator`. One that is a bank itself takes no `initiation`.
 
     Of one that hands out smoothed states, `lagged_s` says at which lags behind the present.
     """
     factory = ESTIMATORS.load(name)
     claims = Claims.of(factory)
-    common = {"hypotheses"} if claims.initiates else {"hypotheses", "initiation"}
-    own = {key: options[key] for key in options if key not in common}
+    own = {key: options[key] for key in options if claims.initiates or key != "initiation"}
     if claims.bank:
         bank: TrackBank = _made(name, factory, motion, lag_s, **own)
         return bank
@@ -184,7 +178,7 @@ def estimator_bank(
             smoother: Smoother = _made(name, factory, motion, start, lag_s, **own)
             return smoother
 
-        return SmoothingBank(motion, one, lag_s, lagged_s, options.get("hypotheses", 1))
+        return SmoothingBank(motion, one, lag_s, lagged_s)
     return ObjectBank(motion, lambda start: start_estimator(name, factory, motion, start, lag_s, options), lag_s)
 
 

@@ -7,7 +7,6 @@ import numpy as np
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import Smoother, Start
-from fgtrack.estimation.hypotheses import Wanted, smoother_hypotheses
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.models.motion import MotionModel
@@ -22,8 +21,6 @@ class SmoothingBank(ObjectBank):
         See `ObjectBank`.
     lagged_s
         Lags of the lagged output.
-    wanted
-        See `hypotheses`.
     """
 
     def __init__(
@@ -32,17 +29,16 @@ class SmoothingBank(ObjectBank):
         start: Callable[[Start], Smoother],
         lag_s: float,
         lagged_s: Sequence[float],
-        wanted: Wanted = 1,
     ) -> None:
         super().__init__(motion, start, lag_s)
         self._smoothers: dict[int, Smoother] = {}
-        self._start_smoother, self._wanted = start, wanted
+        self._start_smoother = start
         self._lagged_s = tuple(lagged_s)
         self._ended: list[SmoothedReport] = []
 
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
-        smoother = smoother_hypotheses(self._motion, prior, self._wanted, self._start_smoother)
+        smoother = self._start_smoother(prior)
         self._smoothers[track_id] = self._estimators[track_id] = smoother
 
     def remove(self, track_id: int) -> None:

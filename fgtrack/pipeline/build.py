@@ -12,6 +12,7 @@ from fgtrack.estimation.banded.bank import BandedBank
 from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.factor_graph import BatchBackend, IncrementalBackend, SmootherBank
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
+from fgtrack.estimation.opening import initiated
 from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator, Propagator
 from fgtrack.estimation.published import (
     AcceleratedEulerCtrv,
@@ -21,7 +22,7 @@ from fgtrack.estimation.published import (
     SaturatedEulerCtrv,
     StalePresent,
 )
-from fgtrack.estimation.registry import ESTIMATORS, Claims, begun, estimator_bank
+from fgtrack.estimation.registry import ESTIMATORS, Claims, estimator_bank
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.published_map import CircularHeadingMap, PublishedMap
 from fgtrack.models.road import MappedRoad, OpenSpace, Road
@@ -116,21 +117,17 @@ def _build_backward_forward(config: Config) -> TrackBank:
     motion = config.motion_model()  # without a map a track may begin in any direction, each at its own time
 
     def one(start: Start) -> Estimator:
-        return begun(motion, start, lambda each: OneObject(motion, bank(), each), *_beginning(config))
+        return initiated(motion, start, config.initiation.method, lambda each: OneObject(motion, bank(), each))
 
     return ObjectBank(motion, one, config.filter.storage_s)
 
 
 def _build_incremental(config: Config) -> TrackBank:
-    return SmootherBank(config.motion_model(), config.smoother, IncrementalBackend, *_beginning(config))
+    return SmootherBank(config.motion_model(), config.smoother, IncrementalBackend, config.initiation.method)
 
 
 def _build_batch(config: Config) -> TrackBank:
-    return SmootherBank(config.motion_model(), config.smoother, BatchBackend, *_beginning(config))
-
-
-def _beginning(config: Config) -> tuple[str, int]:
-    return config.initiation.method, config.initiation.hypotheses
+    return SmootherBank(config.motion_model(), config.smoother, BatchBackend, config.initiation.method)
 
 
 def _build_banded(config: Config) -> TrackBank:
@@ -150,7 +147,7 @@ def build_bank(config: Config) -> TrackBank:
     """The estimators of all objects. Raises `CallError` for options that the estimator does not take."""
     build, options = _BANKS.get(config.estimator), config.options.get(config.estimator, {})
     if build is None:
-        options = {"initiation": config.initiation.method, "hypotheses": config.initiation.hypotheses, **options}
+        options = {"initiation": config.initiation.method, **options}
         reports = Claims.of(ESTIMATORS.load(config.estimator)).reports
         lag_s = config.smoother.lag_s if reports else config.filter.storage_s
         return estimator_bank(config.estimator, config.motion_model(), lag_s, options, config.smoother.lagged_s)

@@ -170,9 +170,6 @@ class InitiationConfig:
     method: Initiation = DEFAULT
     """`one-point`: at the first position, heading along x; `two-point`: along the first two; `regression`: along a line
     through the first ones, until its direction is certain."""
-    hypotheses: Annotated[int, Field(ge=1, le=64)] = 1
-    """So many headings around the circle, each an estimator of its own, until one is left; 1 for none. With several,
-    `method` has nothing to do. Until then a track costs as many times as much."""
 
 
 _PAPER_STD_PER_S = MappingProxyType({"position": 0.2, "yaw": 0.3, "speed": 1.0, "yaw_rate": 0.5})

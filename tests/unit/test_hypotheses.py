@@ -18,8 +18,6 @@ from fgtrack.estimation.hypotheses import Hypotheses
 from fgtrack.estimation.registry import ESTIMATORS, Claims, start_estimator
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRV, CV, MotionModel
-from fgtrack.pipeline.build import build_bank
-from fgtrack.pipeline.config import Config, InitiationConfig, MotionConfig
 
 MS = 1_000_000
 STD = {"x_m": 0.5, "y_m": 0.5}
@@ -190,23 +188,3 @@ def test_circles_that_do_not_meet_touch() -> None:
     assert 4.0 < found[0].position_m[0] < 5.0
     with pytest.raises(fgtrack.CallError, match="two sensor positions are the same"):
         starts.intersections(START, [(1.0, 2.0), (1.0, 2.0)], [4.0, 5.0], 0.3)
-
-
-@pytest.mark.parametrize("name", ["ekf-replay", "smoother", "ekf-backward-forward"])
-def test_the_configuration_says_it_for_all_tracks(name: str) -> None:
-    config = Config(estimator=name, motion=MotionConfig(kind="ctrv"), initiation=InitiationConfig(hypotheses=6))
-    bank = build_bank(config)
-    bank.birth(1, START)
-    finals = 0
-    for k in range(1, 41):
-        bank.advance(50 * k * MS)
-        bank.update(50 * k * MS, [1], [at(50 * k, -0.6 * k, 0.4 * k)])
-        finals += sum(report.lag_s is None for report in bank.smoothed())
-        if k == 3:
-            one = fgtrack.estimator(name, config.motion.model(), START, lag_s=3.5, hypotheses=6)
-            for j in range(1, 4):
-                one.update(at(50 * j, -0.6 * j, 0.4 * j))
-            np.testing.assert_allclose(bank.states_at(150 * MS).means[0], one.state_at(150 * MS).mean, atol=1e-6)
-    bank.remove(1)
-    finals += sum(report.lag_s is None for report in bank.smoothed())
-    assert finals == (41 if name == "smoother" else 0)  # each stamp once, and the start

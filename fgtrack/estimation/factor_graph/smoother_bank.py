@@ -24,8 +24,6 @@ class SmootherBank(SmoothingBank):
         The motion model of all smoothers.
     settings, make_backend, initiation
         See `FixedLagSmoother`.
-    num_headings
-        See `hypotheses`.
     """
 
     def __init__(
@@ -34,13 +32,12 @@ class SmootherBank(SmoothingBank):
         settings: SmootherSettings,
         make_backend: Callable[[FloatArray], Backend] = IncrementalBackend,
         initiation: str = DEFAULT,
-        num_headings: int = 1,
     ) -> None:
         def one(prior: Start) -> FixedLagSmoother:
             return FixedLagSmoother(motion, prior, settings, make_backend, initiation)
 
         lag_s = settings.lag_s + (settings.ring_s if settings.late == "fuse" else 0.0)
-        super().__init__(motion, one, lag_s, settings.lagged_s, num_headings)
+        super().__init__(motion, one, lag_s, settings.lagged_s)
         self._settings = settings
 
     @property
