@@ -74,19 +74,3 @@ def inverse_roots(S: FloatArray) -> FloatArray:
     for i in range(1, n):
         W[..., i : i + 1, :i] = (L[..., i : i + 1, :i] @ W[..., :i, :i]) * -pivots[..., i, None, None]
     return W
-
-
-def eliminated(S: FloatArray, rhs: FloatArray) -> FloatArray:
-    """S^-1 `rhs` of stacks of very small symmetric positive definite matrices S (m, k, k), rhs (m, k, l).
-
-    By Gauss and Jordan's elimination without pivoting, column by column over the whole stack: for a few matrices and up
-    to about three rows at a third of the time of `psd_solve`. Where S is not positive definite, what it gives is not
-    finite, or wrong.
-    """
-    k = S.shape[-1]
-    table = np.concatenate([S, rhs], axis=-1)
-    for pivot in range(k):
-        row = table[..., pivot, None, pivot:] / table[..., pivot, None, pivot, None]
-        table[..., pivot:] -= table[..., pivot, None] * row
-        table[..., pivot, None, pivot:] = row
-    return table[..., k:]

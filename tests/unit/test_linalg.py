@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from fgtrack.core.linalg import eliminated, inverse_roots
+from fgtrack.core.linalg import inverse_roots
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (7, 2, 2), (50, 5, 5), (3, 4, 6, 6)])
@@ -18,15 +18,3 @@ def test_a_stack_with_one_matrix_that_is_not_positive_definite_has_no_inverse_ro
     S = np.array([np.eye(2), -np.eye(2)])
     with pytest.raises(np.linalg.LinAlgError):
         inverse_roots(S)
-
-
-@pytest.mark.parametrize("shape", [(1, 1, 1), (7, 2, 2), (50, 3, 3), (2, 6, 6)])
-def test_elimination_solves_a_stack_of_systems(shape: tuple[int, ...]) -> None:
-    rng = np.random.default_rng(shape[-1])
-    A = rng.normal(size=shape)
-    S = A @ A.mT + 0.1 * np.eye(shape[-1])
-    rhs = rng.normal(size=(*shape[:-1], 4))
-    kept = S.copy(), rhs.copy()
-    np.testing.assert_allclose(eliminated(S, rhs), np.linalg.solve(S, rhs), rtol=1e-9, atol=1e-9)
-    np.testing.assert_array_equal(S, kept[0])
-    np.testing.assert_array_equal(rhs, kept[1])

@@ -5,14 +5,13 @@ the gain and the covariance of the Rauch-Tung-Striebel smoother. No process nois
 stamps 1 us apart.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 
-from fgtrack.core.linalg import eliminated, identity, inverse_roots, symmetrise
+from fgtrack.core.linalg import congruence, identity, inverse_roots, symmetrise
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.banded.nodes import Nodes
 from fgtrack.estimation.banded.steps import Steps, forwards
+from fgtrack.estimation.ekf import joseph, kalman_gain
 
 #: Where a measurement leaves less than this of a variance, the short form of its update keeps too few digits.
 _LEAST_SHARE = 1e-6
@@ -33,23 +32,24 @@ def eliminate(nodes: Nodes, tracks: IntArray, places: IntArray) -> None:
     segment = nodes.segment.take(befores, axis=0)
     F, driven = segment[..., :n], segment[..., n:]  # the noise and the mean that F does not make
     driven[..., n] -= nodes.origin.take(numbers, axis=0)
-    if not inner.all():  # the prior of the oldest node in the window, which follows from nothing
+    all_inner = bool(inner.all())
+    if not all_inner:  # the prior of the oldest node in the window, which follows from nothing
         oldest = ~inner
         F[oldest], driven[oldest] = 0.0, nodes.predicted[numbers[oldest]]
     rows = nodes.rows.take(numbers, axis=0)[:, : int(nodes.num_rows.take(numbers).max())]
-    chosen = steps.order
-    start = nodes.filtered[nodes.at(tracks[chosen], np.maximum(places[chosen] - 1, 0))]
-
-    left, moved, predicted, filtered = _filtered(steps, start, F, driven.copy(), rows, _corrected)
-    shares = _variances(filtered) < _LEAST_SHARE * _variances(predicted)
-    if shares.any():
-        left, moved, predicted, filtered = _filtered(steps, start, F, driven.copy(), rows, _corrected_joseph)
+    begins = nodes.at(tracks[steps.order], np.maximum(places[steps.order] - 1, 0))
+    left, filtered = _filtered(steps, nodes.filtered.take(begins, axis=0), F, driven, rows)
+    moved = F @ left
+    predicted = driven + moved @ _beside_one(F).mT
+    if (_variances(filtered) < _LEAST_SHARE * _variances(predicted)).any():
+        left, predicted, filtered = _filtered_joseph(steps, nodes.filtered.take(begins, axis=0), F, driven, rows)
+        moved = F @ left
     if not np.isfinite(filtered).all():
         raise np.linalg.LinAlgError("a state is not finite")
-    for values in (predicted, filtered):
-        values[..., :n] = symmetrise(values[..., :n])
+    _symmetrise(predicted)
+    _symmetrise(filtered)
     nodes.predicted[numbers], nodes.filtered[numbers] = predicted, filtered
-    if not inner.all():
+    if not all_inner:
         befores, F, left, moved = befores[inner], F[inner], left[inner], moved[inner]
         predicted, segment = predicted[inner], segment[inner]
     if len(befores):
@@ -60,52 +60,73 @@ def _variances(states: FloatArray) -> FloatArray:
     return np.diagonal(states, axis1=-2, axis2=-1)
 
 
-def _filtered(
-    steps: Steps,
-    start: FloatArray,
-    F: FloatArray,
-    driven: FloatArray,
-    rows: FloatArray,
-    correct: Callable[[FloatArray, FloatArray], FloatArray],
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """States [P | x] before each step, F times them, predicted (in the place of `driven`), and corrected."""
+def _symmetrise(states: FloatArray) -> None:
+    states[..., :-1] = symmetrise(states[..., :-1])
+
+
+def _beside_one(F: FloatArray) -> FloatArray:
+    """[[F, 0], [0, 1]]."""
     n = F.shape[-1]
-    left, moved, filtered = (np.empty(driven.shape) for _ in range(3))
-    state = start.copy()
-    measured = rows.shape[1] > 0
+    larger = np.zeros((len(F), n + 1, n + 1))
+    larger[:, :n, :n], larger[:, n, n] = F, 1.0
+    return larger
+
+
+def _filtered(
+    steps: Steps, start: FloatArray, F: FloatArray, driven: FloatArray, rows: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """States [P | x] before each step and after it.
+
+    What is measured, G x - y, stands above the state in one vector with one joint covariance, [[S, G P], [P G', P]].
+    Gaussian elimination of its first entries leaves P - P G' S^-1 G P, and the mean.
+    """
+    n, k = F.shape[-1], rows.shape[-2]
+    both = np.empty((len(F), k + n, n))
+    both[:, :k], both[:, k:] = rows[..., :n], identity(n)
+    joint = np.empty((len(F), k + n, k + n + 1))
+    np.matmul(both @ driven[..., :n], both.mT, out=joint[..., :-1])
+    joint[:, range(k), range(k)] += 1.0
+    joint[..., -1] = np.matvec(both, driven[..., n])
+    joint[:, :k, -1] -= rows[..., n]
+    along = both @ F
+    across = along.mT
+    state, left = start, np.empty(driven.shape)
     for begin, end in steps.slices():
         at, m = slice(begin, end), end - begin
         before = left[at] = state[:m]
-        F_at, predicted = F[at], driven[at]
-        along = np.matmul(F_at, before, out=moved[at])
-        predicted[..., :n] += along[..., :n] @ F_at.mT
-        predicted[..., n] += along[..., n]
-        state[:m] = filtered[at] = correct(predicted, rows[at]) if measured else predicted
-    return left, moved, driven, filtered
+        moved, table = along[at] @ before, joint[at]
+        table[..., :-1] += moved[..., :n] @ across[at]
+        table[..., -1] += moved[..., n]
+        for pivot in range(k):
+            after = pivot + 1
+            row = table[:, pivot, after:] / table[:, pivot, pivot, None]
+            table[:, after:, after:] -= table[:, after:, pivot, None] * row[:, None]
+        state[:m] = table[:, k:, k:]
+    return left, joint[:, k:, k:]
 
 
-def _corrected(state: FloatArray, rows: FloatArray) -> FloatArray:
-    """States [P | x] after measurements [G | y] with noise I: P - P G' S^-1 G P with S = G P G' + I, and the mean."""
-    n = state.shape[-2]
-    G = rows[..., :n]
-    seen = G @ state
-    seen[..., n] -= rows[..., n]
-    S = seen[..., :n] @ G.mT
-    S += identity(S.shape[-1])
-    return np.asarray(state - seen[..., :n].mT @ eliminated(S, seen))
+def _filtered_joseph(
+    steps: Steps, start: FloatArray, F: FloatArray, driven: FloatArray, rows: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """`_filtered` in Joseph's form, which keeps all digits of what precise measurements leave of a vague state.
 
-
-def _corrected_joseph(state: FloatArray, rows: FloatArray) -> FloatArray:
-    """`_corrected` in Joseph's form, which keeps all digits of what a precise measurement leaves of a vague state."""
-    n = state.shape[-2]
-    G = rows[..., :n]
-    seen = G @ state[..., :n]
-    K = eliminated(symmetrise(seen @ G.mT) + identity(G.shape[-2]), seen).mT
-    E = identity(n) - K @ G
-    after = np.empty(state.shape)
-    after[..., :n] = E @ state[..., :n] @ E.mT + K @ K.mT
-    after[..., n] = state[..., n] + np.matvec(K, rows[..., n] - np.matvec(G, state[..., n]))
-    return after
+    Gives the predicted states as well.
+    """
+    n = F.shape[-1]
+    left, predicted, filtered = (np.empty(driven.shape) for _ in range(3))
+    state = start
+    for begin, end in steps.slices():
+        at, m = slice(begin, end), end - begin
+        F_at, G, y = F[at], rows[at, :, :n], rows[at, :, n]
+        before = left[at] = state[:m]
+        P = symmetrise(congruence(F_at, before[..., :n]) + driven[at, :, :n])
+        x = np.matvec(F_at, before[..., n]) + driven[at, :, n]
+        predicted[at, :, :n], predicted[at, :, n] = P, x
+        K, _ = kalman_gain(P, G, identity(G.shape[-2]))
+        state[:m, :, :n] = joseph(P, K, G, identity(G.shape[-2]))
+        state[:m, :, n] = x + np.matvec(K, y - np.matvec(G, x))
+        filtered[at] = state[:m]
+    return left, predicted, filtered
 
 
 def _conditionals(
