@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,13 +10,43 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
 from fgtrack.estimation.banded.whitening import Innovations, innovations
-from fgtrack.estimation.banded.windows import States, Windows
+from fgtrack.estimation.banded.windows import Leaving, States, Windows
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
 from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
+
+_TOO_OLD, _FAILED = UpdateResult(UpdateStatus.TOO_OLD), UpdateResult(UpdateStatus.FAILED)
+
+
+class _Times(NamedTuple):
+    """Stamps of m tracks, each of shape (m,)."""
+
+    newest: IntArray
+    """Of the newest nodes."""
+    start: IntArray
+    """Where the windows start, by the clock and the newest stamps."""
+    reach: IntArray
+    """The oldest that may be fused."""
+    oldest: IntArray
+    """The oldest that can be fused or asked for."""
+
+    def at(self, rows: IntArray) -> "_Times":
+        """Those of some tracks."""
+        return _Times(*(values[rows] for values in self))
+
+
+def _joined(parts: Sequence[Leaving]) -> Leaving:
+    """All of `parts`, one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    tracks, stamps_ns, states = zip(*parts, strict=True)
+    means, covariances = zip(*states, strict=True)
+    return Leaving(
+        np.concatenate(tracks), np.concatenate(stamps_ns), States(np.concatenate(means), np.concatenate(covariances))
+    )
 
 
 class BandedBank:
@@ -43,6 +74,9 @@ class BandedBank:
         self.windows = Windows(motion, settings)
         self._numbers: dict[int, int] = {}
         """Where the arrays hold each track, in order of birth."""
+        self._track_ids: tuple[int, ...] = ()
+        self._tracks: IntArray = np.zeros(0, dtype=np.int64)
+        """Both in order of birth."""
         self._free: list[int] = []
         self._now_ns = 0
         self._clock_ns: IntArray = np.zeros(0, dtype=np.int64)
@@ -50,9 +84,9 @@ class BandedBank:
         self._initiation = checked_initiation(initiation)
         self._searches: dict[int, Search] = {}
         """Of the tracks whose direction is sought."""
-        self._states: dict[int, tuple[tuple[int, ...], dict[int, int], States]] = {}
-        """States by stamp, and the row of each track in them."""
-        self._final: dict[int, list[TrackState]] = {}
+        self._states: dict[int, tuple[tuple[int, ...], IntArray, States]] = {}
+        """The tracks that are known at a stamp, where the arrays hold them, and their states."""
+        self._final: list[Leaving] = []
         self._ended: list[SmoothedReport] = []
 
     # --- what a `TrackBank` says
@@ -74,7 +108,7 @@ class BandedBank:
     @property
     def track_ids(self) -> tuple[int, ...]:
         """See `TrackBank.track_ids`."""
-        return tuple(self._numbers)
+        return self._track_ids
 
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
@@ -102,32 +136,22 @@ class BandedBank:
             return []
         tracks = np.array([self._numbers[track_id] for track_id in track_ids])
         measurements = [measurement.seen_by(self._motion) for measurement in measurements]
-        start_ns, newest_ns = self._start_ns(tracks), self.windows.newest_ns(tracks)
-        if self._settings.late == "raise" and (stamp_ns < start_ns).any():
+        times = self._times_ns(tracks)
+        if self._settings.late == "raise" and (stamp_ns < times.start).any():
             raise DataError(
-                f"a measurement at {stamp_ns} ns is {seconds(int(start_ns.max()) - stamp_ns):g} s older than the "
+                f"a measurement at {stamp_ns} ns is {seconds(int(times.start.max()) - stamp_ns):g} s older than the "
                 "window: lengthen smoother.lag_s, or set smoother.late to fuse or drop"
             )
-        results = [UpdateResult(UpdateStatus.TOO_OLD)] * len(tracks)
-        young = np.flatnonzero(self._window_start_ns(tracks) <= stamp_ns)
-        if not young.size:
-            return results
-        for row in young.tolist():
-            results[row] = UpdateResult(UpdateStatus.FAILED)
-        states = self._states_of(tracks[young], stamp_ns)
-        groups = list(innovations([measurements[row] for row in young.tolist()], *states))
-        groups = [group.at(np.isfinite(group.nis)) for group in groups]
-        for group in groups:
-            rows = young[group.positions].tolist()
-            for row, y, nis in zip(rows, group.y, group.nis.tolist(), strict=True):
-                status = UpdateStatus.OUT_OF_SEQUENCE if stamp_ns < newest_ns[row] else UpdateStatus.IN_SEQUENCE
-                status = UpdateStatus.BEYOND_WINDOW if stamp_ns < start_ns[row] else status
-                results[row] = UpdateResult(status, y, nis)
-        failed = self._fuse(
-            stamp_ns, tracks[young], [measurements[row] for row in young.tolist()], groups, states.means
-        )
-        for position in failed:
-            results[young[position]] = UpdateResult(UpdateStatus.FAILED)
+        young = times.oldest <= stamp_ns
+        if young.all():
+            return self._update(stamp_ns, tracks, measurements, times)
+        results = [_TOO_OLD] * len(tracks)
+        rows = young.nonzero()[0]
+        if rows.size:
+            chosen = [measurements[row] for row in rows.tolist()]
+            updated = self._update(stamp_ns, tracks[rows], chosen, times.at(rows))
+            for row, result in zip(rows.tolist(), updated, strict=True):
+                results[row] = result
         return results
 
     def birth(self, track_id: int, prior: Start) -> None:
@@ -142,21 +166,23 @@ class BandedBank:
         if search is not None:
             self._searches[track] = search
         self._numbers[track_id] = track
-        self._states.clear()
+        self._renumbered()
 
     def remove(self, track_id: int) -> None:
         """See `TrackBank.remove`; what was still inside the window becomes final."""
         rest = self.take_rest(track_id)
-        self._ended += self._reports([track_id] * len(rest), rest)
+        if rest:
+            states = States(np.array([state.mean for state in rest]), np.array([state.covariance for state in rest]))
+            self._ended += self._reported([track_id] * len(rest), [state.stamp_ns for state in rest], states)
         self._free.append(self._numbers.pop(track_id))
-        self._states.clear()
+        self._renumbered()
 
     def present(self) -> list[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
         if not self._numbers:
             return []
-        tracks = self._tracks()
-        states = self.windows.states_at(tracks, np.maximum(self._now_ns, self._window_start_ns(tracks)))
+        tracks = self._tracks
+        states = self.windows.states_at(tracks, np.maximum(self._now_ns, self._times_ns(tracks).oldest))
         means, covariances = self._motion.kinematic(*states)
         means = wrapped_yaw(means)
         return [TrackState(self._now_ns, m, P) for m, P in zip(means, covariances, strict=True)]
@@ -164,13 +190,20 @@ class BandedBank:
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`."""
         reports, self._ended = self._ended, []
-        final = [(track_id, state) for track_id in self._numbers for state in self._final.pop(track_id, ())]
-        reports += self._reports([track_id for track_id, _ in final], [state for _, state in final])
+        if self._final:
+            final, self._final = _joined(self._final), []
+            ranks = np.empty(len(self._clock_ns), dtype=np.int64)
+            ranks[self._tracks] = np.arange(len(self._tracks))
+            ranks = ranks[final.tracks]
+            order = ranks.argsort(kind="stable")
+            track_ids = [self._track_ids[rank] for rank in ranks[order].tolist()]
+            states = States(final.states.means[order], final.states.covariances[order])
+            reports += self._reported(track_ids, final.stamps_ns[order].tolist(), states)
         for lag_s in self._settings.lagged_s:
             stamp_ns = self.present_ns - nanoseconds(lag_s)
-            track_ids, _, states = self._known_at(stamp_ns)
-            if track_ids:
-                reports += self._reported(track_ids, [stamp_ns] * len(track_ids), states, lag_s)
+            known, _, states = self._known_at(stamp_ns)
+            if known:
+                reports += self._reported(known, [stamp_ns] * len(known), states, lag_s)
         return reports
 
     # --- one track
@@ -178,7 +211,7 @@ class BandedBank:
     def window_ns(self, track_id: int) -> tuple[int, int]:
         """See `Estimator.window_ns`."""
         tracks = np.array([self._numbers[track_id]])
-        return int(self._window_start_ns(tracks)[0]), int(self.windows.newest_ns(tracks)[0])
+        return int(self._times_ns(tracks).oldest[0]), int(self.windows.newest_ns(tracks)[0])
 
     def state_at(self, track_id: int, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`."""
@@ -187,7 +220,13 @@ class BandedBank:
 
     def take_final(self, track_id: int) -> list[TrackState]:
         """Smoothed states of the nodes that have left the window since the last call, in order."""
-        return self._final.pop(track_id, [])
+        if not self._final:
+            return []
+        final = _joined(self._final)
+        mine = final.tracks == self._numbers[track_id]
+        self._final = [final.at(~mine)]
+        own = final.at(mine)
+        return [TrackState(*state) for state in zip(own.stamps_ns.tolist(), *own.states, strict=True)]
 
     def take_rest(self, track_id: int) -> list[TrackState]:
         """Like `take_final`, and of the nodes that are still inside."""
@@ -203,6 +242,29 @@ class BandedBank:
 
     # --- inside
 
+    def _update(
+        self, stamp_ns: int, tracks: IntArray, measurements: Sequence[Measurement], times: "_Times"
+    ) -> list[UpdateResult]:
+        """`update` of tracks that reach as far back as `stamp_ns`."""
+        results = [_FAILED] * len(tracks)
+        status = UpdateStatus.IN_SEQUENCE
+        statuses = [status] * len(tracks)
+        for late, status in (
+            (stamp_ns < times.newest, UpdateStatus.OUT_OF_SEQUENCE),
+            (stamp_ns < times.start, UpdateStatus.BEYOND_WINDOW),
+        ):
+            for row in late.nonzero()[0].tolist():
+                statuses[row] = status
+        states = self._states_of(tracks, stamp_ns)
+        groups = list(innovations(measurements, *states))
+        groups = [group.at(np.isfinite(group.nis)) for group in groups]
+        for group in groups:
+            for row, y, nis in zip(group.positions.tolist(), group.y, group.nis.tolist(), strict=True):
+                results[row] = UpdateResult(statuses[row], y, nis)
+        for row in self._fuse(stamp_ns, tracks, measurements, groups, states.means, times):
+            results[row] = _FAILED
+        return results
+
     def _fuse(
         self,
         stamp_ns: int,
@@ -210,41 +272,37 @@ class BandedBank:
         measurements: Sequence[Measurement],
         groups: Sequence[Innovations],
         guesses: FloatArray,
+        times: "_Times",
     ) -> list[int]:
         """Fuse those of `measurements` that are in `groups`; gives the positions of those that cannot be."""
         positions = np.sort(np.concatenate([group.positions for group in groups]))
         if not positions.size:
             return []
-        chosen = tracks[positions]
+        everyone = tracks, measurements, groups, guesses, times
+        if len(positions) < len(tracks):
+            tracks, guesses, times = tracks[positions], guesses[positions], times.at(positions)
+            measurements = [measurements[position] for position in positions.tolist()]
+            groups = [group.numbered(positions) for group in groups]
         self._states.clear()
         try:
-            left = self.windows.fuse(
-                chosen,
-                stamp_ns,
-                [measurements[position] for position in positions.tolist()],
-                [group.numbered(positions) for group in groups],
-                guesses[positions],
-                self._start_ns(chosen),
-                self._reach_ns(chosen),
-            )
+            left = self.windows.fuse(tracks, stamp_ns, measurements, groups, guesses, times.start, times.reach)
         except np.linalg.LinAlgError:
             if len(positions) == 1:
                 return [int(positions[0])]
+            tracks, measurements, groups, guesses, times = everyone
             singles = [group.at(group.positions == position) for position in positions for group in groups]
             return [
                 failed
                 for single in singles
                 if single.positions.size
-                for failed in self._fuse(stamp_ns, tracks, measurements, [single], guesses)
+                for failed in self._fuse(stamp_ns, tracks, measurements, [single], guesses, times)
             ]
-        by_number = {number: track_id for track_id, number in self._numbers.items()} if left.tracks.size else {}
-        for number, at_ns, mean, covariance in zip(
-            left.tracks.tolist(), left.stamps_ns.tolist(), *left.states, strict=True
-        ):
-            self._final.setdefault(by_number[number], []).append(TrackState(at_ns, mean, covariance))
-        for track in self._searches.keys() & set(chosen.tolist()):
-            self._initiate(track, stamp_ns)
-        self.windows.iterate(chosen, self._settings.max_iterations - 1)
+        if left.tracks.size:
+            self._final.append(left)
+        if self._searches:
+            for track in self._searches.keys() & set(tracks.tolist()):
+                self._initiate(track, stamp_ns)
+        self.windows.iterate(tracks, self._settings.max_iterations - 1)
         return []
 
     def _initiate(self, track: int, oldest_ns: int) -> None:
@@ -259,48 +317,40 @@ class BandedBank:
             self.windows.restart(track, line)
             self.windows.iterate(np.array([track]), SMOOTHER_ITERATIONS)
 
-    def _tracks(self) -> IntArray:
-        return np.fromiter(self._numbers.values(), dtype=np.int64, count=len(self._numbers))
+    def _renumbered(self) -> None:
+        self._track_ids = tuple(self._numbers)
+        self._tracks = np.fromiter(self._numbers.values(), dtype=np.int64, count=len(self._numbers))
+        self._states.clear()
 
-    def _start_ns(self, tracks: IntArray) -> IntArray:
-        """Starts of the windows, by the clock and the newest stamps."""
-        newest_ns = np.maximum(self._clock_ns[tracks], self.windows.newest_ns(tracks))
-        return np.asarray(np.maximum(newest_ns - self._lag_ns, self._first_ns[tracks]))
+    def _times_ns(self, tracks: IntArray) -> "_Times":
+        newest, first = self.windows.newest_ns(tracks), self._first_ns[tracks]
+        start = np.maximum(np.maximum(self._clock_ns[tracks], newest) - self._lag_ns, first)
+        reach = np.maximum(start - self._behind_ns, first)
+        return _Times(newest, start, reach, np.maximum(reach, self.windows.oldest_ns(tracks)))
 
-    def _reach_ns(self, tracks: IntArray) -> IntArray:
-        """Oldest stamps that may be fused."""
-        return np.asarray(np.maximum(self._start_ns(tracks) - self._behind_ns, self._first_ns[tracks]))
-
-    def _window_start_ns(self, tracks: IntArray) -> IntArray:
-        return np.asarray(np.maximum(self._reach_ns(tracks), self.windows.oldest_ns(tracks)))
-
-    def _known_at(self, stamp_ns: int) -> tuple[tuple[int, ...], dict[int, int], States]:
+    def _known_at(self, stamp_ns: int) -> tuple[tuple[int, ...], IntArray, States]:
         """States at `stamp_ns` of the tracks that are known there."""
         found = self._states.get(stamp_ns)
         if found is None:
-            tracks = self._tracks()
-            known = self._window_start_ns(tracks) <= stamp_ns
-            track_ids = tuple(i for i, inside in zip(self._numbers, known.tolist(), strict=True) if inside)
-            tracks = tracks[known]
+            track_ids, tracks = self._track_ids, self._tracks
+            known = self._times_ns(tracks).oldest <= stamp_ns
+            if not known.all():
+                track_ids, tracks = tuple(track_ids[row] for row in known.nonzero()[0].tolist()), tracks[known]
             states = self.windows.states_at(tracks, np.full(len(tracks), stamp_ns))
-            rows = {track: row for row, track in enumerate(tracks.tolist())}
-            found = self._states[stamp_ns] = track_ids, rows, states
+            found = self._states[stamp_ns] = track_ids, tracks, states
         return found
 
     def _states_of(self, tracks: IntArray, stamp_ns: int) -> States:
         found = self._states.get(stamp_ns)
         if found is None:
             return self.windows.states_at(tracks, np.full(len(tracks), stamp_ns))
-        _, rows, states = found
-        chosen = [rows[track] for track in tracks.tolist()]
+        _, known, states = found
+        if len(known) == len(tracks) and (known == tracks).all():
+            return states
+        rows = np.empty(len(self._clock_ns), dtype=np.int64)
+        rows[known] = np.arange(len(known))
+        chosen = rows[tracks]
         return States(states.means[chosen], states.covariances[chosen])
-
-    def _reports(self, track_ids: Sequence[int], states: Sequence[TrackState]) -> list[SmoothedReport]:
-        """Final states, one of each of `track_ids`."""
-        if not states:
-            return []
-        stack = States(np.array([state.mean for state in states]), np.array([state.covariance for state in states]))
-        return self._reported(track_ids, [state.stamp_ns for state in states], stack)
 
     def _reported(
         self, track_ids: Sequence[int], stamps_ns: Sequence[int], states: States, lag_s: float | None = None

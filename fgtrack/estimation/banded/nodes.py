@@ -87,6 +87,16 @@ class Nodes:
             return np.asarray((self.stamps_ns[tracks] <= stamps_ns[:, None]).sum(axis=1) - 1)
         return np.asarray(places)
 
+    def last_before(self, tracks: IntArray, places: IntArray, stamps_ns: IntArray) -> IntArray:
+        """`place_before`, or the nodes at `places` where these are later; step by step from there."""
+        last = self.stamps_ns.shape[1] - 1
+        while True:
+            after = np.minimum(places + 1, last)
+            later = (self.stamps_ns[tracks, after] <= stamps_ns) & (after > places)
+            if not later.any():
+                return places
+            places = places + later
+
     def begin(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
         """The first node of a new track."""
         while track >= len(self.first):
@@ -106,8 +116,8 @@ class Nodes:
         if place >= self.stamps_ns.shape[1]:
             self._grow_nodes()
 
-    def insert(self, tracks: IntArray, places: IntArray, stamps_ns: IntArray, origins: FloatArray) -> IntArray:
-        """New nodes at `places`, one for each of `tracks`; those from there on move up. Gives their numbers."""
+    def insert(self, tracks: IntArray, places: IntArray, stamp_ns: int, origins: FloatArray) -> None:
+        """New nodes at `places`, one for each of `tracks`; those from there on move up."""
         count = self.count[tracks]
         last = int(count.max())
         self.reserve(last)
@@ -120,12 +130,11 @@ class Nodes:
             for name in self._ORDER:
                 values = getattr(self, name)
                 values[tracks[:, None], columns] = values[tracks[:, None], source]
-        self.stamps_ns[tracks, places] = stamps_ns
+        self.stamps_ns[tracks, places] = stamp_ns
         self.numbers[tracks, places] = numbers
         self.count[tracks] = count + 1
         self._empty(numbers)
         self.origin[numbers] = origins
-        return numbers
 
     def drop(self, tracks: IntArray, numbers: IntArray) -> None:
         """Forget the oldest `numbers` nodes of each of `tracks`."""
@@ -149,13 +158,18 @@ class Nodes:
             self.rows[numbers, :k] = rows
         self.num_rows[numbers] = used + k
 
-    def snapshot(self, tracks: IntArray) -> tuple[IntArray, ...]:
-        """The order of the nodes of `tracks`, for `restore`."""
-        return tuple(getattr(self, name)[tracks] for name in (*self._ORDER, *self._TRACKS))
+    def snapshot(self, tracks: IntArray, low: int) -> tuple[IntArray, ...]:
+        """The order of the nodes of `tracks` from the place `low` on, for `restore`."""
+        columns = np.arange(low, int(self.count[tracks].max()) + 1)
+        order = (getattr(self, name)[tracks[:, None], columns] for name in self._ORDER)
+        return (columns, *order, *(getattr(self, name)[tracks] for name in self._TRACKS))
 
     def restore(self, tracks: IntArray, saved: Sequence[IntArray]) -> None:
         """Go back to the order of `snapshot`; the values of nodes that were new are lost."""
-        for name, values in zip((*self._ORDER, *self._TRACKS), saved, strict=True):
+        columns, *saved = saved
+        for name, values in zip(self._ORDER, saved, strict=False):
+            getattr(self, name)[tracks[:, None], columns] = values
+        for name, values in zip(self._TRACKS, saved[len(self._ORDER) :], strict=True):
             getattr(self, name)[tracks] = values
 
     def _empty(self, numbers: IntArray) -> None:

@@ -163,25 +163,25 @@ class Blocks:
         self._substitute(tracks, np.maximum(places, solid))
         numbers = nodes.at(tracks, np.maximum(places, solid))
         steps, covariances = nodes.step[numbers], nodes.P[numbers]
-        deep = np.flatnonzero(places < solid)
+        deep = (places < solid).nonzero()[0]
         if not deep.size:
             return steps, covariances
         tracks, places, base, ends = tracks[deep], places[deep], self._base[tracks[deep]], solid[deep]
         step, P = steps[deep], covariances[deep]
         while True:  # from end to end
-            further = np.flatnonzero((places <= ends - _LONG) & (ends > base))
+            further = ((places <= ends - _LONG) & (ends > base)).nonzero()[0]
             if not further.size:
                 break
             ends[further] -= _LONG
             at = nodes.at(tracks[further], ends[further])
             step[further], P[further] = _given(nodes.leap[at], nodes.leap_C[at], step[further], P[further])
-        inside = np.flatnonzero((places < ends) & (ends > base))
+        inside = ((places < ends) & (ends > base)).nonzero()[0]
         if inside.size:
             at = nodes.at(tracks[inside], places[inside])
             step[inside], P[inside] = _given(nodes.leap[at], nodes.leap_C[at], step[inside], P[inside])
             ends[inside] = places[inside]
         while True:  # behind the blocks node by node
-            behind = np.flatnonzero(places < ends)
+            behind = (places < ends).nonzero()[0]
             if not behind.size:
                 break
             ends[behind] -= 1

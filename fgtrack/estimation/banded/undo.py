@@ -9,23 +9,24 @@ from fgtrack.estimation.banded.nodes import Nodes
 class Undo:
     """What an update changes of the nodes of some tracks, but for what is made anew from it."""
 
-    def __init__(self, nodes: Nodes, tracks: IntArray) -> None:
+    def __init__(self, nodes: Nodes, tracks: IntArray, low: int) -> None:
+        """Before an update that changes the order from the place `low` on."""
         self._nodes, self._tracks = nodes, tracks
         nodes.reserve(int(nodes.count[tracks].max()))
-        self._order = nodes.snapshot(tracks)
+        self._order = nodes.snapshot(tracks, low)
         self.first = nodes.first[tracks]
-        self._oldest = nodes.at(tracks, self.first)
-        self._behind = nodes.at(tracks, np.maximum(self.first - 1, 0))
-        self._predicted = nodes.predicted[self._oldest, :, -1]
-        self._b_behind = nodes.back[self._behind, :, -1]
-        self._moved: tuple[IntArray, FloatArray] | None = None
+        self._moved: tuple[IntArray, FloatArray, FloatArray] | None = None
+        self._behind: tuple[IntArray, FloatArray] | None = None
         self._rings: list[tuple[IntArray, FloatArray, FloatArray]] = []
         self.added: list[int] = []
         """Nodes to which a term was added."""
 
-    def keep_origins(self, numbers: IntArray) -> None:
-        """These linearisation points will move."""
-        self._moved = numbers, self._nodes.origin[numbers]
+    def keep_origins(self, tracks: IntArray, numbers: IntArray) -> None:
+        """The linearisation points of these nodes will move, and what is relative to them."""
+        nodes = self._nodes
+        behind = nodes.at(tracks, np.maximum(nodes.first[tracks] - 1, 0))
+        self._moved = numbers, nodes.origin[numbers], nodes.predicted[numbers, :, -1]
+        self._behind = behind, nodes.back[behind, :, -1]
 
     def keep_ring(self, track: int) -> None:
         """What is behind the window of `track` will change."""
@@ -39,9 +40,8 @@ class Undo:
         nodes.restore(self._tracks, self._order)
         for numbers, back, C in self._rings:
             nodes.back[numbers], nodes.C[numbers] = back, C
-        if self._moved is not None:
-            numbers, origins = self._moved
-            nodes.origin[numbers] = origins
-        nodes.predicted[self._oldest, :, -1], nodes.back[self._behind, :, -1] = self._predicted, self._b_behind
+        if self._moved is not None and self._behind is not None:
+            numbers, nodes.origin[numbers], nodes.predicted[numbers, :, -1] = self._moved
+            numbers, nodes.back[numbers, :, -1] = self._behind
         for number in self.added:
             nodes.terms[number].pop()

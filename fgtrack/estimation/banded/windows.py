@@ -47,6 +47,11 @@ class Leaving(NamedTuple):
     """Shape (m,)."""
     states: States
 
+    def at(self, chosen: BoolArray) -> "Leaving":
+        """Those that are `chosen`, shape (m,)."""
+        states = States(self.states.means[chosen], self.states.covariances[chosen])
+        return Leaving(self.tracks[chosen], self.stamps_ns[chosen], states)
+
 
 class Windows:
     """Windows of many tracks, each by its number.
@@ -100,12 +105,14 @@ class Windows:
         known = places + between
         steps, covariances = self._blocks.smoothed(tracks, known)
         means = nodes.origin[nodes.at(tracks, known)] + steps
-        inner = np.flatnonzero(between)
+        inner = between.nonzero()[0]
+        if inner.size == len(tracks):
+            return self._between(tracks, known, stamps_ns, steps, means, covariances)
         if inner.size:
             means[inner], covariances[inner] = self._between(
                 tracks[inner], known[inner], stamps_ns[inner], steps[inner], means[inner], covariances[inner]
             )
-        ahead = np.flatnonzero((until_ns > 0) & ~between)
+        ahead = ((until_ns > 0) & ~between).nonzero()[0]
         if ahead.size:
             means[ahead], F, Q = self._motion.steps(means[ahead], until_ns[ahead] / NS_PER_S)
             covariances[ahead] = propagated(F, covariances[ahead], Q)
@@ -152,22 +159,24 @@ class Windows:
         """
         nodes = self.nodes
         guesses = self._bend(tracks, stamp_ns, measurements, guesses)
-        anchors = np.maximum(nodes.place_before(tracks, start_ns), nodes.first[tracks])
+        anchors = nodes.last_before(tracks, nodes.first[tracks], start_ns)
         left = self._leaving(tracks, anchors)
-        undo = Undo(nodes, tracks)
+        places = nodes.place_before(tracks, np.full(len(tracks), stamp_ns))
+        old = places < anchors
+        undo = Undo(nodes, tracks, 0 if old.any() else int(places.min()))
         try:
             starts = self._relinearise(tracks, undo)
-            old = stamp_ns < nodes.stamps_ns[tracks, anchors]
             if old.any():
                 self._eliminate(tracks[old], starts[old])
-                for row in np.flatnonzero(old).tolist():
+                for row in old.nonzero()[0].tolist():
                     nodes.first[tracks[row]] = anchors[row]
                     undo.keep_ring(int(tracks[row]))
                     term = fuse_behind(nodes, self._motion, int(tracks[row]), measurements[row])
                     starts[row] = anchors[row] = nodes.first[tracks[row]]
                     self._add(int(tracks[row]), int(starts[row]), term, undo)
-            numbers = self._insert(tracks, stamp_ns, ~old, guesses, starts)
-            self._measure(numbers, measurements, groups, guesses, ~old, undo)
+            live = ~old
+            numbers = self._insert(tracks, stamp_ns, places, live, guesses, starts)
+            self._measure(numbers, measurements, groups, guesses, live, undo)
             self._eliminate(tracks, starts)
         except np.linalg.LinAlgError:
             undo()
@@ -213,7 +222,7 @@ class Windows:
         """Move the linearisation points that are too far from their states; gives their first places, or `count`."""
         nodes = self.nodes
         starts = nodes.count[tracks]
-        some = np.flatnonzero(self._blocks.any_far[tracks])
+        some = self._blocks.any_far[tracks].nonzero()[0]
         if not some.size:
             return starts
         free = (nodes.first + self._anchored)[tracks[some]]
@@ -223,7 +232,7 @@ class Windows:
         if rows.size:
             moved, of, places = numbers[rows, columns], tracks[some[rows]], places[rows, columns]
             if undo is not None:
-                undo.keep_origins(moved)
+                undo.keep_origins(of, moved)
             move(nodes, of, moved, nodes.step[moved])
             nodes.far[moved] = False
             linearise_segments(nodes, self._motion, of, places)
@@ -231,20 +240,25 @@ class Windows:
         return starts
 
     def _insert(
-        self, tracks: IntArray, stamp_ns: int, live: BoolArray, guesses: FloatArray, starts: IntArray
+        self,
+        tracks: IntArray,
+        stamp_ns: int,
+        places: IntArray,
+        live: BoolArray,
+        guesses: FloatArray,
+        starts: IntArray,
     ) -> IntArray:
-        """Make nodes at `stamp_ns` where there are none; gives the numbers of the nodes there.
+        """Make nodes at `stamp_ns` where there are none, after those at `places`; gives the numbers of the nodes there.
 
         The windows are eliminated from there on: `starts` becomes smaller.
         """
         nodes = self.nodes
-        stamps_ns = np.full(len(tracks), stamp_ns)
-        places = nodes.place_before(tracks, stamps_ns)
         new = live & (nodes.stamps_ns[tracks, places] != stamp_ns)
         places = places + new
         if new.any():
-            to, at = tracks[new], places[new]
-            nodes.insert(to, at, stamps_ns[new], guesses[new])
+            all_new = bool(new.all())
+            to, at, origins = (tracks, places, guesses) if all_new else (tracks[new], places[new], guesses[new])
+            nodes.insert(to, at, stamp_ns, origins)
             linearise_segments(nodes, self._motion, np.concatenate([to, to]), np.concatenate([at - 1, at]))
         np.minimum(starts, places, out=starts, where=live)
         return nodes.at(tracks, places)
@@ -305,7 +319,7 @@ class Windows:
     def _forget_before(self, tracks: IntArray, stamps_ns: IntArray) -> None:
         nodes = self.nodes
         most = nodes.first[tracks] - 1
-        if (most < _MANY).all():
+        if not ((most >= _MANY) & (nodes.stamps_ns[tracks, _MANY - 1] <= stamps_ns)).any():
             return
         numbers = np.minimum(nodes.place_before(tracks, stamps_ns), most)
         many = numbers >= _MANY
