@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation import innovations
+from fgtrack.evaluation.figures.arrivals import arrivals
 from fgtrack.evaluation.figures.close_up import close_up
 from fgtrack.evaluation.figures.errors import errors, lag
 from fgtrack.evaluation.figures.map import tracks_on_map as map  # noqa: A004  # the name that users know
@@ -21,7 +22,19 @@ from fgtrack.evaluation.figures.style import save
 from fgtrack.evaluation.figures.times import delays, sensor_delays, timing
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged
 
-__all__ = ["FIGURES", "close_up", "delays", "errors", "lag", "map", "residuals", "save", "save_figures", "timing"]
+__all__ = [
+    "FIGURES",
+    "arrivals",
+    "close_up",
+    "delays",
+    "errors",
+    "lag",
+    "map",
+    "residuals",
+    "save",
+    "save_figures",
+    "timing",
+]
 
 _Named = Iterator[tuple[str, Figure]]
 
@@ -52,6 +65,12 @@ def _delays(runs: Sequence[JudgedRun]) -> _Named:
             yield f"delays_{group[0].label}", delays(replace(group[0], label=", ".join(one.label for one in group)))
 
 
+def _arrivals(runs: Sequence[JudgedRun]) -> _Named:
+    for one in runs:
+        if one.run.updates.num_rows:
+            yield f"arrivals_{one.label}", arrivals(one)
+
+
 def _errors(runs: Sequence[JudgedRun]) -> _Named:
     for object_id in sorted({k for one in runs if one.matching for k in one.matching.object_ids}):
         yield f"errors_object_{object_id}", errors(runs, object_id)
@@ -71,6 +90,7 @@ def _timing(runs: Sequence[JudgedRun]) -> _Named:
 FIGURES: Mapping[str, Callable[[Sequence[JudgedRun]], _Named]] = {
     "map": _maps,
     "residuals": _residuals,
+    "arrivals": _arrivals,
     "delays": _delays,
     "errors": _errors,
     "lag": _lag,

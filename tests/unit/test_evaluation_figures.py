@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.types import Disposition
 from fgtrack.evaluation import plot
 from fgtrack.evaluation.figures.style import FORMATS, WRONG, broken_line
 from fgtrack.evaluation.runs import judged
@@ -32,6 +33,11 @@ EXPECTED: dict[str, tuple[bool, set[str], list[str]]] = {
         False,
         {"time [s]", "along track [m]", "across track [m]", "speed [m/s]", "density [1/m]", "density [s/m]"},
         ["lidar: mean -0.200, std 0.141, n 60"],
+    ),
+    "arrivals": (
+        False,
+        {"time [s]", "received at [s]", "delay [ms]"},
+        ["fused in sequence: 120 of 120"],
     ),
     "delays": (
         False,
@@ -121,18 +127,37 @@ def test_there_is_a_figure_of_what_runs_have_data_for(
     names: Callable[[Sequence[Run]], list[str]], runs: list[Run], tmp_path: Path
 ) -> None:
     assert names(runs) == [
-        *("map_smoother", "map_ekf-replay", "residuals_smoother", "residuals_ekf-replay", "delays"),
+        *("map_smoother", "map_ekf-replay", "residuals_smoother", "residuals_ekf-replay"),
+        *("arrivals_smoother", "arrivals_ekf-replay", "delays"),
         *("errors_object_7", "errors_object_8", "error_against_lag", "timing"),
     ]
     assert names(runs[1:]) == [name for name in names(runs) if "smoother" not in name and "lag" not in name]
     plain = replace(runs[0], truth=runs[0].truth.where(np.zeros(len(runs[0].truth["stamp_ns"]), dtype=bool)))
-    assert names([plain]) == ["map_smoother", "residuals_smoother", "delays", "timing"]
+    assert names([plain]) == ["map_smoother", "residuals_smoother", "arrivals_smoother", "delays", "timing"]
     other = write_run(tmp_path / "other", updates={0: [update(delay_ns=1_000_000)]})
     assert [name for name in names([*runs, other]) if "delays" in name] == [
         "delays_smoother",
         "delays_other (smoother)",
     ]
     assert names([write_run(tmp_path / "empty", [[]])]) == []
+
+
+def test_arrivals_show_the_second_with_the_most_late_detections(tmp_path: Path) -> None:
+    late = {
+        k: [update("lidar", tick=k, delay_ns=150_000_000, disposition=Disposition.OUT_OF_SEQUENCE)]
+        for k in range(200, 220)
+    }
+    early = {k: [update("radar", tick=k, delay_ns=20_000_000)] for k in range(0, 400, 5)}
+    updates = {k: [*early.get(k, []), *late.get(k, [])] for k in {*early, *late}}
+    flow, delays = plot.arrivals(write_run(tmp_path / "run", [[]] * 400, updates=updates)).axes
+    assert legend(flow) == ["fused in sequence: 80 of 100", "fused out of sequence: 20 of 100"]
+    low_s, high_s = flow.get_xlim()
+    assert low_s == pytest.approx(200 * TICK_NS / 1e9, abs=0.2)
+    assert high_s - low_s == pytest.approx(1.0)
+    lines = [segment for lines in flow.collections for segment in lines.get_segments()]
+    lengths_s = {round(float(end[0] - start[0]), 3) for start, end in lines}
+    assert lengths_s == {0.15, 0.02}
+    assert [line.get_ydata()[0] for line in delays.lines] == pytest.approx([20.0, 150.0])
 
 
 def test_delays_name_their_runs_where_there_are_several_recordings(
@@ -150,7 +175,9 @@ def test_delays_name_their_runs_where_there_are_several_recordings(
 def test_a_file_is_named_after_its_figure_and_run(tmp_path: Path) -> None:
     run = write_run(tmp_path / "a run", updates={0: [update(x_m=1.0, y_m=1.0)]})
     files = plot.save_figures(run, tmp_path / "out", "svg")
-    assert [file.name for file in files] == ["residuals_a_run_smoother.svg", "delays.svg", "timing.svg"]
+    assert [file.name for file in files] == [
+        *("residuals_a_run_smoother.svg", "arrivals_a_run_smoother.svg", "delays.svg", "timing.svg")
+    ]
 
 
 @pytest.mark.parametrize("name", [name for name in plot.FIGURES if name != "map"])
