@@ -142,6 +142,9 @@ def test_there_is_a_figure_of_what_runs_have_data_for(
     assert names([write_run(tmp_path / "empty", [[]])]) == []
 
 
+LATE = Disposition.OUT_OF_SEQUENCE
+
+
 def test_arrivals_show_the_second_with_the_most_late_detections(tmp_path: Path) -> None:
     late = {
         k: [update("lidar", tick=k, delay_ns=150_000_000, disposition=Disposition.OUT_OF_SEQUENCE)]
