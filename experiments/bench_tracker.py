@@ -18,11 +18,10 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from statistics import median
-from typing import Any
 
 import numpy as np
 
-from fgtrack.core.types import DetectionList, TruthState
+from fgtrack.core.types import DetectionList, Message, TruthState
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Tick, node_ticks
 from fgtrack.pipeline.config import Config
@@ -41,7 +40,7 @@ NODE_HZ = 50.0
 Clock = Callable[[], int]
 """Gives nanoseconds."""
 
-_SPEED_MPS = 65.0
+SPEED_MPS = 65.0
 _MB = 1 << 20
 
 
@@ -105,9 +104,14 @@ def traffic(count: int, duration_s: float = 5.0, delay_s: float | None = None) -
     return list(node_ticks([m for m in scene(count, duration_s, delay_s) if not isinstance(m, TruthState)], NODE_HZ))
 
 
-def scene(count: int, duration_s: float, delay_s: float | None = None) -> list[Any]:
+def scene(count: int, duration_s: float, delay_s: float | None = None) -> list[Message]:
     """The messages of `traffic`, truth included, in order of receipt."""
-    speed = ((0.0, _SPEED_MPS), (duration_s + 4.0, _SPEED_MPS))
+    return simulate(scenario(count, duration_s, delay_s), np.random.default_rng(0))
+
+
+def scenario(count: int, duration_s: float, delay_s: float | None = None, speed_mps: float = SPEED_MPS) -> Scenario:
+    """What `traffic` is drawn from."""
+    speed = ((0.0, speed_mps), (duration_s + 4.0, speed_mps))
     cars = tuple(
         TrackVehicle(arc_m=120.0 + 12.0 * (i // 2), lateral_m=3.5 - 7.0 * (i % 2), speed=speed) for i in range(count)
     )
@@ -120,7 +124,7 @@ def scene(count: int, duration_s: float, delay_s: float | None = None) -> list[A
         ),
     )
     ego = TrackVehicle(arc_m=100.0, speed=speed)
-    return simulate(Scenario(ego, cars, sensors, duration_s=duration_s), np.random.default_rng(0))
+    return Scenario(ego, cars, sensors, duration_s=duration_s)
 
 
 def yardstick_us(clock: Clock = time.perf_counter_ns, at_once: int = 1) -> float:

@@ -2,15 +2,19 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.scripts import EXPERIMENTS
 
 sys.path.insert(0, str(EXPERIMENTS))
 import bench_estimators
+import bench_memory
 import bench_report
 import bench_speed
 import bench_streaming
 import bench_tracker
+
+from fgtrack.core.types import DetectionList, TruthState
 
 CHECKOUT = EXPERIMENTS.parent
 SMALL = {"rounds": 1, "duration_s": 1.6}
@@ -125,3 +129,24 @@ def test_the_streaming_table_has_both_streams_and_every_method(
         asked_m, ready_m = ([float(row.split("|")[k].split()[0]) for row in rows] for k in (2, 3))
         assert max(asked_m) < 2.0
         assert asked_m != ready_m
+
+
+def test_a_drive_of_many_laps_is_one_recording() -> None:
+    messages = list(bench_memory.laps(1, 60.0))
+    receipts_ns = [message.receipt_ns for message in messages]
+    assert receipts_ns == sorted(receipts_ns)
+    lists = [message for message in messages if isinstance(message, DetectionList) and message.sensor == "radar"]
+    periods_ns = set(np.diff(sorted(message.stamp_ns for message in lists)).tolist())
+    assert periods_ns == {50_000_000}  # also where a lap ends
+    truth = [m for m in messages if isinstance(m, TruthState) and m.object_id == 0]
+    steps_m = np.hypot(*np.diff([(m.x_m, m.y_m) for m in truth], axis=0).T)
+    assert steps_m.max() < 1.1 * np.median(steps_m)
+
+
+def test_the_memory_table_follows_one_run_over_its_laps(tmp_path: Path) -> None:
+    bench_memory.main(tmp_path, duration_s=4.0, objects=1, estimator="ekf-replay", parts=4)
+    text = (tmp_path / "memory.md").read_text()
+    rows = [line.split("|") for line in text.splitlines() if line.startswith("| ")][1:]
+    assert [float(row[1]) for row in rows] == pytest.approx([1 / 60, 2 / 60, 3 / 60, 4 / 60], abs=2e-3)
+    assert all(float(row[2]) > 10.0 and int(row[4]) == 1 for row in rows)
+    assert [path.name for path in tmp_path.iterdir()] == ["memory.md"]
