@@ -13,7 +13,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import OneCorrection, Prediction
 from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Line, Search, along, fixes_of
-from fgtrack.estimation.iteration import Iteration, reweighted
+from fgtrack.estimation.iteration import Iteration, largest_move, reweighted
 from fgtrack.estimation.rts import smoothed_one
 from fgtrack.estimation.sigma_points import Regression, measurement_regression, motion_regression
 from fgtrack.estimation.unscented import UkfRecursion
@@ -21,9 +21,6 @@ from fgtrack.estimation.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
 
 _INITIATION = Iteration(SMOOTHER_ITERATIONS, 1e-3)
-#: In standard deviations of the mean, and as a share of a variance: what has changed by less is not regressed again.
-_STILL = 0.01
-_NOTHING = -1.0
 #: Of the covariance, as spread of the states along a line, at which everything is linearised first.
 _NARROW = 1e-6
 
@@ -41,8 +38,6 @@ class _Node:
     """From the node before; of the first node, from all that the window has forgotten."""
     filtered: tuple[FloatArray, FloatArray]
     """With the measurements up to this node."""
-    at: tuple[FloatArray, FloatArray] | None
-    """Mean and covariance of the state over which all was regressed; None where that is to be done."""
 
 
 class PosteriorLinearisationSmoother(WindowedFilter):
@@ -84,7 +79,7 @@ class PosteriorLinearisationSmoother(WindowedFilter):
         super().__init__(motion, prior, lag_s)
         self._iteration, self._recursion = Iteration(max_iterations, tolerance), UkfRecursion(motion)
         x, P = initial_state(motion, prior)
-        self._nodes = [_Node(prior.stamp_ns, (), x, P, Prediction(x, P, P), (x, P), None)]
+        self._nodes = [_Node(prior.stamp_ns, (), x, P, Prediction(x, P, P), (x, P))]
         self._first = prior.stamp_ns, x, P
         self._search = Search.of(motion, prior, initiation)
         self._final: list[TrackState] = []
@@ -105,7 +100,7 @@ class PosteriorLinearisationSmoother(WindowedFilter):
 
     def converge(self, max_iterations: int = 50) -> None:
         """Pass until nothing moves; for comparisons."""
-        self._nodes = self._iterated(self._nodes, Iteration(max_iterations, 1e-9), _NOTHING)
+        self._nodes = self._iterated(self._nodes, Iteration(max_iterations, 1e-9))
 
     def _fuse(self, measurement: Measurement) -> OneCorrection:
         mean, covariance = self._state(measurement.stamp_ns)
@@ -135,11 +130,11 @@ class PosteriorLinearisationSmoother(WindowedFilter):
         node = nodes[place]
         if node.stamp_ns != measurement.stamp_ns:
             predicted = Prediction(mean, covariance, covariance)
-            node = _Node(measurement.stamp_ns, (), mean, covariance, predicted, (mean, covariance), None)
+            node = _Node(measurement.stamp_ns, (), mean, covariance, predicted, (mean, covariance))
             place += 1
             nodes.insert(place, node)
         found = tuple(sorted((*node.measurements, measurement), key=lambda each: each.order))
-        nodes[place] = replace(node, measurements=found, at=None)
+        nodes[place] = replace(node, measurements=found)
         return nodes
 
     def _state(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
@@ -164,12 +159,12 @@ class PosteriorLinearisationSmoother(WindowedFilter):
         regressed = motion_regression(self._motion, *over, dt_s)
         return _through(state, over[0], regressed, self._motion.process_noise(over[0], dt_s))
 
-    def _iterated(self, nodes: list[_Node], iteration: Iteration, still: float = _STILL) -> list[_Node]:
-        """The nodes after passes over them; what has changed by less than `still` since it was regressed stays so."""
+    def _iterated(self, nodes: list[_Node], iteration: Iteration) -> list[_Node]:
+        """The nodes after passes over them."""
         for _ in range(iteration.max_iterations):
-            before, nodes = nodes, self._smoothed(self._filtered(nodes, still))
-            mean, _ = _changes([(node.mean, node.covariance) for node in before], nodes)
-            if mean.max() < iteration.tolerance:
+            before, nodes = nodes, self._smoothed(self._filtered(nodes))
+            steps = np.array([node.mean - old.mean for node, old in zip(nodes, before, strict=True)])
+            if largest_move(steps, np.array([node.covariance for node in nodes])) < iteration.tolerance:
                 break
         return nodes
 
@@ -180,21 +175,18 @@ class PosteriorLinearisationSmoother(WindowedFilter):
         found = [replace(nodes[-1], mean=mean, covariance=covariance)]
         for node, after in zip(nodes[-2::-1], nodes[:0:-1], strict=True):
             mean, covariance, _ = smoothed_one(*node.filtered, after.predicted, mean - after.predicted.mean, covariance)
-            found.append(
-                _Node(node.stamp_ns, node.measurements, mean, covariance, node.predicted, node.filtered, node.at)
-            )
+            found.append(_Node(node.stamp_ns, node.measurements, mean, covariance, node.predicted, node.filtered))
         return found[::-1]
 
-    def _filtered(self, nodes: Sequence[_Node], still: float) -> list[_Node]:
-        """The nodes with new `predicted` and `filtered`, from the first one on that changed by more than `still`."""
-        start = self._first_changed(nodes, still)
-        found, rest = list(nodes[:start]), nodes[start:]
-        means, covariances = np.array([node.mean for node in rest]), np.array([node.covariance for node in rest])
-        gaps_s = np.diff([node.stamp_ns for node in rest]) * 1e-9
-        if len(rest) > 1:
+    def _filtered(self, nodes: Sequence[_Node]) -> list[_Node]:
+        """The nodes with new `predicted` and `filtered`."""
+        means, covariances = np.array([node.mean for node in nodes]), np.array([node.covariance for node in nodes])
+        gaps_s = np.diff([node.stamp_ns for node in nodes]) * 1e-9
+        if len(nodes) > 1:
             steps = motion_regression(self._motion, means[:-1], covariances[:-1], gaps_s)
             Q = self._motion.process_noise(means[:-1], gaps_s)
-        for place, node in enumerate(rest):
+        found: list[_Node] = []
+        for place, node in enumerate(nodes):
             predicted = node.predicted
             if place:
                 step = Regression(*(part[place - 1] for part in steps))
@@ -202,20 +194,8 @@ class PosteriorLinearisationSmoother(WindowedFilter):
             state = predicted.mean, predicted.covariance
             for measurement in node.measurements:
                 state = self._updated(state, node, measurement)
-            at = node.mean, node.covariance
-            found.append(_Node(node.stamp_ns, node.measurements, *at, predicted, state, at))
+            found.append(_Node(node.stamp_ns, node.measurements, node.mean, node.covariance, predicted, state))
         return found
-
-    @staticmethod
-    def _first_changed(nodes: Sequence[_Node], still: float) -> int:
-        """Place of the first node from which on all is to be regressed again; of the last one, where none has to be."""
-        new = next((place for place, node in enumerate(nodes) if node.at is None), len(nodes) - 1)
-        known = [node.at for node in nodes[:new] if node.at is not None]
-        if not known:
-            return 0
-        mean, variance = _changes(known, nodes[:new])
-        moved = np.flatnonzero(np.maximum(mean, variance) > still)
-        return int(moved[0]) if len(moved) else new - 1  # the step to a new node is that of the one before
 
     def _updated(
         self, state: tuple[FloatArray, FloatArray], node: _Node, measurement: Measurement
@@ -242,7 +222,7 @@ class PosteriorLinearisationSmoother(WindowedFilter):
         found = []
         for node in nodes:
             mean = along(line, seconds(node.stamp_ns - self._first[0]), self._motion.state_names)
-            found.append(replace(node, mean=mean, covariance=_NARROW * node.covariance, at=None))
+            found.append(replace(node, mean=mean, covariance=_NARROW * node.covariance))
         prior = nodes[0].predicted.mean.copy()
         if not self._motion.cartesian:
             prior[YAW] = found[0].mean[YAW]
@@ -256,11 +236,3 @@ def _through(state: tuple[FloatArray, FloatArray], origin: FloatArray, step: Reg
     AP = product(step.A, P)
     covariance = symmetrise(product(AP, step.A.T) + step.noise + Q)
     return Prediction(step.mean + step.A.dot(mean - origin), covariance, AP)
-
-
-def _changes(before: Sequence[tuple[FloatArray, FloatArray]], nodes: Sequence[_Node]) -> tuple[FloatArray, FloatArray]:
-    """How far the smoothed states are from those `before`: in standard deviations, and as a share of a variance."""
-    variance = np.array([np.maximum(node.covariance.diagonal(), np.finfo(np.float64).tiny) for node in nodes])
-    step = np.array([node.mean - mean for node, (mean, _) in zip(nodes, before, strict=True)])
-    wider = np.array([covariance.diagonal() for _, covariance in before]) / variance
-    return np.max(np.abs(step) / np.sqrt(variance), axis=1), np.max(np.abs(wider - 1.0), axis=1)

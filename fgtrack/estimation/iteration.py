@@ -47,9 +47,9 @@ class Iteration:
 
 
 def largest_move(step: FloatArray, covariance: FloatArray) -> float:
-    """The largest entry of `step` (n,) in standard deviations of `covariance` (n, n)."""
-    sigma = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
-    return float(np.divide(np.abs(step), sigma, out=np.zeros(len(step)), where=sigma > 0.0).max())
+    """The largest entry of `step` (..., n) in standard deviations of `covariance` (..., n, n)."""
+    sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
+    return float(np.divide(np.abs(step), sigma, out=np.zeros(step.shape), where=sigma > 0.0).max())
 
 
 def negative_log_posterior(
