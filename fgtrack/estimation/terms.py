@@ -1,11 +1,15 @@
 """Measurement terms of a node of the window: its own measurements, and the equivalent ones of older detections."""
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from fgtrack.core.linalg import mahalanobis_squared
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation import ekf
 from fgtrack.estimation.base import Measurement
+from fgtrack.models.robust import penalty
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,3 +47,27 @@ def linearised(term: MeasurementTerm, x: FloatArray) -> Linearised:
     if isinstance(term, EquivalentMeasurement):
         return Linearised(term.y - term.H @ (x - term.origin), term.H, term.R)
     return Linearised(*ekf.linearised(term.z, x, term.model, term.pose), term.R)
+
+
+def cost(term: MeasurementTerm, x: FloatArray) -> float:
+    """Half of the squared Mahalanobis distance of `term` from the state `x` (n,), or its loss there.
+
+    Raises `numpy.linalg.LinAlgError` for a singular covariance.
+    """
+    y, _, R = linearised(term, x)
+    distance = math.sqrt(mahalanobis_squared(y, R))
+    return penalty(term.loss if isinstance(term, Measurement) else None, distance)
+
+
+def overshot(terms: Iterable[MeasurementTerm], origin: FloatArray, mean: FloatArray) -> bool:
+    """Whether the step from the linearisation point `origin` to `mean`, both (n,), left the linear range of a term.
+
+    It did where the linearisation mistakes a measurement by more than a standard deviation.
+    """
+    for term in terms:
+        if isinstance(term, Measurement) and not term.model.linear:
+            y, H, R = linearised(term, origin)
+            missed = term.model.residual(linearised(term, mean).y, y - H @ (mean - origin))
+            if mahalanobis_squared(missed, R) > 1.0:
+                return True
+    return False

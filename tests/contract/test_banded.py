@@ -10,7 +10,7 @@ import pytest
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
-from fgtrack.estimation.banded import windows
+from fgtrack.estimation.banded import solver
 from fgtrack.estimation.banded.bank import BandedBank
 from fgtrack.estimation.banded.nodes import Nodes
 from fgtrack.estimation.banded.smoother import BandedSmoother
@@ -305,7 +305,7 @@ def test_a_track_whose_window_cannot_be_solved_fails_alone_and_stays_as_it_was(
         for bank in (hit, spared):
             bank.advance(START.stamp_ns + 50 * k * MS)
             bank.update(START.stamp_ns + 50 * k * MS, [0, 1, 2], measurements)
-    eliminate = windows.eliminate
+    eliminate = solver.eliminate
 
     for ms in (430, 275, 100, 600):
         stamp_ns = START.stamp_ns + ms * MS
@@ -330,9 +330,9 @@ def test_a_track_whose_window_cannot_be_solved_fails_alone_and_stays_as_it_was(
                 if len(calls) % period == hits:
                     raise np.linalg.LinAlgError("gave up")
 
-        monkeypatch.setattr(windows, "eliminate", gives_up)
+        monkeypatch.setattr(solver, "eliminate", gives_up)
         found = hit.update(stamp_ns, [0, 1, 2], measurements)
-        monkeypatch.setattr(windows, "eliminate", eliminate)
+        monkeypatch.setattr(solver, "eliminate", eliminate)
         assert found[1].status is UpdateStatus.FAILED
         assert [found[0].status, found[2].status] == [result.status for result in expected]
         for before, after in zip(spared.present(), hit.present(), strict=True):

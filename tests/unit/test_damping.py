@@ -5,6 +5,8 @@ import pytest
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
+from fgtrack.estimation.banded.bank import BandedBank
+from fgtrack.estimation.banded.windows import Windows
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother
 from fgtrack.estimation.factor_graph.window import Window
@@ -32,10 +34,12 @@ def heard(rng: np.random.Generator) -> tuple[list[Measurement], FloatArray]:
     return found, last
 
 
+SPREAD = np.diag([RANGE_STD_M**2, (100.0 * STD_RAD) ** 2])
+BIRTH = Start(position_m=(100.0, 0.0), position_covariance=SPREAD, speed_std_mps=10.0)
+
+
 def tracked(measurements: list[Measurement], **backend: object) -> FixedLagSmoother:
-    spread = np.diag([RANGE_STD_M**2, (100.0 * STD_RAD) ** 2])
-    start = Start(position_m=(100.0, 0.0), position_covariance=spread, speed_std_mps=10.0)
-    one = FixedLagSmoother(MOTION, start, SETTINGS, **backend)  # type: ignore[arg-type]  # nothing or a factory
+    one = FixedLagSmoother(MOTION, BIRTH, SETTINGS, **backend)  # type: ignore[arg-type]  # nothing or a factory
     for measurement in measurements[1:]:
         one.update(measurement)
     return one
@@ -51,6 +55,38 @@ def test_bearings_alone_lead_where_levenberg_marquardt_does(seed: int) -> None:
     d = state.mean - truth
     assert d @ np.linalg.solve(state.covariance, d) < 23.5  # one in ten thousand
     assert other.num_damped == 0
+
+
+def tracked_together(streams: list[list[Measurement]]) -> BandedBank:
+    """All objects in one bank of smoother-banded."""
+    bank = BandedBank(MOTION, SETTINGS)
+    for track_id in range(len(streams)):
+        bank.birth(track_id, BIRTH)
+    for measurements in zip(*(stream[1:] for stream in streams), strict=True):
+        bank.update(measurements[0].stamp_ns, range(len(streams)), measurements)
+    return bank
+
+
+def test_smoother_banded_takes_the_same_steps_again() -> None:
+    streams = [heard(np.random.default_rng(seed))[0] for seed in range(4)]
+    bank, expected = tracked_together(streams), [tracked(stream) for stream in streams]
+    assert bank.windows.num_damped == sum(one.num_damped for one in expected)
+    for track_id, one in enumerate(expected):
+        state, other = bank.state_at(track_id, streams[0][-1].stamp_ns), one.state_at(streams[0][-1].stamp_ns)
+        assert np.abs((state.mean - other.mean) / np.sqrt(np.diag(other.covariance))).max() < 1e-6
+
+
+def test_without_damping_smoother_banded_loses_some(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [heard(np.random.default_rng(seed)) for seed in range(4)]
+    streams = [measurements for measurements, _ in found]
+
+    def worst_m(bank: BandedBank) -> float:
+        states = [bank.state_at(track_id, streams[0][-1].stamp_ns) for track_id in range(4)]
+        return max(float(np.hypot(*(s.mean - truth)[:2])) for s, (_, truth) in zip(states, found, strict=True))
+
+    assert worst_m(tracked_together(streams)) < 20.0
+    monkeypatch.setattr(Windows, "damp", lambda self, tracks: None)
+    assert worst_m(tracked_together(streams)) > 1000.0
 
 
 def test_without_damping_some_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -157,7 +157,7 @@ class BandedBank:
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
         track = self._free.pop() if self._free else len(self._numbers)
-        self.windows.begin(track, prior.stamp_ns, *initial_state(self._motion, prior))
+        self.windows.solver.begin(track, prior.stamp_ns, *initial_state(self._motion, prior))
         if track == len(self._clock_ns):
             self._clock_ns, self._first_ns = (np.append(values, 0) for values in (self._clock_ns, self._first_ns))
         self._clock_ns[track] = self._first_ns[track] = prior.stamp_ns
@@ -232,12 +232,12 @@ class BandedBank:
         """Like `take_final`, and of the nodes that are still inside."""
         if not self._settings.final:
             return self.take_final(track_id)
-        stamps_ns = self.windows.stamps_ns(self._numbers[track_id])
+        stamps_ns = self.windows.solver.stamps_ns(self._numbers[track_id])
         return self.take_final(track_id) + [self.state_at(track_id, stamp_ns) for stamp_ns in stamps_ns]
 
     def converge(self, track_id: int, max_iterations: int) -> None:
         """Relinearise a track until nothing moves; for comparisons."""
-        self.windows.converge(self._numbers[track_id], max_iterations)
+        self.windows.solver.converge(self._numbers[track_id], max_iterations)
         self._states.clear()
 
     # --- inside
@@ -302,7 +302,8 @@ class BandedBank:
         if self._searches:
             for track in self._searches.keys() & set(tracks.tolist()):
                 self._initiate(track, stamp_ns)
-        self.windows.iterate(tracks, self._settings.max_iterations - 1)
+        self.windows.damp(tracks)
+        self.windows.solver.iterate(tracks, self._settings.max_iterations - 1)
         return []
 
     def _initiate(self, track: int, oldest_ns: int) -> None:
@@ -315,7 +316,7 @@ class BandedBank:
         if found is not None:
             line, self._searches[track] = found
             self.windows.restart(track, line)
-            self.windows.iterate(np.array([track]), SMOOTHER_ITERATIONS)
+            self.windows.solver.iterate(np.array([track]), SMOOTHER_ITERATIONS)
 
     def _renumbered(self) -> None:
         self._track_ids = tuple(self._numbers)

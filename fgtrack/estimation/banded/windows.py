@@ -1,6 +1,7 @@
 """The windows of all tracks: insertion, relinearisation, elimination, marginalisation and states at any stamp."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -8,11 +9,10 @@ import numpy as np
 from fgtrack.core.linalg import congruence, symmetrise
 from fgtrack.core.time import NS_PER_S, seconds
 from fgtrack.core.types import YAW, BoolArray, FloatArray, IntArray
-from fgtrack.estimation.banded.elimination import eliminate
-from fgtrack.estimation.banded.linearisation import linearise_segments, linearise_terms, move
-from fgtrack.estimation.banded.nodes import Nodes
+from fgtrack.estimation.banded.damping import DampedWindow
+from fgtrack.estimation.banded.linearisation import linearise_segments, linearise_terms
 from fgtrack.estimation.banded.ring import fuse_behind
-from fgtrack.estimation.banded.substitution import Blocks
+from fgtrack.estimation.banded.solver import Solver
 from fgtrack.estimation.banded.undo import Undo
 from fgtrack.estimation.banded.whitening import Innovations, whitened
 from fgtrack.estimation.base import Measurement
@@ -20,11 +20,9 @@ from fgtrack.estimation.ekf import propagated
 from fgtrack.estimation.initiation import Fix, Line, along, fixes_of
 from fgtrack.estimation.interpolation import between_all
 from fgtrack.estimation.smoother_settings import SmootherSettings
-from fgtrack.estimation.terms import EquivalentMeasurement, curved
+from fgtrack.estimation.terms import EquivalentMeasurement, curved, overshot
 from fgtrack.models.motion import MotionModel
 
-#: A step of a state, in m, rad, m/s or rad/s, that is rounding.
-_AT_REST = 1e-7
 #: Nodes behind the window are forgotten when there are so many that nobody needs.
 _MANY = 16
 
@@ -67,24 +65,10 @@ class Windows:
     def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
         self._motion = motion
         self._settings = settings
-        self.nodes = Nodes(motion.dim)
-        self._blocks = Blocks(self.nodes)
-        self._thresholds = np.empty((0, motion.dim))
-        self._curved: BoolArray = np.zeros(0, dtype=bool)
-        self._anchored: IntArray = np.zeros(0, dtype=np.int64)
-        """1 where the oldest node of the window keeps its linearisation, because it has a marginalised past."""
-
-    def begin(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
-        """Start the window of a track with its first node."""
-        self.nodes.begin(track, stamp_ns, mean, covariance)
-        self._blocks.begin(track)
-        more = len(self.nodes.first) - len(self._curved)
-        if more:
-            self._thresholds = np.concatenate([self._thresholds, np.zeros((more, self._motion.dim))])
-            self._curved = np.concatenate([self._curved, np.zeros(more, dtype=bool)])
-            self._anchored = np.concatenate([self._anchored, np.zeros(more, dtype=np.int64)])
-        self._thresholds[track] = self._settings.thresholds(self._motion, curved=False)
-        self._curved[track], self._anchored[track] = False, 0
+        self.solver = Solver(motion, settings)
+        self.nodes = self.solver.nodes
+        self.num_damped = 0
+        """How often a step went too far and was taken again with damping."""
 
     # --- states
 
@@ -103,7 +87,7 @@ class Windows:
         until_ns = stamps_ns - nodes.stamps_ns[tracks, places]
         between = (until_ns > 0) & (places < nodes.count[tracks] - 1)
         known = places + between
-        steps, covariances = self._blocks.smoothed(tracks, known)
+        steps, covariances = self.solver.smoothed(tracks, known)
         means = nodes.origin[nodes.at(tracks, known)] + steps
         inner = between.nonzero()[0]
         if inner.size == len(tracks):
@@ -165,9 +149,9 @@ class Windows:
         old = places < anchors
         undo = Undo(nodes, tracks, 0 if old.any() else int(places.min()))
         try:
-            starts = self._relinearise(tracks, undo)
+            starts = self.solver.relinearise(tracks, undo)
             if old.any():
-                self._eliminate(tracks[old], starts[old])
+                self.solver.eliminate(tracks[old], starts[old])
                 for row in old.nonzero()[0].tolist():
                     nodes.first[tracks[row]] = anchors[row]
                     undo.keep_ring(int(tracks[row]))
@@ -177,34 +161,36 @@ class Windows:
             live = ~old
             numbers = self._insert(tracks, stamp_ns, places, live, guesses, starts)
             self._measure(numbers, measurements, groups, guesses, live, undo)
-            self._eliminate(tracks, starts)
+            self.solver.eliminate(tracks, starts)
         except np.linalg.LinAlgError:
             undo()
-            self._rebuild(tracks)
+            self.solver.rebuild(tracks)
             raise
-        self._anchored[tracks] |= anchors > undo.first
+        self.solver.anchored[tracks] |= anchors > undo.first
         nodes.first[tracks] = anchors
-        self._solved(tracks)
+        self.solver.solve_means(tracks)
         self._forget_before(tracks, reach_ns)
         return left
 
-    def iterate(self, tracks: IntArray, max_iterations: int) -> None:
-        """Take Gauss-Newton steps while a state is further than a threshold from its linearisation point."""
-        for _ in range(max_iterations):
-            starts = self._relinearise(tracks)
-            moved = starts < self.nodes.count[tracks]
-            tracks, starts = tracks[moved], starts[moved]
-            if not tracks.size:
-                return
-            self._eliminate(tracks, starts)
-            self._solved(tracks)
+    def damp(self, tracks: IntArray) -> None:
+        """Solve again by Levenberg-Marquardt where the last step went beyond what its linearisation is good for.
 
-    def _eliminate(self, tracks: IntArray, places: IntArray) -> None:
-        self._blocks.cut(tracks, places)
-        eliminate(self.nodes, tracks, places)
-
-    def _solved(self, tracks: IntArray) -> None:
-        self._blocks.solve_means(tracks, self._thresholds, self._anchored)
+        See `Window.damp` of the smoother with gtsam.
+        """
+        solver, nodes = self.solver, self.nodes
+        tracks = tracks[solver.curved[tracks]]
+        if not tracks.size:
+            return
+        rows, places = solver.far(tracks)
+        moved = nodes.at(tracks[rows], places)
+        far = zip(rows.tolist(), moved.tolist(), nodes.origin[moved], nodes.step[moved], strict=True)
+        for row in sorted({row for row, number, x, step in far if overshot(nodes.terms[number], x, x + step)}):
+            track = int(tracks[row])
+            means = nodes.origin[solver.window(track)]
+            with suppress(np.linalg.LinAlgError):  # then the linearisation points remain
+                means = DampedWindow(solver, self._motion, track).solved()
+            solver.solve_anew(track, means)
+            self.num_damped += 1
 
     def _leaving(self, tracks: IntArray, anchors: IntArray) -> Leaving:
         nodes = self.nodes
@@ -214,30 +200,9 @@ class Windows:
             return Leaving(np.empty(0, np.int64), np.empty(0, np.int64), States(np.empty((0, n)), np.empty((0, n, n))))
         rows, columns = np.nonzero(np.arange(int(going.max())) < going[:, None])
         tracks, places = tracks[rows], (nodes.first[tracks[rows]] + columns)
-        steps, covariances = self._blocks.smoothed(tracks, places)
+        steps, covariances = self.solver.smoothed(tracks, places)
         means = nodes.origin[nodes.at(tracks, places)] + steps
         return Leaving(tracks, nodes.stamps_ns[tracks, places], States(means, covariances))
-
-    def _relinearise(self, tracks: IntArray, undo: Undo | None = None) -> IntArray:
-        """Move the linearisation points that are too far from their states; gives their first places, or `count`."""
-        nodes = self.nodes
-        starts = nodes.count[tracks]
-        some = self._blocks.any_far[tracks].nonzero()[0]
-        if not some.size:
-            return starts
-        free = (nodes.first + self._anchored)[tracks[some]]
-        places = free[:, None] + np.arange(max(int((starts[some] - free).max()), 0))
-        numbers = nodes.numbers[tracks[some, None], np.minimum(places, starts[some, None] - 1)]
-        rows, columns = np.nonzero(nodes.far[numbers] & (places < starts[some, None]))
-        if rows.size:
-            moved, of, places = numbers[rows, columns], tracks[some[rows]], places[rows, columns]
-            if undo is not None:
-                undo.keep_origins(of, moved)
-            move(nodes, of, moved, nodes.step[moved])
-            nodes.far[moved] = False
-            linearise_segments(nodes, self._motion, of, places)
-            np.minimum.at(starts, some[rows], places)
-        return starts
 
     def _insert(
         self,
@@ -304,14 +269,11 @@ class Windows:
         """Where the first measurement comes that is not linear, relinearise the window, and from then on by thresholds
         of its own; gives the states at `stamp_ns` after that.
         """
-        bent = [row for row, item in enumerate(measurements) if not self._curved[tracks[row]] and curved(item)]
+        bent = [row for row, item in enumerate(measurements) if not self.solver.curved[tracks[row]] and curved(item)]
         if not bent:
             return guesses
         for track in tracks[bent].tolist():
-            self._curved[track] = True
-            self._thresholds[track] = self._settings.thresholds(self._motion, curved=True)
-            self._anchored[track] = 0
-            self._to(track, self._estimates(track))
+            self.solver.bend(track)
         guesses = guesses.copy()
         guesses[bent] = self.states_at(tracks[bent], np.full(len(bent), stamp_ns)).means
         return guesses
@@ -325,15 +287,9 @@ class Windows:
         many = numbers >= _MANY
         if many.any():
             nodes.drop(tracks[many], numbers[many])
-            self._blocks.moved(tracks[many], -numbers[many])
+            self.solver.dropped(tracks[many], numbers[many])
 
     # --- one track
-
-    def stamps_ns(self, track: int) -> list[int]:
-        """Stamps of the nodes in the window."""
-        first, count = self.nodes.first[track], self.nodes.count[track]
-        stamps_ns: list[int] = self.nodes.stamps_ns[track, first:count].tolist()
-        return stamps_ns
 
     def whole(self, track: int) -> bool:
         """Whether nothing has left the window yet."""
@@ -341,8 +297,8 @@ class Windows:
 
     def fixes(self, track: int) -> list[Fix]:
         """The positions measured at the nodes, after that of the prior, of a window that nothing has left yet."""
-        nodes, at = self.nodes, self._window(track)
-        stamps_ns = self.stamps_ns(track)
+        nodes, at = self.nodes, self.solver.window(track)
+        stamps_ns = self.solver.stamps_ns(track)
         known = nodes.predicted[at[0]]
         later = (
             (seconds(stamp_ns - stamps_ns[0]), term)
@@ -354,51 +310,9 @@ class Windows:
 
     def restart(self, track: int, line: Line) -> None:
         """Solve again from states along `line`, with the prior's heading, which must be vague, turned there."""
-        nodes, at = self.nodes, self._window(track)
-        times_s = (np.array(self.stamps_ns(track)) - self.stamps_ns(track)[0]) / NS_PER_S
+        nodes, at = self.nodes, self.solver.window(track)
+        times_s = (np.array(self.solver.stamps_ns(track)) - self.solver.stamps_ns(track)[0]) / NS_PER_S
         means = np.array([along(line, time_s, self._motion.state_names) for time_s in times_s.tolist()])
         if not self._motion.cartesian:
             nodes.predicted[at[0], YAW, -1] = means[0, YAW] - nodes.origin[at[0], YAW]
-        self._to(track, means)
-
-    def converge(self, track: int, max_iterations: int) -> None:
-        """Solve again, with all states linearised where the last step led, until none moves by more than rounding.
-
-        Half a step is taken where a whole one comes no closer: process noise that follows its state can make
-        Gauss-Newton oscillate.
-        """
-        means, last = self._estimates(track), np.inf
-        for _ in range(max_iterations):
-            self._to(track, means)
-            steps = self._estimates(track) - means
-            longest = float(np.abs(steps).max())
-            if longest < _AT_REST:
-                return
-            share = 1.0 if longest < 0.5 * last else 0.5
-            means, last = means + share * steps, longest
-
-    def _estimates(self, track: int) -> FloatArray:
-        places = np.arange(int(self.nodes.first[track]), int(self.nodes.count[track]))
-        steps = self._blocks.steps(np.full(len(places), track), places)
-        return np.asarray(self.nodes.origin[self._window(track)] + steps)
-
-    def _window(self, track: int) -> IntArray:
-        """Numbers of all nodes of the window."""
-        return self.nodes.numbers[track, self.nodes.first[track] : self.nodes.count[track]].copy()
-
-    def _to(self, track: int, means: FloatArray) -> None:
-        """Linearise the whole window at `means`, and solve it."""
-        nodes, at = self.nodes, self._window(track)
-        move(nodes, np.full(len(at), track), at, means - nodes.origin[at])
-        self._rebuild(np.array([track]))
-
-    def _rebuild(self, tracks: IntArray) -> None:
-        """Linearise everything anew where it stands, and solve it."""
-        nodes = self.nodes
-        for track in tracks.tolist():
-            at = self._window(track)
-            linearise_segments(nodes, self._motion, np.full(len(at), track), nodes.first[track] + np.arange(len(at)))
-            for number in at.tolist():
-                linearise_terms(nodes, number)
-        self._eliminate(tracks, nodes.first[tracks])
-        self._solved(tracks)
+        self.solver.solve_at(track, means)

@@ -7,7 +7,6 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 
-from fgtrack.core.linalg import mahalanobis_squared
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement
@@ -21,13 +20,11 @@ from fgtrack.estimation.initiation import Fix, Line, along, fixes_of
 from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.marginalised_past import MarginalisedPast, Prior
 from fgtrack.estimation.smoother_settings import SmootherSettings
-from fgtrack.estimation.terms import MeasurementTerm, curved, linearised
+from fgtrack.estimation.terms import MeasurementTerm, curved, overshot
 from fgtrack.models.motion import MotionModel
 
 #: A step of a state, in m, rad, m/s or rad/s, that is rounding.
 _AT_REST = 1e-7
-#: A step that linearisation mistakes by more than this many standard deviations of a measurement went too far.
-_LINEAR_STD = 1.0
 _BROKEN = (RuntimeError, ValueError, IndexError, np.linalg.LinAlgError)
 
 
@@ -161,7 +158,11 @@ class Window:
         A Gauss-Newton step has no limit: while bearings hardly show the range, it can send an object kilometres away,
         where their gradient vanishes and no further step leads back.
         """
-        if not self._curved or self._backend.damped or not any(_overshot(*move) for move in self._moved()):
+        if (
+            not self._curved
+            or self._backend.damped
+            or not any(overshot(node.terms, node.origin, mean) for node, mean in self._moved())
+        ):
             return
         origins = {node.key: node.origin for node in self._chain.nodes}
         with suppress(*_BROKEN):  # then the origins remain
@@ -322,14 +323,3 @@ class Window:
         self._means.clear()
         self._covariances.clear()
         self._states.clear()
-
-
-def _overshot(node: Node, mean: FloatArray) -> bool:
-    """Whether the step of `node` from its linearisation point to `mean` left a measurement's linear range."""
-    for term in node.terms:
-        if isinstance(term, Measurement) and not term.model.linear:
-            y, H, R = linearised(term, node.origin)
-            missed = term.model.residual(linearised(term, mean).y, y - H @ (mean - node.origin))
-            if mahalanobis_squared(missed, R) > _LINEAR_STD**2:
-                return True
-    return False

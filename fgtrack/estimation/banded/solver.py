@@ -1,0 +1,172 @@
+"""The windows of all tracks as systems of equations: linearised, relinearised where they moved, and solved."""
+
+import numpy as np
+
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.estimation.banded.elimination import eliminate
+from fgtrack.estimation.banded.linearisation import linearise_segments, linearise_terms, move
+from fgtrack.estimation.banded.nodes import Nodes
+from fgtrack.estimation.banded.substitution import Blocks
+from fgtrack.estimation.banded.undo import Undo
+from fgtrack.estimation.smoother_settings import SmootherSettings
+from fgtrack.models.motion import MotionModel
+
+#: A step of a state, in m, rad, m/s or rad/s, that is rounding.
+_AT_REST = 1e-7
+
+
+class Solver:
+    """Linearised windows of many tracks, each by its number.
+
+    Parameters
+    ----------
+    motion
+        Motion model of all of them.
+    settings
+        Those of relinearisation.
+    """
+
+    def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
+        self._motion = motion
+        self._settings = settings
+        self.nodes = Nodes(motion.dim)
+        self._blocks = Blocks(self.nodes)
+        self.smoothed = self._blocks.smoothed
+        self._thresholds = np.empty((0, motion.dim))
+        self.curved: BoolArray = np.zeros(0, dtype=bool)
+        """Whether a track has a measurement that is not linear."""
+        self.anchored: IntArray = np.zeros(0, dtype=np.int64)
+        """1 where the oldest node of the window keeps its linearisation, because it has a marginalised past."""
+
+    def begin(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
+        """Start the window of a track with its first node."""
+        self.nodes.begin(track, stamp_ns, mean, covariance)
+        self._blocks.begin(track)
+        more = len(self.nodes.first) - len(self.curved)
+        if more:
+            self._thresholds = np.concatenate([self._thresholds, np.zeros((more, self._motion.dim))])
+            self.curved = np.concatenate([self.curved, np.zeros(more, dtype=bool)])
+            self.anchored = np.concatenate([self.anchored, np.zeros(more, dtype=np.int64)])
+        self._thresholds[track] = self._settings.thresholds(self._motion, curved=False)
+        self.curved[track], self.anchored[track] = False, 0
+
+    def dropped(self, tracks: IntArray, numbers: IntArray) -> None:
+        """So many of the oldest nodes of `tracks` have been forgotten."""
+        self._blocks.moved(tracks, -numbers)
+
+    def eliminate(self, tracks: IntArray, places: IntArray) -> None:
+        """Eliminate the nodes of `tracks` from `places` on. Raises `numpy.linalg.LinAlgError` where it fails."""
+        self._blocks.cut(tracks, places)
+        eliminate(self.nodes, tracks, places)
+
+    def solve_means(self, tracks: IntArray) -> None:
+        """Find out how far the states of `tracks` are from their linearisation points."""
+        self._blocks.solve_means(tracks, self._thresholds, self.anchored)
+
+    def iterate(self, tracks: IntArray, max_iterations: int) -> None:
+        """Take Gauss-Newton steps while a state is further than a threshold from its linearisation point."""
+        for _ in range(max_iterations):
+            starts = self.relinearise(tracks)
+            moved = starts < self.nodes.count[tracks]
+            tracks, starts = tracks[moved], starts[moved]
+            if not tracks.size:
+                return
+            self.eliminate(tracks, starts)
+            self.solve_means(tracks)
+
+    def relinearise(self, tracks: IntArray, undo: Undo | None = None) -> IntArray:
+        """Move the linearisation points that are too far from their states; gives their first places, or `count`."""
+        nodes = self.nodes
+        starts = nodes.count[tracks]
+        rows, places = self.far(tracks)
+        if rows.size:
+            of = tracks[rows]
+            moved = nodes.at(of, places)
+            if undo is not None:
+                undo.keep_origins(of, moved)
+            move(nodes, of, moved, nodes.step[moved])
+            nodes.far[moved] = False
+            linearise_segments(nodes, self._motion, of, places)
+            np.minimum.at(starts, rows, places)
+        return starts
+
+    def far(self, tracks: IntArray) -> tuple[IntArray, IntArray]:
+        """Nodes that are too far from their linearisation points: positions of their tracks, and their places."""
+        nodes = self.nodes
+        some = self._blocks.any_far[tracks].nonzero()[0]
+        if not some.size:
+            return some, some
+        count = nodes.count[tracks[some]]
+        free = (nodes.first + self.anchored)[tracks[some]]
+        places = free[:, None] + np.arange(max(int((count - free).max()), 0))
+        numbers = nodes.numbers[tracks[some, None], np.minimum(places, count[:, None] - 1)]
+        rows, columns = np.nonzero(nodes.far[numbers] & (places < count[:, None]))
+        return some[rows], places[rows, columns]
+
+    # --- one track
+
+    def window(self, track: int) -> IntArray:
+        """Numbers of all nodes of the window."""
+        return self.nodes.numbers[track, self.nodes.first[track] : self.nodes.count[track]].copy()
+
+    def stamps_ns(self, track: int) -> list[int]:
+        """Stamps of the nodes in the window."""
+        stamps_ns: list[int] = self.nodes.stamps_ns[track, self.nodes.first[track] : self.nodes.count[track]].tolist()
+        return stamps_ns
+
+    def bend(self, track: int) -> None:
+        """The first measurement comes that is not linear: linearise anew, with thresholds for that from now on."""
+        self.curved[track] = True
+        self._thresholds[track] = self._settings.thresholds(self._motion, curved=True)
+        self.solve_anew(track, self.estimates(track))
+
+    def estimates(self, track: int) -> FloatArray:
+        """Means of all nodes in the window, shape (m, n)."""
+        places = np.arange(int(self.nodes.first[track]), int(self.nodes.count[track]))
+        steps = self._blocks.steps(np.full(len(places), track), places)
+        return np.asarray(self.nodes.origin[self.window(track)] + steps)
+
+    def solve_at(self, track: int, means: FloatArray) -> None:
+        """Linearise the whole window at `means`, shape (m, n), and solve it."""
+        self.move_to(track, means)
+        self.rebuild(np.array([track]))
+
+    def solve_anew(self, track: int, means: FloatArray) -> None:
+        """`solve_at`, and from now on the oldest node may be relinearised, too, until the next one leaves."""
+        self.anchored[track] = 0
+        self.solve_at(track, means)
+
+    def move_to(self, track: int, means: FloatArray) -> None:
+        """Move all linearisation points of the window."""
+        at = self.window(track)
+        move(self.nodes, np.full(len(at), track), at, means - self.nodes.origin[at])
+
+    def linearise(self, track: int) -> None:
+        """Linearise everything in the window where it stands."""
+        nodes, at = self.nodes, self.window(track)
+        linearise_segments(nodes, self._motion, np.full(len(at), track), nodes.first[track] + np.arange(len(at)))
+        for number in at.tolist():
+            linearise_terms(nodes, number)
+
+    def rebuild(self, tracks: IntArray) -> None:
+        """Linearise everything anew where it stands, and solve it."""
+        for track in tracks.tolist():
+            self.linearise(track)
+        self.eliminate(tracks, self.nodes.first[tracks])
+        self.solve_means(tracks)
+
+    def converge(self, track: int, max_iterations: int) -> None:
+        """Solve again, with all states linearised where the last step led, until none moves by more than rounding.
+
+        Half a step is taken where a whole one comes no closer: process noise that follows its state can make
+        Gauss-Newton oscillate.
+        """
+        means, last = self.estimates(track), np.inf
+        for _ in range(max_iterations):
+            self.solve_at(track, means)
+            steps = self.estimates(track) - means
+            longest = float(np.abs(steps).max())
+            if longest < _AT_REST:
+                return
+            share = 1.0 if longest < 0.5 * last else 0.5
+            means, last = means + share * steps, longest
