@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
-from scipy.linalg.lapack import dgesv
+from scipy.linalg.lapack import dgesv, dpotrf, dtrtri
 
 from fgtrack.core.types import FloatArray
 
@@ -66,6 +66,11 @@ def inverse_roots(S: FloatArray) -> FloatArray:
     S^-1 B is then W' W B, for many small matrices at a third of the time of `psd_solve`. Raises
     `numpy.linalg.LinAlgError` where S is not positive definite.
     """
+    if S.ndim == 2:
+        root, info = dpotrf(S, lower=1)
+        if info:
+            raise np.linalg.LinAlgError("a covariance is not positive definite")
+        return np.asarray(dtrtri(root, lower=1)[0])
     L = np.linalg.cholesky(S)
     W = np.zeros(L.shape)
     n = L.shape[-1]

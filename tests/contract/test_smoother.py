@@ -18,7 +18,7 @@ from fgtrack.testing.streams import COMPONENTS, MS, START, US, Stream, measured,
 
 START_NS = START.stamp_ns
 LAG_S = 0.3
-MakeBackend = Callable[[FloatArray], Backend]
+MakeBackend = Callable[[], Backend]
 BACKENDS: dict[str, MakeBackend] = {"incremental": IncrementalBackend, "batch": BatchBackend}
 TOLERANCES = {"incremental": 1e-9, "batch": 1e-6}
 NUM_STREAMS = {"incremental": 15, "batch": 4}
@@ -49,6 +49,8 @@ When = Literal["before", "after"]
 class Flaky:
     """A backend whose next update raises once its fuse is lit, before the update is applied or after it."""
 
+    damped = False
+
     def __init__(self, inner: Backend, fuse: "Fuse") -> None:
         self._inner, self._fuse = inner, fuse
 
@@ -60,14 +62,11 @@ class Flaky:
             self._fuse.blow()
         return slots
 
-    def mean(self, key: int) -> FloatArray:
-        return self._inner.mean(key)
+    def means(self, keys: Sequence[int]) -> FloatArray:
+        return self._inner.means(keys)
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
         return self._inner.covariance(keys)
-
-    def moves(self, keys: Sequence[int]) -> FloatArray:
-        return self._inner.moves(keys)
 
 
 class Fuse:
@@ -83,7 +82,7 @@ class Fuse:
 
 def flaky(name: str, motion: MotionModel) -> tuple[FixedLagSmoother, Fuse]:
     fuse = Fuse()
-    return smoother(motion, lambda thresholds: Flaky(BACKENDS[name](thresholds), fuse)), fuse
+    return smoother(motion, lambda: Flaky(BACKENDS[name](), fuse)), fuse
 
 
 @pytest.mark.parametrize("when", ["before", "after"])

@@ -17,7 +17,8 @@ from fgtrack.estimation.factor_graph import window
 from fgtrack.estimation.factor_graph.backends.base import Change
 from fgtrack.estimation.factor_graph.backends.batch import BatchBackend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
-from fgtrack.estimation.factor_graph.factors import prior_factor
+from fgtrack.estimation.factor_graph.rows import PriorOf
+from fgtrack.estimation.marginalised_past import Prior
 from fgtrack.estimation.registry import EXACT, Claims
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models import arc
@@ -260,7 +261,7 @@ def one_missing(change: Change) -> Change:
     if not change.removed or not change.values:
         return change
     (key, mean), *_ = change.values.items()
-    nothing = prior_factor(key, mean, 1e12 * np.eye(len(mean)))
+    nothing = PriorOf(key, Prior(mean, 1e12 * np.eye(len(mean))))
     return replace(change, factors=[nothing, *change.factors[1:]])
 
 
@@ -274,7 +275,7 @@ def marginalised(times: float) -> Break:
         return replace(given, factors=[*given.factors, gone.prior], marginalised=gone)
 
     def weak(patch: pytest.MonkeyPatch) -> None:
-        patch.setattr(window, "prior_factor", lambda key, mean, covariance: prior_factor(key, mean, times * covariance))
+        patch.setattr(window, "PriorOf", lambda key, prior: PriorOf(key, Prior(prior.mean, times * prior.covariance)))
 
     return backend(change) if times == 2.0 else weak
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, SensorPose, Start, UpdateStatus
 from fgtrack.estimation.factor_graph import (
     BatchBackend,
@@ -20,7 +19,7 @@ from fgtrack.models.motion import CTRV, CV
 
 MS = 1_000_000
 STD = {"x_m": 0.3, "y_m": 0.3}
-MakeBackend = Callable[[FloatArray], Backend]
+MakeBackend = Callable[[], Backend]
 
 
 def at(ms: int, x_m: float, y_m: float = 0.0) -> Measurement:

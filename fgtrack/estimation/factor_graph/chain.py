@@ -18,6 +18,9 @@ class Node:
     origin: FloatArray
     """Linearisation point, shape (n,); that of the noise of the motion factor to the next node as well."""
     terms: list[MeasurementTerm] = field(default_factory=list)
+    """What is measured there."""
+    term_slots: list[int] = field(default_factory=list)
+    """Graph slots of their factors."""
     slot: int | None = None
     """Graph slot of the motion factor to the next node; None of the newest node."""
 

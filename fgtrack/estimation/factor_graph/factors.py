@@ -1,13 +1,13 @@
-"""gtsam factors that call the motion and measurement models; no equation of their own."""
+"""gtsam factors that call the motion and measurement models, for an optimiser that tries states; no equation of their
+own."""
 
 from collections.abc import Callable, Mapping
 
 import gtsam
 import numpy as np
 from gtsam.noiseModel import mEstimator
-from scipy.linalg.lapack import dpotrf, dtrtri
 
-from fgtrack.core.linalg import identity
+from fgtrack.core.linalg import identity, inverse_roots
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.following_noise import log_determinant, segment_rows
@@ -79,7 +79,7 @@ def measurement_factor(key: int, term: MeasurementTerm, mean: FloatArray) -> gts
 
 
 def _linear_factor(key: int, origin: FloatArray, term: Linearised) -> gtsam.NonlinearFactor:
-    W = _inverse_root(term.R)
+    W = inverse_roots(term.R)
     linear = gtsam.JacobianFactor(key, W @ term.H, W @ term.y, gtsam.noiseModel.Unit.Create(len(term.y)))
     at = gtsam.Values()
     at.insert(key, origin)
@@ -102,12 +102,4 @@ def _callback_factor(key: int, measurement: Measurement) -> gtsam.NonlinearFacto
 
 
 def _gaussian(covariance: FloatArray) -> gtsam.noiseModel.Base:
-    return gtsam.noiseModel.Gaussian.SqrtInformation(_inverse_root(covariance), smart=False)
-
-
-def _inverse_root(covariance: FloatArray) -> FloatArray:
-    """W with W' W = covariance^-1, shape (k, k): the inverse of the lower Cholesky factor."""
-    root, info = dpotrf(covariance, lower=1)
-    if info:
-        raise np.linalg.LinAlgError("a covariance is not positive definite")
-    return np.asarray(dtrtri(root, lower=1)[0])
+    return gtsam.noiseModel.Gaussian.SqrtInformation(inverse_roots(covariance), smart=False)

@@ -7,7 +7,7 @@ import numpy as np
 from fgtrack.core.errors import DataError
 from fgtrack.core.linalg import symmetrise
 from fgtrack.core.time import nanoseconds, seconds
-from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import Innovation, propagated
@@ -38,8 +38,7 @@ class FixedLagSmoother:
     settings
         Window, late policy, relinearisation and outputs.
     make_backend
-        Makes an empty backend with given relinearisation thresholds, shape (n,): `IncrementalBackend` or
-        `BatchBackend`.
+        Makes an empty backend: `IncrementalBackend` or `BatchBackend`.
     initiation
         How the direction of travel is found where `prior` gives none, see `Initiation`.
     """
@@ -49,7 +48,7 @@ class FixedLagSmoother:
         motion: MotionModel,
         prior: Start,
         settings: SmootherSettings = _DEFAULT,
-        make_backend: Callable[[FloatArray], Backend] = IncrementalBackend,
+        make_backend: Callable[[], Backend] = IncrementalBackend,
         initiation: str = DEFAULT,
     ) -> None:
         self._motion = motion

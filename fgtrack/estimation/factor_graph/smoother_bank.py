@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import seconds
-from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Start, StatesAt
 from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
@@ -30,7 +29,7 @@ class SmootherBank(SmoothingBank):
         self,
         motion: MotionModel,
         settings: SmootherSettings,
-        make_backend: Callable[[FloatArray], Backend] = IncrementalBackend,
+        make_backend: Callable[[], Backend] = IncrementalBackend,
         initiation: str = DEFAULT,
     ) -> None:
         def one(prior: Start) -> FixedLagSmoother:

@@ -10,19 +10,20 @@ import numpy as np
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.ekf import predict_one, propagated
 from fgtrack.estimation.factor_graph.backends.base import Backend, Change, Marginalised
 from fgtrack.estimation.factor_graph.backends.batch import BatchBackend
-from fgtrack.estimation.factor_graph.backends.incremental import FIRST_KEY
 from fgtrack.estimation.factor_graph.chain import Chain, Node
-from fgtrack.estimation.factor_graph.factors import map_motion_factor, measurement_factor, motion_factor, prior_factor
+from fgtrack.estimation.factor_graph.rows import Factor, MapSegment, PriorOf, Segment, Term, Whitened
+from fgtrack.estimation.factor_graph.states import Around, State, state
+from fgtrack.estimation.factor_graph.window_update import Update
 from fgtrack.estimation.initiation import Fix, Line, along, fixes_of
-from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.marginalised_past import MarginalisedPast, Prior
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.estimation.terms import MeasurementTerm, curved, overshot
 from fgtrack.models.motion import MotionModel
 
+#: Variables are numbered from here.
+FIRST_KEY: int = gtsam.symbol("x", 0)
 #: A step of a state, in m, rad, m/s or rad/s, that is rounding.
 _AT_REST = 1e-7
 _BROKEN = (RuntimeError, ValueError, IndexError, np.linalg.LinAlgError)
@@ -40,8 +41,8 @@ class Window:
     settings
         Those of relinearisation and outputs.
     make_backend
-        Makes an empty backend with the given relinearisation thresholds; called again after a failed update, and when
-        the first measurement comes that is not linear.
+        Makes an empty backend; called again after a failed update, and when the first measurement comes that is not
+        linear.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class Window:
         stamp_ns: int,
         prior: Prior,
         settings: SmootherSettings,
-        make_backend: Callable[[FloatArray], Backend],
+        make_backend: Callable[[], Backend],
     ) -> None:
         self._motion = motion
         self._settings = settings
@@ -62,8 +63,9 @@ class Window:
         self._chain = Chain(Node(stamp_ns, FIRST_KEY, prior.mean))
         self._past = MarginalisedPast(motion, stamp_ns, prior, self._follows)
         self._means: dict[int, FloatArray] = {}
+        self._far: list[tuple[Node, FloatArray]] | None = None
         self._covariances: dict[tuple[int, ...], FloatArray] = {}
-        self._states: dict[int, tuple[FloatArray, FloatArray]] = {}
+        self._states: dict[int, State] = {}
         self.num_rebuilt = 0
         """How often the graph was built anew after a failed update."""
         self.num_damped = 0
@@ -92,65 +94,102 @@ class Window:
         the states of the nodes that left, where the settings want them. Raises `RuntimeError` where it fails; all is as
         before then.
         """
-        chain, past = self._chain, self._past.copy()
+        return self.solve(self.prepare(measurements, start_ns, reach_ns))
+
+    def prepare(
+        self,
+        measurements: Sequence[Measurement],
+        start_ns: int,
+        reach_ns: int,
+        whitened: Sequence[Whitened | None] | None = None,
+    ) -> Update:
+        """All of `update` up to the solution, which must come next. Raises as `update`.
+
+        `whitened` are the rows of the measurements at the states at their stamps, where they are known.
+        """
+        chain = self._chain
         leaving = chain.nodes[: max(chain.place(start_ns), 0)]
         anchor = chain.nodes[len(leaving)]
-        new: dict[int, FloatArray] = {}
+        update = Update(leaving, self._past.copy(), reach_ns)
         try:
             if not self._curved and any(curved(item) for item in measurements):
                 self._curved, self._thresholds = True, self._settings.thresholds(self._motion, curved=True)
                 self._rebuild(self._estimates())
             moved = self._moved()
             for node, right in zip(leaving, chain.nodes[1:], strict=False):
-                past.pass_node(node.terms, self._mean(node), right.stamp_ns, self._mean(right))
-            left = self._states_behind(past, anchor, leaving) if self._settings.final else []
-            old = [item for item in measurements if item.stamp_ns < anchor.stamp_ns]
-            added: list[tuple[Node, MeasurementTerm]] = [(anchor, past.fuse(item)) for item in old]
-            live = [item for item in measurements if item.stamp_ns >= anchor.stamp_ns]
-            guesses = {item.stamp_ns: self.state_at(item.stamp_ns)[0] for item in live}
-            for item in live:
+                update.past.pass_node(node.terms, self._mean(node), right.stamp_ns, self._mean(right))
+            if self._settings.final:
+                update.left = self._states_behind(update.past, anchor, leaving)
+            known = whitened or [None] * len(measurements)
+            guesses = [
+                self.state_at(item.stamp_ns)[0] if item.stamp_ns >= anchor.stamp_ns else None for item in measurements
+            ]
+            fused: list[tuple[Node, MeasurementTerm, FloatArray, Whitened | None]] = []
+            for item, guess, rows in zip(measurements, guesses, known, strict=True):
+                if guess is None:
+                    fused.append((anchor, update.past.fuse(item), self._mean(anchor), None))
+                    continue
                 at = chain.at(item.stamp_ns)
                 if at is None:
-                    at = chain.insert(item.stamp_ns, guesses[item.stamp_ns])
-                    new[at.key] = at.origin
-                added.append((at, item))
-            self._solve(moved, added, new, leaving, past.prior)
+                    at = chain.insert(item.stamp_ns, guess)
+                    update.new[at.key] = guess
+                fused.append((at, item, guess, rows))
+            self._relinearise(update, moved)
+            for node, term, guess, rows in fused:
+                update.add(Term(node.key, term, node.origin if curved(term) else guess, rows), node, term)
         except _BROKEN as error:
-            chain.remove(new)
-            self._rebuild(self._estimates())
-            self.num_rebuilt += 1
-            raise RuntimeError(f"the graph cannot be solved with the new measurements ({error})") from error
-        past.forget_before(reach_ns)
-        self._past = past
-        chain.drop(len(leaving))
-        for node, term in added:
-            node.terms.append(term)
-        return left
+            raise self._undone(update, error) from error
+        return update
 
-    def state_at(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
+    def solve(self, update: Update) -> list[TrackState]:
+        """Solve what is prepared; see `update`."""
+        try:
+            self._solve(update)
+        except _BROKEN as error:
+            raise self._undone(update, error) from error
+        update.past.forget_before(update.reach_ns)
+        self._past = update.past
+        self._chain.drop(len(update.leaving))
+        return update.left
+
+    def _undone(self, update: Update, error: Exception) -> RuntimeError:
+        """Take `update` back; gives what to raise."""
+        self._chain.remove(update.new)
+        self._rebuild(self._estimates())
+        self.num_rebuilt += 1
+        return RuntimeError(f"the graph cannot be solved with the new measurements ({error})")
+
+    def state_at(self, stamp_ns: int) -> State:
         """Mean and covariance at any stamp from `reach_ns` on: interpolated in the past, predicted ahead."""
-        state = self._states.get(stamp_ns)
-        if state is None:
-            state = self._states[stamp_ns] = self._state_at(stamp_ns)
-        return state
+        found = self.known_at(stamp_ns)
+        if found is None:
+            found = state(self._motion, self.around(stamp_ns))
+            self.know(stamp_ns, found)
+        return found
 
-    def _state_at(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
-        place = self._chain.place(stamp_ns)
+    def known_at(self, stamp_ns: int) -> State | None:
+        """The state at `stamp_ns` where it was asked for before, since the last update."""
+        return self._states.get(stamp_ns)
+
+    def know(self, stamp_ns: int, found: State) -> None:
+        """`found` is the state at `stamp_ns`, of `states.state`."""
+        self._states[stamp_ns] = found
+
+    def around(self, stamp_ns: int) -> Around:
+        """What is known around `stamp_ns`."""
+        place, nodes = self._chain.place(stamp_ns), self._chain.nodes
         if place < 0:
             anchor = self._chain.oldest
-            return self._past.state_at(stamp_ns, self._mean(anchor), self._covariance(anchor))
-        node = self._chain.nodes[place]
-        mean = self._mean(node)
+            return Around(*self._past.state_at(stamp_ns, self._mean(anchor), self._covariance(anchor)))
+        node = nodes[place]
         if node.stamp_ns == stamp_ns:
-            return mean, self._covariance(node)
+            return Around(self._mean(node), self._covariance(node))
         until_s = seconds(stamp_ns - node.stamp_ns)
         if node is self._chain.newest:
-            return predict_one(mean, self._covariance(node), self._motion, until_s)
-        right = self._chain.nodes[place + 1]
+            return Around(self._mean(node), self._covariance(node), until_s)
+        right = nodes[place + 1]
         after_s = seconds(right.stamp_ns - stamp_ns)
-        inner = between(self._motion, mean.tolist(), self._mean(right), until_s, after_s)
-        weights = np.hstack([inner.Lambda, inner.Psi])
-        return inner.mean, propagated(weights, self._covariance(node, right), inner.Sigma)
+        return Around(self._mean(node), self._covariance(node, right), until_s, self._mean(right), after_s)
 
     def damp(self) -> None:
         """Solve again by Levenberg-Marquardt where the last step went beyond what its linearisation is good for.
@@ -176,7 +215,9 @@ class Window:
             moved = self._moved()
             if not moved:
                 return
-            self._solve(moved, [], {}, [], self._past.prior)
+            update = Update([], self._past, self.reach_ns)
+            self._relinearise(update, moved)
+            self._solve(update)
 
     def converge(self, max_iterations: int) -> None:
         """Solve again, with all states linearised where the last step led, until none moves by more than rounding.
@@ -220,22 +261,21 @@ class Window:
         self._past = MarginalisedPast(self._motion, self._first_ns, Prior(mean, prior.covariance), self._follows)
         self._rebuild(means)
 
-    def _rebuild(
-        self, means: Mapping[int, FloatArray], make_backend: Callable[[FloatArray], Backend] | None = None
-    ) -> None:
+    def _rebuild(self, means: Mapping[int, FloatArray], make_backend: Callable[[], Backend] | None = None) -> None:
         """Build the graph anew from the window's own records, near `means` by key, if wanted in another backend."""
         nodes = self._chain.nodes
-        self._backend, self._anchored = (make_backend or self._make_backend)(self._thresholds), False
-        segments = list(pairwise(nodes))
+        self._backend, self._anchored = (make_backend or self._make_backend)(), False
         for node in nodes:
             node.origin = means[node.key]
-        factors = [self._segment(left, right) for left, right in segments]
-        factors.append(prior_factor(nodes[0].key, self._past.prior.mean, self._past.prior.covariance))
-        factors += [measurement_factor(node.key, item, means[node.key]) for node in nodes for item in node.terms]
+        factors: list[Factor] = [self._segment(left, right) for left, right in pairwise(nodes)]
+        factors.append(PriorOf(nodes[0].key, self._past.prior))
+        factors += [Term(node.key, item, node.origin) for node in nodes for item in node.terms]
         stamps_s = {node.key: self._seconds(node.stamp_ns) for node in nodes}
         slots = self._backend.update(Change(dict(means), stamps_s, factors, []))
-        for (left, _), slot in zip(segments, slots, strict=False):
-            left.slot = slot
+        terms = iter(slots[len(nodes) :])
+        for place, node in enumerate(nodes):
+            node.slot = slots[place] if node is not nodes[-1] else None
+            node.term_slots = [next(terms) for _ in node.terms]
         self._forget_estimates()
 
     def _states_behind(self, past: MarginalisedPast, anchor: Node, leaving: Sequence[Node]) -> list[TrackState]:
@@ -244,53 +284,55 @@ class Window:
         mean, covariance = self._mean(anchor), self._covariance(anchor)
         return [TrackState(node.stamp_ns, *past.state_at(node.stamp_ns, mean, covariance)) for node in leaving]
 
-    def _solve(
-        self,
-        moved: Sequence[tuple[Node, FloatArray]],
-        added: Sequence[tuple[Node, MeasurementTerm]],
-        new: dict[int, FloatArray],
-        leaving: Sequence[Node],
-        prior: Prior,
-    ) -> None:
-        """Update the backend, and note the slots of the new segments and of those whose noise follows a moved node."""
-        nodes, changed = self._chain.nodes, set(new)
+    def _relinearise(self, update: Update, moved: Sequence[tuple[Node, FloatArray]]) -> None:
+        """Add the segments of new nodes to `update`, and what has to be linearised where nodes have `moved`."""
+        changed = set(update.new)
         for node, mean in moved:
             node.origin = mean
             changed.add(node.key)
-        segments = [pair for pair in pairwise(nodes) if pair[0].key in changed or pair[1].key in new]
-        removed = [left.slot for left, _ in segments if left.slot is not None]
-        factors = [self._segment(left, right) for left, right in segments]
-        for node, term in added:
-            mean = new[node.key] if node.key in new else self._mean(node)
-            factors.append(measurement_factor(node.key, term, mean))
-        stamps_s = {node.key: self._seconds(node.stamp_ns) for node in nodes if node.key in new}
+        ends = changed if self._follows else update.new.keys()
+        for left, right in pairwise(self._chain.nodes):
+            if left.key in changed or right.key in ends:
+                update.replace(self._segment(left, right), left, left.slot)
+        for node, _ in moved if self._curved else ():
+            for place, term in enumerate(node.terms):
+                if curved(term):
+                    update.replace(Term(node.key, term, node.origin), node, node.term_slots[place], place)
+
+    def _solve(self, update: Update) -> None:
+        """Update the backend, and note the slots of the factors."""
+        nodes, leaving = self._chain.nodes, update.leaving
+        stamps_s = {node.key: self._seconds(node.stamp_ns) for node in nodes if node.key in update.new}
         marginalised = None
         if leaving:
             oldest = nodes[len(leaving)]
-            marginalised = Marginalised(
-                [node.key for node in leaving],
-                0.5 * (self._seconds(leaving[-1].stamp_ns) + self._seconds(oldest.stamp_ns)),
-                prior_factor(oldest.key, prior.mean, prior.covariance),
-            )
-        slots = self._backend.update(Change(new, stamps_s, factors, removed, marginalised))
-        for (left, _), slot in zip(segments, slots, strict=False):
-            left.slot = slot
+            cutoff_s = 0.5 * (self._seconds(leaving[-1].stamp_ns) + self._seconds(oldest.stamp_ns))
+            prior = PriorOf(oldest.key, update.past.prior)
+            marginalised = Marginalised([node.key for node in leaving], cutoff_s, prior)
+        slots = self._backend.update(Change(update.new, stamps_s, update.factors, update.removed, marginalised))
+        update.place(slots)
         self._anchored |= bool(leaving)
         self._forget_estimates()
 
     def _moved(self) -> list[tuple[Node, FloatArray]]:
-        """The nodes that the next update of the backend relinearises, and where."""
-        free = self._chain.nodes[self._anchored :]
-        if not free:
-            return []
-        moves = self._backend.moves([node.key for node in free])
-        far = np.flatnonzero((np.abs(moves) > self._thresholds).any(axis=1))
-        return [(free[place], free[place].origin + moves[place]) for place in far]
+        """The nodes that are too far from their linearisation points, and where they are.
 
-    def _segment(self, left: Node, right: Node) -> gtsam.NonlinearFactor:
+        The oldest one stays linearised where it was, once it has a marginalised past.
+        """
+        if self._far is None:
+            free = self._chain.nodes[self._anchored :]
+            means = self._known_means()[self._anchored :]
+            self._far = []
+            if free:
+                moves = np.abs(means - np.array([node.origin for node in free]))
+                far = np.flatnonzero((moves > self._thresholds).any(axis=1))
+                self._far = [(free[place], means[place]) for place in far]
+        return self._far
+
+    def _segment(self, left: Node, right: Node) -> Segment | MapSegment:
         dt_s = seconds(right.stamp_ns - left.stamp_ns)
-        make = map_motion_factor if self._follows else motion_factor
-        return make(self._motion, left.key, right.key, dt_s, left.origin)
+        make = MapSegment if self._follows else Segment
+        return make(self._motion, (left.key, right.key), dt_s, (left.origin, right.origin))
 
     def _seconds(self, stamp_ns: int) -> float:
         return seconds(stamp_ns - self._first_ns)
@@ -308,9 +350,14 @@ class Window:
 
     def _mean(self, node: Node) -> FloatArray:
         mean = self._means.get(node.key)
-        if mean is None:
-            mean = self._means[node.key] = self._backend.mean(node.key)
-        return mean
+        return self._known_means()[self._chain.nodes.index(node)] if mean is None else mean
+
+    def _known_means(self) -> FloatArray:
+        """Of all nodes, shape (nodes, n)."""
+        keys = [node.key for node in self._chain.nodes]
+        means = self._backend.means(keys)
+        self._means = dict(zip(keys, means, strict=True))
+        return means
 
     def _covariance(self, *nodes: Node) -> FloatArray:
         keys = tuple(node.key for node in nodes)
@@ -321,5 +368,6 @@ class Window:
 
     def _forget_estimates(self) -> None:
         self._means.clear()
+        self._far = None
         self._covariances.clear()
         self._states.clear()

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
-import gtsam
-
 from fgtrack.core.types import FloatArray
+from fgtrack.estimation.factor_graph.rows import Factor
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,7 +15,7 @@ class Marginalised:
     keys: list[int]
     cutoff_s: float
     """Between their stamps and those of the others."""
-    prior: gtsam.NonlinearFactor
+    prior: Factor
     """What they say about the oldest of the others."""
 
 
@@ -28,7 +27,7 @@ class Change:
     """First estimates (n,) of new variables, by key."""
     stamps_s: dict[int, float]
     """Their stamps, in seconds since the run's first one."""
-    factors: list[gtsam.NonlinearFactor]
+    factors: Sequence[Factor]
     """Factors to add."""
     removed: list[int]
     """Slots of factors to remove."""
@@ -36,11 +35,7 @@ class Change:
 
 
 class Backend(Protocol):
-    """Keeps a graph and its solution.
-
-    A variable whose estimate is further than a threshold from its linearisation point is relinearised there at the
-    next update, until it takes part in the prior of what was marginalised.
-    """
+    """Keeps a graph and its solution. Factors stay linearised where they say, until they are replaced."""
 
     damped: ClassVar[bool]
     """Whether no step makes the fit worse."""
@@ -51,11 +46,8 @@ class Backend(Protocol):
         Raises `RuntimeError` or `numpy.linalg.LinAlgError` where it cannot be solved; then only a new backend helps.
         """
 
-    def mean(self, key: int) -> FloatArray:
-        """Estimate of the variable `key`, shape (n,)."""
-
-    def moves(self, keys: Sequence[int]) -> FloatArray:
-        """How far m variables are from their linearisation points, shape (m, n)."""
+    def means(self, keys: Sequence[int]) -> FloatArray:
+        """Estimates of m variables, shape (m, n)."""
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
         """Joint covariance of one variable, shape (n, n), or of two neighbours, (2 n, 2 n)."""

@@ -9,55 +9,41 @@ from scipy.linalg.lapack import dtrtri
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.factor_graph.backends.base import Change
+from fgtrack.estimation.factor_graph.rows import Factor
 
 
 class BatchBackend:
     """Solves the whole window from its last estimates. What leaves it is replaced by the prior it gives.
 
-    Parameters
-    ----------
-    thresholds
-        An entry of a state that moves further than this is relinearised, shape (n,); see `SmootherSettings`. It is the
-        process noise that follows these points: all else is linearised at every step.
+    Process noise stays that of where its factor is linearised; all else is linearised anew at every step.
     """
 
     damped: ClassVar[bool] = True
 
-    def __init__(self, thresholds: FloatArray) -> None:
-        self._thresholds = thresholds
-        self._origins: dict[int, FloatArray] = {}
+    def __init__(self) -> None:
         self._factors: dict[int, gtsam.NonlinearFactor] = {}
         self._values = gtsam.Values()
         self._next_slot = 0
 
     def update(self, change: Change) -> list[int]:
         """See `Backend.update`."""
-        for key in self._origins:
-            if (np.abs(self.moves([key])) > self._thresholds).any():
-                self._origins[key] = self.mean(key)
         for slot in change.removed:
             del self._factors[slot]
         slots = [self._add(factor) for factor in change.factors]
         for key, mean in change.values.items():
             self._values.insert(key, mean)
-            self._origins[key] = mean
         if change.marginalised is not None:
             gone = set(change.marginalised.keys)
             self._factors = {slot: factor for slot, factor in self._factors.items() if gone.isdisjoint(factor.keys())}
             for key in gone:
                 self._values.erase(key)
-                del self._origins[key]
             self._add(change.marginalised.prior)
         self._solve()
         return slots
 
-    def mean(self, key: int) -> FloatArray:
-        """See `Backend.mean`."""
-        return self._values.atVector(key)
-
-    def moves(self, keys: Sequence[int]) -> FloatArray:
-        """See `Backend.moves`."""
-        return np.array([self.mean(key) - self._origins[key] for key in keys])
+    def means(self, keys: Sequence[int]) -> FloatArray:
+        """See `Backend.means`."""
+        return np.array([self._values.atVector(key) for key in keys])
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
         """See `Backend.covariance`; from one dense QR of the whole linearised window."""
@@ -71,10 +57,10 @@ class BatchBackend:
         root = dtrtri(R[-size:, -size:])[0]
         return np.asarray(root @ root.T)
 
-    def _add(self, factor: gtsam.NonlinearFactor) -> int:
+    def _add(self, factor: Factor) -> int:
         slot = self._next_slot
         self._next_slot += 1
-        self._factors[slot] = factor
+        self._factors[slot] = factor.nonlinear()
         return slot
 
     def _graph(self) -> gtsam.NonlinearFactorGraph:

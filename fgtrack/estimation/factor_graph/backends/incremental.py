@@ -1,56 +1,54 @@
 """The default backend: gtsam's incremental fixed-lag smoother on iSAM2."""
 
 from collections.abc import Sequence
+from functools import cache
 from typing import ClassVar, SupportsFloat, SupportsIndex, SupportsInt
 
 import gtsam
+import numpy as np
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.factor_graph.backends.base import Change
+from fgtrack.estimation.factor_graph.rows import Rows
 
 _Key = SupportsInt | SupportsIndex
 _Stamp = SupportsFloat | SupportsIndex
 
-_KIND = "x"
-#: Variables are numbered from here; the symbol's letter chooses their relinearisation thresholds.
-FIRST_KEY: int = gtsam.symbol(_KIND, 0)
 #: Longer than any window: nothing leaves by itself.
 _FOREVER_S = 1e9
 
 
 class IncrementalBackend:
-    """iSAM2 with QR (Cholesky fails for stamps close together), thresholds per entry, and slots that are used again.
+    """iSAM2 with QR (Cholesky fails for stamps close together), and slots that are used again.
 
-    Parameters
-    ----------
-    thresholds
-        An entry of a state that moves further than this is relinearised, shape (n,); see `SmootherSettings`.
+    It is given linear factors only, so it never calls back into Python. They are relative to the first estimates of
+    their variables, which iSAM2 keeps: what has to be linearised elsewhere is replaced.
     """
 
     damped: ClassVar[bool] = False
 
-    def __init__(self, thresholds: FloatArray) -> None:
+    def __init__(self) -> None:
         params = gtsam.ISAM2Params()
         params.setFactorization("QR")
         params.findUnusedFactorSlots = True
-        params.relinearizeSkip = 1
+        params.enableRelinearization = False
         gauss_newton = gtsam.ISAM2GaussNewtonParams()
         gauss_newton.setWildfireThreshold(0.0)
         params.setOptimizationParams(gauss_newton)
-        by_kind = gtsam.ISAM2ThresholdMap()
-        by_kind.insert((_KIND, thresholds))
-        params.setRelinearizeThreshold(by_kind)
         self._smoother = gtsam.IncrementalFixedLagSmoother(_FOREVER_S, params)
         self._newest_s = 0.0
+        self._first: dict[int, FloatArray] = {}
+        """First estimates of the variables."""
 
     def update(self, change: Change) -> list[int]:
         """See `Backend.update`."""
-        graph = gtsam.NonlinearFactorGraph()
-        for factor in change.factors:
-            graph.add(factor)
         values = gtsam.Values()
         for key, mean in change.values.items():
             values.insert(key, mean)
+            self._first[key] = mean
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in change.factors:
+            graph.add(self._container(factor.rows()))
         gone = change.marginalised
         if change.stamps_s:
             self._newest_s = max(self._newest_s, *change.stamps_s.values())
@@ -59,18 +57,35 @@ class IncrementalBackend:
         for key, stamp_s in change.stamps_s.items():
             stamps_s[key] = stamp_s
         self._smoother.update(graph, values, stamps_s, change.removed)
+        for key in gone.keys if gone is not None else ():
+            del self._first[key]
         return list(self._smoother.getISAM2Result().getNewFactorsIndices())[: len(change.factors)]
 
-    def mean(self, key: int) -> FloatArray:
-        """See `Backend.mean`."""
-        return self._smoother.calculateEstimateVector(key)
-
-    def moves(self, keys: Sequence[int]) -> FloatArray:
-        """See `Backend.moves`."""
-        return self._smoother.getDelta().vector(list(keys)).reshape(len(keys), -1)
+    def means(self, keys: Sequence[int]) -> FloatArray:
+        """See `Backend.means`."""
+        first = np.array([self._first[key] for key in keys])
+        return np.asarray(first + self._smoother.getDelta().vector(list(keys)).reshape(first.shape))
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
         """See `Backend.covariance`."""
         if len(keys) == 1:
             return self._smoother.marginalCovariance(keys[0])
         return self._smoother.getISAM2().jointMarginalCovariance(list(keys)).fullMatrix()
+
+    def _container(self, rows: Rows) -> gtsam.LinearContainerFactor:
+        b = rows.b
+        for key, A, at in zip(rows.keys, rows.A, rows.at, strict=True):
+            first = self._first[key]
+            if first is not at:
+                b = b - A.dot(first - at)
+        unit = _unit(len(b))
+        if len(rows.keys) == 1:
+            linear = gtsam.JacobianFactor(rows.keys[0], rows.A[0], b, unit)
+        else:
+            linear = gtsam.JacobianFactor(rows.keys[0], rows.A[0], rows.keys[1], rows.A[1], b, unit)
+        return gtsam.LinearContainerFactor(linear)
+
+
+@cache
+def _unit(size: int) -> gtsam.noiseModel.Unit:
+    return gtsam.noiseModel.Unit.Create(size)
