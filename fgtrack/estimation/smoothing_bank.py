@@ -43,28 +43,28 @@ class SmoothingBank(ObjectBank):
 
     def remove(self, track_id: int) -> None:
         """See `TrackBank.remove`; what was still inside the window becomes final."""
-        self._ended += self._reports(track_id, self._smoothers.pop(track_id).take_rest())
+        self._ended += self._reports([(track_id, state) for state in self._smoothers.pop(track_id).take_rest()])
         super().remove(track_id)
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`."""
         reports, self._ended = self._ended, []
-        for track_id, smoother in self._smoothers.items():
-            reports += self._reports(track_id, smoother.take_final())
+        final = [(track_id, state) for track_id, one in self._smoothers.items() for state in one.take_final()]
+        reports += self._reports(final)
         for lag_s in self._lagged_s:
             stamp_ns = self.present_ns - nanoseconds(lag_s)
-            for track_id, smoother in self._smoothers.items():
-                if smoother.window_ns[0] <= stamp_ns:
-                    reports += self._reports(track_id, [smoother.state_at(stamp_ns)], lag_s)
+            known = [each for each in self._smoothers.items() if each[1].window_ns[0] <= stamp_ns]
+            reports += self._reports([(track_id, one.state_at(stamp_ns)) for track_id, one in known], lag_s)
         return reports
 
-    def _reports(self, track_id: int, states: list[TrackState], lag_s: float | None = None) -> list[SmoothedReport]:
+    def _reports(self, states: Sequence[tuple[int, TrackState]], lag_s: float | None = None) -> list[SmoothedReport]:
+        """Reports of states in the motion model's own form, each with its track."""
         if not states:
             return []
         means, covariances = self._motion.kinematic(
-            np.array([state.mean for state in states]), np.array([state.covariance for state in states])
+            np.array([state.mean for _, state in states]), np.array([state.covariance for _, state in states])
         )
         return [
             SmoothedReport(track_id, TrackState(state.stamp_ns, mean, covariance), lag_s)
-            for state, mean, covariance in zip(states, wrapped_yaw(means), covariances, strict=True)
+            for (track_id, state), mean, covariance in zip(states, wrapped_yaw(means), covariances, strict=True)
         ]

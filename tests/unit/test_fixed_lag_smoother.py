@@ -115,7 +115,7 @@ def test_what_lies_behind_the_ring_is_forgotten() -> None:
     for k in range(1, 31):
         smoother.update(at(100 * k, 1.0 * k))
     assert smoother.window_ns == (2500 * MS, 3000 * MS)
-    assert 2300 * MS <= smoother._window.reach_ns <= 2500 * MS
+    assert 2300 * MS <= smoother.window.reach_ns <= 2500 * MS
     assert smoother.update(at(2500, 25.0)).status is UpdateStatus.BEYOND_WINDOW
     assert smoother.update(at(2499, 25.0)).status is UpdateStatus.TOO_OLD
 

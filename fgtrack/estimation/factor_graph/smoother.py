@@ -13,7 +13,9 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import Innovation, propagated
 from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
+from fgtrack.estimation.factor_graph.rows import Whitened
 from fgtrack.estimation.factor_graph.window import Window
+from fgtrack.estimation.factor_graph.window_update import Update
 from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search
 from fgtrack.estimation.marginalised_past import Prior
 from fgtrack.estimation.smoother_settings import SmootherSettings
@@ -51,28 +53,28 @@ class FixedLagSmoother:
         make_backend: Callable[[], Backend] = IncrementalBackend,
         initiation: str = DEFAULT,
     ) -> None:
-        self._motion = motion
         self._settings = settings
         self._lag_ns, self._ring_ns = nanoseconds(settings.lag_s), nanoseconds(settings.ring_s)
         self._first_ns = self._clock_ns = prior.stamp_ns
-        self._window = Window(motion, prior.stamp_ns, Prior(*initial_state(motion, prior)), settings, make_backend)
+        self.motion = motion
+        self.window = Window(motion, prior.stamp_ns, Prior(*initial_state(motion, prior)), settings, make_backend)
         self._search = Search.of(motion, prior, initiation)
         self._final: list[TrackState] = []
 
     @property
     def window_ns(self) -> tuple[int, int]:
         """See `Estimator.window_ns`."""
-        return max(self._reach_ns, self._window.reach_ns), self._window.newest_ns
+        return max(self._reach_ns, self.window.reach_ns), self.window.newest_ns
 
     @property
     def num_rebuilt(self) -> int:
         """How often the graph was built anew after a failed update."""
-        return self._window.num_rebuilt
+        return self.window.num_rebuilt
 
     @property
     def num_damped(self) -> int:
         """How often a step went too far and was taken again with damping."""
-        return self._window.num_damped
+        return self.window.num_damped
 
     def advance(self, now_ns: int) -> None:
         """See `Estimator.advance`; the nodes that leave are marginalised at the next update."""
@@ -87,24 +89,39 @@ class FixedLagSmoother:
 
         Raises `DataError` for a measurement older than the window where the late policy is `raise`.
         """
-        measurements = [measurement.seen_by(self._motion) for measurement in measurements]
+        measurements = [measurement.seen_by(self.motion) for measurement in measurements]
         results = [self._judged(measurement) for measurement in measurements]
         fusible = [m for m, result in zip(measurements, results, strict=True) if result.innovation is not None]
         if not fusible:
             return results
         try:
-            self._final += self._window.update(fusible, self._start_ns, self._reach_ns)
+            self.solve(self.prepare(fusible))
         except RuntimeError:
             return [r if r.innovation is None else UpdateResult(UpdateStatus.FAILED) for r in results]
-        if self._search is not None:
-            self._search = self._initiated(self._search, min(measurement.stamp_ns for measurement in fusible))
-        self._window.damp()
-        self._window.iterate(self._settings.max_iterations - 1)
+        self.settle(min(measurement.stamp_ns for measurement in fusible))
         return results
+
+    def prepare(self, measurements: Sequence[Measurement], whitened: Sequence[Whitened | None] = ()) -> Update:
+        """The first part of fusing `measurements`; see `Window.prepare`."""
+        return self.window.prepare(measurements, self._start_ns, self._reach_ns, whitened)
+
+    def solve(self, update: Update) -> None:
+        """The second part; see `Window.solve`."""
+        self._final += self.window.solve(update)
+
+    def settle(self, oldest_ns: int) -> None:
+        """What may follow: a new beginning along another line, damping, iterations.
+
+        `oldest_ns` is the oldest stamp of the measurements.
+        """
+        if self._search is not None:
+            self._search = self._initiated(self._search, oldest_ns)
+        self.window.damp()
+        self.window.iterate(self._settings.max_iterations - 1)
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: smoothed in the past, interpolated under the motion model, predicted ahead."""
-        mean, covariance = self._window.state_at(stamp_ns)
+        mean, covariance = self.window.state_at(stamp_ns)
         return TrackState(stamp_ns, mean, symmetrise(covariance))
 
     def take_final(self) -> list[TrackState]:
@@ -114,29 +131,29 @@ class FixedLagSmoother:
 
     def take_rest(self) -> list[TrackState]:
         """Like `take_final`, and of the nodes that are still inside: for when the track ends."""
-        inside = self._window.stamps_ns if self._settings.final else []
+        inside = self.window.stamps_ns if self._settings.final else []
         return self.take_final() + [self.state_at(stamp_ns) for stamp_ns in inside]
 
     def converge(self, max_iterations: int = 50) -> None:
         """Relinearise until nothing moves; for comparisons."""
-        self._window.converge(max_iterations)
+        self.window.converge(max_iterations)
 
     def _initiated(self, search: Search, oldest_ns: int) -> Search | None:
         """Begin again from a straight line, where the oldest new stamp asks for it, as long as nothing has left."""
-        if not self._window.whole:
+        if not self.window.whole:
             return None
-        found = search.next_line(self._window.fixes, oldest_ns)
+        found = search.next_line(self.window.fixes, oldest_ns)
         if found is None:
             return search
         line, search = found
-        self._window.restart(line)
-        self._window.iterate(SMOOTHER_ITERATIONS)
+        self.window.restart(line)
+        self.window.iterate(SMOOTHER_ITERATIONS)
         return search
 
     @property
     def _start_ns(self) -> int:
         """The window's start, by the clock and the newest stamp."""
-        return max(max(self._clock_ns, self._window.newest_ns) - self._lag_ns, self._first_ns)
+        return max(max(self._clock_ns, self.window.newest_ns) - self._lag_ns, self._first_ns)
 
     @property
     def _reach_ns(self) -> int:
@@ -144,29 +161,39 @@ class FixedLagSmoother:
         behind_ns = self._ring_ns if self._settings.late == "fuse" else 0
         return max(self._start_ns - behind_ns, self._first_ns)
 
-    def _judged(self, measurement: Measurement) -> UpdateResult:
-        """What will become of `measurement`; without an innovation where it will not be fused."""
-        stamp_ns, start_ns = measurement.stamp_ns, self._start_ns
+    def status_of(self, stamp_ns: int) -> UpdateStatus:
+        """What will become of a measurement at `stamp_ns` that can be fused.
+
+        Raises `DataError` where it is older than the window and the late policy is `raise`.
+        """
+        start_ns = self._start_ns
         if stamp_ns < start_ns and self._settings.late == "raise":
             raise DataError(
                 f"a measurement at {stamp_ns} ns is {seconds(start_ns - stamp_ns):g} s older than the window: "
                 "lengthen smoother.lag_s, or set smoother.late to fuse or drop"
             )
         if stamp_ns < self.window_ns[0]:
-            return UpdateResult(UpdateStatus.TOO_OLD)
+            return UpdateStatus.TOO_OLD
+        if stamp_ns < start_ns:
+            return UpdateStatus.BEYOND_WINDOW
+        late = stamp_ns < self.window.newest_ns
+        return UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
+
+    def _judged(self, measurement: Measurement) -> UpdateResult:
+        """What will become of `measurement`; without an innovation where it will not be fused."""
+        status = self.status_of(measurement.stamp_ns)
+        if status is UpdateStatus.TOO_OLD:
+            return UpdateResult(status)
         try:
             innovation, nis, S = self._innovation(measurement)
         except np.linalg.LinAlgError:
             return UpdateResult(UpdateStatus.FAILED)
         if not np.isfinite(nis):
             return UpdateResult(UpdateStatus.FAILED)
-        if stamp_ns < start_ns:
-            return UpdateResult(UpdateStatus.BEYOND_WINDOW, innovation, nis, S)
-        late = stamp_ns < self._window.newest_ns
-        return UpdateResult(UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE, innovation, nis, S)
+        return UpdateResult(status, innovation, nis, S)
 
     def _innovation(self, measurement: Measurement) -> Innovation:
-        mean, covariance = self._window.state_at(measurement.stamp_ns)
+        mean, covariance = self.window.state_at(measurement.stamp_ns)
         y, H, R = linearised(measurement, mean)
         S = propagated(H, covariance, R)
         return Innovation(y, measurement.nis(y, S), S)

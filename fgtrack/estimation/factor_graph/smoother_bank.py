@@ -1,10 +1,12 @@
 """The smoothers of all objects."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.time import seconds
-from fgtrack.estimation.base import Start, StatesAt
+from fgtrack.core.time import nanoseconds, seconds
+from fgtrack.core.types import SmoothedReport, TrackState
+from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult
+from fgtrack.estimation.factor_graph import together
 from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
@@ -51,4 +53,33 @@ class SmootherBank(SmoothingBank):
                 f"detections at {stamp_ns} ns are {seconds(self.present_ns - stamp_ns):g} s late, older than the "
                 "window: lengthen smoother.lag_s, or set smoother.late to fuse or drop"
             )
+        self._look_up(stamp_ns)
         return super().states_at(stamp_ns)
+
+    def update(
+        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+    ) -> list[UpdateResult]:
+        """See `TrackBank.update`."""
+        smoothers = [self._smoothers[track_id] for track_id in track_ids]
+        singles = [one for one in smoothers if isinstance(one, FixedLagSmoother)]
+        if len(singles) < max(len(smoothers), 2):
+            return super().update(stamp_ns, track_ids, measurements)
+        return together.update(singles, measurements)
+
+    def present(self) -> list[TrackState]:
+        """See `TrackBank.present`."""
+        self._look_up(self.present_ns)
+        return super().present()
+
+    def smoothed(self) -> list[SmoothedReport]:
+        """See `TrackBank.smoothed`."""
+        for lag_s in self._settings.lagged_s:
+            self._look_up(self.present_ns - nanoseconds(lag_s))
+        return super().smoothed()
+
+    def _look_up(self, stamp_ns: int) -> None:
+        """Find the states at `stamp_ns` of all objects that are known there, at once."""
+        singles = [one for one in self._smoothers.values() if isinstance(one, FixedLagSmoother)]
+        known = [one for one in singles if one.window_ns[0] <= stamp_ns]
+        if len(known) > 1:
+            together.look_up(known, [stamp_ns] * len(known))

@@ -63,6 +63,7 @@ class Window:
         self._chain = Chain(Node(stamp_ns, FIRST_KEY, prior.mean))
         self._past = MarginalisedPast(motion, stamp_ns, prior, self._follows)
         self._means: dict[int, FloatArray] = {}
+        self._mean_rows: FloatArray | None = None
         self._far: list[tuple[Node, FloatArray]] | None = None
         self._covariances: dict[tuple[int, ...], FloatArray] = {}
         self._states: dict[int, State] = {}
@@ -101,7 +102,7 @@ class Window:
         measurements: Sequence[Measurement],
         start_ns: int,
         reach_ns: int,
-        whitened: Sequence[Whitened | None] | None = None,
+        whitened: Sequence[Whitened | None] = (),
     ) -> Update:
         """All of `update` up to the solution, which must come next. Raises as `update`.
 
@@ -320,13 +321,11 @@ class Window:
         The oldest one stays linearised where it was, once it has a marginalised past.
         """
         if self._far is None:
-            free = self._chain.nodes[self._anchored :]
-            means = self._known_means()[self._anchored :]
-            self._far = []
-            if free:
-                moves = np.abs(means - np.array([node.origin for node in free]))
-                far = np.flatnonzero((moves > self._thresholds).any(axis=1))
-                self._far = [(free[place], means[place]) for place in far]
+            nodes = self._chain.nodes
+            means = self._all_means()
+            moves = means - np.concatenate([node.origin for node in nodes]).reshape(means.shape)
+            far = np.flatnonzero((np.abs(moves) > self._thresholds).any(axis=1))
+            self._far = [(nodes[place], means[place]) for place in far.tolist() if place >= self._anchored]
         return self._far
 
     def _segment(self, left: Node, right: Node) -> Segment | MapSegment:
@@ -349,15 +348,17 @@ class Window:
         return mean if np.isfinite(mean).all() else node.origin
 
     def _mean(self, node: Node) -> FloatArray:
-        mean = self._means.get(node.key)
-        return self._known_means()[self._chain.nodes.index(node)] if mean is None else mean
+        if self._mean_rows is None:
+            self._all_means()
+        return self._means[node.key]
 
-    def _known_means(self) -> FloatArray:
+    def _all_means(self) -> FloatArray:
         """Of all nodes, shape (nodes, n)."""
-        keys = [node.key for node in self._chain.nodes]
-        means = self._backend.means(keys)
-        self._means = dict(zip(keys, means, strict=True))
-        return means
+        if self._mean_rows is None:
+            keys = [node.key for node in self._chain.nodes]
+            self._mean_rows = self._backend.means(keys)
+            self._means = dict(zip(keys, self._mean_rows, strict=True))
+        return self._mean_rows
 
     def _covariance(self, *nodes: Node) -> FloatArray:
         keys = tuple(node.key for node in nodes)
@@ -367,7 +368,6 @@ class Window:
         return covariance
 
     def _forget_estimates(self) -> None:
-        self._means.clear()
-        self._far = None
+        self._mean_rows = self._far = None
         self._covariances.clear()
         self._states.clear()

@@ -63,8 +63,8 @@ class IncrementalBackend:
 
     def means(self, keys: Sequence[int]) -> FloatArray:
         """See `Backend.means`."""
-        first = np.array([self._first[key] for key in keys])
-        return np.asarray(first + self._smoother.getDelta().vector(list(keys)).reshape(first.shape))
+        first = np.concatenate([self._first[key] for key in keys])
+        return np.asarray(first + self._smoother.getDelta().vector(list(keys))).reshape(len(keys), -1)
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
         """See `Backend.covariance`."""
