@@ -9,13 +9,13 @@ import numpy as np
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
-from fgtrack.estimation.banded.whitening import Innovations, innovations
 from fgtrack.estimation.banded.windows import Leaving, States, Windows
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
 from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.estimation.smoother_settings import SmootherSettings
+from fgtrack.estimation.whitening import Innovations, innovations
 from fgtrack.models.motion import MotionModel
 
 _TOO_OLD, _FAILED = UpdateResult(UpdateStatus.TOO_OLD), UpdateResult(UpdateStatus.FAILED)

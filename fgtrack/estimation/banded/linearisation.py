@@ -5,8 +5,8 @@ import numpy as np
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.banded.nodes import Nodes
-from fgtrack.estimation.banded.whitening import whitened_term
 from fgtrack.estimation.terms import curved
+from fgtrack.estimation.whitening import whitened_term
 from fgtrack.models.motion import MotionModel
 
 

@@ -14,13 +14,13 @@ from fgtrack.estimation.banded.linearisation import linearise_segments, linearis
 from fgtrack.estimation.banded.ring import fuse_behind
 from fgtrack.estimation.banded.solver import Solver
 from fgtrack.estimation.banded.undo import Undo
-from fgtrack.estimation.banded.whitening import Innovations, whitened
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.ekf import propagated
 from fgtrack.estimation.initiation import Fix, Line, along, fixes_of
 from fgtrack.estimation.interpolation import between_all
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.estimation.terms import EquivalentMeasurement, curved, overshot
+from fgtrack.estimation.whitening import Innovations, whitened
 from fgtrack.models.motion import MotionModel
 
 #: Nodes behind the window are forgotten when there are so many that nobody needs.

@@ -8,15 +8,12 @@ import numpy as np
 
 from fgtrack.core.linalg import inverse_roots
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.banded.whitening import whitened_term
 from fgtrack.estimation.factor_graph.factors import map_motion_factor, measurement_factor, motion_factor, prior_factor
 from fgtrack.estimation.following_noise import log_determinant, segment_rows
 from fgtrack.estimation.marginalised_past import Prior
 from fgtrack.estimation.terms import MeasurementTerm
+from fgtrack.estimation.whitening import whitened_term
 from fgtrack.models.motion import MotionModel
-
-Whitened = tuple[FloatArray, FloatArray]
-"""Rows G (k, n) and y (k,) of a measurement."""
 
 _FEW = 6  # so many segments are linearised faster one by one
 
@@ -104,19 +101,17 @@ class MapSegment:
 class Term:
     """What is measured of the variable `key`, linearised and weighted by its loss at the state `at` (n,).
 
-    `whitened` are its rows there, where they are known.
+    `whitened` is `whitened_term` there, where it is known.
     """
 
-    def __init__(self, key: int, term: MeasurementTerm, at: FloatArray, whitened: Whitened | None = None) -> None:
+    def __init__(self, key: int, term: MeasurementTerm, at: FloatArray, whitened: FloatArray | None = None) -> None:
         self._key, self._term, self._at, self._whitened = key, term, at, whitened
 
     def rows(self) -> Rows:
         """See `Factor.rows`."""
         if self._whitened is None:
-            y, G = whitened_term(self._term, self._at)
-            self._whitened = G, y
-        G, y = self._whitened
-        return Rows((self._key,), (G,), y, (self._at,))
+            self._whitened = whitened_term(self._term, self._at)
+        return Rows((self._key,), (self._whitened[:, :-1],), self._whitened[:, -1], (self._at,))
 
     def nonlinear(self) -> gtsam.NonlinearFactor:
         """See `Factor.nonlinear`."""

@@ -7,19 +7,19 @@ import numpy as np
 from fgtrack.core.errors import DataError
 from fgtrack.core.linalg import symmetrise
 from fgtrack.core.time import nanoseconds, seconds
-from fgtrack.core.types import TrackState
+from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.ekf import Innovation, propagated
+from fgtrack.estimation.ekf import propagated
 from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
-from fgtrack.estimation.factor_graph.rows import Whitened
 from fgtrack.estimation.factor_graph.window import Window
 from fgtrack.estimation.factor_graph.window_update import Update
 from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search
 from fgtrack.estimation.marginalised_past import Prior
 from fgtrack.estimation.smoother_settings import SmootherSettings
-from fgtrack.estimation.terms import linearised
+from fgtrack.estimation.terms import curved, linearised
+from fgtrack.estimation.whitening import whitened
 from fgtrack.models.motion import MotionModel
 
 _DEFAULT = SmootherSettings()
@@ -90,20 +90,21 @@ class FixedLagSmoother:
         Raises `DataError` for a measurement older than the window where the late policy is `raise`.
         """
         measurements = [measurement.seen_by(self.motion) for measurement in measurements]
-        results = [self._judged(measurement) for measurement in measurements]
-        fusible = [m for m, result in zip(measurements, results, strict=True) if result.innovation is not None]
+        judged = [self._judged(measurement) for measurement in measurements]
+        results = [result for result, _ in judged]
+        fusible = [place for place, result in enumerate(results) if result.innovation is not None]
         if not fusible:
             return results
         try:
-            self.solve(self.prepare(fusible))
+            self.solve(self.prepare([measurements[k] for k in fusible], [judged[k][1] for k in fusible]))
         except RuntimeError:
             return [r if r.innovation is None else UpdateResult(UpdateStatus.FAILED) for r in results]
-        self.settle(min(measurement.stamp_ns for measurement in fusible))
+        self.settle(min(measurements[place].stamp_ns for place in fusible))
         return results
 
-    def prepare(self, measurements: Sequence[Measurement], whitened: Sequence[Whitened | None] = ()) -> Update:
+    def prepare(self, measurements: Sequence[Measurement], rows: Sequence[FloatArray | None]) -> Update:
         """The first part of fusing `measurements`; see `Window.prepare`."""
-        return self.window.prepare(measurements, self._start_ns, self._reach_ns, whitened)
+        return self.window.prepare(measurements, self._start_ns, self._reach_ns, rows)
 
     def solve(self, update: Update) -> None:
         """The second part; see `Window.solve`."""
@@ -179,21 +180,21 @@ class FixedLagSmoother:
         late = stamp_ns < self.window.newest_ns
         return UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
 
-    def _judged(self, measurement: Measurement) -> UpdateResult:
-        """What will become of `measurement`; without an innovation where it will not be fused."""
+    def _judged(self, measurement: Measurement) -> tuple[UpdateResult, FloatArray | None]:
+        """What will become of `measurement`, without an innovation where it will not be fused; and its rows, see
+        `Window.prepare`.
+        """
         status = self.status_of(measurement.stamp_ns)
         if status is UpdateStatus.TOO_OLD:
-            return UpdateResult(status)
-        try:
-            innovation, nis, S = self._innovation(measurement)
-        except np.linalg.LinAlgError:
-            return UpdateResult(UpdateStatus.FAILED)
-        if not np.isfinite(nis):
-            return UpdateResult(UpdateStatus.FAILED)
-        return UpdateResult(status, innovation, nis, S)
-
-    def _innovation(self, measurement: Measurement) -> Innovation:
+            return UpdateResult(status), None
         mean, covariance = self.window.state_at(measurement.stamp_ns)
         y, H, R = linearised(measurement, mean)
         S = propagated(H, covariance, R)
-        return Innovation(y, measurement.nis(y, S), S)
+        try:
+            nis = measurement.nis(y, S)
+            rows = None if curved(measurement) else whitened(y, H, R)
+        except np.linalg.LinAlgError:
+            return UpdateResult(UpdateStatus.FAILED), None
+        if not np.isfinite(nis):
+            return UpdateResult(UpdateStatus.FAILED), None
+        return UpdateResult(status, y, nis, S), rows

@@ -8,13 +8,14 @@ from contextlib import suppress
 
 import numpy as np
 
-from fgtrack.estimation.banded.whitening import innovations, whitened
+from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, UpdateResult, UpdateStatus
-from fgtrack.estimation.factor_graph.rows import Segment, Whitened
+from fgtrack.estimation.factor_graph.rows import Segment
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
 from fgtrack.estimation.factor_graph.states import states
 from fgtrack.estimation.factor_graph.window_update import Update
 from fgtrack.estimation.terms import curved
+from fgtrack.estimation.whitening import innovations, whitened
 
 _FAILED = UpdateResult(UpdateStatus.FAILED)
 
@@ -68,18 +69,17 @@ def update(smoothers: Sequence[FixedLagSmoother], measurements: Sequence[Measure
 
 def _judged(
     smoothers: Sequence[FixedLagSmoother], measurements: Sequence[Measurement], statuses: Sequence[UpdateStatus]
-) -> list[tuple[UpdateResult, Whitened | None]]:
+) -> list[tuple[UpdateResult, FloatArray | None]]:
     """What will become of `measurements`, and their rows at the states at their stamps where they are linear."""
     known = [one.window.state_at(item.stamp_ns) for one, item in zip(smoothers, measurements, strict=True)]
-    found: list[tuple[UpdateResult, Whitened | None]] = [(_FAILED, None)] * len(measurements)
+    found: list[tuple[UpdateResult, FloatArray | None]] = [(_FAILED, None)] * len(measurements)
     means, covariances = np.array([mean for mean, _ in known]), np.array([covariance for _, covariance in known])
     for group in innovations(measurements, means, covariances):
         group = group.at(np.isfinite(group.nis))
-        rows: list[Whitened | None] = [None] * len(group.positions)
+        rows: list[FloatArray | None] = [None] * len(group.positions)
         if rows and not curved(measurements[group.positions[0]]):
             with suppress(np.linalg.LinAlgError):  # else each window finds its own, and the one that cannot fails
-                y, G = whitened(group.y, group.H, group.R)
-                rows = list(zip(G, y, strict=True))
+                rows = list(whitened(group.y, group.H, group.R))
         for position, y_one, nis, each in zip(group.positions.tolist(), group.y, group.nis.tolist(), rows, strict=True):
             found[position] = UpdateResult(statuses[position], y_one, nis), each
     return found

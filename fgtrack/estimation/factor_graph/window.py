@@ -13,7 +13,7 @@ from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.factor_graph.backends.base import Backend, Change, Marginalised
 from fgtrack.estimation.factor_graph.backends.batch import BatchBackend
 from fgtrack.estimation.factor_graph.chain import Chain, Node
-from fgtrack.estimation.factor_graph.rows import Factor, MapSegment, PriorOf, Segment, Term, Whitened
+from fgtrack.estimation.factor_graph.rows import Factor, MapSegment, PriorOf, Segment, Term
 from fgtrack.estimation.factor_graph.states import Around, State, state
 from fgtrack.estimation.factor_graph.window_update import Update
 from fgtrack.estimation.initiation import Fix, Line, along, fixes_of
@@ -102,11 +102,11 @@ class Window:
         measurements: Sequence[Measurement],
         start_ns: int,
         reach_ns: int,
-        whitened: Sequence[Whitened | None] = (),
+        whitened: Sequence[FloatArray | None] = (),
     ) -> Update:
         """All of `update` up to the solution, which must come next. Raises as `update`.
 
-        `whitened` are the rows of the measurements at the states at their stamps, where they are known.
+        `whitened` are the `whitened_term`s of the measurements at the states at their stamps, where they are known.
         """
         chain = self._chain
         leaving = chain.nodes[: max(chain.place(start_ns), 0)]
@@ -125,7 +125,7 @@ class Window:
             guesses = [
                 self.state_at(item.stamp_ns)[0] if item.stamp_ns >= anchor.stamp_ns else None for item in measurements
             ]
-            fused: list[tuple[Node, MeasurementTerm, FloatArray, Whitened | None]] = []
+            fused: list[tuple[Node, MeasurementTerm, FloatArray, FloatArray | None]] = []
             for item, guess, rows in zip(measurements, guesses, known, strict=True):
                 if guess is None:
                     fused.append((anchor, update.past.fuse(item), self._mean(anchor), None))
