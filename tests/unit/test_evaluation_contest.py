@@ -82,6 +82,14 @@ def test_gospa_is_that_of_the_metrics(trio: list[Run]) -> None:
     assert found.entries[-1].name == "0"
 
 
+def test_gospa_is_left_out_where_the_scores_of_all_tracks_are_not_asked_for(tmp_path: Path) -> None:
+    plain = "evaluation: {multi_object: false}"
+    runs = [a_run(tmp_path / name, NOISE_M, config_text=plain) for name in "ab"]
+    assert set(quantities_of(contest_of(runs))) == {
+        *("position_rmse_m", "speed_rmse_mps", "yaw_rmse_rad", "position_nees")
+    }
+
+
 def test_of_the_nees_the_nearest_to_two_is_best(tmp_path: Path) -> None:
     """The covariance of a track is the identity, so its NEES is its squared error."""
     noise = np.random.default_rng(2).normal(0.0, 0.2, TICKS)
@@ -89,7 +97,10 @@ def test_of_the_nees_the_nearest_to_two_is_best(tmp_path: Path) -> None:
     found = quantities_of(contest_of([cautious, near]))
     assert [entry.name for entry in found["position_nees"].entries] == ["1", "0"]
     assert found["position_nees"].entries[0].standing == "best"
-    assert found["position_nees"].entries[0].value == pytest.approx(1.8, rel=0.1)
+    best, other = found["position_nees"].entries
+    assert best.value == pytest.approx(1.8, rel=0.1)
+    assert other.worse_by is not None
+    assert other.worse_by.mean == pytest.approx(abs(other.value - 2.0) - abs(best.value - 2.0))
     assert [entry.name for entry in found["position_rmse_m"].entries] == ["0", "1"]
 
 

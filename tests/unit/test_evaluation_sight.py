@@ -77,6 +77,17 @@ def test_what_is_not_known_hides_nothing(tmp_path: Path) -> None:
     assert seen(a_run(tmp_path / "plain", config_text="")) == everything
 
 
+@pytest.mark.parametrize(
+    ("limit", "is_known"),
+    [("", False), (", field_of_view_rad: 1.5", True), (", max_range_m: 50.0", True), (", view_range_m: 50.0", True)],
+)
+def test_sight_is_known_where_every_sensor_has_a_limit(tmp_path: Path, limit: str, is_known: bool) -> None:
+    run = a_run(
+        tmp_path / "run", ["camera"], config_text=CONFIG.replace("bearing_rad: 0.1}", f"bearing_rad: 0.1}}{limit}")
+    )
+    assert in_sight(run, true_paths(run.truth), run.timing["now_ns"])[1] == is_known
+
+
 def test_a_damaged_configuration_is_told(tmp_path: Path) -> None:
     damaged = CONFIG.replace("100.0", "far")
     with pytest.raises(DataError, match=r"config\.yaml: sensors\.radar\.view_range_m"):
