@@ -6,8 +6,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.linalg import congruence, identity, mahalanobis_squared, product, psd_solve, symmetrise
-from fgtrack.core.types import FloatArray
+from fgtrack.core.linalg import (
+    applied,
+    congruence,
+    identity,
+    inverse_roots,
+    mahalanobis_squared,
+    product,
+    psd_solve,
+    symmetrise,
+    times_transposed,
+)
+from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.measurement import MeasurementModel, SensorPose
 from fgtrack.models.motion import MotionModel
@@ -16,6 +26,7 @@ from fgtrack.models.sensors import RobustLoss
 
 _MAX_REWEIGHTINGS = 50
 _REWEIGHTING_TOLERANCE = 1e-9
+_MANY = 12  # so many innovations are sooner solved by Cholesky factors than by one LAPACK call each
 
 
 def propagated(F: FloatArray, P: FloatArray, Q: FloatArray) -> FloatArray:
@@ -35,8 +46,12 @@ def kalman_gain(P: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray
 def _solved(P: FloatArray, H: FloatArray, R: FloatArray, *columns: FloatArray) -> tuple[FloatArray, FloatArray]:
     """S, and S^-1 times H P and further columns."""
     HP = product(H, P)
-    S = product(HP, H.mT) + R
-    return S, psd_solve(S, np.concatenate([HP, *columns], axis=-1) if columns else HP)
+    S = times_transposed(HP, H) + R
+    wanted = np.concatenate([HP, *columns], axis=-1) if columns else HP
+    if S.ndim == 2 or len(S) < _MANY:
+        return S, psd_solve(S, wanted)
+    W = inverse_roots(S)
+    return S, np.ascontiguousarray(W.mT) @ (W @ wanted)
 
 
 def joseph(P: FloatArray, K: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
@@ -91,6 +106,23 @@ class Correction(NamedTuple):
     """Shape (m, k)."""
     nis: FloatArray
     """Normalised innovation squared, shape (m,)."""
+    S: FloatArray
+    """Covariances of the innovations, shape (m, k, k), before any loss."""
+
+
+class Prediction(NamedTuple):
+    """A state after some time, or a stack of them, and how it depends on that before."""
+
+    mean: FloatArray
+    """Shape (..., n); angles are not wrapped."""
+    covariance: FloatArray
+    """Shape (..., n, n)."""
+    cross: FloatArray
+    """Covariance of the state after (rows) and before (columns), of first order F P; shape (..., n, n)."""
+
+    def at(self, rows: IntArray | slice) -> "Prediction":
+        """Those at `rows` of a stack."""
+        return Prediction(self.mean[rows], self.covariance[rows], self.cross[rows])
 
 
 def predict(
@@ -100,8 +132,7 @@ def predict(
 
     Shapes (..., n) and (..., n, n); `dt_s` a number or of shape (...).
     """
-    after, F, Q = motion.steps(mean, np.broadcast_to(np.float64(dt_s), mean.shape[:-1]))
-    return after, propagated(F, covariance, Q)
+    return predict_all(mean, covariance, motion, dt_s)[:2]
 
 
 def correct(
@@ -127,7 +158,7 @@ def correct(
         return found
     parts = zip(losses, y, congruence(H, covariance), R, strict=True)
     w = np.array([robust_weight(*part) for part in parts])
-    return correct_with_innovation(mean, covariance, y, R / w[:, None, None], H)._replace(nis=found.nis)
+    return correct_with_innovation(mean, covariance, y, R / w[:, None, None], H)._replace(nis=found.nis, S=found.S)
 
 
 def correct_with_innovation(
@@ -142,7 +173,7 @@ def correct_with_innovation(
     S, solved = _solved(covariance, H, R, y[..., None])
     K = solved[..., :-1].mT
     nis = np.vecdot(y, solved[..., -1]) if measured is None else mahalanobis_squared(y, S, measured)
-    return Correction(mean + np.vecdot(K, y[..., None, :]), joseph(covariance, K, H, R), y, np.asarray(nis))
+    return Correction(mean + applied(K, y), joseph(covariance, K, H, R), y, np.asarray(nis), S)
 
 
 class OneCorrection(NamedTuple):
@@ -162,17 +193,6 @@ class OneCorrection(NamedTuple):
     """Covariance of the innovation, shape (k, k), before any loss."""
 
 
-class Prediction(NamedTuple):
-    """One state after some time, and how it depends on that before."""
-
-    mean: FloatArray
-    """Shape (n,); angles are not wrapped."""
-    covariance: FloatArray
-    """Shape (n, n)."""
-    cross: FloatArray
-    """Covariance of the state after (rows) and before (columns), of first order F P; shape (n, n)."""
-
-
 def predict_one(
     mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: float
 ) -> tuple[FloatArray, FloatArray]:
@@ -183,8 +203,18 @@ def predict_one(
 def predict_across(mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: float) -> Prediction:
     """`predict_one`, and the cross-covariance of both states, which is half way to the covariance."""
     after, F, Q = motion.step(mean.tolist(), dt_s)
-    FP = product(F, covariance)
-    return Prediction(np.array(after), symmetrise(product(FP, F.T) + Q), FP)
+    return _predicted(np.array(after), F, Q, covariance)
+
+
+def predict_all(mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: FloatArray | float) -> Prediction:
+    """`predict_across` of a stack of states, shapes (..., n) and (..., n, n); `dt_s` a number or of shape (...)."""
+    after, F, Q = motion.steps(mean, np.broadcast_to(np.float64(dt_s), mean.shape[:-1]))
+    return _predicted(after, F, Q, covariance)
+
+
+def _predicted(mean: FloatArray, F: FloatArray, Q: FloatArray, P: FloatArray) -> Prediction:
+    FP = product(F, P)
+    return Prediction(mean, symmetrise(times_transposed(FP, F) + Q), FP)
 
 
 class Update(NamedTuple):
@@ -238,8 +268,23 @@ class Innovation(NamedTuple):
     """Covariance of the innovation, shape (k, k)."""
 
 
+def innovations(
+    mean: FloatArray,
+    covariance: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    model: MeasurementModel,
+    pose: SensorPose,
+    measured: Sequence[int] | None = None,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Innovation (..., k), NIS (...) and S (..., k, k) of `correct` alone; of one state or a stack of them."""
+    y, H = linearised(z, mean, model, pose)
+    S = congruence(H, covariance) + R
+    return y, mahalanobis_squared(y, S, measured), S
+
+
 def innovation_one(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> Innovation:
     """The innovation of `measurement` at one state, shapes (n,) and (n, n), which stays as it is."""
-    y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
-    S = congruence(H, covariance) + measurement.R
-    return Innovation(y, measurement.nis(y, S), S)
+    own = measurement
+    y, nis, S = innovations(mean, covariance, own.z, own.R, own.model, own.pose, own.measured)
+    return Innovation(y, float(nis), S)

@@ -14,7 +14,7 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import OneCorrection, Prediction
 from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Line, Search, along, fixes_of
 from fgtrack.estimation.iteration import Iteration, largest_move, reweighted
-from fgtrack.estimation.rts import smoothed_one
+from fgtrack.estimation.rts import rts_step
 from fgtrack.estimation.sigma_points import Regression, measurement_regression, motion_regression
 from fgtrack.estimation.unscented import UkfRecursion
 from fgtrack.estimation.windowed import WindowedFilter
@@ -150,7 +150,7 @@ class PosteriorLinearisationSmoother(WindowedFilter):
         first = self._moved(node.filtered, (node.mean, node.covariance), seconds(stamp_ns - node.stamp_ns))
         x, P = first.mean, first.covariance
         second = self._moved((x, P), smoothed[:2], seconds(after.stamp_ns - stamp_ns))
-        return smoothed_one(x, P, second, after.mean - second.mean, after.covariance)[:2]
+        return rts_step(x, P, second, after.mean - second.mean, after.covariance)[:2]
 
     def _moved(
         self, state: tuple[FloatArray, FloatArray], over: tuple[FloatArray, FloatArray], dt_s: float
@@ -174,7 +174,7 @@ class PosteriorLinearisationSmoother(WindowedFilter):
         mean, covariance = nodes[-1].filtered
         found = [replace(nodes[-1], mean=mean, covariance=covariance)]
         for node, after in zip(nodes[-2::-1], nodes[:0:-1], strict=True):
-            mean, covariance, _ = smoothed_one(*node.filtered, after.predicted, mean - after.predicted.mean, covariance)
+            mean, covariance, _ = rts_step(*node.filtered, after.predicted, mean - after.predicted.mean, covariance)
             found.append(_Node(node.stamp_ns, node.measurements, mean, covariance, node.predicted, node.filtered))
         return found[::-1]
 

@@ -16,7 +16,7 @@ from fgtrack.estimation.base import KNOWN_YAW_STD_RAD, UNKNOWN_YAW_STD_RAD, Esti
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import Prediction, correct_one, propagated
 from fgtrack.estimation.initiation import Fix, Initiation, Line, checked_initiation, fix_of, over, sought, straight_line
-from fgtrack.estimation.rts import smoothed_one
+from fgtrack.estimation.rts import rts_step
 from fgtrack.models.motion import MotionModel
 
 #: What a filter linearises in this direction stays good.
@@ -125,7 +125,7 @@ class Opening:
                 shift = mean - after.predicted.mean
                 if not self.motion.cartesian:
                     shift[YAW] = wrap_angle(shift[YAW])
-                mean, covariance, _ = smoothed_one(before.mean, before.covariance, after.predicted, shift, covariance)
+                mean, covariance, _ = rts_step(before.mean, before.covariance, after.predicted, shift, covariance)
         return mean, covariance
 
     def _filtered(self, extra_ns: int | None = None) -> list[_Link]:

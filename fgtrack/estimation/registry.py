@@ -17,6 +17,8 @@ from fgtrack.estimation.hypotheses import hypotheses
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.opening import initiated
+from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.replay_bank import ReplayBank
 from fgtrack.estimation.smoothing_bank import SmoothingBank
 from fgtrack.models.motion import MotionModel
 
@@ -63,6 +65,9 @@ MOTION_MODELS = Registry(
     "motion model",
     {"fgtrack.motion_models": {name: f"fgtrack.models.motion:{name.upper()}" for name in ("ctrv", "ctra", "cv")}},
 )
+
+#: Banks that do for all objects at once what an estimator does for one.
+_TOGETHER: Mapping[object, Callable[..., TrackBank]] = {ReplayEkf: ReplayBank}
 
 Factory = Callable[..., Any]  # Any: an estimator or a bank, see the module
 
@@ -172,6 +177,8 @@ def estimator_bank(
         bank: TrackBank = _made(name, factory, motion, lag_s, **own)
         return bank
     _check_options(name, factory, 3, own)
+    if factory in _TOGETHER and options.get("hypotheses", 1) == 1:
+        return _TOGETHER[factory](motion, lag_s, **own)
     if claims.reports:
 
         def one(start: Start) -> Smoother:

@@ -15,7 +15,7 @@ from fgtrack.estimation.ekf import OneCorrection, Prediction
 from fgtrack.estimation.initiation import DEFAULT, checked_initiation
 from fgtrack.estimation.opening import Opening
 from fgtrack.estimation.recursion import EkfRecursion, Recursion
-from fgtrack.estimation.rts import smoothed_one
+from fgtrack.estimation.rts import rts_step
 from fgtrack.estimation.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
 
@@ -23,8 +23,8 @@ _Order = tuple[int, tuple[str, ...], tuple[float, ...]]
 
 
 @dataclass(slots=True)
-class _Stored:
-    """A measurement with the state after it."""
+class Step:
+    """A measurement of a replaying filter with the state after it."""
 
     order: _Order
     """Place among all measurements: by stamp, and at one stamp by content, so that arrival does not matter."""
@@ -70,17 +70,27 @@ class ReplayingFilter(WindowedFilter):
         self._initiation = checked_initiation(initiation)
         self._steps = [self._first(prior)]
 
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """The steps of the window and the one that it is replayed from, in order."""
+        return tuple(self._steps)
+
+    @property
+    def settled(self) -> bool:
+        """Whether no direction of travel is sought any more, nor was at a step that may be replayed."""
+        return self._steps[0].opening is None
+
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: the filter's state, from the measurements up to that stamp."""
         before = max(bisect.bisect_right(self._steps, stamp_ns, key=_stamp) - 1, 0)
         predicted = self._predicted(self._steps[before], stamp_ns)
         return TrackState(stamp_ns, predicted.mean, predicted.covariance)
 
-    def _first(self, prior: Start) -> _Stored:
+    def _first(self, prior: Start) -> Step:
         """The state that everything is replayed from."""
         mean, covariance = initial_state(self._motion, prior)
         opening, predicted = Opening.of(self._motion, prior, self._initiation), Prediction(mean, covariance, covariance)
-        return _Stored((prior.stamp_ns, (), ()), None, mean, covariance, predicted, opening)
+        return Step((prior.stamp_ns, (), ()), None, mean, covariance, predicted, opening)
 
     def _forget_before(self, stamp_ns: int) -> None:
         del self._steps[: max(bisect.bisect_right(self._steps, stamp_ns, key=_stamp) - 1, 0)]
@@ -96,10 +106,10 @@ class ReplayingFilter(WindowedFilter):
         self._steps[place:] = [step, *self._replayed(step, later)]
         return correction
 
-    def _retrodicted(self, step: _Stored, later: Sequence[_Stored]) -> tuple[FloatArray, FloatArray]:
+    def _retrodicted(self, step: Step, later: Sequence[Step]) -> tuple[FloatArray, FloatArray]:
         """The state that the measurement of `step` finds, given all that was fused, the `later` steps included.
 
-        From the newest step back (see `smoothed_one`), each as it was when the measurement of `step` was unknown.
+        From the newest step back (see `rts_step`), each as it was when the measurement of `step` was unknown.
         """
         blank = replace(step, mean=step.predicted.mean, covariance=step.predicted.covariance)
         first = later[0]
@@ -110,10 +120,10 @@ class ReplayingFilter(WindowedFilter):
                 return after.opening.retrodicted(step.order[0], mean, covariance)
             if before.order[0] != after.order[0]:  # else it is the same state
                 shift = self._wrapped(mean - after.predicted.mean)
-                mean, covariance, _ = smoothed_one(before.mean, before.covariance, after.predicted, shift, covariance)
+                mean, covariance, _ = rts_step(before.mean, before.covariance, after.predicted, shift, covariance)
         return mean, covariance
 
-    def _replayed(self, step: _Stored, later: Iterable[_Stored]) -> list[_Stored]:
+    def _replayed(self, step: Step, later: Iterable[Step]) -> list[Step]:
         """The measurements of `later` steps, in their order, applied to `step`."""
         steps = []
         for old in later:
@@ -122,7 +132,7 @@ class ReplayingFilter(WindowedFilter):
                 steps.append(step)
         return steps
 
-    def _fused(self, before: _Stored, order: _Order, measurement: Measurement) -> tuple[_Stored, OneCorrection]:
+    def _fused(self, before: Step, order: _Order, measurement: Measurement) -> tuple[Step, OneCorrection]:
         """The step after `before` with `measurement`; `numpy.linalg.LinAlgError` where it is not finite."""
         predicted = self._predicted(before, measurement.stamp_ns)
         corrected = self._recursion.correct(predicted.mean, predicted.covariance, measurement)
@@ -133,9 +143,9 @@ class ReplayingFilter(WindowedFilter):
             corrected = corrected._replace(mean=mean, covariance=covariance)
         if not math.isfinite(mean.dot(mean) + np.vdot(covariance, covariance)):  # one number instead of a mask
             raise np.linalg.LinAlgError("posterior is not finite")
-        return _Stored(order, measurement, self._wrapped(mean), covariance, predicted, opening), corrected
+        return Step(order, measurement, self._wrapped(mean), covariance, predicted, opening), corrected
 
-    def _predicted(self, before: _Stored, stamp_ns: int) -> Prediction:
+    def _predicted(self, before: Step, stamp_ns: int) -> Prediction:
         """The state at `stamp_ns`, from the step before it."""
         if stamp_ns == before.order[0]:
             return Prediction(before.mean, before.covariance, before.covariance)
@@ -161,9 +171,9 @@ class ReplayEkf(ReplayingFilter):
         super().__init__(motion, prior, lag_s, EkfRecursion(motion), initiation)
 
 
-def _order(step: _Stored) -> _Order:
+def _order(step: Step) -> _Order:
     return step.order
 
 
-def _stamp(step: _Stored) -> int:
+def _stamp(step: Step) -> int:
     return step.order[0]

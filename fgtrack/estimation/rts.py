@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from fgtrack.core.linalg import congruence, psd_solve, symmetrise
+from fgtrack.core.linalg import applied, congruence, psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.ekf import Prediction
 
@@ -11,23 +11,23 @@ class Smoothed(NamedTuple):
     """A state that knows of what was measured after it."""
 
     mean: FloatArray
-    """Shape (n,)."""
+    """Shape (..., n)."""
     covariance: FloatArray
-    """Shape (n, n)."""
+    """Shape (..., n, n)."""
     gain: FloatArray
-    """C = Cov(x, x_next) P_next^-1, shape (n, n)."""
+    """C = Cov(x, x_next) P_next^-1, shape (..., n, n)."""
 
 
-def smoothed_one(
+def rts_step(
     mean: FloatArray, covariance: FloatArray, predicted: Prediction, shift: FloatArray, after: FloatArray
 ) -> Smoothed:
-    """The state `mean` (n,), `covariance` (n, n) after the smoothing of the next one.
+    """The state `mean` (..., n), `covariance` (..., n, n) after the smoothing of the next one, or a stack of them.
 
     x + C s and P + C (P_s - P_next) C' with the prediction P_next of the next state, by how much it was moved in the
-    smoothing, s = `shift` (n,), and its covariance then, P_s = `after` (n, n). Rauch, Tung and Striebel, Maximum
-    likelihood estimates of linear dynamic systems, AIAA Journal 3(8), 1965. Raises `numpy.linalg.LinAlgError` for a
-    singular P_next.
+    smoothing, s = `shift` (..., n), and its covariance then, P_s = `after` (..., n, n). Rauch, Tung and Striebel,
+    Maximum likelihood estimates of linear dynamic systems, AIAA Journal 3(8), 1965. Raises `numpy.linalg.LinAlgError`
+    for a singular P_next.
     """
-    C = psd_solve(predicted.covariance, predicted.cross).T
+    C = psd_solve(predicted.covariance, predicted.cross).mT
     P = covariance + congruence(C, after - predicted.covariance)
-    return Smoothed(mean + C.dot(shift), symmetrise(P), C)
+    return Smoothed(mean + applied(C, shift), symmetrise(P), C)

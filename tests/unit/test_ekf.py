@@ -84,7 +84,7 @@ def test_a_filter_over_linear_motion_is_the_batch_solution_of_the_whole_chain() 
         add(blocks[step] - F @ blocks[step - 1], np.zeros(n), Q)
         add(H @ blocks[step], z, R)
         mean, covariance = predict(mean, covariance, motion, dt_s)
-        mean, covariance, _, _ = correct(mean, covariance, z[None], R[None], model, SensorPose())
+        mean, covariance = correct(mean, covariance, z[None], R[None], model, SensorPose())[:2]
     np.testing.assert_allclose(mean[0], np.linalg.solve(information, vector)[-n:], atol=1e-9)
     np.testing.assert_allclose(covariance[0], np.linalg.inv(information)[-n:, -n:], atol=1e-9)
 
@@ -237,4 +237,4 @@ def test_the_replaying_filter_remembers_no_more_than_its_window() -> None:
     estimator = ReplayEkf(CV(), Start(), 1.0)
     for k in range(100):
         estimator.update(Measurement.of(k * 10**8, x_m=0.0, std={"x_m": 1.0}))
-    assert len(estimator._steps) == 11
+    assert len(estimator.steps) == 11

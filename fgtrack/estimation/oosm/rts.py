@@ -3,7 +3,7 @@
 from fgtrack.estimation.ekf import Prediction
 from fgtrack.estimation.oosm.crossing import Past
 from fgtrack.estimation.oosm.late import CrossingEkf
-from fgtrack.estimation.rts import smoothed_one
+from fgtrack.estimation.rts import rts_step
 
 
 class RtsCrossCovariance(CrossingEkf):
@@ -34,6 +34,6 @@ class RtsCrossCovariance(CrossingEkf):
             x, P_x = (mean, covariance) if at_tau else (before.mean, before.covariance)
             transition = F if at_tau else self._history.transition_to(place)
             predicted = Prediction(after.predicted_mean, after.predicted_covariance, transition @ P_x)
-            smoothed, P, gain = smoothed_one(x, P_x, predicted, smoothed - after.predicted_mean, P)
+            smoothed, P, gain = rts_step(x, P_x, predicted, smoothed - after.predicted_mean, P)
             path = gain @ path
         return Past(smoothed, P, path.T)
