@@ -177,7 +177,7 @@ def estimator_bank(
         bank: TrackBank = _made(name, factory, motion, lag_s, **own)
         return bank
     _check_options(name, factory, 3, own)
-    if factory in _TOGETHER and options.get("hypotheses", 1) == 1:
+    if factory in _TOGETHER:
         return _TOGETHER[factory](motion, lag_s, **own)
     if claims.reports:
 

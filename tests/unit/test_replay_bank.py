@@ -184,9 +184,8 @@ def test_the_bank_keeps_the_contract_of_an_estimator(motion: MotionModel) -> Non
     check_estimator(one, num_streams=5)
 
 
-def test_the_tracker_gets_the_bank_and_several_hypotheses_get_one_estimator_each() -> None:
+def test_the_tracker_gets_the_bank_and_other_filters_are_one_for_each_object() -> None:
     assert isinstance(estimator_bank("ekf-replay", CTRV(), 1.0, {"initiation": "two-point"}), ReplayBank)
-    assert isinstance(estimator_bank("ekf-replay", CTRV(), 1.0, {"hypotheses": 4}), ObjectBank)
     assert isinstance(estimator_bank("iekf-replay", CTRV(), 1.0, {}), ObjectBank)
 
 
