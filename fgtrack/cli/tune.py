@@ -122,6 +122,8 @@ def _sensors(report: TuneReport) -> list[str]:
             lines.append(f"{one.sensor}: {one.own_covariance} measurements have a covariance of their own; it stays")
     settled = "" if report.settled else ", not settled"
     lines.append(f"{report.num_tracks} tracks, {report.rounds} associations{settled}")
+    if report.num_mixed:
+        lines.append(f"{report.num_mixed} measurements left out: most around them are outliers (an exchanged object?)")
     if report.optima > 1:
         lines.append(f"{report.optima} maxima of the likelihood from several starts: this is the highest one")
     return lines

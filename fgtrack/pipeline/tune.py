@@ -12,6 +12,7 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import BoolArray, FloatArray, Message
 from fgtrack.estimation.likelihood.contaminated import outlier_share
 from fgtrack.estimation.likelihood.fit import Likelihood, Problem
+from fgtrack.estimation.likelihood.mixed import without_mixed
 from fgtrack.estimation.likelihood.reference import filtered
 from fgtrack.estimation.likelihood.series import Series
 from fgtrack.io.run import Run
@@ -105,8 +106,9 @@ class _Found:
     values: FloatArray
     free: BoolArray
     """Which of them were fitted."""
+    log_std: FloatArray
+    """Standard errors of their logarithms; NaN where not fitted."""
     known: tuple[Known, ...]
-    """Of these, `roughly`: how well is not looked at here."""
     why: tuple[str, ...]
     likelihood: Likelihood
 
@@ -140,14 +142,14 @@ class _Tuning:
 
     def report(self, config: Config) -> TuneReport:
         """Rounds of association and fit to the first part, the judgement of the rest, and the fit to everything."""
-        series, runs = self._associated(self._configured)
+        series, runs_before = self._associated(self._configured)
         splits = [self._split_ns(tracks) for tracks in series]
-        runs_before = runs
         values, optima, rounds, settled = self._configured, 0, 0, False
         while not settled and rounds < self._rules.max_rounds:
             if rounds:
                 self._on_step(f"association {rounds + 1}")
-                series, runs = self._associated(values)
+                series, _ = self._associated(values)
+                series = [[without_mixed(one, self._space, values) for one in tracks] for tracks in series]
             rounds += 1
             problem = self._problem(_until(series, splits))
             free = self._free(problem)
@@ -157,7 +159,8 @@ class _Tuning:
             before = values
             values, likelihood = problem.maximum(values, free)
             moved = np.abs(np.log(values[free] / before[free]))
-            settled = bool((moved <= self._rules.settled * likelihood.spread(np.log(values[free]))).all())
+            still = (moved <= self._rules.settled * likelihood.spread(np.log(values[free]))).all()
+            settled = rounds > 1 and bool(still)  # with the configured noise one cannot tell what is mixed
         trained = self._found(problem, values, free)
         held_out = self._held_out(trained.values, series, splits, runs_before)
         self._on_step("fit to everything")
@@ -228,26 +231,28 @@ class _Tuning:
         shares = np.array([not name for _, name in self._space.names])
         while True:
             values, likelihood = problem.maximum(values, free)
-            spread = np.full(count, math.inf)
-            spread[free] = likelihood.spread(np.log(values[free]))
-            vague = free & ~shares & (spread > self._rules.rough_std_error)
-            if not vague.any():
+            log_std = np.full(count, math.nan)
+            log_std[free] = likelihood.log_std(np.log(values[free]))
+            errors = np.array(self._noise.shown(values, log_std)[1])
+            vague = np.where(free & ~shares, errors, 0.0)
+            place = int(vague.argmax())  # one at a time: without it another one may be known
+            if vague[place] <= self._rules.rough_std_error:
                 break
-            limits = {place: self._limit(likelihood, values, place) for place in np.flatnonzero(vague).tolist()}
-            for place, limit in limits.items():
-                kept = limit == self._configured[place]
-                known[place] = "no" if kept else "limit"
-                why[place] = (
-                    f"flat: standard error {100.0 * spread[place]:.0f} %"
-                    if kept
-                    else f"only bounded: {'below' if values[place] < limit else 'above'} {limit:.3g} at 95 %"
-                )
-                values[place], free[place] = limit, False
+            limit = self._limit(likelihood, values, place)
+            kept = limit == self._configured[place]
+            known[place] = "no" if kept else "limit"
+            why[place] = (
+                f"flat: standard error {100.0 * errors[place]:.0f} %"
+                if kept
+                else f"only bounded: {'below' if values[place] < limit else 'above'} {limit:.3g} at 95 %"
+            )
+            values[place], free[place] = limit, False
             if not free.any():
                 raise DataError("nothing to fit noise to: no parameter is identifiable in so few measurements")
         for place in np.flatnonzero(free).tolist():
-            known[place], why[place] = "roughly", ""
-        return _Found(values, free, tuple(known), tuple(why), likelihood)
+            known[place] = "yes" if errors[place] <= self._rules.known_std_error else "roughly"
+            why[place] = ""
+        return _Found(values, free, log_std, tuple(known), tuple(why), likelihood)
 
     def _limit(self, likelihood: Likelihood, values: FloatArray, place: int) -> float:
         """The value nearest to the configured one that the data do not reject, the other parameters given."""
@@ -328,16 +333,9 @@ class _Tuning:
         settled: bool,
     ) -> TuneReport:
         tuned_config = ConfigNoise(config).config_with(found.values)
-        self._on_step("standard errors")
-        std_error = np.full(len(found.values), math.nan)
-        std_error[found.free] = found.likelihood.log_std(np.log(found.values[found.free]))
-        was, _ = self._noise.shown(self._configured, std_error)
-        now, errors = self._noise.shown(ConfigNoise(tuned_config).values, std_error)
-        known = [
-            "yes" if error <= self._rules.known_std_error else one
-            for one, error in zip(found.known, errors, strict=True)
-        ]
-        columns = self._noise.keys, was, now, errors, known
+        was, _ = self._noise.shown(self._configured, found.log_std)
+        now, errors = self._noise.shown(ConfigNoise(tuned_config).values, found.log_std)
+        columns = self._noise.keys, was, now, errors, found.known
         parameters = tuple(
             TunedParameter(key, was, value, None if math.isnan(error) else error, one, why)
             for key, was, value, error, one, why in zip(*columns, found.why, strict=True)
@@ -353,6 +351,7 @@ class _Tuning:
             total / count,
             count,
             len(problem.series),
+            sum(len(one.mixed) for one in problem.series),
             rounds,
             optima,
             settled,

@@ -22,14 +22,15 @@ class TunedParameter:
     std_error: float | None
     """Standard error as a share of the value; None where there is none."""
     known: Known
-    """`yes`: to `KNOWN_STD_ERROR`; `roughly`: adopted, but less well known; `limit`: only a limit is known, and the
-    configured value lies beyond it, so that the limit is adopted; `no`: the configured value stays."""
+    """`yes`: `std_error` is at most `TuneRules.known_std_error`; `roughly`: at most `rough_std_error`, and adopted too;
+    `limit`: only a limit is known, and the configured value lies beyond it, so that the limit is adopted; `no`: the
+    configured value stays."""
     why: str
     """Why it is not known; empty where it is."""
 
     @property
     def identifiable(self) -> bool:
-        """Whether it is known to `KNOWN_STD_ERROR`."""
+        """Whether it is known: `yes`."""
         return self.known == "yes"
 
 
@@ -98,6 +99,8 @@ class TuneReport:
     """Innovations that counted in the final fit."""
     num_tracks: int
     """Tracks they belong to."""
+    num_mixed: int
+    """Measurements that were left out, because most of those around them are outliers; see `without_mixed`."""
     rounds: int
     """How often detections were associated."""
     optima: int
@@ -114,7 +117,7 @@ class TuneReport:
             "sensors": [asdict(one) for one in self.sensors],
             "held_out": None,
         }
-        names = ("log_likelihood", "count", "num_tracks", "rounds", "optima", "settled")
+        names = ("log_likelihood", "count", "num_tracks", "num_mixed", "rounds", "optima", "settled")
         values |= {name: getattr(self, name) for name in names}
         values["broken"] = dict(self.broken)
         if self.held_out is not None:

@@ -15,6 +15,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.likelihood import contaminated
 from fgtrack.estimation.likelihood.fit import FitSettings, Problem
+from fgtrack.estimation.likelihood.mixed import without_mixed
 from fgtrack.estimation.likelihood.noise import NoiseSpace
 from fgtrack.estimation.likelihood.reference import filtered
 from fgtrack.estimation.likelihood.series import Observation, Series
@@ -32,6 +33,12 @@ SPACE = NoiseSpace(
 #: Of the velocity, of x and y of each sensor, and odds of outliers too small to count.
 VALUES = np.array([0.8, 0.5, 0.3, 1.5, 1.0, 1e-60, 1e-60])
 EVERYTHING = FitSettings(settle_s=0.0, settle_steps=0)
+#: The same sensors, and objects that turn.
+TURNING = replace(
+    SPACE,
+    motion_names=("position", "yaw", "speed", "yaw_rate"),
+    motion=lambda std: CTRV.from_std_per_step(std, 1.0),
+)
 
 
 def observed(sensor: str, stamp_s: float, z: Sequence[float], turn_rad: float = 0.0) -> Observation:
@@ -144,25 +151,38 @@ def test_the_maximum_is_near_the_truth_whatever_the_outliers(outliers: float) ->
     assert contaminated.outlier_share(values[5:]) == pytest.approx([outliers] * 2, abs=0.03)
 
 
+def moved(one: Observation, by_m: float) -> Observation:
+    """The observation of something that is `by_m` further along x."""
+    return replace(one, measurement=replace(one.measurement, z=np.add(one.measurement.z, [by_m, 0.0])))
+
+
+def test_what_a_track_fuses_of_another_object_says_nothing_of_the_noise() -> None:
+    values = np.array([*VALUES[:5], 0.02, 0.02])
+    track = drawn(np.random.default_rng(7), values, 300, outliers=0.05)
+    assert without_mixed(track, SPACE, values) == track
+    seen = list(track.observations)
+    seen[100:130] = [moved(one, 9.0) for one in seen[100:130]]
+    found = without_mixed(replace(track, observations=seen), SPACE, values)
+    assert set(range(100, 125)) <= found.mixed <= set(range(75, 165))
+    counted = [place for place in range(300) if EVERYTHING.counts(found, place)]
+    assert counted == [place for place in range(300) if place not in found.mixed]
+
+
 def test_a_nonlinear_model_is_linearised_about_the_filter() -> None:
     """At the parameters of the trajectory the likelihood is that of the filter itself."""
-    names = "position", "yaw", "speed", "yaw_rate"
-    space = replace(SPACE, motion_names=names, motion=lambda std: CTRV.from_std_per_step(std, 1.0))
     track = drawn(np.random.default_rng(3), VALUES, 40)
     seen = [replace(one, measurement=one.measurement.seen_by(CTRV())) for one in track.observations]
     values = np.array([0.1, 0.1, 0.5, 0.2, *VALUES[1:5], 0.01, 0.01])
-    problem = Problem([replace(track, observations=seen)], space, values, EVERYTHING)
+    problem = Problem([replace(track, observations=seen)], TURNING, values, EVERYTHING)
     likelihood = problem.likelihood(values, np.ones(10, dtype=bool))
-    steps = filtered(problem.series[0], space, values)
+    steps = filtered(problem.series[0], TURNING, values)
     assert likelihood.totals(values[None])[0] == pytest.approx(sum(step.log_likelihood for step in steps), abs=1e-8)
 
 
-def turning(seed: int, num: int) -> tuple[NoiseSpace, FloatArray, Series]:
-    """A track of CTRV that heads away from the direction that its start has, which is none."""
-    names = "position", "yaw", "speed", "yaw_rate"
-    space = replace(SPACE, motion_names=names, motion=lambda std: CTRV.from_std_per_step(std, 1.0))
+def turning(seed: int, num: int) -> tuple[FloatArray, Series]:
+    """Parameters and a track of CTRV that heads away from the direction that its start has, which is none."""
     values, rng = np.array([0.1, 0.05, 0.5, 0.1, *VALUES[1:5], 0.01, 0.01]), np.random.default_rng(seed)
-    motion = space.motion_model(values)
+    motion = TURNING.motion_model(values)
     x, seen = np.array([3.0, -2.0, 2.5, 20.0, 0.1]), []
     for k in range(num):
         sensor = ("lidar", "radar")[k % 2]
@@ -171,22 +191,22 @@ def turning(seed: int, num: int) -> tuple[NoiseSpace, FloatArray, Series]:
         seen.append(replace(one, measurement=one.measurement.seen_by(motion)))
         x = rng.multivariate_normal(motion.predict(x, 0.05), motion.process_noise(x, 0.05))
     start = Start(position_m=seen[0].measurement.z, position_std_m=1.5, speed_std_mps=30.0)
-    return space, values, Series(start, seen[1:])
+    return values, Series(start, seen[1:])
 
 
 def test_a_track_of_unknown_direction_is_linearised_along_its_first_positions() -> None:
-    space, values, track = turning(5, 200)
-    opened = track.opened(space.motion_model(values), "regression")
+    values, track = turning(5, 200)
+    opened = track.opened(TURNING.motion_model(values), "regression")
     assert 3 < opened.num_opening < 30
-    steps = filtered(opened, space, values)
+    steps = filtered(opened, TURNING, values)
     for step, about in zip(steps, opened.nominal[:-1], strict=False):
         assert np.array_equal(step.about, about)
     assert abs(wrap_angle(steps[opened.num_opening].after[2] - 2.5)) < 0.3
     counted = [step for place, step in enumerate(steps) if FitSettings().counts(opened, place)]
     assert len(counted) > 150
     assert np.mean([step.nis for step in counted]) == pytest.approx(2.0, abs=0.4)
-    assert track.opened(space.motion_model(values), "one-point") is track
-    likelihood = Problem([opened], space, values, EVERYTHING).likelihood(values, np.ones(10, dtype=bool))
+    assert track.opened(TURNING.motion_model(values), "one-point") is track
+    likelihood = Problem([opened], TURNING, values, EVERYTHING).likelihood(values, np.ones(10, dtype=bool))
     place = opened.num_opening
     assert likelihood.totals(values[None])[0] == pytest.approx(
         sum(step.log_likelihood for step in steps[place:]), abs=1e-8
@@ -194,8 +214,8 @@ def test_a_track_of_unknown_direction_is_linearised_along_its_first_positions() 
 
 
 def test_innovations_count_from_where_the_direction_is_known() -> None:
-    space, values, track = turning(6, 100)
-    opened = track.opened(space.motion_model(values), "regression")
+    values, track = turning(6, 100)
+    opened = track.opened(TURNING.motion_model(values), "regression")
     settings = FitSettings(settle_s=1.0, settle_steps=5)
     first = next(place for place in range(100) if settings.counts(opened, place))
     since_s = (opened.observations[first].measurement.stamp_ns - opened.opened_ns) / NS_PER_S

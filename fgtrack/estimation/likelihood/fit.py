@@ -44,9 +44,12 @@ class FitSettings:
     """Linearised again until no parameter changes by more than this share of its standard error."""
 
     def counts(self, series: Series, place: int) -> bool:
-        """Whether the observation at `place` has a part in the likelihood: late enough in its track, in its limits."""
+        """Whether the observation at `place` has a part in the likelihood.
+
+        It has where it is late enough in its track, in its limits, and of one object.
+        """
         stamp_ns = series.observations[place].measurement.stamp_ns
-        settled = place >= series.num_opening + self.settle_steps
+        settled = place >= series.num_opening + self.settle_steps and place not in series.mixed
         settled &= stamp_ns - series.opened_ns >= NS_PER_S * self.settle_s
         after, before = series.from_ns, series.until_ns
         return settled and (after is None or stamp_ns >= after) and (before is None or stamp_ns < before)

@@ -61,8 +61,6 @@ class Innovations:
         self._there: BoolArray = np.zeros(shape, dtype=np.bool_)
         self.counted: BoolArray = np.zeros(shape, dtype=np.bool_)
         """Which steps have a part in the likelihood, shape (k, t)."""
-        self.sensors: IntArray = np.full(shape, -1)
-        """Place of the sensor of each step among those of the space, shape (k, t)."""
         self.since_start_s = np.zeros(shape)
         """Time of each step since the first state, shape (k, t)."""
         self._since_s = np.zeros(shape)
@@ -78,13 +76,11 @@ class Innovations:
         self._padding = np.full(shape, d)
         self._assumed_innovation, self._assumed_jacobian = np.zeros((*shape, a)), np.zeros((*shape, a, n))
         self._assumed_covariance = np.broadcast_to(np.eye(a), (*shape, a, a)).copy()
-        sensors = list(space.sensors)
         for t, (track, one) in enumerate(zip(steps, series, strict=True)):
             for k, step in enumerate(track):
                 observation, size = step.observation, len(step.y)
                 sensor, components = observation.sensor, observation.measurement.model.components
                 self._there[k, t], self.counted[k, t] = True, counts(one, k)
-                self.sensors[k, t] = sensors.index(sensor)
                 self.since_start_s[k, t] = (observation.measurement.stamp_ns - one.start.stamp_ns) / 1e9
                 self._since_s[k, t] = step.since_s
                 self._about[k, t], self._offset[k, t] = step.about, step.before - step.about

@@ -55,6 +55,8 @@ class Series:
     nominal: tuple[FloatArray, ...] = ()
     """States (n,) of a nominal trajectory at the start and at each of the first observations, about which these are
     linearised; empty where the filter is linearised at its own estimates from the start."""
+    mixed: frozenset[int] = frozenset()
+    """Places of observations whose innovations have no part in the likelihood either; see `without_mixed`."""
 
     @property
     def num_opening(self) -> int:
