@@ -6,8 +6,9 @@ from typing import Annotated, Literal
 import typer
 
 from fgtrack.cli.arguments import Json, Runs
-from fgtrack.cli.show import console
+from fgtrack.cli.show import console, warn
 from fgtrack.core.errors import CallError
+from fgtrack.evaluation.cautions import cautions
 from fgtrack.evaluation.comparison import compare as tables_of
 from fgtrack.evaluation.runs import Runs as AnyRuns
 from fgtrack.evaluation.runs import judged
@@ -29,7 +30,10 @@ def compare(
     """Compare runs in tables, and write metrics.json into each."""
     if as_json and form not in (None, "json"):
         raise CallError(f"--json, --format {form}: give one of them")
-    tables = written_tables(runs, streaming)
+    every = judged(runs)
+    for line in dict.fromkeys(f"{one.label}: {line}" for one in every for line in cautions(one.run)):
+        warn(line)
+    tables = written_tables(every, streaming)
     if as_json or form == "json":
         print(json.dumps(tables.to_dict(), indent=2, allow_nan=False))
     elif form is None:

@@ -6,9 +6,11 @@ from typing import Annotated
 import typer
 
 from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Settings, TrackMap
-from fgtrack.cli.show import TickProgress, progress, say
+from fgtrack.cli.show import TickProgress, progress, say, warn
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.estimation.registry import ESTIMATORS
+from fgtrack.evaluation.cautions import cautions, noise_cautions, unused
+from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.replay import located, replay_each
 from fgtrack.pipeline.shipped import read_config
@@ -52,5 +54,11 @@ def replay(
         what = "{estimator}, {detections_received} detections, {wall_s:.1f} s, digest {digest:.12}"
         missed = f", {result.deadline_misses} deadlines missed" if result.deadline_misses else ""
         say(f"{result.path}: {what.format_map(result.meta)}{missed}")
+    runs = [load_run(result.path) for result in results]
+    for line in dict.fromkeys([line for run in runs for line in cautions(run)] + noise_cautions(runs[0])):
+        warn(line)
     if results[0].broken is not None:  # the others break off at the same place
         raise DataError(f"{located(results[0].broken, str(recording))}; replayed up to there")
+    reason = unused(runs[0])
+    if reason is not None:
+        raise DataError(f"{recording}: {reason}")

@@ -32,6 +32,11 @@ def say(line: object) -> None:
     console().print(str(line), highlight=False, soft_wrap=True, markup=False)
 
 
+def warn(line: str) -> None:
+    """Print a warning as one line on stderr."""
+    Console(stderr=True).print(f"fgtrack: warning: {line}", highlight=False, soft_wrap=True, markup=False)
+
+
 def table(*headings: str) -> Table:
     """A table without rows; a heading that begins with `>` stands above numbers, to the right."""
     empty = Table(box=box.SIMPLE_HEAD, show_edge=False)

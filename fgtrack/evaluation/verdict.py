@@ -3,18 +3,14 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from fgtrack.evaluation.cautions import FEWEST, is_far_off
 from fgtrack.evaluation.contest import Contest, Quantity
 from fgtrack.evaluation.lagged import WINDOW
 from fgtrack.evaluation.metrics import Metrics
 from fgtrack.evaluation.paired import UNKNOWN, Estimate
 from fgtrack.evaluation.ranking import Entry
-from fgtrack.evaluation.statistics import ChiSquareMean
 from fgtrack.evaluation.tables import short, two_digits
 
-FAR_OFF = 1.5
-"""A mean NEES or NIS farther from its expected value than by this factor says that the noise does not fit."""
-
-_FEWEST = 30  # updates of a sensor whose NIS says something
 _MOST_NAMED = 3
 _MM = 1e3
 _CM_M = 0.01
@@ -148,14 +144,10 @@ def _squares(one: Metrics) -> Iterator[_Square]:
     nees, interval = one.consistency.position_nees, one.consistency.position_nees_interval
     if nees.count:
         outside = interval.low > nees.dof or interval.high < nees.dof
-        yield _Square("NEES of the position", nees.mean, nees.dof, outside and _is_far(nees), interval)
+        yield _Square("NEES of the position", nees.mean, nees.dof, outside and is_far_off(nees), interval)
     for sensor, nis in one.consistency.nis.items():
-        if nis.count >= _FEWEST:
-            yield _Square(f"NIS of {sensor}", nis.mean, nis.dof, _is_far(nis))
-
-
-def _is_far(square: ChiSquareMean) -> bool:
-    return not square.dof / FAR_OFF <= square.mean <= square.dof * FAR_OFF
+        if nis.count >= FEWEST:
+            yield _Square(f"NIS of {sensor}", nis.mean, nis.dof, is_far_off(nis))
 
 
 def _waiting(label: str, one: Metrics) -> Iterator[str]:

@@ -31,7 +31,7 @@ class Outcome:
     @property
     def error(self) -> str:
         """The one line on stderr."""
-        lines = self.err.splitlines()
+        lines = [line for line in self.err.splitlines() if not line.startswith("fgtrack: warning: ")]
         assert len(lines) == 1, self.err
         assert lines[0].startswith("fgtrack: error: "), self.err
         assert "Traceback" not in self.out + self.err
@@ -151,6 +151,26 @@ def test_runs_are_compared_as_tables_and_as_json(fgtrack: Command, runs: dict[st
         assert (told.code, told.err) == (0, "")
         assert start in told.out
         assert told.out.startswith({"md": "- The configured noise", "latex": "% The configured noise"}.get(form, start))
+
+
+def test_a_recording_of_which_nothing_was_used_fails_and_says_why(fgtrack: Command, stream: Path) -> None:
+    told = fgtrack("replay", stream, "--set", "sensors.lidar.max_delay_s=0.01", "-o", "late")
+    assert told.code == 1
+    assert told.error == f"{stream}: none of the 60 detections was used (60 too_old)"
+    warning = "fgtrack: warning: lidar: 60 of 60 too_old: median delay 0.05 s, allowed 0.01 s: raise sensors.lidar."
+    assert told.err.startswith(warning)
+    assert load_run("late").meta["complete"]
+    assert "late (ekf-backward-forward): lidar: 60 of 60 too_old" in fgtrack("compare", "late").err
+
+
+def test_a_replay_warns_of_noise_that_does_not_fit(fgtrack: Command, stream: Path) -> None:
+    assert fgtrack("simulate", "default", "-o", "noisy.jsonl", "--duration", "4").code == 0
+    fits = ("-c", "tuned", "--map", "oval", "--pit-map", "oval", "-e", "ekf-replay")
+    assert fgtrack("replay", "noisy.jsonl", *fits, "-o", "a").err == ""
+    told = fgtrack("replay", stream, "--set", "sensors.lidar.std={x_m: 9.0, y_m: 9.0}", "-o", "b")
+    assert told.code == 0
+    assert "lidar: mean NIS" in told.err
+    assert "the configured noise is too large; `fgtrack tune` fits it" in told.err
 
 
 def test_streaming_is_compared_when_it_is_asked_for(fgtrack: Command, runs: dict[str, Path]) -> None:

@@ -1,0 +1,127 @@
+"""What a person must know before believing a run: detections that were not used, and why; noise that does not fit."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from fgtrack.core.time import NS_PER_S
+from fgtrack.evaluation.innovations import num_measured
+from fgtrack.evaluation.statistics import ChiSquareMean
+from fgtrack.io.run import Run, Table
+
+USED = ("birth", "in_sequence", "out_of_sequence", "beyond_window", "merged")
+"""Dispositions of detections that took part."""
+FAR_OFF = 1.5
+"""A mean NIS farther from its expected value than by this factor says that the noise does not fit."""
+FEWEST = 30
+"""Updates of a sensor whose NIS says something."""
+
+#: Cause and cure of what can happen to most detections of a sensor, by disposition.
+_CURES = {
+    "gated": "no track was near enough and none was started: check association.gate_m, the clock, and "
+    "ego.detection_origin_x_m",
+    "out_of_bounds": "off the road of the map: is it the right map (--map), and is the frame of the detections right?",
+    "duplicate": "the same list again and again: look at the recording, a sensor or a bridge repeats itself",
+    "superseded": "another list of the sensor came in the same tick, and the inbox keeps one: raise clock.node_hz",
+    "invalid": "no position, a value that is not finite, or a stamp ahead of its receipt: compare the keys of "
+    "sensors.{sensor}.std with what `fgtrack info` shows",
+    "failed": "no ego state near the stamp, or a numerical failure: check the clock of the ego",
+}
+
+
+_NO_EGO = (
+    "no state of the ego was received, so nothing in its frame can be placed: name its topic in the configuration "
+    "(`fgtrack info` lists the topics)"
+)
+
+
+def cautions(run: Run) -> list[str]:
+    """What is wrong with `run` as far as its files say, a line each with cause and cure."""
+    return [*_clocks(run), *_lost(run), *_window(run)]
+
+
+def noise_cautions(run: Run) -> list[str]:
+    """A line for each sensor whose innovations say that the noise does not fit. See also the verdict of `compare`."""
+    measured, found = num_measured(run.updates), []
+    for sensor, mine in _by_sensor(run.updates):
+        nis = ChiSquareMean.of(run.updates["nis"][mine], measured[mine])
+        if nis.count >= FEWEST and is_far_off(nis):
+            size = "small" if nis.mean > nis.dof else "large"
+            found.append(
+                f"{sensor}: mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}; "
+                "`fgtrack tune` fits it"
+            )
+    return found
+
+
+def is_far_off(square: ChiSquareMean) -> bool:
+    """Whether a mean NEES or NIS is out of proportion to what it should be."""
+    return not square.dof / FAR_OFF <= square.mean <= square.dof * FAR_OFF
+
+
+def unused(run: Run) -> str | None:
+    """What became of the detections of `run` where not one was used; None where one was, or there are none."""
+    updates = run.updates
+    if not updates.num_rows or np.isin(updates["disposition"], USED).any():
+        return None
+    fates = zip(*np.unique(updates["disposition"], return_counts=True), strict=True)
+    return f"none of the {updates.num_rows} detections was used ({', '.join(f'{n} {fate}' for fate, n in fates)})"
+
+
+def _clocks(run: Run) -> Iterator[str]:
+    for sensor, mine in _by_sensor(run.updates):
+        if (run.updates["stamp_ns"][mine] == 0).all():
+            yield f"{sensor}: all stamps are 0: its driver does not set them, so nothing is known of its delay"
+
+
+def _lost(run: Run) -> Iterator[str]:
+    """Dispositions that hit more than half of the detections of a sensor."""
+    for sensor, mine in _by_sensor(run.updates):
+        fates, counts = np.unique(run.updates["disposition"][mine], return_counts=True)
+        for fate, count in zip(fates.tolist(), counts.tolist(), strict=True):
+            if fate not in USED and 2 * count > mine.sum():
+                cure = _too_old(run, sensor) if fate == "too_old" else _CURES[fate].format(sensor=sensor)
+                if fate == "failed" and not run.ego.num_rows:
+                    cure = _NO_EGO
+                yield f"{sensor}: {count} of {mine.sum()} {fate}: {cure}"
+
+
+def _too_old(run: Run, sensor: str) -> str:
+    mine = run.updates["sensor"] == sensor
+    delay_s = float(np.median(run.updates["receipt_ns"][mine] - run.updates["stamp_ns"][mine])) / NS_PER_S
+    limit_s = (_section(run, "sensors").get(sensor) or {}).get("max_delay_s")
+    if limit_s is not None and delay_s > limit_s:
+        return (
+            f"median delay {delay_s:.3g} s, allowed {limit_s:g} s: raise sensors.{sensor}.max_delay_s or mend its clock"
+        )
+    key, lag_s = _reach(run)
+    return f"median delay {delay_s:.3g} s, older than the window ({key} {lag_s:g} s): raise it, or mend the clock"
+
+
+def _window(run: Run) -> Iterator[str]:
+    """A window that holds less than two lists of a sensor."""
+    key, lag_s = _reach(run)
+    for sensor, mine in _by_sensor(run.updates):
+        stamps_ns = np.unique(run.updates["stamp_ns"][mine])
+        if len(stamps_ns) < FEWEST:
+            continue
+        period_s = float(np.median(np.diff(stamps_ns))) / NS_PER_S
+        if lag_s < period_s:
+            yield f"{sensor}: one list every {period_s:.3g} s, longer than the window ({key} {lag_s:g} s): raise it"
+
+
+def _reach(run: Run) -> tuple[str, float]:
+    """How far back the estimator reaches, and the key that says so."""
+    if str(run.meta.get("estimator")).startswith(("smoother", "ipls")):
+        return "smoother.lag_s", float(_section(run, "smoother").get("lag_s", np.inf))
+    return "filter.storage_s", float(_section(run, "filter").get("storage_s", np.inf))
+
+
+def _section(run: Run, name: str) -> Mapping[str, Any]:
+    return run.config.get(name) or {}
+
+
+def _by_sensor(updates: Table) -> Iterator[tuple[str, Any]]:
+    for sensor in np.unique(updates["sensor"]).tolist():
+        yield sensor, updates["sensor"] == sensor

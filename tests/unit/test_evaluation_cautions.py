@@ -1,0 +1,101 @@
+"""What a run is warned of: detections that were not used, windows that are too short, noise that does not fit."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from unit.evaluation_runs import TICK_NS, update, write_run
+
+from fgtrack.core.types import Disposition, UpdateRecord
+from fgtrack.evaluation.cautions import cautions, noise_cautions, unused
+from fgtrack.io.run import Run
+
+CONFIG = """
+sensors: {lidar: {max_delay_s: 0.4}, radar: {}}
+smoother: {lag_s: 1.0}
+filter: {storage_s: 3.0}
+"""
+
+
+def run_of(folder: Path, records: list[UpdateRecord], config: str = CONFIG, estimator: str = "smoother") -> Run:
+    by_tick: dict[int, list[UpdateRecord]] = {}
+    for tick, record in enumerate(records):
+        by_tick.setdefault(tick, []).append(record)
+    return write_run(folder, [[]] * len(records), updates=by_tick, meta={"estimator": estimator}, config_text=config)
+
+
+def lists(fate: Disposition, num: int = 40, **values: float) -> list[UpdateRecord]:
+    return [update(tick=k, disposition=fate, delay_ns=150_000_000, **values) for k in range(num)]
+
+
+def test_a_healthy_run_has_none(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    fine = [update(tick=k, delay_ns=150_000_000, nis=float(rng.chisquare(2)), x_m=0.1, y_m=0.1) for k in range(100)]
+    refused = [update(tick=k, disposition=Disposition.GATED) for k in range(100, 150)]
+    run = run_of(tmp_path / "run", fine + refused)
+    assert (cautions(run), noise_cautions(run), unused(run)) == ([], [], None)
+
+
+@pytest.mark.parametrize(
+    ("fate", "cure"),
+    [
+        (Disposition.GATED, "association.gate_m"),
+        (Disposition.OUT_OF_BOUNDS, "--map"),
+        (Disposition.DUPLICATE, "repeats itself"),
+        (Disposition.SUPERSEDED, "clock.node_hz"),
+        (Disposition.INVALID, "sensors.lidar.std"),
+        (Disposition.FAILED, "no state of the ego was received"),
+    ],
+)
+def test_what_most_detections_of_a_sensor_ended_in_is_told_with_a_cure(
+    fate: Disposition, cure: str, tmp_path: Path
+) -> None:
+    run = run_of(tmp_path / "run", [*lists(fate, 30), *lists(Disposition.IN_SEQUENCE, 29)])
+    (line,) = cautions(run)
+    assert line.startswith(f"lidar: 30 of 59 {fate.value}: ")
+    assert cure in line
+    assert unused(run) is None
+    (again,) = cautions(run_of(tmp_path / "other", lists(fate, 3)))
+    assert again.startswith("lidar: 3 of 3")
+
+
+def test_half_is_not_most(tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", [*lists(Disposition.GATED, 30), *lists(Disposition.IN_SEQUENCE, 30)])
+    assert cautions(run) == []
+
+
+def test_too_old_names_the_limit_that_was_passed(tmp_path: Path) -> None:
+    late = [update(tick=k, disposition=Disposition.TOO_OLD, delay_ns=450_000_000) for k in range(5)]
+    (by_sensor,) = cautions(run_of(tmp_path / "a", late))
+    assert "median delay 0.45 s, allowed 0.4 s: raise sensors.lidar.max_delay_s" in by_sensor
+    (by_window,) = cautions(run_of(tmp_path / "b", late, CONFIG.replace("max_delay_s: 0.4", "max_delay_s: 9.0")))
+    assert "the window (smoother.lag_s 1 s)" in by_window
+    unlimited = CONFIG.replace("{max_delay_s: 0.4}", "{}")
+    (by_storage,) = cautions(run_of(tmp_path / "c", late, unlimited, "ekf-replay"))
+    assert "the window (filter.storage_s 3 s)" in by_storage
+
+
+def test_stamps_that_nobody_set_and_a_window_shorter_than_a_period_are_told(tmp_path: Path) -> None:
+    unset = [UpdateRecord("lidar", 0, 10**18 + k, 0, Disposition.IN_SEQUENCE) for k in range(3)]
+    (line,) = cautions(run_of(tmp_path / "a", unset))
+    assert line.startswith("lidar: all stamps are 0")
+    slow = [update(tick=100 * k) for k in range(40)]
+    (line,) = cautions(run_of(tmp_path / "b", slow))
+    period_s = 100 * TICK_NS / 1e9
+    assert line == f"lidar: one list every {period_s:g} s, longer than the window (smoother.lag_s 1 s): raise it"
+    assert cautions(run_of(tmp_path / "c", slow, estimator="ekf-replay")) == []
+
+
+@pytest.mark.parametrize(("nis", "size"), [(26.0, "small"), (0.2, "large")])
+def test_noise_that_does_not_fit_is_told(nis: float, size: str, tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", [update(tick=k, nis=nis, x_m=0.1, y_m=0.1) for k in range(40)])
+    (line,) = noise_cautions(run)
+    assert line.startswith(f"lidar: mean NIS {nis:.3g}, expected 2: the configured noise is too {size}")
+    few = run_of(tmp_path / "few", [update(tick=k, nis=nis, x_m=0.1, y_m=0.1) for k in range(20)])
+    assert noise_cautions(few) == []
+
+
+def test_a_run_that_used_nothing_says_what_became_of_all(tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", [*lists(Disposition.TOO_OLD, 3), *lists(Disposition.GATED, 2)])
+    assert unused(run) == "none of the 5 detections was used (2 gated, 3 too_old)"
+    assert unused(run_of(tmp_path / "empty", [])) is None
