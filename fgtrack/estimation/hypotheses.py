@@ -89,12 +89,11 @@ class Hypotheses:
                 S = result.innovation_covariance
                 y, S = expected if S is None else (result.innovation, S)
                 fused.append(_Hypothesis(each.estimator, each.log_weight + _log_density(y, S)))
-        likely = [each for each in fused if math.isfinite(each.log_weight)]
-        if likely:
-            self._alive = likely
+        if fused:
+            self._alive = fused
             self._prune()
         said = found[id(best)]
-        return said if said.innovation is not None or not likely else found[id(self.best)]
+        return said if said.innovation is not None or not fused else found[id(self.best)]
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: that of the likeliest hypothesis."""
@@ -173,8 +172,5 @@ def _given(motion: MotionModel, start: Start, wanted: Wanted) -> Sequence[Start]
 
 
 def _log_density(y: FloatArray, S: FloatArray) -> float:
-    """log N(y; 0, S) of y (k,), S (k, k); -inf where S is not positive definite."""
-    sign, log_det = np.linalg.slogdet(S)
-    if not sign > 0.0:
-        return -math.inf
-    return -0.5 * (float(mahalanobis_squared(y, S)) + float(log_det) + len(y) * math.log(2.0 * math.pi))
+    """log N(y; 0, S) of y (k,), S (k, k), but for what is the same of all hypotheses."""
+    return -0.5 * float(mahalanobis_squared(y, S) + np.linalg.slogdet(S)[1])

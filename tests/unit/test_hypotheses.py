@@ -44,7 +44,7 @@ def joint_density(motion: MotionModel, start: Start, measurements: list[Measurem
     return float(multivariate_normal.logpdf(np.concatenate([m.z for m in ordered]), mean, S))
 
 
-@pytest.mark.parametrize("name", ["ekf-replay", "ukf-replay", "smoother"])
+@pytest.mark.parametrize("name", ["ekf-replay", "ukf-replay", "smoother", "smoother-banded"])
 def test_the_weights_are_those_of_the_joint_density_in_any_order(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fgtrack.estimation.hypotheses.SAME", 0.0)
     motion = CV(2.0)
