@@ -38,13 +38,19 @@ class Row:
     memory_mb: float = float("nan")
     """Peak of a process of its own, above what it needs without a tracker."""
 
+    @property
+    def lost_tracks(self) -> bool:
+        """Whether there were fewer tracks than objects."""
+        return bool(np.isnan(self.median_ms))
+
     @classmethod
     def of(cls, cell: Cell, rounds: Sequence[Measured]) -> "Row":
-        """Of the rounds of `cell`. Raises `ValueError` where tracks are missing: the time would flatter."""
+        """Of the rounds of `cell`; without tracks of all objects the times would flatter, so there are none."""
+        nan = float("nan")
         if min(one.tracks for one in rounds) < cell.count:
-            raise ValueError(f"{cell.label}: {min(one.tracks for one in rounds):g} tracks of {cell.count} objects")
+            return cls(cell, nan, nan, nan, nan, rounds[0].yardstick_us, nan)
         ticks_ms = np.median([one.ticks_ms for one in rounds], axis=0)
-        published = PUBLISHED_MS_PER_US.get(cell.count, float("nan"))
+        published = PUBLISHED_MS_PER_US.get(cell.count, nan)
         return cls(
             cell,
             median_ms=float(np.median(ticks_ms)),
@@ -83,8 +89,8 @@ class Results:
     against: list[dict[str, float]] = field(default_factory=list)
     stone_soup_us: float = float("nan")
     """Mean time of one prediction and update."""
-    missing: str = ""
-    """Why Stone Soup was not measured."""
+    missing: list[str] = field(default_factory=list)
+    """What was not measured, and why."""
 
     def row(self, label: str, count: int, lag_s: float = 1.0) -> Row | None:
         """The row with the paper's delays."""
@@ -143,7 +149,7 @@ class Results:
             "ticks": [asdict(row) for row in self.rows],
             "per_detection": self.per_detection,
             "stone_soup_us": self.stone_soup_us,
-            "stone_soup_missing": self.missing,
+            "missing": self.missing,
             "floor": self.floors,
             "against": self.against,
         }
@@ -206,7 +212,7 @@ def tables(results: Results) -> str:
             ["one object, per detection", "median [us]", "in sequence", "late", "p99", "mean", "error at the end [m]"],
             [tuple(map(_short, one.values())) for one in results.per_detection],
         ),
-        results.missing,
+        *results.missing,
         _table(
             ["floor: objects", "rows", "LAPACK [us]", "gtsam [us]"],
             [tuple(map(_short, one.values())) for one in results.floors],

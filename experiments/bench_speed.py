@@ -106,18 +106,21 @@ def measure_apart(one: Cell, checkout: Path | None = None) -> Measured:
     return Measured(**json.loads(out))
 
 
-def measure_against(checkout: Path, objects: Iterable[int], rounds: int, duration_s: float) -> list[dict[str, float]]:
+def measure_against(results: Results, checkout: Path, objects: Iterable[int], rounds: int, duration_s: float) -> None:
     """gtsam's smoother of this code and of `checkout`, in turn, each in a process of its own."""
-    found = []
-    for one in _fitted([cell(SMOOTHER, n) for n in (1, 10, 50)], objects, min(duration_s, 2.0 * _SHORT_S)):
+    for one in _fitted([cell(SMOOTHER, n) for n in (1, 10, 50)], objects, duration_s):
         pairs = []
-        for number in range(rounds):
-            progress(f"round {number + 1} of {rounds}: {SMOOTHER}, {one.count} objects, beside {checkout}")
-            order = [None, checkout] if number % 2 == 0 else [checkout, None]
-            pairs.append({path: measure_apart(one, path) for path in order})
+        try:
+            for number in range(rounds):
+                progress(f"round {number + 1} of {rounds}: {SMOOTHER}, {one.count} objects, beside {checkout}")
+                order = [None, checkout] if number % 2 == 0 else [checkout, None]
+                pairs.append({path: measure_apart(one, path) for path in order})
+        except subprocess.CalledProcessError as error:
+            results.missing.append(f"{checkout}: cannot be measured, its benchmark exits {error.returncode}")
+            return
         now_ms, then_ms = ([pair[path].median_ms for pair in pairs] for path in (None, checkout))
         ratios = [then / now for now, then in zip(now_ms, then_ms, strict=True)]
-        found.append(
+        results.against.append(
             {
                 "count": one.count,
                 "now_ms": median(now_ms),
@@ -127,7 +130,6 @@ def measure_against(checkout: Path, objects: Iterable[int], rounds: int, duratio
                 "highest": max(ratios),
             }
         )
-    return found
 
 
 def measure_single(results: Results, names: Iterable[str], rounds: int, duration_s: float, cpu: bool) -> None:
@@ -148,7 +150,7 @@ def measure_single(results: Results, names: Iterable[str], rounds: int, duration
                 if window_s == 0.0:
                     means = [float(np.mean(one.times_us)) for one in passes[name]]
                     results.stone_soup_us = median(means)
-    results.missing = reason
+    results.missing += [reason] if reason else []
     for name, every in passes.items():
         results.per_detection.append(
             {
@@ -198,22 +200,30 @@ def main(
     cells = (full_cells if full else quick_cells)(wanted, duration_s)
     cells = [replace(one, cpu=cpu) for one in cells]
     results.rows = measure_ticks(cells, rounds)
+    results.missing += [f"{r.cell.label}, {r.cell.count} objects: lost tracks" for r in results.rows if r.lost_tracks]
+    save(results, out)  # so that what is measured stays, whatever happens to the rest
     names = list(ESTIMATORS) if full else [name for name in ESTIMATORS if name in MAIN]
     measure_single(results, names, rounds, min(6.0, duration_s), cpu)
     results.floors = measure_floor(wanted)
+    save(results, out)
     if full:
         results.rows = with_memory(results.rows)
     if against is not None:
-        results.against = measure_against(against, wanted, rounds, duration_s)
+        measure_against(results, against, wanted, rounds, duration_s)
+    save(results, out)
+    if figure is not None:
+        draw(results, figure)
     text = tables(results)
-    (out / "speed.md").write_text(text, encoding="utf-8")
-    values = json.dumps(finite(results.as_dict()), indent=2)
-    (out / "speed.json").write_text(values + "\n", encoding="utf-8")
-    for path in filter(None, (out / "speed.png", figure)):
-        draw(results, path)
     if page is not None:
         put_into(page, "speed", text)
-    print(values if as_json else text, end="" if not as_json else "\n")
+    print((out / "speed.json").read_text(encoding="utf-8") if as_json else text, end="")
+
+
+def save(results: Results, out: Path) -> None:
+    """Write speed.md, speed.json and speed.png."""
+    (out / "speed.md").write_text(tables(results), encoding="utf-8")
+    (out / "speed.json").write_text(json.dumps(finite(results.as_dict()), indent=2) + "\n", encoding="utf-8")
+    draw(results, out / "speed.png")
 
 
 def with_memory(rows: Sequence[Row]) -> list[Row]:

@@ -94,8 +94,19 @@ def test_two_hundred_objects_are_all_tracked() -> None:
 
 def test_missing_tracks_are_no_measurement() -> None:
     one = bench_tracker.Measured(1.0, [1.0], 1.0, 1.0, tracks=9.0, memory_mb=0.0)
-    with pytest.raises(ValueError, match="9 tracks of 10 objects"):
-        bench_report.Row.of(bench_tracker.Cell("x", "smoother", 10), [one])
+    row = bench_report.Row.of(bench_tracker.Cell("x", "smoother", 10), [one])
+    assert row.lost_tracks
+    assert np.isnan(row.published_ratio)
+    assert not bench_report.Row.of(bench_tracker.Cell("x", "smoother", 9), [one]).lost_tracks
+
+
+def test_an_older_checkout_that_cannot_be_measured_spoils_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "fgtrack").mkdir()
+    (tmp_path / "fgtrack/__init__.py").write_text("raise SystemExit(3)")
+    results = bench_report.Results()
+    bench_speed.measure_against(results, tmp_path, [1], rounds=1, duration_s=1.0)
+    assert not results.against
+    assert "cannot be measured, its benchmark exits 3" in bench_report.tables(results)
 
 
 @pytest.mark.parametrize(
