@@ -238,9 +238,12 @@ def _objects(count: float) -> str:
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """As Markdown; without the columns in which nothing was measured."""
     if not rows:
         return ""
-    return "\n".join(f"| {' | '.join(line)} |" for line in (header, ["---"] * len(header), *rows))
+    kept = [k for k in range(len(header)) if any(row[k] != "-" for row in rows)]
+    lines = (header, ["---"] * len(header), *rows)
+    return "\n".join(f"| {' | '.join(line[k] for k in kept)} |" for line in lines)
 
 
 def _short(value: float | str) -> str:
