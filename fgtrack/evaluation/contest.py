@@ -5,7 +5,7 @@ bootstrap over time (`fgtrack.evaluation.paired`).
 """
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,9 +15,9 @@ from fgtrack.evaluation.consistency import position_nees
 from fgtrack.evaluation.matching import scenes, track_errors
 from fgtrack.evaluation.multi_object import gospa
 from fgtrack.evaluation.paired import UNKNOWN, Estimate, by_stamp, within_run
-from fgtrack.evaluation.ranking import Entry, ranked, worse_columns
+from fgtrack.evaluation.ranking import STANDING_NOTE, Entry, ranked, value_column, worse_columns
 from fgtrack.evaluation.runs import JudgedRun
-from fgtrack.evaluation.tables import Column, Table, Value, short
+from fgtrack.evaluation.tables import Column, Table
 
 _SEED = 20040101  # of the bootstrap: the same runs give the same intervals
 
@@ -33,7 +33,6 @@ _HEADINGS = {
     "position_nees": "NEES pos.",
     "gospa_in_sight_rms_m": "GOSPA [m]",
 }
-_MARKS: Mapping[Value, str] = {"best": "+", "tie": "=", "worse": " "}
 _LARGE_SHARE = 0.9  # of the samples that all runs have in common; below it the note says how many
 
 
@@ -91,20 +90,13 @@ def differences(found: Sequence[Contest]) -> Table:
         Column("", ("quantity",), lambda row: (row.quantity,)),
         Column("quantity", (), lambda row: (_HEADINGS[row.quantity],), left=True),
         Column("run", ("run",), lambda row: (row.entry.name,), left=True),
-        Column(
-            "value  ",
-            ("value", "standing"),
-            lambda row: (row.entry.value, row.entry.standing),
-            "{} {}",
-            text=lambda value: _MARKS.get(value, "") or short(value),
-            bold=lambda row: row.entry.standing == "best",
-        ),
+        value_column("value", "value", lambda row: row.entry),
         *worse_columns(lambda row: row.entry),
         Column("", ("blocks",), lambda row: ((row.entry.worse_by or UNKNOWN).count,)),
     ]
     notes = [
         "RMSE where all runs track the object; NEES: worse is farther from 2",
-        "+: best; =: ties with the best, as the interval has 0 inside (block bootstrap)",
+        STANDING_NOTE,
     ]
     for contest in found:
         if contest.samples < _LARGE_SHARE * contest.most_samples:

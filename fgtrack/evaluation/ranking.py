@@ -1,6 +1,6 @@
 """Who is best, and how much worse the others are."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
@@ -8,10 +8,15 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.paired import Estimate
-from fgtrack.evaluation.tables import Column, Value, two_digits
+from fgtrack.evaluation.tables import Column, Value, short, two_digits
 
 Standing = Literal["best", "tie", "worse"]
 Row = TypeVar("Row")
+
+STANDING_NOTE = "+: best; =: ties with the best, as the interval has 0 inside (block bootstrap)"
+"""What the marks of `value_column` mean, for a table within a run."""
+
+_MARKS: Mapping[Value, str] = {"best": "+", "tie": "=", "worse": " "}
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,18 @@ def ranked(
     return (
         Entry(names[best], float(values[best]), None, first),
         *(Entry(names[k], float(values[k]), differences[k], standings[k]) for k in others),
+    )
+
+
+def value_column(heading: str, name: str, entry_of: Callable[[Row], Entry]) -> Column[Row]:
+    """The column `name` of `Entry.value` and its standing, the best one bold."""
+    return Column(
+        f"{heading}  ",
+        (name, "standing"),
+        lambda row: (entry_of(row).value, entry_of(row).standing),
+        "{} {}",
+        text=lambda value: _MARKS.get(value, "") or short(value),
+        bold=lambda row: entry_of(row).standing == "best",
     )
 
 

@@ -19,10 +19,10 @@ from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.contest import Quantity, by_recording, quantity
 from fgtrack.evaluation.deadlines import Deadlines, ready
 from fgtrack.evaluation.paired import by_stamp
-from fgtrack.evaluation.ranking import Entry, worse_columns
+from fgtrack.evaluation.ranking import STANDING_NOTE, Entry, value_column, worse_columns
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.statistics import Distribution
-from fgtrack.evaluation.tables import Column, Table, Tables, short
+from fgtrack.evaluation.tables import Column, Table, Tables
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.evaluation.verdict import who_is_best
 
@@ -31,7 +31,6 @@ ASKED, READY, PREDICTED = "asked", "ready", "predicted"
 same after its user has moved it to that moment."""
 
 _TITLES = {ASKED: "at its stamp", READY: "when ready", PREDICTED: "predicted to then"}
-_MARKS = {"best": "+", "tie": "=", "worse": " "}
 _LARGE_SHARE = 0.9
 _PERCENT, _MS = 100.0, 1e3
 
@@ -131,20 +130,13 @@ def _streaming(rows: Sequence[_Row], notes: Sequence[str]) -> Table:
         Column("", ("judged",), lambda row: (row.judged,)),
         Column("judged", (), lambda row: (_TITLES[row.judged],), left=True),
         Column("run", ("run",), lambda row: (row.entry.name,), left=True),
-        Column(
-            "pos. [m]  ",
-            ("position_rmse_m", "standing"),
-            lambda row: (row.entry.value, row.entry.standing),
-            "{} {}",
-            text=lambda value: _MARKS.get(str(value), "") or short(value),
-            bold=lambda row: row.entry.standing == "best",
-        ),
+        value_column("pos. [m]", "position_rmse_m", lambda row: row.entry),
         *worse_columns(lambda row: row.entry),
     ]
     own = [
         "when ready: as published, against the truth when its computation was done",
         "predicted: the same, moved straight on to then at its own speed by its user",
-        "+: best; =: ties with the best, as the interval has 0 inside (block bootstrap)",
+        STANDING_NOTE,
     ]
     title = "Streaming accuracy (position RMSE, each run paying for its time)"
     return Table(title, columns, rows, row_keys=("run", "judged"), notes=[*own, *notes])
