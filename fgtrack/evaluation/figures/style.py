@@ -17,9 +17,8 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.evaluation.palette import PALETTE as PALETTE
 
-#: Colours of Okabe and Ito, which the colour-blind can distinguish as well.
-PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 WRONG = "#000000"
 GREY = "#777777"
 

@@ -18,6 +18,7 @@ from fgtrack.io.errors import UntilBreak
 from fgtrack.io.output import Kind, new_folder
 from fgtrack.io.ros.messages import DETECTED_OBJECTS, DETECTION3D_ARRAY, MessageFactory
 from fgtrack.io.ros.typestore import one_line
+from fgtrack.io.viewer.topics import token
 
 _CHECKPOINT = 1000  # messages; a killed writer loses no more than that
 _PLUGINS = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
@@ -95,7 +96,7 @@ class _MessageWriter:
             case EgoState():
                 self._put("/fgtrack/ego", self._factory.ego(message), message.receipt_ns)
             case DetectionList():
-                topic = f"/fgtrack/detections/{_token(message.sensor)}"
+                topic = f"/fgtrack/detections/{token(message.sensor)}"
                 self._put(topic, self._factory.detections(message), message.receipt_ns)
             case TruthState():
                 self._put("/fgtrack/truth", self._factory.truth(message), message.receipt_ns)
@@ -141,7 +142,7 @@ class _MessageWriter:
 
     def _write_list_twin(self, message: DetectionList, msgtype: str) -> None:
         make = self._factory.detected_objects if msgtype == DETECTED_OBJECTS else self._factory.detection3d_array
-        self._put(f"/detections/{_token(message.sensor)}", make(message), message.receipt_ns)
+        self._put(f"/detections/{token(message.sensor)}", make(message), message.receipt_ns)
 
     def _write_truth_twin(self) -> None:
         if self._truth:
@@ -166,8 +167,3 @@ class _MessageWriter:
                 storage.bio.flush()
             case Sqlite3Writer() as storage:
                 storage.conn.commit()
-
-
-def _token(name: str) -> str:
-    """`name` as a part of a topic name."""
-    return re.sub(r"\W", "_", name, flags=re.ASCII)

@@ -17,6 +17,8 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 DETECTION3D_ARRAY = "vision_msgs/msg/Detection3DArray"
 DETECTED_OBJECTS = "autoware_perception_msgs/msg/DetectedObjects"
 POSE_ARRAY = "geometry_msgs/msg/PoseArray"
+MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 _FRAME_IDS: dict[Frame, str] = {"map": "map", "ego": "base_link"}
 _SECONDS_LIMIT = 1 << 31  # builtin_interfaces/Time holds 32 bits
@@ -24,7 +26,8 @@ _SECONDS_LIMIT = 1 << 31  # builtin_interfaces/Time holds 32 bits
 
 @cache
 def _typestore() -> Typestore:
-    types = (EGO, DETECTIONS, TRUTH, ODOMETRY, DETECTION3D_ARRAY, DETECTED_OBJECTS, POSE_ARRAY)
+    standard = (ODOMETRY, DETECTION3D_ARRAY, DETECTED_OBJECTS, POSE_ARRAY, MARKER_ARRAY, TRANSFORMS)
+    types = (EGO, DETECTIONS, TRUTH, *standard)
     return build_typestore(dict.fromkeys(types), ros1=False)[0]
 
 

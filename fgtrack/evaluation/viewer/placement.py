@@ -1,0 +1,86 @@
+"""Where the detections of a run are in the map, and what became of each."""
+
+from collections import defaultdict, deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgtrack.core.geometry import cartesian, rotations, wrap_angles
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.evaluation.sight import ego_poses
+from fgtrack.io.run import Run
+from fgtrack.io.run.reader import Column
+
+_KEY = ("sensor", "stamp_ns", "receipt_ns", "index")
+
+
+@dataclass(frozen=True)
+class Placed:
+    """The detections of a run in the map, in the order of `Run.detections`."""
+
+    position_m: FloatArray
+    """Shape (n, 2); NaN where only a direction was measured, and where no pose of the ego is known."""
+    yaw_rad: FloatArray
+    """Shape (n,); NaN where it was not measured."""
+    sensor_m: FloatArray
+    """Where the sensor was, shape (n, 2); NaN where no pose of the ego is known."""
+    bearing_rad: FloatArray
+    """Direction from the sensor, shape (n,); NaN where it was not measured."""
+
+
+def placed(run: Run) -> Placed:
+    """The detections of `run` in the map, by the path of the ego in ego.csv, linear between its stamps.
+
+    The tracker itself places them by what it knew of the ego when they came, so its own places may differ by what the
+    ego moved unexpectedly.
+    """
+    table = run.detections
+    frame, stamps_ns = table["frame"], table["stamp_ns"]
+    poses = ego_poses(run.ego, stamps_ns)
+    if poses is None:
+        poses = np.full((len(stamps_ns), 3), np.nan)
+    mounts = _mounts(run, table["sensor"], frame == "sensor")
+    sensor_m, sensor_rad = _moved(poses[:, :2], poses[:, 2], mounts[:, :2]), poses[:, 2] + mounts[:, 2]
+    in_map = frame == "map"
+    given_m = np.stack([table["x_m"], table["y_m"]], axis=-1)
+    turned_m = _moved(sensor_m, sensor_rad, given_m)
+    bearing_rad = sensor_rad + table["bearing_rad"]
+    polar_m = sensor_m + cartesian(np.stack([bearing_rad, table["range_m"]], axis=-1))
+    position_m = np.where(in_map[:, None], given_m, turned_m)
+    position_m = np.where(np.isfinite(given_m).all(axis=-1)[:, None], position_m, polar_m)
+    yaw_rad = np.where(in_map, table["yaw_rad"], table["yaw_rad"] + sensor_rad)
+    return Placed(position_m, _wrapped(yaw_rad), sensor_m, _wrapped(bearing_rad))
+
+
+def update_rows(run: Run) -> IntArray:
+    """The row of `Run.updates` that says what became of each of `Run.detections`, shape (n,); -1 where none does."""
+    waiting: defaultdict[tuple[object, ...], deque[int]] = defaultdict(deque)
+    for row, key in enumerate(zip(*(run.updates[name].tolist() for name in _KEY), strict=True)):
+        waiting[key].append(row)
+    keys = zip(*(run.detections[name].tolist() for name in _KEY), strict=True)
+    return np.array([waiting[key].popleft() if waiting[key] else -1 for key in keys], dtype=np.int64)
+
+
+def _moved(origins_m: FloatArray, yaws_rad: FloatArray, points_m: FloatArray) -> FloatArray:
+    """`points_m` of frames at `origins_m`, turned by `yaws_rad`, in the map, shape (n, 2)."""
+    return np.asarray(origins_m + np.einsum("nij,nj->ni", rotations(yaws_rad), points_m))
+
+
+def _mounts(run: Run, sensors: Column, mounted: BoolArray) -> FloatArray:
+    """Places (ahead, left) and yaw, shape (n, 3), of the frames of detections on the ego.
+
+    `mounted` says which are given in the frame of their sensor; the others are in the ego's detection frame.
+    """
+    config = run.config
+    ego, known = config.get("ego") or {}, config.get("sensors") or {}
+    origin = np.array([float(ego.get("detection_origin_x_m", 0.0)), float(ego.get("detection_origin_y_m", 0.0)), 0.0])
+    found = np.tile(origin, (len(sensors), 1))
+    for name in np.unique(sensors).tolist():
+        mount = (known.get(name) or {}).get("mount") or {}
+        found[mounted & (sensors == name)] += [float(mount.get(key, 0.0)) for key in ("x_m", "y_m", "yaw_rad")]
+    return found
+
+
+def _wrapped(angles_rad: FloatArray) -> FloatArray:
+    known = np.isfinite(angles_rad)
+    return np.where(known, wrap_angles(np.where(known, angles_rad, 0.0)), np.nan)
