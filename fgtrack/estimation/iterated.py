@@ -30,7 +30,7 @@ class IekfRecursion(EkfRecursion):
         self._iteration = iteration
 
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
-        """See `Recursion.correct`."""
+        """See `EkfRecursion.correct`."""
         if measurement.model.linear:
             return super().correct(mean, covariance, measurement)
 

@@ -37,7 +37,7 @@ class IplfRecursion(UkfRecursion):
         self._iteration = iteration
 
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
-        """See `Recursion.correct`."""
+        """See `EkfRecursion.correct`."""
         if measurement.model.linear:
             return super().correct(mean, covariance, measurement)
         x, P = mean, covariance

@@ -14,7 +14,7 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import OneCorrection, Prediction
 from fgtrack.estimation.initiation import DEFAULT, checked_initiation
 from fgtrack.estimation.opening import Opening
-from fgtrack.estimation.recursion import EkfRecursion, Recursion
+from fgtrack.estimation.recursion import EkfRecursion
 from fgtrack.estimation.rts import rts_step
 from fgtrack.estimation.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
@@ -63,7 +63,7 @@ class ReplayingFilter(WindowedFilter):
     initiates = True
 
     def __init__(
-        self, motion: MotionModel, prior: Start, lag_s: float, recursion: Recursion, initiation: str = DEFAULT
+        self, motion: MotionModel, prior: Start, lag_s: float, recursion: EkfRecursion, initiation: str = DEFAULT
     ) -> None:
         super().__init__(motion, prior, lag_s)
         self._recursion = recursion

@@ -3,58 +3,44 @@
 from fgtrack.core.linalg import congruence, product, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.ekf import (
-    Innovation,
-    OneCorrection,
-    Prediction,
-    correct_one,
-    innovation_one,
-    predict_across,
-    updated_one,
-)
+from fgtrack.estimation.ekf import Innovation, OneCorrection, Prediction, updated_one
 from fgtrack.estimation.initiation import DEFAULT
+from fgtrack.estimation.recursion import EkfRecursion
 from fgtrack.estimation.replay import ReplayingFilter
 from fgtrack.estimation.sigma_points import measurement_regression, motion_regression
 from fgtrack.models.motion import MotionModel
 
 
-class UkfRecursion:
+class UkfRecursion(EkfRecursion):
     """A filter that takes motion and measurement as what they are on average over the spread of the state.
 
     Julier and Uhlmann, Unscented filtering and nonlinear estimation, Proceedings of the IEEE 92(3), 2004, written as
-    the statistical linear regression that it is (see `regression`). The process noise, that of the mean, is added.
-
-    Parameters
-    ----------
-    motion
-        Motion model.
+    the statistical linear regression that it is (see `regression`). The process noise, that of the mean, is added. What
+    is linear it does as the extended Kalman filter.
     """
 
-    def __init__(self, motion: MotionModel) -> None:
-        self._motion = motion
-
     def predict(self, mean: FloatArray, covariance: FloatArray, dt_s: float) -> Prediction:
-        """See `Recursion.predict`."""
+        """See `EkfRecursion.predict`."""
         if self._motion.linear:
-            return predict_across(mean, covariance, self._motion, dt_s)
+            return super().predict(mean, covariance, dt_s)
         after, A, noise = motion_regression(self._motion, mean, covariance, dt_s)
         AP = product(A, covariance)
         Q = self._motion.step(mean.tolist(), dt_s).Q
         return Prediction(after, symmetrise(product(AP, A.T) + noise + Q), AP)
 
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
-        """See `Recursion.correct`."""
+        """See `EkfRecursion.correct`."""
         if measurement.model.linear:
-            return correct_one(mean, covariance, measurement)
+            return super().correct(mean, covariance, measurement)
         z, A, noise = measurement_regression(measurement, mean, covariance)
         y = measurement.model.residual(measurement.z, z)
         after, P, S, w = updated_one(mean, covariance, y, A, measurement.R + noise, measurement.loss)
         return OneCorrection(after, P, y, measurement.nis(y, S), w, S)
 
     def innovation(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> Innovation:
-        """See `Recursion.innovation`."""
+        """See `EkfRecursion.innovation`."""
         if measurement.model.linear:
-            return innovation_one(mean, covariance, measurement)
+            return super().innovation(mean, covariance, measurement)
         z, A, noise = measurement_regression(measurement, mean, covariance)
         y = measurement.model.residual(measurement.z, z)
         S = congruence(A, covariance) + noise + measurement.R

@@ -12,7 +12,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.iterated import IekfRecursion
 from fgtrack.estimation.iteration import Iteration, negative_log_posterior
 from fgtrack.estimation.posterior_linearisation import IplfRecursion
-from fgtrack.estimation.recursion import EkfRecursion, Recursion
+from fgtrack.estimation.recursion import EkfRecursion
 from fgtrack.estimation.registry import estimator
 from fgtrack.estimation.unscented import UkfRecursion
 from fgtrack.models.motion import CTRV, CV
@@ -30,7 +30,7 @@ def seen(loss: RobustLoss | None = None) -> Measurement:
     return Measurement.of(0, range_m=10.0, bearing_rad=0.75, std=std, loss=loss)
 
 
-def recursions() -> dict[str, Recursion]:
+def recursions() -> dict[str, EkfRecursion]:
     iteration = Iteration(100, 1e-9)
     return {
         "ekf": EkfRecursion(MOTION),
