@@ -4,8 +4,10 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtri
 
 from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.innovations import num_measured
 from fgtrack.evaluation.statistics import ChiSquareMean
 from fgtrack.io.run import Run, Table
@@ -42,17 +44,27 @@ def cautions(run: Run) -> list[str]:
 
 
 def noise_cautions(run: Run) -> list[str]:
-    """A line for each sensor whose innovations say that the noise does not fit. See also the verdict of `compare`."""
+    """A line for each sensor whose innovations say that the noise does not fit; see also the verdict of `compare`.
+
+    The median must be off as the mean is: the mean alone may be that of a few outliers, or of the first innovations of
+    new tracks.
+    """
     measured, found = num_measured(run.updates), []
     for sensor, mine in _by_sensor(run.updates):
         nis = ChiSquareMean.of(run.updates["nis"][mine], measured[mine])
-        if nis.count >= FEWEST and is_far_off(nis):
+        if nis.count >= FEWEST and is_far_off(nis) and _median_is_off(run.updates["nis"][mine], nis):
             size = "small" if nis.mean > nis.dof else "large"
             found.append(
                 f"{sensor}: mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}; "
                 "`fgtrack tune` fits it"
             )
     return found
+
+
+def _median_is_off(values: FloatArray, nis: ChiSquareMean) -> bool:
+    """Whether the median of `values` is as far off as their mean, on the same side."""
+    ratio = float(np.nanmedian(values)) / float(chdtri(nis.dof, 0.5))
+    return ratio > FAR_OFF if nis.mean > nis.dof else ratio < 1.0 / FAR_OFF
 
 
 def is_far_off(square: ChiSquareMean) -> bool:

@@ -91,6 +91,9 @@ def test_noise_that_does_not_fit_is_told(nis: float, size: str, tmp_path: Path) 
     run = run_of(tmp_path / "run", [update(tick=k, nis=nis, x_m=0.1, y_m=0.1) for k in range(40)])
     (line,) = noise_cautions(run)
     assert line.startswith(f"lidar: mean NIS {nis:.3g}, expected 2: the configured noise is too {size}")
+    burst = [26.0 if k % 10 == 0 else 1.4 for k in range(40)]
+    born = run_of(tmp_path / "born", [update(tick=k, nis=each, x_m=0.1, y_m=0.1) for k, each in enumerate(burst)])
+    assert noise_cautions(born) == []
     few = run_of(tmp_path / "few", [update(tick=k, nis=nis, x_m=0.1, y_m=0.1) for k in range(20)])
     assert noise_cautions(few) == []
 
