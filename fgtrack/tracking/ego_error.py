@@ -121,7 +121,7 @@ class SharedErrors:
         own = candidate.measurement
         names, pose = own.model.components, own.pose
         by_pose = np.zeros((n, 5))
-        offset_m = candidate.position_m[0] - pose.x_m, candidate.position_m[1] - pose.y_m
+        offset_m = candidate.position_m - np.array([pose.x_m, pose.y_m])
         by_pose[:2] = error.placement[:2] if names[:2] == ("x_m", "y_m") else placement(("x_m", "y_m"), offset_m)
         mean, P = initial_state(self._motion, prior)
         P[:2, :2] = candidate.position_covariance

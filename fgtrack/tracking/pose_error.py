@@ -20,9 +20,9 @@ class PoseError:
     covariance: FloatArray
     """Of e, shape (5, 5)."""
     placement: FloatArray
-    """Derivative of z by the pose, shape (k, 5)."""
+    """Derivative of z by the pose, shape (k, 5), or (m, k, 5) of many detections."""
     R: FloatArray
-    """Covariance of the detection itself, without e, shape (k, k)."""
+    """Covariance of the detection itself, without e, shape (k, k) or (m, k, k)."""
 
     def gain(self, model: MeasurementModel, pose: SensorPose, x: FloatArray) -> FloatArray:
         """G at the states `x` (..., n) of the object, shape (..., k, 5), or (k, 5) where it is the same at all."""
@@ -33,19 +33,18 @@ class PoseError:
         return self.R + symmetrise(congruence(self.gain(model, pose, x), self.covariance))
 
 
-def placement(components: tuple[str, ...], offset_m: tuple[float, float], assumed: tuple[str, ...] = ()) -> FloatArray:
-    """Derivative, shape (k, 5), of a detection that a pose placed in the map, by the x, y, yaw, vx, vy of this pose.
+def placement(components: tuple[str, ...], offsets_m: FloatArray, assumed: tuple[str, ...] = ()) -> FloatArray:
+    """Derivative, shape (..., k, 5), of detections that a pose placed in the map, by its x, y, yaw, vx and vy.
 
-    `offset_m` is where the detection lies in the map, seen from the pose. What is `assumed`, as a heading from the map,
+    `offsets_m` (..., 2) is where they lie in the map, seen from the pose. What is `assumed`, as a heading from the map,
     was not turned by the pose; a speed is over ground, whatever the ego does.
     """
-    D = np.zeros((len(components), 5))
-    dx_m, dy_m = offset_m
+    D = np.zeros((*offsets_m.shape[:-1], len(components), 5))
     for row, name in enumerate(components):
         if name == "x_m":
-            D[row, 0], D[row, 2] = 1.0, -dy_m
+            D[..., row, 0], D[..., row, 2] = 1.0, -offsets_m[..., 1]
         elif name == "y_m":
-            D[row, 1], D[row, 2] = 1.0, dx_m
+            D[..., row, 1], D[..., row, 2] = 1.0, offsets_m[..., 0]
         elif name == "yaw_rad" and name not in assumed:
-            D[row, 2] = 1.0
+            D[..., row, 2] = 1.0
     return D

@@ -1,24 +1,24 @@
 """From the detections of one batch to what can be associated: map frame, on the road, merged."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.geometry import body_point, body_point_jacobian, rotation, wrap_angle
+from fgtrack.core.geometry import body_point, body_point_jacobian
 from fgtrack.core.linalg import congruence
-from fgtrack.core.types import MEASURABLE, Detection, Disposition, FloatArray, UpdateRecord
+from fgtrack.core.types import MEASURABLE, Disposition, FloatArray, UpdateRecord
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.correlated_errors import split_error
-from fgtrack.models.measurement import RELATIVE, SensorPose, measured_position, measurement_model
+from fgtrack.models.measurement import RELATIVE, MeasurementModel, SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.ego import EgoPose
-from fgtrack.tracking.inbox import Batch, own_covariance, record
+from fgtrack.tracking.inbox import Batch, record
+from fgtrack.tracking.located import BEARING, RANGE, YAW, Located, X, common, covariances, located, with_map_yaw
 from fgtrack.tracking.merge import Merge
 from fgtrack.tracking.pose_error import PoseError, placement
 
@@ -57,17 +57,6 @@ class Candidate:
         return self.measurement if R is self.measurement.R else replace(self.measurement, R=R)
 
 
-@dataclass(frozen=True, slots=True)
-class MapDetection:
-    """A detection with its components in the map frame."""
-
-    index: int
-    detection: Detection
-    values: dict[str, float]
-    point_m: tuple[float, float] | None
-    """Position in the map; None where only a bearing was measured."""
-
-
 class _View(NamedTuple):
     """A batch, and where its sensor saw it from."""
 
@@ -76,6 +65,18 @@ class _View(NamedTuple):
     pose: SensorPose
     pose_covariance: FloatArray | None
     """Of the entries of `pose`, shape (5, 5); None where it is not considered, or matters to no detection."""
+
+
+class _Group(NamedTuple):
+    """Detections that are one object, as rows of `Located`."""
+
+    leader: int
+    merged: tuple[int, ...]
+    """Those that have no outcome of their own."""
+    parts: tuple[int, ...]
+    """Those that are averaged."""
+    columns: tuple[int, ...]
+    """What is averaged."""
 
 
 class Preprocess:
@@ -97,13 +98,16 @@ class Preprocess:
         """
         pose = self._sensor_pose(batch, sensor, ego)
         view = _View(batch, sensor, pose, _pose_covariance(pose, batch, sensor, ego))
-        located = [_located(index, batch, sensor, pose) for index in batch.indices]
-        far = [] if ego is None else _out_of_range(located, sensor, pose)
-        located = [item for item in located if item.index not in far]
-        outside = self._off_road(located, sensor)
-        located = [item for item in located if item.index not in outside]
-        records = [record(batch.message, index, Disposition.OUT_OF_BOUNDS) for index in far + outside]
-        return self._candidates(located, view), records
+        items = located(batch, sensor, pose)
+        far = np.zeros(len(items.indices), dtype=bool)
+        if ego is not None and sensor.max_range_m is not None:
+            offsets_m = items.points_m - np.array([pose.x_m, pose.y_m])
+            far = np.hypot(offsets_m[:, 0], offsets_m[:, 1]) > sensor.max_range_m
+        lost = items.indices[far].tolist()
+        items = items.at(~far) if lost else items
+        items, outside = self._on_road(items, sensor)
+        records = [record(batch.message, index, Disposition.OUT_OF_BOUNDS) for index in lost + outside]
+        return self._candidates(items, view), records
 
     def _sensor_pose(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> SensorPose:
         """Pose of the frame that the detections are given in, and the velocity of its origin."""
@@ -117,107 +121,137 @@ class Preprocess:
         x_m, y_m, vx_mps, vy_mps = body_point(*ego[:5], x_m, y_m)
         return SensorPose(float(x_m), float(y_m), yaw_rad, float(vx_mps), float(vy_mps))
 
-    def _off_road(self, located: list[MapDetection], sensor: SensorModel) -> list[int]:
-        """Indices of what lies outside the bounds; a yaw that was not measured becomes the map heading."""
-        placed = [item for item in located if item.point_m is not None]
-        if not self._road.known or not placed:
-            return []
-        view = self._road.view(np.array([item.point_m for item in placed]))
+    def _on_road(self, items: Located, sensor: SensorModel) -> tuple[Located, list[int]]:
+        """What lies inside the bounds, with the map heading as a yaw that was not measured; indices of the rest."""
+        placed = items.placed
+        if not self._road.known or not len(placed):
+            return items, []
+        view = self._road.view(items.points_m[placed])
         if sensor.yaw_from_map_std_rad is not None:
-            for item, yaw_rad in zip(placed, view.yaw_rad.tolist(), strict=True):
-                item.values.setdefault("yaw_rad", yaw_rad)
-        return [item.index for item, out in zip(placed, view.outside.tolist(), strict=True) if out]
+            items = with_map_yaw(items, placed, view.yaw_rad)
+        outside = placed[view.outside]
+        if not len(outside):
+            return items, []
+        return items.at(np.delete(np.arange(len(items.indices)), outside)), items.indices[outside].tolist()
 
-    def _candidates(self, located: list[MapDetection], view: _View) -> list[Candidate]:
-        placed = [item for item in located if item.point_m is not None]
-        groups = self._merge.groups(np.array([item.point_m for item in placed]).reshape(-1, 2))
-        candidates = []
+    def _candidates(self, items: Located, view: _View) -> list[Candidate]:
+        placed = items.placed
+        groups = self._merge.groups(items.points_m[placed])
+        kinds = items.kinds()
+        found: list[_Group] = []
         claimed = set(groups)
+        rows = placed.tolist()
         for leader, members in groups.items():
+            if len(members) == 1:
+                row = rows[leader]
+                found.append(_Group(row, (), (row,), kinds[row]))
+                continue
             merged = [i for i in members if i not in claimed]
             claimed.update(merged)
-            others = tuple(placed[i].index for i in merged)
-            parts = [placed[i] for i in members]
-            candidates.append(self._candidate(placed[leader], others, parts, view))
-        bearings = [item for item in located if item.point_m is None]
-        return candidates + [self._candidate(item, (), [item], view) for item in bearings]
+            parts = tuple(rows[i] for i in members)
+            columns = common([kinds[row] for row in parts])
+            if X not in columns and not {RANGE, BEARING} <= set(columns):  # nothing that all have says where they are
+                parts = (rows[leader],)
+                columns = kinds[rows[leader]]
+            found.append(_Group(rows[leader], tuple(rows[i] for i in merged), parts, columns))
+        if len(placed) < len(items.indices):
+            found += [
+                _Group(row, (), (row,), kinds[row]) for row in np.flatnonzero(np.isnan(items.points_m[:, 0])).tolist()
+            ]
+        return self._finished(items, found, view)
 
-    def _candidate(
-        self, leader: MapDetection, merged: tuple[int, ...], parts: Sequence[MapDetection], view: _View
-    ) -> Candidate:
-        """One detection, or the average of several over what all of them measure, if that says where they are."""
+    def _finished(self, items: Located, groups: Sequence[_Group], view: _View) -> list[Candidate]:
+        """The candidates of `groups`; those that measure the same are made together."""
+        map_yaw = items.map_yaw.tolist()
+        alike: dict[tuple[tuple[int, ...], bool], list[int]] = {}
+        for place, group in enumerate(groups):
+            assumed = YAW in group.columns and any(map_yaw[row] for row in group.parts)
+            alike.setdefault((group.columns, assumed), []).append(place)
+        candidates: dict[int, Candidate] = {}
+        for (columns, assumed), places in alike.items():
+            chosen = [groups[place] for place in places]
+            candidates.update(zip(places, self._alike(items, chosen, columns, assumed, view), strict=True))
+        return [candidates[place] for place in range(len(groups))]
+
+    def _alike(
+        self, items: Located, groups: Sequence[_Group], columns: tuple[int, ...], assumed: bool, view: _View
+    ) -> Iterator[Candidate]:
+        """Candidates that measure the same: one detection each, or the average of several."""
         batch, sensor, pose, _ = view
-        names = _common_names(parts)
-        if len(parts) > 1 and "x_m" not in names and not {"range_m", "bearing_rad"} <= set(names):
-            parts = [leader]
-            names = _common_names(parts)
-        covariances = [_covariance(part, names, batch, sensor, pose) for part in parts]
-        if len(parts) == 1:
-            values, R, point_m = leader.values, covariances[0], leader.point_m
-        else:
-            values = {n: self._merge.mean(n, np.array([part.values[n] for part in parts])) for n in names}
-            R = np.asarray(np.mean(covariances, axis=0))
-            x_m, y_m = np.mean([part.point_m for part in parts if part.point_m is not None], axis=0).tolist()
-            point_m = (x_m, y_m)
-        values = {name: values[name] for name in names}
-        assumed = self._assumed(parts, names, sensor)
-        z = np.array(list(values.values()))
-        model = measurement_model(names, self._motion)
-        model, white = split_error(batch.sensor, sensor, model, R, self._motion.state_names)
-        measurement = Measurement(batch.stamp_ns, model, z, white, pose, sensor.loss, assumed)
-        error = self._pose_error(measurement, point_m, view)
-        if error is not None:
-            x = np.zeros(self._motion.dim)
-            x[:2] = _far_along(values["bearing_rad"], pose) if point_m is None else point_m
-            measurement = replace(measurement, R=error.noise(model, pose, x))
-            R = R + (measurement.R - white)
-        found = measured_position(names, z, R, pose)
-        return Candidate(
-            leader.index,
-            merged,
-            measurement,
-            None if point_m is None else np.array(point_m),
-            None if found is None else found[1],
-            values,
-            error,
-        )
+        names = tuple(MEASURABLE[column] for column in columns)
+        leaders = np.array([group.leader for group in groups])
+        z, points_m = items.values[leaders][:, columns], items.points_m[leaders]
+        R = covariances(items.at(leaders), names, batch.frame, sensor, pose)
+        for place, group in enumerate(groups):
+            if len(group.parts) > 1:
+                parts = items.at(np.array(group.parts))
+                z[place] = [
+                    self._merge.mean(name, parts.values[:, column]) for name, column in zip(names, columns, strict=True)
+                ]
+                R[place] = covariances(parts, names, batch.frame, sensor, pose).mean(axis=0)
+                points_m[place] = parts.points_m.mean(axis=0)
+        assumes = self._assumed(assumed)
+        models, white = self._models(names, R, view)
+        whole, errors = white, self._pose_errors(names, models[0], points_m, white, assumes, view)
+        if errors is not None:
+            x = np.zeros((len(groups), self._motion.dim))
+            x[:, :2] = points_m
+            for place in np.flatnonzero(np.isnan(points_m[:, 0])).tolist():
+                x[place, :2] = _far_along(float(z[place, names.index("bearing_rad")]), pose)
+            whole = np.broadcast_to(errors.noise(models[0], pose, x), white.shape)
+            R = R + (whole - white)
+        if names[:2] == ("x_m", "y_m"):
+            spreads = R[:, :2, :2]
+        stamp_ns, loss, none = batch.stamp_ns, sensor.loss, np.isnan(points_m[:, 0]).tolist()
+        indices, numbers = items.indices.tolist(), z.tolist()
+        for place, group in enumerate(groups):
+            yield Candidate(
+                indices[group.leader],
+                tuple(indices[row] for row in group.merged),
+                Measurement(stamp_ns, models[place], z[place], whole[place], pose, loss, assumes),
+                None if none[place] else points_m[place],
+                spreads[place] if names[:2] == ("x_m", "y_m") else _spread(names, z[place], R[place], pose),
+                dict(zip(names, numbers[place], strict=True)),
+                None if errors is None else PoseError(errors.covariance, errors.placement[place], white[place]),
+            )
 
-    def _pose_error(
-        self, measurement: Measurement, point_m: tuple[float, float] | None, view: _View
+    def _models(
+        self, names: tuple[str, ...], R: FloatArray, view: _View
+    ) -> tuple[Sequence[MeasurementModel], FloatArray]:
+        """Measurement models of measurements with the covariances R (m, k, k), and those of the errors that are new."""
+        model = measurement_model(names, self._motion)
+        if view.sensor.correlation is None:
+            return [model] * len(R), R
+        split = [split_error(view.batch.sensor, view.sensor, model, one, self._motion.state_names) for one in R]
+        return [each for each, _ in split], np.array([white for _, white in split])
+
+    def _pose_errors(
+        self,
+        names: tuple[str, ...],
+        model: MeasurementModel,
+        points_m: FloatArray,
+        white: FloatArray,
+        assumed: tuple[str, ...],
+        view: _View,
     ) -> PoseError | None:
-        """How the error of the sensor pose enters a measurement at `point_m` in the map."""
+        """How the error of the sensor pose enters measurements at `points_m` in the map, all stacked."""
         if view.pose_covariance is None:
             return None
-        names, pose = measurement.model.components, view.pose
+        pose = view.pose
         if view.batch.frame == "map":
-            placed = np.zeros((len(names), len(pose)))
+            placed = np.zeros((len(white), len(names), len(pose)))
         else:
-            offset_m = (0.0, 0.0) if point_m is None else (point_m[0] - pose.x_m, point_m[1] - pose.y_m)
-            placed = placement(names, offset_m, measurement.assumed)
-        return PoseError(view.pose_covariance, placed, measurement.R)
+            placed = placement(names, np.nan_to_num(points_m - np.array([pose.x_m, pose.y_m])), assumed)
+        return PoseError(view.pose_covariance, placed, white)
 
-    def _assumed(self, parts: Sequence[MapDetection], names: tuple[str, ...], sensor: SensorModel) -> tuple[str, ...]:
-        """Those of `names` that not all `parts` measured: a yaw that the map gave."""
-        if sensor.yaw_from_map_std_rad is None or "yaw_rad" not in names:
-            return ()
-        measured = "yaw_rad" in sensor.std and all(part.detection.yaw_rad is not None for part in parts)
-        return () if measured else ("yaw_rad",)
+    def _assumed(self, map_yaw: bool) -> tuple[str, ...]:
+        """Components that are prior knowledge: a yaw that the map gave."""
+        return ("yaw_rad",) if map_yaw else ()
 
 
-def _located(index: int, batch: Batch, sensor: SensorModel, pose: SensorPose) -> MapDetection:
-    detection = batch.message.objects[index]
-    values = {name: float(value) for name in sensor.std if (value := getattr(detection, name)) is not None}
-    if "yaw_rad" in values and batch.frame != "map":
-        values["yaw_rad"] = wrap_angle(values["yaw_rad"] + pose.yaw_rad)
-    point_m = None
-    if "x_m" in values:
-        if batch.frame != "map":
-            values["x_m"], values["y_m"] = _in_map(values["x_m"], values["y_m"], pose)
-        point_m = values["x_m"], values["y_m"]
-    elif "range_m" in values:
-        range_m, bearing_rad = values["range_m"], values["bearing_rad"]
-        point_m = _in_map(range_m * math.cos(bearing_rad), range_m * math.sin(bearing_rad), pose)
-    return MapDetection(index, detection, values, point_m)
+def _spread(names: tuple[str, ...], z: FloatArray, R: FloatArray, pose: SensorPose) -> FloatArray | None:
+    found = measured_position(names, z, R, pose)
+    return None if found is None else found[1]
 
 
 def _pose_covariance(pose: SensorPose, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> FloatArray | None:
@@ -234,56 +268,3 @@ def _far_along(bearing_rad: float, pose: SensorPose) -> tuple[float, float]:
     """A place in the map so far along a line of sight that the place of the sensor no longer matters."""
     angle_rad = pose.yaw_rad + bearing_rad
     return pose.x_m + _FAR_M * math.cos(angle_rad), pose.y_m + _FAR_M * math.sin(angle_rad)
-
-
-def _out_of_range(located: list[MapDetection], sensor: SensorModel, pose: SensorPose) -> list[int]:
-    """Indices of what lies further from the sensor than it can be trusted."""
-    limit_m = math.inf if sensor.max_range_m is None else sensor.max_range_m
-    return [
-        item.index
-        for item in located
-        if item.point_m is not None and math.hypot(item.point_m[0] - pose.x_m, item.point_m[1] - pose.y_m) > limit_m
-    ]
-
-
-def _common_names(parts: Sequence[MapDetection]) -> tuple[str, ...]:
-    return _in_order(frozenset(parts[0].values).intersection(*[part.values for part in parts[1:]]))
-
-
-@cache
-def _in_order(names: frozenset[str]) -> tuple[str, ...]:
-    """`names` in the order of `MEASURABLE`."""
-    return tuple(name for name in MEASURABLE if name in names)
-
-
-def _in_map(x_m: float, y_m: float, pose: SensorPose) -> tuple[float, float]:
-    c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
-    return pose.x_m + c * x_m - s * y_m, pose.y_m + s * x_m + c * y_m
-
-
-def _covariance(
-    item: MapDetection, names: tuple[str, ...], batch: Batch, sensor: SensorModel, pose: SensorPose
-) -> FloatArray:
-    """Covariance of `names` in the map: the detection's own where it has one, else the sensor's R.
-
-    A yaw that the map gave has the sensor's standard deviation for it and is not correlated with the rest.
-    """
-    R = sensor.noise(names)
-    if item.detection.covariance is None or not sensor.message_covariance:
-        if "x_m" in names and item.point_m is not None and sensor.std["x_m"] != sensor.std["y_m"]:
-            x_m, y_m = item.point_m
-            R = _turned(R, math.atan2(y_m - pose.y_m, x_m - pose.x_m))
-        return R
-    measured = item.detection.measured
-    common = [name for name in names if name in measured and name in sensor.std]
-    here = [names.index(name) for name in common]
-    R = R.copy()
-    R[np.ix_(here, here)] = own_covariance(item.detection, common)
-    return _turned(R, pose.yaw_rad) if "x_m" in names and batch.frame != "map" else R
-
-
-def _turned(R: FloatArray, yaw_rad: float) -> FloatArray:
-    """R with its position block, and the correlations of the position with the rest, turned by `yaw_rad`."""
-    turn = np.eye(len(R))
-    turn[:2, :2] = rotation(yaw_rad)
-    return congruence(turn, R)

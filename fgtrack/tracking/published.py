@@ -18,7 +18,7 @@ from fgtrack.tracking.gating import euclidean_distances
 from fgtrack.tracking.inbox import Batch, is_covariance, is_number, record, records
 from fgtrack.tracking.lifecycle import Life, Lifecycle
 from fgtrack.tracking.merge import Merge
-from fgtrack.tracking.preprocess import Candidate, MapDetection, Preprocess
+from fgtrack.tracking.preprocess import Candidate, Preprocess
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
 
@@ -162,7 +162,7 @@ class NeighbourhoodMerge(Merge):
 class PublishedPreprocess(Preprocess):
     """A heading that the map gave counts as measured, in the innovations and their NIS."""
 
-    def _assumed(self, parts: Sequence[MapDetection], names: tuple[str, ...], sensor: SensorModel) -> tuple[str, ...]:
+    def _assumed(self, map_yaw: bool) -> tuple[str, ...]:
         return ()
 
 

@@ -1,0 +1,129 @@
+"""The detections of one batch in the map frame, as arrays."""
+
+import math
+from collections.abc import Sequence
+from operator import attrgetter
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.geometry import rotations, wrap_angles
+from fgtrack.core.linalg import congruence
+from fgtrack.core.types import MEASURABLE, BoolArray, Detection, FloatArray, Frame, IntArray
+from fgtrack.models.measurement import SensorPose
+from fgtrack.models.sensors import SensorModel
+from fgtrack.tracking.inbox import Batch, own_covariance
+
+X, Y, YAW, RANGE, BEARING = (MEASURABLE.index(name) for name in ("x_m", "y_m", "yaw_rad", "range_m", "bearing_rad"))
+_VALUES = attrgetter(*MEASURABLE)
+
+
+class Located(NamedTuple):
+    """Detections with their components in the map frame."""
+
+    indices: IntArray
+    """Positions in the message, shape (m,)."""
+    detections: list[Detection]
+    values: FloatArray
+    """Components in the order of `MEASURABLE`, shape (m, 7); NaN where there is none."""
+    points_m: FloatArray
+    """Positions in the map, shape (m, 2); NaN where only a bearing was measured."""
+    map_yaw: BoolArray
+    """Whether the yaw is that of the map, shape (m,)."""
+
+    @property
+    def placed(self) -> IntArray:
+        """Which of them have a position."""
+        return np.flatnonzero(~np.isnan(self.points_m[:, 0]))
+
+    def at(self, rows: IntArray | BoolArray) -> "Located":
+        """Those of `rows`."""
+        chosen = np.arange(len(self.indices))[rows].tolist()
+        detections = [self.detections[row] for row in chosen]
+        return Located(self.indices[rows], detections, self.values[rows], self.points_m[rows], self.map_yaw[rows])
+
+    def kinds(self) -> list[tuple[int, ...]]:
+        """Columns of the components that each has."""
+        measured = ~np.isnan(self.values)
+        if len(measured) and (measured == measured[0]).all():
+            return [tuple(np.flatnonzero(measured[0]).tolist())] * len(measured)
+        return [tuple(np.flatnonzero(row).tolist()) for row in measured]
+
+
+def located(batch: Batch, sensor: SensorModel, pose: SensorPose) -> Located:
+    """The detections of `batch`, what `sensor` measures of them, seen from `pose`."""
+    detections = [batch.message.objects[index] for index in batch.indices]
+    values = np.array([_VALUES(detection) for detection in detections], dtype=np.float64)
+    values = values.reshape(-1, len(MEASURABLE))
+    for column, name in enumerate(MEASURABLE):
+        if name not in sensor.std:
+            values[:, column] = np.nan
+    if batch.frame != "map":
+        if "yaw_rad" in sensor.std:
+            values[:, YAW] = wrap_angles(values[:, YAW] + pose.yaw_rad)
+        if "x_m" in sensor.std:
+            values[:, X], values[:, Y] = _in_map(values[:, X], values[:, Y], pose)
+    points_m = values[:, :2].copy()
+    if "range_m" in sensor.std:
+        polar = np.isnan(points_m[:, 0])
+        range_m, bearing_rad = values[polar, RANGE], values[polar, BEARING]
+        points_m[polar, 0], points_m[polar, 1] = _in_map(
+            range_m * np.cos(bearing_rad), range_m * np.sin(bearing_rad), pose
+        )
+    none = np.zeros(len(detections), dtype=bool)
+    return Located(np.array(batch.indices, dtype=np.int64), detections, values, points_m, none)
+
+
+def with_map_yaw(items: Located, rows: IntArray, yaw_rad: FloatArray) -> Located:
+    """With the yaw of the map, shape (m,), at those of `rows` that have none."""
+    lack = np.isnan(items.values[rows, YAW])
+    values, map_yaw = items.values.copy(), items.map_yaw.copy()
+    values[rows[lack], YAW] = yaw_rad[lack]
+    map_yaw[rows[lack]] = True
+    return items._replace(values=values, map_yaw=map_yaw)
+
+
+def covariances(
+    items: Located, names: tuple[str, ...], frame: Frame, sensor: SensorModel, pose: SensorPose
+) -> FloatArray:
+    """Covariances of `names` in the map, shape (m, k, k): a detection's own where it has one, else the sensor's R.
+
+    A yaw that the map gave has the sensor's standard deviation for it and is not correlated with the rest.
+    """
+    shared = sensor.noise(names)
+    R = np.array(np.broadcast_to(shared, (len(items.indices), *shared.shape)))
+    own = np.zeros(len(R), dtype=bool)
+    if sensor.message_covariance:
+        own = np.array([detection.covariance is not None for detection in items.detections], dtype=bool)
+        for row in np.flatnonzero(own).tolist():
+            measured = items.detections[row].measured
+            common = [name for name in names if name in measured and name in sensor.std]
+            here = [names.index(name) for name in common]
+            R[row][np.ix_(here, here)] = own_covariance(items.detections[row], common)
+    if "x_m" not in names:
+        return R
+    if frame != "map" and own.any():
+        R[own] = _turned(R[own], np.full(int(own.sum()), pose.yaw_rad))
+    if sensor.std["x_m"] != sensor.std["y_m"] and not own.all():
+        offsets_m = items.points_m[~own] - np.array([pose.x_m, pose.y_m])
+        R[~own] = _turned(R[~own], np.arctan2(offsets_m[:, 1], offsets_m[:, 0]))
+    return R
+
+
+def common(kinds: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
+    """The columns that are in all of `kinds`."""
+    return tuple(column for column in kinds[0] if all(column in other for other in kinds[1:]))
+
+
+def _in_map(x_m: FloatArray, y_m: FloatArray, pose: SensorPose) -> tuple[FloatArray, FloatArray]:
+    c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
+    return pose.x_m + c * x_m - s * y_m, pose.y_m + s * x_m + c * y_m
+
+
+def _turned(R: FloatArray, yaws_rad: FloatArray) -> FloatArray:
+    """R with its position blocks, and the correlations of the position with the rest, turned by `yaws_rad` (m,)."""
+    turns = np.zeros(R.shape)
+    places = np.arange(R.shape[-1])
+    turns[:, places, places] = 1.0
+    turns[:, :2, :2] = rotations(yaws_rad)
+    return congruence(turns, R)
