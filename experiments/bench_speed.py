@@ -106,9 +106,9 @@ def measure_apart(one: Cell, checkout: Path | None = None) -> Measured:
     return Measured(**json.loads(out))
 
 
-def measure_against(results: Results, checkout: Path, objects: Iterable[int], rounds: int, duration_s: float) -> None:
+def measure_against(results: Results, checkout: Path, cells: Sequence[Cell], rounds: int) -> None:
     """gtsam's smoother of this code and of `checkout`, in turn, each in a process of its own."""
-    for one in _fitted([cell(SMOOTHER, n) for n in (1, 10, 50)], objects, duration_s):
+    for one in cells:
         pairs = []
         try:
             for number in range(rounds):
@@ -130,6 +130,11 @@ def measure_against(results: Results, checkout: Path, objects: Iterable[int], ro
                 "highest": max(ratios),
             }
         )
+
+
+def is_compared(one: Cell) -> bool:
+    """Whether a cell is measured beside an older checkout."""
+    return one.label == SMOOTHER and one.count in PUBLISHED_MS_PER_US and (one.lag_s, one.delay_s) == (1.0, None)
 
 
 def measure_single(results: Results, names: Iterable[str], rounds: int, duration_s: float, cpu: bool) -> None:
@@ -209,7 +214,7 @@ def main(
     if full:
         results.rows = with_memory(results.rows)
     if against is not None:
-        measure_against(results, against, wanted, rounds, duration_s)
+        measure_against(results, against, [one for one in cells if is_compared(one)], rounds)
     save(results, out)
     if figure is not None:
         draw(results, figure)
