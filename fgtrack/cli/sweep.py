@@ -21,8 +21,8 @@ from fgtrack.pipeline.sweep import Scores, Sweep
 from fgtrack.pipeline.sweep_plan import load_plan
 from fgtrack.pipeline.sweep_store import ERROR_TABLE, PAIRED_TABLE, SWEEP_TABLE, Cell, Scalar, SweepResult
 
-#: Wall times among the metrics; they have a table of their own.
-_TIMES = "time_per_"
+#: Wall times among the metrics, and what follows from them; they have a table of their own.
+_TIMES = ("time_per_", "deadlines.")
 _NAMES = ("name", "estimator")
 
 

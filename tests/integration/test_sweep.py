@@ -114,6 +114,7 @@ def test_estimators_are_compared_over_the_seeds(done: Path) -> None:
 def test_wall_times_have_a_table_of_their_own(done: Path) -> None:
     table, timing = rows(done / "sweep.csv"), rows(done / "timing.csv")
     assert len(timing) == len(table)
+    assert {"deadlines.misses", "time_per_detection_s"} <= set(timing[0])
     assert set(timing[0]) & set(table[0]) == {*POINT, "scenario.sensors.lidar_cluster.delay", "estimator"}
     assert all(float(row[name]) > 0.0 for row in timing for name in ("replay_s", "score_s", "time_per_tick_s.mean"))
 
