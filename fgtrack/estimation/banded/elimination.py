@@ -36,9 +36,10 @@ def eliminate(nodes: Nodes, tracks: IntArray, places: IntArray) -> None:
     if not all_inner:  # the prior of the oldest node in the window, which follows from nothing
         oldest = ~inner
         F[oldest], driven[oldest] = 0.0, nodes.predicted[numbers[oldest]]
-    rows = nodes.rows.take(numbers, axis=0)[:, : int(nodes.num_rows.take(numbers).max())]
+    num_rows = nodes.num_rows.take(numbers)
+    rows = nodes.rows.take(numbers, axis=0)[:, : int(num_rows.max())]
     begins = nodes.at(tracks[steps.order], np.maximum(places[steps.order] - 1, 0))
-    left, filtered = _filtered(steps, nodes.filtered.take(begins, axis=0), F, driven, rows)
+    left, filtered = _filtered(steps, nodes.filtered.take(begins, axis=0), F, driven, rows, num_rows)
     moved = F @ left
     predicted = driven + moved @ _beside_one(F).mT
     if (_variances(filtered) < _LEAST_SHARE * _variances(predicted)).any():
@@ -73,7 +74,7 @@ def _beside_one(F: FloatArray) -> FloatArray:
 
 
 def _filtered(
-    steps: Steps, start: FloatArray, F: FloatArray, driven: FloatArray, rows: FloatArray
+    steps: Steps, start: FloatArray, F: FloatArray, driven: FloatArray, rows: FloatArray, num_rows: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """States [P | x] before each step and after it.
 
@@ -91,16 +92,18 @@ def _filtered(
     along = both @ F
     across = along.mT
     state, left = start, np.empty(driven.shape)
-    for begin, end in steps.slices():
+    slices = steps.slices()
+    most = np.maximum.reduceat(num_rows, [begin for begin, _ in slices]).tolist()
+    for (begin, end), measured in zip(slices, most, strict=True):
         at, m = slice(begin, end), end - begin
         before = left[at] = state[:m]
         moved, table = along[at] @ before, joint[at]
         table[..., :-1] += moved[..., :n] @ across[at]
         table[..., -1] += moved[..., n]
-        for pivot in range(k):
-            after = pivot + 1
-            row = table[:, pivot, after:] / table[:, pivot, pivot, None]
-            table[:, after:, after:] -= table[:, after:, pivot, None] * row[:, None]
+        for pivot in range(measured):
+            rest = table[:, pivot + 1 :, pivot + 1 :]
+            row = table[:, None, pivot, pivot + 1 :]
+            rest -= table[:, pivot + 1 :, pivot, None] * (row / table[:, pivot, pivot, None, None])
         state[:m] = table[:, k:, k:]
     return left, joint[:, k:, k:]
 

@@ -14,6 +14,7 @@ from fgtrack.estimation.banded.nodes import Nodes
 from fgtrack.estimation.banded.steps import backwards
 
 _LONG = 8
+_SELDOM = 4  # blocks are made once in so many solutions, for many tracks together
 
 
 class Blocks:
@@ -29,6 +30,7 @@ class Blocks:
         self._solid: IntArray = np.zeros(0, dtype=np.int64)
         self._known: IntArray = np.zeros(0, dtype=np.int64)
         """From this place on covariances are known."""
+        self._num_solved = 0
         self.any_far: BoolArray = np.zeros(0, dtype=bool)
         """Whether a node of the track is marked as `far`."""
 
@@ -90,7 +92,9 @@ class Blocks:
                 far &= steps.places >= (nodes.first + anchored)[steps.tracks]
                 self.any_far[steps.tracks[far]] = True
             nodes.far[numbers] = far
-        self._extend(tracks, thresholds)
+        self._num_solved += 1
+        if self._num_solved % _SELDOM == 0:
+            self._extend(tracks, thresholds)
         self._check_blocks(tracks, thresholds, anchored)
 
     def _extend(self, tracks: IntArray, thresholds: FloatArray) -> None:
