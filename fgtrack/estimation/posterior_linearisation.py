@@ -10,7 +10,7 @@ from fgtrack.estimation.ekf import OneCorrection
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.iteration import Iteration, largest_move, negative_log_posterior, reweighted
 from fgtrack.estimation.replay import ReplayingFilter
-from fgtrack.estimation.sigma_points import expected_measurement, measurement_regression
+from fgtrack.estimation.sigma_points import measurement_regression
 from fgtrack.estimation.unscented import UkfRecursion
 from fgtrack.models.motion import MotionModel
 
@@ -64,7 +64,7 @@ class IplfRecursion(UkfRecursion):
         x: FloatArray,
     ) -> float:
         """What a step lowers: the negative logarithm of the posterior at a state `x` (n,) of `spread` (n, n)."""
-        z = expected_measurement(measurement, x, spread)
+        z = measurement_regression(measurement, x, spread).mean
         residual = measurement.model.residual(measurement.z, z)
         return negative_log_posterior(x - prior[0], prior[1], residual, R, measurement.loss)
 

@@ -45,25 +45,14 @@ def regression(
     Raises `numpy.linalg.LinAlgError` for a covariance that is not positive semidefinite.
     """
     n, L = mean.shape[-1], _root(covariance)
-    centre, ahead, behind = _around(g, mean, L, difference)
+    centre, offsets = mean[..., None, :], n**0.5 * L.mT
+    values = g(np.concatenate([centre, centre + offsets, centre - offsets], axis=-2))
+    d = difference(values[..., 1:, :], values[..., :1, :])
+    ahead, behind = d[..., :n, :], d[..., n:, :]
     bends, slopes = 0.5 * (ahead + behind), (ahead - behind) / (2.0 * n**0.5)
     shift = bends.sum(axis=-2) / n
     noise = bends.mT @ bends / n - shift[..., :, None] * shift[..., None, :]
-    return Regression(centre + shift, np.linalg.solve(L.mT, slopes).mT, symmetrise(noise))
-
-
-def _around(
-    g: Callable[[FloatArray], FloatArray],
-    mean: FloatArray,
-    L: FloatArray,
-    difference: Callable[[FloatArray, FloatArray], FloatArray],
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """`g` at `mean`, (..., k), and how it differs from that ahead and behind along the root `L`, (..., n, k) each."""
-    n, centre = mean.shape[-1], mean[..., None, :]
-    rows = n**0.5 * L.mT
-    values = g(np.concatenate([centre, centre + rows, centre - rows], axis=-2))
-    d = difference(values[..., 1:, :], values[..., :1, :])
-    return values[..., 0, :], d[..., :n, :], d[..., n:, :]
+    return Regression(values[..., 0, :] + shift, np.linalg.solve(L.mT, slopes).mT, symmetrise(noise))
 
 
 def _root(covariance: FloatArray) -> FloatArray:
@@ -94,13 +83,6 @@ def measurement_regression(measurement: Measurement, mean: FloatArray, covarianc
         k = len(model.components)
         return Regression(model.predict(mean, pose), model.selection(mean.shape[-1]), np.zeros((k, k)))
     return regression(lambda x: model.predict(x, pose), mean, covariance, _difference(model))
-
-
-def expected_measurement(measurement: Measurement, mean: FloatArray, covariance: FloatArray) -> FloatArray:
-    """The mean of `measurement_regression` of a model that is not linear, alone."""
-    model, pose = measurement.model, measurement.pose
-    centre, ahead, behind = _around(lambda x: model.predict(x, pose), mean, _root(covariance), _difference(model))
-    return np.asarray(centre + 0.5 * (ahead + behind).sum(axis=-2) / len(mean))
 
 
 @cache
