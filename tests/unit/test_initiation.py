@@ -7,8 +7,8 @@ from fgtrack.core.geometry import rotation
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
 from fgtrack.estimation.factor_graph.window import Window
-from fgtrack.estimation.initiation import Fix, Line, over, straight_line
-from fgtrack.models.motion import CTRV
+from fgtrack.estimation.initiation import Fix, Line, Search, along, fixes_of, over, straight_line
+from fgtrack.models.motion import CTRV, CV
 from fgtrack.models.sensors import RobustLoss
 
 STD_M = 0.5
@@ -94,3 +94,36 @@ def test_certainty_counts_standard_deviations_of_the_velocity() -> None:
     assert over(line, "regression", 3.0)
     assert not over(line, "regression", 3.2)
     assert over(line, "two-point", 3.2)
+
+
+def test_states_lie_along_the_line() -> None:
+    line = Line(np.array([1.0, 2.0]), np.array([0.0, -4.0]), np.eye(2))
+    np.testing.assert_allclose(along(line, 0.5, CTRV.state_names), [1.0, 0.0, -np.pi / 2.0, 4.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(along(line, -1.0, CV.state_names), [1.0, 6.0, 0.0, -4.0], atol=1e-12)
+
+
+def test_a_line_that_is_certain_stays_unless_something_older_than_its_last_position_comes() -> None:
+    first_ns, R = 7_000_000_000, 0.01 * np.eye(2)
+    search = Search(first_ns, "regression")
+    fixes = [Fix(time_s, np.array([20.0 * time_s, 0.0]), R) for time_s in (0.0, 0.001, 0.1, 0.2)]
+    assert search.next_line(lambda: fixes[:1], first_ns) is None  # all of one time
+    found = search.next_line(lambda: fixes[:2], first_ns + 1_000_000)
+    assert found is not None
+    assert found[1].until_ns is None
+    found = search.next_line(lambda: fixes[::-1], first_ns + 100_000_000)
+    assert found is not None
+    line, search = found
+    assert search.until_ns == first_ns + 100_000_000
+    np.testing.assert_allclose(line.position_m + 0.1 * line.velocity_mps, [2.0, 0.0], atol=1e-9)
+    assert search.next_line(lambda: fixes, first_ns + 100_000_001) is None
+    assert search.next_line(lambda: fixes, first_ns + 100_000_000) is not None
+
+
+def test_the_first_state_is_the_first_position() -> None:
+    bearing = Measurement.of(0, bearing_rad=0.1, std={"bearing_rad": 0.1})
+    seen = Measurement.of(0, x_m=1.0, y_m=2.0, std=STD)
+    first, later = fixes_of(np.arange(5.0), 3.0 * np.eye(5), [(0.3, bearing), (0.4, seen)])
+    assert (first.time_s, later.time_s) == (0.0, 0.4)
+    np.testing.assert_array_equal(first.position_m, [0.0, 1.0])
+    np.testing.assert_array_equal(first.covariance, 3.0 * np.eye(2))
+    np.testing.assert_array_equal(later.position_m, [1.0, 2.0])
