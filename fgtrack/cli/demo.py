@@ -1,6 +1,7 @@
 """`fgtrack demo`: the whole chain in a minute."""
 
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -9,10 +10,10 @@ import typer
 
 from fgtrack.cli.arguments import Overwrite
 from fgtrack.cli.compare import written_tables
-from fgtrack.cli.figure import save_close_up
+from fgtrack.cli.figure import drawn_close_up
 from fgtrack.cli.show import TickProgress, console, progress, say
 from fgtrack.evaluation.comparison import compare
-from fgtrack.evaluation.plot import save_figures
+from fgtrack.evaluation.plot import named_figures, save_named
 from fgtrack.evaluation.runs import judged
 from fgtrack.io.output import Kind, check_output, claimed, new_files
 from fgtrack.io.ros.bag_writer import RECORDING, write_bag
@@ -78,8 +79,8 @@ def demo(
                 say(f"  {sentence}")
         console().print(replace(written_tables(every), verdict=()))
         with progress("draw"), new_files(figures, overwrite) as folder:
-            files, _ = save_close_up(every[-len(_ESTIMATORS) :], folder, "png")
-            files += save_figures(every[-len(_ESTIMATORS) :], folder)
+            fitted = every[-len(_ESTIMATORS) :]
+            files = save_named(chain(drawn_close_up(fitted)[0], named_figures(fitted)), folder, "png")
         say(f"recording: {bag}\nruns: {out / 'runs'}")
         for file in files:
             say(f"figure: {figures / file.name}")

@@ -4,7 +4,7 @@
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -113,8 +113,18 @@ def save_figures(runs: Runs, out_dir: Path | str, form: str = "png") -> list[Pat
         out_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise CallError(f"{out_dir}: cannot be made ({error.strerror}), choose another folder") from error
-    named = (found for figures in FIGURES.values() for found in figures(every))
-    return [save(figure, out_dir / f"{_slug(name)}.{form}") for name, figure in named]
+    return save_named(named_figures(every), out_dir, form)
+
+
+def save_named(named: Iterable[tuple[str, Figure]], folder: Path, form: str) -> list[Path]:
+    """Write figures into `folder`, each into a file of its name; raises `CallError` as `save`."""
+    return [save(figure, folder / f"{_slug(name)}.{form}") for name, figure in named]
+
+
+def named_figures(runs: Runs) -> _Named:
+    """Every figure that `runs` have data for, with its name. Raises `DataError` as `save_figures`."""
+    every = judged(runs)
+    return (found for figures in FIGURES.values() for found in figures(every))
 
 
 def _slug(name: str) -> str:

@@ -1,9 +1,11 @@
 """Writes a recording: a stream or a rosbag2 folder, as its name says."""
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
+from fgtrack.core.errors import CallError
 from fgtrack.core.types import Message
 from fgtrack.io.output import check_output
 from fgtrack.io.ros.bag_writer import RECORDING, write_bag
@@ -11,6 +13,8 @@ from fgtrack.io.stream import STREAM, write_stream
 
 Storage = Literal["mcap", "sqlite3"]
 """Storage of a rosbag2 folder."""
+
+_FILE_ENDING = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,5}$")
 
 
 def write_recording(
@@ -27,6 +31,8 @@ def write_recording(
 
 def check_recording(out: Path, overwrite: bool) -> None:
     """Raise `CallError` where `write_recording` would for what is there, before the messages are made."""
+    if not _is_stream(out) and _FILE_ENDING.search(out.name) and not out.is_dir():
+        raise CallError(f"{out}: is written as .jsonl, as .jsonl.gz, or as a rosbag2 folder without such an ending")
     check_output(out, STREAM if _is_stream(out) else RECORDING, overwrite)
 
 

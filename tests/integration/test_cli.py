@@ -286,6 +286,11 @@ def foreign_folder(path: Path) -> None:
         (("config", "-c", "broken.yaml"), "broken.yaml:2: no valid YAML"),
         (("demo", "-o", "drive.jsonl"), "drive.jsonl: cannot be made a folder"),
         (("demo", "-o", "busy"), "busy/recording: exists and is not a rosbag2 folder"),
+        (("convert", "drive.jsonl", "drive.html"), "drive.html: is written as .jsonl, as .jsonl.gz, or as a rosbag2"),
+        (
+            ("simulate", "default", "-o", "drive.mcap"),
+            "drive.mcap: is written as .jsonl, as .jsonl.gz, or as a rosbag2",
+        ),
         (("replay", "drive.jsonl"), "--out"),
         (("replay", "-o", "run"), "ecording"),
         (("fly",), "fly"),

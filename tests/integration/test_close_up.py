@@ -132,6 +132,19 @@ def test_panels_lie_along_the_direction_of_travel(folder: Path, found: list[Clos
     assert x[-1] > x[0]
 
 
+def test_all_figures_can_be_the_pages_of_one_pdf(folder: Path, tmp_path: Path) -> None:
+    call = ["figure", str(folder / "runs" / NAMES[0]), "-o"]
+    assert command([*call, str(tmp_path / "a.pdf")]) == 0
+    assert command([*call, str(tmp_path / "b.pdf")]) == 0
+    content = (tmp_path / "a.pdf").read_bytes()
+    assert content == (tmp_path / "b.pdf").read_bytes()
+    assert content.startswith(b"%PDF")
+    assert content.count(b"/Type /Page ") >= 6
+    assert command([*call, str(tmp_path / "a.pdf")]) == 2
+    assert command([*call, str(tmp_path / "a.pdf"), "--overwrite"]) == 0
+    assert command([*call, str(tmp_path / "a.svg")]) == 2
+
+
 def test_the_command_draws_it_and_goes_on_without_a_recording(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -3,15 +3,16 @@
 import base64
 import io
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, BinaryIO, ParamSpec, TypeVar
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -133,6 +134,14 @@ def broken_line(stamps_ns: IntArray, x: FloatArray, y: FloatArray, step_ns: floa
     order = np.argsort(stamps_ns, kind="stable")
     pauses = np.flatnonzero(np.diff(stamps_ns[order]) > _PAUSE_STEPS * step_ns) + 1
     return np.insert(x[order], pauses, np.nan), np.insert(y[order], pauses, np.nan)
+
+
+@styled
+def save_pages(figures: Iterable[Figure], file: BinaryIO) -> None:
+    """Write `figures` as the pages of one PDF, without date and version."""
+    with PdfPages(file, metadata=dict(FORMATS["pdf"])) as pages:
+        for figure in figures:
+            pages.savefig(figure)
 
 
 @styled
