@@ -324,12 +324,12 @@ def test_figures_are_replaced_all_or_none(here: Path, call: Call, monkeypatch: p
     figures = sorted(Path("figures").iterdir())
     drawn = {figure.name: figure.read_bytes() for figure in figures}
 
-    def redraw(runs: object, folder: Path, form: str) -> list[Path]:
+    def redraw(named: object, folder: Path, form: str) -> list[Path]:
         for name, picture in drawn.items():
             (folder / name).write_bytes(picture)
         return [folder / name for name in drawn]
 
-    monkeypatch.setattr("fgtrack.cli.figure.save_figures", redraw)
+    monkeypatch.setattr("fgtrack.cli.figure.save_named", redraw)
     assert call("figure", "run", "-o", "figures")[0] == 0  # they would be the same
     figures[-1].write_bytes(figures[-1].read_bytes() + b"x")
     figures[0].unlink()
