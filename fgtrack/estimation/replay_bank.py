@@ -200,7 +200,10 @@ class ReplayBank:
         """States of tracks at `stamp_ns`, or at the start of their window where that is later."""
         tracks = [self._numbers[track_id] for track_id in track_ids]
         here = np.array([track for track in tracks if track is not None], dtype=np.int64)
-        found = self._predicted_together(here, np.maximum(stamp_ns, self._start_ns[here]))
+        n = self._motion.dim
+        found = Prediction(np.zeros((0, n)), np.zeros((0, n, n)), np.zeros((0, n, n)))
+        if len(here):
+            found = self._predicted_together(here, np.maximum(stamp_ns, self._start_ns[here]))
         if not self._single:
             return found
         mean, covariance, cross = (np.zeros((len(tracks), *values.shape[1:])) for values in found)

@@ -11,6 +11,7 @@ from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.tracking.gating import MOST_PAIRS, Pairs
 
 _REFUSED = 1e9  # cost of a pair outside its gate: any number of good pairs is cheaper
+_FEW_COSTS = 1 << 12  # so many are solved at once sooner than they are taken apart
 
 
 class Assignment(NamedTuple):
@@ -32,28 +33,22 @@ def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:
     Those linked by pairs are a problem of their own: its size is what memory and time depend on, not that of all.
     """
     rows, columns = _solved(pairs, num_candidates, num_tracks)
-    order = np.argsort(rows)
-    new, missed = np.ones(num_candidates, dtype=bool), np.ones(num_tracks, dtype=bool)
-    new[rows], missed[columns] = False, False
-    return Assignment(
-        list(zip(rows[order].tolist(), columns[order].tolist(), strict=True)),
-        np.flatnonzero(new).tolist(),
-        np.flatnonzero(missed).tolist(),
-    )
+    return _outcome(rows, columns, num_candidates, num_tracks)
 
 
 def assigned_densely(cost: FloatArray, inside: BoolArray) -> Assignment:
     """`assigned` of all pairs `inside` their gates, both arguments of shape (candidates, tracks)."""
     rows, columns = _least_cost(np.where(inside, cost, _REFUSED))
     good = inside[rows, columns]
-    new, missed = np.ones(cost.shape[0], dtype=bool), np.ones(cost.shape[1], dtype=bool)
-    rows, columns = rows[good], columns[good]
-    new[rows], missed[columns] = False, False
-    return Assignment(
-        list(zip(rows.tolist(), columns.tolist(), strict=True)),
-        np.flatnonzero(new).tolist(),
-        np.flatnonzero(missed).tolist(),
-    )
+    return _outcome(rows[good], columns[good], *cost.shape)
+
+
+def _outcome(rows: IntArray, columns: IntArray, num_candidates: int, num_tracks: int) -> Assignment:
+    pairs = sorted(zip(rows.tolist(), columns.tolist(), strict=True))
+    paired, seen = {i for i, _ in pairs}, {j for _, j in pairs}
+    new = [] if len(pairs) == num_candidates else [i for i in range(num_candidates) if i not in paired]
+    missed = [] if len(pairs) == num_tracks else [j for j in range(num_tracks) if j not in seen]
+    return Assignment(pairs, new, missed)
 
 
 def cheapest(pairs: Pairs, numbers: IntArray) -> Pairs:
@@ -71,31 +66,53 @@ def cheapest(pairs: Pairs, numbers: IntArray) -> Pairs:
     return pairs.at(np.sort(order[rank < numbers[columns]]))
 
 
+class _Table(NamedTuple):
+    """Pairs, and their places in a table of the candidates and tracks that they have."""
+
+    pairs: Pairs
+    rows: IntArray
+    columns: IntArray
+    i: IntArray
+    j: IntArray
+
+    @classmethod
+    def of(cls, pairs: Pairs) -> "_Table":
+        """The table of `pairs`."""
+        rows, i = np.unique(pairs.rows, return_inverse=True)
+        columns, j = np.unique(pairs.columns, return_inverse=True)
+        return cls(pairs, rows, columns, i, j)
+
+    @property
+    def size(self) -> int:
+        return len(self.rows) * len(self.columns)
+
+
 def _solved(pairs: Pairs, num_candidates: int, num_tracks: int) -> tuple[IntArray, IntArray]:
     """Candidates and tracks of the best pairs."""
+    if len(pairs.rows) < 2:
+        return pairs.rows, pairs.columns
     alone = np.bincount(pairs.rows, minlength=num_candidates)[pairs.rows] == 1
     alone &= np.bincount(pairs.columns, minlength=num_tracks)[pairs.columns] == 1
     if alone.all():
         return pairs.rows, pairs.columns
     rows, columns = [pairs.rows[alone]], [pairs.columns[alone]]
-    pairs = pairs.at(~alone)
-    for part in _components(pairs, num_candidates, num_tracks):
-        here, i = np.unique(part.rows, return_inverse=True)
-        there, j = np.unique(part.columns, return_inverse=True)
-        if len(here) * len(there) > MOST_PAIRS:
-            smaller = cheapest(part, _rivals(part, num_candidates, num_tracks))
-            if len(smaller.rows) < len(part.rows):
+    linked = pairs.at(~alone)
+    few = _Table.of(linked)
+    for part in [few] if few.size <= _FEW_COSTS else map(_Table.of, _components(linked, num_candidates, num_tracks)):
+        if part.size > MOST_PAIRS:
+            smaller = cheapest(part.pairs, _rivals(part.pairs, num_candidates, num_tracks))
+            if len(smaller.rows) < len(part.pairs.rows):
                 found = _solved(smaller, num_candidates, num_tracks)
                 rows.append(found[0])
                 columns.append(found[1])
                 continue
-        cost = np.full((len(here), len(there)), _REFUSED)
+        cost = np.full((len(part.rows), len(part.columns)), _REFUSED)
         inside = np.zeros(cost.shape, dtype=bool)
-        cost[i, j], inside[i, j] = part.values, True
+        cost[part.i, part.j], inside[part.i, part.j] = part.pairs.values, True
         first, second = _least_cost(cost)
         good = inside[first, second]
-        rows.append(here[first[good]])
-        columns.append(there[second[good]])
+        rows.append(part.rows[first[good]])
+        columns.append(part.columns[second[good]])
     return np.concatenate(rows), np.concatenate(columns)
 
 

@@ -45,18 +45,22 @@ class GatedEuclidean:
 
     def within(self, gates_m: float | FloatArray, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
         """The same with other gates; `gates_m` has a shape that goes with (candidates, tracks)."""
-        limits_m = np.broadcast_to(gates_m, (len(candidates), len(states.means)))
+        limits_m, reach_m = None, gates_m
+        if isinstance(gates_m, np.ndarray):
+            limits_m = np.broadcast_to(gates_m, (len(candidates), len(states.means)))
+            reach_m = float(gates_m.max(initial=0.0))
         groups = [] if self.max_nis is None else alike(candidates)
         near_any = np.zeros(len(candidates), dtype=bool)
 
         def believed(pairs: Pairs) -> Pairs:
-            pairs = pairs.at(pairs.values <= limits_m[pairs.rows, pairs.columns])
+            if limits_m is not None:
+                pairs = pairs.at(pairs.values <= limits_m[pairs.rows, pairs.columns])
             if self.max_nis is None:
                 return pairs
             near_any[pairs.rows] = True
             return pairs.at(innovations(pairs, groups, len(candidates), states).nis <= self.max_nis)
 
-        found = _assigned(candidates, states, float(np.max(gates_m, initial=0.0)), believed)
+        found = _assigned(candidates, states, reach_m, believed)
         refused = tuple(i for i in found.new if near_any[i])
         return found._replace(new=[i for i in found.new if not near_any[i]], refused=refused) if refused else found
 
@@ -104,10 +108,11 @@ def _assigned(
 ) -> Assignment:
     """The best of the pairs at most `reach_m` apart that `judged` leaves, which gives them their costs."""
     num_tracks = len(states.means)
-    enough = np.full(num_tracks, num_tracks)
     pairs = Pairs.joined([])
     for part in near(candidates, states.means, reach_m):
-        pairs = cheapest(Pairs.joined([pairs, judged(part)]) if len(pairs.rows) else judged(part), enough)
+        pairs = Pairs.joined([pairs, judged(part)]) if len(pairs.rows) else judged(part)
+        if len(pairs.rows) > num_tracks:
+            pairs = cheapest(pairs, np.full(num_tracks, num_tracks))
     return assigned(pairs, len(candidates), num_tracks)
 
 

@@ -101,13 +101,13 @@ def near(candidates: Sequence[Candidate], means: FloatArray, reach_m: float | Fl
     if not candidates or not len(means):
         return
     points = positions_m(candidates)
-    reach_m = np.broadcast_to(reach_m, len(means))
     if points.size // 2 * len(means) <= _FEW_DISTANCES:
         distances = euclidean_distances(candidates, means, points)
         rows, columns = np.nonzero(distances <= reach_m)
         yield Pairs(rows, columns, distances[rows, columns])
         return
     placed = np.flatnonzero(~np.isnan(points[:, 0]))
+    reach_m = np.broadcast_to(reach_m, len(means))
     farthest_m = float(reach_m.max()) * _MARGIN
     tracks = cKDTree(means[:, :2])
     counts = np.zeros(len(points), dtype=np.int64)
@@ -146,8 +146,9 @@ def euclidean_distances(
     points = positions_m(candidates) if points is None else points
     offsets = points[:, None] - means[:, :2]
     distances = np.sqrt(np.vecdot(offsets, offsets))
-    for row in np.flatnonzero(np.isnan(points[:, 0])).tolist():
-        distances[row] = _distances_to_ray(candidates[row], means)
+    for row, candidate in enumerate(candidates):
+        if candidate.position_m is None:
+            distances[row] = _distances_to_ray(candidate, means)
     return np.asarray(distances)
 
 

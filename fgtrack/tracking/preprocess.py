@@ -181,7 +181,8 @@ class Preprocess:
         names = tuple(MEASURABLE[column] for column in columns)
         leaders = np.array([group.leader for group in groups])
         z, points_m = items.values[leaders][:, columns], items.points_m[leaders]
-        R = covariances(items.at(leaders), names, batch.frame, sensor, pose)
+        every = len(leaders) == len(items.indices) and bool((leaders[1:] > leaders[:-1]).all())
+        R = covariances(items if every else items.at(leaders), names, batch.frame, sensor, pose)
         for place, group in enumerate(groups):
             if len(group.parts) > 1:
                 parts = items.at(np.array(group.parts))

@@ -39,6 +39,7 @@ def small_portions(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gating, "MOST_PAIRS", 7)
     monkeypatch.setattr(gating, "_FEW_DISTANCES", 0)
     monkeypatch.setattr(assignment, "MOST_PAIRS", 7)
+    monkeypatch.setattr(assignment, "_FEW_COSTS", 0)
 
 
 # --- assignment
@@ -53,12 +54,16 @@ def outcome(cost: FloatArray, pairs: list[tuple[int, int]]) -> tuple[int, float]
     return len(pairs), sum(cost[pair] for pair in pairs)
 
 
+@pytest.mark.parametrize("taken_apart", [False, True])
 @given(seed=st.integers(0, 2**32 - 1))
-def test_parts_solved_by_themselves_are_the_solution_of_the_whole(seed: int) -> None:
+def test_parts_solved_by_themselves_are_the_solution_of_the_whole(taken_apart: bool, seed: int) -> None:
     rng = np.random.default_rng(seed)
     cost = rng.uniform(0.0, 5.0, size=rng.integers(1, 12, size=2))
     cost[rng.random(cost.shape) > rng.uniform(0.05, 0.9)] = np.inf
-    found = assigned(pairs_of(cost), *cost.shape)
+    with pytest.MonkeyPatch.context() as patch:
+        if taken_apart:
+            patch.setattr(assignment, "_FEW_COSTS", 0)
+        found = assigned(pairs_of(cost), *cost.shape)
     assert found == assigned_densely(cost, np.isfinite(cost))
     rows, columns = linear_sum_assignment(np.where(np.isfinite(cost), cost, 1e9))
     best = [(i, j) for i, j in zip(rows.tolist(), columns.tolist(), strict=True) if np.isfinite(cost[i, j])]
