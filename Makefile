@@ -47,7 +47,7 @@ contest: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/python experiments/bench_speed.py -o out/speed $(if $(OLDER),--against $(OLDER))
 
-# Every estimator, number of objects, lag and delay, memory: an hour.
+# Every estimator, number of objects, lag and delay, memory: takes several times as long.
 bench-full: $(STAMP)
 	$(BIN)/python experiments/bench_speed.py -o out/speed --full $(if $(OLDER),--against $(OLDER))
 

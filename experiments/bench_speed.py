@@ -59,7 +59,7 @@ def cell(label: str, count: int, **settings: Any) -> Cell:
 def quick_cells(objects: Iterable[int], duration_s: float) -> list[Cell]:
     """What the promises need."""
     cells = [cell(label, n) for label in MAIN for n in (1, 10, 50)]
-    cells += [cell(BANDED, 50, lag_s=3.0), cell(BANDED, 5), cell(BANDED, 200)]
+    cells += [cell(BANDED, 50, lag_s=3.0), *(cell(BANDED, n) for n in ALL_OBJECTS)]
     return _fitted(cells, objects, duration_s)
 
 
