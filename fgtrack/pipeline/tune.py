@@ -104,10 +104,8 @@ class _Found:
     """Parameters and what is known of them."""
 
     values: FloatArray
-    free: BoolArray
-    """Which of them were fitted."""
     log_std: FloatArray
-    """Standard errors of their logarithms; NaN where not fitted."""
+    """Standard errors of their logarithms; NaN where they are not known."""
     known: tuple[Known, ...]
     why: tuple[str, ...]
     likelihood: Likelihood
@@ -173,7 +171,7 @@ class _Tuning:
         config = widened(self._noise.config_with(values), self._rules)
         all_series, runs = [], []
         for recording in self._recordings:
-            series, run, _ = recorded(recording.messages, config, recording.name, self._rules.gate_stds)
+            series, run = recorded(recording.messages, config, recording.name, self._rules.gate_stds)
             all_series.append([one for one in series if len(one.observations) >= self._rules.min_observations])
             runs.append(run)
         return all_series, runs
@@ -219,7 +217,11 @@ class _Tuning:
         return reached[0][1], optima
 
     def _found(self, problem: Problem, start: FloatArray, free: BoolArray) -> _Found:
-        """The maximum with what is not known taken out, and fitted again without it."""
+        """The maximum; in place of what is not known there, what is configured, or what is nearest to it.
+
+        The rest is not fitted again: it would make up for what was put there, and with the yaw's noise too large the
+        yaw rate's comes out too small. Nor would its standard errors hold, which are those of all parameters together.
+        """
         count = len(start)
         known: list[Known] = ["no"] * count
         few = f"fewer than {self._rules.min_count} measurements on tracks"
@@ -227,17 +229,17 @@ class _Tuning:
             "kept as asked" if kept else _LASTING if lasting else few
             for kept, lasting in zip(self._kept.tolist(), self._lasting.tolist(), strict=True)
         ]
-        values, free = start.copy(), free.copy()
-        shares = np.array([not name for _, name in self._space.names])
-        while True:
-            values, likelihood = problem.maximum(values, free)
-            log_std = np.full(count, math.nan)
-            log_std[free] = likelihood.log_std(np.log(values[free]))
-            errors = np.array(self._noise.shown(values, log_std)[1])
-            vague = np.where(free & ~shares, errors, 0.0)
-            place = int(vague.argmax())  # one at a time: without it another one may be known
-            if vague[place] <= self._rules.rough_std_error:
-                break
+        maximum, likelihood = problem.maximum(start, free)
+        values = maximum.copy()
+        log_std = np.full(count, math.nan)
+        log_std[free] = likelihood.log_std(np.log(values[free]))
+        errors = np.array(self._noise.shown(values, log_std)[1])
+        fitted = [place for place in np.flatnonzero(free).tolist() if self._space.names[place][1]]
+        for place in sorted(fitted, key=lambda one: -errors[one]):
+            why[place] = ""
+            if errors[place] <= self._rules.rough_std_error:
+                known[place] = "yes" if errors[place] <= self._rules.known_std_error else "roughly"
+                continue
             limit = self._limit(likelihood, values, place)
             kept = limit == self._configured[place]
             known[place] = "no" if kept else "limit"
@@ -246,13 +248,10 @@ class _Tuning:
                 if kept
                 else f"only bounded: {'below' if values[place] < limit else 'above'} {limit:.3g} at 95 %"
             )
-            values[place], free[place] = limit, False
-            if not free.any():
-                raise DataError("nothing to fit noise to: no parameter is identifiable in so few measurements")
-        for place in np.flatnonzero(free).tolist():
-            known[place] = "yes" if errors[place] <= self._rules.known_std_error else "roughly"
-            why[place] = ""
-        return _Found(values, free, log_std, tuple(known), tuple(why), likelihood)
+            values[place], log_std[place] = limit, math.nan
+        if not {"yes", "roughly"} & set(known):
+            raise DataError("nothing to fit noise to: no parameter is identifiable in so few measurements")
+        return _Found(values, log_std, tuple(known), tuple(why), likelihood)
 
     def _limit(self, likelihood: Likelihood, values: FloatArray, place: int) -> float:
         """The value nearest to the configured one that the data do not reject, the other parameters given."""

@@ -26,8 +26,8 @@ from fgtrack.tracking.tracker import TrackerParts
 
 def recorded(
     messages: Iterable[Message], config: Config, origin: str = "", gate_stds: float = 0.0
-) -> tuple[list[Series], Run, str | None]:
-    """The series of all tracks, the run, and why the input broke off, where it did. Raises as `replay`.
+) -> tuple[list[Series], Run]:
+    """The series of all tracks, and the run. Raises as `replay`.
 
     A gate in metres is opened to `gate_stds` standard deviations of the position of each detection.
     """
@@ -41,9 +41,9 @@ def recorded(
             association = _OpenedGate(association, gate_stds)
         return replace(parts, preprocess=preprocess, bank=banks[0], association=association)
 
-    run, broken = replay_in_memory(messages, config, origin=origin, observed=observed)
+    run, _ = replay_in_memory(messages, config, origin=origin, observed=observed)
     motion, method = config.motion_model(), config.initiation.method
-    return [series.opened(motion, method) for series in banks[0].series()], run, broken
+    return [series.opened(motion, method) for series in banks[0].series()], run
 
 
 @dataclass(frozen=True)

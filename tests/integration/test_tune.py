@@ -73,7 +73,7 @@ def test_a_gate_is_opened_to_the_uncertainty_of_a_bearing_far_away(association: 
     )
 
     def radar_count(gate_stds: float) -> int:
-        series, _, _ = recorded(messages, config, gate_stds=gate_stds)
+        series, _ = recorded(messages, config, gate_stds=gate_stds)
         longest = max(series, key=lambda one: len(one.observations))
         return sum(one.sensor == "radar" for one in longest.observations)
 
