@@ -108,6 +108,11 @@ class Claims:
     order of the stamps, or, at convergence, those of least squares over all states. `fgtrack verify` holds it to
     them; empty for others."""
 
+    @property
+    def is_exact(self) -> bool:
+        """Whether nothing late, in whatever number, changes what it gives in a linear model."""
+        return self.exact == EXACT
+
     @classmethod
     def of(cls, factory: Factory) -> "Claims":
         """What `factory` says."""

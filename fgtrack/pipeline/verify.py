@@ -17,7 +17,7 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import YAW, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, UpdateStatus
 from fgtrack.estimation.dense_joint import Difference, dense_joint, difference, innovation_difference, rounding_bound
-from fgtrack.estimation.registry import ESTIMATORS, EXACT, Claims, Factory, start_estimator
+from fgtrack.estimation.registry import ESTIMATORS, Claims, Factory, start_estimator
 from fgtrack.pipeline import verify_streams as streams
 from fgtrack.pipeline.oracle.estimates import Estimate
 from fgtrack.pipeline.oracle.posterior import most_probable
@@ -48,11 +48,6 @@ class Subject:
     factory: Factory
     claims: Claims
     options: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def exact(self) -> bool:
-        """Whether it claims that nothing late, in whatever number, changes what a linear model gives."""
-        return self.claims.exact == EXACT
 
     def start(self, stream: Stream) -> Estimator:
         """One for the object of `stream`."""
@@ -138,7 +133,7 @@ _NONLINEAR: tuple[tuple[_Draw, float], ...] = (
 def exact_estimators() -> dict[str, Subject]:
     """The estimators that claim to be exact for any late measurements, plug-ins included, by name."""
     subjects = {name: _subject(name, factory) for name, factory in ESTIMATORS.loaded().items()}
-    return {name: subject for name, subject in subjects.items() if subject.exact}
+    return {name: subject for name, subject in subjects.items() if subject.claims.is_exact}
 
 
 def one_estimator(name: str) -> dict[str, Subject]:
@@ -176,7 +171,7 @@ def _able(stream: Stream, subjects: Mapping[str, Subject]) -> dict[str, Subject]
     """Those that fuse all that arrives, even where that is older than their window."""
     able = {}
     for name, subject in subjects.items():
-        if not stream.late or (subject.exact and _reaches(subject, stream)):
+        if not stream.late or (subject.claims.is_exact and _reaches(subject, stream)):
             able[name] = subject
     return able
 
@@ -235,7 +230,7 @@ def _against_dense_joint(
     tolerances = {
         name: max(subject.claims.tolerance, subject.claims.rounding * rounding_bound(motion, stamps_ns))
         for name, subject in subjects.items()
-        if subject.exact or order == "time"
+        if subject.claims.is_exact or order == "time"
     }
     told = {
         name: tolerance
@@ -267,11 +262,11 @@ def _nonlinear(stream: Stream, name: str, subject: Subject, converged: float | N
     checks = []
 
     def add(order: str, against: str, apart: Difference, tolerance: float) -> None:
-        promised = None if converged is None or not (subject.exact or oracle) else tolerance
+        promised = None if converged is None or not (subject.claims.is_exact or oracle) else tolerance
         checks.append(Check(stream.name, name, order, against, *apart, runs[order].num_refused, promised))
 
     for order, run in runs.items():
-        if order != "time" and (subject.claims.nonlinear != "never" or not subject.exact):
+        if order != "time" and (subject.claims.nonlinear != "never" or not subject.claims.is_exact):
             apart = _largest(difference(run.states[at], state) for at, state in runs["time"].states.items())
             add(order, "order of stamps", apart, ORDER_TOLERANCE if at_once else converged or math.inf)
         if oracle is not None:
@@ -331,7 +326,7 @@ class _Run:
         """Measurements arrive as `places` says."""
         estimator = subject.start(stream)
         statuses = [estimator.update(stream.measurements[place]).status for place in places]
-        past_ns = stream.probes_ns() if subject.exact or subject.claims.smooths else []
+        past_ns = stream.probes_ns() if subject.claims.is_exact or subject.claims.smooths else []
         stamps_ns = [*past_ns, stream.newest_ns, stream.newest_ns + NS_PER_S // 10]
         before = {at: estimator.state_at(at) for at in stamps_ns}
         states = before

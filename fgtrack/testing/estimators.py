@@ -277,19 +277,19 @@ _PROMISES = (
     Promise(
         _gives_the_dense_joint_posterior_in_any_order,
         _drawn(shuffled, LINEAR),
-        lambda claims: claims.exact == EXACT,
+        lambda claims: claims.is_exact,
         repeats=True,
     ),
     Promise(
         _keeps_all_that_it_accepts_and_nothing_else,
         (partial(shuffled, LINEAR, span_s=4.0 * LAG_S),),
-        lambda claims: claims.exact == EXACT,
+        lambda claims: claims.is_exact,
         repeats=True,
     ),
     Promise(
         _gives_the_estimate_of_the_time_order_in_any_order,
         _drawn(shuffled, NONLINEAR),
-        lambda claims: claims.exact == EXACT and claims.nonlinear != "never",
+        lambda claims: claims.is_exact and claims.nonlinear != "never",
         repeats=True,
     ),
     Promise(_fuses_a_late_measurement_exactly, _drawn(one_late, 1), lambda claims: claims.exact == _ONE_LAG),
@@ -297,7 +297,7 @@ _PROMISES = (
     Promise(
         _reports_the_innovation_against_all_that_it_has_fused,
         _drawn(shuffled, *_BOTH),
-        lambda claims: claims.exact == EXACT,
+        lambda claims: claims.is_exact,
         repeats=True,
     ),
     Promise(_counts_each_measurement_as_what_it_is, _drawn(shuffled, *_BOTH)),

@@ -68,12 +68,15 @@ def signed_speed_mps(vx_mps: float, vy_mps: float, heading_rad: float | None) ->
     return -speed if forward < 0.0 else speed
 
 
+def speed_gradient(vx_mps: float, vy_mps: float) -> FloatArray:
+    """Derivative, shape (2,), of the length of the velocity; along x where that is 0."""
+    speed = math.hypot(vx_mps, vy_mps)
+    return np.array([vx_mps, vy_mps]) / speed if speed > 0.0 else np.array([1.0, 0.0])
+
+
 def speed_variance(vx_mps: float, vy_mps: float, covariance: FloatArray) -> float:
     """Variance of the length of the velocity, from its covariance, shape (2, 2), to first order."""
-    speed = math.hypot(vx_mps, vy_mps)
-    if not speed > 0.0:
-        return float(covariance[0, 0])
-    direction = np.array([vx_mps, vy_mps]) / speed
+    direction = speed_gradient(vx_mps, vy_mps)
     return float(direction @ covariance @ direction)
 
 

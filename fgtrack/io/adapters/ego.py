@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from fgtrack.core.types import EgoState, FloatArray
-from fgtrack.io.adapters.common import RosMessage, planar, signed_speed_mps, stamp_ns, yaw_rad
+from fgtrack.io.adapters.common import RosMessage, planar, signed_speed_mps, speed_gradient, stamp_ns, yaw_rad
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 
@@ -36,18 +36,13 @@ def _covariance(message: RosMessage) -> tuple[float, ...] | None:
         full[:3, :3] = pose
     twist = planar(message.twist.covariance)
     velocity = message.twist.twist.linear
-    along = _direction(signed_speed_mps(velocity.x, velocity.y, 0.0), velocity.x, velocity.y)
-    turned = along @ twist @ along.T
+    direction = speed_gradient(velocity.x, velocity.y)
+    J = np.eye(2, 3, k=1)  # of speed and yaw rate by vx, vy and yaw rate
+    J[0, :2] = -direction if signed_speed_mps(velocity.x, velocity.y, 0.0) < 0.0 else direction
+    turned = J @ twist @ J.T
     if _is_known(turned):
         full[3:, 3:] = turned
     return tuple(full.ravel().tolist()) if full.any() else None
-
-
-def _direction(speed_mps: float, vx_mps: float, vy_mps: float) -> FloatArray:
-    """Derivative, shape (2, 3), of the signed speed and the yaw rate by vx, vy and the yaw rate."""
-    standing = not abs(speed_mps) > 0.0
-    ahead, left = (1.0, 0.0) if standing else (vx_mps / speed_mps, vy_mps / speed_mps)
-    return np.array([[ahead, left, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _is_known(covariance: FloatArray) -> bool:
