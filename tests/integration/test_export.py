@@ -256,7 +256,7 @@ def test_an_ellipse_reaches_two_standard_deviations_along_its_axes(by_hand: Path
     first, second = read(tmp_path / "x.mcap")["/ellipses"]
     straight, turned = (one["cylinders"][0] for one in first[2]["entities"])
     assert (straight["size"]["x"], straight["size"]["y"]) == (8.0, 4.0)  # 2 sigma to both sides: 4 times 2, 4 times 1
-    assert straight["pose"]["position"] == {"x": 98.0, "y": 68.0, "z": 0.0}
+    assert straight["pose"]["position"] == {"x": 98.0, "y": 68.0, "z": 1.25}  # on its box
     assert straight["pose"]["orientation"]["z"] == 0.0
     assert (turned["size"]["x"], turned["size"]["y"]) == (12.0, 2.0)  # 4 times 3, 4 times 0.5
     yaw_rad = 2.0 * math.atan2(turned["pose"]["orientation"]["z"], turned["pose"]["orientation"]["w"])
@@ -472,6 +472,44 @@ def test_a_time_before_1970_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="-5 ns lies outside"):
         write_viewer_bag(tmp_path / "x.mcap", [Scene("/tracks", -5, 5)])
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["missing", "-o", "x.mcap"], "missing: no run folder"),
+        (["RUN", "-o", "x"], "x: viewers know such a file by its name, let it end in .mcap"),
+        (["RUN", "RUN", "-o", "x.mcap"], "is given twice"),
+        (["RUN"], "Missing option '-o'"),
+    ],
+)
+def test_a_call_that_cannot_be_done_is_one_line(
+    runs: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    line: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert command(["export", *(str(runs / "smoother") if word == "RUN" else word for word in arguments)]) == 2
+    [told] = capsys.readouterr().err.strip().splitlines()
+    assert line in told
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_was_killed_is_exported_up_to_there(runs: Path, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    for path in (runs / "smoother").iterdir():
+        content = path.read_bytes()
+        (tmp_path / "run" / path.name).write_bytes(content[: len(content) // 2] if path.suffix == ".csv" else content)
+    meta = json.loads((tmp_path / "run/meta.json").read_text())
+    (tmp_path / "run/meta.json").write_text(json.dumps({"format": meta["format"], "complete": False}))
+    export([tmp_path / "run"], tmp_path / "x.mcap")
+    run = load_run(tmp_path / "run")
+    topics = read(tmp_path / "x.mcap")
+    assert sum(len(value["poses"]) for *_, value in topics["/tracks/poses"]) == run.tracks.num_rows > 0
+    assert len(topics["/outcomes"]) == run.updates.num_rows > 0
 
 
 def test_without_the_package_mcap_a_line_says_how_to_install_it(

@@ -9,7 +9,7 @@ import numpy as np
 
 from fgtrack.core.time import seconds
 from fgtrack.core.types import Detection, DetectionList, Disposition
-from fgtrack.evaluation.viewer.look import GREY, Look, faded, palette
+from fgtrack.evaluation.viewer.look import GREY, Look, faded
 from fgtrack.evaluation.viewer.placement import Placed, placed, update_rows
 from fgtrack.io.run import NO_TRACK, Run
 from fgtrack.io.viewer.scene import Arrow, Dot, Entity, Facts, Line, Objects, Point, Scene, Shape, ViewerMessage
@@ -37,7 +37,7 @@ def detection_messages(run: Run, look: Look) -> Iterator[ViewerMessage]:
     now_at = _positions(run)
     dispositions = updates["disposition"][became] if len(became) else np.zeros(0, dtype=np.str_)
     for (receipt_ns, sensor, stamp_ns), group in groupby(order, key=keys.__getitem__):
-        colour = palette(sensors[sensor])
+        colour = look.of_sensor(sensors[sensor])
         shapes: list[Shape] = []
         arrows: list[Shape] = []
         objects = []

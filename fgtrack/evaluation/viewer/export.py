@@ -38,7 +38,8 @@ def export(runs: Runs, out: Path, *, ros2: bool = False, overwrite: bool = False
     Raises
     ------
     CallError
-        The runs are not of the same recording, the package `mcap` is missing, or something is at `out`.
+        The runs are not of the same recording, the package `mcap` is missing, `out` does not end in `.mcap`, or
+        something is there.
     DataError
         A run or its map is damaged, or a time does not fit into the file.
     """

@@ -13,7 +13,8 @@ NOMINAL_SIZE_M = (4.8, 2.0, 1.2)
 WHITE: Colour = (1.0, 1.0, 1.0, 1.0)
 GREY: Colour = (0.55, 0.55, 0.55, 0.9)
 
-_OPACITY = {"tentative": 0.35, "coasting": 0.55}
+_OPACITY = {"tentative": 0.15, "coasting": 0.3}
+_CONFIRMED = 0.5  # so that ellipses and arrows in the box are seen
 _SPEED_ARROW_S = 0.25
 _LABEL_ABOVE_M = 1.5
 
@@ -31,19 +32,23 @@ class Look:
         """Colour of a track."""
         return palette(track_id) if self.colour is None else self.colour
 
+    def of_sensor(self, index: int) -> Colour:
+        """Colour of the detections of a sensor; from the other end, so that few tracks and sensors differ."""
+        return palette(-1 - index)
+
     def track(self, track_id: int, state: Detection, speed_mps: float, status: str) -> tuple[Shape, ...]:
         """The box of a track with its name, and an arrow to where it is a quarter of a second later."""
         assert state.x_m is not None
         assert state.y_m is not None
         centre_m, yaw_rad = (state.x_m, state.y_m), state.yaw_rad or 0.0
-        colour = faded(self.of_track(track_id), _OPACITY.get(status, 0.9))
+        colour = faded(self.of_track(track_id), _OPACITY.get(status, _CONFIRMED))
         name = Label(centre_m, NOMINAL_SIZE_M[2] + _LABEL_ABOVE_M, str(track_id), WHITE)
         box = car(centre_m, yaw_rad, colour)
         ahead_m = speed_mps * _SPEED_ARROW_S
         if not (math.isfinite(ahead_m) and ahead_m):
             return box, name
         tip_m = centre_m[0] + ahead_m * math.cos(yaw_rad), centre_m[1] + ahead_m * math.sin(yaw_rad)
-        return box, name, Arrow(centre_m, tip_m, 0.25, colour)
+        return box, name, Arrow(centre_m, tip_m, 0.25, self.of_track(track_id))
 
 
 def palette(index: int, opacity: float = 1.0) -> Colour:
@@ -64,5 +69,5 @@ def car(centre_m: Point, yaw_rad: float, colour: Colour) -> Box:
 
 
 def patch(centre_m: Point, axes: tuple[float, float, float], colour: Colour) -> Ellipse:
-    """The ellipse of a covariance, see `ellipses`."""
-    return Ellipse(centre_m, axes[2], (axes[0], axes[1]), colour)
+    """The ellipse of a covariance, see `ellipses`, just above the box of its track."""
+    return Ellipse(centre_m, NOMINAL_SIZE_M[2] + 0.05, axes[2], (axes[0], axes[1]), colour)

@@ -39,7 +39,7 @@ def track_messages(run: Run, look: Look) -> Iterator[ViewerMessage]:
             shapes = look.track(track_id, states[row], speed_mps, status)
             boxes.append(Entity(name, shapes, facts=facts))
             if math.isfinite(axes[row][0]):
-                patches.append(Entity(name, (patch(_point(states[row]), axes[row], faded(colour, 0.3)),)))
+                patches.append(Entity(name, (patch(_point(states[row]), axes[row], faded(colour, 0.6)),)))
             poses[stamp_ns].append(states[row])
         present = frozenset(one.name for one in boxes)
         gone = tuple(sorted(before - present))

@@ -69,7 +69,10 @@ def write_viewer_bag(path: Path, messages: Iterable[ViewerMessage], *, overwrite
         if path.suffix != ".mcap":
             with new_folder(path, _FOLDER, overwrite) as folder:
                 return _write(folder, messages)
-        with new_file(path, _FILE, overwrite) as file, tempfile.TemporaryDirectory(dir=path.parent) as place:
+        with (
+            new_file(path, _FILE, overwrite) as file,
+            tempfile.TemporaryDirectory(".part", f"{path.name}.", path.parent) as place,
+        ):
             folder = Path(place) / path.stem
             counts = _write(folder, messages)
             with (folder / f"{folder.name}.mcap").open("rb") as written:

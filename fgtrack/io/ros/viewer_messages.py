@@ -71,7 +71,7 @@ class ViewerMessageFactory(MessageFactory):
                 return marker(_CUBE, shape.centre_m, shape.size_m[2] / 2.0, shape.yaw_rad, self._vector(*shape.size_m))
             case Ellipse():
                 size = self._vector(*shape.axes_m, _ELLIPSE_HEIGHT_M)
-                return marker(_CYLINDER, shape.centre_m, 0.0, shape.yaw_rad, size)
+                return marker(_CYLINDER, shape.centre_m, shape.height_m, shape.yaw_rad, size)
             case Arrow():
                 found = marker(_ARROW, (0.0, 0.0), shape.width_m, 0.0, self._vector(shape.width_m, 2.5 * shape.width_m))
                 found.points = [self._point(shape.tail_m), self._point(shape.tip_m)]

@@ -37,6 +37,8 @@ EXPORT = Kind("an MCAP file of `fgtrack export`", _is_export)
 
 def check_foxglove(path: Path, overwrite: bool) -> None:
     """Raise `CallError` where `write_foxglove` would before the first message."""
+    if path.suffix != ".mcap":
+        raise CallError(f"{path}: viewers know such a file by its name, let it end in .mcap")
     try:
         import mcap.writer  # noqa: F401
     except ImportError as error:
@@ -61,7 +63,8 @@ def write_foxglove(
     Raises
     ------
     CallError
-        The package `mcap` is missing, something is at `path`, or it cannot be written.
+        The package `mcap` is missing, the name does not end in `.mcap`, something is at `path`, or it cannot be
+        written.
     DataError
         The disk is full, or a time lies before 1970.
     """

@@ -99,7 +99,7 @@ def _primitive(shape: Shape) -> tuple[str, Json]:
             return "cubes", {"pose": pose, "size": _vector(*shape.size_m), "color": colour}
         case Ellipse():
             size = _vector(*shape.axes_m, _ELLIPSE_HEIGHT_M)
-            pose = _pose(shape.centre_m, 0.0, shape.yaw_rad)
+            pose = _pose(shape.centre_m, shape.height_m, shape.yaw_rad)
             return "cylinders", {"pose": pose, "size": size, "bottom_scale": 1.0, "top_scale": 1.0, "color": colour}
         case Arrow():
             length_m, yaw_rad = _reach(shape)

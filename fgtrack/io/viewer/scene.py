@@ -29,6 +29,8 @@ class Ellipse:
     """A flat ellipse."""
 
     centre_m: Point
+    height_m: float
+    """Above the ground."""
     yaw_rad: float
     """Direction of the long axis."""
     axes_m: Point
