@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import shutil
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterator
@@ -14,6 +15,8 @@ import jsonschema
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from rosbags.interfaces import ConnectionExtRosbag2, QosDurability
+from rosbags.rosbag2 import Reader
 
 import fgtrack
 from fgtrack.cli.main import run as command
@@ -208,6 +211,8 @@ def by_hand(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     late = UpdateRecord("lidar", STAMP_NS, RECEIPT_NS, 0, Disposition.OUT_OF_SEQUENCE, 4, 1.5)
     lost = UpdateRecord("lidar", STAMP_NS, RECEIPT_NS, 1, Disposition.GATED)
+    refused = UpdateRecord("lidar", STAMP_NS, RECEIPT_NS, 2, Disposition.TOO_OLD, 4)
+    merged = UpdateRecord("lidar", STAMP_NS, RECEIPT_NS, 3, Disposition.MERGED, 4)
     config = (
         "ego: {detection_origin_x_m: -2.0, detection_origin_y_m: 0.0}\n"
         "sensors: {lidar: {mount: {x_m: 1.0, y_m: 2.0, yaw_rad: 0.0}}}\n"
@@ -215,9 +220,14 @@ def by_hand(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with RunWriter(path, config) as writer:
         for time_ns in (900_000_000, 1_100_000_000):
             writer.write_ego(EgoState(time_ns, time_ns + 5, 100.0, 50.0, math.pi / 2, 0.0))
-        objects = [Detection(x_m=11.0, y_m=0.0), Detection(bearing_rad=0.0)]
+        objects = [
+            Detection(x_m=11.0, y_m=0.0),
+            Detection(bearing_rad=0.0),
+            Detection(range_m=20.0, bearing_rad=math.pi / 2),
+            Detection(x_m=11.0, y_m=1.0),
+        ]
         writer.write_detections(DetectionList("lidar", STAMP_NS, RECEIPT_NS, objects, "sensor"))
-        writer.write_tick(TickReport(0, TICK_NS, reports, (late, lost)), 1, 2)
+        writer.write_tick(TickReport(0, TICK_NS, reports, (late, lost, refused, merged)), 1, 4)
         writer.write_tick(TickReport(1, TICK_NS + 20_000_000, reports[1:], ()), 1, 0)
         writer.finish({"estimator": "smoother"})
     return path
@@ -239,12 +249,18 @@ def test_an_arrow_leads_from_where_a_detection_was_sensed_to_its_track_now(by_ha
     [(_, _, scene)] = topics["/detections"]
     [entity] = scene["entities"]
     assert entity["id"] == "lidar"
-    assert entity["spheres"][0]["pose"]["position"] == pytest.approx({"x": 98.0, "y": 60.0, "z": 0.5})
+    places = [one["pose"]["position"] for one in entity["spheres"]]
+    assert places[0] == pytest.approx({"x": 98.0, "y": 60.0, "z": 0.5})
+    assert places[1] == pytest.approx({"x": 78.0, "y": 49.0, "z": 0.5})  # to the left
+    assert places[2] == pytest.approx({"x": 97.0, "y": 60.0, "z": 0.5})
+    grey = [len({one["color"][c] for c in "rgb"}) == 1 for one in entity["spheres"]]
+    assert grey == [False, True, False]
     [sight] = entity["lines"]
     assert sight["points"][0] == pytest.approx({"x": 98.0, "y": 49.0, "z": 0.0})
     assert sight["points"][1] == pytest.approx({"x": 98.0, "y": 199.0, "z": 0.0})
     assert sight["color"]["r"] == sight["color"]["g"] == sight["color"]["b"]  # grey: it was not used
-    assert [value["disposition"] for *_, value in topics["/outcomes"]] == ["out_of_sequence", "gated"]
+    became = ["out_of_sequence", "gated", "too_old", "merged"]
+    assert [value["disposition"] for *_, value in topics["/outcomes"]] == became
     assert topics["/outcomes"][0][2]["delay_s"] == 0.4
     assert topics["/outcomes"][0][2]["track_id"] == 4
     assert topics["/outcomes"][0][2]["nis"] == 1.5
@@ -306,6 +322,18 @@ def test_a_bag_has_the_messages_and_times_of_the_run(bag: dict[str, list[BagMess
         "/tracks/markers": "visualization_msgs/msg/MarkerArray",
     }
     assert {topic: bag[topic][0].type for topic in kinds} == kinds
+
+
+def test_what_is_sent_once_reaches_those_who_listen_later(bag: dict[str, list[BagMessage]], runs: Path) -> None:
+    lasting = set()
+    with Reader(runs.parent / "rosbag") as reader:
+        for connection in reader.connections:
+            assert isinstance(connection.ext, ConnectionExtRosbag2)
+            [profile] = connection.ext.offered_qos_profiles
+            if profile.durability is QosDurability.TRANSIENT_LOCAL:
+                lasting.add(connection.topic)
+    assert lasting == {"/map/markers", "/ego/markers"}
+    assert all(len(bag[topic]) == 1 for topic in lasting)
 
 
 # Schemas
@@ -549,6 +577,11 @@ def test_runs_of_different_recordings_are_refused(runs: Path, by_hand: Path, tmp
     with pytest.raises(CallError, match="are of different recordings"):
         export([runs / "smoother", by_hand], tmp_path / "x.mcap")
     assert not list(tmp_path.iterdir())
+    shutil.copytree(by_hand, tmp_path / "other")
+    ego = tmp_path / "other/ego.csv"
+    ego.write_text(ego.read_text().replace(",100,", ",101,"))
+    with pytest.raises(CallError, match="are of different recordings"):
+        export([by_hand, tmp_path / "other"], tmp_path / "x.mcap")
 
 
 def test_a_run_of_an_older_version_and_a_map_that_is_gone_are_told(
@@ -566,7 +599,7 @@ def test_a_run_of_an_older_version_and_a_map_that_is_gone_are_told(
     assert "map.track: gone.csv is not there any more" in told
     topics = read(tmp_path / "x.mcap")
     assert "/detections" not in topics
-    assert len(topics["/outcomes"]) == 2
+    assert len(topics["/outcomes"]) == 4
 
 
 def test_thirty_objects(tmp_path: Path) -> None:
