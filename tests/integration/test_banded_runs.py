@@ -6,7 +6,6 @@ from support.messages import shared
 
 import fgtrack
 from fgtrack.io.run.schema import COVARIANCE_STATES
-from fgtrack.pipeline.shipped import read_scenario
 
 STATES = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
 TOLERANCE = 1e-3  # standard deviations
