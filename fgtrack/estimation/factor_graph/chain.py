@@ -30,6 +30,7 @@ class Chain:
 
     def __init__(self, first: Node) -> None:
         self._nodes = [first]
+        self._stamps_ns = [first.stamp_ns]
         self._next_key = first.key + 1
 
     @property
@@ -49,7 +50,7 @@ class Chain:
 
     def place(self, stamp_ns: int) -> int:
         """Index of the newest node at or before `stamp_ns`; -1 where all are after it."""
-        return bisect.bisect_right(self._nodes, stamp_ns, key=lambda node: node.stamp_ns) - 1
+        return bisect.bisect_right(self._stamps_ns, stamp_ns) - 1
 
     def at(self, stamp_ns: int) -> Node | None:
         """The node at exactly `stamp_ns`."""
@@ -61,13 +62,16 @@ class Chain:
         """A new node at `stamp_ns`; the slot of the segment that it splits stays with its left neighbour."""
         node = Node(stamp_ns, self._next_key, origin)
         self._next_key += 1
-        self._nodes.insert(self.place(stamp_ns) + 1, node)
+        place = self.place(stamp_ns) + 1
+        self._nodes.insert(place, node)
+        self._stamps_ns.insert(place, stamp_ns)
         return node
 
     def remove(self, keys: Container[int]) -> None:
         """Take back the insertion of the nodes with `keys`."""
         self._nodes = [node for node in self._nodes if node.key not in keys]
+        self._stamps_ns = [node.stamp_ns for node in self._nodes]
 
     def drop(self, count: int) -> None:
         """Forget the oldest `count` nodes."""
-        del self._nodes[:count]
+        del self._nodes[:count], self._stamps_ns[:count]

@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.linalg import symmetrise
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
@@ -55,7 +54,7 @@ class FixedLagSmoother:
     ) -> None:
         self._settings = settings
         self._lag_ns, self._ring_ns = nanoseconds(settings.lag_s), nanoseconds(settings.ring_s)
-        self._first_ns = self._clock_ns = prior.stamp_ns
+        self._first_ns = self._clock_ns = self._start_ns = self._reach_ns = prior.stamp_ns
         self.motion = motion
         self.window = Window(motion, prior.stamp_ns, Prior(*initial_state(motion, prior)), settings, make_backend)
         self._search = Search.of(motion, prior, initiation)
@@ -79,6 +78,7 @@ class FixedLagSmoother:
     def advance(self, now_ns: int) -> None:
         """See `Estimator.advance`; the nodes that leave are marginalised at the next update."""
         self._clock_ns = max(self._clock_ns, now_ns)
+        self._move()
 
     def update(self, measurement: Measurement) -> UpdateResult:
         """See `Estimator.update`."""
@@ -109,6 +109,7 @@ class FixedLagSmoother:
     def solve(self, update: Update) -> None:
         """The second part; see `Window.solve`."""
         self._final += self.window.solve(update)
+        self._move()
 
     def settle(self, oldest_ns: int) -> None:
         """What may follow: a new beginning along another line, damping, iterations.
@@ -123,7 +124,7 @@ class FixedLagSmoother:
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: smoothed in the past, interpolated under the motion model, predicted ahead."""
         mean, covariance = self.window.state_at(stamp_ns)
-        return TrackState(stamp_ns, mean, symmetrise(covariance))
+        return TrackState(stamp_ns, mean, covariance)
 
     def take_final(self) -> list[TrackState]:
         """Smoothed states of the nodes that have left the window since the last call, in order."""
@@ -151,16 +152,12 @@ class FixedLagSmoother:
         self.window.iterate(SMOOTHER_ITERATIONS)
         return search
 
-    @property
-    def _start_ns(self) -> int:
-        """The window's start, by the clock and the newest stamp."""
-        return max(max(self._clock_ns, self.window.newest_ns) - self._lag_ns, self._first_ns)
-
-    @property
-    def _reach_ns(self) -> int:
-        """Oldest stamp that may be fused."""
+    def _move(self) -> None:
+        """Where the window starts, by the clock and the newest stamp, and the oldest stamp that may be fused."""
+        newest_ns = max(self._clock_ns, self.window.newest_ns)
         behind_ns = self._ring_ns if self._settings.late == "fuse" else 0
-        return max(self._start_ns - behind_ns, self._first_ns)
+        self._start_ns = max(newest_ns - self._lag_ns, self._first_ns)
+        self._reach_ns = max(self._start_ns - behind_ns, self._first_ns)
 
     def status_of(self, stamp_ns: int) -> UpdateStatus:
         """What will become of a measurement at `stamp_ns` that can be fused.

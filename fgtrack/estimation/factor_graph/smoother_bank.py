@@ -60,11 +60,12 @@ class SmootherBank(SmoothingBank):
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
-        smoothers = [self._smoothers[track_id] for track_id in track_ids]
-        singles = [one for one in smoothers if isinstance(one, FixedLagSmoother)]
-        if len(singles) < max(len(smoothers), 2):
-            return super().update(stamp_ns, track_ids, measurements)
-        return together.update(singles, measurements)
+        if len(track_ids) > 1:
+            smoothers = [self._smoothers[track_id] for track_id in track_ids]
+            singles = [one for one in smoothers if isinstance(one, FixedLagSmoother)]
+            if len(singles) == len(smoothers):
+                return together.update(singles, measurements)
+        return super().update(stamp_ns, track_ids, measurements)
 
     def present(self) -> list[TrackState]:
         """See `TrackBank.present`."""
@@ -79,6 +80,8 @@ class SmootherBank(SmoothingBank):
 
     def _look_up(self, stamp_ns: int) -> None:
         """Find the states at `stamp_ns` of all objects that are known there, at once."""
+        if len(self._smoothers) < 2:
+            return
         singles = [one for one in self._smoothers.values() if isinstance(one, FixedLagSmoother)]
         known = [one for one in singles if one.window_ns[0] <= stamp_ns]
         if len(known) > 1:

@@ -112,16 +112,17 @@ class Window:
         leaving = chain.nodes[: max(chain.place(start_ns), 0)]
         anchor = chain.nodes[len(leaving)]
         update = Update(leaving, self._past.copy(), reach_ns)
+        known = list(whitened) or [None] * len(measurements)
         try:
             if not self._curved and any(curved(item) for item in measurements):
                 self._curved, self._thresholds = True, self._settings.thresholds(self._motion, curved=True)
                 self._rebuild(self._estimates())
+                known = [None] * len(measurements)  # the states are others now
             moved = self._moved()
             for node, right in zip(leaving, chain.nodes[1:], strict=False):
                 update.past.pass_node(node.terms, self._mean(node), right.stamp_ns, self._mean(right))
             if self._settings.final:
                 update.left = self._states_behind(update.past, anchor, leaving)
-            known = whitened or [None] * len(measurements)
             guesses = [
                 self.state_at(item.stamp_ns)[0] if item.stamp_ns >= anchor.stamp_ns else None for item in measurements
             ]
@@ -133,7 +134,7 @@ class Window:
                 at = chain.at(item.stamp_ns)
                 if at is None:
                     at = chain.insert(item.stamp_ns, guess)
-                    update.new[at.key] = guess
+                    update.new[at.key], update.stamps_s[at.key] = guess, self._seconds(item.stamp_ns)
                 fused.append((at, item, guess, rows))
             self._relinearise(update, moved)
             for node, term, guess, rows in fused:
@@ -292,7 +293,7 @@ class Window:
             node.origin = mean
             changed.add(node.key)
         ends = changed if self._follows else update.new.keys()
-        for left, right in pairwise(self._chain.nodes):
+        for left, right in pairwise(self._chain.nodes) if changed else ():
             if left.key in changed or right.key in ends:
                 update.replace(self._segment(left, right), left, left.slot)
         for node, _ in moved if self._curved else ():
@@ -303,14 +304,13 @@ class Window:
     def _solve(self, update: Update) -> None:
         """Update the backend, and note the slots of the factors."""
         nodes, leaving = self._chain.nodes, update.leaving
-        stamps_s = {node.key: self._seconds(node.stamp_ns) for node in nodes if node.key in update.new}
         marginalised = None
         if leaving:
             oldest = nodes[len(leaving)]
             cutoff_s = 0.5 * (self._seconds(leaving[-1].stamp_ns) + self._seconds(oldest.stamp_ns))
             prior = PriorOf(oldest.key, update.past.prior)
             marginalised = Marginalised([node.key for node in leaving], cutoff_s, prior)
-        slots = self._backend.update(Change(update.new, stamps_s, update.factors, update.removed, marginalised))
+        slots = self._backend.update(Change(update.new, update.stamps_s, update.factors, update.removed, marginalised))
         update.place(slots)
         self._anchored |= bool(leaving)
         self._forget_estimates()

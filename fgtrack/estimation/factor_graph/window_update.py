@@ -22,6 +22,8 @@ class Update:
     """States of the nodes that leave."""
     new: dict[int, FloatArray] = field(default_factory=dict)
     """First estimates of new nodes, by key."""
+    stamps_s: dict[int, float] = field(default_factory=dict)
+    """Their stamps, in seconds since the first one."""
     factors: list[Factor] = field(default_factory=list)
     removed: list[int] = field(default_factory=list)
     """Slots of the factors that they replace."""
