@@ -11,6 +11,7 @@ from fgtrack.estimation import ekf
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.terms import MeasurementTerm, linearised
 from fgtrack.models.robust import weight
+from fgtrack.models.sensors import RobustLoss
 
 
 class Innovations(NamedTuple):
@@ -63,10 +64,10 @@ def _nis(y: FloatArray, S: FloatArray, entries: Sequence[int] | None) -> FloatAr
 
 
 def _alike(measurements: Sequence[Measurement]) -> list[list[int]]:
-    """Positions of those that share a model, a sensor pose and what is assumed."""
-    groups: dict[tuple[int, int, tuple[str, ...]], list[int]] = {}
+    """Positions of those that share a model, a sensor pose, what is assumed and a loss."""
+    groups: dict[tuple[int, int, tuple[str, ...], RobustLoss | None], list[int]] = {}
     for position, measurement in enumerate(measurements):
-        kind = id(measurement.model), id(measurement.pose), measurement.assumed
+        kind = id(measurement.model), id(measurement.pose), measurement.assumed, measurement.loss
         groups.setdefault(kind, []).append(position)
     return list(groups.values())
 

@@ -76,10 +76,10 @@ def _judged(
     means, covariances = np.array([mean for mean, _ in known]), np.array([covariance for _, covariance in known])
     for group in innovations(measurements, means, covariances):
         group = group.at(np.isfinite(group.nis))
-        rows: list[FloatArray | None] = [None] * len(group.positions)
-        if rows and not curved(measurements[group.positions[0]]):
-            with suppress(np.linalg.LinAlgError):  # else each window finds its own, and the one that cannot fails
-                rows = list(whitened(group.y, group.H, group.R))
-        for position, y_one, nis, each in zip(group.positions.tolist(), group.y, group.nis.tolist(), rows, strict=True):
-            found[position] = UpdateResult(statuses[position], y_one, nis), each
+        rows: list[FloatArray] = []
+        with suppress(np.linalg.LinAlgError):  # else each window finds its own, and the one that cannot fails
+            rows = list(whitened(group.y, group.H, group.R))
+        for place, position in enumerate(group.positions.tolist()):
+            result = UpdateResult(statuses[position], group.y[place], float(group.nis[place]))
+            found[position] = result, rows[place] if rows and not curved(measurements[position]) else None
     return found

@@ -46,9 +46,7 @@ class IncrementalBackend:
         for key, mean in change.values.items():
             values.insert(key, mean)
             self._first[key] = mean
-        graph = gtsam.NonlinearFactorGraph()
-        for factor in change.factors:
-            graph.add(self._container(factor.rows()))
+        graph = self.graph(change)
         gone = change.marginalised
         if change.stamps_s:
             self._newest_s = max(self._newest_s, *change.stamps_s.values())
@@ -60,6 +58,13 @@ class IncrementalBackend:
         for key in gone.keys if gone is not None else ():
             del self._first[key]
         return list(self._smoother.getISAM2Result().getNewFactorsIndices())[: len(change.factors)]
+
+    def graph(self, change: Change) -> gtsam.NonlinearFactorGraph:
+        """The new factors of `change`, relative to the first estimates of their variables."""
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in change.factors:
+            graph.add(self._container(factor.rows()))
+        return graph
 
     def means(self, keys: Sequence[int]) -> FloatArray:
         """See `Backend.means`."""
