@@ -39,8 +39,6 @@ class Consistency:
     """By sensor and innovation, see `autocorrelations`."""
     position_nees_interval: Estimate = UNKNOWN
     """Mean of `position_nees` with the interval of correlated errors, see `within_run`."""
-    state_nees_interval: Estimate = UNKNOWN
-    """Likewise of `state_nees`."""
 
 
 @dataclass(frozen=True)
@@ -90,12 +88,10 @@ def consistency(run: Run, matching: Matching | None) -> Consistency:
     measured = num_measured(updates)
     sensors = {name: updates["sensor"] == name for name in np.unique(updates["sensor"]).tolist()}
     of_position = None if matching is None else position_nees(matching)
-    of_state = None if matching is None else state_nees(matching)
     return Consistency(
         position_nees=_mean(of_position),
-        state_nees=_mean(of_state),
+        state_nees=_mean(None if matching is None else state_nees(matching)),
         position_nees_interval=_interval(of_position),
-        state_nees_interval=_interval(of_state),
         nis={name: ChiSquareMean.of(updates["nis"][mine], measured[mine]) for name, mine in sensors.items()},
         autocorrelation={name: autocorrelations(updates.where(mine)) for name, mine in sensors.items()},
     )
