@@ -16,7 +16,7 @@ from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Line, Se
 from fgtrack.estimation.iteration import Iteration, largest_move, reweighted
 from fgtrack.estimation.rts import rts_step
 from fgtrack.estimation.sigma_points import Regression, measurement_regression, motion_regression
-from fgtrack.estimation.unscented import UkfRecursion
+from fgtrack.estimation.ukf import UkfRecursion
 from fgtrack.estimation.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
 

@@ -32,13 +32,13 @@ ESTIMATORS = Registry(
         "fgtrack.estimators": {
             "ekf-backward-forward": "fgtrack.estimation.backward_forward:backward_forward",
             "ekf-replay": "fgtrack.estimation.replay:ReplayEkf",
-            "iekf-replay": "fgtrack.estimation.iterated:IekfReplay",
+            "iekf-replay": "fgtrack.estimation.iekf:IekfReplay",
             "ipls": "fgtrack.estimation.ipls:PosteriorLinearisationSmoother",
-            "iplf-replay": "fgtrack.estimation.posterior_linearisation:IplfReplay",
+            "iplf-replay": "fgtrack.estimation.iplf:IplfReplay",
             "smoother": "fgtrack.estimation.factor_graph.factories:smoother",
             "smoother-batch": "fgtrack.estimation.factor_graph.factories:smoother_batch",
             "smoother-banded": "fgtrack.estimation.banded.smoother:BandedSmoother",
-            "ukf-replay": "fgtrack.estimation.unscented:UkfReplay",
+            "ukf-replay": "fgtrack.estimation.ukf:UkfReplay",
         },
         OOSM_GROUP: {
             "drop": f"{_OOSM}:Drop",

@@ -9,12 +9,12 @@ from scipy.optimize import minimize
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.iterated import IekfRecursion
+from fgtrack.estimation.iekf import IekfRecursion
+from fgtrack.estimation.iplf import IplfRecursion
 from fgtrack.estimation.iteration import Iteration, negative_log_posterior
-from fgtrack.estimation.posterior_linearisation import IplfRecursion
 from fgtrack.estimation.recursion import EkfRecursion
 from fgtrack.estimation.registry import estimator
-from fgtrack.estimation.unscented import UkfRecursion
+from fgtrack.estimation.ukf import UkfRecursion
 from fgtrack.models.motion import CTRV, CV
 from fgtrack.models.sensors import RobustLoss
 from fgtrack.testing.streams import LINEAR, START, shuffled

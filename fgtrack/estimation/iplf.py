@@ -11,7 +11,7 @@ from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.iteration import Iteration, largest_move, negative_log_posterior, reweighted
 from fgtrack.estimation.replay import ReplayingFilter
 from fgtrack.estimation.sigma_points import measurement_regression
-from fgtrack.estimation.unscented import UkfRecursion
+from fgtrack.estimation.ukf import UkfRecursion
 from fgtrack.models.motion import MotionModel
 
 
