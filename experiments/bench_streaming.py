@@ -26,6 +26,7 @@ from fgtrack.io.run import Table
 
 METHODS = ("smoother-banded", "smoother", "ekf-replay", "ekf-backward-forward")
 _DEMO_SEED = 1
+_SAID = ("is judged when it is ready", "users also predict", "falls behind")  # sentences of the verdict
 _TITLES = {"asked": "at its stamp", "ready": "when ready", "predicted": "predicted to then"}
 _MARKS = {"best": " (best)", "tie": " (tie)", "worse": ""}
 
@@ -86,8 +87,12 @@ def main(
     parts = [short_machine([yardstick_us()])]
     for title, (messages, config) in streams(duration_s, objects).items():
         tables = compared(messages, config, methods.split(","), rounds)
-        said = [line for line in tables.verdict if "judged when" in line or "users also" in line]
-        few = [note for note in tables["streaming"].notes if "of the samples" in note]
+        said = [
+            line
+            for line in tables.verdict
+            if any(part in line for part in ("judged when", "users also", "falls behind"))
+        ]
+        few = [note for note in tables["streaming"].notes if "samples" in note]
         parts += [table(title, tables), *said, *few]
     text = "\n\n".join(parts) + "\n"
     (out / "streaming.md").write_text(text, encoding="utf-8")

@@ -16,9 +16,9 @@ import numpy as np
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.contest import Quantity, by_recording, quantity
+from fgtrack.evaluation.contest import by_recording, quantity
 from fgtrack.evaluation.deadlines import Deadlines, ready
-from fgtrack.evaluation.paired import by_stamp
+from fgtrack.evaluation.paired import UNKNOWN, by_stamp
 from fgtrack.evaluation.ranking import STANDING_NOTE, Entry, value_column, worse_columns
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.statistics import Distribution
@@ -84,28 +84,47 @@ def streamed(one: JudgedRun) -> Streamed:
 
 
 def with_streaming(tables: Tables, runs: Sequence[JudgedRun]) -> Tables:
-    """`tables` with `streaming` and `load` of `runs`; the verdict also says who is best when it pays for its time."""
+    """`tables` with `streaming` and `load` of `runs`; the verdict also says who is best when it pays for its time.
+
+    Runs that fall behind for good are not ranked beside others that keep up: what they lose has no bound, and the few
+    samples that they have before the truth ends would decide about all.
+    """
     rows, notes, sentences = [], [], []
     for group in by_recording(runs):
-        quantities, share = _compared(group)
-        rows += [_Row(one.name, entry) for one in quantities for entry in one.entries]
-        names = ", ".join(one.label for one in group)
+        late = [one for one in group if _load_of(one) > 1.0]
+        ranked = [one for one in group if one not in late] or group
+        entries, share = _compared(ranked)
         if share < _LARGE_SHARE:
+            names = ", ".join(one.label for one in ranked)
             notes.append(f"{names}: {share:.0%} of the samples are judged: the truth ends before the others are ready")
-        if len(group) > 1 and quantities:
-            entries = {one.name: one.entries for one in quantities}
+        if len(ranked) > 1 and entries:
             sentences += [
                 who_is_best(entries[READY], "where each is judged when it is ready"),
                 who_is_best(entries[PREDICTED], "where users also predict what they get to that moment"),
             ]
+        for one in late:
+            behind = f"{one.label} falls behind for good (load {_load_of(one):.0%})"
+            sentences.append(f"{behind}: the longer the run, the worse.")
+            if one not in ranked:
+                alone, share = _compared([one])
+                notes.append(f"{behind}: not ranked, judged at {share:.0%} of its samples, until the truth ends")
+                for judged, (entry,) in alone.items():
+                    unranked = Entry(entry.name, entry.value, UNKNOWN, "worse")
+                    entries[judged] = (*entries.get(judged, ()), unranked)
+        rows += [_Row(judged, entry) for judged, found in entries.items() for entry in found]
     added = {"streaming": _streaming(rows, notes), "load": _load(runs)}
     return replace(tables, tables={**tables.tables, **added}, verdict=(*tables.verdict, *sentences))
 
 
-def _compared(group: Sequence[JudgedRun]) -> tuple[list[Quantity], float]:
-    """Runs of one recording at the objects and ticks that all of them judge, and the least share of a run's samples.
+def _load_of(one: JudgedRun) -> float:
+    return one.metrics.deadlines.load
 
-    A sample is judged where there is truth when it is ready, so that the same samples stand behind all numbers.
+
+def _compared(group: Sequence[JudgedRun]) -> tuple[dict[str, tuple[Entry, ...]], float]:
+    """Runs of one recording by when they are judged, and the least share of a run's samples that is.
+
+    They are compared at the objects and ticks that all of them judge. A sample is judged where there is truth when it
+    is ready, so that the same samples stand behind all numbers.
     """
     every = [streamed(one) for one in group]
     ticks_ns = np.unique(np.concatenate([one.now_ns for one in every]))
@@ -113,15 +132,15 @@ def _compared(group: Sequence[JudgedRun]) -> tuple[list[Quantity], float]:
     judged = [code[np.isfinite(one.errors_m[READY])] for code, one in zip(codes, every, strict=True)]
     common = functools.reduce(np.intersect1d, judged)
     if not len(common):
-        return [], 0.0
+        return {}, 0.0
     orders = [np.argsort(code) for code in codes]
     rows = [order[np.searchsorted(code[order], common)] for code, order in zip(codes, orders, strict=True)]
-    quantities = []
+    entries = {}
     for name in (ASKED, READY, PREDICTED):
         errors_m = [one.errors_m[name][mine] for one, mine in zip(every, rows, strict=True)]
         sums = by_stamp(ticks_ns[common % len(ticks_ns)], np.square(np.stack(errors_m, axis=-1)))
-        quantities.append(quantity(name, [one.label for one in group], sums))
-    return quantities, len(common) / max(map(len, codes))
+        entries[name] = quantity(name, [one.label for one in group], sums).entries
+    return entries, len(common) / max(map(len, codes))
 
 
 def _streaming(rows: Sequence[_Row], notes: Sequence[str]) -> Table:

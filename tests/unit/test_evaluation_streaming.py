@@ -63,19 +63,52 @@ def test_a_track_without_yaw_and_speed_stays_where_it_was_published(tmp_path: Pa
     np.testing.assert_array_equal(found.errors_m[PREDICTED], found.errors_m[READY])
 
 
-def test_what_is_ready_after_the_truth_has_ended_is_not_judged_of_any_run(tmp_path: Path) -> None:
-    truth = WEST.truth(TICKS)
+def timed(path: Path, took_ms: Sequence[int]) -> Run:
+    """A run without errors whose truth ends with its last tick."""
     tracks = [[WEST.track(tick, 1)] for tick in TICKS]
-    runs = [
-        write_run(tmp_path / name, tracks, truth=truth, config_text=AT_50_HZ, process_ns=[took * MS] * len(TICKS))
-        for name, took in (("fast", 1), ("slow", 30))
-    ]
-    tables = compare(*runs, streaming=True)
-    assert rmse(tables, ASKED)["fast (smoother)"] == pytest.approx(0.0, abs=1e-6)
+    process_ns = [took * MS for took in took_ms]
+    return write_run(path, tracks, truth=WEST.truth(TICKS), config_text=AT_50_HZ, process_ns=process_ns)
+
+
+def test_what_is_ready_after_the_truth_has_ended_is_not_judged_of_any_run(tmp_path: Path) -> None:
+    fast = timed(tmp_path / "fast", [1] * 59 + [0])
+    slow = timed(tmp_path / "slow", [0] * 50 + [100] + [1] * 9)  # ready 100, 81, 62 ... ms after they are due
+    tables = compare(fast, slow, streaming=True)
+    later_s = np.array([0.0] * 50 + [0.1, 0.081, 0.062, 0.043, 0.024, 0.005] + [0.001] * 3)
+    assert rmse(tables, READY)["slow (smoother)"] == pytest.approx(20.0 * np.sqrt(np.mean(later_s**2)), rel=1e-6)
+    assert rmse(tables, READY)["fast (smoother)"] == pytest.approx(0.02, rel=1e-6)
+    assert rmse(tables, ASKED) == pytest.approx({"fast (smoother)": 0.0, "slow (smoother)": 0.0}, abs=1e-6)
+
+
+def test_a_note_says_where_few_samples_are_judged(tmp_path: Path) -> None:
+    slow = timed(tmp_path / "slow", [1180] + [0] * 59)  # all are ready when the last tick is due
+    assert not any("of the samples" in note for note in compare(slow, streaming=True)["streaming"].notes)
+    slower = timed(tmp_path / "slower", [1] * 40 + [381] + [0] * 19)
+    found = compare(slower, streaming=True)["streaming"].notes
+    assert any(note.startswith("slower (smoother): 67% of the samples are judged") for note in found)
+
+
+def test_a_run_that_falls_behind_for_good_is_not_ranked_beside_those_that_keep_up(tmp_path: Path) -> None:
+    fast, slow = timed(tmp_path / "fast", [1] * 59 + [0]), timed(tmp_path / "slow", [30] * 60)
+    tables = compare(fast, slow, streaming=True)
+    assert rmse(tables, READY)["fast (smoother)"] == pytest.approx(0.02 * np.sqrt(59 / 60), rel=1e-6)
     judged = [tick for tick in TICKS if 30 * (tick + 1) <= 20 * TICKS[-1]]
     later_s = np.array([0.03 + 0.01 * tick for tick in judged])
     assert rmse(tables, READY)["slow (smoother)"] == pytest.approx(20.0 * np.sqrt(np.mean(later_s**2)), rel=1e-6)
-    assert any(f"{len(judged) / len(TICKS):.0%} of the samples" in note for note in tables["streaming"].notes)
+    assert tables.verdict[-1] == "slow (smoother) falls behind for good (load 153%): the longer the run, the worse."
+    streaming = tables["streaming"]
+    assert streaming["standing"].tolist() == ["best", "worse"] * 3
+    assert any(f"judged at {len(judged) / len(TICKS):.0%} of its samples" in note for note in streaming.notes)
+
+
+def test_runs_that_all_fall_behind_are_ranked(tmp_path: Path) -> None:
+    tables = compare(timed(tmp_path / "a", [25] * 60), timed(tmp_path / "b", [30] * 60), streaming=True)
+    assert rmse(tables, READY)["a (smoother)"] < rmse(tables, READY)["b (smoother)"]
+    assert "a (smoother) is best where each is judged when it is ready" in tables.verdict[-4]
+    assert [line.split(" for good")[0] for line in tables.verdict[-2:]] == [
+        "a (smoother) falls behind",
+        "b (smoother) falls behind",
+    ]
 
 
 def test_a_slow_method_loses_what_it_wins_by_being_exact(tmp_path: Path) -> None:
