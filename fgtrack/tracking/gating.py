@@ -173,24 +173,16 @@ class Innovations(NamedTuple):
 
     nis: FloatArray
     """Shape (m,)."""
-    S: list[tuple[IntArray, FloatArray]]
+    S: list[tuple[IntArray | slice, FloatArray]]
     """Covariances of the innovations, (p, k, k), and which of the pairs they are of, (p,)."""
 
 
 def innovations(pairs: Pairs, groups: Sequence[Alike], num_candidates: int, states: StatesAt) -> Innovations:
     """Innovations of `pairs` of candidates, which are in `groups`, and tracks with these states."""
     nis = np.empty(len(pairs.rows))
-    place = np.empty(num_candidates, dtype=np.int64)
-    number = np.empty(num_candidates, dtype=np.int64)
-    for k, group in enumerate(groups):
-        place[group.rows], number[group.rows] = np.arange(len(group.rows)), k
-    of_group = number[pairs.rows]
     S_all = []
-    for k, group in enumerate(groups):
-        chosen = np.flatnonzero(of_group == k)
-        if not chosen.size:
-            continue
-        places, columns = place[pairs.rows[chosen]], pairs.columns[chosen]
+    for chosen, places, group in _by_group(pairs.rows, groups, num_candidates):
+        columns = pairs.columns[chosen]
         x = states.means[columns]
         y, H = linearised(group.z[places], x, group.one.model, group.one.pose)
         known = (
@@ -200,6 +192,22 @@ def innovations(pairs: Pairs, groups: Sequence[Alike], num_candidates: int, stat
         nis[chosen] = mahalanobis_squared(y, S)
         S_all.append((chosen, S))
     return Innovations(nis, S_all)
+
+
+def _by_group(
+    rows: IntArray, groups: Sequence[Alike], num_candidates: int
+) -> Iterator[tuple[IntArray | slice, IntArray, Alike]]:
+    """Which of `rows` are candidates of each group, at which of its places, and the group."""
+    if len(groups) == 1:
+        yield slice(None), rows, groups[0]
+        return
+    place, number = np.empty((2, num_candidates), dtype=np.int64)
+    for k, group in enumerate(groups):
+        place[group.rows], number[group.rows] = np.arange(len(group.rows)), k
+    for k, group in enumerate(groups):
+        chosen = np.flatnonzero(number[rows] == k)
+        if chosen.size:
+            yield chosen, place[rows[chosen]], group
 
 
 def reaches_m(groups: Sequence[Alike], states: StatesAt, quantiles: Sequence[float], limit_m: float) -> FloatArray:

@@ -34,7 +34,7 @@ class Located(NamedTuple):
     @property
     def placed(self) -> IntArray:
         """Which of them have a position."""
-        return np.flatnonzero(~np.isnan(self.points_m[:, 0]))
+        return np.asarray((self.points_m[:, 0] == self.points_m[:, 0]).nonzero()[0])  # NaN is not equal to itself
 
     def at(self, rows: IntArray | BoolArray) -> "Located":
         """Those of `rows`."""
@@ -44,10 +44,11 @@ class Located(NamedTuple):
 
     def kinds(self) -> list[tuple[int, ...]]:
         """Columns of the components that each has."""
-        measured = ~np.isnan(self.values)
-        if len(measured) and (measured == measured[0]).all():
-            return [tuple(np.flatnonzero(measured[0]).tolist())] * len(measured)
-        return [tuple(np.flatnonzero(row).tolist()) for row in measured]
+        rows, columns = (self.values == self.values).nonzero()  # NaN is not equal to itself
+        found: list[list[int]] = [[] for _ in self.detections]
+        for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
+            found[row].append(column)
+        return list(map(tuple, found))
 
 
 def located(batch: Batch, sensor: SensorModel, pose: SensorPose) -> Located:
@@ -74,13 +75,13 @@ def located(batch: Batch, sensor: SensorModel, pose: SensorPose) -> Located:
     return Located(np.array(batch.indices, dtype=np.int64), detections, values, points_m, none)
 
 
-def with_map_yaw(items: Located, rows: IntArray, yaw_rad: FloatArray) -> Located:
-    """With the yaw of the map, shape (m,), at those of `rows` that have none."""
+def take_map_yaw(items: Located, rows: IntArray, yaw_rad: FloatArray) -> None:
+    """Give those of `rows` that have no yaw that of the map, shape (m,)."""
     lack = np.isnan(items.values[rows, YAW])
-    values, map_yaw = items.values.copy(), items.map_yaw.copy()
-    values[rows[lack], YAW] = yaw_rad[lack]
-    map_yaw[rows[lack]] = True
-    return items._replace(values=values, map_yaw=map_yaw)
+    if not lack.all():
+        rows, yaw_rad = rows[lack], yaw_rad[lack]
+    items.values[rows, YAW] = yaw_rad
+    items.map_yaw[rows] = True
 
 
 def covariances(
@@ -91,22 +92,24 @@ def covariances(
     A yaw that the map gave has the sensor's standard deviation for it and is not correlated with the rest.
     """
     shared = sensor.noise(names)
-    R = np.array(np.broadcast_to(shared, (len(items.indices), *shared.shape)))
-    own = np.zeros(len(R), dtype=bool)
+    R = np.empty((len(items.indices), *shared.shape))
+    R[:] = shared
+    carrying = []
     if sensor.message_covariance:
-        own = np.array([detection.covariance is not None for detection in items.detections], dtype=bool)
-        for row in np.flatnonzero(own).tolist():
+        carrying = [row for row, detection in enumerate(items.detections) if detection.covariance is not None]
+        for row in carrying:
             measured = items.detections[row].measured
             common = [name for name in names if name in measured and name in sensor.std]
             here = [names.index(name) for name in common]
             R[row][np.ix_(here, here)] = own_covariance(items.detections[row], common)
     if "x_m" not in names:
         return R
-    if frame != "map" and own.any():
-        R[own] = _turned(R[own], np.full(int(own.sum()), pose.yaw_rad))
-    if sensor.std["x_m"] != sensor.std["y_m"] and not own.all():
-        offsets_m = items.points_m[~own] - np.array([pose.x_m, pose.y_m])
-        R[~own] = _turned(R[~own], np.arctan2(offsets_m[:, 1], offsets_m[:, 0]))
+    if frame != "map" and carrying:
+        R[carrying] = _turned(R[carrying], np.full(len(carrying), pose.yaw_rad))
+    if sensor.std["x_m"] != sensor.std["y_m"] and len(carrying) < len(R):
+        rest = np.delete(np.arange(len(R)), carrying)
+        offsets_m = items.points_m[rest] - np.array([pose.x_m, pose.y_m])
+        R[rest] = _turned(R[rest], np.arctan2(offsets_m[:, 1], offsets_m[:, 0]))
     return R
 
 

@@ -1,8 +1,9 @@
 """From the detections of one batch to what can be associated: map frame, on the road, merged."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.inbox import Batch, record
-from fgtrack.tracking.located import BEARING, RANGE, YAW, Located, X, common, covariances, located, with_map_yaw
+from fgtrack.tracking.located import BEARING, RANGE, YAW, Located, X, common, covariances, located, take_map_yaw
 from fgtrack.tracking.merge import Merge
 from fgtrack.tracking.pose_error import PoseError, placement
 
@@ -99,12 +100,12 @@ class Preprocess:
         pose = self._sensor_pose(batch, sensor, ego)
         view = _View(batch, sensor, pose, _pose_covariance(pose, batch, sensor, ego))
         items = located(batch, sensor, pose)
-        far = np.zeros(len(items.indices), dtype=bool)
+        lost = list[int]()
         if ego is not None and sensor.max_range_m is not None:
             offsets_m = items.points_m - np.array([pose.x_m, pose.y_m])
             far = np.hypot(offsets_m[:, 0], offsets_m[:, 1]) > sensor.max_range_m
-        lost = items.indices[far].tolist()
-        items = items.at(~far) if lost else items
+            lost = items.indices[far].tolist()
+            items = items.at(~far) if lost else items
         items, outside = self._on_road(items, sensor)
         records = [record(batch.message, index, Disposition.OUT_OF_BOUNDS) for index in lost + outside]
         return self._candidates(items, view), records
@@ -128,10 +129,10 @@ class Preprocess:
             return items, []
         view = self._road.view(items.points_m[placed])
         if sensor.yaw_from_map_std_rad is not None:
-            items = with_map_yaw(items, placed, view.yaw_rad)
-        outside = placed[view.outside]
-        if not len(outside):
+            take_map_yaw(items, placed, view.yaw_rad)
+        if not any(view.outside.tolist()):
             return items, []
+        outside = placed[view.outside]
         return items.at(np.delete(np.arange(len(items.indices)), outside)), items.indices[outside].tolist()
 
     def _candidates(self, items: Located, view: _View) -> list[Candidate]:
@@ -167,6 +168,9 @@ class Preprocess:
         for place, group in enumerate(groups):
             assumed = YAW in group.columns and any(map_yaw[row] for row in group.parts)
             alike.setdefault((group.columns, assumed), []).append(place)
+        if len(alike) == 1:
+            [(columns, assumed)] = alike
+            return self._alike(items, groups, columns, assumed, view)
         candidates: dict[int, Candidate] = {}
         for (columns, assumed), places in alike.items():
             chosen = [groups[place] for place in places]
@@ -175,13 +179,14 @@ class Preprocess:
 
     def _alike(
         self, items: Located, groups: Sequence[_Group], columns: tuple[int, ...], assumed: bool, view: _View
-    ) -> Iterator[Candidate]:
+    ) -> list[Candidate]:
         """Candidates that measure the same: one detection each, or the average of several."""
         batch, sensor, pose, _ = view
         names = tuple(MEASURABLE[column] for column in columns)
         leaders = np.array([group.leader for group in groups])
-        z, points_m = items.values[leaders][:, columns], items.points_m[leaders]
-        every = len(leaders) == len(items.indices) and bool((leaders[1:] > leaders[:-1]).all())
+        z, points_m = items.values[leaders[:, None], columns], items.points_m[leaders]
+        order = leaders.tolist()
+        every = len(order) == len(items.indices) and order == sorted(order)
         R = covariances(items if every else items.at(leaders), names, batch.frame, sensor, pose)
         for place, group in enumerate(groups):
             if len(group.parts) > 1:
@@ -201,20 +206,29 @@ class Preprocess:
                 x[place, :2] = _far_along(float(z[place, names.index("bearing_rad")]), pose)
             whole = np.broadcast_to(errors.noise(models[0], pose, x), white.shape)
             R = R + (whole - white)
-        if names[:2] == ("x_m", "y_m"):
-            spreads = R[:, :2, :2]
-        stamp_ns, loss, none = batch.stamp_ns, sensor.loss, np.isnan(points_m[:, 0]).tolist()
-        indices, numbers = items.indices.tolist(), z.tolist()
-        for place, group in enumerate(groups):
-            yield Candidate(
+        spreads: Iterable[FloatArray | None]
+        spreads = R[:, :2, :2] if names[:2] == ("x_m", "y_m") else map(partial(_spread, names, pose), z, R)
+        places: Iterable[FloatArray | None] = points_m
+        if np.isnan(points_m[0, 0]):
+            places = [None] * len(groups)  # bearings are not like others
+        own: Iterable[PoseError | None] = [None] * len(groups)
+        if errors is not None:
+            own = [PoseError(errors.covariance, *each) for each in zip(errors.placement, white, strict=True)]
+        stamp_ns, loss, indices = batch.stamp_ns, sensor.loss, items.indices.tolist()
+        return [
+            Candidate(
                 indices[group.leader],
-                tuple(indices[row] for row in group.merged),
-                Measurement(stamp_ns, models[place], z[place], whole[place], pose, loss, assumes),
-                None if none[place] else points_m[place],
-                spreads[place] if names[:2] == ("x_m", "y_m") else _spread(names, z[place], R[place], pose),
-                dict(zip(names, numbers[place], strict=True)),
-                None if errors is None else PoseError(errors.covariance, errors.placement[place], white[place]),
+                tuple([indices[row] for row in group.merged]) if group.merged else (),
+                Measurement(stamp_ns, model, one, noise, pose, loss, assumes),
+                point_m,
+                spread,
+                dict(zip(names, numbers, strict=True)),
+                error,
             )
+            for group, model, one, noise, point_m, spread, numbers, error in zip(
+                groups, models, z, whole, places, spreads, z.tolist(), own, strict=True
+            )
+        ]
 
     def _models(
         self, names: tuple[str, ...], R: FloatArray, view: _View
@@ -250,7 +264,7 @@ class Preprocess:
         return ("yaw_rad",) if map_yaw else ()
 
 
-def _spread(names: tuple[str, ...], z: FloatArray, R: FloatArray, pose: SensorPose) -> FloatArray | None:
+def _spread(names: tuple[str, ...], pose: SensorPose, z: FloatArray, R: FloatArray) -> FloatArray | None:
     found = measured_position(names, z, R, pose)
     return None if found is None else found[1]
 
