@@ -10,7 +10,6 @@ from fgtrack.core.linalg import (
     applied,
     congruence,
     identity,
-    inverse_roots,
     mahalanobis_squared,
     product,
     psd_solve,
@@ -26,7 +25,6 @@ from fgtrack.models.sensors import RobustLoss
 
 _MAX_REWEIGHTINGS = 50
 _REWEIGHTING_TOLERANCE = 1e-9
-_MANY = 12  # so many innovations are sooner solved by Cholesky factors than by one LAPACK call each
 
 
 def propagated(F: FloatArray, P: FloatArray, Q: FloatArray) -> FloatArray:
@@ -47,11 +45,7 @@ def _solved(P: FloatArray, H: FloatArray, R: FloatArray, *columns: FloatArray) -
     """S, and S^-1 times H P and further columns."""
     HP = product(H, P)
     S = times_transposed(HP, H) + R
-    wanted = np.concatenate([HP, *columns], axis=-1) if columns else HP
-    if S.ndim == 2 or len(S) < _MANY:
-        return S, psd_solve(S, wanted)
-    W = inverse_roots(S)
-    return S, np.ascontiguousarray(W.mT) @ (W @ wanted)
+    return S, psd_solve(S, np.concatenate([HP, *columns], axis=-1) if columns else HP)
 
 
 def joseph(P: FloatArray, K: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
