@@ -1,8 +1,9 @@
 """The arc of a constant turn rate: heading moments, the way along it, and the noise accumulated on it.
 
 A point of the plane is the complex number x + i y. The heading moments are m_k = integral over s in [0, t] of
-s^k exp(i (yaw + yaw_rate s)); displacement and derivatives are sums of them, for one state and for arrays alike. Only
-the moments are evaluated in two ways: of arrays of states, and of one state that turns little, which needs no array.
+s^k exp(i (yaw + yaw_rate s)); displacement and derivatives are sums of them, for one state and for arrays alike. The
+moments are evaluated in two ways: of arrays of states, and of one state that turns little, which needs no array;
+`arc_series` expands the latter for many states.
 """
 
 import cmath
@@ -52,7 +53,7 @@ def heading_moments(x: FloatArray, t: FloatArray) -> tuple[ComplexArray, Complex
 
 
 class SmallTurn(NamedTuple):
-    """Heading moments of one state that turns little, or of many: arrays instead of numbers."""
+    """Heading moments of one state that turns little; numbers, or what calculates like them."""
 
     turn: Any
     end: Any
@@ -72,21 +73,7 @@ def small_turn(yaw: float, yaw_rate: float, t: float) -> SmallTurn | None:
         return None
     square = turn * turn
     e4 = complex(_horner(_E4_EVEN, square), turn * _horner(_E4_ODD, square))
-    return _small_turn(turn, complex(0.0, turn), cmath.rect(1.0, turn), cmath.rect(1.0, yaw), e4, t)
-
-
-def small_turns(yaw: FloatArray, yaw_rate: FloatArray, t: FloatArray) -> SmallTurn | None:
-    """`small_turn` of many states, shapes (m,); None where it is None for one of them."""
-    turn = yaw_rate * t
-    if not (np.abs(turn).max(initial=0.0) <= MAX_SMALL_TURN_RAD and np.isfinite(yaw).all()):
-        return None
-    even, odd = _polynomials(_E4, turn * turn)
-    iw = 1j * turn
-    return _small_turn(turn, iw, np.exp(iw), np.exp(1j * yaw), even + odd * iw, t)
-
-
-def _small_turn(turn: Any, iw: Any, bend: Any, start: Any, e4: Any, t: Any) -> SmallTurn:
-    """From E_4, exp(i turn) and exp(i yaw)."""
+    iw, bend, start = complex(0.0, turn), cmath.rect(1.0, turn), cmath.rect(1.0, yaw)
     e3 = (bend - iw * e4) / 4.0
     e2 = (bend - iw * e3) / 3.0
     e1 = (bend - iw * e2) / 2.0
@@ -144,30 +131,15 @@ def small_turn_noise(
     y = arc.turn * arc.turn
     kinds = _CONSTANT_SPEED if accel is None else _PRODUCTS
     products = [(_horner(even, y), _horner(mixed, y), _horner(odd, y)) for even, mixed, odd in kinds]
-    entries = _noise_entries(arc, t, densities, products, speed, accel)
+    entries = noise_entries(arc, t, densities, products, speed, accel)
     n = 5 if accel is None else 6
     return np.array(entries).reshape(n, n)
 
 
-def small_turns_noise(
-    arc: SmallTurn, t: FloatArray, densities: Sequence[float], speed: FloatArray, accel: FloatArray | None = None
-) -> FloatArray:
-    """`small_turn_noise` of many states, shape (m, 5, 5) or (m, 6, 6); the arguments of shape (m,)."""
-    table = _CONSTANT_SPEED_TABLE if accel is None else _PRODUCTS_TABLE
-    values = _polynomials(table, arc.turn * arc.turn)
-    products = [(values[k], values[k + 1], values[k + 2]) for k in range(0, len(values), 3)]
-    entries = _noise_entries(arc, t, densities, products, speed, accel)
-    n = 5 if accel is None else 6
-    rows = np.empty((n * n, len(t)))
-    for k, entry in enumerate(entries):
-        rows[k] = entry
-    return np.ascontiguousarray(rows.T).reshape(len(t), n, n)
-
-
-def _noise_entries(
+def noise_entries(
     arc: SmallTurn, t: Any, densities: Sequence[float], products: Sequence[tuple[Any, Any, Any]], speed: Any, accel: Any
 ) -> tuple[Any, ...]:
-    """All entries of Q, row by row, from the values of the `products`: numbers, or arrays of many states."""
+    """All entries of Q, row by row, from the values of the `products`: numbers, or whatever calculates like them."""
     turn, end, moments = arc
     q_position, q_yaw, q_speed, q_rate, q_accel = densities
     t2 = t * t
@@ -224,13 +196,11 @@ def _position_block(
     return uu * aa - 2.0 * uv * ac + vv * cc, uv * (aa - cc) + (uu - vv) * ac, vv * aa + 2.0 * uv * ac + uu * cc
 
 
-def _polynomials(table: FloatArray, y: FloatArray) -> FloatArray:
-    """Values of K polynomials with the coefficients `table` (K, 9) at y (m,), shape (K, m)."""
-    powers = np.empty((_NUM_POWERS, len(y)))
-    powers[0] = 1.0
-    for k in range(1, _NUM_POWERS):
-        np.multiply(powers[k - 1], y, out=powers[k])
-    return np.asarray(table @ powers)
+def product_series(growing: bool) -> Sequence[tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]]:
+    """Coefficients of the products of kernels in w^2, as `noise_entries` wants their values; `growing` with those of an
+    acceleration.
+    """
+    return _PRODUCTS if growing else _CONSTANT_SPEED
 
 
 def _horner(c: tuple[float, ...], y: float) -> float:
@@ -265,7 +235,3 @@ _E4_EVEN, _E4_ODD = (tuple(half.tolist()) for half in _kernel(4, 0))
 # yaw or speed, with ramp of one in their rates. Order 1 is the part that an acceleration adds.
 _PRODUCTS = [_product(first, second, ramp) for ramp in (0, 1) for first, second in ((0, 0), (0, 1), (1, 1))]
 _CONSTANT_SPEED = [_PRODUCTS[0], _PRODUCTS[3]]
-_E4 = np.array([_E4_EVEN, _E4_ODD])
-_PRODUCTS_TABLE, _CONSTANT_SPEED_TABLE = (
-    np.array(kinds).reshape(-1, _NUM_POWERS) for kinds in (_PRODUCTS, _CONSTANT_SPEED)
-)

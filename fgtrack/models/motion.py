@@ -18,17 +18,16 @@ from fgtrack.core.geometry import cartesian, cartesian_gradient, polar, polar_gr
 from fgtrack.core.linalg import congruence, identity, symmetrise
 from fgtrack.core.types import ACCEL, SPEED, STATE_NAMES, YAW, YAW_RATE, FloatArray, X, Y
 from fgtrack.models.arc import (
+    MAX_SMALL_TURN_RAD,
     NODES,
     WEIGHTS,
-    ComplexArray,
     heading_moments,
     small_turn,
     small_turn_noise,
-    small_turns,
-    small_turns_noise,
     way,
     way_gradient,
 )
+from fgtrack.models.arc_series import arc_series
 from fgtrack.models.white_noise import WhiteNoise
 
 #: The first entries of every model's state are either of these.
@@ -37,7 +36,7 @@ POLAR, CARTESIAN = STATE_NAMES[:4], ("x_m", "y_m", "vx_mps", "vy_mps")
 #: The gradient of a heading by the velocity grows as 1 / speed; below this speed it stays as it is there.
 MIN_SPEED_MPS = 1e-3
 
-_FEW = 6  # so many states are faster one by one than as an array
+_FEW = 2  # so many states are faster one by one than as an array
 
 
 class Prediction(NamedTuple):
@@ -237,27 +236,11 @@ class CTRV(WhiteNoise, MotionModel):
         """See `MotionModel.steps`; fast where no state turns further than `MAX_SMALL_TURN_RAD`."""
         if x.ndim == 2 and 0 < len(x) <= _FEW:
             return Predictions(*map(np.array, zip(*map(self.step, x.tolist(), dt_s.tolist()), strict=True)))
-        arc = small_turns(x[:, YAW], x[:, YAW_RATE], dt_s) if x.ndim == 2 and (dt_s >= 0.0).all() else None
-        if arc is None:
+        turn = x[..., YAW_RATE] * dt_s
+        small = np.abs(turn).max(initial=0.0) <= MAX_SMALL_TURN_RAD and (dt_s >= 0.0).all()
+        if not (x.ndim == 2 and small and np.isfinite(x[:, YAW]).all()):
             return super().steps(x, dt_s)
-        mean, F = self._all_along(x, dt_s, arc.moments)
-        return Predictions(mean, F, small_turns_noise(arc, dt_s, self._densities, *_drive(x)))
-
-    def _all_along(
-        self, x: FloatArray, t: FloatArray, moments: Sequence[ComplexArray]
-    ) -> tuple[FloatArray, FloatArray]:
-        """`predict` and `jacobian` of states (m, n) with given heading moments."""
-        drive = _drive(x)
-        moved = way(moments, 0, *drive)
-        F = _identities(t.shape, self.dim)
-        for column, derivative in enumerate(way_gradient(moments, *drive), start=YAW):
-            F[:, X, column], F[:, Y, column] = derivative.real, derivative.imag
-        F[:, YAW, YAW_RATE] = t
-        after = x.copy()
-        after[:, X] += moved.real
-        after[:, Y] += moved.imag
-        after[:, YAW] += x[:, YAW_RATE] * t
-        return after, F
+        return Predictions(*arc_series(self._densities, self.dim)(x, dt_s, turn))
 
     def flow(self, x: Sequence[float], dt_s: float) -> tuple[list[float], FloatArray]:
         """See `MotionModel.flow`; fast up to a turn of `MAX_SMALL_TURN_RAD`."""
@@ -313,14 +296,6 @@ class CTRA(CTRV):
     def start_variance(self, name: str) -> float:
         """See `MotionModel.start_variance`: `accel_birth_variance_m2ps4`."""
         return self.accel_birth_variance_m2ps4
-
-    def _all_along(
-        self, x: FloatArray, t: FloatArray, moments: Sequence[ComplexArray]
-    ) -> tuple[FloatArray, FloatArray]:
-        after, F = super()._all_along(x, t, moments)
-        after[:, SPEED] += x[:, ACCEL] * t
-        F[:, SPEED, ACCEL] = t
-        return after, F
 
     def _along(self, x: Sequence[float], t: float, moments: Sequence[complex]) -> tuple[list[float], FloatArray]:
         mean, F = super()._along(x, t, moments)

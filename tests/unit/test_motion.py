@@ -206,6 +206,31 @@ def test_many_states_and_durations_at_once_equal_one_by_one(model: MotionModel) 
 
 
 @every_model
+@pytest.mark.parametrize("model", [CTRV(), CTRA(), CV()], ids=["ctrv", "ctra", "cv"])
+@pytest.mark.parametrize("num", [1, 4, 60])
+def test_many_steps_at_once_are_what_the_equations_give(model: MotionModel, num: int) -> None:
+    rng = np.random.default_rng(num)
+    kinematic = rng.normal(size=(num, 6)) * [50.0, 50.0, 2.0, 40.0, 0.8, 4.0]
+    x, _ = model.from_kinematic(kinematic, np.tile(np.eye(6), (num, 1, 1)))
+    dt_s = rng.uniform(0.0, 0.15, num)
+    dt_s[: num // 4] = 0.0
+    found = model.steps(x, dt_s)
+    assert_allclose(found.mean, model.predict(x, dt_s), atol=1e-12)
+    assert_allclose(found.F, model.jacobian(x, dt_s), atol=1e-12)
+    Q = model.process_noise(x, dt_s)
+    std = np.sqrt(np.diagonal(Q, axis1=1, axis2=2))
+    assert (np.abs(found.Q - Q) <= 1e-13 * std[:, :, None] * std[:, None]).all()
+
+
+@pytest.mark.parametrize("model", [CTRV(), CTRA()], ids=["ctrv", "ctra"])
+def test_steps_that_turn_far_or_take_no_sense_are_left_to_the_equations(model: MotionModel) -> None:
+    x = np.tile([0.0, 0.0, 0.3, 20.0, 9.0, 1.0][: model.dim], (5, 1))
+    found = model.steps(x, np.full(5, 0.3))
+    assert_array_equal(found.Q, model.process_noise(x, np.full(5, 0.3)))
+    with pytest.raises(CallError, match="noise needs a duration"):
+        model.steps(x, np.full(5, -0.01))
+
+
 def test_inputs_stay_as_they_are(model: MotionModel) -> None:
     x, dt_s = np.ones((2, model.dim)), np.array([0.5, 1.0])
     P = np.broadcast_to(np.eye(model.dim), (2, model.dim, model.dim)).copy()
