@@ -206,7 +206,6 @@ def test_many_states_and_durations_at_once_equal_one_by_one(model: MotionModel) 
 
 
 @every_model
-@pytest.mark.parametrize("model", [CTRV(), CTRA(), CV()], ids=["ctrv", "ctra", "cv"])
 @pytest.mark.parametrize("num", [1, 4, 60])
 def test_many_steps_at_once_are_what_the_equations_give(model: MotionModel, num: int) -> None:
     rng = np.random.default_rng(num)
@@ -222,7 +221,7 @@ def test_many_steps_at_once_are_what_the_equations_give(model: MotionModel, num:
     assert (np.abs(found.Q - Q) <= 1e-13 * std[:, :, None] * std[:, None]).all()
 
 
-@pytest.mark.parametrize("model", [CTRV(), CTRA()], ids=["ctrv", "ctra"])
+@every_arc
 def test_steps_that_turn_far_or_take_no_sense_are_left_to_the_equations(model: MotionModel) -> None:
     x = np.tile([0.0, 0.0, 0.3, 20.0, 9.0, 1.0][: model.dim], (5, 1))
     found = model.steps(x, np.full(5, 0.3))
@@ -231,6 +230,7 @@ def test_steps_that_turn_far_or_take_no_sense_are_left_to_the_equations(model: M
         model.steps(x, np.full(5, -0.01))
 
 
+@every_model
 def test_inputs_stay_as_they_are(model: MotionModel) -> None:
     x, dt_s = np.ones((2, model.dim)), np.array([0.5, 1.0])
     P = np.broadcast_to(np.eye(model.dim), (2, model.dim, model.dim)).copy()
