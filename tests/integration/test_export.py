@@ -262,6 +262,7 @@ def test_an_arrow_leads_from_where_a_detection_was_sensed_to_its_track_now(by_ha
     became = ["out_of_sequence", "gated", "too_old", "merged"]
     assert [value["disposition"] for *_, value in topics["/outcomes"]] == became
     assert topics["/outcomes"][0][2]["delay_s"] == 0.4
+    assert ns(topics["/outcomes"][0][2]["header"]["stamp"]) == STAMP_NS
     assert topics["/outcomes"][0][2]["track_id"] == 4
     assert topics["/outcomes"][0][2]["nis"] == 1.5
     assert not {"track_id", "nis"} & set(topics["/outcomes"][1][2])
@@ -538,6 +539,10 @@ def test_a_run_that_was_killed_is_exported_up_to_there(runs: Path, tmp_path: Pat
     topics = read(tmp_path / "x.mcap")
     assert sum(len(value["poses"]) for *_, value in topics["/tracks/poses"]) == run.tracks.num_rows > 0
     assert len(topics["/outcomes"]) == run.updates.num_rows > 0
+    updates = tmp_path / "run/updates.csv"
+    updates.write_text(updates.read_text().splitlines()[0] + "\n")
+    export([tmp_path / "run"], tmp_path / "y.mcap")
+    assert {"/outcomes", "/arrivals"} & set(read(tmp_path / "y.mcap")) == set()
 
 
 def test_without_the_package_mcap_a_line_says_how_to_install_it(

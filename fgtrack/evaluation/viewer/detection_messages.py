@@ -35,14 +35,15 @@ def detection_messages(run: Run, look: Look) -> Iterator[ViewerMessage]:
     keys = list(zip(*(table[name].tolist() for name in ("receipt_ns", "sensor", "stamp_ns")), strict=True))
     order = sorted(range(len(keys)), key=keys.__getitem__)
     now_at = _positions(run)
-    dispositions = updates["disposition"][became] if len(became) else np.zeros(0, dtype=np.str_)
+    told = updates["disposition"].tolist()
+    dispositions = [told[row] if row >= 0 else "" for row in became.tolist()]
     for (receipt_ns, sensor, stamp_ns), group in groupby(order, key=keys.__getitem__):
         colour = look.of_sensor(sensors[sensor])
         shapes: list[Shape] = []
         arrows: list[Shape] = []
         objects = []
         for row in group:
-            disposition = str(dispositions[row]) if became[row] >= 0 else ""
+            disposition = dispositions[row]
             shapes += _shape(where, row, colour if disposition in _COUNTED else GREY)
             x_m, y_m = where.position_m[row].tolist()
             if not math.isfinite(x_m + y_m):

@@ -15,7 +15,7 @@ from fgtrack.io.run import Run, Table
 from fgtrack.io.viewer.scene import Entity, Line, Objects, Point, Scene, ViewerMessage
 
 _DEFAULT_LAG_S = 1.0  # of `smoother.lag_s`, where the configuration does not say
-_PART = 50  # states of a line of final states; it is sent anew with each of them
+_PART = 20  # states of a line of final states; it is sent anew with each of them
 _TRAIL_S = 10.0  # how long such a line is shown
 _LINE_M = 0.35
 _NO_ROWS = np.zeros(0, dtype=np.int64)

@@ -22,6 +22,11 @@ class ViewerMessageFactory(MessageFactory):
     def __init__(self) -> None:
         super().__init__()
         self._shown: dict[tuple[str, str], int] = {}
+        nothing = np.zeros(0, dtype=np.uint8)
+        self._no_texture = self._make(
+            "sensor_msgs/msg/CompressedImage", header=self._header(0, ""), format="", data=nothing
+        )
+        self._no_mesh = self._make("visualization_msgs/msg/MeshFile", filename="", data=nothing)
 
     def marker_array(self, scene: Scene) -> RosMessage:
         """`visualization_msgs/MarkerArray`: an entity is a namespace, a shape of it a marker."""
@@ -91,7 +96,6 @@ class ViewerMessageFactory(MessageFactory):
     def _empty_marker(self, scene: Scene, entity: Entity, number: int, kind: int, action: int = _ADD) -> RosMessage:
         lifetime_ns = 0 if entity.lifetime_s is None else nanoseconds(entity.lifetime_s)
         sec, nanosec = divmod(lifetime_ns, NS_PER_S)
-        nothing = self._header(0, "")
         return self._make(
             _MARKER,
             header=self._header(scene.stamp_ns, _FRAME_IDS[entity.frame]),
@@ -107,13 +111,11 @@ class ViewerMessageFactory(MessageFactory):
             points=[],
             colors=[],
             texture_resource="",
-            texture=self._make(
-                "sensor_msgs/msg/CompressedImage", header=nothing, format="", data=np.zeros(0, dtype=np.uint8)
-            ),
+            texture=self._no_texture,
             uv_coordinates=[],
             text="",
             mesh_resource="",
-            mesh_file=self._make("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, dtype=np.uint8)),
+            mesh_file=self._no_mesh,
             mesh_use_embedded_materials=False,
         )
 

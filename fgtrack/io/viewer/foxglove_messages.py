@@ -61,11 +61,14 @@ def foxglove_messages(message: ViewerMessage) -> Iterator[tuple[str, str, Json]]
             yield "/ego/pose", POSE_IN_FRAME, {"timestamp": time, "frame_id": "map", "pose": pose}
         case Facts():
             known = {name: value for name, value in message.values.items() if value is not None}
-            yield message.topic, OUTCOME, {"timestamp": time, **known}
+            yield message.topic, OUTCOME, {"header": {"stamp": time}, **known}
 
 
 def scene_update(scene: Scene) -> Json:
-    """`foxglove.SceneUpdate`. A lifetime counts from the stamp, so it is longer by what the scene is late."""
+    """`foxglove.SceneUpdate`.
+
+    By the schema a lifetime counts from the stamp, in viewers from the log time: it is long enough for both.
+    """
     time, late_ns = _time(scene.stamp_ns), scene.log_ns - scene.stamp_ns
     return {
         "deletions": [{"timestamp": time, "type": 0, "id": name} for name in scene.removed],

@@ -126,7 +126,7 @@ OUTCOME = "fgtrack.Outcome"
 
 
 #: By name: what fgtrack writes. The last is its own, what became of a detection (a row of updates.csv); a value that is
-#: not known is left out, as viewers know no type that may be null.
+#: not known is left out, as viewers know no type that may be null. It has a header, by which viewers plot over stamps.
 SCHEMAS: Mapping[str, JsonSchema] = {
     schema["title"]: schema
     for schema in (
@@ -144,7 +144,7 @@ SCHEMAS: Mapping[str, JsonSchema] = {
         {
             **_message(
                 "Outcome",
-                timestamp=_TIME,
+                header={"type": "object", "properties": {"stamp": _TIME}, "required": ["stamp"]},
                 sensor=_STRING,
                 index={"type": "integer"},
                 disposition=_STRING,
@@ -153,7 +153,7 @@ SCHEMAS: Mapping[str, JsonSchema] = {
                 nis=_NUMBER,
             ),
             "title": OUTCOME,
-            "required": ["timestamp", "sensor", "index", "disposition", "delay_s"],
+            "required": ["header", "sensor", "index", "disposition", "delay_s"],
         },
     )
 }
