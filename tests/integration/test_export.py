@@ -14,6 +14,7 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
+from foxglove import messages as sdk
 from mcap.reader import make_reader
 from rosbags.interfaces import ConnectionExtRosbag2, QosDurability
 from rosbags.rosbag2 import Reader
@@ -347,7 +348,6 @@ def test_the_schemas_are_those_that_foxglove_publishes() -> None:
 
 
 def test_the_sdk_of_foxglove_takes_every_message(topics: dict[str, list[Entry]]) -> None:
-    messages = pytest.importorskip("foxglove.messages")
     kinds = {
         "arrows": "ArrowPrimitive",
         "cubes": "CubePrimitive",
@@ -371,20 +371,20 @@ def test_the_sdk_of_foxglove_takes_every_message(topics: dict[str, list[Entry]])
 
     def made(name: str, value: Any) -> Any:
         if name == "timestamp":
-            return messages.Timestamp(value["sec"], value["nsec"])
+            return sdk.Timestamp(value["sec"], value["nsec"])
         if name == "lifetime":
-            return messages.Duration(value["sec"], value["nsec"])
+            return sdk.Duration(value["sec"], value["nsec"])
         if isinstance(value, list):
             return [made(name, one) for one in value]
         if isinstance(value, dict):
-            return getattr(messages, kinds[name])(**fields_of(value))
+            return getattr(sdk, kinds[name])(**fields_of(value))
         return value
 
     def fields_of(value: dict[str, Any]) -> dict[str, Any]:
         found = {key: made(key, one) for key, one in value.items()}
         if "type" in found:
             assert found["type"] == 0
-            strip, one = messages.LinePrimitiveLineType.LineStrip, messages.SceneEntityDeletionType.MatchingId
+            strip, one = sdk.LinePrimitiveLineType.LineStrip, sdk.SceneEntityDeletionType.MatchingId
             found["type"] = strip if "points" in found else one
         return found
 
@@ -393,7 +393,7 @@ def test_the_sdk_of_foxglove_takes_every_message(topics: dict[str, list[Entry]])
     for topic, entries in topics.items():
         root = roots.get(topic, "PosesInFrame" if topic.endswith("/poses") else "SceneUpdate")
         for *_, value in entries[:20] if topic != "/outcomes" else []:
-            assert getattr(messages, root)(**fields_of(value)).encode()
+            assert getattr(sdk, root)(**fields_of(value)).encode()
             tried += 1
     assert tried > 100
 
