@@ -15,7 +15,7 @@ _Key = SupportsInt | SupportsIndex
 _Stamp = SupportsFloat | SupportsIndex
 
 #: Longer than any window: nothing leaves by itself.
-_FOREVER_S = 1e9
+_FOREVER_S = 1e10  # more than stamps in nanoseconds, 64 bit, can be apart
 
 
 class IncrementalBackend:
