@@ -50,7 +50,7 @@ def _even(tracks: IntArray, places: IntArray) -> Steps:
     longest, m = places.shape
     if longest == 0:
         return Steps(tracks[:0], tracks[:0], tracks[:0], [])
-    return Steps(np.tile(tracks, longest), places.ravel(), np.arange(m), list(range(m, m * longest + 1, m)))
+    return Steps(np.concatenate([tracks] * longest), places.ravel(), np.arange(m), list(range(m, m * longest + 1, m)))
 
 
 def _uneven(tracks: IntArray, order: IntArray, active: BoolArray, places: IntArray) -> Steps:

@@ -55,8 +55,8 @@ class Blocks:
         self._base[tracks] = np.where(gone, first, base)
         self._solid[tracks] = np.where(gone, first, solid)
 
-    def moved(self, tracks: IntArray, numbers: IntArray | int) -> None:
-        """The places of all nodes but those before any block have changed by `numbers`."""
+    def moved(self, tracks: IntArray, numbers: IntArray) -> None:
+        """The places of all nodes of `tracks` have changed by `numbers`."""
         for values in (self._base, self._solid, self._known):
             values[tracks] += numbers
 
@@ -67,8 +67,9 @@ class Blocks:
         (tracks,) and (tracks, n) of all tracks.
         """
         nodes, n = self._nodes, self._nodes.dim
-        self.cut(tracks, nodes.count[tracks])  # blocks that have left the window
         count, first = nodes.count[tracks], nodes.first[tracks]
+        if (self._solid[tracks] < first).any():  # all blocks have left the window
+            self.cut(tracks, count)
         self._known[tracks] = count
         free = first + anchored[tracks]
         newest = nodes.at(tracks, count - 1)
