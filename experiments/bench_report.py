@@ -158,7 +158,8 @@ class Results:
 def machine() -> dict[str, str]:
     """What the numbers belong to."""
     info = Path("/proc/cpuinfo")
-    names = [line.partition(":")[2].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     versions = {name: importlib.metadata.version(name) for name in ("numpy", "scipy", "gtsam")}
     return {
         "processor": names[0] if names else platform.processor(),
