@@ -39,9 +39,10 @@ def eliminate(nodes: Nodes, tracks: IntArray, places: IntArray) -> None:
     num_rows = nodes.num_rows.take(numbers)
     rows = nodes.rows.take(numbers, axis=0)[:, : int(num_rows.max())]
     begins = nodes.at(tracks[steps.order], np.maximum(places[steps.order] - 1, 0))
-    left, filtered = _filtered(steps, nodes.filtered.take(begins, axis=0), F, driven, rows, num_rows)
-    moved = F @ left
-    predicted = driven + moved @ _beside_one(F).mT
+    with np.errstate(all="ignore"):  # what is not finite is found below
+        left, filtered = _filtered(steps, nodes.filtered.take(begins, axis=0), F, driven, rows, num_rows)
+        moved = F @ left
+        predicted = driven + moved @ _beside_one(F).mT
     if (_variances(filtered) < _LEAST_SHARE * _variances(predicted)).any():
         left, predicted, filtered = _filtered_joseph(steps, nodes.filtered.take(begins, axis=0), F, driven, rows)
         moved = F @ left
