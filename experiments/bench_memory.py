@@ -19,7 +19,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from bench_report import progress, put_into, short_machine
+from bench_report import plural, progress, put_into, short_machine
 from bench_tracker import SPEED_MPS, scenario, yardstick_us
 
 from fgtrack.core.time import nanoseconds
@@ -100,7 +100,7 @@ def main(
         "|---|---|---|---|",
         *(f"| {s / 60.0:.3g} | {mb:.1f} | {spent_s:.0f} | {count} |" for s, mb, spent_s, count in rows),
         "",
-        f"{estimator}, {objects} objects, {rows[-1][0] / 3600.0:.2g} h, "
+        f"{estimator}, {plural(objects)}, {rows[-1][0] / 3600.0:.2g} h, "
         f"{sizes_mb[1] - sizes_mb[0]:.0f} MB of recording, {sizes_mb[0]:.0f} MB of run folder: "
         f"from the first row to the last the memory grew by {rows[-1][1] - rows[0][1]:.1f} MB.",
     ]

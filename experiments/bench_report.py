@@ -105,7 +105,7 @@ class Results:
         def published(label: str, count: int, required: float, lag_s: float = 1.0) -> Bar:
             row = self.row(label, count, lag_s)
             lag = f", {lag_s:g} s lag" if "smoother" in label else ""
-            what = f"{label}, {_objects(count)}{lag}: times as fast as the published implementation"
+            what = f"{label}, {plural(count)}{lag}: times as fast as the published implementation"
             return Bar(what, row.published_ratio if row else float("nan"), required)
 
         banded = {count: self.row(BANDED, count) for count in (5, 10, 50, 200)}
@@ -136,7 +136,7 @@ class Results:
                 4.0,
             ),
             *(
-                Bar(f"{SMOOTHER}, {_objects(one['count'])}: times as fast as the older checkout", one["ratio"], 1.5)
+                Bar(f"{SMOOTHER}, {plural(one['count'])}: times as fast as the older checkout", one["ratio"], 1.5)
                 for one in self.against
             ),
         ]
@@ -234,7 +234,8 @@ def _tick_cells(row: Row) -> tuple[str, ...]:
     return (one.label, str(one.count), lag, delay, *map(_short, numbers))
 
 
-def _objects(count: float) -> str:
+def plural(count: float) -> str:
+    """So many objects."""
     return f"{count:g} object{'' if count == 1 else 's'}"
 
 
