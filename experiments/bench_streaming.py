@@ -26,7 +26,7 @@ from fgtrack.io.run import Table
 
 METHODS = ("smoother-banded", "smoother", "ekf-replay", "ekf-backward-forward")
 _DEMO_SEED = 1
-_SAID = ("is judged when it is ready", "users also predict", "falls behind")  # sentences of the verdict
+_SAID = ("is judged when it is ready", "users also predict")  # sentences of the verdict
 _TITLES = {"asked": "at its stamp", "ready": "when ready", "predicted": "predicted to then"}
 _MARKS = {"best": " (best)", "tie": " (tie)", "worse": ""}
 
