@@ -5,7 +5,7 @@ import numpy as np
 from fgtrack.core.types import IntArray
 
 NEVER_NS = int(np.iinfo(np.int64).max)
-_FEW_TRACKS, _FEW_PLACES = 4, 16
+_FEW_TRACKS, _FEW_PLACES = 4, 4  # most tracks of a cluttered list have one entry, and end with it
 
 
 class Histories:

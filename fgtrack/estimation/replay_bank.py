@@ -152,9 +152,14 @@ class ReplayBank:
 
     def _begin(self, track_id: int, stamp_ns: int, newest_ns: int, mean: FloatArray, covariance: FloatArray) -> int:
         """Let a track begin with a state at `stamp_ns`; where the arrays hold it."""
-        track = self._free.pop() if self._free else len(self._start_ns)
-        if track == len(self._start_ns):
-            self._start_ns, self._newest_ns = (np.append(values, 0) for values in (self._start_ns, self._newest_ns))
+        if not self._free:
+            size = len(self._start_ns)
+            self._free = list(range(max(2 * size, 1) - 1, size - 1, -1))
+            more = np.zeros(len(self._free), dtype=np.int64)
+            self._start_ns, self._newest_ns = (
+                np.concatenate([values, more]) for values in (self._start_ns, self._newest_ns)
+            )
+        track = self._free.pop()
         self._start_ns[track], self._newest_ns[track] = stamp_ns, newest_ns
         self._steps.begin(track, stamp_ns, mean, covariance)
         self._numbers[track_id] = track
