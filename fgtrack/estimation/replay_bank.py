@@ -205,15 +205,14 @@ class ReplayBank:
         """States of tracks at `stamp_ns`, or at the start of their window where that is later."""
         tracks = [self._numbers[track_id] for track_id in track_ids]
         here = np.array([track for track in tracks if track is not None], dtype=np.int64)
-        n = self._motion.dim
-        found = Prediction(np.zeros((0, n)), np.zeros((0, n, n)), np.zeros((0, n, n)))
-        if len(here):
-            found = self._predicted_together(here, np.maximum(stamp_ns, self._start_ns[here]))
-        if not self._single:
+        found = self._predicted_together(here, np.maximum(stamp_ns, self._start_ns[here])) if len(here) else None
+        if found is not None and len(here) == len(tracks):
             return found
-        mean, covariance, cross = (np.zeros((len(tracks), *values.shape[1:])) for values in found)
-        rows = [row for row, track in enumerate(tracks) if track is not None]
-        mean[rows], covariance[rows], cross[rows] = found
+        n = self._motion.dim
+        mean, covariance, cross = np.zeros((len(tracks), n)), *np.zeros((2, len(tracks), n, n))
+        if found is not None:
+            rows = [row for row, track in enumerate(tracks) if track is not None]
+            mean[rows], covariance[rows], cross[rows] = found
         for row, (track_id, track) in enumerate(zip(track_ids, tracks, strict=True)):
             if track is None:
                 one = self._single[track_id]
