@@ -196,21 +196,21 @@ class Preprocess:
                 ]
                 R[place] = covariances(parts, names, batch.frame, sensor, pose).mean(axis=0)
                 points_m[place] = parts.points_m.mean(axis=0)
+        bearings = math.isnan(points_m[0, 0])  # all or none: what measures the same is placed or not
         assumes = self._assumed(assumed)
         models, white = self._models(names, R, view)
         whole, errors = white, self._pose_errors(names, models[0], points_m, white, assumes, view)
         if errors is not None:
             x = np.zeros((len(groups), self._motion.dim))
-            x[:, :2] = points_m
-            for place in np.flatnonzero(np.isnan(points_m[:, 0])).tolist():
-                x[place, :2] = _far_along(float(z[place, names.index("bearing_rad")]), pose)
-            whole = np.broadcast_to(errors.noise(models[0], pose, x), white.shape)
+            if bearings:
+                x[:, :2] = [_far_along(bearing_rad, pose) for bearing_rad in z[:, names.index("bearing_rad")].tolist()]
+            else:
+                x[:, :2] = points_m
+            whole = errors.noise(models[0], pose, x)
             R = R + (whole - white)
         spreads: Iterable[FloatArray | None]
         spreads = R[:, :2, :2] if names[:2] == ("x_m", "y_m") else map(partial(_spread, names, pose), z, R)
-        places: Iterable[FloatArray | None] = points_m
-        if np.isnan(points_m[0, 0]):
-            places = [None] * len(groups)  # bearings are not like others
+        places: Iterable[FloatArray | None] = [None] * len(groups) if bearings else points_m
         own: Iterable[PoseError | None] = [None] * len(groups)
         if errors is not None:
             own = [PoseError(errors.covariance, *each) for each in zip(errors.placement, white, strict=True)]
@@ -256,7 +256,7 @@ class Preprocess:
         if view.batch.frame == "map":
             placed = np.zeros((len(white), len(names), len(pose)))
         else:
-            placed = placement(names, np.nan_to_num(points_m - np.array([pose.x_m, pose.y_m])), assumed)
+            placed = placement(names, points_m - np.array([pose.x_m, pose.y_m]), assumed)
         return PoseError(view.pose_covariance, placed, white)
 
     def _assumed(self, map_yaw: bool) -> tuple[str, ...]:
