@@ -11,6 +11,7 @@ import typer
 from fgtrack.cli.arguments import Overwrite
 from fgtrack.cli.compare import written_tables
 from fgtrack.cli.figure import drawn_close_up
+from fgtrack.cli.report import REPORT, write_report
 from fgtrack.cli.show import TickProgress, console, progress, say
 from fgtrack.evaluation.comparison import compare
 from fgtrack.evaluation.plot import named_figures, save_named
@@ -35,20 +36,21 @@ _SETTINGS = {
 
 
 def demo(
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for recording, runs and figures.")] = Path(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for recording, runs, figures and report.")] = Path(
         "fgtrack-demo"
     ),
     overwrite: Overwrite = False,
 ) -> None:
-    """Simulate, record, replay with two noises, compare, draw."""
+    """Simulate, record, replay with two noises, compare, draw, report."""
     with claimed(out):
-        bag, figures = out / "recording", out / "figures"
+        bag, figures, page = out / "recording", out / "figures", out / "report.html"
         folders = {
             setting: {name: out / "runs" / f"{name}{ending}" for name in _ESTIMATORS}
             for ending, setting in _SETTINGS.items()
         }
         check_output(bag, RECORDING, overwrite)
         check_output(figures, Kind("a folder", Path.is_dir), overwrite)
+        check_output(page, REPORT, overwrite)
         for named in folders.values():
             for folder in named.values():
                 check_output(folder, RUN, overwrite)
@@ -80,7 +82,11 @@ def demo(
         console().print(replace(written_tables(every), verdict=()))
         with progress("draw"), new_files(figures, overwrite) as folder:
             fitted = every[-len(_ESTIMATORS) :]
-            files = save_named(chain(drawn_close_up(fitted)[0], named_figures(fitted)), folder, "png")
+            drawn = list(chain(drawn_close_up(fitted)[0], named_figures(fitted)))
+            files = save_named(drawn, folder, "png")
+        with progress("report"):
+            write_report(fitted, drawn, page, overwrite)
         say(f"recording: {bag}\nruns: {out / 'runs'}")
         for file in files:
             say(f"figure: {figures / file.name}")
+        say(f"report: {page}")

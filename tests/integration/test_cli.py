@@ -233,6 +233,8 @@ def test_the_demo_goes_from_scenario_to_figures(
     assert found["smoother-tuned"].smoothed["kind"].tolist().count("lagged") == lags_s.count(0.1)
     assert "final" in found["smoother-tuned"].smoothed["kind"]
     assert {path.name for path in (tmp_path / "demo/figures").iterdir()} >= {"error_against_lag.png", "timing.png"}
+    assert "smoother-tuned" in (tmp_path / "demo/report.html").read_text(encoding="utf-8")
+    assert "report: demo/report.html" in shown
 
 
 # --- the call is bad: 2

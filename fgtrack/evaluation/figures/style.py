@@ -145,6 +145,14 @@ def save_pages(figures: Iterable[Figure], file: BinaryIO) -> None:
 
 
 @styled
+def png(figure: Figure, dpi: float) -> bytes:
+    """`figure` as PNG, without date and version."""
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=dpi, metadata=dict(FORMATS["png"]))
+    return picture.getvalue()
+
+
+@styled
 def save(figure: Figure, path: Path | str) -> Path:
     """Write `figure` as PNG, SVG or PDF, as the suffix says, without date and version: equal figures, equal files.
 

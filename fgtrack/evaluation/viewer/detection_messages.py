@@ -18,8 +18,8 @@ from fgtrack.io.viewer.topics import token
 _SHOWN_S = 0.5  # how long a list is shown that no later one of its sensor replaces
 _DOT_M = 1.0
 _BEARING_M = 150.0  # length of the line of sight of a detection without a range
-_LATE: frozenset[str] = frozenset({Disposition.OUT_OF_SEQUENCE, Disposition.BEYOND_WINDOW})
-_FUSED: frozenset[str] = frozenset({Disposition.BIRTH, Disposition.IN_SEQUENCE, *_LATE})
+LATE: frozenset[str] = frozenset({Disposition.OUT_OF_SEQUENCE, Disposition.BEYOND_WINDOW})
+_FUSED: frozenset[str] = frozenset({Disposition.BIRTH, Disposition.IN_SEQUENCE, *LATE})
 _COUNTED: frozenset[str] = frozenset({*_FUSED, Disposition.MERGED})
 
 
@@ -34,7 +34,7 @@ def detection_messages(run: Run, look: Look) -> Iterator[ViewerMessage]:
     sensors = {name: k for k, name in enumerate(np.unique(table["sensor"]).tolist())}
     keys = list(zip(*(table[name].tolist() for name in ("receipt_ns", "sensor", "stamp_ns")), strict=True))
     order = sorted(range(len(keys)), key=keys.__getitem__)
-    now_at = _positions(run)
+    now_at = track_positions(run)
     told = updates["disposition"].tolist()
     dispositions = [told[row] if row >= 0 else "" for row in became.tolist()]
     for (receipt_ns, sensor, stamp_ns), group in groupby(order, key=keys.__getitem__):
@@ -54,7 +54,7 @@ def detection_messages(run: Run, look: Look) -> Iterator[ViewerMessage]:
             if disposition in _FUSED:
                 end_m = now_at.get((int(updates["tick"][became[row]]), int(updates["track_id"][became[row]])))
             if end_m is not None and receipt_ns > stamp_ns and end_m != (x_m, y_m):
-                arrows.append(Arrow((x_m, y_m), end_m, 0.3, faded(colour, 1.0 if disposition in _LATE else 0.3)))
+                arrows.append(Arrow((x_m, y_m), end_m, 0.3, faded(colour, 1.0 if disposition in LATE else 0.3)))
         topic = f"{look.prefix}/detections"
         yield Scene(topic, receipt_ns, stamp_ns, (Entity(sensor, tuple(shapes), _SHOWN_S),))
         yield Objects(f"{topic}/{token(sensor)}", DetectionList(sensor, stamp_ns, receipt_ns, objects, "map"))
@@ -91,7 +91,7 @@ def _shape(where: Placed, row: int, colour: tuple[float, float, float, float]) -
     return [Line(((from_x_m, from_y_m), end_m), 0.15, faded(colour, 0.5))]
 
 
-def _positions(run: Run) -> dict[tuple[int, int], Point]:
+def track_positions(run: Run) -> dict[tuple[int, int], Point]:
     """Positions of the tracks by tick and track."""
     names = ("tick", "track_id", "x_m", "y_m")
     rows = zip(*(run.tracks[name].tolist() for name in names), strict=True)

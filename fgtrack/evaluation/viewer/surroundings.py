@@ -42,20 +42,19 @@ def roads(run: Run) -> tuple[dict[str, TrackMap], list[str]]:
     return found, notes
 
 
+def road_lines(road: TrackMap) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The left bound, the right bound and the reference line of `road`, each of shape (n, 2)."""
+    s_m = np.linspace(0.0, road.length_m, max(2, round(road.length_m / _BOUND_STEP_M)) + 1)
+    left_m, right_m = road.bounds(s_m)
+    return road.position(s_m, left_m), road.position(s_m, -right_m), road.position(s_m, np.zeros_like(s_m))
+
+
 def map_scene(maps: dict[str, TrackMap], at_ns: int) -> Iterator[Scene]:
     """The bounds of the road and its reference line, told once."""
+    colours = (GREY, GREY, faded(GREY, 0.3))
     entities = []
     for name, one in maps.items():
-        s_m = np.linspace(0.0, one.length_m, max(2, round(one.length_m / _BOUND_STEP_M)) + 1)
-        left_m, right_m = one.bounds(s_m)
-        lines = [
-            _line(one.position(s_m, lateral_m), 0.3, colour)
-            for lateral_m, colour in (
-                (left_m, GREY),
-                (-right_m, GREY),
-                (np.zeros_like(s_m), faded(GREY, 0.3)),
-            )
-        ]
+        lines = [_line(points_m, 0.3, colour) for points_m, colour in zip(road_lines(one), colours, strict=True)]
         entities.append(Entity(name, tuple(lines)))
     if entities:
         yield Scene("/map", at_ns, at_ns, tuple(entities), lasting=True)

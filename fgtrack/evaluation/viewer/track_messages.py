@@ -24,7 +24,7 @@ _NO_ROWS = np.zeros(0, dtype=np.int64)
 def track_messages(run: Run, look: Look) -> Iterator[ViewerMessage]:
     """At every tick the boxes, names and speeds, the 2-sigma ellipses of the positions, and the poses."""
     tracks = _placed(run.tracks)
-    states, axes = _detections(tracks), ellipses(_position_covariances(tracks)).tolist()
+    states, axes = _detections(tracks), ellipses(position_covariances(tracks)).tolist()
     names = ("track_id", "stamp_ns", "status", "speed_mps", "num_measured")
     columns = [tracks[name].tolist() for name in names]
     by_tick = dict(groups(tracks["now_ns"]))
@@ -85,7 +85,7 @@ def smoothed_messages(run: Run, look: Look) -> Iterator[ViewerMessage]:
     states = _detections(final)
     stamps_ns, track_ids = final["stamp_ns"].tolist(), final["track_id"].tolist()
     lines: defaultdict[int, list[Point]] = defaultdict(list)
-    for log_ns, rows in groups(_final_ns(run, final)):
+    for log_ns, rows in groups(final_ns(run, final)):
         poses: defaultdict[int, list[Detection]] = defaultdict(list)
         for row in rows[np.argsort(final["stamp_ns"][rows], kind="stable")].tolist():
             poses[stamps_ns[row]].append(states[row])
@@ -111,7 +111,7 @@ def _trail(track_id: int, points_m: list[Point], look: Look) -> Iterator[Entity]
         yield Entity(f"track {track_id} part {part}", (line,), lifetime_s=_TRAIL_S)
 
 
-def _final_ns(run: Run, final: Table) -> IntArray:
+def final_ns(run: Run, final: Table) -> IntArray:
     """When each row of `final` was known to be final, shape (n,)."""
     lag_s = (run.config.get("smoother") or {}).get("lag_s", _DEFAULT_LAG_S)
     ends = {track_id: int(run.tracks["now_ns"][rows].max()) for track_id, rows in groups(run.tracks["track_id"])}
@@ -127,7 +127,7 @@ def _placed(table: Table) -> Table:
     return table.where(np.isfinite(table["x_m"]) & np.isfinite(table["y_m"]))
 
 
-def _position_covariances(states: Table) -> FloatArray:
+def position_covariances(states: Table) -> FloatArray:
     """Covariances of x and y, shape (n, 2, 2)."""
     xx, xy, yy = (states[name] for name in ("p_x_x", "p_x_y", "p_y_y"))
     return np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-2)

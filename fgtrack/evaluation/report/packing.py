@@ -1,0 +1,94 @@
+"""Columns of numbers as text that a page can hold: little-endian arrays in base64, equal ones once."""
+
+import base64
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+_DTYPES = {"u8": "<u1", "u16": "<u2", "i16": "<i2", "i32": "<i4", "f32": "<f4"}
+
+Packed = dict[str, Any]
+"""JSON values of a column: `blob` (its place among the blobs), `type`, and `scale` and `missing` where it has them."""
+
+
+@dataclass(frozen=True)
+class Form:
+    """How the numbers of a column are written."""
+
+    type: str
+    """`u8`, `u16`, `i16`, `i32` or `f32`."""
+    scale: float = 1.0
+    """What is written times this is the number."""
+    missing: int | None = None
+    """What is written for NaN."""
+
+
+_MISSING_I32 = -(2**31)
+
+#: In millimetres, up to 2,100 km from the origin.
+POSITION_M = Form("i32", 1e-3, _MISSING_I32)
+#: In tenths of a milliradian, wrapped angles.
+ANGLE_RAD = Form("i16", 1e-4, -(2**15))
+#: Any number with seven digits.
+NUMBER = Form("f32")
+#: Places in a list of up to 255 names.
+CODE = Form("u8")
+#: Identities, and -1 for none.
+IDENTITY = Form("i32")
+
+
+def time_form(duration_s: float) -> Form:
+    """In tenths of a millisecond up to two days, coarser for more."""
+    step_s = 1e-4
+    while duration_s / step_s >= 2**31 - 1:
+        step_s *= 10.0
+    return Form("i32", step_s)
+
+
+@dataclass
+class Packer:
+    """Collects blobs."""
+
+    blobs: list[str] = field(default_factory=list)
+    """Base64, in the order in which they were first packed."""
+    _places: dict[bytes, int] = field(default_factory=dict)
+
+    def column(self, values: npt.ArrayLike, form: Form) -> Packed:
+        """`values`, shape (n,), as `form` says; one that does not fit is written as missing."""
+        content = _written(np.asarray(values), form).tobytes()
+        place = self._places.setdefault(content, len(self.blobs))
+        if place == len(self.blobs):
+            self.blobs.append(base64.b64encode(content).decode("ascii"))
+        packed: Packed = {"blob": place, "type": form.type}
+        if form.scale != 1.0:
+            packed["scale"] = form.scale
+        if form.missing is not None:
+            packed["missing"] = form.missing
+        return packed
+
+
+def unpacked(column: Mapping[str, Any], blobs: list[str]) -> npt.NDArray[np.float64]:
+    """The numbers of a packed column, shape (n,): what the page's own decoder gives."""
+    written = np.frombuffer(base64.b64decode(blobs[column["blob"]]), dtype=_DTYPES[column["type"]])
+    found = np.asarray(written.astype(np.float64) * float(column.get("scale", 1.0)))
+    if "missing" in column:
+        found[written == column["missing"]] = math.nan
+    return found
+
+
+def _written(values: npt.NDArray[Any], form: Form) -> npt.NDArray[Any]:  # Any: of the type that the form says
+    dtype = np.dtype(_DTYPES[form.type])
+    if dtype.kind == "f":
+        return values.astype(dtype)
+    steps = np.rint(values.astype(np.float64) / form.scale)
+    limits = np.iinfo(dtype)
+    fits = (steps > limits.min if form.missing is not None else steps >= limits.min) & (steps <= limits.max)
+    if not fits.all():
+        if form.missing is None:
+            raise ValueError(f"a value does not fit into {form.type}")
+        steps = np.where(fits, steps, form.missing)
+    return steps.astype(dtype)

@@ -1,0 +1,287 @@
+"""What the viewer of a report shows, as JSON values: recordings (map, ego, truth) and the runs of them."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.special import chdtri
+
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.evaluation.cautions import USED
+from fgtrack.evaluation.palette import PALETTE
+from fgtrack.evaluation.report.packing import (
+    ANGLE_RAD,
+    CODE,
+    IDENTITY,
+    NUMBER,
+    POSITION_M,
+    Form,
+    Packed,
+    Packer,
+    time_form,
+)
+from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.viewer.detection_messages import LATE, track_positions
+from fgtrack.evaluation.viewer.ellipse import ellipses
+from fgtrack.evaluation.viewer.look import NOMINAL_SIZE_M
+from fgtrack.evaluation.viewer.placement import placed, update_rows
+from fgtrack.evaluation.viewer.surroundings import road_lines, roads, start_ns
+from fgtrack.evaluation.viewer.track_messages import final_ns, position_covariances
+from fgtrack.io.run import Run, Table
+
+FORMAT = "fgtrack-report/1"
+MOST_ROWS = 400_000
+"""Rows of a table that the viewer shows; of more, every second tick or stamp is left out, every third ..."""
+_PROBABILITY = 0.95
+_DEVIATIONS = math.sqrt(float(chdtri(2, 1.0 - _PROBABILITY)))
+
+Json = dict[str, Any]  # Any: JSON values
+
+
+@dataclass
+class _Recording:
+    """Runs of the same recording, their common start, and the place that their positions are relative to."""
+
+    runs: list[Run]
+    start_ns: int = 0
+    origin_m: FloatArray = field(default_factory=lambda: np.zeros(2))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the viewer shows."""
+
+    values: Json
+    notes: tuple[str, ...]
+    """What it does not show, a line each."""
+
+
+def scene(runs: Sequence[JudgedRun]) -> Scene:
+    """Everything that the viewer shows of `runs`; times are seconds from the start of the recording.
+
+    Raises
+    ------
+    DataError
+        A run or its map is damaged.
+    """
+    recordings = _recordings([one.run for one in runs])
+    packer, notes = Packer(), dict[str, None]()
+    times = time_form(
+        max((_end_ns(run) - one.start_ns for one in recordings for run in one.runs), default=0) / NS_PER_S
+    )
+    shown = []
+    for one in runs:
+        place = next(k for k, recording in enumerate(recordings) if one.run in recording.runs)
+        packing = _Packing(packer, times, recordings[place], notes, one.label)
+        shown.append({"label": one.label, "recording": place, **_run(one.run, packing)})
+    values = {
+        "format": FORMAT,
+        "palette": PALETTE,
+        "size_m": NOMINAL_SIZE_M[:2],
+        "used": USED,
+        "late": sorted(LATE),
+        "recordings": [_recording(one, _Packing(packer, times, one, notes, "")) for one in recordings],
+        "runs": shown,
+        "blobs": packer.blobs,
+    }
+    return Scene(values, tuple(notes))
+
+
+@dataclass(frozen=True)
+class _Packing:
+    """Packs columns of a recording."""
+
+    packer: Packer
+    times: Form
+    recording: _Recording
+    notes: dict[str, None]
+    label: str
+
+    def time(self, ns: IntArray) -> Packed:
+        return self.packer.column((ns - self.recording.start_ns) / NS_PER_S, self.times)
+
+    def place(self, x_m: FloatArray, y_m: FloatArray) -> Json:
+        x0_m, y0_m = self.recording.origin_m
+        return {"x": self.packer.column(x_m - x0_m, POSITION_M), "y": self.packer.column(y_m - y0_m, POSITION_M)}
+
+    def ellipse(self, states: Table) -> Json:
+        """Half axes and direction of the ellipses that hold 95 %."""
+        found = ellipses(position_covariances(states), _DEVIATIONS)
+        return {
+            "long": self.packer.column(0.5 * found[:, 0], NUMBER),
+            "short": self.packer.column(0.5 * found[:, 1], NUMBER),
+            "direction": self.packer.column(found[:, 2], ANGLE_RAD),
+        }
+
+    def angle(self, angles_rad: FloatArray) -> Packed:
+        return self.packer.column(angles_rad, ANGLE_RAD)
+
+    def thinned(self, table: Table, what: str) -> Table:
+        """`table`, or the rows of every k-th of its stamps where it has too many."""
+        stamps_ns = self.thinned_times(np.unique(table["stamp_ns"]), table.num_rows, what)
+        return table.where(np.isin(table["stamp_ns"], stamps_ns))
+
+    def thinned_times(self, times_ns: IntArray, num_rows: int, what: str) -> IntArray:
+        """Every k-th of `times_ns`, which have `num_rows` rows."""
+        step = max(1, math.ceil(num_rows / MOST_ROWS))
+        if step > 1:
+            name = f"{self.label}: " if self.label else ""
+            self.notes[f"{name}the viewer shows one of {step} times of {what}, as there are {num_rows} rows"] = None
+        return times_ns[::step]
+
+
+def _recordings(runs: Iterable[Run]) -> list[_Recording]:
+    found: list[_Recording] = []
+    for run in runs:
+        for one in found:
+            if one.runs[0].ego == run.ego and one.runs[0].truth == run.truth:
+                one.runs.append(run)
+                break
+        else:
+            found.append(_Recording([run]))
+    for one in found:
+        one.start_ns = min(map(start_ns, one.runs))
+        one.origin_m = _origin_m(one.runs)
+    return found
+
+
+def _origin_m(runs: Sequence[Run]) -> FloatArray:
+    """A place near the middle of all that is drawn, in whole metres."""
+    for table in (runs[0].ego, runs[0].truth, *(run.tracks for run in runs)):
+        places_m = np.stack([table["x_m"], table["y_m"]], axis=-1)
+        places_m = places_m[np.isfinite(places_m).all(axis=1)]
+        if len(places_m):
+            return np.asarray(np.rint(0.5 * (places_m.min(axis=0) + places_m.max(axis=0))))
+    return np.zeros(2)
+
+
+def _end_ns(run: Run) -> int:
+    columns = (run.timing["now_ns"], run.ego["receipt_ns"], run.detections["receipt_ns"], run.truth["stamp_ns"])
+    return max((int(column.max()) for column in columns if len(column)), default=0)
+
+
+def _recording(one: _Recording, packing: _Packing) -> Json:
+    run = one.runs[0]
+    maps, notes = roads(run)
+    packing.notes.update(dict.fromkeys(notes))
+    lines = [
+        {"kind": kind, **packing.place(*points_m.T)}
+        for road in maps.values()
+        for kind, points_m in zip(("bound", "bound", "centre"), road_lines(road), strict=True)
+    ]
+    ego = packing.thinned(_placed(run.ego), "the ego")
+    ego = _sorted(ego, ego["stamp_ns"])
+    truth = run.truth.where(run.truth["object_id"] >= 0)
+    truth = packing.thinned(_placed(truth), "the truth")
+    truth = _sorted(truth, truth["stamp_ns"], truth["object_id"])
+    return {
+        "start_ns": str(one.start_ns),  # of more digits than a number of JavaScript holds
+        "origin_m": one.origin_m.tolist(),
+        "map": lines,
+        "ego": {"t": packing.time(ego["stamp_ns"]), **_pose(ego, packing)},
+        "truth": {
+            "object": packing.packer.column(truth["object_id"], IDENTITY),
+            "t": packing.time(truth["stamp_ns"]),
+            **_pose(truth, packing),
+        },
+    }
+
+
+def _run(run: Run, packing: _Packing) -> Json:
+    column = packing.packer.column
+    statuses = np.unique(run.tracks["status"]).tolist()
+    tracks, lagged = _placed(run.tracks), _placed(run.lagged.where(run.lagged["lag_s"] > 0.0))
+    ticks_ns = packing.thinned_times(
+        np.unique(run.timing["now_ns"]), max(tracks.num_rows, lagged.num_rows), "the ticks"
+    )
+    tracks = tracks.where(np.isin(tracks["now_ns"], ticks_ns))
+    past = lagged.where(np.isin(lagged["now_ns"], ticks_ns))
+    tracks = _sorted(tracks, tracks["now_ns"], tracks["track_id"])
+    past = _sorted(past, past["now_ns"], past["track_id"], past["stamp_ns"])
+    final = packing.thinned(_placed(run.smoothed.where(run.smoothed["kind"] == "final")), "final states")
+    final = _sorted(final, final["track_id"], final["stamp_ns"])
+    return {
+        "estimator": str(run.meta.get("estimator", "")),
+        "statuses": statuses,
+        "ticks": packing.time(ticks_ns),
+        "tracks": {
+            "t": packing.time(tracks["now_ns"]),
+            "track": column(tracks["track_id"], IDENTITY),
+            "status": column(_codes(tracks["status"], statuses), CODE),
+            **_pose(tracks, packing),
+            "speed": column(tracks["speed_mps"], NUMBER),
+            **packing.ellipse(tracks),
+        },
+        "past": {
+            "t": packing.time(past["now_ns"]),
+            "track": column(past["track_id"], IDENTITY),
+            **packing.place(past["x_m"], past["y_m"]),
+            **packing.ellipse(past),
+        },
+        "final": {
+            "track": column(final["track_id"], IDENTITY),
+            "t": packing.time(final["stamp_ns"]),
+            "known": packing.time(final_ns(run, final)),
+            **packing.place(final["x_m"], final["y_m"]),
+            **packing.ellipse(final),
+        },
+        **_detections(run, packing),
+    }
+
+
+def _detections(run: Run, packing: _Packing) -> Json:
+    """Detections in order of receipt: where they were, when, what became of them, where their track was then."""
+    column, table, updates = packing.packer.column, run.detections, run.updates
+    if updates.num_rows and not table.num_rows:
+        packing.notes[f"{packing.label}: has no detections.csv, so no detections are shown; repeat the run"] = None
+    where, became = placed(run), update_rows(run)
+    sensors = np.unique(table["sensor"]).tolist()
+    known = became >= 0
+    rows = np.where(known, became, 0)
+    fates = np.where(known, updates["disposition"][rows], "") if updates.num_rows else np.full(len(became), "")
+    ids = np.where(known, updates["track_id"][rows], -1) if updates.num_rows else np.full(len(became), -1)
+    ticks = updates["tick"][rows].tolist() if updates.num_rows else [0] * len(became)
+    positions = track_positions(run)
+    nowhere = (math.nan, math.nan)
+    track_m = np.array(
+        [positions.get((tick, track), nowhere) for tick, track in zip(ticks, ids.tolist(), strict=True)]
+    ).reshape(-1, 2)
+    order = np.argsort(table["receipt_ns"], kind="stable")
+    dispositions = np.unique(fates).tolist()
+    track = packing.place(*track_m[order].T)
+    found = {
+        "stamp": packing.time(table["stamp_ns"][order]),
+        "receipt": packing.time(table["receipt_ns"][order]),
+        "sensor": column(_codes(table["sensor"][order], sensors), CODE),
+        "disposition": column(_codes(fates[order], dispositions), CODE),
+        "track": column(ids[order], IDENTITY),
+        **packing.place(*where.position_m[order].T),
+        "track_x": track["x"],
+        "track_y": track["y"],
+    }
+    if (np.isnan(where.position_m).any(axis=1) & np.isfinite(where.bearing_rad)).any():
+        origin = packing.place(*where.sensor_m[order].T)
+        found |= {"from_x": origin["x"], "from_y": origin["y"], "bearing": packing.angle(where.bearing_rad[order])}
+    return {"sensors": sensors, "dispositions": dispositions, "detections": found}
+
+
+def _pose(states: Table, packing: _Packing) -> Json:
+    return {**packing.place(states["x_m"], states["y_m"]), "yaw": packing.angle(states["yaw_rad"])}
+
+
+def _codes(names: Any, among: Sequence[str]) -> IntArray:
+    """The place of each of `names`, shape (n,), in the sorted `among`."""
+    return np.asarray(np.searchsorted(np.array(among, dtype=np.str_), names), dtype=np.int64)
+
+
+def _placed(table: Table) -> Table:
+    return table.where(np.isfinite(table["x_m"]) & np.isfinite(table["y_m"]))
+
+
+def _sorted(table: Table, *keys: IntArray) -> Table:
+    """The rows in the order of `keys`, the first one counts most."""
+    order = np.lexsort(keys[::-1])
+    return Table({name: values[order] for name, values in table.items()})

@@ -1,0 +1,171 @@
+"""The viewer of a report in a real browser: it draws, moves by mouse, keyboard and touch, and loads nothing."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.chromium import CHROMIUM, Browser, chromium
+
+import fgtrack
+from fgtrack.cli.main import run as command
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (apt-get install chromium)")
+
+NAMES = ("ekf-replay", "smoother")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four seconds of the default scenario, replayed with a filter and a smoother, and their report."""
+    folder = tmp_path_factory.mktemp("viewer")
+    fgtrack.simulate("default", seed=3, duration_s=4.0, out=folder / "drive.jsonl")
+    for name in NAMES:
+        fgtrack.replay(
+            folder / "drive.jsonl", "tuned", map="oval", pit_map="oval", estimator=name, out=folder / "runs" / name
+        )
+    assert command(["report", str(folder / "runs"), "-o", str(folder / "report.html")]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with chromium(tmp_path_factory.mktemp("profile")) as browser:
+        yield browser
+
+
+@pytest.fixture
+def page(folder: Path, browser: Browser) -> Iterator[Browser]:
+    """The report, newly opened on a wide light screen; it must not complain, and ask for nothing but itself."""
+    browser.events.clear()
+    browser.screen(1280, 900)
+    address = (folder / "report.html").as_uri()
+    browser.open("about:blank#")
+    browser.open(address)
+    yield browser
+    assert browser.complaints() == []
+    assert {each.split("#")[0] for each in browser.requests()} <= {address, "about:blank"}
+
+
+def drawn(page: Browser) -> str:
+    """The picture on the canvas."""
+    return str(page.value("(viewer.draw(), viewer.canvas.toDataURL())"))
+
+
+def test_the_page_decodes_what_the_run_folders_hold(page: Browser, folder: Path) -> None:
+    for index, name in enumerate(NAMES):
+        tracks = fgtrack.load_run(folder / "runs" / name).tracks
+        order = np.lexsort((tracks["track_id"], tracks["now_ns"]))
+        found = page.value(f"[...viewer.scene.runs[{index}].tracks.yaw]")
+        np.testing.assert_allclose(found, tracks["yaw_rad"][order], atol=1e-4)
+        x_m = np.array(page.value(f"[...viewer.scene.runs[{index}].tracks.x]"))
+        np.testing.assert_allclose(x_m - x_m[0], tracks["x_m"][order] - tracks["x_m"][order][0], atol=2e-3)
+
+
+@pytest.mark.parametrize("phone", [False, True])
+@pytest.mark.parametrize("dark", [False, True])
+def test_every_screen_shows_it_without_scrolling_sideways(page: Browser, phone: bool, dark: bool) -> None:
+    page.screen(*((390, 844) if phone else (1280, 900)), dark=dark, phone=phone)
+    page.until("viewer.size.width < innerWidth")
+    assert page.value("document.documentElement.scrollWidth <= innerWidth")
+    background = page.value("getComputedStyle(document.body).backgroundColor")
+    assert background == ("rgb(20, 23, 27)" if dark else "rgb(255, 255, 255)")
+    page.until(f"viewer.theme.background === '{'#14171b' if dark else '#ffffff'}'")
+    page.value("viewer.shown.clear()")
+    empty = drawn(page)
+    page.value("(viewer.shown.add(0), viewer.seek(2))")
+    assert len(drawn(page)) > 1.5 * len(empty)
+
+
+def test_the_scrubber_moves_by_mouse(page: Browser) -> None:
+    before = drawn(page)
+    box = page.box("[data-part=scrubber]")
+    page.click(box["left"] + 0.75 * box["width"], box["top"] + box["height"] / 2)
+    assert page.value("viewer.time / viewer.scene.end") == pytest.approx(0.75, abs=0.03)
+    assert drawn(page) != before
+
+
+def test_the_scrubber_moves_by_touch(page: Browser) -> None:
+    page.screen(390, 844, phone=True)
+    box = page.box("[data-part=scrubber]")
+    y, start = box["top"] + box["height"] / 2, page.value("viewer.time / viewer.scene.end")
+    places = [(box["left"] + share * box["width"], y) for share in np.linspace(start, 0.9, 8).tolist()]
+    page.touch(*places)
+    page.until("viewer.time / viewer.scene.end > 0.8")
+
+
+def test_the_scrubber_and_the_picture_move_by_keys(page: Browser) -> None:
+    box = page.box("#viewer canvas")
+    page.click(box["left"] + box["width"] / 2, box["top"] + box["height"] / 2)
+    page.value("viewer.seek(2)")
+    step = page.value("viewer.scene.runs[0].step")
+    page.key("ArrowRight", 39)
+    assert page.value("viewer.time") == pytest.approx(2.0 + step)
+    page.key("ArrowLeft", 37)
+    assert page.value("viewer.time") == pytest.approx(2.0)
+    page.key("End", 35)
+    assert page.value("viewer.time === viewer.scene.end")
+    page.key("Home", 36)
+    assert page.value("viewer.time") == 0
+    page.key(".", 190, ".")
+    assert page.value("viewer.time") == page.value("viewer.lateTimes[0]") > 0
+    assert page.value("(viewer.parts.scrubber.focus(), viewer.seek(2), document.activeElement.type)") == "range"
+    page.key("ArrowRight", 39)
+    assert page.value("viewer.time") == pytest.approx(2.0 + step)
+
+
+def test_space_plays_and_pauses(page: Browser) -> None:
+    page.value("viewer.canvas.focus(), viewer.seek(0), viewer.setSpeed(1)")
+    page.key(" ", 32, " ")
+    page.until("viewer.time > 0.2")
+    assert page.value("viewer.parts.play.textContent") == "Pause"
+    page.key(" ", 32, " ")
+    assert not page.value("viewer.isPlaying")
+    page.value("viewer.setSpeed(4), viewer.play(true)")
+    page.until("!viewer.isPlaying && viewer.time === viewer.scene.end")
+
+
+def test_a_frame_is_drawn_fast_enough_for_thirty_a_second(page: Browser) -> None:
+    page.screen(390, 844, phone=True)
+    page.value("viewer.shown = new Set(viewer.scene.runs.keys()), viewer.resize()")
+    milliseconds = page.value(
+        "(() => { const took = []; for (let k = 0; k < 200; k += 1) { viewer.time = k * viewer.scene.end / 200;"
+        "const start = performance.now(); viewer.draw(); took.push(performance.now() - start); }"
+        "return took.sort((a, b) => a - b)[100]; })()"
+    )
+    assert milliseconds < 1000 / 30
+
+
+def test_a_link_opens_the_same_picture(page: Browser, folder: Path) -> None:
+    page.value(
+        "viewer.setFollow('object 1'), viewer.pan(40, -20), viewer.zoom(2), viewer.isSideBySide = false,"
+        "viewer.settings.detections = 'stamped', viewer.settings.truth = false, viewer.seek(1.2345), viewer.resize()"
+    )
+    view, link = page.value("viewer.view"), page.value("viewer.link()")
+    assert link.startswith("#t=1.2345&view=")
+    pictures = []
+    for _ in range(2):
+        page.open("about:blank#")
+        page.open((folder / "report.html").as_uri() + link)
+        assert page.value("viewer.link()") == link
+        assert page.value("viewer.view") == pytest.approx(view, abs=0.006)
+        pictures.append(drawn(page))
+    assert pictures[0] == pictures[1]
+    page.value("location.hash = '#t=3'")
+    page.until("viewer.time === 3")
+    assert drawn(page) != pictures[0]
+
+
+def test_each_layer_and_each_way_to_show_detections_changes_the_picture(page: Browser) -> None:
+    page.value("viewer.seek(2.5)")
+    pictures = [drawn(page)]
+    for layer in page.value("LAYERS"):
+        page.value(f"viewer.settings.{layer} = false")
+        pictures.append(drawn(page))
+        page.value(f"viewer.settings.{layer} = true")
+    for mode in ("received", "stamped", "none"):
+        page.value(f"viewer.settings.detections = '{mode}'")
+        pictures.append(drawn(page))
+    page.value("viewer.settings.detections = 'both', viewer.isSideBySide = false, viewer.resize()")
+    pictures.append(drawn(page))
+    assert len(set(pictures)) == len(pictures)
