@@ -29,7 +29,9 @@ def figure(
     stamp: Annotated[float | None, typer.Option(help="Stamp of the close-up: s after the first tick.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Draw runs: a late detection in close-up, map, residuals, delays, errors, lag, time per tick.
+    """Draw runs: late detections, map, residuals, errors, time.
+
+    A late detection in close-up, map, residuals, arrivals, delays, errors over time and against lag, time per tick.
 
     The close-up replays the recording up to the late detection that moved the present of the first run most; where the
     recording is not there any more it is left out.

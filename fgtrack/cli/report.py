@@ -31,10 +31,10 @@ def report(
     out: Annotated[Path, typer.Option("-o", "--out", help="HTML file.")],
     overwrite: Overwrite = False,
 ) -> None:
-    """Write one HTML file: verdict, tables, figures, configuration, and a viewer that plays the runs.
+    """Write one HTML file: verdict, tables, figures, viewer.
 
-    The file needs no network and no other file. Its close-up replays the recording; where that is not there any more
-    it is left out.
+    The verdict, all tables and figures, the configuration, and a viewer that plays the runs. The file needs no network
+    and no other file. Its close-up replays the recording; where that is not there any more it is left out.
     """
     if out.suffix.lower() not in _SUFFIXES:
         raise CallError(f"{out}: a report is one HTML file, end the name with .html")
