@@ -234,7 +234,7 @@ def test_the_demo_goes_from_scenario_to_figures(
     assert "final" in found["smoother-tuned"].smoothed["kind"]
     assert {path.name for path in (tmp_path / "demo/figures").iterdir()} >= {"error_against_lag.png", "timing.png"}
     assert "smoother-tuned" in (tmp_path / "demo/report.html").read_text(encoding="utf-8")
-    assert "report: demo/report.html" in shown
+    assert "report: demo/report.html" in shown.out
 
 
 # --- the call is bad: 2
