@@ -85,6 +85,39 @@ def test_the_scrubber_moves_by_mouse(page: Browser) -> None:
     assert drawn(page) != before
 
 
+def test_a_drag_moves_the_picture_and_the_wheel_zooms(page: Browser) -> None:
+    view, before = page.value("viewer.view"), drawn(page)
+    box = page.box("#viewer canvas")
+    x, y = box["left"] + 100, box["top"] + 100
+    page.drag((x, y), (x + 50, y + 20))
+    moved = page.value("viewer.view")
+    metres = view["width"] / page.value("viewer.panes()[0].width")
+    assert moved == pytest.approx({"x": view["x"] - 50 * metres, "y": view["y"] + 20 * metres, "width": view["width"]})
+    assert drawn(page) != before
+    page("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=200)
+    page.until(f"viewer.view.width > 1.3 * {view['width']}")
+
+
+def test_the_strip_shows_the_errors_and_goes_to_a_time(page: Browser, folder: Path) -> None:
+    (index,) = (k for k, name in enumerate(NAMES) if name == "smoother")
+    run = fgtrack.load_run(folder / "runs" / "smoother")
+    found = np.array(
+        page.value(f"[...errorsOf(viewer.scene.runs[{index}], 0)].map((error) => error || null)"), dtype=float
+    )
+    assert np.isfinite(found).sum() > 100
+    tick = int(np.flatnonzero(np.isfinite(found))[-1])
+    now_ns = run.timing["now_ns"][tick]
+    truth = run.truth.where((run.truth["stamp_ns"] == now_ns) & (run.truth["object_id"] == 0))
+    tracks = run.tracks.where(run.tracks["now_ns"] == now_ns)
+    off_m = np.hypot(tracks["x_m"] - truth["x_m"], tracks["y_m"] - truth["y_m"]).min()
+    assert found[tick] == pytest.approx(off_m, abs=3e-3)
+    box = page.box("[data-part=strip]")
+    page.click(box["left"] + 0.6 * box["width"], box["top"] + 20)
+    assert page.value("viewer.time / viewer.scene.end") == pytest.approx(0.6, abs=0.01)
+    page.value("viewer.setFollow('ego'), viewer.draw()")
+    assert page.value("viewer.controls.parts.strip.clientHeight") == 0
+
+
 def test_the_scrubber_moves_by_touch(page: Browser) -> None:
     page.screen(390, 844, phone=True)
     box = page.box("[data-part=scrubber]")
@@ -109,7 +142,9 @@ def test_the_scrubber_and_the_picture_move_by_keys(page: Browser) -> None:
     assert page.value("viewer.time") == 0
     page.key(".", 190, ".")
     assert page.value("viewer.time") == page.value("viewer.lateTimes[0]") > 0
-    assert page.value("(viewer.parts.scrubber.focus(), viewer.seek(2), document.activeElement.type)") == "range"
+    assert (
+        page.value("(viewer.controls.parts.scrubber.focus(), viewer.seek(2), document.activeElement.type)") == "range"
+    )
     page.key("ArrowRight", 39)
     assert page.value("viewer.time") == pytest.approx(2.0 + step)
 
@@ -118,7 +153,7 @@ def test_space_plays_and_pauses(page: Browser) -> None:
     page.value("viewer.canvas.focus(), viewer.seek(0), viewer.setSpeed(1)")
     page.key(" ", 32, " ")
     page.until("viewer.time > 0.2")
-    assert page.value("viewer.parts.play.textContent") == "Pause"
+    assert page.value("viewer.controls.parts.play.textContent") == "Pause"
     page.key(" ", 32, " ")
     assert not page.value("viewer.isPlaying")
     page.value("viewer.setSpeed(4), viewer.play(true)")
@@ -141,13 +176,13 @@ def test_a_link_opens_the_same_picture(page: Browser, folder: Path) -> None:
         "viewer.setFollow('object 1'), viewer.pan(40, -20), viewer.zoom(2), viewer.isSideBySide = false,"
         "viewer.settings.detections = 'stamped', viewer.settings.truth = false, viewer.seek(1.2345), viewer.resize()"
     )
-    view, link = page.value("viewer.view"), page.value("viewer.link()")
+    view, link = page.value("viewer.view"), page.value("linkTo(viewer)")
     assert link.startswith("#t=1.2345&view=")
     pictures = []
     for _ in range(2):
         page.open("about:blank#")
         page.open((folder / "report.html").as_uri() + link)
-        assert page.value("viewer.link()") == link
+        assert page.value("linkTo(viewer)") == link
         assert page.value("viewer.view") == pytest.approx(view, abs=0.006)
         pictures.append(drawn(page))
     assert pictures[0] == pictures[1]

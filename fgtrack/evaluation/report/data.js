@@ -111,6 +111,12 @@ class Path {
     };
   }
 
+  /** As `at`; before the first and after the last stamp, and in a pause, what is nearest before, or the first. */
+  near(time) {
+    if (!this.t.length) return null;
+    return this.at(time) ?? this.#row(Math.max(0, countUpTo(this.t, time) - 1));
+  }
+
   #row(row) {
     return { x: this.x[row], y: this.y[row], yaw: this.yaw[row] };
   }

@@ -1,35 +1,49 @@
 "use strict";
 // Draws one run, or several over one another, into a pane of the canvas. World: metres, y up; a pane clips it.
 
-const SENSOR_MARKS = ["circle", "square", "triangle", "diamond"];
+const MARKS = { // corners to the right and up
+  circle: null,
+  square: [[-1, -1], [1, -1], [1, 1], [-1, 1]],
+  triangle: [[0, 1.2], [-1.1, -1], [1.1, -1]],
+  diamond: [[0, 1.3], [-1.3, 0], [0, -1.3], [1.3, 0]],
+};
+const SENSOR_MARKS = Object.keys(MARKS);
 const BEARING_M = 150;
 const SHOWN_S = 0.3; // how long a detection stays
 const MOST_IN_FLIGHT = 2000;
 const CHUNK = 64; // points of a piece of the map, which is drawn only if it can be seen
 
-/** Where a pane is on the canvas and what of the world it shows. */
+/** Where a pane is on the canvas, what of the world is in its middle, and which direction points to the right. */
 class Camera {
-  constructor(left, top, width, height, x, y, scale) {
-    Object.assign(this, { left, top, width, height, x, y, scale });
-  }
-
-  /** Distance of a place from the middle of the pane, in half diagonals and more. */
-  sees(x, y, margin) {
-    const reach = 1 / (2 * this.scale);
-    return Math.abs(x - this.x) <= this.width * reach + margin && Math.abs(y - this.y) <= this.height * reach + margin;
+  constructor(pane, x, y, turn, scale) {
+    Object.assign(this, { pane, x, y, scale });
+    this.right = [scale * Math.cos(turn), scale * Math.sin(turn)];
+    this.middle = [pane.left + pane.width / 2, pane.top + pane.height / 2];
   }
 
   /** Lets the context draw in metres from here on. */
   toWorld(context, ratio) {
-    const s = this.scale * ratio;
-    const middleX = (this.left + this.width / 2) * ratio;
-    const middleY = (this.top + this.height / 2) * ratio;
-    context.setTransform(s, 0, 0, -s, middleX - this.x * s, middleY + this.y * s);
+    const [c, s] = this.right;
+    const [left, top] = this.onCanvas(0, 0);
+    context.setTransform(c * ratio, s * ratio, s * ratio, -c * ratio, left * ratio, top * ratio);
   }
 
   /** Place on the canvas in CSS pixels. */
   onCanvas(x, y) {
-    return [this.left + this.width / 2 + (x - this.x) * this.scale, this.top + this.height / 2 - (y - this.y) * this.scale];
+    const [c, s] = this.right;
+    const [dx, dy] = [x - this.x, y - this.y];
+    return [this.middle[0] + c * dx + s * dy, this.middle[1] + s * dx - c * dy];
+  }
+
+  /** Whether a place is in the pane, or not more than `margin` metres beside it. */
+  sees(x, y, margin) {
+    const [left, top] = this.onCanvas(x, y);
+    const { pane } = this;
+    const reach = margin * this.scale;
+    return (
+      left >= pane.left - reach && left <= pane.left + pane.width + reach &&
+      top >= pane.top - reach && top <= pane.top + pane.height + reach
+    );
   }
 }
 
@@ -74,7 +88,7 @@ class Painter {
     return palette[palette.length - 1 - (sensors.indexOf(name) % palette.length)];
   }
 
-  /** One pane: `runs` are numbers of runs of the same recording, over one another. */
+  /** One pane: `runs` are numbers of runs of the same recording, over one another; detections are as of the first one. */
   pane(camera, ratio, time, runs, settings, theme) {
     const { context } = this;
     this.camera = camera;
@@ -83,7 +97,7 @@ class Painter {
     context.save();
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.beginPath();
-    context.rect(camera.left, camera.top, camera.width, camera.height);
+    context.rect(camera.pane.left, camera.pane.top, camera.pane.width, camera.pane.height);
     context.clip();
     camera.toWorld(context, ratio);
     context.lineJoin = "round";
@@ -91,6 +105,7 @@ class Painter {
     if (settings.map) this.#map(recording);
     if (settings.truth) this.#truth(recording, time, settings.trail);
     for (const index of runs) this.#run(index, time, settings);
+    if (settings.detections !== "none") this.#detections(this.scene.runs[runs[0]], time, settings.detections);
     this.#ego(recording, time);
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     if (settings.names) for (const index of runs) this.#names(this.scene.runs[index], time);
@@ -137,7 +152,6 @@ class Painter {
       }
       for (let row = from; row < to; row += 1) this.#track(run, row, settings, colour);
     }
-    if (settings.detections !== "none") this.#detections(run, time, settings.detections);
   }
 
   /** The positions of a track as they were published, dotted. */
@@ -309,23 +323,17 @@ class Painter {
     context.globalAlpha = 1;
   }
 
+  /** A mark that stands upright however the picture is turned. */
   #mark(x, y, sensor, isFull) {
     const { context, px } = this;
     const r = 4.5 * px;
+    const [c, s] = this.camera.right.map((value) => value / this.camera.scale);
+    const corner = ([right, up]) => context.lineTo(x + r * (c * right - s * up), y + r * (s * right + c * up));
+    const corners = MARKS[SENSOR_MARKS[sensor % SENSOR_MARKS.length]];
     context.beginPath();
-    switch (SENSOR_MARKS[sensor % SENSOR_MARKS.length]) {
-      case "square":
-        context.rect(x - r, y - r, 2 * r, 2 * r);
-        break;
-      case "triangle":
-        polygon(context, [[x, y + 1.2 * r], [x - 1.1 * r, y - r], [x + 1.1 * r, y - r]]);
-        break;
-      case "diamond":
-        polygon(context, [[x, y + 1.3 * r], [x - 1.3 * r, y], [x, y - 1.3 * r], [x + 1.3 * r, y]]);
-        break;
-      default:
-        context.arc(x, y, r, 0, 2 * Math.PI);
-    }
+    if (corners === null) context.arc(x, y, r, 0, 2 * Math.PI);
+    else corners.forEach(corner);
+    context.closePath();
     if (isFull) context.fill();
     context.stroke();
   }
@@ -342,11 +350,6 @@ class Painter {
       context.fillText(String(run.tracks.track[row]), left + 8, top - 8);
     }
   }
-}
-
-function polygon(context, corners) {
-  for (const [x, y] of corners) context.lineTo(x, y);
-  context.closePath();
 }
 
 /** Place in `rows`, which are in order of their time, of the first one at `since` or later. */

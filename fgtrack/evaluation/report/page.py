@@ -18,8 +18,9 @@ from fgtrack.evaluation.report.settings import differing, flattened
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.tables import Table
 
-_SCRIPTS = ("data.js", "drawing.js", "viewer.js")
+_SCRIPTS = ("data.js", "drawing.js", "strip.js", "links.js", "controls.js", "viewer.js")
 _NONE = "–"
+_LONG = 40  # characters of a cell that may be broken
 _DPI = 110.0  # of figures: sharp at the width at which they are shown
 
 
@@ -117,19 +118,19 @@ def _table(table: Table) -> str:
     return _wide(table.title, head, "".join(rows)) + _list(table.notes, "soft")
 
 
-def _wide(title: str, head: str, rows: str, kind: str = "") -> str:
+def _wide(title: str, head: str, rows: str) -> str:
     """A table that scrolls sideways where the page is narrower."""
-    name = f' class="{kind}"' if kind else ""
-    caption = f"<h3>{escape(title)}</h3>\n" if title else ""
+    name = escape(title)
     return (
-        f'{caption}<div class="wide" tabindex="0" role="region" aria-label="{escape(title)}"><table{name}>\n'
+        f'<h3>{name}</h3>\n<div class="wide" tabindex="0" role="region" aria-label="{name}"><table>\n'
         f"<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}</tbody>\n</table></div>\n"
     )
 
 
 def _cell(tag: str, text: str, is_left: bool, is_bold: bool = False) -> str:
     content = escape(text).replace("\n", "<br>")
-    kind = ' class="left"' if is_left else ""
+    kinds = [name for name, has in (("left", is_left), ("long", len(text) > _LONG)) if has]
+    kind = f' class="{" ".join(kinds)}"' if kinds else ""
     return f"<{tag}{kind}>{f'<b>{content}</b>' if is_bold else content}</{tag}>"
 
 
@@ -140,8 +141,10 @@ def _figures(figures: Iterable[tuple[str, Figure]]) -> str:
 
 def _figure(name: str, figure: Figure) -> str:
     text, picture = escape(name), base64.b64encode(png(figure, _DPI)).decode()
+    width, height = (round(inches * _DPI) for inches in figure.get_size_inches())
     return (
-        f'<figure class="figure" id="figure-{text}"><img alt="{text}" decoding="async" loading="lazy" '
+        f'<figure class="figure" id="figure-{text}"><img alt="{text}" width="{width}" height="{height}" '
+        f'decoding="async" loading="lazy" '
         f'src="data:image/png;base64,{picture}"><figcaption>{text}</figcaption></figure>\n'
     )
 
@@ -154,7 +157,7 @@ def _configuration(runs: Sequence[JudgedRun]) -> str:
     if len(runs) > 1 and keys:
         head = "".join(_cell("th", text, True) for text in ("key", *settings))
         rows = (_row([key, *(known.get(key, _NONE) for known in settings.values())]) for key in keys)
-        parts.append(_wide("Where the runs differ", head, "".join(rows), "settings"))
+        parts.append(_wide("Where the runs differ", head, "".join(rows)))
     elif len(runs) > 1:
         parts.append("<p>All runs have the same configuration.</p>\n")
     for one in runs:
@@ -167,10 +170,9 @@ def _configuration(runs: Sequence[JudgedRun]) -> str:
 
 def _runs(runs: Sequence[JudgedRun]) -> str:
     """What each run was made of, by whom and how long it took."""
-    head = "".join(
-        _cell("th", text, True) for text in ("run", "estimator", "recording", "detections", "s", "versions", "digest")
-    )
-    return _wide("", head, "".join(_row(_facts(one)) for one in runs), "settings")
+    names = ("run", "estimator", "recording", "detections", "time [s]", "versions", "digest")
+    head = "".join(_cell("th", name, True) for name in names)
+    return _wide("What they were made of", head, "".join(_row(_facts(one)) for one in runs))
 
 
 def _facts(one: JudgedRun) -> list[str]:
