@@ -6,7 +6,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,12 @@ import pytest
 
 import fgtrack
 from fgtrack.cli.main import run as command
-from fgtrack.evaluation.report.packing import ANGLE_RAD, IDENTITY, POSITION_M, Packer, time_form, unpacked
+from fgtrack.evaluation.report.packing import ANGLE_RAD, CODE, POSITION_M, Packer, identity_form, time_form, unpacked
 from fgtrack.evaluation.report.scene import scene
 from fgtrack.evaluation.report.settings import differing, flattened
 from fgtrack.evaluation.runs import judged
 from fgtrack.evaluation.viewer.placement import placed
+from fgtrack.io.run import Table
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = ("ekf-replay", "smoother")
@@ -189,6 +190,32 @@ def test_old_runs_without_detections_and_ego_are_shown_and_noted(folder: Path, t
     assert len(unpacked(found.values["runs"][0]["tracks"]["t"], found.values["blobs"])) > 100
 
 
+def test_a_sensor_without_a_clock_has_no_stamps(folder: Path) -> None:
+    run = fgtrack.load_run(folder / "runs" / NAMES[0])
+    zero = {"stamp_ns": np.zeros_like(run.detections["stamp_ns"])}
+    detections, updates = Table({**run.detections, **zero}), Table({**run.updates, **zero})
+    shown = scene(judged(replace(run, detections=detections, updates=updates))).values
+    found = shown["runs"][0]["detections"]
+    assert np.isnan(unpacked(found["stamp"], shown["blobs"])).all()
+    assert np.isfinite(unpacked(found["receipt"], shown["blobs"])).all()
+
+
+def test_long_runs_are_thinned_and_it_is_said(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fgtrack.evaluation.report.scene.MOST_ROWS", 200)
+    found = scene(judged(folder / "runs" / NAMES[0]))
+    run, (shown,) = fgtrack.load_run(folder / "runs" / NAMES[0]), found.values["runs"]
+    step = -(-run.tracks.num_rows // 200)
+    assert step > 1
+    ticks_s = unpacked(shown["ticks"], found.values["blobs"])
+    start_ns = int(found.values["recordings"][0]["start_ns"])
+    np.testing.assert_allclose(ticks_s, (run.timing["now_ns"][::step] - start_ns) / 1e9, atol=ATOL_S)
+    assert set(unpacked(shown["tracks"]["t"], found.values["blobs"])) <= set(ticks_s)
+    assert (
+        f"{NAMES[0]}: the viewer shows one of {step} times of the ticks, as there are {run.tracks.num_rows} rows"
+        in (found.notes)
+    )
+
+
 def test_names_from_outside_are_text(folder: Path, tmp_path: Path) -> None:
     strange = tmp_path / "<script>alert(1)<!-- & x"
     strange.mkdir()
@@ -243,8 +270,10 @@ def test_equal_columns_are_held_once_and_what_does_not_fit_is_missing() -> None:
     np.testing.assert_array_equal(unpacked(first, packer.blobs), [1.0, np.nan, np.nan, -2.5])
     angles = np.array([np.pi, -np.pi, 0.0])
     np.testing.assert_allclose(unpacked(packer.column(angles, ANGLE_RAD), packer.blobs), angles, atol=ATOL_RAD)
+    for numbers in (np.array([-1, 2**31 - 1]), np.array([-1, 2**40])):
+        np.testing.assert_array_equal(unpacked(packer.column(numbers, identity_form(numbers)), packer.blobs), numbers)
     with pytest.raises(ValueError, match="does not fit"):
-        packer.column([2**40], IDENTITY)
+        packer.column([256], CODE)
 
 
 @pytest.mark.parametrize("duration_s", [1.0, 1e5, 1e6, 1e8])

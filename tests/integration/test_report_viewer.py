@@ -127,6 +127,16 @@ def test_the_scrubber_moves_by_touch(page: Browser) -> None:
     page.until("viewer.time / viewer.scene.end > 0.8")
 
 
+def test_two_fingers_zoom_about_what_is_followed(page: Browser) -> None:
+    page.screen(390, 844, phone=True)
+    box, view = page.box("#viewer canvas"), page.value("viewer.view")
+    page.pinch(box["left"] + 150, box["top"] + 100, 40, 120)
+    page.until(f"viewer.view.width < {view['width']} / 2")
+    found = page.value("viewer.view")
+    assert found["width"] == pytest.approx(view["width"] / 3, rel=0.05)
+    assert found["x"] / found["width"] == pytest.approx(view["x"] / view["width"], abs=0.02)
+
+
 def test_the_scrubber_and_the_picture_move_by_keys(page: Browser) -> None:
     box = page.box("#viewer canvas")
     page.click(box["left"] + box["width"] / 2, box["top"] + box["height"] / 2)

@@ -106,6 +106,13 @@ class Browser:
             self("Input.dispatchTouchEvent", type="touchMove" if k else "touchStart", touchPoints=[{"x": x, "y": y}])
         self("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
+    def pinch(self, x: float, y: float, before: float, after: float) -> None:
+        """Lay two fingers down beside one another, `before` apart, move them until they are `after` apart, lift them."""
+        for kind, apart in (("touchStart", before), ("touchMove", (before + after) / 2), ("touchMove", after)):
+            points = [{"x": x + side * apart / 2, "y": y, "id": k} for k, side in enumerate((-1, 1))]
+            self("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+        self("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
     def box(self, selector: str) -> dict[str, float]:
         """Place and size of an element on the screen, after it is scrolled to."""
         return dict(

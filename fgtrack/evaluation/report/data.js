@@ -1,7 +1,7 @@
 "use strict";
 // Decodes the columns that the report embeds, and indexes them by time: see packing.py and scene.py of fgtrack.
 
-const ARRAY_TYPES = { u8: Uint8Array, u16: Uint16Array, i16: Int16Array, i32: Int32Array, f32: Float32Array };
+const ARRAY_TYPES = { u8: Uint8Array, u16: Uint16Array, i16: Int16Array, i32: Int32Array, f32: Float32Array, f64: Float64Array };
 
 /** Typed array of a base64 text. */
 function arrayOf(base64, type) {
@@ -160,7 +160,8 @@ class Run {
     this.final = columns.table(packed.final);
     this.finalOfTrack = rowsOf(this.final.track);
     this.detections = columns.table(packed.detections);
-    this.byStamp = Int32Array.from(this.detections.stamp.keys()).sort(
+    const stamped = [...this.detections.stamp.keys()].filter((row) => Number.isFinite(this.detections.stamp[row]));
+    this.byStamp = Int32Array.from(stamped).sort(
       (a, b) => this.detections.stamp[a] - this.detections.stamp[b] || a - b,
     );
     this.stamps = Float64Array.from(this.byStamp, (row) => this.detections.stamp[row]);

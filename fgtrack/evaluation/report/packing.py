@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-_DTYPES = {"u8": "<u1", "u16": "<u2", "i16": "<i2", "i32": "<i4", "f32": "<f4"}
+_DTYPES = {"u8": "<u1", "u16": "<u2", "i16": "<i2", "i32": "<i4", "f32": "<f4", "f64": "<f8"}
 
 Packed = dict[str, Any]
 """JSON values of a column: `blob` (its place among the blobs), `type`, and `scale` and `missing` where it has them."""
@@ -20,7 +20,7 @@ class Form:
     """How the numbers of a column are written."""
 
     type: str
-    """`u8`, `u16`, `i16`, `i32` or `f32`."""
+    """`u8`, `u16`, `i16`, `i32`, `f32` or `f64`."""
     scale: float = 1.0
     """What is written times this is the number."""
     missing: int | None = None
@@ -37,16 +37,21 @@ ANGLE_RAD = Form("i16", 1e-4, -(2**15))
 NUMBER = Form("f32")
 #: Places in a list of up to 255 names.
 CODE = Form("u8")
-#: Identities, and -1 for none.
-IDENTITY = Form("i32")
+
+
+def identity_form(numbers: npt.NDArray[np.int64]) -> Form:
+    """Of numbers of tracks or objects: four bytes where all of `numbers` fit."""
+    limits = np.iinfo(np.int32)
+    fits = ((numbers >= limits.min) & (numbers <= limits.max)).all()
+    return Form("i32" if fits else "f64")
 
 
 def time_form(duration_s: float) -> Form:
-    """In tenths of a millisecond up to two days, coarser for more."""
+    """In tenths of a millisecond up to two days, coarser for more; missing far outside, as for a clock that says 0."""
     step_s = 1e-4
     while duration_s / step_s >= 2**31 - 1:
         step_s *= 10.0
-    return Form("i32", step_s)
+    return Form("i32", step_s, _MISSING_I32)
 
 
 @dataclass

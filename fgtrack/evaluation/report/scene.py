@@ -15,12 +15,12 @@ from fgtrack.evaluation.palette import PALETTE
 from fgtrack.evaluation.report.packing import (
     ANGLE_RAD,
     CODE,
-    IDENTITY,
     NUMBER,
     POSITION_M,
     Form,
     Packed,
     Packer,
+    identity_form,
     time_form,
 )
 from fgtrack.evaluation.runs import JudgedRun
@@ -74,7 +74,7 @@ def scene(runs: Sequence[JudgedRun]) -> Scene:
     )
     shown = []
     for one in runs:
-        place = next(k for k, recording in enumerate(recordings) if one.run in recording.runs)
+        place = next(k for k, recording in enumerate(recordings) if any(one.run is its for its in recording.runs))
         packing = _Packing(packer, times, recordings[place], notes, one.label)
         shown.append({"label": one.label, "recording": place, **_run(one.run, packing)})
     values = {
@@ -116,6 +116,9 @@ class _Packing:
             "direction": self.packer.column(found[:, 2], ANGLE_RAD),
         }
 
+    def identity(self, numbers: IntArray) -> Packed:
+        return self.packer.column(numbers, identity_form(numbers))
+
     def angle(self, angles_rad: FloatArray) -> Packed:
         return self.packer.column(angles_rad, ANGLE_RAD)
 
@@ -137,7 +140,7 @@ def _recordings(runs: Iterable[Run]) -> list[_Recording]:
     found: list[_Recording] = []
     for run in runs:
         for one in found:
-            if one.runs[0].ego == run.ego and one.runs[0].truth == run.truth:
+            if _same_recording(one.runs[0], run):
                 one.runs.append(run)
                 break
         else:
@@ -146,6 +149,13 @@ def _recordings(runs: Iterable[Run]) -> list[_Recording]:
         one.start_ns = min(map(start_ns, one.runs))
         one.origin_m = _origin_m(one.runs)
     return found
+
+
+def _same_recording(one: Run, other: Run) -> bool:
+    """Whether both were told the same; without an ego and truth that show it, by what the sensors said."""
+    if one.ego.num_rows or one.truth.num_rows:
+        return one.ego == other.ego and one.truth == other.truth
+    return not (other.ego.num_rows or other.truth.num_rows) and one.detections == other.detections
 
 
 def _origin_m(runs: Sequence[Run]) -> FloatArray:
@@ -183,7 +193,7 @@ def _recording(one: _Recording, packing: _Packing) -> Json:
         "map": lines,
         "ego": {"t": packing.time(ego["stamp_ns"]), **_pose(ego, packing)},
         "truth": {
-            "object": packing.packer.column(truth["object_id"], IDENTITY),
+            "object": packing.identity(truth["object_id"]),
             "t": packing.time(truth["stamp_ns"]),
             **_pose(truth, packing),
         },
@@ -209,20 +219,19 @@ def _run(run: Run, packing: _Packing) -> Json:
         "ticks": packing.time(ticks_ns),
         "tracks": {
             "t": packing.time(tracks["now_ns"]),
-            "track": column(tracks["track_id"], IDENTITY),
+            "track": packing.identity(tracks["track_id"]),
             "status": column(_codes(tracks["status"], statuses), CODE),
             **_pose(tracks, packing),
-            "speed": column(tracks["speed_mps"], NUMBER),
             **packing.ellipse(tracks),
         },
         "past": {
             "t": packing.time(past["now_ns"]),
-            "track": column(past["track_id"], IDENTITY),
+            "track": packing.identity(past["track_id"]),
             **packing.place(past["x_m"], past["y_m"]),
             **packing.ellipse(past),
         },
         "final": {
-            "track": column(final["track_id"], IDENTITY),
+            "track": packing.identity(final["track_id"]),
             "t": packing.time(final["stamp_ns"]),
             "known": packing.time(final_ns(run, final)),
             **packing.place(final["x_m"], final["y_m"]),
@@ -257,7 +266,7 @@ def _detections(run: Run, packing: _Packing) -> Json:
         "receipt": packing.time(table["receipt_ns"][order]),
         "sensor": column(_codes(table["sensor"][order], sensors), CODE),
         "disposition": column(_codes(fates[order], dispositions), CODE),
-        "track": column(ids[order], IDENTITY),
+        "track": packing.identity(ids[order]),
         **packing.place(*where.position_m[order].T),
         "track_x": track["x"],
         "track_y": track["y"],
