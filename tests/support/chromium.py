@@ -107,7 +107,7 @@ class Browser:
         self("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
     def pinch(self, x: float, y: float, before: float, after: float) -> None:
-        """Lay two fingers down beside one another, `before` apart, move them until they are `after` apart, lift them."""
+        """Lay two fingers down `before` apart, move them until they are `after` apart, lift them."""
         for kind, apart in (("touchStart", before), ("touchMove", (before + after) / 2), ("touchMove", after)):
             points = [{"x": x + side * apart / 2, "y": y, "id": k} for k, side in enumerate((-1, 1))]
             self("Input.dispatchTouchEvent", type=kind, touchPoints=points)
