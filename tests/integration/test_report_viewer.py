@@ -105,7 +105,7 @@ def test_the_strip_shows_the_errors_and_goes_to_a_time(page: Browser, folder: Pa
         page.value(f"[...errorsOf(viewer.scene.runs[{index}], 0)].map((error) => error || null)"), dtype=float
     )
     assert np.isfinite(found).sum() > 100
-    tick = int(np.flatnonzero(np.isfinite(found))[-1])
+    tick = int(np.flatnonzero(np.isfinite(found) & np.isin(run.timing["now_ns"], run.truth["stamp_ns"]))[-1])
     now_ns = run.timing["now_ns"][tick]
     truth = run.truth.where((run.truth["stamp_ns"] == now_ns) & (run.truth["object_id"] == 0))
     tracks = run.tracks.where(run.tracks["now_ns"] == now_ns)
