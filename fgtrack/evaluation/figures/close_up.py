@@ -1,5 +1,6 @@
 """The figure of one late detection: the past that it corrects, and the present that follows from it."""
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -10,14 +11,15 @@ from matplotlib.patches import Ellipse
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import rotation
+from fgtrack.core.linalg import congruence
 from fgtrack.core.time import NS_PER_S, seconds
 from fgtrack.core.types import YAW, FloatArray, IntArray
 from fgtrack.evaluation.figures.style import GREY, PALETTE, StyledFigure, colour, styled
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged
 from fgtrack.evaluation.truth import true_paths
+from fgtrack.evaluation.viewer.ellipse import AROUND_95, ellipses
 from fgtrack.tracking.close_up import CloseUp
 
-_RADIUS = 2.448  # standard deviations of the ellipse that holds 95 % of a Gaussian in the plane
 _WIDTH_IN = 10.0
 _AROUND_M = 1.0
 _FORGET = ("ekf-backward-forward", "rewind-forget", "backward-forward")
@@ -92,14 +94,14 @@ class _View:
 
     def ellipse(self, position_m: FloatArray, covariance: FloatArray) -> Ellipse:
         """The 95 % ellipse of a position."""
-        variances, directions = np.linalg.eigh(self.turn @ covariance[:2, :2] @ self.turn.T)
-        width_m, height_m = 2.0 * _RADIUS * np.sqrt(variances)
-        angle_deg = float(np.degrees(np.arctan2(directions[1, 0], directions[0, 0])))
-        return Ellipse(tuple(self.seen(position_m[:2])), width_m, height_m, angle=angle_deg, fill=False)
+        turned = congruence(self.turn, covariance[:2, :2])
+        ((long_m, short_m, direction_rad),) = ellipses(turned[None], AROUND_95).tolist()
+        return Ellipse(tuple(self.seen(position_m[:2])), long_m, short_m, angle=math.degrees(direction_rad), fill=False)
 
 
 def _reach_m(covariances: FloatArray) -> float:
-    return _RADIUS * float(np.sqrt(np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1].max()))
+    """How far the longest of the 95 % ellipses reaches from its middle."""
+    return float(ellipses(covariances[:, :2, :2], AROUND_95)[:, 0].max()) / 2.0
 
 
 def _draw_panel(axes: Axes, view: _View, run: JudgedRun, one: CloseUp, color: str) -> None:

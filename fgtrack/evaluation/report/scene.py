@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
@@ -25,7 +24,7 @@ from fgtrack.evaluation.report.packing import (
 )
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.viewer.detection_messages import LATE, track_positions
-from fgtrack.evaluation.viewer.ellipse import ellipses
+from fgtrack.evaluation.viewer.ellipse import AROUND_95, ellipses
 from fgtrack.evaluation.viewer.look import NOMINAL_SIZE_M
 from fgtrack.evaluation.viewer.placement import placed, update_rows
 from fgtrack.evaluation.viewer.surroundings import road_lines, roads, start_ns
@@ -35,8 +34,6 @@ from fgtrack.io.run import Run, Table
 FORMAT = "fgtrack-report/1"
 MOST_ROWS = 400_000
 """Rows of a table that the viewer shows; of more, every second tick or stamp is left out, every third ..."""
-_PROBABILITY = 0.95
-_DEVIATIONS = math.sqrt(float(chdtri(2, 1.0 - _PROBABILITY)))
 
 Json = dict[str, Any]  # Any: JSON values
 
@@ -109,7 +106,7 @@ class _Packing:
 
     def ellipse(self, states: Table) -> Json:
         """Half axes and direction of the ellipses that hold 95 %."""
-        found = ellipses(position_covariances(states), _DEVIATIONS)
+        found = ellipses(position_covariances(states), AROUND_95)
         return {
             "long": self.packer.column(0.5 * found[:, 0], NUMBER),
             "short": self.packer.column(0.5 * found[:, 1], NUMBER),

@@ -3,11 +3,14 @@
 import math
 
 import numpy as np
+from scipy.special import chdtri
 
 from fgtrack.core.types import FloatArray
 
 #: How many standard deviations from the mean an ellipse reaches. In two dimensions 86 % lie within two.
 DEVIATIONS = 2.0
+#: How many reach around 95 % of a Gaussian in the plane.
+AROUND_95 = math.sqrt(float(chdtri(2, 0.05)))
 
 
 def ellipses(covariances: FloatArray, deviations: float = DEVIATIONS) -> FloatArray:
