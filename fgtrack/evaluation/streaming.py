@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgtrack.core.geometry import cartesian
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.contest import by_recording, quantity
@@ -69,9 +70,7 @@ def streamed(one: JudgedRun) -> Streamed:
         truth[mine] = path.at(ready_ns[mine])[:, :2]
     published = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
     way_m = tracks["speed_mps"] * (ready_ns - tracks["stamp_ns"]) / NS_PER_S
-    moved = published + np.nan_to_num(
-        way_m[:, None] * np.stack([np.cos(tracks["yaw_rad"]), np.sin(tracks["yaw_rad"])], -1)
-    )
+    moved = published + np.nan_to_num(cartesian(np.stack([tracks["yaw_rad"], way_m], axis=-1)))
     return Streamed(
         object_index,
         matching.now_ns[ticks],
