@@ -2,9 +2,10 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from rich import box
-from rich.console import Console, JustifyMethod
+from rich.console import Console, JustifyMethod, RenderableType
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -16,6 +17,8 @@ from rich.progress import (
 )
 from rich.table import Table
 from rich.text import Text
+
+from fgtrack.core.errors import one_line, printable
 
 _WIDTH_WITHOUT_TERMINAL = 120
 _SPEED_PERIOD_S = 600.0  # over which the time of the rest is estimated: jobs differ
@@ -29,17 +32,25 @@ def console() -> Console:
 
 def say(line: object) -> None:
     """Print a line as it is, however long."""
-    console().print(str(line), highlight=False, soft_wrap=True, markup=False)
+    console().print("\n".join(map(printable, str(line).split("\n"))), highlight=False, soft_wrap=True, markup=False)
 
 
 def warn(line: str) -> None:
     """Print a warning as one line on stderr."""
-    Console(stderr=True).print(f"fgtrack: warning: {line}", highlight=False, soft_wrap=True, markup=False)
+    Console(stderr=True).print(f"fgtrack: warning: {one_line(line)}", highlight=False, soft_wrap=True, markup=False)
+
+
+class _Plain(Table):
+    """A table whose cells are shown as they are, whatever names a file brings."""
+
+    def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
+        """See `Table.add_row`; a text is no markup, and holds no control characters."""
+        super().add_row(*(Text(one_line(cell)) if isinstance(cell, str) else cell for cell in cells), **options)
 
 
 def table(*headings: str) -> Table:
     """A table without rows; a heading that begins with `>` stands above numbers, to the right."""
-    empty = Table(box=box.SIMPLE_HEAD, show_edge=False)
+    empty = _Plain(box=box.SIMPLE_HEAD, show_edge=False)
     for heading in headings:
         justify: JustifyMethod = "right" if heading.startswith(">") else "left"
         empty.add_column(Text(heading.removeprefix(">")), justify=justify, overflow="fold")

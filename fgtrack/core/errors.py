@@ -1,8 +1,13 @@
 """Errors that a user sees as one line: what is wrong, where, and what to do."""
 
+_LONGEST, _TAIL = 700, 250
+
 
 class FgtrackError(Exception):
-    """Base of every error that the package raises on purpose."""
+    """Base of every error that the package raises on purpose; its text is `one_line`."""
+
+    def __init__(self, message: object) -> None:
+        super().__init__(one_line(str(message)))
 
 
 class DataError(FgtrackError):
@@ -11,3 +16,21 @@ class DataError(FgtrackError):
 
 class CallError(FgtrackError, ValueError):
     """The call or the configuration is bad (exit code 2); of a configuration file, pydantic adds the key."""
+
+
+def one_line(text: str) -> str:
+    """`text` as a terminal can show it: on one line, not endless, what is no letter or sign written as an escape.
+
+    Names of sensors and topics, and whatever else a file says, come into messages: they must neither move the cursor
+    nor fill the screen. Of a long text the beginning and the end are kept, which say where and what to do.
+    """
+    if len(text) > _LONGEST:
+        text = f"{text[: _LONGEST - _TAIL]} ... {text[-_TAIL:]}"
+    return printable(" ".join(text.split()) if any(space in text for space in "\n\r\t\v\f") else text)
+
+
+def printable(text: str) -> str:
+    """`text` with escapes in place of what is no letter or sign."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)

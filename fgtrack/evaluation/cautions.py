@@ -26,8 +26,8 @@ _CURES = {
     "out_of_bounds": "off the road of the map: is it the right map (--map), and is the frame of the detections right?",
     "duplicate": "the same list again and again: look at the recording, a sensor or a bridge repeats itself",
     "superseded": "another list of the sensor came in the same tick, and the inbox keeps one: raise clock.node_hz",
-    "invalid": "no position, a value that is not finite, or a stamp ahead of its receipt: compare the keys of "
-    "sensors.{sensor}.std with what `fgtrack info` shows",
+    "invalid": "no position, a value that is not finite, a covariance that is none, or a stamp ahead of its receipt: "
+    "compare the keys of sensors.{sensor}.std with what `fgtrack info` shows",
     "failed": "no ego state near the stamp, or a numerical failure: check the clock of the ego",
 }
 
@@ -40,7 +40,7 @@ _NO_EGO = (
 
 def cautions(run: Run) -> list[str]:
     """What is wrong with `run` as far as its files say, a line each with cause and cure."""
-    return [*_clocks(run), *_lost(run), *_window(run)]
+    return [*_clocks(run), *_ego(run), *_lost(run), *_window(run)]
 
 
 def noise_cautions(run: Run) -> list[str]:
@@ -85,6 +85,13 @@ def _clocks(run: Run) -> Iterator[str]:
     for sensor, mine in _by_sensor(run.updates):
         if (run.updates["stamp_ns"][mine] == 0).all():
             yield f"{sensor}: all stamps are 0: its driver does not set them, so nothing is known of its delay"
+
+
+def _ego(run: Run) -> Iterator[str]:
+    """Reasons for which more than half of the states of the ego were refused."""
+    for reason, count in dict(run.meta.get("ego_refused") or {}).items():
+        if 2 * count > run.ego.num_rows:
+            yield f"ego: {count} of {run.ego.num_rows} states not used, {reason}: look at the clock of its driver"
 
 
 def _lost(run: Run) -> Iterator[str]:

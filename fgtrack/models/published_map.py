@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from fgtrack.core.errors import DataError
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.models.track_map import COLUMNS, RoadView, TrackMap
@@ -20,6 +21,11 @@ class PublishedMap:
 
     The raceline's arc length serves as the knots although the projection is on the reference line; the projection
     is taken without its sign, so a place behind the nearest row is mirrored ahead of it.
+
+    Raises
+    ------
+    DataError
+        The raceline's arc length of `track` does not grow from row to row.
     """
 
     def __init__(self, track: TrackMap) -> None:
@@ -34,6 +40,12 @@ class PublishedMap:
         self._x, self._y = closed("x_ref_m"), closed("y_ref_m")
         self._line = np.stack([self._x, self._y], axis=-1)
         self._arc = column["s_racetraj_m"]
+        if np.diff(self._arc).min() <= 0.0:
+            row = int(np.argmax(np.diff(self._arc) <= 0.0)) + 1
+            raise DataError(
+                f"no map for a published look-up: row {row}: s_racetraj_m does not grow to the next row; "
+                "write a raceline, or take map.lookup frenet"
+            )
         self._length_m = float(self._arc.max())
         self._segment = np.roll(self._line, -1, axis=0) - self._line
         self._segment_squared = np.sum(self._segment**2, axis=1)

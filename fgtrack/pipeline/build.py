@@ -175,14 +175,16 @@ def _noise_names(config: MotionConfig) -> list[str]:
 def _build_ego(config: Config) -> EgoSource:
     ego = config.ego
     std = EgoStd(ego.position_std_m, ego.yaw_std_rad, ego.speed_std_mps, ego.yaw_rate_std_radps)
-    known = None if ego.uncertainty == "none" else std
+    known, max_future_s = None if ego.uncertainty == "none" else std, config.inbox.max_future_s
     if ego.kind == "published":
         step_ns = period_ns(config.filter.frequency_hz)
-        return PublishedEgo(ego.yaw_weight, ego.yaw_rate_weight, step_ns, ego.storage_ticks, known)
-    return EgoTrajectory(ego.yaw_weight, ego.yaw_rate_weight, ego.memory_s, ego.max_extrapolation_s, known)
+        return PublishedEgo(ego.yaw_weight, ego.yaw_rate_weight, step_ns, ego.storage_ticks, known, max_future_s)
+    return EgoTrajectory(
+        ego.yaw_weight, ego.yaw_rate_weight, ego.memory_s, ego.max_extrapolation_s, known, max_future_s
+    )
 
 
 def _build_inbox(config: Config) -> Inbox:
     if config.inbox.kind == "slot":
         return SlotInbox(config.sensors)
-    return QueueInbox(config.sensors, config.inbox.max_future_s)
+    return QueueInbox(config.sensors, config.inbox.max_future_s, config.inbox.memory_s)

@@ -108,7 +108,7 @@ class EgoConfig:
     memory_s: PositiveFloat = 5.0
     """How far back the ego pose is known."""
     max_extrapolation_s: PositiveFloat = 1.0
-    """A detection whose stamp is further than this from any ego state cannot be placed."""
+    """A detection whose stamp is further than this from any ego state cannot be placed, in a gap neither."""
     storage_ticks: PositiveInt = 350
     """Length of the ego storage of the published implementation."""
     uncertainty: Literal["none", "independent", "shared"] = "independent"
@@ -130,8 +130,10 @@ class InboxConfig:
 
     kind: Literal["queue", "slot"] = "queue"
     """`slot` keeps only the newest list of each sensor (Q12)."""
-    max_future_s: float = 1.0
-    """A detection stamped further than this ahead of its receipt is invalid."""
+    max_future_s: NonNegativeFloat = 1.0
+    """A detection or ego state stamped further than this ahead of its receipt is not used."""
+    memory_s: PositiveFloat = 10.0
+    """How long a list is remembered at least, so that a copy of it is not fused again."""
 
 
 @dataclass(frozen=True)
@@ -197,6 +199,9 @@ class MotionConfig:
     """`driving`: an acceleration that drives the speed but is never estimated (`ctrv_euler`, takes `accel`)."""
 
     def __post_init__(self) -> None:
+        for name, std_per_s in self.std_per_s.items():
+            if std_per_s < 0.0:
+                raise ValueError(f"std_per_s.{name}: must not be negative, is {std_per_s}")
         departures = (self.noise, self.yaw, self.acceleration) != ("density", "free", "none")
         if departures and self.kind != "ctrv_euler":
             raise ValueError("noise, yaw and acceleration may be changed for kind ctrv_euler only")

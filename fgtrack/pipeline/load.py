@@ -1,10 +1,11 @@
 """YAML files to validated dataclasses and back; every error names the file and the key."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from io import StringIO
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,6 +16,11 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from fgtrack.core.errors import CallError
 
 T = TypeVar("T")
+
+LARGEST, SMALLEST = 1e9, 1e-12
+"""No configured number is larger than this, or nearer to 0, in any unit: their squares and products stay finite."""
+_LONGEST_TEXT = 250_000
+_MOST_NODES = 100_000
 
 
 def load(kind: type[T], path: Path | None, settings: Sequence[str] = ()) -> T:
@@ -51,14 +57,29 @@ def read_yaml(path: Path) -> dict[str, Any]:  # Any: what YAML says is only know
 
 
 def _parse(text: str, origin: str) -> Any:
+    if len(text) > _LONGEST_TEXT:
+        raise CallError(f"{origin}: no configuration is longer than {_LONGEST_TEXT} characters, this has {len(text)}")
     try:
-        return YAML(typ="safe", pure=True).load(text)
+        value = YAML(typ="safe", pure=True).load(text)
+        if next(islice(_nodes(value), _MOST_NODES, None), None) is not None:
+            raise CallError(f"{origin}: more than {_MOST_NODES} values, counting what its aliases repeat")
+        return value
+    except RecursionError as error:
+        raise CallError(f"{origin}: nested too deeply, or an alias that contains itself") from error
     except MarkedYAMLError as error:
         line = "" if error.problem_mark is None else f":{error.problem_mark.line + 1}"
         problem = " ".join(str(error.problem or error.context).split())
         raise CallError(f"{origin}{line}: no valid YAML, {problem.split(' To suppress')[0]}") from error
     except YAMLError as error:
         raise CallError(f"{origin}: no valid YAML, {' '.join(str(error).split())}") from error
+
+
+def _nodes(value: object) -> Iterator[object]:
+    """`value` and all that is in it, as often as it is in it."""
+    yield value
+    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    for item in inner:
+        yield from _nodes(item)
 
 
 def _with_setting(raw: dict[str, Any], setting: str, defaults: object) -> dict[str, Any]:
@@ -100,7 +121,26 @@ def validate(kind: type[T], raw: Mapping[str, Any], origin: str) -> T:
         raise CallError(f"{origin}: {_first(error)}") from error
     for where, name, known in _unknown(raw, value, ""):
         raise CallError(f"{origin}: {where}{name}: unknown key, known here: {', '.join(known)}")
+    for where, number in _numbers(plain(value), ""):
+        if isinstance(number, int):
+            if abs(number) >= 2**63:
+                raise CallError(f"{origin}: {where}: {_name(number)} has more than 64 bits")
+        elif number and not SMALLEST <= abs(number) <= LARGEST:
+            raise CallError(
+                f"{origin}: {where}: {_name(number)} is out of range, a magnitude of {SMALLEST:g} to {LARGEST:g} or 0 "
+                "is needed"
+            )
     return value
+
+
+def _numbers(value: object, where: str) -> Iterator[tuple[str, float]]:
+    """Every number in plain `value`, with its path."""
+    if isinstance(value, float | int):
+        yield where, value
+    elif isinstance(value, (dict, list)):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        for name, item in items:
+            yield from _numbers(item, f"{where}.{name}" if where else str(name))
 
 
 @lru_cache

@@ -15,11 +15,11 @@ from fgtrack.io.run import MemoryRun, Node, Run, RunWriter
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, Tick, listed_ticks, message_ticks, node_ticks, read_ticks
 from fgtrack.pipeline.config import ClockConfig, Config
+from fgtrack.pipeline.ego_clock import EgoClock
 from fgtrack.pipeline.load import dump
 from fgtrack.pipeline.pace import Clock, Pace, WallClock
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
-_LARGEST_STEP_BACK_S = 1.0
 _LONGEST_GAP_S = 3600.0
 _PACKAGES = ("fgtrack", "gtsam", "numpy", "scipy", "rosbags")
 
@@ -48,7 +48,7 @@ class _Feed:
     broken: str | None = None
     ignored_detections: int = 0
     received_detections: int = 0
-    _newest_ego_ns: int | None = field(default=None, init=False)
+    _ego_clock: EgoClock = field(default_factory=EgoClock, init=False)
     _last_receipt_ns: int | None = field(default=None, init=False)
 
     def __iter__(self) -> Iterator[Delivered]:
@@ -77,7 +77,7 @@ class _Feed:
         return self._last_receipt_ns is None
 
     def _check_time(self, message: Delivered) -> None:
-        """Receipts never go back; ego stamps do a little, but not as they do where a recording starts over."""
+        """Receipts never go back and leave no gap of hours; ego stamps keep to one clock."""
         gap_s = 0.0 if self._last_receipt_ns is None else seconds(message.receipt_ns - self._last_receipt_ns)
         if gap_s < 0.0:
             raise DataError(
@@ -89,14 +89,7 @@ class _Feed:
             )
         self._last_receipt_ns = message.receipt_ns
         if isinstance(message, EgoState):
-            newest_ns = self._newest_ego_ns
-            if newest_ns is not None and seconds(newest_ns - message.stamp_ns) > _LARGEST_STEP_BACK_S:
-                back_s = seconds(newest_ns - message.stamp_ns)
-                raise DataError(
-                    f"ego stamps jump back by {back_s:g} s at receipt {message.receipt_ns} ns, "
-                    "as in a looping recording: cut it there"
-                )
-            self._newest_ego_ns = max(message.stamp_ns, newest_ns or message.stamp_ns)
+            self._ego_clock.check(message)
 
 
 def replay(

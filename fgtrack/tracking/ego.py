@@ -15,6 +15,9 @@ from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import EgoState, FloatArray
 from fgtrack.tracking.inbox import ASYMMETRY, LARGEST, is_number
 
+LARGEST_STEP_BACK_S = 1.0
+"""A state that is older than the newest one by more than this has a wrong stamp."""
+
 
 class EgoPose(NamedTuple):
     """Pose of the ego reference point in the map, and how it moves."""
@@ -100,8 +103,13 @@ class EgoSource(ABC):
     says.
     """
 
-    def __init__(self, yaw_weight: float, yaw_rate_weight: float, std: EgoStd | None = None) -> None:
+    def __init__(
+        self, yaw_weight: float, yaw_rate_weight: float, std: EgoStd | None = None, max_future_s: float = 1.0
+    ) -> None:
+        """`max_future_s`: a state stamped further than this ahead of its receipt has a wrong stamp."""
         self._std = std
+        self._max_future_ns = nanoseconds(max_future_s)
+        self._newest_ns: int | None = None
         self.current: EgoState | None = None
         """Newest known state."""
         self.in_pit = False
@@ -117,6 +125,12 @@ class EgoSource(ABC):
             return "not finite"
         if self._std is not None and ego.covariance is not None and not is_ego_covariance(ego.covariance):
             return "not a covariance"
+        if ego.stamp_ns - ego.receipt_ns > self._max_future_ns:
+            return "stamp ahead of its receipt"
+        newest_ns = ego.stamp_ns if self._newest_ns is None else self._newest_ns
+        if newest_ns - ego.stamp_ns > nanoseconds(LARGEST_STEP_BACK_S):
+            return "stamp jumps back"
+        self._newest_ns = max(newest_ns, ego.stamp_ns)
         return self._store(ego)
 
     @abstractmethod
@@ -159,8 +173,9 @@ class EgoTrajectory(EgoSource):
         memory_s: float,
         max_extrapolation_s: float,
         std: EgoStd | None = None,
+        max_future_s: float = 1.0,
     ) -> None:
-        super().__init__(yaw_weight, yaw_rate_weight, std)
+        super().__init__(yaw_weight, yaw_rate_weight, std, max_future_s)
         self._memory_ns = nanoseconds(memory_s)
         self._max_extrapolation_ns = nanoseconds(max_extrapolation_s)
         self._states: list[EgoState] = []
@@ -187,16 +202,20 @@ class EgoTrajectory(EgoSource):
         """See `EgoSource.start_tick`; nothing depends on ticks here."""
 
     def pose_at(self, stamp_ns: int, present_ns: int) -> EgoPose | None:
-        """See `EgoSource.pose_at`; beyond its ends the trajectory is extrapolated for a limited time."""
+        """See `EgoSource.pose_at`; beyond its ends, and into a gap, the trajectory is extrapolated for a limited time.
+
+        A gap is longer than all that two extrapolations, one from either side, could cover.
+        """
         if not self._stamps:
             return None
         place = bisect.bisect_left(self._stamps, stamp_ns)
-        if 0 < place < len(self._stamps):
-            return self._interpolated(self._states[place - 1], self._states[place], stamp_ns)
-        end = self._states[min(place, len(self._states) - 1)]
-        if abs(stamp_ns - end.stamp_ns) > self._max_extrapolation_ns:
+        around = self._states[max(place - 1, 0) : place + 1]
+        if len(around) == 2 and around[1].stamp_ns - around[0].stamp_ns <= 2 * self._max_extrapolation_ns:
+            return self._interpolated(around[0], around[1], stamp_ns)
+        nearest = min(around, key=lambda ego: abs(stamp_ns - ego.stamp_ns))
+        if abs(stamp_ns - nearest.stamp_ns) > self._max_extrapolation_ns:
             return None
-        return self._extrapolated(end, stamp_ns)
+        return self._extrapolated(nearest, stamp_ns)
 
     def _interpolated(self, before: EgoState, after: EgoState, stamp_ns: int) -> EgoPose:
         share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)

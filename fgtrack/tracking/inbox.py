@@ -13,6 +13,8 @@ from fgtrack.models.sensors import SensorModel
 
 #: In any unit: beyond what is tracked, and its square is still far from the largest float.
 LARGEST = 1e9
+#: In any unit: no sensor is better than this.
+SMALLEST_STD = 1e-6
 #: Of the standard deviations' product: what rounding a covariance to single precision may leave.
 ASYMMETRY = 1e-6
 NO_INNOVATION: Mapping[str, float] = MappingProxyType({})
@@ -110,7 +112,7 @@ def is_covariance(detection: Detection, sensor: SensorModel) -> bool:
         return False
     own = own_covariance(detection, [name for name in measured if name in sensor.std])
     variances = np.diag(own)
-    if not np.all((np.abs(own) <= LARGEST**2) & (variances[:, None] > 0.0)):
+    if not np.all((np.abs(own) <= LARGEST**2) & (variances[:, None] >= SMALLEST_STD**2)):
         return False
     deviations = np.sqrt(variances)
     if not np.all(np.abs(own - own.T) <= ASYMMETRY * np.outer(deviations, deviations)):
@@ -133,22 +135,48 @@ def stamps(message: DetectionList, sensor: SensorModel) -> list[int]:
     return [message.stamp_ns] * len(own)
 
 
+class _Seen:
+    """Lists that were received not long ago, by sensor, stamp and contents."""
+
+    def __init__(self, memory_ns: int) -> None:
+        self._memory_ns = memory_ns
+        self._receipts_ns: dict[tuple[str, int, Frame, int], int] = {}  # in order of receipt
+
+    def is_copy(self, message: DetectionList, sensor: SensorModel) -> bool:
+        """Whether `message` repeats one that is remembered; it is remembered from now on.
+
+        Detections that are none, as those with NaN, which equals nothing, are not compared. Contents are compared by
+        their hashes: two different lists of one stamp have the same one by chance once in 2^61 pairs.
+        """
+        usable = tuple(detection for detection in message.objects if is_usable(detection, sensor))
+        if message.objects and not usable:
+            return False
+        key = (message.sensor, message.stamp_ns, message.frame, hash(usable))
+        known = key in self._receipts_ns
+        if not known:
+            self._receipts_ns[key] = message.receipt_ns
+        oldest_ns = message.receipt_ns - self._memory_ns
+        while self._receipts_ns[first := next(iter(self._receipts_ns))] < oldest_ns:
+            del self._receipts_ns[first]
+        return known
+
+
 class QueueInbox:
     """Keeps every message. Refuses repeated, too late and future ones, and single detections that are no detections."""
 
-    def __init__(self, sensors: Mapping[str, SensorModel], max_future_s: float) -> None:
+    def __init__(self, sensors: Mapping[str, SensorModel], max_future_s: float, memory_s: float = 10.0) -> None:
+        """`memory_s`: how long a list is remembered; at least as long as a sensor's list may take."""
         self._sensors = sensors
         self._max_future_ns = nanoseconds(max_future_s)
+        longest_s = max((each.max_delay_s or 0.0 for each in sensors.values()), default=0.0)
+        self._seen = _Seen(nanoseconds(max(memory_s, longest_s)))
         self._pending: list[Batch] = []
-        self._last: dict[str, DetectionList] = {}
 
     def put(self, message: DetectionList) -> list[UpdateRecord]:
-        """See `Inbox.put`; a message is repeated if stamp and contents equal the sensor's last one."""
+        """See `Inbox.put`; a message is repeated if an earlier one of the sensor had its stamp and contents."""
         sensor = self._sensors[message.sensor]
-        last = self._last.get(message.sensor)
-        if last is not None and last.stamp_ns == message.stamp_ns and last.objects == message.objects:
+        if self._seen.is_copy(message, sensor):
             return records(message, Disposition.DUPLICATE)
-        self._last[message.sensor] = message
         ended: list[UpdateRecord] = []
         kept: dict[int, list[int]] = {} if message.objects else {message.stamp_ns: []}
         for index, stamp_ns in enumerate(stamps(message, sensor)):

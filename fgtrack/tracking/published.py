@@ -33,8 +33,9 @@ class PublishedEgo(EgoSource):
         step_ns: int,
         storage_ticks: int,
         std: EgoStd | None = None,
+        max_future_s: float = 1.0,
     ) -> None:
-        super().__init__(yaw_weight, yaw_rate_weight, std)
+        super().__init__(yaw_weight, yaw_rate_weight, std, max_future_s)
         self._half_step_ns = step_ns / 2
         self._length = storage_ticks
         self._stored: list[EgoState] = []  # newest last

@@ -389,8 +389,6 @@ def edited(messages: list[Message], place: int, **changes: int) -> list[Message]
     ("name", "changes", "message"),
     [
         ("loop.jsonl", {"receipt_ns": START_NS}, "receipt"),  # a bag is read in order of receipt
-        ("loop.jsonl", {"stamp_ns": START_NS - 5000 * MS}, "ego stamps jump back"),
-        ("loop", {"stamp_ns": START_NS - 5000 * MS}, "ego stamps jump back"),
         ("loop.jsonl", {"receipt_ns": START_NS + 10**13}, "nothing was received for"),
         ("loop", {"receipt_ns": START_NS + 10**13}, "nothing was received for"),
     ],
@@ -406,6 +404,28 @@ def test_a_recording_with_broken_time_is_replayed_up_to_there(
     assert called.code == 1
     found = load_run("run")
     assert found.updates.num_rows == found.meta["detections_received"] >= 30
+
+
+@pytest.mark.parametrize("name", ["drive.jsonl", "drive"])
+def test_a_stray_stamp_of_the_ego_costs_one_state_and_a_clock_that_was_set_ends_the_run(
+    fgtrack: Command, tmp_path: Path, name: str
+) -> None:
+    recording, write = tmp_path / name, write_stream if name.endswith("jsonl") else write_bag
+    write(recording, edited(drive(), 60, stamp_ns=START_NS + 60_000 * MS))
+    assert fgtrack("replay", recording, "-o", "stray").code == 0
+    found = load_run("stray")
+    assert found.meta["ego_refused"] == {"stamp ahead of its receipt": 1}
+    assert set(found.updates["disposition"].tolist()) <= {"birth", "in_sequence", "out_of_sequence"}
+    jumped = [
+        replace(message, stamp_ns=message.stamp_ns - 5000 * MS) if isinstance(message, EgoState) and i > 80 else message
+        for i, message in enumerate(drive(120))
+    ]
+    write(tmp_path / f"loop-{name}", jumped)
+    called = fgtrack("replay", tmp_path / f"loop-{name}", "-o", "loop")
+    assert f"loop-{name}" in called.error
+    assert "ego stamps jump back by" in called.error
+    assert called.code == 1
+    assert load_run("loop").meta["complete"] is True
 
 
 def test_an_unknown_sensor_says_what_to_do(fgtrack: Command, tmp_path: Path) -> None:
@@ -482,3 +502,17 @@ def test_an_interrupt_is_exit_code_130(fgtrack: Command, stream: Path, monkeypat
     called = fgtrack("replay", stream, "-o", "run")
     assert "interrupted" in called.error
     assert called.code == 130
+
+
+def test_names_in_a_recording_can_neither_move_the_cursor_nor_be_markup(fgtrack: Command, tmp_path: Path) -> None:
+    name = "[bold]x[/bold][/]\x1b[31m\x1b]0;title\x07"
+    sonar = DetectionList(name, START_NS, START_NS, (Detection(x_m=1.0, y_m=2.0),))
+    write_stream(tmp_path / "odd.jsonl", [*drive(10), replace(sonar, receipt_ns=START_NS + 1000 * MS)])
+    shown = fgtrack("info", "odd.jsonl")
+    assert shown.code == 0
+    assert "[bold]x[/bold][/]\\x1b[31m" in shown.out
+    refused = fgtrack("replay", "odd.jsonl", "-o", "run")
+    assert refused.code == 1
+    for text in (shown.out, refused.error):
+        assert "\x1b" not in text
+        assert "\x07" not in text

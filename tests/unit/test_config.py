@@ -172,7 +172,7 @@ def test_a_setting_does_not_change_what_it_stands_on() -> None:
         ("evaluation: {late_switch_s: -0.1}\n", "late_switch_s: must not be negative"),
         ("filter: {storage_s: 1.0}\nfilter: {storage_s: 2.0}\n", "config.yaml:2: no valid YAML, found duplicate key"),
         ("filter: {storage_s: 1.0\n", "no valid YAML"),
-        ("filter: {storage_s: &a [*a]}\n", "only plain YAML values"),
+        ("filter: {storage_s: &a [*a]}\n", "an alias that contains itself"),
         ("clock: {node_hz: 2020-01-01}\n", "only plain YAML values"),
         ("- 1\n", "a mapping of keys to values is needed, this is [1]"),
         ("text\n", 'a mapping of keys to values is needed, this is "text"'),
@@ -225,3 +225,45 @@ def test_an_empty_file_is_the_default_and_a_missing_one_an_error(tmp_path: Path)
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(CallError, match="is no text file"):
         read_yaml(tmp_path / "binary.yaml")
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("smoother.lag_s=1e308", "smoother.lag_s: 1e+308 is out of range"),
+        ("sensors.radar.std.x_m=1e-300", "sensors.radar.std.x_m: 1e-300 is out of range"),
+        ("motion.std_per_s.yaw=1e100", "1e+100 is out of range"),
+        ("motion.std_per_s.yaw=-0.3", "std_per_s.yaw: must not be negative"),
+        ("ego.storage_ticks=99999999999999999999", "has more than 64 bits"),
+        ("inbox.max_future_s=-1", "inbox.max_future_s"),
+        ("sensors=" + "[" * 20_000, "nested too deeply"),
+    ],
+)
+def test_no_setting_is_beyond_reason(setting: str, message: str) -> None:
+    with pytest.raises(CallError) as caught:
+        load(Config, None, [setting])
+    assert message in str(caught.value)
+    assert len(str(caught.value)) < 720
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "a: &a [x, x, x, x, x, x, x, x, x]\n"
+            + "".join(f"{chr(98 + i)}: &{chr(98 + i)} [{', '.join(9 * ['*' + chr(97 + i)])}]\n" for i in range(8)),
+            "more than 100000 values",
+        ),
+        ("a: &a [*a]\n", "nested too deeply"),
+        ("a: " + "[" * 10_000, "nested too deeply"),
+        ("a: [" + "1, " * 100_000 + "1]", "no configuration is longer than"),
+    ],
+    ids=["aliases", "itself", "brackets", "length"],
+)
+def test_a_file_that_would_fill_the_memory_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "bomb.yaml"
+    path.write_text(text)
+    with pytest.raises(CallError) as caught:
+        load(Config, path)
+    assert message in str(caught.value)
+    assert str(path) in str(caught.value)

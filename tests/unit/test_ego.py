@@ -24,6 +24,42 @@ def pose(source: EgoSource, stamp_ms: float):
     return source.pose_at(START_NS + ms(stamp_ms), START_NS)
 
 
+# --- stamps that cannot be right
+
+
+@pytest.mark.parametrize("source", [trajectory(), PublishedEgo(0.9, 0.4, ms(10), 350)])
+def test_a_stray_stamp_is_refused_and_the_next_ones_are_taken(source: EgoSource) -> None:
+    assert source.receive(ego(0.0)) is None
+    assert source.receive(replace(ego(60_000.0), receipt_ns=START_NS + ms(10))) == "stamp ahead of its receipt"
+    assert source.receive(ego(20.0)) is None
+    assert source.receive(replace(ego(-60_000.0), receipt_ns=START_NS + ms(30))) == "stamp jumps back"
+    assert source.receive(ego(40.0, x_m=4.0)) is None
+    assert source.current.x_m == 4.0
+
+
+def test_a_state_that_is_a_little_late_or_early_is_taken() -> None:
+    source = trajectory()
+    assert source.receive(replace(ego(900.0), receipt_ns=START_NS)) is None
+    assert source.receive(replace(ego(-90.0), receipt_ns=START_NS)) is None
+
+
+def test_a_gap_is_filled_from_its_ends_as_far_as_they_are_extrapolated() -> None:
+    source = trajectory(memory_s=60.0)
+    source.receive(ego(0.0, x_m=0.0))
+    source.receive(ego(5000.0, x_m=1000.0))
+    assert pose(source, 900.0).x_m == pytest.approx(9.0)
+    assert pose(source, 4100.0).x_m == pytest.approx(991.0)
+    assert pose(source, 1100.0) is None
+    assert pose(source, 3900.0) is None
+
+
+def test_states_as_far_apart_as_two_extrapolations_are_interpolated() -> None:
+    source = trajectory()
+    source.receive(ego(0.0, x_m=0.0))
+    source.receive(ego(2000.0, x_m=100.0))
+    assert pose(source, 500.0).x_m == pytest.approx(25.0)
+
+
 # --- the clean trajectory
 
 

@@ -54,6 +54,30 @@ def test_equal_stamps_come_out_in_order_of_receipt() -> None:
     assert [batch.sensor for batch in inbox.collect()] == ["each", "lidar"]
 
 
+def test_a_copy_is_recognised_behind_other_lists() -> None:
+    inbox = queue()
+    for stamp_ms in (0.0, 20.0, 40.0):
+        assert inbox.put(message(CAR, stamp_ms=stamp_ms)) == []
+    assert said(inbox.put(message(CAR, stamp_ms=0.0, delay_ms=70.0))) == [(0, "duplicate")]
+    assert inbox.put(message(Detection(x_m=10.5, y_m=1.0), stamp_ms=0.0, delay_ms=80.0)) == []
+    assert inbox.put(message(CAR, sensor="radar", stamp_ms=0.0, delay_ms=80.0)) == []
+
+
+def test_a_copy_of_a_list_with_a_detection_that_is_none_is_recognised() -> None:
+    inbox = queue()
+    nan = Detection(x_m=float("nan"), y_m=1.0)
+    assert said(inbox.put(message(CAR, nan))) == [(1, "invalid")]
+    again = message(CAR, Detection(x_m=float("nan") * 2.0, y_m=1.0), delay_ms=5.0)
+    assert said(inbox.put(again)) == [(0, "duplicate"), (1, "duplicate")]
+
+
+def test_lists_are_forgotten_once_they_are_too_old_anyway() -> None:
+    inbox = QueueInbox(SENSORS, max_future_s=1.0, memory_s=0.1)
+    for stamp_ms in range(0, 10_000, 10):
+        inbox.put(message(CAR, stamp_ms=float(stamp_ms)))
+    assert len(inbox._seen._receipts_ns) == 31  # `lidar` may take 0.3 s
+
+
 def test_a_message_with_stamp_and_contents_of_the_last_one_is_a_duplicate() -> None:
     inbox = queue()
     inbox.put(message(CAR, CAR))
@@ -151,6 +175,9 @@ def test_a_detection_is_usable_if_it_says_where_it_is(given: dict[str, float], u
         ([[1.0, 2.0], [2.0, 1.0]], False),
         (np.zeros((2, 2)), False),
         (-np.eye(2), False),
+        (1e-12 * np.eye(2), True),
+        (1e-13 * np.eye(2), False),
+        (1e-300 * np.eye(2), False),
         ([[1.0, math.nan], [math.nan, 1.0]], False),
         ([[math.inf, 0.0], [0.0, 1.0]], False),
         (np.eye(3), False),

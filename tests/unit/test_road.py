@@ -1,9 +1,13 @@
 """Where an object can be: on track or pit lane, or anywhere without a map."""
 
 import numpy as np
+import pytest
 
+from fgtrack.core.errors import DataError
 from fgtrack.models.oval import make_oval, make_pit_lane
+from fgtrack.models.published_map import PublishedMap
 from fgtrack.models.road import MappedRoad, OpenSpace
+from fgtrack.models.track_map import COLUMNS, TrackMap
 
 
 def test_without_a_map_an_object_may_be_anywhere_and_no_heading_is_known() -> None:
@@ -22,3 +26,10 @@ def test_an_object_is_outside_where_it_is_neither_on_the_track_nor_in_the_pit_la
     assert MappedRoad(track, pit, 1.0, 0.0, 0.0).view(points).outside.tolist() == [False, False, True, False]
     assert MappedRoad(track, pit, 0.0, 0.0, -5.0).view(points).outside.tolist() == [False, True, True, True]
     np.testing.assert_array_equal(road.view(points).yaw_rad, track.heading(points))
+
+
+def test_a_published_look_up_needs_a_raceline_that_goes_on() -> None:
+    table = make_oval().table.copy()
+    table[:, COLUMNS.index("s_racetraj_m")] = 0.0
+    with pytest.raises(DataError, match="row 1: s_racetraj_m does not grow"):
+        PublishedMap(TrackMap(table))

@@ -256,8 +256,9 @@ def with_line(row: int, line: str) -> list[str]:
     [
         (with_line(10, "1;2;3"), r"map\.csv:11: no map: 3 columns, expected 17"),
         (edited(10, "x_ref_m", "east"), r"map\.csv:11: no map: could not convert .*'east'"),
-        (edited(10, "banking_rad", "nan"), r"map\.csv:11: no map: banking_rad is not finite"),
-        (edited(10, "s_ref_m", "inf"), r"map\.csv:11: no map: s_ref_m is not finite"),
+        (edited(10, "banking_rad", "nan"), r"map\.csv:11: no map: banking_rad is no number up to"),
+        (edited(10, "s_ref_m", "1e300"), r"map\.csv:11: no map: s_ref_m is no number up to"),
+        (edited(10, "s_ref_m", "inf"), r"map\.csv:11: no map: s_ref_m is no number up to"),
         (with_line(11, lines_of(circle_table())[10]), r"map\.csv:11: no map: the next row holds the same"),
         (lines_of(circle_table())[:5], r"map\.csv:5: no map: at least 4 rows"),
         (lines_of(circle_table())[:40], r"map\.csv:40: no map: the line does not close"),
