@@ -62,14 +62,15 @@ class Sweep:
 
     @classmethod
     def open(cls, plan: Plan, folder: Path, overwrite: bool = False) -> "Sweep":
-        """The sweep `plan` in `folder`; what was finished there before is taken over.
+        """The sweep `plan` in `folder`; what was finished there before is taken over, if all its cells are there.
 
         Raises as `PartStore`, and `DataError` for a damaged part.
         """
         store = PartStore(folder, overwrite)
         kept = store.keys()
         parts = {key: store.read(key) for key in dict.fromkeys(job.key for job in plan.jobs) if key in kept}
-        return cls(plan, folder, {key: cells for key, cells in parts.items() if cells is not None}, store)
+        whole = {key: cells for key, cells in parts.items() if cells and _names(cells) == sorted(plan.estimators)}
+        return cls(plan, folder, whole, store)
 
     @property
     def todo(self) -> list[Job]:
@@ -129,6 +130,10 @@ class Sweep:
 
     def _is_good(self, key: str) -> bool:
         return key in self.done and all(cell.error is None for cell in self.done[key])
+
+
+def _names(cells: Sequence[Cell]) -> list[str]:
+    return sorted(cell.estimator for cell in cells)
 
 
 def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:

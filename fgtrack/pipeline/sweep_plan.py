@@ -3,6 +3,7 @@
 import hashlib
 import itertools
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,6 +31,9 @@ KEY_COLUMNS = ("seed", "estimator")
 #: Key of a group of keys that names its values, in a column of the group's own name.
 LABEL = "label"
 
+#: More jobs than this are a slip of the pen.
+MOST_JOBS = 100_000
+
 #: Roots of keys; those of the configuration have none.
 CONFIG, SCENARIO, DELAYS = "config", "scenario", "delays"
 
@@ -37,6 +41,8 @@ CONFIG, SCENARIO, DELAYS = "config", "scenario", "delays"
 def _seeds(given: Value) -> Value:
     """A number of seeds as 0, 1, 2, ...; anything else is left to the validation."""
     if isinstance(given, int) and not isinstance(given, bool):
+        if given > MOST_JOBS:
+            raise ValueError(f"no sweep has more than {MOST_JOBS}, not {given}")
         return tuple(range(given))
     return tuple(given) if isinstance(given, list) else given
 
@@ -83,7 +89,9 @@ class SweepConfig:
             raise ValueError("delays: a scenario has delays of its own, vary scenario.sensors.NAME.delay")
         if self.input is not None and len(self.seeds) > 1 and not self._redelays:
             raise ValueError("seeds: nothing is drawn where a recording keeps its delays, leave them out")
-        self.axes()
+        num_points = math.prod(len(axis.points) for axis in self.axes())
+        if num_points * len(self.seeds) > MOST_JOBS:
+            raise ValueError(f"vary, seeds: {num_points} points by {len(self.seeds)} seeds, more than {MOST_JOBS} jobs")
 
     @property
     def _redelays(self) -> bool:

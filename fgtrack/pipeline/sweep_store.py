@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+from pydantic import ConfigDict, TypeAdapter
+
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.io.output import Kind, check_output, write_file
 from fgtrack.pipeline.sweep_plan import KEY_COLUMNS, Plan, Value, compact
@@ -16,7 +18,7 @@ PART_FORMAT = "fgtrack-sweep-part/1"
 SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE = "sweep.csv", "timing.csv", "errors.csv"
 PAIRED_TABLE = "paired.csv"
 
-Scalar = str | int | float | None
+Scalar = str | bool | int | float | None
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,9 @@ class SweepResult:
     first_error: str | None
     unknown_metrics: tuple[str, ...]
     """The plan's metrics that stand for no column."""
+
+
+_CELLS = TypeAdapter(tuple[Cell, ...], config=ConfigDict(strict=True, extra="forbid"))
 
 
 class PartStore:
@@ -73,12 +78,12 @@ class PartStore:
             content = json.loads(path.read_text(encoding="utf-8"))
             if content["format"] != PART_FORMAT:
                 raise DataError(f"{path}: does not say format {PART_FORMAT!r}, delete it")
-            return tuple(Cell(**cell) for cell in content["cells"])
+            return _CELLS.validate_json(json.dumps(content["cells"]))
         except FileNotFoundError:
             return None
         except OSError as error:
             raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise DataError(f"{path}: is no part of a sweep, delete it") from error
 
     def write(self, key: str, cells: Sequence[Cell]) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from fgtrack.core.errors import CallError, DataError
+from fgtrack.pipeline.sweep import Sweep
 from fgtrack.pipeline.sweep_plan import Job, Plan, Recipe
 from fgtrack.pipeline.sweep_store import Cell, PartStore, write_tables
 
@@ -84,7 +85,19 @@ def test_a_half_written_part_is_none(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ['{"format": "fgtrack-sw', "[]", '{"format": "x"}', '{"format": "fgtrack-sweep-part/1", "cells": [{}]}']
+    "text",
+    [
+        '{"format": "fgtrack-sw',
+        "[]",
+        '{"format": "x"}',
+        '{"format": "fgtrack-sweep-part/1", "cells": [{}]}',
+        '{"format": "fgtrack-sweep-part/1", "cells": 7}',
+        *(
+            f'{{"format": "fgtrack-sweep-part/1", "cells": [{{"estimator": "a", "values": {values}, "times": {{}}}}]}}'
+            for values in ("[1]", '"x"', '{"x": [1]}', "null")
+        ),
+        "[" * 100_000,
+    ],
 )
 def test_a_damaged_part_is_reported(tmp_path: Path, text: str) -> None:
     store = PartStore(tmp_path)
@@ -97,3 +110,14 @@ def test_a_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(CallError, match="file: cannot be made a folder"):
         PartStore(tmp_path / "file")
+
+
+def test_a_part_without_all_its_cells_is_not_done(tmp_path: Path) -> None:
+    store = PartStore(tmp_path)
+    for key, cells in {"k0": [cell("a", x=1.0)], "k1": [cell("a", x=1.0), cell("a", x=1.0)]}.items():
+        store.write(key, cells)
+    sweep = Sweep.open(PLAN, tmp_path)
+    assert sweep.done == {}
+    assert [job.key for job in sweep.todo] == ["k0", "k1"]
+    store.write("k1", [cell("b", x=1.0), cell("a", x=1.0)])
+    assert list(Sweep.open(PLAN, tmp_path).done) == ["k1"]
