@@ -69,7 +69,10 @@ class Sweep:
         store = PartStore(folder, overwrite)
         kept = store.keys()
         parts = {key: store.read(key) for key in dict.fromkeys(job.key for job in plan.jobs) if key in kept}
-        whole = {key: cells for key, cells in parts.items() if cells and _names(cells) == sorted(plan.estimators)}
+        names = sorted(plan.estimators)
+        whole: dict[str, Sequence[Cell]] = {
+            key: cells for key, cells in parts.items() if cells and _names(cells) == names
+        }
         return cls(plan, folder, whole, store)
 
     @property
