@@ -5,7 +5,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from fgtrack.core.types import FloatArray
+from fgtrack.core.types import BoolArray, FloatArray
 
 TWO_PI = 2.0 * math.pi
 
@@ -41,6 +41,18 @@ def rotations(yaws_rad: FloatArray) -> FloatArray:
     """Rotation matrices, shape (..., 2, 2), of child frames turned by `yaws_rad`, shape (...)."""
     c, s = np.cos(yaws_rad), np.sin(yaws_rad)
     return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+
+
+def in_polygon(points: FloatArray, corners: FloatArray) -> BoolArray:
+    """Whether each of `points`, shape (n, 2), lies inside a polygon with `corners`, shape (m, 2); shape (n,).
+
+    By the parity of the edges that a ray along +x crosses, so outlines that cross themselves have holes.
+    """
+    x, y = points[:, :1], points[:, 1:]
+    (ax, ay), (bx, by) = corners.T, np.roll(corners, -1, axis=0).T
+    spans = (ay > y) != (by > y)
+    at = ax + (y - ay) * (bx - ax) / np.where(ay == by, 1.0, by - ay)
+    return np.asarray((spans & (x < at)).sum(axis=1) % 2 == 1)
 
 
 def circular_mean(angles_rad: FloatArray) -> float:

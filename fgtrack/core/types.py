@@ -64,6 +64,16 @@ class Detection:
     stamp_ns: int | None = None
     """The object's own stamp, where the sensor gives one per object."""
     object_id: int | None = None
+    z_m: float | None = None
+    """Height of the middle of its box, in the frame of the list."""
+    length_m: float | None = None
+    """Size along its own heading."""
+    width_m: float | None = None
+    height_m: float | None = None
+    score: float | None = None
+    """How sure the detector is, on a scale of its own."""
+    class_name: str | None = None
+    """What it is: `car`, `truck` ..., in the words of the detector."""
 
     @property
     def measured(self) -> tuple[str, ...]:
@@ -74,6 +84,9 @@ class Detection:
 #: What a detection may measure, in the order of its covariance and of the residual columns: the fields of
 #: `Detection` before its covariance.
 MEASURABLE = tuple(takewhile(lambda name: name != "covariance", (each.name for each in fields(Detection))))
+
+#: What a detection says of its object besides: never measurements of the state, and all may be None.
+DESCRIBING = ("z_m", "length_m", "width_m", "height_m", "score", "class_name")
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +118,10 @@ class TruthState:
     speed_mps: float | None = None
     yaw_rate_radps: float | None = None
     accel_mps2: float | None = None
+    ignored: bool = False
+    """Whether a track of this object, or in this region, is neither right nor false when a run is judged."""
+    outline_m: tuple[float, ...] | None = None
+    """Corners x, y, x, y ... of the region that is ignored at this stamp, `x_m` and `y_m` in it; None for an object."""
 
 
 Message = EgoState | DetectionList | TruthState

@@ -8,6 +8,7 @@ from scipy.optimize import linear_sum_assignment
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.evaluation.ignoring import ignored_objects, in_regions
 from fgtrack.evaluation.sight import in_sight
 from fgtrack.evaluation.truth import TRUE_STATE, TruePath, true_paths
 from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, Table, evaluation_config
@@ -101,6 +102,8 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
 
     Without `options` it is judged as its configuration says.
 
+    Tracks of ignored objects and in ignored regions are none of its rows, see `fgtrack.evaluation.ignoring`.
+
     As CLEAR does (Bernardin and Stiefelhagen 2008): a pair of the tick before stays while it lies inside the
     gate, the rest is assigned by the Hungarian method, first as many pairs as possible, then the least sum of
     distances. Ticks are those of timing.csv, so ticks without any track count as well.
@@ -111,6 +114,8 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
         return None
     ticks, now_ns = run.timing["tick"], run.timing["now_ns"]
     tracks = run.tracks.where(_judged(run, options))
+    if run.ignored.num_rows:
+        tracks = tracks.where(~_ignored(run, tracks, paths, options.gate_m))
     candidates = np.stack([path.at(tracks["stamp_ns"]) for path in paths], axis=1)
     xy = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
     distances_m = np.linalg.norm(candidates[..., :2] - xy[:, None], axis=-1)
@@ -212,6 +217,18 @@ def _judged(run: Run, options: EvaluationConfig) -> BoolArray:
     if options.confirmed_only:
         judged &= tracks["num_measured"] >= CONFIRMED_MEASUREMENTS
     return np.asarray(judged)
+
+
+def _ignored(run: Run, tracks: Table, paths: list[TruePath], gate_m: float) -> BoolArray:
+    """Whether each row of `tracks` is neither right nor false, shape (rows,): it is no true object's, and ignored."""
+    ignored = true_paths(ignored_objects(run.ignored))
+    both = np.stack([path.at(tracks["stamp_ns"])[:, :2] for path in [*paths, *ignored]], axis=1)
+    xy = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
+    distances_m = np.linalg.norm(both - xy[:, None], axis=-1)
+    tick_index = np.searchsorted(run.timing["tick"], tracks["tick"])
+    inside = np.where(distances_m <= gate_m, distances_m, np.inf)
+    found = _pair(inside, tracks["track_id"], tick_index, run.timing.num_rows)
+    return np.asarray((found >= len(paths)) | ((found == NO_OBJECT) & in_regions(run, tracks["stamp_ns"], xy)))
 
 
 def _present(paths: list[TruePath], now_ns: IntArray) -> BoolArray:

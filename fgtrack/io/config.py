@@ -32,6 +32,8 @@ class KittiInput:
 
     sequence: int | str | None = None
     """The sequence, where the input is a folder of several: `6` or `0006`."""
+    classes: tuple[str, ...] = ("Car",)
+    """Classes of the data set that are read: `Car`, `Pedestrian`, `Cyclist` ..."""
     min_score: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     """By sensor, the folder of its detections: those of a lower score are left out."""
     image_width_px: float = 1242.0

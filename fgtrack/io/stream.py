@@ -168,7 +168,10 @@ def _record(message: Message) -> Record:
 
 
 def _given(value: EgoState | TruthState | Detection) -> Record:
-    return {name: field for name in _FIELDS[type(value)] if (field := getattr(value, name)) is not None}
+    given = {name: field for name in _FIELDS[type(value)] if (field := getattr(value, name)) is not None}
+    if given.get("ignored") is False:
+        del given["ignored"]
+    return given
 
 
 def _records(path: Path) -> Generator[tuple[int, Record], None, None]:
@@ -309,6 +312,9 @@ _READERS: dict[str, Callable[[str, Any], Any]] = {
     "frame": _checked(lambda value: value in get_args(Frame), f"one of {', '.join(get_args(Frame))}"),
     "objects": _checked(lambda value: isinstance(value, list), "a list"),
     "covariance": _numbers,
+    "class_name": _checked(lambda value: isinstance(value, str), "a name"),
+    "ignored": _checked(lambda value: isinstance(value, bool), "true or false"),
+    "outline_m": _numbers,
 }
 
 #: Names of what a message or a detection holds; of each how to read it from JSON, and whether it has to be given.

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from hypothesis import strategies as st
 
-from fgtrack.core.types import MEASURABLE, Detection, DetectionList, EgoState, Message, TruthState
+from fgtrack.core.types import DESCRIBING, MEASURABLE, Detection, DetectionList, EgoState, Message, TruthState
 
 SHARED = Path(__file__).resolve().parents[2] / "../shared"
 START_NS = 1_700_000_000_000_000_000
@@ -37,6 +37,8 @@ def detections(draw: st.DrawFn) -> Detection:
         covariance=draw(st.none() | st.lists(numbers, min_size=size, max_size=size).map(tuple)),
         stamp_ns=draw(st.none() | times_ns),
         object_id=draw(st.none() | ids),
+        **{name: draw(st.none() | numbers) for name in DESCRIBING if name != "class_name"},
+        class_name=draw(st.none() | st.sampled_from(["", "car", "Straßenbahn, 2"])),
     )
 
 
@@ -54,7 +56,9 @@ def message_lists(draw: st.DrawFn) -> list[Message]:
                 messages.append(EgoState(*times, *state, draw(st.none() | st.booleans()), covariance))
             case 1:
                 optional = [draw(st.none() | numbers) for _ in range(4)]
-                messages.append(TruthState(*times, draw(ids), draw(numbers), draw(numbers), *optional))
+                outline = draw(st.none() | st.lists(numbers, min_size=6, max_size=6).map(tuple))
+                position = (draw(numbers), draw(numbers))
+                messages.append(TruthState(*times, draw(ids), *position, *optional, draw(st.booleans()), outline))
             case _:
                 objects = tuple(draw(st.lists(detections(), max_size=3)))
                 sensor = draw(st.sampled_from(["lidar", "front radar", "Kamera ü"]))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fgtrack.core.geometry import body_point
+from fgtrack.core.geometry import body_point, in_polygon
 
 metres = st.floats(-10.0, 10.0)
 
@@ -37,3 +37,10 @@ def test_arrays_give_what_single_numbers_give() -> None:
     bodies = np.random.default_rng(0).normal(size=(7, 5))
     found = np.stack(body_point(*bodies.T, 2.0, -1.0), axis=1)
     np.testing.assert_allclose(found, [body_point(*body.tolist(), 2.0, -1.0) for body in bodies], rtol=1e-15)
+
+
+def test_a_polygon_holds_what_its_outline_surrounds() -> None:
+    bent = np.array([(0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (3.0, 4.0), (3.0, 1.0), (0.0, 1.0)])
+    points = np.array([(0.5, 0.5), (3.5, 3.0), (1.0, 2.0), (-0.1, 0.5), (4.1, 0.5), (3.5, 4.5)])
+    for corners in (bent, bent[::-1], np.roll(bent, 2, axis=0)):
+        assert in_polygon(points, corners).tolist() == [True, True, False, False, False, False]

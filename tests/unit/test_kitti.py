@@ -107,11 +107,14 @@ def test_a_box_in_space_is_a_position_and_a_yaw_in_the_ego_frame(tmp_path):
     (detection,) = found.objects
     assert detection.measured == ("x_m", "y_m", "yaw_rad")
     assert (detection.x_m, detection.y_m, detection.yaw_rad) == pytest.approx((20.0, 3.0, 0.4))
+    assert (detection.length_m, detection.width_m, detection.height_m) == (4.0, 1.6, 1.5)
+    assert detection.z_m == pytest.approx(-1.5 + 0.5 * 1.5)
+    assert (detection.score, detection.class_name) == (9.0, "car")
 
 
 def test_a_box_in_the_image_is_the_bearing_of_its_middle_from_the_camera(tmp_path):
     (found,) = lists(folder(tmp_path, camera=[box(0, 400.0, 460.0)]))
-    assert found.objects == (Detection(bearing_rad=pytest.approx(math.atan2(170.0, FOCAL_PX))),)
+    assert found.objects == (Detection(bearing_rad=pytest.approx(math.atan2(170.0, FOCAL_PX)), score=1.0),)
 
 
 def test_the_bearing_of_a_wide_box_is_less_certain(tmp_path):
@@ -138,7 +141,7 @@ def test_the_map_begins_at_the_first_frame_with_x_to_the_east(tmp_path):
             oxts(yaw_rad=3.0),
             oxts(100.0 * metre_deg, 50.0 * metre_deg / math.cos(math.radians(49.0)), 0.0, 0.0, 3.5, 8.0, 0.2, -1.0),
         ],
-        label_02=[label(1, 3, "Car", 10.0, 0.0, 0.3), label(1, 4, "Van", 10.0, 0.0, 0.3)],
+        label_02=[label(1, 3, "Car", 10.0, 0.0, 0.3), label(1, 4, "Tram", 10.0, 0.0, 0.3)],
     )
     first, truth, second = messages(drive)
     assert first == EgoState(0, 0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0)
@@ -151,6 +154,67 @@ def test_the_map_begins_at_the_first_frame_with_x_to_the_east(tmp_path):
     offset_m = truth.x_m - second.x_m, truth.y_m - second.y_m
     assert offset_m == pytest.approx((10.0 * math.cos(3.5), 10.0 * math.sin(3.5)))
     assert truth.yaw_rad == pytest.approx(3.8 - 2.0 * math.pi)
+
+
+def test_a_neighbouring_class_and_regions_are_ignored(tmp_path):
+    """The region spans 20 px around the middle and 14 px high: a car of 1.5 m is half inside it from 37.5 m on."""
+    region = f"0 -1 DontCare -1 -1 -10 {CENTRE_PX[0] - 10} 180 {CENTRE_PX[0] + 10} 194 -1 -1 -1 -1000 -1000 -1000 -10"
+    labels = [label(0, 3, "Car", 10.0, 0.0, 0.3), label(0, 4, "Van", 20.0, 0.0, 0.3), region]
+    car, van, dont_care, _ = messages(folder(tmp_path, label_02=labels))
+    assert [item.ignored for item in (car, van, dont_care)] == [False, True, True]
+    assert (van.object_id, van.outline_m) == (4, None)
+    assert dont_care.object_id == -2
+    corners = np.reshape(dont_care.outline_m, (4, 2))
+    near, far = 0.75 * FOCAL_PX / 14.0, 150.0
+    side_rad = math.atan2(10.0, FOCAL_PX)
+    ahead = 2.0 + math.cos(side_rad) * np.array([near, near, far, far])
+    aside = 0.5 + math.sin(side_rad) * np.array([near, -near, -far, far])
+    assert corners == pytest.approx(np.column_stack([ahead, aside]))
+
+
+KITTI = "0 7 Car 0 0 0.1 400 170 460 190 1.5 1.6 4.0"
+
+
+@pytest.mark.parametrize(
+    ("score", "value"),
+    [("", None), (" 0.8", 0.8)],
+)
+def test_results_in_the_form_of_the_data_set_are_detections(tmp_path, score, value):
+    x_m, y_m, z_m = RECTIFIED_FROM_IMU @ [20.0, 3.0, -1.5, 1.0]
+    line = f"{KITTI} {x_m} {y_m} {z_m} {-0.4 - 0.5 * math.pi}{score}"
+    per_frame = tmp_path / "frames/pointpillars/0001"
+    folder(tmp_path / "one", laser=[line, line.replace("Car", "Cyclist")])
+    folder(tmp_path / "frames")
+    per_frame.mkdir(parents=True)
+    (per_frame / "000000.txt").write_text(line.removeprefix("0 7 "))
+    (one,), (other,) = lists(tmp_path / "one"), lists(tmp_path / "frames")
+    assert (one.sensor, other.sensor) == ("laser", "pointpillars")
+    assert one.objects == other.objects
+    (car,) = one.objects
+    assert (car.x_m, car.y_m, car.yaw_rad) == pytest.approx((20.0, 3.0, 0.4))
+    assert (car.length_m, car.score, car.class_name) == (4.0, value, "car")
+
+
+def test_results_without_a_place_in_space_are_bearings(tmp_path):
+    line = f"{KITTI} -1000 -1000 -1000 -10 0.8"
+    (found,) = lists(folder(tmp_path, camera=[line]))
+    bearing_rad = pytest.approx(math.atan2(170.0, FOCAL_PX))
+    assert (found.frame, found.objects) == (
+        "sensor",
+        (Detection(bearing_rad=bearing_rad, score=0.8, class_name="car"),),
+    )
+    with pytest.raises(DataError, match=r"camera/0001\.txt:2: .*in the image alone"):
+        lists(folder(tmp_path, camera=[pose(0, 10.0, 0.0, 0.0), line]))
+
+
+def test_classes_are_named(tmp_path):
+    drive = folder(
+        tmp_path,
+        laser=[pose(0, 10.0, 0.0, 0.0, kind=1), pose(0, 20.0, 0.0, 0.0)],
+        label_02=[label(0, 3, "Car", 10.0, 0.0, 0.3), label(0, 4, "Pedestrian", 20.0, 0.0, 0.3)],
+    )
+    truth, _, found = messages(drive, classes=("Pedestrian",))
+    assert (truth.object_id, [item.class_name for item in found.objects]) == (4, ["pedestrian"])
 
 
 def test_other_classes_low_scores_and_boxes_cut_off_are_left_out(tmp_path):
@@ -220,7 +284,7 @@ def test_every_line_of_the_data_set_is_read_and_lies_at_the_labelled_cars(sequen
     assert len(egos) == count["oxts"]
     truth: dict[int, list[TruthState]] = {}
     for item in found:
-        if isinstance(item, TruthState):
+        if isinstance(item, TruthState) and not item.ignored:
             truth.setdefault(item.stamp_ns, []).append(item)
     labels = (root / "label_02" / f"{sequence}.txt").read_text().splitlines()
     assert sum(map(len, truth.values())) == sum(line.split()[2] == "Car" for line in labels)

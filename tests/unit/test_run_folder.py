@@ -70,6 +70,7 @@ def test_the_header_lines_are_those_of_the_contract(tmp_path):
     path = tmp_path / "run"
     with RunWriter(path) as writer:
         writer.write_truth(TruthState(1, 1, -1, 0.0, 0.0))
+        writer.write_truth(TruthState(1, 1, 8, 0.0, 0.0, ignored=True))
         writer.write_ego(EgoState(1, 2, 0.0, 0.0, 0.0, 0.0))
         writer.write_detections(DetectionList("lidar", 1, 2, [Detection(x_m=1.0, y_m=2.0)]))
         writer.write_tick(TickReport(0, 1, (track(),), (), (SmoothedReport(1, track().state, 0.3),)), 1, 0)
@@ -90,7 +91,9 @@ def test_the_header_lines_are_those_of_the_contract(tmp_path):
         "truth": f"stamp_ns,object_id,{state}",
         "ego": f"stamp_ns,receipt_ns,{state}",
         "detections": "sensor,stamp_ns,receipt_ns,index,frame,"
-        "x_m,y_m,yaw_rad,speed_mps,range_m,bearing_rad,range_rate_mps",
+        "x_m,y_m,yaw_rad,speed_mps,range_m,bearing_rad,range_rate_mps,"
+        "z_m,length_m,width_m,height_m,score,class_name",
+        "ignored": "stamp_ns,object_id,x_m,y_m,outline_m",
     }
 
 

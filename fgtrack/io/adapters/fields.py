@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from functools import reduce
+from typing import Any
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import MEASURABLE, STATE_NAMES, Detection, EgoState
@@ -49,7 +50,7 @@ def ego_by_fields(message: RosMessage, fields: Mapping[str, Path], receipt_ns: i
 
 
 def _object(item: RosMessage, fields: Mapping[str, Path]) -> Detection:
-    measured = {name: _number(item, fields[name]) for name in MEASURABLE if name in fields}
+    measured: dict[str, Any] = {name: _number(item, fields[name]) for name in MEASURABLE if name in fields}
     return Detection(
         **measured,
         covariance=None,

@@ -107,7 +107,9 @@ def _object(item: Json, frame: Frame) -> Detection:
     keys, state = item["keys"], item["state"]
     if len(state) == len(keys) - 1:  # a yaw that the tracker adds from the map only after logging
         keys = [key for key in keys if key != "yaw"]
-    values = {_NAMES[key]: float(value) for key, value in zip(keys, state, strict=True) if key in _NAMES}
+    values: dict[str, Any] = {
+        _NAMES[key]: float(value) for key, value in zip(keys, state, strict=True) if key in _NAMES
+    }
     if frame == "map" and "yaw_rad" in values:
         values["yaw_rad"] = wrap_angle(values["yaw_rad"] + 0.5 * math.pi)
     return Detection(**values, covariance=None, stamp_ns=None, object_id=None)

@@ -1,25 +1,32 @@
-"""The KITTI tracking data set: LiDAR and camera detections of cars, the ego's motion, and labelled truth at 10 Hz.
+"""The KITTI tracking data set: detections of road users, the ego's motion, and labelled truth at 10 Hz.
 
 Geiger, Lenz, Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark suite", CVPR 2012;
 www.cvlibs.net/datasets/kitti, laid out as `oxts/ calib/ label_02/` with a text file per sequence. Every other folder
-beside them with a file of the sequence holds the detections of a sensor of that name, in one of two forms:
+beside them with a file of the sequence, or with a folder of it and a file per frame, holds the detections of a sensor
+of that name, in one of these forms:
 
-- `frame,class,left,top,right,bottom,score,h,w,l,x,y,z,rotation_y,alpha` (as AB3DMOT publishes them): position and yaw;
-- `frame,left,top,right,bottom,score`: the bearing of the middle of the box in the image of camera 2.
+- `frame,class,left,top,right,bottom,score,h,w,l,x,y,z,rotation_y,alpha`, as AB3DMOT publishes them;
+- `frame track type truncated occluded alpha left top right bottom h w l x y z rotation_y score`, as the data set's own
+  results of tracking; in a file per frame without frame and track, as its results of object detection;
+- `frame,left,top,right,bottom,score`: a box in the image of camera 2.
+
+Boxes in space give position, yaw and size; where there is none, the bearing of the middle of the box in the image.
 
 Choices that the data leave open:
 
 - Frame k is at k x 0.1 s and received at once: the data have no receipt times (`fgtrack convert` gives delays).
-- The map frame begins where the ego does: x to the east, y to the north, in the Mercator projection of the data set's
+- The map frame begins where the ego does; x to the east, y to the north, in the Mercator projection of the data set's
   own development kit. The ego frame is that of the inertial unit, levelled by its roll and pitch.
 - A bearing is from camera 2 and relative to the ego's heading: `frame` is `sensor`, and the sensor's `mount` is the
   place of the camera, without a yaw, since the calibration has turned the bearing already.
 - A box that touches the left or right border of the image shows a part of a car, whose middle is elsewhere: left out.
-- Truth is what is labelled `Car`; detections are of cars too, and other classes in their files are left out.
+- Detections and truth of other classes than `input.kitti.classes` are left out. As in the data set's own evaluation a
+  neighbouring class (a van for a car) is ignored, and so is what lies in a `DontCare` region: behind it as seen from
+  camera 2, from the distance on at which a car looks so small that it can be in it.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -27,17 +34,24 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.geometry import rotation, wrap_angle
-from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray, Frame, Message, TruthState
+from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.types import Detection, DetectionList, Frame, Message, TruthState
+from fgtrack.io.adapters.kitti_view import PERIOD_NS, View, lines, read_views
 from fgtrack.io.config import InputConfig, KittiInput
 from fgtrack.io.source import FileFormat
 
-PERIOD_NS = 100_000_000
+__all__ = ["FORMAT", "PERIOD_NS", "locate", "read_sequence"]
+
 _OXTS, _CALIB, _LABELS = "oxts", "calib", "label_02"
-_EARTH_RADIUS_M = 6_378_137.0
-_CAR = 2  # the class of AB3DMOT
+_DONT_CARE = "DontCare"
+_CLASSES = {1: "Pedestrian", 2: "Car", 3: "Cyclist"}  # as AB3DMOT counts them
+_NEIGHBOURS: Mapping[str, str] = {"Car": "Van", "Pedestrian": "Person_sitting"}
 _BORDER_PX = 2.0
-_POSE_FIELDS, _BOX_FIELDS = 15, 6
+_NOWHERE_M = -999.0  # a box without a place in space is at -1000
+_BOX_FIELDS, _AB3DMOT_FIELDS, _KITTI_FIELDS = 6, 15, 18
+_FORMS = "6 fields (a box in the image), 15 (as AB3DMOT) or 18 (as the results of the data set)"
+_CAR_HEIGHT_M, _INSIDE = 1.5, 0.5  # as high and as far inside a region that it counts as in it
+_FAR_M = 150.0
 
 _Parsed = TypeVar("_Parsed")
 
@@ -45,60 +59,13 @@ _Parsed = TypeVar("_Parsed")
 class Row(NamedTuple):
     """A line of a file, split."""
 
-    number: int
-    """Of the line, from 1."""
+    place: str
+    """File and line, for messages."""
     fields: list[str]
 
 
 Rows = Mapping[int, list[Row]]
-"""The lines of a file by frame."""
-
-
-class Calibration(NamedTuple):
-    """How camera 2 and the frame of labels and detections stand in the frame of the inertial unit."""
-
-    projection: FloatArray
-    """Image point, homogeneous, from a point in the rectified frame of camera 0, shape (3, 4)."""
-    rectified_from_imu: FloatArray
-    """Shape (4, 4)."""
-
-    def point(self, rectified_m: Sequence[float]) -> FloatArray:
-        """Point in the frame of the inertial unit, shape (3,)."""
-        return np.asarray(np.linalg.solve(self.rectified_from_imu, [*rectified_m, 1.0])[:3])
-
-    def direction(self, rectified: Sequence[float]) -> FloatArray:
-        """Direction in the frame of the inertial unit, shape (3,)."""
-        return np.asarray(np.linalg.solve(self.rectified_from_imu[:3, :3], rectified))
-
-    def ray(self, u_px: float, v_px: float) -> FloatArray:
-        """Direction from camera 2 to an image point, in the frame of the inertial unit, shape (3,)."""
-        return self.direction(np.linalg.solve(self.projection[:, :3], [u_px, v_px, 1.0]).tolist())
-
-
-class View(NamedTuple):
-    """The ego at a frame, how the inertial unit is tilted, and the calibration."""
-
-    ego: EgoState
-    levelled_from_imu: FloatArray
-    """Shape (3, 3)."""
-    calibration: Calibration
-
-    def pose(self, x_m: float, y_m: float, z_m: float, rotation_y_rad: float) -> tuple[FloatArray, float]:
-        """Position (2,) and yaw in the ego frame of an object given in the rectified camera frame."""
-        heading = self.calibration.direction([math.cos(rotation_y_rad), 0.0, -math.sin(rotation_y_rad)])
-        return self._level(self.calibration.point([x_m, y_m, z_m])), self._azimuth_rad(heading)
-
-    def bearing_rad(self, u_px: float, v_px: float) -> float:
-        """Bearing of an image point from camera 2, 0 along the ego's heading."""
-        return self._azimuth_rad(self.calibration.ray(u_px, v_px))
-
-    def _level(self, imu: FloatArray) -> FloatArray:
-        """The horizontal part of a vector of the inertial unit, in the ego frame, shape (2,)."""
-        return np.asarray((self.levelled_from_imu @ imu)[:2])
-
-    def _azimuth_rad(self, imu: FloatArray) -> float:
-        ahead, aside = self._level(imu).tolist()
-        return math.atan2(aside, ahead)
+"""The lines of a file, or of all files of a folder, by frame."""
 
 
 def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator[Message]:
@@ -109,30 +76,28 @@ def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator
     DataError
         A file is missing or not what the data set holds; the message names file and line.
     """
-    views = _views(folder / _OXTS / f"{sequence}.txt", _calibration(folder / _CALIB / f"{sequence}.txt"))
+    views = read_views(folder / _OXTS / f"{sequence}.txt", folder / _CALIB / f"{sequence}.txt")
     labels = folder / _LABELS / f"{sequence}.txt"
-    truth = _rows(labels, " ", len(views)) if labels.exists() else {}
-    detections = [(file, _rows(file, ",", len(views))) for file in _detection_files(folder, sequence)]
+    truth = _rows(labels, len(views)) if labels.exists() else {}
+    detections = {place.parent.name: _rows(place, len(views)) for place in _detection_places(folder, sequence)}
     for frame, view in enumerate(views):
-        yield from _read(labels, truth.get(frame, []), partial(_truth, view))
+        yield from _read(truth.get(frame, []), partial(_truth, view, settings))
+        yield from _regions(view, truth.get(frame, []))
         yield view.ego
-        for file, rows in detections:
-            sensor = file.parent.name
-            least = settings.min_score.get(sensor, -math.inf)
-            objects = _read(file, rows.get(frame, []), partial(_detection, view, least, settings))
-            yield DetectionList(sensor, view.ego.stamp_ns, view.ego.receipt_ns, list(objects), _frame(rows))
+        for sensor, rows in detections.items():
+            refers_to = _frame(rows)
+            objects = _read(rows.get(frame, []), partial(_detection, view, sensor, settings, refers_to))
+            yield DetectionList(sensor, view.ego.stamp_ns, view.ego.receipt_ns, list(objects), refers_to)
 
 
-def _recognises(path: Path) -> bool:
-    folder = path.parent.parent if path.is_file() and path.parent.name == _OXTS else path
-    return (folder / _OXTS).is_dir() and (folder / _CALIB).is_dir()
+def locate(path: Path, named: int | str | None = None) -> tuple[Path, str]:
+    """Folder and name of the sequence that `path`, a folder or a file of `oxts/`, and `named` mean.
 
-
-def _open(path: Path, config: InputConfig) -> partial[Iterator[Message]]:
+    Raises `CallError` where they mean none.
+    """
     if path.is_file():
-        return partial(read_sequence, path.parent.parent, path.stem, config.kitti)
+        return path.parent.parent, path.stem
     known = sorted(file.stem for file in (path / _OXTS).glob("*.txt"))
-    named = config.kitti.sequence
     if named is None and len(known) != 1:
         raise CallError(
             f"{path}: holds {len(known)} sequences, name one by its file: {path / _OXTS}/{(known or ['0000'])[0]}.txt"
@@ -140,146 +105,165 @@ def _open(path: Path, config: InputConfig) -> partial[Iterator[Message]]:
     sequence = known[0] if named is None else f"{named:04d}" if isinstance(named, int) else named
     if sequence not in known:
         raise CallError(f"{path}: holds no sequence {sequence}, but {', '.join(known)} (input.kitti.sequence)")
-    return partial(read_sequence, path, sequence, config.kitti)
+    return path, sequence
+
+
+def is_sequence(path: Path) -> bool:
+    """Whether `path` is a folder of the data set, or a file of its `oxts/`."""
+    folder = path.parent.parent if path.is_file() and path.parent.name == _OXTS else path
+    return (folder / _OXTS).is_dir() and (folder / _CALIB).is_dir()
+
+
+def _open(path: Path, config: InputConfig) -> partial[Iterator[Message]]:
+    return partial(read_sequence, *locate(path, config.kitti.sequence), config.kitti)
 
 
 FORMAT = FileFormat(
-    "a KITTI tracking folder (oxts/, calib/) or the oxts/NNNN.txt of a sequence in it", _recognises, _open
+    "a KITTI tracking folder (oxts/, calib/) or the oxts/NNNN.txt of a sequence in it", is_sequence, _open
 )
 
 
-def _detection_files(folder: Path, sequence: str) -> list[Path]:
-    files = sorted(folder.glob(f"*/{sequence}.txt"))
-    return [file for file in files if file.parent.name not in (_OXTS, _CALIB, _LABELS)]
+def _detection_places(folder: Path, sequence: str) -> list[Path]:
+    """Files, or folders with a file per frame, of what detected something in `sequence`."""
+    places = [*folder.glob(f"*/{sequence}.txt"), *(each for each in folder.glob(f"*/{sequence}") if each.is_dir())]
+    kept = {place.parent.name: place for place in sorted(places) if place.name == f"{sequence}.txt" or _holds(place)}
+    return [place for name, place in sorted(kept.items()) if name not in (_OXTS, _CALIB, _LABELS)]
 
 
-def _calibration(file: Path) -> Calibration:
-    matrices: dict[str, FloatArray] = {}
-    for number, line in enumerate(_lines(file), 1):
-        name, _, values = line.replace(":", " ", 1).strip().partition(" ")
-        try:
-            matrices[name.replace("R0_", "R_").replace("_to_", "_")] = np.array(values.split(), dtype=np.float64)
-        except ValueError as error:
-            raise DataError(f"{file}:{number}: is no matrix ({error})") from error
-    try:
-        rectified_from_camera = np.eye(4)
-        rectified_from_camera[:3, :3] = matrices["R_rect"].reshape(3, 3)
-        camera_from_velodyne, velodyne_from_imu = (_rigid(matrices[name]) for name in ("Tr_velo_cam", "Tr_imu_velo"))
-        projection = matrices["P2"].reshape(3, 4)
-    except (KeyError, ValueError) as error:
-        raise DataError(f"{file}: is no calibration of the data set ({error!r})") from error
-    return Calibration(projection, rectified_from_camera @ camera_from_velodyne @ velodyne_from_imu)
+def _holds(folder: Path) -> bool:
+    return any(file.stem.isdigit() for file in folder.glob("*.txt"))
 
 
-def _rigid(values: FloatArray) -> FloatArray:
-    return np.vstack([values.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
-
-
-def _views(file: Path, calibration: Calibration) -> list[View]:
-    """What is known of the ego at every frame."""
-    views: list[View] = []
-    origin_m, scale = np.zeros(2), 1.0
-    for number, line in enumerate(_lines(file), 1):
-        try:
-            values = [float(value) for value in line.split()]
-            latitude_deg, longitude_deg, _, roll_rad, pitch_rad, yaw_rad = values[:6]
-            speed_mps, accel_mps2, yaw_rate_radps = values[8], values[14], values[22]
-            if not views:
-                scale = math.cos(math.radians(latitude_deg))
-            position_m = _mercator(latitude_deg, longitude_deg, scale)
-        except (ValueError, IndexError) as error:
-            raise DataError(f"{file}:{number}: is no line of the data set ({error})") from error
-        if not views:
-            origin_m = position_m
-        x_m, y_m = (position_m - origin_m).tolist()
-        stamp_ns = len(views) * PERIOD_NS
-        ego = EgoState(stamp_ns, stamp_ns, x_m, y_m, wrap_angle(yaw_rad), speed_mps, yaw_rate_radps, accel_mps2)
-        views.append(View(ego, _levelling(roll_rad, pitch_rad), calibration))
-    return views
-
-
-def _mercator(latitude_deg: float, longitude_deg: float, scale: float) -> FloatArray:
-    """Position to the east and north, shape (2,), true to scale at the latitude whose cosine is `scale`."""
-    north = math.log(math.tan(math.radians(45.0 + 0.5 * latitude_deg)))
-    return scale * _EARTH_RADIUS_M * np.array([math.radians(longitude_deg), north])
-
-
-def _levelling(roll_rad: float, pitch_rad: float) -> FloatArray:
-    """Rotation, shape (3, 3), from a frame that is rolled and pitched to a level one of the same heading."""
-    about_x, about_y = np.eye(3), np.eye(3)
-    about_x[1:, 1:] = rotation(roll_rad)
-    about_y[::2, ::2] = rotation(-pitch_rad)  # rows and columns x and z, which y turns from z to x
-    return np.asarray(about_y @ about_x)
-
-
-def _truth(view: View, fields: list[str]) -> TruthState | None:
-    if fields[2] != "Car":
+def _truth(view: View, settings: KittiInput, fields: list[str]) -> TruthState | None:
+    kind = fields[2]
+    ignored = kind in {_NEIGHBOURS.get(name) for name in settings.classes}
+    if not ignored and kind not in settings.classes:
         return None
     x_m, y_m, z_m, turned_rad = map(float, fields[13:17])
     ego = view.ego
     position_m, yaw_rad = view.pose(x_m, y_m, z_m, turned_rad)
-    x_m, y_m = (np.array([ego.x_m, ego.y_m]) + rotation(ego.yaw_rad) @ position_m).tolist()
-    return TruthState(ego.stamp_ns, ego.receipt_ns, int(fields[1]), x_m, y_m, wrap_angle(yaw_rad + ego.yaw_rad))
+    x_m, y_m = view.in_map(position_m).tolist()
+    yaw_rad = wrap_angle(yaw_rad + ego.yaw_rad)
+    return TruthState(ego.stamp_ns, ego.receipt_ns, int(fields[1]), x_m, y_m, yaw_rad, ignored=ignored)
 
 
-def _detection(view: View, min_score: float, settings: KittiInput, fields: list[str]) -> Detection | None:
-    """The car of a line; None for another class, one below the score, and a box that the image cuts off."""
-    if len(fields) == _POSE_FIELDS:
-        if int(fields[1]) != _CAR or float(fields[6]) < min_score:
-            return None
-        x_m, y_m, z_m, turned_rad = map(float, fields[10:14])
-        position_m, yaw_rad = view.pose(x_m, y_m, z_m, turned_rad)
-        return Detection(x_m=float(position_m[0]), y_m=float(position_m[1]), yaw_rad=yaw_rad)
-    if len(fields) == _BOX_FIELDS:
-        left_px, top_px, right_px, bottom_px, score = map(float, fields[1:])
-        cut_off = left_px < _BORDER_PX or right_px > settings.image_width_px - 1.0 - _BORDER_PX
-        if cut_off or score < min_score:
-            return None
-        v_px = 0.5 * (top_px + bottom_px)
-        covariance = None
-        if settings.box_std is not None:
-            width_rad = view.bearing_rad(left_px, v_px) - view.bearing_rad(right_px, v_px)
-            covariance = ((settings.box_std * width_rad) ** 2,)
-        return Detection(bearing_rad=view.bearing_rad(0.5 * (left_px + right_px), v_px), covariance=covariance)
-    raise ValueError(f"{len(fields)} fields in place of {_POSE_FIELDS}, a box in space, or {_BOX_FIELDS}, in the image")
+def _regions(view: View, rows: list[Row]) -> Iterator[TruthState]:
+    """The regions of a frame; their ids count down from -2."""
+    boxes = [row for row in rows if len(row.fields) > 2 and row.fields[2] == _DONT_CARE]
+    yield from _read(boxes, partial(_region, view, iter(range(-2, -2 - len(boxes), -1))))
+
+
+def _region(view: View, ids: Iterator[int], fields: list[str]) -> TruthState:
+    left_px, top_px, right_px, bottom_px = map(float, fields[6:10])
+    near_m = _CAR_HEIGHT_M * _INSIDE * view.calibration.projection[1, 1] / max(bottom_px - top_px, 1.0)
+    near_m, far_m = min(near_m, 0.5 * _FAR_M), _FAR_M
+    v_px = 0.5 * (top_px + bottom_px)
+    sides = np.array([view.bearing_rad(u_px, v_px) for u_px in (left_px, right_px)])
+    rays = np.column_stack([np.cos(sides), np.sin(sides)])
+    camera_m = (view.levelled_from_imu @ view.calibration.camera_m)[:2]
+    corners = view.in_map(camera_m + np.vstack([near_m * rays, far_m * rays[::-1]]))
+    x_m, y_m = corners.mean(axis=0).tolist()
+    outline_m = tuple(corners.ravel().tolist())
+    ego = view.ego
+    return TruthState(ego.stamp_ns, ego.receipt_ns, next(ids), x_m, y_m, ignored=True, outline_m=outline_m)
+
+
+def _detection(view: View, sensor: str, settings: KittiInput, frame: Frame, fields: list[str]) -> Detection | None:
+    """The object of a line; None for another class, one below the score, and a box that the image cuts off."""
+    kind: str | None = None
+    score: float | None = None
+    if len(fields) == _AB3DMOT_FIELDS:
+        kind = _CLASSES.get(int(fields[1]), fields[1])
+        image, score, space = fields[2:6], float(fields[6]), fields[7:14]
+    elif len(fields) in (_KITTI_FIELDS - 1, _KITTI_FIELDS):  # the score is last and may be missing
+        kind = fields[2]
+        image, space = fields[6:10], fields[10:17]
+        if len(fields) == _KITTI_FIELDS:
+            score = float(fields[17])
+    elif len(fields) == _BOX_FIELDS:
+        image, score, space = fields[1:5], float(fields[5]), []
+    else:
+        raise ValueError(f"{len(fields)} fields in place of {_FORMS}")
+    if kind is not None and kind not in settings.classes:
+        return None
+    if score is not None and score < settings.min_score.get(sensor, -math.inf):
+        return None
+    name = None if kind is None else kind.lower()
+    if not space or float(space[3]) < _NOWHERE_M:
+        if frame != "sensor":
+            raise ValueError("a box in the image alone, where others of the file are in space: give it a folder")
+        return _in_image(view, settings, list(map(float, image)), score, name)
+    height_m, width_m, length_m, x_m, y_m, z_m, turned_rad = map(float, space)
+    position_m, yaw_rad = view.pose(x_m, y_m, z_m, turned_rad)
+    ahead_m, aside_m, bottom_m = position_m.tolist()
+    return Detection(
+        x_m=ahead_m,
+        y_m=aside_m,
+        yaw_rad=yaw_rad,
+        z_m=bottom_m + 0.5 * height_m,
+        length_m=length_m,
+        width_m=width_m,
+        height_m=height_m,
+        score=score,
+        class_name=name,
+    )
+
+
+def _in_image(
+    view: View, settings: KittiInput, box_px: list[float], score: float | None, name: str | None
+) -> Detection | None:
+    left_px, top_px, right_px, bottom_px = box_px
+    if left_px < _BORDER_PX or right_px > settings.image_width_px - 1.0 - _BORDER_PX:
+        return None
+    v_px = 0.5 * (top_px + bottom_px)
+    covariance = None
+    if settings.box_std is not None:
+        width_rad = view.bearing_rad(left_px, v_px) - view.bearing_rad(right_px, v_px)
+        covariance = ((settings.box_std * width_rad) ** 2,)
+    bearing_rad = view.bearing_rad(0.5 * (left_px + right_px), v_px)
+    return Detection(bearing_rad=bearing_rad, covariance=covariance, score=score, class_name=name)
 
 
 def _frame(rows: Rows) -> Frame:
     """Frame of the detections of a file; bearings are from the camera."""
-    first = next((found[0] for found in rows.values()), None)
-    return "sensor" if first is not None and len(first.fields) == _BOX_FIELDS else "ego"
+    first = next((found[0].fields for found in rows.values() if found), None)
+    if first is None:
+        return "ego"
+    flat = len(first) >= _KITTI_FIELDS - 1 and first[13].startswith("-1000")
+    return "sensor" if flat or len(first) == _BOX_FIELDS else "ego"
 
 
-def _read(file: Path, rows: list[Row], parse: Callable[[list[str]], _Parsed | None]) -> Iterator[_Parsed]:
+def _read(rows: list[Row], parse: Callable[[list[str]], _Parsed | None]) -> Iterator[_Parsed]:
     """What `parse` makes of the fields of `rows`, without what it leaves out."""
     for row in rows:
         try:
             found = parse(row.fields)
         except (ValueError, IndexError) as error:
-            raise DataError(f"{file}:{row.number}: is no line of the data set ({error})") from error
+            raise DataError(f"{row.place}: is no line of the data set ({error})") from error
         if found is not None:
             yield found
 
 
-def _rows(file: Path, separator: str, num_frames: int) -> Rows:
+def _rows(place: Path, num_frames: int) -> Rows:
+    """Lines of a file of the sequence, or of the files of its frames in a folder, as if they were one."""
     rows: dict[int, list[Row]] = {}
-    for number, line in enumerate(_lines(file), 1):
-        fields = line.split(separator)
+    for where, fields in _of_frames(place) if place.is_dir() else _of_file(place):
         try:
             frame = int(fields[0])
         except ValueError as error:
-            raise DataError(f"{file}:{number}: does not begin with the number of a frame") from error
+            raise DataError(f"{where}: does not begin with the number of a frame") from error
         if not 0 <= frame < num_frames:
-            raise DataError(f"{file}:{number}: is of frame {frame}, but {_OXTS} has {num_frames} frames")
-        rows.setdefault(frame, []).append(Row(number, fields))
+            raise DataError(f"{where}: is of frame {frame}, but {_OXTS} has {num_frames} frames")
+        rows.setdefault(frame, []).append(Row(where, fields))
     return rows
 
 
-def _lines(file: Path) -> list[str]:
-    """The lines of `file`, without empty ones at its end."""
-    try:
-        return [line.strip() for line in file.read_text(encoding="utf-8").rstrip().splitlines()]
-    except OSError as error:
-        raise DataError(f"{file}: cannot be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"{file}: is no text ({error.reason})") from error
+def _of_file(file: Path) -> Iterator[tuple[str, list[str]]]:
+    for number, line in enumerate(lines(file), 1):
+        yield f"{file}:{number}", line.split(",") if "," in line else line.split(" ")
+
+
+def _of_frames(folder: Path) -> Iterator[tuple[str, list[str]]]:
+    for file in sorted(folder.glob("*.txt")):
+        for number, line in enumerate(lines(file), 1):
+            yield f"{file}:{number}", [file.stem, "-1", *line.split(" ")]

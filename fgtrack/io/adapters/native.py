@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import fields
 
 from fgtrack.core.types import (
+    DESCRIBING,
     MEASURABLE,
     STATE_NAMES,
     Detection,
@@ -17,8 +18,11 @@ from fgtrack.io.adapters.common import RosMessage, stamp_ns
 EGO, DETECTIONS, TRUTH = (f"fgtrack_msgs/msg/{name}" for name in ("Ego", "DetectionList", "Truth"))
 
 #: Optional fields in the order of the bits of `present`.
-DETECTION_OPTIONAL = (*MEASURABLE, "covariance", "stamp_ns", "object_id")
-TRUTH_OPTIONAL = STATE_NAMES[2:]
+DETECTION_OPTIONAL = (*MEASURABLE, "covariance", "stamp_ns", "object_id", *DESCRIBING)
+TRUTH_OPTIONAL = (*STATE_NAMES[2:], "outline_m")
+
+#: Fields that hold numbers in a list, and those that hold a text.
+LISTS, TEXTS = frozenset({"covariance", "outline_m"}), frozenset({"class_name"})
 
 
 def presence(value: Detection | TruthState, names: tuple[str, ...]) -> int:
@@ -30,7 +34,8 @@ def _given(message: RosMessage) -> dict[str, RosMessage]:
     """The fields behind `present` that were given; their order is that of the recording, whatever wrote it."""
     names = [field.name for field in fields(message)]
     optional = names[names.index("present") + 1 :]
-    return {name: getattr(message, name) for bit, name in enumerate(optional) if message.present >> bit & 1}
+    given = {name: getattr(message, name) for bit, name in enumerate(optional) if message.present >> bit & 1}
+    return {name: tuple(value.tolist()) if name in LISTS else value for name, value in given.items()}
 
 
 def ego(message: RosMessage, receipt_ns: int) -> EgoState:
@@ -47,14 +52,9 @@ def ego(message: RosMessage, receipt_ns: int) -> EgoState:
 
 def detections(message: RosMessage, receipt_ns: int) -> DetectionList:
     """The object list of a `fgtrack_msgs/DetectionList`."""
-    objects = []
-    for item in message.objects:
-        given = _given(item)
-        if "covariance" in given:
-            given["covariance"] = tuple(given["covariance"].tolist())
-        objects.append(Detection(**given))
+    objects = tuple(Detection(**_given(item)) for item in message.objects)
     stamp = stamp_ns(message.header.stamp)
-    return DetectionList(message.sensor, stamp, receipt_ns, tuple(objects), message.header.frame_id)
+    return DetectionList(message.sensor, stamp, receipt_ns, objects, message.header.frame_id)
 
 
 def truth(message: RosMessage, receipt_ns: int) -> TruthState:
@@ -65,6 +65,7 @@ def truth(message: RosMessage, receipt_ns: int) -> TruthState:
         message.object_id,
         message.x_m,
         message.y_m,
+        ignored=getattr(message, "ignored", False),  # recordings of 0.1.0 have none
         **_given(message),
     )
 

@@ -55,6 +55,12 @@ uint16 present
 float64[] covariance
 int64 stamp_ns
 int64 object_id
+float64 z_m
+float64 length_m
+float64 width_m
+float64 height_m
+float64 score
+string class_name
 """,
     "fgtrack_msgs/msg/DetectionList": """\
 # header.frame_id is map, ego or sensor.
@@ -68,11 +74,14 @@ std_msgs/Header header
 int64 object_id
 float64 x_m
 float64 y_m
+bool ignored
 uint16 present
 float64 yaw_rad
 float64 speed_mps
 float64 yaw_rate_radps
 float64 accel_mps2
+# Corners x, y, x, y ... of a region that is ignored.
+float64[] outline_m
 """,
 }
 

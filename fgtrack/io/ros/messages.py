@@ -10,7 +10,16 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import STATE_NAMES, Detection, DetectionList, EgoState, FloatArray, Frame, TruthState
 from fgtrack.io.adapters.common import PLANAR, RosMessage
-from fgtrack.io.adapters.native import DETECTION_OPTIONAL, DETECTIONS, EGO, TRUTH, TRUTH_OPTIONAL, presence
+from fgtrack.io.adapters.native import (
+    DETECTION_OPTIONAL,
+    DETECTIONS,
+    EGO,
+    LISTS,
+    TEXTS,
+    TRUTH,
+    TRUTH_OPTIONAL,
+    presence,
+)
 from fgtrack.io.ros.typestore import build_typestore
 
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -69,8 +78,9 @@ class MessageFactory:
             object_id=state.object_id,
             x_m=state.x_m,
             y_m=state.y_m,
+            ignored=state.ignored,
             present=presence(state, TRUTH_OPTIONAL),
-            **{name: _or_zero(getattr(state, name)) for name in TRUTH_OPTIONAL},
+            **{name: _or_nothing(name, getattr(state, name)) for name in TRUTH_OPTIONAL},
         )
 
     def odometry(self, state: EgoState) -> RosMessage:
@@ -122,8 +132,7 @@ class MessageFactory:
         return self._header(message.stamp_ns, _FRAME_IDS.get(message.frame, message.sensor))
 
     def _detection(self, item: Detection) -> RosMessage:
-        given: dict[str, RosMessage] = {name: _or_zero(getattr(item, name)) for name in DETECTION_OPTIONAL}
-        given["covariance"] = np.array(item.covariance or (), dtype=np.float64)
+        given = {name: _or_nothing(name, getattr(item, name)) for name in DETECTION_OPTIONAL}
         return self._make("fgtrack_msgs/msg/Detection", present=presence(item, DETECTION_OPTIONAL), **given)
 
     def _detection3d(self, item: Detection) -> RosMessage:
@@ -193,8 +202,11 @@ class MessageFactory:
         return self._make(f"geometry_msgs/msg/{kind}WithCovariance", **fields)
 
 
-def _or_zero(value: float | None) -> float:
-    return 0 if value is None else value
+def _or_nothing(name: str, value: RosMessage) -> RosMessage:
+    """What the field `name` holds of `value`, which may be None."""
+    if name in LISTS:
+        return np.array(value or (), dtype=np.float64)
+    return value if value is not None else "" if name in TEXTS else 0
 
 
 def _has_position(item: Detection) -> bool:

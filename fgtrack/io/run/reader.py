@@ -4,7 +4,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from fgtrack.io.run.schema import COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
 # A column holds floats, integers or strings, as its name says; the reader of it knows which.
 Column = npt.NDArray[Any]
 
-_TEXT_COLUMNS = frozenset({"status", "sensor", "disposition", "kind", "frame"})
+_TEXT_COLUMNS = frozenset({"status", "sensor", "disposition", "kind", "frame", "class_name", "outline_m"})
 _INTEGER_COLUMNS = frozenset(
     {
         *("tick", "now_ns", "stamp_ns", "receipt_ns", "process_ns", "track_id", "object_id"),
@@ -85,6 +85,8 @@ class Run:
     """What was told of the ego, in order of receipt."""
     detections: Table
     """What the sensors said, in order of receipt; a row for each of `updates`. Of runs of fgtrack 0.1 it is empty."""
+    ignored: Table = field(default_factory=lambda: Table({name: column(name, ()) for name in COLUMNS["ignored"]}))
+    """Objects and regions at which a track is neither right nor false."""
 
     @property
     def config(self) -> Mapping[str, Any]:
@@ -174,7 +176,7 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
 def column(name: str, cells: Sequence[str | int | float | None]) -> Column:
     """The column `name` from its cells, shape (rows,); None is empty."""
     if name in _TEXT_COLUMNS:
-        return np.array(cells, dtype=np.str_)
+        return np.array(["" if cell is None else cell for cell in cells], dtype=np.str_)
     if name in _INTEGER_COLUMNS:
         return np.array([NO_TRACK if cell is None else cell for cell in cells], dtype=np.int64)
     return np.array(cells, dtype=np.float64)

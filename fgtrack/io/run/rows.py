@@ -6,6 +6,7 @@ from operator import attrgetter, itemgetter
 from typing import Any
 
 from fgtrack.core.types import (
+    DESCRIBING,
     MEASURABLE,
     STATE_NAMES,
     DetectionList,
@@ -21,6 +22,8 @@ from fgtrack.io.run.schema import COLUMNS, COVARIANCE_STATES
 
 Cell = str | int | float | None
 Row = tuple[Cell, ...]
+
+_NAMES = frozenset({"sensor", "class_name"})  # columns that hold whatever the input calls things
 
 
 def rows(
@@ -80,6 +83,12 @@ def truth_row(truth: TruthState) -> Row:
     return (truth.stamp_ns, truth.object_id, *_truth_state(truth))
 
 
+def ignored_row(truth: TruthState) -> Row:
+    """A row of `ignored`; corners as `x y x y ...`."""
+    outline = None if truth.outline_m is None else " ".join(map(repr, map(float, truth.outline_m)))
+    return (truth.stamp_ns, truth.object_id, float(truth.x_m), float(truth.y_m), outline)
+
+
 def ego_row(ego: EgoState) -> Row:
     """A row of `ego`."""
     return (ego.stamp_ns, ego.receipt_ns, *_ego_state(ego))
@@ -91,21 +100,26 @@ def detection_rows(message: DetectionList) -> list[Row]:
     for index, one in enumerate(message.objects):
         stamp_ns = message.stamp_ns if one.stamp_ns is None else one.stamp_ns
         said = (None if value is None else float(value) for value in _measured(one))
-        found.append((message.sensor, stamp_ns, message.receipt_ns, index, message.frame, *said))
+        of_object = (_float_or_text(value) for value in _describing(one))
+        found.append((message.sensor, stamp_ns, message.receipt_ns, index, message.frame, *said, *of_object))
     return found
 
 
 def text(table: str, found: Sequence[Row]) -> str:
     """Rows as lines of the CSV file of `table`, floats with 17 significant digits."""
-    if "sensor" in COLUMNS[table]:
-        place = COLUMNS[table].index("sensor")
-        found = [(*row[:place], _quoted(str(row[place])), *row[place + 1 :]) for row in found]
+    for name in _NAMES & set(COLUMNS[table]):
+        place = COLUMNS[table].index(name)
+        found = [(*row[:place], _quoted(row[place]), *row[place + 1 :]) for row in found]
     return "".join([_line(tuple(map(type, row))) % row for row in found])
 
 
 def text_header(table: str) -> bytes:
     """First line of the CSV file of `table`."""
     return (",".join(COLUMNS[table]) + "\n").encode()
+
+
+def _float_or_text(value: float | str | None) -> Cell:
+    return value if value is None or isinstance(value, str) else float(value)
 
 
 @lru_cache
@@ -120,8 +134,11 @@ def _format(kind: type) -> str:
 
 
 @lru_cache
-def _quoted(name: str) -> str:
+def _quoted(name: Cell) -> Cell:
     """`name` as a CSV cell."""
+    if name is None:
+        return None
+    name = str(name)
     return '"' + name.replace('"', '""') + '"' if set(name) & set(',"\r\n') else name
 
 
@@ -144,3 +161,4 @@ def _upper_triangle(size: int) -> Callable[[list[Cell]], Row]:
 _truth_state = attrgetter(*STATE_NAMES)
 _ego_state = attrgetter(*STATE_NAMES)
 _measured = attrgetter(*MEASURABLE)
+_describing = attrgetter(*DESCRIBING)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from fgtrack.core.types import MEASURABLE, STATE_NAMES
+from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES
 
 RUN_FORMAT = "fgtrack-run/1"
 
@@ -28,9 +28,10 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "smoothed": ("track_id", "stamp_ns", "kind", *STATE_NAMES, *COVARIANCE_COLUMNS),
     "lagged": ("tick", "now_ns", "lag_s", "track_id", "stamp_ns", *STATE_NAMES, *COVARIANCE_COLUMNS),
     "truth": ("stamp_ns", "object_id", *STATE_NAMES),
+    "ignored": ("stamp_ns", "object_id", "x_m", "y_m", "outline_m"),
     "ego": ("stamp_ns", "receipt_ns", *STATE_NAMES),
-    "detections": ("sensor", "stamp_ns", "receipt_ns", "index", "frame", *MEASURABLE),
+    "detections": ("sensor", "stamp_ns", "receipt_ns", "index", "frame", *MEASURABLE, *DESCRIBING),
 }
 
 #: Tables that are written only when there is something to write.
-OPTIONAL_TABLES = ("smoothed", "lagged", "truth", "ego", "detections")
+OPTIONAL_TABLES = ("smoothed", "lagged", "truth", "ignored", "ego", "detections")

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from fgtrack.core.types import DetectionList, Disposition, EgoState, SmoothedReport, TickReport, TruthState
-from fgtrack.io.run.rows import Row, detection_rows, ego_row, rows, smoothed_rows, truth_row
+from fgtrack.io.run.rows import Row, detection_rows, ego_row, ignored_row, rows, smoothed_rows, truth_row
 from fgtrack.io.run.schema import RUN_FORMAT
 
 
@@ -44,8 +44,11 @@ class RunSink(ABC):
             self._append("smoothed", smoothed_rows(reports))
 
     def write_truth(self, truth: TruthState) -> None:
-        """Take a row of `truth`."""
-        self._append("truth", [truth_row(truth)])
+        """Take a row of `truth`, or of `ignored`."""
+        if truth.ignored:
+            self._append("ignored", [ignored_row(truth)])
+        else:
+            self._append("truth", [truth_row(truth)])
 
     def write_ego(self, ego: EgoState) -> None:
         """Take a row of `ego`; the next tick puts it behind the others."""

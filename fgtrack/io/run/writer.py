@@ -50,7 +50,7 @@ class RunWriter(RunSink):
         self.path = Path(path)
         self._overwrite = overwrite
         self._begun = False
-        self._truth: list[Row] = []  # what came before the first tick
+        self._truth: dict[str, list[Row]] = {"truth": [], "ignored": []}  # what came before the first tick
         self._files: dict[str, BinaryIO] = {}
         with ExitStack() as claim:
             claim.enter_context(claimed(self.path))
@@ -82,8 +82,8 @@ class RunWriter(RunSink):
         return finished
 
     def _append(self, table: str, found: Sequence[Row]) -> None:
-        if table == "truth" and not self._begun:
-            self._truth += found
+        if table in self._truth and not self._begun:
+            self._truth[table] += found
             return
         self._begin()
         self._write(table, text(table, found))
@@ -102,8 +102,9 @@ class RunWriter(RunSink):
         for table in COLUMNS:
             if table not in OPTIONAL_TABLES:
                 self._write(table, "")
-        if self._truth:
-            self._write("truth", text("truth", self._truth))
+        for table, found in self._truth.items():
+            if found:
+                self._write(table, text(table, found))
         self._write_meta()
 
     def _write(self, table: str, lines: str) -> None:

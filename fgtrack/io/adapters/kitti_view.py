@@ -1,0 +1,179 @@
+"""Where things of a KITTI sequence are: calibration, the ego at every frame, from camera to ego frame and back."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.geometry import rotation, wrap_angle
+from fgtrack.core.types import EgoState, FloatArray
+
+PERIOD_NS = 100_000_000
+IMAGE_PX = (1242.0, 375.0)
+"""Width and height of the images; of some sequences a few pixels less."""
+
+_EARTH_RADIUS_M = 6_378_137.0
+
+
+class Calibration(NamedTuple):
+    """How camera 2 and the frame of labels and detections stand in the frame of the inertial unit."""
+
+    projection: FloatArray
+    """Image point, homogeneous, from a point in the rectified frame of camera 0, shape (3, 4)."""
+    rectified_from_imu: FloatArray
+    """Shape (4, 4)."""
+
+    def point(self, rectified_m: Sequence[float]) -> FloatArray:
+        """Point in the frame of the inertial unit, shape (3,)."""
+        return np.asarray(np.linalg.solve(self.rectified_from_imu, [*rectified_m, 1.0])[:3])
+
+    def direction(self, rectified: Sequence[float]) -> FloatArray:
+        """Direction in the frame of the inertial unit, shape (3,)."""
+        return np.asarray(np.linalg.solve(self.rectified_from_imu[:3, :3], rectified))
+
+    def ray(self, u_px: float, v_px: float) -> FloatArray:
+        """Direction from camera 2 to an image point, in the frame of the inertial unit, shape (3,)."""
+        return self.direction(np.linalg.solve(self.projection[:, :3], [u_px, v_px, 1.0]).tolist())
+
+    @property
+    def camera_m(self) -> FloatArray:
+        """Camera 2 in the frame of the inertial unit, shape (3,)."""
+        return self.point((-np.linalg.solve(self.projection[:, :3], self.projection[:, 3])).tolist())
+
+
+class Box(NamedTuple):
+    """A box in space, as labels and results give it: in the rectified camera frame, by the middle of its bottom."""
+
+    height_m: float
+    width_m: float
+    length_m: float
+    x_m: float
+    y_m: float
+    z_m: float
+    rotation_y_rad: float
+
+    def image_px(self, calibration: Calibration) -> tuple[float, float, float, float] | None:
+        """Left, top, right and bottom of what camera 2 sees of it; None where it does not."""
+        signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-1.0, 0.0) for c in (-0.5, 0.5)])
+        corners = signs * np.array([self.length_m, self.height_m, self.width_m])
+        corners[:, ::2] = corners[:, ::2] @ rotation(self.rotation_y_rad)  # about y, which points down
+        corners += np.array([self.x_m, self.y_m, self.z_m])
+        points = np.column_stack([corners, np.ones(8)]) @ calibration.projection.T
+        points = points[points[:, 2] > 0.1]
+        if not len(points):
+            return None
+        pixels = points[:, :2] / points[:, 2:]
+        low, high = np.maximum(pixels.min(axis=0), 0.0), np.minimum(pixels.max(axis=0), np.array(IMAGE_PX) - 1.0)
+        return (*low.tolist(), *high.tolist()) if (low < high).all() else None
+
+
+class View(NamedTuple):
+    """The ego at a frame, how the inertial unit is tilted, and the calibration."""
+
+    ego: EgoState
+    levelled_from_imu: FloatArray
+    """Shape (3, 3)."""
+    calibration: Calibration
+
+    def pose(self, x_m: float, y_m: float, z_m: float, rotation_y_rad: float) -> tuple[FloatArray, float]:
+        """Position (3,) and yaw in the ego frame of an object given in the rectified camera frame."""
+        heading = self.calibration.direction([math.cos(rotation_y_rad), 0.0, -math.sin(rotation_y_rad)])
+        return self.levelled_from_imu @ self.calibration.point([x_m, y_m, z_m]), self._azimuth_rad(heading)
+
+    def rectified(self, position_m: FloatArray, yaw_rad: float) -> tuple[FloatArray, float]:
+        """Position (3,) and rotation about y in the rectified camera frame, the inverse of `pose`."""
+        turn = self.calibration.rectified_from_imu[:3, :3] @ self.levelled_from_imu.T
+        heading = turn @ [math.cos(yaw_rad), math.sin(yaw_rad), 0.0]
+        return turn @ position_m + self.calibration.rectified_from_imu[:3, 3], math.atan2(-heading[2], heading[0])
+
+    def bearing_rad(self, u_px: float, v_px: float) -> float:
+        """Bearing of an image point from camera 2, 0 along the ego's heading."""
+        return self._azimuth_rad(self.calibration.ray(u_px, v_px))
+
+    def in_map(self, position_m: FloatArray) -> FloatArray:
+        """Points in the map, shape (..., 2), from those in the ego frame."""
+        return np.array([self.ego.x_m, self.ego.y_m]) + position_m[..., :2] @ rotation(self.ego.yaw_rad).T
+
+    def _azimuth_rad(self, imu: FloatArray) -> float:
+        ahead, aside, _ = (self.levelled_from_imu @ imu).tolist()
+        return math.atan2(aside, ahead)
+
+
+def read_views(oxts: Path, calibration: Path) -> list[View]:
+    """What is known of the ego at every frame; raises `DataError` where the files are not those of the data set."""
+    return _views(oxts, _calibration(calibration))
+
+
+def _calibration(file: Path) -> Calibration:
+    matrices: dict[str, FloatArray] = {}
+    for number, line in enumerate(lines(file), 1):
+        name, _, values = line.replace(":", " ", 1).strip().partition(" ")
+        try:
+            matrices[name.replace("R0_", "R_").replace("_to_", "_")] = np.array(values.split(), dtype=np.float64)
+        except ValueError as error:
+            raise DataError(f"{file}:{number}: is no matrix ({error})") from error
+    try:
+        rectified_from_camera = np.eye(4)
+        rectified_from_camera[:3, :3] = matrices["R_rect"].reshape(3, 3)
+        camera_from_velodyne, velodyne_from_imu = (_rigid(matrices[name]) for name in ("Tr_velo_cam", "Tr_imu_velo"))
+        projection = matrices["P2"].reshape(3, 4)
+    except (KeyError, ValueError) as error:
+        raise DataError(f"{file}: is no calibration of the data set ({error!r})") from error
+    calibration = Calibration(projection, rectified_from_camera @ camera_from_velodyne @ velodyne_from_imu)
+    for matrix in (projection[:, :3], calibration.rectified_from_imu):
+        if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix) < len(matrix):
+            raise DataError(f"{file}: is no calibration of the data set (a matrix has no inverse)")
+    return calibration
+
+
+def _rigid(values: FloatArray) -> FloatArray:
+    return np.vstack([values.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+
+
+def _views(file: Path, calibration: Calibration) -> list[View]:
+    views: list[View] = []
+    origin_m, scale = np.zeros(2), 1.0
+    for number, line in enumerate(lines(file), 1):
+        try:
+            values = [float(value) for value in line.split()]
+            latitude_deg, longitude_deg, _, roll_rad, pitch_rad, yaw_rad = values[:6]
+            speed_mps, accel_mps2, yaw_rate_radps = values[8], values[14], values[22]
+            if not views:
+                scale = math.cos(math.radians(latitude_deg))
+            position_m = _mercator(latitude_deg, longitude_deg, scale)
+        except (ValueError, IndexError) as error:
+            raise DataError(f"{file}:{number}: is no line of the data set ({error})") from error
+        if not views:
+            origin_m = position_m
+        x_m, y_m = (position_m - origin_m).tolist()
+        stamp_ns = len(views) * PERIOD_NS
+        ego = EgoState(stamp_ns, stamp_ns, x_m, y_m, wrap_angle(yaw_rad), speed_mps, yaw_rate_radps, accel_mps2)
+        views.append(View(ego, _levelling(roll_rad, pitch_rad), calibration))
+    return views
+
+
+def _mercator(latitude_deg: float, longitude_deg: float, scale: float) -> FloatArray:
+    """Position to the east and north, shape (2,), true to scale at the latitude whose cosine is `scale`."""
+    north = math.log(math.tan(math.radians(45.0 + 0.5 * latitude_deg)))
+    return scale * _EARTH_RADIUS_M * np.array([math.radians(longitude_deg), north])
+
+
+def _levelling(roll_rad: float, pitch_rad: float) -> FloatArray:
+    """Rotation, shape (3, 3), from a frame that is rolled and pitched to a level one of the same heading."""
+    about_x, about_y = np.eye(3), np.eye(3)
+    about_x[1:, 1:] = rotation(roll_rad)
+    about_y[::2, ::2] = rotation(-pitch_rad)  # rows and columns x and z, which y turns from z to x
+    return np.asarray(about_y @ about_x)
+
+
+def lines(file: Path) -> list[str]:
+    """The lines of `file`, without empty ones at its end."""
+    try:
+        return [line.strip() for line in file.read_text(encoding="utf-8").rstrip().splitlines()]
+    except OSError as error:
+        raise DataError(f"{file}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{file}: is no text ({error.reason})") from error
