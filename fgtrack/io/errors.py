@@ -14,16 +14,24 @@ class TruncatedInput(DataError):  # noqa: N818 - it names what the input is; the
 
 
 class UntilBreak:
-    """Iterates over messages up to the end or the break, and keeps the error of the break for later."""
+    """Iterates over messages up to the end or the break, and keeps the error of the break for later.
+
+    A `DataError` behind a message is a break as well; one before the first is raised.
+    """
 
     def __init__(self, messages: Iterable[Message]) -> None:
         self._messages = messages
-        self.error: TruncatedInput | None = None
+        self.error: DataError | None = None
 
     def __iter__(self) -> Iterator[Message]:
+        count = 0
         try:
-            yield from self._messages
-        except TruncatedInput as error:
+            for message in self._messages:
+                yield message
+                count += 1
+        except DataError as error:
+            if not count and not isinstance(error, TruncatedInput):
+                raise
             self.error = error
 
     def raise_error(self) -> None:

@@ -12,7 +12,7 @@ from fgtrack.core.types import DetectionList, EgoState
 from fgtrack.io.adapters import ADAPTERS
 from fgtrack.io.adapters.ego import ODOMETRY
 from fgtrack.io.config import InputConfig
-from fgtrack.io.errors import TruncatedInput
+from fgtrack.io.errors import TruncatedInput, UntilBreak
 from fgtrack.io.ros.bag import Bag, BagTopic
 from fgtrack.io.ros.topics import topic_uses
 from fgtrack.io.source import input_kind, open_input
@@ -152,16 +152,13 @@ def _note(topic: BagTopic, times: dict[_Key, _Times]) -> str | None:
 
 def _read_messages(path: Path, config: InputConfig | None, times: dict[_Key, _Times]) -> _Found:
     used: dict[_Key, str] = {}
-    problem: str | None = None
-    try:
-        for message in open_input(path, config).messages():
-            if isinstance(message, DetectionList):
-                key, use = (message.sensor, "detections"), f"detections {message.sensor}"
-            else:
-                use = "ego" if isinstance(message, EgoState) else "truth"
-                key = (use, use)
-            used[key] = use
-            times[key].add(message.receipt_ns, message.stamp_ns)
-    except TruncatedInput as error:
-        problem = str(error)
-    return used, {}, problem
+    messages = UntilBreak(open_input(path, config).messages())
+    for message in messages:
+        if isinstance(message, DetectionList):
+            key, use = (message.sensor, "detections"), f"detections {message.sensor}"
+        else:
+            use = "ego" if isinstance(message, EgoState) else "truth"
+            key = (use, use)
+        used[key] = use
+        times[key].add(message.receipt_ns, message.stamp_ns)
+    return used, {}, None if messages.error is None else str(messages.error)

@@ -3,12 +3,14 @@
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Message
 from fgtrack.io.adapters import ADAPTERS
 from fgtrack.io.config import InputConfig
+from fgtrack.io.gate import checked
 
 _logger = logging.getLogger(__name__)
 
@@ -21,7 +23,7 @@ class InputSource:
     kind: str
     """Name of its format."""
     messages: Callable[[], Iterator[Message]]
-    """Gives the messages in receipt order.
+    """Gives the messages in receipt order, as `fgtrack.io.gate` lets them pass.
 
     Raises `TruncatedInput` behind the last message before a break, `DataError` for all else that is wrong.
     """
@@ -51,7 +53,8 @@ def open_input(path: Path | str, config: InputConfig | None = None) -> InputSour
     """
     path = Path(path)
     name = input_kind(path)
-    return InputSource(path, name, file_format(name).open(path, config or InputConfig()))
+    messages = file_format(name).open(path, config or InputConfig())
+    return InputSource(path, name, partial(checked, path, messages))
 
 
 def input_kind(path: Path) -> str:

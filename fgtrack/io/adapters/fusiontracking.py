@@ -50,24 +50,26 @@ def read_log(folder: Path, frames: Mapping[str, Frame]) -> Iterator[Message]:
     """
     file = folder / LOG_NAME
     try:
-        with file.open(encoding="utf-8") as lines:
-            header = next(lines, "").rstrip("\n").split(";")
+        with file.open("rb") as lines:
+            header = next(lines, b"").decode(errors="replace").rstrip("\n").split(";")
             if missing := [name for name in _COLUMNS if name not in header]:
                 raise DataError(f"{file}:1: has no column {missing[0]}, so it is not a log of FusionTracking")
             last_ego_ns: int | None = None
             for number, line in enumerate(lines, 2):
-                cells = line.rstrip("\n").split(";")
-                if len(cells) < len(header) and not line.endswith("\n"):
+                if line.count(b";") < len(header) - 1 and not line.endswith(b"\n"):
                     raise TruncatedInput(f"{file}:{number}: breaks off in the middle of a row")
                 try:
-                    row = dict(zip(header, cells, strict=True))
+                    row = dict(zip(header, line.decode().rstrip("\n").split(";"), strict=True))
                     receipt_ns, detections, ego = (json.loads(row[name]) for name in _COLUMNS)
+                    messages: list[Message] = list(_lists(detections or {}, receipt_ns, frames))
                     if "state" in ego and ego["t"] != last_ego_ns:
                         last_ego_ns = ego["t"]
-                        yield _ego(ego, receipt_ns)
-                    yield from _lists(detections or {}, receipt_ns, frames)
-                except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-                    raise DataError(f"{file}:{number}: is not a row of such a log ({error!r})") from error
+                        messages.insert(0, _ego(ego, receipt_ns))
+                except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError) as error:
+                    raise DataError(
+                        f"{file}:{number}: is not a row of such a log ({type(error).__name__}: {str(error)[:200]})"
+                    ) from error
+                yield from messages
     except OSError as error:
         raise DataError(f"{file}: cannot be read ({error.strerror})") from error
 

@@ -127,6 +127,10 @@ class Bag:
         with _as_data_error(self.path), _opened(self.path) as files:
             try:
                 for connection, log_ns, data in merged(files, topics):
+                    if type(log_ns) is not int or not isinstance(data, bytes | bytearray | memoryview):
+                        raise TruncatedInput(
+                            f"{self.path}: message {count + 1} on {connection.topic} has no time or no bytes"
+                        )
                     if data[:4] == _ZSTD_MAGIC and not self._ros1:
                         data = DECOMPRESSORS["zstd"](data, 0)
                     yield connection, log_ns, data

@@ -1,0 +1,159 @@
+"""The gate behind every reader: all that comes out of an input has the types and ranges that the rest relies on.
+
+A reader may meet anything. What is wrong with its input is a `DataError` that names the place, whatever the reader
+raised itself; everything before has been given, so a run is complete up to there. Numbers that are not finite pass:
+what becomes of them is counted, one by one, where they are used.
+"""
+
+from collections.abc import Callable, Iterator
+from operator import attrgetter
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from fgtrack.core.errors import DataError, FgtrackError
+from fgtrack.core.types import (
+    DESCRIBING,
+    MEASURABLE,
+    STATE_NAMES,
+    Detection,
+    DetectionList,
+    EgoState,
+    Frame,
+    Message,
+    TruthState,
+)
+
+__all__ = ["checked"]
+
+_LONGEST_NAME = 200
+_FRAMES = frozenset(get_args(Frame))
+_INT64 = range(-(1 << 63), 1 << 63)
+_PLAIN = {float, type(None)}
+_DETECTION_NUMBERS = (*MEASURABLE, *(name for name in DESCRIBING if name != "class_name"))
+_state_numbers = attrgetter(*STATE_NAMES)
+_detection_numbers = attrgetter(*_DETECTION_NUMBERS)
+
+
+def checked(path: Path, messages: Callable[[], Iterator[Message]]) -> Iterator[Message]:
+    """The messages of the input at `path`.
+
+    Raises
+    ------
+    DataError
+        The reader failed, or gave what is no message; raised after everything before that.
+    """
+    count = 0
+    try:
+        for message in messages():
+            _check(message)
+            yield message
+            count += 1
+    except _WrongError as error:
+        raise DataError(f"{path}: message {count + 1}: {error}") from error
+    except FgtrackError:
+        raise
+    except Exception as error:  # whatever a foreign input makes a reader raise
+        what = " ".join(f"{type(error).__name__}: {error}".split())[:_LONGEST_NAME]
+        raise DataError(f"{path}: cannot be read beyond message {count} ({what}): repair or convert it") from error
+
+
+class _WrongError(Exception):
+    """What is wrong with a message."""
+
+
+def _check(message: Message) -> None:
+    match message:
+        case DetectionList():
+            _check_list(message)
+        case EgoState() | TruthState():
+            _check_times(message)
+            _check_numbers(STATE_NAMES, _state_numbers(message))
+            _check_integer("object_id", message.object_id if isinstance(message, TruthState) else 0)
+            _check_several("covariance" if isinstance(message, EgoState) else "outline_m", message)
+        case _:
+            raise _WrongError(f"a {type(message).__name__} is no message")
+
+
+def _check_list(message: DetectionList) -> None:
+    _check_name("sensor", message.sensor)
+    _check_times(message)
+    if message.frame not in _FRAMES:
+        raise _WrongError(f"frame: one of {', '.join(sorted(_FRAMES))} expected, not {_shown(message.frame)}")
+    for index, item in enumerate(message.objects):
+        try:
+            _check_detection(item)
+        except _WrongError as error:
+            raise _WrongError(f"{message.sensor}: objects[{index}]: {error}") from error
+
+
+def _check_detection(item: Detection) -> None:
+    if not isinstance(item, Detection):
+        raise _WrongError(f"a {type(item).__name__} is no detection")
+    _check_numbers(_DETECTION_NUMBERS, _detection_numbers(item))
+    for name in ("stamp_ns", "object_id"):
+        if (value := getattr(item, name)) is not None:
+            _check_integer(name, value)
+    if item.class_name:
+        _check_name("class_name", item.class_name)
+    _check_several("covariance", item)
+
+
+def _check_times(message: Message) -> None:
+    _check_integer("stamp_ns", message.stamp_ns)
+    _check_integer("receipt_ns", message.receipt_ns)
+
+
+def _check_integer(name: str, value: object) -> None:
+    if type(value) is int:
+        if value in _INT64:
+            return
+    elif isinstance(value, np.integer):
+        return
+    raise _WrongError(f"{name}: a 64 bit integer expected, not {_shown(value)}")
+
+
+def _check_numbers(names: tuple[str, ...], values: tuple[object, ...]) -> None:
+    if _PLAIN.issuperset(map(type, values)):
+        return
+    for name, value in zip(names, values, strict=True):
+        _check_number(name, value)
+
+
+def _check_number(name: str, value: object) -> None:
+    if value is None or isinstance(value, (float, np.floating, np.integer)):
+        return
+    if type(value) is not int:
+        raise _WrongError(f"{name}: a number expected, not {_shown(value)}")
+    try:
+        float(value)
+    except OverflowError as error:
+        raise _WrongError(f"{name}: {_shown(value)} is too large for a number") from error
+
+
+def _check_several(name: str, message: EgoState | TruthState | Detection) -> None:
+    values = getattr(message, name)
+    if values is None:
+        return
+    if not isinstance(values, tuple):
+        raise _WrongError(f"{name}: a tuple of numbers expected, not {_shown(values)}")
+    for value in values:
+        _check_number(name, value)
+
+
+def _check_name(name: str, value: object) -> None:
+    if not isinstance(value, str) or not 0 < len(value) <= _LONGEST_NAME:
+        raise _WrongError(f"{name}: a name of up to {_LONGEST_NAME} characters expected, not {_shown(value)}")
+    try:
+        value.encode()
+    except UnicodeEncodeError as error:
+        raise _WrongError(f"{name}: {_shown(value)} is no text") from error
+
+
+def _shown(value: object) -> str:
+    try:
+        text = ascii(value)
+    except ValueError:  # an integer of more digits than Python writes
+        text = f"an integer of {getattr(value, 'bit_length', int)()} bits"
+    return text if len(text) <= 60 else f"{text[:57]}..."
