@@ -3,10 +3,9 @@
 import numpy as np
 
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation.banded.elimination import eliminate
 from fgtrack.estimation.banded.linearisation import linearise_segments, linearise_terms, move
+from fgtrack.estimation.banded.methods import fastest
 from fgtrack.estimation.banded.nodes import Nodes
-from fgtrack.estimation.banded.substitution import Blocks
 from fgtrack.estimation.banded.undo import Undo
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
@@ -30,8 +29,9 @@ class Solver:
         self._motion = motion
         self._settings = settings
         self.nodes = Nodes(motion.dim)
-        self._blocks = Blocks(self.nodes)
-        self.smoothed = self._blocks.smoothed
+        self._methods = fastest()
+        self._substitution = self._methods.substitution(self.nodes)
+        self.smoothed = self._substitution.smoothed
         self._thresholds = np.empty((0, motion.dim))
         self.curved: BoolArray = np.zeros(0, dtype=bool)
         """Whether a track has a measurement that is not linear."""
@@ -41,7 +41,7 @@ class Solver:
     def begin(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
         """Start the window of a track with its first node."""
         self.nodes.begin(track, stamp_ns, mean, covariance)
-        self._blocks.begin(track)
+        self._substitution.begin(track)
         more = len(self.nodes.first) - len(self.curved)
         if more:
             self._thresholds = np.concatenate([self._thresholds, np.zeros((more, self._motion.dim))])
@@ -52,16 +52,16 @@ class Solver:
 
     def dropped(self, tracks: IntArray, numbers: IntArray) -> None:
         """So many of the oldest nodes of `tracks` have been forgotten."""
-        self._blocks.moved(tracks, -numbers)
+        self._substitution.moved(tracks, -numbers)
 
     def eliminate(self, tracks: IntArray, places: IntArray) -> None:
         """Eliminate the nodes of `tracks` from `places` on. Raises `numpy.linalg.LinAlgError` where it fails."""
-        self._blocks.cut(tracks, places)
-        eliminate(self.nodes, tracks, places)
+        self._substitution.cut(tracks, places)
+        self._methods.eliminate(self.nodes, tracks, places)
 
     def solve_means(self, tracks: IntArray) -> None:
         """Find out how far the states of `tracks` are from their linearisation points."""
-        self._blocks.solve_means(tracks, self._thresholds, self.anchored)
+        self._substitution.solve_means(tracks, self._thresholds, self.anchored)
 
     def iterate(self, tracks: IntArray, max_iterations: int) -> None:
         """Take Gauss-Newton steps while a state is further than a threshold from its linearisation point."""
@@ -93,7 +93,7 @@ class Solver:
     def far(self, tracks: IntArray) -> tuple[IntArray, IntArray]:
         """Nodes that are too far from their linearisation points: positions of their tracks, and their places."""
         nodes = self.nodes
-        some = self._blocks.any_far[tracks].nonzero()[0]
+        some = self._substitution.any_far[tracks].nonzero()[0]
         if not some.size:
             return some, some
         count = nodes.count[tracks[some]]
@@ -123,7 +123,7 @@ class Solver:
     def estimates(self, track: int) -> FloatArray:
         """Means of all nodes in the window, shape (m, n)."""
         places = np.arange(int(self.nodes.first[track]), int(self.nodes.count[track]))
-        steps = self._blocks.steps(np.full(len(places), track), places)
+        steps = self._substitution.steps(np.full(len(places), track), places)
         return np.asarray(self.nodes.origin[self.window(track)] + steps)
 
     def solve_at(self, track: int, means: FloatArray) -> None:
