@@ -8,19 +8,31 @@ import typer
 
 from fgtrack.cli.arguments import Overwrite, Runs
 from fgtrack.cli.show import progress, say
+from fgtrack.core.errors import CallError
+from fgtrack.evaluation.kitti_result import write_kitti_result
 from fgtrack.evaluation.viewer.export import export as written
+from fgtrack.io.run import load_run
 from fgtrack.pipeline.shipped import shipped_folder
 
 
 def export(
     runs: Runs,
-    out: Annotated[Path, typer.Option("-o", "--out", help="MCAP file; with --ros2 also a rosbag2 folder.")],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="MCAP file; --ros2: or a rosbag2 folder; --kitti: a text file.")
+    ],
     ros2: Annotated[
         bool, typer.Option("--ros2", help="Write standard ROS 2 messages instead of Foxglove's own.")
     ] = False,
+    kitti: Annotated[
+        Path | None,
+        typer.Option("--kitti", metavar="OXTS", help="Write a KITTI result; names the sequence's oxts/NNNN.txt."),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Export runs for Foxglove, Lichtblick or RViz."""
+    """Export runs for Foxglove, Lichtblick or RViz, or one as a KITTI result."""
+    if kitti is not None:
+        _export_kitti(runs, kitti, out, overwrite)
+        return
     with progress("export"):
         exported = written(runs, out, ros2=ros2, overwrite=overwrite)
     for note in exported.notes:
@@ -28,3 +40,13 @@ def export(
     say(f"{out}: {sum(exported.counts.values())} messages on {len(exported.counts)} topics")
     if not ros2:
         say(f"layout to import: {shipped_folder() / 'foxglove_layout.json'}")
+
+
+def _export_kitti(runs: list[Path], sequence: Path, out: Path, overwrite: bool) -> None:
+    if len(runs) != 1:
+        raise CallError(f"--kitti: writes one run, these are {len(runs)}")
+    written = write_kitti_result(load_run(runs[0]), sequence, out, overwrite=overwrite)
+    if written.without_box:
+        log = logging.getLogger(__name__)
+        log.warning(f"{written.without_box} tracks are left out: none of their detections has a size")
+    say(f"{out}: {written.lines} boxes of {written.tracks} tracks")
