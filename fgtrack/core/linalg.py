@@ -19,7 +19,9 @@ def identity(n: int) -> FloatArray:
 
 def symmetrise(matrix: FloatArray) -> FloatArray:
     """Symmetric part of `matrix`, shape (..., n, n)."""
-    return 0.5 * (matrix + matrix.mT)
+    both: FloatArray = matrix + matrix.T if matrix.ndim == 2 else matrix + matrix.mT
+    both *= 0.5
+    return both
 
 
 def product(A: FloatArray, B: FloatArray) -> FloatArray:
@@ -66,7 +68,15 @@ def mahalanobis_squared(
     With `entries`, that of the marginal distribution of these entries.
     """
     if entries is not None:
-        residual, covariance = residual[..., entries], covariance[..., entries, :][..., entries]
+        k = len(entries)
+        if list(entries) == list(range(k)):  # views are faster than copies
+            residual, covariance = residual[..., :k], covariance[..., :k, :k]
+        else:
+            residual, covariance = residual[..., entries], covariance[..., entries, :][..., entries]
+    if residual.ndim == 1:
+        return np.asarray(residual.dot(psd_solve(covariance, residual)))
+    if residual.shape[:-1] == covariance.shape[:-2] == (1,):
+        return mahalanobis_squared(residual[0], covariance[0])[None]
     return np.asarray(np.vecdot(residual, psd_solve(covariance, residual[..., None])[..., 0]))
 
 

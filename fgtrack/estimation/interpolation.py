@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fgtrack.core.linalg import applied, product
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.ekf import joseph, kalman_gain
 from fgtrack.models.motion import MotionModel
@@ -58,5 +59,5 @@ def _given(
 ) -> Between:
     """See `between`."""
     Psi, _ = kalman_gain(Q1, F2, Q2)
-    mean = first + np.vecdot(Psi, (right - second)[..., None, :])
-    return Between(mean, F1 - Psi @ (F2 @ F1), Psi, joseph(Q1, Psi, F2, Q2))
+    mean = first + applied(Psi, right - second)
+    return Between(mean, F1 - product(Psi, product(F2, F1)), Psi, joseph(Q1, Psi, F2, Q2))

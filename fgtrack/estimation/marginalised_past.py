@@ -4,7 +4,7 @@ older than the window."""
 import bisect
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -106,14 +106,15 @@ class MarginalisedPast:
         filtered, P = self.prior.mean, self.prior.covariance
         for y, H, R in weighed:
             K, _ = kalman_gain(P, H, R)
-            filtered, P = filtered + K @ (y - H @ (filtered - mean)), joseph(P, K, H, R)
-        predicted = np.asarray(step.mean) + F @ (filtered - mean)
+            filtered, P = filtered + K.dot(y - H.dot(filtered - mean)), joseph(P, K, H, R)
+        predicted = step.mean + F.dot(filtered - mean)
         A, P_next = kalman_gain(P, F, step.Q)  # the next node measures F x + N(0, Q)
         C = joseph(P, A, F, step.Q)
-        b = filtered - mean + A @ (next_mean - predicted)
+        b = filtered - mean + A.dot(next_mean - predicted)
         if self._ring:
-            left = self._ring[-1]
-            self._ring[-1] = replace(left, b=left.b + left.A @ (mean - self._origin))
+            last = self._ring[-1]
+            own = last.b + last.A.dot(mean - self._origin)
+            self._ring[-1] = Conditional(last.stamp_ns, last.mean, last.A, own, last.C)
         self._ring.append(Conditional(self._stamp_ns, mean, A, b, C))
         self._stamp_ns, self._origin = next_ns, next_mean
         self.prior = Prior(predicted, symmetrise(P_next))

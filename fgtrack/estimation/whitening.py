@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.linalg import congruence, inverse_roots, mahalanobis_squared
+from fgtrack.core.linalg import congruence, inverse_roots, mahalanobis_squared, product
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation import ekf
 from fgtrack.estimation.base import Measurement
@@ -77,7 +77,7 @@ def whitened(y: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
 
     Raises `numpy.linalg.LinAlgError` for a covariance R that is not positive definite.
     """
-    return np.asarray(inverse_roots(R) @ np.concatenate([H, y[..., None]], axis=-1))
+    return product(inverse_roots(R), np.concatenate([H, y[..., None]], axis=-1))
 
 
 def whitened_term(term: MeasurementTerm, x: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from scipy.special import gammaincinv
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import StatesAt
 from fgtrack.tracking.assignment import Assignment, assigned, cheapest
-from fgtrack.tracking.gating import Pairs, alike, innovations, near, reaches_m
+from fgtrack.tracking.gating import NO_PAIRS, Pairs, alike, innovations, near, reaches_m
 from fgtrack.tracking.preprocess import Candidate
 
 #: Assigns candidates to tracks at least cost; the states are those of the tracks at the candidates' stamp.
@@ -50,19 +50,19 @@ class GatedEuclidean:
             limits_m = np.broadcast_to(gates_m, (len(candidates), len(states.means)))
             reach_m = float(gates_m.max(initial=0.0))
         groups = [] if self.max_nis is None else alike(candidates)
-        near_any = np.zeros(len(candidates), dtype=bool)
+        near_any = set[int]()
 
         def believed(pairs: Pairs) -> Pairs:
             if limits_m is not None:
                 pairs = pairs.at(pairs.values <= limits_m[pairs.rows, pairs.columns])
             if self.max_nis is None:
                 return pairs
-            near_any[pairs.rows] = True
+            near_any.update(pairs.rows.tolist())
             return pairs.at(innovations(pairs, groups, len(candidates), states).nis <= self.max_nis)
 
         found = _assigned(candidates, states, reach_m, believed)
-        refused = tuple(i for i in found.new if near_any[i])
-        return found._replace(new=[i for i in found.new if not near_any[i]], refused=refused) if refused else found
+        refused = tuple([i for i in found.new if i in near_any])
+        return found._replace(new=[i for i in found.new if i not in near_any], refused=refused) if refused else found
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def _assigned(
 ) -> Assignment:
     """The best of the pairs at most `reach_m` apart that `judged` leaves, which gives them their costs."""
     num_tracks = len(states.means)
-    pairs = Pairs.joined([])
+    pairs = NO_PAIRS
     for part in near(candidates, states.means, reach_m):
         pairs = Pairs.joined([pairs, judged(part)]) if len(pairs.rows) else judged(part)
         if len(pairs.rows) > num_tracks:

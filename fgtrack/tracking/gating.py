@@ -39,8 +39,10 @@ class Pairs(NamedTuple):
         """All of `parts`, one after the other."""
         if len(parts) == 1:
             return parts[0]
-        none = cls(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
-        return cls(*(np.concatenate(arrays) for arrays in zip(none, *parts, strict=True)))
+        return cls(*(np.concatenate(arrays) for arrays in zip(NO_PAIRS, *parts, strict=True)))
+
+
+NO_PAIRS = Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
 
 
 class Alike(NamedTuple):
@@ -90,7 +92,7 @@ def _stacked(candidates: Sequence[Candidate], rows: IntArray) -> Alike:
 def positions_m(candidates: Sequence[Candidate]) -> FloatArray:
     """Positions in the map, shape (m, 2); NaN of a bearing."""
     points = [_NOWHERE if candidate.position_m is None else candidate.position_m for candidate in candidates]
-    return np.array(points).reshape(-1, 2)
+    return np.array(points, dtype=np.float64).reshape(-1, 2)
 
 
 def near(candidates: Sequence[Candidate], means: FloatArray, reach_m: float | FloatArray) -> Iterator[Pairs]:
@@ -103,7 +105,7 @@ def near(candidates: Sequence[Candidate], means: FloatArray, reach_m: float | Fl
     points = positions_m(candidates)
     if points.size // 2 * len(means) <= _FEW_DISTANCES:
         distances = euclidean_distances(candidates, means, points)
-        rows, columns = np.nonzero(distances <= reach_m)
+        rows, columns = (distances <= reach_m).nonzero()
         yield Pairs(rows, columns, distances[rows, columns])
         return
     placed = np.flatnonzero(~np.isnan(points[:, 0]))

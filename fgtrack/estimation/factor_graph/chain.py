@@ -4,6 +4,8 @@ import bisect
 from collections.abc import Container
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.terms import MeasurementTerm
 
@@ -31,12 +33,25 @@ class Chain:
     def __init__(self, first: Node) -> None:
         self._nodes = [first]
         self._stamps_ns = [first.stamp_ns]
+        self._keys = [first.key]
         self._next_key = first.key + 1
+        self._rows = np.array([first.origin])  # origins from row `_start` on, and room for more
+        self._start = 0
 
     @property
     def nodes(self) -> list[Node]:
         """All nodes, oldest first."""
         return self._nodes
+
+    @property
+    def keys(self) -> list[int]:
+        """Their keys."""
+        return self._keys
+
+    @property
+    def origins(self) -> FloatArray:
+        """Their linearisation points, shape (nodes, n)."""
+        return self._rows[self._start : self._start + len(self._nodes)]
 
     @property
     def oldest(self) -> Node:
@@ -65,13 +80,27 @@ class Chain:
         place = self.place(stamp_ns) + 1
         self._nodes.insert(place, node)
         self._stamps_ns.insert(place, stamp_ns)
+        self._keys.insert(place, node.key)
+        if self._start + len(self._nodes) > len(self._rows):
+            origins = self.origins
+            self._rows, self._start = np.concatenate([origins, np.empty_like(origins)]), 0
+        origins = self.origins
+        origins[place + 1 :] = origins[place:-1]
+        origins[place] = origin
         return node
+
+    def move(self, place: int, origin: FloatArray) -> None:
+        """The node at index `place` is linearised elsewhere."""
+        self._nodes[place].origin = self.origins[place] = origin
 
     def remove(self, keys: Container[int]) -> None:
         """Take back the insertion of the nodes with `keys`."""
         self._nodes = [node for node in self._nodes if node.key not in keys]
         self._stamps_ns = [node.stamp_ns for node in self._nodes]
+        self._keys = [node.key for node in self._nodes]
+        self._rows, self._start = np.array([node.origin for node in self._nodes]), 0
 
     def drop(self, count: int) -> None:
         """Forget the oldest `count` nodes."""
-        del self._nodes[:count], self._stamps_ns[:count]
+        del self._nodes[:count], self._stamps_ns[:count], self._keys[:count]
+        self._start += count

@@ -38,7 +38,7 @@ def state(motion: MotionModel, around: Around) -> State:
     if right is None:
         return predict_one(mean, covariance, motion, until_s)
     inner = between(motion, mean.tolist(), right, until_s, after_s)
-    return inner.mean, propagated(np.hstack([inner.Lambda, inner.Psi]), covariance, inner.Sigma)
+    return inner.mean, propagated(np.concatenate([inner.Lambda, inner.Psi], axis=1), covariance, inner.Sigma)
 
 
 def states(motion: MotionModel, arounds: Sequence[Around]) -> list[State]:

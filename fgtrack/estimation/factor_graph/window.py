@@ -62,8 +62,8 @@ class Window:
         self._first_ns = stamp_ns
         self._chain = Chain(Node(stamp_ns, FIRST_KEY, prior.mean))
         self._past = MarginalisedPast(motion, stamp_ns, prior, self._follows)
-        self._means: dict[int, FloatArray] = {}
-        self._mean_rows: FloatArray | None = None
+        self._means: FloatArray | None = None
+        self._places: dict[int, int] = {}
         self._far: list[tuple[Node, FloatArray]] | None = None
         self._covariances: dict[tuple[int, ...], FloatArray] = {}
         self._states: dict[int, State] = {}
@@ -127,6 +127,7 @@ class Window:
                 self.state_at(item.stamp_ns)[0] if item.stamp_ns >= anchor.stamp_ns else None for item in measurements
             ]
             fused: list[tuple[Node, MeasurementTerm, FloatArray, FloatArray | None]] = []
+            inserted: list[Node] = []
             for item, guess, rows in zip(measurements, guesses, known, strict=True):
                 if guess is None:
                     fused.append((anchor, update.past.fuse(item), self._mean(anchor), None))
@@ -134,9 +135,10 @@ class Window:
                 at = chain.at(item.stamp_ns)
                 if at is None:
                     at = chain.insert(item.stamp_ns, guess)
+                    inserted.append(at)
                     update.new[at.key], update.stamps_s[at.key] = guess, self._seconds(item.stamp_ns)
                 fused.append((at, item, guess, rows))
-            self._relinearise(update, moved)
+            self._relinearise(update, moved, inserted)
             for node, term, guess, rows in fused:
                 update.add(Term(node.key, term, node.origin if curved(term) else guess, rows), node, term)
         except _BROKEN as error:
@@ -267,8 +269,8 @@ class Window:
         """Build the graph anew from the window's own records, near `means` by key, if wanted in another backend."""
         nodes = self._chain.nodes
         self._backend, self._anchored = (make_backend or self._make_backend)(), False
-        for node in nodes:
-            node.origin = means[node.key]
+        for place, node in enumerate(nodes):
+            self._chain.move(place, means[node.key])
         factors: list[Factor] = [self._segment(left, right) for left, right in pairwise(nodes)]
         factors.append(PriorOf(nodes[0].key, self._past.prior))
         factors += [Term(node.key, item, node.origin) for node in nodes for item in node.terms]
@@ -286,16 +288,22 @@ class Window:
         mean, covariance = self._mean(anchor), self._covariance(anchor)
         return [TrackState(node.stamp_ns, *past.state_at(node.stamp_ns, mean, covariance)) for node in leaving]
 
-    def _relinearise(self, update: Update, moved: Sequence[tuple[Node, FloatArray]]) -> None:
+    def _relinearise(
+        self, update: Update, moved: Sequence[tuple[Node, FloatArray]], inserted: Sequence[Node] = ()
+    ) -> None:
         """Add the segments of new nodes to `update`, and what has to be linearised where nodes have `moved`."""
-        changed = set(update.new)
+        chain = self._chain
+        lefts = set[int]()
+        for node in inserted:
+            place = chain.place(node.stamp_ns)
+            lefts.update((place - 1, place))
         for node, mean in moved:
-            node.origin = mean
-            changed.add(node.key)
-        ends = changed if self._follows else update.new.keys()
-        for left, right in pairwise(self._chain.nodes) if changed else ():
-            if left.key in changed or right.key in ends:
-                update.replace(self._segment(left, right), left, left.slot)
+            place = chain.place(node.stamp_ns)
+            chain.move(place, mean)
+            lefts.update((place - 1, place) if self._follows else (place,))
+        for place in sorted(lefts.intersection(range(len(chain.nodes) - 1))):
+            left, right = chain.nodes[place : place + 2]
+            update.replace(self._segment(left, right), left, left.slot)
         for node, _ in moved if self._curved else ():
             for place, term in enumerate(node.terms):
                 if curved(term):
@@ -321,11 +329,10 @@ class Window:
         The oldest one stays linearised where it was, once it has a marginalised past.
         """
         if self._far is None:
-            nodes = self._chain.nodes
-            means = self._all_means()
-            moves = means - np.concatenate([node.origin for node in nodes]).reshape(means.shape)
-            far = np.flatnonzero((np.abs(moves) > self._thresholds).any(axis=1))
-            self._far = [(nodes[place], means[place]) for place in far.tolist() if place >= self._anchored]
+            nodes, means = self._chain.nodes, self._all_means()
+            far = np.abs(means - self._chain.origins) > self._thresholds
+            places = np.flatnonzero(far.any(axis=1)).tolist() if far.any() else []
+            self._far = [(nodes[place], means[place]) for place in places if place >= self._anchored]
         return self._far
 
     def _segment(self, left: Node, right: Node) -> Segment | MapSegment:
@@ -348,17 +355,16 @@ class Window:
         return mean if np.isfinite(mean).all() else node.origin
 
     def _mean(self, node: Node) -> FloatArray:
-        if self._mean_rows is None:
-            self._all_means()
-        return self._means[node.key]
+        means = self._all_means()
+        return np.asarray(means[self._places[node.key]])
 
     def _all_means(self) -> FloatArray:
         """Of all nodes, shape (nodes, n)."""
-        if self._mean_rows is None:
-            keys = [node.key for node in self._chain.nodes]
-            self._mean_rows = self._backend.means(keys)
-            self._means = dict(zip(keys, self._mean_rows, strict=True))
-        return self._mean_rows
+        if self._means is None:
+            keys = self._chain.keys
+            self._means = self._backend.means(keys)
+            self._places = dict(zip(keys, range(len(keys)), strict=True))
+        return self._means
 
     def _covariance(self, *nodes: Node) -> FloatArray:
         keys = tuple(node.key for node in nodes)
@@ -368,6 +374,6 @@ class Window:
         return covariance
 
     def _forget_estimates(self) -> None:
-        self._mean_rows = self._far = None
+        self._means = self._far = None
         self._covariances.clear()
         self._states.clear()

@@ -1,15 +1,13 @@
 """What solves the window: one small protocol, two implementations on gtsam."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.factor_graph.rows import Factor
 
 
-@dataclass(frozen=True, slots=True)
-class Marginalised:
+class Marginalised(NamedTuple):
     """The oldest variables, to be marginalised."""
 
     keys: list[int]
@@ -19,8 +17,7 @@ class Marginalised:
     """What they say about the oldest of the others."""
 
 
-@dataclass(frozen=True, slots=True)
-class Change:
+class Change(NamedTuple):
     """One change of the window."""
 
     values: dict[int, FloatArray]
