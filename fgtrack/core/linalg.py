@@ -31,6 +31,8 @@ def product(A: FloatArray, B: FloatArray) -> FloatArray:
 
 def congruence(F: FloatArray, P: FloatArray) -> FloatArray:
     """F P F', shapes (..., m, n) and (..., n, n)."""
+    if F.shape[:-2] == (1,) and P.ndim == 2:
+        return congruence(F[0], P)[None]
     return times_transposed(product(F, P), F)
 
 

@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.geometry import rotations, wrap_angles
+from fgtrack.core.geometry import Real, rotations, wrap_angles
 from fgtrack.core.linalg import congruence
 from fgtrack.core.types import MEASURABLE, BoolArray, Detection, FloatArray, Frame, IntArray
 from fgtrack.models.measurement import SensorPose
@@ -16,6 +17,7 @@ from fgtrack.tracking.inbox import Batch, own_covariance
 
 X, Y, YAW, RANGE, BEARING = (MEASURABLE.index(name) for name in ("x_m", "y_m", "yaw_rad", "range_m", "bearing_rad"))
 _VALUES = attrgetter(*MEASURABLE)
+_FEW = 6  # so many points are moved faster one by one
 
 
 class Located(NamedTuple):
@@ -34,7 +36,8 @@ class Located(NamedTuple):
     @property
     def placed(self) -> IntArray:
         """Which of them have a position."""
-        return np.asarray((self.points_m[:, 0] == self.points_m[:, 0]).nonzero()[0])  # NaN is not equal to itself
+        x_m = self.points_m[:, 0]
+        return np.asarray((x_m == x_m).nonzero()[0])  # NaN is not equal to itself
 
     def at(self, rows: IntArray | BoolArray) -> "Located":
         """Those of `rows`."""
@@ -44,7 +47,10 @@ class Located(NamedTuple):
 
     def kinds(self) -> list[tuple[int, ...]]:
         """Columns of the components that each has."""
-        rows, columns = (self.values == self.values).nonzero()  # NaN is not equal to itself
+        known = self.values == self.values  # NaN is not equal to itself
+        if len(known) and (len(known) == 1 or bool((known == known[0]).all())):
+            return [tuple(known[0].nonzero()[0].tolist())] * len(known)
+        rows, columns = known.nonzero()
         found: list[list[int]] = [[] for _ in self.detections]
         for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
             found[row].append(column)
@@ -56,14 +62,13 @@ def located(batch: Batch, sensor: SensorModel, pose: SensorPose) -> Located:
     detections = [batch.message.objects[index] for index in batch.indices]
     values = np.array([_VALUES(detection) for detection in detections], dtype=np.float64)
     values = values.reshape(-1, len(MEASURABLE))
-    for column, name in enumerate(MEASURABLE):
-        if name not in sensor.std:
-            values[:, column] = np.nan
+    for column in _unmeasured(tuple(sensor.std)):
+        values[:, column] = np.nan
     if batch.frame != "map":
         if "yaw_rad" in sensor.std:
             values[:, YAW] = wrap_angles(values[:, YAW] + pose.yaw_rad)
         if "x_m" in sensor.std:
-            values[:, X], values[:, Y] = _in_map(values[:, X], values[:, Y], pose)
+            _move_to_map(values[:, :2], pose)
     points_m = values[:, :2].copy()
     if "range_m" in sensor.std:
         polar = np.isnan(points_m[:, 0])
@@ -75,11 +80,12 @@ def located(batch: Batch, sensor: SensorModel, pose: SensorPose) -> Located:
     return Located(np.array(batch.indices, dtype=np.int64), detections, values, points_m, none)
 
 
-def take_map_yaw(items: Located, rows: IntArray, yaw_rad: FloatArray) -> None:
+def take_map_yaw(items: Located, rows: IntArray | slice, yaw_rad: FloatArray) -> None:
     """Give those of `rows` that have no yaw that of the map, shape (m,)."""
-    lack = np.isnan(items.values[rows, YAW])
-    if not lack.all():
-        rows, yaw_rad = rows[lack], yaw_rad[lack]
+    given = items.values[rows, YAW]
+    lack = given != given  # NaN is not equal to itself
+    if False in lack.tolist():
+        rows, yaw_rad = np.arange(len(items.indices))[rows][lack], yaw_rad[lack]
     items.values[rows, YAW] = yaw_rad
     items.map_yaw[rows] = True
 
@@ -118,7 +124,22 @@ def common(kinds: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
     return tuple(column for column in kinds[0] if all(column in other for other in kinds[1:]))
 
 
-def _in_map(x_m: FloatArray, y_m: FloatArray, pose: SensorPose) -> tuple[FloatArray, FloatArray]:
+@cache
+def _unmeasured(names: tuple[str, ...]) -> tuple[int, ...]:
+    """Columns of what is not among `names`."""
+    return tuple(column for column, name in enumerate(MEASURABLE) if name not in names)
+
+
+def _move_to_map(points_m: FloatArray, pose: SensorPose) -> None:
+    """Let `points_m` (m, 2), seen from `pose`, be points of the map."""
+    if len(points_m) > _FEW:
+        points_m[:, 0], points_m[:, 1] = _in_map(points_m[:, 0], points_m[:, 1], pose)
+        return
+    for point_m, (x_m, y_m) in zip(points_m, points_m.tolist(), strict=True):
+        point_m[0], point_m[1] = _in_map(x_m, y_m, pose)
+
+
+def _in_map(x_m: Real, y_m: Real, pose: SensorPose) -> tuple[Real, Real]:
     c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
     return pose.x_m + c * x_m - s * y_m, pose.y_m + s * x_m + c * y_m
 

@@ -1,6 +1,6 @@
 """How an error of the ego's pose and motion enters the innovations of one detection."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,8 +9,7 @@ from fgtrack.core.types import FloatArray
 from fgtrack.models.measurement import MeasurementModel, SensorPose
 
 
-@dataclass(frozen=True, slots=True)
-class PoseError:
+class PoseError(NamedTuple):
     """The error e of a sensor pose in the innovation z - h(x, pose) = ... + G e of a detection.
 
     e is the believed pose minus the true one, of x, y, yaw, vx and vy of the sensor, the same for all detections of a

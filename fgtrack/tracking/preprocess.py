@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -104,8 +104,9 @@ class Preprocess:
         if ego is not None and sensor.max_range_m is not None:
             offsets_m = items.points_m - np.array([pose.x_m, pose.y_m])
             far = np.hypot(offsets_m[:, 0], offsets_m[:, 1]) > sensor.max_range_m
-            lost = items.indices[far].tolist()
-            items = items.at(~far) if lost else items
+            if True in far.tolist():
+                lost = items.indices[far].tolist()
+                items = items.at(~far)
         items, outside = self._on_road(items, sensor)
         records = [record(batch.message, index, Disposition.OUT_OF_BOUNDS) for index in lost + outside]
         return self._candidates(items, view), records
@@ -127,9 +128,10 @@ class Preprocess:
         placed = items.placed
         if not self._road.known or not len(placed):
             return items, []
-        view = self._road.view(items.points_m[placed])
+        all_placed = len(placed) == len(items.indices)
+        view = self._road.view(items.points_m if all_placed else items.points_m[placed])
         if sensor.yaw_from_map_std_rad is not None:
-            take_map_yaw(items, placed, view.yaw_rad)
+            take_map_yaw(items, slice(None) if all_placed else placed, view.yaw_rad)
         if not any(view.outside.tolist()):
             return items, []
         outside = placed[view.outside]
@@ -137,7 +139,7 @@ class Preprocess:
 
     def _candidates(self, items: Located, view: _View) -> list[Candidate]:
         placed = items.placed
-        groups = self._merge.groups(items.points_m[placed])
+        groups = self._merge.groups(items.points_m if len(placed) == len(items.indices) else items.points_m[placed])
         kinds = items.kinds()
         found: list[_Group] = []
         claimed = set(groups)
@@ -182,9 +184,9 @@ class Preprocess:
     ) -> list[Candidate]:
         """Candidates that measure the same: one detection each, or the average of several."""
         batch, sensor, pose, _ = view
-        names = tuple(MEASURABLE[column] for column in columns)
+        names = _names(columns)
         leaders = np.array([group.leader for group in groups])
-        z, points_m = items.values[leaders[:, None], columns], items.points_m[leaders]
+        z, points_m = items.values[leaders].take(columns, axis=1), items.points_m[leaders]
         order = leaders.tolist()
         every = len(order) == len(items.indices) and order == sorted(order)
         R = covariances(items if every else items.at(leaders), names, batch.frame, sensor, pose)
@@ -262,6 +264,11 @@ class Preprocess:
     def _assumed(self, map_yaw: bool) -> tuple[str, ...]:
         """Components that are prior knowledge: a yaw that the map gave."""
         return ("yaw_rad",) if map_yaw else ()
+
+
+@cache
+def _names(columns: tuple[int, ...]) -> tuple[str, ...]:
+    return tuple(MEASURABLE[column] for column in columns)
 
 
 def _spread(names: tuple[str, ...], pose: SensorPose, z: FloatArray, R: FloatArray) -> FloatArray | None:
