@@ -1,4 +1,4 @@
-"""`fgtrack figure`: pictures of runs."""
+"""`fgtrack figure`: pictures of runs and sweeps."""
 
 from collections.abc import Sequence
 from itertools import chain
@@ -8,13 +8,14 @@ from typing import Annotated, Literal
 import typer
 from matplotlib.figure import Figure
 
-from fgtrack.cli.arguments import Overwrite, Runs
+from fgtrack.cli.arguments import Overwrite
 from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.evaluation.figures.style import save_pages
-from fgtrack.evaluation.plot import close_up, named_figures, save_named
+from fgtrack.evaluation.plot import Planned, close_up, drawn, planned, planned_sweep, save_named
 from fgtrack.evaluation.runs import JudgedRun, judged, start_ns
+from fgtrack.evaluation.sweep_table import is_sweep, read_sweep
 from fgtrack.io.output import Kind, new_file, new_files
 from fgtrack.pipeline.close_up import close_ups
 
@@ -22,30 +23,29 @@ PDF = Kind("a PDF file", lambda path: path.is_file() and path.read_bytes()[:4] =
 
 
 def figure(
-    runs: Runs,
+    runs: Annotated[list[Path], typer.Argument(help="Run folders, folders of run folders, or one sweep folder.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the pictures, or one .pdf.")],
     form: Annotated[Literal["png", "svg", "pdf"], typer.Option("--format", help="Format of the pictures.")] = "png",
     track: Annotated[int | None, typer.Option(help="Track of the close-up, in the first run.")] = None,
     stamp: Annotated[float | None, typer.Option(help="Stamp of the close-up: s after the first tick.")] = None,
+    every: Annotated[bool, typer.Option("--all", help="Draw every object, run and metric, not the few.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Draw runs: late detections, map, residuals, errors, time.
+    """Draw runs or a sweep: late detections, map, errors, time.
 
-    A late detection in close-up, map, residuals, arrivals, delays, errors over time and against lag, time per tick.
+    Of runs: a late detection in close-up, the map, the way along the track, residuals, NEES and NIS, arrivals, delays,
+    errors over time (bands where runs differ by their seed only) and against lag, time per tick. Of many objects or
+    runs the worst few. Of a sweep: its metrics over the grid, mean and standard error over the seeds.
 
     The close-up replays the recording up to the late detection that moved the present of the first run most; where the
     recording is not there any more it is left out.
     """
-    found = judged(runs)
-    stamp_ns = None if stamp is None else start_ns(found) + nanoseconds(stamp)
     one_file = out.suffix.lower() == ".pdf" and not out.is_dir()
     if out.suffix.lower() in (".png", ".svg") and not out.is_dir():
         raise CallError(f"{out}: one picture cannot hold all figures, name a folder or a .pdf")
     with progress("draw"):
-        first, missing = drawn_close_up(found, track, stamp_ns)
-        if missing is not None and (track is not None or stamp is not None):
-            raise missing
-        named = chain(first, named_figures(found))
+        first, plans, missing = _of_sweep(runs, track, stamp) or _of_runs(runs, track, stamp)
+        named = chain(first, drawn(plans, every))
         if one_file:
             with new_file(out, PDF, overwrite) as file:
                 save_pages((each for _, each in named), file)
@@ -57,13 +57,42 @@ def figure(
         say(f"no close-up: {missing}")
     for path in files:
         say(path)
+    left_out = 0 if every else sum(one.is_extra for one in plans)
+    if left_out:
+        say(f"{left_out} more with --all")
+
+
+_Figures = tuple[list[tuple[str, Figure]], list[Planned], DataError | None]  # the close-up, the others, why it is none
+
+
+def _of_sweep(folders: Sequence[Path], track: int | None, stamp: float | None) -> _Figures | None:
+    """The figures of a sweep; None where `folders` are none."""
+    sweeps = [folder for folder in folders if is_sweep(folder)]
+    if not sweeps:
+        return None
+    if len(folders) > 1:
+        raise CallError(f"{sweeps[0]}: is a sweep, which is drawn by itself: name it alone")
+    if track is not None or stamp is not None:
+        raise CallError(f"{sweeps[0]}: is a sweep, --track and --stamp choose a late detection of a run")
+    return [], planned_sweep(read_sweep(sweeps[0])), None
+
+
+def _of_runs(folders: Sequence[Path], track: int | None, stamp: float | None) -> _Figures:
+    found = judged(folders)
+    stamp_ns = None if stamp is None else start_ns(found) + nanoseconds(stamp)
+    first, missing = drawn_close_up(found, track, stamp_ns)
+    if missing is not None and (track is not None or stamp is not None):
+        raise missing
+    return first, planned(found), missing
 
 
 def drawn_close_up(
     runs: Sequence[JudgedRun], track_id: int | None = None, stamp_ns: int | None = None
 ) -> tuple[list[tuple[str, Figure]], DataError | None]:
-    """The close-up of `runs` by its name; none where there is none, and why."""
+    """The close-up of those of `runs` that are of the first one's recording, by its name; where it is none, why."""
+    origins = [(one.run.meta.get("input") or {}).get("path") for one in runs]
+    same = [one for one, origin in zip(runs, origins, strict=True) if origin == origins[0]]
     try:
-        return [("close_up", close_up(runs, close_ups([one.run for one in runs], track_id, stamp_ns)))], None
+        return [("close_up", close_up(same, close_ups([one.run for one in same], track_id, stamp_ns)))], None
     except DataError as error:
         return [], error

@@ -1,11 +1,12 @@
 """Figures of runs by name: each function takes runs (or their folders) and gives a matplotlib Figure.
 
-`errors([run, other]).savefig("errors.pdf")` writes one, `save_figures(runs, folder)` all that the runs have data for.
+`errors([run, other]).savefig("errors.pdf")` writes one, `save_figures(runs, folder)` those that the runs have data for.
 """
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,93 +14,204 @@ from matplotlib.figure import Figure
 
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation import innovations
+from fgtrack.evaluation.figures.anatomy import anatomy
 from fgtrack.evaluation.figures.arrivals import arrivals
 from fgtrack.evaluation.figures.close_up import close_up
+from fgtrack.evaluation.figures.consistency import consistency, has_squares
 from fgtrack.evaluation.figures.errors import errors, lag
+from fgtrack.evaluation.figures.frenet import frenet
 from fgtrack.evaluation.figures.map import tracks_on_map as map  # noqa: A004  # the name that users know
 from fgtrack.evaluation.figures.residuals import residuals
+from fgtrack.evaluation.figures.seeds import error_bands, has_seeds
 from fgtrack.evaluation.figures.style import save
+from fgtrack.evaluation.figures.sweep import sweep, sweep_metrics
 from fgtrack.evaluation.figures.times import delays, sensor_delays, timing
+from fgtrack.evaluation.matching import track_errors
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged
+from fgtrack.evaluation.sendings import sendings
+from fgtrack.evaluation.statistics import Moments
+from fgtrack.evaluation.sweep_table import SweepTable
+from fgtrack.evaluation.viewer.surroundings import roads
 
 __all__ = [
     "FIGURES",
+    "anatomy",
     "arrivals",
     "close_up",
+    "consistency",
     "delays",
+    "error_bands",
     "errors",
+    "frenet",
     "lag",
     "map",
     "residuals",
     "save",
     "save_figures",
+    "sweep",
     "timing",
 ]
 
-_Named = Iterator[tuple[str, Figure]]
+_FEW = 3  # of objects, and of runs where they are many: the worst are drawn
+_MOST_RUNS = 6  # that have figures of their own
 
 
-def _maps(runs: Sequence[JudgedRun]) -> _Named:
-    for one in runs:
-        if one.run.tracks.num_rows:
-            yield f"map_{one.label}", map(one)
+@dataclass(frozen=True)
+class Planned:
+    """A figure that can be drawn."""
+
+    name: str
+    draw: Callable[[], Figure]
+    is_extra: bool = False
+    """Whether it is one of many, and drawn on request only."""
 
 
-def _residuals(runs: Sequence[JudgedRun]) -> _Named:
-    for one in runs:
-        if any(np.isfinite(values).any() for values in innovations.residuals(one.run).values()):
-            yield f"residuals_{one.label}", residuals(one)
+_Plans = Iterator[Planned]
 
 
-def _delays(runs: Sequence[JudgedRun]) -> _Named:
-    """One for each recording: runs of the same have the same delays."""
+def _of_each(
+    runs: Sequence[JudgedRun], name: str, has_data: Callable[[JudgedRun], bool], draw: Callable[[JudgedRun], Figure]
+) -> _Plans:
+    """One for each run with data; of many the worst come first."""
+    found = [one for one in runs if has_data(one)]
+    kept = {one.label for one in found} if len(found) <= _MOST_RUNS else {one.label for one in _worst(found)[:_FEW]}
+    for one in found:
+        yield Planned(f"{name}_{one.label}", partial(draw, one), one.label not in kept)
+
+
+def _maps(runs: Sequence[JudgedRun]) -> _Plans:
+    return _of_each(runs, "map", lambda one: bool(one.run.tracks.num_rows), lambda one: map(one))
+
+
+def _along(runs: Sequence[JudgedRun]) -> _Plans:
+    def has_data(one: JudgedRun) -> bool:
+        return bool(one.run.tracks.num_rows) and "track" in roads(one.run)[0]
+
+    return _of_each(runs, "frenet", has_data, lambda one: frenet(one))
+
+
+def _residuals(runs: Sequence[JudgedRun]) -> _Plans:
+    def has_data(one: JudgedRun) -> bool:
+        return any(np.isfinite(values).any() for values in innovations.residuals(one.run).values())
+
+    return _of_each(runs, "residuals", has_data, lambda one: residuals(one))
+
+
+def _consistency(runs: Sequence[JudgedRun]) -> _Plans:
+    return _of_each(runs, "consistency", has_squares, lambda one: consistency(one))
+
+
+def _arrivals(runs: Sequence[JudgedRun]) -> _Plans:
+    return _of_each(runs, "arrivals", lambda one: bool(one.run.updates.num_rows), lambda one: arrivals(one))
+
+
+def _recordings(runs: Sequence[JudgedRun]) -> list[list[JudgedRun]]:
+    """Runs with the same delays, which are those of the same recording."""
     groups: dict[bytes, list[JudgedRun]] = {}
     for one in runs:
         if one.run.updates.num_rows:
             content = b"".join(part.tobytes() for by in sensor_delays(one.run).values() for part in by)
             groups.setdefault(content, []).append(one)
-    for group in groups.values():
-        if len(groups) == 1:
-            yield "delays", delays(replace(group[0], label=""))
-        else:
-            yield f"delays_{group[0].label}", delays(replace(group[0], label=", ".join(one.label for one in group)))
+    return list(groups.values())
 
 
-def _arrivals(runs: Sequence[JudgedRun]) -> _Named:
-    for one in runs:
-        if one.run.updates.num_rows:
-            yield f"arrivals_{one.label}", arrivals(one)
+def _of_recordings(runs: Sequence[JudgedRun], name: str, draw: Callable[[JudgedRun], Figure]) -> _Plans:
+    """One for each recording; of many the first."""
+    groups = _recordings(runs)
+    for place, group in enumerate(groups):
+        label = "" if len(groups) == 1 else ", ".join(one.label for one in group)
+        file = name if len(groups) == 1 else f"{name}_{group[0].label}"
+        is_extra = len(groups) > _MOST_RUNS and place >= _FEW
+        yield Planned(file, partial(draw, replace(group[0], label=label)), is_extra)
 
 
-def _errors(runs: Sequence[JudgedRun]) -> _Named:
-    for object_id in sorted({k for one in runs if one.matching for k in one.matching.object_ids}):
-        yield f"errors_object_{object_id}", errors(runs, object_id)
+def _delays(runs: Sequence[JudgedRun]) -> _Plans:
+    late = [one for one in runs if (one.run.updates["receipt_ns"] != one.run.updates["stamp_ns"]).any()]
+    return _of_recordings(late, "delays", lambda one: delays(one))
 
 
-def _lag(runs: Sequence[JudgedRun]) -> _Named:
+def _anatomy(runs: Sequence[JudgedRun]) -> _Plans:
+    known = [one for group in _recordings(runs) for one in group if sendings(group[0].run)]
+    return _of_recordings(known, "anatomy", lambda one: anatomy(one))
+
+
+def _errors(runs: Sequence[JudgedRun]) -> _Plans:
+    """Of several seeds only the bands, else one for each object; of many all together and the worst."""
+    if has_seeds(runs):
+        return
+    ids = sorted({k for one in runs if one.matching for k in one.matching.object_ids})
+    many = len(ids) > _FEW
+    if many:
+        yield Planned("errors_all_objects", lambda: errors(runs))
+    kept = _worst_objects(runs, ids)[:_FEW]
+    for object_id in ids:
+        yield Planned(f"errors_object_{object_id}", partial(errors, runs, object_id), many and object_id not in kept)
+
+
+def _error_bands(runs: Sequence[JudgedRun]) -> _Plans:
+    if has_seeds(runs):
+        yield Planned("error_bands", lambda: error_bands(runs))
+
+
+def _lag(runs: Sequence[JudgedRun]) -> _Plans:
     if any(entry.is_lagged for one in runs for entry in one.lagged):
-        yield "error_against_lag", lag(runs)
+        yield Planned("error_against_lag", lambda: lag(runs))
 
 
-def _timing(runs: Sequence[JudgedRun]) -> _Named:
+def _timing(runs: Sequence[JudgedRun]) -> _Plans:
     if any((one.run.timing["num_detections"] > 0).any() for one in runs):
-        yield "timing", timing(runs)
+        yield Planned("timing", lambda: timing(runs))
 
 
-#: By the name of the function that draws it: the figures that runs have data for, each with the name of its file.
-FIGURES: Mapping[str, Callable[[Sequence[JudgedRun]], _Named]] = {
+#: By the name of the function that draws them: the figures that runs have data for, each with the name of its file.
+FIGURES: Mapping[str, Callable[[Sequence[JudgedRun]], _Plans]] = {
     "map": _maps,
+    "frenet": _along,
     "residuals": _residuals,
+    "consistency": _consistency,
     "arrivals": _arrivals,
+    "anatomy": _anatomy,
     "delays": _delays,
     "errors": _errors,
+    "error_bands": _error_bands,
     "lag": _lag,
     "timing": _timing,
 }
 
 
-def save_figures(runs: Runs, out_dir: Path | str, form: str = "png") -> list[Path]:
-    """Write every figure that `runs` have data for into `out_dir`, as png, svg or pdf; gives the files.
+def _rmse_m(one: JudgedRun, object_id: int | None = None) -> float:
+    """Position RMSE of a run, of one object or over all; -1 where there is none."""
+    if one.matching is None or (object_id is not None and object_id not in one.matching.object_ids):
+        return -1.0
+    found = track_errors(one.matching)
+    values = found.values["position_m"]
+    if object_id is not None:
+        values = values[found.object_index == one.matching.object_ids.index(object_id)]
+    moments = Moments.of(values)
+    return moments.rmse if moments.count else -1.0
+
+
+def _worst(runs: Sequence[JudgedRun]) -> list[JudgedRun]:
+    """`runs` from the largest position RMSE to the smallest; those that tracked no true object come first."""
+
+    def badness(one: JudgedRun) -> float:
+        lost = one.matching is not None and not one.matching.paired.any()
+        return np.inf if lost else _rmse_m(one)
+
+    return sorted(runs, key=badness, reverse=True)
+
+
+def _worst_objects(runs: Sequence[JudgedRun], ids: Sequence[int]) -> list[int]:
+    """`ids` from the largest position RMSE in any run to the smallest."""
+    if len(ids) <= _FEW:
+        return list(ids)
+    return sorted(ids, key=lambda object_id: max(_rmse_m(one, object_id) for one in runs), reverse=True)
+
+
+def save_figures(runs: Runs, out_dir: Path | str, form: str = "png", every: bool = False) -> list[Path]:
+    """Write the figures that `runs` have data for into `out_dir`, as png, svg or pdf; gives the files.
+
+    Of many objects and runs the worst few are drawn, all where `every` is set.
 
     Raises
     ------
@@ -108,12 +220,12 @@ def save_figures(runs: Runs, out_dir: Path | str, form: str = "png") -> list[Pat
     DataError
         The map that a run names is no map.
     """
-    out_dir, every = Path(out_dir), judged(runs)
+    out_dir, found = Path(out_dir), judged(runs)
     try:
         out_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise CallError(f"{out_dir}: cannot be made ({error.strerror}), choose another folder") from error
-    return save_named(named_figures(every), out_dir, form)
+    return save_named(drawn(planned(found), every), out_dir, form)
 
 
 def save_named(named: Iterable[tuple[str, Figure]], folder: Path, form: str) -> list[Path]:
@@ -121,10 +233,25 @@ def save_named(named: Iterable[tuple[str, Figure]], folder: Path, form: str) -> 
     return [save(figure, folder / f"{_slug(name)}.{form}") for name, figure in named]
 
 
-def named_figures(runs: Runs) -> _Named:
-    """Every figure that `runs` have data for, with its name. Raises `DataError` as `save_figures`."""
-    every = judged(runs)
-    return (found for figures in FIGURES.values() for found in figures(every))
+def named_figures(runs: Runs) -> Iterator[tuple[str, Figure]]:
+    """The figures that `runs` have data for, with their names; of many the worst few. Raises as `save_figures`."""
+    return drawn(planned(judged(runs)))
+
+
+def planned(runs: Sequence[JudgedRun]) -> list[Planned]:
+    """Every figure that `runs` have data for. Raises `DataError` as `save_figures`."""
+    return [one for figures in FIGURES.values() for one in figures(runs)]
+
+
+def planned_sweep(table: SweepTable) -> list[Planned]:
+    """The figures of a sweep, one for each metric; a few of them are no extras."""
+    first, rest = sweep_metrics(table)
+    return [Planned(f"sweep_{metric}", partial(sweep, table, metric), metric in rest) for metric in (*first, *rest)]
+
+
+def drawn(plans: Iterable[Planned], every: bool = False) -> Iterator[tuple[str, Figure]]:
+    """The figures of `plans`, with their names; extras only where `every` is set."""
+    return ((one.name, one.draw()) for one in plans if every or not one.is_extra)
 
 
 def _slug(name: str) -> str:

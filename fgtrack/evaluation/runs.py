@@ -96,6 +96,16 @@ def start_ns(runs: Sequence[JudgedRun]) -> int:
     return min((int(one.run.timing["now_ns"][0]) for one in runs if one.run.timing.num_rows), default=0)
 
 
+def starts_ns(runs: Sequence[JudgedRun]) -> dict[str, int]:
+    """By label when the recording of each run begins: the first tick of it and of those that ran at the same time."""
+    ticks = {one.label: one.run.timing["now_ns"] for one in runs}
+    spans = {label: (int(now_ns[0]), int(now_ns[-1])) if len(now_ns) else (0, 0) for label, now_ns in ticks.items()}
+    return {
+        label: min(first for first, last in spans.values() if first <= end and last >= begin)
+        for label, (begin, end) in spans.items()
+    }
+
+
 def labelled(runs: Sequence[Run]) -> dict[str, Run]:
     """Runs by a label of their own: the end of their path, as long as it must be to be unique.
 

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from fgtrack.core.types import (
+    DetectionList,
     Disposition,
+    EgoState,
     SmoothedReport,
     TickReport,
     TrackReport,
@@ -100,6 +102,8 @@ def write_run(
     config_text: str = "",
     process_ns: Sequence[int] = (),
     num_detections: Sequence[int] = (),
+    ego: Iterable[EgoState] = (),
+    detections: Iterable[DetectionList] = (),
 ) -> Run:
     """A run with the `tracks` of every tick, and the `updates` and `smoothed` states by tick."""
     updates, smoothed = updates or {}, smoothed or {}
@@ -107,6 +111,10 @@ def write_run(
     with RunWriter(path, config_text, smoothed_lag_s=smoothed_lag_s) as writer:
         for row in truth:
             writer.write_truth(row)
+        for state in ego:
+            writer.write_ego(state)
+        for message in detections:
+            writer.write_detections(message)
         for tick in range(ticks):
             rows = tuple(tracks[tick]) if tick < len(tracks) else ()
             records = tuple(updates.get(tick, ()))

@@ -8,9 +8,18 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.time import NS_PER_S, nanoseconds
+from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, IntArray
-from fgtrack.evaluation.figures.style import GREY, PALETTE, StyledFigure, legend_above, styled, titled
+from fgtrack.evaluation.figures.style import (
+    GREY,
+    PALETTE,
+    StyledFigure,
+    legend_above,
+    styled,
+    title,
+    titled,
+    usual_step_ns,
+)
 from fgtrack.evaluation.runs import OneRun, one_judged, start_ns
 from fgtrack.io.run import Table
 from fgtrack.io.run.reader import Column
@@ -31,15 +40,17 @@ _FATES: Mapping[str, str] = {
     "beyond_window": "fused beyond the window",
     "birth": "started a track",
 }
-_SHOWN_S = 1.0  # of the run in the upper panel
+_SENSOR_IN, _DELAYS_IN = 1.3, 2.2  # heights: of a sensor in the upper panel, of the lower panel
+_SHOWN_LISTS = 20  # of the fastest sensor in the upper panel
 
 
 @styled
 def arrivals(run: OneRun) -> Figure:
-    """Above a second of the run, a line for each detection from sensing to receipt; below the delays of all.
+    """Above a part of the run, a line for each detection from sensing to receipt; below the delays of all.
 
-    A line that crosses another was overtaken: it is out of sequence. The second shown is the one in which the most
-    detections were fused out of sequence. Colours say what became of a detection.
+    A line that crosses another was overtaken: it is out of sequence. The part shown is that in which the most
+    detections were fused out of sequence; the fastest sensor sends twenty lists in it. Colours say what became of a
+    detection.
 
     Raises
     ------
@@ -50,8 +61,9 @@ def arrivals(run: OneRun) -> Figure:
     updates = one.run.updates
     if not updates.num_rows:
         raise DataError(f"{one.label}: has no detections, so there are no arrivals to draw")
-    figure = StyledFigure(figsize=(10.0, 6.5))
-    flow, delays = figure.subplots(2, 1, height_ratios=(3, 2))
+    flow_in = _SENSOR_IN * len(np.unique(updates["sensor"]))
+    figure = StyledFigure(figsize=(10.0, flow_in + _DELAYS_IN + 1.5))
+    flow, delays = figure.subplots(2, 1, height_ratios=(flow_in, _DELAYS_IN))
     first_ns = start_ns([one])
     fates = _fates(updates)
     _draw_flow(flow, updates, fates, first_ns)
@@ -61,18 +73,20 @@ def arrivals(run: OneRun) -> Figure:
         mine = fates == name
         if mine.any():
             delays.plot(received_s[mine], delay_ms[mine], ".", ms=4.0, mew=0, alpha=0.8, color=color)
-            flow.plot([], [], ".", color=color, label=f"{name}: {mine.sum()} of {len(mine)}")
+            flow.plot([], [], ".", ms=3.0, color=color, label=f"{name}: {mine.sum()} of {len(mine)}")
     delays.set(xlabel="received at [s]", ylabel="delay [ms]")
-    delays.set_ylim(min(0.0, float(delay_ms.min())), None)
-    legend_above(flow, width=140)
-    figure.suptitle(titled(one.label, "detections from sensing to receipt"))
+    low_ms, high_ms = min(0.0, float(delay_ms.min())), max(1.0, float(delay_ms.max()))
+    delays.set_ylim(low_ms - 0.05 * (high_ms - low_ms), high_ms + 0.05 * (high_ms - low_ms))
+    legend_above(flow, figure.get_figwidth())
+    title(figure, titled(one.label, "detections from sensing to receipt"))
     return figure
 
 
 def _draw_flow(axes: Axes, updates: Table, fates: Column, first_ns: int) -> None:
-    """A line for each detection of the busiest second, a pair of levels for each sensor."""
-    start_ns = _busiest_ns(updates["receipt_ns"], fates == "fused out of sequence")
-    inside = (updates["receipt_ns"] >= start_ns) & (updates["stamp_ns"] <= start_ns + nanoseconds(_SHOWN_S))
+    """A line for each detection of the busiest part, a pair of levels for each sensor."""
+    length_ns = _shown_ns(updates)
+    start_ns = _busiest_ns(updates["receipt_ns"], fates == "fused out of sequence", length_ns)
+    inside = (updates["receipt_ns"] >= start_ns) & (updates["stamp_ns"] <= start_ns + length_ns)
     sensors = np.unique(updates["sensor"][inside]).tolist()
     for name, color in _COLOURS.items():
         for level, sensor in enumerate(sensors):
@@ -85,30 +99,24 @@ def _draw_flow(axes: Axes, updates: Table, fates: Column, first_ns: int) -> None
             )
             axes.plot(sensed_s, tops[:, 1], "o", ms=3.5, color=color, zorder=4)
             axes.plot(received_s, ends[:, 1], "v", ms=4.5, color=color, zorder=4)
-    for level, sensor in enumerate(sensors):
-        axes.annotate(
-            sensor,
-            (0.0, level + 0.5),
-            (-38, 0),
-            xycoords=("axes fraction", "data"),
-            textcoords="offset points",
-            rotation=90,
-            ha="center",
-            va="center",
-            fontsize=9,
-        )
     axes.set_yticks([level + at for level in range(len(sensors)) for at in (0.1, 0.9)])
-    axes.set_yticklabels(["received", "sensed"] * len(sensors))
+    axes.set_yticklabels([text for sensor in sensors for text in ("received", f"{sensor}: sensed")])
     from_s = (start_ns - first_ns) / NS_PER_S
-    axes.set(xlim=(from_s, from_s + _SHOWN_S), ylim=(0.0, len(sensors)), xlabel="time [s]")
+    axes.set(xlim=(from_s, from_s + length_ns / NS_PER_S), ylim=(0.0, len(sensors)), xlabel="time [s]")
 
 
-def _busiest_ns(receipts_ns: IntArray, late: BoolArray) -> int:
-    """When the second begins in which the most of the `late` were received, or of all where there are none."""
+def _shown_ns(updates: Table) -> int:
+    """How long the part shown is."""
+    sensors = updates["sensor"]
+    steps_ns = [usual_step_ns(updates["stamp_ns"][sensors == name]) for name in np.unique(sensors).tolist()]
+    shortest_ns = min(steps_ns)
+    return round(_SHOWN_LISTS * shortest_ns) if np.isfinite(shortest_ns) else NS_PER_S
+
+
+def _busiest_ns(receipts_ns: IntArray, late: BoolArray, length_ns: int) -> int:
+    """When the part begins in which the most of the `late` were received, or of all where there are none."""
     receipts_ns = np.sort(receipts_ns[late] if late.any() else receipts_ns)
-    counts = np.searchsorted(receipts_ns, receipts_ns + nanoseconds(_SHOWN_S), side="right") - np.arange(
-        len(receipts_ns)
-    )
+    counts = np.searchsorted(receipts_ns, receipts_ns + length_ns, side="right") - np.arange(len(receipts_ns))
     return int(receipts_ns[counts.argmax()])
 
 

@@ -1,11 +1,11 @@
-"""The figure of tracks and truth on the map."""
-
-from pathlib import Path
+"""The figure of ego, detections, tracks and truth on the map."""
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from fgtrack.core.types import FloatArray
+from fgtrack.evaluation.figures.ranges import bulk
 from fgtrack.evaluation.figures.style import (
     GREY,
     WRONG,
@@ -14,25 +14,28 @@ from fgtrack.evaluation.figures.style import (
     colour,
     legend_above,
     styled,
+    title,
+    titled,
     usual_step_ns,
 )
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, Matching
 from fgtrack.evaluation.runs import OneRun, one_judged
 from fgtrack.evaluation.truth import true_paths
+from fgtrack.evaluation.viewer.placement import placed
+from fgtrack.evaluation.viewer.surroundings import road_lines, roads
 from fgtrack.io.run import Run, Table
-from fgtrack.models.oval import OVAL, make_oval
-from fgtrack.models.track_map import TrackMap
 
 _NAMED_OBJECTS = 8  # more objects than these share two entries of the legend
 
 
 @styled
 def tracks_on_map(run: OneRun) -> Figure:
-    """Tracks and truth on the map that `config.yaml` names as `map.track`.
+    """Ego, detections, tracks and truth on the map that `config.yaml` names as `map.track`.
 
     Truth is a broad pale line, so a stretch that nothing tracked stays visible; a track has the colour of the
     object that it is paired with, and is black where it is paired with none. Without truth every track with
-    enough measurements has a colour.
+    enough measurements has a colour. The picture holds map, ego, truth and the bulk of the tracks and detections;
+    what lies outside is counted.
 
     Raises
     ------
@@ -40,38 +43,57 @@ def tracks_on_map(run: OneRun) -> Figure:
         `config.yaml` is not YAML, or the map that it names is no map.
     """
     one = one_judged(run)
-    title, matching = one.label, one.matching
+    matching, text = one.matching, [titled(one.label, "on the map")]
     figure = StyledFigure(figsize=(8.0, 7.0))
     axes = figure.add_subplot()
-    name = (one.run.config.get("map") or {}).get("track")
-    if name == OVAL:
-        _draw_bounds(axes, make_oval())
-    elif name and Path(str(name)).exists():
-        _draw_bounds(axes, TrackMap.read(Path(str(name))))
-    elif name:
-        title += "\n(the map file is not there any more)"
+    maps, notes = roads(one.run)
+    bounds_m = [line for road in maps.values() for line in road_lines(road)[:2]]
+    for line in bounds_m:
+        axes.plot(*line.T, color=GREY, lw=0.7, zorder=3)
+    if notes:
+        text.append("the map file is not there any more")
+    detections_m, ego_m = placed(one.run).position_m, _positions(one.run.ego)
+    label = f"detections ({int(np.isfinite(detections_m[:, 0]).sum())})"
+    if np.isfinite(detections_m).any():
+        axes.plot(*detections_m.T, ".", ms=2.0, mew=0, color=GREY, label=label, zorder=2.5, rasterized=True)
+    if np.isfinite(ego_m).any():
+        axes.plot(*ego_m.T, color="black", lw=0.8, ls="--", label="ego", zorder=3.5)
     if matching is None:
         tracks = one.run.tracks.where(one.run.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS)
         step_ns = usual_step_ns(tracks["now_ns"])
-        for k, track_id in enumerate(np.unique(tracks["track_id"]).tolist()):
+        ids = np.unique(tracks["track_id"]).tolist()
+        for k, track_id in enumerate(ids):
             _draw_tracks(axes, tracks.where(tracks["track_id"] == track_id), step_ns, colour(k), "")
-        count = len(np.unique(tracks["track_id"]))
-        title += f"\n{count} tracks with at least {CONFIRMED_MEASUREMENTS} measurements, no truth"
+        text.append(f"{len(ids)} tracks with at least {CONFIRMED_MEASUREMENTS} measurements, no truth")
     else:
+        tracks = matching.tracks
         _draw_matched(axes, one.run, matching)
-        legend_above(axes, width=75)
+    held = [*bounds_m, ego_m, *(path.states[:, :2] for path in true_paths(one.run.truth))]
+    outside = _limit(axes, [_positions(tracks), detections_m], held)
+    if outside:
+        text.append(f"{outside} rows of tracks and detections are outside of the picture")
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
-    figure.suptitle(title.strip())
+    legend_above(axes, figure.get_figwidth())
+    title(figure, "\n".join(text))
     return figure
 
 
-def _draw_bounds(axes: Axes, track_map: TrackMap) -> None:
-    s_m = np.linspace(0.0, track_map.length_m, 2000)
-    left_m, right_m = track_map.bounds(s_m)
-    for lateral_m in (left_m, -right_m):
-        axes.plot(*track_map.position(s_m, lateral_m).T, color=GREY, lw=0.7, zorder=3)
+def _positions(table: Table) -> FloatArray:
+    """Shape (n, 2)."""
+    return np.stack([table["x_m"], table["y_m"]], axis=-1)
+
+
+def _limit(axes: Axes, samples_m: list[FloatArray], held_m: list[FloatArray]) -> int:
+    """Show the bulk of `samples_m` and all of `held_m`, shape (n, 2) each; gives how many samples are outside."""
+    lows, highs = np.transpose(
+        [bulk([one[:, k] for one in samples_m], [one[:, k] for one in held_m]) for k in range(2)]
+    )
+    axes.set_xlim(lows[0], highs[0], auto=True)  # an equal aspect may widen one of the two
+    axes.set_ylim(lows[1], highs[1], auto=True)
+    outside = [((one < lows) | (one > highs)).any(axis=-1).sum() for one in samples_m]
+    return int(sum(outside))
 
 
 def _draw_matched(axes: Axes, run: Run, matching: Matching) -> None:

@@ -1,15 +1,13 @@
 """The figure of the innovations."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from matplotlib.figure import Figure
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import FloatArray
 from fgtrack.evaluation import innovations
-from fgtrack.evaluation.figures.style import StyledFigure, colour, legend_above, styled, titled
+from fgtrack.evaluation.figures.ranges import bulk
+from fgtrack.evaluation.figures.style import StyledFigure, colour, legend_above, styled, title, titled
 from fgtrack.evaluation.innovations import ANGULAR, RESIDUAL_NAMES
 from fgtrack.evaluation.runs import OneRun, one_judged, start_ns
 from fgtrack.evaluation.statistics import Moments
@@ -52,7 +50,7 @@ def residuals(run: OneRun) -> Figure:
     rows = figure.subplots(len(names), 2, squeeze=False, sharey="row", width_ratios=(2, 1))
     for (over_time, histogram), name in zip(rows, names, strict=True):
         known = {sensor: np.isfinite(values[name]) & (updates["sensor"] == sensor) for sensor in sensors}
-        low, high = _core([values[name][mine] for mine in known.values() if mine.any()])
+        low, high = bulk([values[name][mine] for mine in known.values()])
         bins = np.linspace(low, high, 41)
         for k, (sensor, mine) in enumerate(known.items()):
             sample = values[name][mine]
@@ -71,17 +69,6 @@ def residuals(run: OneRun) -> Figure:
         histogram.set_xlabel(f"density [{_DENSITIES[name.rpartition('_')[2]]}]")
         over_time.set_xlabel("time [s]")
         over_time.sharex(rows[0][0])
-        legend_above(over_time, width=80)
-    figure.suptitle(titled(one.label, "residuals (measured minus predicted)"))
+        legend_above(over_time, 2.0 * figure.get_figwidth() / 3.0)
+    title(figure, titled(one.label, "residuals (measured minus predicted)"))
     return figure
-
-
-def _core(samples: Sequence[FloatArray]) -> tuple[float, float]:
-    """Range that holds the bulk of every one of `samples`: three interquartile ranges beyond the quartiles."""
-    lows, highs = [], []
-    for sample in samples:
-        first, third = np.quantile(sample, (0.25, 0.75)).tolist()
-        lows.append(max(float(sample.min()), first - 3.0 * (third - first)))
-        highs.append(min(float(sample.max()), third + 3.0 * (third - first)))
-    margin = max(0.05 * (max(highs) - min(lows)), 1e-6)
-    return min(lows) - margin, max(highs) + margin

@@ -3,6 +3,7 @@
 import base64
 import io
 import math
+import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_pdf import PdfPages
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from fgtrack.core.errors import CallError
@@ -26,6 +27,13 @@ GREY = "#777777"
 _PAUSE_STEPS = 3  # a line is not drawn across a pause that is longer than as many usual steps
 
 _LINES = ("-", "--", ":", "-.")
+
+_TITLE_CHARACTERS_PER_IN = 10  # of a title; a legend has more, its letters are smaller
+_LEGEND_CHARACTERS_PER_IN = 13
+_MOST_ENTRIES = 12  # of a legend
+_HANDLE = 6  # characters that the line before an entry and the space around it take
+_FREE_LINES = 2  # of a legend for which figures have room
+_LINE_IN = 0.17  # height of a line of text
 
 # The defaults of matplotlib, not those of a file in the home folder; backends are not a matter of style.
 _STYLE = {
@@ -97,23 +105,49 @@ def line_style(index: int) -> str:
     return _LINES[index // len(PALETTE) % len(_LINES)]
 
 
+def title(figure: Figure, text: str) -> None:
+    """Write `text` above `figure`, broken into lines that are no wider than it."""
+    width = int(_TITLE_CHARACTERS_PER_IN * figure.get_figwidth())
+    lines = [line for part in text.split("\n") for line in textwrap.wrap(part, width)]
+    figure.suptitle("\n".join(lines))
+    _grow(figure, _LINE_IN * (len(lines) - 1))
+
+
 def titled(label: str, what: str) -> str:
     """Title of a figure that shows `what` of the run `label`, or of all runs where that is empty."""
     return f"{label}: {what}" if label else what[0].upper() + what[1:]
 
 
-def legend_above(axes: Axes, width: int) -> None:
-    """Legend above a plot that is about `width` characters wide, where it hides nothing."""
+def legend_above(axes: Axes, width_in: float) -> None:
+    """Legend above a plot that is `width_in` wide, where it hides nothing; of many entries the first."""
     handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        axes.legend(
-            loc="lower left",
-            bbox_to_anchor=(0.0, 1.0),
-            ncols=max(1, width // (6 + max(map(len, labels)))),
-            frameon=False,
-            borderaxespad=0.2,
-            markerscale=3.0,
-        )
+    if not handles:
+        return
+    more = len(labels) - _MOST_ENTRIES
+    if more > 1:
+        handles, labels = handles[:_MOST_ENTRIES], [*labels[: _MOST_ENTRIES - 1], f"{labels[_MOST_ENTRIES - 1]} ..."]
+        labels[-1] += f" and {more} more"
+    width = int(_LEGEND_CHARACTERS_PER_IN * width_in)
+    broken = [textwrap.wrap(label, width - _HANDLE) for label in labels]
+    columns = max(1, width // (_HANDLE + max(len(line) for lines in broken for line in lines)))
+    labels = ["\n".join(lines) for lines in broken]
+    _grow(axes.figure, _LINE_IN * (math.ceil(sum(map(len, broken)) / columns) - _FREE_LINES))
+    axes.legend(
+        handles,
+        labels,
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=columns,
+        frameon=False,
+        borderaxespad=0.2,
+        markerscale=3.0,
+    )
+
+
+def _grow(figure: Figure | SubFigure, more_in: float) -> None:
+    """Make `figure` higher, so that what is written above its plots takes nothing from them."""
+    if more_in > 0.0 and isinstance(figure, Figure):
+        figure.set_figheight(figure.get_figheight() + more_in)
 
 
 def log_axis(axis: Axis) -> None:

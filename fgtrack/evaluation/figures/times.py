@@ -6,9 +6,19 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.figures.style import StyledFigure, colour, legend_above, line_style, log_axis, styled, titled
+from fgtrack.evaluation.figures.seeds import grouped
+from fgtrack.evaluation.figures.style import (
+    StyledFigure,
+    colour,
+    legend_above,
+    line_style,
+    log_axis,
+    styled,
+    title,
+    titled,
+)
 from fgtrack.evaluation.innovations import message_delays
-from fgtrack.evaluation.runs import OneRun, Runs, judged, one_judged, start_ns
+from fgtrack.evaluation.runs import OneRun, Runs, judged, one_judged, starts_ns
 from fgtrack.evaluation.statistics import Distribution
 from fgtrack.io.run import Run
 
@@ -47,8 +57,8 @@ def delays(run: OneRun) -> Figure:
     for axes in (histogram, arrived):
         axes.set_xlabel("delay [ms] (lines: mean; dashed: p90)")
         axes.set_xlim(low, high)
-    legend_above(histogram, width=60)
-    figure.suptitle(titled(one.label, "delay of the messages with detections"))
+    legend_above(histogram, figure.get_figwidth() / 2.0)
+    title(figure, titled(one.label, "delay of the messages with detections"))
     return figure
 
 
@@ -62,6 +72,8 @@ def sensor_delays(run: Run) -> dict[str, tuple[IntArray, FloatArray]]:
 def timing(runs: Runs) -> Figure:
     """Wall time of the ticks with detections: over the run, and the share of ticks done by then.
 
+    Runs that differ by their seed only are taken together.
+
     Raises
     ------
     DataError
@@ -72,16 +84,16 @@ def timing(runs: Runs) -> Figure:
         raise DataError("no run has detections, so there are no processing times to draw")
     figure = StyledFigure(figsize=(10.0, 4.0))
     over_time, done = figure.subplots(1, 2)
-    first_ns = start_ns(every)
-    for k, one in enumerate(every):
-        busy = one.run.timing.where(one.run.timing["num_detections"] > 0)
-        if not busy.num_rows:
+    first_ns = starts_ns(every)
+    for k, group in enumerate(grouped(every)):
+        busy = [(one.label, one.run.timing.where(one.run.timing["num_detections"] > 0)) for one in group.runs]
+        time_ms = np.concatenate([ticks["process_ns"] / NS_PER_S * _MS for _, ticks in busy])
+        if not len(time_ms):
             continue
-        time_ms = busy["process_ns"] / NS_PER_S * _MS
         spread = Distribution.of(time_ms)
-        text = f"{one.label}: median {spread.p50:.3g} ms, p99 {spread.p99:.3g} ms"
-        time_s = (busy["now_ns"] - first_ns) / NS_PER_S
-        over_time.plot(time_s, time_ms, ".", ms=2.0, alpha=0.5, mew=0, color=colour(k), label=text)
+        text = f"{group.label}: median {spread.p50:.3g} ms, p99 {spread.p99:.3g} ms"
+        time_s = np.concatenate([(ticks["now_ns"] - first_ns[label]) / NS_PER_S for label, ticks in busy])
+        over_time.plot(time_s, time_ms, ".", ms=3.0, alpha=0.5, mew=0, color=colour(k), label=text, rasterized=True)
         done.ecdf(time_ms, color=colour(k), ls=line_style(k), lw=1.4)
     over_time.set_yscale("log")
     over_time.set_xlabel("time [s]")
@@ -91,6 +103,6 @@ def timing(runs: Runs) -> Figure:
     done.set_ylabel("share of the ticks")
     for axis in (over_time.yaxis, done.xaxis):
         log_axis(axis)
-    legend_above(over_time, width=60)
-    figure.suptitle("Processing time")
+    legend_above(over_time, figure.get_figwidth() / 2.0)
+    title(figure, "Processing time")
     return figure

@@ -16,6 +16,7 @@ from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.io.errors import TruncatedInput
 from fgtrack.io.ros.bag_files import BagFile, BagFolder, EmptyFile, merged, storage_of
+from fgtrack.io.ros.mcap_file import McapFile
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
 from fgtrack.io.ros.typestore import build_typestore, one_line, type_name
 
@@ -106,15 +107,32 @@ class Bag:
         """
         by_key = {(topic.name, topic.type): topic for topic in self.topics}
         stamped = {topic: self._starts_with_header(topic) for topic in self.topics}
-        offset = 4  # behind the CDR header, or in ROS 1 behind the sequence number
         for connection, log_ns, data in self._records({topic.name for topic in self.topics}):
             topic = by_key[connection.topic, connection.msgtype]
-            stamp_ns = None
-            if stamped[topic] and len(data) >= offset + 8:
-                layout = ">iI" if not self._ros1 and data[1] == 0 else "<iI"
-                sec, nanosec = struct.unpack_from(layout, data, offset)
-                stamp_ns = sec * NS_PER_S + nanosec
-            yield topic, log_ns, stamp_ns
+            yield topic, log_ns, self._stamp_ns(data) if stamped[topic] else None
+
+    def sendings(self) -> Iterator[tuple[BagTopic, int, int, int]]:
+        """Topic, header stamp, time of sending and log time of every message that has a header, file by file.
+
+        Only MCAP keeps when a message was sent (its publish time); a recorder that did not know it writes the log
+        time. Compression of single messages is not undone, such recordings give nothing.
+        """
+        stamped = {(topic.name, topic.type): topic for topic in self.topics if self._starts_with_header(topic)}
+        with _as_data_error(self.path), _opened(self.path) as files:
+            for file in files:
+                for connection, sent_ns, log_ns, data in file.sendings() if isinstance(file, McapFile) else ():
+                    topic = stamped.get((connection.topic, connection.msgtype))
+                    stamp_ns = None if topic is None or data[:4] == _ZSTD_MAGIC else self._stamp_ns(data)
+                    if topic is not None and stamp_ns is not None:
+                        yield topic, stamp_ns, sent_ns, log_ns
+
+    def _stamp_ns(self, data: bytes) -> int | None:
+        """Stamp of the header with which the message `data` begins."""
+        offset = 4  # behind the CDR header, or in ROS 1 behind the sequence number
+        if len(data) < offset + 8:
+            return None
+        sec, nanosec = struct.unpack_from(">iI" if not self._ros1 and data[1] == 0 else "<iI", data, offset)
+        return int(sec * NS_PER_S + nanosec)
 
     def _starts_with_header(self, topic: BagTopic) -> bool:
         if topic.problem:

@@ -1,13 +1,17 @@
 """An MCAP file, including a truncated one."""
 
-from collections.abc import Collection, Generator
+from collections.abc import Collection, Generator, Iterator
+from io import BytesIO
 from pathlib import Path
+from typing import BinaryIO
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.storage_mcap import (
+    DECOMPRESSORS,
     ChunkInfo,
     McapReader,
+    deserialize_hiqq,
     deserialize_qqqi,
     deserialize_uint64,
     read_string,
@@ -15,6 +19,7 @@ from rosbags.rosbag2.storage_mcap import (
 
 _CHUNK_HEADER = 40  # two times, size, checksum, length of the compression's name, size of the data
 _RECORD_HEADER = 9  # opcode and length
+_MESSAGE_HEADER = 22  # channel, sequence, two times
 
 
 class McapFile(McapReader):
@@ -43,6 +48,17 @@ class McapFile(McapReader):
             yield from super().messages(connections, start, stop)
         else:  # no chunk that could be sorted for itself
             yield from sorted(self.messages_scan(connections, start, stop), key=lambda record: record[1])
+
+    def sendings(self) -> Iterator[tuple[Connection, int, int, bytes]]:
+        """Connection, publish time and log time in ns, and bytes of every message, in the order of the file."""
+        assert self.bio
+        by_id = {item.id: item for item in self.connections}
+        if not self.chunks:
+            yield from _sendings(self.bio, self.data_start, self.data_end, by_id)
+        for chunk in self.chunks:
+            self.bio.seek(chunk.chunk_start_offset + _RECORD_HEADER + _CHUNK_HEADER + len(chunk.compression))
+            data = DECOMPRESSORS[chunk.compression](self.bio.read(chunk.compressed_size), chunk.uncompressed_size)
+            yield from _sendings(BytesIO(data), 0, len(data), by_id)
 
     def _index_by_walking(self) -> None:
         """Find the chunks, schemas and channels without the index at the end of the file."""
@@ -98,3 +114,18 @@ class McapFile(McapReader):
             size,
             {},
         )
+
+
+def _sendings(
+    file: BinaryIO | BytesIO, position: int, end: int, by_id: dict[int, Connection]
+) -> Iterator[tuple[Connection, int, int, bytes]]:
+    """The message records between two places of `file`, as `McapFile.sendings` gives them."""
+    while position < end:
+        file.seek(position)
+        head = file.read(_RECORD_HEADER)
+        length = deserialize_uint64(head[1:])[0]
+        if head[0] == 0x05:
+            channel, _, log_ns, sent_ns = deserialize_hiqq(file.read(_MESSAGE_HEADER))
+            if channel in by_id:
+                yield by_id[channel], sent_ns, log_ns, file.read(length - _MESSAGE_HEADER)
+        position += _RECORD_HEADER + length

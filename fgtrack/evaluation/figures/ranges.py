@@ -1,0 +1,32 @@
+"""What part of its data an axis shows: the bulk, whatever single values are far away."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from fgtrack.core.types import FloatArray
+
+_BEYOND = 3.0  # interquartile ranges beyond the quartiles that still belong to the bulk
+_MARGIN = 0.05
+
+
+def bulk(samples: Iterable[FloatArray], held: Iterable[FloatArray] = ()) -> tuple[float, float]:
+    """Range with the bulk of every one of `samples` and all of `held`, with a margin; values that are not finite count
+    for nothing. Of no values it is (0, 1).
+    """
+    lows, highs = [], []
+    for sample in samples:
+        known = sample[np.isfinite(sample)]
+        if len(known):
+            first, third = np.quantile(known, (0.25, 0.75)).tolist()
+            lows.append(max(float(known.min()), first - _BEYOND * (third - first)))
+            highs.append(min(float(known.max()), third + _BEYOND * (third - first)))
+    for values in held:
+        known = values[np.isfinite(values)]
+        if len(known):
+            lows.append(float(known.min()))
+            highs.append(float(known.max()))
+    if not lows:
+        return 0.0, 1.0
+    margin = max(_MARGIN * (max(highs) - min(lows)), 1e-6)
+    return min(lows) - margin, max(highs) + margin

@@ -1,0 +1,48 @@
+"""`fgtrack figure` on sweeps and on many runs: which files it writes, and what it refuses."""
+
+from pathlib import Path
+
+import pytest
+
+import fgtrack
+from fgtrack.cli.main import run as command
+
+HEADER = "delay_s,seed,estimator,truth.overall.errors.position_m.rmse,truth.overall.errors.yaw_rad.rmse\n"
+
+
+def a_sweep(folder: Path) -> Path:
+    folder.mkdir()
+    rows = [f"{d},{seed},{name},{d + seed},{d}\n" for d in (0.1, 0.2) for seed in (0, 1) for name in ("a", "b")]
+    (folder / "sweep.csv").write_text(HEADER + "".join(rows))
+    return folder
+
+
+def test_a_sweep_is_drawn_by_its_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sweep = str(a_sweep(tmp_path / "sweep"))
+    assert command(["figure", sweep, "-o", str(tmp_path / "few")]) == 0
+    assert "1 more with --all" in capsys.readouterr().out
+    assert [file.name for file in (tmp_path / "few").iterdir()] == ["sweep_truth.overall.errors.position_m.rmse.png"]
+    assert command(["figure", sweep, "-o", str(tmp_path / "all.pdf"), "--all"]) == 0
+    assert "more with" not in capsys.readouterr().out
+    assert (tmp_path / "all.pdf").read_bytes().count(b"/Type /Page ") == 2
+
+
+def test_a_sweep_is_drawn_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sweep, out = str(a_sweep(tmp_path / "sweep")), ["-o", str(tmp_path / "out")]
+    for more, message in (([str(tmp_path)], "name it alone"), (["--track", "1"], "--track and --stamp choose a late")):
+        assert command(["figure", sweep, *more, *out]) == 2
+        assert message in capsys.readouterr().err
+    (tmp_path / "sweep" / "sweep.csv").write_text(HEADER)
+    assert command(["figure", sweep, *out]) == 1
+    assert "holds no rows of a sweep" in capsys.readouterr().err
+
+
+def test_runs_of_several_seeds_have_bands_and_the_close_up_of_the_first(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        recording = tmp_path / f"{seed}.jsonl"
+        fgtrack.simulate("single_opponent", seed=seed, duration_s=4.0, out=recording)
+        fgtrack.replay(recording, "tuned", map="oval", estimator="ekf-replay", out=tmp_path / "runs" / f"seed{seed}")
+    assert command(["figure", str(tmp_path / "runs"), "-o", str(tmp_path / "out")]) == 0
+    names = {file.name for file in (tmp_path / "out").iterdir()}
+    assert {"close_up.png", "error_bands.png", "frenet_seed1_ekf-replay.png"} <= names
+    assert not any(name.startswith("errors_") for name in names)

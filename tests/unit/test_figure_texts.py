@@ -1,0 +1,143 @@
+"""No text of any figure is cut off or lies on another: of few and many objects, runs, sensors, long names."""
+
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluation_runs import START_NS, TICK_NS, Car, update, write_run
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from support.pictures import faults
+
+from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState
+from fgtrack.evaluation import plot
+from fgtrack.evaluation.figures.style import StyledFigure, legend_above, styled, title
+from fgtrack.evaluation.runs import judged
+from fgtrack.io.run import Run
+
+TICKS = range(50)
+LONG = "a-run-with-a-name-that-goes-on-and-on-until-nobody-wants-to-read-it-any-more-and-then-some"
+
+
+def a_run(
+    folder: Path, *, objects: int = 2, sensors: int = 2, seed: int = 0, scale: float = 1.0, truth: bool = True
+) -> Run:
+    """Cars side by side, each tracked with an error of its own; sensors with late detections, an ego, the oval."""
+    rng = np.random.default_rng(seed)
+    cars = [Car(k, 100.0, 12.0 * k, 0.3, 20.0) for k in range(objects)]
+    tracks = [
+        [car.track(k, car.object_id, along_m=scale * 0.1 * rng.normal(), speed_mps=0.1) for car in cars] for k in TICKS
+    ]
+    updates = {
+        k: [
+            update(
+                f"sensor_{index}_of_the_vehicle",
+                tick=k,
+                delay_ns=int(1e7 * (1 + index)) + seed,
+                disposition=Disposition.OUT_OF_SEQUENCE if index else Disposition.IN_SEQUENCE,
+                nis=float(rng.chisquare(3)),
+                x_m=scale * rng.normal(),
+                y_m=rng.normal(),
+                speed_mps=rng.normal(),
+            )
+            for index in range(sensors)
+        ]
+        for k in TICKS
+    }
+    stamps_ns = [START_NS + k * TICK_NS for k in TICKS]
+    return write_run(
+        folder,
+        tracks,
+        truth=[row for car in cars for row in car.truth(TICKS)] if truth else (),
+        updates=updates,
+        smoothed={k: [car.later(k - 5, car.object_id, 0.1) for car in cars] for k in TICKS[5:]},
+        ego=[EgoState(stamp_ns, stamp_ns, 80.0, 0.0, 0.0, 10.0) for stamp_ns in stamps_ns],
+        detections=[DetectionList("lidar", each, each, [Detection(x_m=20.0, y_m=1.0)]) for each in stamps_ns[2:-2]],
+        config_text="map: {track: oval}",
+        process_ns=rng.integers(100_000, 90_000_000, len(TICKS)).tolist(),
+        meta={"estimator": folder.name},
+    )
+
+
+def many_runs(folder: Path) -> list[Run]:
+    return [a_run(folder / f"{LONG}-{k}", scale=1.0 + 0.01 * k) for k in range(9)]
+
+
+SCENES = {
+    "two objects": lambda folder: [a_run(folder / name) for name in ("smoother", "ekf-replay")],
+    "fifty objects": lambda folder: [a_run(folder / "smoother", objects=50)],
+    "one object": lambda folder: [a_run(folder / "smoother", objects=1, sensors=1)],
+    "no truth": lambda folder: [a_run(folder / "smoother", truth=False)],
+    "large numbers": lambda folder: [a_run(folder / name, scale=1e7) for name in ("smoother", "ekf-replay")],
+    "small numbers": lambda folder: [a_run(folder / name, scale=1e-7) for name in ("smoother", "ekf-replay")],
+    "many sensors": lambda folder: [a_run(folder / "smoother", sensors=7)],
+    "many runs with long names": many_runs,
+    "several seeds": lambda folder: [
+        a_run(folder / f"seed{seed}" / name, seed=seed) for seed in range(4) for name in ("smoother", LONG)
+    ],
+}
+
+
+def figures(runs: list[Run]) -> Iterator[tuple[str, Figure]]:
+    """One of each kind."""
+    every = judged(runs)
+    return plot.drawn(plan for plans in plot.FIGURES.values() for plan in islice(plans(every), 1))
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_no_text_is_cut_off_or_lies_on_another(scene: str, tmp_path: Path) -> None:
+    found = {name: faults(figure) for name, figure in figures(SCENES[scene](tmp_path))}
+    assert {name: lines for name, lines in found.items() if lines} == {}
+
+
+def test_every_figure_of_runs_is_among_the_scenes(tmp_path: Path) -> None:
+    """But for those of recordings and sweeps, which have tests of their own."""
+    runs = [*SCENES["two objects"](tmp_path), *SCENES["several seeds"](tmp_path)]
+    seen = {name for name, plans in plot.FIGURES.items() if list(plans(judged(runs)))}
+    seen |= {name for name, plans in plot.FIGURES.items() if list(plans(judged(runs[:2])))}
+    assert set(plot.FIGURES) - seen == {"anatomy"}
+
+
+@styled
+def an_empty_figure(width_in: float) -> tuple[Figure, Axes]:
+    figure = StyledFigure(figsize=(width_in, 2.5))
+    return figure, figure.add_subplot()
+
+
+def test_a_text_that_is_cut_off_or_hidden_is_found() -> None:
+    figure, axes = an_empty_figure(3.0)
+    assert faults(figure) == []
+    axes.text(0.9, 0.5, "far beyond the right edge of the canvas").set_in_layout(False)
+    axes.text(0.1, 0.2, "first")
+    axes.text(0.12, 0.2, "second")
+    assert faults(figure) == [
+        "cut off: 'far beyond the right edge of the canvas'",
+        "overlap: 'first' and 'second'",
+    ]
+
+
+def test_a_long_title_is_broken_into_lines_and_takes_nothing_from_the_plot() -> None:
+    heights = []
+    for text in ("word", "word " * 40):
+        figure, axes = an_empty_figure(5.0)
+        title(figure, text)
+        assert faults(figure) == []
+        heights.append(axes.get_window_extent().height)
+    assert figure.get_suptitle().count("\n") >= 3
+    assert heights[1] > 0.9 * heights[0]
+
+
+def test_a_legend_of_many_entries_names_the_first_and_counts_the_rest() -> None:
+    figure, axes = an_empty_figure(6.0)
+    for index in range(40):
+        axes.plot([0, 1], [0, index], label=f"a line with a rather long name that needs space, number {index}")
+    legend_above(axes, 6.0)
+    assert faults(figure) == []
+    shown = axes.get_legend()
+    assert shown is not None
+    texts = [text.get_text().replace("\n", " ") for text in shown.get_texts()]
+    assert len(texts) == 12
+    assert texts[-1].endswith("... and 28 more")
+    assert axes.get_window_extent().height > 80.0

@@ -1,0 +1,228 @@
+"""What single figures draw: the map, the way along the track, NEES and NIS, differences, bands over seeds, the few."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluation_runs import ROUND, START_NS, TICK_NS, WEST, Car, update, write_run
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray
+from fgtrack.evaluation import plot
+from fgtrack.evaluation.figures.ranges import bulk
+from fgtrack.evaluation.runs import judged
+from fgtrack.io.run import Run, Table
+from fgtrack.models.oval import make_oval
+
+TICKS = range(60)
+OVAL = "map: {track: oval}"
+
+
+def labelled(axes: Axes, label: str) -> Line2D:
+    return next(line for line in axes.lines if str(line.get_label()).startswith(label))
+
+
+def y_of(line: Line2D) -> FloatArray:
+    return np.asarray(line.get_ydata(), dtype=np.float64)
+
+
+def x_of(line: Line2D) -> FloatArray:
+    return np.asarray(line.get_xdata(), dtype=np.float64)
+
+
+def stamp_ns(tick: int) -> int:
+    return START_NS + tick * TICK_NS
+
+
+# --- the map
+
+
+def test_one_stray_track_does_not_stretch_the_map_but_is_counted(tmp_path: Path) -> None:
+    tracks = [[WEST.track(k, 1), *([WEST.track(k, 2, across_m=90_000.0)] if k < 3 else [])] for k in TICKS]
+    figure = plot.map(write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS)))
+    (axes,) = figure.axes
+    figure.canvas.draw()  # an equal aspect is made then
+    assert max(*np.abs(axes.get_xlim()), *np.abs(axes.get_ylim())) < 200.0
+    assert "3 rows of tracks and detections are outside" in figure.get_suptitle()
+
+
+def test_ego_and_detections_are_on_the_map(tmp_path: Path) -> None:
+    """The ego stands at (10, 20), turned to +y; what it sees 5 m ahead is at (10, 25)."""
+    ego = [EgoState(stamp_ns(k), stamp_ns(k), 10.0, 20.0, np.pi / 2, 0.0) for k in TICKS]
+    seen = [DetectionList("lidar", stamp_ns(k), stamp_ns(k), [Detection(x_m=5.0, y_m=0.0)]) for k in TICKS[1:-1]]
+    (axes,) = plot.map(write_run(tmp_path / "run", [[WEST.track(k, 1)] for k in TICKS], ego=ego, detections=seen)).axes
+    own, found = labelled(axes, "ego"), labelled(axes, "detections (58)")
+    assert (x_of(own)[0], y_of(own)[0]) == (10.0, 20.0)
+    assert (x_of(found)[0], y_of(found)[0]) == pytest.approx((10.0, 25.0))
+
+
+def test_the_bulk_of_a_sample_leaves_out_what_is_far_away() -> None:
+    low, high = bulk([np.array([*np.linspace(0.0, 1.0, 101), 1e6, np.nan])])
+    assert -0.2 < low < 0.0 < 1.0 < high < 3.0
+    assert bulk([np.zeros(0)]) == (0.0, 1.0)
+    assert bulk([np.zeros(3)], [np.array([-10.0, 10.0])]) == (-11.0, 11.0)
+
+
+# --- along the track
+
+
+def drive(first_s_m: float, lateral_m: float, object_id: int) -> list[Car]:
+    """A car for each tick, which goes 1 m along the oval in each."""
+    road = make_oval()
+    s_m = np.mod(first_s_m + np.arange(len(TICKS)), road.length_m)
+    return [Car(object_id, *road.position(np.array([s]), np.array([lateral_m]))[0].tolist(), 0.0, 0.0) for s in s_m]
+
+
+def test_the_way_along_the_track_is_in_frenet_coordinates(tmp_path: Path) -> None:
+    length_m = make_oval().length_m
+    cars, own = drive(length_m - 30.0, 2.5, 0), drive(length_m - 40.0, 0.0, -1)
+    tracks = [[car.track(0, 1)] for car in cars]
+    for k, reports in enumerate(tracks):
+        object.__setattr__(reports[0].state, "stamp_ns", stamp_ns(k))
+    ego = [EgoState(stamp_ns(k), stamp_ns(k), one.x_m, one.y_m, 0.0, 0.0) for k, one in enumerate(own)]
+    figure = plot.frenet(write_run(tmp_path / "run", tracks, ego=ego, config_text=OVAL))
+    along, ahead, lateral = figure.axes
+    s_m = y_of(labelled(along, "tracks"))
+    assert np.isnan(s_m).sum() == 1  # the line is broken where the lap ends, and nowhere else
+    assert (s_m[0], s_m[-1]) == pytest.approx((length_m - 30.0, 29.0), abs=0.05)
+    np.testing.assert_allclose(y_of(labelled(ahead, "tracks")), 10.0, atol=0.05)
+    np.testing.assert_allclose(y_of(labelled(lateral, "tracks")), 2.5, atol=0.05)
+    np.testing.assert_allclose(y_of(labelled(lateral, "ego")), 0.0, atol=0.05)
+    assert [axes.get_ylabel() for axes in figure.axes] == [
+        *("along the track [m]", "ahead of the ego [m]", "left of the reference\nline [m] (grey: bounds)")
+    ]
+
+
+def test_without_an_ego_there_is_nothing_ahead_of_it(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", [[WEST.track(k, 1)] for k in TICKS], truth=WEST.truth(TICKS), config_text=OVAL)
+    along, _ = plot.frenet(run).axes
+    assert labelled(along, "object 7, truth").get_color() == labelled(along, "object 7, track").get_color()
+    assert [plan.name for plan in plot.planned(judged(run)) if "frenet" in plan.name] == ["frenet_run (smoother)"]
+
+
+# --- NEES and NIS
+
+
+def test_consistent_values_are_inside_their_bands_and_others_outside(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    updates = {
+        k: [update("lidar", tick=k, nis=nis, x_m=0.0, y_m=0.0), update("radar", tick=k, nis=9.0 * nis, speed_mps=0.0)]
+        for k, nis in enumerate(rng.chisquare(2, 400))
+    }
+    figure = plot.consistency(write_run(tmp_path / "run", updates=updates))
+    said = {}
+    for axes, sensor in zip(figure.axes, ("lidar", "radar"), strict=True):
+        line = labelled(axes, sensor)
+        said[sensor] = str(line.get_label())
+        band = axes.collections[0].get_paths()[0].vertices
+        inside = (y_of(line) > np.min(band[:, 1])) & (y_of(line) < np.max(band[:, 1]))
+        assert inside.mean() > 0.85 if sensor == "lidar" else not inside.any()
+        assert axes.get_yscale() == "log"
+    assert "expected 2; 9" in said["lidar"]
+    assert "mean of 10" in said["lidar"]
+    assert "expected 1; " in said["radar"]
+
+
+def test_the_nees_of_a_tick_is_the_mean_over_its_objects(tmp_path: Path) -> None:
+    tracks = [[WEST.track(k, 1, along_m=2.0), ROUND.track(k, 2)] for k in TICKS]
+    axes = plot.consistency(write_run(tmp_path / "run", tracks, truth=[*WEST.truth(TICKS), *ROUND.truth(TICKS)])).axes[
+        0
+    ]
+    np.testing.assert_allclose(y_of(labelled(axes, "position")), 2.0, rtol=1e-4)  # (4 + 0) / 2
+    assert "mean 2, expected 2; 100 % of the ticks" in str(labelled(axes, "position").get_label())
+
+
+# --- differences
+
+
+def errors_of(tmp_path: Path, *along_m: float) -> Figure:
+    runs = []
+    for index, error_m in enumerate(along_m):
+        tracks = [[WEST.track(k, 1, along_m=error_m, speed_mps=0.5 + index)] for k in TICKS]
+        meta = {"estimator": f"run{index}"}
+        runs.append(write_run(tmp_path / f"run{index}", tracks, truth=WEST.truth(TICKS), meta=meta))
+    return plot.errors(runs)
+
+
+def test_curves_that_nearly_coincide_are_told_apart_by_their_difference(tmp_path: Path) -> None:
+    figure = errors_of(tmp_path, 0.5, 0.51, 2.0)
+    position, difference, speed, *_ = figure.axes
+    assert len(position.lines) == 3
+    (line,) = difference.lines
+    assert line.get_label() == "run1 minus run0"
+    np.testing.assert_allclose(y_of(line), 0.01, atol=1e-6)
+    assert line.get_color() == position.lines[1].get_color()
+    low, high = difference.get_ylim()
+    assert low < 0.0 < 0.01 < high
+    assert speed.get_ylabel() == "speed error [m/s]"  # those of the speeds are far apart
+
+
+def test_equal_curves_are_said_to_be_equal(tmp_path: Path) -> None:
+    figure = errors_of(tmp_path, 0.5, 0.5)
+    labels = [str(line.get_label()) for line in figure.axes[0].lines]
+    assert labels == ["run0: RMSE 0.5 m", "run1: RMSE 0.5 m, same as run0"]
+    assert "larger by" not in "".join(axes.get_ylabel() for axes in figure.axes)
+
+
+def test_runs_of_another_day_begin_at_zero_as_well(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path / name, [[WEST.track(k, 1)] for k in TICKS], truth=WEST.truth(TICKS)) for name in "ab"]
+    day_ns = 86_400 * 1_000_000_000
+    for table, names in (("tracks", ("now_ns", "stamp_ns")), ("timing", ("now_ns",)), ("truth", ("stamp_ns",))):
+        moved = Table({name: of + day_ns if name in names else of for name, of in getattr(runs[1], table).items()})
+        runs[1] = replace(runs[1], **{table: moved})
+    first, second = plot.errors(runs).axes[0].lines
+    np.testing.assert_allclose(x_of(first), x_of(second))
+
+
+# --- over seeds
+
+
+def seed_run(folder: Path, seed: int, along_m: float, estimator: str = "smoother") -> Run:
+    tracks = [[WEST.track(k, 1, along_m=along_m)] for k in TICKS]
+    updates = {k: [update(tick=k, delay_ns=1_000_000 + seed, nis=2.0, x_m=0.1, y_m=0.1)] for k in TICKS}
+    meta = {"estimator": estimator}
+    return write_run(folder / f"seed{seed}" / estimator, tracks, truth=WEST.truth(TICKS), updates=updates, meta=meta)
+
+
+def test_runs_of_several_seeds_are_a_line_and_a_band(tmp_path: Path) -> None:
+    runs = [seed_run(tmp_path, seed, along_m) for seed, along_m in enumerate((1.0, 2.0, 3.0))]
+    runs.append(seed_run(tmp_path, 0, 5.0, "ekf-replay"))  # of one seed only
+    figure = plot.error_bands(runs)
+    position, *_, nees = figure.axes
+    (line,) = position.lines
+    assert line.get_label() == "smoother (3 runs)"
+    np.testing.assert_allclose(y_of(line), np.sqrt(14.0 / 3.0), rtol=1e-4)
+    np.testing.assert_allclose(x_of(line), 0.02 * np.arange(60), atol=1e-9)
+    band = position.collections[0].get_paths()[0].vertices[:, 1]
+    assert (band.min(), band.max()) == pytest.approx((1.2, 2.8), abs=1e-3)  # 10 and 90 % of 1, 2, 3
+    np.testing.assert_allclose(y_of(labelled(nees, "smoother")), 14.0 / 3.0, rtol=1e-4)
+    assert position.get_ylabel() == "position RMSE [m]"
+
+
+def test_bands_take_the_place_of_the_curves_of_many_seeds(tmp_path: Path) -> None:
+    runs = judged([seed_run(tmp_path, seed, 0.1 + 0.1 * seed) for seed in range(8)])
+    plans = plot.planned(runs)
+    names = {plan.name for plan in plans if not plan.is_extra}
+    assert "error_bands" in names
+    assert not any("errors" in name for name in names)
+    assert {name for name in names if "map" in name} == {f"map_seed{k}/smoother" for k in (5, 6, 7)}
+    assert sum("map" in plan.name for plan in plans) == 8
+
+
+# --- few
+
+
+def test_of_many_objects_the_worst_are_drawn_and_the_rest_on_request(tmp_path: Path) -> None:
+    cars = [Car(k, 100.0, 30.0 * k, 0.0, 20.0) for k in range(12)]
+    tracks = [[car.track(k, car.object_id, along_m=0.1 * car.object_id) for car in cars] for k in TICKS]
+    run = write_run(tmp_path / "run", tracks, truth=[row for car in cars for row in car.truth(TICKS)])
+    plans = [plan for plan in plot.planned(judged(run)) if plan.name.startswith("errors")]
+    assert [plan.name for plan in plans if not plan.is_extra] == [
+        *("errors_all_objects", "errors_object_9", "errors_object_10", "errors_object_11")
+    ]
+    assert len(plans) == 13
+    few, every = (plot.save_figures(run, tmp_path / name, every=name == "every") for name in ("few", "every"))
+    assert len(every) == len(few) + 9

@@ -1,0 +1,94 @@
+"""Figures of a sweep: means and standard errors of its table, drawn over the grid."""
+
+import csv
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.pictures import faults
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.evaluation import plot
+from fgtrack.evaluation.sweep_table import SWEEP_FILE, is_sweep, read_sweep
+from fgtrack.pipeline.sweep_store import SWEEP_TABLE
+
+POSITION, NEES = "truth.overall.errors.position_m.rmse", "consistency.position_nees.mean"
+DELAYS = ("0.05", "0.1", "0.2")
+
+
+def a_sweep(folder: Path, *, seeds: int = 3, gates: tuple[str, ...] = ("5.0",), estimators: int = 2) -> Path:
+    """Position RMSE: the delay, plus 1 for each further estimator, plus 0.1 times the seed; one cell is empty."""
+    folder.mkdir(parents=True)
+    with (folder / SWEEP_FILE).open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["delay_s", "sensors.radar.delay", "gate_m", "seed", "estimator", POSITION, NEES, "num_tracks"])
+        for delay, gate, seed, index in product(DELAYS, gates, range(seeds), range(estimators)):
+            rmse = repr(float(delay) + index + 0.1 * seed) if (delay, seed, index) != ("0.2", 2, 1) else ""
+            mapping = f'{{"kind": "constant", "delay_s": {delay}}}'
+            writer.writerow([delay, mapping, gate, seed, f"estimator-{index}", rmse, 2.0, 1])
+    return folder
+
+
+def test_means_and_standard_errors_are_those_of_the_seeds(tmp_path: Path) -> None:
+    table = read_sweep(a_sweep(tmp_path / "sweep"))
+    assert table.axes == ("delay_s", "sensors.radar.delay", "gate_m")
+    assert table.shown_axes == ("delay_s",)
+    first, second, *_ = table.means(POSITION)
+    assert (first.point, first.estimator, first.seeds) == (("0.05",), "estimator-0", 3)
+    assert first.mean == pytest.approx(0.15)
+    assert first.standard_error == pytest.approx(0.1 / np.sqrt(3.0))
+    assert second.mean == pytest.approx(1.15)
+    assert table.means(POSITION)[-1].seeds == 2  # the empty cell is left out
+
+
+def test_the_figure_has_a_line_with_bars_for_each_estimator(tmp_path: Path) -> None:
+    figure = plot.sweep(a_sweep(tmp_path / "sweep"))
+    (axes,) = figure.axes
+    first, second = axes.containers
+    np.testing.assert_allclose(first.lines[0].get_ydata(), [0.15, 0.2, 0.3])
+    np.testing.assert_allclose(second.lines[0].get_ydata(), [1.15, 1.2, 1.25])
+    np.testing.assert_allclose(first.lines[0].get_xdata(), [0.05, 0.1, 0.2], atol=2e-3)
+    assert not np.allclose(first.lines[0].get_xdata(), second.lines[0].get_xdata(), atol=1e-6)  # bars side by side
+    (bars,) = first.lines[2]
+    low, high = bars.get_segments()[0][:, 1]
+    assert (high - low) / 2.0 == pytest.approx(0.1 / np.sqrt(3.0))
+    assert axes.get_xlabel() == "delay_s"
+    assert "mean over 2 to 3 seeds" in figure.get_suptitle()
+    assert faults(figure) == []
+
+
+def test_the_axis_with_the_most_numbers_is_horizontal_and_the_others_have_panels(tmp_path: Path) -> None:
+    figure = plot.sweep(a_sweep(tmp_path / "sweep", gates=("5.0", "3.0", "2.0", "1.0")), NEES)
+    seen = [axes for axes in figure.axes if axes.get_visible()]
+    assert {axes.get_xlabel() for axes in seen} == {"gate_m"}
+    assert [axes.get_title(loc="left") for axes in seen] == [f"delay_s {delay}" for delay in DELAYS]
+    assert faults(figure) == []
+
+
+def test_texts_and_single_seeds_and_many_estimators_are_drawn_as_well(tmp_path: Path) -> None:
+    folder = a_sweep(tmp_path / "sweep", seeds=1, estimators=9)
+    text = (folder / SWEEP_FILE).read_text().replace("\n0.05,", "\nshort-and-sweet,").replace("\n0.1,", "\nlonger,")
+    (folder / SWEEP_FILE).write_text(text)
+    figure = plot.sweep(folder)
+    assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["short-and-sweet", "longer", "0.2"]
+    assert "one seed" in figure.get_suptitle()
+    assert faults(figure) == []
+
+
+def test_few_metrics_are_drawn_and_the_rest_on_request(tmp_path: Path) -> None:
+    plans = plot.planned_sweep(read_sweep(a_sweep(tmp_path / "sweep")))
+    assert [(plan.name, plan.is_extra) for plan in plans] == [(f"sweep_{POSITION}", False), (f"sweep_{NEES}", False)]
+
+
+def test_what_is_no_sweep_is_one_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(CallError, match="cannot be read"):
+        plot.sweep(tmp_path)
+    with pytest.raises(CallError, match="no such metric"):
+        plot.sweep(a_sweep(tmp_path / "sweep"), "rmse")
+    (tmp_path / SWEEP_FILE).write_text("a,b\n1,2\n")
+    with pytest.raises(DataError, match="holds no rows of a sweep"):
+        read_sweep(tmp_path)
+    assert is_sweep(tmp_path / "sweep")
+    assert not is_sweep(tmp_path / "nowhere")
+    assert SWEEP_FILE == SWEEP_TABLE
