@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperGroup
 
 import fgtrack
-from fgtrack.core.errors import CallError, FgtrackError
+from fgtrack.core.errors import CallError, FgtrackError, one_line
 
 DONE, BAD_DATA, BAD_CALL, INTERRUPTED = 0, 1, 2, 130
 
@@ -98,7 +98,7 @@ def run(arguments: Sequence[str]) -> int:
 def _failed(message: str, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
-    print("fgtrack: error: " + " ".join(message.split()), file=sys.stderr)
+    print(f"fgtrack: error: {one_line(message)}", file=sys.stderr)
     return code
 
 

@@ -1,6 +1,7 @@
 """YAML files to validated dataclasses and back; every error names the file and the key."""
 
 import json
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
@@ -11,7 +12,7 @@ from typing import Any, TypeVar
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.error import MarkedYAMLError, ReusedAnchorWarning, YAMLError
 
 from fgtrack.core.errors import CallError
 
@@ -60,7 +61,9 @@ def _parse(text: str, origin: str) -> Any:
     if len(text) > _LONGEST_TEXT:
         raise CallError(f"{origin}: no configuration is longer than {_LONGEST_TEXT} characters, this has {len(text)}")
     try:
-        value = YAML(typ="safe", pure=True).load(text)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ReusedAnchorWarning)  # YAML allows it
+            value = YAML(typ="safe", pure=True).load(text)
         if next(islice(_nodes(value), _MOST_NODES, None), None) is not None:
             raise CallError(f"{origin}: more than {_MOST_NODES} values, counting what its aliases repeat")
         return value

@@ -12,13 +12,14 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S, period_ns, seconds
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.io.run import MemoryRun, Node, Run, RunWriter
+from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, Tick, listed_ticks, message_ticks, node_ticks, read_ticks
 from fgtrack.pipeline.config import ClockConfig, Config
 from fgtrack.pipeline.ego_clock import EgoClock
 from fgtrack.pipeline.load import dump
 from fgtrack.pipeline.pace import Clock, Pace, WallClock
-from fgtrack.tracking.tracker import Tracker, TrackerParts
+from fgtrack.tracking.tracker import Tracker, TrackerParts, check_sensor
 
 _LONGEST_GAP_S = 3600.0
 _PACKAGES = ("fgtrack", "gtsam", "numpy", "scipy", "rosbags")
@@ -38,9 +39,11 @@ class ReplayResult:
 
 @dataclass
 class _Feed:
-    """The input on its way to the tracker: sets truth and ignored sensors apart, and ends where the input breaks."""
+    """The input on its way to the tracker: sets truth and ignored sensors apart, and ends where the input breaks, or
+    has a list of a sensor that has no model."""
 
     messages: Iterable[Message]
+    sensors: Mapping[str, SensorModel]
     ignored_sensors: frozenset[str]
     on_truth: Callable[[TruthState], None]
     on_ego: Callable[[EgoState], None]
@@ -59,6 +62,8 @@ class _Feed:
                 elif isinstance(message, DetectionList) and message.sensor in self.ignored_sensors:
                     self.ignored_detections += len(message.objects)
                 else:
+                    if isinstance(message, DetectionList):
+                        check_sensor(message.sensor, self.sensors)
                     self._check_time(message)
                     if isinstance(message, DetectionList):
                         self.received_detections += len(message.objects)
@@ -170,7 +175,7 @@ def _drive(
     started_ns, pace = clock.now_ns(), Pace(clock)
     node = Node(None if config.clock.node_hz is None else period_ns(config.clock.node_hz))
     ignored = frozenset(config.ignore_sensors)
-    feed = _Feed(messages, ignored, writer.write_truth, writer.write_ego, writer.write_detections)
+    feed = _Feed(messages, config.sensors, ignored, writer.write_truth, writer.write_ego, writer.write_detections)
     for tick in _ticks(feed, config.clock):
         if realtime:
             pace.wait_for(tick.now_ns)
@@ -241,7 +246,7 @@ def located(problem: str, origin: str) -> str:
 
 def delivered(messages: Iterable[Message], config: Config) -> Iterator[Tick]:
     """The ticks of a replay of `messages` with `config`, and what the tracker gets at each."""
-    feed = _Feed(messages, frozenset(config.ignore_sensors), *3 * (lambda _: None,))
+    feed = _Feed(messages, config.sensors, frozenset(config.ignore_sensors), *3 * (lambda _: None,))
     return _ticks(feed, config.clock)
 
 

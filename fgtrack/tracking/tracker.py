@@ -56,6 +56,15 @@ class TrackerParts:
     ego_errors: EgoErrors = field(default_factory=IndependentErrors)
 
 
+def check_sensor(name: str, sensors: Mapping[str, SensorModel]) -> None:
+    """Raise `DataError` for a sensor that has no model."""
+    if name not in sensors:
+        raise DataError(
+            f"sensor {name!r} has no model (the configuration has {', '.join(sensors) or 'none'}): "
+            f"add it under `sensors`, or to `ignore_sensors`"
+        )
+
+
 class Tracker:
     """Tracks objects from object lists that arrive late.
 
@@ -79,12 +88,7 @@ class Tracker:
             if reason is not None:
                 self.refused_ego[reason] += 1
             return
-        if message.sensor not in self._parts.sensors:
-            known = ", ".join(self._parts.sensors) or "none"
-            raise DataError(
-                f"sensor {message.sensor!r} has no model (the configuration has {known}): "
-                f"add it under `sensors`, or to `ignore_sensors`"
-            )
+        check_sensor(message.sensor, self._parts.sensors)
         self._records += self._parts.inbox.put(message)
 
     def tick(self, now_ns: int) -> TickReport:

@@ -516,3 +516,24 @@ def test_names_in_a_recording_can_neither_move_the_cursor_nor_be_markup(fgtrack:
     for text in (shown.out, refused.error):
         assert "\x1b" not in text
         assert "\x07" not in text
+
+
+@pytest.mark.parametrize("same_tick", [True, False])
+def test_an_unknown_sensor_in_mid_stream_is_a_break_up_to_which_the_run_is_complete(
+    fgtrack: Command, tmp_path: Path, same_tick: bool
+) -> None:
+    messages = drive()
+    place = messages[61]
+    late_ns = 0 if same_tick else 10 * MS
+    messages.insert(
+        62, DetectionList("sonar", place.stamp_ns, place.receipt_ns + late_ns, (Detection(x_m=1.0, y_m=2.0),))
+    )
+    write_stream(tmp_path / "odd.jsonl", messages)
+    called = fgtrack("replay", "odd.jsonl", "-o", "run")
+    assert "'sonar' has no model" in called.error
+    assert "replayed up to there" in called.error
+    assert called.code == 1
+    found = load_run("run")
+    assert found.meta["complete"] is True
+    assert found.updates.num_rows == found.meta["detections_received"] == 31
+    assert fgtrack("compare", "run").code == 0
