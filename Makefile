@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # A file stays in one process, so what its tests share is made once.
 BY_FILE := --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-slow coverage mutants check docs bench bench-full contest clean
+.PHONY: demo test test-slow fuzz coverage mutants check docs bench bench-full contest clean
 
 demo: $(STAMP)
 	$(BIN)/fgtrack demo -o out/demo --overwrite
@@ -20,6 +20,10 @@ test: $(STAMP)
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -n auto $(BY_FILE) -m slow
 	$(BIN)/python -m pytest -n auto $(BY_FILE) --hypothesis-profile=thorough
+
+# Half an hour for each of the kinds of input; what is found is kept in out/fuzz. SECONDS=60 SEED=1 for others.
+fuzz: $(STAMP)
+	$(BIN)/python -m pytest tests/fuzz -n auto -m slow --fuzz-seconds $(or $(SECONDS),1800) --fuzz-seed $(or $(SEED),0)
 
 coverage: $(STAMP)
 	$(BIN)/python -m pytest -n auto $(BY_FILE) --cov --cov-report=term-missing:skip-covered

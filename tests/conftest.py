@@ -4,6 +4,7 @@ import os
 import sys
 from pathlib import Path
 
+import pytest
 from hypothesis import settings
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -13,3 +14,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 settings.register_profile("fast", deadline=None, derandomize=True, max_examples=25)
 settings.register_profile("thorough", deadline=None, max_examples=200)
 settings.load_profile("fast")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """How long `tests/fuzz` goes on, and with which random numbers."""
+    parser.addoption("--fuzz-seconds", type=float, default=60.0, help="time for each target of the slow fuzzing tests")
+    parser.addoption("--fuzz-seed", type=int, default=0, help="seed of the slow fuzzing tests")

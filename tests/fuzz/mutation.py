@@ -1,0 +1,231 @@
+"""Spoils files: bytes anywhere, and values where the format says that there are some."""
+
+import csv
+import gzip
+import io
+import json
+import re
+import sqlite3
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+#: What numbers, texts and places are replaced by.
+ODD: tuple[Any, ...] = (
+    *(0, -1, 1, 3, 10**6, 10**18, 2**31, -(2**31) - 1, 2**63 - 1, 2**63, -(2**63) - 1, 10**30, -(10**30)),
+    *(0.0, -0.0, 0.5, 1e-300, 1e-9, 1e9, -1e9, 1e19, 1e200, -1e308, float("nan"), float("inf"), float("-inf")),
+    *(
+        None,
+        True,
+        False,
+        "",
+        "x",
+        "1",
+        "nan",
+        "[bold]",
+        "\x1b[31m",
+        "\u202eabc",
+        "ä",
+        "\x00",
+        "x" * 5000,
+        "a.b.c",
+        "../x",
+    ),
+    *([], {}, [[]], [0], {"x": 0}, [None, None]),
+)
+_NUMBER = re.compile(rb"-?\d+(\.\d+)?([eE][-+]?\d+)?")
+Mutation = Callable[[np.random.Generator, bytes], bytes]
+
+
+def mutated(rng: np.random.Generator, name: str, content: bytes) -> bytes:
+    """`content` of the file `name` with one to four things spoilt."""
+    for _ in range(int(rng.integers(1, 5))):
+        ways = [_bytes, _bytes, *_BY_SUFFIX.get(Path(name).suffix, (_numbers_in_text, _lines))]
+        try:
+            content = ways[rng.integers(len(ways))](rng, content)
+        except Exception:  # of the libraries that read what an earlier mutation has left
+            content = _bytes(rng, content)
+    return content
+
+
+def _bytes(rng: np.random.Generator, content: bytes) -> bytes:
+    """Bits turned, a part cut out, doubled, zeroed or replaced by noise, or the end cut off."""
+    if not content:
+        return bytes(rng.integers(0, 256, 20, dtype=np.uint8))
+    place, length = int(rng.integers(len(content))), int(2 ** rng.uniform(0, 12))
+    head, part, tail = content[:place], content[place : place + length], content[place + length :]
+    match rng.integers(6):
+        case 0:
+            changed = bytearray(content)
+            for at in rng.integers(len(content), size=int(rng.integers(1, 8))):
+                changed[at] ^= 1 << int(rng.integers(8))
+            return bytes(changed)
+        case 1:
+            return head + tail
+        case 2:
+            return head + part + part + tail
+        case 3:
+            return head + bytes(len(part)) + tail
+        case 4:
+            return head + bytes(rng.integers(0, 256, len(part), dtype=np.uint8)) + tail
+    return head
+
+
+def _numbers_in_text(rng: np.random.Generator, content: bytes) -> bytes:
+    """A number somewhere in a text replaced by something odd."""
+    found = list(_NUMBER.finditer(content))
+    one = found[rng.integers(len(found))]
+    return content[: one.start()] + str(_odd(rng)).encode("utf-8", "replace") + content[one.end() :]
+
+
+def _lines(rng: np.random.Generator, content: bytes) -> bytes:
+    """Lines left out, doubled, exchanged or moved."""
+    lines = content.splitlines(keepends=True)
+    one, other = rng.integers(len(lines), size=2)
+    match rng.integers(4):
+        case 0:
+            del lines[one]
+        case 1:
+            lines.insert(other, lines[one])
+        case 2:
+            lines[one], lines[other] = lines[other], lines[one]
+        case 3:
+            lines[min(one, other) : max(one, other)] = lines[min(one, other) : max(one, other)][::-1]
+    return b"".join(lines)
+
+
+def _json_line(rng: np.random.Generator, content: bytes) -> bytes:
+    lines = content.splitlines()
+    place = int(rng.integers(len(lines)))
+    lines[place] = _json(rng, lines[place])
+    return b"\n".join(lines) + b"\n"
+
+
+def _json(rng: np.random.Generator, content: bytes) -> bytes:
+    return json.dumps(_spoilt(rng, json.loads(content)), ensure_ascii=bool(rng.integers(2))).encode("utf-8", "replace")
+
+
+def _yaml(rng: np.random.Generator, content: bytes) -> bytes:
+    from ruamel.yaml import YAML  # slow
+
+    text = io.StringIO()
+    YAML(typ="safe", pure=True).dump(_spoilt(rng, YAML(typ="safe", pure=True).load(content)), text)
+    return text.getvalue().encode("utf-8", "replace")
+
+
+def _csv(rng: np.random.Generator, content: bytes) -> bytes:
+    """A cell replaced, a cell too few or too many."""
+    text = content.decode()
+    mark = ";" if ";" in text[:200] else ","
+    rows = list(csv.reader(io.StringIO(text), delimiter=mark))
+    row = rows[rng.integers(len(rows))]
+    match rng.integers(6):
+        case 0:
+            row.pop(int(rng.integers(len(row))))
+        case 1:
+            row.append("1")
+        case _:
+            row[int(rng.integers(len(row)))] = str(_odd(rng))
+    out = io.StringIO()
+    csv.writer(out, delimiter=mark, lineterminator="\n").writerows(rows)
+    return out.getvalue().encode("utf-8", "replace")
+
+
+def _gzip(rng: np.random.Generator, content: bytes) -> bytes:
+    return gzip.compress(mutated(rng, "inner.jsonl", gzip.decompress(content)), mtime=0)
+
+
+def _sqlite(rng: np.random.Generator, content: bytes) -> bytes:
+    """A cell of a table replaced, or the bytes of a message spoilt."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "x.db3"
+        path.write_bytes(content)
+        base = sqlite3.connect(path)
+        tables = [row[0] for row in base.execute("select name from sqlite_master where type = 'table'")]
+        table = str(rng.choice(tables))
+        columns = [row[1] for row in base.execute(f"pragma table_info({table})")]
+        rows = [row[0] for row in base.execute(f"select rowid from {table}")]
+        column, row = str(rng.choice(columns)), int(rng.choice(rows))
+        (old,) = base.execute(f"select {column} from {table} where rowid = ?", (row,)).fetchone()
+        new = _bytes(rng, old) if isinstance(old, bytes) and rng.integers(4) else _odd(rng)
+        if not isinstance(new, (int, float, str, bytes, type(None))) or (isinstance(new, int) and abs(new) >= 2**63):
+            new = str(new)
+        base.execute(f"update {table} set {column} = ? where rowid = ?", (new, row))
+        base.commit()
+        base.close()
+        return path.read_bytes()
+
+
+def _mcap(rng: np.random.Generator, content: bytes) -> bytes:
+    """The bytes, times or channel of a message spoilt, in a file whose checksums are right."""
+    from mcap.reader import make_reader  # an extra
+    from mcap.writer import CompressionType, Writer
+
+    found = list(make_reader(io.BytesIO(content)).iter_messages(log_time_order=False))
+    out = io.BytesIO()
+    writer = Writer(out, chunk_size=int(rng.choice([100, 10_000, 10**6])), compression=CompressionType.ZSTD)
+    writer.start(profile="ros2", library="")
+    schemas: dict[int, int] = {}
+    channels: dict[int, int] = {}
+    chosen = int(rng.integers(len(found)))
+    for place, (schema, channel, message) in enumerate(found):
+        if schema.id not in schemas:
+            data = _bytes(rng, schema.data) if not rng.integers(20) else schema.data
+            schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, data)
+        if channel.id not in channels:
+            encoding = str(_odd(rng)) if not rng.integers(40) else channel.message_encoding
+            channels[channel.id] = writer.register_channel(
+                channel.topic, encoding, schemas[schema.id], dict(channel.metadata)
+            )
+        data, log_ns = message.data, message.log_time
+        if place == chosen:
+            data, log_ns = _bytes(rng, data), int(rng.choice([log_ns, 0, 2**63 - 1, log_ns + 10**10]))
+        writer.add_message(channels[channel.id], log_ns, data, message.publish_time, message.sequence)
+    writer.finish()
+    return out.getvalue()
+
+
+def _odd(rng: np.random.Generator) -> Any:
+    return ODD[rng.integers(len(ODD))]
+
+
+def _spoilt(rng: np.random.Generator, value: Any) -> Any:
+    """A value inside `value` replaced by something odd, left out, doubled or renamed; `value` is changed."""
+    places = [(value, key) for key in _keys(value)]
+    for inner, key in places:  # grows
+        places += [(inner[key], below) for below in _keys(inner[key])]
+    if not places:
+        return _odd(rng)
+    inner, key = places[rng.integers(len(places))]
+    match rng.integers(8):
+        case 0:
+            del inner[key]
+        case 1 if isinstance(inner, list):
+            inner.insert(key, inner[key])
+        case 1:
+            inner[str(_odd(rng))] = inner[key]
+        case 2:
+            inner[key] = [inner[key]]
+        case _:
+            inner[key] = _odd(rng)
+    return value
+
+
+def _keys(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, dict) else list(range(len(value))) if isinstance(value, list) else []
+
+
+_BY_SUFFIX: dict[str, tuple[Mutation, ...]] = {
+    ".jsonl": (_json_line, _json_line, _json_line, _numbers_in_text, _lines),
+    ".json": (_json, _json, _json, _numbers_in_text),
+    ".yaml": (_yaml, _yaml, _yaml, _yaml, _numbers_in_text, _lines),
+    ".csv": (_csv, _csv, _csv, _numbers_in_text, _lines),
+    ".txt": (_numbers_in_text, _numbers_in_text, _lines),
+    ".gz": (_gzip, _gzip, _gzip),
+    ".db3": (_sqlite, _sqlite, _sqlite),
+    ".mcap": (_mcap, _mcap, _mcap),
+    ".bag": (),
+}
