@@ -33,7 +33,7 @@ from fgtrack.pipeline.shipped import read_config
 from fgtrack.sim.simulate import simulate
 
 _MB = 1 << 20
-_START_NS = 1_700_000_000_000_000_000
+LAPS_START_NS = 1_700_000_000_000_000_000
 
 
 def laps(objects: int, duration_s: float) -> Iterator[Message]:
@@ -43,7 +43,7 @@ def laps(objects: int, duration_s: float) -> Iterator[Message]:
     one_lap = scenario(objects, lap_s, speed_mps=length_m / lap_s)
     waiting: list[Message] = []
     for number in range(int(np.ceil(duration_s / lap_s))):
-        begun_ns = _START_NS + number * nanoseconds(lap_s)
+        begun_ns = LAPS_START_NS + number * nanoseconds(lap_s)
         ended_ns = begun_ns + nanoseconds(lap_s)
         drawn = simulate(replace(one_lap, start_ns=begun_ns), np.random.default_rng(number))
         waiting += [message for message in drawn if message.stamp_ns < ended_ns]
@@ -81,7 +81,7 @@ def main(
     rows: list[tuple[float, float, float, int]] = []  # recording in s, memory in MB, computed in s, tracks
 
     def look(now_ns: int, num_tracks: int) -> None:
-        passed_s = (now_ns - _START_NS) / 1e9
+        passed_s = (now_ns - LAPS_START_NS) / 1e9
         if len(rows) < parts and passed_s >= duration_s * (len(rows) + 1) / parts:
             rows.append((passed_s, memory_mb(), time.perf_counter() - began, num_tracks))
 

@@ -17,7 +17,7 @@ from fgtrack.estimation.base import (
     UpdateStatus,
     no_states,
 )
-from fgtrack.estimation.ekf import predict_one
+from fgtrack.estimation.ekf import predict
 from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.models.motion import MotionModel
 
@@ -153,16 +153,25 @@ class OneObject:
         return state_of(self._bank, self._motion, 0, stamp_ns)
 
 
+def states_of(bank: TrackBank, motion: MotionModel, stamp_ns: int) -> StatesAt:
+    """States of the tracks of `bank` at any stamp, predicted ahead of the present, in the own form of `motion`.
+
+    Those whose window begins later are left out.
+    """
+    states = bank.states_at(min(stamp_ns, bank.present_ns))
+    if stamp_ns <= bank.present_ns or not states.track_ids:
+        return states
+    ahead = predict(states.means, states.covariances, motion, seconds(stamp_ns - bank.present_ns))
+    return StatesAt(states.track_ids, *ahead)
+
+
 def state_of(bank: TrackBank, motion: MotionModel, track_id: int, stamp_ns: int) -> TrackState:
-    """State of a track of `bank` at any stamp, predicted ahead of the present, in the own form of `motion`.
+    """State of a track of `bank` at any stamp, see `states_of`.
 
     Raises `CallError` for a stamp before the track's window.
     """
-    states = bank.states_at(min(stamp_ns, bank.present_ns))
+    states = states_of(bank, motion, stamp_ns)
     if track_id not in states.track_ids:
         raise CallError(f"track {track_id} is not known at {stamp_ns} ns: that is before its window")
     row = states.track_ids.index(track_id)
-    mean, covariance = states.means[row], states.covariances[row]
-    if stamp_ns > bank.present_ns:
-        mean, covariance = predict_one(mean, covariance, motion, seconds(stamp_ns - bank.present_ns))
-    return TrackState(stamp_ns, mean, covariance)
+    return TrackState(stamp_ns, states.means[row], states.covariances[row])

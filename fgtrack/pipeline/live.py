@@ -1,11 +1,15 @@
 """The tracker in a running system: messages in as they arrive, tracks out when they are wanted."""
 
-from collections import Counter
+import threading
+import traceback
+from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from operator import index as whole
 from pathlib import Path
 from typing import Self
 
+from fgtrack.core.time import period_ns
 from fgtrack.core.types import (
     DetectionList,
     Disposition,
@@ -15,10 +19,20 @@ from fgtrack.core.types import (
     TrackReport,
     UpdateRecord,
 )
-from fgtrack.pipeline.build import build_tracker
+from fgtrack.pipeline.build import build_bank, build_tracker
 from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.lateness import Lateness, Receptions, TickTimes, TickTiming
+from fgtrack.pipeline.pace import Clock, WallClock
 from fgtrack.pipeline.shipped import read_config, settings_of
 from fgtrack.tracking.inbox import records
+from fgtrack.tracking.restarting import RestartingBank
+from fgtrack.tracking.tracker import TrackerParts
+
+__all__ = ["TrackOutput", "Tracker", "TracksAt"]
+
+#: Name of the ego among the sensors of `Tracker.lateness`.
+EGO = "ego"
+_LARGEST_NS = 2**63 - 1
 
 
 class Tracker:
@@ -26,20 +40,35 @@ class Tracker:
 
     `receive` takes messages in the order of their arrival, `tick` processes what came since the last one. What cannot
     be used never raises: it is counted in `refused`, and every detection ends in exactly one disposition of `counts`.
+    What an estimator raises does not end the tracker: the track begins anew or ends, counted in `failures`.
+
+    `receive` may be called by any thread, also while a tick runs, and never waits. Everything else may be called by any
+    thread, too, and takes turns.
 
     Parameters
     ----------
     config
         Settings of the tracker. Raises `CallError` where they cannot be built.
+    clock
+        Times the ticks; nothing else depends on it.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, clock: Clock | None = None) -> None:
         self.config = config
-        self._tracker = build_tracker(config)
+        self._failures: Counter[str] = Counter()
+        self._last_failure: str | None = None
+        self._bank = RestartingBank(lambda: build_bank(config))
+        self._tracker = build_tracker(config, self._guarded)
         self._refused: Counter[str] = Counter()
         self._records: list[UpdateRecord] = []
         self._counts: dict[str, Counter[Disposition]] = {}
         self._last = TickReport(-1, 0, (), ())
+        self._first_tick_ns = 0
+        self._arrivals: deque[EgoState | DetectionList] = deque()
+        self._receptions = {name: Receptions() for name in (*config.sensors, EGO)}
+        node_hz = config.clock.node_hz
+        self._times = TickTimes((clock or WallClock()).now_ns, None if node_hz is None else period_ns(node_hz))
+        self._turn = threading.RLock()
 
     @classmethod
     def from_config(
@@ -54,26 +83,91 @@ class Tracker:
         """A tracker with a shipped configuration by name, one from a YAML file, or a `Config`; see `fgtrack.replay`."""
         return cls(read_config(config, settings_of(set), track_map=map, pit_map=pit_map, estimator=estimator))
 
+    def _guarded(self, parts: TrackerParts) -> TrackerParts:
+        return replace(parts, bank=self._bank, on_failure=self._on_failure)
+
+    def _on_failure(self, error: Exception) -> None:
+        self._failures["list failed"] += 1
+        self._last_failure = "".join(traceback.format_exception(error))
+
     @property
     def refused(self) -> Mapping[str, int]:
-        """Messages and ticks that were not used, by reason."""
-        return self._refused + self._tracker.refused_ego
+        """Messages, ticks and output stamps that were not used, by reason."""
+        with self._turn:
+            self._take_arrivals()
+            return self._refused + self._tracker.refused_ego
 
     @property
     def counts(self) -> Mapping[str, Mapping[str, int]]:
         """Number of detections by sensor and disposition, of all ticks so far."""
-        return {
-            sensor: {str(disposition): count for disposition, count in counter.items()}
-            for sensor, counter in self._counts.items()
-        }
+        with self._turn:
+            return {
+                sensor: {str(disposition): count for disposition, count in counter.items()}
+                for sensor, counter in self._counts.items()
+            }
+
+    @property
+    def failures(self) -> Mapping[str, int]:
+        """What was done after failures inside: `track restarted`, `track ended`, `birth failed`, `list failed`."""
+        with self._turn:
+            return self._failures + self._bank.failures
+
+    @property
+    def last_failure(self) -> str | None:
+        """Traceback of the newest failure inside, to report it."""
+        return self._last_failure or self._bank.last_failure
+
+    @property
+    def lateness(self) -> Mapping[str, Lateness]:
+        """How late messages come, by sensor, and under `ego` for the ego, as of the last tick."""
+        with self._turn:
+            self._take_arrivals()
+            first_ns, now_ns = self._first_tick_ns, self._last.now_ns
+            none: Counter[Disposition] = Counter()
+            return {
+                sensor: one.lateness(self._counts.get(sensor, none)[Disposition.TOO_OLD], first_ns, now_ns)
+                for sensor, one in self._receptions.items()
+            }
+
+    @property
+    def timing(self) -> TickTiming:
+        """How long ticks take, and which deadlines they have missed."""
+        with self._turn:
+            return self._times.timing
 
     def receive(self, message: EgoState | DetectionList) -> None:
         """Take a message in the order of arrival.
 
-        The detections of a sensor that the configuration does not know are `invalid` at the next tick; one that is
-        named in `ignore_sensors` is ignored.
+        The detections of a sensor that the configuration does not know, and of a message that cannot be read, are
+        `invalid` at the next tick; a sensor that is named in `ignore_sensors` is ignored.
         """
-        if isinstance(message, DetectionList) and message.sensor not in self.config.sensors:
+        self._arrivals.append(message)
+
+    def _take_arrivals(self) -> None:
+        """Give the tracker what has been received."""
+        for _ in range(len(self._arrivals)):  # what comes meanwhile may wait
+            message = self._arrivals.popleft()
+            try:
+                self._take(message)
+            except Exception as error:
+                self._refused[f"message cannot be read ({type(error).__name__})"] += 1
+                if isinstance(message, DetectionList):
+                    self._records += [
+                        UpdateRecord(str(message.sensor), message.stamp_ns, message.receipt_ns, i, Disposition.INVALID)
+                        for i in range(len(message.objects))
+                    ]
+
+    def _take(self, message: EgoState | DetectionList) -> None:
+        if not isinstance(message, EgoState | DetectionList):
+            self._refused["neither ego state nor object list"] += 1
+            return
+        if not all(0 <= whole(stamp_ns) <= _LARGEST_NS for stamp_ns in (message.stamp_ns, message.receipt_ns)):
+            raise OverflowError("stamps are nanoseconds since 1970")
+        if isinstance(message, EgoState):
+            self._receptions[EGO].add(message.stamp_ns, message.receipt_ns, 0)
+        elif message.sensor in self.config.sensors:
+            self._receptions[message.sensor].add(message.stamp_ns, message.receipt_ns, len(message.objects))
+        else:
             if message.sensor not in self.config.ignore_sensors:
                 self._refused[f"sensor {message.sensor!r} has no model"] += 1
                 self._records += records(message, Disposition.INVALID)
@@ -86,25 +180,78 @@ class Tracker:
         A tick before the last one is refused: it gives the tracks of the last one, without updates, and what was
         received waits for the next.
         """
-        if self._last.tick >= 0 and now_ns < self._last.now_ns:
-            self._refused["tick before the last one"] += 1
-            return replace(self._last, updates=(), smoothed=())
-        report = self._tracker.tick(now_ns)
-        if self._records:
-            report = replace(report, updates=(*self._records, *report.updates))
-            self._records = []
-        for update in report.updates:
-            self._counts.setdefault(update.sensor, Counter())[update.disposition] += 1
-        self._last = report
-        return report
+        with self._turn:
+            if self._last.tick >= 0 and now_ns < self._last.now_ns:
+                self._refused["tick before the last one"] += 1
+                return replace(self._last, updates=(), smoothed=())
+            self._times.begin()
+            self._take_arrivals()
+            report = self._tracker.tick(now_ns)
+            if self._records:
+                report = replace(report, updates=(*self._records, *report.updates))
+                self._records = []
+            for update in report.updates:
+                self._counts.setdefault(update.sensor, Counter())[update.disposition] += 1
+            if self._last.tick < 0:
+                self._first_tick_ns = now_ns
+            self._last = report
+            self._times.end(now_ns)
+            return report
 
     def state_at(self, track_id: int, stamp_ns: int) -> TrackReport:
         """A track at any stamp in or after its window; ahead of the last tick it is predicted.
 
         Raises `CallError` for a track that does not exist and a stamp before its window.
         """
-        return self._tracker.state_at(track_id, stamp_ns)
+        with self._turn:
+            return self._tracker.state_at(track_id, stamp_ns)
+
+    def tracks_at(self, stamp_ns: int) -> tuple[TrackReport, ...]:
+        """All tracks at any stamp, as `state_at` gives them; those whose window begins later are not among them."""
+        with self._turn:
+            return self._tracker.tracks_at(stamp_ns)
+
+    def output(self) -> "TrackOutput":
+        """A stream of published tracks, one for each topic, for a time of your choice."""
+        return TrackOutput(self)
 
     def finish(self) -> tuple[SmoothedReport, ...]:
         """End all tracks; gives the smoothed states that were still inside a window."""
-        return self._tracker.finish()
+        with self._turn:
+            return self._tracker.finish()
+
+
+@dataclass(frozen=True, slots=True)
+class TracksAt:
+    """All tracks at one stamp."""
+
+    stamp_ns: int
+    tracks: tuple[TrackReport, ...]
+
+
+class TrackOutput:
+    """A stream of tracks whose stamps never go back.
+
+    When to publish is up to the host; for which time, it says here: now, some time ago, the stamp of an odometry.
+
+    Parameters
+    ----------
+    tracker
+        Gives the tracks.
+    """
+
+    def __init__(self, tracker: Tracker) -> None:
+        self._tracker = tracker
+        self._last_ns: int | None = None
+        self._turn = threading.Lock()
+        self.refused = 0
+        """Stamps before the one that was published last."""
+
+    def at(self, stamp_ns: int) -> TracksAt | None:
+        """The tracks at `stamp_ns`, see `Tracker.tracks_at`; None, counted, before the stamp published last."""
+        with self._turn:
+            if self._last_ns is not None and stamp_ns < self._last_ns:
+                self.refused += 1
+                return None
+            self._last_ns = stamp_ns
+            return TracksAt(stamp_ns, self._tracker.tracks_at(stamp_ns))

@@ -1,7 +1,7 @@
 """The tracker: what happens at a tick, in the order of the paper's algorithm (Karle et al. 2023, figure 2)."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -22,7 +22,7 @@ from fgtrack.core.types import (
 )
 from fgtrack.estimation.base import StatesAt, TrackBank, UpdateResult, no_states
 from fgtrack.estimation.ekf import propagated
-from fgtrack.estimation.object_bank import state_of
+from fgtrack.estimation.object_bank import state_of, states_of
 from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
@@ -54,6 +54,8 @@ class TrackerParts:
     road: Road
     confirm_count: int
     ego_errors: EgoErrors = field(default_factory=IndependentErrors)
+    on_failure: Callable[[Exception], None] | None = None
+    """Told what the processing of a batch has raised, which then ends as failed; None lets it out."""
 
 
 def check_sensor(name: str, sensors: Mapping[str, SensorModel]) -> None:
@@ -100,7 +102,7 @@ class Tracker:
         self._parts.ego.start_tick()
         self._seen = {id(batch.message): set() for batch in batches}
         for batch in batches:
-            self._process(batch)
+            self._process_if_possible(batch)
         updates, self._records = tuple(self._records), []
         bank = self._parts.bank
         tracks = tuple(self._report(*track) for track in zip(bank.track_ids, bank.present(), strict=True))
@@ -124,6 +126,31 @@ class Tracker:
         state = state_of(bank, motion, track_id, stamp_ns)
         mean, covariance = motion.kinematic(state.mean, state.covariance)
         return self._report(track_id, TrackState(stamp_ns, wrapped_yaw(mean), covariance))
+
+    def tracks_at(self, stamp_ns: int) -> tuple[TrackReport, ...]:
+        """All tracks at a stamp, see `state_at`, in order of birth; without those whose window begins later."""
+        bank, motion = self._parts.bank, self._parts.motion
+        states = states_of(bank, motion, stamp_ns)
+        if not states.track_ids:
+            return ()
+        means, covariances = motion.kinematic(states.means, states.covariances)
+        rows = zip(states.track_ids, wrapped_yaw(means), covariances, strict=True)
+        return tuple(self._report(track_id, TrackState(stamp_ns, mean, P)) for track_id, mean, P in rows)
+
+    def _process_if_possible(self, batch: Batch) -> None:
+        """Process a batch; where that raises and someone is told, what is left of the batch ends as failed."""
+        first = len(self._records)
+        try:
+            self._process(batch)
+        except DataError:
+            raise
+        except Exception as error:
+            if self._parts.on_failure is None:
+                raise
+            self._parts.on_failure(error)
+            ended = {one.index for one in self._records[first:]}
+            left = [index for index in batch.indices if index not in ended]
+            self._records += [record(batch.message, index, Disposition.FAILED) for index in left]
 
     def _process(self, batch: Batch) -> None:
         """One object list, at its own stamp: transform, filter, merge, associate, age, estimate, give birth."""
@@ -233,6 +260,9 @@ class Tracker:
         track_id = self._next_id
         self._next_id += 1
         parts.bank.birth(track_id, prior)
+        if track_id not in parts.bank.track_ids:
+            self._conclude(batch, candidate, Disposition.FAILED)
+            return
         parts.ego_errors.born(track_id, candidate, prior)
         self._seen[id(batch.message)].add(track_id)
         parts.lifecycle.born(track_id, batch.sensor, batch.stamp_ns, parts.bank.present_ns)

@@ -1,0 +1,212 @@
+"""Whether a tracker lasts in a running system: an hour at 50 Hz by the clock of the machine.
+
+    python experiments/bench_live.py                     # an hour
+    python experiments/bench_live.py --duration-s 60     # to see that it works
+
+Two processes. One is the vehicle: cars drive lap after lap on the built-in oval, seen by the paper's sensors, and every
+message is sent when it is due. The other one is the tracker: a thread receives, the main thread ticks. Every detection
+that was sent must have ended in one disposition. The table has the memory and the times of the tracker's process, part
+by part.
+"""
+
+import json
+import multiprocessing
+import queue
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from bench_memory import LAPS_START_NS, laps, memory_mb
+from bench_report import plural, progress, put_into, short_machine
+from bench_tracker import yardstick_us
+
+import fgtrack
+from fgtrack.core.time import first_multiple, nanoseconds, period_ns
+
+Sent = fgtrack.EgoState | fgtrack.DetectionList
+
+_AHEAD = 10_000  # messages that are made before they are due
+_BEGIN_S = 1.0  # until the first message
+
+
+def sleep_until(due_ns: int) -> None:
+    """Sleep until the clock that stamps are of says so."""
+    left_ns = due_ns - time.time_ns()
+    if left_ns > 0:
+        time.sleep(left_ns / 1e9)
+
+
+def made_ahead(objects: int, duration_s: float) -> Iterator[Sent]:
+    """Messages of `laps` up to a receipt, made by a thread before they are asked for."""
+    made: queue.Queue[Sent | None] = queue.Queue(_AHEAD)
+
+    def make() -> None:
+        for message in laps(objects, duration_s):
+            if not isinstance(message, fgtrack.TruthState):
+                made.put(message)
+        made.put(None)
+
+    threading.Thread(target=make, daemon=True).start()
+    while (message := made.get()) is not None and message.receipt_ns - LAPS_START_NS <= nanoseconds(duration_s):
+        yield message
+
+
+def drive(connection: Connection, objects: int, duration_s: float) -> None:
+    """The vehicle: sends every message when it is due, and in the end how many detections that were, by sensor."""
+    sent: dict[str, int] = {}
+    shift_ns = None
+    for message in made_ahead(objects, duration_s):
+        if shift_ns is None:
+            shift_ns = time.time_ns() + nanoseconds(_BEGIN_S) - LAPS_START_NS
+        sleep_until(message.receipt_ns + shift_ns)
+        if isinstance(message, fgtrack.DetectionList):
+            sent[message.sensor] = sent.get(message.sensor, 0) + len(message.objects)
+        connection.send(replace(message, stamp_ns=message.stamp_ns + shift_ns))
+    connection.send(sent)
+
+
+@dataclass
+class Receiver:
+    """The thread that stamps messages with their receipt and passes them on, until the vehicle has stopped."""
+
+    connection: Connection
+    tracker: fgtrack.Tracker
+    sent: dict[str, int] = field(default_factory=dict)
+    """By sensor, as the vehicle says in the end."""
+    begun: threading.Event = field(default_factory=threading.Event)
+    over: threading.Event = field(default_factory=threading.Event)
+
+    def run(self) -> None:
+        """Receive everything."""
+        while isinstance(message := self.connection.recv(), Sent):
+            self.tracker.receive(replace(message, receipt_ns=time.time_ns()))
+            self.begun.set()
+        self.sent |= message
+        self.over.set()
+
+
+@dataclass
+class Part:
+    """What was measured in a part of the time."""
+
+    until_s: float
+    memory_mb: float
+    tick_ms: list[float]
+    cpu_ms: list[float]
+    """Of the ticking thread alone: other processes of the machine take nothing of it."""
+    missed: int
+    skipped: int
+    tracks: int
+
+    def row(self) -> str:
+        """As a row of the table."""
+        times = (
+            f"{p50:.2f} / {p99:.2f} / {worst:.1f}" for p50, p99, worst in (spread(self.tick_ms), spread(self.cpu_ms))
+        )
+        return (
+            f"| {self.until_s / 60.0:.3g} | {self.memory_mb:.1f} | {' | '.join(times)} "
+            f"| {self.missed} of {len(self.tick_ms)} | {self.skipped} | {self.tracks} |"
+        )
+
+
+def spread(values: Sequence[float]) -> list[float]:
+    """Median, 99th percentile, largest."""
+    return np.quantile(values, (0.5, 0.99, 1.0)).tolist()
+
+
+def track(receiver: Receiver, hz: float, duration_s: float, num_parts: int) -> list[Part]:
+    """Tick at multiples of the period, from the first message until the vehicle has stopped."""
+    step_ns = period_ns(hz)
+    receiver.begun.wait()
+    begun_ns = due_ns = first_multiple(time.time_ns(), step_ns)
+    parts: list[Part] = []
+    part = Part(0.0, 0.0, [], [], 0, 0, 0)
+    while True:
+        sleep_until(due_ns)
+        over = receiver.over.is_set()  # then this tick processes all
+        before_ns, cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
+        report = receiver.tracker.tick(due_ns)
+        part.cpu_ms.append((time.thread_time_ns() - cpu_ns) / 1e6)
+        part.tick_ms.append((time.perf_counter_ns() - before_ns) / 1e6)
+        done_ns = time.time_ns()
+        part.missed += done_ns > due_ns + step_ns
+        passed_s = (due_ns - begun_ns) / 1e9
+        if over or (passed_s >= duration_s / num_parts * (len(parts) + 1) and len(parts) + 1 < num_parts):
+            part.until_s, part.memory_mb, part.tracks = passed_s, memory_mb(), len(report.tracks)
+            parts.append(part)
+            progress(part.row())
+            part = Part(0.0, 0.0, [], [], 0, 0, 0)
+        if over:
+            return parts
+        following_ns = max(due_ns + step_ns, first_multiple(done_ns, step_ns))
+        part.skipped += (following_ns - due_ns) // step_ns - 1
+        due_ns = following_ns
+
+
+def main(
+    out: Annotated[Path, typer.Option("-o", help="Folder for live.md and live.json.")] = Path("out/live"),
+    duration_s: Annotated[float, typer.Option(help="By the clock of the machine.")] = 3600.0,
+    hz: Annotated[float, typer.Option(help="Ticks in a second.")] = 50.0,
+    objects: int = 3,
+    estimator: str = "smoother-banded",
+    parts: Annotated[int, typer.Option(help="Rows of the table.")] = 12,
+    page: Annotated[Path | None, typer.Option(help="Put the table into this page, between its marks.")] = None,
+) -> None:
+    """Drive, track, print the table; write live.md and live.json. Exits 1 where a detection is not accounted for."""
+    out.mkdir(parents=True, exist_ok=True)
+    machine = short_machine([yardstick_us()])
+    tracker = fgtrack.Tracker.from_config(
+        "smoother", map="oval", pit_map="oval", estimator=estimator, set={"clock.node_hz": hz}
+    )
+    context = multiprocessing.get_context("spawn")
+    receiving, sending = context.Pipe(duplex=False)
+    vehicle = context.Process(target=drive, args=(sending, objects, duration_s), daemon=True)
+    vehicle.start()
+    sending.close()
+    receiver = Receiver(receiving, tracker)
+    threading.Thread(target=receiver.run, daemon=True).start()
+    measured = track(receiver, hz, duration_s, parts)
+    vehicle.join()
+    sent = receiver.sent
+    counted = {sensor: sum(counts.values()) for sensor, counts in tracker.counts.items()}
+    result = {
+        "sent": sent,
+        "counts": tracker.counts,
+        "refused": tracker.refused,
+        "failures": tracker.failures,
+        "lateness": {name: asdict(one) for name, one in tracker.lateness.items()},
+        "parts": [
+            asdict(part) | {"tick_ms": np.quantile(part.tick_ms, (0.5, 0.99, 1.0)).tolist()} for part in measured
+        ],
+    }
+    (out / "live.json").write_text(json.dumps(result, indent=1, default=dict) + "\n", encoding="utf-8")
+    half = [part.memory_mb for part in measured[max(len(measured) // 2 - 1, 0) :]]
+    lines = [
+        machine,
+        "",
+        "| until [min] | memory [MB] | tick p50 / p99 / worst [ms] | of that CPU [ms] | deadlines missed "
+        "| ticks skipped | tracks |",
+        f"|{'---|' * 7}",
+        *(part.row() for part in measured),
+        "",
+        f"{estimator}, {plural(objects)}, {hz:g} Hz, {measured[-1].until_s / 3600.0:.2g} h: memory grew by "
+        f"{half[-1] - half[0]:.1f} MB in the second half. {sum(sent.values())} detections were sent, "
+        f"{sum(counted.values())} ended in a disposition; failures: {sum(tracker.failures.values())}.",
+    ]
+    text = "\n".join(lines) + "\n"
+    (out / "live.md").write_text(text, encoding="utf-8")
+    if page is not None:
+        put_into(page, "live", text)
+    print(text, end="")
+    if counted != sent:
+        raise SystemExit(f"sent {sent}, accounted for {counted}")
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,244 @@
+"""A bank that outlives the failures of its estimators: a track that fails begins anew, or ends, and is counted."""
+
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
+
+import numpy as np
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.types import ACCEL, SPEED, YAW, YAW_RATE, SmoothedReport, TrackState
+from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
+
+__all__ = ["RestartingBank"]
+
+_T = TypeVar("_T")
+
+
+class RestartingBank:
+    """Stands before a bank, and takes care of what it raises and of states that are not finite.
+
+    A track that fails begins anew from its last good state, under the same id: what it knew of the past is lost, what
+    it knows of the present is not. If it fails again before an update has succeeded, it ends. Where it cannot be told
+    which track failed, all begin anew in a new bank. A `DataError` is an answer, no failure, and is let through.
+
+    Parameters
+    ----------
+    make
+        Makes an empty bank.
+    """
+
+    def __init__(self, make: Callable[[], TrackBank]) -> None:
+        self._make = make
+        self._bank = make()
+        self._now_ns = 0
+        self._starts: dict[int, Start] = {}  # by track: how it began
+        self._good: dict[int, TrackState] = {}  # by track: its last good state
+        self._suspects: dict[int, bool] = {}  # tracks that have failed: whether an update has succeeded since
+        self.failures: Counter[str] = Counter()
+        """What was done after failures: `track restarted`, `track ended`, `birth failed`."""
+        self.last_failure: str | None = None
+        """Traceback of the newest one."""
+
+    @property
+    def present_ns(self) -> int:
+        """See `TrackBank.present_ns`."""
+        return self._bank.present_ns
+
+    @property
+    def window_start_ns(self) -> int:
+        """See `TrackBank.window_start_ns`."""
+        return self._bank.window_start_ns
+
+    @property
+    def track_ids(self) -> tuple[int, ...]:
+        """See `TrackBank.track_ids`."""
+        return self._bank.track_ids
+
+    def advance(self, now_ns: int) -> None:
+        """See `TrackBank.advance`."""
+        self._now_ns = now_ns
+        self._ask(lambda bank: bank.advance(now_ns))
+
+    def states_at(self, stamp_ns: int) -> StatesAt:
+        """See `TrackBank.states_at`; states that are not finite are left out."""
+        states = self._ask(lambda bank: bank.states_at(stamp_ns))
+        sound = np.isfinite(states.means).all(axis=1) & np.isfinite(states.covariances).all(axis=(1, 2))
+        if sound.all():
+            return states
+        rows = np.flatnonzero(sound)
+        return StatesAt(tuple(states.track_ids[row] for row in rows), states.means[rows], states.covariances[rows])
+
+    def update(
+        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+    ) -> list[UpdateResult]:
+        """See `TrackBank.update`; tracks that have failed before are updated alone, to be told from the others."""
+        alone = [[place] for place, track_id in enumerate(track_ids) if track_id in self._suspects]
+        others = [place for place, track_id in enumerate(track_ids) if track_id not in self._suspects]
+        results: dict[int, UpdateResult] = {}
+        for places in [others, *alone] if others else alone:
+            ids = [track_ids[place] for place in places]
+            results |= zip(places, self._update(stamp_ns, ids, [measurements[place] for place in places]), strict=True)
+        return [results[place] for place in range(len(track_ids))]
+
+    def _update(
+        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+    ) -> list[UpdateResult]:
+        try:
+            results = self._bank.update(stamp_ns, track_ids, measurements)
+        except DataError:
+            raise
+        except Exception:
+            self._noted()
+            for track_id in track_ids:
+                self._restart(track_id)
+            return [UpdateResult(UpdateStatus.FAILED) for _ in track_ids]
+        for track_id in self._suspects.keys() & set(track_ids):
+            self._suspects[track_id] = True
+        return results
+
+    def birth(self, track_id: int, prior: Start) -> None:
+        """See `TrackBank.birth`; where it fails, there is no such track afterwards."""
+        try:
+            self._bank.birth(track_id, prior)
+            self._starts[track_id] = prior
+        except Exception:
+            self._noted()
+            self.failures["birth failed"] += 1
+            self._remove(track_id)
+
+    def remove(self, track_id: int) -> None:
+        """See `TrackBank.remove`; a track that has ended by a failure need not be there."""
+        self._remove(track_id)
+
+    def present(self) -> list[TrackState]:
+        """See `TrackBank.present`; all are finite."""
+        while True:  # a track that is not sound twice in a row ends
+            states = self._ask(lambda bank: bank.present())
+            known = dict(zip(self._bank.track_ids, states, strict=True))
+            unsound = [track_id for track_id, state in known.items() if not _is_sound(state)]
+            if not unsound:
+                break
+            self.last_failure = f"the states of the tracks {', '.join(map(str, unsound))} are not finite"
+            for track_id in unsound:
+                self._restart(track_id)
+        self._good = known
+        for track_id in [i for i, updated in self._suspects.items() if updated]:
+            del self._suspects[track_id]
+        return states
+
+    def smoothed(self) -> list[SmoothedReport]:
+        """See `TrackBank.smoothed`; those that are not finite are left out."""
+        return [report for report in self._ask(lambda bank: bank.smoothed()) if _is_sound(report.state)]
+
+    def _ask(self, question: Callable[[TrackBank], _T]) -> _T:
+        """The bank's answer to what concerns all tracks; if it has none, that of a new bank."""
+        try:
+            return question(self._bank)
+        except DataError:
+            raise
+        except Exception:
+            self._noted()
+        self._rebuild(self._bank.track_ids)
+        try:
+            return question(self._bank)
+        except Exception:
+            self._noted()
+        guilty = [track_id for track_id in self._bank.track_ids if not self._answers_alone(track_id, question)]
+        for track_id in guilty or self._bank.track_ids:
+            self._ended(track_id)
+        self._rebuild([track_id for track_id in self._bank.track_ids if track_id in self._starts])
+        return question(self._bank)
+
+    def _answers_alone(self, track_id: int, question: Callable[[TrackBank], object]) -> bool:
+        bank = self._make()
+        try:
+            bank.advance(self._now_ns)
+            bank.birth(track_id, self._start(track_id))
+            question(bank)
+        except Exception:
+            return False
+        return True
+
+    def _rebuild(self, track_ids: Iterable[int]) -> None:
+        """A new bank with these tracks, each from its last good state."""
+        self._bank = self._make()
+        self._bank.advance(self._now_ns)
+        for track_id in track_ids:
+            self._born_again(track_id)
+
+    def _restart(self, track_id: int) -> None:
+        """Begin a track anew in this bank; one that has failed before, without success since, ends."""
+        if track_id not in self._bank.track_ids:
+            return  # it has ended with another one
+        again = track_id in self._suspects
+        start = self._start(track_id)
+        self._remove(track_id)
+        if again:
+            self.failures["track ended"] += 1
+            return
+        self._starts[track_id] = start
+        self._born_again(track_id)
+
+    def _born_again(self, track_id: int) -> None:
+        start = self._start(track_id)
+        try:
+            self._bank.birth(track_id, start)
+        except Exception:
+            self._noted()
+            self._ended(track_id)
+            self._remove(track_id)
+            return
+        self.failures["track restarted"] += 1
+        self._suspects[track_id] = False
+
+    def _ended(self, track_id: int) -> None:
+        self.failures["track ended"] += 1
+        self._forget(track_id)
+
+    def _remove(self, track_id: int) -> None:
+        """Take a track out of the bank, if need be by a new one."""
+        self._forget(track_id)
+        if track_id not in self._bank.track_ids:
+            return
+        try:
+            self._bank.remove(track_id)
+        except Exception:
+            self._noted()
+            self._rebuild([other for other in self._bank.track_ids if other != track_id])
+
+    def _forget(self, track_id: int) -> None:
+        for known in (self._starts, self._good, self._suspects):
+            known.pop(track_id, None)
+
+    def _start(self, track_id: int) -> Start:
+        """What is known of a track: its last good state, or how it began."""
+        state = self._good.get(track_id)
+        return self._starts[track_id] if state is None else _start_at(state)
+
+    def _noted(self) -> None:
+        self.last_failure = traceback.format_exc()
+
+
+def _is_sound(state: TrackState) -> bool:
+    return bool(np.isfinite(state.mean).all() and np.isfinite(state.covariance).all())
+
+
+def _start_at(state: TrackState) -> Start:
+    """A track of which just this kinematic state is known."""
+    std = np.sqrt(np.maximum(np.diag(state.covariance), 0.0)).tolist()
+    mean = state.mean.tolist()
+    accel = {"accel_mps2": mean[ACCEL], "accel_std_mps2": std[ACCEL]} if len(mean) > ACCEL else {}
+    return Start(
+        stamp_ns=state.stamp_ns,
+        position_m=state.mean[:2],
+        position_covariance=state.covariance[:2, :2],
+        yaw_rad=mean[YAW],
+        yaw_std_rad=std[YAW],
+        speed_mps=mean[SPEED],
+        speed_std_mps=std[SPEED],
+        yaw_rate_radps=mean[YAW_RATE],
+        yaw_rate_std_radps=std[YAW_RATE],
+        **accel,
+    )
