@@ -53,7 +53,11 @@ if TYPE_CHECKING:
     from fgtrack.models.sensors import SensorModel as SensorModel
     from fgtrack.pipeline.close_up import close_ups as close_ups
     from fgtrack.pipeline.config import Config as Config
+    from fgtrack.pipeline.lateness import Lateness as Lateness
+    from fgtrack.pipeline.lateness import TickTiming as TickTiming
     from fgtrack.pipeline.live import Tracker as Tracker
+    from fgtrack.pipeline.live import TrackOutput as TrackOutput
+    from fgtrack.pipeline.live import TracksAt as TracksAt
     from fgtrack.pipeline.public import replay as replay
     from fgtrack.pipeline.public import simulate as simulate
     from fgtrack.pipeline.tune import tune as tune

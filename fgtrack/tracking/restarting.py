@@ -19,8 +19,7 @@ _T = TypeVar("_T")
 class RestartingBank:
     """Stands before a bank, and takes care of what it raises and of states that are not finite.
 
-    A track that fails begins anew from its last good state, under the same id: what it knew of the past is lost, what
-    it knows of the present is not. If it fails again before an update has succeeded, it ends. Where it cannot be told
+    A track that fails begins anew from its last good state, under the same id; what it knew of the past is lost. If it fails again before an update has succeeded, it ends. Where it cannot be told
     which track failed, all begin anew in a new bank. A `DataError` is an answer, no failure, and is let through.
 
     Parameters
@@ -226,14 +225,19 @@ def _is_sound(state: TrackState) -> bool:
 
 
 def _start_at(state: TrackState) -> Start:
-    """A track of which just this kinematic state is known."""
-    std = np.sqrt(np.maximum(np.diag(state.covariance), 0.0)).tolist()
+    """A track of which this kinematic state is known, and no more than that.
+
+    A start has no covariances between position, yaw, speed and the others. Without them, P <= k blockdiag(P) for the
+    k blocks on the diagonal: (a + b + ...)^2 is at most k (a^2 + b^2 + ...).
+    """
     mean = state.mean.tolist()
+    blocks = len(mean) - 1
+    std = np.sqrt(blocks * np.maximum(np.diag(state.covariance), 0.0)).tolist()
     accel = {"accel_mps2": mean[ACCEL], "accel_std_mps2": std[ACCEL]} if len(mean) > ACCEL else {}
     return Start(
         stamp_ns=state.stamp_ns,
         position_m=state.mean[:2],
-        position_covariance=state.covariance[:2, :2],
+        position_covariance=blocks * state.covariance[:2, :2],
         yaw_rad=mean[YAW],
         yaw_std_rad=std[YAW],
         speed_mps=mean[SPEED],

@@ -1,0 +1,367 @@
+"""What a running tracker promises: stamps that never go back, threads, failures, lateness, deadlines."""
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from fgtrack.core.types import Detection, DetectionList, EgoState, TrackReport, TrackState, TruthState
+from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult
+from fgtrack.estimation.object_bank import ObjectBank
+from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.lateness import TickTiming
+from fgtrack.pipeline.live import EGO, Tracker
+from fgtrack.pipeline.shipped import read_config
+
+MS = 1_000_000
+NOW_NS = 1_600_000_000_000_000_000
+SETTINGS = {"merge.distance_m": 3.0, "clock.node_hz": 50.0}
+CARS_M = (30.0, 60.0)
+
+
+def tracker_of(estimator: str = "ekf-replay") -> Tracker:
+    return Tracker.from_config("smoother", estimator=estimator, set=SETTINGS)
+
+
+def messages(count: int, sensor: str = "lidar_cluster", delay_ns: int = 40 * MS) -> Iterator[EgoState | DetectionList]:
+    """Two standing cars, seen every 50 ms from a standing ego."""
+    for k in range(count):
+        at_ns = NOW_NS + 50 * MS * k
+        yield EgoState(at_ns, at_ns + 5 * MS, 0.0, 0.0, 0.0, 0.0)
+        objects = [Detection(x_m=x_m, y_m=1.0) for x_m in CARS_M]
+        yield DetectionList(sensor, at_ns, at_ns + delay_ns, objects)
+
+
+def run(tracker: Tracker, count: int = 20) -> tuple[TrackReport, ...]:
+    for message in messages(count):
+        tracker.receive(message)
+        tracks = tracker.tick(message.receipt_ns).tracks
+    return tracks
+
+
+def detections_of(tracker: Tracker) -> int:
+    return sum(sum(counts.values()) for counts in tracker.counts.values())
+
+
+# For which time
+
+
+@pytest.mark.parametrize("estimator", ["ekf-replay", "smoother", "smoother-banded", "ekf-backward-forward"])
+def test_all_tracks_can_be_asked_for_at_any_time_as_one_can(estimator: str) -> None:
+    tracker = tracker_of(estimator)
+    tracks = run(tracker)
+    now_ns = tracks[0].stamp_ns
+    for stamp_ns in (now_ns - 300 * MS, now_ns, now_ns + 1, now_ns + 500 * MS):
+        found = tracker.tracks_at(stamp_ns)
+        assert [track.track_id for track in found] == [track.track_id for track in tracks]
+        for track in found:
+            one = tracker.state_at(track.track_id, stamp_ns)
+            assert track.stamp_ns == stamp_ns
+            assert (track.status, track.num_measured) == (one.status, one.num_measured)
+            np.testing.assert_allclose(track.state.mean, one.state.mean, rtol=1e-12)
+            np.testing.assert_allclose(track.covariance, one.covariance, rtol=1e-12)
+    ahead, now = tracker.tracks_at(now_ns + 500 * MS)[0], tracker.tracks_at(now_ns)[0]
+    assert np.trace(ahead.covariance[:2, :2]) > np.trace(now.covariance[:2, :2])
+    assert tracker.tracks_at(now_ns - 100_000 * MS) == ()
+    assert tracker_of(estimator).tracks_at(now_ns) == ()
+
+
+def test_an_output_never_goes_back_whatever_the_host_asks_for() -> None:
+    tracker = tracker_of()
+    run(tracker)
+    output, other = tracker.output(), tracker.output()
+    now_ns = NOW_NS + 1_000 * MS
+    published = [output.at(now_ns + shift * MS) for shift in (-300, -300, -310, -250, 200, 100)]
+    assert [one and one.stamp_ns - now_ns for one in published] == [
+        -300 * MS,
+        -300 * MS,
+        None,
+        -250 * MS,
+        200 * MS,
+        None,
+    ]
+    assert output.refused == 2
+    past = other.at(now_ns - 300 * MS)
+    assert past is not None
+    assert [track.stamp_ns for track in past.tracks] == [now_ns - 300 * MS] * 2
+    assert other.refused == 0
+
+
+# What cannot be used
+
+
+def test_what_is_no_message_and_what_cannot_be_read_is_counted() -> None:
+    tracker = tracker_of()
+    run(tracker)
+    before = detections_of(tracker)
+    tracker.receive(TruthState(NOW_NS, NOW_NS, 1, 0.0, 0.0))  # type: ignore[arg-type]
+    tracker.receive(EgoState(float("nan"), NOW_NS, 0.0, 0.0, 0.0, 0.0))  # type: ignore[arg-type]
+    tracker.receive(DetectionList("radar", NOW_NS, NOW_NS, [Detection(x_m="near", y_m=1.0)]))  # type: ignore[arg-type]
+    tracker.receive(DetectionList("radar", -(2**70), NOW_NS, [Detection(x_m=1.0, y_m=1.0)] * 3))
+    tracker.receive(DetectionList("radar", NOW_NS, NOW_NS, [{"x_m": 1.0}]))  # type: ignore[list-item]
+    assert sum(tracker.refused.values()) == 5
+    assert tracker.refused["neither ego state nor object list"] == 1
+    report = tracker.tick(NOW_NS + 2_000 * MS)
+    assert [row.disposition for row in report.updates] == ["invalid"] * 5
+    assert detections_of(tracker) == before + 5
+
+
+# Failures
+
+
+class FailingBank(ObjectBank):
+    """Raises when asked to."""
+
+    fails: ClassVar[set[str]] = set()
+
+    def _check(self, method: str) -> None:
+        if method in self.fails:
+            self.fails.remove(method)
+            raise np.linalg.LinAlgError(f"{method} is singular")
+
+    def update(
+        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+    ) -> list[UpdateResult]:
+        self._check("update")
+        return super().update(stamp_ns, track_ids, measurements)
+
+    def advance(self, now_ns: int) -> None:
+        self._check("advance")
+        super().advance(now_ns)
+
+    def states_at(self, stamp_ns: int) -> StatesAt:
+        self._check("states_at")
+        return super().states_at(stamp_ns)
+
+    def present(self) -> list[TrackState]:
+        self._check("present")
+        return super().present()
+
+    def birth(self, track_id: int, prior: Start) -> None:
+        self._check("birth")
+        super().birth(track_id, prior)
+
+
+@pytest.fixture
+def failing(monkeypatch: pytest.MonkeyPatch) -> Iterator[Tracker]:
+    def build(config: Config) -> TrackBank:
+        motion = config.motion_model()
+        return FailingBank(motion, lambda start: ReplayEkf(motion, start, 1.0), 1.0)
+
+    monkeypatch.setattr("fgtrack.pipeline.live.build_bank", build)
+    FailingBank.fails = set()
+    yield tracker_of()
+    assert FailingBank.fails == set()
+
+
+@pytest.mark.parametrize(
+    ("method", "failures", "dispositions"),
+    [
+        ("update", {"track restarted": 2}, {"birth": 2, "in_sequence": 76, "failed": 2}),
+        ("advance", {"track restarted": 2}, {"birth": 2, "in_sequence": 76, "too_old": 2}),
+        ("states_at", {"track restarted": 2}, {"birth": 2, "in_sequence": 76, "too_old": 2}),
+        ("present", {"track restarted": 2}, {"birth": 2, "in_sequence": 78}),
+    ],
+)
+def test_what_an_estimator_raises_neither_ends_the_tracker_nor_the_tracks(
+    failing: Tracker, method: str, failures: dict[str, int], dispositions: dict[str, int]
+) -> None:
+    for number, message in enumerate(messages(40)):
+        failing.receive(message)
+        if number == 41:
+            FailingBank.fails = {method}
+        tracks = failing.tick(message.receipt_ns).tracks
+    assert [track.track_id for track in tracks] == [0, 1]
+    undisturbed = run(tracker_of(), 40)
+    assert [track.x_m for track in tracks] == pytest.approx([track.x_m for track in undisturbed], abs=0.3)
+    assert failing.failures == failures
+    assert f"{method} is singular" in str(failing.last_failure)
+    assert failing.counts == {"lidar_cluster": dispositions}
+
+
+def test_a_birth_that_fails_is_no_birth(failing: Tracker) -> None:
+    FailingBank.fails = {"birth"}
+    run(failing, 3)
+    assert failing.failures == {"birth failed": 1}
+    assert failing.counts == {"lidar_cluster": {"failed": 1, "birth": 2, "in_sequence": 3}}
+
+
+def test_a_list_whose_processing_raises_ends_as_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker = tracker_of()
+    run(tracker)
+
+    def broken(*_: object) -> None:
+        raise KeyError("a defect")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("fgtrack.tracking.tracker.Tracker._estimate", broken)
+        late_ns = NOW_NS + 1_000 * MS
+        tracker.receive(DetectionList("lidar_cluster", late_ns, late_ns, [Detection(x_m=30.0, y_m=1.0)] * 3))
+        report = tracker.tick(late_ns)
+    assert sorted(row.disposition for row in report.updates) == ["failed"] * 3
+    assert tracker.failures == {"list failed": 1}
+    assert "a defect" in str(tracker.last_failure)
+    assert len(report.tracks) == 2
+
+
+# Threads
+
+
+@pytest.fixture
+def eager_threads() -> Iterator[None]:
+    """Threads take turns as often as they can."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(before)
+
+
+@pytest.mark.usefixtures("eager_threads")
+def test_messages_may_be_received_by_many_threads_while_others_tick_and_ask() -> None:
+    tracker = tracker_of()
+    over, problems = threading.Event(), list[BaseException]()
+    counts = {"lidar_cluster": 50, "radar": 50, "stranger": 5000, "unknown": 5000}
+
+    def started(work: Callable[[], None]) -> threading.Thread:
+        def target() -> None:
+            try:
+                work()
+            except BaseException as problem:  # no matter what: the test shall see it
+                problems.append(problem)
+
+        thread = threading.Thread(target=target)
+        thread.start()
+        return thread
+
+    def receive(sensor: str) -> None:
+        lists = [message for message in messages(counts[sensor], sensor) if isinstance(message, DetectionList)]
+        for number, message in enumerate(lists):
+            tracker.receive(message)
+            if number % 300 == 0:
+                time.sleep(0.001)  # let a tick pass
+
+    def ask() -> None:
+        output, last_ns = tracker.output(), 0
+        while not over.is_set():
+            found = output.at(NOW_NS + time.monotonic_ns())
+            assert found is not None
+            assert found.stamp_ns >= last_ns
+            last_ns = found.stamp_ns
+            assert tracker.lateness["radar"].messages <= counts["radar"]
+            assert tracker.timing.ticks >= 0
+            assert sum(tracker.refused.values()) <= 10_000
+            assert detections_of(tracker) <= 2 * sum(counts.values())
+
+    receivers = [started(partial(receive, sensor)) for sensor in counts]
+    asker = started(ask)
+    now_ns, ticks = NOW_NS, 0
+    while any(thread.is_alive() for thread in receivers):
+        now_ns, ticks = now_ns + 20 * MS, ticks + 1
+        tracker.tick(now_ns)
+    tracker.tick(now_ns)
+    over.set()
+    for thread in (*receivers, asker):
+        thread.join(30.0)
+    assert problems == []
+    assert ticks > 10
+    found = {sensor: sum(of_sensor.values()) for sensor, of_sensor in tracker.counts.items()}
+    assert found == {sensor: 2 * count for sensor, count in counts.items()}
+    assert [tracker.lateness[sensor].messages for sensor in ("lidar_cluster", "radar")] == [50, 50]
+    assert sum(tracker.refused.values()) == 10_000
+
+
+def test_receiving_never_waits_for_a_tick() -> None:
+    tracker = tracker_of()
+    with tracker._turn:  # as a tick that takes long
+        thread = threading.Thread(target=lambda: [tracker.receive(message) for message in messages(5)])
+        thread.start()
+        thread.join(10.0)
+        assert not thread.is_alive()
+    run(tracker)
+    assert tracker.lateness["lidar_cluster"].messages == 25
+
+
+# What it says of itself
+
+
+def test_it_says_how_late_every_sensor_is() -> None:
+    tracker = tracker_of()
+    delays_ms = np.arange(1, 1101)
+    np.random.default_rng(1).shuffle(delays_ms)
+    for k, delay_ms in enumerate(delays_ms.tolist()):
+        stamp_ns = NOW_NS + 10 * MS * k
+        tracker.receive(DetectionList("radar", stamp_ns, stamp_ns + delay_ms * MS, [Detection(x_m=9.0, y_m=0.0)] * 2))
+    tracker.tick(NOW_NS)
+    tracker.tick(NOW_NS + 20_000 * MS)
+    late = tracker.lateness["radar"]
+    newest_s = delays_ms[-1000:] / 1e3
+    assert (late.messages, late.detections, late.delay_worst_s) == (1100, 2200, 1.1)
+    assert (late.delay_median_s, late.delay_p99_s) == pytest.approx(tuple(np.quantile(newest_s, (0.5, 0.99))))
+    receipts_ns = NOW_NS + MS * (10 * np.arange(1100) + delays_ms)
+    assert late.last_receipt_ns == receipts_ns.max()
+    assert late.silent_s == pytest.approx((NOW_NS + 20_000 * MS - receipts_ns.max()) / 1e9)
+    assert late.too_late == tracker.counts["radar"].get("too_old", 0) > 0
+
+
+def test_a_sensor_that_has_said_nothing_is_silent_since_the_first_tick() -> None:
+    tracker = tracker_of()
+    run(tracker)
+    none = tracker.lateness["radar"]
+    assert (none.messages, none.delay_median_s, none.delay_worst_s, none.last_receipt_ns) == (0, None, None, None)
+    assert none.silent_s == pytest.approx(19 * 0.05 + 0.04 - 0.005)
+    ego = tracker.lateness[EGO]
+    assert (ego.messages, ego.detections, ego.delay_median_s) == (20, 0, pytest.approx(0.005))
+    assert set(tracker.lateness) == {*tracker.config.sensors, EGO}
+
+
+class Clock:
+    """Stands still unless told how long ticks take."""
+
+    def __init__(self, durations_ms: Sequence[int]) -> None:
+        self._times_ns = [0]
+        for duration_ms in durations_ms:
+            self._times_ns += [self._times_ns[-1], self._times_ns[-1] + duration_ms * MS]
+        self._times_ns.pop(0)
+
+    def now_ns(self) -> int:
+        return self._times_ns.pop(0)
+
+    def wait_until(self, time_ns: int) -> None:
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize(
+    ("period_ms", "durations_ms", "misses", "skipped"),
+    [
+        (20, [5, 5, 5, 5], 0, 0),
+        (20, [5, 50, 5, 5], 2, 0),  # the next one begins late
+        (20, [5, 21, 5, 5], 1, 0),
+        (60, [5, 50, 5, 5], 1, 6),
+        (22, [5, 5, 5, 5], 0, 0),  # the host's timer is not exact
+    ],
+)
+def test_it_counts_missed_deadlines_and_skipped_ticks(
+    period_ms: int, durations_ms: list[int], misses: int, skipped: int
+) -> None:
+    config = read_config("smoother", ["clock.node_hz=50"])
+    tracker = Tracker(config, Clock(durations_ms))
+    assert tracker.timing == TickTiming(0, None, None, None, 0, 0)
+    for k in range(4):
+        tracker.tick(NOW_NS + k * period_ms * MS)
+    timing = tracker.timing
+    assert (timing.ticks, timing.deadline_misses, timing.skipped) == (4, misses, skipped)
+    assert timing.worst_s == max(durations_ms) / 1e3
+    assert timing.median_s == pytest.approx(np.median(durations_ms) / 1e3)
+
+
+def test_without_a_node_there_are_no_deadlines() -> None:
+    tracker = Tracker(read_config("smoother", ["clock.node_hz=null"]), Clock([5, 5000]))
+    tracker.tick(NOW_NS)
+    tracker.tick(NOW_NS + 9_000 * MS)
+    assert (tracker.timing.deadline_misses, tracker.timing.skipped) == (0, 0)
