@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # A file stays in one process, so what its tests share is made once.
 BY_FILE := --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-slow fuzz coverage mutants check docs bench bench-full contest clean
+.PHONY: demo test test-slow fuzz coverage mutants check docs bench bench-full soak-live contest clean
 
 demo: $(STAMP)
 	$(BIN)/fgtrack demo -o out/demo --overwrite
@@ -54,6 +54,10 @@ bench: $(STAMP)
 # Every estimator, number of objects, lag and delay, memory: takes several times as long.
 bench-full: $(STAMP)
 	$(BIN)/python experiments/bench_speed.py -o out/speed --full $(if $(OLDER),--against $(OLDER))
+
+# An hour, by the clock.
+soak-live: $(STAMP)
+	$(BIN)/python experiments/bench_live.py -o out/live
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fgtrack needs Python 3.11 or newer")'

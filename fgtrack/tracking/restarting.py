@@ -19,8 +19,9 @@ _T = TypeVar("_T")
 class RestartingBank:
     """Stands before a bank, and takes care of what it raises and of states that are not finite.
 
-    A track that fails begins anew from its last good state, under the same id; what it knew of the past is lost. If it fails again before an update has succeeded, it ends. Where it cannot be told
-    which track failed, all begin anew in a new bank. A `DataError` is an answer, no failure, and is let through.
+    A track that fails begins anew from its last good state, under the same id; what it knew of the past is lost. If it
+    fails again before an update has succeeded, it ends. Where it cannot be told which track failed, all begin anew in a
+    new bank. A `DataError` is an answer, no failure, and is let through.
 
     Parameters
     ----------
