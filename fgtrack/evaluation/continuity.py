@@ -14,6 +14,8 @@ LATE = (Disposition.OUT_OF_SEQUENCE, Disposition.BEYOND_WINDOW)
 #: Dispositions of detections that were fused into a track.
 FUSED = (Disposition.BIRTH, Disposition.IN_SEQUENCE, *LATE)
 
+_SHORTEST_ABSENCE_NS = NS_PER_S
+
 
 def late_switches(run: Run, matching: Matching, within_s: float) -> IntArray:
     """Identity switches of every object that follow on an out-of-sequence update, shape (objects,).
@@ -61,6 +63,23 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
     times_s = np.full(count, np.nan)
     times_s[known] = (confirmed_ns[known] - seen_ns[known]) / NS_PER_S
     return times_s
+
+
+def tracked_visits(matching: Matching) -> int:
+    """How often an object came into sight and was tracked there by a confirmed track, over all objects.
+
+    "A TP object gets a unique identifier while it's inside the detectable area" (Karle et al. 2023, section IV-A): one
+    that leaves the sight of all sensors for a second or longer, and comes back, counts again.
+    """
+    confirmed = matching.paired & (matching.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS)
+    tracked = np.zeros_like(matching.in_sight)
+    tracked[matching.tick_index[confirmed], matching.object_index[confirmed]] = True
+    count = 0
+    for in_sight, has_track in zip(matching.in_sight.T, tracked.T, strict=True):
+        ticks = np.flatnonzero(in_sight)
+        comes = np.diff(matching.now_ns[ticks], prepend=-_SHORTEST_ABSENCE_NS) >= _SHORTEST_ABSENCE_NS
+        count += len(np.unique(np.cumsum(comes)[has_track[ticks]]))
+    return count
 
 
 def with_disposition(updates: Table, dispositions: tuple[Disposition, ...]) -> BoolArray:

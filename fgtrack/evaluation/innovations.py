@@ -17,6 +17,8 @@ RESIDUAL_NAMES = ("along_m", "across_m", *MEASURABLE)
 #: Residuals that are directions.
 ANGULAR = frozenset({"yaw_rad", "bearing_rad"})
 
+_TRACK_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps")
+
 LAGS = 10
 """Highest lag examined."""
 FEWEST = 20
@@ -51,7 +53,7 @@ def residuals(run: Run) -> Mapping[str, FloatArray]:
     published yaw at the detection's stamp: they are x_loc and y_loc of Karle et al. 2023.
     """
     values: dict[str, FloatArray] = {name: run.updates[f"res_{name}"] for name in MEASURABLE}
-    yaw_rad = _track_yaw(run, np.isfinite(values["x_m"]))
+    yaw_rad = track_states(run, np.isfinite(values["x_m"]))[:, 2]
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     along_m = c * values["x_m"] + s * values["y_m"]
     across_m = c * values["y_m"] - s * values["x_m"]
@@ -117,13 +119,13 @@ def _summary(sums: FloatArray, count: int) -> Autocorrelation:
     )
 
 
-def _track_yaw(run: Run, wanted: BoolArray) -> FloatArray:
-    """Yaw of the updated track at the stamps of the `wanted` updates, shape (rows,); NaN elsewhere.
+def track_states(run: Run, wanted: BoolArray) -> FloatArray:
+    """x, y, yaw (not wrapped) and speed of the updated track at the stamps of the `wanted` updates, shape (rows, 4).
 
-    Linear between the published rows of the track, constant before the first and after the last one; NaN for
-    a track that was never published.
+    Linear between the published rows of the track, constant before the first and after the last one; NaN elsewhere, and
+    for a track that was never published.
     """
-    yaw_rad = np.full(run.updates.num_rows, np.nan)
+    states = np.full((run.updates.num_rows, len(_TRACK_STATE)), np.nan)
     order = np.lexsort((run.tracks["stamp_ns"], run.tracks["track_id"]))
     ids = run.tracks["track_id"][order]
     for track_id in np.unique(run.updates["track_id"][wanted]).tolist():
@@ -134,10 +136,8 @@ def _track_yaw(run: Run, wanted: BoolArray) -> FloatArray:
         mine = np.flatnonzero(wanted & (run.updates["track_id"] == track_id))
         stamps_ns = run.tracks["stamp_ns"][rows]
         first_ns = stamps_ns[0]  # differences are exact as floats, epoch stamps are not
-        known_rad = np.unwrap(run.tracks["yaw_rad"][rows])
-        yaw_rad[mine] = np.interp(
-            (run.updates["stamp_ns"][mine] - first_ns).astype(np.float64),
-            (stamps_ns - first_ns).astype(np.float64),
-            known_rad,
-        )
-    return yaw_rad
+        asked, known = ((ns - first_ns).astype(np.float64) for ns in (run.updates["stamp_ns"][mine], stamps_ns))
+        for column, name in enumerate(_TRACK_STATE):
+            values = run.tracks[name][rows]
+            states[mine, column] = np.interp(asked, known, np.unwrap(values) if name in ANGULAR else values)
+    return states

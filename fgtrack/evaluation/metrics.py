@@ -10,12 +10,13 @@ import numpy as np
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, Disposition, IntArray
 from fgtrack.evaluation.consistency import Consistency, consistency
-from fgtrack.evaluation.continuity import late_switches, times_to_confirm
+from fgtrack.evaluation.continuity import late_switches, times_to_confirm, tracked_visits
 from fgtrack.evaluation.deadlines import Deadlines
 from fgtrack.evaluation.innovations import ANGULAR, RESIDUAL_NAMES, message_delays, num_measured, residuals
 from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, ERROR_NAMES, Matching, match, track_errors
 from fgtrack.evaluation.multi_object import MultiObjectMetrics, multi_object_metrics
+from fgtrack.evaluation.residual_samples import residual_samples
 from fgtrack.evaluation.statistics import ChiSquareMean, Distribution, Moments
 from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, evaluation_config
 
@@ -84,7 +85,9 @@ class TruthMetrics:
     false_tracks: int
     """Those of them paired in less than `FALSE_TRACK_SHARE` of their judged rows."""
     tracked_objects: int
-    """True objects that a confirmed track was ever paired with: the trackable ones, TP of the precision."""
+    """True objects that a confirmed track was ever paired with."""
+    tracked_visits: int
+    """How often one came into sight and was tracked there: TP of the precision, see `tracked_visits`."""
 
     @property
     def overall(self) -> ObjectMetrics:
@@ -126,6 +129,8 @@ class Metrics:
     num_confirmed: int
     """Ids with at least `CONFIRMED_MEASUREMENTS` measurements."""
     sensors: Mapping[str, SensorMetrics]
+    residuals: Mapping[str, Moments]
+    """Innovations of all sensors and confirmed tracks, by name of `LOCAL_NAMES`: table I of Karle et al. 2023."""
     time_per_tick_s: Distribution
     """Wall time of the ticks with a detection."""
     time_per_detection_s: float
@@ -141,10 +146,10 @@ class Metrics:
 
     @property
     def precision(self) -> float:
-        """TP / (TP + FP) of Karle et al. 2023, section IV-A: trackable true objects / confirmed ids."""
+        """TP / (TP + FP) of Karle et al. 2023, section IV-A: tracked visits of true objects / confirmed ids."""
         if self.truth is None or not self.num_confirmed:
             return math.nan
-        return self.truth.tracked_objects / self.num_confirmed
+        return self.truth.tracked_visits / self.num_confirmed
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values by name, derived ones included; None for what does not exist."""
@@ -179,6 +184,7 @@ def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationCon
         num_tracks=len(np.unique(ids)),
         num_confirmed=len(np.unique(ids[confirmed])),
         sensors=_sensor_metrics(run),
+        residuals=residual_samples(run).moments(),
         time_per_tick_s=Distribution.of(time_s),
         time_per_detection_s=float(time_s.sum() / detections.sum()) if len(time_s) else math.nan,
         consistency=consistency(run, matching),
@@ -214,6 +220,7 @@ def _truth_metrics(run: Run, matching: Matching, options: EvaluationConfig) -> T
         judged_tracks=len(ids),
         false_tracks=int((paired_life < FALSE_TRACK_SHARE * life).sum()),
         tracked_objects=len(np.unique(matching.object_index[paired & confirmed])),
+        tracked_visits=tracked_visits(matching),
     )
 
 

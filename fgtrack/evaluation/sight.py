@@ -48,8 +48,14 @@ def in_sight(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> tuple[Boo
 
 def ego_poses(ego: Table, stamps_ns: IntArray) -> FloatArray | None:
     """x, y and yaw (not wrapped) of the ego at `stamps_ns`, shape (n, 3), constant beyond the ends; None if unknown."""
-    rows = np.stack([ego[name] for name in ("x_m", "y_m", "yaw_rad")], axis=-1)
-    known = np.flatnonzero(np.isfinite(rows).all(axis=1))
+    states = ego_states(ego, stamps_ns)
+    return None if states is None else states[:, :3]
+
+
+def ego_states(ego: Table, stamps_ns: IntArray) -> FloatArray | None:
+    """As `ego_poses`, with the speed, shape (n, 4)."""
+    rows = np.stack([ego[name] for name in ("x_m", "y_m", "yaw_rad", "speed_mps")], axis=-1)
+    known = np.flatnonzero(np.isfinite(rows[:, :3]).all(axis=1))
     if not len(known):
         return None
     at_ns, first = np.unique(ego["stamp_ns"][known], return_index=True)

@@ -232,7 +232,7 @@ class Config:
     """Name of the estimator of all tracks."""
     sensors: Mapping[str, SensorModel] = field(default_factory=lambda: PAPER_SENSORS)
     ignore_sensors: tuple[str, ...] = ()
-    """Sensors of the input that are left out on purpose."""
+    """Sensors of the input that are left out on purpose, also where they are under `sensors`."""
     input: InputConfig = field(default_factory=InputConfig)
     clock: ClockConfig = field(default_factory=ClockConfig)
     map: MapConfig = field(default_factory=MapConfig)
@@ -257,9 +257,6 @@ class Config:
                 raise ValueError(f"options: {name!r} is now {ESTIMATORS.resolve(name)!r}")
         if not self.sensors:
             raise ValueError("sensors: name at least one")
-        both = set(self.sensors) & set(self.ignore_sensors)
-        if both:
-            raise ValueError(f"ignore_sensors: {sorted(both)[0]!r} is under sensors as well")
         strangers = set(self.input.detections) - set(self.sensors) - set(self.ignore_sensors)
         if strangers:
             raise ValueError(f"input.detections: {sorted(strangers)[0]!r} has no model under sensors")

@@ -34,6 +34,9 @@ LABEL = "label"
 #: More jobs than this are a slip of the pen.
 MOST_JOBS = 100_000
 
+#: Columns of `one_at_a_time`: which setting is changed, and to what; in the row without a change, this and nothing.
+CHANGED, TO, BASE = "changed", "to", "base"
+
 #: Roots of keys; those of the configuration have none.
 CONFIG, SCENARIO, DELAYS = "config", "scenario", "delays"
 
@@ -70,6 +73,8 @@ class SweepConfig:
     """Keys that are changed for all runs alike."""
     vary: Mapping[str, Value] = field(default_factory=lambda: MappingProxyType({}))
     """Axes of the grid: a key and its values, or a name and a group of keys with equally many values each."""
+    one_at_a_time: Mapping[str, Value] = field(default_factory=lambda: MappingProxyType({}))
+    """Written as `vary`: the base, and then every value alone, all other keys as in the base."""
     metrics: tuple[str, ...] = ()
     """Columns of metrics, `*` matches anything; all of them where none is named."""
 
@@ -96,17 +101,20 @@ class SweepConfig:
     @property
     def _redelays(self) -> bool:
         return self.delays is not None or any(
-            key.startswith(f"{DELAYS}.") for axis in self.axes() for key in axis.points[0].changes
+            key.startswith(f"{DELAYS}.") for axis in self.axes() for point in axis.points for key in point.changes
         )
 
     def axes(self) -> "tuple[Axis, ...]":
         """The axes of the grid; raises `ValueError` with the key's path."""
-        axes = tuple(_axis(name, values) for name, values in self.vary.items())
+        axes = tuple(_axis("vary", name, values) for name, values in self.vary.items())
+        if self.one_at_a_time:
+            axes = (_one_at_a_time(self.one_at_a_time), *axes)
         columns = [*KEY_COLUMNS, *(column for axis in axes for column in axis.columns)]
         for column in columns:
             if columns.count(column) > 1:
                 raise ValueError(f"vary: {column!r} is named twice, or is a column that every table has")
-        for where, keys in (("set", self.set), *((f"vary.{axis.name}", axis.points[0].changes) for axis in axes)):
+        changes = [(axis.name, point.changes) for axis in axes for point in axis.points]
+        for where, keys in (("set", self.set), *changes):
             for key in keys:
                 self._check_key(where, key)
         return axes
@@ -117,7 +125,7 @@ class SweepConfig:
             yield Point(
                 cells=tuple(cell for point in points for cell in point.cells),
                 changes={key: value for point in points for key, value in point.changes.items()},
-                description=", ".join(point.description for point in points),
+                description=", ".join(point.description for point in points if point.description),
             )
 
     def _check_key(self, where: str, key: str) -> None:
@@ -147,23 +155,25 @@ class Axis:
     """One direction of the grid."""
 
     name: str
+    """Its path in the file."""
     columns: tuple[str, ...]
     """Columns of the tables that identify a point."""
     points: tuple[Point, ...]
 
 
-def _axis(name: str, given: Value) -> Axis:
-    """The axis under `vary.name`; raises `ValueError` with the key's path."""
+def _axis(section: str, name: str, given: Value) -> Axis:
+    """The axis under `section.name`; raises `ValueError` with the key's path."""
+    where = f"{section}.{name}"
     if isinstance(given, (list, tuple)):
-        lists = {name: _values(f"vary.{name}", given)}
+        lists = {name: _values(where, given)}
     elif isinstance(given, Mapping) and set(given) - {LABEL}:
-        lists = {key: _values(f"vary.{name}.{key}", values) for key, values in given.items()}
+        lists = {key: _values(f"{where}.{key}", values) for key, values in given.items()}
     else:
-        raise ValueError(f"vary.{name}: a list of values is needed, or a mapping of keys to lists of values")
+        raise ValueError(f"{where}: a list of values is needed, or a mapping of keys to lists of values")
     lengths = {key: len(values) for key, values in lists.items()}
     if len(set(lengths.values())) > 1:
         lengths_text = ", ".join(f"{key} has {length}" for key, length in lengths.items())
-        raise ValueError(f"vary.{name}: its keys change together and need equally many values, {lengths_text}")
+        raise ValueError(f"{where}: its keys change together and need equally many values, {lengths_text}")
     labels = {name: lists.pop(LABEL)} if LABEL in lists else {}
     points = []
     for cells in zip(*labels.values(), *lists.values(), strict=True):
@@ -171,7 +181,18 @@ def _axis(name: str, given: Value) -> Axis:
         shown = dict(zip(labels or lists, cells, strict=False))
         description = ", ".join(f"{column}={_short(cell)}" for column, cell in shown.items())
         points.append(Point(cells, changes, description))
-    return Axis(name, (*labels, *lists), tuple(points))
+    return Axis(where, (*labels, *lists), tuple(points))
+
+
+def _one_at_a_time(given: Mapping[str, Value]) -> Axis:
+    """The axis whose points are the base and every value alone; raises `ValueError` with the key's path."""
+    section = "one_at_a_time"
+    points = [Point((BASE, None), {}, "")]
+    for name, values in given.items():
+        axis = _axis(section, name, values)
+        alike = len(axis.columns) == 1 or axis.columns[0] == name  # one key, or a label: the first cell says it all
+        points += [replace(one, cells=(name, one.cells[0] if alike else list(one.cells))) for one in axis.points]
+    return Axis(section, (CHANGED, TO), tuple(points))
 
 
 def _values(where: str, given: Value) -> tuple[Value, ...]:

@@ -147,7 +147,6 @@ def test_a_setting_does_not_change_what_it_stands_on() -> None:
         ("sensors: {lidar: {std: {x_m: 1.0, y_m: 1.0, mass_kg: 1.0}}}\n", "unknown component 'mass_kg'"),
         ("sensors: {lidar: {counter_init: 3}}\n", "sensors.lidar.std"),
         ("sensors: {}\n", "sensors: name at least one"),
-        ("ignore_sensors: [lidar]\n", "ignore_sensors: 'lidar'"),
         ("input: {detections: {sonar: {topic: /sonar}}}\n", "input.detections: 'sonar' has no model"),
         ("filter: 3\n", "filter: "),
         ("filter: {frequency_hz: fast}\n", 'filter.frequency_hz: Input should be a valid number, not "fast"'),

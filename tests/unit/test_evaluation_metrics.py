@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from fgtrack.core.types import Disposition
+from fgtrack.core.types import Disposition, TrackReport
 from fgtrack.evaluation.metrics import Metrics, ObjectMetrics, evaluate
 from fgtrack.evaluation.statistics import Distribution, Moments
 from fgtrack.io.run import EvaluationConfig, Run
@@ -111,6 +111,21 @@ def test_false_tracks_and_precision(story: Run) -> None:
     assert (metrics.truth.judged_tracks, metrics.truth.false_tracks) == (4, 1)
     assert metrics.truth.tracked_objects == 2
     assert metrics.precision == pytest.approx(2 / 4)
+
+
+def test_precision_counts_every_visit_of_an_object(tmp_path: Path) -> None:
+    """WEST is there for 0.2 s, and comes by again 1.8 s later."""
+    again = dataclasses.replace(WEST, x_m=WEST.x_m + 40.0)
+    moments = [(WEST, range(10)), (again, range(100, 110))]
+    truth = [row for car, ticks in moments for row in car.truth(ticks)]
+    tracks: list[list[TrackReport]] = [[] for _ in range(110)]
+    for car, ticks in moments:
+        for tick in ticks:
+            tracks[tick] = [car.track(tick, 1)]
+    metrics = evaluate(write_run(tmp_path / "run", tracks, truth=truth))
+    assert metrics.truth is not None
+    assert (metrics.truth.tracked_objects, metrics.truth.tracked_visits) == (1, 2)
+    assert metrics.precision == 2.0  # one track for both
 
 
 def test_precision_counts_confirmed_tracks_whatever_is_judged(story: Run) -> None:

@@ -90,6 +90,43 @@ def test_a_changed_value_leaves_the_original_alone() -> None:
     assert items["sensors"][1]["rate"] == 2
 
 
+# --- one setting at a time
+
+
+def test_one_at_a_time_is_the_base_and_every_value_alone(plan: Any) -> None:
+    made = plan("""
+seeds: [4, 2]
+one_at_a_time:
+  association.gate_m: [1.0, 2.0]
+  modality: {label: [LiDAR], ignore_sensors: [[radar]]}
+  both: {association.gate_m: [3.0], clock.node_hz: [null]}
+""")
+    assert made.columns == ("changed", "to")
+    rows = [
+        ("base", None, 5.0, 50.0, []),
+        ("association.gate_m", 1.0, 1.0, 50.0, []),
+        ("association.gate_m", 2.0, 2.0, 50.0, []),
+        ("modality", "LiDAR", 5.0, 50.0, ["radar"]),
+        ("both", [3.0, None], 3.0, None, []),
+    ]
+    assert [(*job.cells, job.seed) for job in made.jobs] == [(*row[:2], seed) for row in rows for seed in (4, 2)]
+    for job, row in zip(made.jobs[::2], rows, strict=True):
+        config = job.recipe.config
+        found = (config["association"]["gate_m"], config["clock"]["node_hz"], config["ignore_sensors"])
+        assert found == row[2:]
+
+
+def test_every_point_of_a_grid_has_one_setting_at_a_time(plan: Any) -> None:
+    made = plan("vary: {clock.node_hz: [20.0, 50.0]}\none_at_a_time: {association.gate_m: [1.0]}")
+    assert made.columns == ("changed", "to", "clock.node_hz")
+    assert [job.cells for job in made.jobs] == [
+        ("base", None, 20.0),
+        ("base", None, 50.0),
+        ("association.gate_m", 1.0, 20.0),
+        ("association.gate_m", 1.0, 50.0),
+    ]
+
+
 # --- errors name the key
 
 
@@ -119,6 +156,10 @@ def test_a_changed_value_leaves_the_original_alone() -> None:
         ("set: {estimator: smoother}", "set: name estimators under `estimators`"),
         ("vary: {clock..node_hz: [5.0]}", "vary.clock..node_hz: 'clock..node_hz' is no key"),
         ("vary: {delays.radar.delay: [null]}", "delays.radar.delay changes the delays, of which this sweep has none"),
+        ("one_at_a_time: {association.gate_m: 5.0}", "one_at_a_time.association.gate_m: a list of values is needed"),
+        ("one_at_a_time: {clock.node_hz: [5.0], seed: [1], estimator: [x]}", "one_at_a_time: name estimators under"),
+        ("vary: {to: {label: [1], clock.node_hz: [5.0]}}\none_at_a_time: {clock.node_hz: [5.0]}", "'to' is named"),
+        ("one_at_a_time: {clok.node_hz: [5.0], a.b: [1]}\nset: {clok.x: 1}", "configuration: clok: unknown key"),
         ("delays: d.yaml", "delays: a scenario has delays of its own"),
         ("input: x", "scenario, input: name one of them"),
         ("vary: {clok.node_hz: [5.0, 7.0]}", "clok.node_hz=5.0: configuration: clok: unknown key"),
