@@ -37,6 +37,12 @@ def sweep(
     dask: Annotated[
         str | None, typer.Option("--dask", metavar="ADDRESS", help="Let the workers of a dask cluster do it.")
     ] = None,
+    recording: Annotated[
+        Path | None, typer.Option("--input", metavar="INPUT", help="Replay this instead of the sweep's input.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a key in every run; may be repeated.")
+    ] = None,
     overwrite: Overwrite = False,
 ) -> int:
     """Run settings x seeds x estimators into one table; resumes."""
@@ -45,7 +51,7 @@ def sweep(
     if jobs is not None and dask is not None:
         raise CallError("--jobs, --dask: the cluster has its own number of workers, give one of them")
     sweep_file = find_file("sweep", sweep_name)
-    work = Sweep.open(load_plan(sweep_file), out, overwrite)
+    work = Sweep.open(load_plan(sweep_file, recording, settings or ()), out, overwrite)
     left = len(work.todo)
     say(f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {left}")
     if work.num_unused:

@@ -85,11 +85,17 @@ def _nodes(value: object) -> Iterator[object]:
         yield from _nodes(item)
 
 
-def _with_setting(raw: dict[str, Any], setting: str, defaults: object) -> dict[str, Any]:
+def key_and_value(setting: str) -> tuple[str, Any]:  # Any: what YAML says
+    """The key and the value of a setting of the form a.b=value. Raises `CallError` for another form."""
     key, equals, text = setting.partition("=")
-    names = key.strip().split(".")
-    if not equals or not all(names):
+    if not equals or not all(key.strip().split(".")):
         raise CallError(f"--set {setting}: write key=value, with dots between the keys of a path")
+    return key.strip(), _parse(text, f"--set {setting}")
+
+
+def _with_setting(raw: dict[str, Any], setting: str, defaults: object) -> dict[str, Any]:
+    key, value = key_and_value(setting)
+    names = key.split(".")
     changed = dict(raw)
     inner = changed
     for name in names[:-1]:
@@ -99,7 +105,7 @@ def _with_setting(raw: dict[str, Any], setting: str, defaults: object) -> dict[s
             raise CallError(f"--set {setting}: {name} is a single value and has no keys below it")
         inner[name] = dict(below or {})
         inner = inner[name]
-    inner[names[-1]] = _parse(text, f"--set {setting}")
+    inner[names[-1]] = value
     return changed
 
 

@@ -16,7 +16,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import load, plain, read_yaml, validate
+from fgtrack.pipeline.load import key_and_value, load, plain, read_yaml, validate
 from fgtrack.pipeline.replay import versions
 from fgtrack.pipeline.shipped import read_config, read_scenario
 from fgtrack.sim.redelay import SensorDelays
@@ -279,10 +279,10 @@ class Plan:
     metrics: tuple[str, ...]
 
 
-def load_plan(path: Path) -> Plan:
-    """The plan of the sweep file `path`.
+def load_plan(path: Path, recording: Path | None = None, settings: Sequence[str] = ()) -> Plan:
+    """The plan of the sweep file `path`, on `recording` instead of what it names, with `settings` a.b=value for all.
 
-    A grid point with settings that do not fit is a job with a problem.
+    A grid point with settings that do not fit is a job with a problem. A recording has one seed, the first.
 
     Raises
     ------
@@ -290,13 +290,21 @@ def load_plan(path: Path) -> Plan:
         The file is wrong, something that it names is missing, or no grid point can be run.
     """
     sweep = load(SweepConfig, path)
+    changes: dict[str, Value] = {"set": {**sweep.set, **dict(map(key_and_value, settings))}}
+    if recording is not None:
+        of_scenario = {"scenario": None, "duration_s": None, "delays": None}
+        changes |= {**of_scenario, "input": str(recording.resolve()), "seeds": sweep.seeds[:1]}
+    try:
+        sweep = replace(sweep, **changes)
+    except ValueError as error:
+        raise CallError(f"{path}: {error}") from error
     try:
         sweep = replace(sweep, estimators=tuple(ESTIMATORS.resolve(name) for name in sweep.estimators))
     except CallError as error:
         raise CallError(f"{path}: estimators: {error}") from error
     base = _with_keys(_base(sweep, path), sweep.set, f"{path}: set")
-    recording = None if sweep.input is None else (path.parent / sweep.input).resolve()
-    jobs = tuple(job for point in sweep.grid() for job in _jobs(sweep, base, point, recording))
+    source = None if sweep.input is None else (path.parent / sweep.input).resolve()
+    jobs = tuple(job for point in sweep.grid() for job in _jobs(sweep, base, point, source))
     if all(job.recipe is None for job in jobs):
         raise CallError(f"{path}: {jobs[0].problem}")
     columns = tuple(column for axis in sweep.axes() for column in axis.columns)

@@ -300,3 +300,26 @@ def test_the_delay_sweep_is_seven_delays_by_five_rates_by_twenty_seeds_by_six_es
     made = load_plan(CONFIGS / "sweeps/delay.yaml")
     assert len(made.jobs) == len({job.key for job in made.jobs}) == 7 * 5 * 20
     assert len(made.estimators) == 6
+
+
+# --- on another recording
+
+
+def test_a_recording_takes_the_place_of_the_scenario(tmp_path: Path) -> None:
+    (tmp_path / "sweep.yaml").write_text(
+        f"{HEAD}\nseeds: 3\nduration_s: 2.0\nset: {{map.track: oval}}\nvary: {{clock.node_hz: [20.0, 50.0]}}"
+    )
+    scenario = read_scenario("single_opponent", duration_s=0.2)
+    recording = tmp_path / "drive.jsonl"
+    write_stream(recording, simulate(scenario, np.random.default_rng(0)))
+    made = load_plan(tmp_path / "sweep.yaml", recording, ["map.track=null", "association.gate_m=3.5"])
+    assert [(job.cells, job.seed) for job in made.jobs] == [((20.0,), 0), ((50.0,), 0)]
+    for job in made.jobs:
+        assert (job.recipe.scenario, job.recipe.recording) == (None, str(recording.resolve()))
+        assert (job.recipe.config["map"]["track"], job.recipe.config["association"]["gate_m"]) == (None, 3.5)
+
+
+def test_a_sweep_of_the_scenario_cannot_take_a_recording(tmp_path: Path) -> None:
+    (tmp_path / "sweep.yaml").write_text(f"{HEAD}\nvary: {{scenario.sensors.radar.rate_hz: [20.0]}}")
+    with pytest.raises(CallError, match="changes the scenario, of which this sweep has none"):
+        load_plan(tmp_path / "sweep.yaml", tmp_path / "drive.jsonl")
