@@ -1,5 +1,6 @@
 """The fixed-lag smoother of one object."""
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -192,6 +193,6 @@ class FixedLagSmoother:
             rows = None if curved(measurement) else whitened(y, H, R)
         except np.linalg.LinAlgError:
             return UpdateResult(UpdateStatus.FAILED), None
-        if not np.isfinite(nis):
+        if not math.isfinite(nis):
             return UpdateResult(UpdateStatus.FAILED), None
         return UpdateResult(status, y, nis, S), rows

@@ -331,7 +331,7 @@ class Window:
         if self._far is None:
             nodes, means = self._chain.nodes, self._all_means()
             far = np.abs(means - self._chain.origins) > self._thresholds
-            places = np.flatnonzero(far.any(axis=1)).tolist() if far.any() else []
+            places = np.flatnonzero(far.any(axis=1)).tolist() if np.count_nonzero(far) else []
             self._far = [(nodes[place], means[place]) for place in places if place >= self._anchored]
         return self._far
 
