@@ -10,7 +10,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.innovations import num_measured
 from fgtrack.evaluation.statistics import ChiSquareMean
-from fgtrack.io.run import Run, Table
+from fgtrack.io.run import Run, Table, digest
 
 USED = ("birth", "in_sequence", "out_of_sequence", "beyond_window", "merged")
 """Dispositions of detections that took part."""
@@ -40,7 +40,7 @@ _NO_EGO = (
 
 def cautions(run: Run) -> list[str]:
     """What is wrong with `run` as far as its files say, a line each with cause and cure."""
-    return [*_clocks(run), *_ego(run), *_lost(run), *_window(run)]
+    return [*_changed(run), *_clocks(run), *_ego(run), *_lost(run), *_window(run)]
 
 
 def noise_cautions(run: Run) -> list[str]:
@@ -79,6 +79,12 @@ def unused(run: Run) -> str | None:
         return None
     fates = zip(*np.unique(updates["disposition"], return_counts=True), strict=True)
     return f"none of the {updates.num_rows} detections was used ({', '.join(f'{n} {fate}' for fate, n in fates)})"
+
+
+def _changed(run: Run) -> Iterator[str]:
+    """Whether the files of a finished run are those that it has written."""
+    if run.path is not None and run.meta.get("complete") and digest(run.path) != run.meta.get("digest"):
+        yield "tracks.csv or updates.csv has been changed since the run: its digest is another; repeat the run"
 
 
 def _clocks(run: Run) -> Iterator[str]:

@@ -63,6 +63,8 @@ def input_kind(path: Path) -> str:
         raise CallError(f"{path}: there is no such file or folder")
     formats = _formats()
     try:
+        if not path.is_file() and not path.is_dir():
+            raise DataError(f"{path}: is neither a file nor a folder, write what comes out of it to a file first")
         if path.is_file() and path.stat().st_size == 0:
             raise DataError(f"{path}: is empty")
         for name, form in formats.items():

@@ -1,5 +1,6 @@
 """What a run is warned of: detections that were not used, windows that are too short, noise that does not fit."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,8 @@ from unit.evaluation_runs import TICK_NS, update, write_run
 
 from fgtrack.core.types import Disposition, UpdateRecord
 from fgtrack.evaluation.cautions import cautions, noise_cautions, unused
-from fgtrack.io.run import Run
+from fgtrack.io.run import Run, Table
+from fgtrack.io.run.reader import column
 
 CONFIG = """
 sensors: {lidar: {max_delay_s: 0.4}, radar: {}}
@@ -102,3 +104,24 @@ def test_a_run_that_used_nothing_says_what_became_of_all(tmp_path: Path) -> None
     run = run_of(tmp_path / "run", [*lists(Disposition.TOO_OLD, 3), *lists(Disposition.GATED, 2)])
     assert unused(run) == "none of the 5 detections was used (2 gated, 3 too_old)"
     assert unused(run_of(tmp_path / "empty", [])) is None
+
+
+def test_a_table_that_was_changed_after_the_run_is_told(tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", lists(Disposition.IN_SEQUENCE))
+    table = tmp_path / "run/updates.csv"
+    table.write_text(table.read_text().replace("lidar", "radar"))
+    assert cautions(run) == [
+        "tracks.csv or updates.csv has been changed since the run: its digest is another; repeat the run"
+    ]
+
+
+@pytest.mark.parametrize(("refused", "told"), [(2, False), (3, True)])
+def test_states_of_the_ego_that_were_refused_are_told_where_they_are_most(
+    refused: int, told: bool, tmp_path: Path
+) -> None:
+    run = run_of(tmp_path / "run", lists(Disposition.IN_SEQUENCE))
+    ego = Table({name: column(name, [0, 1, 2, 3]) for name in run.ego})
+    meta = {**run.meta, "ego_refused": {"stamp ahead of its receipt": refused}}
+    found = cautions(replace(run, ego=ego, meta=meta))
+    assert len(found) == told
+    assert not told or found[0].startswith(f"ego: {refused} of 4 states not used, stamp ahead of its receipt")

@@ -1,5 +1,7 @@
 """Inputs are recognised by their content, those of plug-ins too."""
 
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -83,3 +85,10 @@ def test_a_part_of_a_folder_names_the_folder(tmp_path: Path, name: str) -> None:
     file.write_text("x")
     with pytest.raises(DataError, match=f"{file.name}: is no input by itself, name its folder .*{file.parent.name} "):
         open_input(file)
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/null")], ids=["pipe", "device"])
+def test_a_pipe_or_device_is_refused_at_once(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    make(tmp_path / "x.jsonl")
+    with pytest.raises(DataError, match=r"x\.jsonl: is neither a file nor a folder"):
+        open_input(tmp_path / "x.jsonl")
