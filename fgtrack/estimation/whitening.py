@@ -77,7 +77,8 @@ def whitened(y: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
 
     Raises `numpy.linalg.LinAlgError` for a covariance R that is not positive definite.
     """
-    return product(inverse_roots(R), np.concatenate([H, y[..., None]], axis=-1))
+    alike = R.ndim == 3 and len(R) > 0 and bool((R[:1] == R).all())
+    return product(inverse_roots(R[0] if alike else R), np.concatenate([H, y[..., None]], axis=-1))
 
 
 def whitened_term(term: MeasurementTerm, x: FloatArray) -> FloatArray:

@@ -77,6 +77,8 @@ class BandedBank:
         self._track_ids: tuple[int, ...] = ()
         self._tracks: IntArray = np.zeros(0, dtype=np.int64)
         """Both in order of birth."""
+        self._ranks: IntArray = np.zeros(0, dtype=np.int64)
+        """Position in that order of each track of the arrays."""
         self._free: list[int] = []
         self._now_ns = 0
         self._clock_ns: IntArray = np.zeros(0, dtype=np.int64)
@@ -86,6 +88,8 @@ class BandedBank:
         """Of the tracks whose direction is sought."""
         self._states: dict[int, tuple[tuple[int, ...], IntArray, States]] = {}
         """The tracks that are known at a stamp, where the arrays hold them, and their states."""
+        self._times: _Times | None = None
+        """Of all tracks, in order of birth, where they are known; like `_states` until something changes."""
         self._final: list[Leaving] = []
         self._ended: list[SmoothedReport] = []
 
@@ -114,7 +118,7 @@ class BandedBank:
         """See `TrackBank.advance`."""
         self._now_ns = now_ns
         self._clock_ns = np.maximum(self._clock_ns, now_ns)
-        self._states.clear()  # which tracks are known at a stamp depends on the clock
+        self._changed()  # which tracks are known at a stamp depends on the clock
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`. Raises `DataError` for a stamp before the window where the policy is `raise`."""
@@ -136,7 +140,7 @@ class BandedBank:
             return []
         tracks = np.array([self._numbers[track_id] for track_id in track_ids])
         measurements = [measurement.seen_by(self._motion) for measurement in measurements]
-        times = self._times_ns(tracks)
+        times = self._all_times().at(self._ranks[tracks])
         if self._settings.late == "raise" and (stamp_ns < times.start).any():
             raise DataError(
                 f"a measurement at {stamp_ns} ns is {seconds(int(times.start.max()) - stamp_ns):g} s older than the "
@@ -182,7 +186,7 @@ class BandedBank:
         if not self._numbers:
             return []
         tracks = self._tracks
-        states = self.windows.states_at(tracks, np.maximum(self._now_ns, self._times_ns(tracks).oldest))
+        states = self.windows.states_at(tracks, np.maximum(self._now_ns, self._all_times().oldest))
         means, covariances = self._motion.kinematic(*states)
         means = wrapped_yaw(means)
         return [TrackState(self._now_ns, m, P) for m, P in zip(means, covariances, strict=True)]
@@ -192,9 +196,7 @@ class BandedBank:
         reports, self._ended = self._ended, []
         if self._final:
             final, self._final = _joined(self._final), []
-            ranks = np.empty(len(self._clock_ns), dtype=np.int64)
-            ranks[self._tracks] = np.arange(len(self._tracks))
-            ranks = ranks[final.tracks]
+            ranks = self._ranks[final.tracks]
             order = ranks.argsort(kind="stable")
             track_ids = [self._track_ids[rank] for rank in ranks[order].tolist()]
             states = States(final.states.means[order], final.states.covariances[order])
@@ -238,7 +240,7 @@ class BandedBank:
     def converge(self, track_id: int, max_iterations: int) -> None:
         """Relinearise a track until nothing moves; for comparisons."""
         self.windows.solver.converge(self._numbers[track_id], max_iterations)
-        self._states.clear()
+        self._changed()
 
     # --- inside
 
@@ -283,7 +285,7 @@ class BandedBank:
             tracks, guesses, times = tracks[positions], guesses[positions], times.at(positions)
             measurements = [measurements[position] for position in positions.tolist()]
             groups = [group.numbered(positions) for group in groups]
-        self._states.clear()
+        self._changed()
         try:
             left = self.windows.fuse(tracks, stamp_ns, measurements, groups, guesses, times.start, times.reach)
         except np.linalg.LinAlgError:
@@ -321,7 +323,19 @@ class BandedBank:
     def _renumbered(self) -> None:
         self._track_ids = tuple(self._numbers)
         self._tracks = np.fromiter(self._numbers.values(), dtype=np.int64, count=len(self._numbers))
+        self._ranks = np.zeros(len(self._clock_ns), dtype=np.int64)
+        self._ranks[self._tracks] = np.arange(len(self._tracks))
+        self._changed()
+
+    def _changed(self) -> None:
+        """Forget what was computed of the states."""
         self._states.clear()
+        self._times = None
+
+    def _all_times(self) -> "_Times":
+        if self._times is None:
+            self._times = self._times_ns(self._tracks)
+        return self._times
 
     def _times_ns(self, tracks: IntArray) -> "_Times":
         newest, first = self.windows.newest_ns(tracks), self._first_ns[tracks]
@@ -334,7 +348,7 @@ class BandedBank:
         found = self._states.get(stamp_ns)
         if found is None:
             track_ids, tracks = self._track_ids, self._tracks
-            known = self._times_ns(tracks).oldest <= stamp_ns
+            known = self._all_times().oldest <= stamp_ns
             if not known.all():
                 track_ids, tracks = tuple(track_ids[row] for row in known.nonzero()[0].tolist()), tracks[known]
             states = self.windows.states_at(tracks, np.full(len(tracks), stamp_ns))

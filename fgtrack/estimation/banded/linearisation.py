@@ -12,17 +12,7 @@ from fgtrack.models.motion import MotionModel
 
 def move(nodes: Nodes, tracks: IntArray, numbers: IntArray, steps: FloatArray) -> None:
     """Move linearisation points by `steps`, (m, n): what is relative to them follows."""
-    n = nodes.dim
-    nodes.origin[numbers] += steps
-    nodes.predicted[numbers, :, n] -= steps
-    nodes.step[numbers] -= steps
-    first = nodes.first[tracks]
-    oldest = (first > 0) & (numbers == nodes.numbers[tracks, first])
-    if oldest.any():  # what is known of the node behind it is relative to its linearisation point
-        behind = nodes.at(tracks[oldest], first[oldest] - 1)
-        nodes.back[behind, :, n] += np.matvec(nodes.back[behind, :, :n], steps[oldest])
-    rows = nodes.rows[numbers]
-    nodes.rows[numbers, :, n] = rows[..., n] - np.matvec(rows[..., :n], steps)
+    nodes.shift(tracks, numbers, steps)
     for number in numbers.tolist():
         if any(map(curved, nodes.terms[number])):
             linearise_terms(nodes, number)

@@ -40,12 +40,14 @@ class Substitution(Protocol):
 class Methods(NamedTuple):
     """How the windows are solved."""
 
+    nodes: Callable[[int], Nodes]
+    """The arrays, for states of so many entries."""
     eliminate: Callable[[Nodes, IntArray, IntArray], None]
     """See `elimination.eliminate`."""
     substitution: Callable[[Nodes], Substitution]
 
 
-IN_NUMPY = Methods(eliminate, Blocks)
+IN_NUMPY = Methods(Nodes, eliminate, Blocks)
 
 
 @cache
@@ -57,8 +59,8 @@ def fastest() -> Methods:
     if find_spec("numba") is None:
         return IN_NUMPY
     try:
-        from fgtrack.estimation.banded import compiled
+        from fgtrack.estimation.banded import compiled, compiled_nodes
     except (ImportError, RuntimeError) as error:  # of another NumPy; nowhere to keep what is compiled
         warnings.warn(f"smoother-banded runs without numba, which fails: {error}", RuntimeWarning, stacklevel=2)
         return IN_NUMPY
-    return Methods(compiled.eliminate, compiled.Substitution)
+    return Methods(compiled_nodes.CompiledNodes, compiled.eliminate, compiled.Substitution)

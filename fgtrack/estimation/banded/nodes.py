@@ -118,13 +118,17 @@ class Nodes:
 
     def insert(self, tracks: IntArray, places: IntArray, stamp_ns: int, origins: FloatArray) -> None:
         """New nodes at `places`, one for each of `tracks`; those from there on move up."""
+        self.reserve(int(self.count[tracks].max()))
+        numbers = self._place(tracks, places, stamp_ns)
+        self._empty(numbers)
+        self.origin[numbers] = origins
+
+    def _place(self, tracks: IntArray, places: IntArray, stamp_ns: int) -> IntArray:
+        """The order of `insert`; gives the numbers of the new nodes."""
         count = self.count[tracks]
-        last = int(count.max())
-        self.reserve(last)
-        low = int(places.min())
         numbers = self.numbers[tracks, count]
         if (places < count).any():
-            columns = np.arange(low, last + 1)
+            columns = np.arange(int(places.min()), int(count.max()) + 1)
             moved = (columns > places[:, None]) & (columns <= count[:, None])
             source = columns - moved
             for name in self._ORDER:
@@ -133,8 +137,23 @@ class Nodes:
         self.stamps_ns[tracks, places] = stamp_ns
         self.numbers[tracks, places] = numbers
         self.count[tracks] = count + 1
-        self._empty(numbers)
-        self.origin[numbers] = origins
+        return numbers
+
+    def shift(self, tracks: IntArray, numbers: IntArray, steps: FloatArray) -> None:
+        """Move the linearisation points of nodes of `tracks`, one each, by `steps` (m, n): what is relative to them
+        follows, measurements as if they were linear.
+        """
+        n = self.dim
+        self.origin[numbers] += steps
+        self.predicted[numbers, :, n] -= steps
+        self.step[numbers] -= steps
+        first = self.first[tracks]
+        oldest = (first > 0) & (numbers == self.numbers[tracks, first])
+        if oldest.any():  # what is known of the node behind it is relative to its linearisation point
+            behind = self.at(tracks[oldest], first[oldest] - 1)
+            self.back[behind, :, n] += np.matvec(self.back[behind, :, :n], steps[oldest])
+        rows = self.rows[numbers]
+        self.rows[numbers, :, n] = rows[..., n] - np.matvec(rows[..., :n], steps)
 
     def drop(self, tracks: IntArray, numbers: IntArray) -> None:
         """Forget the oldest `numbers` nodes of each of `tracks`."""
@@ -158,18 +177,14 @@ class Nodes:
             self.rows[numbers, :k] = rows
         self.num_rows[numbers] = used + k
 
-    def snapshot(self, tracks: IntArray, low: int) -> tuple[IntArray, ...]:
-        """The order of the nodes of `tracks` from the place `low` on, for `restore`."""
-        columns = np.arange(low, int(self.count[tracks].max()) + 1)
-        order = (getattr(self, name)[tracks[:, None], columns] for name in self._ORDER)
-        return (columns, *order, *(getattr(self, name)[tracks] for name in self._TRACKS))
+    def snapshot(self, tracks: IntArray) -> list[IntArray]:
+        """The order of the nodes of `tracks`, for `restore` after at most one insertion in each."""
+        self.reserve(int(self.count[tracks].max()))
+        return [getattr(self, name).take(tracks, axis=0) for name in (*self._ORDER, *self._TRACKS)]
 
     def restore(self, tracks: IntArray, saved: Sequence[IntArray]) -> None:
         """Go back to the order of `snapshot`; the values of nodes that were new are lost."""
-        columns, *saved = saved
-        for name, values in zip(self._ORDER, saved, strict=False):
-            getattr(self, name)[tracks[:, None], columns] = values
-        for name, values in zip(self._TRACKS, saved[len(self._ORDER) :], strict=True):
+        for name, values in zip((*self._ORDER, *self._TRACKS), saved, strict=True):
             getattr(self, name)[tracks] = values
 
     def _empty(self, numbers: IntArray) -> None:

@@ -1,17 +1,29 @@
 """The windows of all tracks as systems of equations: linearised, relinearised where they moved, and solved."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.banded.linearisation import linearise_segments, linearise_terms, move
 from fgtrack.estimation.banded.methods import fastest
-from fgtrack.estimation.banded.nodes import Nodes
 from fgtrack.estimation.banded.undo import Undo
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
 
 #: A step of a state, in m, rad, m/s or rad/s, that is rounding.
 _AT_REST = 1e-7
+
+
+class Moved(NamedTuple):
+    """Where the linearisation points of m tracks have moved."""
+
+    starts: IntArray
+    """First places, or `count` where none has; shape (m,)."""
+    tracks: IntArray
+    """Track of each node that has moved, shape (k,)."""
+    places: IntArray
+    """Their places, shape (k,)."""
 
 
 class Solver:
@@ -28,8 +40,8 @@ class Solver:
     def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
         self._motion = motion
         self._settings = settings
-        self.nodes = Nodes(motion.dim)
         self._methods = fastest()
+        self.nodes = self._methods.nodes(motion.dim)
         self._substitution = self._methods.substitution(self.nodes)
         self.smoothed = self._substitution.smoothed
         self._thresholds = np.empty((0, motion.dim))
@@ -74,21 +86,27 @@ class Solver:
             self.eliminate(tracks, starts)
             self.solve_means(tracks)
 
-    def relinearise(self, tracks: IntArray, undo: Undo | None = None) -> IntArray:
-        """Move the linearisation points that are too far from their states; gives their first places, or `count`."""
+    def relinearise(self, tracks: IntArray) -> IntArray:
+        """Relinearise where states are too far from their linearisation points; the first places, or `count`."""
+        moved = self.move_far(tracks)
+        if moved.tracks.size:
+            linearise_segments(self.nodes, self._motion, moved.tracks, moved.places)
+        return moved.starts
+
+    def move_far(self, tracks: IntArray, undo: Undo | None = None) -> Moved:
+        """Move the linearisation points that are too far from their states, without the segments from there."""
         nodes = self.nodes
         starts = nodes.count[tracks]
         rows, places = self.far(tracks)
+        of = tracks[rows]
         if rows.size:
-            of = tracks[rows]
             moved = nodes.at(of, places)
             if undo is not None:
                 undo.keep_origins(of, moved)
             move(nodes, of, moved, nodes.step[moved])
             nodes.far[moved] = False
-            linearise_segments(nodes, self._motion, of, places)
             np.minimum.at(starts, rows, places)
-        return starts
+        return Moved(starts, of, places)
 
     def far(self, tracks: IntArray) -> tuple[IntArray, IntArray]:
         """Nodes that are too far from their linearisation points: positions of their tracks, and their places."""

@@ -9,11 +9,9 @@ from fgtrack.estimation.banded.nodes import Nodes
 class Undo:
     """What an update changes of the nodes of some tracks, but for what is made anew from it."""
 
-    def __init__(self, nodes: Nodes, tracks: IntArray, low: int) -> None:
-        """Before an update that changes the order from the place `low` on."""
+    def __init__(self, nodes: Nodes, tracks: IntArray) -> None:
         self._nodes, self._tracks = nodes, tracks
-        nodes.reserve(int(nodes.count[tracks].max()))
-        self._order = nodes.snapshot(tracks, low)
+        self._order = nodes.snapshot(tracks)
         self.first = nodes.first[tracks]
         self._moved: tuple[IntArray, FloatArray, FloatArray] | None = None
         self._behind: tuple[IntArray, FloatArray] | None = None

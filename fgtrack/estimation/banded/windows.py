@@ -12,7 +12,7 @@ from fgtrack.core.types import YAW, BoolArray, FloatArray, IntArray
 from fgtrack.estimation.banded.damping import DampedWindow
 from fgtrack.estimation.banded.linearisation import linearise_segments, linearise_terms
 from fgtrack.estimation.banded.ring import fuse_behind
-from fgtrack.estimation.banded.solver import Solver
+from fgtrack.estimation.banded.solver import Moved, Solver
 from fgtrack.estimation.banded.undo import Undo
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.ekf import propagated
@@ -25,6 +25,8 @@ from fgtrack.models.motion import MotionModel
 
 #: Nodes behind the window are forgotten when there are so many that nobody needs.
 _MANY = 16
+#: Further than any place.
+_NEVER = np.iinfo(np.int64).max
 
 
 class States(NamedTuple):
@@ -147,10 +149,13 @@ class Windows:
         left = self._leaving(tracks, anchors)
         places = nodes.place_before(tracks, np.full(len(tracks), stamp_ns))
         old = places < anchors
-        undo = Undo(nodes, tracks, 0 if old.any() else int(places.min()))
+        undo = Undo(nodes, tracks)
         try:
-            starts = self.solver.relinearise(tracks, undo)
+            moved = self.solver.move_far(tracks, undo)
+            starts = moved.starts
             if old.any():
+                linearise_segments(nodes, self._motion, moved.tracks, moved.places)
+                moved = Moved(starts, tracks[:0], tracks[:0])
                 self.solver.eliminate(tracks[old], starts[old])
                 for row in old.nonzero()[0].tolist():
                     nodes.first[tracks[row]] = anchors[row]
@@ -159,7 +164,7 @@ class Windows:
                     starts[row] = anchors[row] = nodes.first[tracks[row]]
                     self._add(int(tracks[row]), int(starts[row]), term, undo)
             live = ~old
-            numbers = self._insert(tracks, stamp_ns, places, live, guesses, starts)
+            numbers = self._insert(tracks, stamp_ns, places, live, guesses, moved)
             self._measure(numbers, measurements, groups, guesses, live, undo)
             self.solver.eliminate(tracks, starts)
         except np.linalg.LinAlgError:
@@ -205,27 +210,29 @@ class Windows:
         return Leaving(tracks, nodes.stamps_ns[tracks, places], States(means, covariances))
 
     def _insert(
-        self,
-        tracks: IntArray,
-        stamp_ns: int,
-        places: IntArray,
-        live: BoolArray,
-        guesses: FloatArray,
-        starts: IntArray,
+        self, tracks: IntArray, stamp_ns: int, places: IntArray, live: BoolArray, guesses: FloatArray, moved: Moved
     ) -> IntArray:
         """Make nodes at `stamp_ns` where there are none, after those at `places`; gives the numbers of the nodes there.
 
-        The windows are eliminated from there on: `starts` becomes smaller.
+        Linearises the motion from and to them, and from the nodes that have `moved`. The windows are eliminated from
+        there on: `moved.starts` becomes smaller.
         """
         nodes = self.nodes
         new = live & (nodes.stamps_ns[tracks, places] != stamp_ns)
         places = places + new
+        of, at = moved.tracks, moved.places
         if new.any():
             all_new = bool(new.all())
-            to, at, origins = (tracks, places, guesses) if all_new else (tracks[new], places[new], guesses[new])
-            nodes.insert(to, at, stamp_ns, origins)
-            linearise_segments(nodes, self._motion, np.concatenate([to, to]), np.concatenate([at - 1, at]))
-        np.minimum(starts, places, out=starts, where=live)
+            to, inner, origins = (tracks, places, guesses) if all_new else (tracks[new], places[new], guesses[new])
+            nodes.insert(to, inner, stamp_ns, origins)
+            if of.size:
+                inserted = np.full(len(nodes.first), _NEVER)
+                inserted[to] = inner
+                at = at + (at >= inserted[of])
+            of, at = np.concatenate([of, to, to]), np.concatenate([at, inner - 1, inner])
+        if of.size:
+            linearise_segments(nodes, self._motion, of, at)
+        np.minimum(moved.starts, places, out=moved.starts, where=live)
         return nodes.at(tracks, places)
 
     def _measure(
