@@ -1,10 +1,65 @@
 """What of an input is read: topics of a recording that hold the ego, detections and truth, parts of a data set."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from types import MappingProxyType
+from typing import Literal
+
+from pydantic import NonNegativeFloat
 
 from fgtrack.core.types import Frame
+
+Path = str | Sequence[str]
+"""Names of fields with dots between; several paths are the components of a vector, whose length is meant."""
+
+
+@dataclass(frozen=True)
+class Field:
+    """A number of a message, and how it is converted: `scale` times the number, plus `offset`."""
+
+    path: str | Sequence[str]
+    """Where it is; as a `fields` entry without a conversion."""
+    scale: float = 1.0
+    """Factor; -1 turns the sign."""
+    offset: float = 0.0
+    """Added to the scaled number, in its unit: a compass heading in degrees is a yaw by `scale: -1, offset: 90`."""
+    degrees: bool = False
+    """Whether the result is in degrees and has to be radians."""
+
+    def value(self, raw: float) -> float:
+        """The converted number."""
+        value = self.scale * raw + self.offset
+        return math.radians(value) if self.degrees else value
+
+
+FieldPath = str | Sequence[str] | Field
+
+
+@dataclass(frozen=True)
+class Filter:
+    """Which values pass; all that is given must hold."""
+
+    min: float | None = None
+    """Smallest value that passes."""
+    max: float | None = None
+    """Largest value that passes."""
+    one_of: tuple[bool | int | float | str, ...] | None = None
+    """Values that pass, no others."""
+    none_of: tuple[bool | int | float | str, ...] = ()
+    """Values that do not."""
+
+    def passes(self, value: object) -> bool:
+        """Whether `value` passes; what is not there or not a number does not pass a bound."""
+        if (self.one_of is not None and value not in self.one_of) or value in self.none_of:
+            return False
+        if self.min is None and self.max is None:
+            return True
+        if not isinstance(value, Real):
+            return False
+        low, high = -math.inf if self.min is None else self.min, math.inf if self.max is None else self.max
+        return low <= float(value) <= high
 
 
 @dataclass(frozen=True)
@@ -17,13 +72,25 @@ class TopicInput:
     """Message type, where the topic has several or must have this one."""
     frame: Frame | None = None
     """Frame of the positions; by default `map` where the header names a fixed frame, else `ego`."""
-    fields: Mapping[str, str | Sequence[str]] | None = None
+    fields: Mapping[str, FieldPath] | None = None
     """Paths of the fields, for a type that fgtrack does not know.
 
-    `objects` is the list in the message, `stamp` its time (default `header.stamp`), `object_stamp`,
-    `object_id` and the measured components are paths in one object; several paths for one component are a
-    vector, whose length is meant: `speed_mps: [velocity.x, velocity.y]`. A quaternion gives its yaw.
+    `objects` is the list in the message, `stamp` its time (default `header.stamp`), `object_stamp`, `object_id`, the
+    measured components and what describes an object (`score`, `class_name`, sizes) are paths in one object; several
+    paths for one component are a vector, whose length is meant: `speed_mps: [velocity.x, velocity.y]`. A quaternion
+    gives its yaw. A mapping converts: `{path: angle, scale: -1, offset: 0, degrees: true}`.
     """
+    filters: Mapping[str, Filter] = field(default_factory=lambda: MappingProxyType({}))
+    """Which objects are taken: by what a detection has (`score`, `class_name`, `speed_mps` ...), or with `fields` by
+    the path of any field in one object: `{rcs_dbsm: {min: -5}, status: {one_of: [1, 3]}}`."""
+    scan_s: NonNegativeFloat | None = None
+    """For one detection per message: those whose stamps are at most this apart are one scan (0: the same stamp). Null:
+    every message is a list of its own."""
+    stamp_from: Literal["message", "receipt"] = "message"
+    """`receipt`: the stamp is the receipt, where the driver sets none or one of another clock; the delay is then
+    unknown and taken as 0."""
+    object_id: int | str | None = None
+    """Of truth with one object per topic: its id. By default its place in the list of topics."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +117,8 @@ class InputConfig:
     ego: TopicInput | None = None
     detections: Mapping[str, TopicInput] = field(default_factory=lambda: MappingProxyType({}))
     """Topic of every sensor."""
-    truth: TopicInput | None = None
+    truth: TopicInput | tuple[TopicInput, ...] | None = None
+    """Topic of the true objects, or a list of topics with an object each."""
     message_definitions: tuple[str, ...] = ()
     """`.msg` files, or folders of them, of types that neither the recording nor fgtrack defines."""
     kitti: KittiInput = field(default_factory=KittiInput)

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from types import SimpleNamespace as Message
 
 import numpy as np
@@ -9,6 +10,8 @@ from fgtrack.io.adapters import ADAPTERS
 from fgtrack.io.adapters.common import yaw_rad
 from fgtrack.io.adapters.ego import ego_from_odometry
 from fgtrack.io.adapters.fields import FieldError, ego_by_fields, objects_by_fields
+from fgtrack.io.adapters.ids import object_id
+from fgtrack.io.config import Field, Filter
 
 
 def xyz(x=0.0, y=0.0, z=0.0):
@@ -56,7 +59,10 @@ def autoware(availability=2, has_twist=True, has_covariance=True, velocity=(-3.0
         has_twist=has_twist,
         has_twist_covariance=has_covariance,
     )
-    return Message(header=header(), objects=[Message(kinematics=kinematics)])
+    shape = Message(dimensions=xyz(4.5, 1.9, 1.6))
+    labels = [Message(label=2, probability=0.2), Message(label=1, probability=0.7)]
+    item = Message(kinematics=kinematics, shape=shape, existence_probability=0.9, classification=labels)
+    return Message(header=header(), objects=[item])
 
 
 @pytest.mark.parametrize("package", ["autoware_perception_msgs", "autoware_auto_perception_msgs"])
@@ -67,6 +73,54 @@ def test_autoware_gives_pose_and_a_speed_with_the_sign_of_the_forward_axis(packa
     assert (item.x_m, item.y_m, item.speed_mps) == (1.0, 2.0, -3.0)
     assert item.yaw_rad == pytest.approx(0.5)
     assert item.covariance[10:] == (3.0, 0.0, 0.0, 0.0, 0.0, 0.25)
+    assert (item.length_m, item.width_m, item.height_m, item.z_m) == (4.5, 1.9, 1.6, 0.0)
+    assert (item.score, item.class_name) == (0.9, "car")
+
+
+@pytest.mark.parametrize("package", ["autoware_perception_msgs", "autoware_auto_perception_msgs"])
+def test_tracked_objects_are_read_as_detected_ones_with_their_id(package):
+    message = autoware()
+    tracked = message.objects[0]
+    for name in ("has_position_covariance", "has_twist", "has_twist_covariance"):
+        delattr(tracked.kinematics, name)
+    tracked.object_id = Message(uuid=[5] + [0] * 15)
+    (found,) = read(f"{package}/msg/TrackedObjects", message).objects
+    (expected,) = read(f"{package}/msg/DetectedObjects", autoware()).objects
+    assert found == replace(expected, object_id=5)
+
+
+def test_a_continental_radar_gives_what_it_measures_and_no_invalid_point():
+    point = Message(id=3, longitude_dist=3.0, lateral_dist=4.0, longitude_vel=-10.0, lateral_vel=0.0, invalid_state=0)
+    invalid = Message(**vars(point) | {"invalid_state": 1})
+    found = read("conti_radar/msg/Measurement", Message(header=header(), points=[point, invalid]))
+    assert (found.frame, len(found.objects)) == ("sensor", 1)
+    (item,) = found.objects
+    assert (item.x_m, item.y_m, item.range_m, item.object_id) == (3.0, 4.0, 5.0, 3)
+    assert item.bearing_rad == pytest.approx(math.atan2(4.0, 3.0))
+    assert item.range_rate_mps == pytest.approx(-6.0)
+
+
+def test_a_delphi_esr_counts_degrees_clockwise():
+    track = Message(header=header(), status=3, range=50.0, angle=90.0, range_rate=-2.0, id=7, width=0.0)
+    (found,) = read("delphi_esr_msgs/msg/EsrTrack", track).objects
+    bearing_rad = pytest.approx(-0.5 * math.pi)
+    assert found == Detection(range_m=50.0, bearing_rad=bearing_rad, range_rate_mps=-2.0, object_id=7)
+    track.status = 0
+    assert read("delphi_esr_msgs/msg/EsrTrack", track).objects == ()
+
+
+@pytest.mark.parametrize("camel", [False, True])
+def test_a_delphi_mrr_counts_radians_clockwise(camel):
+    names = ("detection_id", "valid_level", "host_veh_clutter", "range_rate")
+    if camel:
+        names = ("detectionId", "validLevel", "hostVehClutter", "rangeRate")
+    values = dict(zip(names, (9, True, False, 1.5), strict=True))
+    message = Message(header=header(), azimuth=0.5, range=20.0, **values)
+    found = read("delphi_mrr_msgs/msg/Detection", message)
+    expected = Detection(range_m=20.0, bearing_rad=-0.5, range_rate_mps=1.5, object_id=9)
+    assert (found.frame, found.objects) == ("sensor", (expected,))
+    setattr(message, names[2], True)
+    assert read("delphi_mrr_msgs/msg/MrrDetection", message).objects == ()
 
 
 @pytest.mark.parametrize("availability", [0, 1])
@@ -100,7 +154,7 @@ def vision(size=1.0, results=True, **identity):
 
 @pytest.mark.parametrize(
     ("identity", "object_id"),
-    [({"id": "12"}, 12), ({"id": ""}, None), ({"id": "car"}, None), ({"tracking_id": "4"}, 4), ({}, None)],
+    [({"id": "12"}, 12), ({"id": ""}, None), ({"id": "car"}, object_id("car")), ({"tracking_id": "4"}, 4), ({}, None)],
 )
 def test_vision_detections_of_every_version_give_pose_covariance_and_id(identity, object_id):
     found = read("vision_msgs/msg/Detection3DArray", vision(**identity))
@@ -139,10 +193,12 @@ def test_a_radar_track_has_a_speed_without_sign_and_no_yaw():
         position=xyz(1.0, 2.0),
         velocity=xyz(-3.0, 4.0),
         position_covariance=[1.0, 0.1, 0.0, 2.0, 0.0, 0.0],
+        size=xyz(4.0, 2.0, 1.5),
         velocity_covariance=[1.0, 0.0, 0.0, 1.0, 0.0, 0.0],
     )
     (found,) = read("radar_msgs/msg/RadarTracks", Message(header=header(), tracks=[item])).objects
     assert (found.speed_mps, found.yaw_rad, found.object_id) == (5.0, None, 3)
+    assert (found.length_m, found.width_m, found.height_m) == (4.0, 2.0, 1.5)
     assert found.covariance == pytest.approx((1.0, 0.1, 0.0, 0.1, 2.0, 0.0, 0.0, 0.0, 1.0))
 
 
@@ -253,3 +309,72 @@ def test_a_part_that_is_not_known_is_zero_and_nothing_at_all_is_none(unknown):
     )
     assert pose_alone[0, 0] == 1.0
     assert not pose_alone[3:].any()
+
+
+def test_a_field_is_scaled_shifted_and_turned_into_radians():
+    """A compass heading of 350 degrees is a yaw of -260, or 100; a sign is a scale."""
+    message = Message(angle=350.0, side=2.0, kmh=36.0, bare=7)
+    fields = {
+        "x_m": "bare",
+        "y_m": Field("side", scale=-1.0, offset=0.5),
+        "yaw_rad": Field("angle", scale=-1.0, offset=90.0, degrees=True),
+        "speed_mps": Field("kmh", scale=1 / 3.6),
+    }
+    (found,) = objects_by_fields(message, fields).objects
+    assert (found.x_m, found.y_m, found.speed_mps) == (7.0, -1.5, pytest.approx(10.0))
+    assert found.yaw_rad == pytest.approx(math.radians(100.0))
+    ego = ego_by_fields(message, fields | {"yaw_rate_radps": Field("angle", degrees=True)}, 5)
+    assert (ego.yaw_rad, ego.yaw_rate_radps) == pytest.approx((math.radians(100.0), math.radians(350.0)))
+
+
+def test_what_describes_an_object_is_read_by_paths_and_places_in_lists():
+    item = Message(results=[Message(name="bus", p=0.7)], dims=[12.0, 2.5], tag="bus-12")
+    fields = {
+        "class_name": "results.0.name",
+        "score": "results.0.p",
+        "length_m": "dims.0",
+        "width_m": "dims.1",
+        "object_id": "tag",
+    }
+    (found,) = objects_by_fields(item, fields).objects
+    assert found == Detection(class_name="bus", score=0.7, length_m=12.0, width_m=2.5, object_id=object_id("bus-12"))
+    with pytest.raises(FieldError, match=r"results\.1\.name: leads nowhere, there is no '1'"):
+        objects_by_fields(item, {"class_name": "results.1.name"})
+
+
+def test_a_wrong_path_names_what_there_is():
+    item = Detection(x_m=1.0)
+    with pytest.raises(FieldError, match=r"x: leads nowhere, there is no 'x', but x_m, y_m, yaw_rad, .*\.\.\."):
+        objects_by_fields(item, {"x_m": "x"})
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [(7, 7), ("7", 7), (" -7 ", -7), ("", None), ("9223372036854775807", (1 << 63) - 1)],
+)
+def test_an_id_that_is_an_integer_stays_it(given, expected):
+    assert object_id(given) == expected
+
+
+def test_any_other_id_is_a_number_that_is_always_the_same():
+    names = ["car", "car ", "Car", "7a", "9223372036854775808", "１", "fd8420396768425eabec9bdddf7e64b6"]
+    numbers = [object_id(name) for name in names]
+    assert numbers[0] == numbers[1] == 276_895_352_868_199
+    assert len({*numbers}) == len(names) - 1
+    assert all(0 < number < 1 << 48 for number in numbers)
+
+
+@pytest.mark.parametrize(
+    ("given", "passing"),
+    [
+        (Filter(min=2.0), [2, 2.5]),
+        (Filter(max=2.0), [-1.0, 2]),
+        (Filter(min=0.0, max=2.0), [2]),
+        (Filter(one_of=(2, "car")), [2, "car"]),
+        (Filter(none_of=(2, "car")), [-1.0, 2.5, None, math.nan]),
+        (Filter(), [-1.0, 2, 2.5, "car", None, math.nan]),
+    ],
+)
+def test_a_filter_lets_pass_what_it_says(given, passing):
+    values = [-1.0, 2, 2.5, "car", None, math.nan]
+    assert [value for value in values if given.passes(value)] == passing

@@ -1,45 +1,55 @@
 """Messages of any type, read by the paths that the configuration gives to their fields."""
 
 import math
-from collections.abc import Mapping, Sequence
-from functools import reduce
+from collections.abc import Mapping
 from typing import Any
 
+from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import MEASURABLE, STATE_NAMES, Detection, EgoState
+from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES, Detection, EgoState
 from fgtrack.io.adapters.common import ObjectList, RosMessage, frame_of, stamp_ns, yaw_rad
+from fgtrack.io.adapters.ids import object_id
+from fgtrack.io.config import Field, FieldPath, Path
 
-Path = str | Sequence[str]
-"""Attribute names with dots between; several paths are the components of a vector, whose length is meant."""
-
-OBJECT_FIELDS = frozenset({"objects", "stamp", "object_stamp", "object_id", *MEASURABLE})
+OBJECT_FIELDS = frozenset({"objects", "stamp", "object_stamp", "object_id", *MEASURABLE, *DESCRIBING})
 """What the `fields` of an object list may name: `objects` is the path of the list, `stamp` that of the
 message's time (default `header.stamp`); the others are paths in one object."""
 EGO_FIELDS = frozenset({"stamp", "in_pit", *STATE_NAMES})
 """What the `fields` of the ego may name."""
+
+ANGLES = frozenset({"yaw_rad", "bearing_rad"})
+"""What is wrapped to (-pi, pi] once it is converted."""
+
+_MOST_NAMES = 12  # of fields that a message about a wrong path lists
 
 
 class FieldError(Exception):
     """A path does not lead to what is needed; the reader of the recording adds where."""
 
 
-def objects_by_fields(message: RosMessage, fields: Mapping[str, Path]) -> ObjectList:
+def objects_by_fields(message: RosMessage, fields: Mapping[str, FieldPath]) -> ObjectList:
     """Object list of `message`; without `objects` in `fields` the message itself is the one object."""
-    path = fields.get("objects")
-    items = [message] if path is None else _follow(message, path)
-    try:
-        objects = tuple(_object(item, fields) for item in items)
-    except TypeError as error:
-        raise FieldError(f"{path}: is not a list") from error
+    objects = tuple(_object(item, fields) for item in items_by_fields(message, fields))
     header = getattr(message, "header", None)
     return ObjectList(_message_stamp(message, fields), None if header is None else frame_of(header), objects)
 
 
-def ego_by_fields(message: RosMessage, fields: Mapping[str, Path], receipt_ns: int) -> EgoState:
+def items_by_fields(message: RosMessage, fields: Mapping[str, FieldPath]) -> list[RosMessage]:
+    """The objects of `message` as they are in it, in the order of `objects_by_fields`."""
+    path = fields.get("objects")
+    if path is None:
+        return [message]
+    try:
+        return list(value_at(message, _single(path)))
+    except TypeError as error:
+        raise FieldError(f"{path}: is not a list") from error
+
+
+def ego_by_fields(message: RosMessage, fields: Mapping[str, FieldPath], receipt_ns: int) -> EgoState:
     """The ego's state; `x_m`, `y_m`, `yaw_rad` and `speed_mps` must be among `fields`."""
     stamp = _message_stamp(message, fields)
-    values = {name: _number(message, path) for name, path in fields.items() if name in STATE_NAMES}
-    in_pit = _follow(message, fields["in_pit"]) if "in_pit" in fields else None
+    values = {name: _number(message, path, name) for name, path in fields.items() if name in STATE_NAMES}
+    in_pit = value_at(message, _single(fields["in_pit"])) if "in_pit" in fields else None
     return EgoState(
         receipt_ns if stamp is None else stamp,
         receipt_ns,
@@ -49,34 +59,62 @@ def ego_by_fields(message: RosMessage, fields: Mapping[str, Path], receipt_ns: i
     )
 
 
-def _object(item: RosMessage, fields: Mapping[str, Path]) -> Detection:
-    measured: dict[str, Any] = {name: _number(item, fields[name]) for name in MEASURABLE if name in fields}
+def value_at(message: RosMessage, path: str) -> RosMessage:
+    """What `path` leads to: attributes, or places in a list, with dots between. Raises `FieldError`."""
+    value = message
+    for part in path.split("."):
+        try:
+            value = value[int(part)] if part.isdigit() else getattr(value, part)
+        except (AttributeError, LookupError, TypeError) as error:
+            raise FieldError(f"{path}: leads nowhere, there is no {part!r}{_known(value)}") from error
+    return value
+
+
+def _known(value: RosMessage) -> str:
+    names = [name for name in getattr(value, "__dataclass_fields__", ()) if not name.startswith("_")]
+    shown = ", ".join(names[:_MOST_NAMES]) + (", ..." if len(names) > _MOST_NAMES else "")
+    return f", but {shown}" if names else ""
+
+
+def _object(item: RosMessage, fields: Mapping[str, FieldPath]) -> Detection:
+    values: dict[str, Any] = {
+        name: _number(item, fields[name], name)
+        for name in (*MEASURABLE, *DESCRIBING)
+        if name in fields and name != "class_name"
+    }
     return Detection(
-        **measured,
-        covariance=None,
-        stamp_ns=_time(item, fields["object_stamp"]) if "object_stamp" in fields else None,
-        object_id=int(_follow(item, fields["object_id"])) if "object_id" in fields else None,
+        **values,
+        class_name=str(value_at(item, _single(fields["class_name"]))) if "class_name" in fields else None,
+        stamp_ns=_time(item, _single(fields["object_stamp"])) if "object_stamp" in fields else None,
+        object_id=object_id(value_at(item, _single(fields["object_id"]))) if "object_id" in fields else None,
     )
 
 
-def _message_stamp(message: RosMessage, fields: Mapping[str, Path]) -> int | None:
+def _message_stamp(message: RosMessage, fields: Mapping[str, FieldPath]) -> int | None:
     if "stamp" in fields:
-        return _time(message, fields["stamp"])
+        return _time(message, _single(fields["stamp"]))
     header = getattr(message, "header", None)
     return None if header is None else stamp_ns(header.stamp)
 
 
-def _follow(message: RosMessage, path: Path) -> RosMessage:
-    try:
-        return reduce(getattr, str(path).split("."), message)
-    except AttributeError as error:
-        raise FieldError(f"{path}: leads nowhere ({error})") from error
-
-
-def _number(message: RosMessage, path: Path) -> float:
+def _single(path: FieldPath) -> str:
+    path = path.path if isinstance(path, Field) else path
     if not isinstance(path, str):
-        return math.hypot(*[_number(message, part) for part in path])
-    value = _follow(message, path)
+        raise FieldError(f"{path}: one path is needed, not several")
+    return path
+
+
+def _number(message: RosMessage, path: FieldPath, name: str) -> float:
+    if not isinstance(path, Field):
+        return _raw(message, path)
+    value = path.value(_raw(message, path.path))
+    return wrap_angle(value) if name in ANGLES and math.isfinite(value) else value
+
+
+def _raw(message: RosMessage, path: Path) -> float:
+    if not isinstance(path, str):
+        return math.hypot(*[_raw(message, part) for part in path])
+    value = value_at(message, path)
     if hasattr(value, "w"):  # a quaternion; what names it wants the yaw
         yaw = yaw_rad(value)
         return math.nan if yaw is None else yaw
@@ -86,9 +124,9 @@ def _number(message: RosMessage, path: Path) -> float:
         raise FieldError(f"{path}: is not a number") from error
 
 
-def _time(message: RosMessage, path: Path) -> int:
+def _time(message: RosMessage, path: str) -> int:
     """A ROS time, integer nanoseconds or float seconds."""
-    value = _follow(message, path)
+    value = value_at(message, path)
     if hasattr(value, "nanosec"):
         return stamp_ns(value)
     return round(value * NS_PER_S) if isinstance(value, float) else int(value)

@@ -4,6 +4,9 @@ Which of it a tracker uses is the sensor model's choice. A speed is negative whe
 No object is left out: what is not a number stays so and is counted by the tracker.
 """
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 
 from fgtrack.core.types import Detection
@@ -19,8 +22,10 @@ from fgtrack.io.adapters.common import (
     speed_variance,
     yaw_rad,
 )
+from fgtrack.io.adapters.ids import object_id
 
 _ORIENTATION_AVAILABLE = 2  # in autoware's DetectedObjectKinematics
+_AUTOWARE_CLASSES = ("unknown", "car", "truck", "bus", "trailer", "motorcycle", "bicycle", "pedestrian")
 _ID_MASK = (1 << 63) - 1
 
 
@@ -38,14 +43,34 @@ def _detection3d(item: RosMessage) -> Detection:
     hypothesis = item.results[0].pose if len(item.results) else None
     if hypothesis is not None and size.x == size.y == size.z == 0.0:
         pose = hypothesis.pose
-    text = str(getattr(item, "id", "") or getattr(item, "tracking_id", ""))
+    identity = getattr(item, "id", "") or getattr(item, "tracking_id", "")
     values = {"x_m": pose.position.x, "y_m": pose.position.y, "yaw_rad": yaw_rad(pose.orientation)}
     return Detection(
         **values,
         covariance=None if hypothesis is None else covariance(measured(values), planar(hypothesis.covariance)),
         stamp_ns=object_stamp_ns(item.header),
-        object_id=int(text) if text.isascii() and text.isdigit() and int(text) <= _ID_MASK else None,
+        object_id=object_id(identity),
+        **_vision_description(item, pose),
     )
+
+
+def _vision_description(item: RosMessage, pose: RosMessage) -> dict[str, Any]:
+    """Size, height, and class and score of the first hypothesis, whose place differs between the versions."""
+    first = item.results[0] if len(item.results) else None
+    hypothesis = getattr(first, "hypothesis", first)
+    name = getattr(hypothesis, "class_id", getattr(hypothesis, "id", None))
+    return {
+        **_size(item.bbox.size, pose),
+        "score": getattr(hypothesis, "score", None),
+        "class_name": None if name in (None, "") else str(name),
+    }
+
+
+def _size(size: RosMessage, pose: RosMessage) -> dict[str, float | None]:
+    """Length, width and height, where there is a length, and the height of the middle."""
+    if not size.x > 0.0:
+        return {}
+    return {"z_m": pose.position.z, "length_m": size.x, "width_m": size.y, "height_m": size.z}
 
 
 def detected_objects(message: RosMessage) -> ObjectList:
@@ -54,10 +79,29 @@ def detected_objects(message: RosMessage) -> ObjectList:
     Position, yaw where the orientation is available without a doubt about its sign, speed where there is a
     twist, which is in the object's own frame.
     """
-    return object_list(message.header, [_detected_object(item.kinematics) for item in message.objects])
+    return object_list(message.header, [_detected_object(item) for item in message.objects])
 
 
-def _detected_object(kinematics: RosMessage) -> Detection:
+def tracked_objects(message: RosMessage) -> ObjectList:
+    """`TrackedObjects` of the same packages, as `DetectedObjects`; twist and covariances are always there."""
+    return object_list(message.header, [_tracked_object(item) for item in message.objects])
+
+
+def _tracked_object(item: RosMessage) -> Detection:
+    kinematics = item.kinematics
+    found = _autoware_object(item, kinematics, has_twist=True, has_pose_covariance=True, has_twist_covariance=True)
+    return replace(found, object_id=_uuid(item.object_id))
+
+
+def _detected_object(item: RosMessage) -> Detection:
+    kinematics = item.kinematics
+    has_covariances = kinematics.has_position_covariance, kinematics.has_twist_covariance
+    return _autoware_object(item, kinematics, kinematics.has_twist, *has_covariances)
+
+
+def _autoware_object(
+    item: RosMessage, kinematics: RosMessage, has_twist: bool, has_pose_covariance: bool, has_twist_covariance: bool
+) -> Detection:
     pose = kinematics.pose_with_covariance.pose
     twist = kinematics.twist_with_covariance
     velocity = twist.twist.linear
@@ -66,12 +110,10 @@ def _detected_object(kinematics: RosMessage) -> Detection:
         "x_m": pose.position.x,
         "y_m": pose.position.y,
         "yaw_rad": yaw_rad(pose.orientation) if available else None,
-        "speed_mps": signed_speed_mps(velocity.x, velocity.y, 0.0 if available else None)
-        if kinematics.has_twist
-        else None,
+        "speed_mps": signed_speed_mps(velocity.x, velocity.y, 0.0 if available else None) if has_twist else None,
     }
     variance = None
-    if kinematics.has_twist_covariance:
+    if has_twist_covariance:
         planar_twist = np.asarray(twist.covariance, dtype=float).reshape(6, 6)[:2, :2]
         variance = speed_variance(velocity.x, velocity.y, planar_twist)
     pose_covariance = kinematics.pose_with_covariance.covariance
@@ -79,10 +121,22 @@ def _detected_object(kinematics: RosMessage) -> Detection:
         **values,
         covariance=covariance(
             measured(values),
-            planar(pose_covariance) if kinematics.has_position_covariance else None,
+            planar(pose_covariance) if has_pose_covariance else None,
             variance,
         ),
+        **_autoware_description(item, pose),
     )
+
+
+def _autoware_description(item: RosMessage, pose: RosMessage) -> dict[str, Any]:
+    """Size of a box or a cylinder, existence probability and the most likely class."""
+    likely = max(item.classification, key=lambda each: each.probability, default=None)
+    label = 0 if likely is None else likely.label
+    return {
+        **_size(item.shape.dimensions, pose),
+        "score": float(item.existence_probability),
+        "class_name": _AUTOWARE_CLASSES[label] if 0 < label < len(_AUTOWARE_CLASSES) else None,
+    }
 
 
 def object_array(message: RosMessage) -> ObjectList:
@@ -117,8 +171,16 @@ def _radar_track(item: RosMessage) -> Detection:
         "speed_mps": signed_speed_mps(velocity.x, velocity.y, None),
     }
     variance = speed_variance(velocity.x, velocity.y, _planar_triangle(item.velocity_covariance))
-    uuid = int.from_bytes(bytes(item.uuid.uuid), "little") & _ID_MASK
-    return Detection(**values, covariance=covariance(measured(values), pose, variance), object_id=uuid or None)
+    own = covariance(measured(values), pose, variance)
+    return Detection(**values, covariance=own, object_id=_uuid(item.uuid), **_radar_size(item.size))
+
+
+def _radar_size(size: RosMessage) -> dict[str, Any]:
+    return {"length_m": size.x, "width_m": size.y, "height_m": size.z} if size.x > 0.0 else {}
+
+
+def _uuid(identity: RosMessage) -> int | None:
+    return int.from_bytes(bytes(identity.uuid), "little") & _ID_MASK or None
 
 
 def _planar_triangle(triangle: RosMessage) -> np.ndarray:

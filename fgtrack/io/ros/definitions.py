@@ -25,13 +25,48 @@ ObjectClassification[] classification
 DetectedObjectKinematics kinematics
 Shape shape
 """
+_AUTOWARE_TRACKED_KINEMATICS = """\
+uint8 UNAVAILABLE=0
+uint8 SIGN_UNKNOWN=1
+uint8 AVAILABLE=2
+geometry_msgs/PoseWithCovariance pose_with_covariance
+uint8 orientation_availability
+geometry_msgs/TwistWithCovariance twist_with_covariance
+geometry_msgs/AccelWithCovariance acceleration_with_covariance
+bool is_stationary
+"""
+_AUTOWARE_TRACKED_OBJECT = """\
+unique_identifier_msgs/UUID object_id
+float32 existence_probability
+ObjectClassification[] classification
+TrackedObjectKinematics kinematics
+Shape shape
+"""
 _AUTOWARE = {
     "ObjectClassification": _AUTOWARE_CLASSIFICATION,
     "Shape": _AUTOWARE_SHAPE,
     "DetectedObjectKinematics": _AUTOWARE_KINEMATICS,
     "DetectedObject": _AUTOWARE_OBJECT,
     "DetectedObjects": "std_msgs/Header header\nDetectedObject[] objects\n",
+    "TrackedObjectKinematics": _AUTOWARE_TRACKED_KINEMATICS,
+    "TrackedObject": _AUTOWARE_TRACKED_OBJECT,
+    "TrackedObjects": "std_msgs/Header header\nTrackedObject[] objects\n",
 }
+
+_DELPHI_MRR_DETECTION = """\
+std_msgs/Header header
+uint8 detection_id
+uint8 confid_azimuth
+bool super_res_target
+bool nd_target
+bool host_veh_clutter
+bool valid_level
+float32 azimuth
+float32 range
+float32 range_rate
+int8 amplitude
+uint8 index_2lsb
+"""
 
 _COMPONENTS = "\n".join(f"float64 {name}" for name in MEASURABLE)
 FGTRACK_DEFINITIONS = {
@@ -116,6 +151,46 @@ float32[6] acceleration_covariance
 float32[6] size_covariance
 """,
     "radar_msgs/msg/RadarTracks": "std_msgs/Header header\nRadarTrack[] tracks\n",
+    "conti_radar/msg/ContiRadar": """\
+std_msgs/Header header
+uint16 id
+float32 longitude_dist
+float32 lateral_dist
+float32 longitude_vel
+float32 lateral_vel
+float32 longitude_vel_comp
+float32 lateral_vel_comp
+uint16 dynProp
+float32 rcs
+uint32 is_quality_valid
+uint32 ambig_state
+uint32 x_rms
+uint32 y_rms
+uint32 vx_rms
+uint32 vy_rms
+uint32 invalid_state
+uint32 ProbExists
+""",
+    "conti_radar/msg/Measurement": "std_msgs/Header header\nContiRadar[] points\n",
+    "delphi_esr_msgs/msg/EsrTrack": """\
+std_msgs/Header header
+string canmsg
+uint8 id
+float32 lat_rate
+bool grouping_changed
+bool oncoming
+uint8 status
+float32 angle
+float32 range
+bool bridge_object
+bool rolling_count
+float32 width
+float32 range_accel
+uint8 med_range_mode
+float32 range_rate
+""",
+    "delphi_mrr_msgs/msg/Detection": _DELPHI_MRR_DETECTION,
+    "delphi_mrr_msgs/msg/MrrDetection": _DELPHI_MRR_DETECTION,
     "derived_object_msgs/msg/Object": """\
 std_msgs/Header header
 uint32 id

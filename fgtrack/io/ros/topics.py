@@ -1,11 +1,13 @@
 """Converts the topics of a recording to fgtrack's messages, as configured."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.types import DetectionList, Message, TruthState
+from fgtrack.core.time import nanoseconds
+from fgtrack.core.types import DESCRIBING, MEASURABLE, DetectionList, Message, TruthState
 from fgtrack.io.adapters import ADAPTERS, message_types
 from fgtrack.io.adapters.common import ObjectList, RosMessage
 from fgtrack.io.adapters.ego import ODOMETRY, ego_from_odometry
@@ -14,13 +16,20 @@ from fgtrack.io.adapters.fields import (
     OBJECT_FIELDS,
     FieldError,
     ego_by_fields,
+    items_by_fields,
     objects_by_fields,
+    value_at,
 )
+from fgtrack.io.adapters.ids import object_id
 from fgtrack.io.adapters.native import NATIVE_ADAPTERS
+from fgtrack.io.adapters.scans import grouped
 from fgtrack.io.config import InputConfig, TopicInput
 from fgtrack.io.errors import TruncatedInput
 from fgtrack.io.ros.bag import Bag, BagTopic, is_bag, type_name
 from fgtrack.io.source import FileFormat
+
+DETECTION_FIELDS = frozenset({*MEASURABLE, *DESCRIBING, "object_id"})
+"""What a filter may go by, whatever the type of the message."""
 
 Convert = Callable[[RosMessage, int], Iterator[Message]]
 
@@ -50,7 +59,8 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
         The configuration of a topic does not fit its type.
     """
     names = {topic.name for topic in bag.topics}
-    named = [item.topic for item in (config.ego, *config.detections.values(), config.truth) if item]
+    truth = config.truth if isinstance(config.truth, tuple) else (config.truth,) if config.truth else ()
+    named = [item.topic for item in (config.ego, *config.detections.values(), *truth) if item]
     native = tuple(
         TopicUse(topic, "messages", _native(topic.type)) for topic in bag.topics if topic.type in NATIVE_ADAPTERS
     )
@@ -66,20 +76,21 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
     uses = []
     if config.ego:
         topic = _find(bag, config.ego)
-        uses.append(TopicUse(topic, "ego", _ego(topic, config.ego)))
+        uses.append(TopicUse(topic, "ego", _stamped(_ego(topic, config.ego), config.ego)))
     for sensor, item in config.detections.items():
         topic = _find(bag, item)
-        uses.append(TopicUse(topic, f"detections {sensor}", _detections(topic, item, sensor)))
-    if config.truth:
-        topic = _find(bag, config.truth)
-        uses.append(TopicUse(topic, "truth", _objects(topic, config.truth, _truth)))
+        uses.append(TopicUse(topic, f"detections {sensor}", _stamped(_detections(topic, item, sensor), item)))
+    for number, item in enumerate(truth):
+        topic = _find(bag, item)
+        uses.append(TopicUse(topic, "truth", _stamped(_truths(topic, item, number, len(truth)), item)))
     return tuple(uses)
 
 
 def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
     bag = Bag(path, config.message_definitions)
     uses = topic_uses(bag, config)
-    return lambda: bag_messages(bag, uses)
+    windows_ns = {name: nanoseconds(each.scan_s) for name, each in config.detections.items() if each.scan_s is not None}
+    return lambda: grouped(bag_messages(bag, uses), windows_ns) if windows_ns else bag_messages(bag, uses)
 
 
 FORMAT = FileFormat("a rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file", is_bag, _open)
@@ -130,6 +141,13 @@ def _listed(topics: tuple[BagTopic, ...] | list[BagTopic]) -> str:
     return ", ".join(f"{topic.name} ({topic.type})" for topic in topics) or "no topic"
 
 
+def _check_filters(item: TopicInput) -> None:
+    for name in item.filters if item.fields is None else ():
+        if name not in DETECTION_FIELDS:
+            known = ", ".join(sorted(DETECTION_FIELDS))
+            raise CallError(f"topic {item.topic}: without fields, filters go by {known}, not by {name!r}")
+
+
 def _check_fields(item: TopicInput, known: frozenset[str], needed: tuple[str, ...] = ()) -> None:
     fields = item.fields or {}
     for name in sorted(set(fields) - known):
@@ -162,6 +180,7 @@ def _objects(
     """Makes `messages` of an object list, its stamp (without one the receipt) and its receipt."""
     if topic.type in NATIVE_ADAPTERS:
         return _native(topic.type)
+    _check_filters(item)
     read = _object_list(topic, item)
 
     def convert(message: RosMessage, receipt_ns: int) -> Iterator[Message]:
@@ -172,15 +191,30 @@ def _objects(
 
 
 def _object_list(topic: BagTopic, item: TopicInput) -> Callable[[RosMessage], ObjectList]:
+    read: Callable[[RosMessage], ObjectList]
     if item.fields is not None:
-        fields = item.fields
         _check_fields(item, OBJECT_FIELDS)
-        return lambda message: objects_by_fields(message, fields)
-    if topic.type not in ADAPTERS:
+        read = partial(objects_by_fields, fields=item.fields)
+    elif topic.type not in ADAPTERS:
         known = ", ".join(message_types())
         raise CallError(f"topic {topic.name}: objects of type {topic.type} need fields, known are {known}")
-    adapter: Callable[[RosMessage], ObjectList] = ADAPTERS.load(topic.type)
-    return adapter
+    else:
+        read = ADAPTERS.load(topic.type)
+    return partial(_passing, read, item) if item.filters else read
+
+
+def _passing(read: Callable[[RosMessage], ObjectList], item: TopicInput, message: RosMessage) -> ObjectList:
+    """The objects of `message` that all filters let pass."""
+    found = read(message)
+    own = found.objects if item.fields is None else items_by_fields(message, item.fields)
+    kept = []
+    for detection, source in zip(found.objects, own, strict=True):
+        values = (
+            getattr(detection, name) if name in DETECTION_FIELDS else value_at(source, name) for name in item.filters
+        )
+        if all(each.passes(value) for each, value in zip(item.filters.values(), values, strict=True)):
+            kept.append(detection)
+    return replace(found, objects=tuple(kept))
 
 
 def _detections(topic: BagTopic, item: TopicInput, sensor: str) -> Convert:
@@ -188,6 +222,34 @@ def _detections(topic: BagTopic, item: TopicInput, sensor: str) -> Convert:
         yield DetectionList(sensor, stamp_ns, receipt_ns, objects.objects, item.frame or objects.frame or "ego")
 
     return _objects(topic, item, messages)
+
+
+def _truths(topic: BagTopic, item: TopicInput, number: int, topics: int) -> Convert:
+    """Of several topics each has one object, which is known by the place of its topic if it has no other id."""
+    if topics == 1 and item.object_id is None:
+        return _objects(topic, item, _truth)
+    own = object_id(number if item.object_id is None else item.object_id)
+
+    def messages(objects: ObjectList, stamp_ns: int, receipt_ns: int) -> Iterator[Message]:
+        if len(objects.objects) > 1:
+            raise FieldError("truth of one object expected, give no object_id and name one topic of truth alone")
+        named = tuple(replace(state, object_id=own) for state in objects.objects)
+        return _truth(replace(objects, objects=named), stamp_ns, receipt_ns)
+
+    return _objects(topic, item, messages)
+
+
+def _stamped(convert: Convert, item: TopicInput) -> Convert:
+    if item.stamp_from == "message":
+        return convert
+    return lambda message, receipt_ns: map(_at_receipt, convert(message, receipt_ns))
+
+
+def _at_receipt(message: Message) -> Message:
+    if isinstance(message, DetectionList):
+        objects = [replace(item, stamp_ns=None) for item in message.objects]
+        return replace(message, stamp_ns=message.receipt_ns, objects=objects)
+    return replace(message, stamp_ns=message.receipt_ns)
 
 
 def _truth(objects: ObjectList, stamp_ns: int, receipt_ns: int) -> Iterator[Message]:
