@@ -69,6 +69,8 @@ class ObjectBank:
         if not known:
             return no_states(self._motion.dim)
         states = [self._estimators[track_id].state_at(stamp_ns) for track_id in known]
+        if len(states) == 1:
+            return StatesAt(tuple(known), states[0].mean[None], states[0].covariance[None])
         means = np.array([state.mean for state in states])
         return StatesAt(tuple(known), means, np.array([state.covariance for state in states]))
 

@@ -105,7 +105,7 @@ class Tracker:
             self._process_if_possible(batch)
         updates, self._records = tuple(self._records), []
         bank = self._parts.bank
-        tracks = tuple(self._report(*track) for track in zip(bank.track_ids, bank.present(), strict=True))
+        tracks = tuple([self._report(*track) for track in zip(bank.track_ids, bank.present(), strict=True)])
         return TickReport(self._tick, now_ns, tracks, updates, tuple(bank.smoothed()))
 
     def finish(self) -> tuple[SmoothedReport, ...]:

@@ -171,7 +171,7 @@ class FixedLagSmoother:
                 f"a measurement at {stamp_ns} ns is {seconds(start_ns - stamp_ns):g} s older than the window: "
                 "lengthen smoother.lag_s, or set smoother.late to fuse or drop"
             )
-        if stamp_ns < self.window_ns[0]:
+        if stamp_ns < self._reach_ns or stamp_ns < self.window.reach_ns:
             return UpdateStatus.TOO_OLD
         if stamp_ns < start_ns:
             return UpdateStatus.BEYOND_WINDOW
