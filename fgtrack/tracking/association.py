@@ -11,9 +11,10 @@ from scipy.special import gammaincinv
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import StatesAt
 from fgtrack.tracking.assignment import Assignment, assigned, cheapest
-from fgtrack.tracking.gating import NO_PAIRS, Pairs, alike, innovations, near, reaches_m
+from fgtrack.tracking.gating import NO_PAIRS, Pairs, alike, innovations, near, nis_of, reaches_m
 from fgtrack.tracking.preprocess import Candidate
 
+_FEW_PAIRS = 2  # so many are judged faster one by one
 #: Assigns candidates to tracks at least cost; the states are those of the tracks at the candidates' stamp.
 Association = Callable[[Sequence[Candidate], StatesAt], Assignment]
 
@@ -49,7 +50,8 @@ class GatedEuclidean:
         if isinstance(gates_m, np.ndarray):
             limits_m = np.broadcast_to(gates_m, (len(candidates), len(states.means)))
             reach_m = float(gates_m.max(initial=0.0))
-        groups = [] if self.max_nis is None else alike(candidates)
+        few = self.max_nis is None or len(candidates) * len(states.means) <= _FEW_PAIRS
+        groups = [] if few else alike(candidates)
         near_any = set[int]()
 
         def believed(pairs: Pairs) -> Pairs:
@@ -58,7 +60,7 @@ class GatedEuclidean:
             if self.max_nis is None:
                 return pairs
             near_any.update(pairs.rows.tolist())
-            return pairs.at(innovations(pairs, groups, len(candidates), states).nis <= self.max_nis)
+            return pairs.at(nis_of(pairs, groups, candidates, states) <= self.max_nis)
 
         found = _assigned(candidates, states, reach_m, believed)
         refused = tuple([i for i in found.new if i in near_any])

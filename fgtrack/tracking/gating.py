@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from fgtrack.core.linalg import congruence, mahalanobis_squared, symmetrise
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, StatesAt
+from fgtrack.estimation.ekf import innovations as innovations_of
 from fgtrack.estimation.ekf import linearised
 from fgtrack.tracking.pose_error import PoseError
 from fgtrack.tracking.preprocess import Candidate
@@ -194,6 +195,17 @@ def innovations(pairs: Pairs, groups: Sequence[Alike], num_candidates: int, stat
         nis[chosen] = mahalanobis_squared(y, S)
         S_all.append((chosen, S))
     return Innovations(nis, S_all)
+
+
+def nis_of(pairs: Pairs, groups: Sequence[Alike], candidates: Sequence[Candidate], states: StatesAt) -> FloatArray:
+    """The NIS of `innovations`, shape (m,); without `groups` for few pairs."""
+    if groups:
+        return innovations(pairs, groups, len(candidates), states).nis
+    found = np.empty(len(pairs.rows))
+    for place, (row, column) in enumerate(zip(pairs.rows.tolist(), pairs.columns.tolist(), strict=True)):
+        own, x, P = candidates[row].measurement, states.means[column], states.covariances[column]
+        found[place] = innovations_of(x, P, own.z, candidates[row].noise_at(x), own.model, own.pose)[1]
+    return found
 
 
 def _by_group(
