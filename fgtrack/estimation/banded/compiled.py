@@ -1,6 +1,6 @@
 """Elimination and back-substitution compiled by numba: what `elimination` and `substitution` do in NumPy.
 
-Track by track, node by node, by the same formulas; measurements are fused one row after another, all in Joseph's form.
+Track by track, node by node, by the same formulas; measurements are fused one row after another.
 `pip install fgtrack[fast]` installs numba, without which this module cannot be imported. It is compiled when it is
 imported for the first time, in some 10 s, and kept for later processes where numba keeps it (`NUMBA_CACHE_DIR`).
 """
@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.estimation.banded.elimination import LEAST_SHARE
 from fgtrack.estimation.banded.nodes import Nodes
 
 _ORDER = "int64[::1], int64[::1], int64[:, ::1]"  # first, count, numbers
@@ -184,23 +185,29 @@ def _condition(
 def _correct(
     state: FloatArray, row: FloatArray, gain: FloatArray, E: FloatArray, P: FloatArray, product: FloatArray
 ) -> None:
-    """Fuse y = G x + N(0, 1), `row` being [G | y], into `state` [P | x] in Joseph's form."""
+    """Fuse y = G x + N(0, 1), `row` being [G | y], into `state` [P | x]; precise ones in Joseph's form."""
     n = len(gain)
     S, y = 1.0, row[n]
     for i in range(n):
         gain[i] = 0.0
         for j in range(n):
-            P[i, j] = state[i, j]
             gain[i] += state[i, j] * row[j]
         S += row[i] * gain[i]
         y -= row[i] * state[i, n]
+    precise = S > 1.0 / LEAST_SHARE
+    if precise:
+        P[:] = state[:, :n]
     for i in range(n):
         gain[i] /= S
         state[i, n] += gain[i] * y
-        for j in range(n):
-            E[i, j] = (1.0 if i == j else 0.0) - gain[i] * row[j]
-            state[i, j] = gain[i] * gain[j]
-    _congruence(E, P, product, state[:, :n])
+        for j in range(i + 1):
+            state[i, j] -= gain[i] * S * gain[j]
+    if precise:
+        for i in range(n):
+            for j in range(n):
+                E[i, j] = (1.0 if i == j else 0.0) - gain[i] * row[j]
+                state[i, j] = gain[i] * gain[j]
+        _congruence(E, P, product, state[:, :n])
     _mirror(state[:, :n])
 
 

@@ -14,7 +14,7 @@ from fgtrack.estimation.banded.steps import Steps, forwards
 from fgtrack.estimation.ekf import joseph, kalman_gain
 
 #: Where a measurement leaves less than this of a variance, the short form of its update keeps too few digits.
-_LEAST_SHARE = 1e-6
+LEAST_SHARE = 1e-6
 
 
 def eliminate(nodes: Nodes, tracks: IntArray, places: IntArray) -> None:
@@ -43,7 +43,7 @@ def eliminate(nodes: Nodes, tracks: IntArray, places: IntArray) -> None:
         left, filtered = _filtered(steps, nodes.filtered.take(begins, axis=0), F, driven, rows, num_rows)
         moved = F @ left
         predicted = driven + moved @ _beside_one(F).mT
-    if (_variances(filtered) < _LEAST_SHARE * _variances(predicted)).any():
+    if (_variances(filtered) < LEAST_SHARE * _variances(predicted)).any():
         left, predicted, filtered = _filtered_joseph(steps, nodes.filtered.take(begins, axis=0), F, driven, rows)
         moved = F @ left
     if not np.isfinite(filtered).all():
