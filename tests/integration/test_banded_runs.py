@@ -21,7 +21,9 @@ def recording(name: str) -> dict[str, object]:
     return {"recording": shared(f"reference/{name}/stream.jsonl.gz"), **maps}
 
 
-@pytest.mark.parametrize("name", ["default", "short10", "lidar3_10"])
+@pytest.mark.parametrize(
+    "name", ["default", "short10", "lidar3_10", "jitter10", pytest.param("full60", marks=pytest.mark.slow)]
+)
 def test_whole_runs_are_those_of_the_smoother(name: str) -> None:
     given = recording(name)
     expected, found = (

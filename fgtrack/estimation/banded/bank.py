@@ -362,9 +362,9 @@ class BandedBank:
         _, known, states = found
         if len(known) == len(tracks) and (known == tracks).all():
             return states
-        rows = np.empty(len(self._clock_ns), dtype=np.int64)
-        rows[known] = np.arange(len(known))
-        chosen = rows[tracks]
+        chosen = self._ranks[tracks]
+        if len(known) < len(self._tracks):
+            chosen = np.searchsorted(self._ranks[known], chosen)
         return States(states.means[chosen], states.covariances[chosen])
 
     def _reported(

@@ -99,10 +99,16 @@ class Windows:
                 tracks[inner], known[inner], stamps_ns[inner], steps[inner], means[inner], covariances[inner]
             )
         ahead = ((until_ns > 0) & ~between).nonzero()[0]
+        if ahead.size == len(tracks):
+            return self._ahead(means, covariances, until_ns)
         if ahead.size:
-            means[ahead], F, Q = self._motion.steps(means[ahead], until_ns[ahead] / NS_PER_S)
-            covariances[ahead] = propagated(F, covariances[ahead], Q)
+            means[ahead], covariances[ahead] = self._ahead(means[ahead], covariances[ahead], until_ns[ahead])
         return States(means, covariances)
+
+    def _ahead(self, means: FloatArray, covariances: FloatArray, until_ns: IntArray) -> States:
+        """States so long after those of the newest nodes."""
+        means, F, Q = self._motion.steps(means, until_ns / NS_PER_S)
+        return States(means, propagated(F, covariances, Q))
 
     def _between(
         self,
