@@ -25,7 +25,7 @@ from fgtrack.evaluation.figures.residuals import residuals
 from fgtrack.evaluation.figures.seeds import error_bands, has_seeds
 from fgtrack.evaluation.figures.style import save
 from fgtrack.evaluation.figures.sweep import sweep, sweep_metrics
-from fgtrack.evaluation.figures.times import delays, sensor_delays, timing
+from fgtrack.evaluation.figures.times import delays, timing
 from fgtrack.evaluation.matching import track_errors
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged
 from fgtrack.evaluation.sendings import sendings
@@ -54,6 +54,7 @@ __all__ = [
 
 _FEW = 3  # of objects, and of runs where they are many: the worst are drawn
 _MOST_RUNS = 6  # that have figures of their own
+_DETECTION = ("index", "sensor", "stamp_ns", "receipt_ns")  # what is the same of a detection in all runs
 
 
 @dataclass(frozen=True)
@@ -101,23 +102,20 @@ def _consistency(runs: Sequence[JudgedRun]) -> _Plans:
     return _of_each(runs, "consistency", has_squares, lambda one: consistency(one))
 
 
-def _arrivals(runs: Sequence[JudgedRun]) -> _Plans:
-    return _of_each(runs, "arrivals", lambda one: bool(one.run.updates.num_rows), lambda one: arrivals(one))
-
-
-def _recordings(runs: Sequence[JudgedRun]) -> list[list[JudgedRun]]:
-    """Runs with the same delays, which are those of the same recording."""
+def _alike(runs: Sequence[JudgedRun], *names: str) -> list[list[JudgedRun]]:
+    """Runs with detections, together those whose columns `names` of updates.csv are the same."""
     groups: dict[bytes, list[JudgedRun]] = {}
     for one in runs:
         if one.run.updates.num_rows:
-            content = b"".join(part.tobytes() for by in sensor_delays(one.run).values() for part in by)
+            updates = one.run.updates
+            order = np.lexsort([updates[name] for name in _DETECTION])  # estimators may take them in another order
+            content = b"".join(updates[name][order].tobytes() for name in (*_DETECTION, *names))
             groups.setdefault(content, []).append(one)
     return list(groups.values())
 
 
-def _of_recordings(runs: Sequence[JudgedRun], name: str, draw: Callable[[JudgedRun], Figure]) -> _Plans:
-    """One for each recording; of many the first."""
-    groups = _recordings(runs)
+def _of_groups(groups: Sequence[Sequence[JudgedRun]], name: str, draw: Callable[[JudgedRun], Figure]) -> _Plans:
+    """One for each of `groups`; of many the first."""
     for place, group in enumerate(groups):
         label = "" if len(groups) == 1 else ", ".join(one.label for one in group)
         file = name if len(groups) == 1 else f"{name}_{group[0].label}"
@@ -125,14 +123,20 @@ def _of_recordings(runs: Sequence[JudgedRun], name: str, draw: Callable[[JudgedR
         yield Planned(file, partial(draw, replace(group[0], label=label)), is_extra)
 
 
+def _arrivals(runs: Sequence[JudgedRun]) -> _Plans:
+    """One for all runs in which the same became of every detection."""
+    return _of_groups(_alike(runs, "disposition"), "arrivals", lambda one: arrivals(one))
+
+
 def _delays(runs: Sequence[JudgedRun]) -> _Plans:
+    """One for each recording, but for those without any delay."""
     late = [one for one in runs if (one.run.updates["receipt_ns"] != one.run.updates["stamp_ns"]).any()]
-    return _of_recordings(late, "delays", lambda one: delays(one))
+    return _of_groups(_alike(late), "delays", lambda one: delays(one))
 
 
 def _anatomy(runs: Sequence[JudgedRun]) -> _Plans:
-    known = [one for group in _recordings(runs) for one in group if sendings(group[0].run)]
-    return _of_recordings(known, "anatomy", lambda one: anatomy(one))
+    known = [group for group in _alike(runs) if sendings(group[0].run)]
+    return _of_groups(known, "anatomy", lambda one: anatomy(one))
 
 
 def _errors(runs: Sequence[JudgedRun]) -> _Plans:

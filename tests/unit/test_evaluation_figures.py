@@ -136,13 +136,13 @@ def test_there_is_a_figure_of_what_runs_have_data_for(
     assert names(runs) == [
         *("map_smoother", "map_ekf-replay", "residuals_smoother", "residuals_ekf-replay"),
         *("consistency_smoother", "consistency_ekf-replay"),
-        *("arrivals_smoother", "arrivals_ekf-replay", "delays"),
+        *("arrivals", "delays"),
         *("errors_object_7", "errors_object_8", "error_against_lag", "timing"),
     ]
     assert names(runs[1:]) == [name for name in names(runs) if "smoother" not in name and "lag" not in name]
     plain = replace(runs[0], truth=runs[0].truth.where(np.zeros(len(runs[0].truth["stamp_ns"]), dtype=bool)))
     assert names([plain]) == [
-        *("map_smoother", "residuals_smoother", "consistency_smoother", "arrivals_smoother", "delays", "timing")
+        *("map_smoother", "residuals_smoother", "consistency_smoother", "arrivals", "delays", "timing")
     ]
     other = write_run(tmp_path / "other", updates={0: [update(delay_ns=1_000_000)]})
     assert [name for name in names([*runs, other]) if "delays" in name] == [
@@ -150,6 +150,12 @@ def test_there_is_a_figure_of_what_runs_have_data_for(
         "delays_other (smoother)",
     ]
     assert names([write_run(tmp_path / "empty", [[]])]) == []
+    lidar, radar = update("lidar", tick=0, delay_ns=7), update("radar", tick=1, delay_ns=9)
+    gated = replace(radar, disposition=Disposition.GATED)
+    order = {"as received": [lidar, radar], "the other way": [radar, lidar], "gated": [lidar, gated]}
+    alike = [write_run(tmp_path / name, updates={0: rows}) for name, rows in order.items()]
+    found = [name for name in names(alike) if name.startswith(("arrivals", "delays"))]
+    assert found == ["arrivals_as received (smoother)", "arrivals_gated (smoother)", "delays"]
     at_once = write_run(tmp_path / "at once", updates={0: [update(delay_ns=0)]})
     assert [name for name in names([at_once]) if "delays" in name] == []
 
@@ -192,7 +198,7 @@ def test_a_file_is_named_after_its_figure_and_run(tmp_path: Path) -> None:
     run = write_run(tmp_path / "a run", updates={0: [update(x_m=1.0, y_m=1.0, delay_ns=1)]})
     files = plot.save_figures(run, tmp_path / "out", "svg")
     assert [file.name for file in files] == [
-        *("residuals_a_run_smoother.svg", "arrivals_a_run_smoother.svg", "delays.svg", "timing.svg")
+        *("residuals_a_run_smoother.svg", "arrivals.svg", "delays.svg", "timing.svg")
     ]
 
 

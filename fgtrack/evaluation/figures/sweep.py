@@ -25,12 +25,18 @@ _NAMES: Mapping[str, str] = {
     "truth.overall.errors.position_m.rmse": "position RMSE [m]",
     "truth.overall.errors.speed_mps.rmse": "speed RMSE [m/s]",
     "truth.overall.errors.yaw_rad.rmse": "yaw RMSE [rad]",
-    "consistency.position_nees.mean": "mean NEES of the position (expected: 2)",
+    "consistency.position_nees.mean": "mean NEES of the position (dashed: expected)",
     "multi_object.gospa.in_sight_rms_m": "GOSPA of objects in sight [m]",
     "multi_object.gospa.rms_m": "GOSPA [m]",
     "truth.overall.tracked_share_in_sight": "share of the time in sight that is tracked",
     "truth.overall.tracked_share": "share of the time that is tracked",
+    "truth.false_tracks": "false tracks",
+    "truth.overall.id_switches": "identity switches",
+    "multi_object.clear.mota": "MOTA",
+    "multi_object.identity.idf1": "IDF1",
+    "multi_object.hota.hota": "HOTA",
 }
+_EXPECTED: Mapping[str, float] = {"consistency.position_nees.mean": 2.0}
 #: Those that are drawn where nothing else is asked for.
 _FIRST = (*tuple(_NAMES)[:2], "consistency.position_nees.mean")
 #: Of the rest, those with a better and a worse.
@@ -39,11 +45,6 @@ _REST = (
     "truth.overall.errors.*.rmse",
     "consistency.nis.*.mean",
     "lagged.*.errors.position_m.rmse",
-    "truth.false_tracks",
-    "truth.overall.id_switches",
-    "multi_object.clear.mota",
-    "multi_object.identity.idf1",
-    "multi_object.hota.hota",
 )
 _WIDE = 3  # panels side by side
 _LOG_FROM = 20.0  # largest over smallest value
@@ -106,6 +107,9 @@ def sweep(table: SweepTable | Path | str, metric: str = "truth.overall.errors.po
         panel.set_title("\n".join(f"{_short(axis)} {cell}" for axis, cell in named), loc="left")
     for place in range(len(panels), rows * columns):
         grid[divmod(place, columns)].set_visible(False)
+    for panel in grid.flat[: len(panels)]:
+        if metric in _EXPECTED:
+            panel.axhline(_EXPECTED[metric], color="black", lw=0.9, ls="--")
     _scale(grid[0, 0], means, steps)
     for place in range(len(panels)):
         if place + columns >= len(panels):
@@ -162,7 +166,7 @@ def _scale(panel: Axes, means: Sequence[PointMean], steps: _Steps) -> None:
         panel.set_yscale("log")
         log_axis(panel.yaxis)
     elif (values >= 0.0).all():
-        panel.set_ylim(0.0, None)
+        panel.set_ylim(0.0, None if values.any() else 1.0)
     if not steps.are_numbers or len(steps.names) <= _NAMED_STEPS:
         panel.set_xticks(list(steps.at.values()), steps.names)
     margin = 0.08 * steps.width
