@@ -16,6 +16,7 @@ from matplotlib.axis import Axis
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import LogLocator, NullFormatter
+from PIL import Image
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import FloatArray, IntArray
@@ -180,10 +181,12 @@ def save_pages(figures: Iterable[Figure], file: BinaryIO) -> None:
 
 @styled
 def png(figure: Figure, dpi: float) -> bytes:
-    """`figure` as PNG, without date and version."""
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=dpi, metadata=dict(FORMATS["png"]))
-    return picture.getvalue()
+    """`figure` as a small PNG of 256 colours, without date and version."""
+    drawn, small = io.BytesIO(), io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=dpi, metadata=dict(FORMATS["png"]))
+    with Image.open(drawn) as picture:
+        picture.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
+    return small.getvalue()
 
 
 @styled

@@ -3,16 +3,28 @@
 
 const ARRAY_TYPES = { u8: Uint8Array, u16: Uint16Array, i16: Int16Array, i32: Int32Array, f32: Float32Array, f64: Float64Array };
 
-/** Typed array of a base64 text. */
-function arrayOf(base64, type) {
+/** The bytes of a deflated base64 text. */
+async function inflated(base64) {
   const text = atob(base64);
   const bytes = new Uint8Array(text.length);
   for (let k = 0; k < text.length; k += 1) bytes[k] = text.charCodeAt(k);
-  return new ARRAY_TYPES[type](bytes.buffer);
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+/** Typed array of bytes of which the first ones of all its numbers come first, then the second ones ... */
+function arrayOf(planes, type) {
+  const Type = ARRAY_TYPES[type];
+  const size = Type.BYTES_PER_ELEMENT;
+  const count = planes.length / size;
+  const bytes = new Uint8Array(planes.length);
+  for (let k = 0; k < count; k += 1) for (let b = 0; b < size; b += 1) bytes[k * size + b] = planes[b * count + k];
+  return new Type(bytes.buffer);
 }
 
 /** Decodes columns; equal ones are decoded once. */
 class Columns {
+  /** Of the bytes of every blob. */
   constructor(blobs) {
     this.blobs = blobs;
     this.decoded = new Map();
@@ -198,9 +210,9 @@ class Run {
 }
 
 /** Everything that the viewer shows. */
-function readScene(text) {
+async function readScene(text) {
   const packed = JSON.parse(text);
-  const columns = new Columns(packed.blobs);
+  const columns = new Columns(await Promise.all(packed.blobs.map(inflated)));
   const recordings = packed.recordings.map((one) => new Recording(one, columns));
   const runs = packed.runs.map((one) => new Run(one, recordings, columns));
   return {

@@ -1,7 +1,12 @@
-"""Columns of numbers as text that a page can hold: little-endian arrays in base64, equal ones once."""
+"""Columns of numbers as text that a page can hold: little-endian arrays, deflated, in base64, equal ones once.
+
+Before an array is deflated, the first bytes of all its numbers are put together, then the second ones, and so on: the
+high bytes of neighbours are alike.
+"""
 
 import base64
 import math
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,6 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 _DTYPES = {"u8": "<u1", "u16": "<u2", "i16": "<i2", "i32": "<i4", "f32": "<f4", "f64": "<f8"}
+
+_LEVEL = 9  # of zlib: the smallest
 
 Packed = dict[str, Any]
 """JSON values of a column: `blob` (its place among the blobs), `type`, and `scale` and `missing` where it has them."""
@@ -29,12 +36,10 @@ class Form:
 
 _MISSING_I32 = -(2**31)
 
-#: In millimetres, up to 2,100 km from the origin.
+#: A position or length in millimetres, up to 2,100 km.
 POSITION_M = Form("i32", 1e-3, _MISSING_I32)
 #: In tenths of a milliradian, wrapped angles.
 ANGLE_RAD = Form("i16", 1e-4, -(2**15))
-#: Any number with seven digits.
-NUMBER = Form("f32")
 #: Places in a list of up to 255 names.
 CODE = Form("u8")
 
@@ -60,14 +65,15 @@ class Packer:
 
     blobs: list[str] = field(default_factory=list)
     """Base64, in the order in which they were first packed."""
-    _places: dict[bytes, int] = field(default_factory=dict)
+    _places: dict[tuple[str, bytes], int] = field(default_factory=dict)
 
     def column(self, values: npt.ArrayLike, form: Form) -> Packed:
         """`values`, shape (n,), as `form` says; one that does not fit is written as missing."""
         content = _written(np.asarray(values), form).tobytes()
-        place = self._places.setdefault(content, len(self.blobs))
+        place = self._places.setdefault((form.type, content), len(self.blobs))
         if place == len(self.blobs):
-            self.blobs.append(base64.b64encode(content).decode("ascii"))
+            planes = np.frombuffer(content, np.uint8).reshape(-1, np.dtype(_DTYPES[form.type]).itemsize).T
+            self.blobs.append(base64.b64encode(zlib.compress(planes.tobytes(), _LEVEL)).decode("ascii"))
         packed: Packed = {"blob": place, "type": form.type}
         if form.scale != 1.0:
             packed["scale"] = form.scale
@@ -78,7 +84,9 @@ class Packer:
 
 def unpacked(column: Mapping[str, Any], blobs: list[str]) -> npt.NDArray[np.float64]:
     """The numbers of a packed column, shape (n,): what the page's own decoder gives."""
-    written = np.frombuffer(base64.b64decode(blobs[column["blob"]]), dtype=_DTYPES[column["type"]])
+    dtype = np.dtype(_DTYPES[column["type"]])
+    planes = np.frombuffer(zlib.decompress(base64.b64decode(blobs[column["blob"]])), np.uint8)
+    written = np.frombuffer(planes.reshape(dtype.itemsize, -1).T.tobytes(), dtype)
     found = np.asarray(written.astype(np.float64) * float(column.get("scale", 1.0)))
     if "missing" in column:
         found[written == column["missing"]] = math.nan

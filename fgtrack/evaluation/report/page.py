@@ -143,7 +143,7 @@ def _figure(name: str, figure: Figure) -> str:
     text, picture = escape(name), base64.b64encode(png(figure, _DPI)).decode()
     width, height = (round(inches * _DPI) for inches in figure.get_size_inches())
     return (
-        f'<figure class="figure" id="figure-{text}"><img alt="{text}" width="{width}" height="{height}" '
+        f'<figure class="figure" id="figure-{text}" tabindex="0"><img alt="{text}" width="{width}" height="{height}" '
         f'decoding="async" loading="lazy" '
         f'src="data:image/png;base64,{picture}"><figcaption>{text}</figcaption></figure>\n'
     )

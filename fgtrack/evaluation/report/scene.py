@@ -14,7 +14,6 @@ from fgtrack.evaluation.palette import PALETTE
 from fgtrack.evaluation.report.packing import (
     ANGLE_RAD,
     CODE,
-    NUMBER,
     POSITION_M,
     Form,
     Packed,
@@ -32,8 +31,8 @@ from fgtrack.evaluation.viewer.track_messages import final_ns, position_covarian
 from fgtrack.io.run import Run, Table
 
 FORMAT = "fgtrack-report/1"
-MOST_ROWS = 400_000
-"""Rows of a table that the viewer shows; of more, every second tick or stamp is left out, every third ..."""
+MOST_ROWS = 200_000
+"""Rows of a table that the viewer shows of all runs together; of more every second tick or stamp, every third ..."""
 
 Json = dict[str, Any]  # Any: JSON values
 
@@ -72,7 +71,7 @@ def scene(runs: Sequence[JudgedRun]) -> Scene:
     shown = []
     for one in runs:
         place = next(k for k, recording in enumerate(recordings) if any(one.run is its for its in recording.runs))
-        packing = _Packing(packer, times, recordings[place], notes, one.label)
+        packing = _Packing(packer, times, recordings[place], notes, one.label, len(runs))
         shown.append({"label": one.label, "recording": place, **_run(one.run, packing)})
     values = {
         "format": FORMAT,
@@ -80,7 +79,7 @@ def scene(runs: Sequence[JudgedRun]) -> Scene:
         "size_m": NOMINAL_SIZE_M[:2],
         "used": USED,
         "late": sorted(LATE),
-        "recordings": [_recording(one, _Packing(packer, times, one, notes, "")) for one in recordings],
+        "recordings": [_recording(one, _Packing(packer, times, one, notes, "", len(recordings))) for one in recordings],
         "runs": shown,
         "blobs": packer.blobs,
     }
@@ -96,6 +95,7 @@ class _Packing:
     recording: _Recording
     notes: dict[str, None]
     label: str
+    num_runs: int
 
     def time(self, ns: IntArray) -> Packed:
         return self.packer.column((ns - self.recording.start_ns) / NS_PER_S, self.times)
@@ -108,8 +108,8 @@ class _Packing:
         """Half axes and direction of the ellipses that hold 95 %."""
         found = ellipses(position_covariances(states), AROUND_95)
         return {
-            "long": self.packer.column(0.5 * found[:, 0], NUMBER),
-            "short": self.packer.column(0.5 * found[:, 1], NUMBER),
+            "long": self.packer.column(0.5 * found[:, 0], POSITION_M),
+            "short": self.packer.column(0.5 * found[:, 1], POSITION_M),
             "direction": self.packer.column(found[:, 2], ANGLE_RAD),
         }
 
@@ -126,7 +126,7 @@ class _Packing:
 
     def thinned_times(self, times_ns: IntArray, num_rows: int, what: str) -> IntArray:
         """Every k-th of `times_ns`, which have `num_rows` rows."""
-        step = max(1, math.ceil(num_rows / MOST_ROWS))
+        step = max(1, math.ceil(num_rows * self.num_runs / MOST_ROWS))
         if step > 1:
             name = f"{self.label}: " if self.label else ""
             self.notes[f"{name}the viewer shows one of {step} times of {what}, as there are {num_rows} rows"] = None

@@ -304,7 +304,11 @@ class Viewer {
   }
 }
 
-const viewer = new Viewer(
-  document.getElementById("viewer"),
-  readScene(document.getElementById("scene").textContent),
-);
+let viewer;
+if (typeof DecompressionStream === "undefined") {
+  document.getElementById("viewer").textContent = "This browser cannot play the runs: any of 2023 or later can.";
+} else {
+  readScene(document.getElementById("scene").textContent).then((scene) => {
+    viewer = new Viewer(document.getElementById("viewer"), scene);
+  });
+}
