@@ -45,7 +45,7 @@ def sendings(run: Run) -> list[Sendings]:
         if not origin or not Path(origin).exists() or input_kind(Path(origin)) != _RECORDING:
             return []
         config = TypeAdapter(InputConfig).validate_python(run.config.get("input") or {})
-        bag = Bag(origin, config.message_definitions)
+        bag = Bag(origin, config.message_definitions, config.largest_bytes)
         roles = {use.topic: use.role for use in topic_uses(bag, config)}
         times: dict[str, list[tuple[int, int, int]]] = {}
         by_name = {topic.name: role for topic, role in roles.items()}

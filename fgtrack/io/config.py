@@ -10,6 +10,7 @@ from typing import Literal
 from pydantic import NonNegativeFloat
 
 from fgtrack.core.types import Frame
+from fgtrack.io.errors import LARGEST_BYTES, MOST_OBJECTS
 
 Path = str | Sequence[str]
 """Names of fields with dots between; several paths are the components of a vector, whose length is meant."""
@@ -122,3 +123,18 @@ class InputConfig:
     message_definitions: tuple[str, ...] = ()
     """`.msg` files, or folders of them, of types that neither the recording nor fgtrack defines."""
     kitti: KittiInput = field(default_factory=KittiInput)
+    largest_mb: float = LARGEST_BYTES / 1e6
+    """A chunk, message or line of the input that is larger than this, unpacked, is refused."""
+    most_objects: int = MOST_OBJECTS
+    """A list with more objects than this is refused."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.largest_mb <= 10_000.0:
+            raise ValueError(f"largest_mb: must be positive, and at most 10000, is {self.largest_mb}")
+        if self.most_objects < 1:
+            raise ValueError(f"most_objects: must be at least 1, is {self.most_objects}")
+
+    @property
+    def largest_bytes(self) -> int:
+        """`largest_mb` in bytes."""
+        return int(self.largest_mb * 1e6)

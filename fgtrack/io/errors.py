@@ -5,12 +5,26 @@ from collections.abc import Iterable, Iterator
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Message
 
+_MEGABYTE = 1_000_000
+LARGEST_BYTES = 128 * _MEGABYTE
+"""Of a chunk, a message or a line, where nothing else is said."""
+MOST_OBJECTS = 100_000
+"""In a list, where nothing else is said."""
+
 
 class TruncatedInput(DataError):  # noqa: N818 - it names what the input is; the readers have given all before it
     """An input broke off; everything before the break has been yielded.
 
     A replay finishes the run with what there is, reports the break and exits with 1.
     """
+
+
+def refuse_larger(num_bytes: int, what: str, largest_bytes: int) -> None:
+    """Raise `DataError` where `what` has more than `largest_bytes`: a few packed bytes can stand for gigabytes."""
+    if num_bytes > largest_bytes:
+        raise DataError(
+            f"{what}: is larger than {largest_bytes / _MEGABYTE:g} MB: raise input.largest_mb, if that is right"
+        )
 
 
 class UntilBreak:

@@ -24,6 +24,7 @@ from fgtrack.core.types import (
     Message,
     TruthState,
 )
+from fgtrack.io.errors import MOST_OBJECTS
 
 __all__ = ["checked"]
 
@@ -36,8 +37,10 @@ _state_numbers = attrgetter(*STATE_NAMES)
 _detection_numbers = attrgetter(*_DETECTION_NUMBERS)
 
 
-def checked(path: Path, messages: Callable[[], Iterator[Message]]) -> Iterator[Message]:
-    """The messages of the input at `path`.
+def checked(
+    path: Path, messages: Callable[[], Iterator[Message]], most_objects: int = MOST_OBJECTS
+) -> Iterator[Message]:
+    """The messages of the input at `path`; a list with more than `most_objects` is refused.
 
     Raises
     ------
@@ -48,6 +51,10 @@ def checked(path: Path, messages: Callable[[], Iterator[Message]]) -> Iterator[M
     try:
         for message in messages():
             _check(message)
+            if isinstance(message, DetectionList) and len(message.objects) > most_objects:
+                raise _WrongError(
+                    f"{message.sensor}: a list of {len(message.objects)} objects, more than input.most_objects allows"
+                )
             yield message
             count += 1
     except _WrongError as error:

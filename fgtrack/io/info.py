@@ -122,11 +122,12 @@ class _Times:
 
 
 def _read_bag(path: Path, config: InputConfig | None, times: dict[_Key, _Times]) -> _Found:
-    bag = Bag(path, config.message_definitions if config else ())
+    given = config or InputConfig()
+    bag = Bag(path, given.message_definitions, given.largest_bytes)
     used: dict[_Key, str] = {}
     problem: str | None = None
     try:
-        used = {(use.topic.name, use.topic.type): use.role for use in topic_uses(bag, config or InputConfig())}
+        used = {(use.topic.name, use.topic.type): use.role for use in topic_uses(bag, given)}
     except DataError as error:
         problem = str(error) if config else None
     for topic in bag.topics:

@@ -53,8 +53,9 @@ def open_input(path: Path | str, config: InputConfig | None = None) -> InputSour
     """
     path = Path(path)
     name = input_kind(path)
-    messages = file_format(name).open(path, config or InputConfig())
-    return InputSource(path, name, partial(checked, path, messages))
+    config = config or InputConfig()
+    messages = file_format(name).open(path, config)
+    return InputSource(path, name, partial(checked, path, messages, config.most_objects))
 
 
 def input_kind(path: Path) -> str:

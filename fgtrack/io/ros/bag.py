@@ -7,18 +7,18 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2
-from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
 
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S
-from fgtrack.io.errors import TruncatedInput
-from fgtrack.io.ros.bag_files import BagFile, BagFolder, EmptyFile, merged, storage_of
+from fgtrack.io.errors import LARGEST_BYTES, TruncatedInput
+from fgtrack.io.ros.bag_files import BagFile, EmptyFile, bag_folder, check_serialization, merged, storage_of
 from fgtrack.io.ros.mcap_file import McapFile
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
 from fgtrack.io.ros.typestore import build_typestore, one_line, type_name
+from fgtrack.io.ros.unpacking import unpacked
 
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _BAG_SUFFIXES = (".mcap", ".db3")
@@ -57,6 +57,8 @@ class Bag:
     message_definitions
         `.msg` files, or folders of them, for types that the recording does not define. The package is the
         name of the folder (or of the one above a folder `msg`).
+    largest_bytes
+        A chunk or message that unpacks to more is refused.
 
     Raises
     ------
@@ -64,11 +66,16 @@ class Bag:
         The recording cannot be read at all.
     """
 
-    def __init__(self, path: Path | str, message_definitions: Collection[str] = ()) -> None:
+    def __init__(
+        self, path: Path | str, message_definitions: Collection[str] = (), largest_bytes: int = LARGEST_BYTES
+    ) -> None:
         self.path = Path(path)
-        with _as_data_error(self.path), _opened(self.path) as files:
+        self._largest_bytes = largest_bytes
+        with self._files() as files:
             connections = [item for file in files for item in file.connections]
-            _check_serialization(self.path, connections)
+            for item in connections:
+                if isinstance(item.ext, ConnectionExtRosbag2):
+                    check_serialization(self.path, item.topic, item.ext.serialization_format)
             self._ros1 = any(isinstance(file, Rosbag1File) for file in files)
             definitions = {item.msgtype: item.msgdef for item in connections}
             self._store, problems = build_typestore(definitions, self._ros1, message_definitions)
@@ -118,7 +125,7 @@ class Bag:
         time. Compression of single messages is not undone, such recordings give nothing.
         """
         stamped = {(topic.name, topic.type): topic for topic in self.topics if self._starts_with_header(topic)}
-        with _as_data_error(self.path), _opened(self.path) as files:
+        with self._files() as files:
             for file in files:
                 for connection, sent_ns, log_ns, data in file.sendings() if isinstance(file, McapFile) else ():
                     topic = stamped.get((connection.topic, connection.msgtype))
@@ -140,9 +147,14 @@ class Bag:
         fields = self._store.fielddefs[topic.type][1]
         return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
 
+    @contextmanager
+    def _files(self) -> Iterator[list[BagFile]]:
+        with _as_data_error(self.path), _opened(self.path, self._largest_bytes) as files:
+            yield files
+
     def _records(self, topics: Collection[str]) -> Iterator[tuple[Connection, int, bytes]]:
         count = 0
-        with _as_data_error(self.path), _opened(self.path) as files:
+        with self._files() as files:
             try:
                 for connection, log_ns, data in merged(files, topics):
                     if type(log_ns) is not int or not isinstance(data, bytes | bytearray | memoryview):
@@ -150,7 +162,8 @@ class Bag:
                             f"{self.path}: message {count + 1} on {connection.topic} has no time or no bytes"
                         )
                     if data[:4] == _ZSTD_MAGIC and not self._ros1:
-                        data = DECOMPRESSORS["zstd"](data, 0)
+                        what = f"{self.path}: the message on {connection.topic} at {log_ns} ns"
+                        data = unpacked("zstd", bytes(data), what, self._largest_bytes)
                     yield connection, log_ns, data
                     count += 1
             except FgtrackError:
@@ -177,14 +190,6 @@ def _topics(connections: list[Connection], problems: Mapping[str, str]) -> tuple
     )
 
 
-def _check_serialization(path: Path, connections: list[Connection]) -> None:
-    for item in connections:
-        if isinstance(item.ext, ConnectionExtRosbag2) and item.ext.serialization_format != "cdr":
-            raise DataError(
-                f"{path}: topic {item.topic} is serialized as {item.ext.serialization_format!r}, only 'cdr' can be read"
-            )
-
-
 def _break_off(files: list[BagFile]) -> str | None:
     return next((f"{file.path} {file.break_off}" for file in files if file.break_off), None)
 
@@ -198,33 +203,29 @@ def _bag_files(path: Path) -> list[Path]:
     return sorted((file for file in path.iterdir() if file.suffix in _BAG_SUFFIXES), key=natural)
 
 
-def _bag_file(path: Path, alone: bool) -> BagFile:
+def _bag_file(path: Path, alone: bool, largest_bytes: int) -> BagFile:
     empty = path.stat().st_size == 0
     if empty and not alone:
         return EmptyFile(path)
     kind = storage_of(path)
     if kind is None:
         raise DataError(f"{path}: {'is empty' if empty else 'is not a bag file'}")
-    return kind(path)
+    return kind(path, largest_bytes)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[list[BagFile]]:
+def _opened(path: Path, largest_bytes: int) -> Iterator[list[BagFile]]:
     with ExitStack() as stack:
-        files: list[BagFile] = []
         if (path / "metadata.yaml").is_file():
-            folder = BagFolder(path)
-            folder.open()
-            stack.callback(folder.close)
-            # Its storages are made from STORAGE_PLUGINS, which are BagFiles.
-            files += cast("list[BagFile]", folder.storages)
+            parts = stack.enter_context(bag_folder(path))
         else:
             parts = _bag_files(path) if path.is_dir() else [path]
-            for part in parts:
-                file = _bag_file(part, alone=len(parts) == 1)
-                file.open()
-                stack.callback(file.close)
-                files.append(file)
+        files: list[BagFile] = []
+        for part in parts:
+            file = _bag_file(part, len(parts) == 1, largest_bytes)
+            stack.callback(file.close)
+            file.open()
+            files.append(file)
         yield files
 
 

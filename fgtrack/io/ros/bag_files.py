@@ -2,20 +2,25 @@
 
 import heapq
 from collections.abc import Collection, Iterator
-from pathlib import Path
+from contextlib import contextmanager, nullcontext
+from pathlib import Path, PurePath
+from tempfile import TemporaryDirectory
 from typing import Protocol
 
 from rosbags.interfaces import Connection
-from rosbags.rosbag2.reader import DirectoryReader
+from ruamel.yaml import YAML
 
-from fgtrack.io.ros.mcap_file import McapFile
+from fgtrack.core.errors import DataError
+from fgtrack.io.ros.mcap_file import MCAP_MAGIC, McapFile
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
 from fgtrack.io.ros.sqlite3_file import Sqlite3File
+from fgtrack.io.ros.unpacking import unpacked_file
 
 Record = tuple[Connection, int, bytes]
 """Connection, log time in ns, serialized message."""
 
-MCAP_MAGIC = b"\x89MCAP0\r\n"
+_LONGEST_METADATA = 1_000_000
+_NEWEST_VERSION = 9
 SQLITE_MAGIC = b"SQLite format 3\x00"
 ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
 
@@ -38,16 +43,52 @@ class BagFile(Protocol):
         """Records of `connections` in log-time order; equal times keep the order of writing."""
 
 
-class BagFolder(DirectoryReader):
-    """A rosbag2 folder: the reading of its metadata and the unpacking of its files."""
+@contextmanager
+def bag_folder(path: Path) -> Iterator[list[Path]]:
+    """Files of the rosbag2 folder `path` by its metadata.yaml; unpacked, where each was packed.
 
-    STORAGE_PLUGINS = {"mcap": McapFile, "sqlite3": Sqlite3File}  # noqa: RUF012 - declared by the base
+    Raises `DataError` where it does not say what a rosbag2 folder says.
+    """
+    file = path / "metadata.yaml"
+    if file.stat().st_size > _LONGEST_METADATA:
+        raise DataError(f"{file}: is longer than that of any recording")
+    known = YAML(typ="safe", pure=True).load(file.read_text(encoding="utf-8"))
+    try:
+        metadata = known["rosbag2_bagfile_information"]
+        files = [path / PurePath(name).name for name in metadata["relative_file_paths"]]
+        version = int(metadata["version"])
+        mode = str(metadata.get("compression_mode") or "none").lower()
+        form = metadata.get("compression_format") or "zstd"
+        topics = [item["topic_metadata"] for item in metadata.get("topics_with_message_count") or ()]
+        serializations = {str(topic["name"]): str(topic["serialization_format"]) for topic in topics}
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise DataError(f"{file}: is no metadata of a recording ({type(error).__name__}: {error})") from error
+    if missing := [file for file in files if not file.is_file()]:
+        raise DataError(f"{missing[0]}: is missing, {file} names it")
+    if version > _NEWEST_VERSION or (mode != "none" and form != "zstd"):
+        what = f"version {version}" if version > _NEWEST_VERSION else f"compression {form!r}"
+        raise DataError(f"{file}: {what} of a recording is not known")
+    for topic, serialization in serializations.items():
+        check_serialization(file, topic, serialization)
+    with TemporaryDirectory() if mode == "file" else nullcontext("") as folder:
+        if folder:
+            packed, files = files, [Path(folder) / file.stem for file in files]
+            for source, target in zip(packed, files, strict=True):
+                with target.open("wb") as out:
+                    unpacked_file(source, out)
+        yield files
+
+
+def check_serialization(path: Path, topic: str, serialization: str) -> None:
+    """Raise `DataError` where the messages of a topic cannot be decoded."""
+    if serialization != "cdr":
+        raise DataError(f"{path}: topic {topic} is serialized as {serialization!r}, only 'cdr' can be read")
 
 
 class EmptyFile:
     """A file into which a killed recorder has not written anything yet."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, largest_bytes: int = 0) -> None:
         self.path = path
         self.connections: list[Connection] = []
         self.break_off: str | None = "is empty"

@@ -1,131 +1,237 @@
-"""An MCAP file, including a truncated one."""
+"""An MCAP file of ROS 2 messages, including a truncated one (format: https://mcap.dev/spec)."""
 
-from collections.abc import Collection, Generator, Iterator
-from io import BytesIO
+import heapq
+import struct
+from binascii import crc32
+from collections import Counter
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
-from rosbags.interfaces import Connection
-from rosbags.rosbag2.errors import ReaderError
-from rosbags.rosbag2.storage_mcap import (
-    DECOMPRESSORS,
-    ChunkInfo,
-    McapReader,
-    deserialize_hiqq,
-    deserialize_qqqi,
-    deserialize_uint64,
-    read_string,
-)
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
-_CHUNK_HEADER = 40  # two times, size, checksum, length of the compression's name, size of the data
-_RECORD_HEADER = 9  # opcode and length
-_MESSAGE_HEADER = 22  # channel, sequence, two times
+from fgtrack.core.errors import DataError
+from fgtrack.io.errors import LARGEST_BYTES, refuse_larger
+from fgtrack.io.ros.unpacking import unpacked
+
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0B
+_RECORD_HEADER = struct.Struct("<BQ")  # opcode, length
+_CHUNK_HEADER = struct.Struct("<QQQI")  # first and last log time, size, checksum
+_MESSAGE_HEADER = struct.Struct("<HIQQ")  # channel, sequence, log and publish time
+_STATISTICS_HEADER = struct.Struct("<QHIIIIQQ")
+_LONGEST_COMPRESSION = 100
+_FORMATS = {
+    "ros2msg": MessageDefinitionFormat.MSG,
+    "ros2idl": MessageDefinitionFormat.IDL,
+    "omgidl": MessageDefinitionFormat.IDL,
+}
 
 
-class McapFile(McapReader):
-    """An MCAP file; one without a usable index is indexed by walking over its records."""
+class Sending(NamedTuple):
+    """A message, and when it was sent."""
 
-    path: Path
-    break_off: str | None = None
+    connection: Connection
+    sent_ns: int
+    """Publish time."""
+    log_ns: int
+    data: bytes
 
-    def _open(self) -> None:
-        try:
-            super()._open()
-        except Exception:  # rosbags reads complete files only; whatever it raises, index from the start
-            if not self.data_start:
-                raise
-            self._index_by_walking()
-            self.break_off = self.break_off or "has no end record"
-            return
-        if any(not chunk.channel_count for chunk in self.chunks) or not self.chunks:
-            self._index_by_walking()
 
-    def messages(
-        self, connections: Collection[Connection], start: int | None = None, stop: int | None = None
-    ) -> Generator[tuple[Connection, int, bytes], None, None]:
+@dataclass(frozen=True)
+class _Chunk:
+    """Where a chunk is."""
+
+    place: int
+    """Of its record in the file."""
+    first_ns: int
+    size: int
+    """Of its records, unpacked."""
+    checksum: int
+    compression: str
+    data_place: int
+    data_size: int
+    """As packed; of a chunk that is cut in two what there is."""
+    cut: bool
+
+
+class McapFile:
+    """An MCAP file. One that breaks off is read up to the last whole message, also within its last chunk."""
+
+    def __init__(self, path: Path, largest_bytes: int = LARGEST_BYTES) -> None:
+        self.path = path
+        self.connections: list[Connection] = []
+        self.break_off: str | None = None
+        self._largest_bytes = largest_bytes
+        self._file: BinaryIO | None = None
+        self._schemas: dict[int, tuple[str, MessageDefinition]] = {}
+        self._channels: dict[int, Connection] = {}
+        self._counts: Counter[int] = Counter()
+        self._chunks: list[_Chunk] = []
+        self._loose_end: int | None = None  # of the last message outside of chunks
+
+    def open(self) -> None:
+        """Open the file and read which connections it holds."""
+        self._file = self.path.open("rb")
+        num_channels = self._walk()
+        if self.break_off or num_channels is None or num_channels > len(self._channels) or self._loose_end:
+            self._counts.clear()
+            try:
+                for opcode, _, content in self._inner_records():
+                    self._note(opcode, content)
+            except DataError as error:  # what comes before can be read
+                self.break_off = f"is damaged ({error})"
+            except Exception as error:  # whatever damaged bytes raise
+                self.break_off = self.break_off or f"is damaged ({error})"
+        self.connections = [
+            connection._replace(msgcount=self._counts[number]) for number, connection in self._channels.items()
+        ]
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file:
+            self._file.close()
+
+    def messages(self, connections: Collection[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
         """Records of `connections` in log-time order; equal times keep the order of writing."""
-        if self.chunks:
-            yield from super().messages(connections, start, stop)
-        else:  # no chunk that could be sorted for itself
-            yield from sorted(self.messages_scan(connections, start, stop), key=lambda record: record[1])
+        wanted = {connection.id: connection for connection in connections}
 
-    def sendings(self) -> Iterator[tuple[Connection, int, int, bytes]]:
-        """Connection, publish time and log time in ns, and bytes of every message, in the order of the file."""
-        assert self.bio
-        by_id = {item.id: item for item in self.connections}
-        if not self.chunks:
-            yield from _sendings(self.bio, self.data_start, self.data_end, by_id)
-        for chunk in self.chunks:
-            self.bio.seek(chunk.chunk_start_offset + _RECORD_HEADER + _CHUNK_HEADER + len(chunk.compression))
-            data = DECOMPRESSORS[chunk.compression](self.bio.read(chunk.compressed_size), chunk.uncompressed_size)
-            yield from _sendings(BytesIO(data), 0, len(data), by_id)
+        def of(chunk: _Chunk) -> Iterator[tuple[int, Sending | None]]:
+            yield chunk.first_ns, None  # the chunk is unpacked when its time has come
+            found = [(one.log_ns, one) for one in self._sendings(self._chunk_records(chunk), wanted)]
+            yield from sorted(found, key=itemgetter(0))
 
-    def _index_by_walking(self) -> None:
-        """Find the chunks, schemas and channels without the index at the end of the file."""
-        self.schemas.clear()
-        self.channels.clear()
-        self.connections.clear()
-        self.chunks.clear()
-        chunks = self._walk()
-        self.meta_scan()
-        counts = dict(self.statistics.channel_message_counts) if self.statistics else {}
-        self.connections[:] = [item._replace(msgcount=counts.get(item.id, 0)) for item in self.connections]
-        self.chunks.extend(chunk._replace(channel_count=counts) for chunk in chunks)
+        loose = sorted(((one.log_ns, one) for one in self._sendings(self._loose(), wanted)), key=itemgetter(0))
+        for log_ns, one in heapq.merge(*map(of, self._chunks), loose, key=itemgetter(0)):
+            if one is not None:
+                yield one.connection, log_ns, one.data
 
-    def _walk(self) -> list[ChunkInfo]:
-        """Chunks up to the end of the data or the break; sets `data_end` and `break_off`."""
-        assert self.bio
+    def sendings(self) -> Iterator[Sending]:
+        """Every message, in the order of the file."""
+        by_id = {connection.id: connection for connection in self.connections}
+        yield from self._sendings(self._inner_records(), by_id)
+
+    def _walk(self) -> int | None:
+        """Look at the records of the file, not into its chunks; gives the number of channels, if the file says it."""
+        assert self._file
         size = self.path.stat().st_size
-        chunks: list[ChunkInfo] = []
-        position = self.data_start
-        while True:
-            self.bio.seek(position)
-            head = self.bio.read(_RECORD_HEADER)
-            opcode = head[0] if head else 0
-            if opcode in (0x02, 0x0F):  # footer, end of data
-                break
-            length = deserialize_uint64(head[1:])[0] if len(head) == _RECORD_HEADER else size
-            end = position + _RECORD_HEADER + length
+        if self._file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
+            raise DataError(f"{self.path}: does not begin as an MCAP file")
+        place, num_channels = len(MCAP_MAGIC), None
+        while place < size - len(MCAP_MAGIC):
+            self._file.seek(place)
+            opcode, length = _RECORD_HEADER.unpack(self._file.read(_RECORD_HEADER.size))
+            if opcode == _FOOTER:
+                return num_channels
+            end = place + _RECORD_HEADER.size + length
+            if opcode == _CHUNK:
+                self._chunks += self._chunk(place, min(end, size), end > size)
             if opcode == 0 or end > size:
-                self.break_off = f"breaks off at byte {position}"
                 break
-            if opcode == 0x06:
-                chunks.append(self._chunk(position, length))
-            position = end
-        self.data_end = position
-        return chunks
+            if opcode == _MESSAGE:
+                self._loose_end = end
+            elif opcode in (_HEADER, _SCHEMA, _CHANNEL, _STATISTICS):
+                refuse_larger(length, f"{self.path}: the record at byte {place}", self._largest_bytes)
+                num_channels = self._note(opcode, self._file.read(length)) or num_channels
+            place = end
+        self.break_off = f"breaks off at byte {place}"
+        return num_channels
 
-    def _chunk(self, position: int, length: int) -> ChunkInfo:
-        assert self.bio
-        first_ns, last_ns, size, _ = deserialize_qqqi(self.bio.read(28))
-        compression = read_string(self.bio)
-        (compressed_size,) = deserialize_uint64(self.bio.read(8))
-        if _CHUNK_HEADER + len(compression) + compressed_size > length:
-            raise ReaderError(f"Chunk at byte {position} is larger than its record.")
-        return ChunkInfo(
-            first_ns,
-            last_ns,
-            position,
-            _RECORD_HEADER + length,
-            {},
-            0,
-            compression,
-            compressed_size,
-            size,
-            {},
-        )
+    def _chunk(self, place: int, end: int, cut: bool) -> Iterator[_Chunk]:
+        """The chunk whose record is at `place` and ends at `end`; none, where not even its header is there."""
+        assert self._file
+        head = self._file.read(_CHUNK_HEADER.size + 4)
+        if len(head) < _CHUNK_HEADER.size + 4:
+            return
+        first_ns, _, size, checksum = _CHUNK_HEADER.unpack_from(head)
+        (length,) = struct.unpack_from("<I", head, _CHUNK_HEADER.size)
+        compression = self._file.read(min(length, _LONGEST_COMPRESSION)).decode()
+        stated = self._file.read(8)
+        if len(stated) < 8:
+            return
+        data_place, data_size = self._file.tell(), int.from_bytes(stated, "little")
+        if data_place + data_size > end and not cut:
+            raise DataError(f"{self.path}: the chunk at byte {place} is larger than its record")
+        data_size = min(data_size, end - data_place)
+        yield _Chunk(place, first_ns, size, checksum, compression, data_place, data_size, cut)
+
+    def _note(self, opcode: int, content: bytes) -> int | None:
+        """Keep what a record says of the messages; gives the number of channels, where it is that of the statistics."""
+        if opcode == _SCHEMA:
+            (number,) = struct.unpack_from("<H", content)
+            (name, encoding, text), _ = _texts(content, 2, 3)
+            form = _FORMATS.get(encoding, MessageDefinitionFormat.NONE)
+            self._schemas[number] = name, MessageDefinition(form, text)
+        elif opcode == _CHANNEL:
+            number, schema = struct.unpack_from("<HH", content)
+            (topic, encoding), _ = _texts(content, 4, 2)
+            name, definition = self._schemas.get(schema, ("", MessageDefinition(MessageDefinitionFormat.NONE, "")))
+            ext = ConnectionExtRosbag2(encoding, [])
+            self._channels.setdefault(number, Connection(number, topic, name, definition, "", 0, ext, self))
+        elif opcode == _MESSAGE:
+            self._counts[_MESSAGE_HEADER.unpack_from(content)[0]] += 1
+        elif opcode == _STATISTICS:
+            num_channels = _STATISTICS_HEADER.unpack_from(content)[2]
+            counts = struct.iter_unpack("<HQ", content[_STATISTICS_HEADER.size + 4 :])
+            self._counts.update({number: min(count, 1 << 62) for number, count in counts})
+            return int(num_channels)
+        return None
+
+    def _inner_records(self) -> Iterator[tuple[int, int, bytes]]:
+        """Opcode, place and content of the records in all chunks, and of the messages outside of chunks."""
+        for chunk in self._chunks:
+            yield from self._chunk_records(chunk)
+        yield from self._loose()
+
+    def _chunk_records(self, chunk: _Chunk) -> Iterator[tuple[int, int, bytes]]:
+        assert self._file
+        what = f"{self.path}: the chunk at byte {chunk.place}"
+        for num_bytes in (chunk.size, chunk.data_size):
+            refuse_larger(num_bytes, what, self._largest_bytes)
+        self._file.seek(chunk.data_place)
+        data = unpacked(chunk.compression, self._file.read(chunk.data_size), what, self._largest_bytes, chunk.cut)
+        whole = len(data) == chunk.size and not (chunk.checksum and crc32(data) != chunk.checksum)
+        if not whole and not chunk.cut:
+            raise DataError(f"{what}: is damaged, its size or checksum is wrong")
+        place = 0
+        while place + _RECORD_HEADER.size <= len(data):
+            opcode, length = _RECORD_HEADER.unpack_from(data, place)
+            begin = place + _RECORD_HEADER.size
+            place = begin + length
+            if place > len(data):
+                break
+            yield opcode, begin, data[begin:place]
+
+    def _loose(self) -> Iterator[tuple[int, int, bytes]]:
+        """The messages outside of chunks."""
+        assert self._file
+        place = len(MCAP_MAGIC)
+        while self._loose_end and place < self._loose_end:
+            self._file.seek(place)
+            opcode, length = _RECORD_HEADER.unpack(self._file.read(_RECORD_HEADER.size))
+            if opcode == _MESSAGE:
+                refuse_larger(length, f"{self.path}: the message at byte {place}", self._largest_bytes)
+                yield opcode, place, self._file.read(length)
+            place += _RECORD_HEADER.size + length
+
+    @staticmethod
+    def _sendings(records: Iterator[tuple[int, int, bytes]], wanted: dict[int, Connection]) -> Iterator[Sending]:
+        for opcode, _, content in records:
+            if opcode == _MESSAGE:
+                channel, _, log_ns, sent_ns = _MESSAGE_HEADER.unpack_from(content)
+                if channel in wanted:
+                    yield Sending(wanted[channel], sent_ns, log_ns, content[_MESSAGE_HEADER.size :])
 
 
-def _sendings(
-    file: BinaryIO | BytesIO, position: int, end: int, by_id: dict[int, Connection]
-) -> Iterator[tuple[Connection, int, int, bytes]]:
-    """The message records between two places of `file`, as `McapFile.sendings` gives them."""
-    while position < end:
-        file.seek(position)
-        head = file.read(_RECORD_HEADER)
-        length = deserialize_uint64(head[1:])[0]
-        if head[0] == 0x05:
-            channel, _, log_ns, sent_ns = deserialize_hiqq(file.read(_MESSAGE_HEADER))
-            if channel in by_id:
-                yield by_id[channel], sent_ns, log_ns, file.read(length - _MESSAGE_HEADER)
-        position += _RECORD_HEADER + length
+def _texts(content: bytes, place: int, count: int) -> tuple[list[str], int]:
+    """So many texts, each behind its length, from `place` on, and where they end."""
+    found = []
+    for _ in range(count):
+        (length,) = struct.unpack_from("<I", content, place)
+        place += 4 + length
+        if place > len(content):
+            raise DataError("a text is longer than its record")
+        found.append(content[place - length : place].decode())
+    return found, place

@@ -5,6 +5,7 @@ from io import BytesIO
 from pathlib import Path
 
 from rosbags.rosbag1.reader import (
+    Chunk,
     Header,
     IndexData,
     Reader,
@@ -13,12 +14,35 @@ from rosbags.rosbag1.reader import (
     read_uint32,
 )
 
+from fgtrack.io.errors import LARGEST_BYTES
+from fgtrack.io.ros.unpacking import unpacked
+
 
 class Rosbag1File(Reader):
     """A ROS 1 bag; one without its index is indexed by walking over its chunks."""
 
     path: Path
     break_off: str | None = None
+
+    def __init__(self, path: Path, largest_bytes: int = LARGEST_BYTES) -> None:
+        super().__init__(path)
+        self._largest_bytes = largest_bytes
+        self._cut: set[int] = set()  # where the data of chunks are that the file does not hold whole
+
+    def read_chunk(self) -> Chunk:
+        """The header of the chunk at this place of the file, whose data are never unpacked to more than is allowed."""
+        file = self.bio
+        assert file
+        place = file.tell()
+        compression = Header.read(file, RecordType.CHUNK).get_string("compression")
+        file.seek(place)
+        chunk = super().read_chunk()
+        what = f"{self.path}: the chunk at byte {place}"
+
+        def decompressor(data: bytes) -> bytes:
+            return unpacked(compression, data, what, self._largest_bytes, cut=chunk.datapos in self._cut)
+
+        return chunk._replace(decompressor=decompressor)
 
     def open(self) -> None:
         """Open the file and read which connections it holds."""
@@ -52,6 +76,10 @@ class Rosbag1File(Reader):
         assert file
         file.seek(position)
         chunk = self.read_chunk()
+        left = self.path.stat().st_size - chunk.datapos
+        if left < chunk.datasize:
+            self._cut.add(chunk.datapos)
+            chunk = chunk._replace(datasize=left)
         file.seek(chunk.datapos)
         data = chunk.decompressor(read_bytes(file, chunk.datasize))
         self.chunks[position] = chunk
@@ -68,7 +96,7 @@ class Rosbag1File(Reader):
                         self.connections.append(connection)
                 else:
                     entry = IndexData(header.get_time("time"), position, offset)
+                    read_bytes(inside, read_uint32(inside))  # raises where the message is cut
                     indexes[header.get_uint32("conn")].append(entry)
-                    read_bytes(inside, read_uint32(inside))
         finally:
             self.bio = file

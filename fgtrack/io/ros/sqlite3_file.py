@@ -16,6 +16,8 @@ from rosbags.interfaces import (
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
+from fgtrack.io.errors import LARGEST_BYTES, refuse_larger
+
 
 class Sqlite3File(Sqlite3Reader):
     """A SQLite file; one that was not closed is recovered in a copy, a truncated one is read row by row."""
@@ -23,8 +25,9 @@ class Sqlite3File(Sqlite3Reader):
     path: Path
     break_off: str | None = None
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, largest_bytes: int = LARGEST_BYTES) -> None:
         super().__init__(path)
+        self._largest_bytes = largest_bytes
         self._copies: tempfile.TemporaryDirectory[str] | None = None
         self._damaged = False
 
@@ -59,6 +62,8 @@ class Sqlite3File(Sqlite3Reader):
             rows = cast("list[tuple[int, int, bytes]]", self.dbconn.execute(query))
         for topic_id, log_ns, data in rows:
             if topic_id in by_id:
+                if isinstance(data, bytes):
+                    refuse_larger(len(data), f"{self.path}: the message at {log_ns} ns", self._largest_bytes)
                 yield by_id[topic_id], log_ns, data
 
     def _reconnect(self) -> None:

@@ -87,7 +87,7 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
 
 
 def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
-    bag = Bag(path, config.message_definitions)
+    bag = Bag(path, config.message_definitions, config.largest_bytes)
     uses = topic_uses(bag, config)
     windows_ns = {name: nanoseconds(each.scan_s) for name, each in config.detections.items() if each.scan_s is not None}
     return lambda: grouped(bag_messages(bag, uses), windows_ns) if windows_ns else bag_messages(bag, uses)

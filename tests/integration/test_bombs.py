@@ -1,0 +1,219 @@
+"""A few bytes that stand for gigabytes are refused in little memory; what breaks off is read as far as it goes."""
+
+import gzip
+import json
+import sqlite3
+import struct
+import tracemalloc
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+
+import lz4.frame
+import pytest
+from backports import zstd
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.typesys import Stores, get_typestore
+from support.messages import drive
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.types import Message
+from fgtrack.io.config import InputConfig, TopicInput
+from fgtrack.io.errors import TruncatedInput, UntilBreak
+from fgtrack.io.info import describe
+from fgtrack.io.ros.bag import Bag
+from fgtrack.io.ros.bag_writer import write_bag
+from fgtrack.io.ros.mcap_file import MCAP_MAGIC
+from fgtrack.io.source import open_input
+
+SMALL = InputConfig(largest_mb=1.0, most_objects=1000)
+_COMPRESSIONS = {"": CompressionType.NONE, "zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4}
+BOMB = bytes(100_000_000)
+HEADER = json.dumps({"type": "header", "format": "fgtrack-stream/1"}).encode() + b"\n"
+
+
+@contextmanager
+def little_memory() -> Iterator[None]:
+    """What is done here takes no fifth of what a bomb unpacks to."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < len(BOMB) / 5
+    finally:
+        tracemalloc.stop()
+
+
+def refused(path: Path, what: str) -> None:
+    with little_memory(), pytest.raises(DataError, match=what) as caught:
+        list(open_input(path, SMALL).messages())
+    assert "input." in str(caught.value)
+    with little_memory(), pytest.raises(DataError, match=what):
+        told(path)
+
+
+def told(path: Path) -> None:
+    problem = describe(path, SMALL).problem
+    if problem is not None:
+        raise DataError(problem)
+
+
+def drive_as(folder: Path, storage: str, messages: list[Message] | None = None, **options: bool) -> Path:
+    write_bag(folder / "bag", drive() if messages is None else messages, storage, **options)
+    (file,) = (file for file in (folder / "bag").iterdir() if file.suffix != ".yaml")
+    return file
+
+
+def test_a_long_line(tmp_path: Path) -> None:
+    path = tmp_path / "x.jsonl.gz"
+    path.write_bytes(gzip.compress(HEADER) + gzip.compress(BOMB.replace(b"\0", b" ")))
+    refused(path, r"x\.jsonl\.gz:2: is larger than 1 MB")
+
+
+@pytest.mark.parametrize("item", [b"{}", b"[]", b'{"x_m":1}', b"1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1"])
+def test_a_line_of_very_many_objects(tmp_path: Path, item: bytes) -> None:
+    path = tmp_path / "x.jsonl.gz"
+    start = b'{"type": "detections", "sensor": "a", "stamp_ns": 1, "receipt_ns": 1, "objects": ['
+    path.write_bytes(gzip.compress(HEADER + start + b",".join([item] * 90_000) + b"]}\n"))
+    refused(path, r"x\.jsonl\.gz:2: (is larger than 1 MB|holds more than 1000 objects)")
+
+
+def test_a_list_with_more_objects_than_allowed(tmp_path: Path) -> None:
+    path = tmp_path / "x.jsonl"
+    record = {
+        "type": "detections",
+        "sensor": "a",
+        "stamp_ns": 1,
+        "receipt_ns": 1,
+        "objects": [{"x_m": 1.0, "y_m": 1.0}] * 1001,
+    }
+    path.write_bytes(HEADER + json.dumps(record).encode())
+    with pytest.raises(DataError, match=r"a list of 1001 objects, more than input\.most_objects allows"):
+        list(open_input(path, SMALL).messages())
+
+
+def record(opcode: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def text(value: str) -> bytes:
+    return struct.pack("<I", len(value)) + value.encode()
+
+
+@pytest.mark.parametrize("stated", [0, 100, len(BOMB), 2**63])
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_chunk_of_an_mcap_file(tmp_path: Path, compression: str, stated: int, whole: bool) -> None:
+    """Whatever the chunk says of its size, and whether the file has its end or not."""
+    packed = {"zstd": zstd.compress, "lz4": lz4.frame.compress}[compression](BOMB)
+    chunk = struct.pack("<QQQI", 1, 1, stated, 0) + text(compression) + struct.pack("<Q", len(packed)) + packed
+    end = record(0x0F, bytes(4)) + record(0x02, bytes(20)) + MCAP_MAGIC if whole else b""
+    path = tmp_path / "x.mcap"
+    path.write_bytes(MCAP_MAGIC + record(0x01, text("ros2") + text("")) + record(0x06, chunk) + end)
+    refused(path, r"the chunk at byte \d+: is larger than 1 MB: raise input\.largest_mb")
+
+
+def test_a_packed_message(tmp_path: Path) -> None:
+    file = drive_as(tmp_path, "sqlite3")
+    with sqlite3.connect(file) as base:
+        base.execute("update messages set data = ? where id = 20", (zstd.compress(BOMB),))
+    base.close()
+    refused(tmp_path / "bag", r"the message on \S+ at \d+ ns: is larger than 1 MB")
+
+
+def test_a_packed_file(tmp_path: Path) -> None:
+    file = drive_as(tmp_path, "mcap")
+    file.with_name(f"{file.name}.zstd").write_bytes(zstd.compress(bytes(200_000_000)))
+    metadata = tmp_path / "bag/metadata.yaml"
+    changes = {
+        file.name: f"{file.name}.zstd",
+        "compression_mode: ''": "compression_mode: FILE",
+        "compression_format: ''": "compression_format: zstd",
+    }
+    content = metadata.read_text()
+    for old, new in changes.items():
+        assert old in content
+        content = content.replace(old, new)
+    metadata.write_text(content)
+    with pytest.raises(DataError, match="unpacks to more than 100 times its size"):
+        open_input(tmp_path / "bag")
+
+
+def test_a_chunk_of_a_ros1_bag(tmp_path: Path) -> None:
+    path = tmp_path / "x.bag"
+    writer = Rosbag1Writer(path)
+    writer.set_compression(Rosbag1Writer.CompressionFormat.BZ2)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with writer:
+        topic = writer.add_connection("/x", "std_msgs/msg/String", typestore=store)
+        for k in range(20):
+            writer.write(topic, k, struct.pack("<I", 5_000_000) + bytes(5_000_000))
+    config = InputConfig(ego=TopicInput("/x"), largest_mb=1.0)
+    with pytest.raises(DataError, match="larger than 1 MB"):
+        list(Bag(path, (), config.largest_bytes).messages(["/x"]))
+
+
+# --- what breaks off within its only chunk
+
+
+@pytest.mark.parametrize("kept", [0.3, 0.7, 0.97])
+@pytest.mark.parametrize("compression", ["", "zstd", "lz4"])
+def test_an_mcap_file_that_breaks_off_in_its_only_chunk_gives_the_messages_before(
+    tmp_path: Path, compression: str, kept: float
+) -> None:
+    messages = drive(600)
+    file = drive_as(tmp_path, "mcap", messages, standard_topics=False)
+    out = BytesIO()
+    with file.open("rb") as source:
+        read = list(make_reader(source).iter_messages())
+    writer = McapWriter(out, chunk_size=10**9, compression=_COMPRESSIONS[compression])
+    writer.start(profile="ros2", library="")
+    numbers: dict[str, int] = {}
+    for schema, channel, message in read:
+        if channel.topic not in numbers:
+            schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
+            numbers[channel.topic] = writer.register_channel(channel.topic, "cdr", schema_id)
+        writer.add_message(numbers[channel.topic], message.log_time, message.data, message.publish_time)
+    writer.finish()
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(out.getvalue())
+    assert list(open_input(path).messages()) == messages
+    path.write_bytes(out.getvalue()[: int(kept * out.tell())])
+    readable = UntilBreak(open_input(path).messages())
+    found = list(readable)
+    assert readable.error is not None
+    assert found == messages[: len(found)]
+    assert len(found) > (kept - 0.25) * len(messages)
+
+
+def until_break(bag: Bag) -> Iterator[int]:
+    try:
+        for message in bag.messages(["/x"]):
+            yield message.log_ns
+    except TruncatedInput:
+        return
+    pytest.fail("does not break off")
+
+
+@pytest.mark.parametrize("compression", [None, *Rosbag1Writer.CompressionFormat])
+def test_a_ros1_bag_that_breaks_off_in_its_only_chunk_gives_the_messages_before(
+    tmp_path: Path, compression: Rosbag1Writer.CompressionFormat | None
+) -> None:
+    path = tmp_path / "x.bag"
+    store = get_typestore(Stores.ROS1_NOETIC)
+    writer = Rosbag1Writer(path)
+    if compression is not None:
+        writer.set_compression(compression)
+    with writer:
+        topic = writer.add_connection("/x", "std_msgs/msg/UInt32", typestore=store)
+        writer.chunk_threshold = 10**9
+        for k in range(30_000):  # bzip2 packs 900 kB at a time
+            writer.write(topic, k, struct.pack("<I", k * 2_654_435_761 % 2**32))
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 3])
+    found = list(until_break(Bag(path)))
+    assert found == list(range(len(found)))
+    assert len(found) > 1_000
