@@ -56,6 +56,17 @@ def test_a_detection_comes_to_the_map_from_its_frame(frame: Frame, x_m: float, y
     assert found.measurement.z == pytest.approx([x_m, y_m, yaw_rad])
 
 
+@pytest.mark.parametrize("frame", ["map", "ego", "sensor"])
+def test_few_detections_are_placed_where_they_are_among_many(frame: Frame) -> None:
+    many = [Detection(x_m=10.0 + 3.0 * k, y_m=2.0 * k - 9.0, yaw_rad=0.1 * k) for k in range(20)]
+    among = candidates(*many, frame=frame)
+    for k in (0, 7, 19):
+        [alone] = candidates(many[k], frame=frame)
+        assert alone.measurement.z == pytest.approx(among[k].measurement.z, rel=1e-14)
+        assert alone.position_m == pytest.approx(among[k].position_m, rel=1e-14)
+        np.testing.assert_allclose(alone.measurement.R, among[k].measurement.R, rtol=1e-12)
+
+
 def test_the_sensor_pose_has_lever_arm_mount_and_the_velocity_of_the_ego() -> None:
     [found] = candidates(Detection(range_m=10.0, bearing_rad=0.1), sensor=POLAR, frame="sensor")
     pose = found.measurement.pose

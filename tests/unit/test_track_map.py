@@ -299,3 +299,15 @@ def test_a_map_cannot_be_changed() -> None:
         track.table[0, 0] = 1.0
     with pytest.raises(FrozenInstanceError):
         track.length_m = 1.0  # type: ignore[misc]
+
+
+def test_few_points_are_looked_up_as_many_are() -> None:
+    rng = np.random.default_rng(0)
+    points = OVAL.position(rng.uniform(0.0, OVAL.length_m, 60), rng.normal(0.0, 8.0, 60))
+    points[0] = OVAL.position(np.array([0.0]), np.array([2.0]))[0]  # its foot is where the line closes
+    many = OVAL.view(points, 1.0, 2.0)
+    assert 0 < many.outside.sum() < 60
+    for size in (1, 2, 3):
+        parts = [OVAL.view(points[k : k + size], 1.0, 2.0) for k in range(0, 60, size)]
+        for few, all_of_them in zip(zip(*parts, strict=True), many, strict=True):
+            np.testing.assert_allclose(np.concatenate(few), all_of_them, rtol=0.0, atol=1e-13)

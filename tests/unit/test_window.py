@@ -49,6 +49,22 @@ def test_the_place_of_a_stamp_is_that_of_the_newest_node_at_or_before_it() -> No
     assert made.at(9) is None
 
 
+def test_the_origins_of_a_chain_are_those_of_its_nodes_whatever_becomes_of_them() -> None:
+    rng = np.random.default_rng(0)
+    made = chain(0)
+    for number in range(1, 400):
+        made.insert(1000 * number - int(rng.integers(4)) * 1500 + number, rng.normal(size=2))
+        if number % 3 == 0:
+            made.move(int(rng.integers(len(made.nodes))), rng.normal(size=2))
+        if number % 7 == 0:
+            made.remove({made.newest.key})
+        if len(made.nodes) > 12:
+            made.drop(int(rng.integers(3)))
+        np.testing.assert_array_equal(made.origins, [node.origin for node in made.nodes])
+        assert made.keys == [node.key for node in made.nodes]
+    assert len(made.nodes) > 5
+
+
 def test_a_segment_that_is_split_stays_with_its_left_neighbour() -> None:
     made = chain(10, 30)
     made.oldest.slot = 7
