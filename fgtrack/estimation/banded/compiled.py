@@ -49,6 +49,15 @@ class Substitution:
         _solve_means(tracks, *order, thresholds, anchored, nodes.filtered, nodes.back, *found)
         self._known[tracks] = nodes.count[tracks]
 
+    def find_far(self, tracks: IntArray, anchored: IntArray) -> tuple[IntArray, IntArray]:
+        """See `Blocks.find_far`."""
+        nodes = self._nodes
+        rows, places = np.empty((2, int((nodes.count - nodes.first)[tracks].sum())), dtype=np.int64)
+        num = _find_far(
+            tracks, nodes.first, nodes.count, nodes.numbers, anchored, nodes.far, self.any_far, rows, places
+        )
+        return rows[:num], places[:num]
+
     def smoothed(self, tracks: IntArray, places: IntArray) -> tuple[FloatArray, FloatArray]:
         """See `Blocks.smoothed`."""
         nodes = self._nodes
@@ -290,6 +299,30 @@ def _solve_means(
             far[at] = too_long and place >= first[track] + anchored[track]
             any_far[track] |= far[at]
             later = at
+
+
+@njit(f"int64(int64[:], {_ORDER}, int64[::1], b1[::1], b1[::1], int64[::1], int64[::1])", cache=True)
+def _find_far(
+    tracks: IntArray,
+    first: IntArray,
+    count: IntArray,
+    numbers: IntArray,
+    anchored: IntArray,
+    far: BoolArray,
+    any_far: BoolArray,
+    rows: IntArray,
+    places: IntArray,
+) -> int:
+    """Write `rows` and `places`; how many."""
+    num = 0
+    for t in range(len(tracks)):
+        track = tracks[t]
+        if any_far[track]:
+            for place in range(first[track] + anchored[track], count[track]):
+                if far[numbers[track, place]]:
+                    rows[num], places[num] = t, place
+                    num += 1
+    return num
 
 
 @njit(

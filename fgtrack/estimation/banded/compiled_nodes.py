@@ -29,6 +29,13 @@ class CompiledNodes(Nodes):
         order = self.first, self.numbers
         _shift(tracks, numbers, steps, *order, self.origin, self.step, self.predicted, self.back, self.rows)
 
+    def observe(self, numbers: IntArray, y: FloatArray, H: FloatArray, R: FloatArray, offsets: FloatArray) -> None:
+        """See `Nodes.observe`."""
+        while int(self.num_rows[numbers].max(initial=0)) + y.shape[1] > self.rows.shape[1]:
+            self._grow_rows()
+        if not _observe(numbers, y, H.copy(), R, offsets, self.rows, self.num_rows):
+            raise np.linalg.LinAlgError("a covariance is not positive definite")
+
     def _place(self, tracks: IntArray, places: IntArray, stamp_ns: int) -> IntArray:
         numbers = np.empty(len(tracks), dtype=np.int64)
         _place(tracks, places, stamp_ns, self.stamps_ns, self.numbers, self.count, numbers)
@@ -103,3 +110,46 @@ def _shift(
             for i in range(n):
                 for j in range(n):
                     back[behind, i, n] += back[behind, i, j] * steps[t, j]
+
+
+@njit(
+    f"b1(int64[:], float64[:, :], {_TABLES}, float64[:, :, :], float64[:, :], {_TABLES}, {_TRACKS})",
+    cache=True,
+    error_model="numpy",
+)
+def _observe(
+    numbers: IntArray,
+    y: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+    offsets: FloatArray,
+    rows: FloatArray,
+    num_rows: IntArray,
+) -> bool:
+    """Whether all covariances are positive definite."""
+    k, n = H.shape[1:]
+    L = np.empty((k, k))
+    for t in range(len(numbers)):
+        at = numbers[t]
+        used = num_rows[at]
+        for i in range(k):
+            for j in range(i + 1):
+                value = R[t, i, j]
+                for m in range(j):
+                    value -= L[i, m] * L[j, m]
+                if i > j:
+                    L[i, j] = value / L[j, j]
+                elif value > 0.0:
+                    L[i, i] = np.sqrt(value)
+                else:
+                    return False
+            measured = y[t, i]
+            for j in range(n):
+                measured += H[t, i, j] * offsets[t, j]
+            for j in range(n + 1):
+                value = measured if j == n else H[t, i, j]
+                for m in range(i):
+                    value -= L[i, m] * rows[at, used + m, j]
+                rows[at, used + i, j] = value / L[i, i]
+        num_rows[at] += k
+    return True

@@ -6,7 +6,7 @@ from functools import cache
 from importlib.util import find_spec
 from typing import NamedTuple, Protocol
 
-from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.banded.elimination import eliminate
 from fgtrack.estimation.banded.nodes import Nodes
 from fgtrack.estimation.banded.substitution import Blocks
@@ -14,9 +14,6 @@ from fgtrack.estimation.banded.substitution import Blocks
 
 class Substitution(Protocol):
     """Smoothed means and covariances of the nodes of many tracks, see `Blocks`."""
-
-    any_far: BoolArray
-    """Whether a node of the track is marked as `far`."""
 
     def begin(self, track: int) -> None:
         """A new track, with one node."""
@@ -29,6 +26,9 @@ class Substitution(Protocol):
 
     def solve_means(self, tracks: IntArray, thresholds: FloatArray, anchored: IntArray) -> None:
         """Find the steps of the nodes in the windows of `tracks`; mark all that are too long."""
+
+    def find_far(self, tracks: IntArray, anchored: IntArray) -> tuple[IntArray, IntArray]:
+        """Nodes of `tracks` that are marked as `far`, but for the first `anchored` ones of each window."""
 
     def smoothed(self, tracks: IntArray, places: IntArray) -> tuple[FloatArray, FloatArray]:
         """Steps (m, n) and covariances (m, n, n) of the nodes at `places` of `tracks`."""

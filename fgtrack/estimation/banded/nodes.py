@@ -12,6 +12,7 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.terms import MeasurementTerm
+from fgtrack.estimation.whitening import whitened
 
 _NEVER_NS = np.iinfo(np.int64).max
 _FEW_TRACKS, _FEW_NODES, _FEW_COMPONENTS = 4, 16, 4
@@ -176,6 +177,15 @@ class Nodes:
         else:
             self.rows[numbers, :k] = rows
         self.num_rows[numbers] = used + k
+
+    def observe(self, numbers: IntArray, y: FloatArray, H: FloatArray, R: FloatArray, offsets: FloatArray) -> None:
+        """`measure` y = H (x - guess) + N(0, R), shapes (m, k), (m, k, n), (m, k, k); guess - x0 is `offsets`, (m, n).
+
+        Raises `numpy.linalg.LinAlgError` for an R that is not positive definite.
+        """
+        rows = whitened(y, H, R)
+        rows[..., -1] += np.matvec(rows[..., :-1], offsets)
+        self.measure(numbers, rows)
 
     def snapshot(self, tracks: IntArray) -> list[IntArray]:
         """The order of the nodes of `tracks`, for `restore` after at most one insertion in each."""

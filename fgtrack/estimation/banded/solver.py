@@ -110,16 +110,7 @@ class Solver:
 
     def far(self, tracks: IntArray) -> tuple[IntArray, IntArray]:
         """Nodes that are too far from their linearisation points: positions of their tracks, and their places."""
-        nodes = self.nodes
-        some = self._substitution.any_far[tracks].nonzero()[0]
-        if not some.size:
-            return some, some
-        count = nodes.count[tracks[some]]
-        free = (nodes.first + self.anchored)[tracks[some]]
-        places = free[:, None] + np.arange(max(int((count - free).max()), 0))
-        numbers = nodes.numbers[tracks[some, None], np.minimum(places, count[:, None] - 1)]
-        rows, columns = np.nonzero(nodes.far[numbers] & (places < count[:, None]))
-        return some[rows], places[rows, columns]
+        return self._substitution.find_far(tracks, self.anchored)
 
     # --- one track
 

@@ -161,6 +161,19 @@ class Blocks:
         nodes.step[inner], nodes.far[inner] = found, far
         self.any_far[of[far.any(axis=0)]] = True
 
+    def find_far(self, tracks: IntArray, anchored: IntArray) -> tuple[IntArray, IntArray]:
+        """Nodes of `tracks` that are marked as `far`: positions of their tracks, and their places."""
+        nodes = self._nodes
+        some = self.any_far[tracks].nonzero()[0]
+        if not some.size:
+            return some, some
+        count = nodes.count[tracks[some]]
+        free = (nodes.first + anchored)[tracks[some]]
+        places = free[:, None] + np.arange(max(int((count - free).max()), 0))
+        numbers = nodes.numbers[tracks[some, None], np.minimum(places, count[:, None] - 1)]
+        rows, columns = np.nonzero(nodes.far[numbers] & (places < count[:, None]))
+        return some[rows], places[rows, columns]
+
     def smoothed(self, tracks: IntArray, places: IntArray) -> tuple[FloatArray, FloatArray]:
         """Steps (m, n) and covariances (m, n, n) of the nodes at `places` of `tracks`."""
         nodes = self._nodes

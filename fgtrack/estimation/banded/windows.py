@@ -20,7 +20,7 @@ from fgtrack.estimation.initiation import Fix, Line, along, fixes_of
 from fgtrack.estimation.interpolation import between_all
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.estimation.terms import EquivalentMeasurement, curved, overshot
-from fgtrack.estimation.whitening import Innovations, whitened
+from fgtrack.estimation.whitening import Innovations
 from fgtrack.models.motion import MotionModel
 
 #: Nodes behind the window are forgotten when there are so many that nobody needs.
@@ -266,9 +266,8 @@ class Windows:
                 for number in at.tolist():
                     linearise_terms(nodes, number)
                 continue
-            measured = whitened(group.y, group.H, group.R)[chosen]
-            measured[..., -1] += np.matvec(measured[..., :-1], guesses[rows] - nodes.origin[at])
-            nodes.measure(at, measured)
+            y, H, R = (values[chosen] for values in (group.y, group.H, group.R))
+            nodes.observe(at, y, H, R, guesses[rows] - nodes.origin[at])
 
     def _add(self, track: int, place: int, term: EquivalentMeasurement, undo: Undo) -> None:
         number = int(self.nodes.numbers[track, place])
@@ -282,7 +281,7 @@ class Windows:
         """Where the first measurement comes that is not linear, relinearise the window, and from then on by thresholds
         of its own; gives the states at `stamp_ns` after that.
         """
-        bent = [row for row, item in enumerate(measurements) if not self.solver.curved[tracks[row]] and curved(item)]
+        bent = [row for row, item in enumerate(measurements) if curved(item) and not self.solver.curved[tracks[row]]]
         if not bent:
             return guesses
         for track in tracks[bent].tolist():
