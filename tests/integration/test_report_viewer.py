@@ -181,6 +181,20 @@ def test_a_frame_is_drawn_fast_enough_for_thirty_a_second(page: Browser) -> None
     assert milliseconds < 1000 / 30
 
 
+def test_lines_are_left_out_only_where_they_cannot_be_seen(page: Browser) -> None:
+    """Of a pane of 100 by 100 pixels, a metre each, around the origin: two ends beyond a common side."""
+    sides = "(() => { const c = new Camera({ left: 0, top: 0, width: 100, height: 100 }, 0, 0, 0, 1);"
+    for one, other, is_left_out in (
+        ((-500, 0), (-400, 0), True),
+        ((0, 500), (300, 500), True),
+        ((-500, 0), (500, 0), False),  # right across
+        ((-500, 300), (300, -500), False),
+        ((0, 0), (0, 10), False),
+    ):
+        shared = page.value(f"{sides} return c.sides({one[0]}, {one[1]}) & c.sides({other[0]}, {other[1]}); }})()")
+        assert (shared != 0) is is_left_out
+
+
 def test_a_link_opens_the_same_picture(page: Browser, folder: Path) -> None:
     page.value(
         "viewer.setFollow('object 1'), viewer.pan(40, -20), viewer.zoom(2), viewer.isSideBySide = false,"

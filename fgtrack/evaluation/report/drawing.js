@@ -11,6 +11,7 @@ const SENSOR_MARKS = Object.keys(MARKS);
 const BEARING_M = 150;
 const SHOWN_S = 0.3; // how long a detection stays
 const MOST_IN_FLIGHT = 2000;
+const WIDEST = 100; // pixels of a line
 const CHUNK = 64; // points of a piece of the map, which is drawn only if it can be seen
 
 /** Where a pane is on the canvas, what of the world is in its middle, and which direction points to the right. */
@@ -44,6 +45,14 @@ class Camera {
       left >= pane.left - reach && left <= pane.left + pane.width + reach &&
       top >= pane.top - reach && top <= pane.top + pane.height + reach
     );
+  }
+
+  /** Beyond which sides of the pane a place is, a bit for each: a line between two with a common one is not seen. */
+  sides(x, y) {
+    const [left, top] = this.onCanvas(x, y);
+    const { pane } = this;
+    const [right, bottom] = [pane.left + pane.width + WIDEST, pane.top + pane.height + WIDEST];
+    return (left < pane.left - WIDEST) | ((left > right) << 1) | ((top < pane.top - WIDEST) << 2) | ((top > bottom) << 3);
   }
 }
 
@@ -122,20 +131,29 @@ class Painter {
     }
   }
 
+  /** Continues the line to a place; a piece that cannot be seen is left out. */
+  #lineTo(x, y, isFirst = false) {
+    const sides = this.camera.sides(x, y);
+    if (isFirst || (sides & this.sides) !== 0) this.context.moveTo(x, y);
+    else this.context.lineTo(x, y);
+    this.sides = sides;
+  }
+
   #truth(recording, time, trail) {
     const { context, theme } = this;
     for (const path of recording.objects.values()) {
       const here = path.at(time);
-      if (here === null || !this.camera.sees(here.x, here.y, 500)) continue;
+      if (here === null) continue;
       context.strokeStyle = theme.truth;
       context.lineWidth = Math.max(this.scene.size[1], 4 * this.px);
       context.beginPath();
-      for (let row = countUpTo(path.t, time - trail); row < path.t.length && path.t[row] <= time; row += 1) {
-        context.lineTo(path.x[row], path.y[row]);
+      const first = countUpTo(path.t, time - trail);
+      for (let row = first; row < path.t.length && path.t[row] <= time; row += 1) {
+        this.#lineTo(path.x[row], path.y[row], row === first);
       }
-      context.lineTo(here.x, here.y);
+      this.#lineTo(here.x, here.y);
       context.stroke();
-      this.#box(here.x, here.y, here.yaw, theme.truth, null);
+      if (this.camera.sees(here.x, here.y, 50)) this.#box(here.x, here.y, here.yaw, theme.truth, null);
     }
   }
 
@@ -163,7 +181,7 @@ class Painter {
     context.lineWidth = 1.2 * px;
     context.setLineDash([2 * px, 3 * px]);
     context.beginPath();
-    for (let at = row; at >= 0 && t[at] >= since; at = run.trackBefore[at]) context.lineTo(x[at], y[at]);
+    for (let at = row; at >= 0 && t[at] >= since; at = run.trackBefore[at]) this.#lineTo(x[at], y[at], at === row);
     context.stroke();
     context.setLineDash([]);
     context.globalAlpha = 1;
@@ -184,19 +202,19 @@ class Painter {
       const at = rows[k];
       if (final.t[at] > time) break;
       if (final.known[at] > time + 1e-9) continue;
-      context.lineTo(final.x[at], final.y[at]);
+      this.#lineTo(final.x[at], final.y[at], last === -Infinity);
       last = at;
     }
     const [from, to] = [run.pastOfTick[tick], run.pastOfTick[tick + 1]];
     let known = last > -Infinity;
     for (let at = from; at < to; at += 1) {
       if (past.track[at] !== track) continue;
+      this.#lineTo(past.x[at], past.y[at], !known);
       known = true;
-      context.lineTo(past.x[at], past.y[at]);
       ellipses.push([past, at]);
     }
     if (!known) return;
-    if (to > from || time - final.t[last] < 3) context.lineTo(tracks.x[row], tracks.y[row]);
+    if (to > from || time - final.t[last] < 3) this.#lineTo(tracks.x[row], tracks.y[row]);
     context.stroke();
     if (!settings.ellipses) return;
     if (last > -Infinity) ellipses.push([final, last]);
@@ -223,7 +241,7 @@ class Painter {
   #ellipse(table, row, fill = 0) {
     const { context } = this;
     const [long, short] = [table.long[row], table.short[row]];
-    if (!(long >= 0)) return;
+    if (!(long >= 0) || !this.camera.sees(table.x[row], table.y[row], long)) return;
     context.beginPath();
     context.ellipse(table.x[row], table.y[row], long, short, table.direction[row], 0, 2 * Math.PI);
     if (fill) {
