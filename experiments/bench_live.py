@@ -97,7 +97,9 @@ class Part:
 
     until_s: float
     memory_mb: float
+    ticks: int
     tick_ms: list[float]
+    """Median, 99th percentile, largest."""
     cpu_ms: list[float]
     """Of the ticking thread alone: other processes of the machine take nothing of it."""
     missed: int
@@ -106,12 +108,10 @@ class Part:
 
     def row(self) -> str:
         """As a row of the table."""
-        times = (
-            f"{p50:.2f} / {p99:.2f} / {worst:.1f}" for p50, p99, worst in (spread(self.tick_ms), spread(self.cpu_ms))
-        )
+        times = (f"{p50:.2f} / {p99:.2f} / {worst:.1f}" for p50, p99, worst in (self.tick_ms, self.cpu_ms))
         return (
             f"| {self.until_s / 60.0:.3g} | {self.memory_mb:.1f} | {' | '.join(times)} "
-            f"| {self.missed} of {len(self.tick_ms)} | {self.skipped} | {self.tracks} |"
+            f"| {self.missed} of {self.ticks} | {self.skipped} | {self.tracks} |"
         )
 
 
@@ -126,26 +126,26 @@ def track(receiver: Receiver, hz: float, duration_s: float, num_parts: int) -> l
     receiver.begun.wait()
     begun_ns = due_ns = first_multiple(time.time_ns(), step_ns)
     parts: list[Part] = []
-    part = Part(0.0, 0.0, [], [], 0, 0, 0)
+    tick_ms, cpu_ms, missed, skipped = list[float](), list[float](), 0, 0
     while True:
         sleep_until(due_ns)
         over = receiver.over.is_set()  # then this tick processes all
         before_ns, cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
         report = receiver.tracker.tick(due_ns)
-        part.cpu_ms.append((time.thread_time_ns() - cpu_ns) / 1e6)
-        part.tick_ms.append((time.perf_counter_ns() - before_ns) / 1e6)
+        cpu_ms.append((time.thread_time_ns() - cpu_ns) / 1e6)
+        tick_ms.append((time.perf_counter_ns() - before_ns) / 1e6)
         done_ns = time.time_ns()
-        part.missed += done_ns > due_ns + step_ns
+        missed += done_ns > due_ns + step_ns
         passed_s = (due_ns - begun_ns) / 1e9
         if over or (passed_s >= duration_s / num_parts * (len(parts) + 1) and len(parts) + 1 < num_parts):
-            part.until_s, part.memory_mb, part.tracks = passed_s, memory_mb(), len(report.tracks)
-            parts.append(part)
-            progress(part.row())
-            part = Part(0.0, 0.0, [], [], 0, 0, 0)
+            times = (len(tick_ms), spread(tick_ms), spread(cpu_ms))
+            parts.append(Part(passed_s, memory_mb(), *times, missed, skipped, len(report.tracks)))
+            progress(parts[-1].row())
+            tick_ms, cpu_ms, missed, skipped = [], [], 0, 0
         if over:
             return parts
         following_ns = max(due_ns + step_ns, first_multiple(done_ns, step_ns))
-        part.skipped += (following_ns - due_ns) // step_ns - 1
+        skipped += (following_ns - due_ns) // step_ns - 1
         due_ns = following_ns
 
 

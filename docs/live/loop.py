@@ -16,15 +16,23 @@ PUBLISHED_AGO_NS = 100_000_000  # waiting makes the tracks better: late detectio
 Received = fgtrack.EgoState | fgtrack.DetectionList
 
 
-def run(tracker: fgtrack.Tracker, source: Iterable[Received], publish: Callable[[fgtrack.TracksAt], None]) -> None:
-    """Track until the source ends; what it gives is already stamped with its receipt."""
+def run(
+    tracker: fgtrack.Tracker,
+    source: Iterable[Received],
+    publish: Callable[[fgtrack.TracksAt], None],
+    now_ns: Callable[[], int] = time.time_ns,
+) -> None:
+    """Track until the source ends; what it gives is stamped with its receipt by the clock `now_ns`."""
     receiver = threading.Thread(target=lambda: [tracker.receive(message) for message in source], daemon=True)
     receiver.start()
     output = tracker.output()
-    due_ns = time.time_ns() // PERIOD_NS * PERIOD_NS
+    while now_ns() == 0 and receiver.is_alive():  # simulated time has not begun
+        time.sleep(0.001)
+    due_ns = now_ns() // PERIOD_NS * PERIOD_NS
     while receiver.is_alive():
-        due_ns = max(due_ns, time.time_ns() // PERIOD_NS * PERIOD_NS) + PERIOD_NS  # after a long tick: skip some
-        time.sleep(max(due_ns - time.time_ns(), 0) / 1e9)
+        due_ns = max(due_ns + PERIOD_NS, now_ns() // PERIOD_NS * PERIOD_NS)  # after a long tick: skip some
+        while (left_ns := due_ns - now_ns()) > 0 and receiver.is_alive():
+            time.sleep(min(left_ns / 1e9, 0.001))
         tracker.tick(due_ns)
         published = output.at(due_ns - PUBLISHED_AGO_NS)
         if published is not None:
