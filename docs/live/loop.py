@@ -33,6 +33,8 @@ def run(
         due_ns = max(due_ns + PERIOD_NS, now_ns() // PERIOD_NS * PERIOD_NS)  # after a long tick: skip some
         while (left_ns := due_ns - now_ns()) > 0 and receiver.is_alive():
             time.sleep(min(left_ns / 1e9, 0.001))
+        if left_ns > 0:
+            break
         tracker.tick(due_ns)
         published = output.at(due_ns - PUBLISHED_AGO_NS)
         if published is not None:

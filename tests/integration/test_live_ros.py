@@ -118,7 +118,9 @@ def test_a_list_waits_for_its_pose_and_keeps_its_receipt(script: ModuleType) -> 
     assert counts(node) == {}
     node.buffer.known[NOW_NS + 60 * MS] = pose(NOW_NS + 60 * MS)
     tick(node, NOW_NS + 70 * MS)
+    tick(node, NOW_NS + 90 * MS)
     assert counts(node) == {"radar": {"birth": 1}}
+    assert node.tracker.refused == {}  # no pose is given twice
     assert node.tracker.lateness["radar"].delay_worst_s == 0.01
     assert node.without_pose == 0
 
