@@ -36,8 +36,7 @@ def run(
         if left_ns > 0:
             break
         tracker.tick(due_ns)
-        published = output.at(due_ns - PUBLISHED_AGO_NS)
-        if published is not None:
+        if (published := output.at(due_ns - PUBLISHED_AGO_NS)) is not None:
             publish(published)
     tracker.tick(due_ns)  # what came last
 
@@ -62,6 +61,4 @@ def show(published: fgtrack.TracksAt) -> None:
 if __name__ == "__main__":
     tracker = fgtrack.Tracker.from_config("smoother", map="oval")
     run(tracker, drive(duration_s=5.0), show)
-    for sensor, late in tracker.lateness.items():
-        print(sensor, late)
-    print(tracker.timing, tracker.counts, tracker.refused, tracker.failures)
+    print(*tracker.lateness.items(), tracker.timing, tracker.counts, tracker.refused, tracker.failures, sep="\n")
