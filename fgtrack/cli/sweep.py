@@ -11,7 +11,7 @@ import typer
 
 from fgtrack.cli.arguments import Overwrite
 from fgtrack.cli.show import console, progress, say
-from fgtrack.core.errors import CallError
+from fgtrack.core.errors import CallError, one_line
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.over_seeds import seed_contests, shown_tables, to_csv
 from fgtrack.io.output import write_file
@@ -125,5 +125,5 @@ def _complain(result: SweepResult, sweep_file: Path, out: Path) -> int:
         names = ", ".join(result.unknown_metrics)
         problems.append(f"{sweep_file}: metrics: no column fits {names}; without `metrics` {SWEEP_TABLE} has all")
     for problem in problems:
-        print(f"fgtrack: error: {' '.join(problem.split())}", file=sys.stderr)
+        print(f"fgtrack: error: {one_line(problem)}", file=sys.stderr)
     return 1 if problems else 0

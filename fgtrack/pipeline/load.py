@@ -130,26 +130,30 @@ def validate(kind: type[T], raw: Mapping[str, Any], origin: str) -> T:
         raise CallError(f"{origin}: {_first(error)}") from error
     for where, name, known in _unknown(raw, value, ""):
         raise CallError(f"{origin}: {where}{name}: unknown key, known here: {', '.join(known)}")
-    for where, number in _numbers(plain(value), ""):
-        if isinstance(number, int):
-            if abs(number) >= 2**63:
-                raise CallError(f"{origin}: {where}: {_name(number)} has more than 64 bits")
-        elif number and not SMALLEST <= abs(number) <= LARGEST:
+    for where, scalar in _scalars(plain(value), ""):
+        if isinstance(scalar, str):
+            if not scalar.isprintable():
+                raise CallError(f"{origin}: {where}: {scalar!a} holds what is no letter or sign")
+        elif isinstance(scalar, int):
+            if abs(scalar) >= 2**63:
+                raise CallError(f"{origin}: {where}: {_name(scalar)} has more than 64 bits")
+        elif scalar and not SMALLEST <= abs(scalar) <= LARGEST:
             raise CallError(
-                f"{origin}: {where}: {_name(number)} is out of range, a magnitude of {SMALLEST:g} to {LARGEST:g} or 0 "
+                f"{origin}: {where}: {_name(scalar)} is out of range, a magnitude of {SMALLEST:g} to {LARGEST:g} or 0 "
                 "is needed"
             )
     return value
 
 
-def _numbers(value: object, where: str) -> Iterator[tuple[str, float]]:
-    """Every number in plain `value`, with its path."""
-    if isinstance(value, float | int):
+def _scalars(value: object, where: str) -> Iterator[tuple[str, float | str]]:
+    """Every number and text in plain `value`, keys too, with its path."""
+    if isinstance(value, float | int | str):
         yield where, value
     elif isinstance(value, (dict, list)):
         items = value.items() if isinstance(value, dict) else enumerate(value)
         for name, item in items:
-            yield from _numbers(item, f"{where}.{name}" if where else str(name))
+            yield where, name
+            yield from _scalars(item, f"{where}.{name}" if where else str(name))
 
 
 @lru_cache

@@ -3,12 +3,12 @@
 from dataclasses import field
 from typing import Annotated
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
+from pydantic import Field, NonNegativeFloat, NonNegativeInt
 
 from fgtrack.models.oval import OVAL
 from fgtrack.sim.delays import AnyDelay, ConstantDelay
 from fgtrack.sim.sensor import SimulatedSensor
-from fgtrack.sim.settings import settings
+from fgtrack.sim.settings import Rate, settings
 from fgtrack.sim.vehicles import AnyVehicle, TrackVehicle
 
 
@@ -16,7 +16,7 @@ from fgtrack.sim.vehicles import AnyVehicle, TrackVehicle
 class EgoMessages:
     """What the localisation of the ego vehicle reports."""
 
-    rate_hz: PositiveFloat = 100.0
+    rate_hz: Rate = 100.0
     position_std_m: NonNegativeFloat = 0.02
     """Of x and of y."""
     yaw_std_rad: NonNegativeFloat = 0.001
@@ -37,7 +37,7 @@ class Scenario:
     """Path of a map file, `oval` for the built-in track, or None for open space."""
     duration_s: Annotated[float, Field(gt=0.0, le=86_400.0)] = 60.0
     ego_messages: EgoMessages = field(default_factory=EgoMessages)
-    truth_rate_hz: PositiveFloat = 100.0
+    truth_rate_hz: Rate = 100.0
     detection_origin_x_m: float = -1.74
     """Origin of the detection frame in the ego frame; by default the rear axle of the paper's vehicle."""
     start_ns: NonNegativeInt = 1_000_000_000_000

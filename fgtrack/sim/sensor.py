@@ -6,13 +6,13 @@ from dataclasses import field
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat, PositiveFloat
+from pydantic import Field, NonNegativeFloat
 
 from fgtrack.core.types import MEASURABLE, BoolArray, FloatArray, Frame
 from fgtrack.models.sensors import Mount
 from fgtrack.sim.clocks import AnyClock
 from fgtrack.sim.delays import AnyDelay, NoDelay
-from fgtrack.sim.settings import Probability, require, settings
+from fgtrack.sim.settings import Probability, Rate, require, settings
 
 #: Components in the frame of the sensor, relative to it.
 POLAR = ("range_m", "bearing_rad", "range_rate_mps")
@@ -45,7 +45,7 @@ class SimulatedSensor:
     name: Annotated[str, Field(min_length=1)]
     std: Mapping[str, NonNegativeFloat]
     """Standard deviation of each measured component; x_m along, y_m across the line of sight."""
-    rate_hz: PositiveFloat = 20.0
+    rate_hz: Rate = 20.0
     phase_s: NonNegativeFloat = 0.0
     """Time of the first scan."""
     jitter_s: NonNegativeFloat = 0.0
@@ -103,7 +103,7 @@ class SimulatedSensor:
         """Times of all scans from 0 to `duration_s`, ascending, drop-outs included."""
         num_scans = max(math.floor((duration_s - self.phase_s) * self.rate_hz + 1e-9) + 1, 0)
         times = self.phase_s + np.arange(num_scans) / self.rate_hz
-        times += rng.uniform(0.0, self.jitter_s, num_scans)
+        times += rng.uniform(0.0, abs(self.jitter_s), num_scans)  # not -0.0
         return times[times <= duration_s]
 
     def silent(self, times_s: FloatArray) -> BoolArray:

@@ -8,6 +8,8 @@ from pydantic.dataclasses import dataclass
 
 T = TypeVar("T")
 
+Rate = Annotated[float, Field(gt=0.0, le=10_000.0)]
+"""In Hz."""
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 
 

@@ -266,3 +266,12 @@ def test_a_file_that_would_fill_the_memory_is_refused(tmp_path: Path, text: str,
         load(Config, path)
     assert message in str(caught.value)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "setting", ['map.track="a\\0b"', 'ignore_sensors=["\\x1b[31m"]', 'input.ego={topic: "\\u202ex"}']
+)
+def test_a_text_of_the_configuration_can_be_printed(setting: str) -> None:
+    with pytest.raises(CallError, match="holds what is no letter or sign") as caught:
+        load(Config, None, [setting])
+    assert str(caught.value).isprintable()

@@ -357,3 +357,21 @@ def test_a_track_row_is_written_in_tens_of_microseconds(tmp_path):
             writer.write_tick(TickReport(tick, tick, tracks, ()), 1, 0)
             best_s = min(best_s, time.perf_counter() - start_s)
     assert best_s / 50 < 60e-6  # 9 us on the machine where it was written
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"versions": "x"},
+        {"input": []},
+        {"counts": {"radar": 3}},
+        {"counts": {"radar": {"birth": "x"}}},
+        {"complete": 1},
+    ],
+)
+def test_a_meta_file_that_says_something_else_is_one_line(tmp_path, change):
+    write(tmp_path / "run", report())
+    file = tmp_path / "run/meta.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    with pytest.raises(DataError, match=rf"meta\.json: {next(iter(change))}\S* is not what a run writes there"):
+        load_run(tmp_path / "run")

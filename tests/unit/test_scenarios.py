@@ -8,6 +8,7 @@ import pytest
 
 from fgtrack.core.types import DetectionList, FloatArray, Message, TruthState
 from fgtrack.pipeline.shipped import read_scenario
+from fgtrack.sim.sensor import SimulatedSensor
 from fgtrack.sim.simulate import simulate
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -77,3 +78,14 @@ def test_only_one_car_of_the_default_is_in_sight_at_a_time(cars: dict[int, Float
     near = [np.hypot(*(car - ego)[:, :2].T) < 57.0 for i, car in cars.items() if i != EGO_ID]
     assert all(mask.any() for mask in near)
     assert not any((a & b).any() for a, b in pairwise(near))
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, 10_001.0, 1e6])
+def test_no_rate_is_beyond_reason(rate_hz: float) -> None:
+    with pytest.raises(ValueError, match="rate_hz"):
+        SimulatedSensor(name="lidar", std={"x_m": 0.1, "y_m": 0.1}, rate_hz=rate_hz)
+
+
+def test_a_jitter_of_minus_zero_is_none() -> None:
+    sensor = SimulatedSensor(name="lidar", std={"x_m": 0.1, "y_m": 0.1}, rate_hz=10.0, jitter_s=-0.0)
+    assert sensor.scan_times(np.random.default_rng(1), 0.25).tolist() == [0.0, 0.1, 0.2]

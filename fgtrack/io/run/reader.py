@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import TypeAdapter, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
@@ -31,6 +32,30 @@ _INTEGER_COLUMNS = frozenset(
 
 NO_TRACK = -1
 """Track id of an update that belongs to no track."""
+
+
+@dataclass(frozen=True)
+class _Input:
+    path: str = ""
+    kind: str = ""
+
+
+@dataclass(frozen=True)
+class _Meta:
+    """What is relied on in meta.json; other keys may hold anything."""
+
+    input: _Input = field(default_factory=_Input)
+    estimator: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    complete: bool = False
+    digest: str = ""
+    detections_received: int = 0
+    counts: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    ego_refused: Mapping[str, int] = field(default_factory=dict)
+    broken_off: str | None = None
+
+
+_META = TypeAdapter(_Meta)
 
 
 class Table(dict[str, Column]):
@@ -145,6 +170,11 @@ def _read_meta(path: Path) -> Mapping[str, Any]:
         raise DataError(f"{file}: is not JSON ({error}), repeat the run") from error
     if not isinstance(meta, dict) or meta.get("format") != RUN_FORMAT:
         raise DataError(f"{file}: does not say format {RUN_FORMAT!r}, so this is not a run folder")
+    try:
+        _META.validate_json(json.dumps(meta), strict=True)
+    except ValidationError as error:
+        where = ".".join(str(part) for part in error.errors()[0]["loc"])
+        raise DataError(f"{file}: {where} is not what a run writes there, repeat the run") from error
     return meta
 
 
