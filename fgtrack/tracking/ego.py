@@ -3,8 +3,9 @@
 import bisect
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from functools import lru_cache
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,11 @@ from fgtrack.tracking.inbox import ASYMMETRY, LARGEST, is_number
 
 LARGEST_STEP_BACK_S = 1.0
 """A state that is older than the newest one by more than this has a wrong stamp."""
+
+
+_FIELDS = [field.name for field in fields(EgoState)]
+_VALUES = attrgetter(*_FIELDS)
+_YAW, _YAW_RATE = _FIELDS.index("yaw_rad"), _FIELDS.index("yaw_rate_radps")
 
 
 class EgoPose(NamedTuple):
@@ -153,11 +159,11 @@ class EgoSource(ABC):
 
     def _low_passed(self, ego: EgoState, yaw_rad: float, yaw_rate_radps: float) -> EgoState:
         """`ego` with its yaw and yaw rate drawn towards the given ones."""
-        return replace(
-            ego,
-            yaw_rad=wrap_angle(yaw_rad + self._yaw_weight * wrap_angle(ego.yaw_rad - yaw_rad)),
-            yaw_rate_radps=(1.0 - self._yaw_rate_weight) * yaw_rate_radps + self._yaw_rate_weight * ego.yaw_rate_radps,
-        )
+        values = list(_VALUES(ego))  # in a third of the time of `dataclasses.replace`, at every message
+        values[_YAW] = wrap_angle(yaw_rad + self._yaw_weight * wrap_angle(ego.yaw_rad - yaw_rad))
+        own, last = self._yaw_rate_weight, 1.0 - self._yaw_rate_weight
+        values[_YAW_RATE] = last * yaw_rate_radps + own * ego.yaw_rate_radps
+        return EgoState(*values)
 
 
 class EgoTrajectory(EgoSource):
