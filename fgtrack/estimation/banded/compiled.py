@@ -2,7 +2,7 @@
 
 Track by track, node by node, by the same formulas; measurements are fused one row after another.
 `pip install fgtrack[fast]` installs numba, without which this module cannot be imported. It is compiled when it is
-imported for the first time, in some 10 s, and kept for later processes where numba keeps it (`NUMBA_CACHE_DIR`).
+imported for the first time, in 10 to 20 s, and kept for later processes where numba keeps it (`NUMBA_CACHE_DIR`).
 """
 
 import numpy as np
