@@ -19,12 +19,11 @@ from joblib import Parallel, delayed
 
 import fgtrack
 from fgtrack.core.geometry import rotation
-from fgtrack.core.types import DetectionList, EgoState, FloatArray
-from fgtrack.evaluation.matching import Scenes
+from fgtrack.core.types import DetectionList, EgoState, FloatArray, TrackStatus
+from fgtrack.evaluation.matching import match, scenes
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.multi_object import Clear
-from fgtrack.evaluation.truth import true_paths
-from fgtrack.io.run import Run
+from fgtrack.io.run import Run, Table
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
@@ -77,20 +76,20 @@ def scans(source: Path, config: Config) -> Iterator[Scan]:
 
 
 def raw_mota(source: Path, config: Config, run: Run) -> float:
-    """MOTA of the detections themselves, each scan for itself: no misses filled, nothing suppressed, no identity."""
-    paths = true_paths(run.truth)
-    first_ns, last_ns = run.truth["stamp_ns"].min(), run.truth["stamp_ns"].max()
-    seen = [scan for scan in scans(source, config) if first_ns <= scan.stamp_ns <= last_ns]
+    """MOTA of the detections themselves, each scan for itself: no miss filled, nothing suppressed, no identity."""
+    seen = list(scans(source, config))
     stamps_ns = np.array([scan.stamp_ns for scan in seen])
-    truth = np.stack([path.at(stamps_ns)[:, :2] for path in paths], axis=1)
-    tick_index = np.repeat(np.arange(len(seen)), [len(scan.positions_m) for scan in seen])
-    positions_m = np.concatenate([scan.positions_m for scan in seen])
-    distances_m = np.linalg.norm(truth[tick_index] - positions_m[:, None], axis=-1)
-    present = np.isfinite(truth[..., 0])
-    everything = np.arange(len(tick_index))
-    found = Scenes(tick_index, everything, np.nan_to_num(distances_m, nan=np.inf), present, present)
-    clear = Clear.of(found, config.evaluation.gate_m)
-    return 1.0 - (clear.misses + clear.false_positives) / int(present.sum())
+    tick = np.repeat(np.arange(len(seen)), [len(scan.positions_m) for scan in seen])
+    x_m, y_m = np.concatenate([scan.positions_m for scan in seen]).T
+    status = np.full(len(tick), TrackStatus.CONFIRMED.value)
+    tracks = {"tick": tick, "stamp_ns": stamps_ns[tick], "track_id": np.arange(len(tick)), "x_m": x_m, "y_m": y_m}
+    tracks |= {"num_measured": np.full(len(tick), 99), "status": status}
+    timing = Table({"tick": np.arange(len(seen)), "now_ns": stamps_ns})
+    raw = replace(run, tracks=Table(tracks), timing=timing)
+    matching = match(raw, config.evaluation)
+    assert matching is not None
+    clear = Clear.of(scenes(raw, matching), config.evaluation.gate_m)
+    return 1.0 - (clear.misses + clear.false_positives) / (clear.pairs + clear.misses)
 
 
 def judged(name: str, source: Path, config: Config) -> Found:

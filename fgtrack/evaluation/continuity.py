@@ -4,7 +4,8 @@ import numpy as np
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, Disposition, FloatArray, IntArray
-from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, Matching
+from fgtrack.evaluation.matching import Matching
+from fgtrack.evaluation.matching import confirmed as is_confirmed
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import NO_TRACK, Run, Table
 
@@ -56,7 +57,7 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
     never = np.iinfo(np.int64).max
     seen_ns, confirmed_ns = np.full(count, never), np.full(count, never)
     np.minimum.at(seen_ns, distances_m[near].argmin(axis=1), stamps_ns[near])
-    confirmed = matching.paired & (matching.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS)
+    confirmed = matching.paired & is_confirmed(matching.tracks)
     at_ns = matching.now_ns[matching.tick_index[confirmed]]
     np.minimum.at(confirmed_ns, matching.object_index[confirmed], at_ns)
     known = (seen_ns != never) & (confirmed_ns != never)

@@ -17,7 +17,7 @@ import numpy as np
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.time import seconds
-from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS
+from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.viewer.placement import update_rows
 from fgtrack.io.adapters.kitti import CLASS_NAMES, is_sequence, view_of_sequence
 from fgtrack.io.adapters.kitti_view import PERIOD_NS, Box, View
@@ -64,7 +64,7 @@ class _Seen:
 def write_kitti_result(run: Run, sequence: Path, out: Path, *, overwrite: bool = False) -> KittiResult:
     """Write the tracks of `run` at the frames of `sequence` to the text file `out`.
 
-    A track is in it from `CONFIRMED_MEASUREMENTS` on, unless the run is judged by all (`evaluation.confirmed_only`).
+    A track is in it where it is `confirmed`, unless the run is judged by all (`evaluation.confirmed_only`).
 
     Parameters
     ----------
@@ -105,8 +105,7 @@ RESULT = Kind("a result file of the KITTI data set", _is_result)
 
 def _lines(run: Run, views: list[View]) -> tuple[list[str], set[int], set[int]]:
     """Lines, the tracks that are in them, and those that are not for want of a box at some frame."""
-    least = CONFIRMED_MEASUREMENTS if evaluation_config(run).confirmed_only else 1
-    tracks = run.tracks.where(run.tracks["num_measured"] >= least)
+    tracks = run.tracks.where(confirmed(run.tracks)) if evaluation_config(run).confirmed_only else run.tracks
     of_tick = defaultdict(list)
     for row, tick in enumerate(tracks["tick"].tolist()):
         of_tick[tick].append(row)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from fgtrack.core.geometry import wrap_angles
-from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.core.types import BoolArray, FloatArray, IntArray, TrackStatus
 from fgtrack.evaluation.ignoring import ignored_objects, in_regions
 from fgtrack.evaluation.sight import in_sight
 from fgtrack.evaluation.truth import TRUE_STATE, TruePath, true_paths
@@ -206,6 +206,11 @@ def recorded(run: Run, matching: Matching) -> BoolArray:
     return np.asarray((matching.now_ns >= truth_ns.min()) & (matching.now_ns <= truth_ns.max()))
 
 
+def confirmed(tracks: Table) -> BoolArray:
+    """Rows of tracks.csv that count: those that the tracker does not call tentative, shape (rows,)."""
+    return np.asarray(tracks["status"] != TrackStatus.TENTATIVE.value)
+
+
 def _judged(run: Run, options: EvaluationConfig) -> BoolArray:
     """Rows of tracks.csv to judge: stamped while truth was recorded, of a finished tick, confirmed if asked.
 
@@ -215,7 +220,7 @@ def _judged(run: Run, options: EvaluationConfig) -> BoolArray:
     judged = (tracks["stamp_ns"] >= truth_ns.min()) & (tracks["stamp_ns"] <= truth_ns.max())
     judged &= np.isin(tracks["tick"], run.timing["tick"])
     if options.confirmed_only:
-        judged &= tracks["num_measured"] >= CONFIRMED_MEASUREMENTS
+        judged &= confirmed(tracks)
     return np.asarray(judged)
 
 

@@ -14,7 +14,7 @@ from fgtrack.evaluation.continuity import late_switches, times_to_confirm, track
 from fgtrack.evaluation.deadlines import Deadlines
 from fgtrack.evaluation.innovations import ANGULAR, RESIDUAL_NAMES, message_delays, num_measured, residuals
 from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
-from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, ERROR_NAMES, Matching, match, track_errors
+from fgtrack.evaluation.matching import ERROR_NAMES, Matching, confirmed, match, track_errors
 from fgtrack.evaluation.multi_object import MultiObjectMetrics, multi_object_metrics
 from fgtrack.evaluation.residual_samples import residual_samples
 from fgtrack.evaluation.statistics import ChiSquareMean, Distribution, Moments
@@ -127,7 +127,7 @@ class Metrics:
     num_tracks: int
     """Distinct ids in tracks.csv."""
     num_confirmed: int
-    """Ids with at least `CONFIRMED_MEASUREMENTS` measurements."""
+    """Ids that were `confirmed`."""
     sensors: Mapping[str, SensorMetrics]
     residuals: Mapping[str, Moments]
     """Innovations of all sensors and confirmed tracks, by name of `LOCAL_NAMES`: table I of Karle et al. 2023."""
@@ -174,7 +174,7 @@ def evaluate(run: Run, options: EvaluationConfig | None = None) -> Metrics:
 def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationConfig) -> Metrics:
     """Metrics of `run`, whose `match` by these `options` is known."""
     ids = run.tracks["track_id"]
-    confirmed = run.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS
+    is_confirmed = confirmed(run.tracks)
     busy = run.timing["num_detections"] > 0
     time_s, detections = run.timing["process_ns"][busy] / NS_PER_S, run.timing["num_detections"][busy]
     return Metrics(
@@ -182,7 +182,7 @@ def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationCon
         estimator=str(run.meta.get("estimator", "")),
         options=options,
         num_tracks=len(np.unique(ids)),
-        num_confirmed=len(np.unique(ids[confirmed])),
+        num_confirmed=len(np.unique(ids[is_confirmed])),
         sensors=_sensor_metrics(run),
         residuals=residual_samples(run).moments(),
         time_per_tick_s=Distribution.of(time_s),
@@ -214,12 +214,12 @@ def _truth_metrics(run: Run, matching: Matching, options: EvaluationConfig) -> T
     ids, inverse = np.unique(tracks["track_id"], return_inverse=True)
     life = np.bincount(inverse, minlength=len(ids))
     paired_life = np.bincount(inverse[paired], minlength=len(ids))
-    confirmed = tracks["num_measured"] >= CONFIRMED_MEASUREMENTS
+    is_confirmed = confirmed(tracks)
     return TruthMetrics(
         objects=objects,
         judged_tracks=len(ids),
         false_tracks=int((paired_life < FALSE_TRACK_SHARE * life).sum()),
-        tracked_objects=len(np.unique(matching.object_index[paired & confirmed])),
+        tracked_objects=len(np.unique(matching.object_index[paired & is_confirmed])),
         tracked_visits=tracked_visits(matching),
     )
 

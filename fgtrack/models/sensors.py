@@ -52,6 +52,24 @@ class Correlation:
 
 
 @dataclass(frozen=True)
+class Score:
+    """What the score of a detection says: log p(score | object) / p(score | clutter) = (score - even) / scale."""
+
+    even: float
+    """A score that objects and clutter have equally often."""
+    scale: float
+    """What more of it makes an object e times more probable."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.even) and math.isfinite(self.scale) and self.scale > 0.0):
+            raise ValueError(f"even must be finite and scale positive, are {self.even} and {self.scale}")
+
+    def log_ratio(self, score: float) -> float:
+        """The logarithm of the ratio, at most 10 to either side."""
+        return min(max((score - self.even) / self.scale, -10.0), 10.0)
+
+
+@dataclass(frozen=True)
 class SensorModel:
     """One modality. Positions have their standard deviations along and across the line of sight."""
 
@@ -74,17 +92,23 @@ class SensorModel:
     max_range_m: float | None = None
     """A detection further from the sensor than this is out of bounds: beyond it clutter outweighs objects."""
     view_range_m: float | None = None
-    """How far it sees, where that is less than `max_range_m`; the evaluation alone asks, no detection is out of bounds
-    by it."""
+    """How far it sees, where that is less than `max_range_m`; for existence and evaluation, no
+    detection is out of bounds by it."""
     max_range_behind_m: float | None = None
-    """How far it sees in the half behind it, where that is less; the evaluation alone asks."""
+    """How far it sees in the half behind it, where that is less; for existence and evaluation."""
     field_of_view_rad: float = math.tau
-    """Full angle that it sees, centred on its axis; the evaluation alone asks, no detection is out of bounds by it."""
+    """Full angle that it sees, centred on its axis; for existence and evaluation, as these ranges."""
     births: bool = True
     """Whether an unmatched detection of this sensor starts a track."""
     loss: RobustLoss | None = None
     """Robust loss of its measurements; null is the Gaussian. A smoother weighs them anew while they are in its
     window, a filter once, at the state that the update gives."""
+    detection_probability: float = 0.9
+    """That a list shows an object which is in range and in the field of view (`lifecycle.kind: existence`)."""
+    clutter_per_m2: float = 1e-4
+    """False detections in a list for each square metre (`lifecycle.kind: existence`)."""
+    score: Score | None = None
+    """What the score of a detection says of the existence of its object; null: nothing."""
     mount: Mount = field(default_factory=Mount)
     correlation: Correlation | None = None
     """Errors that are correlated in time, estimated with each object; null: every detection errs anew."""
@@ -106,6 +130,10 @@ class SensorModel:
                 raise ValueError(f"{name}: must be positive, is {value}")
         if not 0.0 < self.field_of_view_rad <= math.tau:
             raise ValueError(f"field_of_view_rad: must lie in (0, 2 pi], is {self.field_of_view_rad}")
+        if not 0.0 < self.detection_probability < 1.0:
+            raise ValueError(f"detection_probability: must lie between 0 and 1, is {self.detection_probability}")
+        if not (math.isfinite(self.clutter_per_m2) and self.clutter_per_m2 > 0.0):
+            raise ValueError(f"clutter_per_m2: must be positive and finite, is {self.clutter_per_m2}")
         if self.counter_init < 1 or self.counter_add < 0:
             raise ValueError("counter_init must be at least 1 and counter_add not negative")
 
@@ -113,6 +141,11 @@ class SensorModel:
     def components(self) -> tuple[str, ...]:
         """Measured components in the order of `MEASURABLE`."""
         return tuple(name for name in MEASURABLE if name in self.std)
+
+    @property
+    def gives_position(self) -> bool:
+        """Whether its detections say where an object is: x and y, or range and bearing."""
+        return "x_m" in self.std or {"range_m", "bearing_rad"} <= self.std.keys()
 
     def sees(self, positions_m: FloatArray, ego_poses: FloatArray, origin_m: tuple[float, float]) -> BoolArray:
         """Whether an object there is in range and in the field of view, shape (...); nothing hides it.

@@ -30,8 +30,9 @@ from fgtrack.models.track_map import TrackMap
 from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
 from fgtrack.tracking.ego import EgoSource, EgoStd, EgoTrajectory
 from fgtrack.tracking.ego_error import IndependentErrors, SharedErrors
+from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules
 from fgtrack.tracking.inbox import Inbox, QueueInbox
-from fgtrack.tracking.lifecycle import Lifecycle
+from fgtrack.tracking.lifecycle import CountingLifecycle, Lifecycle
 from fgtrack.tracking.preprocess import Preprocess
 from fgtrack.tracking.published import (
     PublishedEgo,
@@ -73,14 +74,21 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
         association=config.association,
         bank=build_bank(config),
         motion=motion,
-        lifecycle=(PublishedLifecycle if published_order else Lifecycle)(config.lifecycle, config.sensors),
+        lifecycle=build_lifecycle(config),
         claim_overtaken=config.lifecycle.claim_overtaken,
         birth=config.birth,
         road=road,
-        confirm_count=config.lifecycle.confirm_count,
         ego_errors=SharedErrors(motion) if config.ego.uncertainty == "shared" else IndependentErrors(),
     )
     return (PublishedTracker if published_order else Tracker)(parts if observed is None else observed(parts))
+
+
+def build_lifecycle(config: Config) -> Lifecycle:
+    """What says which tracks are believed, and which end."""
+    rules, origin_m = config.lifecycle, (config.ego.detection_origin_x_m, config.ego.detection_origin_y_m)
+    if isinstance(rules, ExistenceRules):
+        return ExistenceLifecycle(rules, config.sensors, origin_m)
+    return (PublishedLifecycle if rules.kind == "published" else CountingLifecycle)(rules, config.sensors)
 
 
 def build_road(config: MapConfig) -> Road:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Annotated, Literal
 
-from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat, PositiveInt, Tag
 
 from fgtrack.estimation.initiation import DEFAULT, Initiation
 from fgtrack.estimation.registry import ESTIMATORS, motion_model
@@ -18,6 +18,7 @@ from fgtrack.models.sensors import SensorModel
 from fgtrack.sim.settings import settings
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
+from fgtrack.tracking.existence import ExistenceRules
 from fgtrack.tracking.lifecycle import LifecycleRules
 from fgtrack.tracking.merge import ConnectedMerge, NoMerge
 from fgtrack.tracking.published import NeighbourhoodMerge, UngatedEuclidean
@@ -137,14 +138,26 @@ class InboxConfig:
 
 
 @dataclass(frozen=True)
-class LifecycleConfig(LifecycleRules):
-    """When a track starts and ends."""
+class CountingConfig(LifecycleRules):
+    """When a track starts and ends, by counts of matches and misses."""
 
     kind: Literal["counting", "published"] = "counting"
     """`published`: which sensor ages which track, and when, as published (Q9, Q15, Q22)."""
     claim_overtaken: bool = False
     """Whether a track claims a detection that the newer one which started it has overtaken. As in the paper it does
     not, and the detection starts a second track: with a fast and a slow sensor nearly every new object gets two."""
+
+
+def _lifecycle_kind(value: object) -> str:
+    """Which form of `lifecycle` is meant: counting, as ever, where it does not say."""
+    kind = value.get("kind", "counting") if isinstance(value, Mapping) else getattr(value, "kind", "counting")
+    return "existence" if kind == "existence" else "counting"
+
+
+LifecycleConfig = Annotated[
+    Annotated[CountingConfig, Tag("counting")] | Annotated[ExistenceRules, Tag("existence")],
+    Discriminator(_lifecycle_kind),
+]
 
 
 @settings
@@ -240,7 +253,7 @@ class Config:
     inbox: InboxConfig = field(default_factory=InboxConfig)
     merge: MergeConfig = field(default_factory=ConnectedMerge)
     association: AssociationConfig = field(default_factory=GatedEuclidean)
-    lifecycle: LifecycleConfig = field(default_factory=LifecycleConfig)
+    lifecycle: LifecycleConfig = field(default_factory=CountingConfig)
     birth: BirthConfig = field(default_factory=FixedBirth)
     initiation: InitiationConfig = field(default_factory=InitiationConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)

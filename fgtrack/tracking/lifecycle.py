@@ -1,11 +1,62 @@
-"""How long a track lives: the status counter of Karle et al. 2023, section III-D."""
+"""How long a track lives: the protocol, and the status counter of Karle et al. 2023, section III-D."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import FloatArray, TrackStatus
+from fgtrack.core.types import Detection, FloatArray, TrackStatus
 from fgtrack.models.sensors import SensorModel
+from fgtrack.tracking.ego import EgoPose
+from fgtrack.tracking.preprocess import Candidate
+
+
+class Look(NamedTuple):
+    """A list as far as it matters to the life of tracks: who looked, when, and from where."""
+
+    sensor: str
+    stamp_ns: int
+    present_ns: int
+    ego: EgoPose | None = None
+    """At `stamp_ns`; None where it is not known."""
+    objects: Sequence[Detection] = ()
+    """All detections of the message."""
+
+
+class Sighting(NamedTuple):
+    """A detection that belongs to a track, and the track's state at its stamp; None of one that starts with it."""
+
+    candidate: Candidate
+    mean: FloatArray | None = None
+    covariance: FloatArray | None = None
+
+
+class Lifecycle(Protocol):
+    """Says how far tracks can be trusted, and which of them end."""
+
+    def born(self, track_id: int, look: Look, sighting: Sighting) -> None:
+        """A detection started a track."""
+
+    def matched(self, track_id: int, look: Look, sighting: Sighting) -> None:
+        """A detection was associated."""
+
+    def fused(self, track_id: int) -> None:
+        """The associated detection changed the state."""
+
+    def missed(self, look: Look, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
+        """These tracks, at `positions_m` (n, 2) and so far from the ego, were not seen; the ids of those that end."""
+
+    def expired(self, present_ns: int) -> list[int]:
+        """The ids of tracks that end because time has passed."""
+
+    def forget(self, track_id: int) -> None:
+        """The track has ended."""
+
+    def status(self, track_id: int) -> TrackStatus:
+        """How far the track can be trusted."""
+
+    def num_measured(self, track_id: int) -> int:
+        """How many detections have changed its state, the first one included."""
 
 
 @dataclass(slots=True)
@@ -49,7 +100,7 @@ class LifecycleRules:
             raise ValueError("forget_s must be positive and short_range_m not negative")
 
 
-class Lifecycle:
+class CountingLifecycle:
     """Counts matches and misses, and says which tracks end.
 
     A track is aged by every sensor at the range it is responsible for, and by time alone as well.
@@ -62,30 +113,30 @@ class Lifecycle:
         self.lives: dict[int, Life] = {}
         """What is counted, by track."""
 
-    def born(self, track_id: int, sensor: str, stamp_ns: int, present_ns: int) -> None:
-        """A detection of `sensor` started a track."""
-        self.lives[track_id] = Life(self._sensors[sensor].counter_init, stamp_ns)
+    def born(self, track_id: int, look: Look, sighting: Sighting | None = None) -> None:
+        """See `Lifecycle.born`."""
+        self.lives[track_id] = Life(self._sensors[look.sensor].counter_init, look.stamp_ns)
 
-    def matched(self, track_id: int, sensor: str, stamp_ns: int) -> None:
-        """A detection of `sensor` at `stamp_ns` was associated."""
+    def matched(self, track_id: int, look: Look, sighting: Sighting | None = None) -> None:
+        """See `Lifecycle.matched`."""
         life = self.lives[track_id]
-        life.counter = min(life.counter + self._sensors[sensor].counter_add, self._rules.counter_cap)
-        life.last_seen_ns = max(life.last_seen_ns, stamp_ns)
+        life.counter = min(life.counter + self._sensors[look.sensor].counter_add, self._rules.counter_cap)
+        life.last_seen_ns = max(life.last_seen_ns, look.stamp_ns)
         life.misses = 0
 
     def fused(self, track_id: int) -> None:
-        """The associated detection changed the state."""
+        """See `Lifecycle.fused`."""
         self.lives[track_id].num_measured += 1
 
-    def missed(self, track_ids: Sequence[int], sensor: str, ranges_m: FloatArray, present_ns: int) -> list[int]:
-        """These tracks, at these distances from the ego, were not seen; the ids of those that end."""
+    def missed(self, look: Look, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
+        """See `Lifecycle.missed`."""
         ended = []
         for track_id, range_m in zip(track_ids, ranges_m.tolist(), strict=True):
             life = self.lives[track_id]
-            if self._ages(sensor, range_m):
+            if self._ages(look.sensor, range_m):
                 life.counter -= 1
                 life.misses += 1
-            if self._ends(life, present_ns):
+            if self._ends(life, look.present_ns):
                 ended.append(track_id)
         return ended
 
@@ -101,9 +152,17 @@ class Lifecycle:
         return life.counter <= 0 or (limit is not None and life.misses >= limit and unconfirmed)
 
     def expired(self, present_ns: int) -> list[int]:
-        """The ids of tracks that end because time has passed."""
+        """See `Lifecycle.expired`."""
         return [i for i, life in self.lives.items() if present_ns - life.last_seen_ns > self._forget_ns]
 
     def forget(self, track_id: int) -> None:
-        """The track has ended."""
+        """See `Lifecycle.forget`."""
         del self.lives[track_id]
+
+    def status(self, track_id: int) -> TrackStatus:
+        """See `Lifecycle.status`."""
+        return self.lives[track_id].status(self._rules.confirm_count)
+
+    def num_measured(self, track_id: int) -> int:
+        """See `Lifecycle.num_measured`."""
+        return self.lives[track_id].num_measured

@@ -16,7 +16,7 @@ from fgtrack.tracking.assignment import Assignment, assigned_densely
 from fgtrack.tracking.ego import EgoPose, EgoSource, EgoStd
 from fgtrack.tracking.gating import euclidean_distances
 from fgtrack.tracking.inbox import Batch, is_covariance, is_number, record, records
-from fgtrack.tracking.lifecycle import Life, Lifecycle
+from fgtrack.tracking.lifecycle import CountingLifecycle, Life, Look, Sighting
 from fgtrack.tracking.merge import Merge
 from fgtrack.tracking.preprocess import Candidate, Preprocess
 from fgtrack.tracking.tracker import Tracker, TrackerParts
@@ -186,23 +186,23 @@ class UngatedEuclidean:
         return Assignment(good, found.new + [i for i, _ in torn], missed)
 
 
-class PublishedLifecycle(Lifecycle):
+class PublishedLifecycle(CountingLifecycle):
     """Only two sensors age a track, each at its range; time counts only where a list came in; the cap may be passed;
     a birth is dated to the tick and a match to the sensor's stamp (defects Q9 and Q15).
 
     The range is that of a state which is one batch old; see `PublishedTracker`.
     """
 
-    def born(self, track_id: int, sensor: str, stamp_ns: int, present_ns: int) -> None:
+    def born(self, track_id: int, look: Look, sighting: Sighting | None = None) -> None:
         """See `Lifecycle.born`."""
-        super().born(track_id, sensor, present_ns, present_ns)
+        super().born(track_id, look._replace(stamp_ns=look.present_ns))
 
-    def matched(self, track_id: int, sensor: str, stamp_ns: int) -> None:
+    def matched(self, track_id: int, look: Look, sighting: Sighting | None = None) -> None:
         """See `Lifecycle.matched`."""
         life = self.lives[track_id]
         if life.counter < self._rules.counter_cap:
-            life.counter += self._sensors[sensor].counter_add
-        life.last_seen_ns = stamp_ns
+            life.counter += self._sensors[look.sensor].counter_add
+        life.last_seen_ns = look.stamp_ns
         life.misses = 0
 
     def _ages(self, sensor: str, range_m: float) -> bool:

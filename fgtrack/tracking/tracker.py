@@ -33,7 +33,7 @@ from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.ego import EgoPose, EgoSource
 from fgtrack.tracking.ego_error import EgoErrors, IndependentErrors
 from fgtrack.tracking.inbox import NO_INNOVATION, Batch, Inbox, record
-from fgtrack.tracking.lifecycle import Lifecycle
+from fgtrack.tracking.lifecycle import Lifecycle, Look, Sighting
 from fgtrack.tracking.preprocess import Candidate, Preprocess
 
 
@@ -52,7 +52,6 @@ class TrackerParts:
     claim_overtaken: bool
     birth: Birth
     road: Road
-    confirm_count: int
     ego_errors: EgoErrors = field(default_factory=IndependentErrors)
     on_failure: Callable[[Exception], None] | None = None
     """Told what the processing of a batch has raised, which then ends as failed; None lets it out."""
@@ -168,12 +167,12 @@ class Tracker:
             return
         states = self._offered(batch)
         assignment = parts.association(candidates, states)
-        self._count(batch, assignment, states, ego)
+        self._count(batch, candidates, assignment, states, ego)
         self._estimate(batch, candidates, assignment, states)
         for position in assignment.refused:
             self._conclude(batch, candidates[position], Disposition.GATED)
         for position in self._unclaimed(batch, candidates, assignment.new, states):
-            self._give_birth(batch, candidates[position], sensor)
+            self._give_birth(batch, candidates[position], sensor, ego)
 
     def _unclaimed(
         self, batch: Batch, candidates: Sequence[Candidate], new: Sequence[int], states: StatesAt
@@ -217,22 +216,34 @@ class Tracker:
             return np.zeros(len(track_ids))
         return np.asarray(np.hypot(positions_m[:, 0] - ego.x_m, positions_m[:, 1] - ego.y_m))
 
-    def _count(self, batch: Batch, assignment: Assignment, states: StatesAt, ego: EgoPose | None) -> None:
-        """Status counters of matched and missed tracks; tracks that run out end here.
+    def _count(
+        self,
+        batch: Batch,
+        candidates: Sequence[Candidate],
+        assignment: Assignment,
+        states: StatesAt,
+        ego: EgoPose | None,
+    ) -> None:
+        """Lives of matched and missed tracks; tracks that run out end here.
 
         A track is missed by a message as a whole, so only its last batch counts.
         """
         lifecycle = self._parts.lifecycle
         seen = self._seen[id(batch.message)]
-        for _, track in assignment.pairs:
-            lifecycle.matched(states.track_ids[track], batch.sensor, batch.stamp_ns)
+        look = self._look(batch, ego)
+        for place, track in assignment.pairs:
+            sighting = Sighting(candidates[place], states.means[track], states.covariances[track])
+            lifecycle.matched(states.track_ids[track], look, sighting)
             seen.add(states.track_ids[track])
         rows = [track for track in assignment.missed if states.track_ids[track] not in seen]
         if not rows or not batch.last:
             return
         missed = [states.track_ids[track] for track in rows]
-        ranges_m = self._ranges_m(missed, states.means[rows, :2], ego)
-        self._end(lifecycle.missed(missed, batch.sensor, ranges_m, self._parts.bank.present_ns))
+        positions_m = states.means[rows, :2]
+        self._end(lifecycle.missed(look, missed, positions_m, self._ranges_m(missed, positions_m, ego)))
+
+    def _look(self, batch: Batch, ego: EgoPose | None) -> Look:
+        return Look(batch.sensor, batch.stamp_ns, self._parts.bank.present_ns, ego, batch.message.objects)
 
     def _estimate(
         self, batch: Batch, candidates: Sequence[Candidate], assignment: Assignment, states: StatesAt
@@ -249,7 +260,7 @@ class Tracker:
                 self._parts.lifecycle.fused(track_id)
             self._conclude(batch, candidate, Disposition(result.status.value), track_id, result)
 
-    def _give_birth(self, batch: Batch, candidate: Candidate, sensor: SensorModel) -> None:
+    def _give_birth(self, batch: Batch, candidate: Candidate, sensor: SensorModel, ego: EgoPose | None) -> None:
         parts = self._parts
         prior = None
         if sensor.births:
@@ -265,7 +276,7 @@ class Tracker:
             return
         parts.ego_errors.born(track_id, candidate, prior)
         self._seen[id(batch.message)].add(track_id)
-        parts.lifecycle.born(track_id, batch.sensor, batch.stamp_ns, parts.bank.present_ns)
+        parts.lifecycle.born(track_id, self._look(batch, ego), Sighting(candidate))
         self._conclude(batch, candidate, Disposition.BIRTH, track_id)
 
     def _conclude(
@@ -292,5 +303,5 @@ class Tracker:
             self._parts.lifecycle.forget(track_id)
 
     def _report(self, track_id: int, state: TrackState) -> TrackReport:
-        life = self._parts.lifecycle.lives[track_id]
-        return TrackReport(track_id, life.status(self._parts.confirm_count), state, life.num_measured)
+        lifecycle = self._parts.lifecycle
+        return TrackReport(track_id, lifecycle.status(track_id), state, lifecycle.num_measured(track_id))

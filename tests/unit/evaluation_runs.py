@@ -78,7 +78,8 @@ class Car:
             ]
         )
         state = TrackState(START_NS + round(tick * TICK_NS), mean, np.eye(5))
-        return TrackReport(track_id, TrackStatus.CONFIRMED, state, num_measured)
+        status = TrackStatus.TENTATIVE if num_measured < 3 else TrackStatus.CONFIRMED
+        return TrackReport(track_id, status, state, num_measured)
 
     def later(self, tick: float, track_id: int, lag_s: float | None = None, **errors: float) -> SmoothedReport:
         """What is known later of this car at `tick`; finally, without `lag_s`."""

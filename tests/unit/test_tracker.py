@@ -9,12 +9,12 @@ from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.models.oval import make_oval
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.config import Config, LifecycleConfig
+from fgtrack.pipeline.config import Config, CountingConfig
 from fgtrack.pipeline.load import load
 from fgtrack.tracking.association import GatedEuclidean
 from fgtrack.tracking.tracker import Tracker
 
-CLAIMING = LifecycleConfig(claim_overtaken=True)
+CLAIMING = CountingConfig(claim_overtaken=True)
 POINTS = SensorModel(std={"x_m": 0.3, "y_m": 0.3})
 
 

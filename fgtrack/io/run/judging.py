@@ -15,7 +15,7 @@ class EvaluationConfig:
     car's length (more for ships): a track farther off is not updated by its object any more. It bounds the errors,
     so compare at one gate."""
     confirmed_only: bool = True
-    """Whether only tracks with at least 3 measurements are judged, the "valid" ones of Karle et al. 2023."""
+    """Whether tentative tracks are left out: by counting, those measured less than `lifecycle.confirm_count` times."""
     multi_object: bool = True
     """Whether GOSPA, CLEAR, IDF1 and HOTA are computed."""
     gospa_c_m: float | None = None

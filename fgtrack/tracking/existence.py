@@ -1,0 +1,235 @@
+"""How probable it is that the object of a track exists: integrated probabilistic data association.
+
+Musicki, Evans, Stankovic: Integrated probabilistic data association, IEEE Trans. Automatic Control 39, 1994; the same
+recursion is that of a Bernoulli filter (Ristic, Vo, Vo, Farina: A tutorial on Bernoulli filters, IEEE Trans. Signal
+Processing 61, 2013). With the existence probability r, an object survives the time dt with probability
+exp(-dt / lifetime), and a list that could have shown it changes the odds r / (1 - r) by the factor
+
+    1 - P_D + P_D L,   L = N(z - h(x); 0, S) / clutter density * p(score | object) / p(score | clutter)
+
+where the track was matched, and by 1 - P_D where it was not. Approximate are: L is that of the one detection which the
+assignment gives (the probabilities of other assignments are left out), of its position alone, and as it was when the
+detection arrived. Each factor counts at the stamp of its list, whatever the order of arrival within `memory_s`: what
+is late changes what came after it.
+"""
+
+import math
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from fgtrack.core.linalg import mahalanobis_squared
+from fgtrack.core.time import nanoseconds, seconds
+from fgtrack.core.types import FloatArray, TrackStatus
+from fgtrack.models.sensors import SensorModel
+from fgtrack.tracking.lifecycle import Look, Sighting
+
+#: Bounds of log-odds: a probability that differs from 0 or 1 by less says nothing more.
+_LARGEST_LOG_ODDS = 30.0
+
+
+@dataclass(frozen=True)
+class ExistenceRules:
+    """When a track is believed: by the probability that its object exists."""
+
+    kind: Literal["existence"] = "existence"
+    birth_probability: float = 0.2
+    """That the object of a detection which belongs to no track exists, before its score is considered."""
+    confirm_probability: float = 0.9
+    """A track is confirmed from here on."""
+    doubt_probability: float = 0.5
+    """A confirmed track below this is published as tentative until it is seen again."""
+    delete_probability: float = 0.02
+    """A track below this ends."""
+    lifetime_s: float = 10.0
+    """Mean time for which an object stays."""
+    out_of_view_s: float = 2.0
+    """A track ends so long after it was last in the range and field of view of a sensor that looked."""
+    memory_s: float = 5.0
+    """How far back late lists change the probability at their own stamp; older ones count as if they were so old."""
+    claim_overtaken: bool = True
+    """Whether a track claims a detection that the newer one which started it has overtaken."""
+
+    def __post_init__(self) -> None:
+        for name in ("birth_probability", "confirm_probability", "doubt_probability", "delete_probability"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise ValueError(f"{name}: must lie between 0 and 1, is {getattr(self, name)}")
+        if not self.delete_probability < min(self.birth_probability, self.doubt_probability):
+            raise ValueError("delete_probability: must be less than birth_probability and doubt_probability")
+        if self.doubt_probability > self.confirm_probability:
+            raise ValueError("doubt_probability: must not be more than confirm_probability")
+        for name in ("lifetime_s", "out_of_view_s", "memory_s"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise ValueError(f"{name}: must be positive and finite, is {getattr(self, name)}")
+
+
+@dataclass(slots=True)
+class Existence:
+    """The existence probability of one object as a function of time: evidence in order of its stamps."""
+
+    lifetime_s: float
+    stamps_ns: list[int]
+    """Rising; the first is the birth, or the oldest that is remembered."""
+    weights: list[float]
+    """Logarithm of the factor by which each evidence changes the odds; of the first the log-odds themselves."""
+    log_odds: list[float] = field(default_factory=list)
+    """After each evidence."""
+    num_measured: int = 1
+    in_view_ns: int = 0
+    """Stamp of the newest list that could have shown it."""
+    misses: int = 0
+    """Lists since the last match that could have shown it."""
+    confirmed: bool = False
+
+    @classmethod
+    def born(cls, lifetime_s: float, stamp_ns: int, log_odds: float) -> "Existence":
+        """Of a new object."""
+        log_odds = _bounded(log_odds)
+        return cls(lifetime_s, [stamp_ns], [log_odds], [log_odds], in_view_ns=stamp_ns)
+
+    def learn(self, stamp_ns: int, weight: float) -> None:
+        """Evidence of `stamp_ns`, in any order; what is older than all that is remembered counts as the oldest."""
+        place = max(bisect_right(self.stamps_ns, stamp_ns), 1)
+        self.in_view_ns = max(self.in_view_ns, stamp_ns)
+        self.stamps_ns.insert(place, max(stamp_ns, self.stamps_ns[0]))
+        self.weights.insert(place, weight)
+        del self.log_odds[place:]
+        for k in range(place, len(self.stamps_ns)):
+            self.log_odds.append(_bounded(self._survived(k - 1, self.stamps_ns[k]) + self.weights[k]))
+
+    def probability(self, stamp_ns: int) -> float:
+        """That the object exists at `stamp_ns`, at or after the newest evidence."""
+        return 1.0 / (1.0 + math.exp(-self._survived(-1, stamp_ns)))
+
+    def forget(self, oldest_ns: int) -> None:
+        """Remember what is older than `oldest_ns` by its outcome alone."""
+        keep = max(bisect_right(self.stamps_ns, oldest_ns) - 1, 0)
+        if keep:
+            del self.stamps_ns[:keep], self.weights[:keep], self.log_odds[:keep]
+            self.weights[0] = self.log_odds[0]
+
+    def _survived(self, place: int, stamp_ns: int) -> float:
+        """Log-odds that it exists and is still there at `stamp_ns`, given the evidence up to `place`."""
+        log_odds, dt_s = self.log_odds[place], seconds(stamp_ns - self.stamps_ns[place])
+        if dt_s <= 0.0:
+            return log_odds
+        gone = -math.expm1(-dt_s / self.lifetime_s)
+        dead = math.exp(-log_odds)  # odds r / (1 - r) become r s / (1 - r s) with s = 1 - gone
+        return -math.log((dead + gone) / (1.0 - gone))
+
+
+class ExistenceLifecycle:
+    """Tracks live by the probability that their objects exist; see the module.
+
+    A sensor that gives no position says nothing of existence, so a bearing neither confirms a track nor keeps it, and
+    a list says nothing of objects out of its sensor's range and field of view. Without an ego all are in view.
+    """
+
+    def __init__(
+        self, rules: ExistenceRules, sensors: Mapping[str, SensorModel], detection_origin_m: tuple[float, float]
+    ) -> None:
+        """`detection_origin_m`: origin of the ego frame of detections, seen from the ego reference point."""
+        self._rules = rules
+        self._sensors = sensors
+        self._origin_m = detection_origin_m
+        self._memory_ns = nanoseconds(rules.memory_s)
+        self._out_of_view_ns = nanoseconds(rules.out_of_view_s)
+        self._present_ns = 0
+        self.lives: dict[int, Existence] = {}
+        """What is known of each track."""
+
+    def born(self, track_id: int, look: Look, sighting: Sighting) -> None:
+        """See `Lifecycle.born`."""
+        odds = self._rules.birth_probability / (1.0 - self._rules.birth_probability)
+        log_odds = math.log(odds) + self._score(look, sighting)
+        self.lives[track_id] = life = Existence.born(self._rules.lifetime_s, look.stamp_ns, log_odds)
+        self._judge(life)
+
+    def matched(self, track_id: int, look: Look, sighting: Sighting) -> None:
+        """See `Lifecycle.matched`."""
+        life = self.lives[track_id]
+        life.misses = 0
+        found = _position_density(sighting)
+        if found is None:
+            return
+        sensor = self._sensors[look.sensor]
+        ratio = found / sensor.clutter_per_m2 * math.exp(self._score(look, sighting))
+        seen = sensor.detection_probability
+        life.learn(look.stamp_ns, math.log(1.0 - seen + seen * ratio))
+        self._judge(life)
+
+    def fused(self, track_id: int) -> None:
+        """See `Lifecycle.fused`."""
+        self.lives[track_id].num_measured += 1
+
+    def missed(self, look: Look, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
+        """See `Lifecycle.missed`."""
+        sensor = self._sensors[look.sensor]
+        if not sensor.gives_position:
+            return []
+        weight = math.log1p(-sensor.detection_probability)
+        in_view = np.ones(len(track_ids), dtype=bool)
+        if look.ego is not None:
+            pose = np.array([look.ego.x_m, look.ego.y_m, look.ego.yaw_rad])
+            in_view = sensor.sees(positions_m, np.broadcast_to(pose, (len(track_ids), 3)), self._origin_m)
+        for track_id in np.asarray(track_ids)[in_view].tolist():
+            life = self.lives[track_id]
+            life.misses += 1
+            life.learn(look.stamp_ns, weight)
+        return [track_id for track_id in track_ids if self._ends(self.lives[track_id])]
+
+    def expired(self, present_ns: int) -> list[int]:
+        """See `Lifecycle.expired`."""
+        self._present_ns = present_ns
+        for life in self.lives.values():
+            life.forget(present_ns - self._memory_ns)
+        return [track_id for track_id, life in self.lives.items() if self._ends(life)]
+
+    def forget(self, track_id: int) -> None:
+        """See `Lifecycle.forget`."""
+        del self.lives[track_id]
+
+    def status(self, track_id: int) -> TrackStatus:
+        """See `Lifecycle.status`."""
+        life = self.lives[track_id]
+        if not life.confirmed or life.probability(self._present_ns) < self._rules.doubt_probability:
+            return TrackStatus.TENTATIVE
+        return TrackStatus.COASTING if life.misses else TrackStatus.CONFIRMED
+
+    def num_measured(self, track_id: int) -> int:
+        """See `Lifecycle.num_measured`."""
+        return self.lives[track_id].num_measured
+
+    def _judge(self, life: Existence) -> None:
+        life.confirmed = life.confirmed or life.probability(self._present_ns) >= self._rules.confirm_probability
+
+    def _ends(self, life: Existence) -> bool:
+        if self._present_ns - life.in_view_ns > self._out_of_view_ns:
+            return True
+        return life.probability(self._present_ns) < self._rules.delete_probability
+
+    def _score(self, look: Look, sighting: Sighting) -> float:
+        """Logarithm of p(score | object) / p(score | clutter) of the best detection; 0 where there is none."""
+        model = self._sensors[look.sensor].score
+        if model is None or not look.objects:
+            return 0.0
+        places = (sighting.candidate.index, *sighting.candidate.merged)
+        scores = [score for place in places if (score := look.objects[place].score) is not None]
+        return model.log_ratio(max(scores)) if scores else 0.0
+
+
+def _position_density(sighting: Sighting) -> float | None:
+    """N(z - h(x); 0, S) of the position in 1/m^2; None where the detection gives none."""
+    candidate, mean, P = sighting
+    if candidate.position_m is None or candidate.position_covariance is None or mean is None or P is None:
+        return None
+    S = P[:2, :2] + candidate.position_covariance
+    squared = float(mahalanobis_squared(candidate.position_m - mean[:2], S))
+    return math.exp(-0.5 * squared) / (2.0 * math.pi * math.sqrt(float(S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0])))
+
+
+def _bounded(log_odds: float) -> float:
+    return min(max(log_odds, -_LARGEST_LOG_ODDS), _LARGEST_LOG_ODDS)
