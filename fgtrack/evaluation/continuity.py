@@ -72,7 +72,7 @@ def tracked_visits(matching: Matching) -> int:
     "A TP object gets a unique identifier while it's inside the detectable area" (Karle et al. 2023, section IV-A): one
     that leaves the sight of all sensors for a second or longer, and comes back, counts again.
     """
-    confirmed = matching.paired & (matching.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS)
+    confirmed = matching.paired & is_confirmed(matching.tracks)
     tracked = np.zeros_like(matching.in_sight)
     tracked[matching.tick_index[confirmed], matching.object_index[confirmed]] = True
     count = 0

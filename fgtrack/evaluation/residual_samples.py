@@ -10,7 +10,7 @@ from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.evaluation.innovations import ANGULAR, residuals, track_states
-from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS
+from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.sight import ego_states
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.evaluation.viewer.surroundings import roads
@@ -22,7 +22,7 @@ LOCAL_NAMES = ("along_m", "across_m", "yaw_rad", "speed_mps")
 
 @dataclass(frozen=True, eq=False)
 class ResidualSamples:
-    """Innovations of the tracks with at least `CONFIRMED_MEASUREMENTS` measurements, n in all, by stamp."""
+    """Innovations of the tracks that were `confirmed`, n in all, by stamp."""
 
     sensors: npt.NDArray[np.str_]
     """Shape (n,)."""
@@ -58,7 +58,7 @@ class ResidualSamples:
 
 def residual_samples(run: Run) -> ResidualSamples:
     """The samples of `run`. Raises `DataError` where the map that it names is no map."""
-    ids = np.unique(run.tracks["track_id"][run.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS])
+    ids = np.unique(run.tracks["track_id"][confirmed(run.tracks)])
     local = residuals(run)
     known = np.isin(run.updates["track_id"], ids) & np.isfinite([local[name] for name in LOCAL_NAMES]).any(axis=0)
     rows = np.flatnonzero(known)
