@@ -48,6 +48,8 @@ class ExistenceRules:
     """Mean time for which an object stays."""
     out_of_view_s: float = 2.0
     """A track ends so long after it was last in the range and field of view of a sensor that looked."""
+    min_travel_m: float = 0.0
+    """A track is not confirmed before it was so far from where it began: what never moves is shore, or moored."""
     memory_s: float = 5.0
     """How far back late lists change the probability at their own stamp; older ones count as if they were so old."""
     claim_overtaken: bool = True
@@ -61,6 +63,8 @@ class ExistenceRules:
             raise ValueError("delete_probability: must be less than birth_probability and doubt_probability")
         if self.doubt_probability > self.confirm_probability:
             raise ValueError("doubt_probability: must not be more than confirm_probability")
+        if not 0.0 <= self.min_travel_m < math.inf:
+            raise ValueError(f"min_travel_m: must be finite and not negative, is {self.min_travel_m}")
         for name in ("lifetime_s", "out_of_view_s", "memory_s"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise ValueError(f"{name}: must be positive and finite, is {getattr(self, name)}")
@@ -83,6 +87,10 @@ class Existence:
     misses: int = 0
     """Lists since the last match that could have shown it."""
     confirmed: bool = False
+    first_m: FloatArray | None = None
+    """Where it began, shape (2,)."""
+    travelled: bool = False
+    """Whether it was ever as far from there as a track must be to be confirmed."""
 
     @classmethod
     def born(cls, lifetime_s: float, stamp_ns: int, log_odds: float) -> "Existence":
@@ -146,12 +154,16 @@ class ExistenceLifecycle:
         odds = self._rules.birth_probability / (1.0 - self._rules.birth_probability)
         log_odds = math.log(odds) + self._score(look, sighting)
         self.lives[track_id] = life = Existence.born(self._rules.lifetime_s, look.stamp_ns, log_odds)
+        life.first_m, life.travelled = sighting.candidate.position_m, self._rules.min_travel_m == 0.0
         self._judge(life)
 
     def matched(self, track_id: int, look: Look, sighting: Sighting) -> None:
         """See `Lifecycle.matched`."""
         life = self.lives[track_id]
         life.misses = 0
+        if not life.travelled and sighting.mean is not None and life.first_m is not None:
+            travel_m = math.dist(sighting.mean[:2].tolist(), life.first_m.tolist())
+            life.travelled = travel_m >= self._rules.min_travel_m
         found = _position_density(sighting)
         if found is None:
             return
@@ -204,7 +216,8 @@ class ExistenceLifecycle:
         return self.lives[track_id].num_measured
 
     def _judge(self, life: Existence) -> None:
-        life.confirmed = life.confirmed or life.probability(self._present_ns) >= self._rules.confirm_probability
+        believed = life.travelled and life.probability(self._present_ns) >= self._rules.confirm_probability
+        life.confirmed = life.confirmed or believed
 
     def _ends(self, life: Existence) -> bool:
         if self._present_ns - life.in_view_ns > self._out_of_view_ns:

@@ -161,8 +161,21 @@ def test_a_confirmed_track_is_coasting_when_missed_tentative_when_doubted_and_co
     assert life.status(0) is TrackStatus.CONFIRMED
 
 
+def test_what_never_moves_is_not_confirmed_and_what_has_moved_stays_so() -> None:
+    life = lifecycle(replace(STILL, min_travel_m=5.0))
+    life.born(0, look(), Sighting(HERE))
+    found = []
+    for k, x_m in enumerate((10.0, 14.9, 15.1, 10.0)):
+        mean = np.array([x_m, 0.0, 0.0, 0.0, 0.0])
+        life.matched(0, look(at_ms=10.0 * k), Sighting(candidate(x_m, 0.0), mean, P))
+        life.expired(START_NS + ms(10 * k))
+        found.append(life.status(0))
+    assert found == [TrackStatus.TENTATIVE, TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.CONFIRMED]
+
+
 @pytest.mark.parametrize(
-    "setting", ["delete_probability=0.3", "birth_probability=0", "lifetime_s=0", "doubt_probability=0.95"]
+    "setting",
+    ["delete_probability=0.3", "birth_probability=0", "lifetime_s=0", "min_travel_m=-1", "doubt_probability=0.95"],
 )
 def test_rules_that_make_no_sense_are_refused(setting: str) -> None:
     with pytest.raises(CallError, match="lifecycle"):
