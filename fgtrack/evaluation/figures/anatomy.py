@@ -18,6 +18,7 @@ _PARTS = {
     "sent to received": PALETTE[1],
     "received to tick": PALETTE[2],
 }
+_OWN_ROLE = "messages"  # of a topic that fgtrack has written
 _WHISKERS = (5.0, 95.0)
 
 
@@ -63,11 +64,16 @@ def anatomy(run: OneRun) -> Figure:
                 )
     for axes, what in ((means, "mean [ms]"), (spread, "distribution [ms]")):
         axes.set_xlabel(what)
-    means.set_yticks(range(len(topics)), [f"{one.topic}\n({one.role})" for one in topics])
+    means.set_yticks(range(len(topics)), [_named(one) for one in topics])
     means.set_ylim(len(topics) - 0.5, -0.5)
     legend_above(means, figure.get_figwidth() / 2.0)
     title(figure, titled(one.label, "what the delays are made of"))
     return figure
+
+
+def _named(topic: Sendings) -> str:
+    """The topic and what it is used as, where its type does not say that."""
+    return topic.topic if topic.role == _OWN_ROLE else f"{topic.topic}\n({topic.role})"
 
 
 def _parts_ms(topic: Sendings) -> Mapping[str, FloatArray]:
