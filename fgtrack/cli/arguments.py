@@ -9,7 +9,7 @@ from fgtrack.io.recording import Storage
 
 Input = Annotated[
     Path,
-    typer.Argument(help="Recording: rosbag2 folder, .mcap, .db3, .bag, fgtrack stream or Autoferry folder."),
+    typer.Argument(help="Recording: rosbag2, .mcap, .db3, .bag, stream, CSV or data set."),
 ]
 ConfigFile = Annotated[
     str | None,

@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Real
 from types import MappingProxyType
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import NonNegativeFloat
+from pydantic import NonNegativeFloat, StringConstraints
 
 from fgtrack.core.types import Frame
 from fgtrack.io.errors import LARGEST_BYTES, MOST_OBJECTS
@@ -95,6 +95,38 @@ class TopicInput:
 
 
 @dataclass(frozen=True)
+class CsvTable:
+    """A CSV file, or of a file that holds several things the rows of one."""
+
+    columns: Mapping[str, FieldPath]
+    """Column of `stamp`, `receipt` (by default the stamp), `object_id` and of each component, as in `fields`."""
+    file: str | None = None
+    """Name of the file beside or in the input; by default the input itself."""
+    time_unit: Literal["s", "ms", "us", "ns"] = "s"
+    """Unit of `stamp` and `receipt`."""
+    delimiter: Annotated[str, StringConstraints(min_length=1, max_length=1)] | None = None
+    """Character between the cells; by default what the first line has most of: comma, semicolon or tab."""
+    frame: Frame | None = None
+    """Frame of the positions of detections; by default `ego`. Truth and the ego are in the map."""
+    filters: Mapping[str, Filter] = field(default_factory=lambda: MappingProxyType({}))
+    """Which rows are read, by column: `{sensor: {one_of: [radar]}, snr: {min: 6}}`."""
+    stamp_from: Literal["message", "receipt"] = "message"
+    """As of a topic; `columns` must name `stamp` all the same."""
+
+
+@dataclass(frozen=True)
+class CsvInput:
+    """What the columns of CSV files are."""
+
+    ego: CsvTable | None = None
+    """The ego: `x_m`, `y_m`, `yaw_rad` and `speed_mps` must be there."""
+    detections: Mapping[str, CsvTable] = field(default_factory=lambda: MappingProxyType({}))
+    """Detections of every sensor; rows of one stamp and receipt are one list."""
+    truth: CsvTable | None = None
+    """True objects: `x_m`, `y_m`, and where there are several `object_id`."""
+
+
+@dataclass(frozen=True)
 class KittiInput:
     """What is read of a folder of the KITTI tracking data set."""
 
@@ -112,6 +144,22 @@ class KittiInput:
 
 
 @dataclass(frozen=True)
+class NuscenesInput:
+    """What is read of results in the form of nuScenes."""
+
+    scene: str | None = None
+    """Name or token of the scene, where the results are of several: `scene-0061`."""
+    tables: str | None = None
+    """Folder of the data set's tables, from the file's folder on; by default the `v1.0-...` beside the file."""
+    sensor: str = "detector"
+    """Name of the sensor that the boxes are of."""
+    classes: tuple[str, ...] = ("car",)
+    """Classes that are read, of boxes and of truth; empty for all."""
+    min_score: float = 0.0
+    """Boxes of a lower score are left out."""
+
+
+@dataclass(frozen=True)
 class InputConfig:
     """The topics that a replay reads; a recording that fgtrack wrote needs none of it."""
 
@@ -123,6 +171,8 @@ class InputConfig:
     message_definitions: tuple[str, ...] = ()
     """`.msg` files, or folders of them, of types that neither the recording nor fgtrack defines."""
     kitti: KittiInput = field(default_factory=KittiInput)
+    csv: CsvInput = field(default_factory=CsvInput)
+    nuscenes: NuscenesInput = field(default_factory=NuscenesInput)
     largest_mb: float = LARGEST_BYTES / 1e6
     """A chunk, message or line of the input that is larger than this, unpacked, is refused."""
     most_objects: int = MOST_OBJECTS

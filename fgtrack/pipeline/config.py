@@ -270,9 +270,10 @@ class Config:
                 raise ValueError(f"options: {name!r} is now {ESTIMATORS.resolve(name)!r}")
         if not self.sensors:
             raise ValueError("sensors: name at least one")
-        strangers = set(self.input.detections) - set(self.sensors) - set(self.ignore_sensors)
-        if strangers:
-            raise ValueError(f"input.detections: {sorted(strangers)[0]!r} has no model under sensors")
+        for key, named in (("detections", self.input.detections), ("csv.detections", self.input.csv.detections)):
+            strangers = set(named) - set(self.sensors) - set(self.ignore_sensors)
+            if strangers:
+                raise ValueError(f"input.{key}: {sorted(strangers)[0]!r} has no model under sensors")
         erring = [name for name, sensor in self.sensors.items() if sensor.correlation is not None]
         if erring and self.motion.kind == "ctrv_euler":
             raise ValueError(f"sensors.{erring[0]}.correlation: needs motion.kind ctrv, ctra or cv")

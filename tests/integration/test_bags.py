@@ -472,10 +472,10 @@ def test_any_type_is_read_by_its_paths(tmp_path):
 
 def test_an_empty_file_and_a_text_are_no_inputs(tmp_path):
     (tmp_path / "a.mcap").touch()
-    (tmp_path / "b.csv").write_text("x;y\n")
+    (tmp_path / "b.txt").write_text("x;y\n")
     for name, complaint in (
         ("a.mcap", "is empty"),
-        ("b.csv", "none of the inputs"),
+        ("b.txt", "none of the inputs"),
         ("", "none of the inputs"),
     ):
         with pytest.raises(DataError, match=complaint) as caught:
@@ -484,4 +484,4 @@ def test_an_empty_file_and_a_text_are_no_inputs(tmp_path):
         (tmp_path / "a.mcap").unlink(missing_ok=True)
     with pytest.raises(CallError, match="no such file"):
         open_input(tmp_path / "nothing")
-    assert os.listdir(tmp_path) == ["b.csv"]
+    assert os.listdir(tmp_path) == ["b.txt"]

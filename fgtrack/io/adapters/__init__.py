@@ -13,10 +13,12 @@ ADAPTERS = Registry(
     "adapter",
     {
         "fgtrack.adapters": {
+            "csv": "fgtrack.io.adapters.tables:FORMAT",
             "stream": "fgtrack.io.stream:FORMAT",
             "recording": "fgtrack.io.ros.topics:FORMAT",
             "autoferry": "fgtrack.io.adapters.autoferry:FORMAT",
             "fusiontracking": "fgtrack.io.adapters.fusiontracking:FORMAT",
+            "nuscenes": "fgtrack.io.adapters.nuscenes:FORMAT",
             "kitti": "fgtrack.io.adapters.kitti:FORMAT",
             "autoware_auto_perception_msgs/msg/DetectedObjects": f"{_OBJECTS}:detected_objects",
             "autoware_perception_msgs/msg/DetectedObjects": f"{_OBJECTS}:detected_objects",

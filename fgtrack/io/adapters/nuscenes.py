@@ -1,0 +1,215 @@
+"""nuScenes: boxes in the submission form of the data set, ego poses and truth from its tables.
+
+Caesar et al., "nuScenes: a multimodal dataset for autonomous driving", CVPR 2020; www.nuscenes.org. The input is the
+JSON file of the results (`meta` and `results` by sample) of a detector or tracker; the tables (`sample.json`,
+`sample_data.json`, `ego_pose.json`, `scene.json`; for truth `sample_annotation.json`, `instance.json`, `category.json`)
+stand in a folder of the version, `v1.0-...`, beside it. Choices that the data leave open:
+
+- A box is sensed at the stamp of its sample and received at once: the data have no receipt times.
+- Boxes and truth are in the map frame, that of the data set's maps. The ego's speed and yaw rate are those between its
+  poses.
+- Truth that no sensor has a point of is ignored, as in the data set's own evaluation.
+"""
+
+import json
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from itertools import pairwise
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+from fgtrack.core.errors import CallError, DataError, FgtrackError
+from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.time import seconds
+from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
+from fgtrack.io.adapters.common import signed_speed_mps
+from fgtrack.io.adapters.ids import object_id
+from fgtrack.io.config import InputConfig, NuscenesInput
+from fgtrack.io.source import FileFormat
+
+__all__ = ["FORMAT", "read_scene"]
+
+_RESULTS = re.compile(rb'\s*\{\s*"(meta|results)"\s*:')
+_NS_PER_US = 1000
+_CATEGORIES = {
+    "movable_object.barrier": "barrier",
+    "movable_object.trafficcone": "traffic_cone",
+    "vehicle.bicycle": "bicycle",
+    "vehicle.bus": "bus",
+    "vehicle.car": "car",
+    "vehicle.construction": "construction_vehicle",
+    "vehicle.motorcycle": "motorcycle",
+    "vehicle.trailer": "trailer",
+    "vehicle.truck": "truck",
+    "human.pedestrian": "pedestrian",
+}
+
+# Parsed JSON, checked while it is read.
+Json = Any
+
+
+def read_scene(file: Path, settings: NuscenesInput) -> Iterator[Message]:
+    """Messages of a scene in the order of receipt; at one stamp the truth first, then the ego, then the boxes.
+
+    Raises
+    ------
+    CallError
+        The results are of several scenes and none is named, or the tables are not found.
+    DataError
+        A file is not what the data set holds; the message names it.
+    """
+    results = _loaded(file)
+    tables = _tables(file, settings)
+    try:
+        boxes = results["results"]
+        samples = _samples(tables, boxes, settings)
+        egos = _egos(tables, samples)
+        truth = _truth(tables, samples, settings)
+        lists = [
+            DetectionList(settings.sensor, stamp_ns, stamp_ns, list(_boxes(boxes[token], settings)), "map")
+            for token, stamp_ns in samples.items()
+            if token in boxes
+        ]
+    except FgtrackError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        what = f"{type(error).__name__}: {str(error)[:100]}"
+        raise DataError(f"{file}: it or its tables in {tables} are not those of nuScenes ({what})") from error
+    messages: list[Message] = [*truth, *egos, *lists]
+    yield from sorted(messages, key=attrgetter("receipt_ns"))
+
+
+def _tables(file: Path, settings: NuscenesInput) -> Path:
+    if settings.tables is not None:
+        folder = file.parent / settings.tables
+    else:
+        found = [each.parent for each in sorted(file.parent.glob("v1.0-*/ego_pose.json"))]
+        folder = found[0] if len(found) == 1 else file.parent
+    if not (folder / "ego_pose.json").is_file():
+        raise CallError(f"{file}: no folder with ego_pose.json is beside it, name one as input.nuscenes.tables")
+    return folder
+
+
+def _loaded(file: Path) -> Json:
+    try:
+        return json.loads(file.read_bytes())
+    except OSError as error:
+        raise DataError(f"{file}: cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{file}: is not JSON ({error}), fetch it again") from error
+
+
+def _samples(tables: Path, boxes: Mapping[str, Json], settings: NuscenesInput) -> dict[str, int]:
+    """Stamps of the samples of the scene, by token, in the order of time."""
+    names = {each["token"]: each["name"] for each in _loaded(tables / "scene.json")}
+    samples = _loaded(tables / "sample.json")
+    scenes = {each["scene_token"] for each in samples if each["token"] in boxes}
+    if settings.scene is not None:
+        scenes = {token for token, name in names.items() if settings.scene in (token, name)}
+        if not scenes:
+            raise CallError(f"{tables}: has no scene {settings.scene}, but {_some(names.values())}")
+    if len(scenes) != 1:
+        has = _some(names[token] for token in scenes) if scenes else "none of these tables"
+        raise CallError(f"the results are of {len(scenes)} scenes ({has}), name one as input.nuscenes.scene")
+    chosen = sorted((each["timestamp"], each["token"]) for each in samples if each["scene_token"] in scenes)
+    return {token: int(time_us) * _NS_PER_US for time_us, token in chosen}
+
+
+def _some(names: Any) -> str:
+    names = sorted(names)
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+def _egos(tables: Path, samples: Mapping[str, int]) -> list[EgoState]:
+    """The poses at the data of the samples, with the motion between them."""
+    wanted = {
+        each["ego_pose_token"] for each in _loaded(tables / "sample_data.json") if each["sample_token"] in samples
+    }
+    poses = {}
+    for each in _loaded(tables / "ego_pose.json"):
+        if each["token"] in wanted:
+            x_m, y_m, _ = map(float, each["translation"])
+            poses[int(each["timestamp"]) * _NS_PER_US] = (x_m, y_m, _yaw_rad(each["rotation"]))
+    stamps = sorted(poses)
+    motions = [_motion(poses[a], poses[b], seconds(b - a)) for a, b in pairwise(stamps)]
+    motions = motions[:1] + motions if motions else [(0.0, 0.0)] * len(stamps)
+    return [
+        EgoState(stamp, stamp, *poses[stamp], speed, rate) for stamp, (speed, rate) in zip(stamps, motions, strict=True)
+    ]
+
+
+def _motion(one: tuple[float, ...], other: tuple[float, ...], after_s: float) -> tuple[float, float]:
+    """Speed along the yaw, and yaw rate, from one pose to another."""
+    middle_rad = one[2] + 0.5 * wrap_angle(other[2] - one[2])
+    vx_mps, vy_mps = (other[0] - one[0]) / after_s, (other[1] - one[1]) / after_s
+    return signed_speed_mps(vx_mps, vy_mps, middle_rad), wrap_angle(other[2] - one[2]) / after_s
+
+
+def _boxes(boxes: list[Json], settings: NuscenesInput) -> Iterator[Detection]:
+    for box in boxes:
+        name = box.get("detection_name", box.get("tracking_name"))
+        score = float(box.get("detection_score", box.get("tracking_score", math.nan)))
+        if (settings.classes and name not in settings.classes) or score < settings.min_score:
+            continue
+        x_m, y_m, z_m = map(float, box["translation"])
+        width_m, length_m, height_m = map(float, box["size"])
+        yaw_rad = _yaw_rad(box["rotation"])
+        vx_mps, vy_mps = map(float, box.get("velocity") or (math.nan, math.nan))
+        yield Detection(
+            x_m=x_m,
+            y_m=y_m,
+            yaw_rad=yaw_rad,
+            speed_mps=signed_speed_mps(vx_mps, vy_mps, yaw_rad) if math.isfinite(vx_mps + vy_mps) else None,
+            object_id=object_id(box.get("tracking_id", "")),
+            z_m=z_m,
+            length_m=length_m,
+            width_m=width_m,
+            height_m=height_m,
+            score=score if math.isfinite(score) else None,
+            class_name=name,
+        )
+
+
+def _truth(tables: Path, samples: Mapping[str, int], settings: NuscenesInput) -> list[TruthState]:
+    if not (tables / "sample_annotation.json").is_file():
+        return []
+    categories = {each["token"]: _class(each["name"]) for each in _loaded(tables / "category.json")}
+    kinds = {each["token"]: categories[each["category_token"]] for each in _loaded(tables / "instance.json")}
+    states = []
+    for each in _loaded(tables / "sample_annotation.json"):
+        stamp_ns = samples.get(each["sample_token"])
+        kind = kinds[each["instance_token"]]
+        if stamp_ns is None or kind is None or (settings.classes and kind not in settings.classes):
+            continue
+        x_m, y_m, _ = map(float, each["translation"])
+        number = object_id(each["instance_token"]) or 0
+        unseen = not each.get("num_lidar_pts", 1) + each.get("num_radar_pts", 0)
+        states.append(TruthState(stamp_ns, stamp_ns, number, x_m, y_m, _yaw_rad(each["rotation"]), ignored=unseen))
+    return states
+
+
+def _class(category: str) -> str | None:
+    """Class of detections that `category` is of; None where the data set detects none."""
+    return next((name for start, name in _CATEGORIES.items() if category.startswith(start)), None)
+
+
+def _yaw_rad(rotation: list[float]) -> float:
+    w, x, y, z = map(float, rotation)
+    return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
+def _recognises(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return _RESULTS.match(file.read(64)) is not None
+
+
+def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
+    return partial(read_scene, path, config.nuscenes)
+
+
+FORMAT = FileFormat("results in the form of nuScenes (.json) with its tables beside it", _recognises, _open)

@@ -1,0 +1,217 @@
+"""CSV files by a mapping of their columns."""
+
+import math
+from pathlib import Path
+
+import pytest
+from support.messages import drive, exact
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
+from fgtrack.io.adapters.ids import object_id
+from fgtrack.io.config import CsvInput, CsvTable, Field, Filter, InputConfig
+from fgtrack.io.errors import UntilBreak
+from fgtrack.io.source import input_kind, open_input
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.load import validate
+from fgtrack.pipeline.replay import replay_in_memory
+
+EGO = CsvTable({"stamp": "t", "x_m": "x", "y_m": "y", "yaw_rad": "yaw", "speed_mps": "v"}, "ego.csv")
+RADAR = CsvTable({"stamp": "t", "receipt": "seen", "x_m": "x", "y_m": "y"}, "radar.csv")
+RADAR_TEXT = "t,seen,x,y\n1.0,1.1,30,2\n1.0,1.1,40,-2\n1.05,1.15,31,2\n"
+
+
+def write(folder: Path, **files: str) -> Path:
+    for name, text in files.items():
+        (folder / f"{name}.csv").write_text(text)
+    return folder
+
+
+def messages(path: Path, **tables: object) -> list[Message]:
+    return list(open_input(path, InputConfig(csv=CsvInput(**tables))).messages())
+
+
+def test_rows_become_messages_in_the_order_of_receipt(tmp_path):
+    ego = "t,x,y,yaw,v\n1.0,0,0,0.5,10\n1.12,1,0,0.5,10\n"
+    truth = "t;id;px;py\n1.1;car_a;30.5;2\n"
+    write(tmp_path, ego=ego, radar=RADAR_TEXT, truth=truth)
+    cars = CsvTable({"stamp": "t", "object_id": "id", "x_m": "px", "y_m": "py"}, "truth.csv")
+    assert messages(tmp_path, ego=EGO, detections={"radar": RADAR}, truth=cars) == [
+        EgoState(1_000_000_000, 1_000_000_000, 0.0, 0.0, 0.5, 10.0),
+        TruthState(1_100_000_000, 1_100_000_000, object_id("car_a"), 30.5, 2.0),
+        DetectionList(
+            "radar", 1_000_000_000, 1_100_000_000, (Detection(x_m=30.0, y_m=2.0), Detection(x_m=40.0, y_m=-2.0))
+        ),
+        EgoState(1_120_000_000, 1_120_000_000, 1.0, 0.0, 0.5, 10.0),
+        DetectionList("radar", 1_050_000_000, 1_150_000_000, (Detection(x_m=31.0, y_m=2.0),)),
+    ]
+    assert input_kind(tmp_path) == input_kind(tmp_path / "radar.csv") == "csv"
+
+
+def test_one_file_may_hold_everything(tmp_path):
+    """Rows are told apart by a filter; a compass in degrees, milliseconds and km/h are converted."""
+    path = tmp_path / "log.csv"
+    path.write_text(
+        "kind\tms\ta\tb\theading\tkmh\tsnr\n"
+        "ego\t1500.25\t1\t2\t350\t36\t\n"
+        "radar\t1500.5\t10\t\t-10\t\t9\n"
+        "radar\t1500.5\t20\t\t5\t\t3\n"
+    )
+    heading = Field("heading", scale=-1.0, offset=90.0, degrees=True)
+    ego = {"stamp": "ms", "x_m": "a", "y_m": "b", "yaw_rad": heading, "speed_mps": Field("kmh", scale=1 / 3.6)}
+    radar = {"stamp": "ms", "range_m": "a", "bearing_rad": Field("heading", scale=-1.0, degrees=True)}
+    found = messages(
+        path,
+        ego=CsvTable(ego, time_unit="ms", filters={"kind": Filter(one_of=("ego",))}),
+        detections={
+            "radar": CsvTable(
+                radar,
+                time_unit="ms",
+                frame="sensor",
+                filters={"kind": Filter(one_of=("radar",)), "snr": Filter(min=6.0)},
+            )
+        },
+    )
+    assert found[0] == EgoState(
+        1_500_250_000, 1_500_250_000, 1.0, 2.0, pytest.approx(math.radians(100.0)), pytest.approx(10.0)
+    )
+    bearing_rad = pytest.approx(math.radians(10.0))
+    assert found[1:] == [
+        DetectionList(
+            "radar", 1_500_500_000, 1_500_500_000, (Detection(range_m=10.0, bearing_rad=bearing_rad),), "sensor"
+        )
+    ]
+
+
+def test_an_empty_cell_is_not_given_and_a_row_without_a_measurement_is_a_scan_that_saw_nothing(tmp_path):
+    write(tmp_path, radar="t,seen,x,y,v,name\n1,1,30,2,,car\n2,2,,,,\n3,3,nan,2,5,\n")
+    columns = {**RADAR.columns, "speed_mps": "v", "class_name": "name"}
+    first, second, third = messages(tmp_path, detections={"radar": CsvTable(columns, "radar.csv")})
+    assert first.objects == (Detection(x_m=30.0, y_m=2.0, class_name="car"),)
+    assert second.objects == ()
+    assert math.isnan(third.objects[0].x_m)
+    assert third.objects[0].speed_mps == 5.0
+
+
+def test_times_keep_all_their_digits(tmp_path):
+    write(tmp_path, radar="t,seen,x,y\n1700000000.123456789,1700000000.2,1,2\n")
+    (found,) = messages(tmp_path, detections={"radar": RADAR})
+    assert (found.stamp_ns, found.receipt_ns) == (1_700_000_000_123_456_789, 1_700_000_000_200_000_000)
+    late = CsvTable(RADAR.columns, "radar.csv", stamp_from="receipt")
+    (found,) = messages(tmp_path, detections={"radar": late})
+    assert found.stamp_ns == found.receipt_ns
+
+
+def test_a_drive_survives_csv_to_the_bit(tmp_path):
+    """Of every message what a table can hold; times in nanoseconds, numbers with all digits."""
+    names = {
+        "ego": ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2"),
+        "lidar": ("x_m", "y_m", "yaw_rad", "object_id"),
+        "radar": ("x_m", "y_m", "speed_mps"),
+        "truth": ("object_id", "x_m", "y_m", "yaw_rad", "speed_mps"),
+    }
+    rows = {name: [["stamp_ns", "receipt_ns", *columns]] for name, columns in names.items()}
+    for message in drive():
+        times = [message.stamp_ns, message.receipt_ns]
+        if isinstance(message, DetectionList):
+            for item in message.objects or [Detection()]:
+                rows[message.sensor].append([*times, *(getattr(item, name) for name in names[message.sensor])])
+        else:
+            kind = "ego" if isinstance(message, EgoState) else "truth"
+            rows[kind].append([*times, *(getattr(message, name) for name in names[kind])])
+    for name, lines in rows.items():
+        text = [",".join("" if value is None else str(value) for value in line) for line in lines]
+        (tmp_path / f"{name}.csv").write_text("\n".join(text))
+    tables = {
+        name: CsvTable(
+            {"stamp": "stamp_ns", "receipt": "receipt_ns", **dict(zip(columns, columns, strict=True))},
+            f"{name}.csv",
+            "ns",
+        )
+        for name, columns in names.items()
+    }
+    sensors = {name: tables[name] for name in ("lidar", "radar")}
+    found = messages(tmp_path, ego=tables["ego"], detections=sensors, truth=tables["truth"])
+    assert sorted(exact(found)) == sorted(exact(drive()))
+    assert [item.receipt_ns for item in found] == [item.receipt_ns for item in drive()]
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("t,seen,x\n1,1,2\n", r"radar\.csv:1: has no column 'y', but t, seen, x"),
+        ("t,seen,x,y,x\n", r"radar\.csv:1: has the column 'x' twice"),
+        (RADAR_TEXT + "2,2,far,1\n", r"radar\.csv:5: x: 'far' is no number"),
+        (RADAR_TEXT + "noon,2,1,1\n", r"radar\.csv:5: t: 'noon' is no time"),
+        (RADAR_TEXT + "1e999999999,2,1,1\n", r"radar\.csv:5: t: '1e999999999' is no time"),
+        (RADAR_TEXT + "nan,2,1,1\n", r"radar\.csv:5: t: 'nan' is no time"),
+        (RADAR_TEXT + "1e15,2,1,1\n", "64 bit integer"),
+        (RADAR_TEXT + "2,2,1\n", r"radar\.csv:5: has 3 cells, the header has 4"),
+        (RADAR_TEXT + '2,2,"' + "1" * 200_000 + '",1\n', r"radar\.csv:5: is no CSV"),
+        ("", r"radar\.csv:1: has no column 't'"),
+    ],
+)
+def test_a_damaged_file_is_one_line_and_what_is_before_it_is_replayed(tmp_path, text, complaint):
+    write(tmp_path, ego="t,x,y,yaw,v\n" + "".join(f"{k / 10},0,0,0,1\n" for k in range(30)), radar=text)
+    config = InputConfig(csv=CsvInput(EGO, {"radar": RADAR}))
+    readable = UntilBreak(open_input(tmp_path, config).messages())
+    with pytest.raises(DataError, match=complaint) as caught:  # noqa: PT012 - wrong from the start, or at a row
+        list(readable)
+        readable.raise_error()
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+    if text.startswith(RADAR_TEXT):
+        run, broken = replay_in_memory(open_input(tmp_path, config).messages(), Config())
+        assert broken == str(caught.value)
+        assert run.detections.num_rows == 3
+
+
+def test_a_byte_that_is_no_text_is_one_line(tmp_path):
+    (tmp_path / "radar.csv").write_bytes(RADAR_TEXT.encode() + b"2,2,\xff,1\n")
+    with pytest.raises(DataError, match=r"radar\.csv: is no UTF-8 text"):
+        messages(tmp_path, detections={"radar": RADAR})
+
+
+@pytest.mark.parametrize(
+    ("tables", "complaint"),
+    [
+        ({}, r"is CSV, so the configuration must say what its columns are \(input\.csv\.detections"),
+        ({"ego": CsvTable({"stamp": "t"}, "radar.csv")}, r"input\.csv\.ego\.columns: must name x_m"),
+        (
+            {"detections": {"radar": CsvTable({"x_m": "x"}, "radar.csv")}},
+            r"input\.csv\.detections\.radar.*must name stamp",
+        ),
+        (
+            {"detections": {"radar": CsvTable({"stamp": "t", "speed": "v"}, "radar.csv")}},
+            "unknown column 'speed', known",
+        ),
+        ({"detections": {"radar": CsvTable({"stamp": ["t", "x"]}, "radar.csv")}}, "the name of one column is needed"),
+        ({"detections": {"radar": CsvTable({"stamp": "t"})}}, "is a folder, so .* must name its file"),
+        ({"detections": {"radar": CsvTable({"stamp": "t"}, "lidar.csv")}}, r"lidar\.csv: there is no such file"),
+    ],
+)
+def test_a_mapping_that_does_not_fit_is_one_line(tmp_path, tables, complaint):
+    write(tmp_path, radar=RADAR_TEXT)
+    with pytest.raises(CallError, match=complaint):
+        messages(tmp_path, **tables)
+
+
+def test_the_mapping_is_written_in_the_configuration(tmp_path):
+    write(tmp_path, radar=RADAR_TEXT)
+    raw = {
+        "input": {
+            "csv": {
+                "detections": {
+                    "radar": {
+                        "file": "radar.csv",
+                        "columns": {"stamp": "t", "x_m": "x", "y_m": {"path": "y", "scale": -1}},
+                    }
+                }
+            }
+        }
+    }
+    (first, _) = open_input(tmp_path, validate(Config, raw, "test").input).messages()
+    assert [item.y_m for item in first.objects] == [-2.0, 2.0]
+    raw["input"]["csv"]["detections"]["radar"]["columns"]["y_m"] = {"path": "y", "scal": -1}
+    with pytest.raises(CallError, match=r"input\.csv\.detections\.radar\.columns\.y_m\.scal: unknown key"):
+        validate(Config, raw, "test")
