@@ -1,0 +1,164 @@
+"""A configuration on trial: what it makes of the first seconds of an input, before a whole replay is worth it."""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import takewhile
+
+import numpy as np
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.time import nanoseconds
+from fgtrack.core.types import DESCRIBING, MEASURABLE, Detection, DetectionList, EgoState, Message, TruthState
+from fgtrack.io.errors import UntilBreak
+from fgtrack.io.run import Run
+from fgtrack.models.sensors import SensorModel
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.replay import replay_in_memory
+
+__all__ = ["Trial", "suspicions", "try_out"]
+
+TRIAL_S = 5.0
+_FULL_CIRCLE_RAD = 2.0 * math.pi + 0.01
+_ANGLES = ("yaw_rad", "bearing_rad")
+_FAR_M, _NEARER = 250.0, 0.3  # what is so far, and so much nearer in another frame, is in that one
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What came out."""
+
+    duration_s: float
+    """How much of the input was tried."""
+    samples: Mapping[str, str]
+    """What the first message of everything was read as, by `ego`, `truth` and the names of sensors."""
+    suspicions: tuple[str, ...]
+    """What is probably wrong with the configuration, each with its cure."""
+    run: Run | None
+    """The dry run; None where nothing could be tracked."""
+    problem: str | None
+    """Why reading or tracking ended early."""
+
+
+def try_out(messages: Iterable[Message], config: Config, duration_s: float = TRIAL_S) -> Trial:
+    """Read and track the first `duration_s` of `messages`, in memory."""
+    readable = UntilBreak(messages)
+    try:
+        found = list(_beginning(readable, nanoseconds(duration_s)))
+    except DataError as error:  # of the first message
+        return Trial(duration_s, {}, (), None, str(error))
+    problem = None if readable.error is None else str(readable.error)
+    run = None
+    try:
+        run, broken = replay_in_memory(found, replace(config, clock=replace(config.clock, ticks_file=None)))
+        problem = problem or broken
+    except DataError as error:
+        problem = problem or str(error)
+    return Trial(duration_s, _samples(found), tuple(suspicions(found, config)), run, problem)
+
+
+def _beginning(messages: Iterable[Message], duration_ns: int) -> Iterator[Message]:
+    iterator = iter(messages)
+    first = next(iterator, None)
+    if first is not None:
+        yield first
+        yield from takewhile(lambda message: message.receipt_ns - first.receipt_ns <= duration_ns, iterator)
+
+
+def suspicions(messages: Sequence[Message], config: Config) -> Iterator[str]:
+    """What is probably wrong with how `messages` are read, a line each, with what to do."""
+    egos = [message for message in messages if isinstance(message, EgoState)]
+    truth = [message for message in messages if isinstance(message, TruthState)]
+    lists: dict[str, list[DetectionList]] = {}
+    for message in messages:
+        if isinstance(message, DetectionList) and message.sensor not in config.ignore_sensors:
+            lists.setdefault(message.sensor, []).append(message)
+    relative = sorted(name for name, found in lists.items() if any(each.frame != "map" for each in found))
+    if relative and not egos:
+        yield f"no state of the ego is read, but {relative[0]} is relative to it: name the ego's topic (input.ego)"
+    if egos and not any(ego.stamp_ns for ego in egos):
+        yield "ego: all stamps are 0: set `stamp_from: receipt` on its topic"
+    yield from _degrees("ego", egos)
+    yield from _degrees("truth", truth)
+    for name in sorted(set(config.sensors) - set(lists)):
+        if name in (config.input.detections or config.input.csv.detections):
+            yield f"{name}: sends nothing in the first seconds"
+    for name, found in sorted(lists.items()):
+        sensor, objects = config.sensors.get(name), [item for each in found for item in each.objects]
+        if not any(each.stamp_ns for each in found):
+            yield f"{name}: all stamps are 0: set `stamp_from: receipt` on its topic; nothing is known of its delay"
+        yield from _degrees(name, objects)
+        yield from _frames(name, found, egos)
+        if sensor is not None and objects:
+            yield from _measured(name, objects, sensor)
+
+
+def _degrees(name: str, states: Sequence[EgoState | TruthState | Detection]) -> Iterator[str]:
+    for angle in _ANGLES:
+        values = [abs(value) for state in states if (value := getattr(state, angle, None)) is not None]
+        largest = max((value for value in values if math.isfinite(value)), default=0.0)
+        if largest > _FULL_CIRCLE_RAD:
+            yield f"{name}: {angle} goes up to {largest:.4g}: degrees? Convert it by `{{path: ..., degrees: true}}`"
+
+
+def _frames(name: str, lists: Sequence[DetectionList], egos: Sequence[EgoState]) -> Iterator[str]:
+    """Whether positions are far from where their frame puts them, and near in the other one."""
+    points = [
+        (each.stamp_ns, item.x_m, item.y_m)
+        for each in lists
+        for item in each.objects
+        if item.x_m is not None and item.y_m is not None
+    ]
+    if not points or not egos:
+        return
+    stamps = np.array([ego.stamp_ns for ego in egos])
+    nearest = [egos[int(np.abs(stamps - stamp_ns).argmin())] for stamp_ns, _, _ in points]
+    bare_m = float(np.median([math.hypot(x_m, y_m) for _, x_m, y_m in points]))
+    offsets = [math.hypot(x_m - ego.x_m, y_m - ego.y_m) for (_, x_m, y_m), ego in zip(points, nearest, strict=True)]
+    from_ego_m = float(np.median(offsets))
+    frame = lists[0].frame
+    if frame == "map" and from_ego_m > _FAR_M and bare_m < _NEARER * from_ego_m:
+        yield (
+            f"{name}: is read as in the map, {from_ego_m:.0f} m from the ego, but its numbers are small "
+            f"({bare_m:.0f} m): set `frame: ego` (or sensor)"
+        )
+    if frame != "map" and bare_m > _FAR_M and from_ego_m < _NEARER * bare_m:
+        yield (
+            f"{name}: is read as relative to the {frame}, {bare_m:.0f} m away, but its numbers lie "
+            f"{from_ego_m:.0f} m from where the ego is in the map: set `frame: map`"
+        )
+
+
+def _measured(name: str, objects: Sequence[Detection], sensor: SensorModel) -> Iterator[str]:
+    given = {component for item in objects for component in item.measured}
+    missing = [component for component in sensor.std if component not in given]
+    if missing:
+        has = ", ".join(component for component in MEASURABLE if component in given) or "nothing"
+        what = f"{', '.join(missing)} of its std, but {has}"
+        yield f"{name}: never measures {what}: change sensors.{name}.std or the fields"
+
+
+def _samples(messages: Sequence[Message]) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for message in messages:
+        match message:
+            case DetectionList() if message.objects:
+                name, of = f"{message.sensor} (in the frame {message.frame})", message.objects[0]
+                text = _told(of, (*MEASURABLE, *DESCRIBING, "object_id"))
+            case EgoState():
+                name, text = "ego", _told(message, ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps"))
+            case TruthState() if not message.ignored:
+                name, text = "truth", _told(message, ("object_id", "x_m", "y_m", "yaw_rad", "speed_mps"))
+            case _:
+                continue
+        found.setdefault(name, text)
+    return found
+
+
+def _told(message: Message | Detection, names: Sequence[str]) -> str:
+    values = ((name, getattr(message, name)) for name in names)
+    return ", ".join(
+        f"{name} {value:.6g}" if isinstance(value, float) else f"{name} {value}"
+        for name, value in values
+        if value is not None
+    )
