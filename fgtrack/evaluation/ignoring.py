@@ -6,6 +6,7 @@ or with none and lies in an ignored region, is neither right nor false; and no t
 
 import numpy as np
 
+from fgtrack.core.errors import DataError
 from fgtrack.core.geometry import in_polygon
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.io.run import Run, Table
@@ -34,6 +35,12 @@ def in_regions(run: Run, stamps_ns: IntArray, points_m: FloatArray) -> BoolArray
     for stamp_ns, text in zip(regions["stamp_ns"], regions["outline_m"], strict=True):
         rows = np.flatnonzero((nearest_ns == stamp_ns) & ~found)
         if len(rows):
-            corners = np.array(text.split(), dtype=np.float64).reshape(-1, 2)
-            found[rows] = in_polygon(points_m[rows], corners)
+            found[rows] = in_polygon(points_m[rows], _corners(run, text))
     return found
+
+
+def _corners(run: Run, text: str) -> FloatArray:
+    try:
+        return np.array(text.split(), dtype=np.float64).reshape(-1, 2)
+    except ValueError as error:
+        raise DataError(f"{run.path}: ignored.csv holds a bad outline ({error}), repeat the run") from error

@@ -29,6 +29,7 @@ from fgtrack.io.errors import MOST_OBJECTS
 __all__ = ["checked"]
 
 _LONGEST_NAME = 200
+_FAR_M = 1e9
 _FRAMES = frozenset(get_args(Frame))
 _INT64 = range(-(1 << 63), 1 << 63)
 _PLAIN = {float, type(None)}
@@ -147,6 +148,8 @@ def _check_several(name: str, message: EgoState | TruthState | Detection) -> Non
         raise _WrongError(f"{name}: a tuple of numbers expected, not {_shown(values)}")
     for value in values:
         _check_number(name, value)
+    if name == "outline_m" and (len(values) < 6 or len(values) % 2 or not all(abs(each) <= _FAR_M for each in values)):
+        raise _WrongError(f"outline_m: x and y of at least three corners expected, not {_shown(values)}")
 
 
 def _check_name(name: str, value: object) -> None:

@@ -56,7 +56,7 @@ def message_lists(draw: st.DrawFn) -> list[Message]:
                 messages.append(EgoState(*times, *state, draw(st.none() | st.booleans()), covariance))
             case 1:
                 optional = [draw(st.none() | numbers) for _ in range(4)]
-                outline = draw(st.none() | st.lists(numbers, min_size=6, max_size=6).map(tuple))
+                outline = draw(st.none() | st.lists(st.floats(-1e9, 1e9), min_size=6, max_size=6).map(tuple))
                 position = (draw(numbers), draw(numbers))
                 messages.append(TruthState(*times, draw(ids), *position, *optional, draw(st.booleans()), outline))
             case _:
