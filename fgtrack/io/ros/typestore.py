@@ -1,18 +1,25 @@
 """The message types of a recording: rosbags', fgtrack's, the user's and those embedded in the recording."""
 
+import re
 from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import cast
 
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
-from rosbags.interfaces.typing import FieldDesc, Typesdict
+from rosbags.interfaces.typing import Constdefs, Fielddefs, FieldDesc, Typesdict
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from fgtrack.core.errors import CallError
 from fgtrack.io.ros.definitions import DEFINITIONS
 
+_TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*)+", re.ASCII)
+_MEMBER_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
+_BASE_NAME = re.compile(r"[a-z]+[0-9]*", re.ASCII)
+_MOST_MEMBERS = 2_000
+_LONGEST_ARRAY = 1_000_000
+_LONGEST_TEXT = 1_000_000
 _IDL_SEPARATOR = "=" * 80 + "\n"
 
 
@@ -49,7 +56,7 @@ def build_typestore(
     problems: dict[str, str] = {}
     for name, definition in definitions.items():
         try:
-            types |= _embedded_types(name, definition) if definition else {}
+            types |= _checked(_embedded_types(name, definition)) if definition else {}
         except Exception as error:  # whatever a foreign definition makes the parser raise
             problems[name] = f"its embedded definition cannot be read ({one_line(error)})"
     needed: Typesdict = {}
@@ -63,6 +70,49 @@ def build_typestore(
     store = get_typestore(Stores.EMPTY)
     store.register({name: fields for name, fields in needed.items() if name not in store.fielddefs})
     return store, problems
+
+
+def check_definition(name: str, definition: tuple[Constdefs, Fielddefs]) -> None:
+    """Raise `ValueError` unless all names of a definition are such, and its values plain.
+
+    rosbags generates Python code from a definition, with these names in it, and runs it: what a recording brings must
+    not become anything but names and numbers there.
+    """
+    constants, members = definition
+    if not _TYPE_NAME.fullmatch(name):
+        raise ValueError(f"{name!a} is no name of a message type")
+    if len(constants) + len(members) > _MOST_MEMBERS:
+        raise ValueError(f"{name} has more than {_MOST_MEMBERS} members")
+    for member in (*(constant[0] for constant in constants), *(one[0] for one in members)):
+        if not _MEMBER_NAME.fullmatch(member):
+            raise ValueError(f"{member!a} is no name of a member")
+    for member, kind, value in constants:
+        if type(value) not in (bool, int, float, str) or not _BASE_NAME.fullmatch(kind):
+            raise ValueError(f"the constant {member} is no plain value")
+    for member, description in members:
+        _check_description(member, description)
+
+
+def _check_description(member: str, description: FieldDesc) -> None:
+    kind, value = description
+    if kind == Nodetype.BASE:
+        base, size = cast("tuple[str, int]", value)
+        if not _BASE_NAME.fullmatch(base) or not 0 <= int(size) <= _LONGEST_ARRAY:
+            raise ValueError(f"{member} is of no known type")
+    elif kind == Nodetype.NAME:
+        if not _TYPE_NAME.fullmatch(cast("str", value)):
+            raise ValueError(f"{value!a} is no name of a message type")
+    else:
+        inner, size = cast("tuple[FieldDesc, int]", value)
+        if not 0 <= int(size) <= _LONGEST_ARRAY:
+            raise ValueError(f"{member} is longer than {_LONGEST_ARRAY}")
+        _check_description(member, inner)
+
+
+def _checked(types: Typesdict) -> Typesdict:
+    for name, definition in types.items():
+        check_definition(name, definition)
+    return types
 
 
 def one_line(error: BaseException) -> str:
@@ -109,13 +159,15 @@ def _user_types(path: Path) -> Typesdict:
     for file in files:
         package = file.parent.parent.name if file.parent.name == "msg" else file.parent.name
         try:
-            types |= get_types_from_msg(file.read_text(encoding="utf-8"), f"{package}/msg/{file.stem}")
+            types |= _checked(get_types_from_msg(file.read_text(encoding="utf-8"), f"{package}/msg/{file.stem}"))
         except Exception as error:  # whatever a foreign definition makes the parser raise
             raise CallError(f"{file}: is not a message definition ({one_line(error)})") from error
     return types
 
 
 def _embedded_types(name: str, definition: MessageDefinition) -> Typesdict:
+    if len(definition.data) > _LONGEST_TEXT:
+        raise ValueError(f"it has more than {_LONGEST_TEXT} characters")
     match definition.format:
         case MessageDefinitionFormat.MSG if definition.data.strip():
             return get_types_from_msg(definition.data, name)
