@@ -29,7 +29,7 @@ def export(
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Export runs for Foxglove, Lichtblick or RViz, or one as a KITTI result."""
+    """Export runs for Foxglove, Lichtblick, RViz; or a KITTI result."""
     if kitti is not None:
         _export_kitti(runs, kitti, out, overwrite)
         return
