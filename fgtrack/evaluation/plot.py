@@ -21,12 +21,14 @@ from fgtrack.evaluation.figures.consistency import consistency, has_squares
 from fgtrack.evaluation.figures.errors import errors, lag
 from fgtrack.evaluation.figures.frenet import frenet
 from fgtrack.evaluation.figures.map import tracks_on_map as map  # noqa: A004  # the name that users know
+from fgtrack.evaluation.figures.observed import sensed, transient
 from fgtrack.evaluation.figures.residuals import residuals
 from fgtrack.evaluation.figures.seeds import error_bands, has_seeds
 from fgtrack.evaluation.figures.style import save
 from fgtrack.evaluation.figures.sweep import sweep, sweep_metrics
 from fgtrack.evaluation.figures.times import delays, timing
 from fgtrack.evaluation.matching import track_errors
+from fgtrack.evaluation.residual_samples import residual_samples
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged
 from fgtrack.evaluation.sendings import sendings
 from fgtrack.evaluation.statistics import Moments
@@ -48,8 +50,10 @@ __all__ = [
     "residuals",
     "save",
     "save_figures",
+    "sensed",
     "sweep",
     "timing",
+    "transient",
 ]
 
 _FEW = 3  # of objects, and of runs where they are many: the worst are drawn
@@ -128,6 +132,17 @@ def _arrivals(runs: Sequence[JudgedRun]) -> _Plans:
     return _of_groups(_alike(runs, "disposition"), "arrivals", lambda one: arrivals(one))
 
 
+def _transients(runs: Sequence[JudgedRun]) -> _Plans:
+    for one in runs:
+        if len(residual_samples(one.run).sensors):
+            yield Planned(f"transient_{one.label}", partial(transient, one), is_extra=True)
+
+
+def _sensed(runs: Sequence[JudgedRun]) -> _Plans:
+    for plan in _of_groups(_alike(runs), "sensed", lambda one: sensed(one)):
+        yield replace(plan, is_extra=True)
+
+
 def _delays(runs: Sequence[JudgedRun]) -> _Plans:
     """One for each recording, but for those without any delay."""
     late = [one for one in runs if (one.run.updates["receipt_ns"] != one.run.updates["stamp_ns"]).any()]
@@ -176,6 +191,8 @@ FIGURES: Mapping[str, Callable[[Sequence[JudgedRun]], _Plans]] = {
     "arrivals": _arrivals,
     "anatomy": _anatomy,
     "delays": _delays,
+    "transient": _transients,
+    "sensed": _sensed,
     "errors": _errors,
     "error_bands": _error_bands,
     "lag": _lag,

@@ -136,13 +136,14 @@ def test_there_is_a_figure_of_what_runs_have_data_for(
     assert names(runs) == [
         *("map_smoother", "map_ekf-replay", "residuals_smoother", "residuals_ekf-replay"),
         *("consistency_smoother", "consistency_ekf-replay"),
-        *("arrivals", "delays"),
+        *("arrivals", "delays", "transient_smoother", "transient_ekf-replay", "sensed"),
         *("errors_object_7", "errors_object_8", "error_against_lag", "timing"),
     ]
     assert names(runs[1:]) == [name for name in names(runs) if "smoother" not in name and "lag" not in name]
     plain = replace(runs[0], truth=runs[0].truth.where(np.zeros(len(runs[0].truth["stamp_ns"]), dtype=bool)))
     assert names([plain]) == [
-        *("map_smoother", "residuals_smoother", "consistency_smoother", "arrivals", "delays", "timing")
+        *("map_smoother", "residuals_smoother", "consistency_smoother", "arrivals", "delays"),
+        *("transient_smoother", "sensed", "timing"),
     ]
     other = write_run(tmp_path / "other", updates={0: [update(delay_ns=1_000_000)]})
     assert [name for name in names([*runs, other]) if "delays" in name] == [

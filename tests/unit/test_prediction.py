@@ -1,0 +1,63 @@
+"""Predictions from the published states, and the figures of the evaluation of Karle et al. 2023."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluation_runs import START_NS, TICK_NS, WEST, update, write_run
+
+from fgtrack.core.types import Disposition, EgoState, TickReport, TrackReport
+from fgtrack.evaluation import plot
+from fgtrack.evaluation.matching import match
+from fgtrack.evaluation.prediction import prediction_errors
+from fgtrack.io.run import Run, RunWriter, load_run
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    """WEST, tracked with an error of 2 m along from the start on; the ego drives beside it at 30 m/s."""
+    tracks = [[WEST.track(k, 1, along_m=2.0)] for k in range(150)]
+    updates = {k: [update("lidar", tick=k, x_m=0.3, y_m=0.1)] for k in range(1, 150)}
+    updates |= {
+        k: [*updates[k], update("radar", tick=k - 5, delay_ns=100_000_000, x_m=-1.0, y_m=0.0, speed_mps=2.0)]
+        for k in (100, 120)
+    }
+    updates[0] = [update("lidar", tick=0, disposition=Disposition.BIRTH)]
+    with RunWriter(tmp_path / "run", "") as writer:
+        for row in WEST.truth(range(250)):
+            writer.write_truth(row)
+        for tick in range(150):
+            x_m, y_m, yaw_rad, _ = WEST.state(tick * TICK_NS / 1e9)
+            now_ns = START_NS + tick * TICK_NS
+            writer.write_ego(EgoState(now_ns, now_ns, x_m + 30.0, y_m + 3.0, yaw_rad, 30.0))
+            writer.write_tick(TickReport(tick, now_ns, tuple(tracks[tick]), tuple(updates[tick])), 2_000_000, 1)
+        writer.finish({"estimator": "ekf-replay"})
+    return load_run(tmp_path / "run")
+
+
+def test_a_prediction_is_judged_where_the_truth_goes_on(run: Run) -> None:
+    """The truth lasts for 5 s, so one second can be judged of all 30 predictions, five of none."""
+    found = {one.horizon_s: one for one in prediction_errors(run, match(run))}
+    assert {horizon_s: one.final_m.count for horizon_s, one in found.items()} == {1.0: 30, 2.0: 30, 3.0: 20, 5.0: 0}
+    assert found[1.0].final_m.mean == found[1.0].average_m.mean == pytest.approx(2.0)  # WEST drives straight on
+
+
+def test_an_error_of_the_speed_grows_with_the_horizon(tmp_path: Path) -> None:
+    tracks: list[list[TrackReport]] = [[WEST.track(k, 1, speed_mps=1.0)] for k in range(10)]
+    made = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(300)))
+    found = {one.horizon_s: one for one in prediction_errors(made, match(made))}
+    for horizon_s, one in found.items():
+        assert one.final_m.mean == pytest.approx(horizon_s)
+        assert one.average_m.mean == pytest.approx((horizon_s + 0.1) / 2.0)
+
+
+def test_figures_show_the_transient_and_what_the_sensors_saw(run: Run) -> None:
+    shown = plot.transient(run)
+    assert [axes.get_ylabel() for axes in shown.axes] == ["along track [m]", "across track [m]", "speed [m/s]"]
+    assert not shown.axes[2].lines  # two are too few
+    lidar = next(line for line in shown.axes[0].lines if line.get_label() == "lidar")
+    assert np.asarray(lidar.get_ydata())[:6] == pytest.approx(0.3)
+    assert not np.isfinite(np.asarray(lidar.get_ydata())[6:]).any()
+    titles = [axes.get_title() for axes in plot.sensed(run).axes]
+    assert titles[0] == "delay [ms]"
+    assert titles[-1] == "detections per\nobject (3+)"
