@@ -87,6 +87,8 @@ def sightings(kitti: Path, sequence: str) -> dict[int, list[Sighting]]:
     mount, settings = config.sensors[CAMERA].mount, replace(config.input.kitti, sequence=sequence)
     ego, cars, found = None, {}, {}
     for message in open_input(kitti, replace(config.input, kitti=settings)).messages():
+        if isinstance(message, TruthState) and message.ignored:
+            continue
         if isinstance(message, TruthState):
             cars = {message.object_id: message} | {
                 i: car for i, car in cars.items() if car.stamp_ns == message.stamp_ns
