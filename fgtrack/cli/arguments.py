@@ -1,10 +1,11 @@
 """Arguments that several commands share."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
+from fgtrack.cli.completion import configurations
 from fgtrack.io.recording import Storage
 
 Input = Annotated[
@@ -13,7 +14,12 @@ Input = Annotated[
 ]
 ConfigFile = Annotated[
     str | None,
-    typer.Option("-c", "--config", help="Configuration: a file (YAML) or a shipped name; without it the defaults."),
+    typer.Option(
+        "-c",
+        "--config",
+        help="Configuration: a file (YAML) or a shipped name; without it the defaults.",
+        autocompletion=configurations,
+    ),
 ]
 TrackMap = Annotated[str | None, typer.Option("--map", help="Map of the track (CSV), or `oval` for the built-in one.")]
 PitMap = Annotated[str | None, typer.Option("--pit-map", help="Map of the pit lane (CSV), or `oval`.")]
@@ -22,6 +28,10 @@ Settings = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Override one key of the configuration; may be repeated."),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what such a command wrote there before.")]
-Runs = Annotated[list[Path], typer.Argument(help="Run folders, or folders that hold run folders.")]
+Runs = Annotated[list[Path], typer.Argument(help="Run folders, or folders of runs, as that of the demo.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 StorageOption = Annotated[Storage, typer.Option("--storage", help="Storage of a rosbag2 folder.")]
+
+Form = Literal["md", "csv", "latex", "json"]
+FormOption = Annotated[Form | None, typer.Option("--format", help="Print this instead of tables for a terminal.")]
+All = Annotated[bool, typer.Option("--all", help="Show every table and column, not the main ones alone.")]

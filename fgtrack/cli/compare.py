@@ -1,15 +1,14 @@
 """`fgtrack compare`: tables of runs."""
 
-import json
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
-from fgtrack.cli.arguments import Json, Runs
-from fgtrack.cli.show import console, warn
-from fgtrack.core.errors import CallError
+from fgtrack.cli.arguments import All, FormOption, Json, Runs
+from fgtrack.cli.show import chosen_form, say, show, warn
 from fgtrack.evaluation.cautions import cautions
 from fgtrack.evaluation.comparison import compare as tables_of
+from fgtrack.evaluation.recordings import recordings_caution
 from fgtrack.evaluation.runs import Runs as AnyRuns
 from fgtrack.evaluation.runs import judged
 from fgtrack.evaluation.tables import Tables
@@ -19,27 +18,22 @@ from fgtrack.io.run import write_metrics
 def compare(
     runs: Runs,
     as_json: Json = False,
-    form: Annotated[
-        Literal["md", "csv", "latex", "json"] | None,
-        typer.Option("--format", help="Print this instead of tables for a terminal."),
-    ] = None,
+    form: FormOption = None,
+    everything: All = False,
     streaming: Annotated[
         bool, typer.Option("--streaming", help="Judge what was published when it was ready, too.")
     ] = False,
 ) -> None:
     """Compare runs in tables, and write metrics.json into each."""
-    if as_json and form not in (None, "json"):
-        raise CallError(f"--json, --format {form}: give one of them")
+    form = chosen_form(as_json, form)
     every = judged(runs)
-    for line in dict.fromkeys(f"{one.label}: {line}" for one in every for line in cautions(one.run)):
+    of_each = dict.fromkeys(f"{one.label}: {line}" for one in every for line in cautions(one.run))
+    for line in (*recordings_caution(every), *of_each):
         warn(line)
     tables = written_tables(every, streaming)
-    if as_json or form == "json":
-        print(json.dumps(tables.to_dict(), indent=2, allow_nan=False))
-    elif form is None:
-        console().print(tables)
-    else:
-        print({"md": tables.to_markdown, "csv": tables.to_csv, "latex": tables.to_latex}[form](), end="")
+    show(tables.in_full() if everything else tables, form)
+    if form is None and tables.has_more and not everything:
+        say("\nevery table and column: --all")
 
 
 def written_tables(runs: AnyRuns, streaming: bool = False) -> Tables:

@@ -5,7 +5,7 @@ from typing import Annotated, get_args
 import typer
 
 from fgtrack.cli.arguments import ConfigFile, Settings
-from fgtrack.cli.show import say
+from fgtrack.cli.show import entries, say
 from fgtrack.pipeline.load import dump
 from fgtrack.pipeline.shipped import Kind, read_config, shipped, summary
 
@@ -23,5 +23,4 @@ def config(
         return
     for kind in get_args(Kind):
         say(f"{kind}s")
-        for name, path in shipped(kind).items():
-            say(f"  {name:20} {summary(path)}")
+        entries({name: summary(path) for name, path in shipped(kind).items()})

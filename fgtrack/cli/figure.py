@@ -14,6 +14,7 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.evaluation.figures.style import save_pages
 from fgtrack.evaluation.plot import Planned, close_up, drawn, planned, planned_sweep, save_named
+from fgtrack.evaluation.recordings import by_recording
 from fgtrack.evaluation.runs import JudgedRun, judged, start_ns
 from fgtrack.evaluation.sweep_table import is_sweep, read_sweep
 from fgtrack.io.output import Kind, new_file, new_files
@@ -90,8 +91,7 @@ def drawn_close_up(
     runs: Sequence[JudgedRun], track_id: int | None = None, stamp_ns: int | None = None
 ) -> tuple[list[tuple[str, Figure]], DataError | None]:
     """The close-up of those of `runs` that are of the first one's recording, by its name; where it is none, why."""
-    origins = [(one.run.meta.get("input") or {}).get("path") for one in runs]
-    same = [one for one, origin in zip(runs, origins, strict=True) if origin == origins[0]]
+    same = by_recording(runs)[0]
     try:
         return [("close_up", close_up(same, close_ups([one.run for one in same], track_id, stamp_ns)))], None
     except DataError as error:

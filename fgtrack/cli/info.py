@@ -3,35 +3,33 @@
 from datetime import UTC, datetime
 from pathlib import Path
 
-from rich.table import Table
-
-from fgtrack.cli.arguments import ConfigFile, Input
-from fgtrack.cli.show import console, progress, say, table, warn
+from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json
+from fgtrack.cli.show import chosen_form, progress, say, show, warn
 from fgtrack.core.errors import DataError
-from fgtrack.io.info import DelayInfo, InputInfo, describe
+from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value
+from fgtrack.io.info import InputInfo, TopicInfo, describe
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.trial import Trial, try_out
 
+_DELAYS = ("delay_mean_s", "delay_p50_s", "delay_p90_s", "delay_max_s")
 _OTHER_CLOCK_S = 3600.0  # nothing is that late: the stamps and the recorder have different clocks
 
 
-def info(recording: Input, config_file: ConfigFile = None) -> None:
+def info(recording: Input, config_file: ConfigFile = None, as_json: Json = False, form: FormOption = None) -> None:
     """Show topics, rates and delays of a recording.
 
     With a configuration also what it would take from them, what a message of each is read as, and what a replay of the
     first seconds makes of them.
     """
+    form = chosen_form(as_json, form)
     config = None if config_file is None else read_config(config_file)
     found = describe(recording, None if config is None else config.input)
-    say(_heading(found))
-    console().print(_table(found, "–" if config is None else "ignored"))
-    for topic in found.topics:
-        if topic.note is not None and topic.used_as is None:
-            say(f"{topic.name}: {topic.note}")
+    topics = _table(found, NO_VALUE if config is None else "ignored")
+    show(topics, form, _values(found, topics))
     trial = None
-    if config is not None and found.problem is None:
+    if config is not None and found.problem is None and form is None:
         trial = _try_out(recording, config)
     problem = found.problem if trial is None else trial.problem
     if problem is not None:
@@ -53,6 +51,12 @@ def _try_out(recording: Path, config: Config) -> Trial:
     return trial
 
 
+def _values(found: InputInfo, topics: Table) -> dict[str, object]:
+    """JSON values."""
+    about = {"path": str(found.path), "kind": found.kind, "start_ns": found.start_ns, "duration_s": found.duration_s}
+    return {**about, "problem": found.problem, "topics": topics.records()}
+
+
 def _heading(found: InputInfo) -> str:
     text = f"{found.path}: {found.kind}"
     if found.start_ns is None:
@@ -62,16 +66,25 @@ def _heading(found: InputInfo) -> str:
 
 
 def _table(found: InputInfo, unused: str) -> Table:
-    rows = table("topic", "type", "taken as", ">messages", ">rate [Hz]", ">delay [ms] mean/p50/p90/max")
-    for topic in found.topics:
-        rate = "–" if topic.rate_hz is None else f"{topic.rate_hz:.1f}"
-        rows.add_row(topic.name, topic.type, topic.used_as or unused, str(topic.count), rate, _delay(topic.delay))
-    return rows
+    columns: list[Column[TopicInfo]] = [
+        Column("topic", ("topic",), lambda one: (one.name,), left=True),
+        Column("messages", ("messages",), lambda one: (one.count,)),
+        Column("rate\n[Hz]", ("rate_hz",), lambda one: None if one.rate_hz is None else (one.rate_hz,)),
+        Column("delay [ms]\nmean/p50/p90/max", _DELAYS, _delays, "{}/{}/{}/{}", 1e3, text=_whole),
+        Column("taken as", ("taken_as",), lambda one: (one.used_as or unused,), left=True),
+        Column("type", ("type",), lambda one: (one.type,), left=True),
+    ]
+    notes = [
+        f"{topic.name}: {topic.note}" for topic in found.topics if topic.note is not None and topic.used_as is None
+    ]
+    return Table(_heading(found), columns, found.topics, row_keys=("topic",), notes=notes)
 
 
-def _delay(delay: DelayInfo | None) -> str:
-    if delay is None:
-        return "–"
-    if abs(delay.p50_s) > _OTHER_CLOCK_S:
-        return "other clock"
-    return "/".join(f"{1e3 * value:.0f}" for value in (delay.mean_s, delay.p50_s, delay.p90_s, delay.max_s))
+def _delays(one: TopicInfo) -> tuple[Value, ...] | None:
+    found = one.delay
+    return None if found is None else (found.mean_s, found.p50_s, found.p90_s, found.max_s)
+
+
+def _whole(value: Value) -> str:
+    """Whole milliseconds; of a recorder with another clock than the sensor nothing."""
+    return f"{value:.0f}" if abs(float(value)) < 1e3 * _OTHER_CLOCK_S else NO_VALUE

@@ -50,7 +50,7 @@ app = typer.Typer(
     name="fgtrack",
     cls=_LazyCommands,
     help="Track objects from delayed object lists, and compare how delays are dealt with.",
-    **_STYLE,
+    **{**_STYLE, "add_completion": True},
 )
 for _name in COMMANDS:
     app.command(_name, help=_help(_name))(lambda: None)

@@ -1,16 +1,15 @@
 """`fgtrack offsets`: how wrong the clocks of a recording are."""
 
-import json
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
-from fgtrack.cli.arguments import ConfigFile, Input, Json, PitMap, Settings, TrackMap
-from fgtrack.cli.show import console, progress, say, table
+from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, PitMap, Settings, TrackMap
+from fgtrack.cli.show import chosen_form, progress, show
 from fgtrack.core.errors import DataError
+from fgtrack.evaluation.tables import Column, Table, Value
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.clock_offsets import OffsetReport, estimate_offsets
+from fgtrack.pipeline.clock_offsets import OffsetReport, SensorOffset, estimate_offsets
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
 
@@ -25,36 +24,43 @@ def offsets(
     pit_map: PitMap = None,
     settings: Settings = None,
     as_json: Json = False,
+    form: FormOption = None,
 ) -> None:
     """Estimate constant clock offsets of sensors.
 
     Says which ones are not identifiable.
     """
+    form = chosen_form(as_json, form)
     config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
     source = open_input(recording, config.input)
     with progress("offsets"):
         report = estimate_offsets(source.messages(), config, reference)
-    if as_json:
-        print(json.dumps(report.as_dict(), indent=2, allow_nan=False))
-    else:
-        say(f"{report.num_detections} detections of {report.num_tracks} tracks; offset = reported stamp - true time")
-        console().print(_table(report))
+    show(_table(report), form, report.as_dict())
     if report.broken is not None:
         raise DataError(f"{located(report.broken, str(recording))}; used up to there")
 
 
 def _table(report: OffsetReport) -> Table:
-    rows = table("sensor", ">offset [ms]", ">std [ms]", ">detections", ">residual [sigma]", "known", "why")
-    for item in report.sensors:
-        numbers = (_ms(item.offset_s), _ms(item.std_s), str(item.num_detections), _plain(item.residual))
-        known = "reference" if item.sensor == report.reference else "yes" if item.identifiable else "no"
-        rows.add_row(item.sensor, *numbers, known, item.why)
-    return rows
+    columns: list[Column[SensorOffset]] = [
+        Column("sensor", ("sensor",), lambda one: (one.sensor,), left=True),
+        Column("offset\n[ms]", ("offset_s",), lambda one: _known(one.offset_s), scale=1e3, text=_one_decimal),
+        Column("std\n[ms]", ("std_s",), lambda one: _known(one.std_s), scale=1e3, text=_one_decimal),
+        Column("detections", ("num_detections",), lambda one: (one.num_detections,)),
+        Column("residual\n[sigma]", ("residual",), lambda one: _known(one.residual)),
+        Column("known", ("known",), lambda one: (_verdict(one, report.reference),), left=True),
+    ]
+    notes = [f"{one.sensor}: {one.why}" for one in report.sensors]
+    title = f"Offsets of {report.num_detections} detections of {report.num_tracks} tracks (reported stamp - true time)"
+    return Table(title, columns, report.sensors, row_keys=("sensor",), notes=notes)
 
 
-def _ms(value_s: float | None) -> str:
-    return "–" if value_s is None else f"{1e3 * value_s:.1f}"
+def _verdict(one: SensorOffset, reference: str) -> str:
+    return "reference" if one.sensor == reference else "yes" if one.identifiable else "no"
 
 
-def _plain(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}"
+def _known(value: float | None) -> tuple[Value, ...] | None:
+    return None if value is None else (value,)
+
+
+def _one_decimal(value: Value) -> str:
+    return f"{value:.1f}"

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from fgtrack.cli import completion
 from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Settings, TrackMap
 from fgtrack.cli.show import TickProgress, progress, say, warn
 from fgtrack.core.errors import CallError, DataError
@@ -12,6 +13,7 @@ from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.evaluation.cautions import cautions, noise_cautions, unused
 from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
+from fgtrack.io.span import end_ns
 from fgtrack.pipeline.replay import located, replay_each
 from fgtrack.pipeline.shipped import read_config
 
@@ -21,7 +23,13 @@ def replay(
     out: Annotated[Path, typer.Option("-o", "--out", help="Run folder; for several estimators one below it each.")],
     config_file: ConfigFile = None,
     estimators: Annotated[
-        str | None, typer.Option("-e", "--estimator", help="Estimator, or several with commas between them.")
+        str | None,
+        typer.Option(
+            "-e",
+            "--estimator",
+            help="Estimator, or several with commas between them.",
+            autocompletion=completion.estimators,
+        ),
     ] = None,
     track_map: TrackMap = None,
     pit_map: PitMap = None,
@@ -39,14 +47,14 @@ def replay(
         if names.count(name) > 1:
             raise CallError(f"estimator {name!r} is named twice")
     source = open_input(recording, config.input)
-    with progress("replay") as show:
+    with progress("replay") as tell:
         results = replay_each(
             source.messages,
             config,
             {name: out / name for name in names} if len(names) > 1 else {names[0]: out},
             origin=str(recording),
             kind=source.kind,
-            on_tick=TickProgress(show),
+            on_tick=TickProgress(tell, lambda: end_ns(source), len(names)),
             overwrite=overwrite,
             realtime=realtime,
         )

@@ -7,7 +7,8 @@ import numpy as np
 import typer
 
 from fgtrack.cli.arguments import Overwrite, StorageOption
-from fgtrack.cli.show import progress, say
+from fgtrack.cli.completion import scenarios
+from fgtrack.cli.show import progress, say, told
 from fgtrack.io.recording import check_recording, write_recording
 from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.sim.simulate import simulate as simulated
@@ -16,7 +17,11 @@ from fgtrack.sim.simulate import simulate as simulated
 def simulate(
     scenario_file: Annotated[
         str,
-        typer.Argument(metavar="SCENARIO", help="Scenario: a file (YAML) or a shipped name, as `default`."),
+        typer.Argument(
+            metavar="SCENARIO",
+            help="Scenario: a file (YAML) or a shipped name, as `default`.",
+            autocompletion=scenarios,
+        ),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder.")],
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random generator.")] = 0,
@@ -29,6 +34,7 @@ def simulate(
     """Simulate a scenario into a stream or a rosbag2 folder."""
     check_recording(out, overwrite)
     scenario = read_scenario(scenario_file, duration_s=duration_s)
-    with progress("simulate"):
-        count = write_recording(out, simulated(scenario, np.random.default_rng(seed)), storage, overwrite=overwrite)
+    with progress("simulate") as tell:
+        messages = simulated(scenario, np.random.default_rng(seed))
+        count = write_recording(out, told(messages, tell), storage, overwrite=overwrite)
     say(f"{out}: {count} messages")

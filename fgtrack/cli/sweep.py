@@ -9,17 +9,27 @@ from typing import Annotated
 
 import typer
 
-from fgtrack.cli.arguments import Overwrite
-from fgtrack.cli.show import console, progress, say
+from fgtrack.cli.arguments import All, Form, FormOption, Overwrite
+from fgtrack.cli.completion import sweeps
+from fgtrack.cli.show import progress, say, show
 from fgtrack.core.errors import CallError, one_line
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.over_seeds import seed_contests, shown_tables, to_csv
+from fgtrack.evaluation.over_seeds import seed_contests, shown_tables, summary_table, to_csv
+from fgtrack.evaluation.sweep_table import SweepTable, read_sweep
 from fgtrack.io.output import write_file
 from fgtrack.io.run import Run
 from fgtrack.pipeline.shipped import find_file
 from fgtrack.pipeline.sweep import Scores, Sweep
 from fgtrack.pipeline.sweep_plan import load_plan
-from fgtrack.pipeline.sweep_store import ERROR_TABLE, PAIRED_TABLE, SWEEP_TABLE, Cell, Scalar, SweepResult
+from fgtrack.pipeline.sweep_store import (
+    ERROR_TABLE,
+    PAIRED_TABLE,
+    SUMMARY_TABLE,
+    SWEEP_TABLE,
+    Cell,
+    Scalar,
+    SweepResult,
+)
 
 #: Wall times among the metrics, and what follows from them; they have a table of their own.
 _TIMES = ("time_per_", "deadlines.")
@@ -28,7 +38,12 @@ _NAMES = ("name", "estimator")
 
 def sweep(
     sweep_name: Annotated[
-        str, typer.Argument(metavar="SWEEP", help="What is varied: a file (YAML, fgtrack-sweep/1) or a shipped name.")
+        str,
+        typer.Argument(
+            metavar="SWEEP",
+            help="What is varied: a file (YAML, fgtrack-sweep/1) or a shipped name.",
+            autocompletion=sweeps,
+        ),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the tables; what is done there is kept.")],
     jobs: Annotated[
@@ -43,9 +58,15 @@ def sweep(
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a key in every run; may be repeated.")
     ] = None,
+    form: FormOption = None,
+    everything: All = False,
     overwrite: Overwrite = False,
 ) -> int:
-    """Run settings x seeds x estimators into one table; resumes."""
+    """Run settings x seeds x estimators into one table; resumes.
+
+    Ends with mean and standard error at each point of the grid, and who is better.
+    """
+    tell = say if form is None else _silent
     if jobs is not None and jobs < 1:
         raise CallError(f"--jobs {jobs}: at least one process is needed")
     if jobs is not None and dask is not None:
@@ -53,19 +74,20 @@ def sweep(
     sweep_file = find_file("sweep", sweep_name)
     work = Sweep.open(load_plan(sweep_file, recording, settings or ()), out, overwrite)
     left = len(work.todo)
-    say(f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {left}")
+    tell(f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {left}")
     if work.num_unused:
-        say(f"{work.num_unused} parts in {out} belong to other settings, files or versions and stay unused")
+        tell(f"{work.num_unused} parts in {out} belong to other settings, files or versions and stay unused")
     bad: list[Cell] = []
-    with progress("sweep", left) as show:
+    with progress("sweep", left) as moved:
 
         def count(cells: Sequence[Cell]) -> None:
             bad.extend(cell for cell in cells if cell.error is not None)
-            show(f"{len(bad)} bad cells" if bad else "")
+            moved(f"{len(bad)} bad cells" if bad else "")
 
         result = work.run(score, jobs=jobs or -1, dask=dask, on_job=count)
-    say(f"{out / SWEEP_TABLE}: {result.num_good} of {result.num_cells} cells")
-    _compare(out, work.plan.columns)
+    tell(f"{out / SWEEP_TABLE}: {result.num_good} of {result.num_cells} cells")
+    if result.num_good:
+        _summarise(read_sweep(out), out, form, everything)
     return _complain(result, sweep_file, out)
 
 
@@ -87,13 +109,23 @@ def _read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def _compare(out: Path, axes: Sequence[str]) -> None:
-    """Write the paired differences between the estimators, and show those of the first metric."""
-    contests = seed_contests(_read(out / SWEEP_TABLE), axes)
-    write_file(out / PAIRED_TABLE, to_csv(contests, axes))
-    for shown in shown_tables(contests, axes):
-        console().print(shown)
-        say(f"all points and metrics: {out / PAIRED_TABLE}")
+def _summarise(table: SweepTable, out: Path, form: Form | None, everything: bool) -> None:
+    """Write means and paired differences of the estimators; show the differences of one metric, and the means."""
+    contests = seed_contests(table.rows, table.axes)
+    write_file(out / PAIRED_TABLE, to_csv(contests, table.axes))
+    summary = summary_table(table, contests)
+    write_file(out / SUMMARY_TABLE, summary.to_csv())
+    if form is None:
+        for shown in shown_tables(contests, table.axes):
+            show(shown, form)
+            say(f"all points and metrics: {out / PAIRED_TABLE}")
+    show(summary.in_full() if everything else summary, form)
+    if form is None and summary.has_more and not everything:
+        say(f"\nevery metric: --all, or {out / SUMMARY_TABLE}")
+
+
+def _silent(line: str) -> None:
+    """Of a table for another program nothing else is said."""
 
 
 def score(run: Run) -> Scores:

@@ -1,7 +1,8 @@
 """`fgtrack tune`: process and measurement noise from recordings."""
 
-import json
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 from typing import Annotated
@@ -9,14 +10,14 @@ from typing import Annotated
 import numpy as np
 import typer
 from rich.console import Console
-from rich.table import Table
 
-from fgtrack.cli.arguments import ConfigFile, Json, Overwrite, PitMap, Settings, TrackMap
-from fgtrack.cli.show import console, progress, say, table
+from fgtrack.cli.arguments import ConfigFile, FormOption, Json, Overwrite, PitMap, Settings, TrackMap
+from fgtrack.cli.show import chosen_form, progress, say, show
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.consistency import position_nees
 from fgtrack.evaluation.matching import match
+from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
 from fgtrack.io.output import check_output
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
@@ -42,30 +43,26 @@ def tune(
     ] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
+    form: FormOption = None,
 ) -> None:
     """Fit process and measurement noise to recordings.
 
     Maximum likelihood of the innovations; truth is not needed. Says which parameters are not identifiable.
     """
+    form = chosen_form(as_json, form)
     check_output(out, TUNED, overwrite)
     config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
     sources = {str(path): open_input(path, config.input).messages for path in recordings}
-    with progress("tune") as show:
-        report = tuned(sources, config, TuneRules(keep=tuple(keep or ())), show)
-    tables = _tables(report)
+    with progress("tune") as tell:
+        report = tuned(sources, config, TuneRules(keep=tuple(keep or ())), tell)
+    tables, found = Tables(_tables(report)), _sensors(report)
     options = [*(f"--set '{setting}'" for setting in settings or []), *(f"--keep {key}" for key in keep or [])]
     lines = [_command(recordings, out, config_file, track_map, pit_map, options), ""]
-    lines += _text(tables)
+    lines += [*_text(tables), "", *found]
     write_tuned(out, config_file, report.config, lines, overwrite)
-    if as_json:
-        print(json.dumps(report.as_dict() | {"nees": _nees_values(report.held_out)}, indent=2, allow_nan=False))
-    else:
-        for one in tables:
-            if isinstance(one, str):
-                say(one)
-            else:
-                console().print(one)
-        say(f"{out}: written")
+    show(tables, form, report.as_dict() | {"nees": _nees_values(report.held_out)})
+    if form is None:
+        say("\n".join(["", *found, f"{out}: written"]))
     if report.broken:
         raise DataError(f"{next(iter(report.broken.values()))}; used up to there")
 
@@ -84,28 +81,31 @@ def _command(
     return " ".join([*words, *options])
 
 
-def _tables(report: TuneReport) -> list[Table | str]:
-    shown: list[Table | str] = [_parameters(report.parameters)]
-    shown += [f"{_short(one.key)}: {one.why}" for one in report.parameters if one.why]
-    shown.append("")
-    shown += _sensors(report)
+def _tables(report: TuneReport) -> dict[str, Table]:
+    tables = {"parameters": _parameters(report.parameters)}
     if report.held_out is not None:
-        held_out = report.held_out
-        shown += [
-            "",
-            f"Held out: the last {100.0 * held_out.share:.0f} % of the time, {held_out.count} innovations, "
-            "by the noise fitted to the rest.",
-            _judged(held_out),
-        ]
-    return shown
+        tables["held_out"] = _judged(report.held_out)
+    return tables
 
 
 def _parameters(parameters: Sequence[TunedParameter]) -> Table:
-    rows = table("parameter", ">configured", ">tuned", ">error", "known")
-    for one in parameters:
-        error = "–" if one.std_error is None or one.known in ("no", "limit") else f"{100.0 * one.std_error:.1f} %"
-        rows.add_row(_short(one.key), f"{one.configured:.4g}", f"{one.tuned:.4g}", error, _KNOWN[one.known])
-    return rows
+    def error(one: TunedParameter) -> tuple[Value, ...] | None:
+        return None if one.std_error is None or one.known in ("no", "limit") else (one.std_error,)
+
+    columns: list[Column[TunedParameter]] = [
+        Column("parameter", (), lambda one: (_short(one.key),), left=True),
+        Column("", ("key",), lambda one: (one.key,)),
+        Column("configured", ("configured",), lambda one: (one.configured,), text=_four_digits),
+        Column("tuned", ("tuned",), lambda one: (one.tuned,), text=_four_digits),
+        Column("error", ("std_error",), error, "{} %", 100.0, text=lambda value: f"{value:.1f}"),
+        Column("known", ("known",), lambda one: (_KNOWN[one.known],), left=True),
+    ]
+    notes = [f"{_short(one.key)}: {one.why}" for one in parameters if one.why]
+    return Table("Noise, as standard deviations", columns, parameters, row_keys=("key",), notes=notes)
+
+
+def _four_digits(value: Value) -> str:
+    return f"{value:.4g}" if math.isfinite(float(value)) else NO_VALUE
 
 
 def _short(key: str) -> str:
@@ -129,17 +129,38 @@ def _sensors(report: TuneReport) -> list[str]:
     return lines
 
 
+@dataclass(frozen=True)
+class _Judged:
+    """A number on the time held out, with the configured and with the fitted noise."""
+
+    name: str
+    count: int | None
+    before: float
+    after: float
+    expected: float = math.nan
+    band: float = math.nan
+
+
 def _judged(held_out: HeldOut) -> Table:
-    rows = table("", ">count", ">before", ">after", ">expected", ">95 %")
-    for one in held_out.innovations:
-        numbers = (str(one.count), f"{one.before:.2f}", f"{one.after:.2f}", "1", f"± {one.band:.2f}")
-        rows.add_row(f"NIS {one.sensor} {one.component}", *numbers)
+    rows = [
+        _Judged(f"NIS {one.sensor} {one.component}", one.count, one.before, one.after, 1.0, one.band)
+        for one in held_out.innovations
+    ]
     found = _nees_values(held_out)
     if found is not None:
-        rows.add_row("NEES of the position", "", f"{found['before']:.2f}", f"{found['after']:.2f}", "2", "")
-    numbers = (str(held_out.count), f"{held_out.before:.3f}", f"{held_out.after:.3f}", "", "")
-    rows.add_row("log-likelihood per innovation", *numbers)
-    return rows
+        rows.append(_Judged("NEES of the position", None, found["before"], found["after"], 2.0))
+    rows.append(_Judged("log-likelihood per innovation", held_out.count, held_out.before, held_out.after))
+    columns: list[Column[_Judged]] = [
+        Column("of", ("of",), lambda row: (row.name,), left=True),
+        Column("count", ("count",), lambda row: None if row.count is None else (row.count,)),
+        Column("before", ("before",), lambda row: (row.before,)),
+        Column("after", ("after",), lambda row: (row.after,)),
+        Column("expected", ("expected",), lambda row: (row.expected,), text=_four_digits),
+        Column("95 %", ("band",), lambda row: (row.band,), "± {}"),
+    ]
+    share = f"the last {100.0 * held_out.share:.0f} % of the time"
+    title = f"Held out: {share}, {held_out.count} innovations, by the noise fitted to the rest"
+    return Table(title, columns, rows, row_keys=("of",))
 
 
 def _nees_values(held_out: HeldOut | None) -> dict[str, float] | None:
@@ -164,10 +185,8 @@ def _nees(run: Run, from_ns: int) -> FloatArray:
     return nees.values[(nees.stamps_ns >= from_ns) & np.isfinite(nees.values)]
 
 
-def _text(tables: Sequence[Table | str]) -> list[str]:
+def _text(tables: Tables) -> list[str]:
     """The tables as lines of text."""
     file = StringIO()
-    plain = Console(file=file, width=_WIDTH, color_system=None)
-    for one in tables:
-        plain.print(one, highlight=False, soft_wrap=isinstance(one, str), markup=False)
+    Console(file=file, width=_WIDTH, color_system=None).print(tables)
     return [line.rstrip() for line in file.getvalue().splitlines()]

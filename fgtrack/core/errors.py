@@ -1,5 +1,8 @@
 """Errors that a user sees as one line: what is wrong, where, and what to do."""
 
+import difflib
+from collections.abc import Iterable
+
 _LONGEST, _TAIL = 700, 250
 
 
@@ -16,6 +19,12 @@ class DataError(FgtrackError):
 
 class CallError(FgtrackError, ValueError):
     """The call or the configuration is bad (exit code 2); of a configuration file, pydantic adds the key."""
+
+
+def did_you_mean(name: object, known: Iterable[object]) -> str:
+    """What to append to a message on a `name` that is not among the `known` ones; empty where none is alike."""
+    near = difflib.get_close_matches(str(name), [str(each) for each in known], n=1)
+    return f", did you mean {near[0]!r}?" if near else ""
 
 
 def one_line(text: str) -> str:

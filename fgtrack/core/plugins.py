@@ -1,13 +1,12 @@
 """Parts by name: built-in ones, and those of installed packages (entry points), loaded on first use."""
 
-import difflib
 import logging
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from fgtrack.core.errors import CallError
+from fgtrack.core.errors import CallError, did_you_mean
 
 _logger = logging.getLogger(__name__)
 
@@ -64,8 +63,7 @@ class Registry:
         """The present form of `name`. Raises `CallError` for one that does not exist."""
         name = self._aliases.get(name, name)
         if name not in self._entries:
-            near = difflib.get_close_matches(name, [*self._entries, *self._aliases], n=1)
-            hint = f", did you mean {near[0]!r}" if near else ""
+            hint = did_you_mean(name, [*self._entries, *self._aliases]).removesuffix("?")
             raise CallError(f"{self._noun} {name!r} is unknown{hint}: there are {', '.join(self)}")
         return name
 

@@ -1,5 +1,6 @@
 """What a person must know before believing a run: detections that were not used, and why; noise that does not fit."""
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -40,7 +41,7 @@ _NO_EGO = (
 
 def cautions(run: Run) -> list[str]:
     """What is wrong with `run` as far as its files say, a line each with cause and cure."""
-    return [*_changed(run), *_clocks(run), *_ego(run), *_lost(run), *_window(run)]
+    return [*_changed(run), *_clocks(run), *_ego(run), *_surroundings(run), *_lost(run), *_window(run)]
 
 
 def noise_cautions(run: Run) -> list[str]:
@@ -55,10 +56,18 @@ def noise_cautions(run: Run) -> list[str]:
         if nis.count >= FEWEST and is_far_off(nis) and _median_is_off(run.updates["nis"][mine], nis):
             size = "small" if nis.mean > nis.dof else "large"
             found.append(
-                f"{sensor}: mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}; "
-                "`fgtrack tune` fits it"
+                f"{sensor}: mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}, as if "
+                f"errors were {math.sqrt(nis.mean / nis.dof):.2g} times what is configured; `{_tune(run)}` fits it"
             )
     return found
+
+
+def _tune(run: Run) -> str:
+    """The command that fits the noise of `run` to its recording."""
+    source = str((run.meta.get("input") or {}).get("path") or "")
+    if run.path is None or not source:
+        return "fgtrack tune"
+    return f"fgtrack tune {source} -c {run.path / 'config.yaml'} -o tuned.yaml"
 
 
 def _median_is_off(values: FloatArray, nis: ChiSquareMean) -> bool:
@@ -90,7 +99,10 @@ def _changed(run: Run) -> Iterator[str]:
 def _clocks(run: Run) -> Iterator[str]:
     for sensor, mine in _by_sensor(run.updates):
         if (run.updates["stamp_ns"][mine] == 0).all():
-            yield f"{sensor}: all stamps are 0: its driver does not set them, so nothing is known of its delay"
+            yield (
+                f"{sensor}: all stamps are 0: its driver does not set them, so nothing is known of its delay; "
+                "`stamp_from: receipt` on its topic takes the receipt for the stamp"
+            )
 
 
 def _ego(run: Run) -> Iterator[str]:
@@ -100,12 +112,34 @@ def _ego(run: Run) -> Iterator[str]:
             yield f"ego: {count} of {run.ego.num_rows} states not used, {reason}: look at the clock of its driver"
 
 
+def _surroundings(run: Run) -> Iterator[str]:
+    """No ego, or no map, where the configuration takes from them what new objects do."""
+    if not run.updates.num_rows or not _section(run, "birth").get("ego_speed_factor"):
+        return
+    failed = run.updates["disposition"] == "failed"
+    if not run.ego.num_rows and 2 * failed.sum() <= len(failed):
+        yield (
+            "no state of the ego was received, so new objects are assumed to stand still, and what the sensors could "
+            "see is not known: name its topic in the configuration (`fgtrack info` lists the topics), or set "
+            "birth.ego_speed_factor to 0"
+        )
+    if not _section(run, "map").get("track"):
+        measured = run.detections
+        blind = [sensor for sensor, mine in _by_sensor(measured) if not np.isfinite(measured["yaw_rad"][mine]).any()]
+        if blind:
+            yield (
+                f"no map, and no heading from {', '.join(blind)}: new objects may drive in any direction; name the map "
+                "with --map (`oval` for the simulated races), or set birth.ego_speed_factor to 0 for open space"
+            )
+
+
 def _lost(run: Run) -> Iterator[str]:
     """Dispositions that hit more than half of the detections of a sensor."""
     for sensor, mine in _by_sensor(run.updates):
         fates, counts = np.unique(run.updates["disposition"][mine], return_counts=True)
         for fate, count in zip(fates.tolist(), counts.tolist(), strict=True):
-            if fate not in USED and 2 * count > mine.sum():
+            unset = fate == "too_old" and not run.updates["stamp_ns"][mine].any()  # which is told already
+            if fate not in USED and 2 * count > mine.sum() and not unset:
                 cure = _too_old(run, sensor) if fate == "too_old" else _CURES[fate].format(sensor=sensor)
                 if fate == "failed" and not run.ego.num_rows:
                     cure = _NO_EGO

@@ -16,8 +16,10 @@ from fgtrack.evaluation.matching import scenes, track_errors
 from fgtrack.evaluation.multi_object import gospa
 from fgtrack.evaluation.paired import UNKNOWN, Estimate, by_stamp, within_run
 from fgtrack.evaluation.ranking import STANDING_NOTE, Entry, ranked, value_column, worse_columns
+from fgtrack.evaluation.recordings import by_recording
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.tables import Column, Table
+from fgtrack.io.run import EvaluationConfig
 
 _SEED = 20040101  # of the bootstrap: the same runs give the same intervals
 
@@ -33,6 +35,9 @@ _HEADINGS = {
     "position_nees": "NEES pos.",
     "gospa_in_sight_rms_m": "GOSPA [m]",
 }
+_MAIN = ("position_rmse_m", "gospa_in_sight_rms_m")
+BEST_NOTE = "bold: the best run of its recording in this, with 95 % confidence"
+"""What a bold value means in a table of runs."""
 _LARGE_SHARE = 0.9  # of the samples that all runs have in common; below it the note says how many
 
 
@@ -67,20 +72,16 @@ class _Row:
 
 def contests(runs: Sequence[JudgedRun]) -> list[Contest]:
     """A contest for every recording of which there are several runs; runs without truth take no part."""
-    return [_contest(group) for group in by_recording(runs) if len(group) > 1]
+    return [_contest(group) for group in judged_alike(runs) if len(group) > 1]
 
 
-def by_recording(runs: Sequence[JudgedRun]) -> list[list[JudgedRun]]:
-    """The runs with truth, those of the same recording together."""
-    groups: list[list[JudgedRun]] = []
-    for one in runs:
-        if one.matching is not None:
-            group = next((group for group in groups if same_recording(group[0], one)), None)
-            if group is None:
-                groups.append([one])
-            else:
-                group.append(one)
-    return groups
+def judged_alike(runs: Sequence[JudgedRun]) -> list[list[JudgedRun]]:
+    """The runs with truth, those of the same recording and judged by the same settings together."""
+    groups: dict[tuple[int, EvaluationConfig], list[JudgedRun]] = {}
+    for number, group in enumerate(by_recording([one for one in runs if one.matching is not None])):
+        for one in group:
+            groups.setdefault((number, one.options), []).append(one)
+    return list(groups.values())
 
 
 def differences(found: Sequence[Contest]) -> Table:
@@ -103,25 +104,20 @@ def differences(found: Sequence[Contest]) -> Table:
             notes.append(
                 f"{', '.join(contest.runs)}: {contest.samples} samples in common, of up to {contest.most_samples}"
             )
-    return Table("Differences of runs of the same recording", columns, rows, row_keys=("run", "quantity"), notes=notes)
-
-
-def same_recording(one: JudgedRun, other: JudgedRun) -> bool:
-    """Whether two runs are of the same scene and judged alike, so that their errors can be paired.
-
-    The truth is the same, and of every sensor that both have the detections are as many and have the same stamps (a
-    recording with other delays) or the same receipts (a configuration with other stamps).
-    """
-    if one.run.truth != other.run.truth or one.options != other.options:
-        return False
-    mine, its = one.run.updates, other.run.updates
-    return all(
-        any(
-            np.array_equal(np.sort(mine[name][mine["sensor"] == sensor]), np.sort(its[name][its["sensor"] == sensor]))
-            for name in ("stamp_ns", "receipt_ns")
-        )
-        for sensor in np.intersect1d(mine["sensor"], its["sensor"]).tolist()
+    return Table(
+        "Differences of runs of the same recording",
+        columns,
+        rows,
+        row_keys=("run", "quantity"),
+        notes=notes,
+        detail_rows=lambda row: row.quantity not in _MAIN,
     )
+
+
+def is_best(found: Sequence[Contest], quantity: str, run: str) -> bool:
+    """Whether `run` is better than all other runs of its recording, none of which ties with it."""
+    quantities = (one for contest in found for one in contest.quantities if one.name == quantity)
+    return any(one.entries[0].name == run and one.entries[0].standing == "best" for one in quantities)
 
 
 def _contest(group: Sequence[JudgedRun]) -> Contest:

@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ import numpy as np
 
 from fgtrack.evaluation.paired import Estimate, paired
 from fgtrack.evaluation.ranking import Entry, Standing, ranked, worse_columns
+from fgtrack.evaluation.sweep_table import SweepTable
 from fgtrack.evaluation.tables import Column, Table, Value
 
 #: Metrics that have a better and a worse, in the order in which they are asked for; the first is shown.
@@ -34,6 +36,16 @@ _BETTER: Mapping[str, Literal["less", "more", "nearer"]] = {
     "multi_object.identity.idf1": "more",
     "multi_object.hota.hota": "more",
 }
+
+#: Metrics that a summary shows first, and their headings.
+_MAIN: Mapping[str, str] = {
+    "truth.overall.errors.position_m.rmse": "pos.\n[m]",
+    "consistency.position_nees.mean": "NEES\npos.",
+    "multi_object.gospa.in_sight_rms_m": "GOSPA\n[m]",
+    "truth.overall.tracked_share_in_sight": "tracked\n[%]",
+}
+_SHARES = ("truth.overall.tracked_share_in_sight",)
+_PERCENT = 100.0
 
 _INTERVALS = "t intervals of paired differences over seeds; tie with the best: 0 is inside"
 _MOST_ROWS = 40
@@ -103,8 +115,61 @@ def shown_tables(contests: Sequence[SeedContest], axes: Sequence[str]) -> list[T
     metric, points = mine[0].metric, _point_texts(mine, axes)
     rows = [_Row(text, one.seeds, entry) for text, one in zip(points, mine, strict=True) for entry in one.entries]
     if len(rows) <= _MOST_ROWS:
-        return [_every_point(metric, rows, _heading(mine, axes))]
+        return [_every_point(metric, rows, _axis_names(_places([one.point for one in mine], axes), axes))]
     return [_counts(metric, len(mine), rows)]
+
+
+def summary_table(sweep: SweepTable, contests: Sequence[SeedContest]) -> Table:
+    """Mean and standard error over the seeds of every metric, a row for each point and estimator; few metrics first.
+
+    The best value at a point is bold where `contests`, those of the sweep, know of no tie.
+    """
+    means = {metric: sweep.means(metric, sweep.axes) for metric in sweep.metrics}
+    means = {metric: found for metric, found in means.items() if found}
+    values = {(one.point, one.estimator, metric): one for metric, found in means.items() for one in found}
+    best = {
+        (one.point, entry.name, one.metric) for one in contests for entry in one.entries if entry.standing == "best"
+    }
+    rows = list(dict.fromkeys((tuple(row[axis] for axis in sweep.axes), row["estimator"]) for row in sweep.rows))
+    points = list(dict.fromkeys(point for point, _ in rows))
+    places = _places(points, sweep.axes)
+    main = [name for name in _MAIN if name in means] or list(means)[: len(_MAIN)]
+
+    def column(metric: str) -> Column[_Cell]:
+        def of(row: _Cell) -> tuple[Value, ...] | None:
+            found = values.get((*row, metric))
+            return None if found is None else (found.mean, found.standard_error)
+
+        return Column(
+            _MAIN.get(metric) or re.sub(r"\.(?!\d)", "\n", metric),
+            (metric, f"{metric}.standard_error"),
+            of,
+            "{} ± {}",
+            _PERCENT if metric in _SHARES else 1.0,
+            bold=lambda row: (*row, metric) in best,
+            when="always" if metric in main else "full",
+        )
+
+    def axis(place: int) -> Column[_Cell]:
+        return Column("", (sweep.axes[place],), lambda row: (row[0][place],))
+
+    def seeds(row: _Cell) -> tuple[Value, ...]:
+        return (max((values[(*row, metric)].seeds for metric in means if (*row, metric) in values), default=0),)
+
+    columns: list[Column[_Cell]] = [
+        *map(axis, range(len(sweep.axes))),
+        Column(_axis_names(places, sweep.axes), (), lambda row: (", ".join(row[0][k] for k in places),), left=True),
+        Column("estimator", ("estimator",), lambda row: (row[1],), left=True),
+        *map(column, [*main, *(name for name in means if name not in main)]),
+        Column("seeds", ("seeds",), seeds),
+    ]
+    notes = ["± standard error of the mean over the seeds"]
+    if any((point, name, metric) in best for point, name in rows for metric in main):
+        notes.append("bold: the best estimator of its point in this, with 95 % confidence")
+    return Table("Summary", columns, rows, row_keys=(*sweep.axes, "estimator"), notes=notes)
+
+
+_Cell = tuple[tuple[str, ...], str]  # cells of the axes, and the estimator
 
 
 @dataclass(frozen=True)
@@ -144,20 +209,20 @@ def _counts(metric: str, num_points: int, rows: Sequence[_Row]) -> Table:
 
 
 def _point_texts(contests: Sequence[SeedContest], axes: Sequence[str]) -> list[str]:
-    places = _places(contests, axes)
+    places = _places([one.point for one in contests], axes)
     return [", ".join(one.point[place] for place in places) for one in contests]
 
 
-def _heading(contests: Sequence[SeedContest], axes: Sequence[str]) -> str:
+def _axis_names(places: Sequence[int], axes: Sequence[str]) -> str:
     """The last parts of the names of the axes shown."""
-    return ",\n".join(axes[place].rpartition(".")[2] for place in _places(contests, axes)) or "point"
+    return ",\n".join(axes[place].rpartition(".")[2] for place in places) or "point"
 
 
-def _places(contests: Sequence[SeedContest], axes: Sequence[str]) -> list[int]:
+def _places(points: Sequence[tuple[str, ...]], axes: Sequence[str]) -> list[int]:
     """Axes that tell the points apart, without those of whole mappings where labels do it."""
-    plain = [k for k in range(len(axes)) if not any(one.point[k].startswith(("{", "[")) for one in contests)]
-    points = {tuple(one.point[k] for k in plain) for one in contests}
-    return plain if len(points) == len(contests) else list(range(len(axes)))
+    plain = [k for k in range(len(axes)) if not any(point[k].startswith(("{", "[")) for point in points)]
+    told = {tuple(point[k] for k in plain) for point in points}
+    return plain if len(told) == len(points) else list(range(len(axes)))
 
 
 def _contest(point: tuple[str, ...], metric: str, rows: Sequence[Mapping[str, str]]) -> SeedContest | None:

@@ -57,7 +57,9 @@ Runs = OneRun | Iterable[OneRun | Iterable[OneRun]]
 
 
 def judged(runs: Runs) -> list[JudgedRun]:
-    """Runs under labels of their own; a path is a run folder, or a folder that holds run folders (by name).
+    """Runs under labels of their own; a path is a run folder, or a folder that holds some.
+
+    Runs of a folder come by name; they may be one folder deeper, as in that of `fgtrack demo`.
 
     Raises
     ------
@@ -138,7 +140,8 @@ def labelled(runs: Sequence[Run]) -> dict[str, Run]:
 def _read(path: Path) -> list[Run]:
     if is_run_folder(path):
         return [load_run(path)]
-    below = [child for child in sorted(path.iterdir()) if is_run_folder(child)] if path.is_dir() else []
-    if not below:
-        raise CallError(f"{path}: no run folder, make one with `fgtrack replay`")
-    return [load_run(child) for child in below]
+    for pattern in ("*", "*/*") if path.is_dir() else ():
+        below = [load_run(child) for child in sorted(path.glob(pattern)) if is_run_folder(child)]
+        if below:
+            return below
+    raise CallError(f"{path}: no run folder, make one with `fgtrack replay`")

@@ -17,7 +17,7 @@ import numpy as np
 from fgtrack.core.geometry import cartesian
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.contest import by_recording, quantity
+from fgtrack.evaluation.contest import judged_alike, quantity
 from fgtrack.evaluation.deadlines import Deadlines, ready
 from fgtrack.evaluation.paired import UNKNOWN, by_stamp
 from fgtrack.evaluation.ranking import STANDING_NOTE, Entry, value_column, worse_columns
@@ -89,7 +89,7 @@ def with_streaming(tables: Tables, runs: Sequence[JudgedRun]) -> Tables:
     samples that they have before the truth ends would decide about all.
     """
     rows, notes, sentences = [], [], []
-    for group in by_recording(runs):
+    for group in judged_alike(runs):
         late = [one for one in group if _load_of(one) > 1.0]
         ranked = [one for one in group if one not in late] or group
         entries, share = _compared(ranked)

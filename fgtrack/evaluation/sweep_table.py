@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.errors import CallError, DataError, did_you_mean
 
 SWEEP_FILE = "sweep.csv"
 _SEED, _ESTIMATOR = "seed", "estimator"
@@ -59,7 +59,8 @@ class SweepTable:
             There is no such metric.
         """
         if metric not in self.metrics:
-            raise CallError(f"{metric}: the sweep has no such metric, there are {', '.join(self.metrics[:5])} ...")
+            hint = did_you_mean(metric, self.metrics) or f", there are {', '.join(self.metrics[:5])} ..."
+            raise CallError(f"{metric}: the sweep has no such metric{hint}")
         axes = self.shown_axes if axes is None else axes
         values: dict[tuple[tuple[str, ...], str], list[float]] = {}
         for row in self.rows:

@@ -1,20 +1,20 @@
 """Tables of numbers by column name, and their forms: terminal, Markdown, LaTeX, CSV, JSON values."""
 
+import copy
 import csv
 import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import takewhile
-from typing import Any, Generic, TypeVar
+from dataclasses import dataclass, field, replace
+from typing import Any, Generic, Literal, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
-from rich.table import Table as RichTable
 from rich.text import Text
 
+from fgtrack.core.errors import printable
+from fgtrack.evaluation.terminal import Shown, bulleted, lines, of_rows
 from fgtrack.io.run import Table as RunTable
 
 Row = TypeVar("Row")
@@ -72,26 +72,15 @@ class Column(Generic[Row]):
     """Whether cells are aligned left, for text; else right."""
     bold: Callable[[Row], bool] | None = None
     """Which rows have the best value; none without it."""
+    when: Literal["always", "few", "full"] = "always"
+    """Whether it is shown only among few columns, or only where the table is shown in full."""
+    note: str = ""
+    """A line below the table where the column is shown."""
 
     def cell(self, values: tuple[Value, ...] | None) -> str:
         """What is shown; a dash where no number is known."""
         texts = [self.text(v * self.scale if isinstance(v, float) else v) for v in values or ()]
         return self.form.format(*texts) if set(texts) - {NO_VALUE} else NO_VALUE
-
-
-@dataclass(frozen=True)
-class Shown:
-    """A column as it is shown."""
-
-    heading: str
-    cells: tuple[str, ...]
-    left: bool
-    bold: tuple[bool, ...]
-
-    @property
-    def width(self) -> int:
-        """Of the column in a terminal, without the space beside it."""
-        return max(map(len, (*self.heading.split("\n"), *self.cells)), default=0)
 
 
 class Table(RunTable):
@@ -104,9 +93,11 @@ class Table(RunTable):
     row_keys
         Names of the columns that identify a row; the first is the run.
     notes
-        Lines below the table.
+        Lines below the table, where it is shown in full.
     shown
         Columns as people read them: rounded, in handy units, some with several numbers in a cell.
+    is_detail
+        Whether it is shown only where a comparison is shown in full.
     """
 
     def __init__(
@@ -116,67 +107,91 @@ class Table(RunTable):
         rows: Sequence[Row],
         row_keys: tuple[str, ...] = ("run",),
         notes: Sequence[str] = (),
+        *,
+        detail: bool = False,
+        detail_rows: Callable[[Row], bool] = lambda row: False,
     ) -> None:
-        self.title, self.row_keys, self.notes = title, row_keys, tuple(notes)
+        self.title, self.row_keys, self.is_detail = title, row_keys, detail
         data: dict[str, npt.NDArray[Any]] = {}  # Any: a column holds floats, integers or text
         shown = []
         for column in columns:
             values = [column.of(row) for row in rows]
             for k, name in enumerate(column.names):
                 data[name] = np.array([math.nan if one is None else one[k] for one in values])
-            cells = tuple(map(column.cell, values))
+            cells = tuple(printable(column.cell(each)) for each in values)
             if column.heading:
                 bold = tuple(column.bold is not None and column.bold(row) for row in rows)
-                shown.append(Shown(column.heading, cells, column.left, bold))
+                shown.append((column, Shown(column.heading, cells, column.left, bold)))
         super().__init__(data)
-        self.shown = tuple(shown)
+        self._shown, self._own_notes, self._full = shown, tuple(notes), False
+        self._few_rows = [k for k, row in enumerate(rows) if not detail_rows(row)]
+        self.shown = tuple(each for column, each in shown if column.when != "few")
+        self.notes = self._notes("few")
+
+    def in_full(self) -> Self:
+        """The same table, which shows all of its columns and rows; without it `str` and files show the main ones."""
+        full = copy.copy(self)
+        full._full = True
+        return full
+
+    @property
+    def has_more(self) -> bool:
+        """Whether there is more than what is shown."""
+        hidden = len(self._few_rows) < self.num_rows or any(column.when == "full" for column, _ in self._shown)
+        return hidden and not self._full
 
     def __str__(self) -> str:
         return _text(self)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """The table; where the terminal is narrower, the columns that fit, and the others below."""
-        yield Text(f"\n{self.title}")
-        for number, columns in enumerate(self._parts(options.max_width)):
-            if number:
-                yield Text("continued:")
-            yield _grid(columns)
-        if self.notes:
-            yield Text("\n".join(self.notes))
+        """The table, its columns arranged as the width of the terminal demands."""
+        yield Text(f"\n{printable(self.title)}")
+        yield from lines(self._visible(), options.max_width)
+        yield from map(Text, map(printable, self._visible_notes()))
 
-    def _parts(self, width: int) -> Iterator[list[Shown]]:
-        """The columns in parts that are not wider than `width`; the names of the rows stand in each of them."""
-        names = list(takewhile(lambda column: column.left, self.shown))
-        part = list(names)
-        for column in self.shown[len(names) :]:
-            if len(part) > len(names) and sum(one.width + 2 for one in (*part, column)) - 1 > width:
-                yield part
-                part = list(names)
-            part.append(column)
-        yield part
+    def _visible(self) -> list[Shown]:
+        if self._full:
+            return list(self.shown)
+        return [of_rows(each, self._few_rows) for column, each in self._shown if column.when != "full"]
+
+    def _visible_notes(self) -> tuple[str, ...]:
+        return self.notes if self._full else self._notes("full")
+
+    def _notes(self, hidden: str) -> tuple[str, ...]:
+        """The notes, without those of the columns that are `hidden`."""
+        of_columns = (column.note for column, _ in self._shown if column.note and column.when != hidden)
+        return tuple(dict.fromkeys((*of_columns, *self._own_notes)))
 
     def to_markdown(self) -> str:
         """A table of GitHub Markdown under a heading, the notes below."""
-        head = [_one_line(column.heading) for column in self.shown]
-        rule = [":---" if column.left else "---:" for column in self.shown]
-        cells = _rows(self.shown, lambda cell, bold: f"**{cell}**" if bold else cell)
+        shown, notes = self._visible(), self._visible_notes()
+        head = [_one_line(column.heading) for column in shown]
+        rule = [":---" if column.left else "---:" for column in shown]
+        cells = _rows(shown, lambda cell, bold: f"**{cell.strip()}**" if bold else cell)
         rows = [[cell.replace("|", r"\|") for cell in row] for row in (head, rule, *cells)]
-        lines = [f"### {self.title}", "", *(f"| {' | '.join(row)} |" for row in rows), ""]
-        return "\n".join([*lines, *(f"- {note}" for note in self.notes), *([""] if self.notes else [])])
+        text = [f"### {self.title}", "", *(f"| {' | '.join(row)} |" for row in rows), ""]
+        return "\n".join([*text, *(f"- {note}" for note in notes), *([""] if notes else [])])
 
     _repr_markdown_ = to_markdown  # what a notebook shows
 
     def to_latex(self) -> str:
         """A table environment with the rules of the package booktabs; notes as comments."""
-        head = [_latex(_one_line(column.heading)) for column in self.shown]
-        rows = _rows(self.shown, lambda cell, bold: f"\\textbf{{{_latex(cell)}}}" if bold else _latex(cell))
+        shown = self._visible()
+        head = [_latex(_one_line(column.heading)) for column in shown]
+        rows = _rows(shown, lambda cell, bold: f"\\textbf{{{_latex(cell)}}}" if bold else _latex(cell))
         body = [f"{' & '.join(row)} \\\\" for row in rows]
-        spec = "".join("l" if column.left else "r" for column in self.shown)
+        spec = "".join("l" if column.left else "r" for column in shown)
         return "\n".join(
             [
                 *(r"\begin{table}", r"\centering", f"\\caption{{{_latex(self.title)}}}"),
                 *(f"\\begin{{tabular}}{{{spec}}}", r"\toprule", f"{' & '.join(head)} \\\\", r"\midrule", *body),
-                *(r"\bottomrule", r"\end{tabular}", *(f"% {note}" for note in self.notes), r"\end{table}", ""),
+                *(
+                    r"\bottomrule",
+                    r"\end{tabular}",
+                    *(f"% {note}" for note in self._visible_notes()),
+                    r"\end{table}",
+                    "",
+                ),
             ]
         )
 
@@ -192,13 +207,24 @@ class Table(RunTable):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tables(Mapping[str, Table]):
-    """Tables by name; `str` gives the verdict and the tables that have rows as text."""
+    """Tables by name; `str` gives the verdict and the main tables as text, in full all that have rows."""
 
     tables: Mapping[str, Table]
     details: Mapping[str, Any] = field(default_factory=dict)  # Any: JSON values
     """What JSON has besides the tables."""
     verdict: tuple[str, ...] = ()
     """Sentences that say what the tables amount to."""
+    is_full: bool = False
+
+    def in_full(self) -> "Tables":
+        """The same tables, which show all of their columns and rows, and those of details."""
+        return replace(self, tables={name: table.in_full() for name, table in self.tables.items()}, is_full=True)
+
+    @property
+    def has_more(self) -> bool:
+        """Whether there is more than what is shown."""
+        filled = [table for table in self.tables.values() if table.num_rows]
+        return not self.is_full and any(table.is_detail or table.has_more for table in filled)
 
     def __getitem__(self, name: str) -> Table:
         return self.tables[name]
@@ -210,7 +236,8 @@ class Tables(Mapping[str, Table]):
         return len(self.tables)
 
     def __str__(self) -> str:
-        return "\n".join([*(_text(Text(line)) for line in self.verdict), *map(str, self._filled())])
+        parts: list[Table | Text] = [*bulleted(self.verdict, _WIDTH), *self._filled()]
+        return "\n".join(map(_text, parts))
 
     def __repr__(self) -> str:
         return f"<Tables: {', '.join(self)}>"
@@ -219,16 +246,16 @@ class Tables(Mapping[str, Table]):
         return self.to_markdown()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield from map(Text, self.verdict)
+        yield from bulleted(self.verdict, options.max_width)
         yield from self._filled()
 
     def to_markdown(self, name: str | None = None) -> str:
-        """The table `name`, or all that have rows."""
+        """The table `name`, or those that are shown."""
         lines = "" if name or not self.verdict else "\n".join([*(f"- {line}" for line in self.verdict), "", ""])
         return lines + "\n".join(table.to_markdown() for table in self._filled(name))
 
     def to_latex(self, name: str | None = None) -> str:
-        """The table `name`, or all that have rows."""
+        """The table `name`, or those that are shown."""
         lines = "" if name else "".join(f"% {line}\n" for line in self.verdict)
         return lines + "\n".join(table.to_latex() for table in self._filled(name))
 
@@ -252,7 +279,9 @@ class Tables(Mapping[str, Table]):
         }
 
     def _filled(self, name: str | None = None) -> list[Table]:
-        return [self[name]] if name else [table for table in self.tables.values() if table.num_rows]
+        if name is not None:
+            return [self[name]]
+        return [table for table in self.tables.values() if table.num_rows and (self.is_full or not table.is_detail)]
 
 
 def _text(shown: Table | Text) -> str:
@@ -260,23 +289,6 @@ def _text(shown: Table | Text) -> str:
     with console.capture() as capture:
         console.print(shown)
     return capture.get().removesuffix("\n")
-
-
-def _grid(columns: Sequence[Shown]) -> RichTable:
-    """Columns for a terminal; the name of a run is in its first row only."""
-    table = RichTable(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 0, 0, 1))
-    for column in columns:
-        if column.left:
-            table.add_column(Text(column.heading), overflow="fold")
-        else:
-            table.add_column(Text(column.heading), justify="right", no_wrap=True)
-    for cells in _rows(columns, _as_text):
-        table.add_row(*cells)
-    return table
-
-
-def _as_text(cell: str, bold: bool) -> Text:
-    return Text(cell, "bold" if bold else "")
 
 
 def _rows(columns: Sequence[Shown], form: Callable[[str, bool], Cell]) -> Iterator[list[Cell]]:

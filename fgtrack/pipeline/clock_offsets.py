@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
-from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.errors import CallError, DataError, did_you_mean
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import DetectionList, EgoState, Message
 from fgtrack.estimation.factor_graph.clock_calibration.offsets import OffsetSettings, OffsetSolution, solve_offsets
@@ -116,7 +116,8 @@ def estimate_offsets(
     if not sensors:
         raise DataError("there are no detections of a sensor that the configuration has")
     if reference is not None and reference not in sensors:
-        raise CallError(f"reference {reference!r} is no sensor of the input, which has {', '.join(sensors)}")
+        hint = did_you_mean(reference, sensors)
+        raise CallError(f"reference {reference!r} is no sensor of the input, which has {', '.join(sensors)}{hint}")
     remeasure = Remeasure(config, _path(heard, raw, rules))
     tracks = measurements_by_track(run, raw, raw, config.sensors, remeasure)
     reference = reference or max(sensors, key=_counts(tracks).__getitem__)

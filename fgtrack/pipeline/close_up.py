@@ -8,7 +8,7 @@ import numpy as np
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.io.run import Run, load_run
+from fgtrack.io.run import Run, load_run, recording_of
 from fgtrack.io.source import open_input
 from fgtrack.models.motion import CTRV
 from fgtrack.pipeline.build import build_tracker
@@ -56,11 +56,12 @@ def close_up_of(run: Run, arrival: Arrival) -> CloseUp:
     DataError
         The recording is not there any more, or does not hold the detection; or no track fused it.
     """
-    origin = str((run.meta.get("input") or {}).get("path") or "")
-    if not origin or not Path(origin).exists():
-        raise DataError(f"{origin or 'messages in memory'}: the recording of the run is not there, so no close-up")
+    recording = recording_of(run)
+    if recording is None:
+        given = (run.meta.get("input") or {}).get("path") or "messages in memory"
+        raise DataError(f"{given}: the recording of the run is not there, so no close-up")
     config = validate(Config, run.config, f"configuration of {run.path or 'the run'}")
-    ticks = delivered(open_input(Path(origin), config.input).messages(), config)
+    ticks = delivered(open_input(recording, config.input).messages(), config)
     return close_up(lambda observed: build_tracker(config, observed), ticks, arrival)
 
 

@@ -14,7 +14,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, ReusedAnchorWarning, YAMLError
 
-from fgtrack.core.errors import CallError
+from fgtrack.core.errors import CallError, did_you_mean
 
 T = TypeVar("T")
 
@@ -127,9 +127,10 @@ def validate(kind: type[T], raw: Mapping[str, Any], origin: str) -> T:
         # What is unknown is found below, which says what is known.
         value: T = _adapter(kind).validate_json(text, strict=True, extra="ignore")  # type: ignore[arg-type]  # a class is hashable
     except ValidationError as error:
-        raise CallError(f"{origin}: {_first(error)}") from error
+        raise CallError(f"{origin}: {_first(error)}{_meant(error, raw)}") from error
     for where, name, known in _unknown(raw, value, ""):
-        raise CallError(f"{origin}: {where}{name}: unknown key, known here: {', '.join(known)}")
+        hint = did_you_mean(name, known).removesuffix("?")
+        raise CallError(f"{origin}: {where}{name}: unknown key{hint}, known here: {', '.join(known)}")
     for where, scalar in _scalars(plain(value), ""):
         if isinstance(scalar, str):
             if not scalar.isprintable():
@@ -177,6 +178,22 @@ def _first(error: ValidationError) -> str:
 def _name(value: object) -> str:
     text = json.dumps(value, default=str)
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _meant(error: ValidationError, raw: object) -> str:
+    """What may have been meant: of a form that does not exist one that does; of a part that lacks something one beside.
+
+    `sensors.radr.std` is missing where `sensors.radr` was not meant to be a new sensor.
+    """
+    first = error.errors(include_url=False)[0]
+    if first["type"] == "union_tag_invalid":
+        return did_you_mean(first["ctx"]["tag"], first["ctx"]["expected_tags"].replace("'", "").split(", "))
+    if first["type"] != "missing" or len(first["loc"]) < 2:
+        return ""
+    for key in first["loc"][:-2]:
+        raw = raw.get(key) if isinstance(raw, Mapping) else None
+    name = first["loc"][-2]
+    return did_you_mean(name, [key for key in raw if key != name]) if isinstance(raw, Mapping) else ""
 
 
 def _unknown(raw: object, value: object, where: str) -> list[tuple[str, str, list[str]]]:

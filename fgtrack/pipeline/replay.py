@@ -11,7 +11,7 @@ from pathlib import Path
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S, period_ns, seconds
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
-from fgtrack.io.run import MemoryRun, Node, Run, RunWriter
+from fgtrack.io.run import MemoryRun, Node, Run, RunWriter, path_from_run
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, Tick, listed_ticks, message_ticks, node_ticks, read_ticks
@@ -51,12 +51,15 @@ class _Feed:
     broken: str | None = None
     ignored_detections: int = 0
     received_detections: int = 0
+    num_messages: int = 0
     _ego_clock: EgoClock = field(default_factory=EgoClock, init=False)
-    _last_receipt_ns: int | None = field(default=None, init=False)
+    first_receipt_ns: int | None = field(default=None, init=False)
+    last_receipt_ns: int | None = field(default=None, init=False)
 
     def __iter__(self) -> Iterator[Delivered]:
         try:
             for message in self.messages:
+                self.num_messages += 1
                 if isinstance(message, TruthState):
                     self.on_truth(message)
                 elif isinstance(message, DetectionList) and message.sensor in self.ignored_sensors:
@@ -73,17 +76,17 @@ class _Feed:
                     yield message
         except DataError as error:
             self.broken = str(error)
-        if self._last_receipt_ns is None and self.broken is None:
+        if self.last_receipt_ns is None and self.broken is None:
             self.broken = "holds neither ego states nor detections"
 
     @property
     def is_empty(self) -> bool:
         """Whether nothing came out before the end or the break."""
-        return self._last_receipt_ns is None
+        return self.last_receipt_ns is None
 
     def _check_time(self, message: Delivered) -> None:
         """Receipts never go back and leave no gap of hours; ego stamps keep to one clock."""
-        gap_s = 0.0 if self._last_receipt_ns is None else seconds(message.receipt_ns - self._last_receipt_ns)
+        gap_s = 0.0 if self.last_receipt_ns is None else seconds(message.receipt_ns - self.last_receipt_ns)
         if gap_s < 0.0:
             raise DataError(
                 f"receipt time goes back by {-gap_s:g} s at {message.receipt_ns} ns: sort the input by receipt"
@@ -92,7 +95,9 @@ class _Feed:
             raise DataError(
                 f"nothing was received for {gap_s:.0f} s before {message.receipt_ns} ns: cut the recording there"
             )
-        self._last_receipt_ns = message.receipt_ns
+        self.last_receipt_ns = message.receipt_ns
+        if self.first_receipt_ns is None:
+            self.first_receipt_ns = message.receipt_ns
         if isinstance(message, EgoState):
             self._ego_clock.check(message)
 
@@ -194,6 +199,9 @@ def _drive(
     writer.write_smoothed(tracker.finish())
     meta = {
         "wall_s": (clock.now_ns() - started_ns) / NS_PER_S,
+        "messages_received": feed.num_messages,
+        "first_receipt_ns": feed.first_receipt_ns,
+        "last_receipt_ns": feed.last_receipt_ns,
         "detections_received": feed.received_detections,
         "detections_ignored": feed.ignored_detections,
         "ego_refused": dict(tracker.refused_ego),
@@ -202,9 +210,13 @@ def _drive(
     return writer.finish(meta), feed.broken, None if node.period_ns is None else node.misses
 
 
-def _opening(config: Config, origin: str, kind: str) -> tuple[str, dict[str, object], float | None]:
-    """What a run begins with: text of its configuration, meta data, lag of its smoothed states."""
+def _opening(
+    config: Config, origin: str, kind: str, folder: Path | None = None
+) -> tuple[str, dict[str, object], float | None]:
+    """What a run in `folder` begins with: text of its configuration, meta data, lag of its smoothed states."""
     source = {"path": origin, "kind": kind}
+    if folder is not None and (place := path_from_run(origin, folder)) is not None:
+        source["path_from_run"] = place
     meta: dict[str, object] = {"input": source, "estimator": config.estimator, "versions": versions(), "seed": None}
     return dump(config), meta, next(iter(config.smoother.lagged_s), None)
 
@@ -230,7 +242,7 @@ def replay_each(
         for estimator, folder in folders.items():
             chosen = replace(config, estimator=estimator)
             tracker = build_tracker(chosen)
-            writer = RunWriter(folder, *_opening(chosen, origin, kind), overwrite)
+            writer = RunWriter(folder, *_opening(chosen, origin, kind, folder), overwrite)
             runs.append((chosen, tracker, claims.enter_context(writer)))
         for chosen, tracker, writer in runs:
             finished = _drive(tracker, messages(), chosen, writer, on_tick, origin, realtime=realtime)

@@ -1,13 +1,12 @@
 """Configurations, scenarios and sweeps that come with the package, by name."""
 
-import difflib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from fgtrack.core.errors import CallError
+from fgtrack.core.errors import CallError, did_you_mean
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load, plain, read_yaml, validate, with_settings
 from fgtrack.sim.scenario import Scenario
@@ -45,9 +44,8 @@ def find_file(kind: Kind, name: str | Path, folder: Path | None = None) -> Path:
         return known[str(name)]
     if path.exists() or path.suffix or len(Path(name).parts) != 1:
         raise CallError(f"{path}: there is no such {kind} file")
-    alike = difflib.get_close_matches(str(name), known, 1)
-    hint = f"did you mean {alike[0]}?" if alike else f"shipped are {', '.join(known)}"
-    raise CallError(f"{path}: there is no such file, and no shipped {kind} of that name; {hint}")
+    hint = did_you_mean(name, known) or f"; shipped are {', '.join(known)}"
+    raise CallError(f"{path}: there is no such file, and no shipped {kind} of that name{hint}")
 
 
 def summary(path: Path) -> str:

@@ -16,7 +16,7 @@ from fgtrack.pipeline.sweep_plan import KEY_COLUMNS, Plan, Value, compact
 
 PART_FORMAT = "fgtrack-sweep-part/1"
 SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE = "sweep.csv", "timing.csv", "errors.csv"
-PAIRED_TABLE = "paired.csv"
+PAIRED_TABLE, SUMMARY_TABLE = "paired.csv", "summary.csv"
 
 Scalar = str | bool | int | float | None
 
@@ -60,7 +60,7 @@ class PartStore:
     def __init__(self, folder: Path, overwrite: bool = False) -> None:
         self._folder = folder / "parts"
         if not self._folder.is_dir():
-            for name in (SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE, PAIRED_TABLE):
+            for name in (SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE, PAIRED_TABLE, SUMMARY_TABLE):
                 check_output(folder / name, Kind("a table", Path.is_file), overwrite)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)

@@ -195,7 +195,14 @@ class _Tuning:
 
     def _free(self, problem: Problem) -> BoolArray:
         """Which parameters have enough measurements and can be told from others."""
-        return np.asarray((problem.counts() >= self._rules.min_count) & ~self._lasting & ~self._kept)
+        free = np.asarray((problem.counts() >= self._rules.min_count) & ~self._lasting & ~self._kept)
+        if not free.any():
+            names = ", ".join(recording.name for recording in self._recordings)
+            raise DataError(
+                f"{names}: nothing to fit noise to: no parameter that may be fitted has {self._rules.min_count} "
+                "measurements on tracks; take a longer recording, or look at the gate"
+            )
+        return free
 
     def _best_start(self, problem: Problem, free: BoolArray) -> tuple[FloatArray, int]:
         """The start, of three, from which the highest maximum is reached on a part of the data; how many there are."""
@@ -204,6 +211,8 @@ class _Tuning:
         some = [replace(one, observations=one.observations[: self._rules.start_observations]) for one in longest]
         part = replace(problem, series=some)
         free = free & (part.counts() >= self._rules.min_count)
+        if not free.any():  # too little in the part to choose a start by
+            return self._configured.copy(), 1
         moving = np.flatnonzero(free[: self._space.num_motion])
         reached: list[tuple[float, FloatArray]] = []
         for factor in (1.0, self._rules.start_factor, 1.0 / self._rules.start_factor):

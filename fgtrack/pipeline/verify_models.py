@@ -36,7 +36,7 @@ def model_differences() -> Iterator[tuple[str, Difference]]:
         yield type(motion).__name__, _motion(motion)
     for motion in (CTRV(), CV()):
         kind = "vx, vy" if motion.cartesian else "yaw, speed"
-        yield f"measurements of a state with {kind}", Difference(_measurements(motion), 0.0)
+        yield f"measurements with {kind}", Difference(_measurements(motion), 0.0)
 
 
 def _motion(motion: MotionModel) -> Difference:

@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.errors import CallError, DataError, did_you_mean
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, DetectionList, IntArray, Message
 from fgtrack.sim.clocks import AnyClock, reported_stamps
@@ -103,7 +103,8 @@ def _chosen(delays: Mapping[str, SensorDelays], known: Iterable[str]) -> dict[st
     missing = [sensor for sensor in delays if sensor not in names and sensor != OTHERS]
     if missing:
         there = ", ".join(names) or "none"
-        raise CallError(f"sensor {missing[0]!r} is not in the input, whose sensors are: {there}")
+        hint = did_you_mean(missing[0], names)
+        raise CallError(f"sensor {missing[0]!r} is not in the input, whose sensors are: {there}{hint}")
     chosen = {sensor: settings for sensor, settings in delays.items() if sensor != OTHERS}
     if OTHERS in delays:
         chosen |= {sensor: delays[OTHERS] for sensor in names if sensor not in chosen}

@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.errors import CallError, DataError, did_you_mean
 from fgtrack.core.time import seconds
 from fgtrack.core.types import (
     DetectionList,
@@ -61,7 +61,8 @@ def check_sensor(name: str, sensors: Mapping[str, SensorModel]) -> None:
     """Raise `DataError` for a sensor that has no model."""
     if name not in sensors:
         raise DataError(
-            f"sensor {name!r} has no model (the configuration has {', '.join(sensors) or 'none'}): "
+            f"sensor {name!r} has no model (the configuration has {', '.join(sensors) or 'none'}"
+            f"{did_you_mean(name, sensors)}): "
             f"add it under `sensors`, or to `ignore_sensors`"
         )
 

@@ -1,6 +1,7 @@
 """The command line in-process: exit codes, one line for every error, and the chain from scenario to figure."""
 
 import json
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fgtrack.cli import demo
+from fgtrack.cli import demo, show
 from fgtrack.cli.main import run
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
 from fgtrack.io.ros.bag_writer import write_bag
@@ -46,6 +47,7 @@ Command = Callable[..., Outcome]
 def fgtrack(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
     """Runs a command in an empty folder."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(show, "LINE_PERIOD_S", math.inf)  # a slow machine says no more than a fast one
 
     def call(*arguments: object) -> Outcome:
         capsys.readouterr()
@@ -106,6 +108,43 @@ def test_every_storage_gives_the_same_run_to_the_byte(runs: dict[str, Path]) -> 
     assert all(content == contents[0] for content in contents)
     assert len({load_run(path).meta["digest"] for path in runs.values()}) == 1
     assert load_run(runs["mcap"]).tracks.num_rows > 50
+
+
+def test_off_a_terminal_progress_is_lines_with_a_percentage(
+    fgtrack: Command, recordings: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(show, "LINE_PERIOD_S", 0.0)
+    monkeypatch.setattr(show, "SOON_S", 0.0)
+    for name in ("s.jsonl", "s.jsonl.gz", "mcap", "sqlite3"):
+        lines = fgtrack(
+            "replay", recordings[name], "-e", "drop,ekf-replay", "--map", "oval", "-o", name
+        ).err.splitlines()
+        told = [line for line in lines if line.startswith("fgtrack: replay, ")]
+        shares = [int(line.split(", ")[1].removesuffix("%")) for line in told]
+        assert shares == sorted(shares)
+        assert shares[0] < 35
+        assert shares[-1] > 90
+    lines = fgtrack("simulate", "default", "-o", "x.jsonl", "--duration", "2").err.splitlines()
+    assert lines[0] == "fgtrack: simulate, 0%"
+    assert len(lines) > 1
+    monkeypatch.setattr(show, "LINE_PERIOD_S", 60.0)
+    assert fgtrack("simulate", "default", "-o", "y.jsonl", "--duration", "2").err == "", "short work says nothing"
+
+
+def test_the_demo_takes_seed_delay_and_objects(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = read_scenario("default")
+    changed, settings = demo._changed(scenario, 0.302, 5)
+    assert len(changed.opponents) == 5
+    delays = {sensor.name: sensor.delay for sensor in changed.sensors}
+    assert delays["lidar_cluster"].mean_s == pytest.approx(0.302)
+    assert delays["radar"].mean_s == pytest.approx(0.124)
+    limits = dict(setting.split("=") for setting in settings)
+    assert float(limits["sensors.lidar_cluster.max_delay_s"]) > delays["lidar_cluster"].q90_s
+    assert float(limits["smoother.lag_s"]) == pytest.approx(2.0)
+    assert demo._changed(scenario, None, 2) == (scenario, [])
+    none, settings = demo._changed(scenario, 0.0, 1)
+    assert (len(none.opponents), settings) == (1, [])
+    assert all(sensor.delay.delay_s == 0.0 for sensor in none.sensors)
 
 
 def test_the_same_replay_twice_gives_the_same_digest(fgtrack: Command, recordings: dict[str, Path]) -> None:
@@ -296,6 +335,16 @@ def foreign_folder(path: Path) -> None:
         (("replay", "drive.jsonl"), "--out"),
         (("replay", "-o", "run"), "ecording"),
         (("fly",), "fly"),
+        (("replya", "drive.jsonl"), "Did you mean 'replay'?"),
+        (("replay", "drive.jsonl", "-o", "run", "-e", "smother"), "did you mean 'smoother'"),
+        (("replay", "drive.jsonl", "-o", "run", "-c", "smoth"), "did you mean 'smoother'"),
+        (("simulate", "defalt", "-o", "x.jsonl"), "did you mean 'default'"),
+        (("sweep", "smok", "-o", "x"), "did you mean 'smoke'"),
+        (("replay", "drive.jsonl", "-o", "run", "--set", "smoother.lag=3"), "did you mean 'lag_s'"),
+        (("replay", "drive.jsonl", "-o", "run", "--set", "association.kind=euclidian"), "did you mean 'euclidean'"),
+        (("replay", "drive.jsonl", "-o", "run", "--set", "sensors.radr.max_delay_s=2"), "did you mean 'radar'"),
+        (("offsets", "drive.jsonl", "--reference", "lidr"), "did you mean 'lidar'"),
+        (("info", "drive.jsonl", "--jsn"), "--json"),
         (("replay", "drive.jsonl", "-o", "run", "--fast"), "--fast"),
     ],
     ids=" ".join,

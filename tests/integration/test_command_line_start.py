@@ -1,7 +1,10 @@
 """What the command line imports, and what its help says."""
 
+import os
 import subprocess
 import sys
+
+import pytest
 
 from fgtrack.cli.main import COMMANDS, run
 
@@ -32,3 +35,26 @@ def test_every_command_has_a_line_in_the_help_and_a_help_of_its_own(capsys) -> N
 def test_python_m_runs_the_command_line() -> None:
     done = subprocess.run([sys.executable, "-m", "fgtrack", "--version"], capture_output=True, text=True, check=True)
     assert done.stdout.startswith("fgtrack ")
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        ("rep", {"replay", "report"}),
+        ("replay --over", {"--overwrite"}),
+        ("replay drive.jsonl -e ekf-rep", {"ekf-replay"}),
+        ("replay drive.jsonl -e ekf-replay,smoother-b", {"ekf-replay,smoother-batch", "ekf-replay,smoother-banded"}),
+        ("replay drive.jsonl -c karle", {"karle2023", "karle2023_reference"}),
+        ("simulate no_", {"no_delay"}),
+        ("sweep smo", {"smoke"}),
+    ],
+)
+def test_the_shell_completes_commands_options_and_names(words: str, offered: set[str]) -> None:
+    asked = {
+        "_FGTRACK_COMPLETE": "complete_bash",
+        "COMP_WORDS": f"fgtrack {words}",
+        "COMP_CWORD": str(len(words.split())),
+    }
+    program = [sys.executable, "-c", "import sys; sys.argv[0] = 'fgtrack'; from fgtrack.cli.entry import main; main()"]
+    done = subprocess.run(program, capture_output=True, text=True, env={**os.environ, **asked})
+    assert set(done.stdout.split()) == offered, done.stderr

@@ -198,7 +198,7 @@ def test_command_lines_can_be_parsed(where: str, line: str) -> None:
     words = shlex.split(re.sub(r"[\[\]]", "", line), comments=True)[1:]
     group = typer.main.get_command(app)
     if words[0].startswith("-"):
-        assert words[0] in ("--help", "--version", "--debug")
+        assert words[0] in ("--help", "--version", "--debug", "--install-completion")
         return
     assert words[0] in COMMANDS, where
     with group.make_context("fgtrack", list(words)) as context:

@@ -147,7 +147,7 @@ def test_other_files_beside_a_run_stay(here: Path, call: Call) -> None:
     (here / "run/notes.txt").write_text("why")
     assert call("replay", "drive.jsonl", "-o", "run", "--overwrite")[0] == 0
     assert (here / "run/notes.txt").read_text() == "why"
-    assert load_run("run").meta["input"]["path"] == "drive.jsonl"
+    assert load_run("run").meta["input"] == {"path": "drive.jsonl", "kind": "stream", "path_from_run": "../drive.jsonl"}
 
 
 HEADER = '{"type": "header", "format": "fgtrack-stream/1"}\n'

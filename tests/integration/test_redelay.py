@@ -113,7 +113,10 @@ def test_a_stream_that_breaks_off_is_converted_up_to_the_break(fgtrack: Command)
         ("radar: {delay: {kind: slow}}", "radar.delay: "),
         ("radar: {clock: [{kind: drift, ppm: 3.0}]}", "radar.clock.0.drift.drift_ppm: Field required"),
         ("radar: {clock: [{kind: arrival, offset_s: 0.1}]}", "radar.clock.0.offset_s: unknown key"),
-        ("radar: {dely: {kind: none}}", "bad.yaml: radar.dely: unknown key, known here: delay, clock"),
+        (
+            "radar: {dely: {kind: none}}",
+            "bad.yaml: radar.dely: unknown key, did you mean 'delay', known here: delay, clock",
+        ),
         ("radar: {loss_probability: 2.0}", "radar.loss_probability: Input should be less than or equal to 1"),
         ("sonar: {delay: {kind: none}}", "bad.yaml: sensor 'sonar' is not in the input, whose sensors are: lidar"),
         ("radar: [", "bad.yaml:1: no valid YAML"),

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import os
 import re
 import signal
@@ -109,6 +110,20 @@ def test_estimators_are_compared_over_the_seeds(done: Path) -> None:
     for best, other in zip(compared[::2], compared[1::2], strict=True):
         assert float(other["worse_by"]) == pytest.approx(float(other["mean"]) - float(best["mean"]))
         assert (float(other["low"]) > 0.0) == (other["standing"] == "worse") == (best["standing"] == "best")
+
+
+def test_it_ends_with_means_and_standard_errors(smoke: Path, done: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    metric = "truth.overall.errors.position_m.rmse"
+    summary = rows(done / "summary.csv")
+    assert len(summary) == 8  # four points and two estimators
+    first = [float(row[metric]) for row in rows(done / "sweep.csv") if row["estimator"] == "smoother"][:3]
+    assert float(summary[0][metric]) == pytest.approx(np.mean(first))
+    assert float(summary[0][f"{metric}.standard_error"]) == pytest.approx(np.std(first, ddof=1) / math.sqrt(3))
+    assert run(["sweep", str(smoke), "-o", str(done)]) == 0
+    shown = capsys.readouterr().out
+    assert shown.index("worse") < shown.index("Summary") < shown.index("every metric: --all")
+    assert run(["sweep", str(smoke), "-o", str(done), "--format", "md"]) == 0
+    assert capsys.readouterr().out.startswith("### Summary")
 
 
 def test_wall_times_have_a_table_of_their_own(done: Path) -> None:

@@ -141,8 +141,11 @@ def test_a_setting_does_not_change_what_it_stands_on() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("filtre: {}\n", "config.yaml: filtre: unknown key, known here: estimator, sensors"),
-        ("filter: {frequence: 3.0}\n", "filter.frequence: unknown key, known here: frequency_hz"),
+        ("filtre: {}\n", "config.yaml: filtre: unknown key, did you mean 'filter', known here: estimator, sensors"),
+        (
+            "filter: {frequence: 3.0}\n",
+            "filter.frequence: unknown key, did you mean 'frequency_hz', known here: frequency_hz",
+        ),
         ("sensors: {lidar: {std: {x_m: 1.0, y_m: 1.0}, colour: red}}\n", "sensors.lidar.colour: unknown key"),
         ("sensors: {lidar: {std: {x_m: 1.0, y_m: 1.0, mass_kg: 1.0}}}\n", "unknown component 'mass_kg'"),
         ("sensors: {lidar: {counter_init: 3}}\n", "sensors.lidar.std"),

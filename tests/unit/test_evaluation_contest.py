@@ -11,7 +11,8 @@ from evaluation_runs import ROUND, WEST, update, write_run
 
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.comparison import compare
-from fgtrack.evaluation.contest import Contest, Quantity, contests, same_recording
+from fgtrack.evaluation.contest import Contest, Quantity, contests
+from fgtrack.evaluation.recordings import same_recording
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.io.run import Run
 
@@ -137,7 +138,6 @@ def test_runs_of_other_recordings_or_judged_otherwise_are_not_paired(tmp_path: P
     other_gate = a_run(tmp_path / "gate", NOISE_M, config_text="evaluation: {gate_m: 3.0}")
     more_detections = replace(trio[1], updates=write_run(tmp_path / "more", updates={0: [update(), update()]}).updates)
     for other in (other_truth, other_gate, more_detections):
-        assert not same_recording(one, JudgedRun("other", other))
         assert contests([one, JudgedRun("other", other)]) == []
 
 
@@ -145,8 +145,9 @@ def test_the_same_detections_with_other_delays_or_other_stamps_are_paired(tmp_pa
     one = JudgedRun("one", trio[0])
     later = write_run(tmp_path / "later", updates={k: [update(tick=k, delay_ns=7)] for k in range(0, TICKS, 5)})
     restamped = a_run(tmp_path / "restamped", NOISE_M, stamps_late=1)
-    assert same_recording(one, JudgedRun("later", replace(trio[1], updates=later.updates)))
-    assert same_recording(one, JudgedRun("restamped", restamped))
+    for other in (replace(trio[1], updates=later.updates), restamped):
+        assert same_recording(one.run, other)
+        assert len(contests([one, JudgedRun("other", other)])) == 1
 
 
 def test_each_recording_has_a_contest_of_its_own(tmp_path: Path, trio: list[Run]) -> None:
@@ -168,3 +169,16 @@ def test_the_table_has_all_numbers_and_says_best_tie_or_worse(trio: list[Run]) -
     assert shown.bold[:2] == (True, False)
     assert [cell[-2:] for cell in shown.cells[:2]] == [" +", "  "]
     assert "**" in compare(trio[:2])["differences"].to_markdown()
+
+
+def test_a_value_of_the_other_tables_is_bold_only_where_no_run_ties_with_it(trio: list[Run]) -> None:
+    def bold(runs: list[Run]) -> list[bool]:
+        return list(next(shown for shown in compare(runs)["tracking"].shown if shown.heading == "pos.\n[m]").bold)
+
+    assert bold(trio) == [False, False, False]
+    tables = compare(trio[:2])
+    best = [name == tables["differences"]["run"][0] for name in tables["tracking"]["run"]]
+    assert (bold(trio[:2]), sum(best)) == (best, 1)
+    assert bold(trio[:1]) == [False]
+    assert "bold: the best run" in str(compare(trio[:2])["tracking"])
+    assert "bold" not in str(compare(trio[:1])["tracking"])

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from fgtrack.evaluation.over_seeds import SeedContest, seed_contests, shown_tables, to_csv
+from fgtrack.evaluation.over_seeds import SeedContest, seed_contests, shown_tables, summary_table, to_csv
 from fgtrack.evaluation.paired import paired
+from fgtrack.evaluation.sweep_table import SweepTable
 
 RMSE = "truth.overall.errors.position_m.rmse"
 SEEDS = 6
@@ -119,3 +120,31 @@ def test_of_many_points_it_is_shown_how_often_who_is_best() -> None:
 def test_a_single_seed_shows_nothing() -> None:
     assert shown_tables(seed_contests(rows_of({"a": [1.0], "b": [2.0]}), ()), ()) == []
     assert shown_tables([], ()) == []
+
+
+def test_a_summary_has_mean_and_standard_error_of_each_point_and_estimator() -> None:
+    values = {"a": [0.4, 0.5, 0.6, 0.5], "b": [0.9, 1.0, 1.1, 1.0]}
+    cells = {"late": "much", "delay": '{"kind": "none"}'}
+    rows = [row | {"truth.false_tracks": "3"} for row in rows_of({k: values[k] for k in values}, **cells)]
+    rows += [row | {"truth.false_tracks": ""} for row in rows_of({"a": [0.7]}, **{**cells, "late": "little"})]
+    sweep = SweepTable(tuple(cells), (RMSE, "truth.false_tracks"), rows)
+    table = summary_table(sweep, seed_contests(rows, tuple(cells)))
+    assert table[RMSE].tolist() == pytest.approx([0.5, 1.0, 0.7])
+    assert table[f"{RMSE}.standard_error"][:2] == pytest.approx(np.std(values["a"], ddof=1) / 2)
+    assert np.isnan(table[f"{RMSE}.standard_error"][2]), "of one seed nothing is known"
+    assert (table["late"].tolist(), table["seeds"].tolist()) == (["much", "much", "little"], [4, 4, 1])
+    text = str(table)
+    assert "0.500 ± 0.041" in text
+    assert "false_tracks" not in text
+    assert "false_tracks" in str(table.in_full())
+    assert "**0.500 ± 0.041**" in table.to_markdown()
+    assert "**1.00" not in table.to_markdown()
+    assert next(csv.DictReader(io.StringIO(table.to_csv())))["delay"] == cells["delay"]
+
+
+def test_a_summary_of_few_metrics_shows_those_that_there_are() -> None:
+    rows = rows_of({"a": [1.0, 2.0], "b": [1.0, 2.0]}, "lagged.0.3.errors.yaw_rad.rmse")
+    text = str(summary_table(SweepTable((), ("lagged.0.3.errors.yaw_rad.rmse",), rows), []))
+    assert "lagged.0.3" in text
+    assert "1.50 ± 0.500" in text
+    assert "bold" not in text

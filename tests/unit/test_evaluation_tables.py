@@ -103,7 +103,7 @@ def test_csv_of_all_tables_has_every_number_once(tables: Tables) -> None:
 
 @pytest.mark.parametrize("name", TABLES)
 def test_markdown_has_the_cells_that_are_shown(tables: Tables, name: str) -> None:
-    lines = [line for line in tables.to_markdown(name).splitlines() if line.startswith("|")]
+    lines = [line for line in tables.in_full().to_markdown(name).splitlines() if line.startswith("|")]
     head, rule, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     assert len(head) == len(rule) == len(tables[name].shown)
     shown = [list(cells) for cells in zip(*(column.cells for column in tables[name].shown), strict=True)]
@@ -113,7 +113,7 @@ def test_markdown_has_the_cells_that_are_shown(tables: Tables, name: str) -> Non
 
 @pytest.mark.parametrize("name", TABLES)
 def test_latex_has_a_cell_for_every_column(tables: Tables, name: str) -> None:
-    lines = tables.to_latex(name).splitlines()
+    lines = tables.in_full().to_latex(name).splitlines()
     rows = [line for line in lines if line.endswith(r" \\")]
     assert {row.count(" & ") + 1 for row in rows} == {len(tables[name].shown)}
     assert len(rows) == 1 + tables[name].num_rows
@@ -156,7 +156,7 @@ def test_a_table_is_a_data_frame(tables: Tables) -> None:
 
 def test_tables_fit_a_terminal_of_120_columns(runs: dict[str, Run], tables: Tables) -> None:
     wide = compare([JudgedRun(f"race/{label}", run) for label, run in runs.items()])
-    for shown in (str(tables), str(wide)):
+    for shown in (str(tables), str(tables.in_full()), str(wide.in_full())):
         assert max(map(len, shown.splitlines())) <= 120
         assert "…" not in shown
     assert all(f"race/{estimator} " in str(wide["tracking"]) for estimator in ESTIMATORS)
@@ -165,15 +165,83 @@ def test_tables_fit_a_terminal_of_120_columns(runs: dict[str, Run], tables: Tabl
 def test_on_a_narrow_terminal_the_columns_that_do_not_fit_stand_below(tables: Tables) -> None:
     console = Console(width=80, file=io.StringIO(), color_system=None)
     with console.capture() as capture:
-        console.print(tables["tracking"])
+        console.print(tables["tracking"].in_full())
     first, second = capture.get().split("continued:\n")
     assert max(map(len, (first + second).splitlines())) <= 80
     assert "…" not in first + second
     for part in (first, second):
         assert all(part.count(f" {estimator} ") == 1 for estimator in ESTIMATORS)
     headings = [column.heading.split("\n")[0] for column in tables["tracking"].shown]
-    assert [(first + second).count(heading) for heading in headings[1:5]] == [1, 1, 1, 1]
-    assert "continued" not in str(tables)
+    assert [(first + second).count(heading) for heading in headings[2:5]] == [1, 1, 1]
+    assert "continued" not in str(tables.in_full())
+
+
+def test_few_tables_columns_and_rows_are_shown_unless_all_are_asked_for(tables: Tables) -> None:
+    few, full = str(tables), str(tables.in_full())
+    for detail in ("Multi-object metrics", "Consistency (", "Residuals of", "preci-", "speed [m/s]"):
+        assert detail not in few
+        assert detail in full
+    assert "across" not in tables.to_markdown()
+    assert "across" in tables.in_full().to_markdown()
+    assert "across" in tables.to_csv() == tables.in_full().to_csv(), "files with all digits have everything"
+    assert tables.to_dict() == tables.in_full().to_dict()
+    assert (tables.has_more, tables.in_full().has_more) == (True, False)
+    notes = str(tables["tracking"]).splitlines()
+    assert not any(line.startswith("precision:") for line in notes), "the note of a column that is not shown"
+    assert any(line.startswith("tracked:") for line in notes)
+
+
+def test_few_dispositions_add_up(tables: Tables) -> None:
+    table = tables["dispositions"]
+    (_, rows) = str(table).split("─\n")
+    for line, total in zip(rows.splitlines(), table["detections"].tolist(), strict=False):
+        fused, late, merged, refused, shown = map(int, line.split()[-5:])
+        assert late <= fused
+        assert fused + merged + refused == shown == total
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 100])
+@pytest.mark.parametrize("label", ["{}", "a-long-name-of-a-campaign-of-2026/wet-and-cold/{}"])
+def test_no_row_is_longer_than_the_terminal_and_every_name_is_whole(
+    runs: dict[str, Run], width: int, label: str
+) -> None:
+    tables = compare([JudgedRun(label.format(name), run) for name, run in runs.items()])
+    console = Console(width=width, file=io.StringIO(), color_system=None)
+    for shown in (tables, tables.in_full()):
+        with console.capture() as capture:
+            console.print(shown)
+        lines = capture.get().splitlines()
+        assert max(map(len, lines)) <= width
+        assert all(label.format(name) in "".join(lines) for name in runs)  # one longer than a line goes on in the next
+        assert "…" not in capture.get()
+
+
+def test_names_too_long_to_stand_beside_stand_above_their_rows() -> None:
+    rows = [("a" * 28, "x", 1.0), ("a" * 28, "y", 2.0), ("b", "x", 3.0)]
+    columns: list[Column[tuple[str, str, float]]] = [
+        Column("run", ("run",), lambda row: row[:1], left=True),
+        Column("of", ("of",), lambda row: row[1:2], left=True),
+        Column("value", ("value",), lambda row: row[2:]),
+    ]
+    console = Console(width=30, file=io.StringIO(), color_system=None)
+    with console.capture() as capture:
+        console.print(Table("numbers", columns, rows, row_keys=("run", "of")))
+    assert capture.get().splitlines()[2:] == [
+        *(" run", "   of  value", "────────────"),
+        *(" " + "a" * 28, "   x    1.00", "   y    2.00", " b", "   x    3.00"),
+    ]
+
+
+def test_a_number_and_its_unit_stay_on_one_line() -> None:
+    tables = Tables({}, verdict=("b is worse by 0.14 m (0.1 to 0.2), which is 52 % of it.",))
+    for width in range(12, 60):
+        console = Console(width=width, file=io.StringIO(), color_system=None)
+        with console.capture() as capture:
+            console.print(tables)
+        lines = capture.get().splitlines()
+        assert max(map(len, lines)) <= width
+        assert any("0.14 m" in line for line in lines)
+        assert any("52 %" in line for line in lines)
 
 
 def test_the_best_value_is_bold_in_every_form_that_knows_bold() -> None:
@@ -188,8 +256,8 @@ def test_the_best_value_is_bold_in_every_form_that_knows_bold() -> None:
     console = Console(width=80, file=io.StringIO(), force_terminal=True, color_system="standard")
     with console.capture() as capture:
         console.print(table)
-    assert "\x1b[1m 1.00" in capture.get()
-    assert "\x1b[1m 2.00" not in capture.get()
+    assert "\x1b[1m1.00" in capture.get()
+    assert "\x1b[1m2.00" not in capture.get()
 
 
 def test_the_verdict_stands_first_in_every_form(tables: Tables) -> None:
@@ -206,6 +274,7 @@ def test_what_is_printed_is_what_the_console_shows(tables: Tables) -> None:
         console.print(tables)
     assert f"{tables}\n" == capture.get()
     assert str(tables["lag"]) in str(tables)
+    assert str(tables["lag"].in_full()) in str(tables.in_full())
     assert tables._repr_markdown_() == tables.to_markdown()
     assert repr(tables) == f"<Tables: {', '.join(TABLES)}>"
 
@@ -221,7 +290,7 @@ def test_json_has_the_metrics_the_notes_and_the_tables(tables: Tables) -> None:
 
 def test_a_name_in_brackets_is_shown_as_it_is(runs: dict[str, Run]) -> None:
     tables = comparison({"[bold]run": evaluate(runs["smoother"])})
-    assert str(tables).count("[bold]run") == len(TABLES)
+    assert str(tables.in_full()).count(" [bold]run ") == len(TABLES) - 1  # of one run there are no differences
 
 
 @pytest.mark.parametrize(
@@ -344,7 +413,8 @@ def test_the_disposition_table_sums_up_and_names_what_never_occurred(tables: Tab
 
 
 def test_the_note_on_backward_forward_stands_where_it_is_shown_only(runs: dict[str, Run], tables: Tables) -> None:
-    assert all(table.notes[-1] == BACKWARD_FORWARD_NOTE for name, table in tables.items() if name != "differences")
+    assert [name for name, table in tables.items() if BACKWARD_FORWARD_NOTE in table.notes] == ["tracking"]
+    assert str(tables.in_full()).count(BACKWARD_FORWARD_NOTE) == str(tables).count(BACKWARD_FORWARD_NOTE) == 1
     others = comparison({"smoother": evaluate(runs["smoother"])})
     assert BACKWARD_FORWARD_NOTE not in str(others)
     assert others.to_dict()["notes"] == []

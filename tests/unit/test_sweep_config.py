@@ -133,7 +133,7 @@ def test_every_point_of_a_grid_has_one_setting_at_a_time(plan: Any) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("seed: 3", "seed: unknown key, known here: format, estimators"),
+        ("seed: 3", "seed: unknown key, did you mean 'seeds', known here: format, estimators"),
         ("seeds: 0", "seeds: a positive number"),
         ("seeds: [1, 1]", "seeds: one is named twice"),
         ("seeds: [1, x]", 'seeds.1: Input should be a valid integer, not "x"'),

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from fgtrack.evaluation.cautions import cautions, noise_cautions
 from fgtrack.evaluation.comparison import compare
 from fgtrack.evaluation.figures.style import png
+from fgtrack.evaluation.recordings import recordings_caution
 from fgtrack.evaluation.report.scene import scene
 from fgtrack.evaluation.report.settings import differing, flattened
 from fgtrack.evaluation.runs import JudgedRun
@@ -47,7 +48,8 @@ def page(
     """
     tables = compare(*runs)
     shown = scene(runs)
-    warnings = [f"{one.label}: {line}" for one in runs for line in (*cautions(one.run), *noise_cautions(one.run))]
+    warnings = recordings_caution(runs)
+    warnings += [f"{one.label}: {line}" for one in runs for line in (*cautions(one.run), *noise_cautions(one.run))]
     filled = {name: table for name, table in tables.items() if table.num_rows}
     dispositions = filled.pop("dispositions", None)
     parts = {

@@ -11,6 +11,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.cautions import USED
 from fgtrack.evaluation.palette import PALETTE
+from fgtrack.evaluation.recordings import same_recording
 from fgtrack.evaluation.report.packing import (
     ANGLE_RAD,
     CODE,
@@ -137,7 +138,7 @@ def _recordings(runs: Iterable[Run]) -> list[_Recording]:
     found: list[_Recording] = []
     for run in runs:
         for one in found:
-            if _same_recording(one.runs[0], run):
+            if same_recording(one.runs[0], run):
                 one.runs.append(run)
                 break
         else:
@@ -146,13 +147,6 @@ def _recordings(runs: Iterable[Run]) -> list[_Recording]:
         one.start_ns = min(map(start_ns, one.runs))
         one.origin_m = _origin_m(one.runs)
     return found
-
-
-def _same_recording(one: Run, other: Run) -> bool:
-    """Whether both were told the same; without an ego and truth that show it, by what the sensors said."""
-    if one.ego.num_rows or one.truth.num_rows:
-        return one.ego == other.ego and one.truth == other.truth
-    return not (other.ego.num_rows or other.truth.num_rows) and one.detections == other.detections
 
 
 def _origin_m(runs: Sequence[Run]) -> FloatArray:

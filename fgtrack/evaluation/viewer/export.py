@@ -7,6 +7,7 @@ from operator import attrgetter
 from pathlib import Path
 
 from fgtrack.core.errors import CallError
+from fgtrack.evaluation.recordings import same_recording
 from fgtrack.evaluation.runs import Runs, judged
 from fgtrack.evaluation.viewer.detection_messages import detection_messages, outcome_messages
 from fgtrack.evaluation.viewer.look import Look, palette
@@ -93,7 +94,7 @@ def _looks(runs: Mapping[str, Run]) -> list[Look]:
 def _check_same_recording(runs: Mapping[str, Run]) -> None:
     (first, its), *others = runs.items()
     for name, run in others:
-        if run.ego != its.ego or run.truth != its.truth:
+        if not same_recording(its, run) or run.ego != its.ego:  # the file has one ego
             raise CallError(f"{first} and {name} are of different recordings, export each to a file of its own")
 
 

@@ -133,6 +133,12 @@ class Bag:
                     if topic is not None and stamp_ns is not None:
                         yield topic, stamp_ns, sent_ns, log_ns
 
+    def end_ns(self) -> int | None:
+        """The end of the log times as the indexes of the files say it, without reading messages; None without any."""
+        with self._files() as files:
+            ends = [getattr(getattr(file, "metadata", file), "end_time", 0) for file in files]  # rosbags' readers
+        return max(ends, default=0) or None
+
     def _stamp_ns(self, data: bytes) -> int | None:
         """Stamp of the header with which the message `data` begins."""
         offset = 4  # behind the CDR header, or in ROS 1 behind the sequence number

@@ -2,6 +2,7 @@
 
 from fgtrack.io.run.judging import EvaluationConfig, evaluation_config
 from fgtrack.io.run.memory import MemoryRun
+from fgtrack.io.run.origin import path_from_run, recording_of
 from fgtrack.io.run.reader import NO_TRACK, Run, Table, load_run
 from fgtrack.io.run.schema import COLUMNS, COVARIANCE_COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
 from fgtrack.io.run.timing import Node, ready_times
@@ -24,6 +25,8 @@ __all__ = [
     "evaluation_config",
     "is_run_folder",
     "load_run",
+    "path_from_run",
     "ready_times",
+    "recording_of",
     "write_metrics",
 ]

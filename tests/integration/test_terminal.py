@@ -1,0 +1,100 @@
+"""Commands in a terminal: a pseudo-terminal of some width, and what a person sees in it."""
+
+import fcntl
+import os
+import pty
+import re
+import struct
+import subprocess
+import sys
+import termios
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
+RUNS = (*ESTIMATORS, *(f"{name}-tuned" for name in ESTIMATORS))
+SHORT_DEMO = """
+from dataclasses import replace
+from fgtrack.cli import demo, main
+read = demo.read_scenario
+demo.read_scenario = lambda name: replace(read(name), duration_s=3.0)
+main.main()
+"""
+
+
+def lines_in_terminal(width: int, *arguments: object, program: Sequence[str] = ("-m", "fgtrack")) -> list[str]:
+    """What the command shows on a terminal of `width` columns, as the lines that it writes."""
+    leader, follower = pty.openpty()
+    fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 50, width, 0, 0))
+    environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES", "NO_COLOR")}
+    command = [sys.executable, *program, *map(str, arguments)]
+    with subprocess.Popen(
+        command, stdout=follower, stderr=subprocess.PIPE, env={**environment, "TERM": "xterm"}
+    ) as ran:
+        os.close(follower)
+        shown = b""
+        while True:
+            try:
+                block = os.read(leader, 1 << 16)
+            except OSError:  # the terminal is closed
+                break
+            if not block:
+                break
+            shown += block
+        os.close(leader)
+        error = ran.stderr.read().decode() if ran.stderr else ""
+    assert ran.returncode == 0, error
+    return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.decode()).replace("\r\n", "\n").splitlines()
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a short demo, made in a terminal of 80 columns; `shown.txt` holds what it showed."""
+    folder = tmp_path_factory.mktemp("demo")
+    lines = lines_in_terminal(80, "demo", "-o", folder, program=("-c", SHORT_DEMO))
+    (folder / "shown.txt").write_text("\n".join(lines), encoding="utf-8")
+    return folder
+
+
+def check(lines: Sequence[str], width: int) -> None:
+    """No row is wrapped or cut, and every run has its name in every table that has a row for it."""
+    assert max(map(len, lines)) <= width
+    assert "…" not in "".join(lines)
+    text = "\n".join(lines)
+    for title in ("Differences of runs", "Tracking", "Error against lag", "Dispositions"):
+        (_, table) = text.split(f"\n\n{title}")
+        rows = [line.split() for line in table.split("\n\n")[0].splitlines()]
+        for name in RUNS:
+            assert any(name in row for row in rows), (title, name)
+
+
+def test_the_demo_shows_every_name_in_80_columns(demo: Path) -> None:
+    lines = (demo / "shown.txt").read_text(encoding="utf-8").splitlines()
+    check([line for line in lines if str(demo) not in line], 80)  # a path is as long as it is
+    assert any("--all" in line for line in lines)
+
+
+def test_the_demo_shows_every_name_in_100_columns(tmp_path: Path) -> None:
+    lines = lines_in_terminal(100, "demo", "-o", tmp_path, program=("-c", SHORT_DEMO))
+    check([line for line in lines if str(tmp_path) not in line], 100)
+
+
+@pytest.mark.parametrize(
+    ("width", "options"), [(60, ()), (80, ()), (80, ("--all", "--streaming")), (100, ()), (100, ("--all",))]
+)
+def test_a_comparison_shows_every_name_in_a_narrow_terminal(demo: Path, width: int, options: Sequence[str]) -> None:
+    lines = lines_in_terminal(width, "compare", demo, *options)
+    check(lines, width)
+    assert any("every table and column: --all" in line for line in lines) == ("--all" not in options)
+
+
+def test_other_tables_fit_too(demo: Path) -> None:
+    width = 60
+    topics = lines_in_terminal(width, "info", demo / "recording")
+    assert max(map(len, [line for line in topics if str(demo) not in line])) <= width
+    for topic in ("/fgtrack/detections/lidar_cluster", "/detections/radar"):
+        assert sum(topic in line.split() for line in topics) >= 1
+    listed = lines_in_terminal(width, "config", "--list")
+    assert max(map(len, listed)) <= width

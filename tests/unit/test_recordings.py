@@ -1,0 +1,95 @@
+"""Which runs are of one recording, and where a run's recording is."""
+
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from unit.evaluation_runs import ROUND, WEST, update, write_run
+
+from fgtrack.core.types import Detection, DetectionList, EgoState, Message
+from fgtrack.evaluation.recordings import by_recording, recordings_caution, same_recording
+from fgtrack.evaluation.runs import judged
+from fgtrack.io.run import Run, load_run, recording_of
+from fgtrack.io.stream import write_stream
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.replay import replay, replay_in_memory
+from fgtrack.pipeline.shipped import read_config
+
+MS = 1_000_000
+START_NS = 1_600_000_000_000_000_000
+
+
+def drive(offset_m: float = 0.0, delay_ms: int = 50, ego_x_m: float = 0.0, sensor: str = "lidar") -> list[Message]:
+    """An ego at rest, and one car ahead of it."""
+    messages: list[Message] = []
+    for k in range(20):
+        now_ns = START_NS + k * 20 * MS
+        messages.append(EgoState(now_ns, now_ns, ego_x_m, 0.0, 0.0, 0.0))
+        car = Detection(x_m=20.0 + 0.1 * k + offset_m, y_m=1.0, yaw_rad=0.0)
+        messages.append(DetectionList(sensor, now_ns - delay_ms * MS, now_ns, (car,)))
+    return messages
+
+
+def run_of(messages: list[Message], *settings: str) -> Run:
+    run, _ = replay_in_memory(messages, read_config(None, settings))
+    return run
+
+
+def test_a_recording_is_the_same_whatever_the_configuration_and_the_estimator() -> None:
+    one = run_of(drive())
+    assert same_recording(one, run_of(drive(), "estimator=ekf-replay", "clock.node_hz=20.0"))
+    later = [replace(m, receipt_ns=m.receipt_ns + 5 * MS) for m in drive()]
+    assert same_recording(one, run_of(later)), "the same with other delays"
+
+
+def test_other_detections_are_another_recording_even_at_the_same_times() -> None:
+    one = run_of(drive())
+    assert not same_recording(one, run_of(drive(offset_m=1e-9)))
+    assert not same_recording(one, run_of(drive()[:-2]))
+    assert not same_recording(one, run_of(drive(delay_ms=51)[:-2] + drive(delay_ms=51)[-2:-1]))
+
+
+def test_without_a_common_sensor_the_ego_decides() -> None:
+    lidar, radar = run_of(drive()), run_of(drive(sensor="radar"))
+    assert same_recording(lidar, radar)
+    assert not same_recording(lidar, run_of(drive(sensor="radar", ego_x_m=1.0)))
+
+
+def test_runs_of_different_recordings_are_told_by_name(tmp_path: Path) -> None:
+    def write(name: str, car: object) -> Path:
+        rows = car.truth(range(4))  # type: ignore[attr-defined]
+        meta = {"estimator": "smoother", "input": {"path": f"{name}.mcap"}, "messages_received": 7}
+        return write_run(tmp_path / name, updates={0: [update()]}, truth=rows, meta=meta).path or tmp_path
+
+    runs = judged([write("a", WEST), write("b", ROUND), write("c", WEST)])
+    assert [[one.label[:1] for one in group] for group in by_recording(runs)] == [["a", "c"], ["b"]]
+    (line,) = recordings_caution(runs)
+    assert line.startswith("the runs are of 2 recordings")
+    assert "a.mcap, 7 messages" in line
+    assert "b (smoother) (b.mcap" in line
+    assert recordings_caution(runs[::2]) == []
+
+
+def test_the_recording_of_a_run_is_found_from_elsewhere_and_after_a_move(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    write_stream(Path("drive.jsonl"), drive())
+    replay(drive(), Config(), Path("out/run"), origin="drive.jsonl", kind="stream")
+    monkeypatch.chdir(tmp_path)
+    place = recording_of(load_run("work/out/run"))
+    assert place is not None
+    assert place.samefile("work/drive.jsonl")
+    os.rename("work", "moved")
+    moved = recording_of(load_run("moved/out/run"))
+    assert moved is not None
+    assert moved.samefile("moved/drive.jsonl")
+    shutil.copytree("moved/out/run", "copy")
+    assert recording_of(load_run("copy")) is None
+    assert recording_of(run_of(drive())) is None
+    meta = load_run("copy").meta
+    assert (meta["messages_received"], meta["first_receipt_ns"]) == (40, START_NS)
+    assert meta["last_receipt_ns"] == START_NS + 380 * MS
