@@ -11,6 +11,7 @@ from fgtrack.evaluation.lagged import WINDOW, LagMetrics
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS
 from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics, ObjectMetrics, TruthMetrics
 from fgtrack.evaluation.multi_object import MultiObjectMetrics
+from fgtrack.evaluation.paper_tables import with_paper_tables
 from fgtrack.evaluation.runs import OneRun, judged
 from fgtrack.evaluation.sensor_tables import consistency_table, dispositions_table, residuals_table
 from fgtrack.evaluation.streaming import with_streaming
@@ -30,7 +31,7 @@ _FEW_LAGS = 3
 
 def compare(*runs: OneRun | Iterable[OneRun], streaming: bool = False) -> Tables:
     """Metrics of `runs` in comparison: the `verdict`, and tables `differences`, `tracking`, `multi_object`, `lag`,
-    `consistency`, `dispositions` and `residuals_SENSOR` of every sensor.
+    `consistency`, `dispositions`, `residuals_SENSOR` of every sensor, and those of `with_paper_tables`.
 
     Runs of the same recording are compared sample by sample. A path is a run folder, or a folder that holds run
     folders. With `streaming` a table of that name judges what was published when it was ready, and the verdict says who
@@ -47,6 +48,7 @@ def compare(*runs: OneRun | Iterable[OneRun], streaming: bool = False) -> Tables
     if not every:
         raise CallError("compare: no run is given, name at least one")
     tables = comparison({one.label: one.metrics for one in every}, contests(every))
+    tables = with_paper_tables(tables, every)
     return with_streaming(tables, every) if streaming else tables
 
 

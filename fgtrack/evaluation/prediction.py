@@ -1,5 +1,6 @@
 """How good predictions from the published states are: displacement errors some seconds ahead (ADE, FDE)."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,7 +8,9 @@ import numpy as np
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, Matching
+from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.statistics import Moments
+from fgtrack.evaluation.tables import Column, Table
 from fgtrack.evaluation.truth import TRUE_STATE, true_paths
 from fgtrack.evaluation.viewer.surroundings import roads
 from fgtrack.io.run import Run
@@ -15,6 +18,8 @@ from fgtrack.models.predictor import ArcPredictor, Predictor, RailPredictor
 
 #: At which times ahead predictions are judged, in s.
 HORIZONS_S = (1.0, 2.0, 3.0, 5.0)
+
+_Row = tuple[str, str, Sequence["PredictionErrors"]]
 
 _STEP_S = 0.1
 _PERIOD_NS = NS_PER_S // 10  # of the published node's predictions
@@ -51,6 +56,35 @@ def prediction_errors(run: Run, matching: Matching | None) -> tuple[PredictionEr
             until = until[np.isfinite(until).all(axis=1)]
             found.append(PredictionErrors(name, horizon_s, Moments.of(until[:, -1]), Moments.of(until.mean(axis=1))))
     return tuple(found)
+
+
+def predictions_table(runs: Sequence[JudgedRun]) -> Table:
+    """A row for each run and predictor: FDE and ADE at every horizon."""
+    rows: list[_Row] = []
+    for one in runs:
+        by_predictor: dict[str, list[PredictionErrors]] = {}
+        for errors in prediction_errors(one.run, one.matching):
+            by_predictor.setdefault(errors.predictor, []).append(errors)
+        rows += [(one.label, name, errors) for name, errors in by_predictor.items()]
+
+    def displacement(k: int) -> Callable[[_Row], tuple[float, float]]:
+        return lambda row: (row[2][k].final_m.mean, row[2][k].average_m.mean)
+
+    columns: list[Column[_Row]] = [
+        Column("run", ("run",), lambda row: (row[0],), left=True),
+        Column("along", ("predictor",), lambda row: (row[1],), left=True),
+        Column("predic-\ntions", ("count",), lambda row: (row[2][0].final_m.count,)),
+    ]
+    for k, horizon_s in enumerate(HORIZONS_S):
+        names = (f"fde_{horizon_s:g}s_m", f"ade_{horizon_s:g}s_m")
+        columns.append(Column(f"{horizon_s:g} s [m]\nFDE/ADE", names, displacement(k), "{}/{}"))
+    notes = [
+        "FDE: mean distance from the truth at that time ahead; ADE: the same, averaged up to it",
+        "arc: constant turn rate and speed; rail: the same for 0.2 s, then along the track",
+    ]
+    return Table(
+        "Predictions from the published states", columns, rows, row_keys=("run", "predictor"), notes=notes, detail=True
+    )
 
 
 def _predictors(run: Run) -> dict[str, Predictor]:

@@ -1,0 +1,87 @@
+"""The tables of the evaluation of Karle et al. 2023."""
+
+import math
+from pathlib import Path
+
+import pytest
+from evaluation_runs import START_NS, TICK_NS, WEST, update, write_run
+
+from fgtrack.core.types import Disposition, EgoState, TickReport
+from fgtrack.evaluation.comparison import compare
+from fgtrack.io.run import Run, RunWriter, load_run
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    """WEST, tracked with an error of 2 m along from the start on; the ego drives beside it at 30 m/s."""
+    tracks = [[WEST.track(k, 1, along_m=2.0)] for k in range(150)]
+    updates = {k: [update("lidar", tick=k, x_m=0.3, y_m=0.1)] for k in range(1, 150)}
+    updates |= {
+        k: [*updates[k], update("radar", tick=k - 5, delay_ns=100_000_000, x_m=-1.0, y_m=0.0, speed_mps=2.0)]
+        for k in (100, 120)
+    }
+    updates[0] = [update("lidar", tick=0, disposition=Disposition.BIRTH)]
+    with RunWriter(tmp_path / "run", "") as writer:
+        for row in WEST.truth(range(250)):
+            writer.write_truth(row)
+        for tick in range(150):
+            x_m, y_m, yaw_rad, _ = WEST.state(tick * TICK_NS / 1e9)
+            now_ns = START_NS + tick * TICK_NS
+            writer.write_ego(EgoState(now_ns, now_ns, x_m + 30.0, y_m + 3.0, yaw_rad, 30.0))
+            writer.write_tick(TickReport(tick, now_ns, tuple(tracks[tick]), tuple(updates[tick])), 2_000_000, 1)
+        writer.finish({"estimator": "ekf-replay"})
+    return load_run(tmp_path / "run")
+
+
+def test_residuals_of_all_sensors_stand_beside_the_precision(run: Run) -> None:
+    (row,) = compare(run)["residuals"].records()
+    assert row["along_mean_m"] == pytest.approx((149 * -0.3 + 2 * 1.0) / 151)
+    assert row["across_mean_m"] == pytest.approx(149 * -0.1 / 151)
+    assert (row["speed_mean_mps"], row["speed_std_mps"]) == (2.0, 0.0)
+    assert row["yaw_mean_rad"] is None
+    assert (row["precision"], row["num_confirmed"]) == (1.0, 1)
+
+
+def test_residuals_are_grouped_by_time_speed_and_place(run: Run) -> None:
+    rows = {str(row["of"]): row for row in compare(run)["residuals_by"].records()}
+    assert {name: row["num_samples"] for name, row in rows.items()} == {
+        "observed below 1 s, lidar": 49,
+        "observed 1 to 2 s, lidar": 50,
+        "observed 1 to 2 s, radar": 1,
+        "observed 2 to 3 s, lidar": 50,
+        "observed 2 to 3 s, radar": 1,
+        "speed below 40 m/s, lidar": 149,
+        "speed below 40 m/s, radar": 2,
+        "ahead 0 to 50 m, lidar": 149,
+        "ahead 0 to 50 m, radar": 2,
+    }
+    assert rows["ahead 0 to 50 m, radar"]["along_mean_m"] == pytest.approx(1.0)
+
+
+def test_what_the_sensors_saw_is_told_by_sensor(run: Run) -> None:
+    rows = {row["sensor"]: row for row in compare(run)["sensed"].records()}
+    radar = rows["radar"]
+    assert (radar["delay_mean_s"], radar["delay_max_s"]) == pytest.approx((0.1, 0.1))
+    assert radar["moved_max_m"] == pytest.approx(3.0)
+    assert (radar["num_fused"], radar["num_objects"]) == (2, 0)
+    assert rows["lidar"]["num_objects"] == 1
+    assert radar["relative_speed_median_mps"] == pytest.approx(-10.0)
+    assert radar["ahead_median_m"] == pytest.approx(32.0)
+    assert radar["distance_median_m"] == pytest.approx(math.hypot(32.0, 3.0))
+    assert rows["lidar"]["detections_median"] == 149.0
+
+
+def test_latency_is_of_the_ticks_with_detections(run: Run) -> None:
+    (row,) = compare(run)["latency"].records()
+    assert (row["num_ticks"], row["time_per_tick_mean_s"], row["time_per_tick_p90_s"]) == pytest.approx(
+        (150, 0.002, 0.002)
+    )
+
+
+def test_without_truth_nothing_is_predicted(tmp_path: Path) -> None:
+    assert not compare(write_run(tmp_path / "run", [[WEST.track(0, 1)]]))["predictions"].num_rows
+
+
+def test_predictions_are_a_row_for_each_run_and_predictor(run: Run) -> None:
+    (row,) = compare(run)["predictions"].records()
+    assert (row["predictor"], row["fde_1s_m"], row["fde_5s_m"]) == ("arc", pytest.approx(2.0), None)
