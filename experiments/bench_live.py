@@ -181,9 +181,8 @@ def main(
         "refused": tracker.refused,
         "failures": tracker.failures,
         "lateness": {name: asdict(one) for name, one in tracker.lateness.items()},
-        "parts": [
-            asdict(part) | {"tick_ms": np.quantile(part.tick_ms, (0.5, 0.99, 1.0)).tolist()} for part in measured
-        ],
+        "timing": asdict(tracker.timing),
+        "parts": [asdict(part) for part in measured],
     }
     (out / "live.json").write_text(json.dumps(result, indent=1, default=dict) + "\n", encoding="utf-8")
     half = [part.memory_mb for part in measured[max(len(measured) // 2 - 1, 0) :]]

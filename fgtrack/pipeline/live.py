@@ -55,8 +55,6 @@ class Tracker:
 
     def __init__(self, config: Config, clock: Clock | None = None) -> None:
         self.config = config
-        self._failures: Counter[str] = Counter()
-        self._last_failure: str | None = None
         self._bank = RestartingBank(lambda: build_bank(config))
         self._tracker = build_tracker(config, self._guarded)
         self._refused: Counter[str] = Counter()
@@ -87,8 +85,8 @@ class Tracker:
         return replace(parts, bank=self._bank, on_failure=self._on_failure)
 
     def _on_failure(self, error: Exception) -> None:
-        self._failures["list failed"] += 1
-        self._last_failure = "".join(traceback.format_exception(error))
+        self._bank.failures["list failed"] += 1
+        self._bank.last_failure = "".join(traceback.format_exception(error))
 
     @property
     def refused(self) -> Mapping[str, int]:
@@ -110,12 +108,12 @@ class Tracker:
     def failures(self) -> Mapping[str, int]:
         """What was done after failures inside: `track restarted`, `track ended`, `birth failed`, `list failed`."""
         with self._turn:
-            return self._failures + self._bank.failures
+            return Counter(self._bank.failures)
 
     @property
     def last_failure(self) -> str | None:
         """Traceback of the newest failure inside, to report it."""
-        return self._last_failure or self._bank.last_failure
+        return self._bank.last_failure
 
     @property
     def lateness(self) -> Mapping[str, Lateness]:

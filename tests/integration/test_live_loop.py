@@ -66,5 +66,7 @@ def test_a_soak_of_some_seconds_accounts_for_every_detection(
     assert counted == result["sent"]
     assert sum(counted.values()) > 100
     assert result["refused"] == result["failures"] == {}
+    assert result["timing"]["ticks"] == sum(part["ticks"] for part in result["parts"])
+    assert all(part["tick_ms"] == sorted(part["tick_ms"]) and len(part["tick_ms"]) == 3 for part in result["parts"])
     ticks = sum(int(row[5].split()[2]) + int(row[6]) for row in rows)  # done and skipped
     assert ticks == pytest.approx(50 * 60 * until_min[-1], abs=5)
