@@ -124,7 +124,7 @@ def test_off_a_terminal_progress_is_lines_with_a_percentage(
         assert shares == sorted(shares)
         assert shares[0] < 35
         assert shares[-1] > 90
-    lines = fgtrack("simulate", "default", "-o", "x.jsonl", "--duration", "2").err.splitlines()
+    lines = fgtrack("simulate", "default", "-o", "x.jsonl", "--duration", "5").err.splitlines()
     assert lines[0] == "fgtrack: simulate, 0%"
     assert len(lines) > 1
     monkeypatch.setattr(show, "LINE_PERIOD_S", 60.0)

@@ -136,7 +136,7 @@ class Bag:
     def end_ns(self) -> int | None:
         """The end of the log times as the indexes of the files say it, without reading messages; None without any."""
         with self._files() as files:
-            ends = [getattr(getattr(file, "metadata", file), "end_time", 0) for file in files]  # rosbags' readers
+            ends = [getattr(getattr(file, "metadata", file), "end_time", 0) for file in files]
         return max(ends, default=0) or None
 
     def _stamp_ns(self, data: bytes) -> int | None:

@@ -47,6 +47,7 @@ class _Chunk:
     place: int
     """Of its record in the file."""
     first_ns: int
+    last_ns: int
     size: int
     """Of its records, unpacked."""
     checksum: int
@@ -88,6 +89,11 @@ class McapFile:
         self.connections = [
             connection._replace(msgcount=self._counts[number]) for number, connection in self._channels.items()
         ]
+
+    @property
+    def end_time(self) -> int:
+        """The last log time in ns as the chunks say it; 0 without chunks."""
+        return max((chunk.last_ns for chunk in self._chunks), default=0)
 
     def close(self) -> None:
         """Close the file."""
@@ -145,7 +151,7 @@ class McapFile:
         head = self._file.read(_CHUNK_HEADER.size + 4)
         if len(head) < _CHUNK_HEADER.size + 4:
             return
-        first_ns, _, size, checksum = _CHUNK_HEADER.unpack_from(head)
+        first_ns, last_ns, size, checksum = _CHUNK_HEADER.unpack_from(head)
         (length,) = struct.unpack_from("<I", head, _CHUNK_HEADER.size)
         compression = self._file.read(min(length, _LONGEST_COMPRESSION)).decode()
         stated = self._file.read(8)
@@ -155,7 +161,7 @@ class McapFile:
         if data_place + data_size > end and not cut:
             raise DataError(f"{self.path}: the chunk at byte {place} is larger than its record")
         data_size = min(data_size, end - data_place)
-        yield _Chunk(place, first_ns, size, checksum, compression, data_place, data_size, cut)
+        yield _Chunk(place, first_ns, last_ns, size, checksum, compression, data_place, data_size, cut)
 
     def _note(self, opcode: int, content: bytes) -> int | None:
         """Keep what a record says of the messages; gives the number of channels, where it is that of the statistics."""
