@@ -47,7 +47,7 @@ class ExistenceRules:
     lifetime_s: float = 10.0
     """Mean time for which an object stays."""
     out_of_view_s: float = 2.0
-    """A track ends so long after it was last in the range and field of view of a sensor that looked."""
+    """A track ends where the newest list that could not show it is so much newer than the last one that could."""
     min_travel_m: float = 0.0
     """A track is not confirmed before it was so far from where it began: what never moves is shore, or moored."""
     memory_s: float = 5.0
@@ -146,6 +146,7 @@ class ExistenceLifecycle:
         self._memory_ns = nanoseconds(rules.memory_s)
         self._out_of_view_ns = nanoseconds(rules.out_of_view_s)
         self._present_ns = 0
+        self._newest_ns = 0  # stamp of the newest list that could have shown something
         self.lives: dict[int, Existence] = {}
         """What is known of each track."""
 
@@ -182,6 +183,7 @@ class ExistenceLifecycle:
         sensor = self._sensors[look.sensor]
         if not sensor.gives_position:
             return []
+        self._newest_ns = max(self._newest_ns, look.stamp_ns)
         weight = math.log1p(-sensor.detection_probability)
         in_view = np.ones(len(track_ids), dtype=bool)
         if look.ego is not None:
@@ -220,7 +222,7 @@ class ExistenceLifecycle:
         life.confirmed = life.confirmed or believed
 
     def _ends(self, life: Existence) -> bool:
-        if self._present_ns - life.in_view_ns > self._out_of_view_ns:
+        if self._newest_ns - life.in_view_ns > self._out_of_view_ns:
             return True
         return life.probability(self._present_ns) < self._rules.delete_probability
 

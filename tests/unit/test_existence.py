@@ -111,10 +111,10 @@ def test_a_track_that_left_the_view_of_all_sensors_ends_although_it_is_believed(
     life.born(0, look("ahead"), Sighting(HERE))
     for k in range(5):
         life.matched(0, look("ahead", 10.0 * k, ego=ego()), Sighting(HERE, MEAN, P))
-    for k in range(5, 50):
-        life.missed(look("ahead", 10.0 * k, ego=ego(x_m=100.0)), [0], np.array([[10.0, 0.0]]), np.array([90.0]))
-    assert life.expired(START_NS + ms(540)) == []
-    assert life.expired(START_NS + ms(541)) == [0]
+    for at_ms in (100.0, 540.0, 541.0):
+        assert life.expired(START_NS + ms(5000)) == []  # nobody looked
+        ended = life.missed(look("ahead", at_ms, ego=ego(x_m=100.0)), [0], np.array([[10.0, 0.0]]), np.array([90.0]))
+        assert ended == ([0] if at_ms > 540.0 else [])
 
 
 def test_bearings_neither_confirm_a_track_nor_keep_it() -> None:

@@ -40,7 +40,7 @@ def sequence(at: Path, **files: list[str]) -> Path:
         oxts(frame * METRE_DEG * math.cos(math.radians(49.0)), 0.0, 0.01, -0.02, 0.5 * math.pi, 10.0)
         for frame in FRAMES
     ]
-    seen = [line(frame, car, score=" 0.75") for frame in FRAMES for car in (0, 1)]
+    seen = [line(frame, car, score=" 7.75") for frame in FRAMES for car in (0, 1)]
     folder(at, oxts=ego, pointrcnn_car=seen, **files)
     (views,) = [read_views(at / "oxts/0001.txt", at / "calib/0001.txt")]
     labels = []
@@ -80,7 +80,7 @@ def test_a_result_holds_a_box_of_every_track_at_every_frame(tmp_path, replayed):
         assert fields[2] == "Car"
         assert len(fields) == 18
         assert list(map(float, fields[10:13])) == [1.5, 1.6, 4.0]
-        assert float(fields[17]) == pytest.approx(0.75)
+        assert float(fields[17]) == pytest.approx(7.75)
         assert [float(value) for value in fields[13:16]] == pytest.approx(list(map(float, label[13:16])), abs=0.1)
         assert math.cos(float(fields[16]) - float(label[16])) > 0.999
         assert [float(value) for value in fields[6:10]] == pytest.approx(list(map(float, label[6:10])), abs=5.0)
