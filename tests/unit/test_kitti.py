@@ -210,6 +210,7 @@ def test_an_input_is_a_folder_of_one_sequence_a_file_or_a_sequence_by_name(tmp_p
     ("files", "where"),
     [
         ({"oxts": ["1 2 3"]}, r"oxts/0001\.txt:1: "),
+        ({"oxts": [oxts(yaw_rad=math.inf)]}, r"oxts/0001\.txt:1: .*not finite"),
         ({"calib": ["P2: 1 2 x"]}, r"calib/0001\.txt:1: "),
         ({"calib": ["P2: 1 2 3"]}, r"calib/0001\.txt: "),
         ({"laser": [pose(0, 1.0, 2.0, 0.0), "0,2,3"]}, r"laser/0001\.txt:2: .*3 fields"),
@@ -223,6 +224,14 @@ def test_a_damaged_file_is_one_line_that_names_it(tmp_path, files, where):
     with pytest.raises(DataError, match=where) as caught:
         messages(drive)
     assert "\n" not in str(caught.value)
+
+
+def test_what_is_not_finite_in_a_detection_is_left_to_the_tracker_without_a_warning(tmp_path):
+    whole = pose(0, 10.0, 0.0, 0.0)
+    cells = whole.split(",")
+    lines = [",".join([*cells[:10], bad, *cells[11:]]) for bad in ("inf", "nan")] + [whole]
+    (found,) = lists(folder(tmp_path, laser=lines))
+    assert [math.isfinite(item.x_m + item.y_m) for item in found.objects] == [False, False, True]
 
 
 def test_a_sequence_without_a_calibration_is_one_line(tmp_path):

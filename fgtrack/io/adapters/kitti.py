@@ -250,7 +250,8 @@ def _read(rows: list[Row], parse: Callable[[list[str]], _Parsed | None]) -> Iter
     """What `parse` makes of the fields of `rows`, without what it leaves out."""
     for row in rows:
         try:
-            found = parse(row.fields)
+            with np.errstate(all="ignore"):  # of what is not finite: the tracker counts it
+                found = parse(row.fields)
         except (ValueError, IndexError) as error:
             raise DataError(f"{row.place}: is no line of the data set ({error})") from error
         if found is not None:

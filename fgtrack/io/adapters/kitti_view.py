@@ -139,6 +139,8 @@ def _views(file: Path, calibration: Calibration) -> list[View]:
     for number, line in enumerate(lines(file), 1):
         try:
             values = [float(value) for value in line.split()]
+            if not all(map(math.isfinite, values)):
+                raise ValueError("a value is not finite")
             latitude_deg, longitude_deg, _, roll_rad, pitch_rad, yaw_rad = values[:6]
             speed_mps, accel_mps2, yaw_rate_radps = values[8], values[14], values[22]
             if not views:
