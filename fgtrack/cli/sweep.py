@@ -88,6 +88,8 @@ def sweep(
     tell(f"{out / SWEEP_TABLE}: {result.num_good} of {result.num_cells} cells")
     if result.num_good:
         _summarise(read_sweep(out), out, form, everything)
+    if recording is not None:  # the metrics were chosen for another input: of this one, all that it has are taken
+        result = replace(result, unknown_metrics=())
     return _complain(result, sweep_file, out)
 
 

@@ -18,9 +18,11 @@ import pytest
 
 from fgtrack.cli.main import run
 from fgtrack.cli.sweep import score, swept
+from fgtrack.core.types import TruthState
 from fgtrack.io.run import Run
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.load import load
+from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.pipeline.sweep import Scores, Sweep
 from fgtrack.pipeline.sweep_plan import load_plan
 from fgtrack.sim.scenario import Scenario
@@ -355,6 +357,15 @@ def test_metrics_that_do_not_exist_are_reported(tmp_path: Path, capsys: pytest.C
     text = "duration_s: 0.5\nestimators: [ekf-replay]\nmetrics: [num_tracks, truth.positon]\n"
     assert run(["sweep", str(write_sweep(tmp_path, text)), "-o", str(tmp_path / "out"), "--jobs", "1"]) == 1
     assert "metrics: no column fits truth.positon" in capsys.readouterr().err
+    assert list(rows(tmp_path / "out/sweep.csv")[0]) == ["seed", "estimator", "num_tracks"]
+
+
+def test_another_recording_may_lack_what_the_metrics_need(tmp_path: Path) -> None:
+    messages = simulate(read_scenario("single_opponent", duration_s=0.5), np.random.default_rng(0))
+    write_stream(tmp_path / "drive.jsonl", [message for message in messages if not isinstance(message, TruthState)])
+    text = "duration_s: 0.5\nestimators: [ekf-replay]\nmetrics: [num_tracks, truth.false_tracks]\n"
+    call = ["sweep", str(write_sweep(tmp_path, text)), "--input", str(tmp_path / "drive.jsonl")]
+    assert run([*call, "-o", str(tmp_path / "out"), "--jobs", "1", "--set", "association.gate_m=4.0"]) == 0
     assert list(rows(tmp_path / "out/sweep.csv")[0]) == ["seed", "estimator", "num_tracks"]
 
 
