@@ -209,7 +209,8 @@ def test_a_replay_warns_of_noise_that_does_not_fit(fgtrack: Command, stream: Pat
     told = fgtrack("replay", stream, "--set", "sensors.lidar.std={x_m: 9.0, y_m: 9.0}", "-o", "b")
     assert told.code == 0
     assert "lidar: mean NIS" in told.err
-    assert "the configured noise is too large; `fgtrack tune` fits it" in told.err
+    assert "the configured noise is too large" in told.err
+    assert "`fgtrack tune" in told.err
 
 
 def test_streaming_is_compared_when_it_is_asked_for(fgtrack: Command, runs: dict[str, Path]) -> None:

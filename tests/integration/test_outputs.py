@@ -16,6 +16,7 @@ from fgtrack.io import output
 from fgtrack.io.output import claimed, new_file, write_file
 from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.run import RunWriter, load_run
+from fgtrack.io.source import open_input
 from fgtrack.io.stream import STREAM, read_stream, write_stream
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_each
@@ -302,14 +303,37 @@ def test_what_appears_at_the_last_moment_is_not_replaced(here: Path, monkeypatch
 def test_an_error_while_writing_keeps_the_old_recording(here: Path) -> None:
     def failing() -> Iterator[Message]:
         yield from drive(5)
-        raise DataError("broken")
+        raise RuntimeError("broken")
 
     before = content(here)
-    with pytest.raises(DataError, match="broken"):
+    with pytest.raises(RuntimeError, match="broken"):
         write_stream("other.jsonl", failing(), overwrite=True)
     with pytest.raises(DataError, match="broken"):
         write_bag("bag", failing(), overwrite=True)
     assert content(here) == before
+
+
+def test_an_input_that_breaks_at_once_keeps_the_old_recording(here: Path) -> None:
+    def failing() -> Iterator[Message]:
+        raise DataError("broken")
+        yield
+
+    before = content(here)
+    for write, out in ((write_stream, "other.jsonl"), (write_bag, "bag")):
+        with pytest.raises(DataError, match="broken"):
+            write(out, failing(), overwrite=True)
+    assert content(here) == before
+
+
+def test_of_an_input_that_breaks_off_what_came_before_is_written(here: Path) -> None:
+    def failing() -> Iterator[Message]:
+        yield from drive(5)
+        raise DataError("broken")
+
+    for write, out in ((write_stream, "other.jsonl"), (write_bag, "bag")):
+        with pytest.raises(DataError, match="broken"):
+            write(out, failing(), overwrite=True)
+        assert list(open_input(here / out).messages()) == drive(5)
 
 
 def test_a_file_has_the_usual_permissions(here: Path) -> None:

@@ -254,7 +254,7 @@ def backend(change: Callable[[Change], Change]) -> Break:
 
 
 def none_removed(change: Change) -> Change:
-    return replace(change, removed=[]) if change.values else change
+    return change._replace(removed=[]) if change.values else change
 
 
 def one_missing(change: Change) -> Change:
@@ -262,7 +262,7 @@ def one_missing(change: Change) -> Change:
         return change
     (key, mean), *_ = change.values.items()
     nothing = PriorOf(key, Prior(mean, 1e12 * np.eye(len(mean))))
-    return replace(change, factors=[nothing, *change.factors[1:]])
+    return change._replace(factors=[nothing, *change.factors[1:]])
 
 
 def marginalised(times: float) -> Break:
@@ -272,7 +272,7 @@ def marginalised(times: float) -> Break:
         gone = given.marginalised
         if gone is None:
             return given
-        return replace(given, factors=[*given.factors, gone.prior], marginalised=gone)
+        return given._replace(factors=[*given.factors, gone.prior], marginalised=gone)
 
     def weak(patch: pytest.MonkeyPatch) -> None:
         patch.setattr(window, "PriorOf", lambda key, prior: PriorOf(key, Prior(prior.mean, times * prior.covariance)))

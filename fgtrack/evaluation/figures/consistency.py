@@ -116,7 +116,9 @@ def _draw_nis(axes: Axes, time_s: FloatArray, values: FloatArray, dof: IntArray,
     middle_ns = (NS_PER_S * middle_s).astype(np.int64)
     _draw(axes, middle_ns, middle_s, total / length, band, total_dof / length, color, text, 1.3)
     bottom, top = axes.get_ylim()
-    axes.set_ylim(min(bottom, float(np.quantile(values, 0.05))), max(top, float(np.quantile(values, 0.99))))
+    shown = values[values > 0.0]  # the axis is logarithmic
+    if len(shown):
+        axes.set_ylim(min(bottom, float(np.quantile(shown, 0.05))), max(top, float(np.quantile(shown, 0.99))))
 
 
 def _draw(
