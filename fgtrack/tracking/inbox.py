@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from types import MappingProxyType
 from typing import Protocol
 
@@ -142,16 +143,16 @@ class _Seen:
         self._memory_ns = memory_ns
         self._receipts_ns: dict[tuple[str, int, Frame, int], int] = {}  # in order of receipt
 
-    def is_copy(self, message: DetectionList, sensor: SensorModel) -> bool:
+    def is_copy(self, message: DetectionList, usable: Sequence[bool]) -> bool:
         """Whether `message` repeats one that is remembered; it is remembered from now on.
 
-        Detections that are none, as those with NaN, which equals nothing, are not compared. Contents are compared by
+        Those that are not `usable`, as with NaN, which equals nothing, are not compared. Contents are compared by
         their hashes: two different lists of one stamp have the same one by chance once in 2^61 pairs.
         """
-        usable = tuple(detection for detection in message.objects if is_usable(detection, sensor))
-        if message.objects and not usable:
+        if message.objects and not any(usable):
             return False
-        key = (message.sensor, message.stamp_ns, message.frame, hash(usable))
+        contents = message.objects if all(usable) else tuple(compress(message.objects, usable))
+        key = (message.sensor, message.stamp_ns, message.frame, hash(contents))
         known = key in self._receipts_ns
         if not known:
             self._receipts_ns[key] = message.receipt_ns
@@ -175,12 +176,13 @@ class QueueInbox:
     def put(self, message: DetectionList) -> list[UpdateRecord]:
         """See `Inbox.put`; a message is repeated if an earlier one of the sensor had its stamp and contents."""
         sensor = self._sensors[message.sensor]
-        if self._seen.is_copy(message, sensor):
+        usable = [is_usable(detection, sensor) for detection in message.objects]
+        if self._seen.is_copy(message, usable):
             return records(message, Disposition.DUPLICATE)
         ended: list[UpdateRecord] = []
         kept: dict[int, list[int]] = {} if message.objects else {message.stamp_ns: []}
         for index, stamp_ns in enumerate(stamps(message, sensor)):
-            refusal = self._refusal(message, sensor, index, stamp_ns)
+            refusal = self._refusal(message, sensor, stamp_ns) if usable[index] else Disposition.INVALID
             if refusal is None:
                 kept.setdefault(stamp_ns, []).append(index)
             else:
@@ -191,8 +193,8 @@ class QueueInbox:
         ]
         return ended
 
-    def _refusal(self, message: DetectionList, sensor: SensorModel, index: int, stamp_ns: int) -> Disposition | None:
-        if not is_usable(message.objects[index], sensor) or stamp_ns - message.receipt_ns > self._max_future_ns:
+    def _refusal(self, message: DetectionList, sensor: SensorModel, stamp_ns: int) -> Disposition | None:
+        if stamp_ns - message.receipt_ns > self._max_future_ns:
             return Disposition.INVALID
         limit_s = sensor.max_delay_s
         if limit_s is not None and message.receipt_ns - stamp_ns > nanoseconds(limit_s):
