@@ -8,7 +8,6 @@ from typing import Literal
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.contest import BEST_NOTE, POSITION_NEES, Contest, contests, differences, is_best
 from fgtrack.evaluation.lagged import WINDOW, LagMetrics
-from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS
 from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics, ObjectMetrics, TruthMetrics
 from fgtrack.evaluation.multi_object import MultiObjectMetrics
 from fgtrack.evaluation.paper_tables import with_paper_tables
@@ -125,7 +124,7 @@ def _tracking(rows: Sequence[Row[Metrics]], found: Sequence[Contest], notes: Seq
             lambda row: (row.of.precision,),
             text=_two_decimals,
             when="full",
-            note=f"precision: true objects tracked / tracks with {CONFIRMED_MEASUREMENTS}+ measurements",
+            note="precision: true objects tracked / tracks that were confirmed",
         ),
     ]
     columns = [
@@ -133,12 +132,12 @@ def _tracking(rows: Sequence[Row[Metrics]], found: Sequence[Contest], notes: Seq
         Column("", ("estimator",), lambda row: (row.of.estimator,)),
         *(truth if with_truth else [replace(column, heading="") for column in truth]),
         Column(
-            f"tracks\nall/{CONFIRMED_MEASUREMENTS}+",
+            "tracks all/\nconfirmed",
             ("num_tracks", "num_confirmed"),
             lambda row: (row.of.num_tracks, row.of.num_confirmed),
             "{}/{}",
             when="full" if with_truth else "always",
-            note=f"{CONFIRMED_MEASUREMENTS}+: tracks with at least {CONFIRMED_MEASUREMENTS} measurements",
+            note="confirmed: published as more than tentative at some tick",
         ),
         Column(
             "ms/tick\np50/p99",

@@ -42,8 +42,8 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
     """Time from the first detection of every object to its first confirmed track in s, shape (objects,).
 
     It begins at the stamp of the first detection that was fused into a track which then lies on the object (nearest
-    object within `gate_m`), and ends with the tick at which the object is first paired with a row with
-    `CONFIRMED_MEASUREMENTS` measurements. NaN where there is no such row.
+    object within `gate_m`), and ends with the tick at which the object is first paired with a row that is `confirmed`.
+    NaN where there is no such row.
     """
     count = len(matching.object_ids)
     updates = run.updates.where(with_disposition(run.updates, FUSED) & (run.updates["track_id"] != NO_TRACK))

@@ -7,7 +7,7 @@ import numpy as np
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, Matching
+from fgtrack.evaluation.matching import Matching, confirmed
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.evaluation.tables import Column, Table
@@ -97,7 +97,7 @@ def _starts(matching: Matching) -> tuple[FloatArray, IntArray, IntArray]:
     _, first = np.unique(matching.now_ns // _PERIOD_NS, return_index=True)
     tracks = matching.tracks
     chosen = matching.paired & np.isin(matching.tick_index, first)
-    chosen &= tracks["num_measured"] >= CONFIRMED_MEASUREMENTS
+    chosen &= confirmed(tracks)
     states = np.stack([tracks[name][chosen] for name in TRUE_STATE], axis=-1)
     states[np.isnan(states[:, 4]), 4] = 0.0  # models without a yaw rate
     known = np.isfinite(states).all(axis=1)

@@ -248,7 +248,7 @@ def test_the_built_in_oval_is_drawn_and_open_space_has_no_bounds(runs: list[Run]
 
 def test_without_truth_the_map_shows_the_tracks_with_enough_measurements(runs: list[Run]) -> None:
     plain = replace(runs[0], truth=runs[0].truth.where(np.zeros(len(runs[0].truth["stamp_ns"]), dtype=bool)))
-    assert "3 tracks with at least 3 measurements, no truth" in plot.map(plain).get_suptitle()
+    assert "3 confirmed tracks, no truth" in plot.map(plain).get_suptitle()
 
 
 def test_two_rows_that_are_far_apart_are_no_line(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from fgtrack.evaluation.figures.style import (
     titled,
     usual_step_ns,
 )
-from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS
+from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.runs import JudgedRun, OneRun, one_judged, start_ns
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.evaluation.viewer.surroundings import roads
@@ -131,7 +131,7 @@ def _lines(one: JudgedRun, road: TrackMap) -> Iterator[_Line]:
             road, path.stamps_ns, path.states[:, :2], colour(index), label, "-", _FEW_TRUE if few else _MANY_TRUE
         )
     tracks = one.run.tracks if matching is None else matching.tracks
-    tracks = tracks.where(tracks["num_measured"] >= CONFIRMED_MEASUREMENTS) if matching is None else tracks
+    tracks = tracks.where(confirmed(tracks)) if matching is None else tracks
     named: set[str] = set()
     for place, track_id in enumerate(np.unique(tracks["track_id"]).tolist()):
         mine = tracks["track_id"] == track_id

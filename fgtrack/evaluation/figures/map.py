@@ -18,7 +18,7 @@ from fgtrack.evaluation.figures.style import (
     titled,
     usual_step_ns,
 )
-from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS, Matching
+from fgtrack.evaluation.matching import Matching, confirmed
 from fgtrack.evaluation.runs import OneRun, one_judged
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.evaluation.viewer.placement import placed
@@ -59,12 +59,12 @@ def tracks_on_map(run: OneRun) -> Figure:
     if np.isfinite(ego_m).any():
         axes.plot(*ego_m.T, color="black", lw=0.8, ls="--", label="ego", zorder=3.5)
     if matching is None:
-        tracks = one.run.tracks.where(one.run.tracks["num_measured"] >= CONFIRMED_MEASUREMENTS)
+        tracks = one.run.tracks.where(confirmed(one.run.tracks))
         step_ns = usual_step_ns(tracks["now_ns"])
         ids = np.unique(tracks["track_id"]).tolist()
         for k, track_id in enumerate(ids):
             _draw_tracks(axes, tracks.where(tracks["track_id"] == track_id), step_ns, colour(k), "")
-        text.append(f"{len(ids)} tracks with at least {CONFIRMED_MEASUREMENTS} measurements, no truth")
+        text.append(f"{len(ids)} confirmed tracks, no truth")
     else:
         tracks = matching.tracks
         _draw_matched(axes, one.run, matching)

@@ -88,7 +88,7 @@ def check_serialization(path: Path, topic: str, serialization: str) -> None:
 class EmptyFile:
     """A file into which a killed recorder has not written anything yet."""
 
-    def __init__(self, path: Path, largest_bytes: int = 0) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.connections: list[Connection] = []
         self.break_off: str | None = "is empty"

@@ -80,7 +80,7 @@ class McapFile:
         if self.break_off or num_channels is None or num_channels > len(self._channels) or self._loose_end:
             self._counts.clear()
             try:
-                for opcode, _, content in self._inner_records():
+                for opcode, content in self._inner_records():
                     self._note(opcode, content)
             except DataError as error:  # what comes before can be read
                 self.break_off = f"is damaged ({error})"
@@ -167,12 +167,12 @@ class McapFile:
         """Keep what a record says of the messages; gives the number of channels, where it is that of the statistics."""
         if opcode == _SCHEMA:
             (number,) = struct.unpack_from("<H", content)
-            (name, encoding, text), _ = _texts(content, 2, 3)
+            name, encoding, text = _texts(content, 2, 3)
             form = _FORMATS.get(encoding, MessageDefinitionFormat.NONE)
             self._schemas[number] = name, MessageDefinition(form, text)
         elif opcode == _CHANNEL:
             number, schema = struct.unpack_from("<HH", content)
-            (topic, encoding), _ = _texts(content, 4, 2)
+            topic, encoding = _texts(content, 4, 2)
             name, definition = self._schemas.get(schema, ("", MessageDefinition(MessageDefinitionFormat.NONE, "")))
             ext = ConnectionExtRosbag2(encoding, [])
             self._channels.setdefault(number, Connection(number, topic, name, definition, "", 0, ext, self))
@@ -185,13 +185,13 @@ class McapFile:
             return int(num_channels)
         return None
 
-    def _inner_records(self) -> Iterator[tuple[int, int, bytes]]:
-        """Opcode, place and content of the records in all chunks, and of the messages outside of chunks."""
+    def _inner_records(self) -> Iterator[tuple[int, bytes]]:
+        """Opcode and content of the records in all chunks, and of the messages outside of chunks."""
         for chunk in self._chunks:
             yield from self._chunk_records(chunk)
         yield from self._loose()
 
-    def _chunk_records(self, chunk: _Chunk) -> Iterator[tuple[int, int, bytes]]:
+    def _chunk_records(self, chunk: _Chunk) -> Iterator[tuple[int, bytes]]:
         assert self._file
         what = f"{self.path}: the chunk at byte {chunk.place}"
         for num_bytes in (chunk.size, chunk.data_size):
@@ -208,9 +208,9 @@ class McapFile:
             place = begin + length
             if place > len(data):
                 break
-            yield opcode, begin, data[begin:place]
+            yield opcode, data[begin:place]
 
-    def _loose(self) -> Iterator[tuple[int, int, bytes]]:
+    def _loose(self) -> Iterator[tuple[int, bytes]]:
         """The messages outside of chunks."""
         assert self._file
         place = len(MCAP_MAGIC)
@@ -219,20 +219,20 @@ class McapFile:
             opcode, length = _RECORD_HEADER.unpack(self._file.read(_RECORD_HEADER.size))
             if opcode == _MESSAGE:
                 refuse_larger(length, f"{self.path}: the message at byte {place}", self._largest_bytes)
-                yield opcode, place, self._file.read(length)
+                yield opcode, self._file.read(length)
             place += _RECORD_HEADER.size + length
 
     @staticmethod
-    def _sendings(records: Iterator[tuple[int, int, bytes]], wanted: dict[int, Connection]) -> Iterator[Sending]:
-        for opcode, _, content in records:
+    def _sendings(records: Iterator[tuple[int, bytes]], wanted: dict[int, Connection]) -> Iterator[Sending]:
+        for opcode, content in records:
             if opcode == _MESSAGE:
                 channel, _, log_ns, sent_ns = _MESSAGE_HEADER.unpack_from(content)
                 if channel in wanted:
                     yield Sending(wanted[channel], sent_ns, log_ns, content[_MESSAGE_HEADER.size :])
 
 
-def _texts(content: bytes, place: int, count: int) -> tuple[list[str], int]:
-    """So many texts, each behind its length, from `place` on, and where they end."""
+def _texts(content: bytes, place: int, count: int) -> list[str]:
+    """So many texts, each behind its length, from `place` on."""
     found = []
     for _ in range(count):
         (length,) = struct.unpack_from("<I", content, place)
@@ -240,4 +240,4 @@ def _texts(content: bytes, place: int, count: int) -> tuple[list[str], int]:
         if place > len(content):
             raise DataError("a text is longer than its record")
         found.append(content[place - length : place].decode())
-    return found, place
+    return found
