@@ -428,7 +428,8 @@ def test_the_note_on_backward_forward_stands_where_it_is_shown_only(runs: dict[s
 def test_runs_without_truth_have_no_errors(tmp_path: Path, runs: dict[str, Run]) -> None:
     without = evaluate(a_run(tmp_path / "without", "smoother", truth=False))
     alone = comparison({"a": without})
-    assert [column.heading for column in alone["tracking"].shown] == ["run", "tracks all/\nconfirmed", "ms/tick\np50/p99"]
+    headings = [column.heading for column in alone["tracking"].shown]
+    assert headings == ["run", "tracks all/\nconfirmed", "ms/tick\np50/p99"]
     assert np.isnan(alone["tracking"]["position_rmse_m"]).all()
     assert alone["consistency"]["of"].tolist() == [f"NIS {sensor}" for sensor in SENSORS]
     assert "Error against lag" not in str(alone)

@@ -4,35 +4,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluation_runs import START_NS, TICK_NS, WEST, update, write_run
+from evaluation_runs import WEST, run_beside, write_run
 
-from fgtrack.core.types import Disposition, EgoState, TickReport, TrackReport
+from fgtrack.core.types import TrackReport
 from fgtrack.evaluation import plot
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.prediction import prediction_errors
-from fgtrack.io.run import Run, RunWriter, load_run
+from fgtrack.io.run import Run
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
-    """WEST, tracked with an error of 2 m along from the start on; the ego drives beside it at 30 m/s."""
-    tracks = [[WEST.track(k, 1, along_m=2.0)] for k in range(150)]
-    updates = {k: [update("lidar", tick=k, x_m=0.3, y_m=0.1)] for k in range(1, 150)}
-    updates |= {
-        k: [*updates[k], update("radar", tick=k - 5, delay_ns=100_000_000, x_m=-1.0, y_m=0.0, speed_mps=2.0)]
-        for k in (100, 120)
-    }
-    updates[0] = [update("lidar", tick=0, disposition=Disposition.BIRTH)]
-    with RunWriter(tmp_path / "run", "") as writer:
-        for row in WEST.truth(range(250)):
-            writer.write_truth(row)
-        for tick in range(150):
-            x_m, y_m, yaw_rad, _ = WEST.state(tick * TICK_NS / 1e9)
-            now_ns = START_NS + tick * TICK_NS
-            writer.write_ego(EgoState(now_ns, now_ns, x_m + 30.0, y_m + 3.0, yaw_rad, 30.0))
-            writer.write_tick(TickReport(tick, now_ns, tuple(tracks[tick]), tuple(updates[tick])), 2_000_000, 1)
-        writer.finish({"estimator": "ekf-replay"})
-    return load_run(tmp_path / "run")
+    return run_beside(tmp_path / "run")
 
 
 def test_a_prediction_is_judged_where_the_truth_goes_on(run: Run) -> None:
