@@ -137,23 +137,17 @@ def _solve(matrix: FloatArray, rhs: FloatArray) -> bool:
 
 
 @njit(error_model="numpy")
-def _predict(
-    left: FloatArray, segment: FloatArray, origin: FloatArray, moved: FloatArray, product: FloatArray, ahead: FloatArray
-) -> None:
+def _predict(left: FloatArray, segment: FloatArray, origin: FloatArray, moved: FloatArray, ahead: FloatArray) -> None:
     """[F P F' + Q | F x + f - x0] to `ahead`, and F P to `moved`."""
     n = len(origin)
     for i in range(n):
         mean = segment[i, 2 * n] - origin[i]
         for j in range(n):
             mean += segment[i, j] * left[j, n]
-            value = 0.0
-            for k in range(n):
-                value += segment[i, k] * left[k, j]
-            moved[i, j] = value
         ahead[i, n] = mean
         for j in range(i + 1):
             ahead[i, j] = 0.5 * (segment[i, n + j] + segment[j, n + i])
-    _congruence(segment[:, :n], left, product, ahead[:, :n])
+    _congruence(segment[:, :n], left, moved, ahead[:, :n])
     _mirror(ahead[:, :n])
 
 
@@ -249,7 +243,7 @@ def _eliminate(
             at = numbers[track, place]
             if place > first[track]:  # else the prior of the oldest node in the window, which follows from nothing
                 before = numbers[track, place - 1]
-                _predict(filtered[before], segment[before], origin[at], A, product, predicted[at])
+                _predict(filtered[before], segment[before], origin[at], A, predicted[at])
                 if not _condition(
                     filtered[before], segment[before], predicted[at], A, E, product, back[before], C[before]
                 ):
