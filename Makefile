@@ -3,12 +3,14 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+TOOLS := .venv-tools
+QUIET := --quiet --disable-pip-version-check
 # The matrices are small; more threads only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
 # A file stays in one process, so what its tests share is made once.
 BY_FILE := --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-slow fuzz coverage mutants check docs bench bench-full soak-live contest clean
+.PHONY: demo test test-slow test-matrix lock audit fuzz coverage mutants check docs bench bench-full soak-live contest clean
 
 demo: $(STAMP)
 	$(BIN)/fgtrack demo -o out/demo --overwrite
@@ -40,7 +42,6 @@ check: $(STAMP)
 	$(BIN)/lint-imports
 
 docs: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
 	$(BIN)/python -m sphinx -W --keep-going -q -c docs . out/docs
 	$(BIN)/python -m pytest tests/integration/test_docs.py
 
@@ -59,11 +60,30 @@ bench-full: $(STAMP)
 soak-live: $(STAMP)
 	$(BIN)/python experiments/bench_live.py -o out/live
 
-$(STAMP): pyproject.toml
+# Every package in the version, and with the content, that requirements.lock says.
+$(STAMP): pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fgtrack needs Python 3.11 or newer")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test,dev]'
+	$(BIN)/python -m pip install $(QUIET) --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install $(QUIET) --no-deps --no-build-isolation -e .
 	touch $@
 
+$(TOOLS):
+	$(PYTHON) -m venv $(TOOLS)
+	$(TOOLS)/bin/python -m pip install $(QUIET) uv pip-audit
+
+# The newest versions that pyproject.toml allows, for every platform and Python from 3.11 on.
+lock: $(TOOLS)
+	$(TOOLS)/bin/uv pip compile pyproject.toml --extra test --extra dev --extra docs --universal --python-version 3.11 \
+	    --generate-hashes --no-emit-index-url --upgrade --quiet --custom-compile-command "make lock" -o requirements.lock
+
+# Known weaknesses of what is locked; asks pypi.org.
+audit: $(TOOLS)
+	$(TOOLS)/bin/pip-audit --require-hashes --disable-pip -r requirements.lock
+
+# The tests with the oldest and newest versions allowed, and with those locked on every Python that is installed.
+test-matrix: $(TOOLS)
+	.ci/matrix $(TOOLS)/bin/uv
+
 clean:
-	rm -rf $(VENV) out build *.egg-info
+	rm -rf $(VENV) $(VENV)-* out build *.egg-info
