@@ -132,8 +132,7 @@ class Existence:
 class ExistenceLifecycle:
     """Tracks live by the probability that their objects exist; see the module.
 
-    A sensor that gives no position says nothing of existence, so a bearing neither confirms a track nor keeps it, and
-    a list says nothing of objects out of its sensor's range and field of view. Without an ego all are in view.
+    A list says nothing of objects out of its sensor's range and field of view. Without an ego all are in view.
     """
 
     def __init__(
@@ -174,15 +173,13 @@ class ExistenceLifecycle:
         life.learn(look.stamp_ns, math.log(1.0 - seen + seen * ratio))
         self._judge(life)
 
-    def fused(self, track_id: int) -> None:
+    def fused(self, track_id: int, placed: bool = True) -> None:
         """See `Lifecycle.fused`."""
         self.lives[track_id].num_measured += 1
 
     def missed(self, look: Look, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
         """See `Lifecycle.missed`."""
         sensor = self._sensors[look.sensor]
-        if not sensor.gives_position:
-            return []
         self._newest_ns = max(self._newest_ns, look.stamp_ns)
         weight = math.log1p(-sensor.detection_probability)
         in_view = np.ones(len(track_ids), dtype=bool)

@@ -32,7 +32,11 @@ class Sighting(NamedTuple):
 
 
 class Lifecycle(Protocol):
-    """Says how far tracks can be trusted, and which of them end."""
+    """Says how far tracks can be trusted, and which of them end.
+
+    It hears of sensors that give positions alone: a bearing fits whatever is behind or before its object as well, so it
+    neither starts nor confirms nor keeps a track.
+    """
 
     def born(self, track_id: int, look: Look, sighting: Sighting) -> None:
         """A detection started a track."""
@@ -40,8 +44,8 @@ class Lifecycle(Protocol):
     def matched(self, track_id: int, look: Look, sighting: Sighting) -> None:
         """A detection was associated."""
 
-    def fused(self, track_id: int) -> None:
-        """The associated detection changed the state."""
+    def fused(self, track_id: int, placed: bool = True) -> None:
+        """The associated detection, which is `placed` where it gives a position, changed the state."""
 
     def missed(self, look: Look, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
         """These tracks, at `positions_m` (n, 2) and so far from the ego, were not seen; the ids of those that end."""
@@ -66,12 +70,14 @@ class Life:
     counter: int
     last_seen_ns: int
     num_measured: int = 1
+    num_placed: int = 1
+    """Those of the measurements that give a position."""
     misses: int = 0
     """Misses since the last match."""
 
     def status(self, confirm_count: int) -> TrackStatus:
         """How far the track can be trusted."""
-        if self.num_measured < confirm_count:
+        if self.num_placed < confirm_count:
             return TrackStatus.TENTATIVE
         return TrackStatus.COASTING if self.misses else TrackStatus.CONFIRMED
 
@@ -87,7 +93,7 @@ class LifecycleRules:
     short_range_m: float = 60.0
     """Up to here short-range sensors age a track, beyond it long-range sensors do."""
     confirm_count: int = 3
-    """Measurements after which a track is confirmed."""
+    """Measurements of its position after which a track is confirmed."""
     tentative_misses: int | None = None
     """A track that is not yet confirmed ends after so many misses; null leaves it to its counter."""
 
@@ -124,9 +130,10 @@ class CountingLifecycle:
         life.last_seen_ns = max(life.last_seen_ns, look.stamp_ns)
         life.misses = 0
 
-    def fused(self, track_id: int) -> None:
+    def fused(self, track_id: int, placed: bool = True) -> None:
         """See `Lifecycle.fused`."""
         self.lives[track_id].num_measured += 1
+        self.lives[track_id].num_placed += placed
 
     def missed(self, look: Look, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
         """See `Lifecycle.missed`."""
@@ -148,7 +155,7 @@ class CountingLifecycle:
 
     def _ends(self, life: Life, present_ns: int) -> bool:
         limit = self._rules.tentative_misses
-        unconfirmed = life.num_measured < self._rules.confirm_count
+        unconfirmed = life.num_placed < self._rules.confirm_count
         return life.counter <= 0 or (limit is not None and life.misses >= limit and unconfirmed)
 
     def expired(self, present_ns: int) -> list[int]:

@@ -225,7 +225,7 @@ class Tracker:
         states: StatesAt,
         ego: EgoPose | None,
     ) -> None:
-        """Lives of matched and missed tracks; tracks that run out end here.
+        """Lives of matched and missed tracks, where it is positions that are seen; tracks that run out end here.
 
         A track is missed by a message as a whole, so only its last batch counts.
         """
@@ -233,11 +233,12 @@ class Tracker:
         seen = self._seen[id(batch.message)]
         look = self._look(batch, ego)
         for place, track in assignment.pairs:
-            sighting = Sighting(candidates[place], states.means[track], states.covariances[track])
-            lifecycle.matched(states.track_ids[track], look, sighting)
             seen.add(states.track_ids[track])
+            if candidates[place].position_m is not None:
+                sighting = Sighting(candidates[place], states.means[track], states.covariances[track])
+                lifecycle.matched(states.track_ids[track], look, sighting)
         rows = [track for track in assignment.missed if states.track_ids[track] not in seen]
-        if not rows or not batch.last:
+        if not rows or not batch.last or not self._parts.sensors[batch.sensor].gives_position:
             return
         missed = [states.track_ids[track] for track in rows]
         positions_m = states.means[rows, :2]
@@ -258,7 +259,7 @@ class Tracker:
         results = self._parts.bank.update(batch.stamp_ns, track_ids, fused)
         for candidate, track_id, result in zip(matched, track_ids, results, strict=True):
             if result.innovation is not None:
-                self._parts.lifecycle.fused(track_id)
+                self._parts.lifecycle.fused(track_id, candidate.position_m is not None)
             self._conclude(batch, candidate, Disposition(result.status.value), track_id, result)
 
     def _give_birth(self, batch: Batch, candidate: Candidate, sensor: SensorModel, ego: EgoPose | None) -> None:

@@ -6,11 +6,10 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from support.tracking import START_NS, bearing, candidate, ms
+from support.tracking import START_NS, candidate, ms
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Detection, DetectionList, TrackStatus
-from fgtrack.models.measurement import SensorPose
 from fgtrack.models.sensors import Score, SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config
@@ -22,7 +21,6 @@ from fgtrack.tracking.lifecycle import Look, Sighting
 SENSORS = {
     "lidar": SensorModel(std={"x_m": 0.3, "y_m": 0.3}, detection_probability=0.8, clutter_per_m2=1e-3),
     "ahead": SensorModel(std={"x_m": 0.3, "y_m": 0.3}, view_range_m=50.0, field_of_view_rad=1.0),
-    "camera": SensorModel(std={"bearing_rad": 0.02}),
     "scored": SensorModel(std={"x_m": 0.3, "y_m": 0.3}, score=Score(even=3.0, scale=0.5)),
 }
 STILL = ExistenceRules(lifetime_s=1e9)
@@ -115,19 +113,6 @@ def test_a_track_that_left_the_view_of_all_sensors_ends_although_it_is_believed(
         assert life.expired(START_NS + ms(5000)) == []  # nobody looked
         ended = life.missed(look("ahead", at_ms, ego=ego(x_m=100.0)), [0], np.array([[10.0, 0.0]]), np.array([90.0]))
         assert ended == ([0] if at_ms > 540.0 else [])
-
-
-def test_bearings_neither_confirm_a_track_nor_keep_it() -> None:
-    life = lifecycle(ExistenceRules(lifetime_s=1.0, out_of_view_s=1e6))
-    life.born(0, look(), Sighting(HERE))
-    line = bearing(0.0, SensorPose())
-    for k in range(20):
-        life.matched(0, look("camera", 10.0 * k), Sighting(line, MEAN, P))
-    assert life.expired(START_NS + ms(200)) == []
-    assert life.status(0) is TrackStatus.TENTATIVE
-    for k in range(20, 400):
-        life.matched(0, look("camera", 10.0 * k), Sighting(line, MEAN, P))
-    assert life.expired(START_NS + ms(4000)) == [0]
 
 
 def test_a_better_score_makes_an_object_more_probable() -> None:
