@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # A file stays in one process, so what its tests share is made once.
 BY_FILE := --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-slow test-matrix lock audit fuzz coverage mutants check docs bench bench-full soak-live contest clean
+.PHONY: demo test test-slow test-matrix lock audit fuzz coverage mutants check docs bench bench-full soak soak-live contest clean
 
 demo: $(STAMP)
 	$(BIN)/fgtrack demo -o out/demo --overwrite
@@ -55,6 +55,10 @@ bench: $(STAMP)
 # Every estimator, number of objects, lag and delay, memory: takes several times as long.
 bench-full: $(STAMP)
 	$(BIN)/python experiments/bench_speed.py -o out/speed --full $(if $(OLDER),--against $(OLDER))
+
+# A day of race, as fast as it goes, twice: hours. HOURS=6 ESTIMATOR=smoother-banded for others.
+soak: $(STAMP)
+	$(BIN)/python experiments/bench_soak.py -o out/soak --hours $(or $(HOURS),24) --estimator $(or $(ESTIMATOR),ekf-replay)
 
 # An hour, by the clock.
 soak-live: $(STAMP)

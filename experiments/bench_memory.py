@@ -12,7 +12,7 @@ import resource
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -38,19 +38,36 @@ LAPS_START_NS = 1_700_000_000_000_000_000
 
 def laps(objects: int, duration_s: float) -> Iterator[Message]:
     """Messages of a drive of whole laps, at least `duration_s` long, in order of receipt."""
+    lap_s, speed_mps = whole_laps()
+    one_lap = scenario(objects, lap_s, speed_mps=speed_mps)
+
+    def lap(number: int, begun_ns: int) -> Iterable[Message]:
+        return simulate(replace(one_lap, start_ns=begun_ns), np.random.default_rng(number))
+
+    return joined(lap, lap_s, int(np.ceil(duration_s / lap_s)))
+
+
+def whole_laps() -> tuple[float, float]:
+    """Time of a lap of the oval in whole seconds, so that every lap begins with the same scans, and the speed then."""
     length_m = Track.through(make_oval().table[:, :2]).length_m
-    lap_s = float(round(length_m / SPEED_MPS))  # whole seconds: every lap begins with the same scans
-    one_lap = scenario(objects, lap_s, speed_mps=length_m / lap_s)
+    lap_s = float(round(length_m / SPEED_MPS))
+    return lap_s, length_m / lap_s
+
+
+def joined(lap: Callable[[int, int], Iterable[Message]], lap_s: float, count: int) -> Iterator[Message]:
+    """Messages of `count` laps in order of receipt, made lap by lap; `lap` is given the number and the begin in ns.
+
+    What a lap says of its very end is left out: the next one begins with it.
+    """
     waiting: list[Message] = []
-    for number in range(int(np.ceil(duration_s / lap_s))):
+    for number in range(count):
         begun_ns = LAPS_START_NS + number * nanoseconds(lap_s)
         ended_ns = begun_ns + nanoseconds(lap_s)
-        drawn = simulate(replace(one_lap, start_ns=begun_ns), np.random.default_rng(number))
-        waiting += [message for message in drawn if message.stamp_ns < ended_ns]
+        waiting += [message for message in lap(number, begun_ns) if message.stamp_ns < ended_ns]
         waiting.sort(key=lambda message: message.receipt_ns)
-        count = sum(message.receipt_ns < ended_ns for message in waiting)
-        yield from waiting[:count]
-        waiting = waiting[count:]
+        ready = sum(message.receipt_ns < ended_ns for message in waiting)
+        yield from waiting[:ready]
+        waiting = waiting[ready:]
     yield from waiting
 
 
