@@ -17,6 +17,13 @@ from fgtrack.models.sensors import RobustLoss
 
 _AT_ORIGIN = SensorPose()
 
+Content = tuple[tuple[str, ...], tuple[float, ...], tuple[str, ...]]
+"""Names of what is measured, numbers, names of what is assumed and of the loss; it has an order."""
+Order = tuple[int, Content]
+"""Stamp and content."""
+NOTHING: Content = (), (), ()
+"""Before every other content."""
+
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
@@ -79,9 +86,17 @@ class Measurement:
         return replace(self, model=measurement_model(self.model.components, motion))
 
     @property
-    def order(self) -> tuple[int, tuple[str, ...], tuple[float, ...]]:
+    def content(self) -> Content:
+        """All but the stamp: only what is the same in every respect is equal."""
+        numbers = [*self.z.tolist(), *self.R.ravel().tolist(), *self.pose]
+        if self.loss is None:
+            return self.model.components, tuple(numbers), self.assumed
+        return self.model.components, (*numbers, self.loss.width), (*self.assumed, self.loss.kind)
+
+    @property
+    def order(self) -> Order:
         """Place among measurements: by stamp, and at one stamp by content, so that arrival does not matter."""
-        return self.stamp_ns, self.model.components, tuple(self.z.tolist())
+        return self.stamp_ns, self.content
 
     @property
     def measured(self) -> list[int] | None:

@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.errors import CallError
+from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import seconds
-from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult
 from fgtrack.estimation.birth import initial_state
 from fgtrack.models.motion import MotionModel
@@ -81,10 +82,12 @@ class Difference(NamedTuple):
     """Largest difference of the covariances, relative to the two standard deviations that belong to the entry."""
 
 
-def difference(found: TrackState, expected: TrackState) -> Difference:
-    """How far `found` is from `expected`; a NaN stays one."""
-    sigma = np.sqrt(np.diag(expected.covariance))
-    mean = np.abs(found.mean - expected.mean) / sigma
+def difference(found: TrackState, expected: TrackState, motion: MotionModel | None = None) -> Difference:
+    """How far `found` is from `expected`; a NaN stays one. The yaw of a state of `motion` goes the short way round."""
+    sigma, off = np.sqrt(np.diag(expected.covariance)), found.mean - expected.mean
+    if motion is not None and not motion.cartesian:
+        off[YAW] = wrap_angle(off[YAW])
+    mean = np.abs(off) / sigma
     covariance = np.abs(found.covariance - expected.covariance) / np.outer(sigma, sigma)
     return Difference(float(mean.max()), float(covariance.max()))
 

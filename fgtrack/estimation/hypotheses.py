@@ -13,6 +13,7 @@ from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation import starts
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateResult
 from fgtrack.estimation.ekf import linearised
+from fgtrack.estimation.propagation import track_state
 from fgtrack.models.motion import MotionModel
 
 #: A hypothesis is dropped once it is so much less likely than the best.
@@ -109,7 +110,7 @@ class Hypotheses:
             (w * (state.covariance + np.outer(each - mean, each - mean)))
             for w, state, each in zip(self.weights, states, off, strict=True)
         )
-        return TrackState(stamp_ns, middle + mean, symmetrise(np.asarray(spread)))
+        return track_state(self._motion, stamp_ns, middle + mean, symmetrise(np.asarray(spread)))
 
     def _expected(self, estimator: Estimator, measurement: Measurement) -> tuple[FloatArray, FloatArray]:
         """Innovation (k,) and its covariance (k, k) by the state before, for estimators that do not give the latter."""

@@ -49,6 +49,11 @@ class Fix(NamedTuple):
     covariance: FloatArray
     """Shape (2, 2)."""
 
+    @property
+    def order(self) -> tuple[float, ...]:
+        """Place among fixes: by time, and at one time by content, so that arrival does not matter."""
+        return self.time_s, *self.position_m.tolist(), *self.covariance.ravel().tolist()
+
 
 class Line(NamedTuple):
     """Position and velocity at time 0, and how well the velocity is known."""
@@ -136,7 +141,7 @@ class Search:
         if self.until_ns is not None and oldest_ns > self.until_ns:
             return None
         sums, line, until_ns = _Sums(), None, None
-        ordered = sorted(fixes(), key=lambda fix: (fix.time_s, *fix.position_m.tolist()))
+        ordered = sorted(fixes(), key=lambda fix: fix.order)
         try:
             for fix in ordered:
                 sums.add(fix)

@@ -18,7 +18,7 @@ from fgtrack.estimation.base import (
     no_states,
 )
 from fgtrack.estimation.ekf import predict
-from fgtrack.estimation.propagation import wrapped_yaw
+from fgtrack.estimation.propagation import track_state, wrapped_yaw
 from fgtrack.models.motion import MotionModel
 
 
@@ -176,4 +176,4 @@ def state_of(bank: TrackBank, motion: MotionModel, track_id: int, stamp_ns: int)
     if track_id not in states.track_ids:
         raise CallError(f"track {track_id} is not known at {stamp_ns} ns: that is before its window")
     row = states.track_ids.index(track_id)
-    return TrackState(stamp_ns, states.means[row], states.covariances[row])
+    return track_state(motion, stamp_ns, states.means[row], states.covariances[row])

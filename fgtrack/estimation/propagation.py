@@ -7,7 +7,7 @@ import numpy as np
 
 from fgtrack.core.geometry import rotations, wrap_angles
 from fgtrack.core.linalg import symmetrise
-from fgtrack.core.types import SPEED, YAW, YAW_RATE, FloatArray, IntArray
+from fgtrack.core.types import SPEED, YAW, YAW_RATE, FloatArray, IntArray, TrackState
 from fgtrack.estimation.ekf import predict
 from fgtrack.models.measurement import MeasurementModel
 from fgtrack.models.motion import MotionModel
@@ -168,6 +168,11 @@ class EulerCtrv:
     def residual(self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
         """See `Propagator.residual`: the model's own."""
         return model.residual(z, z_predicted)
+
+
+def track_state(motion: MotionModel, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> TrackState:
+    """A state of `motion` as it is handed out, with the yaw in (-pi, pi]."""
+    return TrackState(stamp_ns, mean if motion.cartesian else wrapped_yaw(mean), covariance)
 
 
 def wrapped_yaw(mean: FloatArray) -> FloatArray:

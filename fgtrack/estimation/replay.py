@@ -9,24 +9,23 @@ import numpy as np
 
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.base import NOTHING, Measurement, Order, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import OneCorrection, Prediction
 from fgtrack.estimation.initiation import DEFAULT, checked_initiation
 from fgtrack.estimation.opening import Opening
+from fgtrack.estimation.propagation import track_state
 from fgtrack.estimation.recursion import EkfRecursion
 from fgtrack.estimation.rts import rts_step
 from fgtrack.estimation.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
-
-_Order = tuple[int, tuple[str, ...], tuple[float, ...]]
 
 
 @dataclass(slots=True)
 class Step:
     """A measurement of a replaying filter with the state after it."""
 
-    order: _Order
+    order: Order
     """Place among all measurements: by stamp, and at one stamp by content, so that arrival does not matter."""
     measurement: Measurement | None
     """None of the oldest step, which is the prior."""
@@ -84,19 +83,19 @@ class ReplayingFilter(WindowedFilter):
         """See `Estimator.state_at`: the filter's state, from the measurements up to that stamp."""
         before = max(bisect.bisect_right(self._steps, stamp_ns, key=_stamp) - 1, 0)
         predicted = self._predicted(self._steps[before], stamp_ns)
-        return TrackState(stamp_ns, predicted.mean, predicted.covariance)
+        return track_state(self._motion, stamp_ns, predicted.mean, predicted.covariance)
 
     def _first(self, prior: Start) -> Step:
         """The state that everything is replayed from."""
         mean, covariance = initial_state(self._motion, prior)
         opening, predicted = Opening.of(self._motion, prior, self._initiation), Prediction(mean, covariance, covariance)
-        return Step((prior.stamp_ns, (), ()), None, mean, covariance, predicted, opening)
+        return Step((prior.stamp_ns, NOTHING), None, mean, covariance, predicted, opening)
 
     def _forget_before(self, stamp_ns: int) -> None:
         del self._steps[: max(bisect.bisect_right(self._steps, stamp_ns, key=_stamp) - 1, 0)]
 
     def _fuse(self, measurement: Measurement) -> OneCorrection:
-        order = (measurement.stamp_ns, measurement.model.components, tuple(measurement.z.tolist()))
+        order = measurement.order
         place = bisect.bisect_right(self._steps, order, lo=1, key=_order)
         step, correction = self._fused(self._steps[place - 1], order, measurement)
         later = self._steps[place:]
@@ -132,7 +131,7 @@ class ReplayingFilter(WindowedFilter):
                 steps.append(step)
         return steps
 
-    def _fused(self, before: Step, order: _Order, measurement: Measurement) -> tuple[Step, OneCorrection]:
+    def _fused(self, before: Step, order: Order, measurement: Measurement) -> tuple[Step, OneCorrection]:
         """The step after `before` with `measurement`; `numpy.linalg.LinAlgError` where it is not finite."""
         predicted = self._predicted(before, measurement.stamp_ns)
         corrected = self._recursion.correct(predicted.mean, predicted.covariance, measurement)
@@ -171,7 +170,7 @@ class ReplayEkf(ReplayingFilter):
         super().__init__(motion, prior, lag_s, EkfRecursion(motion), initiation)
 
 
-def _order(step: Step) -> _Order:
+def _order(step: Step) -> Order:
     return step.order
 
 

@@ -13,7 +13,7 @@ from fgtrack.estimation.ekf import Prediction, predict_all
 from fgtrack.estimation.initiation import DEFAULT, checked_initiation, sought
 from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.estimation.replay import ReplayEkf
-from fgtrack.estimation.replayed_steps import LaterSteps, ReplayedSteps, Said, content
+from fgtrack.estimation.replayed_steps import LaterSteps, ReplayedSteps, Said
 from fgtrack.estimation.rts import rts_step
 from fgtrack.models.motion import MotionModel
 
@@ -371,7 +371,7 @@ class ReplayBank:
         if equal.size:
             first = order.place_before(tracks[equal], self._start_ns[tracks[equal]])
             for row, lowest in zip(equal.tolist(), first.tolist(), strict=True):
-                track, own = tracks[row], content(measurements[row])
+                track, own = tracks[row], measurements[row].content
                 while places[row] - 1 > lowest and order.stamps_ns[track, places[row] - 1] == stamp_ns:
                     if self._steps.content_of(int(order.numbers[track, places[row] - 1])) <= own:
                         break

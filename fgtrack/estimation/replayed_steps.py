@@ -7,7 +7,7 @@ import numpy as np
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.base import Measurement
+from fgtrack.estimation.base import NOTHING, Content, Measurement
 from fgtrack.estimation.ekf import Prediction, correct, innovations
 from fgtrack.estimation.histories import Histories
 from fgtrack.models.sensors import RobustLoss
@@ -167,10 +167,10 @@ class ReplayedSteps:
         """The states before measurements."""
         return Prediction(self.before[numbers], self.covariance_before[numbers], self.cross[numbers])
 
-    def content_of(self, number: int) -> tuple[tuple[str, ...], tuple[float, ...]]:
+    def content_of(self, number: int) -> Content:
         """Place of a step among those of one stamp: by content."""
         measurement = self.measurements[number]
-        return ((), ()) if measurement is None else content(measurement)
+        return NOTHING if measurement is None else measurement.content
 
     def _fit(self) -> None:
         """As many values as there are numbers."""
@@ -187,11 +187,6 @@ class ReplayedSteps:
         k = self.z.shape[1]
         self.z = np.pad(self.z, ((0, 0), (0, k)))
         self.R = np.pad(self.R, ((0, 0), (0, k), (0, k)))
-
-
-def content(measurement: Measurement) -> tuple[tuple[str, ...], tuple[float, ...]]:
-    """What orders measurements of one stamp, so that their arrival does not matter."""
-    return measurement.model.components, tuple(measurement.z.tolist())
 
 
 def _equal(kinds: Sequence[object]) -> list[list[int]]:

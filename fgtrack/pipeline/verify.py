@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from fgtrack.core.time import NS_PER_S, nanoseconds
-from fgtrack.core.types import YAW, TrackState
+from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Estimator, Measurement, UpdateStatus
 from fgtrack.estimation.dense_joint import Difference, dense_joint, difference, innovation_difference, rounding_bound
 from fgtrack.estimation.registry import ESTIMATORS, Claims, Factory, start_estimator
+from fgtrack.models.motion import MotionModel
 from fgtrack.pipeline import verify_streams as streams
 from fgtrack.pipeline.oracle.estimates import Estimate
 from fgtrack.pipeline.oracle.posterior import most_probable
@@ -267,13 +268,15 @@ def _nonlinear(stream: Stream, name: str, subject: Subject, converged: float | N
 
     for order, run in runs.items():
         if order != "time" and (subject.claims.nonlinear != "never" or not subject.claims.is_exact):
-            apart = _largest(difference(run.states[at], state) for at, state in runs["time"].states.items())
+            apart = _largest(
+                difference(run.states[at], state, stream.motion) for at, state in runs["time"].states.items()
+            )
             add(order, "order of stamps", apart, ORDER_TOLERANCE if at_once else converged or math.inf)
         if oracle is not None:
-            apart = _from_oracle(run.states, oracle)
+            apart = _from_oracle(run.states, oracle, stream.motion)
             add(order, "SciPy", apart, ORACLE_TOLERANCE if at_once else converged or math.inf)
             if not at_once:
-                add(order, "SciPy, as it grew", _from_oracle(run.before, oracle), GROWN_TOLERANCE)
+                add(order, "SciPy, as it grew", _from_oracle(run.before, oracle, stream.motion), GROWN_TOLERANCE)
     return checks
 
 
@@ -299,17 +302,10 @@ def _oracle(stream: Stream, subject: Subject) -> _Oracle | None:
     return stream.filtered.get if subject.claims.solves == "ekf" and not weighted else None
 
 
-def _from_oracle(states: Mapping[int, TrackState], oracle: _Oracle) -> Difference:
+def _from_oracle(states: Mapping[int, TrackState], oracle: _Oracle, motion: MotionModel) -> Difference:
     """Largest difference at the stamps at which the oracle has a state."""
     expected = {at: estimate for at in states if (estimate := oracle(at)) is not None}
-    return _largest(difference(states[at], _beside(states[at], one)) for at, one in expected.items())
-
-
-def _beside(found: TrackState, estimate: Estimate) -> TrackState:
-    """The oracle's estimate with its yaw by whole turns next to the one that was found."""
-    mean = estimate.mean.copy()
-    mean[YAW] += 2.0 * math.pi * np.round((found.mean[YAW] - mean[YAW]) / (2.0 * math.pi))
-    return TrackState(found.stamp_ns, mean, estimate.covariance)
+    return _largest(difference(states[at], TrackState(at, *one), motion) for at, one in expected.items())
 
 
 @dataclass(frozen=True)

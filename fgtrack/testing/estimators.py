@@ -38,7 +38,7 @@ _CONVERGED, _ORDER = 1e-5, 1e-9
 
 
 def _close(found: TrackState, expected: TrackState, tolerance: float, stream: Stream, what: str) -> None:
-    mean_sigma, covariance = difference(found, expected)
+    mean_sigma, covariance = difference(found, expected, stream.motion)
     at_s = (found.stamp_ns - stream.start.stamp_ns) / 1e9
     require(
         mean_sigma < tolerance and covariance < tolerance,

@@ -13,7 +13,7 @@ from fgtrack.estimation.banded.windows import Leaving, States, Windows
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
-from fgtrack.estimation.propagation import wrapped_yaw
+from fgtrack.estimation.propagation import track_state, wrapped_yaw
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.estimation.whitening import Innovations, innovations
 from fgtrack.models.motion import MotionModel
@@ -218,7 +218,7 @@ class BandedBank:
     def state_at(self, track_id: int, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`."""
         states = self.windows.states_at(np.array([self._numbers[track_id]]), np.array([stamp_ns]))
-        return TrackState(stamp_ns, states.means[0], states.covariances[0])
+        return track_state(self._motion, stamp_ns, states.means[0], states.covariances[0])
 
     def take_final(self, track_id: int) -> list[TrackState]:
         """Smoothed states of the nodes that have left the window since the last call, in order."""
@@ -228,7 +228,7 @@ class BandedBank:
         mine = final.tracks == self._numbers[track_id]
         self._final = [final.at(~mine)]
         own = final.at(mine)
-        return [TrackState(*state) for state in zip(own.stamps_ns.tolist(), *own.states, strict=True)]
+        return [track_state(self._motion, *state) for state in zip(own.stamps_ns.tolist(), *own.states, strict=True)]
 
     def take_rest(self, track_id: int) -> list[TrackState]:
         """Like `take_final`, and of the nodes that are still inside."""

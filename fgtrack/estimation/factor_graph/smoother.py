@@ -17,6 +17,7 @@ from fgtrack.estimation.factor_graph.window import Window
 from fgtrack.estimation.factor_graph.window_update import Update
 from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search
 from fgtrack.estimation.marginalised_past import Prior
+from fgtrack.estimation.propagation import track_state
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.estimation.terms import curved, linearised
 from fgtrack.estimation.whitening import whitened
@@ -124,13 +125,12 @@ class FixedLagSmoother:
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: smoothed in the past, interpolated under the motion model, predicted ahead."""
-        mean, covariance = self.window.state_at(stamp_ns)
-        return TrackState(stamp_ns, mean, covariance)
+        return track_state(self.motion, stamp_ns, *self.window.state_at(stamp_ns))
 
     def take_final(self) -> list[TrackState]:
         """Smoothed states of the nodes that have left the window since the last call, in order."""
         final, self._final = self._final, []
-        return final
+        return [track_state(self.motion, state.stamp_ns, state.mean, state.covariance) for state in final]
 
     def take_rest(self) -> list[TrackState]:
         """Like `take_final`, and of the nodes that are still inside: for when the track ends."""

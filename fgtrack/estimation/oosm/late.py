@@ -10,6 +10,7 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import OneCorrection
 from fgtrack.estimation.oosm.crossing import Past, fuse_across
 from fgtrack.estimation.oosm.history import History
+from fgtrack.estimation.propagation import track_state
 from fgtrack.estimation.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
 
@@ -33,8 +34,8 @@ class LateEkf(WindowedFilter):
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: predicted from the last stored step before that stamp."""
         step = self._history.steps[self._history.left(stamp_ns)]
-        mean = self._wrapped(step.mean)
-        return TrackState(stamp_ns, *self._history.moved(mean, step.covariance, step.stamp_ns, stamp_ns))
+        moved = self._history.moved(self._wrapped(step.mean), step.covariance, step.stamp_ns, stamp_ns)
+        return track_state(self._motion, stamp_ns, *moved)
 
     def _forget_before(self, stamp_ns: int) -> None:
         self._history.forget_before(stamp_ns)
