@@ -17,7 +17,8 @@ from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import correct
-from fgtrack.estimation.propagation import ExactPropagator, Propagator, wrapped_yaw
+from fgtrack.estimation.present import PresentStates
+from fgtrack.estimation.propagation import ExactPropagator, Propagator
 from fgtrack.models.motion import MotionModel
 
 _LONGEST_STRETCH = 64  # steps of pure prediction after which a state is stored, so that predictions stay short
@@ -266,9 +267,7 @@ class BackwardForwardBank:
         if rest_s:
             one = np.ones(len(mean), dtype=np.int64)
             mean, covariance = self._propagator.propagate(mean, covariance, one, rest_s)
-        mean, covariance = self._propagator.motion.kinematic(mean, covariance)
-        mean = wrapped_yaw(mean)
-        return [TrackState(self.present_ns, m, P) for m, P in zip(mean, covariance, strict=True)]
+        return PresentStates(self._propagator.motion, self.present_ns, mean, covariance)
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`: none."""

@@ -18,7 +18,8 @@ from fgtrack.estimation.base import (
     no_states,
 )
 from fgtrack.estimation.ekf import predict
-from fgtrack.estimation.propagation import track_state, wrapped_yaw
+from fgtrack.estimation.present import PresentStates
+from fgtrack.estimation.propagation import track_state
 from fgtrack.models.motion import MotionModel
 
 
@@ -96,11 +97,8 @@ class ObjectBank:
         if not self._estimators:
             return []
         states = [one.state_at(max(self._now_ns, one.window_ns[0])) for one in self._estimators.values()]
-        mean, covariance = self._motion.kinematic(
-            np.array([state.mean for state in states]), np.array([state.covariance for state in states])
-        )
-        mean = wrapped_yaw(mean)
-        return [TrackState(self._now_ns, m, P) for m, P in zip(mean, covariance, strict=True)]
+        means, covariances = zip(*((state.mean, state.covariance) for state in states), strict=True)
+        return PresentStates(self._motion, self._now_ns, np.array(means), np.array(covariances))
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`: none."""

@@ -11,6 +11,7 @@ from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, 
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import Prediction, predict_all
 from fgtrack.estimation.initiation import DEFAULT, checked_initiation, sought
+from fgtrack.estimation.present import PresentStates
 from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.estimation.replayed_steps import LaterSteps, ReplayedSteps, Said
@@ -140,9 +141,7 @@ class ReplayBank:
         if not self._numbers:
             return []
         known = self._predicted(tuple(self._numbers), self._now_ns)
-        mean, covariance = self._motion.kinematic(known.mean, known.covariance)
-        mean = wrapped_yaw(mean)
-        return [TrackState(self._now_ns, m, P) for m, P in zip(mean, covariance, strict=True)]
+        return PresentStates(self._motion, self._now_ns, known.mean, known.covariance)
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`: none."""

@@ -9,6 +9,7 @@ from scipy.special import chdtri
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
+from fgtrack.estimation.failures import Failure
 from fgtrack.evaluation.innovations import num_measured
 from fgtrack.evaluation.statistics import ChiSquareMean
 from fgtrack.io.run import Run, Table, digest
@@ -41,7 +42,8 @@ _NO_EGO = (
 
 def cautions(run: Run) -> list[str]:
     """What is wrong with `run` as far as its files say, a line each with cause and cure."""
-    return [*_changed(run), *_clocks(run), *_ego(run), *_surroundings(run), *_lost(run), *_window(run)]
+    found = (_changed, _clocks, _ego, _surroundings, _lost, _window, _failures)
+    return [line for of_kind in found for line in of_kind(run)]
 
 
 def noise_cautions(run: Run) -> list[str]:
@@ -168,6 +170,23 @@ def _window(run: Run) -> Iterator[str]:
         period_s = float(np.median(np.diff(stamps_ns))) / NS_PER_S
         if lag_s < period_s:
             yield f"{sensor}: one list every {period_s:.3g} s, longer than the window ({key} {lag_s:g} s): raise it"
+
+
+def _failures(run: Run) -> Iterator[str]:
+    """What failed inside the estimator; damped steps alone are none: with bearings they belong to the work."""
+    counts = {kind: n for kind, n in dict(run.meta.get("failures") or {}).items() if n and kind != Failure.STEP_DAMPED}
+    if counts:
+        first = run.meta.get("first_failure")
+        yield (
+            f"failures inside the estimator: {', '.join(f'{n} {kind}' for kind, n in counts.items())}"
+            f"{f' (the first one: {first})' if first else ''}: {_what_to_do(counts)}"
+        )
+
+
+def _what_to_do(failed: Mapping[str, int]) -> str:
+    if not failed.keys() - {Failure.DIVERGED}:
+        return "8 measurements in a row contradicted a track: look at NIS by sensor, the clocks, and the noise"
+    return "what these tracks say is worth less; look at the noise and the starts, or take another estimator"
 
 
 def _reach(run: Run) -> tuple[str, float]:

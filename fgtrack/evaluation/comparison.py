@@ -7,6 +7,7 @@ from typing import Literal
 
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.contest import BEST_NOTE, POSITION_NEES, Contest, contests, differences, is_best
+from fgtrack.evaluation.failures_table import failures_table
 from fgtrack.evaluation.lagged import WINDOW, LagMetrics
 from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics, ObjectMetrics, TruthMetrics
 from fgtrack.evaluation.multi_object import MultiObjectMetrics
@@ -30,7 +31,7 @@ _FEW_LAGS = 3
 
 def compare(*runs: OneRun | Iterable[OneRun], streaming: bool = False) -> Tables:
     """Metrics of `runs` in comparison: the `verdict`, and tables `differences`, `tracking`, `multi_object`, `lag`,
-    `consistency`, `dispositions`, `residuals_SENSOR` of every sensor, and those of `with_paper_tables`.
+    `consistency`, `dispositions`, `failures`, `residuals_SENSOR` of every sensor, and those of `with_paper_tables`.
 
     Runs of the same recording are compared sample by sample. A path is a run folder, or a folder that holds run
     folders. With `streaming` a table of that name judges what was published when it was ready, and the verdict says who
@@ -66,6 +67,7 @@ def comparison(metrics: Mapping[str, Metrics], found: Sequence[Contest] = ()) ->
     for sensor in dict.fromkeys(row.part for row in of_sensors):
         tables[f"residuals_{sensor}"] = residuals_table(sensor, [row for row in of_sensors if row.part == sensor])
     tables["dispositions"] = dispositions_table(of_sensors)
+    tables["failures"] = failures_table(rows)
     details = {"runs": {label: one.as_dict() for label, one in metrics.items()}, "notes": notes}
     return Tables(tables, details, verdict(metrics, found))
 

@@ -143,6 +143,8 @@ class Metrics:
     """Present, lagged and final states, see `lag_metrics`."""
     multi_object: MultiObjectMetrics | None = None
     """None for a run without truth, and where they are not asked for."""
+    failures: Mapping[str, int] = field(default_factory=dict)
+    """What failed while the run was made, by kind, zeros included; empty of runs that did not count it."""
 
     @property
     def precision(self) -> float:
@@ -192,6 +194,7 @@ def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationCon
         truth=None if matching is None else _truth_metrics(run, matching, options),
         lagged=lag_metrics(run, matching),
         multi_object=multi_object_metrics(run, matching, options),
+        failures=dict(run.meta.get("failures") or {}),
     )
 
 

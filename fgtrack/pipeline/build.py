@@ -11,6 +11,7 @@ from fgtrack.estimation.backward_forward import BackwardForwardBank
 from fgtrack.estimation.banded.bank import BandedBank
 from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.factor_graph import BatchBackend, IncrementalBackend, SmootherBank
+from fgtrack.estimation.failures import Failures
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.opening import initiated
 from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator, Propagator
@@ -41,6 +42,7 @@ from fgtrack.tracking.published import (
     PublishedTracker,
     SlotInbox,
 )
+from fgtrack.tracking.restarting import RestartingBank
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
 _EULER = {
@@ -63,7 +65,7 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
     `observed` may put its own parts, which watch the others, in their place.
     """
     road = build_road(config.map)
-    motion = config.motion_model()
+    motion, failures = config.motion_model(), Failures()
     origin_m = (config.ego.detection_origin_x_m, config.ego.detection_origin_y_m)
     published_order = config.lifecycle.kind == "published"
     parts = TrackerParts(
@@ -72,7 +74,8 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
         inbox=_build_inbox(config),
         preprocess=(PublishedPreprocess if published_order else Preprocess)(road, config.merge, motion, origin_m),
         association=config.association,
-        bank=build_bank(config),
+        bank=RestartingBank(lambda: build_bank(config, failures), failures),
+        failures=failures,
         motion=motion,
         lifecycle=build_lifecycle(config),
         claim_overtaken=config.lifecycle.claim_overtaken,
@@ -112,7 +115,7 @@ def _read_map(name: str, built_in: Callable[[], TrackMap]) -> TrackMap:
     return TrackMap.read(Path(name))
 
 
-def _build_backward_forward(config: Config) -> TrackBank:
+def _build_backward_forward(config: Config, failures: Failures) -> TrackBank:
     step_ns = period_ns(config.filter.frequency_hz)
     storage = _STORAGE[config.filter.clock, config.filter.present]
     steps = round(config.filter.storage_s * config.filter.frequency_hz)
@@ -130,20 +133,20 @@ def _build_backward_forward(config: Config) -> TrackBank:
     return ObjectBank(motion, one, config.filter.storage_s)
 
 
-def _build_incremental(config: Config) -> TrackBank:
-    return SmootherBank(config.motion_model(), config.smoother, IncrementalBackend, config.initiation.method)
+def _build_incremental(config: Config, failures: Failures) -> TrackBank:
+    return SmootherBank(config.motion_model(), config.smoother, IncrementalBackend, config.initiation.method, failures)
 
 
-def _build_batch(config: Config) -> TrackBank:
-    return SmootherBank(config.motion_model(), config.smoother, BatchBackend, config.initiation.method)
+def _build_batch(config: Config, failures: Failures) -> TrackBank:
+    return SmootherBank(config.motion_model(), config.smoother, BatchBackend, config.initiation.method, failures)
 
 
-def _build_banded(config: Config) -> TrackBank:
-    return BandedBank(config.motion_model(), config.smoother, config.initiation.method)
+def _build_banded(config: Config, failures: Failures) -> TrackBank:
+    return BandedBank(config.motion_model(), config.smoother, config.initiation.method, failures)
 
 
 #: Banks that are built from settings of their own.
-_BANKS: Mapping[str, Callable[[Config], TrackBank]] = {
+_BANKS: Mapping[str, Callable[[Config, Failures], TrackBank]] = {
     "ekf-backward-forward": _build_backward_forward,
     "smoother": _build_incremental,
     "smoother-batch": _build_batch,
@@ -151,8 +154,11 @@ _BANKS: Mapping[str, Callable[[Config], TrackBank]] = {
 }
 
 
-def build_bank(config: Config) -> TrackBank:
-    """The estimators of all objects. Raises `CallError` for options that the estimator does not take."""
+def build_bank(config: Config, failures: Failures | None = None) -> TrackBank:
+    """The estimators of all objects, which add to `failures`.
+
+    Raises `CallError` for options that the estimator does not take.
+    """
     build, options = _BANKS.get(config.estimator), config.options.get(config.estimator, {})
     if build is None:
         options = {"initiation": config.initiation.method, **options}
@@ -161,7 +167,7 @@ def build_bank(config: Config) -> TrackBank:
         return estimator_bank(config.estimator, config.motion_model(), lag_s, options, config.smoother.lagged_s)
     if options:
         raise CallError(f"options.{config.estimator}: set the keys of smoother or filter instead")
-    return build(config)
+    return build(config, failures or Failures())
 
 
 def build_propagator(config: Config, step_s: float) -> Propagator:

@@ -1,7 +1,6 @@
 """The tracker in a running system: messages in as they arrive, tracks out when they are wanted."""
 
 import threading
-import traceback
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -9,6 +8,7 @@ from operator import index as whole
 from pathlib import Path
 from typing import Self
 
+from fgtrack.core.errors import DataError
 from fgtrack.core.time import period_ns
 from fgtrack.core.types import (
     DetectionList,
@@ -19,14 +19,12 @@ from fgtrack.core.types import (
     TrackReport,
     UpdateRecord,
 )
-from fgtrack.pipeline.build import build_bank, build_tracker
+from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.lateness import Lateness, Receptions, TickTimes, TickTiming
 from fgtrack.pipeline.pace import Clock, WallClock
 from fgtrack.pipeline.shipped import read_config, settings_of
 from fgtrack.tracking.inbox import records
-from fgtrack.tracking.restarting import RestartingBank
-from fgtrack.tracking.tracker import TrackerParts
 
 __all__ = ["TrackOutput", "Tracker", "TracksAt"]
 
@@ -55,8 +53,7 @@ class Tracker:
 
     def __init__(self, config: Config, clock: Clock | None = None) -> None:
         self.config = config
-        self._bank = RestartingBank(lambda: build_bank(config))
-        self._tracker = build_tracker(config, self._guarded)
+        self._tracker = build_tracker(config, lambda parts: replace(parts, answers=(DataError,)))
         self._refused: Counter[str] = Counter()
         self._records: list[UpdateRecord] = []
         self._counts: dict[str, Counter[Disposition]] = {}
@@ -81,13 +78,6 @@ class Tracker:
         """A tracker with a shipped configuration by name, one from a YAML file, or a `Config`; see `fgtrack.replay`."""
         return cls(read_config(config, settings_of(set), track_map=map, pit_map=pit_map, estimator=estimator))
 
-    def _guarded(self, parts: TrackerParts) -> TrackerParts:
-        return replace(parts, bank=self._bank, on_failure=self._on_failure)
-
-    def _on_failure(self, error: Exception) -> None:
-        self._bank.failures["list failed"] += 1
-        self._bank.last_failure = "".join(traceback.format_exception(error))
-
     @property
     def refused(self) -> Mapping[str, int]:
         """Messages, ticks and output stamps that were not used, by reason."""
@@ -106,14 +96,14 @@ class Tracker:
 
     @property
     def failures(self) -> Mapping[str, int]:
-        """What was done after failures inside: `track restarted`, `track ended`, `birth failed`, `list failed`."""
+        """How often what failed inside, and what was done about it; see `Failure` for the kinds."""
         with self._turn:
-            return Counter(self._bank.failures)
+            return {failure.value: count for failure, count in self._tracker.failures.counts.items()}
 
     @property
     def last_failure(self) -> str | None:
         """Traceback of the newest failure inside, to report it."""
-        return self._bank.last_failure
+        return self._tracker.failures.last
 
     @property
     def lateness(self) -> Mapping[str, Lateness]:

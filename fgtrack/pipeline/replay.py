@@ -205,6 +205,7 @@ def _drive(
         "detections_received": feed.received_detections,
         "detections_ignored": feed.ignored_detections,
         "ego_refused": dict(tracker.refused_ego),
+        **tracker.failures.as_meta(),
         "broken_off": feed.broken,
     }
     return writer.finish(meta), feed.broken, None if node.period_ns is None else node.misses

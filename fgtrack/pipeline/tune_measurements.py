@@ -8,8 +8,9 @@ import numpy as np
 
 from fgtrack.core.geometry import rotation
 from fgtrack.core.linalg import congruence
-from fgtrack.core.types import FloatArray, Message, SmoothedReport, TrackState, UpdateRecord
+from fgtrack.core.types import FloatArray, Message, UpdateRecord
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult
+from fgtrack.estimation.forwarding import ForwardingBank
 from fgtrack.estimation.likelihood.series import Observation, Series, positive_part
 from fgtrack.io.run import Run
 from fgtrack.models.correlated_errors import whole_error
@@ -118,11 +119,11 @@ def observation(name: str, sensor: SensorModel, measurement: Measurement, own: b
     return Observation(name, measurement, measured, assumed, T, np.zeros_like(R), positive_part(R - known))
 
 
-class _RecordingBank:
-    """Another `TrackBank`; keeps the first state and the fused measurements of every track."""
+class _RecordingBank(ForwardingBank):
+    """Keeps the first state and the fused measurements of every track of another `TrackBank`."""
 
     def __init__(self, bank: TrackBank, preprocess: _WatchedPreprocess) -> None:
-        self._bank = bank
+        super().__init__(bank)
         self._preprocess = preprocess
         self._starts: dict[int, Start] = {}
         self._fused: dict[int, list[Observation]] = {}
@@ -134,34 +135,11 @@ class _RecordingBank:
             for track_id, start in self._starts.items()
         ]
 
-    @property
-    def present_ns(self) -> int:
-        """See `TrackBank.present_ns`."""
-        return self._bank.present_ns
-
-    @property
-    def window_start_ns(self) -> int:
-        """See `TrackBank.window_start_ns`."""
-        return self._bank.window_start_ns
-
-    @property
-    def track_ids(self) -> tuple[int, ...]:
-        """See `TrackBank.track_ids`."""
-        return self._bank.track_ids
-
-    def advance(self, now_ns: int) -> None:
-        """See `TrackBank.advance`."""
-        self._bank.advance(now_ns)
-
-    def states_at(self, stamp_ns: int) -> StatesAt:
-        """See `TrackBank.states_at`."""
-        return self._bank.states_at(stamp_ns)
-
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
-        results = self._bank.update(stamp_ns, track_ids, measurements)
+        results = super().update(stamp_ns, track_ids, measurements)
         for track_id, measurement, result in zip(track_ids, measurements, results, strict=True):
             if result.innovation is not None:
                 self._fused[track_id].append(self._preprocess.observation(measurement))
@@ -169,18 +147,6 @@ class _RecordingBank:
 
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
-        self._bank.birth(track_id, prior)
+        super().birth(track_id, prior)
         self._starts[track_id] = prior
         self._fused[track_id] = []
-
-    def remove(self, track_id: int) -> None:
-        """See `TrackBank.remove`."""
-        self._bank.remove(track_id)
-
-    def present(self) -> list[TrackState]:
-        """See `TrackBank.present`."""
-        return self._bank.present()
-
-    def smoothed(self) -> list[SmoothedReport]:
-        """See `TrackBank.smoothed`."""
-        return self._bank.smoothed()

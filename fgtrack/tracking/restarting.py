@@ -1,60 +1,51 @@
 """A bank that outlives the failures of its estimators: a track that fails begins anew, or ends, and is counted."""
 
 import traceback
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
 
 import numpy as np
 
-from fgtrack.core.errors import DataError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import ACCEL, SPEED, YAW, YAW_RATE, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
+from fgtrack.estimation.failures import Failure, Failures
+from fgtrack.estimation.forwarding import ForwardingBank
+from fgtrack.tracking.soundness import Divergence, are_finite, faults
 
 __all__ = ["RestartingBank"]
 
 _T = TypeVar("_T")
+_SHAPES = {(n, n, n) for n in (5, 6)}
 
 
-class RestartingBank:
-    """Stands before a bank, and takes care of what it raises and of states that are not finite.
+class RestartingBank(ForwardingBank):
+    """Stands before a bank, and takes care of what it raises and of states that cannot be published (see `faults`).
 
     A track that fails begins anew from its last good state, under the same id; what it knew of the past is lost. If it
     fails again before an update has succeeded, it ends. Where it cannot be told which track failed, all begin anew in a
-    new bank. A `DataError` is an answer, no failure, and is let through.
+    new bank. A `DataError` is an answer, no failure, and is let through; so is a `CallError` until a first track could
+    be started: the estimator cannot be made as it is configured.
 
     Parameters
     ----------
     make
         Makes an empty bank.
+    failures
+        Counts.
     """
 
-    def __init__(self, make: Callable[[], TrackBank]) -> None:
+    def __init__(self, make: Callable[[], TrackBank], failures: Failures | None = None) -> None:
+        super().__init__(make())
         self._make = make
-        self._bank = make()
         self._now_ns = 0
         self._starts: dict[int, Start] = {}  # by track: how it began
         self._good: dict[int, TrackState] = {}  # by track: its last good state
         self._suspects: dict[int, bool] = {}  # tracks that have failed: whether an update has succeeded since
-        self.failures: Counter[str] = Counter()
-        """What was done after failures: `track restarted`, `track ended`, `birth failed`."""
-        self.last_failure: str | None = None
-        """Traceback of the newest one."""
-
-    @property
-    def present_ns(self) -> int:
-        """See `TrackBank.present_ns`."""
-        return self._bank.present_ns
-
-    @property
-    def window_start_ns(self) -> int:
-        """See `TrackBank.window_start_ns`."""
-        return self._bank.window_start_ns
-
-    @property
-    def track_ids(self) -> tuple[int, ...]:
-        """See `TrackBank.track_ids`."""
-        return self._bank.track_ids
+        self._can_start = False
+        self._divergence = Divergence()
+        self.failures = failures or Failures()
+        """What has failed, and what was done about it."""
 
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
@@ -64,16 +55,17 @@ class RestartingBank:
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`; states that are not finite are left out."""
         states = self._ask(lambda bank: bank.states_at(stamp_ns))
-        sound = np.isfinite(states.means).all(axis=1) & np.isfinite(states.covariances).all(axis=(1, 2))
-        if sound.all():
+        if are_finite(states.means, states.covariances):
             return states
-        rows = np.flatnonzero(sound)
+        rows = [row for row in range(len(states.means)) if are_finite(states.means[row], states.covariances[row])]
         return StatesAt(tuple(states.track_ids[row] for row in rows), states.means[rows], states.covariances[rows])
 
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
         """See `TrackBank.update`; tracks that have failed before are updated alone, to be told from the others."""
+        if not self._suspects:
+            return self._update(stamp_ns, track_ids, measurements)
         alone = [[place] for place, track_id in enumerate(track_ids) if track_id in self._suspects]
         others = [place for place, track_id in enumerate(track_ids) if track_id not in self._suspects]
         results: dict[int, UpdateResult] = {}
@@ -87,25 +79,40 @@ class RestartingBank:
     ) -> list[UpdateResult]:
         try:
             results = self._bank.update(stamp_ns, track_ids, measurements)
+            self._count(track_ids, measurements, results)
         except DataError:
             raise
-        except Exception:
-            self._noted()
+        except Exception as error:
+            self._note(error)
+            self.failures.add(Failure.UPDATE_FAILED, len(track_ids))
             for track_id in track_ids:
-                self._restart(track_id)
+                self._restart(track_id, Failure.UPDATE_FAILED)
             return [UpdateResult(UpdateStatus.FAILED) for _ in track_ids]
         for track_id in self._suspects.keys() & set(track_ids):
             self._suspects[track_id] = True
         return results
+
+    def _count(
+        self, track_ids: Sequence[int], measurements: Sequence[Measurement], results: Sequence[UpdateResult]
+    ) -> None:
+        for result in results:
+            if result.status is UpdateStatus.FAILED:
+                self.failures.add(Failure.UPDATE_FAILED)
+        diverged = self._divergence.count(track_ids, measurements, results)
+        if diverged:
+            self.failures.add(Failure.DIVERGED, diverged)
 
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`; where it fails, there is no such track afterwards."""
         try:
             self._bank.birth(track_id, prior)
             self._starts[track_id] = prior
-        except Exception:
-            self._noted()
-            self.failures["birth failed"] += 1
+            self._can_start = True
+        except Exception as error:
+            if isinstance(error, CallError) and not self._can_start:
+                raise
+            self._note(error)
+            self.failures.add(Failure.BIRTH_FAILED)
             self._remove(track_id)
 
     def remove(self, track_id: int) -> None:
@@ -113,24 +120,30 @@ class RestartingBank:
         self._remove(track_id)
 
     def present(self) -> list[TrackState]:
-        """See `TrackBank.present`; all are finite."""
+        """See `TrackBank.present`; all are sound."""
         while True:  # a track that is not sound twice in a row ends
-            states = self._ask(lambda bank: bank.present())
-            known = dict(zip(self._bank.track_ids, states, strict=True))
-            unsound = [track_id for track_id, state in known.items() if not _is_sound(state)]
-            if not unsound:
+            states = self._ask(_present)
+            track_ids = self._bank.track_ids
+            found = faults(states)
+            if not found:
                 break
-            self.last_failure = f"the states of the tracks {', '.join(map(str, unsound))} are not finite"
-            for track_id in unsound:
-                self._restart(track_id)
-        self._good = known
+            for place, fault in found.items():
+                self.failures.add(fault)
+                self.failures.note(f"the state of track {track_ids[place]} is {fault.value}")
+            for place, fault in found.items():
+                self._restart(track_ids[place], fault)
+        self._good = dict(zip(track_ids, states, strict=True))
         for track_id in [i for i, updated in self._suspects.items() if updated]:
             del self._suspects[track_id]
         return states
 
     def smoothed(self) -> list[SmoothedReport]:
-        """See `TrackBank.smoothed`; those that are not finite are left out."""
-        return [report for report in self._ask(lambda bank: bank.smoothed()) if _is_sound(report.state)]
+        """See `TrackBank.smoothed`; those that are not sound are left out."""
+        reports = self._ask(lambda bank: bank.smoothed())
+        found = faults([report.state for report in reports])
+        for fault in found.values():
+            self.failures.add(fault)
+        return [report for place, report in enumerate(reports) if place not in found] if found else reports
 
     def _ask(self, question: Callable[[TrackBank], _T]) -> _T:
         """The bank's answer to what concerns all tracks; if it has none, that of a new bank."""
@@ -138,18 +151,18 @@ class RestartingBank:
             return question(self._bank)
         except DataError:
             raise
-        except Exception:
-            self._noted()
+        except Exception as error:
+            self._raised(error)
         self._rebuild(self._bank.track_ids)
         try:
             return question(self._bank)
-        except Exception:
-            self._noted()
+        except Exception as error:
+            self._raised(error)
         guilty = [track_id for track_id in self._bank.track_ids if not self._answers_alone(track_id, question)]
         for track_id in guilty or self._bank.track_ids:
-            self._ended(track_id)
+            self._ended(track_id, Failure.ESTIMATOR_RAISED)
         self._rebuild([track_id for track_id in self._bank.track_ids if track_id in self._starts])
-        return question(self._bank)
+        return self._without_excuse(question)
 
     def _answers_alone(self, track_id: int, question: Callable[[TrackBank], object]) -> bool:
         bank = self._make()
@@ -164,11 +177,18 @@ class RestartingBank:
     def _rebuild(self, track_ids: Iterable[int]) -> None:
         """A new bank with these tracks, each from its last good state."""
         self._bank = self._make()
-        self._bank.advance(self._now_ns)
+        self._without_excuse(lambda bank: bank.advance(self._now_ns))
         for track_id in track_ids:
-            self._born_again(track_id)
+            self._born_again(track_id, Failure.ESTIMATOR_RAISED)
 
-    def _restart(self, track_id: int) -> None:
+    def _without_excuse(self, question: Callable[[TrackBank], _T]) -> _T:
+        """The bank's answer, which it must give: its tracks are new, or there are none."""
+        try:
+            return question(self._bank)
+        except Exception as error:
+            raise DataError(f"the estimator fails whatever its tracks are ({type(error).__name__}: {error})") from error
+
+    def _restart(self, track_id: int, failure: Failure) -> None:
         """Begin a track anew in this bank; one that has failed before, without success since, ends."""
         if track_id not in self._bank.track_ids:
             return  # it has ended with another one
@@ -176,25 +196,26 @@ class RestartingBank:
         start = self._start(track_id)
         self._remove(track_id)
         if again:
-            self.failures["track ended"] += 1
+            self.failures.end(track_id, self._now_ns, failure)
             return
         self._starts[track_id] = start
-        self._born_again(track_id)
+        self._born_again(track_id, failure)
 
-    def _born_again(self, track_id: int) -> None:
+    def _born_again(self, track_id: int, failure: Failure) -> None:
         start = self._start(track_id)
         try:
             self._bank.birth(track_id, start)
-        except Exception:
-            self._noted()
-            self._ended(track_id)
+        except Exception as error:
+            self._note(error)
+            self._ended(track_id, failure)
             self._remove(track_id)
             return
-        self.failures["track restarted"] += 1
+        self.failures.add(Failure.TRACK_RESTARTED)
         self._suspects[track_id] = False
+        self._divergence.forget(track_id)
 
-    def _ended(self, track_id: int) -> None:
-        self.failures["track ended"] += 1
+    def _ended(self, track_id: int, failure: Failure) -> None:
+        self.failures.end(track_id, self._now_ns, failure)
         self._forget(track_id)
 
     def _remove(self, track_id: int) -> None:
@@ -204,25 +225,34 @@ class RestartingBank:
             return
         try:
             self._bank.remove(track_id)
-        except Exception:
-            self._noted()
+        except Exception as error:
+            self._raised(error)
             self._rebuild([other for other in self._bank.track_ids if other != track_id])
 
     def _forget(self, track_id: int) -> None:
         for known in (self._starts, self._good, self._suspects):
             known.pop(track_id, None)
+        self._divergence.forget(track_id)
 
     def _start(self, track_id: int) -> Start:
         """What is known of a track: its last good state, or how it began."""
         state = self._good.get(track_id)
         return self._starts[track_id] if state is None else _start_at(state)
 
-    def _noted(self) -> None:
-        self.last_failure = traceback.format_exc()
+    def _raised(self, error: Exception) -> None:
+        self.failures.add(Failure.ESTIMATOR_RAISED)
+        self._note(error)
+
+    def _note(self, error: Exception) -> None:
+        self.failures.note(f"{type(error).__name__}: {error}", traceback.format_exc())
 
 
-def _is_sound(state: TrackState) -> bool:
-    return bool(np.isfinite(state.mean).all() and np.isfinite(state.covariance).all())
+def _present(bank: TrackBank) -> list[TrackState]:
+    states, many = bank.present(), len(bank.track_ids)
+    shapes = {(*state.mean.shape, *state.covariance.shape) for state in states}
+    if len(states) != many or not shapes <= _SHAPES:
+        raise ValueError(f"{many} tracks have {len(states)} states of shapes {', '.join(map(str, shapes))}")
+    return states
 
 
 def _start_at(state: TrackState) -> Start:

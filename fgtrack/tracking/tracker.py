@@ -1,13 +1,14 @@
 """The tracker: what happens at a tick, in the order of the paper's algorithm (Karle et al. 2023, figure 2)."""
 
+import traceback
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
 
-from fgtrack.core.errors import CallError, DataError, did_you_mean
+from fgtrack.core.errors import CallError, DataError, FgtrackError, did_you_mean
 from fgtrack.core.time import seconds
 from fgtrack.core.types import (
     DetectionList,
@@ -22,6 +23,7 @@ from fgtrack.core.types import (
 )
 from fgtrack.estimation.base import StatesAt, TrackBank, UpdateResult, no_states
 from fgtrack.estimation.ekf import propagated
+from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.object_bank import state_of, states_of
 from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.models.motion import MotionModel
@@ -53,8 +55,10 @@ class TrackerParts:
     birth: Birth
     road: Road
     ego_errors: EgoErrors = field(default_factory=IndependentErrors)
-    on_failure: Callable[[Exception], None] | None = None
-    """Told what the processing of a batch has raised, which then ends as failed; None lets it out."""
+    failures: Failures = field(default_factory=Failures)
+    """Counts what fails inside, shared with `bank`."""
+    answers: tuple[type[Exception], ...] = (FgtrackError,)
+    """Exceptions that the processing of a batch lets out; after any other one, it ends as failed."""
 
 
 def check_sensor(name: str, sensors: Mapping[str, SensorModel]) -> None:
@@ -80,6 +84,8 @@ class Tracker:
         self._next_id = 0
         self._records: list[UpdateRecord] = []
         self._seen: dict[int, set[int]] = {}  # in this tick, by message: tracks that it has matched or started
+        self.failures = parts.failures
+        """What has failed inside, and what was done about it."""
         self.refused_ego: Counter[str] = Counter()
         """Ego messages that were not used, by reason."""
 
@@ -105,7 +111,8 @@ class Tracker:
             self._process_if_possible(batch)
         updates, self._records = tuple(self._records), []
         bank = self._parts.bank
-        tracks = tuple([self._report(*track) for track in zip(bank.track_ids, bank.present(), strict=True)])
+        states = bank.present()  # first: tracks may end by it
+        tracks = tuple([self._report(*track) for track in zip(bank.track_ids, states, strict=True)])
         return TickReport(self._tick, now_ns, tracks, updates, tuple(bank.smoothed()))
 
     def finish(self) -> tuple[SmoothedReport, ...]:
@@ -138,16 +145,15 @@ class Tracker:
         return tuple(self._report(track_id, TrackState(stamp_ns, mean, P)) for track_id, mean, P in rows)
 
     def _process_if_possible(self, batch: Batch) -> None:
-        """Process a batch; where that raises and someone is told, what is left of the batch ends as failed."""
+        """Process a batch; where that raises what is no answer, what is left of the batch ends as failed."""
         first = len(self._records)
         try:
             self._process(batch)
-        except DataError:
-            raise
         except Exception as error:
-            if self._parts.on_failure is None:
+            if isinstance(error, self._parts.answers):
                 raise
-            self._parts.on_failure(error)
+            self.failures.add(Failure.LIST_FAILED)
+            self.failures.note(f"{type(error).__name__}: {error}", "".join(traceback.format_exception(error)))
             ended = {one.index for one in self._records[first:]}
             left = [index for index in batch.indices if index not in ended]
             self._records += [record(batch.message, index, Disposition.FAILED) for index in left]

@@ -113,7 +113,7 @@ def check(done: Drive, num_detections: int) -> None:
     assert len(done.smoothers) == VEHICLES
     assert sum(done.statuses.values()) == num_detections - VEHICLES
     assert done.statuses[UpdateStatus.FAILED] == 0
-    assert [smoother.num_rebuilt for smoother in done.smoothers] == [0] * VEHICLES
+    assert [smoother.failures.counts for smoother in done.smoothers] == [{}] * VEHICLES
     late = done.statuses[UpdateStatus.OUT_OF_SEQUENCE] + done.statuses[UpdateStatus.BEYOND_WINDOW]
     assert late > 0.35 * num_detections
     assert done.statuses[UpdateStatus.BEYOND_WINDOW] > 0.005 * num_detections

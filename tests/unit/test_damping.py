@@ -1,5 +1,7 @@
 """Steps of the smoother that go further than their linearisation holds are taken again with damping."""
 
+from collections import Counter
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from fgtrack.estimation.banded.windows import Windows
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother
 from fgtrack.estimation.factor_graph.window import Window
+from fgtrack.estimation.failures import Failure
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CV
@@ -54,7 +57,7 @@ def test_bearings_alone_lead_where_levenberg_marquardt_does(seed: int) -> None:
     assert np.abs((state.mean - slow.mean) / std).max() < 0.1
     d = state.mean - truth
     assert d @ np.linalg.solve(state.covariance, d) < 23.5  # one in ten thousand
-    assert other.num_damped == 0
+    assert not other.failures.counts
 
 
 def tracked_together(streams: list[list[Measurement]]) -> BandedBank:
@@ -70,7 +73,7 @@ def tracked_together(streams: list[list[Measurement]]) -> BandedBank:
 def test_smoother_banded_takes_the_same_steps_again() -> None:
     streams = [heard(np.random.default_rng(seed))[0] for seed in range(4)]
     bank, expected = tracked_together(streams), [tracked(stream) for stream in streams]
-    assert bank.windows.num_damped == sum(one.num_damped for one in expected)
+    assert bank.windows.failures.counts == sum((one.failures.counts for one in expected), Counter())
     for track_id, one in enumerate(expected):
         state, other = bank.state_at(track_id, streams[0][-1].stamp_ns), one.state_at(streams[0][-1].stamp_ns)
         assert np.abs((state.mean - other.mean) / np.sqrt(np.diag(other.covariance))).max() < 1e-6
@@ -104,5 +107,6 @@ def test_without_damping_some_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_positions_need_none() -> None:
     model = measurement_model(("x_m", "y_m"), MOTION)
     fixes = [Measurement(k * NS_PER_S, model, np.array([5.0 * k, 1.0]), np.eye(2)) for k in range(5)]
-    assert tracked(fixes).num_damped == 0
-    assert sum(tracked(heard(np.random.default_rng(seed))[0]).num_damped for seed in range(4)) > 0
+    assert not tracked(fixes).failures.counts
+    found = [tracked(heard(np.random.default_rng(seed))[0]).failures.counts for seed in range(4)]
+    assert sum(found, Counter())[Failure.STEP_DAMPED] > 0

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Disposition
+from fgtrack.estimation.failures import Failures
 from fgtrack.evaluation.comparison import BACKWARD_FORWARD_NOTE, compare, comparison
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.runs import JudgedRun, labelled
@@ -35,6 +36,7 @@ TABLES = {
     "consistency": "of",
     **{f"residuals_{sensor}": None for sensor in SENSORS},
     "dispositions": "sensor",
+    "failures": None,
     "residuals": None,
     "residuals_by": "of",
     "sensed": "sensor",
@@ -54,7 +56,7 @@ def a_run(folder: Path, estimator: str, *, truth: bool = True) -> Run:
     }
     rows = [*WEST.truth(range(4)), *ROUND.truth(range(4))] if truth else []
     smoothed = {3: [WEST.later(k, 1, along_m=0.1) for k in range(2)]} if estimator == "smoother" else {}
-    meta = {"estimator": estimator}
+    meta = {"estimator": estimator, "failures": Failures().as_meta()["failures"]}
     return write_run(folder, tracks, truth=rows, updates=updates, smoothed=smoothed, meta=meta)
 
 

@@ -8,6 +8,7 @@ import pytest
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateResult, UpdateStatus
+from fgtrack.estimation.failures import EndedTrack, Failure
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.motion import CTRA, CTRV, MotionModel
@@ -49,7 +50,7 @@ def bank_of(*x_m: float, motion: MotionModel = MOTION) -> RestartingBank:
         bank.birth(track_id, Start(stamp_ns=0, position_m=(x, 0.0), yaw_rad=0.0, speed_mps=10.0, speed_std_mps=1.0))
     for k in range(1, 6):
         step(bank, 100 * MS * k, [x + 1.0 * k for x in x_m])
-    assert bank.failures == {}
+    assert counted(bank) == {}
     return bank
 
 
@@ -58,6 +59,11 @@ def step(bank: RestartingBank, stamp_ns: int, x_m: Sequence[float]) -> tuple[lis
     bank.advance(stamp_ns)
     measured = [Measurement.of(stamp_ns, x_m=x, y_m=0.0, std={"x_m": 0.3, "y_m": 0.3}) for x in x_m]
     return bank.update(stamp_ns, bank.track_ids, measured), bank.present()
+
+
+def counted(bank: RestartingBank) -> dict[str, int]:
+    """What was done about failures, and the failures."""
+    return {failure.value: count for failure, count in bank.failures.counts.items()}
 
 
 def states(bank: RestartingBank) -> dict[int, TrackState]:
@@ -70,8 +76,8 @@ def test_a_track_whose_update_raises_begins_anew_where_it_was_and_is_no_surer_th
     calm.advance(600 * MS)
     [result], [after] = step(bank, 600 * MS, [1000.0])
     assert result == UpdateResult(UpdateStatus.FAILED)
-    assert bank.failures == {"track restarted": 1}
-    assert "singular" in str(bank.last_failure)
+    assert counted(bank) == {"update failed": 1, "track restarted": 1}
+    assert "singular" in str(bank.failures.last)
     travelled = np.array([before.mean[3] * 0.1, 0.0, 0.0, 0.0, 0.0])
     np.testing.assert_allclose(after.mean, before.mean + travelled, atol=1e-9)
     surer = after.covariance - calm.present()[0].covariance
@@ -86,7 +92,8 @@ def test_a_track_that_fails_again_before_an_update_has_succeeded_ends() -> None:
     bank = bank_of(0.0)
     step(bank, 600 * MS, [1000.0])
     step(bank, 700 * MS, [1000.0])
-    assert (bank.failures, bank.track_ids) == ({"track restarted": 1, "track ended": 1}, ())
+    assert (counted(bank), bank.track_ids) == ({"update failed": 2, "track restarted": 1, "track ended": 1}, ())
+    assert bank.failures.ended == [EndedTrack(0, 700 * MS, Failure.UPDATE_FAILED)]
     bank.remove(0)  # as the tracker does when its time has come
 
 
@@ -94,17 +101,17 @@ def test_a_track_that_fails_again_after_an_update_has_succeeded_begins_anew_agai
     bank = bank_of(0.0)
     for stamp_ns, x_m in ((600, 1000.0), (700, 7.0), (800, 1000.0), (900, 9.0)):
         step(bank, stamp_ns * MS, [x_m])
-    assert (bank.failures, bank.track_ids) == ({"track restarted": 2}, (0,))
+    assert (counted(bank), bank.track_ids) == ({"update failed": 2, "track restarted": 2}, (0,))
 
 
 def test_tracks_that_failed_together_are_told_apart_by_their_next_updates() -> None:
     bank = bank_of(0.0, 100.0, 200.0)
     step(bank, 600 * MS, [6.0, 1000.0, 206.0])
-    assert bank.failures == {"track restarted": 3}  # nobody knows which of them it was
+    assert counted(bank) == {"update failed": 3, "track restarted": 3}  # nobody knows which of them it was
     results, _ = step(bank, 700 * MS, [7.0 if i == 0 else 1000.0 if i == 1 else 207.0 for i in bank.track_ids])
     assert [result.status for result in results].count(UpdateStatus.FAILED) == 1
     assert sorted(bank.track_ids) == [0, 2]
-    assert bank.failures == {"track restarted": 3, "track ended": 1}
+    assert counted(bank) == {"update failed": 4, "track restarted": 3, "track ended": 1}
     assert states(bank)[2].mean[0] == pytest.approx(207.0, abs=0.5)
 
 
@@ -118,8 +125,8 @@ def test_a_measurement_that_is_said_to_have_failed_is_not_fused() -> None:
 def test_a_track_whose_state_is_not_finite_begins_anew() -> None:
     bank = bank_of(0.0, 100.0)
     _, found = step(bank, 600 * MS, [6.0, 2000.0])
-    assert bank.failures == {"track restarted": 1}
-    assert bank.last_failure == "the states of the tracks 1 are not finite"
+    assert counted(bank) == {"not finite": 1, "track restarted": 1}
+    assert bank.failures.last == "the state of track 1 is not finite"
     assert all(np.isfinite(state.mean).all() for state in found)
     assert states(bank)[1].mean[0] == pytest.approx(106.0, abs=0.5)
 
@@ -134,7 +141,7 @@ def test_states_that_are_not_finite_are_not_offered() -> None:
 def test_where_all_are_asked_and_one_raises_all_begin_anew() -> None:
     bank = bank_of(0.0, 100.0)
     _, found = step(bank, 600 * MS, [6.0, 4000.0])
-    assert bank.failures == {"track restarted": 2}
+    assert counted(bank) == {"estimator raised": 1, "track restarted": 2}
     assert [round(state.mean[0]) for state in found] == [6, 106]
 
 
@@ -155,7 +162,7 @@ def test_a_track_that_even_anew_has_no_state_ends_and_the_others_stay() -> None:
         bank.birth(track_id, Start(position_m=(x_m, 0.0), yaw_rad=0.0, speed_mps=10.0))
     assert len(bank.present()) == 1
     assert bank.track_ids == (0,)
-    assert bank.failures["track ended"] == 1
+    assert bank.failures.counts[Failure.TRACK_ENDED] == 1
 
 
 def test_a_birth_that_raises_leaves_no_track() -> None:
@@ -166,14 +173,14 @@ def test_a_birth_that_raises_leaves_no_track() -> None:
     bank.advance(0)
     bank.birth(0, Start())
     assert (bank.track_ids, bank.present()) == ((), [])
-    assert bank.failures == {"birth failed": 1}
+    assert counted(bank) == {"birth failed": 1}
 
 
 def test_bad_data_is_an_answer_and_is_let_through() -> None:
     bank = bank_of(0.0)
     with pytest.raises(DataError, match="not this one"):
         step(bank, 600 * MS, [3000.0])
-    assert bank.failures == {}
+    assert counted(bank) == {}
 
 
 def test_a_bank_that_cannot_remove_a_track_is_made_anew_without_it() -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from fgtrack.core.types import Detection, DetectionList, EgoState, TrackReport, TrackState, TruthState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult
+from fgtrack.estimation.failures import Failures
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.pipeline.config import Config
@@ -150,11 +151,11 @@ class FailingBank(ObjectBank):
 
 @pytest.fixture
 def failing(monkeypatch: pytest.MonkeyPatch) -> Iterator[Tracker]:
-    def build(config: Config) -> TrackBank:
+    def build(config: Config, failures: Failures) -> TrackBank:
         motion = config.motion_model()
         return FailingBank(motion, lambda start: ReplayEkf(motion, start, 1.0), 1.0)
 
-    monkeypatch.setattr("fgtrack.pipeline.live.build_bank", build)
+    monkeypatch.setattr("fgtrack.pipeline.build.build_bank", build)
     FailingBank.fails = set()
     yield tracker_of()
     assert FailingBank.fails == set()
@@ -163,10 +164,10 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Iterator[Tracker]:
 @pytest.mark.parametrize(
     ("method", "failures", "dispositions"),
     [
-        ("update", {"track restarted": 2}, {"birth": 2, "in_sequence": 76, "failed": 2}),
-        ("advance", {"track restarted": 2}, {"birth": 2, "in_sequence": 76, "too_old": 2}),
-        ("states_at", {"track restarted": 2}, {"birth": 2, "in_sequence": 76, "too_old": 2}),
-        ("present", {"track restarted": 2}, {"birth": 2, "in_sequence": 78}),
+        ("update", {"update failed": 2, "track restarted": 2}, {"birth": 2, "in_sequence": 76, "failed": 2}),
+        ("advance", {"estimator raised": 1, "track restarted": 2}, {"birth": 2, "in_sequence": 76, "too_old": 2}),
+        ("states_at", {"estimator raised": 1, "track restarted": 2}, {"birth": 2, "in_sequence": 76, "too_old": 2}),
+        ("present", {"estimator raised": 1, "track restarted": 2}, {"birth": 2, "in_sequence": 78}),
     ],
 )
 def test_what_an_estimator_raises_neither_ends_the_tracker_nor_the_tracks(

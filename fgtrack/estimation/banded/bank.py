@@ -12,7 +12,9 @@ from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
 from fgtrack.estimation.banded.windows import Leaving, States, Windows
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.birth import initial_state
+from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
+from fgtrack.estimation.present import PresentStates
 from fgtrack.estimation.propagation import track_state, wrapped_yaw
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.estimation.whitening import Innovations, innovations
@@ -60,18 +62,26 @@ class BandedBank:
         Window, late policy, relinearisation and outputs.
     initiation
         How the direction of travel of a new object is found where nothing else gives one, see `Initiation`.
+    failures
+        Counts how often windows are built anew and steps are damped.
 
     Raises `CallError` for an objective other than `reweighted`.
     """
 
-    def __init__(self, motion: MotionModel, settings: SmootherSettings, initiation: str = DEFAULT) -> None:
+    def __init__(
+        self,
+        motion: MotionModel,
+        settings: SmootherSettings,
+        initiation: str = DEFAULT,
+        failures: Failures | None = None,
+    ) -> None:
         if settings.objective != "reweighted" and not motion.linear:
             raise CallError(f"smoother.objective: {settings.objective} needs the estimator smoother or smoother-batch")
         self._motion = motion
         self._settings = settings
         self._lag_ns, self._ring_ns = nanoseconds(settings.lag_s), nanoseconds(settings.ring_s)
         self._behind_ns = self._ring_ns if settings.late == "fuse" else 0
-        self.windows = Windows(motion, settings)
+        self.windows = Windows(motion, settings, failures or Failures())
         self._numbers: dict[int, int] = {}
         """Where the arrays hold each track, in order of birth."""
         self._track_ids: tuple[int, ...] = ()
@@ -187,9 +197,7 @@ class BandedBank:
             return []
         tracks = self._tracks
         states = self.windows.states_at(tracks, np.maximum(self._now_ns, self._all_times().oldest))
-        means, covariances = self._motion.kinematic(*states)
-        means = wrapped_yaw(means)
-        return [TrackState(self._now_ns, m, P) for m, P in zip(means, covariances, strict=True)]
+        return PresentStates(self._motion, self._now_ns, *states)
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`."""
@@ -290,6 +298,7 @@ class BandedBank:
             left = self.windows.fuse(tracks, stamp_ns, measurements, groups, guesses, times.start, times.reach)
         except np.linalg.LinAlgError:
             if len(positions) == 1:
+                self.windows.failures.add(Failure.GRAPH_REBUILT)
                 return [int(positions[0])]
             tracks, measurements, groups, guesses, times = everyone
             singles = [group.at(group.positions == position) for position in positions for group in groups]

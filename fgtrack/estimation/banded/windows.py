@@ -16,6 +16,7 @@ from fgtrack.estimation.banded.solver import Moved, Solver
 from fgtrack.estimation.banded.undo import Undo
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.ekf import propagated
+from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.initiation import Fix, Line, along, fixes_of
 from fgtrack.estimation.interpolation import between_all
 from fgtrack.estimation.smoother_settings import SmootherSettings
@@ -62,15 +63,16 @@ class Windows:
         Motion model of all of them.
     settings
         Those of relinearisation.
+    failures
+        Counts how often steps are damped.
     """
 
-    def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
+    def __init__(self, motion: MotionModel, settings: SmootherSettings, failures: Failures) -> None:
         self._motion = motion
         self._settings = settings
         self.solver = Solver(motion, settings)
         self.nodes = self.solver.nodes
-        self.num_damped = 0
-        """How often a step went too far and was taken again with damping."""
+        self.failures = failures
 
     # --- states
 
@@ -201,7 +203,7 @@ class Windows:
             with suppress(np.linalg.LinAlgError):  # then the linearisation points remain
                 means = DampedWindow(solver, self._motion, track).solved()
             solver.solve_anew(track, means)
-            self.num_damped += 1
+            self.failures.add(Failure.STEP_DAMPED)
 
     def _leaving(self, tracks: IntArray, anchors: IntArray) -> Leaving:
         nodes = self.nodes

@@ -15,6 +15,7 @@ from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
 from fgtrack.estimation.factor_graph.window import Window
 from fgtrack.estimation.factor_graph.window_update import Update
+from fgtrack.estimation.failures import Failures
 from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search
 from fgtrack.estimation.marginalised_past import Prior
 from fgtrack.estimation.propagation import track_state
@@ -44,6 +45,8 @@ class FixedLagSmoother:
         Makes an empty backend: `IncrementalBackend` or `BatchBackend`.
     initiation
         How the direction of travel is found where `prior` gives none, see `Initiation`.
+    failures
+        Counts how often the graph is built anew and steps are damped.
     """
 
     def __init__(
@@ -53,12 +56,15 @@ class FixedLagSmoother:
         settings: SmootherSettings = _DEFAULT,
         make_backend: Callable[[], Backend] = IncrementalBackend,
         initiation: str = DEFAULT,
+        failures: Failures | None = None,
     ) -> None:
         self._settings = settings
         self._lag_ns, self._ring_ns = nanoseconds(settings.lag_s), nanoseconds(settings.ring_s)
         self._first_ns = self._clock_ns = self._start_ns = self._reach_ns = prior.stamp_ns
         self.motion = motion
-        self.window = Window(motion, prior.stamp_ns, Prior(*initial_state(motion, prior)), settings, make_backend)
+        self.failures = failures or Failures()
+        first = Prior(*initial_state(motion, prior))
+        self.window = Window(motion, prior.stamp_ns, first, settings, make_backend, self.failures)
         self._search = Search.of(motion, prior, initiation)
         self._final: list[TrackState] = []
 
@@ -66,16 +72,6 @@ class FixedLagSmoother:
     def window_ns(self) -> tuple[int, int]:
         """See `Estimator.window_ns`."""
         return max(self._reach_ns, self.window.reach_ns), self.window.newest_ns
-
-    @property
-    def num_rebuilt(self) -> int:
-        """How often the graph was built anew after a failed update."""
-        return self.window.num_rebuilt
-
-    @property
-    def num_damped(self) -> int:
-        """How often a step went too far and was taken again with damping."""
-        return self.window.num_damped
 
     def advance(self, now_ns: int) -> None:
         """See `Estimator.advance`; the nodes that leave are marginalised at the next update."""

@@ -10,6 +10,7 @@ from fgtrack.estimation.factor_graph import together
 from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
+from fgtrack.estimation.failures import Failures
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.estimation.smoothing_bank import SmoothingBank
@@ -23,7 +24,7 @@ class SmootherBank(SmoothingBank):
     ----------
     motion
         The motion model of all smoothers.
-    settings, make_backend, initiation
+    settings, make_backend, initiation, failures
         See `FixedLagSmoother`.
     """
 
@@ -33,9 +34,10 @@ class SmootherBank(SmoothingBank):
         settings: SmootherSettings,
         make_backend: Callable[[], Backend] = IncrementalBackend,
         initiation: str = DEFAULT,
+        failures: Failures | None = None,
     ) -> None:
         def one(prior: Start) -> FixedLagSmoother:
-            return FixedLagSmoother(motion, prior, settings, make_backend, initiation)
+            return FixedLagSmoother(motion, prior, settings, make_backend, initiation, failures)
 
         lag_s = settings.lag_s + (settings.ring_s if settings.late == "fuse" else 0.0)
         super().__init__(motion, one, lag_s, settings.lagged_s)

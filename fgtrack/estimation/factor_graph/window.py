@@ -16,6 +16,7 @@ from fgtrack.estimation.factor_graph.chain import Chain, Node
 from fgtrack.estimation.factor_graph.rows import Factor, MapSegment, PriorOf, Segment, Term
 from fgtrack.estimation.factor_graph.states import Around, State, state
 from fgtrack.estimation.factor_graph.window_update import Update
+from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.initiation import Fix, Line, along, fixes_of
 from fgtrack.estimation.marginalised_past import MarginalisedPast, Prior
 from fgtrack.estimation.smoother_settings import SmootherSettings
@@ -43,6 +44,8 @@ class Window:
     make_backend
         Makes an empty backend; called again after a failed update, and when the first measurement comes that is not
         linear.
+    failures
+        Counts how often the graph is built anew and steps are damped.
     """
 
     def __init__(
@@ -52,6 +55,7 @@ class Window:
         prior: Prior,
         settings: SmootherSettings,
         make_backend: Callable[[], Backend],
+        failures: Failures,
     ) -> None:
         self._motion = motion
         self._settings = settings
@@ -67,10 +71,7 @@ class Window:
         self._far: list[tuple[Node, FloatArray]] | None = None
         self._covariances: dict[tuple[int, ...], FloatArray] = {}
         self._states: dict[int, State] = {}
-        self.num_rebuilt = 0
-        """How often the graph was built anew after a failed update."""
-        self.num_damped = 0
-        """How often a step went too far and was taken again with damping."""
+        self._failures = failures
         self._rebuild({FIRST_KEY: prior.mean})
 
     @property
@@ -160,7 +161,7 @@ class Window:
         """Take `update` back; gives what to raise."""
         self._chain.remove(update.new)
         self._rebuild(self._estimates())
-        self.num_rebuilt += 1
+        self._failures.add(Failure.GRAPH_REBUILT)
         return RuntimeError(f"the graph cannot be solved with the new measurements ({error})")
 
     def state_at(self, stamp_ns: int) -> State:
@@ -211,7 +212,7 @@ class Window:
         with suppress(*_BROKEN):  # then the origins remain
             self._rebuild(origins, BatchBackend)
         self._rebuild(self._estimates())
-        self.num_damped += 1
+        self._failures.add(Failure.STEP_DAMPED)
 
     def iterate(self, max_iterations: int) -> None:
         """Take Gauss-Newton steps while a state is further than a threshold from its linearisation point."""

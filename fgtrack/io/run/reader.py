@@ -52,6 +52,8 @@ class _Meta:
     detections_received: int = 0
     counts: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     ego_refused: Mapping[str, int] = field(default_factory=dict)
+    failures: Mapping[str, int] = field(default_factory=dict)
+    first_failure: str | None = None
     broken_off: str | None = None
 
 

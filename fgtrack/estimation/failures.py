@@ -1,0 +1,87 @@
+"""What went wrong inside estimators, and what was done about it: the counters that all of them share."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+__all__ = ["EndedTrack", "Failure", "Failures"]
+
+_MOST_ENDED = 100
+
+
+class Failure(StrEnum):
+    """A kind of failure, or of what was done about one."""
+
+    DIVERGED = "diverged"
+    """A track's measurements contradicted it several times in a row, see `Divergence`."""
+    NOT_FINITE = "not finite"
+    """A state that was to be published was not."""
+    NOT_DEFINITE = "not positive definite"
+    """A covariance that was to be published was not."""
+    OUT_OF_BOUNDS = "out of bounds"
+    """A state that was to be published was none that an object can have, see `faults`."""
+    UPDATE_FAILED = "update failed"
+    """A measurement could not be fused; its disposition is `failed`."""
+    ESTIMATOR_RAISED = "estimator raised"
+    """It raised an exception where it was asked for states, or told of the clock."""
+    GRAPH_REBUILT = "graph rebuilt"
+    """A factor graph could not be solved with a new measurement, and was built anew without it."""
+    STEP_DAMPED = "step damped"
+    """A smoother's step went too far and was taken again by Levenberg-Marquardt."""
+    BIRTH_FAILED = "birth failed"
+    """A detection could not start a track."""
+    LIST_FAILED = "list failed"
+    """The processing of an object list raised an exception; what was left of it is `failed`."""
+    TRACK_RESTARTED = "track restarted"
+    """A track that failed began anew from its last sound state, under the same id."""
+    TRACK_ENDED = "track ended"
+    """A track that failed again before an update had succeeded ended."""
+
+
+@dataclass(frozen=True)
+class EndedTrack:
+    """A track that a failure has ended."""
+
+    track_id: int
+    now_ns: int
+    """Time of the tick."""
+    failure: Failure
+    """The last straw."""
+
+
+@dataclass
+class Failures:
+    """Counts by kind, shared by all that may fail in one tracker."""
+
+    counts: Counter[Failure] = field(default_factory=Counter)
+    ended: list[EndedTrack] = field(default_factory=list)
+    """Tracks that failures have ended, the first hundred."""
+    first: str | None = None
+    """What the first failure said, in a line."""
+    last: str | None = None
+    """Traceback, or line, of the newest one."""
+
+    def add(self, failure: Failure, count: int = 1) -> None:
+        """Count a failure."""
+        self.counts[failure] += count
+
+    def end(self, track_id: int, now_ns: int, failure: Failure) -> None:
+        """Count a track that ends."""
+        self.add(Failure.TRACK_ENDED)
+        if len(self.ended) < _MOST_ENDED:
+            self.ended.append(EndedTrack(track_id, now_ns, failure))
+
+    def note(self, line: str, traceback: str | None = None) -> None:
+        """Remember what a failure said."""
+        self.first = self.first or " ".join(line.split())
+        self.last = traceback or line
+
+    def as_meta(self) -> dict[str, object]:
+        """What meta.json says: every kind, zeros included."""
+        return {
+            "failures": {failure.value: self.counts[failure] for failure in Failure},
+            "first_failure": self.first,
+            "ended_by_failure": [
+                {"track_id": one.track_id, "now_ns": one.now_ns, "failure": one.failure.value} for one in self.ended
+            ],
+        }

@@ -1,0 +1,118 @@
+"""Whether states can be those of an object, and whether measurements bear a track out."""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+from scipy.special import chdtri
+
+from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.estimation.base import Measurement, UpdateResult
+from fgtrack.estimation.failures import Failure
+from fgtrack.estimation.present import PresentStates
+
+__all__ = ["Divergence", "are_finite", "faults"]
+
+_MOST = np.array([1e9, 1e9, 1e3, 1e5, 1e4, 1e6])
+"""Largest x, y, yaw, speed, yaw rate and acceleration, in SI units: far beyond any vehicle on Earth."""
+_ROUNDING = 1e-9
+"""So much less than 0 an eigenvalue of a correlation matrix may be: rounding, where an entry is known for certain."""
+_TINY = 1e-300
+
+#: A track has diverged when so many measurements in a row have a NIS that is rarer than this.
+_IN_A_ROW = 8
+_RARE = 1e-4
+
+
+def are_finite(means: FloatArray, covariances: FloatArray) -> bool:
+    """Whether all states are, means (m, n) and covariances (m, n, n)."""
+    return bool(np.isfinite(means).all() and np.isfinite(covariances).all())
+
+
+def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
+    """What is wrong with kinematic states, by their place; nothing where all can be published.
+
+    A state is sound where it is finite, no entry is larger than any vehicle's (10^9 m, 10^5 m/s, 10^4 rad/s,
+    10^6 m/s^2), and its covariance is positive definite: up to rounding, as an entry that the motion model does not
+    have is 0 with variance 0.
+    """
+    if not states:
+        return {}
+    if isinstance(states, PresentStates):
+        means, covariances = states.means, states.covariances
+    else:
+        means, covariances = np.array([one.mean for one in states]), np.array([one.covariance for one in states])
+    small = (np.abs(means) <= _MOST[: means.shape[1]]).all()
+    if small and (_are_definite(covariances) or _are_semidefinite(covariances)):
+        return {}
+    found = ((place, _fault(mean, P)) for place, (mean, P) in enumerate(zip(means, covariances, strict=True)))
+    return {place: fault for place, fault in found if fault is not None}
+
+
+def _fault(mean: FloatArray, covariance: FloatArray) -> Failure | None:
+    if not are_finite(mean, covariance):
+        return Failure.NOT_FINITE
+    if (np.abs(mean) > _MOST[: len(mean)]).any():
+        return Failure.OUT_OF_BOUNDS
+    return None if _are_semidefinite(covariance[None]) else Failure.NOT_DEFINITE
+
+
+def _are_semidefinite(covariances: FloatArray) -> bool:
+    """Whether all of `covariances`, shape (m, n, n), are finite and positive semidefinite up to rounding."""
+    variances = np.diagonal(covariances, axis1=-2, axis2=-1)
+    if not (np.isfinite(covariances).all() and (variances >= 0.0).all()):
+        return False
+    std = np.sqrt(np.maximum(variances, _TINY))
+    with np.errstate(over="ignore"):
+        correlations = covariances / std[:, :, None] / std[:, None, :]
+    n = covariances.shape[-1]
+    correlations[:, range(n), range(n)] = 1.0 + _ROUNDING
+    return _are_definite(correlations)
+
+
+def _are_definite(covariances: FloatArray) -> bool:
+    """Whether all of `covariances`, shape (m, n, n), are finite and positive definite; their lower halves count."""
+    try:
+        roots = np.linalg.cholesky(covariances)
+    except np.linalg.LinAlgError:
+        return False
+    return bool(np.isfinite(roots).all())
+
+
+@cache
+def _limit(dof: int) -> float:
+    return float(chdtri(dof, _RARE))
+
+
+class Divergence:
+    """Counts how often a track diverges: 8 measurements in a row with a NIS that fewer than 1 in 10^4 should have.
+
+    With a noise that fits, this happens by chance once in 10^32 measurements; where the errors of positions are three
+    times as large as the noise says, once in some 5000. A NIS is judged by the chi-square distribution of what was
+    measured; measurements count in the order of their arrival, whatever their sensors. A track diverges again only
+    after a measurement that fits.
+    """
+
+    def __init__(self) -> None:
+        self._surprises: dict[int, int] = {}  # by track: how many in a row
+
+    def count(
+        self, track_ids: Sequence[int], measurements: Sequence[Measurement], results: Sequence[UpdateResult]
+    ) -> int:
+        """How many tracks diverge with these updates."""
+        least, surprises, diverged = _limit(1), self._surprises, 0
+        for track_id, measurement, result in zip(track_ids, measurements, results, strict=True):
+            nis = result.nis
+            if nis is None:
+                continue
+            if nis <= least or nis <= _limit(len(measurement.z) - len(measurement.assumed)):
+                if surprises:
+                    surprises.pop(track_id, None)
+                continue
+            surprises[track_id] = surprises.get(track_id, 0) + 1
+            diverged += surprises[track_id] == _IN_A_ROW
+        return diverged
+
+    def forget(self, track_id: int) -> None:
+        """A track has ended, or begun anew."""
+        self._surprises.pop(track_id, None)
