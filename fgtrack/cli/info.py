@@ -6,6 +6,7 @@ from pathlib import Path
 from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json
 from fgtrack.cli.show import chosen_form, progress, say, show, warn
 from fgtrack.core.errors import DataError
+from fgtrack.evaluation.left_out import left_out
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value
 from fgtrack.io.info import InputInfo, TopicInfo, describe
 from fgtrack.io.source import open_input
@@ -45,6 +46,8 @@ def _try_out(recording: Path, config: Config) -> Trial:
         for sensor, counts in trial.run.meta["counts"].items():
             became = ", ".join(f"{count} {fate.replace('_', ' ')}" for fate, count in counts.items() if count)
             say(f"first {trial.duration_s:g} s of {sensor}: {became or 'no detection'}")
+        for line in left_out(trial.run.meta):
+            say(f"first {trial.duration_s:g} s of {line}")
         say(f"first {trial.duration_s:g} s: {len(set(trial.run.tracks['track_id'].tolist()))} tracks")
     for line in trial.suspicions:
         warn(line)

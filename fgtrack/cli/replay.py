@@ -11,6 +11,7 @@ from fgtrack.cli.show import TickProgress, progress, say, warn
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.evaluation.cautions import cautions, noise_cautions, unused
+from fgtrack.evaluation.left_out import left_out
 from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
 from fgtrack.io.span import end_ns
@@ -62,6 +63,8 @@ def replay(
         what = "{estimator}, {detections_received} detections, {wall_s:.1f} s, digest {digest:.12}"
         missed = f", {result.deadline_misses} deadlines missed" if result.deadline_misses else ""
         say(f"{result.path}: {what.format_map(result.meta)}{missed}")
+    for line in left_out(results[0].meta):  # the same of all
+        say(line)
     runs = [load_run(result.path) for result in results]
     for line in dict.fromkeys([line for run in runs for line in cautions(run)] + noise_cautions(runs[0])):
         warn(line)

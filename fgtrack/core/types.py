@@ -99,6 +99,8 @@ class DetectionList:
     objects: Sequence[Detection]
     """Kept as a tuple."""
     frame: Frame = "ego"
+    left_out: tuple[str, ...] = field(default=(), compare=False)
+    """For every object that the reader has left out of the list the setting that says so."""
 
     def __post_init__(self) -> None:
         if type(self.objects) is not tuple:
@@ -225,6 +227,8 @@ class UpdateRecord:
     nis: float | None = None
     innovation: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     """Measured minus predicted, by name of `MEASURABLE`."""
+    reason: str | None = None
+    """The setting by which it is out of bounds; None of other dispositions."""
 
 
 @dataclass(frozen=True, slots=True)

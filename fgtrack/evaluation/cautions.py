@@ -11,6 +11,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.failures import Failure
 from fgtrack.evaluation.innovations import num_measured
+from fgtrack.evaluation.left_out import because
 from fgtrack.evaluation.statistics import ChiSquareMean
 from fgtrack.io.run import Run, Table, digest
 
@@ -25,7 +26,8 @@ FEWEST = 30
 _CURES = {
     "gated": "no track was near enough and none was started: check association.gate_m, the clock, and "
     "ego.detection_origin_x_m",
-    "out_of_bounds": "off the road of the map: is it the right map (--map), and is the frame of the detections right?",
+    "out_of_bounds": "{because}: are these settings meant, and is it the right map (--map), and the frame of the "
+    "detections?",
     "duplicate": "the same list again and again: look at the recording, a sensor or a bridge repeats itself",
     "superseded": "another list of the sensor came in the same tick, and the inbox keeps one: raise clock.node_hz",
     "invalid": "no position, a value that is not finite, a covariance that is none, or a stamp ahead of its receipt: "
@@ -142,7 +144,8 @@ def _lost(run: Run) -> Iterator[str]:
         for fate, count in zip(fates.tolist(), counts.tolist(), strict=True):
             unset = fate == "too_old" and not run.updates["stamp_ns"][mine].any()  # which is told already
             if fate not in USED and 2 * count > mine.sum() and not unset:
-                cure = _too_old(run, sensor) if fate == "too_old" else _CURES[fate].format(sensor=sensor)
+                told = {"sensor": sensor, "because": because((run.meta.get("out_of_bounds") or {}).get(sensor, {}))}
+                cure = _too_old(run, sensor) if fate == "too_old" else _CURES[fate].format_map(told)
                 if fate == "failed" and not run.ego.num_rows:
                     cure = _NO_EGO
                 yield f"{sensor}: {count} of {mine.sum()} {fate}: {cure}"

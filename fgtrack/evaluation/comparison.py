@@ -66,7 +66,9 @@ def comparison(metrics: Mapping[str, Metrics], found: Sequence[Contest] = ()) ->
     }
     for sensor in dict.fromkeys(row.part for row in of_sensors):
         tables[f"residuals_{sensor}"] = residuals_table(sensor, [row for row in of_sensors if row.part == sensor])
-    tables["dispositions"] = dispositions_table(of_sensors)
+    tables["dispositions"] = dispositions_table(
+        of_sensors, dict.fromkeys(line for row in rows for line in row.of.left_out)
+    )
     tables["failures"] = failures_table(rows)
     details = {"runs": {label: one.as_dict() for label, one in metrics.items()}, "notes": notes}
     return Tables(tables, details, verdict(metrics, found))

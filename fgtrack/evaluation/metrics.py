@@ -14,6 +14,7 @@ from fgtrack.evaluation.continuity import late_switches, times_to_confirm, track
 from fgtrack.evaluation.deadlines import Deadlines
 from fgtrack.evaluation.innovations import ANGULAR, RESIDUAL_NAMES, message_delays, num_measured, residuals
 from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
+from fgtrack.evaluation.left_out import left_out
 from fgtrack.evaluation.matching import ERROR_NAMES, Matching, confirmed, match, track_errors
 from fgtrack.evaluation.multi_object import MultiObjectMetrics, multi_object_metrics
 from fgtrack.evaluation.residual_samples import residual_samples
@@ -145,6 +146,8 @@ class Metrics:
     """None for a run without truth, and where they are not asked for."""
     failures: Mapping[str, int] = field(default_factory=dict)
     """What failed while the run was made, by kind, zeros included; empty of runs that did not count it."""
+    left_out: tuple[str, ...] = ()
+    """For sensors of which settings left out detections, how many by which."""
 
     @property
     def precision(self) -> float:
@@ -195,6 +198,7 @@ def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationCon
         lagged=lag_metrics(run, matching),
         multi_object=multi_object_metrics(run, matching, options),
         failures=dict(run.meta.get("failures") or {}),
+        left_out=tuple(left_out(run.meta)),
     )
 
 

@@ -1,6 +1,6 @@
 """Tables of a comparison about the sensors: whether the noise fits, residuals, what became of the detections."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from fgtrack.core.types import Disposition
 from fgtrack.evaluation.cautions import USED
@@ -90,8 +90,8 @@ def residuals_table(sensor: str, rows: Sequence[Row[SensorMetrics]]) -> Table:
     return Table(title, columns, rows, detail=True)
 
 
-def dispositions_table(rows: Sequence[Row[SensorMetrics]]) -> Table:
-    """A row for each run and sensor: what became of the detections, and their sum."""
+def dispositions_table(rows: Sequence[Row[SensorMetrics]], left_out: Iterable[str] = ()) -> Table:
+    """A row for each run and sensor: what became of the detections, and their sum; `left_out` is noted below."""
 
     def count(*names: Disposition) -> Callable[[Row[SensorMetrics]], Values]:
         return lambda row: (sum(row.of.dispositions[name] for name in names),)
@@ -111,5 +111,6 @@ def dispositions_table(rows: Sequence[Row[SensorMetrics]]) -> Table:
         Column("sum", ("detections",), lambda row: (row.of.detections,)),
     ]
     own = [f"none: {', '.join(name.replace('_', ' ') for name in absent)}"] if absent else []
+    own += left_out
     title = "Dispositions (what became of every detection)"
     return Table(title, columns, rows, row_keys=("run", "sensor"), notes=own)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from numbers import Real
 from types import MappingProxyType
 from typing import Annotated, Literal
 
@@ -11,6 +10,7 @@ from pydantic import NonNegativeFloat, StringConstraints
 
 from fgtrack.core.types import Frame
 from fgtrack.io.errors import LARGEST_BYTES, MOST_OBJECTS
+from fgtrack.models.sensors import Filter
 
 Path = str | Sequence[str]
 """Names of fields with dots between; several paths are the components of a vector, whose length is meant."""
@@ -36,31 +36,6 @@ class Field:
 
 
 FieldPath = str | Sequence[str] | Field
-
-
-@dataclass(frozen=True)
-class Filter:
-    """Which values pass; all that is given must hold."""
-
-    min: float | None = None
-    """Smallest value that passes."""
-    max: float | None = None
-    """Largest value that passes."""
-    one_of: tuple[bool | int | float | str, ...] | None = None
-    """Values that pass, no others."""
-    none_of: tuple[bool | int | float | str, ...] = ()
-    """Values that do not."""
-
-    def passes(self, value: object) -> bool:
-        """Whether `value` passes; what is not there or not a number does not pass a bound."""
-        if (self.one_of is not None and value not in self.one_of) or value in self.none_of:
-            return False
-        if self.min is None and self.max is None:
-            return True
-        if not isinstance(value, Real):
-            return False
-        low, high = -math.inf if self.min is None else self.min, math.inf if self.max is None else self.max
-        return low <= float(value) <= high
 
 
 @dataclass(frozen=True)

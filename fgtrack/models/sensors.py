@@ -4,12 +4,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Real
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
 
 from fgtrack.core.geometry import body_point, polar, wrap_angles
-from fgtrack.core.types import MEASURABLE, BoolArray, FloatArray
+from fgtrack.core.types import DESCRIBING, MEASURABLE, BoolArray, Detection, FloatArray
 
 
 @dataclass(frozen=True)
@@ -19,6 +21,31 @@ class Mount:
     x_m: float = 0.0
     y_m: float = 0.0
     yaw_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class Filter:
+    """Which values pass; all that is given must hold."""
+
+    min: float | None = None
+    """Smallest value that passes."""
+    max: float | None = None
+    """Largest value that passes."""
+    one_of: tuple[bool | int | float | str, ...] | None = None
+    """Values that pass, no others."""
+    none_of: tuple[bool | int | float | str, ...] = ()
+    """Values that do not."""
+
+    def passes(self, value: object) -> bool:
+        """Whether `value` passes; what is not there or not a number does not pass a bound."""
+        if (self.one_of is not None and value not in self.one_of) or value in self.none_of:
+            return False
+        if self.min is None and self.max is None:
+            return True
+        if not isinstance(value, Real):
+            return False
+        low, high = -math.inf if self.min is None else self.min, math.inf if self.max is None else self.max
+        return low <= float(value) <= high
 
 
 @dataclass(frozen=True)
@@ -91,6 +118,9 @@ class SensorModel:
     """Use a detection's own covariance where the message carries one."""
     max_range_m: float | None = None
     """A detection further from the sensor than this is out of bounds: beyond it clutter outweighs objects."""
+    filters: Mapping[str, Filter] = field(default_factory=lambda: MappingProxyType({}))
+    """Which detections are used, by anything that they say: `{score: {min: 0.5}, class_name: {one_of: [car]}}`. The
+    others are out of bounds."""
     view_range_m: float | None = None
     """How far it sees, where that is less than `max_range_m`; for existence and evaluation, no
     detection is out of bounds by it."""
@@ -122,6 +152,9 @@ class SensorModel:
         for name, value in self.std.items():
             if not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"std.{name}: must be positive and finite, is {value}")
+        for name in self.filters:
+            if name not in (*MEASURABLE, *DESCRIBING):
+                raise ValueError(f"filters: unknown {name!r}, known are {', '.join((*MEASURABLE, *DESCRIBING))}")
         if ("x_m" in self.std) != ("y_m" in self.std):
             raise ValueError("std: x_m and y_m are measured together")
         for name in ("yaw_from_map_std_rad", "max_delay_s", "max_range_m", "view_range_m", "max_range_behind_m"):
@@ -141,6 +174,10 @@ class SensorModel:
     def components(self) -> tuple[str, ...]:
         """Measured components in the order of `MEASURABLE`."""
         return tuple(name for name in MEASURABLE if name in self.std)
+
+    def refusing(self, detection: Detection) -> str | None:
+        """Name of the first of the filters that `detection` does not pass; None where it passes all."""
+        return next((name for name, one in self.filters.items() if not one.passes(getattr(detection, name))), None)
 
     @property
     def gives_position(self) -> bool:

@@ -24,6 +24,7 @@ from fgtrack.estimation.published import (
     StalePresent,
 )
 from fgtrack.estimation.registry import ESTIMATORS, Claims, estimator_bank
+from fgtrack.models.areas import ExclusionAreas
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.published_map import CircularHeadingMap, PublishedMap
 from fgtrack.models.road import MappedRoad, OpenSpace, Road
@@ -72,7 +73,9 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
         sensors=config.sensors,
         ego=_build_ego(config),
         inbox=_build_inbox(config),
-        preprocess=(PublishedPreprocess if published_order else Preprocess)(road, config.merge, motion, origin_m),
+        preprocess=(PublishedPreprocess if published_order else Preprocess)(
+            road, config.merge, motion, origin_m, ExclusionAreas.read(config.map.excluded)
+        ),
         association=config.association,
         bank=RestartingBank(lambda: build_bank(config, failures), failures),
         failures=failures,

@@ -90,6 +90,8 @@ class MapConfig:
     """The same for the outer bound."""
     pit_buffer_m: float = -1.5
     """The same for both bounds of the pit lane."""
+    excluded: tuple[str, ...] = ()
+    """Files of polygons in which no object is, as shore and buildings: GeoJSON or CSV, in metres of the map."""
 
 
 @settings

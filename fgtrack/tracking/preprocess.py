@@ -10,8 +10,9 @@ import numpy as np
 
 from fgtrack.core.geometry import body_point, body_point_jacobian
 from fgtrack.core.linalg import congruence
-from fgtrack.core.types import MEASURABLE, Disposition, FloatArray, UpdateRecord
+from fgtrack.core.types import MEASURABLE, BoolArray, Disposition, FloatArray, UpdateRecord
 from fgtrack.estimation.base import Measurement
+from fgtrack.models.areas import ExclusionAreas
 from fgtrack.models.correlated_errors import split_error
 from fgtrack.models.measurement import RELATIVE, MeasurementModel, SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import MotionModel
@@ -24,6 +25,7 @@ from fgtrack.tracking.merge import Merge
 from fgtrack.tracking.pose_error import PoseError, placement
 
 _FAR_M = 1e6
+_NO_AREAS = ExclusionAreas(())
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,12 +85,20 @@ class _Group(NamedTuple):
 class Preprocess:
     """Transformation to the map, false-positive filter and merge (Karle et al. 2023, sections III-B and III-C)."""
 
-    def __init__(self, road: Road, merge: Merge, motion: MotionModel, detection_origin_m: tuple[float, float]) -> None:
+    def __init__(
+        self,
+        road: Road,
+        merge: Merge,
+        motion: MotionModel,
+        detection_origin_m: tuple[float, float],
+        excluded: ExclusionAreas = _NO_AREAS,
+    ) -> None:
         """`detection_origin_m`: origin of the ego frame of detections, seen from the ego reference point."""
         self._road = road
         self._merge = merge
         self._motion = motion
         self._origin_m = detection_origin_m
+        self._excluded = excluded
 
     def __call__(
         self, batch: Batch, sensor: SensorModel, ego: EgoPose | None
@@ -100,15 +110,19 @@ class Preprocess:
         pose = self._sensor_pose(batch, sensor, ego)
         view = _View(batch, sensor, pose, _pose_covariance(pose, batch, sensor, ego))
         items = located(batch, sensor, pose)
-        lost = list[int]()
+        lost = dict[int, str]()
+        if sensor.filters:
+            refusals = [sensor.refusing(detection) for detection in items.detections]
+            items = _without(items, np.array([name is not None for name in refusals], dtype=bool), "", lost)
+            lost |= {index: f"filters.{name}" for index, name in zip(batch.indices, refusals, strict=True) if name}
         if ego is not None and sensor.max_range_m is not None:
             offsets_m = items.points_m - np.array([pose.x_m, pose.y_m])
             far = np.hypot(offsets_m[:, 0], offsets_m[:, 1]) > sensor.max_range_m
-            if True in far.tolist():
-                lost = items.indices[far].tolist()
-                items = items.at(~far)
-        items, outside = self._on_road(items, sensor)
-        records = [record(batch.message, index, Disposition.OUT_OF_BOUNDS) for index in lost + outside]
+            items = _without(items, far, "max_range_m", lost)
+        if self._excluded.polygons_m:
+            items = _without(items, self._excluded.contain(items.points_m), "map.excluded", lost)
+        items = self._on_road(items, sensor, lost)
+        records = [_out_of_bounds(batch, index, reason) for index, reason in lost.items()]
         return self._candidates(items, view), records
 
     def _sensor_pose(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> SensorPose:
@@ -123,19 +137,20 @@ class Preprocess:
         x_m, y_m, vx_mps, vy_mps = body_point(*ego[:5], x_m, y_m)
         return SensorPose(float(x_m), float(y_m), yaw_rad, float(vx_mps), float(vy_mps))
 
-    def _on_road(self, items: Located, sensor: SensorModel) -> tuple[Located, list[int]]:
-        """What lies inside the bounds, with the map heading as a yaw that was not measured; indices of the rest."""
+    def _on_road(self, items: Located, sensor: SensorModel, lost: dict[int, str]) -> Located:
+        """What lies inside the bounds, with the map heading as a yaw that was not measured; `lost` gets the rest."""
         placed = items.placed
         if not self._road.known or not len(placed):
-            return items, []
+            return items
         all_placed = len(placed) == len(items.indices)
         view = self._road.view(items.points_m if all_placed else items.points_m[placed])
         if sensor.yaw_from_map_std_rad is not None:
             take_map_yaw(items, slice(None) if all_placed else placed, view.yaw_rad)
         if not any(view.outside.tolist()):
-            return items, []
-        outside = placed[view.outside]
-        return items.at(np.delete(np.arange(len(items.indices)), outside)), items.indices[outside].tolist()
+            return items
+        outside = np.zeros(len(items.indices), dtype=bool)
+        outside[placed[view.outside]] = True
+        return _without(items, outside, "map.track", lost)
 
     def _candidates(self, items: Located, view: _View) -> list[Candidate]:
         placed = items.placed
@@ -264,6 +279,18 @@ class Preprocess:
     def _assumed(self, map_yaw: bool) -> tuple[str, ...]:
         """Components that are prior knowledge: a yaw that the map gave."""
         return ("yaw_rad",) if map_yaw else ()
+
+
+def _without(items: Located, outside: BoolArray, reason: str, lost: dict[int, str]) -> Located:
+    """`items` without those `outside`, shape (m,), whose indices `lost` gets with the `reason`."""
+    if True not in outside.tolist():
+        return items
+    lost |= dict.fromkeys(items.indices[outside].tolist(), reason)
+    return items.at(~outside)
+
+
+def _out_of_bounds(batch: Batch, index: int, reason: str) -> UpdateRecord:
+    return replace(record(batch.message, index, Disposition.OUT_OF_BOUNDS), reason=reason)
 
 
 @cache

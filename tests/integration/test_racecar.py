@@ -132,7 +132,9 @@ def test_the_same_by_fields_filters_and_stamps_from_the_receipt(recording):
     found = lists(recording, InputConfig(detections={"radar_front": by_fields}))
     assert found == lists(recording, InputConfig(detections={"radar_front": TopicInput(topic, scan_s=0.02)}))
     near = TopicInput(topic, filters={"range_m": Filter(max=45.0)})
-    assert sum(len(item.objects) for item in lists(recording, InputConfig(detections={"radar_front": near}))) == 80
+    found = lists(recording, InputConfig(detections={"radar_front": near}))
+    assert sum(len(item.objects) for item in found) == 80
+    assert [each for item in found for each in item.left_out] == ["filters.range_m"] * 80
     late = TopicInput(topic, stamp_from="receipt")
     found = lists(recording, InputConfig(detections={"radar_front": late}))
     assert len(found) == 320

@@ -183,6 +183,8 @@ def test_other_classes_low_scores_and_boxes_cut_off_are_left_out(tmp_path):
     )
     camera, laser = lists(drive, min_score={"laser": 3.0, "camera": 0.9})
     assert [round(item.x_m) for item in laser.objects] == [30]
+    assert laser.left_out == ("input.kitti.classes", "input.kitti.min_score")
+    assert camera.left_out == (*["input.kitti.image_width_px"] * 2, "input.kitti.min_score")
     assert len(camera.objects) == 1
     camera, laser = lists(drive, image_width_px=1300.0)
     assert (len(camera.objects), len(laser.objects)) == (3, 2)

@@ -109,6 +109,7 @@ def test_classes_scores_and_ids_of_trackers(tmp_path):
         item for item in messages(path, min_score=0.2, classes=("bus", "car")) if isinstance(item, DetectionList)
     )
     (item,) = found.objects
+    assert found.left_out == ("input.nuscenes.classes", "input.nuscenes.min_score")
     assert (item.class_name, item.score, item.object_id, item.speed_mps) == ("bus", 0.3, object_id("7a"), None)
     (found, _) = (item for item in messages(path, classes=(), sensor="x") if isinstance(item, DetectionList))
     assert (found.sensor, len(found.objects)) == ("x", 3)

@@ -75,6 +75,7 @@ def test_one_file_may_hold_everything(tmp_path):
     assert found[0] == EgoState(
         1_500_250_000, 1_500_250_000, 1.0, 2.0, pytest.approx(math.radians(100.0)), pytest.approx(10.0)
     )
+    assert sorted(found[1].left_out) == ["filters.kind", "filters.snr"]
     bearing_rad = pytest.approx(math.radians(10.0))
     assert found[1:] == [
         DetectionList(

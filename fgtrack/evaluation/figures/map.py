@@ -22,7 +22,7 @@ from fgtrack.evaluation.matching import Matching, confirmed
 from fgtrack.evaluation.runs import OneRun, one_judged
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.evaluation.viewer.placement import placed
-from fgtrack.evaluation.viewer.surroundings import road_lines, roads
+from fgtrack.evaluation.viewer.surroundings import excluded_lines, road_lines, roads
 from fgtrack.io.run import Run, Table
 
 _NAMED_OBJECTS = 8  # more objects than these share two entries of the legend
@@ -50,6 +50,10 @@ def tracks_on_map(run: OneRun) -> Figure:
     bounds_m = [line for road in maps.values() for line in road_lines(road)[:2]]
     for line in bounds_m:
         axes.plot(*line.T, color=GREY, lw=0.7, zorder=3)
+    label = "excluded"
+    for ring in excluded_lines(one.run):
+        axes.fill(*ring.T, facecolor=GREY, alpha=0.2, edgecolor=GREY, lw=0.7, zorder=2.2, label=label)
+        label = ""
     if notes:
         text.append("the map file is not there any more")
     detections_m, ego_m = placed(one.run).position_m, _positions(one.run.ego)

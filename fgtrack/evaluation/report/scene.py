@@ -27,7 +27,7 @@ from fgtrack.evaluation.viewer.detection_messages import LATE, track_positions
 from fgtrack.evaluation.viewer.ellipse import AROUND_95, ellipses
 from fgtrack.evaluation.viewer.look import NOMINAL_SIZE_M
 from fgtrack.evaluation.viewer.placement import placed, update_rows
-from fgtrack.evaluation.viewer.surroundings import road_lines, roads, start_ns
+from fgtrack.evaluation.viewer.surroundings import excluded_lines, road_lines, roads, start_ns
 from fgtrack.evaluation.viewer.track_messages import final_ns, position_covariances
 from fgtrack.io.run import Run, Table
 
@@ -173,6 +173,7 @@ def _recording(one: _Recording, packing: _Packing) -> Json:
         for road in maps.values()
         for kind, points_m in zip(("bound", "bound", "centre"), road_lines(road), strict=True)
     ]
+    lines += [{"kind": "bound", **packing.place(*points_m.T)} for points_m in excluded_lines(run)]
     ego = packing.thinned(_placed(run.ego), "the ego")
     ego = _sorted(ego, ego["stamp_ns"])
     truth = run.truth.where(run.truth["object_id"] >= 0)

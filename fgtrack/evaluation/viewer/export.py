@@ -11,7 +11,14 @@ from fgtrack.evaluation.recordings import same_recording
 from fgtrack.evaluation.runs import Runs, judged
 from fgtrack.evaluation.viewer.detection_messages import detection_messages, outcome_messages
 from fgtrack.evaluation.viewer.look import Look, palette
-from fgtrack.evaluation.viewer.surroundings import ego_messages, map_scene, roads, start_ns, truth_messages
+from fgtrack.evaluation.viewer.surroundings import (
+    ego_messages,
+    excluded_lines,
+    map_scene,
+    roads,
+    start_ns,
+    truth_messages,
+)
 from fgtrack.evaluation.viewer.track_messages import past_messages, smoothed_messages, track_messages
 from fgtrack.io.ros.viewer_bag import check_viewer_bag, write_viewer_bag
 from fgtrack.io.run import Run
@@ -60,7 +67,10 @@ def viewer_messages(runs: Mapping[str, Run]) -> tuple[Iterator[ViewerMessage], l
     _check_same_recording(runs)
     at_ns = start_ns(first)
     maps, notes = roads(first)
-    parts: list[Iterable[ViewerMessage]] = [map_scene(maps, at_ns), ego_messages(first.ego, at_ns)]
+    parts: list[Iterable[ViewerMessage]] = [
+        map_scene(maps, excluded_lines(first), at_ns),
+        ego_messages(first.ego, at_ns),
+    ]
     parts.append(truth_messages(first.truth))
     for look, (name, run) in zip(_looks(runs), runs.items(), strict=True):
         parts += [make(run, look) for make in _PARTS]

@@ -1,6 +1,6 @@
 """What the runs of a recording share: the map, the ego, the truth."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +9,7 @@ from fgtrack.core.types import STATE_NAMES, Detection, DetectionList, EgoState, 
 from fgtrack.evaluation.viewer.look import GREY, WHITE, car, faded
 from fgtrack.io.run import Run, Table
 from fgtrack.io.viewer.scene import EgoMotion, Entity, Line, Objects, Scene, ViewerMessage
+from fgtrack.models.areas import ExclusionAreas
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.track_map import TrackMap
 
@@ -22,7 +23,7 @@ def start_ns(run: Run) -> int:
 
 
 def roads(run: Run) -> tuple[dict[str, TrackMap], list[str]]:
-    """The maps that the configuration names, by `track` and `pit`, and a line for each whose file is gone.
+    """The maps that the configuration names, by `track` and `pit`, and a line for each file that is gone, of any kind.
 
     Raises
     ------
@@ -39,7 +40,22 @@ def roads(run: Run) -> tuple[dict[str, TrackMap], list[str]]:
             found[key] = TrackMap.read(Path(str(name)))
         elif name:
             notes.append(f"map.{key}: {name} is not there any more, so it is not shown")
+    lost = [name for name in config.get("excluded") or () if not Path(str(name)).is_file()]
+    notes += [f"map.excluded: {name} is not there any more, so it is not shown" for name in lost]
     return found, notes
+
+
+def excluded_lines(run: Run) -> list[FloatArray]:
+    """The rings of the exclusion areas that the configuration names, each closed, shape (n, 2); of lost files none.
+
+    Raises
+    ------
+    DataError
+        A file holds no areas.
+    """
+    names = [name for name in (run.config.get("map") or {}).get("excluded") or () if Path(str(name)).is_file()]
+    rings = [ring for polygon in ExclusionAreas.read(names).polygons_m for ring in polygon]
+    return [np.concatenate([ring, ring[:1]]) for ring in rings]
 
 
 def road_lines(road: TrackMap) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -49,13 +65,15 @@ def road_lines(road: TrackMap) -> tuple[FloatArray, FloatArray, FloatArray]:
     return road.position(s_m, left_m), road.position(s_m, -right_m), road.position(s_m, np.zeros_like(s_m))
 
 
-def map_scene(maps: dict[str, TrackMap], at_ns: int) -> Iterator[Scene]:
-    """The bounds of the road and its reference line, told once."""
+def map_scene(maps: dict[str, TrackMap], excluded: Sequence[FloatArray], at_ns: int) -> Iterator[Scene]:
+    """The bounds of the road and its reference line, and the `excluded_lines`, told once."""
     colours = (GREY, GREY, faded(GREY, 0.3))
     entities = []
     for name, one in maps.items():
         lines = [_line(points_m, 0.3, colour) for points_m, colour in zip(road_lines(one), colours, strict=True)]
         entities.append(Entity(name, tuple(lines)))
+    if excluded:
+        entities.append(Entity("excluded", tuple(_line(points_m, 0.3, faded(GREY, 0.6)) for points_m in excluded)))
     if entities:
         yield Scene("/map", at_ns, at_ns, tuple(entities), lasting=True)
 

@@ -1,7 +1,7 @@
 """What the adapters share: headers, quaternions, speeds and covariances of ROS messages."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +29,20 @@ class ObjectList:
     frame: Frame | None
     """None where the message does not say."""
     objects: tuple[Detection, ...]
+    left_out: tuple[str, ...] = ()
+    """As of a `DetectionList`."""
+
+
+def split(found: Iterable[Detection | str]) -> tuple[tuple[Detection, ...], tuple[str, ...]]:
+    """The detections among `found`, and what says of each other object by which setting it is left out."""
+    objects: list[Detection] = []
+    left_out: list[str] = []
+    for one in found:
+        if isinstance(one, str):
+            left_out.append(one)
+        else:
+            objects.append(one)
+    return tuple(objects), tuple(left_out)
 
 
 def stamp_ns(time: RosMessage) -> int:

@@ -36,6 +36,7 @@ import numpy as np
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import Detection, DetectionList, Frame, Message, TruthState
+from fgtrack.io.adapters.common import split
 from fgtrack.io.adapters.kitti_view import PERIOD_NS, View, lines, read_views
 from fgtrack.io.config import InputConfig, KittiInput
 from fgtrack.io.source import FileFormat
@@ -90,8 +91,10 @@ def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator
         yield view.ego
         for sensor, rows in detections.items():
             refers_to = _frame(rows)
-            objects = _read(rows.get(frame, []), partial(_detection, view, sensor, settings, refers_to))
-            yield DetectionList(sensor, view.ego.stamp_ns, view.ego.receipt_ns, list(objects), refers_to)
+            parse = partial(_detection, view, sensor, settings, refers_to)
+            found: Iterator[Detection | str] = _read(rows.get(frame, []), parse)
+            objects, left_out = split(found)
+            yield DetectionList(sensor, view.ego.stamp_ns, view.ego.receipt_ns, objects, refers_to, left_out)
 
 
 def view_of_sequence(path: Path) -> list[View]:
@@ -181,8 +184,8 @@ def _region(view: View, ids: Iterator[int], fields: list[str]) -> TruthState:
     return TruthState(ego.stamp_ns, ego.receipt_ns, next(ids), x_m, y_m, ignored=True, outline_m=outline_m)
 
 
-def _detection(view: View, sensor: str, settings: KittiInput, frame: Frame, fields: list[str]) -> Detection | None:
-    """The object of a line; None for another class, one below the score, and a box that the image cuts off."""
+def _detection(view: View, sensor: str, settings: KittiInput, frame: Frame, fields: list[str]) -> Detection | str:
+    """The object of a line; for another class, one below the score, and a box that the image cuts off the setting."""
     kind: str | None = None
     score: float | None = None
     if len(fields) == _AB3DMOT_FIELDS:
@@ -198,9 +201,9 @@ def _detection(view: View, sensor: str, settings: KittiInput, frame: Frame, fiel
     else:
         raise ValueError(f"{len(fields)} fields in place of {_FORMS}")
     if kind is not None and kind not in settings.classes:
-        return None
+        return "input.kitti.classes"
     if score is not None and score < settings.min_score.get(sensor, -math.inf):
-        return None
+        return "input.kitti.min_score"
     name = None if kind is None else kind.lower()
     if not space or float(space[3]) < _NOWHERE_M:
         if frame != "sensor":
@@ -224,10 +227,10 @@ def _detection(view: View, sensor: str, settings: KittiInput, frame: Frame, fiel
 
 def _in_image(
     view: View, settings: KittiInput, box_px: list[float], score: float | None, name: str | None
-) -> Detection | None:
+) -> Detection | str:
     left_px, top_px, right_px, bottom_px = box_px
     if left_px < _BORDER_PX or right_px > settings.image_width_px - 1.0 - _BORDER_PX:
-        return None
+        return "input.kitti.image_width_px"
     v_px = 0.5 * (top_px + bottom_px)
     covariance = None
     if settings.box_std is not None:

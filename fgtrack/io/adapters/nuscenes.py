@@ -25,7 +25,7 @@ from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import seconds
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
-from fgtrack.io.adapters.common import signed_speed_mps
+from fgtrack.io.adapters.common import signed_speed_mps, split
 from fgtrack.io.adapters.ids import object_id
 from fgtrack.io.config import InputConfig, NuscenesInput
 from fgtrack.io.source import FileFormat
@@ -69,9 +69,10 @@ def read_scene(file: Path, settings: NuscenesInput) -> Iterator[Message]:
         egos = _egos(tables, samples)
         truth = _truth(tables, samples, settings)
         lists = [
-            DetectionList(settings.sensor, stamp_ns, stamp_ns, list(_boxes(boxes[token], settings)), "map")
+            DetectionList(settings.sensor, stamp_ns, stamp_ns, objects, "map", left_out)
             for token, stamp_ns in samples.items()
             if token in boxes
+            for objects, left_out in [split(_boxes(boxes[token], settings))]
         ]
     except FgtrackError:
         raise
@@ -148,11 +149,15 @@ def _motion(one: tuple[float, ...], other: tuple[float, ...], after_s: float) ->
     return signed_speed_mps(vx_mps, vy_mps, middle_rad), wrap_angle(other[2] - one[2]) / after_s
 
 
-def _boxes(boxes: list[Json], settings: NuscenesInput) -> Iterator[Detection]:
+def _boxes(boxes: list[Json], settings: NuscenesInput) -> Iterator[Detection | str]:
     for box in boxes:
         name = box.get("detection_name", box.get("tracking_name"))
         score = float(box.get("detection_score", box.get("tracking_score", math.nan)))
-        if (settings.classes and name not in settings.classes) or score < settings.min_score:
+        if settings.classes and name not in settings.classes:
+            yield "input.nuscenes.classes"
+            continue
+        if score < settings.min_score:
+            yield "input.nuscenes.min_score"
             continue
         x_m, y_m, z_m = map(float, box["translation"])
         width_m, length_m, height_m = map(float, box["size"])

@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
@@ -42,7 +43,8 @@ class _Scan:
             objects += one.objects if same else [_stamped(item, one.stamp_ns) for item in one.objects]
         last = self.lists[-1]
         mean_ns = stamps_ns[0] + sum(stamp - stamps_ns[0] for stamp in stamps_ns) // len(stamps_ns)
-        return DetectionList(last.sensor, mean_ns, last.receipt_ns, objects, last.frame)
+        left_out = tuple(chain.from_iterable(one.left_out for one in self.lists))
+        return DetectionList(last.sensor, mean_ns, last.receipt_ns, objects, last.frame, left_out)
 
 
 def _stamped(item: Detection, stamp_ns: int) -> Detection:

@@ -8,6 +8,7 @@ empty cell is a value that is not given. Files are sorted by receipt when they a
 import csv
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from decimal import Decimal, InvalidOperation
 from functools import partial
 from itertools import chain, groupby
@@ -91,18 +92,25 @@ def read_tables(tables: Sequence[tuple[Path, CsvTable, str]]) -> Iterator[Messag
 def _read(file: Path, table: CsvTable, role: str) -> tuple[list[Message], DataError | None]:
     """All messages of a table, up to its end or to what is wrong with it."""
     rows: list[tuple[_Times, Any]] = []
+    left_out: list[str] = []
     error = None
     make: Make = partial(_state, table, role) if role in ("ego", "truth") else partial(_detection, table)
     try:
         for cells in _rows(file, table):
-            if all(each.passes(_typed(cells.values[name])) for name, each in table.filters.items()):
-                times = _times(cells, table)
-                rows.append((times, make(cells, times)))
+            refused = (name for name, each in table.filters.items() if not each.passes(_typed(cells.values[name])))
+            if (name := next(refused, None)) is not None:
+                left_out.append(f"filters.{name}")
+                continue
+            times = _times(cells, table)
+            rows.append((times, make(cells, times)))
     except DataError as found:
         error = found
     if role in ("ego", "truth"):
         return [state for _, state in rows], error
-    return list(_lists(rows, role.removeprefix("detections "), table)), error
+    lists = list(_lists(rows, role.removeprefix("detections "), table))
+    if lists:
+        lists[0] = replace(lists[0], left_out=tuple(left_out))  # of no list: their times are not read
+    return [*lists], error
 
 
 def _lists(rows: list[tuple[_Times, Detection | None]], sensor: str, table: CsvTable) -> Iterator[DetectionList]:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import DESCRIBING, MEASURABLE, DetectionList, Message, TruthState
+from fgtrack.core.types import DESCRIBING, MEASURABLE, Detection, DetectionList, Message, TruthState
 from fgtrack.io.adapters import ADAPTERS, message_types
-from fgtrack.io.adapters.common import ObjectList, RosMessage
+from fgtrack.io.adapters.common import ObjectList, RosMessage, split
 from fgtrack.io.adapters.ego import ODOMETRY, ego_from_odometry
 from fgtrack.io.adapters.fields import (
     EGO_FIELDS,
@@ -207,19 +207,22 @@ def _passing(read: Callable[[RosMessage], ObjectList], item: TopicInput, message
     """The objects of `message` that all filters let pass."""
     found = read(message)
     own = found.objects if item.fields is None else items_by_fields(message, item.fields)
-    kept = []
-    for detection, source in zip(found.objects, own, strict=True):
-        values = (
-            getattr(detection, name) if name in DETECTION_FIELDS else value_at(source, name) for name in item.filters
-        )
-        if all(each.passes(value) for each, value in zip(item.filters.values(), values, strict=True)):
-            kept.append(detection)
-    return replace(found, objects=tuple(kept))
+    kept, left_out = split(_judged(item, *pair) for pair in zip(found.objects, own, strict=True))
+    return replace(found, objects=kept, left_out=left_out)
+
+
+def _judged(item: TopicInput, detection: Detection, source: RosMessage) -> Detection | str:
+    """`detection`, or the first filter that it does not pass: by what it says, or by a field that it is read from."""
+    for name, each in item.filters.items():
+        if not each.passes(getattr(detection, name) if name in DETECTION_FIELDS else value_at(source, name)):
+            return f"filters.{name}"
+    return detection
 
 
 def _detections(topic: BagTopic, item: TopicInput, sensor: str) -> Convert:
     def messages(objects: ObjectList, stamp_ns: int, receipt_ns: int) -> Iterator[Message]:
-        yield DetectionList(sensor, stamp_ns, receipt_ns, objects.objects, item.frame or objects.frame or "ego")
+        frame = item.frame or objects.frame or "ego"
+        yield DetectionList(sensor, stamp_ns, receipt_ns, objects.objects, frame, objects.left_out)
 
     return _objects(topic, item, messages)
 

@@ -51,6 +51,8 @@ class _Meta:
     digest: str = ""
     detections_received: int = 0
     counts: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    out_of_bounds: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    left_out: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     ego_refused: Mapping[str, int] = field(default_factory=dict)
     failures: Mapping[str, int] = field(default_factory=dict)
     first_failure: str | None = None

@@ -27,6 +27,8 @@ class RunSink(ABC):
         self._meta: dict[str, object] = {"format": RUN_FORMAT, **(meta or {}), "complete": False}
         self._smoothed_lag_s = smoothed_lag_s
         self._counts: dict[str, Counter[Disposition]] = {}
+        self._out_of_bounds: dict[str, Counter[str]] = {}  # by setting
+        self._left_out: dict[str, Counter[str]] = {}  # by the reader and its settings
         self._received: dict[str, list[Row]] = {"ego": [], "detections": []}  # since the last tick
 
     def write_tick(self, report: TickReport, process_ns: int, num_detections: int) -> None:
@@ -34,6 +36,8 @@ class RunSink(ABC):
         self._append_received()
         for record in report.updates:
             self._counts.setdefault(record.sensor, Counter())[record.disposition] += 1
+            if record.reason is not None:
+                self._out_of_bounds.setdefault(record.sensor, Counter())[record.reason] += 1
         for table, found in rows(report, process_ns, num_detections, self._smoothed_lag_s):
             if found:
                 self._append(table, found)
@@ -57,18 +61,22 @@ class RunSink(ABC):
     def write_detections(self, message: DetectionList) -> None:
         """Take the rows of `detections`; the next tick puts them behind the others."""
         self._received["detections"] += detection_rows(message)
+        if message.left_out:
+            self._left_out.setdefault(message.sensor, Counter()).update(message.left_out)
 
     def finish(self, meta: Mapping[str, object]) -> dict[str, object]:
         """Complete the run with `meta`, the counts and the digest; gives the content of `meta.json`.
 
-        `counts` holds, per sensor, the number of detections of every disposition.
+        `counts` holds, per sensor, the number of detections of every disposition, `out_of_bounds` of those with this
+        disposition how many by which setting, and `left_out` the same of what the reader did not give.
         """
         self._append_received()
         counts = {
             sensor: {disposition.value: counter[disposition] for disposition in Disposition}
             for sensor, counter in sorted(self._counts.items())
         }
-        self._meta |= {**meta, "counts": counts, "digest": self._digest(), "complete": True}
+        bounds = {"out_of_bounds": _by_reason(self._out_of_bounds), "left_out": _by_reason(self._left_out)}
+        self._meta |= {**meta, "counts": counts, **bounds, "digest": self._digest(), "complete": True}
         return dict(self._meta)
 
     def _append_received(self) -> None:
@@ -84,3 +92,7 @@ class RunSink(ABC):
     @abstractmethod
     def _digest(self) -> str:
         """SHA-256 of the bytes of tracks.csv and then updates.csv, in hex."""
+
+
+def _by_reason(counts: Mapping[str, Counter[str]]) -> dict[str, dict[str, int]]:
+    return {sensor: dict(sorted(counter.items())) for sensor, counter in sorted(counts.items())}

@@ -1,0 +1,101 @@
+"""Detections that a filter leaves out: each is counted by the setting that did it, and said."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from support.tracking import START_NS, ms
+from typer.testing import CliRunner
+
+import fgtrack
+from fgtrack.cli.main import app
+from fgtrack.core.types import Detection, DetectionList, Disposition
+from fgtrack.evaluation.left_out import because, left_out
+from fgtrack.io.adapters.scans import grouped
+from fgtrack.io.stream import write_stream
+from fgtrack.models.sensors import Filter, SensorModel
+from fgtrack.pipeline.build import build_tracker
+from fgtrack.pipeline.config import Config, InboxConfig
+from fgtrack.pipeline.replay import replay_in_memory
+
+SEEN = (
+    Detection(x_m=10.0, y_m=0.0, speed_mps=5.0, score=0.9, class_name="car"),
+    Detection(x_m=30.0, y_m=0.0, speed_mps=5.0, score=0.2, class_name="car"),
+    Detection(x_m=50.0, y_m=0.0, speed_mps=5.0, score=0.9, class_name="bush"),
+    Detection(x_m=70.0, y_m=0.0, speed_mps=80.0, score=0.9, class_name="car"),
+    Detection(x_m=90.0, y_m=0.0, speed_mps=5.0, class_name="car"),
+    Detection(x_m=math.nan, y_m=0.0, speed_mps=5.0, score=0.1, class_name="car"),
+)
+FILTERS = {
+    "score": Filter(min=0.5),
+    "class_name": Filter(none_of=("bush",)),
+    "speed_mps": Filter(min=-70.0, max=70.0),
+}
+RADAR = SensorModel(std={"x_m": 0.3, "y_m": 0.3}, filters=FILTERS)
+
+
+def radar_list(at_ms: float = 0.0) -> DetectionList:
+    now_ns = START_NS + ms(at_ms)
+    return DetectionList("radar", now_ns, now_ns, SEEN, "map")
+
+
+@pytest.mark.parametrize("inbox", ["queue", "slot"])
+def test_score_class_and_speed_decide_what_is_used_and_the_rest_is_out_of_bounds(inbox: str) -> None:
+    one = build_tracker(replace(Config(), sensors={"radar": RADAR}, inbox=InboxConfig(kind=inbox)))
+    one.receive(radar_list())
+    report = one.tick(START_NS)
+    found = {each.index: (each.disposition.value, each.reason) for each in report.updates}
+    out = Disposition.OUT_OF_BOUNDS.value
+    assert found == {
+        0: ("birth", None),
+        1: (out, "filters.score"),
+        2: (out, "filters.class_name"),
+        3: (out, "filters.speed_mps"),
+        4: (out, "filters.score"),  # says none
+        5: ("invalid", None),
+    }
+
+
+def test_a_filter_goes_by_what_detections_have() -> None:
+    with pytest.raises(ValueError, match="unknown 'snr', known are x_m, .*score"):
+        replace(RADAR, filters={"snr": Filter(min=1.0)})
+
+
+def test_a_run_counts_what_was_left_out_by_sensor_and_setting_and_compare_shows_it(tmp_path: Path) -> None:
+    config = tmp_path / "config.yaml"
+    config.write_text(
+        "sensors: {radar: {std: {x_m: 0.3, y_m: 0.3}, max_range_m: 1.0e+4,\n"
+        "  filters: {score: {min: 0.5}, class_name: {none_of: [bush]}, speed_mps: {max: 70.0}}}}\n"
+        "birth: {kind: measured, ego_speed_factor: 0.0}\n"
+    )
+    stream, out = tmp_path / "in.jsonl", tmp_path / "run"
+    write_stream(stream, [radar_list(100.0 * k) for k in range(4)])
+    said = CliRunner().invoke(app, ["replay", str(stream), "-c", str(config), "-o", str(out)])
+    line = (
+        "radar: 16 of 24 detections out of bounds (8 by filters.score, 4 by filters.class_name, 4 by filters.speed_mps)"
+    )
+    assert line in said.output.replace("\n", " "), said.output
+    meta = json.loads((out / "meta.json").read_text())
+    counts = {"filters.class_name": 4, "filters.score": 8, "filters.speed_mps": 4}
+    assert meta["out_of_bounds"] == {"radar": counts}
+    assert meta["counts"]["radar"]["out_of_bounds"] == 16
+    assert meta["left_out"] == {}
+    assert line in str(fgtrack.compare(fgtrack.load_run(out)))
+    tried = CliRunner().invoke(app, ["info", str(stream), "-c", str(config)])
+    assert f"first 5 s of {line}" in tried.output.replace("\n", " ")
+
+
+def test_what_a_reader_leaves_out_is_counted_and_stays_with_its_scan() -> None:
+    one, other = (replace(radar_list(at), left_out=("filters.rcs",) * 2) for at in (0.0, 1.0))
+    (scan,) = grouped([one, other], {"radar": ms(5.0)})
+    assert scan.left_out == ("filters.rcs",) * 4
+    config = replace(Config(), sensors={"radar": replace(RADAR, filters={})})
+    run, _ = replay_in_memory([scan], config)
+    assert run.meta["left_out"] == {"radar": {"filters.rcs": 4}}
+    assert list(left_out(run.meta)) == ["radar: 4 left out when read (4 by filters.rcs)"]
+
+
+def test_the_most_frequent_reason_comes_first() -> None:
+    assert because({"b": 1, "a": 3}) == "3 by a, 1 by b"
