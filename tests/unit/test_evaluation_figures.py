@@ -17,7 +17,9 @@ from fgtrack.core.types import Disposition
 from fgtrack.evaluation import plot
 from fgtrack.evaluation.figures.style import FORMATS, WRONG, broken_line
 from fgtrack.evaluation.runs import judged
+from fgtrack.evaluation.viewer.export import viewer_messages
 from fgtrack.io.run import Run
+from fgtrack.io.viewer.scene import Scene
 from fgtrack.models.track_map import COLUMNS, TrackMap
 
 TICKS = range(60)
@@ -230,6 +232,17 @@ def test_the_map_shows_the_bounds_of_the_track(tmp_path: Path) -> None:
     assert radii == pytest.approx([292.5, 307.5], abs=0.5)
     west, west_track, *_, wrong = [line.get_color() for line in axes.lines[2:]]
     assert west == west_track != wrong == WRONG
+
+
+def test_exclusion_areas_are_shown_on_the_map_and_in_the_viewer(tmp_path: Path, runs: list[Run]) -> None:
+    (tmp_path / "shore.csv").write_text("area,x_m,y_m\na,0,0\na,9,0\na,9,9\nb,20,0\nb,29,0\nb,29,9\nb,20,9\n")
+    shown = replace(runs[0], config_text=f"map: {{excluded: [{tmp_path / 'shore.csv'}, lost.csv]}}")
+    axes = plot.map(shown).axes[0]
+    assert [len(line.get_xdata()) for line in axes.lines if line.get_linestyle() == ":"] == [4, 5]
+    messages, notes = viewer_messages({"run": shown})
+    scene = next(message for message in messages if isinstance(message, Scene) and message.topic == "/map")
+    assert [len(line.points_m) for line in scene.entities[0].shapes] == [4, 5]
+    assert notes[0] == "map.excluded: lost.csv is not there any more, so it is not shown"
 
 
 def test_a_map_that_is_gone_is_said_and_one_that_is_none_is_refused(tmp_path: Path, runs: list[Run]) -> None:

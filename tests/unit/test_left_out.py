@@ -59,7 +59,7 @@ def test_score_class_and_speed_decide_what_is_used_and_the_rest_is_out_of_bounds
 
 
 def test_a_filter_goes_by_what_detections_have() -> None:
-    with pytest.raises(ValueError, match="unknown 'snr', known are x_m, .*score"):
+    with pytest.raises(ValueError, match=r"unknown 'snr', known are x_m, .*score"):
         replace(RADAR, filters={"snr": Filter(min=1.0)})
 
 

@@ -52,7 +52,7 @@ def tracks_on_map(run: OneRun) -> Figure:
         axes.plot(*line.T, color=GREY, lw=0.7, zorder=3)
     label = "excluded"
     for ring in excluded_lines(one.run):
-        axes.fill(*ring.T, facecolor=GREY, alpha=0.2, edgecolor=GREY, lw=0.7, zorder=2.2, label=label)
+        axes.plot(*ring.T, color=GREY, lw=1.2, ls=":", zorder=3, label=label)
         label = ""
     if notes:
         text.append("the map file is not there any more")
