@@ -10,8 +10,8 @@ import numpy as np
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.linalg import mahalanobis_squared
-from fgtrack.core.types import MEASURABLE, FloatArray, SmoothedReport, TrackState
-from fgtrack.models.measurement import MeasurementModel, SensorPose, measurement_model
+from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
+from fgtrack.models.measurement import COMPONENTS, MeasurementModel, SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.sensors import RobustLoss
 
@@ -53,15 +53,15 @@ class Measurement:
         assumed: tuple[str, ...] = (),
         **values: float,
     ) -> "Measurement":
-        """The measurement of `values`, by name of `MEASURABLE`, with a standard deviation each or a covariance.
+        """The measurement of `values`, by name of `COMPONENTS`, with a standard deviation each or a covariance.
 
-        `covariance`, shape (k, k), is in the order of `MEASURABLE`. Raises `CallError` for an unknown or missing name
+        `covariance`, shape (k, k), is in the order of `COMPONENTS`. Raises `CallError` for an unknown or missing name
         and a value or covariance that makes no sense.
         """
-        names = tuple(name for name in MEASURABLE if name in values)
+        names = tuple(name for name in COMPONENTS if name in values)
         if not names or len(names) < len(values):
-            given = ", ".join(name for name in values if name not in MEASURABLE) or "nothing"
-            raise CallError(f"measurement of {given}: give one or more of {', '.join(MEASURABLE)}")
+            given = ", ".join(name for name in values if name not in COMPONENTS) or "nothing"
+            raise CallError(f"measurement of {given}: give one or more of {', '.join(COMPONENTS)}")
         if not set(assumed) < set(names):
             raise CallError(f"measurement of {', '.join(names)}: assumed must name some of them, is {assumed!r}")
         if (std is None) == (covariance is None):

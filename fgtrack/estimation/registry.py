@@ -33,6 +33,7 @@ ESTIMATORS = Registry(
             "ekf-backward-forward": "fgtrack.estimation.backward_forward:backward_forward",
             "ekf-replay": "fgtrack.estimation.replay:ReplayEkf",
             "iekf-replay": "fgtrack.estimation.iekf:IekfReplay",
+            "imm-replay": "fgtrack.estimation.imm:ImmReplay",
             "ipls": "fgtrack.estimation.ipls:PosteriorLinearisationSmoother",
             "iplf-replay": "fgtrack.estimation.iplf:IplfReplay",
             "smoother": "fgtrack.estimation.factor_graph.factories:smoother",
@@ -93,6 +94,9 @@ class Claims:
     sensed after it. One that smooths does so anyway."""
     spreads: bool = False
     """Whether predictions of a nonlinear model are averages over the spread of the state, not values at its mean."""
+    mixes: bool = False
+    """Whether it weighs other motion models beside the one that it is given: what it predicts, and what it estimates in
+    sequence, is then not what that model alone would give."""
     held_s: float = 0.0
     """How long a measurement waits before it counts."""
     initiates: bool = False

@@ -99,7 +99,7 @@ class ReplayingFilter(WindowedFilter):
         place = bisect.bisect_right(self._steps, order, lo=1, key=_order)
         step, correction = self._fused(self._steps[place - 1], order, measurement)
         later = self._steps[place:]
-        if later:
+        if later and self.retrodicts:
             found = self._recursion.innovation(*self._retrodicted(step, later), measurement)
             correction = correction._replace(**found._asdict())
         self._steps[place:] = [step, *self._replayed(step, later)]
@@ -135,6 +135,12 @@ class ReplayingFilter(WindowedFilter):
         """The step after `before` with `measurement`; `numpy.linalg.LinAlgError` where it is not finite."""
         predicted = self._predicted(before, measurement.stamp_ns)
         corrected = self._recursion.correct(predicted.mean, predicted.covariance, measurement)
+        return self._concluded(before, order, measurement, predicted, corrected)
+
+    def _concluded(
+        self, before: Step, order: Order, measurement: Measurement, predicted: Prediction, corrected: OneCorrection
+    ) -> tuple[Step, OneCorrection]:
+        """The step of a corrected state; while the direction of travel is sought, that along the line instead."""
         mean, covariance = corrected.mean, corrected.covariance
         opening = None if before.opening is None else before.opening.with_measurement(measurement)
         if opening is not None and opening.line is not None:

@@ -1,7 +1,8 @@
 """Measurement models: any subset of the measurable components, seen from a sensor pose.
 
 x_m, y_m and yaw_rad are in the map frame and speed_mps is over ground along the heading. range_m, bearing_rad
-(0 along the sensor's x axis, counter-clockwise) and range_rate_mps are relative to the sensor.
+(0 along the sensor's x axis, counter-clockwise) and range_rate_mps are relative to the sensor. curvature_radpm, left
+turn positive, is that of the way of the object: its yaw rate over its speed. No sensor measures it, a map tells it.
 """
 
 from collections.abc import Callable
@@ -13,12 +14,17 @@ import numpy as np
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import cartesian, cartesian_gradient, polar, polar_gradient, wrap_angles
-from fgtrack.core.types import MEASURABLE, FloatArray, IntArray
+from fgtrack.core.types import MEASURABLE, YAW_RATE, FloatArray, IntArray
 from fgtrack.models.motion import CARTESIAN, MIN_SPEED_MPS, POLAR, MotionModel
 
 #: The gradient of a bearing by the position grows as 1 / range; below this range it stays as it is there.
 MIN_RANGE_M = 1e-6
 
+#: Far below this speed a curvature says nothing of the yaw rate: an object at rest has no way that could turn.
+SLOW_MPS = 1.0
+
+#: What a measurement may be of: what a detection measures, and what the map says of a moving object.
+COMPONENTS = (*MEASURABLE, "curvature_radpm")
 #: Components that are angles.
 ANGULAR = ("yaw_rad", "bearing_rad")
 #: Components that are relative to the sensor.
@@ -48,20 +54,22 @@ class MeasurementModel:
     """
 
     components: tuple[str, ...]
-    """Measured components, a non-empty subset of `MEASURABLE` in that order."""
+    """Measured components, a non-empty subset of `COMPONENTS` in that order."""
     state_names: tuple[str, ...]
     """Names of the entries of the state: x, y and either yaw, speed or vx, vy, and what follows."""
 
     def __post_init__(self) -> None:
-        if not self.components or self.components != tuple(name for name in MEASURABLE if name in self.components):
+        if not self.components or self.components != tuple(name for name in COMPONENTS if name in self.components):
             raise CallError(
                 f"measurement of {', '.join(self.components) or 'nothing'}: give one or more of "
-                f"{', '.join(MEASURABLE)}, each once and in this order"
+                f"{', '.join(COMPONENTS)}, each once and in this order"
             )
         if self.state_names[:4] not in (POLAR, CARTESIAN):
             raise CallError(
                 f"state of {', '.join(self.state_names)}: must begin with {', '.join(POLAR)} or {', '.join(CARTESIAN)}"
             )
+        if "curvature_radpm" in self.components and self.state_names[YAW_RATE : YAW_RATE + 1] != ("yaw_rate_radps",):
+            raise CallError("measurement of curvature_radpm: needs a state with a yaw rate, as that of CTRV or CTRA")
 
     @cached_property
     def angular(self) -> tuple[int, ...]:
@@ -97,7 +105,10 @@ class MeasurementModel:
         scene = _Scene(x, pose, self._cartesian)
         H = np.zeros(shape)
         for row, name in enumerate(self.components):
-            H[..., row, :2], H[..., row, 2:4] = _COMPONENTS[name].gradient(scene)
+            component = _COMPONENTS[name]
+            H[..., row, :2], H[..., row, 2:4] = component.gradient(scene)
+            if component.by_yaw_rate is not None:
+                H[..., row, YAW_RATE] = component.by_yaw_rate(scene)
         return H
 
     def pose_jacobian(self, x: FloatArray, pose: SensorPose) -> FloatArray:
@@ -177,12 +188,13 @@ class _Scene:
     """States and a sensor pose, and what several components derive from them.
 
     `motion` is the third and fourth entry of the state: (yaw, speed), or (vx, vy) where `cartesian_motion` is
-    set.
+    set. `turn`, shape (..., 1), is the yaw rate of a state that has one.
     """
 
     def __init__(self, x: FloatArray, pose: SensorPose, cartesian_motion: bool) -> None:
         self.position: FloatArray = x[..., :2]
         self.motion: FloatArray = x[..., 2:4]
+        self.turn: FloatArray = x[..., YAW_RATE : YAW_RATE + 1]
         self.pose = pose
         self.cartesian_motion = cartesian_motion
 
@@ -224,10 +236,12 @@ class _Scene:
 
 
 class _Component(NamedTuple):
-    """One measurable quantity: its value and its gradients by position and `motion`, shape (..., 2) each."""
+    """One quantity: its value and its gradients by position and `motion`, shape (..., 2) each."""
 
     value: Callable[[_Scene], FloatArray]
     gradient: Callable[[_Scene], tuple[FloatArray, FloatArray]]
+    by_yaw_rate: Callable[[_Scene], FloatArray] | None = None
+    """Derivative by the yaw rate, shape (...); None where it is 0."""
 
 
 def _range_rate(scene: _Scene) -> FloatArray:
@@ -244,6 +258,18 @@ def _range_rate_gradient(scene: _Scene) -> tuple[FloatArray, FloatArray]:
     return across_mps * scene.offset_gradient[..., 0, :], by_motion
 
 
+def _pace(scene: _Scene) -> FloatArray:
+    """1 / v, which falls to 0 at rest: v / (v^2 + v0^2) with v0 = `SLOW_MPS`."""
+    speed_mps = scene.motion[..., 1]
+    return np.asarray(speed_mps / (speed_mps**2 + SLOW_MPS**2))
+
+
+def _curvature_gradient(scene: _Scene) -> tuple[FloatArray, FloatArray]:
+    """By the speed alone: the derivative of `_pace` is 1 / (v^2 + v0^2) - 2 pace^2."""
+    by_speed = scene.turn[..., 0] * (1.0 / (scene.motion[..., 1] ** 2 + SLOW_MPS**2) - 2.0 * _pace(scene) ** 2)
+    return _NONE, np.stack([np.zeros_like(by_speed), by_speed], axis=-1)
+
+
 _COMPONENTS = {
     "x_m": _Component(lambda s: s.position[..., 0], lambda s: (np.array([1.0, 0.0]), _NONE)),
     "y_m": _Component(lambda s: s.position[..., 1], lambda s: (np.array([0.0, 1.0]), _NONE)),
@@ -254,4 +280,5 @@ _COMPONENTS = {
         lambda s: polar(s.offset)[..., 0] - s.pose.yaw_rad, lambda s: (s.offset_gradient[..., 0, :], _NONE)
     ),
     "range_rate_mps": _Component(_range_rate, _range_rate_gradient),
+    "curvature_radpm": _Component(lambda s: s.turn[..., 0] * _pace(s), _curvature_gradient, _pace),
 }

@@ -96,6 +96,10 @@ class Score:
         return min(max((score - self.even) / self.scale, -10.0), 10.0)
 
 
+#: What the map may stand in for, and the key that says how well.
+_FROM_MAP = {"yaw_rad": "yaw_from_map_std_rad", "curvature_radpm": "curvature_from_map_std_radpm"}
+
+
 @dataclass(frozen=True)
 class SensorModel:
     """One modality. Positions have their standard deviations along and across the line of sight."""
@@ -104,6 +108,12 @@ class SensorModel:
     """Standard deviation of each measured component; the keys say what the sensor measures."""
     yaw_from_map_std_rad: float | None = None
     """Where the sensor measures no yaw: take the map heading as a yaw measurement with this standard deviation."""
+    curvature_from_map_std_radpm: float | None = None
+    """Take the curvature of the map's line as a measurement of yaw rate over speed with this standard deviation: the
+    yaw rate is speed times curvature, but for what a driver does beside the line; null: the map says nothing of it."""
+    std_growth: Mapping[str, float] = field(default_factory=dict)
+    """By how much the standard deviation of a component grows with each metre of range: its variance is std^2 +
+    (std_growth range)^2. A detection's own covariance stays as it is."""
     max_delay_s: float | None = None
     """A message that arrives later than this is refused as too old."""
     counter_init: int = 3
@@ -155,9 +165,14 @@ class SensorModel:
         for name in self.filters:
             if name not in (*MEASURABLE, *DESCRIBING):
                 raise ValueError(f"filters: unknown {name!r}, known are {', '.join((*MEASURABLE, *DESCRIBING))}")
+        for name, value in self.std_growth.items():
+            if name not in self.std:
+                raise ValueError(f"std_growth.{name}: the sensor measures {', '.join(self.components)}")
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"std_growth.{name}: must be finite and not negative, is {value}")
         if ("x_m" in self.std) != ("y_m" in self.std):
             raise ValueError("std: x_m and y_m are measured together")
-        for name in ("yaw_from_map_std_rad", "max_delay_s", "max_range_m", "view_range_m", "max_range_behind_m"):
+        for name in ("max_delay_s", "max_range_m", "view_range_m", "max_range_behind_m", *_FROM_MAP.values()):
             value = getattr(self, name)
             if value is not None and not value > 0.0:
                 raise ValueError(f"{name}: must be positive, is {value}")
@@ -212,15 +227,32 @@ class SensorModel:
             self._noises[components] = R
         return self._noises[components]
 
+    @property
+    def round(self) -> bool:
+        """Whether its error of the position is the same along and across the line of sight."""
+        growth = self.std_growth
+        return self.std["x_m"] == self.std["y_m"] and growth.get("x_m", 0.0) == growth.get("y_m", 0.0)
+
+    def growth(self, components: tuple[str, ...], range_m: FloatArray) -> FloatArray | None:
+        """What the variances of `components` are larger at `range_m` (m,) than in `noise`, shape (m, k).
+
+        None where nothing grows; 0 at a range that is not known (NaN).
+        """
+        rates = np.array([self.std_growth.get(name, 0.0) for name in components])
+        return np.nan_to_num(np.outer(range_m, rates) ** 2) if rates.any() else None
+
     @cached_property
     def _noises(self) -> dict[tuple[str, ...], FloatArray]:
         return {}
 
     def component_std(self, name: str) -> float:
-        """Standard deviation of `name`; a yaw that the sensor does not measure comes from the map."""
-        if name == "yaw_rad" and name not in self.std and self.yaw_from_map_std_rad is not None:
-            return self.yaw_from_map_std_rad
-        return self.std[name]
+        """Standard deviation of `name`; a yaw that the sensor does not measure, and a curvature, come from the map."""
+        if name in self.std:
+            return self.std[name]
+        std: float | None = getattr(self, _FROM_MAP.get(name, ""), None)
+        if std is None:
+            raise KeyError(name)
+        return std
 
 
 def in_view(

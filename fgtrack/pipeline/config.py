@@ -279,6 +279,12 @@ class Config:
         erring = [name for name, sensor in self.sensors.items() if sensor.correlation is not None]
         if erring and self.motion.kind == "ctrv_euler":
             raise ValueError(f"sensors.{erring[0]}.correlation: needs motion.kind ctrv, ctra or cv")
+        curved = [name for name, sensor in self.sensors.items() if sensor.curvature_from_map_std_radpm is not None]
+        if curved and "yaw_rate_radps" not in self.motion.model().state_names:
+            key = f"sensors.{curved[0]}.curvature_from_map_std_radpm"
+            raise ValueError(
+                f"{key}: needs a motion model with a yaw rate, as ctrv or ctra, and not {self.motion.kind}"
+            )
 
     def motion_model(self) -> MotionModel:
         """The motion model of the tracks, with the errors of sensors that are correlated in time."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from fgtrack.core.types import MEASURABLE, FloatArray
 from fgtrack.estimation.dense_joint import Difference
-from fgtrack.models.measurement import SensorPose, measurement_model
+from fgtrack.models.measurement import COMPONENTS, SensorPose, measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.pipeline.oracle.dynamics import Flow
 from fgtrack.pipeline.oracle.sightings import Eye, Sighting, seen
@@ -67,7 +67,8 @@ def _apart(found: Flow, expected: Flow) -> Difference:
 def _measurements(motion: MotionModel) -> float:
     """Values, residuals and Jacobians of every component, alone and all together."""
     pose, largest = SensorPose(*_EYE), 0.0
-    for names in ((name,) for name in MEASURABLE), (MEASURABLE,):
+    known = MEASURABLE if motion.cartesian else COMPONENTS
+    for names in ((name,) for name in known), (known,):
         for components, x in product(names, _of(motion)):
             model, k = measurement_model(components, motion), len(components)
             value = seen(components, x, motion.state_names, _EYE)

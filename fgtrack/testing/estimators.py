@@ -273,7 +273,7 @@ def _drawn(make: Callable[..., Stream], *what: MotionModel | int) -> tuple[Draw,
 
 _BOTH = (LINEAR, NONLINEAR)
 _PROMISES = (
-    Promise(_is_the_kalman_filter_in_sequence, _drawn(regular, LINEAR)),
+    Promise(_is_the_kalman_filter_in_sequence, _drawn(regular, LINEAR), lambda claims: not claims.mixes),
     Promise(
         _gives_the_dense_joint_posterior_in_any_order,
         _drawn(shuffled, LINEAR),
@@ -307,7 +307,7 @@ _PROMISES = (
     Promise(_reports_what_is_too_old_and_stays_as_it_was, _drawn(regular, *_BOTH)),
     Promise(_stays_as_it_was_after_a_failure_and_fuses_the_next, _drawn(regular, *_BOTH)),
     Promise(_moves_only_the_window_with_the_clock, _drawn(regular, *_BOTH)),
-    Promise(_predicts_ahead_by_the_motion_model, _drawn(regular, *_BOTH)),
+    Promise(_predicts_ahead_by_the_motion_model, _drawn(regular, *_BOTH), lambda claims: not claims.mixes),
     Promise(_keeps_a_heading_that_passes_half_a_turn, (across_pi,)),
 )
 

@@ -11,11 +11,13 @@ import numpy as np
 from fgtrack.core.geometry import Real, rotations, wrap_angles
 from fgtrack.core.linalg import congruence
 from fgtrack.core.types import MEASURABLE, BoolArray, Detection, FloatArray, Frame, IntArray
-from fgtrack.models.measurement import SensorPose
+from fgtrack.models.measurement import COMPONENTS, SensorPose
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.inbox import Batch, own_covariance
 
-X, Y, YAW, RANGE, BEARING = (MEASURABLE.index(name) for name in ("x_m", "y_m", "yaw_rad", "range_m", "bearing_rad"))
+X, Y, YAW, RANGE, BEARING, CURVATURE = (
+    COMPONENTS.index(name) for name in ("x_m", "y_m", "yaw_rad", "range_m", "bearing_rad", "curvature_radpm")
+)
 _VALUES = attrgetter(*MEASURABLE)
 _FEW = 6  # so many points are moved faster one by one
 
@@ -27,7 +29,7 @@ class Located(NamedTuple):
     """Positions in the message, shape (m,)."""
     detections: list[Detection]
     values: FloatArray
-    """Components in the order of `MEASURABLE`, shape (m, 7); NaN where there is none."""
+    """In the order of `COMPONENTS`, shape (m, 8); NaN where there is none."""
     points_m: FloatArray
     """Positions in the map, shape (m, 2); NaN where only a bearing was measured."""
     map_yaw: BoolArray
@@ -60,8 +62,9 @@ class Located(NamedTuple):
 def located(batch: Batch, sensor: SensorModel, pose: SensorPose) -> Located:
     """The detections of `batch`, what `sensor` measures of them, seen from `pose`."""
     detections = [batch.message.objects[index] for index in batch.indices]
-    values = np.array([_VALUES(detection) for detection in detections], dtype=np.float64)
-    values = values.reshape(-1, len(MEASURABLE))
+    values = np.full((len(detections), len(COMPONENTS)), np.nan)
+    if detections:
+        values[:, : len(MEASURABLE)] = [_VALUES(detection) for detection in detections]
     for column in _unmeasured(tuple(sensor.std)):
         values[:, column] = np.nan
     if batch.frame != "map":
@@ -95,11 +98,15 @@ def covariances(
 ) -> FloatArray:
     """Covariances of `names` in the map, shape (m, k, k): a detection's own where it has one, else the sensor's R.
 
-    A yaw that the map gave has the sensor's standard deviation for it and is not correlated with the rest.
+    What the map gave has the sensor's standard deviation for it and is not correlated with the rest.
     """
     shared = sensor.noise(names)
     R = np.empty((len(items.indices), *shared.shape))
     R[:] = shared
+    offsets_m = items.points_m - np.array([pose.x_m, pose.y_m])
+    more = sensor.growth(names, np.hypot(offsets_m[:, 0], offsets_m[:, 1])) if sensor.std_growth else None
+    if more is not None:
+        R[:, np.arange(len(names)), np.arange(len(names))] += more
     carrying = []
     if sensor.message_covariance:
         carrying = [row for row, detection in enumerate(items.detections) if detection.covariance is not None]
@@ -112,10 +119,9 @@ def covariances(
         return R
     if frame != "map" and carrying:
         R[carrying] = _turned(R[carrying], np.full(len(carrying), pose.yaw_rad))
-    if sensor.std["x_m"] != sensor.std["y_m"] and len(carrying) < len(R):
+    if not sensor.round and len(carrying) < len(R):
         rest = np.delete(np.arange(len(R)), carrying)
-        offsets_m = items.points_m[rest] - np.array([pose.x_m, pose.y_m])
-        R[rest] = _turned(R[rest], np.arctan2(offsets_m[:, 1], offsets_m[:, 0]))
+        R[rest] = _turned(R[rest], np.arctan2(offsets_m[rest, 1], offsets_m[rest, 0]))
     return R
 
 

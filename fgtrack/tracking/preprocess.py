@@ -10,17 +10,35 @@ import numpy as np
 
 from fgtrack.core.geometry import body_point, body_point_jacobian
 from fgtrack.core.linalg import congruence
-from fgtrack.core.types import MEASURABLE, BoolArray, Disposition, FloatArray, UpdateRecord
+from fgtrack.core.types import BoolArray, Disposition, FloatArray, UpdateRecord
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.areas import ExclusionAreas
 from fgtrack.models.correlated_errors import split_error
-from fgtrack.models.measurement import RELATIVE, MeasurementModel, SensorPose, measured_position, measurement_model
+from fgtrack.models.measurement import (
+    COMPONENTS,
+    RELATIVE,
+    MeasurementModel,
+    SensorPose,
+    measured_position,
+    measurement_model,
+)
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.inbox import Batch, record
-from fgtrack.tracking.located import BEARING, RANGE, YAW, Located, X, common, covariances, located, take_map_yaw
+from fgtrack.tracking.located import (
+    BEARING,
+    CURVATURE,
+    RANGE,
+    YAW,
+    Located,
+    X,
+    common,
+    covariances,
+    located,
+    take_map_yaw,
+)
 from fgtrack.tracking.merge import Merge
 from fgtrack.tracking.pose_error import PoseError, placement
 
@@ -138,7 +156,7 @@ class Preprocess:
         return SensorPose(float(x_m), float(y_m), yaw_rad, float(vx_mps), float(vy_mps))
 
     def _on_road(self, items: Located, sensor: SensorModel, lost: dict[int, str]) -> Located:
-        """What lies inside the bounds, with the map heading as a yaw that was not measured; `lost` gets the rest."""
+        """What lies inside the bounds, with what the map says in place of a measurement; `lost` gets the rest."""
         placed = items.placed
         if not self._road.known or not len(placed):
             return items
@@ -146,6 +164,8 @@ class Preprocess:
         view = self._road.view(items.points_m if all_placed else items.points_m[placed])
         if sensor.yaw_from_map_std_rad is not None:
             take_map_yaw(items, slice(None) if all_placed else placed, view.yaw_rad)
+        if sensor.curvature_from_map_std_radpm is not None:
+            items.values[placed, CURVATURE] = view.curvature_radpm
         if not any(view.outside.tolist()):
             return items
         outside = np.zeros(len(items.indices), dtype=bool)
@@ -214,7 +234,7 @@ class Preprocess:
                 R[place] = covariances(parts, names, batch.frame, sensor, pose).mean(axis=0)
                 points_m[place] = parts.points_m.mean(axis=0)
         bearings = math.isnan(points_m[0, 0])  # all or none: what measures the same is placed or not
-        assumes = self._assumed(assumed)
+        assumes = self._assumed(assumed) + (("curvature_radpm",) if CURVATURE in columns else ())
         models, white = self._models(names, R, view)
         whole, errors = white, self._pose_errors(names, models[0], points_m, white, assumes, view)
         if errors is not None:
@@ -295,7 +315,7 @@ def _out_of_bounds(batch: Batch, index: int, reason: str) -> UpdateRecord:
 
 @cache
 def _names(columns: tuple[int, ...]) -> tuple[str, ...]:
-    return tuple(MEASURABLE[column] for column in columns)
+    return tuple(COMPONENTS[column] for column in columns)
 
 
 def _spread(names: tuple[str, ...], pose: SensorPose, z: FloatArray, R: FloatArray) -> FloatArray | None:

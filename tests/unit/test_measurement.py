@@ -10,7 +10,14 @@ from support.models import MODELS
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import MEASURABLE, FloatArray
-from fgtrack.models.measurement import MIN_RANGE_M, MeasurementModel, SensorPose, measurement_model
+from fgtrack.models.measurement import (
+    COMPONENTS,
+    MIN_RANGE_M,
+    SLOW_MPS,
+    MeasurementModel,
+    SensorPose,
+    measurement_model,
+)
 from fgtrack.models.motion import CTRV, CV, MIN_SPEED_MPS, MotionModel
 
 every_model = pytest.mark.parametrize("motion", MODELS, ids=lambda model: type(model).__name__)
@@ -237,3 +244,24 @@ def test_inputs_stay_as_they_are(motion: MotionModel) -> None:
     model = measurement_model(MEASURABLE, motion)
     model.residual(z, model.predict(x, SensorPose(9.0, 9.0)))
     model.jacobian(x, SensorPose(9.0, 9.0))
+
+
+@given(speed_mps=st.floats(-20.0, 90.0), yaw_rate_radps=st.floats(-1.0, 1.0))
+def test_a_curvature_is_the_yaw_rate_over_the_speed_and_says_nothing_at_rest(
+    speed_mps: float, yaw_rate_radps: float
+) -> None:
+    model, x = measurement_model(("curvature_radpm",), CTRV()), np.array([5.0, -3.0, 0.4, speed_mps, yaw_rate_radps])
+    expected = yaw_rate_radps * speed_mps / (speed_mps**2 + SLOW_MPS**2)
+    assert model.predict(x) == pytest.approx([expected])
+    steps = 1e-6 * np.eye(5)
+    numeric = [(model.predict(x + step) - model.predict(x - step))[0] / 2e-6 for step in steps]
+    assert_allclose(model.jacobian(x)[0], numeric, atol=1e-8)
+    still = x.copy()
+    still[3] = 0.0
+    assert model.jacobian(still)[0, 4] == 0.0
+
+
+def test_a_curvature_needs_a_yaw_rate() -> None:
+    assert (*MEASURABLE, "curvature_radpm") == COMPONENTS
+    with pytest.raises(CallError, match="needs a state with a yaw rate"):
+        measurement_model(("x_m", "y_m", "curvature_radpm"), CV())

@@ -264,6 +264,46 @@ def test_a_yaw_that_the_map_gave_is_assumed_and_one_that_was_measured_is_not() -
     assert merged.measurement.assumed == ("yaw_rad",)
 
 
+def test_a_curvature_from_the_map_is_assumed_and_turns_the_state() -> None:
+    """Beside what was measured; a bearing alone has no place on the map."""
+    curved = replace(POINTS, curvature_from_map_std_radpm=0.002)
+    [found] = candidates(Detection(x_m=10.0, y_m=3.0), sensor=curved, road=StraightRoad(curvature_radpm=0.01))
+    measurement = found.measurement
+    assert measurement.model.components == ("x_m", "y_m", "yaw_rad", "curvature_radpm")
+    assert measurement.assumed == ("yaw_rad", "curvature_radpm")
+    assert found.values["curvature_radpm"] == measurement.z[3] == 0.01
+    assert measurement.R[3, 3] == pytest.approx(0.002**2)
+    assert candidates(Detection(x_m=10.0, y_m=3.0), sensor=curved)[0].measurement.model.components == ("x_m", "y_m")
+    seen = SensorModel(std={"bearing_rad": 0.02}, curvature_from_map_std_radpm=0.002)
+    [bearing] = candidates(Detection(bearing_rad=0.1), sensor=seen, road=StraightRoad(), frame="sensor")
+    assert bearing.measurement.model.components == ("bearing_rad",)
+
+
+# --- noise that grows with the range
+
+
+@pytest.mark.parametrize("frame", ["sensor", "ego", "map"])
+def test_noise_grows_along_and_across_the_line_of_sight(frame: Frame) -> None:
+    sensor = replace(LIDAR, std={"x_m": 0.3, "y_m": 0.1}, std_growth={"x_m": 0.01, "y_m": 0.02})
+    [found] = candidates(Detection(x_m=40.0, y_m=30.0), sensor=sensor, frame=frame)
+    pose = found.measurement.pose
+    offset_m = found.position_m - np.array([pose.x_m, pose.y_m])
+    range_m, turn = np.hypot(*offset_m), rotation(math.atan2(offset_m[1], offset_m[0]))
+    expected = np.diag([0.3**2 + (0.01 * range_m) ** 2, 0.1**2 + (0.02 * range_m) ** 2])
+    np.testing.assert_allclose(turn.T @ found.measurement.R @ turn, expected, atol=1e-12)
+
+
+def test_noise_of_range_and_bearing_grows_too_and_a_covariance_of_its_own_does_not() -> None:
+    polar = replace(POLAR, std_growth={"range_m": 0.03})
+    [found] = candidates(Detection(range_m=50.0, bearing_rad=0.1), sensor=polar, frame="sensor")
+    np.testing.assert_allclose(np.diag(found.measurement.R), [0.5**2 + 1.5**2, 0.02**2])
+    own = replace(POINTS, std_growth={"x_m": 0.1, "y_m": 0.1})
+    [kept] = candidates(Detection(x_m=50.0, y_m=0.0, covariance=(0.04, 0.0, 0.0, 0.04)), sensor=own)
+    np.testing.assert_allclose(kept.measurement.R, 0.04 * np.eye(2), atol=1e-12)
+    [bearing] = candidates(Detection(bearing_rad=0.1), sensor=replace(polar, std_growth={"bearing_rad": 0.1}))
+    np.testing.assert_allclose(bearing.measurement.R, [[0.02**2]])  # how far it is, is not known
+
+
 @pytest.mark.parametrize("frame", ["sensor", "ego"])
 def test_a_sensor_of_a_turning_ego_moves_with_its_lever_arm(frame: Frame) -> None:
     """v + w x r, with the arm from the ego reference point to the origin of the frame."""

@@ -51,8 +51,25 @@ def test_a_sensor_sees_what_is_in_range_and_in_its_field_of_view(
     assert bool(sensor.sees(places[1], poses[1], ORIGIN_M)) is seen
 
 
+def test_what_grows_with_range_is_measured_and_does_not_shrink() -> None:
+    sensor = SensorModel(std=POSITION, std_growth={"y_m": 0.01})
+    assert sensor.growth(("x_m",), np.array([10.0])) is None
+    found = sensor.growth(("x_m", "y_m"), np.array([0.0, 10.0, np.nan]))
+    assert found is not None
+    np.testing.assert_allclose(found, [[0.0, 0.0], [0.0, 0.01], [0.0, 0.0]])
+    for growth, said in (({"speed_mps": 0.1}, "measures x_m, y_m"), ({"x_m": -0.1}, "not negative")):
+        with pytest.raises(ValueError, match=said):
+            SensorModel(std=POSITION, std_growth=growth)
+
+
 @pytest.mark.parametrize(
-    "setting", [{"field_of_view_rad": 0.0}, {"field_of_view_rad": 7.0}, {"max_range_behind_m": 0.0}]
+    "setting",
+    [
+        {"curvature_from_map_std_radpm": 0.0},
+        {"field_of_view_rad": 0.0},
+        {"field_of_view_rad": 7.0},
+        {"max_range_behind_m": 0.0},
+    ],
 )
 def test_a_field_of_view_must_make_sense(setting: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(setting))):

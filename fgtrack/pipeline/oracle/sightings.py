@@ -104,5 +104,6 @@ def seen(names: tuple[str, ...], x: FloatArray, state_names: tuple[str, ...], ey
         "range_m": range_m,
         "bearing_rad": math.atan2(north_m, east_m) - eye.yaw_rad,
         "range_rate_mps": closing / range_m if range_m else 0.0,
+        "curvature_radpm": state.get("yaw_rate_radps", 0.0) * speed_mps / (1.0 + speed_mps * speed_mps),
     }
     return np.array([everything[name] for name in names])

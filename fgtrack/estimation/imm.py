@@ -1,0 +1,255 @@
+"""The interacting multiple model filter, in continuous time, so that late measurements can be rewound to."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.errors import CallError
+from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.linalg import mahalanobis_squared, symmetrise
+from fgtrack.core.time import seconds
+from fgtrack.core.types import YAW, FloatArray
+from fgtrack.estimation.base import Measurement, Order, Start
+from fgtrack.estimation.birth import initial_state
+from fgtrack.estimation.ekf import OneCorrection, Prediction, correct_one, predict_one
+from fgtrack.estimation.initiation import DEFAULT
+from fgtrack.estimation.recursion import EkfRecursion
+from fgtrack.estimation.registry import motion_model
+from fgtrack.estimation.replay import ReplayingFilter, Step
+from fgtrack.models.correlated_errors import CorrelatedErrors
+from fgtrack.models.motion import CTRA, CTRV, MotionModel
+from fgtrack.models.robust import penalty
+
+#: Of no model the probability falls below this, so that it can come back.
+_LEAST = 1e-12
+
+
+class Sojourns:
+    """Which motion model an object follows, as a Markov chain in continuous time.
+
+    A model is left after an exponentially distributed time, for each of the others alike. The probabilities of a
+    transition over dt, exp(G dt) with the generator G, compose: exp(G (a + b)) = exp(G a) exp(G b), so a stretch of
+    time may be split anywhere.
+
+    Parameters
+    ----------
+    stay_s
+        Mean time that an object stays with each of the m models.
+    """
+
+    def __init__(self, stay_s: Sequence[float]) -> None:
+        stay = np.array(stay_s, dtype=np.float64)
+        if not (np.isfinite(stay).all() and (stay > 0.0).all()):
+            raise ValueError(f"the mean time with a model must be positive and finite, is {stay.tolist()} s")
+        m = len(stay)
+        self.share = stay / stay.sum()
+        """Probabilities of the models in the long run, shape (m,)."""
+        root = np.sqrt(self.share)
+        # The chain is reversible, so root_i G_ij / root_j is symmetric and has real eigenvalues.
+        G = np.repeat(1.0 / (max(m - 1, 1) * stay)[:, None], m, axis=1)
+        np.fill_diagonal(G, -1.0 / stay if m > 1 else 0.0)
+        self._rates_hz, vectors = np.linalg.eigh(symmetrise(root[:, None] * G / root))
+        self._left, self._right = vectors / root[:, None], vectors.T * root
+
+    def transition(self, dt_s: float) -> FloatArray:
+        """Probability of model j (columns) `dt_s` after model i (rows), shape (m, m)."""
+        found = (self._left * np.exp(np.minimum(self._rates_hz, 0.0) * dt_s)) @ self._right
+        found = np.maximum(found, 0.0)  # rounding
+        return np.asarray(found / found.sum(axis=1, keepdims=True))
+
+
+class Mixture(NamedTuple):
+    """A Gaussian for each motion model, in the state of that model, and how probable the models are."""
+
+    means: tuple[FloatArray, ...]
+    covariances: tuple[FloatArray, ...]
+    probabilities: FloatArray
+    """Shape (m,)."""
+
+
+@dataclass(slots=True)
+class ImmStep(Step):
+    """A `Step` and the states by each of the models after it; mean and covariance are those of the mixture."""
+
+    mixture: Mixture | None = None
+
+
+class ImmReplay(ReplayingFilter):
+    """Interacting multiple model filter that rewinds and replays: `motion` and another model, weighed by what they say.
+
+    Blom and Bar-Shalom, The interacting multiple model algorithm for systems with Markovian switching coefficients,
+    IEEE Transactions on Automatic Control 33(8), 1988, with a Markov chain in continuous time (see `Sojourns`). Each
+    step of the window keeps the states by both models and their probabilities, so a late measurement gives what it
+    would have given in time. With one model it is `ReplayEkf`. The innovation of a late measurement is that before
+    what was sensed after it.
+
+    Parameters
+    ----------
+    motion, prior, lag_s
+        See `WindowedFilter`. States are those of `motion`.
+    other
+        The other model, or its name. Where nothing is given: CTRA if `motion` is CTRV, CTRV if it is CTRA, with the
+        same noise, and none beside another `motion`.
+    stay_s, other_stay_s
+        Mean time that an object stays with `motion`, and with the other model.
+    accel_density_m2ps5
+        Noise of the acceleration of CTRA beside CTRV.
+    initiation
+        See `ReplayingFilter`.
+    """
+
+    spreads = mixes = True
+    retrodicts = False
+
+    def __init__(
+        self,
+        motion: MotionModel,
+        prior: Start,
+        lag_s: float,
+        other: str | MotionModel = "",
+        stay_s: float = 5.0,
+        other_stay_s: float = 5.0,
+        accel_density_m2ps5: float = CTRA.accel_density_m2ps5,
+        initiation: str = DEFAULT,
+    ) -> None:
+        beside = _beside(motion, other, accel_density_m2ps5)
+        self._models = (motion,) if beside is None else (motion, beside)
+        self._sojourns = Sojourns((stay_s, other_stay_s)[: len(self._models)])
+        super().__init__(motion, prior, lag_s, EkfRecursion(motion), initiation)
+
+    @property
+    def probabilities(self) -> FloatArray:
+        """How probable `motion` and the other model are after the newest measurement, shape (m,)."""
+        return _mixture(self._steps[-1]).probabilities.copy()
+
+    def _first(self, prior: Start) -> ImmStep:
+        """See `ReplayingFilter`."""
+        states = [initial_state(model, prior) for model in self._models]
+        means, covariances = zip(*states, strict=True)
+        return _with(super()._first(prior), Mixture(means, covariances, self._sojourns.share))
+
+    def _fused(self, before: Step, order: Order, measurement: Measurement) -> tuple[Step, OneCorrection]:
+        """See `ReplayingFilter`."""
+        prior = self._mixed(before, measurement.stamp_ns)
+        predicted = self._moments(prior, prior.probabilities, self._motion)
+        corrected = [
+            correct_one(mean, covariance, measurement.seen_by(model))
+            for model, mean, covariance in zip(self._models, prior.means, prior.covariances, strict=True)
+        ]
+        posterior = Mixture(
+            tuple(_turned(model, each.mean) for model, each in zip(self._models, corrected, strict=True)),
+            tuple(each.covariance for each in corrected),
+            _weighed(prior.probabilities, [_log_likelihood(each, measurement) for each in corrected]),
+        )
+        found = self._recursion.innovation(*predicted, measurement)
+        weight = float(posterior.probabilities @ [each.weight for each in corrected])
+        whole = self._moments(posterior, posterior.probabilities, self._motion)
+        step, correction = self._concluded(
+            before, order, measurement, Prediction(*predicted, predicted[1]), OneCorrection(*whole, *found[:2], weight)
+        )
+        if step.along:  # the state comes from all that was measured, along a line, by `motion`
+            alike = [self._own(self._motion, model, step.mean, step.covariance) for model in self._models]
+            means, covariances = zip(*alike, strict=True)
+            posterior = posterior._replace(means=means, covariances=covariances)
+        return _with(step, posterior), correction._replace(S=found.S)
+
+    def _predicted(self, before: Step, stamp_ns: int) -> Prediction:
+        """See `ReplayingFilter`; the cross-covariance, of which nothing is asked, is the covariance."""
+        mixture = self._mixed(before, stamp_ns)
+        mean, covariance = self._moments(mixture, mixture.probabilities, self._motion)
+        return Prediction(mean, covariance, covariance)
+
+    def _mixed(self, before: Step, stamp_ns: int) -> Mixture:
+        """The mixture at `stamp_ns`, from the step before it.
+
+        Each model starts from the mixture of what the object may have followed before, given that it follows that model
+        now; all of these together have the moments of the mixture before.
+        """
+        old = _mixture(before)
+        if stamp_ns == before.order[0]:
+            return old
+        dt_s = seconds(stamp_ns - before.order[0])
+        joint = old.probabilities[:, None] * self._sojourns.transition(dt_s)
+        probabilities = joint.sum(axis=0)
+        means, covariances = [], []
+        for model, shares, total in zip(self._models, joint.T, probabilities, strict=True):
+            mean, covariance = predict_one(*self._moments(old, shares / total, model), model, dt_s)
+            means.append(mean)
+            covariances.append(covariance)
+        return Mixture(tuple(means), tuple(covariances), probabilities)
+
+    def _moments(self, mixture: Mixture, weights: FloatArray, model: MotionModel) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance of the Gaussians of `mixture` with other `weights`, in the state of `model`."""
+        states = [
+            self._own(each, model, mean, covariance)
+            for each, mean, covariance in zip(self._models, mixture.means, mixture.covariances, strict=True)
+        ]
+        if len(states) == 1:
+            return states[0]
+        reference = states[int(weights.argmax())][0]
+        apart = [_turned(model, mean - reference) for mean, _ in states]
+        offset = weights @ np.array(apart)
+        spread = [P + np.outer(d - offset, d - offset) for d, (_, P) in zip(apart, states, strict=True)]
+        return reference + offset, symmetrise(np.tensordot(weights, np.array(spread), axes=1))
+
+    def _own(
+        self, model: MotionModel, wanted: MotionModel, mean: FloatArray, covariance: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """A state of `model` in the form of another one that is `wanted`."""
+        if model.state_names == wanted.state_names:
+            return mean, covariance
+        return wanted.from_kinematic(*model.kinematic(mean, covariance))
+
+
+def _beside(motion: MotionModel, other: str | MotionModel, accel_density_m2ps5: float) -> MotionModel | None:
+    """The other model. Raises `CallError` where there is none of that name, or `motion` cannot be one of two."""
+    if isinstance(motion, CorrelatedErrors):
+        raise CallError("imm-replay: takes no sensors with correlated errors")
+    if isinstance(other, MotionModel):
+        return other
+    default = "ctrv" if isinstance(motion, CTRA) else "ctra" if isinstance(motion, CTRV) else ""
+    name = other or default
+    if not name:
+        return None
+    if name == default and isinstance(motion, CTRV):
+        noise = {key: value for key, value in asdict(motion).items() if hasattr(CTRV, key)}
+        return CTRV(**noise) if name == "ctrv" else CTRA(**noise, accel_density_m2ps5=accel_density_m2ps5)
+    return motion_model(name, {})
+
+
+def _weighed(probabilities: FloatArray, log_likelihoods: Sequence[float]) -> FloatArray:
+    """The probabilities (m,) after a measurement of these likelihoods; of no model it is ever 0."""
+    logs = np.log(np.maximum(probabilities, _LEAST)) + log_likelihoods
+    found = np.maximum(np.exp(logs - logs.max()), _LEAST)
+    return np.asarray(found / found.sum())
+
+
+def _log_likelihood(found: OneCorrection, measurement: Measurement) -> float:
+    """Of the innovation by one model, under the loss of the measurement, without what all models share."""
+    if found.S is None or not np.isfinite(found.S).all():
+        raise np.linalg.LinAlgError("an innovation without a finite covariance")
+    distance = math.sqrt(max(float(mahalanobis_squared(found.innovation, found.S)), 0.0))
+    return -penalty(measurement.loss, distance) - 0.5 * float(np.linalg.slogdet(found.S)[1])
+
+
+def _turned(model: MotionModel, mean: FloatArray) -> FloatArray:
+    """`mean` (n,), or a difference of means, with its yaw in (-pi, pi]."""
+    if model.cartesian:
+        return mean
+    mean = mean.copy()
+    mean[YAW] = wrap_angle(mean[YAW])
+    return mean
+
+
+def _with(step: Step, mixture: Mixture) -> ImmStep:
+    plain = step.order, step.measurement, step.mean, step.covariance, step.predicted, step.opening
+    return ImmStep(*plain, mixture)
+
+
+def _mixture(step: Step) -> Mixture:
+    assert isinstance(step, ImmStep)  # every step of this filter is one
+    assert step.mixture is not None
+    return step.mixture

@@ -1,0 +1,94 @@
+"""A yaw rate from the curvature of the map: the same for every estimator, and in any order of arrival."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import fgtrack
+from fgtrack.core.types import YAW_RATE, FloatArray
+from fgtrack.estimation.base import Estimator, Measurement, Start
+from fgtrack.estimation.dense_joint import difference
+from fgtrack.models.motion import CTRV
+from fgtrack.pipeline.config import Config, MotionConfig
+from fgtrack.pipeline.shipped import read_config
+
+RADIUS_M, SPEED_MPS, STD_M, CURVATURE_STD = 150.0, 60.0, 0.3, 0.001
+START = Start(speed_mps=55.0, speed_std_mps=5.0, yaw_rad=0.0, yaw_std_rad=0.2)
+TINY = {"yaw_rad": 1e-7, "speed_mps": 1e-7, "yaw_rate_radps": 1e-7}
+MS = 1_000_000
+
+
+def on_the_circle(curvature_radpm: float | None, num: int = 16) -> list[Measurement]:
+    """Positions every 50 ms of a car that turns left, and what a map says of the curvature there."""
+    rng, found = np.random.default_rng(4), []
+    for k in range(1, num + 1):
+        angle = SPEED_MPS * 0.05 * k / RADIUS_M
+        x_m, y_m = RADIUS_M * np.array([math.sin(angle), 1.0 - math.cos(angle)]) + STD_M * rng.standard_normal(2)
+        values, std, assumed = {"x_m": x_m, "y_m": y_m}, {"x_m": STD_M, "y_m": STD_M}, ()
+        if curvature_radpm is not None:
+            values["curvature_radpm"], std["curvature_radpm"] = curvature_radpm, CURVATURE_STD
+            assumed = ("curvature_radpm",)
+        found.append(Measurement.of(50 * MS * k, std=std, assumed=assumed, **values))
+    return found
+
+
+def fed(name: str, measurements: list[Measurement], order: FloatArray | None = None) -> Estimator:
+    smooths = name.startswith("smoother")
+    options = {"relinearise": TINY, "ring_s": 10.0} if smooths else {}
+    estimator = fgtrack.estimator(name, CTRV(), START, lag_s=2.0, **options)
+    for place in range(len(measurements)) if order is None else order.tolist():
+        result = estimator.update(measurements[place])
+        assert result.innovation is not None
+    if smooths:
+        estimator.converge(30)  # type: ignore[attr-defined]  # smoothers have it
+    return estimator
+
+
+@pytest.mark.parametrize(
+    "name", ["ekf-replay", "imm-replay", "ukf-replay", "smoother", "smoother-banded", "smoother-batch"]
+)
+def test_it_is_exact_in_any_order_of_arrival(name: str) -> None:
+    measurements = on_the_circle(1.0 / RADIUS_M)
+    in_time = fed(name, measurements)
+    for seed in range(3):
+        found = fed(name, measurements, np.random.default_rng(seed).permutation(len(measurements)))
+        for at_ns in (400 * MS, 800 * MS, 900 * MS):
+            tolerance = 1e-5 if name.startswith("smoother") else 1e-9
+            assert max(difference(found.state_at(at_ns), in_time.state_at(at_ns))) < tolerance
+
+
+def test_the_smoothers_agree() -> None:
+    measurements = on_the_circle(1.0 / RADIUS_M)
+    first, *others = (fed(name, measurements) for name in ("smoother", "smoother-banded", "smoother-batch"))
+    for other in others:
+        for at_ns in (100 * MS, 400 * MS, 800 * MS):
+            assert max(difference(other.state_at(at_ns), first.state_at(at_ns))) < 1e-5
+
+
+@pytest.mark.parametrize("name", ["ekf-replay", "smoother", "ekf-backward-forward"])
+def test_it_gives_the_yaw_rate_that_positions_do_not_show(name: str) -> None:
+    """To the standard deviation of the curvature times the speed, from the first measurement on."""
+    plain, curved = (fed(name, on_the_circle(curvature, num=1)) for curvature in (None, 1.0 / RADIUS_M))
+    at_ns = 50 * MS
+    expected, std = SPEED_MPS / RADIUS_M, CURVATURE_STD * 55.0
+    assert math.sqrt(plain.state_at(at_ns).covariance[YAW_RATE, YAW_RATE]) > 3.0 * std
+    found = curved.state_at(at_ns)
+    assert math.sqrt(found.covariance[YAW_RATE, YAW_RATE]) == pytest.approx(std, rel=0.2)
+    assert found.mean[YAW_RATE] == pytest.approx(expected, abs=0.1)
+
+
+def test_it_is_no_measurement_for_the_nis() -> None:
+    [plain], [wrong] = on_the_circle(None, num=1), on_the_circle(0.5, num=1)
+    first, second = (fgtrack.estimator("ekf-replay", CTRV(), START).update(each) for each in (plain, wrong))
+    assert second.nis == pytest.approx(first.nis)
+
+
+def test_a_model_without_a_yaw_rate_is_refused() -> None:
+    config = read_config("smoother", ["sensors.radar.curvature_from_map_std_radpm=0.001"])
+    with pytest.raises(
+        ValueError, match=r"sensors.radar.curvature_from_map_std_radpm: needs .* ctrv or ctra, and not cv"
+    ):
+        replace(config, motion=MotionConfig("cv", {"velocity": 1.0}))
+    assert isinstance(config, Config)
