@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Protocol
 
@@ -155,6 +155,9 @@ class Start:
     """Along both axes; not used where `position_covariance` is given."""
     position_covariance: FloatArray | None = None
     """Shape (2, 2)."""
+    position_cross: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Covariance of the position with further entries of the state, by their names: where it is off by an error that
+    lasts, this entry is known to be opposite."""
     yaw_rad: float | None = None
     """Direction of travel; None where it is unknown."""
     yaw_std_rad: float | None = None
@@ -171,6 +174,9 @@ class Start:
             given = getattr(self, name)
             if given is not None and not (np.shape(given) == shape and np.isfinite(given).all()):
                 raise CallError(f"Start: {name}: must be finite and of shape {shape}, is {given}")
+        for name, pair in self.position_cross.items():
+            if not (np.shape(pair) == (2,) and np.isfinite(pair).all()):
+                raise CallError(f"Start: position_cross of {name}: must be two finite numbers, is {pair}")
         for name in ("yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2"):
             if not math.isfinite(getattr(self, name) or 0.0):
                 raise CallError(f"Start: {name}: must be finite, is {getattr(self, name)}")

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from fgtrack.core.errors import CallError
 from fgtrack.core.linalg import symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import KNOWN_YAW_STD_RAD, UNKNOWN_YAW_STD_RAD, Start
@@ -12,7 +13,8 @@ def initial_state(motion: MotionModel, start: Start) -> tuple[FloatArray, FloatA
     """Mean (n,) and covariance (n, n), in the state of `motion`, of `start`.
 
     Where the direction of travel is unknown, a Cartesian model starts with an isotropic velocity of mean zero; a
-    model with a yaw starts at yaw 0 with its (wide) standard deviation.
+    model with a yaw starts at yaw 0 with its (wide) standard deviation. Raises `CallError` for a `position_cross` with
+    an entry that the state lacks.
     """
     position = np.eye(2) * start.position_std_m**2
     if start.position_covariance is not None:
@@ -29,4 +31,8 @@ def initial_state(motion: MotionModel, start: Start) -> tuple[FloatArray, FloatA
     if unknown and motion.cartesian:
         x[2:4] = P[2:4] = P[:, 2:4] = 0.0
         P[2:4, 2:4] = np.eye(2) * (start.speed_std_mps**2 + start.speed_mps**2)
+    for name, pair in start.position_cross.items():
+        if name not in motion.state_names:
+            raise CallError(f"Start: position_cross: the state has no {name}, but {', '.join(motion.state_names)}")
+        P[:2, motion.state_names.index(name)] = P[motion.state_names.index(name), :2] = pair
     return x, P

@@ -15,7 +15,7 @@ import numpy as np
 
 from fgtrack.core.linalg import symmetrise
 from fgtrack.core.types import FloatArray
-from fgtrack.models.measurement import MeasurementModel, SensorPose
+from fgtrack.models.measurement import MeasurementModel, SensorPose, position_gradient
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.sensors import SensorModel
 
@@ -149,6 +149,21 @@ def whole_error(measurement: MeasurementModel, white: FloatArray) -> FloatArray:
     if not isinstance(measurement, ErringMeasurement):
         return white
     return white + measurement.gain @ measurement.gain.T
+
+
+def position_cross(measurement: MeasurementModel, z: FloatArray, pose: SensorPose) -> dict[str, tuple[float, float]]:
+    """Covariance of the position that z (k,) gives with the lasting errors, by the names of these in the state.
+
+    An object that is placed at its first detection, x = G (z - gain e - noise), is off by what the error is: -G gain.
+    """
+    if not isinstance(measurement, ErringMeasurement):
+        return {}
+    G = position_gradient(measurement.components, z, pose)
+    if G is None:
+        return {}
+    x_m, y_m = (-G @ measurement.gain).tolist()
+    names = [measurement.state_names[column] for column in measurement.columns]
+    return dict(zip(names, zip(x_m, y_m, strict=True), strict=True))
 
 
 def _name(sensor: str, component: str) -> str:

@@ -176,12 +176,28 @@ def measured_position(
     """
     if components[:2] == ("x_m", "y_m"):
         return z[:2], R[:2, :2]
-    if {"range_m", "bearing_rad"} <= set(components):
-        rows = [components.index("bearing_rad"), components.index("range_m")]
-        direction_range = z[rows] + np.array([pose.yaw_rad, 0.0])
-        G = cartesian_gradient(direction_range)
-        return np.array([pose.x_m, pose.y_m]) + cartesian(direction_range), G @ R[np.ix_(rows, rows)] @ G.T
-    return None
+    G = position_gradient(components, z, pose)
+    if G is None:
+        return None
+    direction_range = z[_polar_rows(components)] + np.array([pose.yaw_rad, 0.0])
+    return np.array([pose.x_m, pose.y_m]) + cartesian(direction_range), G @ R @ G.T
+
+
+def position_gradient(components: tuple[str, ...], z: FloatArray, pose: SensorPose) -> FloatArray | None:
+    """Derivative of what `measured_position` gives by z, shape (2, k); None where z holds no position."""
+    G = np.zeros((2, len(components)))
+    if components[:2] == ("x_m", "y_m"):
+        G[:, :2] = np.eye(2)
+    elif {"range_m", "bearing_rad"} <= set(components):
+        rows = _polar_rows(components)
+        G[:, rows] = cartesian_gradient(z[rows] + np.array([pose.yaw_rad, 0.0]))
+    else:
+        return None
+    return G
+
+
+def _polar_rows(components: tuple[str, ...]) -> list[int]:
+    return [components.index("bearing_rad"), components.index("range_m")]
 
 
 class _Scene:

@@ -149,6 +149,9 @@ class SensorModel:
     """False detections in a list for each square metre (`lifecycle.kind: existence`)."""
     score: Score | None = None
     """What the score of a detection says of the existence of its object; null: nothing."""
+    near_side_m: float = 0.0
+    """How much nearer than its reference point the sensor sees an object, along the line of sight: the near side of a
+    hull or a car. Positions are moved away from the sensor by it."""
     mount: Mount = field(default_factory=Mount)
     correlation: Correlation | None = None
     """Errors that are correlated in time, estimated with each object; null: every detection errs anew."""
@@ -176,6 +179,8 @@ class SensorModel:
             value = getattr(self, name)
             if value is not None and not value > 0.0:
                 raise ValueError(f"{name}: must be positive, is {value}")
+        if not math.isfinite(self.near_side_m):
+            raise ValueError(f"near_side_m: must be finite, is {self.near_side_m}")
         if not 0.0 < self.field_of_view_rad <= math.tau:
             raise ValueError(f"field_of_view_rad: must lie in (0, 2 pi], is {self.field_of_view_rad}")
         if not 0.0 < self.detection_probability < 1.0:

@@ -10,7 +10,7 @@ import numpy as np
 from fgtrack.core.geometry import rotation
 from fgtrack.core.types import EgoState, FloatArray
 from fgtrack.estimation.base import Start
-from fgtrack.models.correlated_errors import whole_error
+from fgtrack.models.correlated_errors import position_cross, whole_error
 from fgtrack.models.road import Road
 from fgtrack.tracking.preprocess import Candidate
 
@@ -58,6 +58,7 @@ class Birth(ABC):
             stamp_ns=candidate.measurement.stamp_ns,
             position_m=candidate.position_m,
             position_covariance=position_covariance,
+            position_cross=self.position_cross(candidate),
             yaw_rad=yaw_rad,
             yaw_std_rad=yaw_std_rad if yaw_rad is not None else None,
             speed_mps=speed_mps,
@@ -71,6 +72,10 @@ class Birth(ABC):
     @abstractmethod
     def spread(self, candidate: Candidate, yaw_rad: float) -> tuple[FloatArray, float, float]:
         """Covariance of the position, standard deviations of yaw and speed, of an object that heads for `yaw_rad`."""
+
+    def position_cross(self, candidate: Candidate) -> dict[str, tuple[float, float]]:
+        """Covariance of the position with errors of the sensor that last."""
+        return {}
 
 
 @dataclass(frozen=True)
@@ -87,6 +92,11 @@ class MeasuredBirth(Birth):
         own = dict(zip(candidate.values, np.sqrt(np.diag(R)).tolist(), strict=True))
         position = np.zeros((2, 2)) if position is None else position
         return position, own.get("yaw_rad", self.yaw_std_rad), own.get("speed_mps", self.speed_std_mps)
+
+    def position_cross(self, candidate: Candidate) -> dict[str, tuple[float, float]]:
+        """See `Birth.position_cross`; an object stands where its first detection says, but for what that errs."""
+        measurement = candidate.measurement
+        return position_cross(measurement.model, measurement.z, measurement.pose)
 
 
 @dataclass(frozen=True)

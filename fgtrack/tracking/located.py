@@ -11,7 +11,7 @@ import numpy as np
 from fgtrack.core.geometry import Real, rotations, wrap_angles
 from fgtrack.core.linalg import congruence
 from fgtrack.core.types import MEASURABLE, BoolArray, Detection, FloatArray, Frame, IntArray
-from fgtrack.models.measurement import COMPONENTS, SensorPose
+from fgtrack.models.measurement import COMPONENTS, MIN_RANGE_M, SensorPose
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.inbox import Batch, own_covariance
 
@@ -81,6 +81,16 @@ def located(batch: Batch, sensor: SensorModel, pose: SensorPose) -> Located:
         )
     none = np.zeros(len(detections), dtype=bool)
     return Located(np.array(batch.indices, dtype=np.int64), detections, values, points_m, none)
+
+
+def move_back(items: Located, pose: SensorPose, by_m: float) -> None:
+    """Move all positions away from the sensor at `pose` by `by_m`, along the line of sight."""
+    offsets_m = items.points_m - np.array([pose.x_m, pose.y_m])
+    ranges_m = np.hypot(offsets_m[:, 0], offsets_m[:, 1])
+    moves_m = by_m * offsets_m / np.maximum(ranges_m, MIN_RANGE_M)[:, None]
+    items.points_m[:] += moves_m
+    items.values[:, :2] += moves_m
+    items.values[:, RANGE] += by_m
 
 
 def take_map_yaw(items: Located, rows: IntArray | slice, yaw_rad: FloatArray) -> None:

@@ -37,6 +37,7 @@ from fgtrack.tracking.located import (
     common,
     covariances,
     located,
+    move_back,
     take_map_yaw,
 )
 from fgtrack.tracking.merge import Merge
@@ -139,6 +140,8 @@ class Preprocess:
             items = _without(items, far, "max_range_m", lost)
         if self._excluded.polygons_m:
             items = _without(items, self._excluded.contain(items.points_m), "map.excluded", lost)
+        if ego is not None and sensor.near_side_m:
+            move_back(items, pose, sensor.near_side_m)
         items = self._on_road(items, sensor, lost)
         records = [_out_of_bounds(batch, index, reason) for index, reason in lost.items()]
         return self._candidates(items, view), records

@@ -8,15 +8,26 @@ import pytest
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.birth import initial_state
+from fgtrack.estimation.ekf import correct_one
 from fgtrack.estimation.registry import estimator
-from fgtrack.models.correlated_errors import CorrelatedErrors, split_error, whole_error, with_correlated_errors
-from fgtrack.models.measurement import SensorPose, measurement_model
+from fgtrack.models.correlated_errors import (
+    CorrelatedErrors,
+    position_cross,
+    split_error,
+    whole_error,
+    with_correlated_errors,
+)
+from fgtrack.models.measurement import SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
+from fgtrack.models.road import OpenSpace
 from fgtrack.models.sensors import Correlation, SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config, MotionConfig
 from fgtrack.pipeline.load import load
 from fgtrack.testing import check_motion_model
+from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
+from fgtrack.tracking.preprocess import Candidate
 
 WHITE = SensorModel({"x_m": 1.0, "y_m": 1.0})
 CAMERA = SensorModel({"bearing_rad": 0.02}, correlation=Correlation(0.8, 2.0))
@@ -144,3 +155,60 @@ def test_both_estimators_agree_where_all_is_linear() -> None:
 def test_a_bad_share_in_a_configuration_is_one_line() -> None:
     with pytest.raises(CallError, match=r"sensors\.a\.correlation.*share"):
         load(Config, None, ["sensors={a: {std: {x_m: 1.0, y_m: 1.0}, correlation: {share: 2.0}}}"])
+
+
+@pytest.mark.parametrize("seen", ["x_m", "range_m"])
+def test_an_object_that_begins_where_a_detection_is_knows_that_it_shares_its_error(seen: str) -> None:
+    """The same as an object of which nothing was known before that detection."""
+    std = {"x_m": 1.0, "y_m": 2.0} if seen == "x_m" else {"range_m": 1.0, "bearing_rad": 0.01}
+    sensor = SensorModel(std, correlation=Correlation(0.9, 10.0))
+    motion, pose = with_correlated_errors(CV(), {"lidar": sensor}), SensorPose(3.0, -2.0, 0.4)
+    components = sensor.components
+    z, R = np.array([40.0, 30.0]) if seen == "x_m" else np.array([50.0, 0.3]), sensor.noise(components)
+    model, white = split_error("lidar", sensor, measurement_model(components, motion), R, motion.state_names)
+    first = measured_position(components, z, R, pose)
+    assert first is not None
+    cross = position_cross(model, z, pose)
+    start = Start(position_m=first[0], position_covariance=first[1], position_cross=cross, speed_std_mps=2.0)
+    _, P = initial_state(motion, start)
+    vague = replace(start, position_covariance=np.eye(2) * 1e6, position_cross={})
+    x = np.concatenate([first[0], np.zeros(4)])
+    _, expected, *_ = correct_one(x, initial_state(motion, vague)[1], Measurement(0, model, z, white, pose))
+    np.testing.assert_allclose(P, expected, atol=2e-2)
+    assert abs(expected[:2, 4:]).max() > 0.5
+
+
+def test_a_second_detection_at_once_says_only_what_is_new_of_it() -> None:
+    cross = {"lidar.x_m": (-(0.9**0.5), 0.0), "lidar.y_m": (0.0, -(0.9**0.5))}
+    sensor = SensorModel({"x_m": 1.0, "y_m": 1.0}, correlation=Correlation(0.9, 10.0))
+    motion = with_correlated_errors(CV(), {"lidar": sensor})
+    plain = measurement_model(("x_m", "y_m"), motion)
+    model, white = split_error("lidar", sensor, plain, np.eye(2), motion.state_names)
+    for name in ("ekf-replay", "smoother", "smoother-banded"):
+        one = estimator(name, motion, Start(position_cross=cross), lag_s=2.0)
+        one.update(Measurement(0, model, np.array([1.0, 0.0]), white))
+        np.testing.assert_allclose(np.diag(one.state_at(0).covariance)[:2], 0.95, rtol=1e-6)
+
+
+def test_the_tracker_gives_a_new_track_the_error_of_its_detection() -> None:
+    sensor = SensorModel({"x_m": 1.0, "y_m": 1.0}, correlation=Correlation(0.9, 10.0))
+    motion = with_correlated_errors(CV(), {"lidar": sensor})
+    model, white = split_error(
+        "lidar", sensor, measurement_model(("x_m", "y_m"), motion), np.eye(2), motion.state_names
+    )
+    z = np.array([3.0, 4.0])
+    candidate = Candidate(0, (), Measurement(0, model, z, white), z, np.eye(2), {"x_m": 3.0, "y_m": 4.0})
+    measured = MeasuredBirth().prior(candidate, OpenSpace(), None, ego_in_pit=False)
+    assert measured is not None
+    assert measured.position_cross["lidar.x_m"] == pytest.approx((-(0.9**0.5), 0.0))
+    assert measured.position_cross["lidar.y_m"] == pytest.approx((0.0, -(0.9**0.5)))
+    fixed = FixedBirth().prior(candidate, OpenSpace(), None, ego_in_pit=False)
+    assert fixed is not None
+    assert fixed.position_cross == {}
+
+
+def test_an_entry_that_the_state_lacks_is_refused() -> None:
+    with pytest.raises(CallError, match=r"position_cross: the state has no radar\.x_m"):
+        initial_state(CV(), Start(position_cross={"radar.x_m": (1.0, 0.0)}))
+    with pytest.raises(CallError, match="position_cross of a: must be two finite numbers"):
+        Start(position_cross={"a": (float("nan"), 0.0)})

@@ -57,6 +57,31 @@ def test_a_detection_comes_to_the_map_from_its_frame(frame: Frame, x_m: float, y
 
 
 @pytest.mark.parametrize("frame", ["map", "ego", "sensor"])
+def test_an_object_lies_behind_the_near_side_that_the_sensor_sees(frame: Frame) -> None:
+    [seen] = candidates(Detection(x_m=30.0, y_m=40.0), sensor=POINTS, frame=frame)
+    [moved] = candidates(Detection(x_m=30.0, y_m=40.0), sensor=replace(POINTS, near_side_m=2.0), frame=frame)
+    origin_m = np.array([100.0, 50.0 - 1.74])
+    assert seen.position_m is not None
+    assert moved.position_m is not None
+    away_m = seen.position_m - origin_m
+    assert moved.position_m == pytest.approx(seen.position_m + 2.0 * away_m / np.hypot(*away_m))
+    assert moved.measurement.z[:2] == pytest.approx(moved.position_m)
+
+
+def test_a_range_is_as_much_longer_as_the_near_side_is_nearer() -> None:
+    [found] = candidates(Detection(range_m=30.0, bearing_rad=0.1), sensor=replace(POLAR, near_side_m=2.0))
+    assert found.values == pytest.approx({"range_m": 32.0, "bearing_rad": 0.1})
+
+
+def test_without_an_ego_nothing_is_moved_and_a_near_side_must_be_finite() -> None:
+    sensor = replace(POINTS, near_side_m=2.0)
+    [found] = candidates(Detection(x_m=30.0, y_m=40.0), sensor=sensor, frame="map", ego=None)
+    assert found.position_m == pytest.approx([30.0, 40.0])
+    with pytest.raises(ValueError, match="near_side_m: must be finite"):
+        replace(POINTS, near_side_m=math.inf)
+
+
+@pytest.mark.parametrize("frame", ["map", "ego", "sensor"])
 def test_few_detections_are_placed_where_they_are_among_many(frame: Frame) -> None:
     many = [Detection(x_m=10.0 + 3.0 * k, y_m=2.0 * k - 9.0, yaw_rad=0.1 * k) for k in range(20)]
     among = candidates(*many, frame=frame)
