@@ -91,7 +91,7 @@ def main(
     print(
         "| tracker | position [m] | along [m] | across [m] | yaw [rad] | speed [m/s] "
         "| LiDAR residual std along / across [m] | RADAR residual std along / across [m] "
-        "| tracks | tracks 3+ | tracked [%] |"
+        "| tracks | confirmed | tracked [%] |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for number, (name, config) in enumerate(variants(published, clean).items()):

@@ -13,9 +13,6 @@ from fgtrack.evaluation.sight import in_sight
 from fgtrack.evaluation.truth import TRUE_STATE, TruePath, true_paths
 from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, Table, evaluation_config
 
-CONFIRMED_MEASUREMENTS = 3
-"""Measurements from which on a track counts: the "valid" tracks of Karle et al. 2023."""
-
 NO_OBJECT = -1
 """Object index of a track row that is paired with no true object."""
 

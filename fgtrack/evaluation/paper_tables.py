@@ -51,12 +51,12 @@ def _residuals(rows: Sequence[Row[Metrics]]) -> Table:
         run_column(rows),
         *(_moments_column(name, lambda row: row.of.residuals) for name in LOCAL_NAMES),
         Column("preci-\nsion", ("precision",), lambda row: (row.of.precision,)),
-        Column("tracks\n3+", ("num_confirmed",), lambda row: (row.of.num_confirmed,)),
+        Column("con-\nfirmed", ("num_confirmed",), lambda row: (row.of.num_confirmed,)),
     ]
     notes = [
-        "measured minus predicted, of tracks with 3+ measurements: mean ± standard deviation",
+        "measured minus predicted, of confirmed tracks: mean ± standard deviation",
         "yaw: where no sensor measures it the heading of the map stands in for it, as in the paper",
-        "precision: visits of true objects that were tracked / tracks with 3+ measurements",
+        "precision: visits of true objects that were tracked / confirmed tracks",
     ]
     title = "Residuals of all sensors, and precision (table I of Karle et al. 2023)"
     return Table(title, columns, rows, notes=notes, detail=True)
@@ -135,7 +135,7 @@ def _sensed(rows: Sequence[Row[Sensed]]) -> Table:
         Column("delay [ms]\nmean/p90/max", ("delay_mean_s", "delay_p90_s", "delay_max_s"), delay, "{}/{}/{}", MS),
         Column("moved [m]\nmean/max", ("moved_mean_m", "moved_max_m"), moved, "{}/{}"),
         Column("fused", ("num_fused",), lambda row: (len(row.of.object_speed_mps),)),
-        Column("objects\n3+", ("num_objects",), lambda row: (len(row.of.detections),)),
+        Column("ob-\njects", ("num_objects",), lambda row: (len(row.of.detections),)),
     ]
     for name, (unit, heading, get) in spreads.items():
         names = tuple(f"{name}_{moment}_{unit}" for moment in ("min", "median", "max"))
@@ -143,7 +143,7 @@ def _sensed(rows: Sequence[Row[Sensed]]) -> Table:
     names = tuple(f"detections_{moment}" for moment in ("min", "median", "max"))
     columns.append(Column("detections\nper object", names, spread(lambda of: of.detections), "{}/{}/{}"))
     notes = [
-        "moved: way of the ego while a message was under way; fused: detections of tracks with 3+",
+        "moved: way of the ego while a message was under way; fused: detections of confirmed tracks (objects)",
         "speed to detections: smallest/median/largest; relative: to the ego",
     ]
     title = "What the sensors saw (figures 5 and 6 of Karle et al. 2023)"

@@ -7,7 +7,6 @@ import numpy as np
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.innovations import message_delays
-from fgtrack.evaluation.matching import CONFIRMED_MEASUREMENTS
 from fgtrack.evaluation.residual_samples import residual_samples
 from fgtrack.evaluation.sight import ego_states
 from fgtrack.io.run import Run
@@ -30,7 +29,7 @@ class Sensed:
     ahead_m: FloatArray
     """How far it is ahead of the ego, shape (n,)."""
     detections: FloatArray
-    """Fused detections of every track that has at least three of this sensor, shape (tracks,)."""
+    """Fused detections of every track that has any of this sensor, shape (tracks,)."""
 
 
 def sensed(run: Run) -> dict[str, Sensed]:
@@ -49,6 +48,6 @@ def sensed(run: Run) -> dict[str, Sensed]:
             relative_speed_mps=samples.relative_speed_mps[mine],
             distance_m=samples.distance_m[mine],
             ahead_m=samples.ahead_m[mine],
-            detections=counts[counts >= CONFIRMED_MEASUREMENTS].astype(np.float64),
+            detections=counts.astype(np.float64),
         )
     return found

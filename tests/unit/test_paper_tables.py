@@ -45,7 +45,7 @@ def test_what_the_sensors_saw_is_told_by_sensor(run: Run) -> None:
     radar = rows["radar"]
     assert (radar["delay_mean_s"], radar["delay_max_s"]) == pytest.approx((0.1, 0.1))
     assert radar["moved_max_m"] == pytest.approx(3.0)
-    assert (radar["num_fused"], radar["num_objects"]) == (2, 0)
+    assert (radar["num_fused"], radar["num_objects"], radar["detections_median"]) == (2, 1, 2.0)
     assert rows["lidar"]["num_objects"] == 1
     assert radar["relative_speed_median_mps"] == pytest.approx(-10.0)
     assert radar["ahead_median_m"] == pytest.approx(32.0)

@@ -43,4 +43,4 @@ def test_figures_show_the_transient_and_what_the_sensors_saw(run: Run) -> None:
     assert not np.isfinite(np.asarray(lidar.get_ydata())[6:]).any()
     titles = [axes.get_title() for axes in plot.sensed(run).axes]
     assert titles[0] == "delay [ms]"
-    assert titles[-1] == "detections per\nobject (3+)"
+    assert titles[-1] == "detections per\nobject"

@@ -32,7 +32,7 @@ _SEEN: Mapping[str, Callable[[Sensed], FloatArray]] = {
     "speed relative to\nthe ego [m/s]": lambda of: of.relative_speed_mps,
     "distance [m]": lambda of: of.distance_m,
     "ahead of the\nego [m]": lambda of: of.ahead_m,
-    "detections per\nobject (3+)": lambda of: of.detections,
+    "detections per\nobject": lambda of: of.detections,
 }
 
 
