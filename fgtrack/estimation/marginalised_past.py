@@ -15,7 +15,14 @@ from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.ekf import joseph, kalman_gain, propagated
 from fgtrack.estimation.following_noise import log_determinant, segment_rows
 from fgtrack.estimation.interpolation import between
-from fgtrack.estimation.terms import EquivalentMeasurement, Linearised, MeasurementTerm, linearised
+from fgtrack.estimation.terms import (
+    NEAR_NS,
+    EquivalentMeasurement,
+    Linearised,
+    MeasurementTerm,
+    NearMeasurement,
+    linearised,
+)
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import weight
 
@@ -137,7 +144,16 @@ class MarginalisedPast:
 
         Raises `numpy.linalg.LinAlgError` for one that cannot be fused, and stays as it was.
         """
-        before, path = self._path(measurement.stamp_ns)
+        stamps_ns = [*(at.stamp_ns for at in self._ring), self._stamp_ns]
+        near_ns = min(stamps_ns, key=lambda stamp_ns: abs(stamp_ns - measurement.stamp_ns))
+        if 0 < abs(near_ns - measurement.stamp_ns) <= NEAR_NS:
+            measurement = NearMeasurement.at(measurement, near_ns, self._motion)
+        else:
+            near_ns = measurement.stamp_ns
+        if near_ns == self._stamp_ns:
+            y, H, R = _weighed(measurement, self._origin)
+            return EquivalentMeasurement(self._origin, H, y, R)
+        before, path = self._path(near_ns)
         y, H, R = _weighed(measurement, path[0].mean)
         updated = []
         for at in path:

@@ -2,14 +2,21 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, fields
+from typing import NamedTuple, Self
+
+import numpy as np
 
 from fgtrack.core.linalg import mahalanobis_squared
+from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation import ekf
 from fgtrack.estimation.base import Measurement
+from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import penalty
+
+#: Stamps at most so far apart share a node of the graph: the process noise between them would be all but singular.
+NEAR_NS = 1_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +31,21 @@ class EquivalentMeasurement:
     """Shape (k,)."""
     R: FloatArray
     """Shape (k, k)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NearMeasurement(Measurement):
+    """A measurement so close to a node that it counts there: of the state that follows from that of the node."""
+
+    motion: MotionModel
+    ahead_s: float
+    """From the node's stamp to its own; at most `NEAR_NS`, in which next to no process noise gathers."""
+
+    @classmethod
+    def at(cls, measurement: Measurement, node_ns: int, motion: MotionModel) -> Self:
+        """`measurement` as one of the node at `node_ns`."""
+        own = {each.name: getattr(measurement, each.name) for each in fields(Measurement)}
+        return cls(**own, motion=motion, ahead_s=seconds(measurement.stamp_ns - node_ns))
 
 
 MeasurementTerm = Measurement | EquivalentMeasurement
@@ -46,6 +68,10 @@ def linearised(term: MeasurementTerm, x: FloatArray) -> Linearised:
     """`term` near the state `x`, shape (n,)."""
     if isinstance(term, EquivalentMeasurement):
         return Linearised(term.y - term.H @ (x - term.origin), term.H, term.R)
+    if isinstance(term, NearMeasurement):
+        there, F = term.motion.flow(x.tolist(), term.ahead_s)
+        y, H = ekf.linearised(term.z, np.array(there), term.model, term.pose)
+        return Linearised(y, H @ F, term.R)
     return Linearised(*ekf.linearised(term.z, x, term.model, term.pose), term.R)
 
 

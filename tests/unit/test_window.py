@@ -44,9 +44,14 @@ def test_a_chain_keeps_its_nodes_in_the_order_of_their_stamps() -> None:
 def test_the_place_of_a_stamp_is_that_of_the_newest_node_at_or_before_it() -> None:
     made = chain(10, 30)
     assert [made.place(stamp_ns) for stamp_ns in (9, 10, 29, 30, 31)] == [-1, 0, 0, 1, 1]
-    assert made.at(30) is made.nodes[1]
-    assert made.at(29) is None
-    assert made.at(9) is None
+
+
+def test_a_stamp_up_to_a_microsecond_away_from_a_node_is_near_the_nearest_one() -> None:
+    made = chain(10_000, 10_000 + 1_500, 50_000)
+    assert made.near(50_000) is made.nodes[2]
+    assert [made.near(stamp_ns) for stamp_ns in (8_999, 12_501, 48_999, 51_001)] == [None] * 4
+    assert [made.near(stamp_ns) for stamp_ns in (9_000, 10_749)] == [made.nodes[0]] * 2
+    assert [made.near(stamp_ns) for stamp_ns in (10_751, 12_500)] == [made.nodes[1]] * 2
 
 
 def test_the_origins_of_a_chain_are_those_of_its_nodes_whatever_becomes_of_them() -> None:
@@ -143,7 +148,7 @@ def fused(past: MarginalisedPast, measurements: list[Measurement]) -> tuple[Floa
 
 
 @pytest.mark.parametrize("order", list(permutations(range(4))), ids=str)
-@pytest.mark.parametrize("gap_ns", [1 * US, 10 * US, 1 * MS, 50 * MS])
+@pytest.mark.parametrize("gap_ns", [1, 100, 1 * US, 10 * US, 1 * MS, 50 * MS])
 def test_detections_close_together_behind_the_window_are_exact_in_any_order(
     order: tuple[int, ...], gap_ns: int
 ) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.terms import MeasurementTerm
+from fgtrack.estimation.terms import NEAR_NS, MeasurementTerm
 
 
 @dataclass(slots=True)
@@ -67,11 +67,12 @@ class Chain:
         """Index of the newest node at or before `stamp_ns`; -1 where all are after it."""
         return bisect.bisect_right(self._stamps_ns, stamp_ns) - 1
 
-    def at(self, stamp_ns: int) -> Node | None:
-        """The node at exactly `stamp_ns`."""
+    def near(self, stamp_ns: int) -> Node | None:
+        """The node at `stamp_ns`, or else the nearest one at most `NEAR_NS` away."""
         place = self.place(stamp_ns)
-        found = place >= 0 and self._nodes[place].stamp_ns == stamp_ns
-        return self._nodes[place] if found else None
+        around = self._nodes[max(place, 0) : place + 2]
+        node = min(around, key=lambda node: abs(node.stamp_ns - stamp_ns))
+        return node if abs(node.stamp_ns - stamp_ns) <= NEAR_NS else None
 
     def insert(self, stamp_ns: int, origin: FloatArray) -> Node:
         """A new node at `stamp_ns`; the slot of the segment that it splits stays with its left neighbour."""

@@ -87,15 +87,13 @@ def _linear_factor(key: int, origin: FloatArray, term: Linearised) -> gtsam.Nonl
 
 
 def _callback_factor(key: int, measurement: Measurement) -> gtsam.NonlinearFactor:
-    model, z, pose, loss = measurement.model, measurement.z, measurement.pose, measurement.loss
-
     def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
-        x = values.atVector(key)
+        y, H, _ = linearised(measurement, values.atVector(key))
         if jacobians is not None:
-            jacobians[0] = model.jacobian(x, pose)
-        return -model.residual(z, model.predict(x, pose))
+            jacobians[0] = H
+        return -y
 
-    noise = _gaussian(measurement.R)
+    noise, loss = _gaussian(measurement.R), measurement.loss
     if loss is not None:
         noise = gtsam.noiseModel.Robust.Create(_LOSSES[loss.kind](loss.width), noise)
     return gtsam.CustomFactor(noise, [key], error)

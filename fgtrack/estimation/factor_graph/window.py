@@ -20,7 +20,7 @@ from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.initiation import Fix, Line, along, fixes_of
 from fgtrack.estimation.marginalised_past import MarginalisedPast, Prior
 from fgtrack.estimation.smoother_settings import SmootherSettings
-from fgtrack.estimation.terms import MeasurementTerm, curved, overshot
+from fgtrack.estimation.terms import MeasurementTerm, NearMeasurement, curved, overshot
 from fgtrack.models.motion import MotionModel
 
 #: Variables are numbered from here.
@@ -133,11 +133,15 @@ class Window:
                 if guess is None:
                     fused.append((anchor, update.past.fuse(item), self._mean(anchor), None))
                     continue
-                at = chain.at(item.stamp_ns)
+                at = chain.near(item.stamp_ns)
                 if at is None:
                     at = chain.insert(item.stamp_ns, guess)
                     inserted.append(at)
                     update.new[at.key], update.stamps_s[at.key] = guess, self._seconds(item.stamp_ns)
+                elif at.stamp_ns != item.stamp_ns:
+                    near = NearMeasurement.at(item, at.stamp_ns, self._motion)
+                    fused.append((at, near, update.new[at.key] if at.key in update.new else self._mean(at), None))
+                    continue
                 fused.append((at, item, guess, rows))
             self._relinearise(update, moved, inserted)
             for node, term, guess, rows in fused:
