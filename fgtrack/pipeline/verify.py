@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import NS_PER_S, nanoseconds
-from fgtrack.core.types import TrackState
+from fgtrack.core.types import YAW, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, UpdateStatus
 from fgtrack.estimation.dense_joint import Difference, dense_joint, difference, innovation_difference, rounding_bound
 from fgtrack.estimation.registry import ESTIMATORS, Claims, Factory, start_estimator
@@ -286,9 +287,11 @@ def _most_probable(stream: Stream, smoother: Subject) -> Check:
     estimator, sigma = subject.start(stream), np.sqrt(np.diag(stream.solution.covariance))
     for place in stream.orders["random"]:
         estimator.update(stream.measurements[place])
-    found = [estimator.state_at(stamp_ns).mean for stamp_ns in stream.problem.stamps_ns]
-    apart = np.abs(np.array(found) - most_probable(stream.problem)).ravel() / sigma
-    return Check(stream.name, "smoother (map)", "random", "SciPy", float(apart.max()), 0.0, 0, WHOLE_TOLERANCE)
+    found = np.array([estimator.state_at(stamp_ns).mean for stamp_ns in stream.problem.stamps_ns])
+    off = found - most_probable(stream.problem)
+    off[:, YAW] = wrap_angles(off[:, YAW])
+    apart = float(np.abs(off.ravel() / sigma).max())
+    return Check(stream.name, "smoother (map)", "random", "SciPy", apart, 0.0, 0, WHOLE_TOLERANCE)
 
 
 _Oracle = Callable[[int], Estimate | None]

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from fgtrack.core.types import FloatArray
+from fgtrack.core.geometry import wrap_angles
+from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
 from fgtrack.estimation.following_noise import log_determinant, segment_rows
 from fgtrack.models.motion import CTRA, CTRV, MotionModel
@@ -34,7 +35,9 @@ def apart(stream: Stream, estimator: FixedLagSmoother, means: FloatArray, reach_
     stamps_ns = stream.problem.stamps_ns
     places = [k for k, at in enumerate(stamps_ns) if at >= stream.newest_ns - 1e9 * reach_s]
     found = np.array([estimator.state_at(stamps_ns[k]).mean for k in places])
-    return float((np.abs(found - means[places]) / sigma[places]).max())
+    off = found - means[places]
+    off[:, YAW] = wrap_angles(off[:, YAW])
+    return float((np.abs(off) / sigma[places]).max())
 
 
 @pytest.mark.parametrize("motion", [CTRV(), CTRA()])
