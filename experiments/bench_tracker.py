@@ -126,7 +126,7 @@ def scenario(count: int, duration_s: float, delay_s: float | None = None, speed_
         ),
     )
     ego = TrackVehicle(arc_m=100.0, speed=speed)
-    return Scenario(ego, cars, sensors, duration_s=duration_s)
+    return Scenario(ego, cars, sensors, duration_s=duration_s, detection_origin_x_m=-1.74)
 
 
 def yardstick_us(clock: Clock = time.perf_counter_ns, at_once: int = 1) -> float:

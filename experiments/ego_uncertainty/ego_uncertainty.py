@@ -13,6 +13,7 @@ NEES (expected 2) are those of the present positions, from 2 s on.
 """
 
 import csv
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,8 +29,9 @@ from fgtrack.evaluation.consistency import position_nees
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.paired import average, paired
 from fgtrack.models.sensors import SensorModel
-from fgtrack.pipeline.config import Config, EgoConfig, MotionConfig
+from fgtrack.pipeline.config import EgoConfig, MotionConfig
 from fgtrack.pipeline.public import replay
+from fgtrack.pipeline.shipped import read_config
 from fgtrack.sim.delays import ConstantDelay
 from fgtrack.sim.scenario import EgoMessages, Scenario
 from fgtrack.sim.sensor import SimulatedSensor
@@ -43,6 +45,8 @@ INTERVAL = ("mean", "low", "high")
 COUNTS, TIMES_S = (3, 8), (0.0, 1.0)
 RANGE_M, SPEED_MPS = 60.0, 20.0
 YAW_STD_RAD, POSITION_STD_M = 0.01, 0.1
+ORIGIN_M = -1.74
+"""Of the detections, ahead of the ego reference point: the rear axle."""
 STD = {"x_m": 0.3, "y_m": 0.1, "yaw_rad": 0.1}
 MOTION = MotionConfig(kind="ctrv", std_per_s={"position": 0.1, "yaw": 0.05, "speed": 0.5, "yaw_rate": 0.1})
 SETTLED_S = 2.0
@@ -75,6 +79,7 @@ def scenario(count: int, duration_s: float) -> Scenario:
         map=None,
         duration_s=duration_s,
         ego_messages=EgoMessages(**exact),
+        detection_origin_x_m=ORIGIN_M,
     )
 
 
@@ -97,12 +102,13 @@ def erring(messages: Sequence[Message], time_s: float, rng: np.random.Generator)
 
 def result(messages: Sequence[Message], mode: str, estimator: str) -> Result:
     """One drive, tracked with `ego.uncertainty` of `mode`."""
-    config = Config(
+    config = replace(
+        read_config("karle2023"),
         estimator=estimator,
         sensors={"lidar": SensorModel(std=STD)},
         motion=MOTION,
-        ego=EgoConfig(yaw_weight=1.0, yaw_rate_weight=1.0, uncertainty=mode),
-        birth=MeasuredBirth(ego_speed_factor=1.0, speed_std_mps=3.0),
+        ego=EgoConfig(detection_origin_x_m=ORIGIN_M, uncertainty=mode),
+        birth=MeasuredBirth(ego_speed_factor=1.0, speed_std_mps=3.0, yaw_rate_std_radps=math.sqrt(0.3)),
     )
     matching = match(replay(iter(messages), config))
     tracks, truth = matching.tracks.where(matching.paired), matching.true_states[matching.paired]

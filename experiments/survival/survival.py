@@ -19,8 +19,9 @@ import typer
 
 from fgtrack.core.types import FloatArray
 from fgtrack.io.run import Run, load_run
-from fgtrack.pipeline.config import ClockConfig, Config
+from fgtrack.pipeline.config import ClockConfig
 from fgtrack.pipeline.replay import replay
+from fgtrack.pipeline.shipped import read_config
 from fgtrack.sim.delays import ConstantDelay
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.sensor import SimulatedSensor
@@ -45,7 +46,9 @@ def scenario(lidar_delay_s: float, lidar_rate_hz: float, duration_s: float) -> S
         delay=ConstantDelay(RADAR_DELAY_S),
     )
     ego = TrackVehicle(arc_m=100.0, speed=((0.0, 65.0), (duration_s, 65.0)))
-    return Scenario(ego, (replace(ego, arc_m=140.0),), (lidar, radar), duration_s=duration_s)
+    return Scenario(
+        ego, (replace(ego, arc_m=140.0),), (lidar, radar), duration_s=duration_s, detection_origin_x_m=-1.74
+    )
 
 
 def expected_share(lidar_delay_s: FloatArray | float, lidar_rate_hz: float) -> FloatArray:
@@ -72,7 +75,7 @@ def main(
 ) -> None:
     """Run the tracker over all delays and rates, write survival.csv and survival.png."""
     out.mkdir(parents=True, exist_ok=True)
-    config = Config()
+    config = read_config("karle2023")
     config = replace(config, map=replace(config.map, track="oval", pit="oval"), clock=ClockConfig(node_hz=None))
     rows = []
     for rate_hz in LIDAR_RATES_HZ:

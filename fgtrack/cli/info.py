@@ -11,6 +11,7 @@ from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value
 from fgtrack.io.info import InputInfo, TopicInfo, describe
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.effective import effective
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.trial import Trial, try_out
 
@@ -28,7 +29,10 @@ def info(recording: Input, config_file: ConfigFile = None, as_json: Json = False
     config = None if config_file is None else read_config(config_file)
     found = describe(recording, None if config is None else config.input)
     topics = _table(found, NO_VALUE if config is None else "ignored")
-    show(topics, form, _values(found, topics))
+    comes_to = effective(config or Config())
+    show(topics, form, {**_values(found, topics), "effective": comes_to.values()})
+    if form is None:
+        say(f"{config_file or 'without a configuration'}: {comes_to}")
     trial = None
     if config is not None and found.problem is None and form is None:
         trial = _try_out(recording, config)

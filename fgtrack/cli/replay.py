@@ -1,5 +1,7 @@
 """`fgtrack replay`: a recording through the tracker into a run folder."""
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -15,6 +17,7 @@ from fgtrack.evaluation.left_out import left_out
 from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
 from fgtrack.io.span import end_ns
+from fgtrack.pipeline.effective import effective
 from fgtrack.pipeline.replay import located, replay_each
 from fgtrack.pipeline.shipped import read_config
 
@@ -59,6 +62,12 @@ def replay(
             overwrite=overwrite,
             realtime=realtime,
         )
+    for line in dict.fromkeys(str(effective(replace(config, estimator=name))) for name in names):
+        say(line)
+    if not config.sensors:
+        assumed = load_run(results[0].path).config["sensors"]
+        text = "; ".join(f"{name}: {_listed(sensor['std'])}" for name, sensor in assumed.items())
+        say(f"no sensors configured, assumed standard deviations: {text}")
     for result in results:
         what = "{estimator}, {detections_received} detections, {wall_s:.1f} s, digest {digest:.12}"
         missed = f", {result.deadline_misses} deadlines missed" if result.deadline_misses else ""
@@ -73,3 +82,7 @@ def replay(
     reason = unused(runs[0])
     if reason is not None:
         raise DataError(f"{recording}: {reason}")
+
+
+def _listed(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {value:g}" for name, value in values.items())

@@ -24,7 +24,7 @@ FEWEST = 30
 
 #: Cause and cure of what can happen to most detections of a sensor, by disposition.
 _CURES = {
-    "gated": "no track was near enough and none was started: check association.gate_m, the clock, and "
+    "gated": "no track was near enough and none was started: check the gate of `association`, the clock, and "
     "ego.detection_origin_x_m",
     "out_of_bounds": "{because}: are these settings meant, and is it the right map (--map), and the frame of the "
     "detections?",

@@ -1,4 +1,4 @@
-"""The configuration of a run. The defaults are the clean method of Karle et al. 2023; a YAML file overrides them."""
+"""The configuration of a run. The defaults are those of open space; a YAML file overrides them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -28,41 +28,6 @@ AssociationConfig = Annotated[GatedEuclidean | GatedMahalanobis | UngatedEuclide
 BirthConfig = Annotated[MeasuredBirth | FixedBirth, Discriminator("kind")]
 _Weight = Annotated[float, Field(gt=0.0, le=1.0)]
 
-#: The sensors of the paper, table II; LiDAR clusters and RADAR detections measure no yaw, the map gives it. Their
-#: ranges are those of section III-H; the paper has one RADAR, in front, and does not give its field of view.
-PAPER_SENSORS: Mapping[str, SensorModel] = MappingProxyType(
-    {
-        "lidar": SensorModel(
-            std={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.4},
-            max_delay_s=0.3,
-            counter_init=5,
-            counter_add=2,
-            ages="short_range",
-            view_range_m=98.0,
-            max_range_behind_m=57.0,
-        ),
-        "lidar_cluster": SensorModel(
-            std={"x_m": 0.3, "y_m": 0.3},
-            yaw_from_map_std_rad=0.35,
-            max_delay_s=0.4,
-            ages="short_range",
-            view_range_m=98.0,
-            max_range_behind_m=57.0,
-        ),
-        "radar": SensorModel(
-            std={"x_m": 3.0, "y_m": 3.0, "speed_mps": 0.2},
-            yaw_from_map_std_rad=0.35,
-            max_delay_s=0.2,
-            counter_init=5,
-            counter_add=2,
-            ages="long_range",
-            stamp_from="objects_mean",
-            view_range_m=105.0,
-            field_of_view_rad=1.57,
-        ),
-    }
-)
-
 
 @settings
 class ClockConfig:
@@ -84,11 +49,11 @@ class MapConfig:
     """CSV file of the pit lane, `oval` for the built-in one, or null."""
     lookup: Literal["frenet", "published", "published_circular_heading"] = "frenet"
     """`frenet` projects on the reference line; the others are look-ups of the published implementation (Q3, Q4)."""
-    inner_buffer_m: float = -0.5
+    inner_buffer_m: float = 0.0
     """How far beyond the inner bound an object may be."""
-    outer_buffer_m: float = -1.5
+    outer_buffer_m: float = 0.0
     """The same for the outer bound."""
-    pit_buffer_m: float = -1.5
+    pit_buffer_m: float = 0.0
     """The same for both bounds of the pit lane."""
     excluded: tuple[str, ...] = ()
     """Files of polygons in which no object is, as shore and buildings: GeoJSON or CSV, in metres of the map."""
@@ -100,12 +65,12 @@ class EgoConfig:
 
     kind: Literal["low_pass", "published"] = "low_pass"
     """`published` filters its own output again at every tick (Q13)."""
-    yaw_weight: _Weight = 0.9
-    """Weight of the new yaw in the low-pass."""
-    yaw_rate_weight: _Weight = 0.4
+    yaw_weight: _Weight = 1.0
+    """Weight of the new yaw in the low-pass; 1 leaves it as it is."""
+    yaw_rate_weight: _Weight = 1.0
     """Weight of the new yaw rate."""
-    detection_origin_x_m: float = -1.74
-    """Origin of the detections' ego frame, ahead of the ego reference point (the paper's: the rear axle)."""
+    detection_origin_x_m: float = 0.0
+    """Origin of the detections' ego frame, ahead of the ego reference point."""
     detection_origin_y_m: float = 0.0
     """The same to the left."""
     memory_s: PositiveFloat = 5.0
@@ -151,8 +116,8 @@ class CountingConfig(LifecycleRules):
 
 
 def _lifecycle_kind(value: object) -> str:
-    """Which form of `lifecycle` is meant: counting, as ever, where it does not say."""
-    kind = value.get("kind", "counting") if isinstance(value, Mapping) else getattr(value, "kind", "counting")
+    """Which form of `lifecycle` is meant: by existence where it does not say."""
+    kind = value.get("kind", "existence") if isinstance(value, Mapping) else getattr(value, "kind", "existence")
     return "existence" if kind == "existence" else "counting"
 
 
@@ -168,7 +133,7 @@ class FilterConfig:
 
     frequency_hz: Annotated[float, Field(ge=1.0, le=10_000.0)] = 100.0
     """Frequency of the grid."""
-    storage_s: float = 3.5
+    storage_s: float = 3.0
     """How far back states are kept."""
     clock: Literal["grid", "leading"] = "grid"
     """`leading`: the tracking time leads the clock by up to a step (Q14)."""
@@ -189,7 +154,8 @@ class InitiationConfig:
     through the first ones, until its direction is certain."""
 
 
-_PAPER_STD_PER_S = MappingProxyType({"position": 0.2, "yaw": 0.3, "speed": 1.0, "yaw_rate": 0.5})
+#: Of traffic: 1.5 m/s and 0.2 rad/s of change within a second.
+_STD_PER_S = MappingProxyType({"position": 0.3, "yaw": 0.1, "speed": 15.0, "yaw_rate": 2.0})
 _BUILT_IN_MOTION: Mapping[str, type[CTRV | CV]] = {"ctrv_euler": CTRV, "ctrv": CTRV, "ctra": CTRA, "cv": CV}
 
 
@@ -197,10 +163,10 @@ _BUILT_IN_MOTION: Mapping[str, type[CTRV | CV]] = {"ctrv_euler": CTRV, "ctrv": C
 class MotionConfig:
     """Motion model and its process noise."""
 
-    kind: str = "ctrv_euler"
-    """`ctrv_euler` (the paper's steps), `ctrv`, `ctra`, `cv`, or the name of a plug-in."""
-    std_per_s: Mapping[str, float] = field(default_factory=lambda: _PAPER_STD_PER_S)
-    """The paper's process noise: each step of 1 / noise_hz adds (std_per_s / noise_hz)^2, hence the density
+    kind: str = "ctrv"
+    """`ctrv`, `ctra`, `cv`, `ctrv_euler` (the paper's steps), or the name of a plug-in."""
+    std_per_s: Mapping[str, float] = field(default_factory=lambda: _STD_PER_S)
+    """Process noise as the paper gives it: each step of 1 / noise_hz adds (std_per_s / noise_hz)^2, hence the density
     std_per_s^2 / noise_hz. `ctra` takes `accel` as well, `cv` takes `velocity` alone."""
     noise_hz: float = 100.0
     """Frequency of the steps to which `std_per_s` belongs."""
@@ -222,7 +188,7 @@ class MotionConfig:
             raise ValueError("noise, yaw and acceleration may be changed for kind ctrv_euler only")
         if self.kind in _BUILT_IN_MOTION and self.parameters:
             raise ValueError(f"parameters: are a plug-in's, kind {self.kind} takes std_per_s")
-        if self.kind not in _BUILT_IN_MOTION and dict(self.std_per_s) != _PAPER_STD_PER_S:
+        if self.kind not in _BUILT_IN_MOTION and dict(self.std_per_s) != _STD_PER_S:
             raise ValueError(f"std_per_s: is that of the built-in models, give parameters for kind {self.kind}")
         self.model()
 
@@ -243,9 +209,10 @@ class MotionConfig:
 class Config:
     """Everything that decides a run besides its input."""
 
-    estimator: str = "ekf-backward-forward"
+    estimator: str = "ekf-replay"
     """Name of the estimator of all tracks."""
-    sensors: Mapping[str, SensorModel] = field(default_factory=lambda: PAPER_SENSORS)
+    sensors: Mapping[str, SensorModel] = field(default_factory=lambda: MappingProxyType({}))
+    """The sensors by name; where none is named, a replay takes those of the recording, with `ASSUMED_STD`."""
     ignore_sensors: tuple[str, ...] = ()
     """Sensors of the input that are left out on purpose, also where they are under `sensors`."""
     input: InputConfig = field(default_factory=InputConfig)
@@ -253,10 +220,10 @@ class Config:
     map: MapConfig = field(default_factory=MapConfig)
     ego: EgoConfig = field(default_factory=EgoConfig)
     inbox: InboxConfig = field(default_factory=InboxConfig)
-    merge: MergeConfig = field(default_factory=ConnectedMerge)
-    association: AssociationConfig = field(default_factory=GatedEuclidean)
-    lifecycle: LifecycleConfig = field(default_factory=CountingConfig)
-    birth: BirthConfig = field(default_factory=FixedBirth)
+    merge: MergeConfig = field(default_factory=NoMerge)
+    association: AssociationConfig = field(default_factory=GatedMahalanobis)
+    lifecycle: LifecycleConfig = field(default_factory=ExistenceRules)
+    birth: BirthConfig = field(default_factory=MeasuredBirth)
     initiation: InitiationConfig = field(default_factory=InitiationConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
     filter: FilterConfig = field(default_factory=FilterConfig)
@@ -270,11 +237,9 @@ class Config:
         for name in self.options:
             if ESTIMATORS.resolve(name) != name:
                 raise ValueError(f"options: {name!r} is now {ESTIMATORS.resolve(name)!r}")
-        if not self.sensors:
-            raise ValueError("sensors: name at least one")
         for key, named in (("detections", self.input.detections), ("csv.detections", self.input.csv.detections)):
             strangers = set(named) - set(self.sensors) - set(self.ignore_sensors)
-            if strangers:
+            if strangers and self.sensors:
                 raise ValueError(f"input.{key}: {sorted(strangers)[0]!r} has no model under sensors")
         erring = [name for name, sensor in self.sensors.items() if sensor.correlation is not None]
         if erring and self.motion.kind == "ctrv_euler":

@@ -11,11 +11,13 @@ from pathlib import Path
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S, period_ns, seconds
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
+from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import MemoryRun, Node, Run, RunWriter, path_from_run
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, Tick, listed_ticks, message_ticks, node_ticks, read_ticks
 from fgtrack.pipeline.config import ClockConfig, Config
+from fgtrack.pipeline.effective import effective, with_sensors
 from fgtrack.pipeline.ego_clock import EgoClock
 from fgtrack.pipeline.load import dump
 from fgtrack.pipeline.pace import Clock, Pace, WallClock
@@ -133,7 +135,7 @@ def replay(
         A sensor of the input has no model, or the input gives the tracker nothing.
     """
     runs = replay_each(
-        lambda: messages,
+        _again(messages, config),
         config,
         {config.estimator: out},
         origin=origin,
@@ -156,10 +158,26 @@ def replay_in_memory(
 
     Without files it takes less time. `observed` is that of `build_tracker`. Raises as `replay`.
     """
+    again = _again(messages, config)
+    config = with_sensors(config, again)
     tracker = build_tracker(config, observed)
     memory = MemoryRun(*_opening(config, origin, kind))
-    _, broken, _ = _drive(tracker, messages, config, memory, origin=origin)
+    _, broken, _ = _drive(tracker, again(), config, memory, origin=origin)
     return memory.run, broken
+
+
+def _again(messages: Iterable[Message], config: Config) -> Callable[[], Iterable[Message]]:
+    """Gives `messages`; kept where they are needed twice, to find the sensors that `config` does not name."""
+    if config.sensors:
+        return lambda: messages
+    readable = UntilBreak(messages)
+    kept = list(readable)
+
+    def again() -> Iterator[Message]:
+        yield from kept
+        readable.raise_error()
+
+    return again
 
 
 def _drive(
@@ -219,6 +237,7 @@ def _opening(
     if folder is not None and (place := path_from_run(origin, folder)) is not None:
         source["path_from_run"] = place
     meta: dict[str, object] = {"input": source, "estimator": config.estimator, "versions": versions(), "seed": None}
+    meta["effective"] = effective(config).values()
     return dump(config), meta, next(iter(config.smoother.lagged_s), None)
 
 
@@ -238,6 +257,7 @@ def replay_each(
     In real time each tick waits until it is due; the runs are the same.
     """
     results = []
+    config = with_sensors(config, messages)
     with ExitStack() as claims:
         runs = []
         for estimator, folder in folders.items():

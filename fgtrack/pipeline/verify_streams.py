@@ -15,7 +15,6 @@ from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.road import OpenSpace
 from fgtrack.models.sensors import Mount, RobustLoss, SensorModel
-from fgtrack.pipeline.config import PAPER_SENSORS
 from fgtrack.pipeline.oracle.dynamics import Dynamics
 from fgtrack.pipeline.oracle.estimates import Estimate, Problem, Solution, filtered, kinematic_start, smoothed
 from fgtrack.pipeline.oracle.sightings import Eye, Sighting, Vehicle, mounted, seen
@@ -47,6 +46,10 @@ _TURNING = replace(_FAST, position_m=(30.0, 12.0), yaw_rad=3.0, yaw_std_rad=0.2,
 #: Seen from the observer: its detections' frame, and the pose of its RADAR in that frame. The object is behind it.
 _FRAME_M = (-1.2, 0.3)
 _ARM = Mount(4.9, 0.6, -1.86)
+_PAPER = {
+    "lidar_cluster": SensorModel(std={"x_m": 0.3, "y_m": 0.3}),
+    "radar": SensorModel(std={"x_m": 3.0, "y_m": 3.0, "speed_mps": 0.2}),
+}
 _ONBOARD: Mapping[str, SensorModel] = {
     "lidar_cluster": SensorModel(std={"x_m": 0.5, "y_m": 0.2, "yaw_rad": 0.15}),
     "radar": SensorModel(std={"range_m": 0.5, "bearing_rad": 0.02, "range_rate_mps": 0.1}, mount=_ARM),
@@ -173,7 +176,7 @@ def _paper_stamps(duration_s: float) -> _Plan:
 
 def _paper(rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str) -> tuple[Measurement, Sighting]:
     """What the paper's `sensor` measures of `x`; in a linear model its position only."""
-    noise, motion = PAPER_SENSORS[sensor], next(m for m in (CV(), CTRV(), CTRA()) if m.dim == len(x))
+    noise, motion = _PAPER[sensor], next(m for m in (CV(), CTRV(), CTRA()) if m.dim == len(x))
     names = _POSITION if motion.linear else tuple(noise.std)
     std = np.array([noise.std[name] for name in names])
     z = seen(names, x, motion.state_names, Eye()) + std * rng.standard_normal(len(names))

@@ -38,8 +38,8 @@ class Scenario:
     duration_s: Annotated[float, Field(gt=0.0, le=86_400.0)] = 60.0
     ego_messages: EgoMessages = field(default_factory=EgoMessages)
     truth_rate_hz: Rate = 100.0
-    detection_origin_x_m: float = -1.74
-    """Origin of the detection frame in the ego frame; by default the rear axle of the paper's vehicle."""
+    detection_origin_x_m: float = 0.0
+    """Origin of the detection frame in the ego frame, as `ego.detection_origin_x_m` of a configuration."""
     start_ns: NonNegativeInt = 1_000_000_000_000
     """Stamp of the start."""
 

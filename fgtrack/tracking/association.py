@@ -75,7 +75,7 @@ class GatedMahalanobis:
     """
 
     kind: Literal["mahalanobis"] = "mahalanobis"
-    gate_probability: float = 0.99
+    gate_probability: float = 0.999
     """Probability with which a true pair passes the gate."""
     max_distance_m: float = 50.0
     """Largest distance of a pair."""

@@ -1,6 +1,5 @@
 """What is assumed of a new object (Karle et al. 2023, section III-E)."""
 
-import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Literal
@@ -19,17 +18,17 @@ from fgtrack.tracking.preprocess import Candidate
 class Birth(ABC):
     """The first state of a track: what is assumed of what a detection does not measure, with standard deviations."""
 
-    ego_speed_factor: float = 0.8
+    ego_speed_factor: float = 0.0
     """An object is assumed as fast as the ego times this; 0 for traffic that has nothing to do with the ego."""
-    yaw_std_rad: float = math.sqrt(0.3)
+    yaw_std_rad: float = 0.5
     """Standard deviation of a yaw from the map."""
-    speed_std_mps: float = 2.0
+    speed_std_mps: float = 10.0
     """Standard deviation of a speed that is not measured."""
-    yaw_rate_std_radps: float = math.sqrt(0.3)
+    yaw_rate_std_radps: float = 0.5
     """Standard deviation of the yaw rate."""
     accel_std_mps2: float = 1.0
     """Standard deviation of the acceleration."""
-    slow_ego_mps: float = 10.0
+    slow_ego_mps: float = 0.0
     """Below this ego speed an object is assumed to accelerate as the ego does (models with acceleration)."""
 
     def __post_init__(self) -> None:

@@ -50,9 +50,9 @@ class NoMerge(Merge):
 class ConnectedMerge(Merge):
     """Joins detections that are linked by steps of at most a distance."""
 
-    kind: Literal["connected"] = "connected"
-    distance_m: float = 5.1
+    distance_m: float
     """Detections at most this far apart are linked."""
+    kind: Literal["connected"] = "connected"
 
     def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
         """See `Merge.groups`; in the order of their first members, which lead."""

@@ -99,7 +99,12 @@ def runs(recordings: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) 
     """A replay of each of them."""
     folder = tmp_path_factory.mktemp("runs")
     for name, path in recordings.items():
-        assert run(["replay", str(path), "-o", str(folder / name), "--map", "oval", "--pit-map", "oval"]) == 0
+        assert (
+            run(
+                ["replay", str(path), "-c", "karle2023", "-o", str(folder / name), "--map", "oval", "--pit-map", "oval"]
+            )
+            == 0
+        )
     return {name: folder / name for name in recordings}
 
 
@@ -117,7 +122,7 @@ def test_off_a_terminal_progress_is_lines_with_a_percentage(
     monkeypatch.setattr(show, "SOON_S", 0.0)
     for name in ("s.jsonl", "s.jsonl.gz", "mcap", "sqlite3"):
         lines = fgtrack(
-            "replay", recordings[name], "-e", "drop,ekf-replay", "--map", "oval", "-o", name
+            "replay", recordings[name], "-c", "karle2023", "-e", "drop,ekf-replay", "--map", "oval", "-o", name
         ).err.splitlines()
         told = [line for line in lines if line.startswith("fgtrack: replay, ")]
         shares = [int(line.split(", ")[1].removesuffix("%")) for line in told]
@@ -150,7 +155,12 @@ def test_the_demo_takes_seed_delay_and_objects(monkeypatch: pytest.MonkeyPatch) 
 def test_the_same_replay_twice_gives_the_same_digest(fgtrack: Command, recordings: dict[str, Path]) -> None:
     digests = []
     for _ in range(2):  # the second one replaces the first
-        assert fgtrack("replay", recordings["s.jsonl"], "-o", "run", "--map", "oval", "--overwrite").code == 0
+        assert (
+            fgtrack(
+                "replay", recordings["s.jsonl"], "-c", "karle2023", "-o", "run", "--map", "oval", "--overwrite"
+            ).code
+            == 0
+        )
         digests.append(load_run("run").meta["digest"])
     assert digests[0] == digests[1]
 
@@ -171,7 +181,7 @@ def test_stream_to_bag_to_stream_is_the_stream(fgtrack: Command, recordings: dic
 
 def test_several_estimators_have_a_folder_each(fgtrack: Command, stream: Path) -> None:
     names = ("ekf-backward-forward", "ekf-replay", "smoother")
-    assert fgtrack("replay", stream, "-o", "runs", "-e", ",".join(names)).code == 0
+    assert fgtrack("replay", stream, "-c", "karle2023", "-o", "runs", "-e", ",".join(names)).code == 0
     for name in names:
         assert load_run(Path("runs") / name).meta["estimator"] == name
     table = fgtrack("compare", "runs")
@@ -193,7 +203,7 @@ def test_runs_are_compared_as_tables_and_as_json(fgtrack: Command, runs: dict[st
 
 
 def test_a_recording_of_which_nothing_was_used_fails_and_says_why(fgtrack: Command, stream: Path) -> None:
-    told = fgtrack("replay", stream, "--set", "sensors.lidar.max_delay_s=0.01", "-o", "late")
+    told = fgtrack("replay", stream, "-c", "karle2023", "--set", "sensors.lidar.max_delay_s=0.01", "-o", "late")
     assert told.code == 1
     assert told.error == f"{stream}: none of the 60 detections was used (60 too_old)"
     warning = "fgtrack: warning: lidar: 60 of 60 too_old: median delay 0.05 s, allowed 0.01 s: raise sensors.lidar."
@@ -205,8 +215,8 @@ def test_a_recording_of_which_nothing_was_used_fails_and_says_why(fgtrack: Comma
 def test_a_replay_warns_of_noise_that_does_not_fit(fgtrack: Command, stream: Path) -> None:
     assert fgtrack("simulate", "default", "-o", "noisy.jsonl", "--duration", "4").code == 0
     fits = ("-c", "tuned", "--map", "oval", "--pit-map", "oval", "-e", "ekf-replay")
-    assert fgtrack("replay", "noisy.jsonl", *fits, "-o", "a").err == ""
-    told = fgtrack("replay", stream, "--set", "sensors.lidar.std={x_m: 9.0, y_m: 9.0}", "-o", "b")
+    assert fgtrack("replay", "noisy.jsonl", "-c", "karle2023", *fits, "-o", "a").err == ""
+    told = fgtrack("replay", stream, "-c", "karle2023", "--set", "sensors.lidar.std={x_m: 9.0, y_m: 9.0}", "-o", "b")
     assert told.code == 0
     assert "lidar: mean NIS" in told.err
     assert "the configured noise is too large" in told.err
@@ -241,7 +251,7 @@ def test_info_tells_topics_and_delays(fgtrack: Command, recordings: dict[str, Pa
 
 
 def test_the_printed_configuration_is_one(fgtrack: Command, stream: Path) -> None:
-    printed = fgtrack("config", "--set", "filter.storage_s=2.0")
+    printed = fgtrack("config", "-c", "karle2023", "--set", "filter.storage_s=2.0")
     assert printed.code == 0
     Path("c.yaml").write_text(printed.out)
     assert fgtrack("config", "-c", "c.yaml").out == printed.out
@@ -343,8 +353,11 @@ def foreign_folder(path: Path) -> None:
         (("sweep", "smok", "-o", "x"), "did you mean 'smoke'"),
         (("replay", "drive.jsonl", "-o", "run", "--set", "smoother.lag=3"), "did you mean 'lag_s'"),
         (("replay", "drive.jsonl", "-o", "run", "--set", "association.kind=euclidian"), "did you mean 'euclidean'"),
-        (("replay", "drive.jsonl", "-o", "run", "--set", "sensors.radr.max_delay_s=2"), "did you mean 'radar'"),
-        (("offsets", "drive.jsonl", "--reference", "lidr"), "did you mean 'lidar'"),
+        (
+            ("replay", "drive.jsonl", "-c", "karle2023", "-o", "run", "--set", "sensors.radr.max_delay_s=2"),
+            "did you mean 'radar'",
+        ),
+        (("offsets", "drive.jsonl", "-c", "karle2023", "--reference", "lidr"), "did you mean 'lidar'"),
         (("info", "drive.jsonl", "--jsn"), "--json"),
         (("replay", "drive.jsonl", "-o", "run", "--fast"), "--fast"),
     ],
@@ -481,7 +494,7 @@ def test_a_stray_stamp_of_the_ego_costs_one_state_and_a_clock_that_was_set_ends_
 def test_an_unknown_sensor_says_what_to_do(fgtrack: Command, tmp_path: Path) -> None:
     sonar = DetectionList("sonar", START_NS, START_NS, (Detection(x_m=1.0, y_m=2.0),))
     write_stream(tmp_path / "sonar.jsonl", [sonar])
-    called = fgtrack("replay", "sonar.jsonl", "-o", "run")
+    called = fgtrack("replay", "sonar.jsonl", "-c", "karle2023", "-o", "run")
     assert "'sonar' has no model" in called.error
     assert "ignore_sensors" in called.error
     assert called.code == 1
@@ -561,7 +574,7 @@ def test_names_in_a_recording_can_neither_move_the_cursor_nor_be_markup(fgtrack:
     shown = fgtrack("info", "odd.jsonl")
     assert shown.code == 0
     assert "[bold]x[/bold][/]\\x1b[31m" in shown.out
-    refused = fgtrack("replay", "odd.jsonl", "-o", "run")
+    refused = fgtrack("replay", "odd.jsonl", "-c", "karle2023", "-o", "run")
     assert refused.code == 1
     for text in (shown.out, refused.error):
         assert "\x1b" not in text
@@ -579,7 +592,7 @@ def test_an_unknown_sensor_in_mid_stream_is_a_break_up_to_which_the_run_is_compl
         62, DetectionList("sonar", place.stamp_ns, place.receipt_ns + late_ns, (Detection(x_m=1.0, y_m=2.0),))
     )
     write_stream(tmp_path / "odd.jsonl", messages)
-    called = fgtrack("replay", "odd.jsonl", "-o", "run")
+    called = fgtrack("replay", "odd.jsonl", "-c", "karle2023", "-o", "run")
     assert "'sonar' has no model" in called.error
     assert "replayed up to there" in called.error
     assert called.code == 1

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from support.paper import paper
 
 from fgtrack.cli import demo
 from fgtrack.cli.main import run
@@ -18,7 +19,6 @@ from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.run import RunWriter, load_run
 from fgtrack.io.source import open_input
 from fgtrack.io.stream import STREAM, read_stream, write_stream
-from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_each
 
 MS = 1_000_000
@@ -170,7 +170,7 @@ def test_an_input_that_gives_nothing_leaves_the_old_run(here: Path, call: Call, 
 def test_a_run_that_fails_before_its_first_tick_leaves_the_old_one(here: Path, call: Call) -> None:
     write_stream("sonar.jsonl", [DetectionList("sonar", START_NS, START_NS, (Detection(x_m=1.0, y_m=2.0),))])
     before = content(here / "run")
-    assert call("replay", "sonar.jsonl", "-o", "run", "--overwrite")[0] == 1
+    assert call("replay", "sonar.jsonl", "-c", "smoother", "-o", "run", "--overwrite")[0] == 1
     assert content(here / "run") == before
 
 
@@ -209,7 +209,7 @@ def test_a_replay_that_is_under_way_holds_all_its_folders(here: Path) -> None:
                 RunWriter(folder, overwrite=True)
         yield from drive(10)[10:]
 
-    assert len(replay_each(messages, Config(), folders)) == 2
+    assert len(replay_each(messages, paper(), folders)) == 2
 
 
 def test_a_sweep_does_not_share_its_folder(here: Path, call: Call) -> None:

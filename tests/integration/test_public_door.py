@@ -67,8 +67,9 @@ def test_settings_estimator_and_messages_can_be_given(drive: Path) -> None:
     run = fgtrack.replay(messages, "smoother", estimator="ekf-replay", set={"filter.storage_s": 2.0}, map="oval")
     assert run.meta["estimator"] == "ekf-replay"
     assert run.config["filter"]["storage_s"] == 2.0
-    again = fgtrack.replay(iter(messages), fgtrack.Config(), set={"association.gate_m": 3.0})
-    assert again.config["association"]["gate_m"] == 3.0
+    again = fgtrack.replay(iter(messages), fgtrack.Config(), set={"association.max_distance_m": 3.0})
+    assert again.config["association"]["max_distance_m"] == 3.0
+    assert set(again.config["sensors"]) == {"lidar_cluster", "radar"}  # those of the messages
     with pytest.raises(fgtrack.CallError, match=r"filter\.storage"):
         fgtrack.replay(messages, "smoother", set={"filter.storage": 2.0})
 

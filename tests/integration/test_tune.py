@@ -135,7 +135,9 @@ def test_a_recording_of_nothing_is_one_line(tmp_path: Path, capsys: Capture) -> 
 
 
 def test_without_a_file_the_text_holds_what_is_no_default() -> None:
-    config = read_config(None, ["sensors.radar.std.x_m=1.5", "motion.std_per_s.yaw=0.1"])
+    config = read_config(
+        None, ["sensors={radar: {std: {x_m: 1.5, y_m: 3.0, speed_mps: 0.2}}}", "motion.std_per_s.yaw=0.1"]
+    )
     text = tuned_text(None, config, ["why"])
     assert text.startswith("# The noise of the defaults, fitted to recordings (fgtrack tune).\n#\n# why\n")
     assert "estimator" not in text
@@ -191,7 +193,7 @@ ignore_sensors: [lamp]
 
 # how objects move
 motion: {kind: cv, std_per_s: {velocity: 4.0}}
-birth: {speed_std_mps: 3.0, kind: fixed}
+birth: {speed_std_mps: 3.0, kind: measured}
 # the end
 """
 

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.examples import few
+from support.paper import paper
 
 from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, TickReport, UpdateRecord
 from fgtrack.estimation.registry import ESTIMATORS
@@ -17,7 +18,7 @@ from fgtrack.models.oval import make_oval
 from fgtrack.models.sensors import Mount, SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, node_ticks
-from fgtrack.pipeline.config import PAPER_SENSORS, Config
+from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
 
 REFERENCE = Path(__file__).resolve().parents[2] / "configs/karle2023_reference.yaml"
@@ -43,40 +44,29 @@ def _with_all_sensors(config: Config) -> Config:
 
 
 CONFIGS = {
-    "clean": _with_all_sensors(load(Config, None, OVAL)),
+    "clean": _with_all_sensors(paper(*OVAL)),
     "clean in open space": _with_all_sensors(
-        load(
-            Config,
-            None,
-            [
-                "association={kind: mahalanobis}",
-                "birth={kind: measured}",
-                "motion={kind: ctrv}",
-                "filter.storage_s=0.3",
-            ],
+        paper(
+            "association={kind: mahalanobis}", "birth={kind: measured}", "motion={kind: ctrv}", "filter.storage_s=0.3"
         )
     ),
     "no merge, cv": _with_all_sensors(
-        load(Config, None, ["merge={kind: none}", "motion={kind: cv, std_per_s: {velocity: 5.0}}", "clock.node_hz=7.0"])
+        paper("merge={kind: none}", "motion={kind: cv, std_per_s: {velocity: 5.0}}", "clock.node_hz=7.0")
     ),
     "replaying": replace(
-        _with_all_sensors(load(Config, None, [*OVAL, "filter.storage_s=0.3", "association.max_nis=50.0", CLAIM])),
+        _with_all_sensors(paper(*OVAL, "filter.storage_s=0.3", "association.max_nis=50.0", CLAIM)),
         estimator="ekf-replay",
     ),
     "smoothing": replace(
-        _with_all_sensors(load(Config, None, ["smoother={lag_s: 0.3, ring_s: 0.3}", "motion={kind: ctrv}", CLAIM])),
+        _with_all_sensors(paper("smoother={lag_s: 0.3, ring_s: 0.3}", "motion={kind: ctrv}", CLAIM)),
         estimator="smoother",
     ),
     "smoothing what is not too late": replace(
         _with_all_sensors(
-            load(
-                Config,
-                None,
-                [
-                    *OVAL,
-                    "smoother={lag_s: 0.3, late: drop}",
-                    "motion={kind: ctra, std_per_s: {position: 0.2, yaw: 0.3, speed: 1.0, yaw_rate: 0.5, accel: 3.0}}",
-                ],
+            paper(
+                *OVAL,
+                "smoother={lag_s: 0.3, late: drop}",
+                "motion={kind: ctra, std_per_s: {position: 0.2, yaw: 0.3, speed: 1.0, yaw_rate: 0.5, accel: 3.0}}",
             )
         ),
         estimator="smoother",
@@ -148,7 +138,7 @@ def streams(draw: st.DrawFn) -> list[Delivered]:
             continue
         delay_ns = draw(st.sampled_from([0, 1, 5 * MS, 60 * MS, 150 * MS, 290 * MS, 450 * MS, 4000 * MS, -900 * MS]))
         far_future = draw(st.integers(0, 19)) == 0
-        sensor = draw(st.sampled_from([*PAPER_SENSORS, *PAPER_SENSORS, *EXTRA_SENSORS]))
+        sensor = draw(st.sampled_from([*paper().sensors, *paper().sensors, *EXTRA_SENSORS]))
         messages.append(
             DetectionList(
                 sensor,
@@ -221,7 +211,7 @@ def test_every_detection_ends_in_exactly_one_row_and_every_state_is_sound(name: 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_a_detection_stamped_ahead_of_the_clock_starts_a_track_at_once(estimator: str) -> None:
     ahead = DetectionList("lidar", START_NS + 900 * MS, START_NS, (Detection(20.0, 1.0, 0.0),), "map")
-    [report] = run(replace(Config(), estimator=estimator), [ahead])
+    [report] = run(replace(paper(), estimator=estimator), [ahead])
     [track] = report.tracks
     assert track.state.stamp_ns == START_NS
     assert track.state.mean[:2] == pytest.approx([20.0, 1.0])

@@ -17,7 +17,7 @@ from fgtrack.sim.vehicles import DrawnVehicle
 from fgtrack.tracking.birth import MeasuredBirth
 
 STD = {"range_m": 0.3, "bearing_rad": 0.01, "range_rate_mps": 0.1}
-AT_REFERENCE = Mount(1.74, 0.0, 0.0)
+AT_REFERENCE = Mount(0.0, 0.0, 0.0)
 MOTION = MotionConfig(kind="ctrv")
 OBJECTS = ((40.0, 40.0, 1.0), (-60.0, 30.0, -2.0))
 

@@ -1,4 +1,3 @@
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -31,16 +30,17 @@ def seen(**values: float) -> Candidate:
     return Candidate(0, (), measurement, z[:2], R[:2, :2], components)
 
 
-@pytest.mark.parametrize("birth", [FixedBirth(), MeasuredBirth()])
+@pytest.mark.parametrize("birth", [FixedBirth, MeasuredBirth])
 def test_what_is_not_measured_comes_from_the_map_and_the_ego(birth) -> None:
-    prior = birth.prior(seen(), ROAD, EGO, ego_in_pit=False)
+    prior = birth(ego_speed_factor=0.8, speed_std_mps=2.0).prior(seen(), ROAD, EGO, ego_in_pit=False)
     assert prior.stamp_ns == START_NS
     assert tuple(prior.position_m) == (3.0, 4.0)
     assert prior.yaw_rad == 0.4
     assert prior.speed_mps == pytest.approx(0.8 * 50.0)
     assert prior.yaw_rate_radps == pytest.approx(40.0 * 0.01)
     assert prior.accel_mps2 == 0.0
-    assert (prior.yaw_std_rad, prior.speed_std_mps) == (math.sqrt(0.3), 2.0)
+    assert (prior.yaw_std_rad, prior.speed_std_mps) == (0.5, 2.0)
+    assert birth().prior(seen(), ROAD, EGO, ego_in_pit=False).speed_mps == 0.0
 
 
 @pytest.mark.parametrize("birth", [FixedBirth(), MeasuredBirth()])
@@ -56,20 +56,20 @@ def test_a_measured_component_starts_with_its_own_deviation_or_a_fixed_one() -> 
     assert (measured.yaw_std_rad, measured.speed_std_mps) == pytest.approx((0.7, 0.7))
     assert measured.position_covariance == pytest.approx(POSITION_COVARIANCE)
     fixed = FixedBirth(along_std_m=2.0, across_std_m=0.5).prior(candidate, ROAD, EGO, ego_in_pit=False)
-    assert (fixed.yaw_std_rad, fixed.speed_std_mps) == (math.sqrt(0.3), 2.0)
+    assert (fixed.yaw_std_rad, fixed.speed_std_mps) == (0.5, 10.0)
     turn = rotation(1.0)
     assert fixed.position_covariance == pytest.approx(turn @ np.diag([4.0, 0.25]) @ turn.T)
 
 
 @pytest.mark.parametrize(("ego", "in_pit"), [(None, False), (EGO, True)])
 def test_without_an_ego_on_the_track_an_object_is_assumed_to_stand(ego: EgoState | None, in_pit: bool) -> None:
-    prior = FixedBirth().prior(seen(), ROAD, ego, ego_in_pit=in_pit)
+    prior = FixedBirth(ego_speed_factor=0.8).prior(seen(), ROAD, ego, ego_in_pit=in_pit)
     assert (prior.speed_mps, prior.yaw_rate_radps, prior.accel_mps2) == (0.0, 0.0, 0.0)
 
 
 def test_a_slow_ego_lends_its_acceleration() -> None:
     for speed_mps, accel_mps2 in [(9.9, -2.0), (10.0, 0.0)]:
-        prior = FixedBirth().prior(seen(), ROAD, replace(EGO, speed_mps=speed_mps), ego_in_pit=False)
+        prior = FixedBirth(slow_ego_mps=10.0).prior(seen(), ROAD, replace(EGO, speed_mps=speed_mps), ego_in_pit=False)
         assert prior.accel_mps2 == accel_mps2
 
 

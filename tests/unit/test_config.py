@@ -2,16 +2,19 @@ from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import pytest
+from support.paper import paper
 
 from fgtrack.core.errors import CallError
 from fgtrack.estimation.base import Start
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.pipeline.build import build_bank, build_tracker
-from fgtrack.pipeline.config import PAPER_SENSORS, Config
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.effective import Effective, effective
 from fgtrack.pipeline.load import dump, load, read_yaml, validate
 from fgtrack.pipeline.sweep_plan import SweepConfig
 from fgtrack.sim.scenario import Scenario
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
+from fgtrack.tracking.birth import FixedBirth
 from fgtrack.tracking.published import PublishedTracker
 from fgtrack.tracking.tracker import Tracker
 
@@ -52,11 +55,25 @@ def test_there_are_files_of_every_kind() -> None:
     assert {"karle2023", "karle2023_reference", "autoferry"} <= {path.stem for path in FILES}
 
 
-def test_the_clean_method_is_the_default_but_for_the_uncertainty_of_the_ego() -> None:
-    clean = load(Config, CONFIGS / "karle2023.yaml")
-    assert clean.ego.uncertainty == "none"
-    with_uncertainty = replace(clean, ego=replace(clean.ego, uncertainty="independent"))
-    assert with_uncertainty == load(Config, None) == Config()
+def test_the_defaults_are_those_of_open_space_and_shift_join_and_expect_nothing() -> None:
+    config = load(Config, None)
+    assert config == Config()
+    assert effective(config) == Effective((0.0, 0.0), None, 3.0, 3.0)
+    assert (config.map.track, config.birth.ego_speed_factor, config.lifecycle.kind) == (None, 0.0, "existence")
+    assert (config.ego.yaw_weight, config.ego.yaw_rate_weight) == (1.0, 1.0)
+
+
+@pytest.mark.parametrize("name", ["karle2023", "karle2023_reference"])
+def test_the_papers_configurations_name_every_value_of_the_paper(name: str) -> None:
+    """None of what the paper gives may follow from a default, which is that of open space."""
+    given = read_yaml(CONFIGS / f"{name}.yaml")
+    assert given["ego"].keys() >= {"yaw_weight", "yaw_rate_weight", "detection_origin_x_m"}
+    assert given["map"].keys() >= {"inner_buffer_m", "outer_buffer_m", "pit_buffer_m"}
+    assert given["birth"].keys() >= {entry.name for entry in fields(FixedBirth)} - {"accel_std_mps2"}
+    assert given["lifecycle"].keys() >= {"kind", "counter_cap", "forget_s", "short_range_m", "confirm_count"}
+    assert given["motion"].keys() >= {"kind", "std_per_s", "noise_hz"}
+    assert (given["merge"]["distance_m"], given["association"]["gate_m"], given["clock"]["node_hz"]) == (5.1, 5.0, 50.0)
+    assert (given["filter"]["frequency_hz"], given["filter"]["storage_s"]) == (100.0, 3.5)
 
 
 def test_a_dump_writes_every_key_out() -> None:
@@ -114,15 +131,17 @@ def test_settings_stand_above_the_file_and_the_last_one_wins(tmp_path: Path) -> 
     assert config.map.track == "oval"
 
 
-def test_a_setting_of_one_sensor_leaves_the_other_default_ones() -> None:
-    sensors = load(Config, None, ["sensors.radar.max_delay_s=1.5", "sensors.radar.counter_add=2"]).sensors
-    radar = replace(PAPER_SENSORS["radar"], max_delay_s=1.5, counter_add=2)
-    assert sensors == {**PAPER_SENSORS, "radar": radar}
+def test_a_setting_of_one_sensor_leaves_the_other_ones() -> None:
+    sensors = paper("sensors.radar.max_delay_s=1.5", "sensors.radar.counter_add=1").sensors
+    radar = replace(paper().sensors["radar"], max_delay_s=1.5, counter_add=1)
+    assert sensors == {**paper().sensors, "radar": radar}
 
 
 def test_a_setting_of_a_choice_is_of_the_default_kind_unless_it_names_another() -> None:
-    assert load(Config, None, ["association.gate_m=3.0"]).association == GatedEuclidean(gate_m=3.0)
-    assert load(Config, None, ["association.kind=mahalanobis"]).association == GatedMahalanobis()
+    assert load(Config, None, ["association.gate_probability=0.9"]).association == GatedMahalanobis(
+        gate_probability=0.9
+    )
+    assert load(Config, None, ["association.kind=euclidean"]).association == GatedEuclidean()
 
 
 def test_a_setting_below_a_key_of_the_file_adds_nothing_to_it(tmp_path: Path) -> None:
@@ -135,7 +154,7 @@ def test_a_setting_does_not_change_what_it_stands_on() -> None:
     validate(Config, raw, "here")
     load(Config, None, ["filter.storage_s=1.0"])
     assert raw == {"filter": {"storage_s": 2.0}}
-    assert Config().filter.storage_s == 3.5
+    assert Config().filter.storage_s == 3.0
 
 
 @pytest.mark.parametrize(
@@ -149,8 +168,10 @@ def test_a_setting_does_not_change_what_it_stands_on() -> None:
         ("sensors: {lidar: {std: {x_m: 1.0, y_m: 1.0}, colour: red}}\n", "sensors.lidar.colour: unknown key"),
         ("sensors: {lidar: {std: {x_m: 1.0, y_m: 1.0, mass_kg: 1.0}}}\n", "unknown component 'mass_kg'"),
         ("sensors: {lidar: {counter_init: 3}}\n", "sensors.lidar.std"),
-        ("sensors: {}\n", "sensors: name at least one"),
-        ("input: {detections: {sonar: {topic: /sonar}}}\n", "input.detections: 'sonar' has no model"),
+        (
+            "sensors: {radar: {std: {range_m: 1.0}}}\ninput: {detections: {sonar: {topic: /sonar}}}\n",
+            "input.detections: 'sonar' has no model",
+        ),
         ("filter: 3\n", "filter: "),
         ("filter: {frequency_hz: fast}\n", 'filter.frequency_hz: Input should be a valid number, not "fast"'),
         ("filter: {frequency_hz: '50'}\n", "filter.frequency_hz"),
@@ -233,7 +254,7 @@ def test_an_empty_file_is_the_default_and_a_missing_one_an_error(tmp_path: Path)
     ("setting", "message"),
     [
         ("smoother.lag_s=1e308", "smoother.lag_s: 1e+308 is out of range"),
-        ("sensors.radar.std.x_m=1e-300", "sensors.radar.std.x_m: 1e-300 is out of range"),
+        ("sensors.radar.std.speed_mps=1e-300", "sensors.radar.std.speed_mps: 1e-300 is out of range"),
         ("motion.std_per_s.yaw=1e100", "1e+100 is out of range"),
         ("motion.std_per_s.yaw=-0.3", "std_per_s.yaw: must not be negative"),
         ("ego.storage_ticks=99999999999999999999", "has more than 64 bits"),

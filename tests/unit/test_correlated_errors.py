@@ -103,7 +103,7 @@ def test_the_steps_of_the_paper_have_no_such_state(tmp_path) -> None:
     build_tracker(erring)
     build_tracker(replace(erring, estimator="ekf-backward-forward"))
     with pytest.raises(ValueError, match=r"sensors.radar.correlation: needs motion.kind ctrv, ctra or cv"):
-        replace(erring, motion=MotionConfig())
+        replace(erring, motion=MotionConfig(kind="ctrv_euler"))
 
 
 def nees(name: str, modelled: bool, lag_s: float, num_runs: int = 40) -> float:

@@ -210,5 +210,5 @@ def test_groups_are_those_of_a_search_by_hand_in_a_crowd_as_well(
 def test_a_crowd_is_merged_in_memory_that_grows_with_its_points(spread_m: float) -> None:
     """20,000 points within 10 m have 200 million pairs, 3.2 GB of two numbers each."""
     points = np.random.default_rng(0).uniform(0.0, spread_m, size=(20_000, 2))
-    peak = peak_bytes(lambda: ConnectedMerge().groups(points))
+    peak = peak_bytes(lambda: ConnectedMerge(5.1).groups(points))
     assert peak < 40 * MB, f"{peak / MB:.0f} MB"

@@ -41,7 +41,7 @@ def test_a_healthy_run_has_none(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fate", "cure"),
     [
-        (Disposition.GATED, "association.gate_m"),
+        (Disposition.GATED, "the gate of `association`"),
         (Disposition.OUT_OF_BOUNDS, "--map"),
         (Disposition.DUPLICATE, "repeats itself"),
         (Disposition.SUPERSEDED, "clock.node_hz"),

@@ -126,4 +126,7 @@ def test_the_configuration_says_it_for_all_tracks(name: str, method: str) -> Non
 
 
 def test_on_a_map_backward_forward_stays_one_bank_for_all_objects() -> None:
-    assert type(build_bank(Config(map=MapConfig(track="oval")))).__name__ == "BackwardForwardBank"
+    assert (
+        type(build_bank(Config(estimator="ekf-backward-forward", map=MapConfig(track="oval")))).__name__
+        == "BackwardForwardBank"
+    )

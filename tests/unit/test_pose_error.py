@@ -50,7 +50,7 @@ def candidates(
     sensor = SensorModel(std={name: STD[name] for name in seen[0]}, mount=MOUNT)
     if road is not None:
         sensor = replace(sensor, yaw_from_map_std_rad=0.3)
-    merge = ConnectedMerge() if len(seen) > 1 else NoMerge()
+    merge = ConnectedMerge(5.1) if len(seen) > 1 else NoMerge()
     preprocess = Preprocess(road or OpenSpace(), merge, motion or CTRV(), ORIGIN_M)
     return preprocess(batch(*(Detection(**values) for values in seen), frame=frame), sensor, ego)[0]
 

@@ -215,7 +215,7 @@ CHAIN = np.array([[0.0, 0.0], [4.0, 0.0], [8.0, 0.0], [50.0, 0.0], [50.0, 5.1]])
 
 
 def test_a_chain_of_neighbours_is_one_object() -> None:
-    groups = ConnectedMerge().groups(CHAIN)
+    groups = ConnectedMerge(5.1).groups(CHAIN)
     assert list(groups.items()) == [(0, (0, 1, 2)), (3, (3, 4))]
 
 
@@ -225,7 +225,7 @@ def test_the_published_merge_makes_an_object_of_every_neighbourhood() -> None:
     assert list(groups)[-1] == 5
 
 
-@pytest.mark.parametrize("merge", [ConnectedMerge(), NeighbourhoodMerge(), NoMerge()])
+@pytest.mark.parametrize("merge", [ConnectedMerge(5.1), NeighbourhoodMerge(), NoMerge()])
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 12))
 def test_every_detection_leads_or_is_merged_into_exactly_one_candidate(merge: Merge, seed: int, count: int) -> None:
     points = np.random.default_rng(seed).uniform(0.0, 15.0, size=(count, 2)).round(1)
@@ -244,28 +244,28 @@ def test_connected_groups_are_those_of_a_search_by_hand(seed: int, count: int) -
             if math.dist(points[i], points[j]) <= 5.1:
                 a, b = (next(group for group in groups if k in group) for k in (i, j))
                 groups = groups - {a, b} | {a | b}
-    assert {frozenset(members) for members in ConnectedMerge().groups(points).values()} == groups
+    assert {frozenset(members) for members in ConnectedMerge(5.1).groups(points).values()} == groups
 
 
 def test_a_merged_yaw_is_the_mean_direction_and_the_published_one_is_not() -> None:
     yaws = np.array([math.pi - 0.1, -math.pi + 0.1])
-    assert abs(ConnectedMerge().mean("yaw_rad", yaws)) == pytest.approx(math.pi)
+    assert abs(ConnectedMerge(5.1).mean("yaw_rad", yaws)) == pytest.approx(math.pi)
     jump = np.array([-math.pi / 2 - 0.1, -math.pi / 2 + 0.1])  # where the published yaw jumps
-    assert ConnectedMerge().mean("yaw_rad", jump) == pytest.approx(-math.pi / 2)
+    assert ConnectedMerge(5.1).mean("yaw_rad", jump) == pytest.approx(-math.pi / 2)
     assert NeighbourhoodMerge().mean("yaw_rad", jump) == pytest.approx(math.pi / 2)
     assert NeighbourhoodMerge().mean("yaw_rad", yaws) == pytest.approx(math.pi)
-    assert ConnectedMerge().mean("x_m", np.array([1.0, 2.0, 6.0])) == 3.0
+    assert ConnectedMerge(5.1).mean("x_m", np.array([1.0, 2.0, 6.0])) == 3.0
 
 
 def test_merged_detections_keep_what_all_of_them_measure() -> None:
     items = (Detection(x_m=0.0, y_m=0.0001, yaw_rad=0.2), Detection(x_m=2.0, y_m=0.0))
-    [found] = candidates(*items, merge=ConnectedMerge(), frame="map")
+    [found] = candidates(*items, merge=ConnectedMerge(5.1), frame="map")
     assert found.measurement.model.components == ("x_m", "y_m")
     assert pytest.approx(0.09 * np.eye(2)) == found.measurement.R
     assert found.values == pytest.approx({"x_m": 1.0, "y_m": 0.00005})
 
 
-@pytest.mark.parametrize("merge", [ConnectedMerge(), NeighbourhoodMerge()])
+@pytest.mark.parametrize("merge", [ConnectedMerge(5.1), NeighbourhoodMerge()])
 def test_detections_that_say_in_different_ways_where_they_are_merge_into_the_first(merge: Merge) -> None:
     both = SensorModel(std={"x_m": 0.3, "y_m": 0.3, "range_m": 0.5, "bearing_rad": 0.02})
     items = (Detection(range_m=20.0, bearing_rad=0.0), Detection(x_m=20.0, y_m=0.5, bearing_rad=0.0))
@@ -285,7 +285,7 @@ def test_a_yaw_that_the_map_gave_is_assumed_and_one_that_was_measured_is_not() -
     assert candidates(point, sensor=both, road=StraightRoad())[0].measurement.assumed == ("yaw_rad",)
     assert candidates(known, sensor=both, road=StraightRoad())[0].measurement.assumed == ()
     assert candidates(point, sensor=POINTS)[0].measurement.assumed == ()
-    [merged] = candidates(known, point, sensor=both, road=StraightRoad(), merge=ConnectedMerge())
+    [merged] = candidates(known, point, sensor=both, road=StraightRoad(), merge=ConnectedMerge(5.1))
     assert merged.measurement.assumed == ("yaw_rad",)
 
 

@@ -1,6 +1,7 @@
 from dataclasses import replace
 
 import pytest
+from support.paper import paper
 from support.tracking import START_NS, ms
 
 from fgtrack.core.errors import DataError
@@ -9,8 +10,7 @@ from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.models.oval import make_oval
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.config import Config, CountingConfig
-from fgtrack.pipeline.load import load
+from fgtrack.pipeline.config import CountingConfig
 from fgtrack.tracking.association import GatedEuclidean
 from fgtrack.tracking.tracker import Tracker
 
@@ -19,7 +19,7 @@ POINTS = SensorModel(std={"x_m": 0.3, "y_m": 0.3})
 
 
 def tracker(**sensors: SensorModel) -> Tracker:
-    return build_tracker(replace(Config(), sensors=sensors or {"lidar": POINTS}))
+    return build_tracker(replace(paper(), sensors=sensors or {"lidar": POINTS}))
 
 
 def seen(
@@ -49,7 +49,7 @@ def dispositions(report: TickReport) -> list[str]:
 )
 def test_a_track_is_missed_by_a_message_as_a_whole_and_not_by_each_stamp_in_it(estimator: str, stamp_from) -> None:
     sensor = replace(POINTS, stamp_from=stamp_from)
-    one = build_tracker(replace(Config(), sensors={"lidar": sensor}, estimator=estimator))
+    one = build_tracker(replace(paper(), sensors={"lidar": sensor}, estimator=estimator))
     for k in range(10):
         stamp_ns = START_NS + k * ms(50)
         items = tuple(Detection(x_m=20.0 * i, y_m=1.0, stamp_ns=stamp_ns - ms(3 * i)) for i in range(4))
@@ -80,7 +80,7 @@ def test_batches_of_one_tick_are_processed_in_order_of_their_stamps() -> None:
 
 def test_a_detection_that_no_noise_explains_is_gated_and_starts_no_track() -> None:
     one = build_tracker(
-        replace(Config(), sensors={"lidar": POINTS}, association=GatedEuclidean(gate_m=20.0, max_nis=50.0))
+        replace(paper(), sensors={"lidar": POINTS}, association=GatedEuclidean(gate_m=20.0, max_nis=50.0))
     )
     tick(one, 0.0, seen((10.0, 0.0)))
     report = tick(one, 50.0, seen((28.0, 0.0), (40.0, 0.0), at_ms=50.0))
@@ -94,7 +94,7 @@ def test_a_detection_that_no_noise_explains_is_gated_and_starts_no_track() -> No
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_detections_that_the_first_one_has_overtaken_start_no_second_track(estimator: str) -> None:
     one = build_tracker(
-        replace(Config(), sensors={"lidar": POINTS, "radar": POINTS}, estimator=estimator, lifecycle=CLAIMING)
+        replace(paper(), sensors={"lidar": POINTS, "radar": POINTS}, estimator=estimator, lifecycle=CLAIMING)
     )
     tick(one, 100.0, seen((10.0, 0.0), at_ms=100.0, sensor="radar"))
     late = seen((10.5, 0.0), (30.0, 0.0), at_ms=110.0, late_ms=50.0)
@@ -108,7 +108,7 @@ def test_detections_that_the_first_one_has_overtaken_start_no_second_track(estim
 def test_what_is_near_a_younger_track_but_not_believed_is_gated() -> None:
     one = build_tracker(
         replace(
-            Config(),
+            paper(),
             sensors={"lidar": POINTS, "radar": POINTS},
             association=GatedEuclidean(gate_m=20.0, max_nis=50.0),
             lifecycle=CLAIMING,
@@ -120,7 +120,7 @@ def test_what_is_near_a_younger_track_but_not_believed_is_gated() -> None:
 
 
 def test_a_track_that_begins_ahead_of_the_clock_claims_nothing() -> None:
-    one = build_tracker(replace(Config(), sensors={"lidar": POINTS}, estimator="ekf-replay", lifecycle=CLAIMING))
+    one = build_tracker(replace(paper(), sensors={"lidar": POINTS}, estimator="ekf-replay", lifecycle=CLAIMING))
     tick(one, 100.0, seen((10.0, 0.0), at_ms=100.0, late_ms=-200.0))
     report = tick(one, 120.0, seen((10.5, 0.0), at_ms=110.0, late_ms=10.0))
     assert dispositions(report) == ["birth"]
@@ -129,7 +129,7 @@ def test_a_track_that_begins_ahead_of_the_clock_claims_nothing() -> None:
 def test_where_a_track_was_before_it_began_follows_its_motion() -> None:
     """20 m/s along x, first seen at 0.1 s at x = 50: 0.5 s before it was at 40."""
     road_runner = SensorModel(std={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.1, "speed_mps": 0.2})
-    one = build_tracker(replace(Config(), sensors={"lidar": POINTS, "v2v": road_runner}, lifecycle=CLAIMING))
+    one = build_tracker(replace(paper(), sensors={"lidar": POINTS, "v2v": road_runner}, lifecycle=CLAIMING))
     stamp_ns = START_NS + ms(600)
     first = Detection(x_m=50.0, y_m=0.0, yaw_rad=0.0, speed_mps=20.0)
     tick(one, 600.0, DetectionList("v2v", stamp_ns, stamp_ns, (first,), "map"))
@@ -175,7 +175,7 @@ def test_a_late_detection_is_placed_by_where_the_ego_was_at_its_stamp() -> None:
 @pytest.mark.parametrize(("late", "expected"), [("fuse", "beyond_window"), ("drop", "too_old")])
 def test_a_smoother_fuses_behind_its_window_as_far_as_its_ring(late: str, expected: str) -> None:
     settings = [f"smoother={{lag_s: 0.3, ring_s: 0.3, late: {late}}}", "sensors={lidar: {std: {x_m: 0.3, y_m: 0.3}}}"]
-    one = build_tracker(replace(load(Config, None, settings), estimator="smoother"))
+    one = build_tracker(replace(paper(*settings), estimator="smoother"))
     for k in range(21):
         tick(one, 50.0 * k, seen((10.0, 0.0), at_ms=50.0 * k))
     late_ms = (250.0, 450.0, 650.0)
@@ -233,7 +233,7 @@ def test_an_innovation_is_named_by_what_was_measured() -> None:
 @pytest.mark.parametrize("published", [False, True])
 def test_a_heading_from_the_map_is_no_innovation_except_in_the_published_configuration(published: bool) -> None:
     """NIS and innovation have the same degrees of freedom; the estimates do not differ."""
-    config = load(Config, None, ["map.track=oval", *(["lifecycle.kind=published"] if published else [])])
+    config = paper("map.track=oval", *(["lifecycle.kind=published"] if published else []))
     one = build_tracker(config)
     x_m, y_m = make_oval().table[100, :2].tolist()
     for at_ms in (0.0, 50.0):
