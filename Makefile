@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # A file stays in one process, so what its tests share is made once.
 BY_FILE := --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-slow test-matrix lock audit fuzz coverage mutants check docs bench bench-full soak soak-live contest clean
+.PHONY: demo test test-slow test-matrix lock audit fuzz faults coverage mutants check docs bench bench-full soak soak-live contest clean
 
 demo: $(STAMP)
 	$(BIN)/fgtrack demo -o out/demo --overwrite
@@ -26,6 +26,10 @@ test-slow: $(STAMP)
 # Half an hour for each of the kinds of input; what is found is kept in out/fuzz. SECONDS=60 SEED=1 for others.
 fuzz: $(STAMP)
 	$(BIN)/python -m pytest tests/fuzz -n auto -m slow --fuzz-seconds $(or $(SECONDS),1800) --fuzz-seed $(or $(SEED),0)
+
+# Some 20 minutes: 400 kills, full disks, folders of others, workers and schedulers that die. KILLS=1000 SEED=1 for others.
+faults: $(STAMP)
+	$(BIN)/python -m pytest tests/faults -n auto -m 'slow or not slow' --kills $(or $(KILLS),100) --fuzz-seed $(or $(SEED),0)
 
 coverage: $(STAMP)
 	$(BIN)/python -m pytest -n auto $(BY_FILE) --cov --cov-report=term-missing:skip-covered

@@ -17,6 +17,7 @@ settings.load_profile("fast")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """How long `tests/fuzz` goes on, and with which random numbers."""
+    """How long `tests/fuzz` goes on, how often `tests/faults` kills, and with which random numbers."""
     parser.addoption("--fuzz-seconds", type=float, default=60.0, help="time for each target of the slow fuzzing tests")
     parser.addoption("--fuzz-seed", type=int, default=0, help="seed of the slow fuzzing tests")
+    parser.addoption("--kills", type=int, default=100, help="kills of each command in tests/faults")

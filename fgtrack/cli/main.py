@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 
 import fgtrack
 from fgtrack.core.errors import CallError, FgtrackError, one_line
+from fgtrack.io.output import FULL
 
 DONE, BAD_DATA, BAD_CALL, INTERRUPTED = 0, 1, 2, 130
 
@@ -81,6 +82,7 @@ def run(arguments: Sequence[str]) -> int:
         outcome = typer.main.get_command(app).main(words or ["--help"], prog_name="fgtrack", standalone_mode=False)
         if outcome == INTERRUPTED:  # typer turns the exception into this code
             return _failed("interrupted; what was computed so far is in the output folder", INTERRUPTED, debug)
+        sys.stdout.flush()
         return BAD_CALL if not words else outcome if isinstance(outcome, int) else DONE
     except typer.TyperException as error:
         return _failed(error.format_message(), BAD_CALL, debug)
@@ -91,6 +93,10 @@ def run(arguments: Sequence[str]) -> int:
     except BrokenPipeError:
         sys.stderr.close()  # the reader of a pipe has left: not an error worth a line
         return DONE
+    except OSError as error:  # of files, the library makes its own errors
+        if error.errno not in FULL:
+            return _failed(f"internal error: {type(error).__name__}: {error} (run with --debug)", BAD_DATA, debug)
+        return _failed(f"what was to be printed cannot be written ({error.strerror}), free some space", BAD_DATA, debug)
     except Exception as error:  # the last line of defence: a bug must not look like bad data
         return _failed(f"internal error: {type(error).__name__}: {error} (run with --debug)", BAD_DATA, debug)
 

@@ -8,6 +8,7 @@ instead: created, and locked until the command ends.
 import errno
 import importlib
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Callable, Iterator
@@ -18,7 +19,9 @@ from typing import BinaryIO
 
 from fgtrack.core.errors import CallError, DataError, FgtrackError
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+_PART = re.compile(r"\.[0-9a-f]{12}\.part$")
+#: Of a disk that takes no more.
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ def check_output(path: Path, kind: Kind, overwrite: bool) -> None:
 
 def write_error(path: Path, error: OSError) -> FgtrackError:
     """The error to raise where `path` cannot be written: `DataError` for a full or broken disk, else `CallError`."""
-    if error.errno in _FULL:
+    if error.errno in FULL:
         return DataError(f"{path}: cannot be written ({error.strerror}), free some space")
     return CallError(f"{path}: cannot be written ({error.strerror or error}), choose another place")
 
@@ -168,6 +171,11 @@ def _rename(part: Path, path: Path, kind: Kind, overwrite: bool) -> None:
             return
     check_output(path, kind, overwrite)
     os.replace(part, path)
+
+
+def part_of(name: str) -> str:
+    """Name of the file that a `.part` was to become; that of any other file itself."""
+    return _PART.sub("", name)
 
 
 def _part_of(path: Path) -> Path:

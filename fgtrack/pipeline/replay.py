@@ -59,27 +59,34 @@ class _Feed:
     last_receipt_ns: int | None = field(default=None, init=False)
 
     def __iter__(self) -> Iterator[Delivered]:
+        for message in self._until_break():
+            if isinstance(message, TruthState):
+                self.on_truth(message)
+                continue
+            if isinstance(message, DetectionList):
+                self.received_detections += len(message.objects)
+                self.on_detections(message)
+            else:
+                self.on_ego(message)
+            yield message
+        if self.last_receipt_ns is None and self.broken is None:
+            self.broken = "holds neither ego states nor detections"
+
+    def _until_break(self) -> Iterator[Message]:
+        """What the input holds up to its break; what is raised where a message goes to breaks off no input."""
         try:
             for message in self.messages:
                 self.num_messages += 1
-                if isinstance(message, TruthState):
-                    self.on_truth(message)
-                elif isinstance(message, DetectionList) and message.sensor in self.ignored_sensors:
-                    self.ignored_detections += len(message.objects)
-                else:
-                    if isinstance(message, DetectionList):
-                        check_sensor(message.sensor, self.sensors)
+                if isinstance(message, DetectionList):
+                    if message.sensor in self.ignored_sensors:
+                        self.ignored_detections += len(message.objects)
+                        continue
+                    check_sensor(message.sensor, self.sensors)
+                if not isinstance(message, TruthState):
                     self._check_time(message)
-                    if isinstance(message, DetectionList):
-                        self.received_detections += len(message.objects)
-                        self.on_detections(message)
-                    else:
-                        self.on_ego(message)
-                    yield message
+                yield message
         except DataError as error:
             self.broken = str(error)
-        if self.last_receipt_ns is None and self.broken is None:
-            self.broken = "holds neither ego states nor detections"
 
     @property
     def is_empty(self) -> bool:

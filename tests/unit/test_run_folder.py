@@ -5,6 +5,7 @@ import math
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from io import FileIO
 
 import numpy as np
 import pytest
@@ -244,6 +245,44 @@ def test_a_killed_run_is_readable_up_to_its_last_whole_row(tmp_path):
     assert run.tracks.num_rows == 5
     assert run.timing.num_rows == 3
     writer.close()
+
+
+def test_a_disk_that_takes_only_a_part_at_a_time_gets_all(tmp_path, monkeypatch):
+    """As one that is nearly full does: what it did not take must not be lost without a word."""
+
+    class Grudging(FileIO):
+        def write(self, data):
+            return super().write(bytes(data)[:7])
+
+    write(tmp_path / "right", report())
+    monkeypatch.setattr("fgtrack.io.run.writer.FileIO", Grudging)
+    write(tmp_path / "run", report())
+    for name in ("tracks.csv", "updates.csv", "timing.csv"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "right" / name).read_bytes()
+
+
+def test_a_run_without_meta_says_that_it_was_killed_at_its_beginning(tmp_path):
+    write(tmp_path / "run", report())
+    (tmp_path / "run/meta.json").unlink()
+    with pytest.raises(DataError, match=r"run: has no meta\.json, what wrote it was killed at its beginning: repeat"):
+        load_run(tmp_path / "run")
+
+
+@pytest.mark.parametrize("name", ["config.yaml.0123456789ab.part", "meta.json.ba9876543210.part"])
+def test_what_a_kill_within_the_first_files_leaves_is_replaced_with_overwrite(tmp_path, name):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / name).write_text("{")
+    with pytest.raises(CallError, match="replace it with --overwrite"):
+        RunWriter(tmp_path / "run")
+    RunWriter(tmp_path / "run", overwrite=True).close()
+
+
+@pytest.mark.parametrize("name", ["notes.txt.0123456789ab.part", "meta.json.part", "meta.json.0123456789ab"])
+def test_a_part_of_something_else_is_nothing_to_replace(tmp_path, name):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / name).write_text("{")
+    with pytest.raises(CallError, match="is not a run folder"):
+        RunWriter(tmp_path / "run", overwrite=True)
 
 
 def test_an_exception_leaves_the_run_marked_as_incomplete(tmp_path):

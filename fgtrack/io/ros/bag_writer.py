@@ -65,7 +65,9 @@ def write_bag(
     except FgtrackError:
         raise
     except Exception as error:  # rosbags lets SQLite and struct errors through
-        raise DataError(f"{path}: cannot be written ({one_line(error)})") from error
+        raise DataError(
+            f"{path}: cannot be written ({one_line(error)}), free some space or choose another place"
+        ) from error
     readable.raise_error()
     return writer.count
 

@@ -168,6 +168,8 @@ def _read_text(path: Path) -> str:
 
 def _read_meta(path: Path) -> Mapping[str, Any]:
     file = path / "meta.json"
+    if not file.exists() and (path / "config.yaml").is_file():
+        raise DataError(f"{path}: has no meta.json, what wrote it was killed at its beginning: repeat the run")
     try:
         meta = json.loads(_read_text(file))
     except ValueError as error:

@@ -4,11 +4,12 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import Self
 
-from fgtrack.io.output import Kind, check_output, claimed, write_error, write_file
+from fgtrack.io.output import Kind, check_output, claimed, part_of, write_error, write_file
 from fgtrack.io.run.rows import Row, text, text_header
 from fgtrack.io.run.schema import COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
 from fgtrack.io.run.sink import RunSink
@@ -51,7 +52,7 @@ class RunWriter(RunSink):
         self._overwrite = overwrite
         self._begun = False
         self._truth: dict[str, list[Row]] = {"truth": [], "ignored": []}  # what came before the first tick
-        self._files: dict[str, BinaryIO] = {}
+        self._files: dict[str, FileIO] = {}
         with ExitStack() as claim:
             claim.enter_context(claimed(self.path))
             check_output(self.path, RUN, overwrite)
@@ -112,9 +113,9 @@ class RunWriter(RunSink):
         path = self.path / f"{table}.csv"
         try:
             if file is None:
-                file = self._files[table] = path.open("xb", buffering=0)
-                file.write(text_header(table))
-            file.write(lines.encode())
+                file = self._files[table] = FileIO(path, "x")
+                _write_all(file, text_header(table))
+            _write_all(file, lines.encode())
         except OSError as error:
             raise write_error(path, error) from error
 
@@ -149,9 +150,17 @@ def is_run_folder(path: Path) -> bool:
     return isinstance(meta, dict) and meta.get("format") == RUN_FORMAT
 
 
+def _write_all(file: FileIO, data: bytes) -> None:
+    """Write `data`; a disk that is about to be full takes only the first part of it at a time."""
+    while data:
+        data = data[file.write(data) :]
+
+
 def _is_run(path: Path) -> bool:
     """Whether `path` holds a run, or what is left of one whose writer was killed at its beginning."""
-    return is_run_folder(path) or (path.is_dir() and {file.name for file in path.iterdir()} <= set(_FILES))
+    if is_run_folder(path):
+        return True
+    return path.is_dir() and all(part_of(file.name) in _FILES for file in path.iterdir())
 
 
 RUN = Kind("a run folder", _is_run)

@@ -1,0 +1,147 @@
+"""Runs commands in forks of itself, so that each costs what it does and not what it imports; a script of its own.
+
+Every line of stdin is an `Order` as JSON, answered by a line with its `Outcome`.
+"""
+
+import json
+import os
+import resource
+import select
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import fgtrack.cli.sweep  # noqa: F401  # as what it imports
+from fgtrack.cli.main import run
+
+#: What a process does to files, as Python's audit events; writing into an open file is none.
+_CHANGES = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.truncate", "sqlite3.connect")
+
+
+@dataclass(frozen=True)
+class Order:
+    """A command, and what is to disturb it."""
+
+    words: list[str]
+    folder: str
+    """Where it runs."""
+    kill_after_s: float | None = None
+    kill_at_change: int | None = None
+    """Kill it right before so many files were opened for writing, renamed, removed or made; -1 only counts them."""
+    largest_file: int | None = None
+    """Bytes of a file from which on writing fails."""
+    user: int | None = None
+    """Number of the user that it runs as."""
+    out: str | None = None
+    """Where stdout goes."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a command ended."""
+
+    code: int
+    """-9 for a killed one."""
+    took_s: float
+    said: str
+    changes: int | None
+    """Counted, where that was asked for."""
+
+
+def serve() -> None:
+    """Answer every line of stdin until its end."""
+    _warm_up()
+    _answer("ready")
+    for line in sys.stdin:
+        _answer(json.dumps(asdict(_outcome(Order(**json.loads(line))))))
+
+
+def _answer(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+def _warm_up() -> None:
+    """Import what the commands import."""
+    with tempfile.TemporaryDirectory() as folder, open(os.devnull, "w") as nowhere:
+        standard, sys.stdout = sys.stdout, nowhere
+        stream = f"{folder}/x.jsonl"
+        assert run(["simulate", "single_opponent", "--duration", "1", "-o", stream]) == 0
+        for storage in ("mcap", "sqlite3"):
+            assert run(["convert", stream, f"{folder}/{storage}", "--storage", storage]) == 0
+        assert run(["convert", f"{folder}/mcap", f"{folder}/y.jsonl.gz"]) == 0
+        assert run(["replay", stream, "-c", "smoother", "--map", "oval", "-o", f"{folder}/run"]) == 0
+        assert run(["compare", f"{folder}/run"]) == 0
+        sys.stdout = standard
+
+
+def _outcome(order: Order) -> Outcome:
+    began_s = time.monotonic()
+    with tempfile.TemporaryFile() as said, tempfile.TemporaryFile() as counted:
+        pid = os.fork()
+        if pid == 0:
+            _child(order, said.fileno(), counted.fileno())
+        watched = select.poll()
+        watched.register(os.pidfd_open(pid), select.POLLIN)
+        if not watched.poll(None if order.kill_after_s is None else 1e3 * order.kill_after_s):
+            os.kill(pid, signal.SIGKILL)
+        code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        took_s = time.monotonic() - began_s
+        said.seek(0)
+        counted.seek(0)
+        text = said.read().decode(errors="replace")
+        changes = int(counted.read() or b"-1")
+    return Outcome(code, took_s, text, None if changes < 0 else changes)
+
+
+def _child(order: Order, said: int, counted: int) -> None:
+    code = 70
+    try:
+        os.chdir(order.folder)
+        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        os.dup2(said if order.out is None else os.open(order.out, os.O_WRONLY), 1)
+        os.dup2(said, 2)
+        sys.stdout, sys.stderr = (os.fdopen(number, "w", closefd=False) for number in (1, 2))
+        if order.largest_file is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (order.largest_file,) * 2)
+        if order.user is not None:
+            os.setgroups([])
+            os.setgid(order.user)
+            os.setuid(order.user)
+        changes = (lambda: -1) if order.kill_at_change is None else _kill_at(order.kill_at_change)
+        code = run(order.words)
+        os.write(counted, str(changes()).encode())
+        sys.stderr.flush()
+        sys.stdout.flush()
+    finally:
+        os._exit(code)
+
+
+def _kill_at(number: int) -> Callable[[], int]:
+    """Kill this process before a change of files; gives how many there were so far."""
+    seen = 0
+
+    def look(event: str, arguments: tuple[object, ...]) -> None:
+        nonlocal seen
+        if event not in _CHANGES or (event == "open" and not _writes(arguments)):
+            return
+        if seen == number:
+            os.kill(os.getpid(), signal.SIGKILL)
+        seen += 1
+
+    sys.addaudithook(look)
+    return lambda: seen
+
+
+def _writes(arguments: tuple[object, ...]) -> bool:
+    flags = arguments[2]
+    return isinstance(flags, int) and bool(flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    serve()
