@@ -6,6 +6,7 @@ import typer
 
 from fgtrack.cli.arguments import All, FormOption, Json, Runs
 from fgtrack.cli.show import chosen_form, say, show, warn
+from fgtrack.core.errors import FgtrackError
 from fgtrack.evaluation.cautions import cautions
 from fgtrack.evaluation.comparison import compare as tables_of
 from fgtrack.evaluation.recordings import recordings_caution
@@ -37,10 +38,13 @@ def compare(
 
 
 def written_tables(runs: AnyRuns, streaming: bool = False) -> Tables:
-    """The tables of `runs`; the metrics of each are written into its folder."""
+    """The tables of `runs`; the metrics of each are written into its folder, with a warning where they cannot be."""
     every = judged(runs)
     tables = tables_of(*every, streaming=streaming)
     for one in every:
         if one.run.path is not None:
-            write_metrics(one.run.path, one.metrics.as_dict())
+            try:
+                write_metrics(one.run.path, one.metrics.as_dict())
+            except FgtrackError as error:
+                warn(f"{error}; the tables are complete without it")
     return tables

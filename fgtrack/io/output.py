@@ -34,9 +34,16 @@ class Kind:
 
 
 def check_output(path: Path, kind: Kind, overwrite: bool) -> None:
-    """Raise `CallError` unless `path` is free, an empty folder or, with `overwrite`, of this kind."""
+    """Raise `CallError` unless `path` can be made, is an empty folder or, with `overwrite`, of this kind."""
     try:
-        if not os.path.lexists(path) or (path.is_dir() and not path.is_symlink() and not any(path.iterdir())):
+        if not os.path.lexists(path):
+            parent = next(above for above in Path(os.path.abspath(path)).parents if above.exists())
+            if not parent.is_dir():
+                raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+            if not os.access(parent, os.W_OK):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+            return
+        if path.is_dir() and not path.is_symlink() and not any(path.iterdir()):
             return
         own = not path.is_symlink() and kind.recognises(path)
     except OSError as error:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgtrack.core.errors import CallError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import period_ns, seconds
 from fgtrack.estimation.backward_forward import BackwardForwardBank
 from fgtrack.estimation.banded.bank import BandedBank
@@ -107,7 +107,10 @@ def build_road(config: MapConfig) -> Road:
     if config.lookup == "frenet":
         return MappedRoad(track, pit, *buffers)
     lookup = PublishedMap if config.lookup == "published" else CircularHeadingMap
-    return MappedRoad(lookup(track), None if pit is None else lookup(pit), *buffers)
+    try:
+        return MappedRoad(lookup(track), None if pit is None else lookup(pit), *buffers)
+    except DataError as error:
+        raise DataError(f"{config.track}: {error}") from error
 
 
 def _read_map(name: str, built_in: Callable[[], TrackMap]) -> TrackMap:

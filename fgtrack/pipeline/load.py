@@ -47,6 +47,8 @@ def with_settings(kind: type[T], raw: dict[str, Any], settings: Sequence[str], o
 
 def read_yaml(path: Path) -> dict[str, Any]:  # Any: what YAML says is only known after validation
     """The mapping that the YAML 1.2 file `path` holds; empty for an empty file."""
+    if path.exists() and not path.is_file():  # a pipe would be waited for
+        raise CallError(f"{path}: is no file")
     try:
         value = _parse(path.read_text(encoding="utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as error:

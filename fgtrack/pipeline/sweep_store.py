@@ -4,6 +4,7 @@ import csv
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -15,6 +16,7 @@ from fgtrack.io.output import Kind, check_output, write_file
 from fgtrack.pipeline.sweep_plan import KEY_COLUMNS, Plan, Value, compact
 
 PART_FORMAT = "fgtrack-sweep-part/1"
+_PART_START = json.dumps({"format": PART_FORMAT})[:-1].encode()
 SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE = "sweep.csv", "timing.csv", "errors.csv"
 PAIRED_TABLE, SUMMARY_TABLE = "paired.csv", "summary.csv"
 
@@ -59,7 +61,7 @@ class PartStore:
 
     def __init__(self, folder: Path, overwrite: bool = False) -> None:
         self._folder = folder / "parts"
-        if not self._folder.is_dir():
+        if not any(map(_is_part, self._folder.glob("*.json"))):
             for name in (SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE, PAIRED_TABLE, SUMMARY_TABLE):
                 check_output(folder / name, Kind("a table", Path.is_file), overwrite)
         try:
@@ -90,6 +92,12 @@ class PartStore:
         """Keep the cells of a finished job."""
         content = {"format": PART_FORMAT, "cells": [asdict(cell) for cell in cells]}
         write_file(self._folder / f"{key}.json", json.dumps(content))
+
+
+def _is_part(path: Path) -> bool:
+    with suppress(OSError), path.open("rb") as file:
+        return file.read(len(_PART_START)) == _PART_START
+    return False
 
 
 def write_tables(folder: Path, plan: Plan, done: Mapping[str, Sequence[Cell]]) -> SweepResult:

@@ -3,6 +3,8 @@
 import json
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from fgtrack.core.types import Detection, DetectionList, EgoState, Message, Tick
 from fgtrack.io import output
 from fgtrack.io.output import claimed, new_file, write_file
 from fgtrack.io.ros.bag_writer import write_bag
-from fgtrack.io.run import RunWriter, load_run
+from fgtrack.io.run import RunWriter, digest, load_run
 from fgtrack.io.source import open_input
 from fgtrack.io.stream import STREAM, read_stream, write_stream
 from fgtrack.pipeline.replay import replay_each
@@ -371,17 +373,121 @@ def test_figures_are_replaced_all_or_none(here: Path, call: Call, monkeypatch: p
 
 def test_an_output_that_cannot_be_written_is_a_bad_call_everywhere(here: Path, call: Call) -> None:
     Path("file").write_text("")
+    Path("sweep.yaml").write_text(SWEEP)
     for words in (
         ("simulate", "default", "--duration", "1", "-o", "file/x.jsonl"),
         ("simulate", "default", "--duration", "1", "-o", "file/x"),
         ("convert", "drive.jsonl", "file/x.jsonl"),
         ("replay", "drive.jsonl", "-o", "file/x"),
         ("figure", "run", "-o", "file/x"),
+        ("figure", "run", "-o", "file/x.pdf"),
+        ("report", "run", "-o", "file/x.html"),
+        ("export", "run", "-o", "file/x.mcap"),
+        ("export", "run", "-o", "file/x", "--ros2"),
+        ("tune", "drive.jsonl", "-o", "file/x.yaml"),
+        ("sweep", "sweep.yaml", "-o", "file/x"),
         ("demo", "-o", "file/x"),
     ):
         code, error = call(*words)
         assert code == 2, words
         assert "file/x" in error
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("report", "run", "-o", "out.html"),
+        ("figure", "run", "-o", "out.pdf"),
+        ("export", "run", "-o", "out.mcap"),
+        ("export", "run", "-o", "out.mcap", "--ros2"),
+        ("tune", "drive.jsonl", "-o", "out.yaml"),
+    ],
+    ids=str,
+)
+def test_what_another_program_wrote_is_never_replaced(here: Path, call: Call, words: tuple[str, ...]) -> None:
+    out = Path(words[words.index("-o") + 1])
+    out.write_text("years of work")
+    before = content(here)
+    for more in ((), ("--overwrite",)):
+        code, error = call(*words, *more)
+        assert code == 2
+        assert str(out) in error
+        assert content(here) == before
+
+
+def test_two_replays_at_once_into_one_folder_are_one_run_and_one_refusal(here: Path) -> None:
+    write_stream("long.jsonl", drive(1500))
+    words = [sys.executable, "-m", "fgtrack", "replay", "long.jsonl", "-o", "both", "--overwrite"]
+    both = [subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) for _ in range(2)]
+    errors = [one.communicate(timeout=120)[1] for one in both]
+    refused = [error for one, error in zip(both, errors, strict=True) if one.returncode == 2]
+    assert all("another command is writing there" in error for error in refused)
+    assert sorted(one.returncode for one in both) in ([0, 2], [0, 0])  # where the second began after the first
+    run = load_run("both")
+    assert run.meta["complete"] is True
+    assert digest(Path("both")) == run.meta["digest"]
+    assert run.updates.num_rows == 1500
+
+
+def test_a_folder_of_parts_of_another_program_is_no_sweep(here: Path, call: Call) -> None:
+    Path("sweep.yaml").write_text(SWEEP)
+    Path("swept/parts").mkdir(parents=True)
+    Path("swept/parts/wheel.json").write_text('{"format": "parts of a car"}')
+    Path("swept/sweep.csv").write_text("mine")
+    before = content(Path("swept"))
+    code, error = call("sweep", "sweep.yaml", "-o", "swept")
+    assert code == 2
+    assert "swept/sweep.csv: already exists" in error
+    assert content(Path("swept")) == before
+
+
+def test_a_run_that_cannot_be_written_to_is_compared_with_a_warning(
+    here: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["compare", "run", "--json"]) == 0
+    tables = json.loads(capfd.readouterr().out)
+    Path("run/metrics.json").unlink()
+    Path("run/metrics.json").mkdir()  # as in a folder that may only be read, for root too
+    before = content(here)
+    assert run(["compare", "run", "--json"]) == 0
+    said = capfd.readouterr()
+    assert json.loads(said.out) == tables
+    [line] = [line for line in said.err.splitlines() if "metrics.json" in line]
+    assert line.startswith("fgtrack: warning: run/metrics.json: cannot be written")
+    assert content(here) == before
+
+
+def test_compare_tells_a_run_whose_tables_were_changed(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    rows = Path("run/updates.csv").read_text().splitlines(keepends=True)
+    Path("run/updates.csv").write_text("".join(rows[:-1]))
+    assert run(["compare", "run"]) == 0
+    assert "its digest is another; repeat the run" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("info", "pipe.jsonl"),
+        ("replay", "pipe.jsonl", "-o", "new"),
+        ("convert", "pipe.jsonl", "new.jsonl"),
+        ("config", "-c", "pipe.jsonl"),
+        ("replay", "drive.jsonl", "-c", "pipe.jsonl", "-o", "new"),
+        ("replay", "drive.jsonl", "--map", "pipe.jsonl", "-o", "new"),
+        ("convert", "drive.jsonl", "new.jsonl", "--delays", "pipe.jsonl"),
+        ("simulate", "pipe.jsonl", "-o", "new.jsonl"),
+        ("sweep", "pipe.jsonl", "-o", "new"),
+        ("compare", "pipe.jsonl"),
+    ],
+    ids=str,
+)
+def test_a_pipe_in_place_of_a_file_is_one_line_at_once(here: Path, words: tuple[str, ...]) -> None:
+    os.mkfifo("pipe.jsonl")
+    done = subprocess.run([sys.executable, "-m", "fgtrack", *words], capture_output=True, text=True, timeout=60)
+    assert done.returncode in (1, 2)
+    [line] = done.stderr.splitlines()
+    assert "pipe.jsonl" in line
+    assert "internal error" not in line
+    assert not Path("new").exists()
 
 
 def test_a_full_disk_is_no_fault_of_the_call(here: Path) -> None:
