@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fgtrack.estimation.failures import Failure
 from fgtrack.io.run import load_run
 from fuzz.mutation import mutated
 from fuzz.targets import RUN, TARGETS, Files, Target, run
@@ -172,6 +173,11 @@ def _problem_of_run(path: Path) -> str | None:
     counted = sum(sum(counts.values()) for counts in found.meta["counts"].values())
     if not found.updates.num_rows == counted == found.meta["detections_received"]:
         return f"{found.meta['detections_received']} detections, {counted} counted, {found.updates.num_rows} rows"
+    raised = [
+        kind for kind in (Failure.LIST_FAILED, Failure.ESTIMATOR_RAISED) if found.meta.get("failures", {}).get(kind)
+    ]
+    if raised:  # what the guards hide is a defect all the same
+        return f"{', '.join(raised)}: {found.meta['first_failure']}"
     for table in (found.tracks, found.smoothed):
         if not table.num_rows:
             continue
