@@ -92,7 +92,7 @@ def _list(sensor: str, stamp_ns: int, objects: list[Detection], frame: fgtrack.c
 
 def configuration(modelled: str) -> Config:
     """The tracker's, with the noise of the scene; the errors of the cameras are taken for white or lasting ones."""
-    camera = SensorModel({"bearing_rad": BEARING_STD_RAD}, births=False, counter_add=0, ages="never")
+    camera = SensorModel({"bearing_rad": BEARING_STD_RAD})
     correlation = LASTING if modelled == "lasting" else None
     densities = {
         name: float(np.sqrt(100.0 * getattr(MOTION, field)))

@@ -251,6 +251,11 @@ class Config:
                 f"{key}: needs a motion model with a yaw rate, as ctrv or ctra, and not {self.motion.kind}"
             )
 
+    @property
+    def used_sensors(self) -> Mapping[str, SensorModel]:
+        """The sensors that are not ignored."""
+        return {name: sensor for name, sensor in self.sensors.items() if name not in self.ignore_sensors}
+
     def motion_model(self) -> MotionModel:
         """The motion model of the tracks, with the errors of sensors that are correlated in time."""
-        return with_correlated_errors(self.motion.model(), self.sensors)
+        return with_correlated_errors(self.motion.model(), self.used_sensors)

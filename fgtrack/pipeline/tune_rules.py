@@ -58,7 +58,7 @@ def widened(config: Config, rules: TuneRules) -> Config:
     """The configuration with a gate of so many standard deviations of the position of the least precise sensor."""
     axes = ("x_m", "y_m", "range_m")
     needed_m = rules.gate_stds * max(
-        [0.0, *(one.std[name] for one in config.sensors.values() for name in axes if name in one.std)]
+        [0.0, *(one.std[name] for one in config.used_sensors.values() for name in axes if name in one.std)]
     )
     association = config.association
     if isinstance(association, GatedEuclidean):

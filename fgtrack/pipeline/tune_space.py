@@ -45,16 +45,16 @@ class ConfigNoise:
     @property
     def space(self) -> NoiseSpace:
         """The parameters as the likelihood needs them."""
-        sensors = {name: sensor.components for name, sensor in self.config.sensors.items()}
+        sensors = {name: sensor.components for name, sensor in self.config.used_sensors.items()}
         return NoiseSpace(tuple(self._motion_stds), self._motion_model, sensors, tuple(self._correlations))
 
     @property
     def values(self) -> FloatArray:
         """The configured parameters, shape (p,)."""
         lasting = self._correlations.values()
-        stds = [sensor.std[name] for sensor in self.config.sensors.values() for name in sensor.components]
+        stds = [sensor.std[name] for sensor in self.config.used_sensors.values() for name in sensor.components]
         odds = [one.share / (1.0 - one.share) for one in lasting]
-        return np.array([*self._motion_stds.values(), *stds, *odds, *[_FIRST_SHARE] * len(self.config.sensors)])
+        return np.array([*self._motion_stds.values(), *stds, *odds, *[_FIRST_SHARE] * len(self.config.used_sensors)])
 
     def shown(self, values: FloatArray, log_std: FloatArray) -> tuple[list[float], list[float]]:
         """Parameters as the configuration has them, and standard errors as shares of these, in the order of `keys`.
@@ -79,7 +79,7 @@ class ConfigNoise:
         }
         sensors = {
             sensor: replace(model, std={name: found[sensor, name] for name in model.std})
-            for sensor, model in self.config.sensors.items()
+            for sensor, model in self.config.used_sensors.items()
         }
         for sensor, was in self._correlations.items():
             odds = found[sensor, "share"]
@@ -87,12 +87,12 @@ class ConfigNoise:
             share = was.share if kept else _rounded(odds / (1.0 + odds))
             sensors[sensor] = replace(sensors[sensor], correlation=replace(was, share=min(share, _MAX_SHARE)))
         motion = self._motion_with({n: found["", n] for n in self._motion_stds})
-        return replace(self.config, motion=motion, sensors=sensors)
+        return replace(self.config, motion=motion, sensors={**self.config.sensors, **sensors})
 
     @property
     def _correlations(self) -> dict[str, Correlation]:
         """Those of the sensors whose errors last, by sensor."""
-        found = {name: sensor.correlation for name, sensor in self.config.sensors.items()}
+        found = {name: sensor.correlation for name, sensor in self.config.used_sensors.items()}
         return {name: one for name, one in found.items() if one is not None}
 
     @property
@@ -126,7 +126,7 @@ class ConfigNoise:
         )
 
     def _motion_model(self, stds: Mapping[str, float]) -> MotionModel:
-        return with_correlated_errors(self._motion_with(stds).model(), self.config.sensors)
+        return with_correlated_errors(self._motion_with(stds).model(), self.config.used_sensors)
 
 
 def _root(name: str, value: float) -> float:

@@ -16,6 +16,7 @@ from fgtrack.pipeline.load import load
 from fgtrack.pipeline.shipped import read_config, read_scenario
 from fgtrack.pipeline.tune_file import tuned_text
 from fgtrack.pipeline.tune_measurements import recorded
+from fgtrack.pipeline.tune_space import ConfigNoise
 from fgtrack.sim.simulate import simulate
 
 Capture = pytest.CaptureFixture[str]
@@ -212,3 +213,10 @@ def test_comments_stay_with_what_they_are_about(tmp_path: Path) -> None:
     ]
     text = tuned_text(path, read_config(path, settings), [])
     assert text.partition("#\n#\n")[2] == CHANGED
+
+
+def test_sensors_that_are_ignored_are_not_tuned_and_stay_as_they_are() -> None:
+    config = read_config("autoferry")
+    space = ConfigNoise(config)
+    assert not {sensor for sensor, _ in space.space.names} & {"infrared", "daylight"}
+    assert space.config_with(space.values) == config

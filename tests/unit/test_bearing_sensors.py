@@ -1,14 +1,12 @@
 """A direction alone is no object: what sensors without a range may do to a track, and what not."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from support.tracking import START_NS, ms
 
 from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, TickReport, TrackStatus
 from fgtrack.estimation.registry import ESTIMATORS
-from fgtrack.models.sensors import SensorModel
+from fgtrack.models.sensors import Correlation, SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config, CountingConfig, MotionConfig
 from fgtrack.tracking.association import GatedEuclidean
@@ -26,12 +24,17 @@ LIVES: list[LifecycleRules | ExistenceRules] = [
 SENSORS = {"lidar": SensorModel(std={"x_m": 0.3, "y_m": 0.3}), "camera": SensorModel(std={"bearing_rad": 0.01})}
 
 
-def tracker(lifecycle, estimator: str = "ekf-replay") -> Tracker:
-    motion = MotionConfig("cv", {"velocity": 1.0})
-    association = GatedEuclidean(gate_m=5.0)
-    birth = MeasuredBirth(ego_speed_factor=0.0)
-    config = Config(estimator, sensors=SENSORS, lifecycle=lifecycle, association=association, birth=birth)
-    return build_tracker(replace(config, motion=motion if estimator != "ekf-backward-forward" else config.motion))
+def tracker(lifecycle, estimator: str = "ekf-replay", camera: SensorModel = SENSORS["camera"]) -> Tracker:
+    motion = Config().motion if estimator == "ekf-backward-forward" else MotionConfig("cv", {"velocity": 1.0})
+    config = Config(
+        estimator,
+        sensors={**SENSORS, "camera": camera},
+        lifecycle=lifecycle,
+        association=GatedEuclidean(gate_m=5.0),
+        birth=MeasuredBirth(ego_speed_factor=0.0),
+        motion=motion,
+    )
+    return build_tracker(config)
 
 
 def look(tracker: Tracker, sensor: str, at_ms: float) -> TickReport:
@@ -85,3 +88,31 @@ def test_a_camera_that_does_not_see_a_track_does_not_end_it(lifecycle) -> None:
         one.receive(EgoState(now_ns, now_ns, 0.0, 0.0, 0.0, 0.0))
         one.receive(DetectionList("camera", now_ns, now_ns, (), "ego"))
         assert len(one.tick(now_ns).tracks) == 1
+
+
+@pytest.mark.parametrize("estimator", ["ekf-replay", "smoother-banded"])
+def test_a_bias_that_is_a_state_pulls_no_track_and_is_found_whatever_arrives_first(estimator: str) -> None:
+    """Bearings that are wrong by 2 m at the object, for good; half of them overtake the positions."""
+    bias_rad, std_rad, errors_m, innovations = 0.05, 0.05, {}, []
+    for name, correlation in (("white", None), ("lasting", Correlation(share=0.99, time_s=100.0))):
+        white_rad = std_rad * 0.1  # what of the error is new in every detection
+        camera = SensorModel(std={"bearing_rad": std_rad if correlation else white_rad}, correlation=correlation)
+        one = tracker(ExistenceRules(lifetime_s=100.0), estimator, camera)
+        rng = np.random.default_rng(3)
+        for k in range(100):
+            now_ns = START_NS + ms(100.0 * k)
+            one.receive(EgoState(now_ns, now_ns, 0.0, 0.0, 0.0, 0.0))
+            if k % 5 == 2:  # 150 ms late
+                x_m, y_m = AT_M + 0.3 * rng.standard_normal(2)
+                late_ns = now_ns - ms(150.0)
+                one.receive(DetectionList("lidar", late_ns, now_ns, [Detection(x_m=x_m, y_m=y_m)], "map"))
+            bearing_rad = float(np.arctan2(AT_M[1], AT_M[0] + 1.74)) + bias_rad + white_rad * rng.standard_normal()
+            one.receive(DetectionList("camera", now_ns, now_ns, [Detection(bearing_rad=bearing_rad)], "ego"))
+            report = one.tick(now_ns)
+            innovations += [each.innovation for each in report.updates if correlation and each.sensor == "camera"]
+        (track,) = report.tracks
+        errors_m[name] = float(np.hypot(track.x_m - AT_M[0], track.y_m - AT_M[1]))
+    assert errors_m["white"] > 0.8
+    assert errors_m["lasting"] < 0.3
+    last_rad = [each["bearing_rad"] for each in innovations[-30:]]
+    assert abs(np.mean(last_rad)) < 0.2 * bias_rad

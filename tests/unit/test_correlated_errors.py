@@ -49,6 +49,11 @@ def test_there_is_a_state_for_every_component_of_a_sensor_whose_errors_last() ->
     assert with_correlated_errors(CTRV(), {"white": WHITE}) == CTRV()
 
 
+def test_a_sensor_that_is_ignored_adds_no_state() -> None:
+    config = Config(sensors=SENSORS, ignore_sensors=("lidar",), motion=MotionConfig("ctrv"))
+    assert config.motion_model().state_names == (*CTRV.state_names, "camera.bearing_rad")
+
+
 def test_an_error_is_stationary_and_falls_to_its_e_th_part_after_its_time() -> None:
     motion = CorrelatedErrors(CV(), (("a.x_m", 2.0), ("a.y_m", 0.5)))
     F, Q = motion.jacobian(np.zeros(6), 2.0), motion.process_noise(np.zeros(6), 2.0)
