@@ -31,7 +31,7 @@ def tracker(lifecycle, estimator: str = "ekf-replay", camera: SensorModel = SENS
         sensors={**SENSORS, "camera": camera},
         lifecycle=lifecycle,
         association=GatedEuclidean(gate_m=5.0),
-        birth=MeasuredBirth(ego_speed_factor=0.0),
+        birth=MeasuredBirth(ego_speed_factor=0.0, speed_std_mps=2.0),
         motion=motion,
     )
     return build_tracker(config)
@@ -41,7 +41,7 @@ def look(tracker: Tracker, sensor: str, at_ms: float) -> TickReport:
     """What the tracker makes of a list with one detection of the object, which stands still."""
     now_ns = START_NS + ms(at_ms)
     tracker.receive(EgoState(now_ns, now_ns, 0.0, 0.0, 0.0, 0.0))
-    bearing_rad = float(np.arctan2(AT_M[1], AT_M[0] + 1.74))  # from the origin of the detections
+    bearing_rad = float(np.arctan2(AT_M[1], AT_M[0]))
     seen = Detection(x_m=AT_M[0], y_m=AT_M[1]) if sensor == "lidar" else Detection(bearing_rad=bearing_rad)
     tracker.receive(DetectionList(sensor, now_ns, now_ns, [seen], "map" if sensor == "lidar" else "ego"))
     return tracker.tick(now_ns)
@@ -106,7 +106,7 @@ def test_a_bias_that_is_a_state_pulls_no_track_and_is_found_whatever_arrives_fir
                 x_m, y_m = AT_M + 0.3 * rng.standard_normal(2)
                 late_ns = now_ns - ms(150.0)
                 one.receive(DetectionList("lidar", late_ns, now_ns, [Detection(x_m=x_m, y_m=y_m)], "map"))
-            bearing_rad = float(np.arctan2(AT_M[1], AT_M[0] + 1.74)) + bias_rad + white_rad * rng.standard_normal()
+            bearing_rad = float(np.arctan2(AT_M[1], AT_M[0])) + bias_rad + white_rad * rng.standard_normal()
             one.receive(DetectionList("camera", now_ns, now_ns, [Detection(bearing_rad=bearing_rad)], "ego"))
             report = one.tick(now_ns)
             innovations += [each.innovation for each in report.updates if correlation and each.sensor == "camera"]
