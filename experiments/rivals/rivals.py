@@ -7,6 +7,7 @@ the one before the slash in its name, or with `EKF`, seed by seed or sequence by
 """
 
 import csv
+import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
@@ -22,6 +23,8 @@ from fgtrack.core.types import Detection, DetectionList, Message
 from fgtrack.evaluation.paired import average, paired
 from fgtrack.evaluation.prediction import prediction_errors
 from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.models.oval import OVAL, make_oval
+from fgtrack.models.track_map import COLUMNS, TrackMap
 from fgtrack.pipeline.shipped import read_scenario
 
 Settings = Mapping[str, Any]  # Any: values of a configuration
@@ -63,6 +66,7 @@ CURVED = {
 }
 #: The filters alone, where a smoother says the same of the present.
 FILTERS = {name: one for name, one in {**MODELS, **CURVED}.items() if one.estimator != SMOOTHER}
+FILTERS_CURVED = {name: one for name, one in FILTERS.items() if name == "EKF" or "curvature" in name}
 DOPPLER = {"range_m": 0.8, "bearing_rad": 0.01, "range_rate_mps": 0.2}
 SPREADING = {"range_m": 0.3, "bearing_rad": 0.01}
 SPREAD_ON_AVERAGE = {"x_m": 0.3, "y_m": 0.35}
@@ -79,6 +83,8 @@ class Scene:
     sensors: Mapping[str, Mapping[str, Any]] | None = None
     """What is changed of the scenario's sensors, by name."""
     settings: Settings | None = None
+    straightened: float = 0.0
+    """Share by which the tracker's map says too little of the curvature."""
 
 
 SCENES: Mapping[str, Scene] = {
@@ -89,9 +95,10 @@ SCENES: Mapping[str, Scene] = {
         "tuned",
         {"EKF": MODELS["EKF"], "smoother": MODELS["smoother"], **CURVED},
         {"radar": {"std": DOPPLER}},
-        {"sensors.radar.std": DOPPLER},
+        {"sensors.radar.std": DOPPLER, "sensors.radar.mount": {"x_m": 3.0}},
     ),
     "race": Scene("race", "tuned", FILTERS),
+    "default, curvature 20 % too small": Scene("default", "tuned", FILTERS_CURVED, straightened=0.2),
     "default, LiDAR worse with distance": Scene(
         "default",
         "tuned",
@@ -148,6 +155,16 @@ def in_points(messages: Iterable[Message], sensor: str) -> Iterable[Message]:
         yield message
 
 
+def straightened(share: float, folder: Path) -> str:
+    """The built-in track, as a map that says too little of the curvature, or by its name."""
+    if not share:
+        return OVAL
+    table = make_oval().table.copy()
+    table[:, COLUMNS.index("kappa_ref_radpm")] *= 1.0 - share
+    TrackMap(table).write(folder / "map.csv")
+    return str(folder / "map.csv")
+
+
 def judged(scene: str, contestant: str, recording: str, run: fgtrack.Run) -> Result:
     """The numbers of a run."""
     one = JudgedRun(contestant, run)
@@ -180,8 +197,10 @@ def simulated(name: str, contestant: str, seed: int, duration_s: float | None) -
         messages = in_points(messages, "lidar_cluster")
     one = scene.contestants[contestant]
     settings = {**QUIET, "evaluation.multi_object": False, **(scene.settings or {}), **one.settings}
-    run = fgtrack.replay(messages, scene.config, map="oval", pit_map="oval", estimator=one.estimator, set=settings)
-    return judged(name, contestant, str(seed), run)
+    with tempfile.TemporaryDirectory() as folder:
+        track = straightened(scene.straightened, Path(folder))
+        run = fgtrack.replay(messages, scene.config, map=track, pit_map="oval", estimator=one.estimator, set=settings)
+        return judged(name, contestant, str(seed), run)
 
 
 def recorded(kitti: Path, contestant: str, sequence: str) -> Result:

@@ -22,6 +22,7 @@ from fgtrack.estimation.likelihood.series import Observation, Series
 from fgtrack.models.correlated_errors import split_error
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, CV
+from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.tune_measurements import observation
 from fgtrack.pipeline.tune_space import ConfigNoise
@@ -264,3 +265,12 @@ def test_errors_that_last_are_parameters_too() -> None:
     place = noise.keys.index("sensors.lidar.correlation.share")
     assert tuned.share == pytest.approx(shown[place], rel=1e-3)
     assert errors[place] == pytest.approx(0.1 * (1.0 - shown[place]))
+
+
+def test_noise_that_grows_with_range_is_not_laid_to_the_standard_deviations() -> None:
+    sensor = SensorModel(std={"x_m": 0.5, "y_m": 0.3}, std_growth={"x_m": 0.02, "y_m": 0.01})
+    turn = rotation(math.atan2(30.0, 40.0))
+    grown = turn @ np.diag([1.0, 0.25]) @ turn.T  # at 50 m
+    R = turn @ np.diag([0.25, 0.09]) @ turn.T + grown
+    measurement = Measurement(0, measurement_model(("x_m", "y_m"), CV()), np.array([40.0, 30.0]), R)
+    assert observation("lidar", sensor, measurement, own=False).foreign == pytest.approx(grown)
