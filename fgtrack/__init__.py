@@ -12,6 +12,8 @@ __version__ = "0.2.0.dev0"
 
 if TYPE_CHECKING:
     from fgtrack import testing as testing
+    from fgtrack.advice.advise import advise as advise
+    from fgtrack.advice.page import Advice as Advice
     from fgtrack.core.errors import CallError as CallError
     from fgtrack.core.errors import DataError as DataError
     from fgtrack.core.errors import FgtrackError as FgtrackError

@@ -54,16 +54,23 @@ def noise_cautions(run: Run) -> list[str]:
     The median must be off as the mean is: the mean alone may be that of a few outliers, or of the first innovations of
     new tracks.
     """
-    measured, found = num_measured(run.updates), []
+    found = []
+    for sensor, nis in misfits(run):
+        size = "small" if nis.mean > nis.dof else "large"
+        found.append(
+            f"{sensor}: mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}, as if "
+            f"errors were {math.sqrt(nis.mean / nis.dof):.2g} times what is configured; `{_tune(run)}` fits it"
+        )
+    return found
+
+
+def misfits(run: Run) -> Iterator[tuple[str, ChiSquareMean]]:
+    """The sensors of `noise_cautions`, and their NIS."""
+    measured = num_measured(run.updates)
     for sensor, mine in _by_sensor(run.updates):
         nis = ChiSquareMean.of(run.updates["nis"][mine], measured[mine])
         if nis.count >= FEWEST and is_far_off(nis) and _median_is_off(run.updates["nis"][mine], nis):
-            size = "small" if nis.mean > nis.dof else "large"
-            found.append(
-                f"{sensor}: mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}, as if "
-                f"errors were {math.sqrt(nis.mean / nis.dof):.2g} times what is configured; `{_tune(run)}` fits it"
-            )
-    return found
+            yield sensor, nis
 
 
 def _tune(run: Run) -> str:
@@ -105,7 +112,7 @@ def _clocks(run: Run) -> Iterator[str]:
         if (run.updates["stamp_ns"][mine] == 0).all():
             yield (
                 f"{sensor}: all stamps are 0: its driver does not set them, so nothing is known of its delay; "
-                "`stamp_from: receipt` on its topic takes the receipt for the stamp"
+                f"`stamp_from: receipt` on its topic, or sensors.{sensor}.stamp_from, takes the receipt for the stamp"
             )
 
 

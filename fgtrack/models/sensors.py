@@ -13,6 +13,8 @@ import numpy as np
 from fgtrack.core.geometry import body_point, polar, wrap_angles
 from fgtrack.core.types import DESCRIBING, MEASURABLE, BoolArray, Detection, FloatArray
 
+_LONGEST_OFFSET_S = 60.0
+
 
 @dataclass(frozen=True)
 class Mount:
@@ -122,8 +124,12 @@ class SensorModel:
     """What a match with this sensor adds to the status counter."""
     ages: Literal["always", "short_range", "long_range", "never"] = "always"
     """At which range a track that this sensor does not see loses one count."""
-    stamp_from: Literal["message", "object", "objects_mean"] = "message"
-    """A detection's stamp: the list's, its own where it carries one, or the mean of those that do."""
+    stamp_from: Literal["message", "object", "objects_mean", "receipt"] = "message"
+    """A detection's stamp: the list's, its own where it carries one, the mean of those that do, or the receipt, where
+    the driver sets none or one of another clock."""
+    clock_offset_s: float = 0.0
+    """How far its stamps are ahead of the time at which it sensed; taken off before anything else is done. With
+    `stamp_from: receipt` its latency. `fgtrack advise` and `fgtrack offsets` find it."""
     message_covariance: bool = True
     """Use a detection's own covariance where the message carries one."""
     max_range_m: float | None = None
@@ -181,6 +187,8 @@ class SensorModel:
                 raise ValueError(f"{name}: must be positive, is {value}")
         if not math.isfinite(self.near_side_m):
             raise ValueError(f"near_side_m: must be finite, is {self.near_side_m}")
+        if not abs(self.clock_offset_s) <= _LONGEST_OFFSET_S:
+            raise ValueError(f"clock_offset_s: must lie within {_LONGEST_OFFSET_S:g} s, is {self.clock_offset_s}")
         if not 0.0 < self.field_of_view_rad <= math.tau:
             raise ValueError(f"field_of_view_rad: must lie in (0, 2 pi], is {self.field_of_view_rad}")
         if not 0.0 < self.detection_probability < 1.0:

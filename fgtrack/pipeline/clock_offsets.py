@@ -1,5 +1,6 @@
 """What is wrong with the clocks of a recording: a constant offset per sensor, and whether it can be known at all."""
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -11,11 +12,13 @@ from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import DetectionList, EgoState, Message
 from fgtrack.estimation.factor_graph.clock_calibration.offsets import OffsetSettings, OffsetSolution, solve_offsets
 from fgtrack.estimation.factor_graph.clock_calibration.time_shift import ShiftableMeasurement
+from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.clock import Delivered
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.ego_path import EgoPath
 from fgtrack.pipeline.offset_measurements import Remeasure, measurements_by_track
 from fgtrack.pipeline.replay import replay_in_memory
+from fgtrack.pipeline.stamping import mended
 from fgtrack.sim.redelay import restamped
 
 Track = Sequence[ShiftableMeasurement]
@@ -40,6 +43,10 @@ class OffsetRules:
     """See `EgoPath`."""
     repeat_above_s: float = 0.005
     """Where an offset is larger, tracks are made a second time, with corrected stamps."""
+    fit_noise: bool = False
+    """Whether the standard deviations of each sensor are first scaled to the residuals of a part of the tracks."""
+    probe_detections: int = 300
+    """Of so many detections of a track are these residuals."""
 
     @property
     def needed_std_s(self) -> float:
@@ -66,7 +73,9 @@ class SensorOffset:
     why: str
     """A line."""
     residual: float | None = None
-    """RMS residual over the configured standard deviation: `std_s` is as right as this is near 1."""
+    """RMS residual over the standard deviation used: `std_s` is as right as this is near 1."""
+    spread_s: float | None = None
+    """Standard deviation by how much stretches of 5 s disagree; errors that last make it larger than `std_s`."""
 
 
 @dataclass(frozen=True)
@@ -108,9 +117,10 @@ def estimate_offsets(
         There are no detections, fewer than five ego states, or a sensor has no model.
     """
     rules = rules or OffsetRules()
-    config = replace(config, sensors={name: replace(one, max_delay_s=None) for name, one in config.sensors.items()})
     heard: list[Delivered] = []
-    run, broken = replay_in_memory(_recorded(messages, heard), config)
+    recorded = _recorded(messages, heard, config.sensors)
+    config = unrefused(config)
+    run, broken = replay_in_memory(recorded, config)
     raw = _lists(heard, config)
     sensors = [name for name in config.sensors if any(one.sensor == name for one in raw)]
     if not sensors:
@@ -122,6 +132,9 @@ def estimate_offsets(
     tracks = measurements_by_track(run, raw, raw, config.sensors, remeasure)
     reference = reference or max(sensors, key=_counts(tracks).__getitem__)
     used = _chosen(tracks, reference, rules)
+    if rules.fit_noise and used:
+        remeasure = Remeasure(_with_noise(config, used, reference, rules), _path(heard, raw, rules))
+        used = _chosen(measurements_by_track(run, raw, raw, config.sensors, remeasure), reference, rules)
     solution = _solution(used, reference, config, rules, {})
     known_s = {} if solution is None else _known(solution, rules)
     if any(abs(offset_s) > rules.repeat_above_s for offset_s in known_s.values()):
@@ -136,9 +149,38 @@ def estimate_offsets(
     return OffsetReport(reference, rows, len(used), counts.total(), broken)
 
 
-def _recorded(messages: Iterable[Message], heard: list[Delivered]) -> Iterator[Message]:
-    """The same messages; those that a tracker hears are kept in `heard` as well."""
+def unrefused(config: Config) -> Config:
+    """`config` for messages whose stamps it has mended: it takes them as they are, and refuses none for its delay."""
+    sensors = {}
+    for name, sensor in config.sensors.items():
+        stamp_from = "message" if sensor.stamp_from == "receipt" else sensor.stamp_from
+        sensors[name] = replace(sensor, max_delay_s=None, clock_offset_s=0.0, stamp_from=stamp_from)
+    return replace(config, sensors=sensors)
+
+
+def _with_noise(config: Config, used: Sequence[Track], reference: str, rules: OffsetRules) -> Config:
+    """`config` with standard deviations that fit the residuals of the beginning of each track."""
+    solver = replace(rules.solver, max_rounds=1)
+    beginnings = [track[: rules.probe_detections] for track in used]
+    probe = _chosen(beginnings, reference, replace(rules, max_detections=5 * rules.probe_detections))
+    found = _solution(probe, reference, config, replace(rules, solver=solver), {})
+    if found is None:
+        return config
+    sensors = dict(config.sensors)
+    for name, residual in found.residuals.items():
+        if residual > 0.0:
+            std = {component: value * residual for component, value in sensors[name].std.items()}
+            sensors[name] = replace(sensors[name], std=std)
+    return replace(config, sensors=sensors)
+
+
+def _recorded(
+    messages: Iterable[Message], heard: list[Delivered], sensors: Mapping[str, SensorModel]
+) -> Iterator[Message]:
+    """The messages with stamps as `sensors` mend them; those that a tracker hears are kept in `heard` as well."""
     for message in messages:
+        if isinstance(message, DetectionList):
+            message = mended(message, sensors)
         if isinstance(message, (EgoState, DetectionList)):
             heard.append(message)
         yield message
@@ -224,4 +266,6 @@ def _row(
     offset_s, std_s = float(solution.offsets_s[place]), float(np.sqrt(solution.covariance[place, place]))
     information = max(std_s**-2 - rules.solver.prior_std_s**-2, 0.0)
     why = f"information {information:.3g} /s2, {rules.needed_information:.3g} /s2 needed: {speed}"
-    return SensorOffset(name, offset_s, std_s, count, std_s < rules.needed_std_s, why, residual)
+    spread_s = float(solution.spread_s[place])
+    known = std_s < rules.needed_std_s
+    return SensorOffset(name, offset_s, std_s, count, known, why, residual, None if math.isnan(spread_s) else spread_s)

@@ -24,6 +24,7 @@ from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.lateness import Lateness, Receptions, TickTimes, TickTiming
 from fgtrack.pipeline.pace import Clock, WallClock
 from fgtrack.pipeline.shipped import read_config, settings_of
+from fgtrack.pipeline.stamping import mended
 from fgtrack.tracking.inbox import records
 
 __all__ = ["TrackOutput", "Tracker", "TracksAt"]
@@ -154,6 +155,7 @@ class Tracker:
         if isinstance(message, EgoState):
             self._receptions[EGO].add(message.stamp_ns, message.receipt_ns, 0)
         elif message.sensor in self.config.sensors:
+            message = mended(message, self.config.sensors)
             self._receptions[message.sensor].add(message.stamp_ns, message.receipt_ns, len(message.objects))
         else:
             if message.sensor not in self.config.ignore_sensors:

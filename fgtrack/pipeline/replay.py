@@ -21,6 +21,7 @@ from fgtrack.pipeline.effective import effective, with_sensors
 from fgtrack.pipeline.ego_clock import EgoClock
 from fgtrack.pipeline.load import dump
 from fgtrack.pipeline.pace import Clock, Pace, WallClock
+from fgtrack.pipeline.stamping import mended
 from fgtrack.tracking.tracker import Tracker, TrackerParts, check_sensor
 
 _LONGEST_GAP_S = 3600.0
@@ -84,6 +85,8 @@ class _Feed:
                     check_sensor(message.sensor, self.sensors)
                 if not isinstance(message, TruthState):
                     self._check_time(message)
+                if isinstance(message, DetectionList):
+                    message = mended(message, self.sensors)
                 yield message
         except DataError as error:
             self.broken = str(error)

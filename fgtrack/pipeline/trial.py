@@ -16,7 +16,7 @@ from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_in_memory
 
-__all__ = ["Trial", "suspicions", "try_out"]
+__all__ = ["TRIAL_S", "Trial", "beginning", "suspicions", "try_out"]
 
 TRIAL_S = 5.0
 _FULL_CIRCLE_RAD = 2.0 * math.pi + 0.01
@@ -44,7 +44,7 @@ def try_out(messages: Iterable[Message], config: Config, duration_s: float = TRI
     """Read and track the first `duration_s` of `messages`, in memory."""
     readable = UntilBreak(messages)
     try:
-        found = list(_beginning(readable, nanoseconds(duration_s)))
+        found = list(beginning(readable, nanoseconds(duration_s)))
     except DataError as error:  # of the first message
         return Trial(duration_s, {}, (), None, str(error))
     problem = None if readable.error is None else str(readable.error)
@@ -57,7 +57,8 @@ def try_out(messages: Iterable[Message], config: Config, duration_s: float = TRI
     return Trial(duration_s, _samples(found), tuple(suspicions(found, config)), run, problem)
 
 
-def _beginning(messages: Iterable[Message], duration_ns: int) -> Iterator[Message]:
+def beginning(messages: Iterable[Message], duration_ns: int) -> Iterator[Message]:
+    """The messages of the first time."""
     iterator = iter(messages)
     first = next(iterator, None)
     if first is not None:
@@ -85,8 +86,11 @@ def suspicions(messages: Sequence[Message], config: Config) -> Iterator[str]:
             yield f"{name}: sends nothing in the first seconds"
     for name, found in sorted(lists.items()):
         sensor, objects = config.sensors.get(name), [item for each in found for item in each.objects]
-        if not any(each.stamp_ns for each in found):
-            yield f"{name}: all stamps are 0: set `stamp_from: receipt` on its topic; nothing is known of its delay"
+        if not any(each.stamp_ns for each in found) and (sensor is None or sensor.stamp_from != "receipt"):
+            yield (
+                f"{name}: all stamps are 0: set `stamp_from: receipt` on its topic, or sensors.{name}.stamp_from; "
+                "nothing is known of its delay"
+            )
         yield from _degrees(name, objects)
         yield from _frames(name, found, egos)
         if sensor is not None and objects:

@@ -14,17 +14,24 @@ from ruamel.yaml.tokens import CommentToken
 from fgtrack.io.output import Kind, new_file
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import plain, validate
-from fgtrack.pipeline.shipped import find_file
+from fgtrack.pipeline.shipped import find_file, read_config
 
 _MARK = "(fgtrack tune)"
+_ADVISED_MARK = "(fgtrack advise)"
 
 
 def _is_tuned(path: Path) -> bool:
     return path.is_file() and _MARK in path.read_text(encoding="utf-8", errors="replace").partition("\n")[0]
 
 
+def _is_advised(path: Path) -> bool:
+    return path.is_file() and _ADVISED_MARK in path.read_text(encoding="utf-8", errors="replace").partition("\n")[0]
+
+
 #: A file that `fgtrack tune` has written.
 TUNED = Kind("a tuned configuration", _is_tuned)
+#: A file that `fgtrack advise` has written.
+ADVISED = Kind("an advised configuration", _is_advised)
 
 
 def write_tuned(path: Path, base: str | Path | None, config: Config, comments: Sequence[str], overwrite: bool) -> None:
@@ -38,8 +45,22 @@ def write_tuned(path: Path, base: str | Path | None, config: Config, comments: S
         file.write(text.encode())
 
 
+def write_advised(
+    path: Path, base: str | Path | None, config: Config, comments: Sequence[str], overwrite: bool
+) -> None:
+    """The same for settings that belong to a recording: with its maps."""
+    text = _text(base, config, comments, "Settings for a recording, from {}", _ADVISED_MARK)
+    with new_file(path, ADVISED, overwrite) as file:
+        file.write(text.encode())
+
+
 def tuned_text(base: str | Path | None, config: Config, comments: Sequence[str]) -> str:
     """The text that `write_tuned` writes."""
+    origin = read_config(base)
+    return _text(base, replace(config, map=origin.map), comments, "The noise of {}, fitted to recordings", _MARK)
+
+
+def _text(base: str | Path | None, wanted: Config, comments: Sequence[str], title: str, mark: str) -> str:
     yaml = YAML()
     yaml.preserve_quotes = True
     yaml.width = 120
@@ -49,11 +70,10 @@ def tuned_text(base: str | Path | None, config: Config, comments: Sequence[str])
         name = source.stem
         document = yaml.load(source.read_text(encoding="utf-8")) or document
     origin = validate(Config, document, name)
-    wanted = replace(config, map=origin.map)
     _change(document, origin, wanted)
     text = StringIO()
     yaml.dump(document, text)
-    head = [f"# The noise of {name}, fitted to recordings {_MARK}.", "#", *(f"# {line}".rstrip() for line in comments)]
+    head = [f"# {title.format(name)} {mark}.", "#", *(f"# {line}".rstrip() for line in comments)]
     return "\n".join([*head, "#", text.getvalue()])
 
 

@@ -13,14 +13,14 @@ maximised is p(all | offsets) / product of p(one sensor | its offset), the agree
 """
 
 import bisect
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import gtsam
 import numpy as np
 
-from fgtrack.core.linalg import psd_solve, symmetrise
+from fgtrack.core.linalg import congruence, psd_solve, symmetrise
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import YAW, BoolArray, FloatArray
 from fgtrack.estimation.factor_graph.clock_calibration.levenberg_marquardt import solved
@@ -53,6 +53,7 @@ _LINE = 12  # measurements that a first guess of a state is a line through
 _LARGEST_MOVE_S = 0.1  # of an offset in one round, at first
 _SMALLEST_STEP_S, _LARGEST_STEP_S = 2e-4, 5e-3  # of differences by an offset
 _NEGLIGIBLE = 0.2  # of a standard deviation: what is left after such a Newton step is far less
+_STRETCH_S, _FEWEST_STRETCHES = 5.0, 4
 _LOST, _PATIENCE = 0.1, 3  # an offset that is known no better than that share of the prior is let go after some rounds
 
 
@@ -101,6 +102,9 @@ class OffsetSolution:
     """RMS velocity of a sensor's objects against the frame that it measured them in."""
     residuals: Mapping[str, float]
     """RMS residual of a sensor in its assumed standard deviations; near 1 where they are right."""
+    spread_s: FloatArray
+    """Standard deviations by how much stretches of a few seconds disagree, shape (m,): where errors last, or the noise
+    is not that assumed, these are larger. NaN of fewer than four stretches."""
 
 
 def solve_offsets(
@@ -148,7 +152,23 @@ def solve_offsets(
         lost = (std_s > _LOST * settings.prior_std_s) & (rounds >= _PATIENCE)
         if (converged | lost).all():
             break
-    return OffsetSolution(tuple(start_s), offsets_s, covariance, converged, rounds, *objective.summary(offsets_s))
+    spread_s = _spread(objective.scores(offsets_s), covariance)
+    return OffsetSolution(
+        tuple(start_s), offsets_s, covariance, converged, rounds, *objective.summary(offsets_s), spread_s
+    )
+
+
+def _spread(scores: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Standard deviations of parameters from the `scores` (b, m) of independent stretches (White 1982, the sandwich).
+
+    covariance * sum of g g' * covariance, with g around their mean and b / (b - 1) for the small number.
+    """
+    count = len(scores)
+    if count < _FEWEST_STRETCHES:
+        return np.full(len(covariance), np.nan)
+    around = scores - scores.mean(axis=0)
+    variances = np.diag(congruence(covariance, around.T @ around)) * count / (count - 1)
+    return np.sqrt(np.maximum(variances, 0.0))
 
 
 class _Path:
@@ -186,12 +206,18 @@ class _Path:
         sum of -w (dy/dt)' R^-1 y, with the weight w of the loss. That R changes with the time is left out.
         """
         slopes = dict.fromkeys(offsets_s, 0.0)
+        for sensor, _, slope in self.each_slope(offsets_s):
+            slopes[sensor] += slope
+        return slopes
+
+    def each_slope(self, offsets_s: Mapping[str, float]) -> Iterator[tuple[str, int, float]]:
+        """Sensor, stamp and share of each measurement in `slopes`."""
         for item in self._measurements:
-            if item.sensor in slopes:
+            if item.sensor in offsets_s:
                 found = self.pair_term(item, offsets_s)
                 rate = rates(self._motion, self._nodes, item, _sensed_ns(item, offsets_s)).y
-                slopes[item.sensor] -= _weight(found, self._huber_width) * float(rate @ psd_solve(found.R, found.y))
-        return slopes
+                slope = -_weight(found, self._huber_width) * float(rate @ psd_solve(found.R, found.y))
+                yield item.sensor, item.stamp_ns, slope
 
     def pair_term(self, item: ShiftableMeasurement, offsets_s: Mapping[str, float]) -> PairTerm:
         """What `item` says, at the time that the offsets give it."""
@@ -249,6 +275,18 @@ class _Agreement:
             mean = np.mean([squares for name, *squares in rows if name == sensor], axis=0)
             speeds[sensor], residuals[sensor] = np.sqrt(mean).tolist()
         return speeds, residuals
+
+    def scores(self, offsets_s: FloatArray) -> FloatArray:
+        """Gradient of each stretch of `_STRETCH_S` of all tracks, at the states as they are, shape (b, m)."""
+        named = self._named(offsets_s)
+        self._optimise(named)
+        found: dict[int, FloatArray] = {}
+        for sign, paths in ((1.0, self._all), (-1.0, self._alone)):
+            for path in paths:
+                for sensor, stamp_ns, slope in path.each_slope(named):
+                    row = found.setdefault(stamp_ns // nanoseconds(_STRETCH_S), np.zeros(len(self._sensors)))
+                    row[self._sensors.index(sensor)] += sign * slope
+        return np.array(list(found.values())).reshape(len(found), len(self._sensors))
 
     def _named(self, offsets_s: FloatArray) -> dict[str, float]:
         return dict(zip(self._sensors, offsets_s.tolist(), strict=True))

@@ -1,0 +1,143 @@
+"""Whether stamps can be believed: zeros, other clocks, the future, jumps, drifts, and offsets between sensors."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgtrack.advice.arrivals import EGO, FEWEST, Arrivals
+from fgtrack.advice.finding import Finding, milliseconds, percent
+from fgtrack.pipeline.clock_offsets import OffsetReport, SensorOffset
+from fgtrack.pipeline.truth_offsets import TRUTH
+
+__all__ = ["OFFSET_STDS", "offset_findings", "offset_of", "stamp_findings"]
+
+_AHEAD_S = 1e-3  # rounding of stamps
+_AHEAD_SHARE = 0.005
+_JUMP_S, _JUMP_STDS, _JUMP_WINDOW_S = 0.1, 8.0, 3.0
+_DRIFT_BINS, _DRIFT_S, _DRIFT_STDS, _DRIFT_FIT = 10, 0.01, 5.0, 0.8
+_LONGEST_S = 3600.0
+OFFSET_STDS = 3.0
+"""An offset that is larger than so many of its standard deviations is believed ..."""
+_SMALLEST_OFFSET_S = 0.01  # ... if it matters
+_LARGEST_STD_S = 0.05
+
+
+def stamp_findings(one: Arrivals) -> Iterator[Finding]:
+    """What the stamps and receipts of one sensor, or of the ego, show by themselves."""
+    name, receipt = one.name, {f"sensors.{one.name}.stamp_from": "receipt"}
+    mend = "" if name == EGO else f" Set sensors.{name}.stamp_from: receipt; its delay is then unknown."
+    if not one.stamps_ns.any():
+        if name != EGO:  # of the ego it is a suspicion of what is read
+            text = f"all {len(one.stamps_ns)} stamps are 0: its driver sets none.{mend}"
+            yield Finding("clock", name, 95.0, text, receipt)
+        return
+    if one.is_other_clock:
+        off_s = float(np.median(one.delays_s))
+        text = (
+            f"stamps and receipts are {abs(off_s):.3g} s apart: they are of clocks that have nothing in common.{mend}"
+        )
+        yield Finding("clock", name, 95.0, text, {} if name == EGO else receipt)
+        return
+    if len(one.stamps_ns) < FEWEST:
+        return
+    ahead = one.delays_s < -_AHEAD_S
+    if float(ahead.mean()) > _AHEAD_SHARE:
+        most_s = -float(np.quantile(one.delays_s, 0.01))
+        text = (
+            f"{percent(float(ahead.mean()))} of its stamps lie after their receipt, by up to {milliseconds(most_s)}: "
+            "its clock is ahead of the recorder's by at least that."
+        )
+        yield Finding("clock", name, 85.0, text)
+    jump = _jump(one)
+    if jump is not None:
+        at_s, by_s = jump
+        text = (
+            f"its delay changes by {milliseconds(by_s)} at {at_s:.1f} s and stays so: its clock was set, or its driver "
+            "started anew. No setting mends that: cut the recording there."
+        )
+        yield Finding("clock", name, 80.0, text)
+        return
+    drift = _drift(one)
+    if drift is not None:
+        ppm, std_ppm, by_s = drift
+        text = (
+            f"its delay {'grows' if ppm > 0.0 else 'shrinks'} by {abs(ppm):.3g} us per second (± {2.0 * std_ppm:.2g}), "
+            f"{milliseconds(by_s)} over the recording: its clock drifts, or a queue fills. No setting mends that: "
+            "synchronise the clock, or replay shorter pieces."
+        )
+        yield Finding("clock", name, 60.0, text)
+
+
+def _jump(one: Arrivals) -> tuple[float, float] | None:
+    """When, from the first receipt, the delay changed for good, and by how much."""
+    delays_s, count = one.delays_s, len(one.delays_s)
+    width = max(FEWEST // 2, math.ceil(_JUMP_WINDOW_S * count / max(one.duration_s, 1e-9)))
+    if count < 2 * width:
+        return None
+    medians = np.array([np.median(delays_s[k : k + width]) for k in range(count - width + 1)])
+    changes = medians[width:] - medians[:-width]
+    place = int(np.abs(changes).argmax())
+    before, after = delays_s[: place + width], delays_s[place + width :]
+    noise_s = 1.4826 * float(np.median(np.abs(np.diff(delays_s))))
+    lasting_s = float(np.median(after) - np.median(before))
+    if min(abs(float(changes[place])), abs(lasting_s)) < max(_JUMP_S, _JUMP_STDS * noise_s):
+        return None
+    at_ns = one.receipts_ns[place + width] - one.receipts_ns[0]
+    return float(at_ns) / 1e9, lasting_s
+
+
+def _drift(one: Arrivals) -> tuple[float, float, float] | None:
+    """Slope of the delay over time and its standard deviation in 1e-6, and the change over the recording in s."""
+    if len(one.stamps_ns) < _DRIFT_BINS * 10 or one.duration_s < 10.0:
+        return None
+    parts = np.array_split(np.arange(len(one.delays_s)), _DRIFT_BINS)
+    times_s = (one.receipts_ns - one.receipts_ns[0]) / 1e9
+    middles_s = np.array([times_s[part].mean() for part in parts])
+    medians_s = np.array([np.median(one.delays_s[part]) for part in parts])
+    slope, offset = np.polyfit(middles_s, medians_s, 1)
+    left = medians_s - slope * middles_s - offset
+    around_s = middles_s - middles_s.mean()
+    std = math.sqrt(float(left @ left) / (len(parts) - 2) / float(around_s @ around_s))
+    change_s = float(slope) * one.duration_s
+    explained = 1.0 - float(left @ left) / max(float(np.square(medians_s - medians_s.mean()).sum()), 1e-30)
+    if abs(change_s) < _DRIFT_S or abs(slope) < _DRIFT_STDS * std or explained < _DRIFT_FIT:
+        return None
+    return 1e6 * float(slope), 1e6 * std, change_s
+
+
+@dataclass(frozen=True)
+class _Offset:
+    """By how much stamps are late, and the standard deviation of that."""
+
+    value_s: float
+    std_s: float
+
+
+def offset_of(one: SensorOffset) -> _Offset | None:
+    """The offset of a sensor with a standard deviation that its residuals bear out; None where it is not known."""
+    if one.offset_s is None or not one.std_s or one.std_s > _LARGEST_STD_S:
+        return None
+    return _Offset(one.offset_s, max(one.std_s * max(1.0, one.residual or 1.0), (one.spread_s or 0.0) * 2.0 / 3.0))
+
+
+def offset_findings(report: OffsetReport, configured_s: Mapping[str, float]) -> Iterator[Finding]:
+    """Sensors whose clock does not agree with that of the reference; `configured_s` is what is taken off already."""
+    for one in report.sensors:
+        found = offset_of(one)
+        if found is None or abs(found.value_s) < max(OFFSET_STDS * found.std_s, _SMALLEST_OFFSET_S):
+            continue
+        total_s = round(configured_s[one.sensor] + found.value_s, 4)
+        way = "later" if found.value_s > 0.0 else "earlier"
+        off = f"{milliseconds(abs(found.value_s))} (± {milliseconds(2.0 * found.std_s)})"
+        key = f"sensors.{one.sensor}.clock_offset_s"
+        if report.reference == TRUTH:
+            text = f"its stamps are {off} {way} than the truth of the recording says. Set {key}: {total_s:g}."
+        else:
+            text = (
+                f"its stamps are {off} {way} than those of {report.reference}. Which of the two clocks is wrong the "
+                f"recording does not tell: {report.reference} is taken to be right (--reference takes another). Set "
+                f"{key}: {total_s:g}."
+            )
+        yield Finding("clock", one.sensor, 90.0, text, {key: total_s})

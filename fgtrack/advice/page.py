@@ -1,0 +1,132 @@
+"""The page of `fgtrack advise`: sentences, two tables, and the configuration that follows them."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from textwrap import wrap
+
+from fgtrack.advice.arrivals import Arrivals
+from fgtrack.advice.finding import Finding
+from fgtrack.advice.noise import NoiseFit
+from fgtrack.advice.windows import BeyondLag
+from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
+from fgtrack.pipeline.config import Config
+
+__all__ = ["Advice", "Change"]
+
+_COMMENT = 110  # characters in a line of a file
+
+
+@dataclass(frozen=True)
+class Change:
+    """A setting that the advice changes."""
+
+    key: str
+    value: object
+    why: str
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What is wrong with a recording and its configuration; `str` shows it as a page of plain sentences."""
+
+    recording: str
+    findings: tuple[Finding, ...]
+    """The most important first."""
+    fine: tuple[str, ...]
+    """What nothing was found of."""
+    changes: tuple[Change, ...]
+    config: Config = field(repr=False)
+    """The configuration with these changes; with noise fitted to the recording where that was asked for."""
+    arrivals: tuple[Arrivals, ...] = field(repr=False)
+    """Of the sensors that are used, with the stamps that the advice gives them."""
+    overtaken: Mapping[str, float] = field(repr=False)
+    beyond: tuple[BeyondLag, ...] = field(repr=False)
+    noise: tuple[NoiseFit, ...] = field(repr=False)
+    """With these changes, but the noise as it was configured."""
+    used: Mapping[str, tuple[float, float]] = field(repr=False)
+    """Share of the detections of each sensor that took part in tracking, before and after the changes."""
+    broken: str | None
+    """Why the recording breaks off, where it does; what came before was used."""
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The findings, and a line of what is fine."""
+        lines = [f"{one.about}: {one.text}" for one in self.findings]
+        if self.fine:
+            lines.append(f"Fine: {', '.join(self.fine)}.")
+        return tuple(lines)
+
+    @property
+    def tables(self) -> Tables:
+        """`lateness` of each sensor, and `beyond`: what windows of several lengths would lose."""
+        return Tables({"lateness": self._lateness(), "beyond": self._beyond()}, verdict=self.sentences)
+
+    def __str__(self) -> str:
+        return str(self.tables)
+
+    def _lateness(self) -> Table:
+        def quantiles(one: Arrivals) -> tuple[Value, ...]:
+            return (one.quantile_s(0.5), one.quantile_s(0.95), float(one.delays_s.max()))
+
+        def bursts(one: Arrivals) -> tuple[Value, ...] | None:
+            return None if one.bursts is None else (one.bursts.count, one.bursts.mean_length_s)
+
+        names = ("delay_p50_s", "delay_p95_s", "delay_max_s")
+        columns: list[Column[Arrivals]] = [
+            Column("sensor", ("sensor",), lambda one: (one.name,), left=True),
+            Column("lists", ("lists",), lambda one: (len(one.counts),)),
+            Column("period\n[ms]", ("period_s",), lambda one: _known(one.period_s), scale=1e3),
+            Column("delay [ms]\np50/p95/max", names, quantiles, "{}/{}/{}", 1e3, text=_whole),
+            Column("overtaken\n[%]", ("overtaken",), lambda one: (self.overtaken[one.name],), scale=100.0),
+            Column("lost\n[%]", ("lost",), lambda one: _known(one.lost), scale=100.0),
+            Column("bursts\n[s]", ("bursts", "burst_s"), bursts, "{} of {}"),
+            Column(
+                "used [%]\nnow/followed", ("used", "used_followed"), lambda one: self.used.get(one.name), "{}/{}", 100.0
+            ),
+            Column("NIS\n/ expected", ("nis_ratio",), lambda one: _known(self._ratio(one.name))),
+        ]
+        return Table("Lists by sensor, with the stamps advised", columns, self.arrivals, row_keys=("sensor",))
+
+    def _ratio(self, sensor: str) -> float | None:
+        return next((one.ratio.mean for one in self.noise if one.sensor == sensor), None)
+
+    def _beyond(self) -> Table:
+        columns: list[Column[BeyondLag]] = [Column("lag [s]", ("lag_s",), lambda row: (row.lag_s,), text=str)]
+        for one in self.arrivals:
+            columns.append(_share_column(one.name))
+        return Table("Detections that are later than a window or limit [%]", columns, self.beyond, row_keys=("lag_s",))
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values for JSON."""
+        return {
+            "recording": self.recording,
+            "findings": [asdict(one) for one in self.findings],
+            "fine": list(self.fine),
+            "changes": [asdict(one) for one in self.changes],
+            "broken": self.broken,
+            **self.tables.to_dict(),
+        }
+
+    def comments(self) -> list[str]:
+        """Why each setting is changed, and what no setting mends."""
+        lines = [line for one in self.changes for line in _wrapped(f"{one.key} = {one.value}: {one.why}")]
+        if not self.changes:
+            lines = ["Nothing is changed."]
+        rest = [line for one in self.findings if not one.settings for line in _wrapped(f"{one.about}: {one.text}")]
+        return [*lines, *(["", "Without a setting that mends it:"] if rest else []), *rest]
+
+
+def _wrapped(text: str) -> list[str]:
+    return wrap(text, _COMMENT, initial_indent="- ", subsequent_indent="  ", break_long_words=False)
+
+
+def _known(value: float | None) -> tuple[Value, ...] | None:
+    return None if value is None else (value,)
+
+
+def _whole(value: Value) -> str:
+    return f"{value:.0f}" if abs(float(value)) < 3.6e6 else NO_VALUE
+
+
+def _share_column(name: str) -> Column[BeyondLag]:
+    return Column(name, (f"{name}_share",), lambda row: (row.share[name],), scale=100.0)

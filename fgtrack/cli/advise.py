@@ -1,0 +1,51 @@
+"""`fgtrack advise`: what is wrong with a recording and its configuration, and the settings that mend it."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fgtrack.advice.advise import advise as advised
+from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, Overwrite, PitMap, Settings, TrackMap
+from fgtrack.cli.show import chosen_form, progress, say, show
+from fgtrack.core.errors import DataError
+from fgtrack.io.output import check_output
+from fgtrack.pipeline.replay import located
+from fgtrack.pipeline.shipped import read_config
+from fgtrack.pipeline.tune_file import ADVISED, write_advised
+
+
+def advise(
+    recording: Input,
+    config_file: ConfigFile = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Configuration to write that follows the advice (YAML).")
+    ] = None,
+    tune: Annotated[bool, typer.Option("--tune", help="Fit noise that does not fit, too.")] = False,
+    reference: Annotated[
+        str | None, typer.Option("--reference", help="Sensor whose clock is right, where two do not agree.")
+    ] = None,
+    track_map: TrackMap = None,
+    pit_map: PitMap = None,
+    settings: Settings = None,
+    overwrite: Overwrite = False,
+    as_json: Json = False,
+    form: FormOption = None,
+) -> None:
+    """Say what is late, wrong or does not fit, and the setting that mends it.
+
+    Sentences in order of importance, and what windows of several lengths would lose.
+    """
+    form = chosen_form(as_json, form)
+    if out is not None:
+        check_output(out, ADVISED, overwrite)
+    config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
+    with progress("advise") as tell:
+        advice = advised(recording, config, reference=reference, tune=tune, on_step=tell)
+    show(advice.tables, form, advice.as_dict())
+    if out is not None:
+        write_advised(out, config_file, advice.config, advice.comments(), overwrite)
+        if form is None:
+            say(f"{out}: written; follow it by `fgtrack replay {recording} -c {out} -o RUN`")
+    if advice.broken is not None:
+        raise DataError(f"{located(advice.broken, str(recording))}; used up to there")
