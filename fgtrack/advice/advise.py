@@ -110,7 +110,7 @@ class _Adviser:
         self._take(_receipts([self._arrivals[name] for name in sensors]))
         first = list(beginning(self._messages, nanoseconds(TRIAL_S)))
         self._take(
-            Finding("input", about, 94.0, f"{text}.")
+            Finding("input", about, 45.0 if "never measures" in text else 94.0, f"{text}.")
             for about, _, text in (_about(line) for line in suspicions(first, self._config))
         )
         self._take(self._offsets())
@@ -298,8 +298,8 @@ def _receipts(arrivals: Sequence[Arrivals]) -> Iterator[Finding]:
     names = [one.name for one in arrivals if one.is_receipt and len(one.counts) >= FEWEST]
     if names:
         text = (
-            "every stamp is the receipt: the recording has no times of receipt, or they were taken for stamps. Nothing is "
-            "known of the delay, and no advice on it is given"
+            "every stamp is the receipt: the recording has no times of receipt, or they were taken for stamps. "
+            "Nothing is known of the delay, and no advice on it is given"
         )
         text += "." if len(names) == len(arrivals) else "; its latency is sensors.NAME.clock_offset_s."
         yield Finding("receipt", ", ".join(names), 20.0, text)

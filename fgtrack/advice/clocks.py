@@ -79,12 +79,15 @@ def _jump(one: Arrivals) -> tuple[float, float] | None:
     medians = np.array([np.median(delays_s[k : k + width]) for k in range(count - width + 1)])
     changes = medians[width:] - medians[:-width]
     place = int(np.abs(changes).argmax())
-    before, after = delays_s[: place + width], delays_s[place + width :]
+    middle_s = (medians[place] + medians[place + width]) / 2.0
+    above = np.where((delays_s > middle_s) == (changes[place] > 0.0), 1, -1)
+    split = int((np.cumsum(-above)[width - 1 : count - width]).argmax()) + width
+    before, after = delays_s[:split], delays_s[split:]
     noise_s = 1.4826 * float(np.median(np.abs(np.diff(delays_s))))
     lasting_s = float(np.median(after) - np.median(before))
     if min(abs(float(changes[place])), abs(lasting_s)) < max(_JUMP_S, _JUMP_STDS * noise_s):
         return None
-    at_ns = one.receipts_ns[place + width] - one.receipts_ns[0]
+    at_ns = one.receipts_ns[split] - one.receipts_ns[0]
     return float(at_ns) / 1e9, lasting_s
 
 

@@ -61,8 +61,8 @@ def noise_findings(run: Run, fits: list[NoiseFit]) -> Iterator[Finding]:
             if one.count >= FEWEST and one.ratio.low > FAR_OFF:
                 text = (
                     f"mean NIS is {one.ratio.mean:.3g} times what is expected ({one.ratio.low:.3g} to "
-                    f"{one.ratio.high:.3g}), but its median is as it should be: a few detections are of something else. "
-                    f"Look at its clutter and at the gate, or set sensors.{sensor}.loss: {{kind: huber, width: 3.0}}."
+                    f"{one.ratio.high:.3g}), but its median is right: a few detections are of something else. "
+                    f"Look at its clutter and the gate, or set sensors.{sensor}.loss: {{kind: huber, width: 3.0}}."
                 )
                 yield Finding("noise", sensor, 45.0, text)
             continue

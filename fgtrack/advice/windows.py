@@ -107,11 +107,12 @@ def _life(arrivals: Sequence[Arrivals], config: Config) -> Iterator[Finding]:
     limit_s = rules.out_of_view_s if isinstance(rules, ExistenceRules) else rules.forget_s
     placing = [one for one in arrivals if config.sensors[one.name].gives_position and one.period_s]
     silent_s = {one.name: one.bursts.longest_s if one.bursts else 0.0 for one in placing}
+    fastest_s = min((each.period_s or math.inf for each in placing), default=math.inf)
     for one in placing:
-        fastest_s = min(each.period_s or math.inf for each in placing)
-        shortest_s = (one.period_s or 0.0) + silent_s[one.name]
-        alone = len(placing) == 1 or (one.period_s or 0.0) > 2.0 * fastest_s
-        if alone and limit_s < shortest_s:
+        period_s = one.period_s or 0.0
+        alone = len(placing) == 1 or period_s > 2.0 * fastest_s
+        shortest_s = period_s + (silent_s[one.name] if alone else 0.0)
+        if (alone or fastest_s > limit_s) and limit_s < shortest_s:
             value = nice_above(_LISTS * shortest_s)
             text = (
                 f"{key} {limit_s:g} s is shorter than the time in which {one.name} may say nothing, "

@@ -1,0 +1,367 @@
+"""`advise`: what it says of a recording is right, and the configuration that it writes follows it."""
+
+import csv
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.messages import drive as support_drive
+
+import fgtrack
+from fgtrack.cli.main import run as run_command
+from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
+from fgtrack.evaluation.metrics import evaluate
+from fgtrack.io.ros.bag_writer import write_bag
+from fgtrack.io.run import load_run
+from fgtrack.io.stream import write_stream
+from fgtrack.sim.redelay import restamped
+
+MS = 1_000_000
+START_NS = 1_600_000_000_000_000_000
+
+#: Neither a map nor a racing team: cars anywhere, two sensors that measure positions.
+CONFIG = """\
+estimator: ekf-replay
+sensors:
+  lidar: {std: {x_m: 0.3, y_m: 0.3}}
+  radar: {std: {x_m: 1.0, y_m: 1.0}}
+motion: {kind: ctrv, std_per_s: {position: 0.2, yaw: 0.3, speed: 30.0, yaw_rate: 0.5}}
+birth: {kind: measured, ego_speed_factor: 0.0, speed_std_mps: 10.0}
+ego: {detection_origin_x_m: 0.0}
+merge: {kind: none}
+"""
+
+CSV_CONFIG = """\
+input:
+  csv:
+    ego: {file: ego.csv, columns: {stamp: stamp, receipt: receipt, x_m: x, y_m: y, yaw_rad: yaw, speed_mps: speed},
+          time_unit: ns}
+    detections:
+      lidar: {file: lidar.csv, columns: {stamp: stamp, receipt: receipt, x_m: x, y_m: y, yaw_rad: yaw}, time_unit: ns,
+              frame: FRAME}
+      radar: {file: radar.csv, columns: {stamp: stamp, receipt: receipt, x_m: x, y_m: y, yaw_rad: yaw}, time_unit: ns,
+              frame: FRAME}
+"""
+
+KINDS = ("stream", "bag", "csv")
+Call = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call:
+    """Runs a command in an empty folder; gives its exit code and what it prints, its lines joined."""
+    monkeypatch.chdir(tmp_path)
+
+    def called(*arguments: object) -> tuple[int, str]:
+        capsys.readouterr()
+        code = run_command([str(argument) for argument in arguments])
+        out, err = capsys.readouterr()
+        return code, " ".join(f"{out} {err}".split())
+
+    return called
+
+
+def drive(
+    count: int = 150, *, truth: bool = True, late_ms: Callable[[int], float] = lambda k: 100.0, wave_mps: float = 6.0
+) -> list[Message]:
+    """The ego at 20 m/s far from the origin of the map; a car ahead that is faster and slower than it by turns."""
+    rng = np.random.default_rng(1)
+    messages: list[Message] = []
+    for k in range(count):
+        now_s = 0.05 * k
+        now_ns = START_NS + k * 50 * MS
+        ego_m = 1000.0 + 20.0 * now_s
+        messages.append(EgoState(now_ns, now_ns, ego_m, 500.0, 0.0, 20.0))
+        ahead_m = 30.0 + wave_mps * (1.0 - np.cos(now_s))
+        if truth:
+            messages.append(TruthState(now_ns, now_ns, 1, ego_m + ahead_m, 501.0, 0.0, 20.0 + wave_mps * np.sin(now_s)))
+        for sensor, std_m, delay_ms in (("lidar", 0.3, late_ms(k)), ("radar", 1.0, 40.0)):
+            x_m, y_m = rng.normal((ahead_m, 1.0), std_m).tolist()
+            receipt_ns = now_ns + round(delay_ms * MS)
+            messages.append(
+                DetectionList(sensor, now_ns, receipt_ns, (Detection(x_m=x_m, y_m=y_m, yaw_rad=0.0),), "ego")
+            )
+    return sorted(messages, key=lambda message: message.receipt_ns)
+
+
+def changed(change: Callable[[DetectionList], DetectionList], messages: Iterable[Message]) -> list[Message]:
+    return [change(item) if isinstance(item, DetectionList) else item for item in messages]
+
+
+def write(kind: str, messages: Sequence[Message], *, ego: bool = True, frame: str = "ego") -> str:
+    """Write the recording of a kind and `c.yaml` that reads it; gives its name."""
+    if kind == "stream":
+        write_stream("drive.jsonl", messages, overwrite=True)
+        Path("c.yaml").write_text(CONFIG)
+        return "drive.jsonl"
+    if kind == "bag":
+        write_bag(Path("drive"), messages)
+        Path("c.yaml").write_text(CONFIG)
+        return "drive"
+    Path("table").mkdir()
+    tables: dict[str, list[list[object]]] = {"ego": [], "lidar": [], "radar": []}
+    for one in messages:
+        if isinstance(one, EgoState):
+            tables["ego"].append([one.stamp_ns, one.receipt_ns, one.x_m, one.y_m, one.yaw_rad, one.speed_mps])
+        elif isinstance(one, DetectionList):
+            tables[one.sensor] += [[one.stamp_ns, one.receipt_ns, of.x_m, of.y_m, of.yaw_rad] for of in one.objects]
+    for name, rows in tables.items():
+        with Path(f"table/{name}.csv").open("w", newline="") as file:
+            csv.writer(file).writerows(
+                [["stamp", "receipt", "x", "y", "yaw", "speed"][: 6 if name == "ego" else 5], *rows]
+            )
+    text = CSV_CONFIG.replace("FRAME", frame)
+    if not ego:
+        text = "\n".join(
+            line for line in text.splitlines() if "ego.csv" not in line and line.strip() != "time_unit: ns}"
+        )
+    Path("c.yaml").write_text(f"{text}\n{CONFIG}")
+    return "table"
+
+
+def advised(call: Call, recording: str, *options: str) -> tuple[int, str]:
+    return call("advise", recording, "-c", "c.yaml", *options)
+
+
+def test_a_healthy_recording_is_fine_and_nothing_is_changed(call: Call) -> None:
+    write("stream", drive())
+    code, text = advised(call, "drive.jsonl", "-o", "a.yaml")
+    assert code == 0
+    assert "Fine: the ego (20 Hz" in text
+    assert "stamps of lidar, radar, frames, angles and fields" in text
+    assert "noise of lidar, radar" in text
+    assert "# Nothing is changed." in Path("a.yaml").read_text()
+    for name in ("c", "a"):
+        assert call("replay", "drive.jsonl", "-c", f"{name}.yaml", "-o", f"runs/{name}")[0] == 0
+    assert load_run("runs/a").meta["digest"] == load_run("runs/c").meta["digest"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_stamps_of_zero(call: Call, kind: str) -> None:
+    zero = changed(lambda item: replace(item, stamp_ns=0) if item.sensor == "radar" else item, drive())
+    recording = write(kind, zero)
+    _, shown = call("info", recording, "-c", "c.yaml")
+    assert "radar: all stamps are 0: set `stamp_from: receipt`" in shown
+    code, text = advised(call, recording, "-o", "a.yaml")
+    assert code == 0
+    assert "radar: all 150 stamps are 0: its driver sets none. Set sensors.radar.stamp_from: receipt" in text
+    assert call("replay", recording, "-c", "a.yaml", "-o", "run")[0] == 0
+    fates = load_run("run").meta["counts"]["radar"]
+    assert sum(fates.get(fate, 0) for fate in ("birth", "in_sequence", "out_of_sequence")) > 140
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_missing_ego(call: Call, kind: str) -> None:
+    recording = write(kind, [item for item in drive() if not isinstance(item, EgoState)], ego=False)
+    wanted = "no state of the ego is read, but lidar is relative to it: name the ego's topic (input.ego)"
+    assert wanted in call("info", recording, "-c", "c.yaml")[1]
+    code, text = advised(call, recording)
+    assert code == 0
+    assert wanted in text
+    assert "Fine: " not in text or "the ego" not in text.partition("Fine: ")[2]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_wrong_frame(call: Call, kind: str) -> None:
+    recording = write(kind, changed(lambda item: replace(item, frame="map"), drive()), frame="map")
+    for command in ("info", "advise"):
+        code, text = call(command, recording, "-c", "c.yaml")
+        assert code == 0
+        assert "lidar: is read as in the map, " in text
+        assert "set `frame: ego` (or sensor)" in text
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_degrees_for_radians(call: Call, kind: str) -> None:
+    turned = [replace(item, yaw_rad=90.0) if isinstance(item, EgoState) else item for item in drive()]
+    recording = write(kind, turned)
+    for command in ("info", "advise"):
+        assert "ego: yaw_rad goes up to 90: degrees?" in call(command, recording, "-c", "c.yaml")[1]
+
+
+def test_a_typo_in_a_field_path(call: Call) -> None:
+    write_bag(Path("bag"), support_drive())
+    Path("c.yaml").write_text(
+        "input:\n  ego: {topic: /ego/odometry}\n  detections:\n"
+        "    radar: {topic: /detections/radar, fields: {objects: objects, x_m: kinematics.pose.x}}\n"
+        "sensors:\n  radar: {std: {x_m: 1.0, y_m: 1.0}}\n"
+    )
+    for command in ("info", "advise"):
+        code, text = call(command, "bag", "-c", "c.yaml")
+        assert code == 1
+        assert "kinematics.pose.x: leads nowhere, there is no 'pose', but pose_with_covariance" in text
+
+
+def test_a_typo_in_a_column(call: Call) -> None:
+    recording = write("csv", drive())
+    Path("c.yaml").write_text(Path("c.yaml").read_text().replace("x_m: x,", "x_m: xx,"))
+    for command in ("info", "advise"):
+        code, text = call(command, recording, "-c", "c.yaml")
+        assert code == 1
+        assert "'xx'" in text
+
+
+@pytest.mark.parametrize("sensor", ["lidar", "radar"])
+def test_a_wrong_clock_is_found_by_the_truth_and_mended(call: Call, sensor: str) -> None:
+    off = changed(lambda item: restamped(item, item.stamp_ns + 80 * MS) if item.sensor == sensor else item, drive(600))
+    write("stream", off)
+    code, text = advised(call, "drive.jsonl", "-o", "a.yaml")
+    assert code == 0
+    assert f"later than the truth of the recording says. Set sensors.{sensor}.clock_offset_s" in text
+    changes = {
+        line.split()[2]: float(line.split()[4].rstrip(":"))
+        for line in Path("a.yaml").read_text().splitlines()
+        if line.startswith("# - sensors")
+    }
+    assert changes == {f"sensors.{sensor}.clock_offset_s": pytest.approx(0.08, abs=0.02)}
+    for name in ("c", "a"):
+        assert call("replay", "drive.jsonl", "-c", f"{name}.yaml", "-o", f"runs/{name}")[0] == 0
+    before, after = (rmse_m(f"runs/{name}") for name in ("c", "a"))
+    assert after < before
+
+
+def rmse_m(path: str) -> float:
+    truth = evaluate(load_run(path)).truth
+    assert truth is not None
+    return truth.overall.errors["position_m"].rmse
+
+
+def test_without_truth_only_the_difference_of_two_clocks_is_known(call: Call) -> None:
+    off = changed(
+        lambda item: restamped(item, item.stamp_ns + 80 * MS) if item.sensor == "lidar" else item,
+        drive(400, truth=False, wave_mps=12.0),
+    )
+    write("stream", off)
+    advice = fgtrack.advise("drive.jsonl", "c.yaml", reference="radar")
+    (clock,) = [one for one in advice.findings if one.kind == "clock"]
+    assert "later than those of radar. Which of the two clocks is wrong the recording does not tell" in clock.text
+    assert advice.config.sensors["lidar"].clock_offset_s == pytest.approx(0.08, abs=0.02)
+
+
+def test_what_an_advised_clock_leaves_is_nothing(call: Call) -> None:
+    off = changed(lambda item: restamped(item, item.stamp_ns + 80 * MS) if item.sensor == "lidar" else item, drive(600))
+    write("stream", off)
+    advised(call, "drive.jsonl", "-o", "a.yaml")
+    code, text = call("advise", "drive.jsonl", "-c", "a.yaml", "-o", "b.yaml")
+    assert code == 0
+    assert "clock_offset_s" not in text
+    assert "Nothing is changed" in Path("b.yaml").read_text()
+
+
+def test_bursts_and_a_limit_that_refuses_them(call: Call) -> None:
+    def late_ms(k: int) -> float:
+        return 600.0 + 5.0 * (k % 7) if k % 100 in range(40, 60) else 100.0 + 3.0 * (k % 7)
+
+    write("stream", drive(600, late_ms=late_ms))
+    Path("c.yaml").write_text(CONFIG.replace("lidar: {", "lidar: {max_delay_s: 0.3, "))
+    advice = fgtrack.advise("drive.jsonl", "c.yaml")
+    lidar = next(one for one in advice.arrivals if one.name == "lidar")
+    assert lidar.bursts is not None
+    assert (lidar.bursts.count, lidar.bursts.mean_length_s) == (6, pytest.approx(1.0, abs=0.1))
+    assert advice.config.sensors["lidar"].max_delay_s == pytest.approx(0.8)
+    assert advice.used["lidar"] == (pytest.approx(0.8, abs=0.02), pytest.approx(1.0, abs=0.01))
+    assert [row.share["lidar"] for row in advice.beyond if row.lag_s in (0.05, 0.3, 0.75)] == [
+        1.0,
+        pytest.approx(0.2),
+        0.0,
+    ]
+    lines = " ".join(advice.sentences)
+    assert "20 % of its detections come later than max_delay_s 0.3 s allows" in lines
+    assert "come together: 6 times, for 1 s on average" in lines
+
+
+def test_a_window_shorter_than_the_delays_and_than_a_period(call: Call) -> None:
+    write("stream", drive(300))
+    Path("c.yaml").write_text(CONFIG + "filter: {storage_s: 0.05}\n")
+    assert fgtrack.advise("drive.jsonl", "c.yaml").config.filter.storage_s == pytest.approx(0.2)
+    slow = [
+        item
+        for item in drive(1200)
+        if not isinstance(item, DetectionList) or (item.stamp_ns - START_NS) % (1500 * MS) == 0
+    ]
+    write("stream", slow)
+    text = CONFIG.replace("estimator: ekf-replay", "estimator: smoother-banded") + "lifecycle: {forget_s: 1.0}\n"
+    Path("c.yaml").write_text(text)
+    advice = fgtrack.advise("drive.jsonl", "c.yaml")
+    assert advice.config.smoother.lag_s == pytest.approx(5.0)
+    assert advice.config.lifecycle.forget_s == pytest.approx(5.0)
+
+
+def test_negative_delays_a_jump_and_a_drift(call: Call) -> None:
+    def ahead(item: DetectionList) -> DetectionList:
+        return restamped(item, item.stamp_ns + 70 * MS) if item.sensor == "radar" else item
+
+    write("stream", changed(ahead, drive(300)))
+    assert "radar: 100 % of its stamps lie after their receipt, by up to 30 ms" in " ".join(told())
+
+    def jump(item: DetectionList) -> DetectionList:
+        later = item.sensor == "radar" and item.stamp_ns > START_NS + 10_000 * MS
+        return restamped(item, item.stamp_ns - 500 * MS) if later else item
+
+    write("stream", changed(jump, drive(400)))
+    assert "radar: its delay changes by 500 ms at 10.0 s and stays so" in " ".join(told())
+
+    def drift(item: DetectionList) -> DetectionList:
+        slow_ns = (item.stamp_ns - START_NS) * 2 // 1000
+        return restamped(item, item.stamp_ns - slow_ns) if item.sensor == "radar" else item
+
+    write("stream", changed(drift, drive(400)))
+    assert "radar: its delay grows by 2e+03 us per second" in " ".join(told())
+
+
+def told() -> tuple[str, ...]:
+    Path("c.yaml").write_text(CONFIG)
+    return fgtrack.advise("drive.jsonl", "c.yaml").sentences
+
+
+def test_receipts_for_stamps(call: Call) -> None:
+    write("stream", changed(lambda item: replace(item, stamp_ns=item.receipt_ns), drive(truth=False)))
+    assert any("every stamp is the receipt" in line for line in told())
+
+
+def test_a_sensor_without_a_model_is_left_out(call: Call) -> None:
+    write("stream", drive())
+    Path("c.yaml").write_text("\n".join(line for line in CONFIG.splitlines() if "radar" not in line))
+    code, text = advised(call, "drive.jsonl", "-o", "a.yaml")
+    assert code == 0
+    assert "no model of radar (radar: x_m, y_m, yaw_rad): give sensors.NAME.std, or leave them out" in text
+    assert call("replay", "drive.jsonl", "-c", "a.yaml", "-o", "run")[0] == 0
+
+
+def test_an_estimator_that_forgets_and_noise_that_does_not_fit(call: Call) -> None:
+    write("stream", drive(400))
+    text = CONFIG.replace("ekf-replay", "ekf-backward-forward").replace(
+        "radar: {std: {x_m: 1.0", "radar: {std: {x_m: 9.0"
+    )
+    Path("c.yaml").write_text(text.replace("y_m: 1.0}", "y_m: 9.0}"))
+    advice = fgtrack.advise("drive.jsonl", "c.yaml", tune=True)
+    assert advice.config.estimator == "ekf-replay"
+    assert [one.about for one in advice.findings if one.kind == "noise"] == ["radar"]
+    assert advice.config.sensors["radar"].std["x_m"] == pytest.approx(1.0, rel=0.3)
+
+
+def test_the_forms_of_the_page(call: Call, capsys: pytest.CaptureFixture[str]) -> None:
+    write("stream", drive())
+    assert run_command(["advise", "drive.jsonl", "-c", "c.yaml", "--json"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert values["recording"] == "drive.jsonl"
+    assert {row["sensor"] for row in values["tables"]["lateness"]} == {"lidar", "radar"}
+    for form, expected in (("md", "|"), ("csv", "sensor,lists"), ("latex", "tabular")):
+        assert run_command(["advise", "drive.jsonl", "-c", "c.yaml", "--format", form]) == 0
+        assert expected in capsys.readouterr().out
+
+
+def test_bad_calls(call: Call) -> None:
+    write("stream", drive())
+    assert advised(call, "drive.jsonl", "--reference", "sonar")[0] == 2
+    Path("mine.yaml").write_text("estimator: smoother\n")
+    assert advised(call, "drive.jsonl", "-o", "mine.yaml")[0] == 2
+    assert advised(call, "nothing.jsonl")[0] == 2
+    Path("cut.jsonl").write_text("\n".join(Path("drive.jsonl").read_text().splitlines()[:300]) + '\n{"type": "eg')
+    code, text = call("advise", "cut.jsonl", "-c", "c.yaml")
+    assert code == 1
+    assert "Fine: " in text
+    assert "used up to there" in text
