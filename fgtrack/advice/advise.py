@@ -133,7 +133,7 @@ class _Adviser:
             if self._take(_remaining(run_after, known)):
                 run_after = self._replayed(self._config) or run_after
                 fits = noise_fits(run_after)
-            if not any(one.weight >= _USELESS and not one.settings for one in self._findings):
+            if not self._is_useless:
                 self._take(noise_findings(run_after, fits))
         changes = self._changes()
         if tune and any(one.kind == "noise" for one in self._findings):
@@ -162,6 +162,11 @@ class _Adviser:
             self._config = read_config(self._config, settings_of(values))
         return bool(values)
 
+    @property
+    def _is_useless(self) -> bool:
+        """Whether something is wrong that no setting mends: nothing else can be judged then."""
+        return any(one.weight >= _USELESS and not one.settings for one in self._findings)
+
     def _strangers(self) -> Iterator[Finding]:
         """Sensors of the recording that the configuration does not know."""
         known = {*self._config.sensors, *self._config.ignore_sensors, EGO}
@@ -181,6 +186,8 @@ class _Adviser:
 
     def _offsets(self) -> Iterator[Finding]:
         """Clocks that do not agree, where that can be known."""
+        if self._is_useless:
+            return
         self._on_step("clock offsets")
         config = replace(self._config, estimator="ekf-replay")
         try:
