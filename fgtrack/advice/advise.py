@@ -19,6 +19,7 @@ from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.clock_offsets import OffsetReport, OffsetRules, estimate_offsets
 from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.effective import with_sensors
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.shipped import read_config, settings_of
 from fgtrack.pipeline.stamping import mended
@@ -93,7 +94,7 @@ class _Adviser:
         on_step: Callable[[str], None],
     ) -> None:
         self._recording, self._messages, self._reference, self._on_step = recording, messages, reference, on_step
-        self._origin = self._config = config
+        self._config = with_sensors(config, lambda: messages)
         self._findings: list[Finding] = []
         self._arrivals = arrivals_of(messages)
         self._tracked = list(beginning(messages, nanoseconds(TRACKED_S)))
