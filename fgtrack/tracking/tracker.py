@@ -25,7 +25,7 @@ from fgtrack.estimation.base import StatesAt, TrackBank, UpdateResult, no_states
 from fgtrack.estimation.ekf import propagated
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.object_bank import state_of, states_of
-from fgtrack.estimation.propagation import wrapped_yaw
+from fgtrack.estimation.present import PresentStates
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
@@ -37,6 +37,7 @@ from fgtrack.tracking.ego_error import EgoErrors, IndependentErrors
 from fgtrack.tracking.inbox import NO_INNOVATION, Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Lifecycle, Look, Sighting
 from fgtrack.tracking.preprocess import Candidate, Preprocess
+from fgtrack.tracking.soundness import faults
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ class Tracker:
     def state_at(self, track_id: int, stamp_ns: int) -> TrackReport:
         """A track at any stamp in or after its window: smoothed or filtered in the past, predicted ahead of now.
 
-        Raises `CallError` for a track that does not exist and a stamp before its window.
+        Raises `CallError` for a track that does not exist, a stamp before its window, and a state that is not sound.
         """
         bank, motion = self._parts.bank, self._parts.motion
         if track_id not in bank.track_ids:
@@ -131,18 +132,20 @@ class Tracker:
                 f"track {track_id} does not exist: there are {', '.join(map(str, bank.track_ids)) or 'none'}"
             )
         state = state_of(bank, motion, track_id, stamp_ns)
-        mean, covariance = motion.kinematic(state.mean, state.covariance)
-        return self._report(track_id, TrackState(stamp_ns, wrapped_yaw(mean), covariance))
+        found = PresentStates(motion, stamp_ns, state.mean[None], state.covariance[None])
+        for fault in faults(found).values():
+            raise CallError(f"track {track_id} has no state at {stamp_ns} ns: it is {fault}")
+        return self._report(track_id, found[0])
 
     def tracks_at(self, stamp_ns: int) -> tuple[TrackReport, ...]:
-        """All tracks at a stamp, see `state_at`, in order of birth; without those whose window begins later."""
+        """All tracks that have a state at a stamp, see `state_at`, in order of birth."""
         bank, motion = self._parts.bank, self._parts.motion
         states = states_of(bank, motion, stamp_ns)
         if not states.track_ids:
             return ()
-        means, covariances = motion.kinematic(states.means, states.covariances)
-        rows = zip(states.track_ids, wrapped_yaw(means), covariances, strict=True)
-        return tuple(self._report(track_id, TrackState(stamp_ns, mean, P)) for track_id, mean, P in rows)
+        found = PresentStates(motion, stamp_ns, states.means, states.covariances)
+        unsound, rows = faults(found), enumerate(zip(states.track_ids, found, strict=True))
+        return tuple(self._report(*track) for place, track in rows if place not in unsound)
 
     def _process_if_possible(self, batch: Batch) -> None:
         """Process a batch; where that raises what is no answer, what is left of the batch ends as failed."""

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from fgtrack.core.errors import DataError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import Failure
@@ -289,6 +289,24 @@ def test_what_a_motion_model_does_wrong_is_not_published_and_counted(
     check_published(run)
     if wrong != "has endless noise":  # of which nothing is known, is sound
         check_told(run)
+
+
+def test_a_state_that_a_model_spoils_on_the_way_to_another_time_is_not_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Config, "motion_model", lambda self: Rotten())
+    tracker = Tracker(read_config("smoother", SETTINGS, estimator="ekf-replay"))
+    for message in messages():
+        tracker.receive(message)
+        tracks = tracker.tick(message.receipt_ns).tracks
+    assert len(tracks) == 2
+    ahead_ns = tracks[0].stamp_ns + 100 * MS
+    assert len(tracker.tracks_at(ahead_ns)) == 2
+    monkeypatch.setattr(Rotten, "wrong", "steps to nowhere")
+    monkeypatch.setattr(Rotten, "asked", 1000)
+    [near] = tracker.tracks_at(ahead_ns)
+    assert near.x_m < BETWEEN_M
+    [far_id] = {track.track_id for track in tracks} - {near.track_id}
+    with pytest.raises(CallError, match=f"track {far_id} has no state at {ahead_ns} ns: it is not finite"):
+        tracker.state_at(far_id, ahead_ns)
 
 
 class NeverBank(ObjectBank):
