@@ -21,6 +21,7 @@ from fgtrack.estimation.dense_joint import Difference, dense_joint, difference, 
 from fgtrack.estimation.registry import ESTIMATORS, Claims, Factory, start_estimator
 from fgtrack.models.motion import MotionModel
 from fgtrack.pipeline import verify_streams as streams
+from fgtrack.pipeline.nasty_streams import gathered
 from fgtrack.pipeline.oracle.estimates import Estimate
 from fgtrack.pipeline.oracle.posterior import most_probable
 from fgtrack.pipeline.verify_models import MODEL_TOLERANCE, model_differences
@@ -125,6 +126,7 @@ _LINEAR: tuple[tuple[_Draw, bool], ...] = ((streams.linear, True), (streams.clos
 _NONLINEAR: tuple[tuple[_Draw, float], ...] = (
     (streams.whole, WHOLE_TOLERANCE),
     (streams.observed, WHOLE_TOLERANCE),
+    (gathered, WHOLE_TOLERANCE),
     (streams.robust, WHOLE_TOLERANCE),
     (streams.accelerated, WHOLE_TOLERANCE),
     (streams.leaving, MARGINALISED_TOLERANCE),
@@ -301,7 +303,7 @@ def _oracle(stream: Stream, subject: Subject) -> _Oracle | None:
     """What the estimator says that it solves, at a stamp."""
     if subject.claims.solves == "least squares":
         return stream.solution.state_at
-    weighted = any(one.huber is not None for one in stream.sightings)
+    weighted = any(one.loss is not None for one in stream.sightings)
     return stream.filtered.get if subject.claims.solves == "ekf" and not weighted else None
 
 

@@ -31,7 +31,7 @@ _LOSS_WIDTH = 1.5
 _OUTLIERS = 0.2
 
 #: A fast car that begins to turn; one that passes a yaw of pi before a turning observer.
-_FAST = Start(
+FAST = Start(
     stamp_ns=_START_NS,
     position_m=(20.0, -5.0),
     yaw_rad=0.6,
@@ -41,7 +41,7 @@ _FAST = Start(
     yaw_rate_radps=0.1,
     yaw_rate_std_radps=0.1,
 )
-_TURNING = replace(_FAST, position_m=(30.0, 12.0), yaw_rad=3.0, yaw_std_rad=0.2, speed_mps=12.0, yaw_rate_radps=0.5)
+_TURNING = replace(FAST, position_m=(30.0, 12.0), yaw_rad=3.0, yaw_std_rad=0.2, speed_mps=12.0, yaw_rate_radps=0.5)
 
 #: Seen from the observer: its detections' frame, and the pose of its RADAR in that frame. The object is behind it.
 _FRAME_M = (-1.2, 0.3)
@@ -110,30 +110,30 @@ def dynamics_of(motion: MotionModel) -> Dynamics:
 
 # A sensor measures the state x at a stamp.
 _Sense = Callable[[np.random.Generator, FloatArray, int, str], tuple[Measurement, Sighting]]
-_Plan = tuple[FloatArray, npt.NDArray[np.str_]]
+Plan = tuple[FloatArray, npt.NDArray[np.str_]]
 
 
 def linear(rng: np.random.Generator) -> Stream:
     """Positions of the paper's LiDAR and RADAR in a linear model, with the paper's delays."""
-    return _drawn(rng, "CV, paper's delays", CV(), _paper_stamps(1.2), lag_s=1.0, reach_s=0.95)
+    return drawn(rng, "CV, paper's delays", CV(), paper_stamps(1.2), lag_s=1.0, reach_s=0.95)
 
 
 def close(rng: np.random.Generator) -> Stream:
     """The same with stamps of the two sensors that are equal, or 1 us or 1 ms apart."""
-    stamps_s, sensors = _paper_stamps(0.5)
+    stamps_s, sensors = paper_stamps(0.5)
     gaps_s = np.resize([0.0, 1e-6, 1e-3, _RADAR_PHASE_S], len(stamps_s) // 2)
     stamps_s = np.where(sensors == "radar", stamps_s - _RADAR_PHASE_S + np.repeat(gaps_s, 2), stamps_s)
-    return _drawn(rng, "CV, stamps 1 us apart", CV(), (stamps_s, sensors), lag_s=1.5, reach_s=1.4)
+    return drawn(rng, "CV, stamps 1 us apart", CV(), (stamps_s, sensors), lag_s=1.5, reach_s=1.4)
 
 
 def late(rng: np.random.Generator) -> Stream:
     """A window shorter than the delays: most of it arrives when it is older than the window."""
-    return _drawn(rng, "CV, lag 0.05 s", CV(), _paper_stamps(1.0), lag_s=0.05, reach_s=0.5, late=True)
+    return drawn(rng, "CV, lag 0.05 s", CV(), paper_stamps(1.0), lag_s=0.05, reach_s=0.5, late=True)
 
 
 def whole(rng: np.random.Generator) -> Stream:
     """A car at 65 m/s in a bend, the RADAR with its speed; shorter than the window."""
-    return _drawn(rng, "CTRV, all in the window", CTRV(), _paper_stamps(0.7), lag_s=2.0, reach_s=1.9)
+    return drawn(rng, "CTRV, all in the window", CTRV(), paper_stamps(0.7), lag_s=2.0, reach_s=1.9)
 
 
 def observed(rng: np.random.Generator) -> Stream:
@@ -141,40 +141,40 @@ def observed(rng: np.random.Generator) -> Stream:
 
     The object passes a yaw of pi, and the RADAR sees it about a bearing of pi. Through the tracker's own preparation.
     """
-    stamps_s, sensors = _paper_stamps(0.6)
+    stamps_s, sensors = paper_stamps(0.6)
     stamps_s = np.where(stamps_s > 0.3, stamps_s + 0.7, stamps_s)  # nothing for a while
     plan = stamps_s, sensors
-    return _drawn(rng, "CTRV, from a turning ego", CTRV(), plan, 2.0, 1.9, start=_TURNING, sense=_Onboard(stamps_s))
+    return drawn(rng, "CTRV, from a turning ego", CTRV(), plan, 2.0, 1.9, start=_TURNING, sense=_Onboard(stamps_s))
 
 
 def robust(rng: np.random.Generator) -> Stream:
     """Outliers among the positions, and a Huber loss."""
-    return _drawn(rng, "CTRV, Huber loss", CTRV(), _paper_stamps(0.45), lag_s=2.0, reach_s=1.9, sense=_with_outliers)
+    return drawn(rng, "CTRV, Huber loss", CTRV(), paper_stamps(0.45), lag_s=2.0, reach_s=1.9, sense=_with_outliers)
 
 
 def accelerated(rng: np.random.Generator) -> Stream:
     """A short stream in CTRA."""
-    return _drawn(rng, "CTRA, all in the window", CTRA(), _paper_stamps(0.4), lag_s=2.0, reach_s=1.9)
+    return drawn(rng, "CTRA, all in the window", CTRA(), paper_stamps(0.4), lag_s=2.0, reach_s=1.9)
 
 
 def leaving(rng: np.random.Generator) -> Stream:
     """As `whole`, longer than the window."""
-    return _drawn(rng, "CTRV, lag 1 s", CTRV(), _paper_stamps(1.25), lag_s=1.0, reach_s=0.4)
+    return drawn(rng, "CTRV, lag 1 s", CTRV(), paper_stamps(1.25), lag_s=1.0, reach_s=0.4)
 
 
 def short(rng: np.random.Generator) -> Stream:
     """As `whole`, in a window as long as the delays: some arrives when it is older than the window."""
-    return _drawn(rng, "CTRV, lag 0.3 s", CTRV(), _paper_stamps(0.9), lag_s=0.3, reach_s=0.6, late=True)
+    return drawn(rng, "CTRV, lag 0.3 s", CTRV(), paper_stamps(0.9), lag_s=0.3, reach_s=0.6, late=True)
 
 
-def _paper_stamps(duration_s: float) -> _Plan:
+def paper_stamps(duration_s: float) -> Plan:
     """Stamps of LiDAR and RADAR at 20 Hz each, and which is which."""
     rounds = 0.05 * np.arange(1, round(20 * duration_s) + 1)
     stamps_s = np.stack([rounds, rounds + _RADAR_PHASE_S], axis=-1).ravel()
     return stamps_s, np.tile(["lidar_cluster", "radar"], len(rounds))
 
 
-def _paper(rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str) -> tuple[Measurement, Sighting]:
+def paper(rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str) -> tuple[Measurement, Sighting]:
     """What the paper's `sensor` measures of `x`; in a linear model its position only."""
     noise, motion = _PAPER[sensor], next(m for m in (CV(), CTRV(), CTRA()) if m.dim == len(x))
     names = _POSITION if motion.linear else tuple(noise.std)
@@ -185,11 +185,11 @@ def _paper(rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str) 
 
 
 def _with_outliers(rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str) -> tuple[Measurement, Sighting]:
-    measurement, sighting = _paper(rng, x, stamp_ns, sensor)
+    measurement, sighting = paper(rng, x, stamp_ns, sensor)
     outlier = np.sqrt(np.diag(sighting.R)) * rng.normal(0.0, 8.0, len(sighting.z))
     z = sighting.z + outlier * (rng.random() < _OUTLIERS)
     measurement = replace(measurement, z=z, loss=RobustLoss("huber", _LOSS_WIDTH))
-    return measurement, replace(sighting, z=z, huber=_LOSS_WIDTH)
+    return measurement, replace(sighting, z=z, loss=("huber", _LOSS_WIDTH))
 
 
 class _Onboard:
@@ -243,16 +243,16 @@ def _observer(stamp_ns: int) -> Vehicle:
     return Vehicle(radius_m * math.sin(yaw_rad), -radius_m * math.cos(yaw_rad), yaw_rad, speed_mps, yaw_rate)
 
 
-def _drawn(
+def drawn(
     rng: np.random.Generator,
     name: str,
     motion: MotionModel,
-    plan: _Plan,
+    plan: Plan,
     lag_s: float,
     reach_s: float,
     late: bool = False,
-    start: Start = _FAST,
-    sense: _Sense = _paper,
+    start: Start = FAST,
+    sense: _Sense = paper,
 ) -> Stream:
     """Truth with the motion model's own noise, measured as `plan` says; in the random order up to `reach_s` late."""
     stamps_s, sensors = plan

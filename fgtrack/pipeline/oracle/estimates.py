@@ -98,13 +98,13 @@ class Solution:
         return Estimate(until.mean + by_right @ (right - after.mean), C + T @ self.covariance[both, both] @ T.T)
 
 
-def smoothed(problem: Problem) -> Solution:
+def smoothed(problem: Problem, first: FloatArray | None = None) -> Solution:
     """Least squares over all states; where noise and robust weights follow the state, reweighted until nothing moves.
 
-    Gauss-Newton on the normal equations' orthogonal factor, from the filter's states; a step that comes no closer is
-    halved.
+    Gauss-Newton on the normal equations' orthogonal factor, from `first` (N, n) or the filter's states; a step that
+    comes no closer is halved.
     """
-    means = np.array([estimate.mean for estimate in filtered(problem).values()])
+    means = np.array([estimate.mean for estimate in filtered(problem).values()]) if first is None else first
     last, share = np.inf, 1.0
     for _ in range(_MAX_STEPS):
         A, b = _rows(problem, means)
