@@ -1,5 +1,6 @@
 """Which candidate belongs to which track (Karle et al. 2023, section III-D)."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -79,8 +80,12 @@ class GatedMahalanobis:
     """Probability with which a true pair passes the gate."""
     max_distance_m: float = 50.0
     """Largest distance of a pair."""
+    claim_m: float = 0.0
+    """A candidate that belongs to no track starts none nearer than this to one: it is the other end of a long hull."""
 
     def __post_init__(self) -> None:
+        if not (math.isfinite(self.claim_m) and self.claim_m >= 0.0):
+            raise ValueError(f"claim_m: must be finite and not negative, is {self.claim_m}")
         if not 0.0 < self.gate_probability < 1.0:
             raise ValueError(f"gate_probability: must lie between 0 and 1, is {self.gate_probability}")
         if not self.max_distance_m > 0.0:
@@ -99,7 +104,14 @@ class GatedMahalanobis:
                 good[chosen] = nis[chosen] <= chi_square_quantile(self.gate_probability, S.shape[-1])
             return pairs._replace(values=cost).at(good)
 
-        return _assigned(candidates, states, reaches_m(groups, states, quantiles, self.max_distance_m), inside)
+        found = _assigned(candidates, states, reaches_m(groups, states, quantiles, self.max_distance_m), inside)
+        if not (self.claim_m and found.new and len(states.means)):
+            return found
+        loose = [candidates[i] for i in found.new]
+        claimed = {found.new[row] for part in near(loose, states.means, self.claim_m) for row in part.rows.tolist()}
+        return found._replace(
+            new=[i for i in found.new if i not in claimed], refused=tuple([i for i in found.new if i in claimed])
+        )
 
 
 def _assigned(

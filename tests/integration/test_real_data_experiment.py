@@ -1,14 +1,19 @@
 """The experiment on real recordings runs, and says what it measured."""
 
 import csv
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.scripts import load
 
+from fgtrack.pipeline.shipped import read_config
+
 script = load("real_data")
 cameras = load("real_data", "bearings")
+sys.modules["real_data"] = script  # as where the script beside it runs
+held_out = load("real_data", "held_out")
 DATA = Path(__file__).resolve().parents[2] / "../shared/data"
 
 
@@ -42,3 +47,17 @@ def test_errors_of_bearings_are_those_of_the_vessel_that_is_alone_in_that_direct
     assert cameras.product(series, series, 0.0) == (pytest.approx(0.03), 3)
     assert cameras.product(series, series, 1.0) == (pytest.approx(0.0), 2)
     assert cameras.product(series, cameras.Series(np.zeros(0, dtype=np.int64), np.zeros(0)), 0.0) == (0.0, 0)
+
+
+@pytest.mark.skipif(not (DATA / "autoferry" / "scenario6").is_dir(), reason="needs ../shared/data/autoferry")
+def test_the_shipped_numbers_are_those_of_the_rules_and_a_scenario_is_judged_without_its_own(tmp_path: Path) -> None:
+    held_out.main(DATA / "autoferry", tmp_path, estimators="ekf-replay", judge="scenario2", delay_s=0.5)
+    with (tmp_path / "rules.csv").open(newline="") as file:
+        without, everything = csv.DictReader(file)
+    assert (without.pop("held_out"), everything.pop("held_out")) == ("scenario2", "none")
+    assert without != everything
+    shipped = held_out.numbers(read_config("autoferry"))
+    assert {key: float(value) for key, value in everything.items()} == pytest.approx(shipped)
+    with (tmp_path / "scores.csv").open(newline="") as file:
+        assert float(next(csv.DictReader(file))["mota"]) > 40.0
+    assert (tmp_path / "scenario2.jsonl").is_file()

@@ -199,3 +199,20 @@ def test_the_uncertainty_of_a_bearing_is_that_seen_from_the_sensor() -> None:
 def test_a_gate_that_makes_no_sense_is_named(make, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_a_candidate_near_a_track_that_is_not_its_own_starts_none() -> None:
+    """The other end of a hull: beyond the gate, or its track has a better one."""
+    tracks = states([(0.0, 0.0), (100.0, 0.0)], variance_m2=0.5)
+    seen = [candidate(0.5, 0.0, 0.5), candidate(15.0, 0.0, 0.5), candidate(60.0, 0.0, 0.5), candidate(0.0, 3.0, 0.5)]
+    free = GatedMahalanobis()(seen, tracks)
+    assert (free.pairs, free.new, free.refused) == ([(0, 0)], [1, 2, 3], ())
+    claimed = GatedMahalanobis(claim_m=20.0)(seen, tracks)
+    assert (claimed.pairs, claimed.new, claimed.missed, claimed.refused) == ([(0, 0)], [2], [1], (1, 3))
+    assert GatedMahalanobis(claim_m=20.0)(seen[1:2], states([])).new == [0]
+
+
+@pytest.mark.parametrize("claim_m", [-1.0, math.inf, math.nan])
+def test_a_claim_that_makes_no_sense_is_refused(claim_m: float) -> None:
+    with pytest.raises(ValueError, match="claim_m: must be finite and not negative"):
+        GatedMahalanobis(claim_m=claim_m)

@@ -37,7 +37,7 @@ def test_maps_and_settings_go_before_what_the_file_says() -> None:
         ("smothr", "no shipped configuration of that name, did you mean 'smoother'?"),
         (
             "zzz",
-            "shipped are autoferry, autoferry_tuned, karle2023, karle2023_reference, kitti, open_space, racecar",
+            "shipped are autoferry, karle2023, karle2023_reference, kitti, open_space, racecar",
         ),
         ("smother.yaml", "smother.yaml: there is no such configuration file"),
         ("some/smoother", "some/smoother: there is no such configuration file"),
