@@ -131,6 +131,74 @@ def _kitti() -> Files:
     return {f"in/{name}/0001.txt": "\n".join(lines).encode() for name, lines in texts.items()}
 
 
+def _kitti_forms() -> list[Files]:
+    """The forms in which detectors and trackers publish, beside that of `_kitti`."""
+    files = _kitti()
+    other = {name: content for name, content in files.items() if "pointrcnn" not in name}
+    place = "1 2 3 4 1.5 1.6 4.0 2.0 1.5 20.0"
+    tracking = "\n".join(f"{k} 5 Car -1 -1 0.1 {place} -1.57 9.{k}" for k in range(20)).encode()
+    image = "\n".join(f"{k},100.5,150,180.25,200,0.9" for k in range(20)).encode()
+    frames = {f"in/pointrcnn_car/0001/{k:06d}.txt": f"Car 0 0 0.1 {place} -1.57 9.{k}\n".encode() for k in range(20)}
+    return [
+        {**other, "in/pointrcnn_car/0001.txt": tracking},
+        {**other, "in/rrc_car/0001.txt": image},
+        {**other, **frames},
+    ]
+
+
+def _tables() -> Files:
+    """CSV in three files, with a mapping of their columns."""
+    ego, seen, cars = ["t;east;north;heading;kmh"], ["ms\tgot\trange\tazimuth\tkind\tsnr\tid"], ["t,id,x,y"]
+    for k in range(40):
+        t = f"{1000.0 + 0.05 * k:.2f}"
+        ego.append(f"{t};{k}.5;2;90.0;72")
+        seen.append(f"{1_000_000 + 50 * k}\t{1_000_090 + 50 * k}\t{20 + 0.1 * k}\t-1.5\tcar\t9\tcar_a")
+        cars.append(f'{t},"car_a",{k + 20},3')
+    texts = {"ego.csv": ego, "radar.tsv": seen, "cars.csv": cars}
+    return {"x.yaml": _MAPPING} | {f"in/{name}": "\n".join(lines).encode() for name, lines in texts.items()}
+
+
+def _nuscenes() -> Files:
+    north = [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
+    boxes: dict[str, object] = {}
+    tables: dict[str, list[dict[str, object]]] = {
+        "scene": [{"token": "a", "name": "scene-0001"}],
+        "category": [{"token": "c", "name": "vehicle.car"}],
+        "instance": [{"token": "i", "category_token": "c"}],
+    }
+    for k in range(10):
+        stamp_us, token, at = 10**15 + 500_000 * k, f"s{k}", [110.0, 2.0 + k, 1.0]
+        boxes[token] = [
+            {
+                "sample_token": token,
+                "translation": at,
+                "size": [1.9, 4.5, 1.6],
+                "rotation": north,
+                "velocity": [0.0, 2.0],
+                "tracking_name": "car",
+                "tracking_id": "7",
+                "tracking_score": 0.8,
+            }
+        ]
+        seen = {"num_lidar_pts": 5, "num_radar_pts": 0}
+        place = {"translation": [100.0, 1.0 * k, 0.0], "rotation": north}
+        for name, entry in {
+            "sample": {"token": token, "timestamp": stamp_us, "scene_token": "a"},
+            "sample_data": {"sample_token": token, "ego_pose_token": f"p{k}"},
+            "ego_pose": {"token": f"p{k}", "timestamp": stamp_us, **place},
+            "sample_annotation": {
+                "sample_token": token,
+                "instance_token": "i",
+                "translation": at,
+                "rotation": north,
+                **seen,
+            },
+        }.items():
+            tables.setdefault(name, []).append(entry)
+    files = {f"in/v1.0-mini/{name}.json": json.dumps(entries).encode() for name, entries in tables.items()}
+    return {"in/results.json": json.dumps({"meta": {}, "results": boxes}).encode(), **files}
+
+
 def _map() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         make_oval().write(Path(folder) / "x.csv")
@@ -158,7 +226,33 @@ set: {map.track: null}
 vary: {association.gate_m: [3.0, 5.0], scenario.sensors.radar.rate_hz: [10.0]}
 metrics: ["position_*"]
 """
+_MAPPING = b"""estimator: ekf-replay
+input:
+  csv:
+    ego:
+      file: ego.csv
+      columns:
+        {stamp: t, x_m: east, y_m: north, yaw_rad: {path: heading, scale: -1, offset: 90, degrees: true},
+         speed_mps: kmh}
+    detections:
+      radar:
+        file: radar.tsv
+        columns:
+          {stamp: ms, receipt: got, range_m: range, bearing_rad: {path: azimuth, degrees: true}, class_name: kind,
+           object_id: id}
+        time_unit: ms
+        frame: sensor
+        filters: {snr: {min: 6}}
+    truth: {file: cars.csv, columns: {stamp: t, object_id: id, x_m: x, y_m: y}}
+sensors:
+  radar: {std: {range_m: 0.5, bearing_rad: 0.02}, max_delay_s: 1.0}
+"""
+_EXCLUDED = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {}, "geometry":
+{"type": "MultiPolygon", "coordinates":
+[[[[0.0, 0.0], [90.0, 0.0], [90.0, 90.5], [0.0, 0.0]]], [[[5, 5], [9, 5], [9, 9], [5, 5]]]]}}]}"""
+_CORNERS = b"area,x_m,y_m\nshore,0.0,0.0\nshore,90.0,0.5\nshore,90.0,90.0\npier,5,5\npier,9,5\npier,9,9\n"
 _DELAYS = b"radar: {delay: {kind: gamma, mean_s: 0.1, std_s: 0.05, least_s: 0.01}}\n"
+_NUSCENES = "sensors={detector: {std: {x_m: 0.5, y_m: 0.5}}}"
 _REPLAY = ("--overwrite", "-o", RUN, "-e")
 
 
@@ -230,6 +324,33 @@ TARGETS = (
         lambda: [_kitti()],
         _all,
         [("info", "in"), ("replay", "in", "-c", "kitti", *_REPLAY, "ekf-replay")],
+    ),
+    Target(
+        "kitti-forms",
+        _kitti_forms,
+        lambda name: "_car" in name,
+        [("info", "in"), ("replay", "in", "-c", "kitti", *_REPLAY, "ekf-replay")],
+    ),
+    Target(
+        "tables",
+        lambda: [_tables()],
+        _all,
+        [("info", "in", "-c", "x.yaml"), ("replay", "in", "-c", "x.yaml", "--overwrite", "-o", RUN)],
+    ),
+    Target(
+        "nuscenes",
+        lambda: [_nuscenes()],
+        _all,
+        [
+            ("info", "in/results.json"),
+            ("replay", "in/results.json", "-c", "open_space", "--set", _NUSCENES, *_REPLAY, "ekf-replay"),
+        ],
+    ),
+    Target(
+        "excluded",
+        lambda: [{"x.json": _EXCLUDED, "x.jsonl": _stream()}, {"x.json": _CORNERS, "x.jsonl": _stream()}],
+        _only("x.json"),
+        [("replay", "x.jsonl", "-c", "open_space", "--set", 'map.excluded=["x.json"]', *_REPLAY, "ekf-replay")],
     ),
     Target(
         "configuration",
