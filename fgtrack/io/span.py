@@ -33,12 +33,17 @@ def end_ns(source: InputSource) -> int | None:
 
 def _last_receipt_ns(path: Path) -> int | None:
     """Receipt of the last whole record of a stream."""
-    tail = _gzip_tail(path) if path.read_bytes()[:2] == GZIP_MAGIC else _tail(path)
+    tail = _gzip_tail(path) if _head(path) == GZIP_MAGIC else _tail(path)
     lines = tail.split(b"\n")
     receipts = [
         json.loads(line)["receipt_ns"] for line in lines[-200:] if line.endswith(b"}") and b"receipt_ns" in line
     ]
     return max(receipts, default=None)
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(len(GZIP_MAGIC))
 
 
 def _tail(path: Path) -> bytes:

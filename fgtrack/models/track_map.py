@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fgtrack.core.errors import DataError
+from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.models.arc import ComplexArray
@@ -41,6 +42,7 @@ _ARCS = (_COLUMN["s_racetraj_m"], _COLUMN["s_ref_m"])
 
 _FILE_HEADING_OFFSET_RAD = math.pi / 2  # a file's heading is 0 along +y, REP-103 is 0 along +x
 _SAME_POINT_M = 1e-3
+_LARGEST_MB = 20.0  # some 100,000 rows
 _LARGEST = 1e9
 _MAX_GAP = 10.0  # closing segment, in lengths of the longest other segment
 _MAX_HEADING_ERROR_RAD = 1.0  # coarse maps turn much in a row; a wrong convention is off by pi / 2
@@ -145,10 +147,9 @@ class TrackMap:
         rows: list[list[float]] = []
         lines: list[int] = []
         try:
-            text = Path(path).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            reason = getattr(error, "strerror", None) or "it is no text file"
-            raise DataError(f"{path}: cannot read the map ({reason})") from error
+            text = read_whole(Path(path), _LARGEST_MB).decode()
+        except UnicodeDecodeError as error:
+            raise DataError(f"{path}: cannot read the map (it is no text file)") from error
         for number, line in enumerate(text.splitlines(), start=1):
             if not line.strip() or line.lstrip().startswith("#"):
                 continue

@@ -50,7 +50,8 @@ def read_yaml(path: Path) -> dict[str, Any]:  # Any: what YAML says is only know
     if path.exists() and not path.is_file():  # a pipe would be waited for
         raise CallError(f"{path}: is no file")
     try:
-        value = _parse(path.read_text(encoding="utf-8"), str(path))
+        with path.open(encoding="utf-8") as file:
+            value = _parse(file.read(_LONGEST_TEXT + 1), str(path))
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "is no text file"
         raise CallError(f"{path}: configuration cannot be read ({reason})") from error
@@ -61,7 +62,7 @@ def read_yaml(path: Path) -> dict[str, Any]:  # Any: what YAML says is only know
 
 def _parse(text: str, origin: str) -> Any:
     if len(text) > _LONGEST_TEXT:
-        raise CallError(f"{origin}: no configuration is longer than {_LONGEST_TEXT} characters, this has {len(text)}")
+        raise CallError(f"{origin}: no configuration is longer than {_LONGEST_TEXT} characters")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ReusedAnchorWarning)  # YAML allows it

@@ -50,6 +50,10 @@ class Outcome:
     said: str
     changes: int | None
     """Counted, where that was asked for."""
+    peak_mb: float = 0.0
+    """Most memory that it had, with what this process has from the start."""
+    cpu_s: float = 0.0
+    """Of the processor, however busy it is with other things."""
 
 
 def serve() -> None:
@@ -89,13 +93,16 @@ def _outcome(order: Order) -> Outcome:
         watched.register(os.pidfd_open(pid), select.POLLIN)
         if not watched.poll(None if order.kill_after_s is None else 1e3 * order.kill_after_s):
             os.kill(pid, signal.SIGKILL)
-        code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        _, status, used = os.wait4(pid, 0)
+        code = os.waitstatus_to_exitcode(status)
         took_s = time.monotonic() - began_s
         said.seek(0)
         counted.seek(0)
         text = said.read().decode(errors="replace")
         changes = int(counted.read() or b"-1")
-    return Outcome(code, took_s, text, None if changes < 0 else changes)
+    return Outcome(
+        code, took_s, text, None if changes < 0 else changes, used.ru_maxrss / 1000.0, used.ru_utime + used.ru_stime
+    )
 
 
 def _child(order: Order, said: int, counted: int) -> None:

@@ -130,7 +130,7 @@ def test_of_several_scenes_one_is_named(tmp_path):
     [
         ("ego_pose", "[{", r"ego_pose\.json: is not JSON"),
         ("ego_pose", '[{"token": "p0"}]', r"not those of nuScenes \(KeyError: 'translation'\)"),
-        ("sample", "3", "not those of nuScenes"),
+        ("sample", "3", r"sample\.json: is not JSON of the expected form"),
         ("sample_annotation", '[{"sample_token": "s0", "instance_token": "zz"}]', "not those of nuScenes"),
     ],
 )

@@ -279,7 +279,7 @@ def test_a_file_that_is_no_map_is_refused_with_its_line(tmp_path: Path, lines: l
 def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
     (tmp_path / "map.csv").write_bytes(b"\xff\xfe\x00")
     for path in (tmp_path / "map.csv", tmp_path / "missing.csv", tmp_path):
-        with pytest.raises(DataError, match="cannot read the map"):
+        with pytest.raises(DataError, match=r"cannot (be read|read the map)"):
             TrackMap.read(path)
 
 

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from fgtrack.core.errors import DataError
+from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
@@ -32,6 +33,7 @@ from fgtrack.io.source import FileFormat
 
 SENSORS = {1: "lidar", 2: "radar", 3: "infrared", 4: "daylight"}
 _CAMERAS = {3, 4}
+_LARGEST_MB = 20.0  # those of the data set have less than one
 
 # Parsed JSON, checked while it is read.
 Json = Any
@@ -126,9 +128,7 @@ def _truth(file: Path) -> list[TruthState]:
 
 def _records(file: Path) -> list[Json]:
     try:
-        records = json.loads(file.read_bytes(), parse_float=Decimal)
-    except OSError as error:
-        raise DataError(f"{file}: cannot be read ({error.strerror})") from error
+        records = json.loads(read_whole(file, _LARGEST_MB), parse_float=Decimal)
     except (ValueError, RecursionError) as error:
         raise DataError(f"{file}: is not JSON ({error}), fetch it again") from error
     if not isinstance(records, list):

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.errors import DataError
+from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.types import EgoState, FloatArray
 
@@ -15,6 +16,7 @@ PERIOD_NS = 100_000_000
 IMAGE_PX = (1242.0, 375.0)
 """Width and height of the images; of some sequences a few pixels less."""
 
+_LARGEST_MB = 16.0  # those of the data set have a few
 _EARTH_RADIUS_M = 6_378_137.0
 
 
@@ -174,8 +176,6 @@ def _levelling(roll_rad: float, pitch_rad: float) -> FloatArray:
 def lines(file: Path) -> list[str]:
     """The lines of `file`, without empty ones at its end."""
     try:
-        return [line.strip() for line in file.read_text(encoding="utf-8").rstrip().splitlines()]
-    except OSError as error:
-        raise DataError(f"{file}: cannot be read ({error.strerror})") from error
+        return [line.strip() for line in read_whole(file, _LARGEST_MB).decode().rstrip().splitlines()]
     except UnicodeDecodeError as error:
         raise DataError(f"{file}: is no text ({error.reason})") from error

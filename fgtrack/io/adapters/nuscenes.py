@@ -11,7 +11,6 @@ stand in a folder of the version, `v1.0-...`, beside it. Choices that the data l
 - Truth that no sensor has a point of is ignored, as in the data set's own evaluation.
 """
 
-import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -27,6 +26,7 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.io.adapters.common import signed_speed_mps, split
 from fgtrack.io.adapters.ids import object_id
+from fgtrack.io.adapters.json_entries import list_entries, object_entries
 from fgtrack.io.config import InputConfig, NuscenesInput
 from fgtrack.io.source import FileFormat
 
@@ -61,11 +61,10 @@ def read_scene(file: Path, settings: NuscenesInput) -> Iterator[Message]:
     DataError
         A file is not what the data set holds; the message names it.
     """
-    results = _loaded(file)
     tables = _tables(file, settings)
     try:
-        boxes = results["results"]
-        samples = _samples(tables, boxes, settings)
+        samples = _samples(tables, file, settings)
+        boxes = {token: of for token, of in object_entries(file, "results") if token in samples}
         egos = _egos(tables, samples)
         truth = _truth(tables, samples, settings)
         lists = [
@@ -94,20 +93,11 @@ def _tables(file: Path, settings: NuscenesInput) -> Path:
     return folder
 
 
-def _loaded(file: Path) -> Json:
-    try:
-        return json.loads(file.read_bytes())
-    except OSError as error:
-        raise DataError(f"{file}: cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{file}: is not JSON ({error}), fetch it again") from error
-
-
-def _samples(tables: Path, boxes: Mapping[str, Json], settings: NuscenesInput) -> dict[str, int]:
+def _samples(tables: Path, file: Path, settings: NuscenesInput) -> dict[str, int]:
     """Stamps of the samples of the scene, by token, in the order of time."""
-    names = {each["token"]: each["name"] for each in _loaded(tables / "scene.json")}
-    samples = _loaded(tables / "sample.json")
-    scenes = {each["scene_token"] for each in samples if each["token"] in boxes}
+    names = {each["token"]: each["name"] for each in list_entries(tables / "scene.json")}
+    judged = {token for token, _ in object_entries(file, "results")}
+    scenes = {each["scene_token"] for each in list_entries(tables / "sample.json") if each["token"] in judged}
     if settings.scene is not None:
         scenes = {token for token, name in names.items() if settings.scene in (token, name)}
         if not scenes:
@@ -115,7 +105,8 @@ def _samples(tables: Path, boxes: Mapping[str, Json], settings: NuscenesInput) -
     if len(scenes) != 1:
         has = _some(names[token] for token in scenes) if scenes else "none of these tables"
         raise CallError(f"the results are of {len(scenes)} scenes ({has}), name one as input.nuscenes.scene")
-    chosen = sorted((each["timestamp"], each["token"]) for each in samples if each["scene_token"] in scenes)
+    entries = list_entries(tables / "sample.json")
+    chosen = sorted((each["timestamp"], each["token"]) for each in entries if each["scene_token"] in scenes)
     return {token: int(time_us) * _NS_PER_US for time_us, token in chosen}
 
 
@@ -127,10 +118,10 @@ def _some(names: Any) -> str:
 def _egos(tables: Path, samples: Mapping[str, int]) -> list[EgoState]:
     """The poses at the data of the samples, with the motion between them."""
     wanted = {
-        each["ego_pose_token"] for each in _loaded(tables / "sample_data.json") if each["sample_token"] in samples
+        each["ego_pose_token"] for each in list_entries(tables / "sample_data.json") if each["sample_token"] in samples
     }
     poses = {}
-    for each in _loaded(tables / "ego_pose.json"):
+    for each in list_entries(tables / "ego_pose.json"):
         if each["token"] in wanted:
             x_m, y_m, _ = map(float, each["translation"])
             poses[int(each["timestamp"]) * _NS_PER_US] = (x_m, y_m, _yaw_rad(each["rotation"]))
@@ -181,10 +172,10 @@ def _boxes(boxes: list[Json], settings: NuscenesInput) -> Iterator[Detection | s
 def _truth(tables: Path, samples: Mapping[str, int], settings: NuscenesInput) -> list[TruthState]:
     if not (tables / "sample_annotation.json").is_file():
         return []
-    categories = {each["token"]: _class(each["name"]) for each in _loaded(tables / "category.json")}
-    kinds = {each["token"]: categories[each["category_token"]] for each in _loaded(tables / "instance.json")}
+    categories = {each["token"]: _class(each["name"]) for each in list_entries(tables / "category.json")}
+    kinds = {each["token"]: categories[each["category_token"]] for each in list_entries(tables / "instance.json")}
     states = []
-    for each in _loaded(tables / "sample_annotation.json"):
+    for each in list_entries(tables / "sample_annotation.json"):
         stamp_ns = samples.get(each["sample_token"])
         kind = kinds[each["instance_token"]]
         if stamp_ns is None or kind is None or (settings.classes and kind not in settings.classes):

@@ -14,7 +14,7 @@ from functools import partial
 from itertools import chain, groupby
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.geometry import wrap_angle
@@ -43,6 +43,8 @@ _EGO = frozenset({*_TIMES, *STATE_NAMES})
 _OBJECT = frozenset({*_TIMES, "object_id", *MEASURABLE, *DESCRIBING})
 _TRUTH = frozenset({*_TIMES, "object_id", *STATE_NAMES})
 _NS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
+_LONGEST_LINE = 1_000_000
+_MOST_ROWS = 1_000_000
 _LONGEST_TIME = 25  # digits of a time before and behind the point
 
 
@@ -123,13 +125,15 @@ def _lists(rows: list[tuple[_Times, Detection | None]], sensor: str, table: CsvT
 def _rows(file: Path, table: CsvTable) -> Iterator[Cells]:
     try:
         with file.open(encoding="utf-8-sig", newline="") as text:
-            first = text.readline()
+            first = text.readline(_LONGEST_LINE)
             text.seek(0)
             delimiter = table.delimiter or max(",;\t", key=first.count)
-            reader = csv.reader(text, delimiter=delimiter, skipinitialspace=True)
+            reader = csv.reader(_lines(file, text), delimiter=delimiter, skipinitialspace=True)
             header = [name.strip() for name in next(reader, [])]
             _check_columns(file, table, header)
-            for cells in reader:
+            for count, cells in enumerate(reader):
+                if count >= _MOST_ROWS:
+                    raise DataError(f"{file}: has more than {_MOST_ROWS} rows, give it in parts")
                 if not any(cells):
                     continue
                 if len(cells) != len(header):
@@ -141,6 +145,13 @@ def _rows(file: Path, table: CsvTable) -> Iterator[Cells]:
         raise DataError(f"{file}: is no UTF-8 text ({error.reason})") from error
     except csv.Error as error:
         raise DataError(f"{file}:{reader.line_num}: is no CSV ({error})") from error
+
+
+def _lines(file: Path, text: TextIO) -> Iterator[str]:
+    for number, line in enumerate(iter(partial(text.readline, _LONGEST_LINE), ""), start=1):
+        if len(line) == _LONGEST_LINE:
+            raise DataError(f"{file}:{number}: is longer than {_LONGEST_LINE} characters")
+        yield line
 
 
 def _check_columns(file: Path, table: CsvTable, header: list[str]) -> None:
