@@ -50,6 +50,8 @@ class Scan(NamedTuple):
     stamp_ns: int
     positions_m: FloatArray
     """Shape (m, 2), in the map."""
+    scores: FloatArray
+    """How sure the detector is of each, shape (m,); NaN where it does not say."""
 
 
 class Found(NamedTuple):
@@ -72,12 +74,12 @@ def scans(source: Path, config: Config) -> Iterator[Scan]:
             if message.frame != "map":
                 assert ego is not None
                 points_m = points_m @ rotation(ego.yaw_rad).T + [ego.x_m, ego.y_m]
-            yield Scan(message.stamp_ns, points_m)
+            scores = np.array([one.score for one in message.objects], dtype=np.float64)
+            yield Scan(message.stamp_ns, points_m, scores)
 
 
-def raw_mota(source: Path, config: Config, run: Run) -> float:
-    """MOTA of the detections themselves, each scan for itself: no miss filled, nothing suppressed, no identity."""
-    seen = list(scans(source, config))
+def raw(run: Run, seen: Sequence[Scan]) -> Run:
+    """`run` with the detections of `seen` in place of its tracks, numbered through."""
     stamps_ns = np.array([scan.stamp_ns for scan in seen])
     tick = np.repeat(np.arange(len(seen)), [len(scan.positions_m) for scan in seen])
     x_m, y_m = np.concatenate([scan.positions_m for scan in seen]).T
@@ -85,10 +87,15 @@ def raw_mota(source: Path, config: Config, run: Run) -> float:
     tracks = {"tick": tick, "stamp_ns": stamps_ns[tick], "track_id": np.arange(len(tick)), "x_m": x_m, "y_m": y_m}
     tracks |= {"num_measured": np.full(len(tick), 99), "status": status}
     timing = Table({"tick": np.arange(len(seen)), "now_ns": stamps_ns})
-    raw = replace(run, tracks=Table(tracks), timing=timing)
-    matching = match(raw, config.evaluation)
+    return replace(run, tracks=Table(tracks), timing=timing)
+
+
+def raw_mota(source: Path, config: Config, run: Run) -> float:
+    """MOTA of the detections themselves, each scan for itself: no miss filled, nothing suppressed, no identity."""
+    found = raw(run, list(scans(source, config)))
+    matching = match(found, config.evaluation)
     assert matching is not None
-    clear = Clear.of(scenes(raw, matching), config.evaluation.gate_m)
+    clear = Clear.of(scenes(found, matching), config.evaluation.gate_m)
     return 1.0 - (clear.misses + clear.false_positives) / (clear.pairs + clear.misses)
 
 

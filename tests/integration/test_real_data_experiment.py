@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.scripts import load
+from support.scripts import EXPERIMENTS, load
 
 from fgtrack.pipeline.shipped import read_config
 
@@ -61,3 +61,43 @@ def test_the_shipped_numbers_are_those_of_the_rules_and_a_scenario_is_judged_wit
     with (tmp_path / "scores.csv").open(newline="") as file:
         assert float(next(csv.DictReader(file))["mota"]) > 40.0
     assert (tmp_path / "scenario2.jsonl").is_file()
+
+
+KITTI = DATA / "kitti"
+
+
+@pytest.mark.skipif(not KITTI.is_dir(), reason="needs ../shared/data/kitti")
+def test_the_score_of_one_drive_follows_from_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(EXPERIMENTS / "real_data"))
+    left_out = load("real_data", "leave_one_out")
+    left_out.main(kitti=KITTI, out=tmp_path, sequences="0006,0010", estimator="ekf-replay")
+    with (tmp_path / "leave_one_out.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["sequence"] for row in rows] == ["0006", "0010"]
+    for row in rows:
+        assert 3.0 < float(row["even"]) < 6.0
+        assert float(row["mota"]) > max(float(row["mota_raw_2"]), float(row["mota_raw_3"])) - 1.0
+        assert int(row["id_switches"]) <= 2
+
+
+def test_the_even_score_is_where_objects_and_clutter_are_as_frequent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scores of clutter and of objects are normal with the same variance: the log ratio is a line."""
+    monkeypatch.syspath_prepend(str(EXPERIMENTS / "real_data"))
+    left_out = load("real_data", "leave_one_out")
+    rng = np.random.default_rng(4)
+    clutter, cars = rng.normal(2.0, 1.0, 20_000), rng.normal(4.0, 1.0, 5_000)
+    found = left_out.Labelled(np.concatenate([clutter, cars]), np.arange(25_000) >= 20_000)
+    score = left_out.fitted([found])
+    assert score.even == pytest.approx(3.0, abs=0.05)  # half way between the means
+    assert score.scale == pytest.approx(0.5, abs=0.02)  # variance / difference of the means
+
+
+@pytest.mark.skipif(not KITTI.is_dir(), reason="needs ../shared/data/kitti")
+def test_a_late_lidar_costs_every_estimator_something(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    late = load("real_data", "delayed")
+    late.main(kitti=KITTI, out=tmp_path, sequences="0006")
+    with (tmp_path / "delayed.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["estimator"] for row in rows] == list(late.ESTIMATORS)
+    assert all(int(row["samples"]) > 100 and float(row["cost_m"]) > 0.0 for row in rows)
+    assert "smoother: costs less than ekf-backward-forward by" in capsys.readouterr().out
