@@ -168,6 +168,20 @@ class TrackStatus(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class ObjectReport:
+    """What the detections of a track say of its object besides its state; None of what none of them says."""
+
+    class_name: str | None = None
+    """That of most detections."""
+    class_share: float | None = None
+    """Share of these among those that name a class."""
+    length_m: float | None = None
+    """Mean over the detections, as the other two."""
+    width_m: float | None = None
+    height_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class TrackReport:
     """A track as the tracker publishes it; those of a tick are the rows of tracks.csv."""
 
@@ -176,6 +190,8 @@ class TrackReport:
     state: TrackState
     """Kinematic: x, y, yaw, speed, yaw rate and, if the motion model has it, acceleration."""
     num_measured: int
+    object: ObjectReport | None = None
+    """Class and size; None where no detection gives any."""
 
     @property
     def stamp_ns(self) -> int:

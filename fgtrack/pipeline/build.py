@@ -35,6 +35,7 @@ from fgtrack.tracking.ego_error import IndependentErrors, SharedErrors
 from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules
 from fgtrack.tracking.inbox import Inbox, QueueInbox
 from fgtrack.tracking.lifecycle import CountingLifecycle, Lifecycle
+from fgtrack.tracking.objects import Objects
 from fgtrack.tracking.preprocess import Preprocess
 from fgtrack.tracking.published import (
     PublishedEgo,
@@ -80,6 +81,7 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
         bank=RestartingBank(lambda: build_bank(config, failures), failures),
         failures=failures,
         motion=motion,
+        objects=Objects(config.objects),
         lifecycle=build_lifecycle(config),
         claim_overtaken=config.lifecycle.claim_overtaken,
         birth=config.birth,

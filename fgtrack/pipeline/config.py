@@ -21,6 +21,7 @@ from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
 from fgtrack.tracking.existence import ExistenceRules
 from fgtrack.tracking.lifecycle import LifecycleRules
 from fgtrack.tracking.merge import ConnectedMerge, NoMerge
+from fgtrack.tracking.objects import ObjectRules
 from fgtrack.tracking.published import NeighbourhoodMerge, UngatedEuclidean
 
 MergeConfig = Annotated[ConnectedMerge | NoMerge | NeighbourhoodMerge, Discriminator("kind")]
@@ -222,6 +223,7 @@ class Config:
     inbox: InboxConfig = field(default_factory=InboxConfig)
     merge: MergeConfig = field(default_factory=NoMerge)
     association: AssociationConfig = field(default_factory=GatedMahalanobis)
+    objects: ObjectRules = field(default_factory=ObjectRules)
     lifecycle: LifecycleConfig = field(default_factory=ExistenceRules)
     birth: BirthConfig = field(default_factory=MeasuredBirth)
     initiation: InitiationConfig = field(default_factory=InitiationConfig)

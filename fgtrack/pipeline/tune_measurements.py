@@ -21,6 +21,7 @@ from fgtrack.tracking.assignment import Assignment
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.inbox import Batch
+from fgtrack.tracking.objects import Apart
 from fgtrack.tracking.preprocess import Candidate, Preprocess
 from fgtrack.tracking.tracker import TrackerParts
 
@@ -54,13 +55,13 @@ class _OpenedGate:
     association: GatedEuclidean | GatedMahalanobis
     stds: float
 
-    def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
+    def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
         needed_m = self.stds * np.array([self._stds_m(candidate, states.means) for candidate in candidates])
         needed_m = needed_m.reshape(len(candidates), len(states.means))
         if isinstance(self.association, GatedEuclidean):
-            return self.association.within(np.maximum(self.association.gate_m, needed_m), candidates, states)
+            return self.association.within(np.maximum(self.association.gate_m, needed_m), candidates, states, apart)
         limit_m = float(needed_m.max(initial=self.association.max_distance_m))
-        return replace(self.association, max_distance_m=limit_m)(candidates, states)
+        return replace(self.association, max_distance_m=limit_m)(candidates, states, apart)
 
     def _stds_m(self, candidate: Candidate, means: FloatArray) -> FloatArray:
         """Largest standard deviation of the position; of a bearing alone, across the line of sight at each track."""

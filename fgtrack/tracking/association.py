@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -13,11 +13,17 @@ from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import StatesAt
 from fgtrack.tracking.assignment import Assignment, assigned, cheapest
 from fgtrack.tracking.gating import NO_PAIRS, Pairs, alike, innovations, near, nis_of, reaches_m
+from fgtrack.tracking.objects import Apart
 from fgtrack.tracking.preprocess import Candidate
 
 _FEW_PAIRS = 2  # so many are judged faster one by one
-#: Assigns candidates to tracks at least cost; the states are those of the tracks at the candidates' stamp.
-Association = Callable[[Sequence[Candidate], StatesAt], Assignment]
+
+
+class Association(Protocol):
+    """Assigns candidates to tracks at least cost."""
+
+    def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
+        """The states are those of the tracks at the candidates' stamp; pairs that are `apart` are not made."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +47,17 @@ class GatedEuclidean:
         if self.max_nis is not None and not self.max_nis > 0.0:
             raise ValueError(f"max_nis: must be positive, is {self.max_nis}")
 
-    def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
+    def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
         """See `Association`."""
-        return self.within(self.gate_m, candidates, states)
+        return self.within(self.gate_m, candidates, states, apart)
 
-    def within(self, gates_m: float | FloatArray, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
+    def within(
+        self,
+        gates_m: float | FloatArray,
+        candidates: Sequence[Candidate],
+        states: StatesAt,
+        apart: Apart | None = None,
+    ) -> Assignment:
         """The same with other gates; `gates_m` has a shape that goes with (candidates, tracks)."""
         limits_m, reach_m = None, gates_m
         if isinstance(gates_m, np.ndarray):
@@ -63,7 +75,7 @@ class GatedEuclidean:
             near_any.update(pairs.rows.tolist())
             return pairs.at(nis_of(pairs, groups, candidates, states) <= self.max_nis)
 
-        found = _assigned(candidates, states, reach_m, believed)
+        found = _assigned(candidates, states, reach_m, believed, apart)
         refused = tuple([i for i in found.new if i in near_any])
         return found._replace(new=[i for i in found.new if i not in near_any], refused=refused) if refused else found
 
@@ -91,7 +103,7 @@ class GatedMahalanobis:
         if not self.max_distance_m > 0.0:
             raise ValueError(f"max_distance_m: must be positive, is {self.max_distance_m}")
 
-    def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
+    def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
         """See `Association`; the cost adds log det S, so that a vague track does not win by being vague."""
         groups = alike(candidates)
         quantiles = [chi_square_quantile(self.gate_probability, group.z.shape[-1]) for group in groups]
@@ -104,11 +116,13 @@ class GatedMahalanobis:
                 good[chosen] = nis[chosen] <= chi_square_quantile(self.gate_probability, S.shape[-1])
             return pairs._replace(values=cost).at(good)
 
-        found = _assigned(candidates, states, reaches_m(groups, states, quantiles, self.max_distance_m), inside)
+        found = _assigned(candidates, states, reaches_m(groups, states, quantiles, self.max_distance_m), inside, apart)
         if not (self.claim_m and found.new and len(states.means)):
             return found
-        loose = [candidates[i] for i in found.new]
-        claimed = {found.new[row] for part in near(loose, states.means, self.claim_m) for row in part.rows.tolist()}
+        loose, claimed = np.array(found.new), set[int]()
+        for part in near([candidates[i] for i in found.new], states.means, self.claim_m):
+            rows = loose[part.rows]
+            claimed.update((rows if apart is None else rows[~apart(rows, part.columns)]).tolist())
         return found._replace(
             new=[i for i in found.new if i not in claimed], refused=tuple([i for i in found.new if i in claimed])
         )
@@ -119,11 +133,14 @@ def _assigned(
     states: StatesAt,
     reach_m: float | FloatArray,
     judged: Callable[[Pairs], Pairs],
+    apart: Apart | None,
 ) -> Assignment:
     """The best of the pairs at most `reach_m` apart that `judged` leaves, which gives them their costs."""
     num_tracks = len(states.means)
     pairs = NO_PAIRS
     for part in near(candidates, states.means, reach_m):
+        if apart is not None:
+            part = part.at(~apart(part.rows, part.columns))
         pairs = Pairs.joined([pairs, judged(part)]) if len(pairs.rows) else judged(part)
         if len(pairs.rows) > num_tracks:
             pairs = cheapest(pairs, np.full(num_tracks, num_tracks))

@@ -18,6 +18,7 @@ from fgtrack.tracking.gating import euclidean_distances
 from fgtrack.tracking.inbox import Batch, is_covariance, is_number, record, records
 from fgtrack.tracking.lifecycle import CountingLifecycle, Life, Look, Sighting
 from fgtrack.tracking.merge import Merge
+from fgtrack.tracking.objects import Apart
 from fgtrack.tracking.preprocess import Candidate, Preprocess
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
@@ -176,8 +177,8 @@ class UngatedEuclidean:
     gate_m: float = 5.0
     """Largest distance of a pair that is kept."""
 
-    def __call__(self, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
-        """See `Association`; torn pairs are born after the detections that had no partner."""
+    def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
+        """See `Association`; torn pairs are born after the detections that had no partner. Nothing is `apart`."""
         cost = euclidean_distances(candidates, states.means)
         found = assigned_densely(cost, np.ones(cost.shape, dtype=bool))
         torn = [pair for pair in found.pairs if cost[pair] > self.gate_m]

@@ -36,6 +36,7 @@ from fgtrack.tracking.ego import EgoPose, EgoSource
 from fgtrack.tracking.ego_error import EgoErrors, IndependentErrors
 from fgtrack.tracking.inbox import NO_INNOVATION, Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Lifecycle, Look, Sighting
+from fgtrack.tracking.objects import ObjectRules, Objects
 from fgtrack.tracking.preprocess import Candidate, Preprocess
 from fgtrack.tracking.soundness import faults
 
@@ -56,6 +57,7 @@ class TrackerParts:
     birth: Birth
     road: Road
     ego_errors: EgoErrors = field(default_factory=IndependentErrors)
+    objects: Objects = field(default_factory=lambda: Objects(ObjectRules()))
     failures: Failures = field(default_factory=Failures)
     """Counts what fails inside, shared with `bank`."""
     answers: tuple[type[Exception], ...] = (FgtrackError,)
@@ -176,13 +178,19 @@ class Tracker:
                 self._conclude(batch, candidate, Disposition.TOO_OLD)
             return
         states = self._offered(batch)
-        assignment = parts.association(candidates, states)
+        assignment = self._assigned(batch, candidates, states)
         self._count(batch, candidates, assignment, states, ego)
         self._estimate(batch, candidates, assignment, states)
         for position in assignment.refused:
             self._conclude(batch, candidates[position], Disposition.GATED)
         for position in self._unclaimed(batch, candidates, assignment.new, states):
             self._give_birth(batch, candidates[position], sensor, ego)
+
+    def _assigned(self, batch: Batch, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
+        """Which candidate belongs to which track; of another class none does."""
+        objects = batch.message.objects
+        named = [objects[candidate.index].class_name for candidate in candidates]
+        return self._parts.association(candidates, states, self._parts.objects.apart(named, states.track_ids))
 
     def _unclaimed(
         self, batch: Batch, candidates: Sequence[Candidate], new: Sequence[int], states: StatesAt
@@ -194,7 +202,7 @@ class Tracker:
         if not new or not self._parts.claim_overtaken:
             return new
         younger = self._younger(batch.stamp_ns, states)
-        claims = self._parts.association([candidates[position] for position in new], younger)
+        claims = self._assigned(batch, [candidates[position] for position in new], younger)
         for place, track in claims.pairs:
             self._conclude(batch, candidates[new[place]], Disposition.TOO_OLD, younger.track_ids[track])
         for place in claims.refused:
@@ -246,6 +254,7 @@ class Tracker:
             if candidates[place].position_m is not None:
                 sighting = Sighting(candidates[place], states.means[track], states.covariances[track])
                 lifecycle.matched(states.track_ids[track], look, sighting)
+            self._describe(batch, candidates[place], states.track_ids[track])
         rows = [track for track in assignment.missed if states.track_ids[track] not in seen]
         if not rows or not batch.last or not self._parts.sensors[batch.sensor].gives_position:
             return
@@ -288,7 +297,12 @@ class Tracker:
         parts.ego_errors.born(track_id, candidate, prior)
         self._seen[id(batch.message)].add(track_id)
         parts.lifecycle.born(track_id, self._look(batch, ego), Sighting(candidate))
+        self._describe(batch, candidate, track_id)
         self._conclude(batch, candidate, Disposition.BIRTH, track_id)
+
+    def _describe(self, batch: Batch, candidate: Candidate, track_id: int) -> None:
+        objects = batch.message.objects
+        self._parts.objects.learn(track_id, [objects[index] for index in (candidate.index, *candidate.merged)])
 
     def _conclude(
         self,
@@ -311,8 +325,15 @@ class Tracker:
         for track_id in track_ids:
             self._parts.bank.remove(track_id)
             self._parts.ego_errors.ended(track_id)
+            self._parts.objects.forget(track_id)
             self._parts.lifecycle.forget(track_id)
 
     def _report(self, track_id: int, state: TrackState) -> TrackReport:
         lifecycle = self._parts.lifecycle
-        return TrackReport(track_id, lifecycle.status(track_id), state, lifecycle.num_measured(track_id))
+        return TrackReport(
+            track_id,
+            lifecycle.status(track_id),
+            state,
+            lifecycle.num_measured(track_id),
+            self._parts.objects.report(track_id),
+        )

@@ -60,7 +60,8 @@ def parts(out: Path) -> list[Path]:
 def write_sweep(folder: Path, text: str, name: str = "sweep.yaml") -> Path:
     """A sweep of the clean scenario with one car."""
     path = folder / name
-    path.write_text(f"format: fgtrack-sweep/1\nscenario: {CONFIGS}/scenarios/single_opponent.yaml\n{text}")
+    head = f"scenario: {CONFIGS}/scenarios/single_opponent.yaml\nconfig: {CONFIGS}/karle2023.yaml\n"
+    path.write_text(f"format: fgtrack-sweep/1\n{head}{text}")
     return path
 
 

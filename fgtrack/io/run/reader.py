@@ -116,6 +116,8 @@ class Run:
     """What the sensors said, in order of receipt; a row for each of `updates`. Of runs of fgtrack 0.1 it is empty."""
     ignored: Table = field(default_factory=lambda: Table({name: column(name, ()) for name in COLUMNS["ignored"]}))
     """Objects and regions at which a track is neither right nor false."""
+    objects: Table = field(default_factory=lambda: Table({name: column(name, ()) for name in COLUMNS["objects"]}))
+    """Class and size of the objects of tracks, as far as detections say them."""
 
     @property
     def config(self) -> Mapping[str, Any]:

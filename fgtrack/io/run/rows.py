@@ -11,6 +11,7 @@ from fgtrack.core.types import (
     STATE_NAMES,
     DetectionList,
     EgoState,
+    ObjectReport,
     SmoothedReport,
     TickReport,
     TrackReport,
@@ -87,6 +88,11 @@ def ignored_row(truth: TruthState) -> Row:
     """A row of `ignored`; corners as `x y x y ...`."""
     outline = None if truth.outline_m is None else " ".join(map(repr, map(float, truth.outline_m)))
     return (truth.stamp_ns, truth.object_id, float(truth.x_m), float(truth.y_m), outline)
+
+
+def object_row(track_id: int, found: ObjectReport) -> Row:
+    """The row of `objects` of one track."""
+    return (track_id, found.class_name, found.class_share, found.length_m, found.width_m, found.height_m)
 
 
 def ego_row(ego: EgoState) -> Row:

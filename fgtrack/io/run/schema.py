@@ -30,8 +30,9 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "truth": ("stamp_ns", "object_id", *STATE_NAMES),
     "ignored": ("stamp_ns", "object_id", "x_m", "y_m", "outline_m"),
     "ego": ("stamp_ns", "receipt_ns", *STATE_NAMES),
+    "objects": ("track_id", "class_name", "class_share", "length_m", "width_m", "height_m"),
     "detections": ("sensor", "stamp_ns", "receipt_ns", "index", "frame", *MEASURABLE, *DESCRIBING),
 }
 
 #: Tables that are written only when there is something to write.
-OPTIONAL_TABLES = ("smoothed", "lagged", "truth", "ignored", "ego", "detections")
+OPTIONAL_TABLES = ("smoothed", "lagged", "truth", "ignored", "ego", "objects", "detections")

@@ -2,10 +2,18 @@
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 
-from fgtrack.core.types import DetectionList, Disposition, EgoState, SmoothedReport, TickReport, TruthState
-from fgtrack.io.run.rows import Row, detection_rows, ego_row, ignored_row, rows, smoothed_rows, truth_row
+from fgtrack.core.types import (
+    DetectionList,
+    Disposition,
+    EgoState,
+    ObjectReport,
+    SmoothedReport,
+    TickReport,
+    TruthState,
+)
+from fgtrack.io.run.rows import Row, detection_rows, ego_row, ignored_row, object_row, rows, smoothed_rows, truth_row
 from fgtrack.io.run.schema import RUN_FORMAT
 
 
@@ -29,6 +37,7 @@ class RunSink(ABC):
         self._counts: dict[str, Counter[Disposition]] = {}
         self._out_of_bounds: dict[str, Counter[str]] = {}  # by setting
         self._left_out: dict[str, Counter[str]] = {}  # by the reader and its settings
+        self._objects: dict[int, ObjectReport] = {}  # the last word on tracks that have not ended
         self._received: dict[str, list[Row]] = {"ego": [], "detections": []}  # since the last tick
 
     def write_tick(self, report: TickReport, process_ns: int, num_detections: int) -> None:
@@ -38,6 +47,8 @@ class RunSink(ABC):
             self._counts.setdefault(record.sensor, Counter())[record.disposition] += 1
             if record.reason is not None:
                 self._out_of_bounds.setdefault(record.sensor, Counter())[record.reason] += 1
+        self._append_objects({track.track_id for track in report.tracks})
+        self._objects |= {track.track_id: track.object for track in report.tracks if track.object is not None}
         for table, found in rows(report, process_ns, num_detections, self._smoothed_lag_s):
             if found:
                 self._append(table, found)
@@ -71,6 +82,7 @@ class RunSink(ABC):
         disposition how many by which setting, and `left_out` the same of what the reader did not give.
         """
         self._append_received()
+        self._append_objects(set())
         counts = {
             sensor: {disposition.value: counter[disposition] for disposition in Disposition}
             for sensor, counter in sorted(self._counts.items())
@@ -78,6 +90,12 @@ class RunSink(ABC):
         bounds = {"out_of_bounds": _by_reason(self._out_of_bounds), "left_out": _by_reason(self._left_out)}
         self._meta |= {**meta, "counts": counts, **bounds, "digest": self._digest(), "complete": True}
         return dict(self._meta)
+
+    def _append_objects(self, alive: Set[int]) -> None:
+        """Append rows of `objects` of tracks that are not `alive` any more."""
+        ended = sorted(self._objects.keys() - alive)
+        if ended:
+            self._append("objects", [object_row(track_id, self._objects.pop(track_id)) for track_id in ended])
 
     def _append_received(self) -> None:
         for table, found in self._received.items():

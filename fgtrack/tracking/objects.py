@@ -1,0 +1,117 @@
+"""What the objects of tracks are, as their detections say: class by vote, size by average."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fgtrack.core.types import BoolArray, Detection, IntArray, ObjectReport
+
+__all__ = ["Apart", "ObjectRules", "Objects"]
+
+#: Says which pairs of candidates and tracks, as positions in their lists, both (m,), are not one object, shape (m,).
+Apart = Callable[[IntArray, IntArray], BoolArray]
+
+_VEHICLES = ("car", "van", "truck", "bus", "trailer", "vehicle")
+_PERSONS = ("pedestrian", "person", "person_sitting")
+_RIDERS = ("cyclist", "bicycle", "motorcycle", "rider")
+_UNKNOWN = 0
+
+
+@dataclass(frozen=True)
+class ObjectRules:
+    """What the class of a detection decides."""
+
+    separate_classes: bool = True
+    """Whether a detection may only belong to a track of its class or of one like it; what has no class may belong to
+    any. The class of a track is that of most of its detections."""
+    alike: tuple[tuple[str, ...], ...] = (_VEHICLES, _PERSONS, _RIDERS)
+    """Groups of classes that a detector may confuse, in lower case; any other class is like none."""
+
+    def __post_init__(self) -> None:
+        names = [name for group in self.alike for name in group]
+        if len(set(names)) < len(names):
+            raise ValueError("alike: a class is named twice")
+        if any(name != name.lower() for name in names):
+            raise ValueError("alike: write classes in lower case")
+
+
+@dataclass(slots=True)
+class _Seen:
+    """What the detections of one track have said."""
+
+    classes: Counter[str] = field(default_factory=Counter)
+    num_sizes: int = 0
+    sizes_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Mean length, width and height."""
+
+
+class Objects:
+    """Remembers what the detections of each track have said, and says which detections cannot be of it."""
+
+    def __init__(self, rules: ObjectRules) -> None:
+        self._separate = rules.separate_classes
+        self._groups = {name: -1 - number for number, group in enumerate(rules.alike) for name in group}
+        self._seen: dict[int, _Seen] = {}
+
+    def learn(self, track_id: int, detections: Iterable[Detection]) -> None:
+        """These are detections of the track."""
+        for one in detections:
+            length_m, width_m, height_m = one.length_m, one.width_m, one.height_m
+            sized = length_m is not None and width_m is not None
+            if one.class_name is None and not sized:
+                continue
+            seen = self._seen.setdefault(track_id, _Seen())
+            if one.class_name is not None:
+                seen.classes[one.class_name] += 1
+            if length_m is not None and width_m is not None:
+                seen.num_sizes += 1
+                share, new = 1.0 / seen.num_sizes, (length_m, width_m, np.nan if height_m is None else height_m)
+                old = seen.sizes_m
+                seen.sizes_m = (
+                    old[0] + share * (new[0] - old[0]),
+                    old[1] + share * (new[1] - old[1]),
+                    old[2] + share * (new[2] - old[2]),
+                )
+
+    def apart(self, named: Sequence[str | None], track_ids: Sequence[int]) -> Apart | None:
+        """Which candidates of these classes are not these tracks; None where nothing speaks against any pair."""
+        if not self._separate or not self._seen or not any(named):
+            return None
+        classes = [self._class(track_id) for track_id in track_ids]
+        if not any(classes):
+            return None
+        numbers = dict(self._groups)
+        theirs, own = (np.array([_number(name, numbers) for name in names]) for names in (named, classes))
+
+        def differ(rows: IntArray, columns: IntArray) -> BoolArray:
+            a, b = theirs[rows], own[columns]
+            return np.asarray((a != b) & (a != _UNKNOWN) & (b != _UNKNOWN))
+
+        return differ
+
+    def report(self, track_id: int) -> ObjectReport | None:
+        """What is known of the track's object; None where no detection has said anything."""
+        seen = self._seen.get(track_id)
+        if seen is None:
+            return None
+        name = self._class(track_id)
+        share = None if name is None else seen.classes[name] / seen.classes.total()
+        if not seen.num_sizes:
+            return ObjectReport(name, share)
+        length_m, width_m, height_m = seen.sizes_m
+        return ObjectReport(name, share, length_m, width_m, None if np.isnan(height_m) else height_m)
+
+    def forget(self, track_id: int) -> None:
+        """The track has ended."""
+        self._seen.pop(track_id, None)
+
+    def _class(self, track_id: int) -> str | None:
+        seen = self._seen.get(track_id)
+        return max(seen.classes, key=seen.classes.__getitem__) if seen is not None and seen.classes else None
+
+
+def _number(name: str | None, numbers: dict[str, int]) -> int:
+    """The number of the group of a class, 0 of none; a class that is in no group gets the next."""
+    return _UNKNOWN if not name else numbers.setdefault(name.lower(), len(numbers) + 1)
