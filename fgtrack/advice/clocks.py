@@ -18,7 +18,7 @@ _AHEAD_SHARE = 0.005
 _JUMP_S, _JUMP_STDS, _JUMP_WINDOW_S = 0.1, 8.0, 3.0
 _DRIFT_BINS, _DRIFT_S, _DRIFT_STDS, _DRIFT_FIT = 10, 0.01, 5.0, 0.8
 _LONGEST_S = 3600.0
-OFFSET_STDS = 3.0
+OFFSET_STDS = 4.0
 """An offset that is larger than so many of its standard deviations is believed ..."""
 _SMALLEST_OFFSET_S = 0.01  # ... if it matters
 _LARGEST_STD_S = 0.05
