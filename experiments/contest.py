@@ -65,6 +65,7 @@ def turning_ego(mount: tuple[float, float], duration_s: float) -> Scenario:
     }
     raw = {
         "map": None,
+        "detection_origin_x_m": -1.74,
         "duration_s": duration_s,
         "ego": {**ego, "motion": _STILL},
         "ego_messages": dict.fromkeys(exact, 0.0),
