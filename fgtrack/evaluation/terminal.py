@@ -4,6 +4,7 @@ import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import groupby, takewhile
 
 from rich.cells import cell_len
@@ -23,7 +24,7 @@ class Shown:
     left: bool
     bold: tuple[bool, ...]
 
-    @property
+    @cached_property
     def width(self) -> int:
         """Of the column in a terminal, without the space beside it."""
         return max(map(cell_len, (*self.heading.split("\n"), *self.cells)), default=0)

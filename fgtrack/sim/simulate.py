@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import (
@@ -28,6 +29,7 @@ from fgtrack.sim.sensor import SimulatedSensor
 from fgtrack.sim.vehicles import AnyVehicle, DrawnVehicle, Trajectory
 
 EGO_ID = -1
+_MOST_STATES = 5e6  # three hours of the default scenario
 
 
 def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
@@ -42,6 +44,8 @@ def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
     ------
     DataError
         If the map cannot be read.
+    CallError
+        If it does not fit into memory.
     """
     return _Simulation(scenario, rng).messages()
 
@@ -51,6 +55,12 @@ class _Simulation:
 
     def __init__(self, scenario: Scenario, rng: np.random.Generator) -> None:
         self.scenario = scenario
+        count = _num_states(scenario)
+        if count > _MOST_STATES:
+            raise CallError(
+                f"the scenario has some {count:.3g} sightings and states, more than {_MOST_STATES:g} do not fit into "
+                "memory: shorten duration_s, or lower rates, vehicles or clutter"
+            )
         vehicles_rng, self.ego_rng, self.sensors_rng = rng.spawn(3)
         self.track = _track(scenario)
         path = None if self.track is None else Path.through(self.track.table[:, :2])
@@ -126,6 +136,15 @@ class _Simulation:
         since_start_ns = [nanoseconds(time_s) for time_s in times_s.tolist()]
         stamps = [self.scenario.start_ns + time_ns for time_ns in since_start_ns]
         return stamps, np.array([seconds(time_ns) for time_ns in since_start_ns])
+
+
+def _num_states(scenario: Scenario) -> float:
+    """About how many states of vehicles, sightings and ghosts are drawn."""
+    vehicles = 1 + len(scenario.opponents)
+    per_s = scenario.ego_messages.rate_hz + scenario.truth_rate_hz * vehicles
+    per_s += sum(sensor.rate_hz * (vehicles + sensor.clutter.mean_per_scan) for sensor in scenario.sensors)
+    drawn = [one for one in (scenario.ego, *scenario.opponents) if isinstance(one, DrawnVehicle)]
+    return scenario.duration_s * (per_s + sum(1.0 / one.step_s for one in drawn))
 
 
 def _track(scenario: Scenario) -> TrackMap | None:

@@ -245,7 +245,7 @@ def _recording_problems(folder: Path, out: str, undisturbed: Path, older: Path |
             yield f"{out} holds {len(found[0])} of {len(right[0])} messages"
         old_is_there |= found == right
     for part in folder.glob(f"{out}.*.part"):
-        if (part / ".replaced").exists():
+        if not path.exists() and (part / ".replaced").exists():  # else it is being removed
             old_is_there |= _messages(part / ".replaced") == old
         inner = part / out if part.is_dir() else part
         if not inner.exists() or (inner.is_dir() and not any(inner.iterdir())):

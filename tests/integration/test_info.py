@@ -1,4 +1,5 @@
 import pytest
+from mcap.writer import Writer as McapWriter
 from support.messages import START_NS, drive, shared
 
 from fgtrack.core.errors import DataError
@@ -77,3 +78,16 @@ def test_stamps_of_another_clock_are_pointed_out():
     topic = by_name(describe(shared("data/bags/nav2_turtlebot.mcap")))["/odom"]
     assert topic.count == 2639
     assert "another clock" in topic.note
+
+
+def test_a_channel_without_a_type_is_listed_with_its_problem(tmp_path):
+    """As MCAP allows it, for JSON or bytes."""
+    with (tmp_path / "x.mcap").open("wb") as file:
+        writer = McapWriter(file)
+        writer.start(profile="ros2", library="")
+        channel = writer.register_channel("/plain", "cdr", 0)
+        writer.add_message(channel, 5, b"\0\1\0\0", 5)
+        writer.finish()
+    (topic,) = describe(tmp_path / "x.mcap", InputConfig()).topics
+    assert topic.name == "/plain"
+    assert "a type without a name is neither in the recording nor known" in topic.note

@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from ruamel.yaml import YAML
 from scipy import stats
 
-from fgtrack.core.errors import DataError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.sim.delays import ConstantDelay, GammaDelay, LossyDelay, NoDelay
@@ -224,3 +224,17 @@ def test_a_map_file_may_stand_for_the_oval() -> None:
         assert (a.x_m, a.y_m) == pytest.approx((b.x_m, b.y_m), abs=1e-5)
     with pytest.raises(DataError, match=r"cannot (be read|read the map)"):
         run(replace(SHORT, map="missing.csv"))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"duration_s": 86_400.0},
+        {"sensors": (SimulatedSensor("radar", {"x_m": 1.0, "y_m": 1.0}, clutter=Clutter(1e6)),)},
+        {"sensors": (SimulatedSensor("radar", {"x_m": 1.0, "y_m": 1.0}, rate_hz=1e4),), "duration_s": 3600.0},
+        {"opponents": (DrawnVehicle(0.0, 0.0, 0.0, 10.0, step_s=1e-9),)},
+    ],
+)
+def test_a_scenario_that_does_not_fit_into_memory_is_refused(changes):
+    with pytest.raises(CallError, match="do not fit into memory: shorten duration_s, or lower rates, vehicles or clut"):
+        run(replace(SHORT, **changes))

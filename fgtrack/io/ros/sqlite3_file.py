@@ -2,7 +2,7 @@
 
 import shutil
 import tempfile
-from collections.abc import Collection, Generator, Iterator
+from collections.abc import Collection, Generator, Iterable, Iterator
 from pathlib import Path
 from typing import cast
 
@@ -18,12 +18,17 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from fgtrack.io.errors import LARGEST_BYTES, refuse_larger
 
+_Row = tuple[int, int, bytes, int]
+"""Topic id, log time, message (None of one that is too large), its length."""
+
 
 class Sqlite3File(Sqlite3Reader):
     """A SQLite file; one that was not closed is recovered in a copy, a truncated one is read row by row."""
 
     path: Path
     break_off: str | None = None
+    # Of a message that is too large only its length: reading it would need twice its memory.
+    _query = "SELECT topic_id, timestamp, CASE WHEN length(data) <= ? THEN data END, length(data) FROM messages"
 
     def __init__(self, path: Path, largest_bytes: int = LARGEST_BYTES) -> None:
         super().__init__(path)
@@ -55,15 +60,16 @@ class Sqlite3File(Sqlite3Reader):
         """Records of `connections` in log-time order; equal times keep the order of writing."""
         assert self.dbconn
         by_id = {connection.id: connection for connection in connections}
+        rows: Iterable[_Row]
         if self._damaged:
             rows = sorted(self._rows_before_break(), key=lambda row: row[1])
         else:
-            query = "SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp, id"
-            rows = cast("list[tuple[int, int, bytes]]", self.dbconn.execute(query))
-        for topic_id, log_ns, data in rows:
+            query = f"{self._query} ORDER BY timestamp, id"
+            rows = cast("Iterator[_Row]", self.dbconn.execute(query, (self._largest_bytes,)))
+        for topic_id, log_ns, data, num_bytes in rows:
             if topic_id in by_id:
-                if isinstance(data, bytes):
-                    refuse_larger(len(data), f"{self.path}: the message at {log_ns} ns", self._largest_bytes)
+                if data is None and num_bytes:
+                    refuse_larger(num_bytes, f"{self.path}: the message at {log_ns} ns", self._largest_bytes)
                 yield by_id[topic_id], log_ns, data
 
     def _reconnect(self) -> None:
@@ -139,11 +145,11 @@ class Sqlite3File(Sqlite3Reader):
         formats = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
         return {name: MessageDefinition(formats[kind], text) for name, kind, text in rows if kind in formats}
 
-    def _rows_before_break(self) -> Iterator[tuple[int, int, bytes]]:
-        """Topic id, log time and message, in the order of writing."""
+    def _rows_before_break(self) -> Iterator[_Row]:
+        """Rows in the order of writing."""
         assert self.dbconn
         try:
-            query = "SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id"
-            yield from cast("Iterator[tuple[int, int, bytes]]", self.dbconn.execute(query))
+            query = f"{self._query} NOT INDEXED ORDER BY id"
+            yield from cast("Iterator[_Row]", self.dbconn.execute(query, (self._largest_bytes,)))
         except apsw.Error as error:
             self.break_off = f"is truncated ({error})"

@@ -62,9 +62,9 @@ def build_typestore(
     needed: Typesdict = {}
     for name in definitions:
         missing = _collect(types, name, needed)
-        if missing and name not in problems:
+        if missing is not None and name not in problems:
             problems[name] = (
-                f"the definition of {missing} is neither in the recording nor known, "
+                f"the definition of {missing or 'a type without a name'} is neither in the recording nor known, "
                 "name its .msg file in message_definitions"
             )
     store = get_typestore(Stores.EMPTY)

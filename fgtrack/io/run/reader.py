@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -17,7 +18,7 @@ from ruamel.yaml.error import YAMLError
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import BoolArray
-from fgtrack.io.run.schema import COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
+from fgtrack.io.run.schema import COLUMNS, LARGEST_META_MB, OPTIONAL_TABLES, RUN_FORMAT
 
 # A column holds floats, integers or strings, as its name says; the reader of it knows which.
 Column = npt.NDArray[Any]
@@ -159,8 +160,10 @@ def load_run(path: Path | str) -> Run:
     return Run(path, meta, _read_text(path / "config.yaml"), **tables)
 
 
-def _read_text(path: Path) -> str:
+def _read_text(path: Path, largest_mb: float = math.inf) -> str:
     try:
+        if path.stat().st_size > 1e6 * largest_mb:
+            raise DataError(f"{path}: is larger than {largest_mb:g} MB, repeat the run")
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: is not UTF-8 text (byte {error.start}), repeat the run") from error
@@ -173,7 +176,7 @@ def _read_meta(path: Path) -> Mapping[str, Any]:
     if not file.exists() and (path / "config.yaml").is_file():
         raise DataError(f"{path}: has no meta.json, what wrote it was killed at its beginning: repeat the run")
     try:
-        meta = json.loads(_read_text(file))
+        meta = json.loads(_read_text(file, LARGEST_META_MB))
     except ValueError as error:
         raise DataError(f"{file}: is not JSON ({error}), repeat the run") from error
     if not isinstance(meta, dict) or meta.get("format") != RUN_FORMAT:

@@ -9,9 +9,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from fgtrack.core.errors import DataError
+from fgtrack.core.files import read_whole
 from fgtrack.io.output import Kind, check_output, claimed, part_of, write_error, write_file
 from fgtrack.io.run.rows import Row, text, text_header
-from fgtrack.io.run.schema import COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
+from fgtrack.io.run.schema import COLUMNS, LARGEST_META_MB, OPTIONAL_TABLES, RUN_FORMAT
 from fgtrack.io.run.sink import RunSink
 
 _FILES = ("meta.json", "config.yaml", "metrics.json", *(f"{table}.csv" for table in COLUMNS))
@@ -144,8 +146,8 @@ def digest(path: Path) -> str:
 def is_run_folder(path: Path) -> bool:
     """Whether `path` holds a run: its `meta.json` names the format."""
     try:
-        meta = json.loads((path / "meta.json").read_bytes())
-    except (OSError, ValueError):
+        meta = json.loads(read_whole(path / "meta.json", LARGEST_META_MB))
+    except (DataError, ValueError, RecursionError):
         return False
     return isinstance(meta, dict) and meta.get("format") == RUN_FORMAT
 
