@@ -372,7 +372,7 @@ BOMBS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
         run_folder("meta.json", b'{"format":"fgtrack-run/1","x":[0', b",{}", 20 * MILLION, b"]}"),
         ("compare", "run"),
     ),
-    "run with 20 million rows": (run_folder("timing.csv", b"", b"1,1,1,1,1\n", 20 * MILLION), ("compare", "run")),
+    "run with two million rows": (run_folder("timing.csv", b"", b"1,1,1,1,1\n", 2 * MILLION), ("compare", "run")),
 }
 
 

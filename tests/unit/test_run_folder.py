@@ -268,6 +268,21 @@ def test_a_run_without_meta_says_that_it_was_killed_at_its_beginning(tmp_path):
         load_run(tmp_path / "run")
 
 
+def test_ticks_that_do_not_increase_are_refused(tmp_path):
+    write(tmp_path / "run", report())
+    with (tmp_path / "run/timing.csv").open("a") as file:
+        file.write("0,1000,1,1,1\n")
+    with pytest.raises(DataError, match=r"timing\.csv: its ticks do not increase, repeat the run"):
+        load_run(tmp_path / "run")
+
+
+def test_a_meta_that_is_too_large_is_not_read(tmp_path):
+    write(tmp_path / "run", report())
+    (tmp_path / "run/meta.json").write_text('{"format": "fgtrack-run/1"' + " " * 17_000_000 + "}")
+    with pytest.raises(DataError, match=r"meta\.json: is larger than 16 MB"):
+        load_run(tmp_path / "run")
+
+
 @pytest.mark.parametrize("name", ["config.yaml.0123456789ab.part", "meta.json.ba9876543210.part"])
 def test_what_a_kill_within_the_first_files_leaves_is_replaced_with_overwrite(tmp_path, name):
     (tmp_path / "run").mkdir()

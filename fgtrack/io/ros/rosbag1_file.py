@@ -2,10 +2,14 @@
 
 from collections import defaultdict
 from io import BytesIO
+from os import SEEK_CUR
 from pathlib import Path
+from typing import BinaryIO
 
+from rosbags.interfaces import Connection
 from rosbags.rosbag1.reader import (
     Chunk,
+    ChunkInfo,
     Header,
     IndexData,
     Reader,
@@ -14,8 +18,10 @@ from rosbags.rosbag1.reader import (
     read_uint32,
 )
 
-from fgtrack.io.errors import LARGEST_BYTES
+from fgtrack.io.errors import LARGEST_BYTES, refuse_larger
 from fgtrack.io.ros.unpacking import unpacked
+
+_LONGEST_MAGIC = 100
 
 
 class Rosbag1File(Reader):
@@ -31,8 +37,7 @@ class Rosbag1File(Reader):
 
     def read_chunk(self) -> Chunk:
         """The header of the chunk at this place of the file, whose data are never unpacked to more than is allowed."""
-        file = self.bio
-        assert file
+        file = self._before_headers(1)
         place = file.tell()
         compression = Header.read(file, RecordType.CHUNK).get_string("compression")
         file.seek(place)
@@ -44,8 +49,34 @@ class Rosbag1File(Reader):
 
         return chunk._replace(decompressor=decompressor)
 
+    def read_connection(self) -> Connection:
+        """The connection at this place of the file."""
+        self._before_headers(2)
+        return super().read_connection()
+
+    def read_chunk_info(self) -> ChunkInfo:
+        """What the index at this place of the file says of a chunk."""
+        self._before_headers(1)
+        return super().read_chunk_info()
+
+    def _before_headers(self, count: int) -> BinaryIO:
+        """The file at this place, where so many headers begin that are not too long to be read."""
+        file = self.bio
+        assert file
+        place = file.tell()
+        for _ in range(count):
+            num_bytes = read_uint32(file)
+            refuse_larger(num_bytes, f"{self.path}: the header at byte {file.tell() - 4}", self._largest_bytes)
+            file.seek(num_bytes, SEEK_CUR)
+        file.seek(place)
+        return file
+
     def open(self) -> None:
         """Open the file and read which connections it holds."""
+        with self.path.open("rb") as self.bio:
+            self.bio.readline(_LONGEST_MAGIC)
+            self._before_headers(1)
+        self.bio = None
         try:
             super().open()
         except Exception:  # rosbags reads indexed files only; whatever it raises, index from the start
@@ -60,7 +91,7 @@ class Rosbag1File(Reader):
         position = self.bio.tell()
         try:
             while True:
-                position = self.bio.tell()
+                position = self._before_headers(1).tell()
                 if Header.read(self.bio).get_uint8("op") == RecordType.CHUNK:
                     self._index_chunk(position, indexes)
                 else:

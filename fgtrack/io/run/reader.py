@@ -157,6 +157,8 @@ def load_run(path: Path | str) -> Run:
     meta = _read_meta(path)
     complete = bool(meta.get("complete"))
     tables = {name: _read_table(path / f"{name}.csv", name, complete) for name in COLUMNS}
+    if (np.diff(tables["timing"]["tick"]) <= 0).any():
+        raise DataError(f"{path / 'timing.csv'}: its ticks do not increase, repeat the run")
     return Run(path, meta, _read_text(path / "config.yaml"), **tables)
 
 
