@@ -30,6 +30,7 @@ from joblib import Parallel, delayed
 import fgtrack
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Disposition, EgoState, Message, TruthState
+from fgtrack.estimation.failures import Failure
 from fgtrack.io.run.rows import Row, text
 from fgtrack.io.run.sink import RunSink
 from fgtrack.pipeline.clock import node_ticks
@@ -45,6 +46,8 @@ Sent = EgoState | DetectionList
 #: By how much a stamp is off, now and then.
 _WRONG_S = (-3600.0, -60.0, -5.0, -1.0, 0.5, 5.0, 60.0, 3600.0)
 _WRONG_LIST, _WRONG_EGO, _REPEATED, _NO_NUMBERS = 1e-3, 1e-4, 5e-3, 1e-3
+#: Failures that wrong stamps and false tracks bring about, and no fault of the tracker.
+_OF_THE_DATA = (Failure.DIVERGED, Failure.STEP_DAMPED)
 _SETTLED = 6  # of so many parts of the time, the first is for what is built up once
 _MOST_GROWTH = 0.01
 
@@ -251,8 +254,9 @@ def problems(runs: Sequence[Sequence[Part]]) -> list[str]:
             for part in parts
             if part.sent != sum(part.counts.values())
         ][:1]
-        if parts[-1].failures:
-            said.append(f"run {number}: failures: {parts[-1].failures}")
+        failures = {kind: count for kind, count in parts[-1].failures.items() if kind not in _OF_THE_DATA}
+        if failures:
+            said.append(f"run {number}: failures: {failures}")
         if growth(parts) > _MOST_GROWTH:
             said.append(f"run {number}: memory grew by {100.0 * growth(parts):.2f} %")
     for together in zip(*runs, strict=False):
@@ -298,9 +302,13 @@ def table(estimator: str, runs: Sequence[Sequence[Part]], rows: int = 12) -> str
         f"{estimator}: {' and '.join(hours)} of race at {NODE_HZ:g} Hz in {last.wall_s / 3600.0:.2g} h. Memory grew by "
         f"{100.0 * growth(first):.2f} % after the first sixth, the median tick changed by "
         f"{100.0 * (slowing(first) - 1.0):.0f} % from the first third to the last. "
-        + (f"{len(runs)} runs have the same {first[alike - 1].rows} rows. " if len(runs) > 1 else "")
+        + (
+            f"{len(runs)} runs have the same {first[alike - 1].rows} rows up to {first[alike - 1].until_h:.3g} h. "
+            if len(runs) > 1
+            else ""
+        )
         + f"Refused: {', '.join(f'{name} {count}' for name, count in sorted(last.refused.items())) or 'nothing'}; "
-        f"failures: {sum(last.failures.values())}. "
+        f"failures: {', '.join(f'{name} {count}' for name, count in last.failures.items()) or 'none'}. "
         f"Dispositions: {', '.join(f'{name} {100.0 * share:.2g} %' for name, share in shares.items())}.",
         *(f"\nNOT AS PROMISED: {problem}" for problem in problems(runs)),
     ]
