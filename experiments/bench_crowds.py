@@ -75,7 +75,7 @@ def association(name: str, detections: int, tracks: int, side_m: float) -> Calla
 def merge(detections: int, side_m: float) -> Callable[[], object]:
     """Detections everywhere in a square, merged."""
     points = np.random.default_rng(0).uniform(0.0, side_m, size=(detections, 2))
-    return lambda: ConnectedMerge().groups(points)
+    return lambda: ConnectedMerge(distance_m=5.1).groups(points)
 
 
 def tick(estimator: str, objects: int, clutter: int, lists: int, side_m: float) -> Callable[[], object]:

@@ -32,7 +32,7 @@ def advise(
     as_json: Json = False,
     form: FormOption = None,
 ) -> None:
-    """Say what is late, wrong or does not fit, and the setting that mends it.
+    """Say what is late or wrong, and which settings mend it.
 
     Sentences in order of importance, and what windows of several lengths would lose.
     """

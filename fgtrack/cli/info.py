@@ -4,7 +4,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json
-from fgtrack.cli.show import chosen_form, progress, say, show, warn
+from fgtrack.cli.show import chosen_form, progress, say, sentences, show, warn
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.left_out import left_out
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value
@@ -32,7 +32,7 @@ def info(recording: Input, config_file: ConfigFile = None, as_json: Json = False
     comes_to = effective(config or Config())
     show(topics, form, {**_values(found, topics), "effective": comes_to.values()})
     if form is None:
-        say(f"{config_file or 'without a configuration'}: {comes_to}")
+        sentences([f"{config_file or 'without a configuration'}: {comes_to}"])
     trial = None
     if config is not None and found.problem is None and form is None:
         trial = _try_out(recording, config)

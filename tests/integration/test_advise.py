@@ -283,11 +283,11 @@ def test_a_window_shorter_than_the_delays_and_than_a_period(call: Call) -> None:
         if not isinstance(item, DetectionList) or (item.stamp_ns - START_NS) % (1500 * MS) == 0
     ]
     write("stream", slow)
-    text = CONFIG.replace("estimator: ekf-replay", "estimator: smoother-banded") + "lifecycle: {forget_s: 1.0}\n"
+    text = CONFIG.replace("estimator: ekf-replay", "estimator: smoother-banded") + "lifecycle: {out_of_view_s: 1.0}\n"
     Path("c.yaml").write_text(text)
     advice = fgtrack.advise("drive.jsonl", "c.yaml")
     assert advice.config.smoother.lag_s == pytest.approx(5.0)
-    assert advice.config.lifecycle.forget_s == pytest.approx(5.0)
+    assert advice.config.lifecycle.out_of_view_s == pytest.approx(5.0)
 
 
 def test_negative_delays_a_jump_and_a_drift(call: Call) -> None:
