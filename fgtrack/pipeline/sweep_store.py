@@ -55,13 +55,14 @@ _CELLS = TypeAdapter(tuple[Cell, ...], config=ConfigDict(strict=True, extra="for
 class PartStore:
     """The parts of a sweep, each in a file named by the key of its job and written whole or not at all.
 
-    Raises `CallError` where `folder` cannot be made one, or holds tables but no parts: those of another program, which
-    `overwrite` lets a sweep replace.
+    Raises `CallError` where `folder` cannot be made one, or holds tables but no place of parts: those of another
+    program, which `overwrite` lets a sweep replace. Of a sweep that could not keep a single part, the place is there.
     """
 
     def __init__(self, folder: Path, overwrite: bool = False) -> None:
         self._folder = folder / "parts"
-        if not any(map(_is_part, self._folder.glob("*.json"))):
+        parts = list(self._folder.glob("*.json"))
+        if not any(map(_is_part, parts)) and (parts or not self._folder.is_dir()):
             for name in (SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE, PAIRED_TABLE, SUMMARY_TABLE):
                 check_output(folder / name, Kind("a table", Path.is_file), overwrite)
         try:
