@@ -11,6 +11,7 @@ from fgtrack.core.types import ACCEL, SPEED, YAW, YAW_RATE, SmoothedReport, Trac
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.forwarding import ForwardingBank
+from fgtrack.estimation.present import PresentStates
 from fgtrack.tracking.soundness import Divergence, are_finite, faults
 
 __all__ = ["RestartingBank"]
@@ -249,6 +250,8 @@ class RestartingBank(ForwardingBank):
 
 def _present(bank: TrackBank) -> list[TrackState]:
     states, many = bank.present(), len(bank.track_ids)
+    if isinstance(states, PresentStates) and len(states) == many:
+        return states
     shapes = {(*state.mean.shape, *state.covariance.shape) for state in states}
     if len(states) != many or not shapes <= _SHAPES:
         raise ValueError(f"{many} tracks have {len(states)} states of shapes {', '.join(map(str, shapes))}")
