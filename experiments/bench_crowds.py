@@ -81,7 +81,7 @@ def merge(detections: int, side_m: float) -> Callable[[], object]:
 def tick(estimator: str, objects: int, clutter: int, lists: int, side_m: float) -> Callable[[], object]:
     """A tick with `lists` lists of `objects` objects that stand still in a square, and clutter in each."""
     rng = np.random.default_rng(0)
-    config = read_config("open_space", estimator=estimator)
+    config = read_config("open_space", ["merge={kind: connected, distance_m: 5.1}"], estimator=estimator)
     tracker, sensor = build_tracker(config), next(iter(config.sensors))
     points = rng.uniform(0.0, side_m, size=(objects, 2))
     for k in range(WARM_UP + lists):

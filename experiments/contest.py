@@ -65,7 +65,6 @@ def turning_ego(mount: tuple[float, float], duration_s: float) -> Scenario:
     }
     raw = {
         "map": None,
-        "detection_origin_x_m": -1.74,
         "duration_s": duration_s,
         "ego": {**ego, "motion": _STILL},
         "ego_messages": dict.fromkeys(exact, 0.0),
@@ -84,8 +83,6 @@ def lever_arm(seeds: int, duration_s: float) -> str:
             "sensors": {"radar": sensor},
             "birth.speed_std_mps": 20.0,
             "smoother.lagged_s": [],
-            "ego.yaw_weight": 1.0,
-            "ego.yaw_rate_weight": 1.0,
         }
         found = []
         for seed in range(seeds):

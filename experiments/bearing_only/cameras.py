@@ -98,9 +98,7 @@ def configuration(modelled: str) -> Config:
         name: float(np.sqrt(100.0 * getattr(MOTION, field)))
         for name, field in zip(("position", "yaw", "speed", "yaw_rate"), CTRV.density_names(), strict=True)
     }
-    base = read_config(
-        "open_space", ["ego.detection_origin_x_m=0", "merge={kind: none}", "clock.node_hz=10", "association.gate_m=15"]
-    )
+    base = read_config("open_space", ["clock.node_hz=10", "association.gate_m=15"])
     sensors = {name: replace(camera, mount=mount, correlation=correlation) for name, mount in MOUNTS.items()}
     lidar = SensorModel({"x_m": LIDAR_STD_M, "y_m": LIDAR_STD_M, "yaw_rad": LIDAR_STD_RAD})
     motion = replace(base.motion, std_per_s=densities)

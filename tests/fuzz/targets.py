@@ -254,6 +254,7 @@ _CORNERS = b"area,x_m,y_m\nshore,0.0,0.0\nshore,90.0,0.5\nshore,90.0,90.0\npier,
 _DELAYS = b"radar: {delay: {kind: gamma, mean_s: 0.1, std_s: 0.05, least_s: 0.01}}\n"
 _NUSCENES = "sensors={detector: {std: {x_m: 0.5, y_m: 0.5}}}"
 _REPLAY = ("--overwrite", "-o", RUN, "-e")
+_MERGE = "merge={kind: connected, distance_m: 5.1}"
 
 
 def _all(name: str) -> bool:
@@ -275,7 +276,7 @@ TARGETS = (
         "stream-smoother",
         lambda: [{"x.jsonl": _stream()}],
         _all,
-        [("replay", "x.jsonl", "-c", "open_space", *_REPLAY, "smoother")],
+        [("replay", "x.jsonl", "-c", "open_space", "--set", _MERGE, *_REPLAY, "smoother")],
     ),
     Target(
         "gzip",
