@@ -125,8 +125,8 @@ class Existence:
         if dt_s <= 0.0:
             return log_odds
         gone = -math.expm1(-dt_s / self.lifetime_s)
-        dead = math.exp(-log_odds)  # odds r / (1 - r) become r s / (1 - r s) with s = 1 - gone
-        return -math.log((dead + gone) / (1.0 - gone))
+        dead = math.exp(-log_odds)  # odds r / (1 - r) become r s / (1 - r s) with s = exp(-dt / lifetime)
+        return _bounded(-math.log(dead + gone) - dt_s / self.lifetime_s)
 
 
 class ExistenceLifecycle:

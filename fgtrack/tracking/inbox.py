@@ -151,15 +151,15 @@ class _Seen:
         """
         if message.objects and not any(usable):
             return False
+        oldest_ns = message.receipt_ns - self._memory_ns
+        while self._receipts_ns and self._receipts_ns[first := next(iter(self._receipts_ns))] < oldest_ns:
+            del self._receipts_ns[first]
         contents = message.objects if all(usable) else tuple(compress(message.objects, usable))
         key = (message.sensor, message.stamp_ns, message.frame, hash(contents))
-        known = key in self._receipts_ns
-        if not known:
-            self._receipts_ns[key] = message.receipt_ns
-        oldest_ns = message.receipt_ns - self._memory_ns
-        while self._receipts_ns[first := next(iter(self._receipts_ns))] < oldest_ns:
-            del self._receipts_ns[first]
-        return known
+        if key in self._receipts_ns:
+            return True
+        self._receipts_ns[key] = message.receipt_ns
+        return False
 
 
 class QueueInbox:

@@ -65,6 +65,17 @@ def test_an_object_survives_as_long_as_its_lifetime_says() -> None:
     assert one.probability(START_NS + ms(6000)) == pytest.approx(0.75 * math.exp(-1.5))
 
 
+@pytest.mark.parametrize("gap_s", [400.0, 1e7])
+def test_nothing_survives_a_gap_of_many_lifetimes(gap_s: float) -> None:
+    one = Existence.born(10.0, START_NS, math.log(3.0))
+    assert one.probability(START_NS + ms(1e3 * gap_s)) < 1e-9
+    life = lifecycle(ExistenceRules())
+    life.born(0, look(), Sighting(HERE))
+    assert life.expired(START_NS + ms(1e3 * gap_s)) == [0]
+    one.learn(START_NS + ms(1e3 * gap_s), 20.0)
+    assert 0.0 < one.probability(START_NS + ms(1e3 * gap_s)) < 1e-4
+
+
 def test_evidence_counts_at_its_own_stamp_in_whatever_order_it_arrives() -> None:
     evidence = [(300.0, -1.2), (500.0, 2.5), (900.0, -0.4), (1400.0, 1.0)]
     found = set()

@@ -78,6 +78,13 @@ def test_lists_are_forgotten_once_they_are_too_old_anyway() -> None:
     assert len(inbox._seen._receipts_ns) == 31  # `lidar` may take 0.3 s
 
 
+def test_a_list_that_comes_again_when_all_are_forgotten_is_no_copy() -> None:
+    inbox = QueueInbox(SENSORS, max_future_s=1.0, memory_s=0.1)
+    for delay_ms in (0.0, 299.0, 700.0):
+        inbox.put(message(CAR, sensor="each", delay_ms=delay_ms))
+    assert len(inbox.collect()) == 2  # the second one is a copy
+
+
 def test_a_message_with_stamp_and_contents_of_the_last_one_is_a_duplicate() -> None:
     inbox = queue()
     inbox.put(message(CAR, CAR))
