@@ -176,7 +176,7 @@ class ObjectReport:
     class_share: float | None = None
     """Share of these among those that name a class."""
     length_m: float | None = None
-    """Mean over the detections, as the other two."""
+    """Mean over the detections that give it, as the other two."""
     width_m: float | None = None
     height_m: float | None = None
 

@@ -38,6 +38,10 @@ class Filter:
     none_of: tuple[bool | int | float | str, ...] = ()
     """Values that do not."""
 
+    def __post_init__(self) -> None:
+        if self.min is not None and self.max is not None and not self.min <= self.max:
+            raise ValueError(f"min: must not be more than max = {self.max}, is {self.min}")
+
     def passes(self, value: object) -> bool:
         """Whether `value` passes; what is not there or not a number does not pass a bound."""
         if (self.one_of is not None and value not in self.one_of) or value in self.none_of:
@@ -138,8 +142,8 @@ class SensorModel:
     """Which detections are used, by anything that they say: `{score: {min: 0.5}, class_name: {one_of: [car]}}`. The
     others are out of bounds."""
     view_range_m: float | None = None
-    """How far it sees, where that is less than `max_range_m`; for existence and evaluation, no
-    detection is out of bounds by it."""
+    """How far it sees, where that is less than `max_range_m`; for existence and evaluation, no detection is out of
+    bounds by it."""
     max_range_behind_m: float | None = None
     """How far it sees in the half behind it, where that is less; for existence and evaluation."""
     field_of_view_rad: float = math.tau

@@ -1,7 +1,7 @@
 """What is assumed of a new object (Karle et al. 2023, section III-E)."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
@@ -32,7 +32,7 @@ class Birth(ABC):
     """Below this ego speed an object is assumed to accelerate as the ego does (models with acceleration)."""
 
     def __post_init__(self) -> None:
-        for name in ("yaw_std_rad", "speed_std_mps", "yaw_rate_std_radps", "accel_std_mps2"):
+        for name in (each.name for each in fields(self) if "_std_" in each.name):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name}: must be positive, is {getattr(self, name)}")
 

@@ -17,6 +17,7 @@ _VEHICLES = ("car", "van", "truck", "bus", "trailer", "vehicle")
 _PERSONS = ("pedestrian", "person", "person_sitting")
 _RIDERS = ("cyclist", "bicycle", "motorcycle", "rider")
 _UNKNOWN = 0
+_SIZES = ("length_m", "width_m", "height_m")
 
 
 @dataclass(frozen=True)
@@ -42,9 +43,10 @@ class _Seen:
     """What the detections of one track have said."""
 
     classes: Counter[str] = field(default_factory=Counter)
-    num_sizes: int = 0
-    sizes_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Mean length, width and height."""
+    num_sizes: Counter[str] = field(default_factory=Counter)
+    """How many have given each of `_SIZES`."""
+    sizes_m: dict[str, float] = field(default_factory=dict)
+    """Their means."""
 
 
 class Objects:
@@ -58,22 +60,16 @@ class Objects:
     def learn(self, track_id: int, detections: Iterable[Detection]) -> None:
         """These are detections of the track."""
         for one in detections:
-            length_m, width_m, height_m = one.length_m, one.width_m, one.height_m
-            sized = length_m is not None and width_m is not None
-            if one.class_name is None and not sized:
+            sizes_m = [(name, value) for name in _SIZES if (value := getattr(one, name)) is not None]
+            if one.class_name is None and not sizes_m:
                 continue
             seen = self._seen.setdefault(track_id, _Seen())
             if one.class_name is not None:
                 seen.classes[one.class_name] += 1
-            if length_m is not None and width_m is not None:
-                seen.num_sizes += 1
-                share, new = 1.0 / seen.num_sizes, (length_m, width_m, np.nan if height_m is None else height_m)
-                old = seen.sizes_m
-                seen.sizes_m = (
-                    old[0] + share * (new[0] - old[0]),
-                    old[1] + share * (new[1] - old[1]),
-                    old[2] + share * (new[2] - old[2]),
-                )
+            for name, value in sizes_m:
+                seen.num_sizes[name] += 1
+                mean = seen.sizes_m.get(name, 0.0)
+                seen.sizes_m[name] = mean + 1.0 / seen.num_sizes[name] * (value - mean)
 
     def apart(self, named: Sequence[str | None], track_ids: Sequence[int]) -> Apart | None:
         """Which candidates of these classes are not these tracks; None where nothing speaks against any pair."""
@@ -98,10 +94,7 @@ class Objects:
             return None
         name = self._class(track_id)
         share = None if name is None else seen.classes[name] / seen.classes.total()
-        if not seen.num_sizes:
-            return ObjectReport(name, share)
-        length_m, width_m, height_m = seen.sizes_m
-        return ObjectReport(name, share, length_m, width_m, None if np.isnan(height_m) else height_m)
+        return ObjectReport(name, share, **seen.sizes_m)
 
     def forget(self, track_id: int) -> None:
         """The track has ended."""

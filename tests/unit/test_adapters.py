@@ -378,3 +378,8 @@ def test_any_other_id_is_a_number_that_is_always_the_same():
 def test_a_filter_lets_pass_what_it_says(given, passing):
     values = [-1.0, 2, 2.5, "car", None, math.nan]
     assert [value for value in values if given.passes(value)] == passing
+
+
+def test_a_filter_that_nothing_can_pass_is_refused():
+    with pytest.raises(ValueError, match=r"min: must not be more than max = 1.0, is 2.0"):
+        Filter(min=2.0, max=1.0)

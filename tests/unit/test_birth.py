@@ -84,7 +84,9 @@ def test_a_bearing_alone_starts_nothing() -> None:
     assert FixedBirth().prior(bearing(0.1, SensorPose()), ROAD, EGO, ego_in_pit=False) is None
 
 
-@pytest.mark.parametrize("name", ["yaw_std_rad", "speed_std_mps", "yaw_rate_std_radps", "accel_std_mps2"])
+@pytest.mark.parametrize(
+    "name", ["yaw_std_rad", "speed_std_mps", "yaw_rate_std_radps", "accel_std_mps2", "across_std_m"]
+)
 def test_a_deviation_that_makes_no_sense_is_named(name: str) -> None:
     with pytest.raises(ValueError, match=name):
         FixedBirth(**{name: 0.0})

@@ -73,6 +73,14 @@ def test_the_class_of_a_track_is_that_of_most_of_its_detections_and_its_size_the
     assert track.object == ObjectReport("car", 2 / 3, pytest.approx(4.4), pytest.approx(1.8), None)
 
 
+def test_what_some_detections_do_not_give_is_the_mean_of_the_others() -> None:
+    one = tracker()
+    for k, (width_m, height_m) in enumerate([(1.8, 1.5), (2.0, None), (None, 1.7)]):
+        report = seen(one, k, Detection(x_m=10.0, y_m=0.0, length_m=4.0, width_m=width_m, height_m=height_m))
+    [track] = report.tracks
+    assert track.object == ObjectReport(None, None, pytest.approx(4.0), pytest.approx(1.9), pytest.approx(1.6))
+
+
 def test_a_track_without_any_word_on_its_object_says_nothing() -> None:
     [track] = seen(tracker(), 0, Detection(x_m=10.0, y_m=0.0)).tracks
     assert track.object is None
@@ -81,7 +89,7 @@ def test_a_track_without_any_word_on_its_object_says_nothing() -> None:
 def test_what_is_known_ends_with_the_track() -> None:
     objects = Objects(ObjectRules())
     objects.learn(3, [Detection(class_name="car", height_m=1.5)])
-    assert objects.report(3) == ObjectReport("car", 1.0)
+    assert objects.report(3) == ObjectReport("car", 1.0, height_m=1.5)
     apart = objects.apart(["person", None, "car"], [3, 4])
     assert apart is not None
     assert apart(np.array([0, 1, 2, 0]), np.array([0, 0, 0, 1])).tolist() == [True, False, False, False]
