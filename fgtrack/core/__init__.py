@@ -1,1 +1,1 @@
-"""Types, time, geometry, linear algebra and errors that every other floor uses; imports numpy only."""
+"""Types, time, geometry, linear algebra, files and errors that every other floor uses."""

@@ -3,6 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass, field
 from enum import StrEnum
+from traceback import format_exception
 
 __all__ = ["EndedTrack", "Failure", "Failures"]
 
@@ -71,10 +72,13 @@ class Failures:
         if len(self.ended) < _MOST_ENDED:
             self.ended.append(EndedTrack(track_id, now_ns, failure))
 
-    def note(self, line: str, traceback: str | None = None) -> None:
-        """Remember what a failure said."""
+    def note(self, what: str | Exception) -> None:
+        """Remember what a failure said, or the exception that it was."""
+        if isinstance(what, Exception):
+            line, self.last = f"{type(what).__name__}: {what}", "".join(format_exception(what))
+        else:
+            line = self.last = what
         self.first = self.first or " ".join(line.split())
-        self.last = traceback or line
 
     def as_meta(self) -> dict[str, object]:
         """What meta.json says: every kind, zeros included."""

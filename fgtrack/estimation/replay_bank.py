@@ -257,9 +257,7 @@ class ReplayBank:
             if len(tracks) == 1:
                 return [UpdateResult(UpdateStatus.FAILED)]
             return [
-                self._fused_all(
-                    stamp_ns, tracks[k : k + 1], [one], Prediction(*(each[k : k + 1] for each in predicted))
-                )[0]
+                self._fused_all(stamp_ns, tracks[k : k + 1], [one], predicted.at(slice(k, k + 1)))[0]
                 for k, one in enumerate(measurements)
             ]
 
@@ -273,12 +271,8 @@ class ReplayBank:
         many = order.count[tracks] - places
         if many.any() and (many[1:] > many[:-1]).any():  # those with the most to replay first
             turn = np.argsort(-many, kind="stable")
-            results = self._fused(
-                stamp_ns,
-                tracks[turn],
-                [measurements[row] for row in turn.tolist()],
-                predicted.at(turn),
-            )
+            turned = [measurements[row] for row in turn.tolist()]
+            results = self._fused(stamp_ns, tracks[turn], turned, predicted.at(turn))
             return [results[place] for place in np.argsort(turn).tolist()]
         between = np.flatnonzero(places < newest)
         if between.size:  # not after all of the same stamp
@@ -349,9 +343,7 @@ class ReplayBank:
             predicted = unaware
             before = blank.at(slice(m))
             if place:
-                predicted = Prediction(
-                    *(values[numbers] for values in (steps.before, steps.covariance_before, steps.cross))
-                )
+                predicted = steps.predicted(numbers)
                 earlier = later.numbers[place - 1][:m]
                 before = before._replace(mean=steps.mean[earlier], covariance=steps.covariance[earlier])
             shift = self._wrapped(mean[:m] - predicted.mean)

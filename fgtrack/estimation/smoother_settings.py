@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.models.motion import MotionModel
 
@@ -55,6 +57,26 @@ class SmootherSettings:
             raise ValueError(f"lagged_s: must lie between 0 and lag_s = {self.lag_s}, is {list(self.lagged_s)}")
         if len(set(self.lagged_s)) < len(self.lagged_s):
             raise ValueError(f"lagged_s: names a lag twice, is {list(self.lagged_s)}")
+
+    @classmethod
+    def of_options(cls, name: str, lag_s: float, options: Mapping[str, Any]) -> "SmootherSettings":
+        """The settings of the estimator `name` of one object, which gives no lagged output unless told to.
+
+        Raises `CallError` for an option that does not exist.
+        """
+        taken = [each.name for each in fields(cls) if each.name != "lag_s"]
+        unknown = sorted(set(options) - set(taken))
+        if unknown:
+            raise CallError(f"{name}: unknown option {unknown[0]!r}; its options are {', '.join(taken)}, initiation")
+        return cls(lag_s=lag_s, **{"lagged_s": (), **options})
+
+    def refuse_older(self, stamp_ns: int, oldest_ns: int) -> None:
+        """Raise `DataError` for a detection before `oldest_ns` where `late` is `raise`."""
+        if self.late == "raise" and stamp_ns < oldest_ns:
+            raise DataError(
+                f"a detection at {stamp_ns} ns is {seconds(oldest_ns - stamp_ns):g} s older than the window: "
+                "lengthen smoother.lag_s, or set smoother.late to fuse or drop"
+            )
 
     def thresholds(self, motion: MotionModel, curved: bool) -> FloatArray:
         """Relinearisation thresholds of the state of `motion`, shape (n,).

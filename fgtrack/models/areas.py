@@ -12,12 +12,13 @@ from typing import Any, Self
 import numpy as np
 
 from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import in_polygon
 from fgtrack.core.types import BoolArray, FloatArray
 
 __all__ = ["ExclusionAreas"]
 
-_LARGEST_BYTES = 10_000_000
+_LARGEST_MB = 10.0
 _MOST_CORNERS = 20_000
 _LARGEST_M = 1e9
 _SMALLEST_M = 0.1  # across: what is smaller is in degrees
@@ -78,13 +79,7 @@ def _text(path: Path) -> str:
     if not path.is_file():
         raise CallError(f"{path}: there is no such file of exclusion areas (map.excluded)")
     try:
-        with path.open("rb") as file:
-            found = file.read(_LARGEST_BYTES + 1)
-        if len(found) > _LARGEST_BYTES:
-            raise DataError(f"{path}: is larger than {_LARGEST_BYTES / 1e6:g} MB: simplify the exclusion areas")
-        return found.decode("utf-8-sig")
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+        return read_whole(path, _LARGEST_MB).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: is neither GeoJSON nor CSV (no text)") from error
 

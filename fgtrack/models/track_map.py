@@ -53,7 +53,6 @@ _POINT, _BACK, (_HEADING, _CURVATURE, _LEFT, _RIGHT, _ARC, _ALONG) = slice(0, 2)
 _QUANTITIES = 10
 _FEW_DISTANCES = 3000  # so many are calculated sooner than the tree is asked
 _FEW = 3  # so many points are looked up faster one by one
-_FEW = 3  # so many points are looked up faster one by one
 
 
 class RoadView(NamedTuple):

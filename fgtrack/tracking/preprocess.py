@@ -131,9 +131,9 @@ class Preprocess:
         items = located(batch, sensor, pose)
         lost = dict[int, str]()
         if sensor.filters:
-            refusals = [sensor.refusing(detection) for detection in items.detections]
-            items = _without(items, np.array([name is not None for name in refusals], dtype=bool), "", lost)
-            lost |= {index: f"filters.{name}" for index, name in zip(batch.indices, refusals, strict=True) if name}
+            names = [sensor.refusing(detection) for detection in items.detections]
+            lost = {index: f"filters.{name}" for index, name in zip(batch.indices, names, strict=True) if name}
+            items = items.at(np.array([name is None for name in names], dtype=bool)) if lost else items
         if ego is not None and sensor.max_range_m is not None:
             offsets_m = items.points_m - np.array([pose.x_m, pose.y_m])
             far = np.hypot(offsets_m[:, 0], offsets_m[:, 1]) > sensor.max_range_m
@@ -237,7 +237,8 @@ class Preprocess:
                 R[place] = covariances(parts, names, batch.frame, sensor, pose).mean(axis=0)
                 points_m[place] = parts.points_m.mean(axis=0)
         bearings = math.isnan(points_m[0, 0])  # all or none: what measures the same is placed or not
-        assumes = self._assumed(assumed) + (("curvature_radpm",) if CURVATURE in columns else ())
+        curved = ("curvature_radpm",) if CURVATURE in columns else ()
+        assumes = self._assumed(assumed) + curved
         models, white = self._models(names, R, view)
         whole, errors = white, self._pose_errors(names, models[0], points_m, white, assumes, view)
         if errors is not None:

@@ -1,6 +1,5 @@
 """A bank that outlives the failures of its estimators: a track that fails begins anew, or ends, and is counted."""
 
-import traceback
 from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
 
@@ -84,7 +83,7 @@ class RestartingBank(ForwardingBank):
         except DataError:
             raise
         except Exception as error:
-            self._note(error)
+            self.failures.note(error)
             self.failures.add(Failure.UPDATE_FAILED, len(track_ids))
             for track_id in track_ids:
                 self._restart(track_id, Failure.UPDATE_FAILED)
@@ -112,7 +111,7 @@ class RestartingBank(ForwardingBank):
         except Exception as error:
             if isinstance(error, CallError) and not self._can_start:
                 raise
-            self._note(error)
+            self.failures.note(error)
             self.failures.add(Failure.BIRTH_FAILED)
             self._remove(track_id)
 
@@ -207,7 +206,7 @@ class RestartingBank(ForwardingBank):
         try:
             self._bank.birth(track_id, start)
         except Exception as error:
-            self._note(error)
+            self.failures.note(error)
             self._ended(track_id, failure)
             self._remove(track_id)
             return
@@ -242,10 +241,7 @@ class RestartingBank(ForwardingBank):
 
     def _raised(self, error: Exception) -> None:
         self.failures.add(Failure.ESTIMATOR_RAISED)
-        self._note(error)
-
-    def _note(self, error: Exception) -> None:
-        self.failures.note(f"{type(error).__name__}: {error}", traceback.format_exc())
+        self.failures.note(error)
 
 
 def _present(bank: TrackBank) -> list[TrackState]:

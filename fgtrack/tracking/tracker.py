@@ -1,6 +1,5 @@
 """The tracker: what happens at a tick, in the order of the paper's algorithm (Karle et al. 2023, figure 2)."""
 
-import traceback
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -158,7 +157,7 @@ class Tracker:
             if isinstance(error, self._parts.answers):
                 raise
             self.failures.add(Failure.LIST_FAILED)
-            self.failures.note(f"{type(error).__name__}: {error}", "".join(traceback.format_exception(error)))
+            self.failures.note(error)
             ended = {one.index for one in self._records[first:]}
             left = [index for index in batch.indices if index not in ended]
             self._records += [record(batch.message, index, Disposition.FAILED) for index in left]

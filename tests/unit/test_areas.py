@@ -104,7 +104,7 @@ def test_files_that_are_too_large_missing_or_binary_are_refused(monkeypatch, tmp
     binary.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(DataError, match="no text"):
         ExclusionAreas.read([binary])
-    monkeypatch.setattr("fgtrack.models.areas._LARGEST_BYTES", 20)
+    monkeypatch.setattr("fgtrack.models.areas._LARGEST_MB", 2e-5)
     with pytest.raises(DataError, match="larger than"):
         ExclusionAreas.read([written(tmp_path, polygon(SQUARE))])
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.time import nanoseconds, seconds
+from fgtrack.core.errors import CallError
+from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
 from fgtrack.estimation.banded.windows import Leaving, States, Windows
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
@@ -132,11 +132,7 @@ class BandedBank:
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`. Raises `DataError` for a stamp before the window where the policy is `raise`."""
-        if self._settings.late == "raise" and stamp_ns < self._oldest_ns:
-            raise DataError(
-                f"detections at {stamp_ns} ns are {seconds(self.present_ns - stamp_ns):g} s late, older than the "
-                "window: lengthen smoother.lag_s, or set smoother.late to fuse or drop"
-            )
+        self._settings.refuse_older(stamp_ns, self._oldest_ns)
         track_ids, _, states = self._known_at(stamp_ns)
         if not track_ids:
             return no_states(self._motion.dim)
@@ -151,11 +147,8 @@ class BandedBank:
         tracks = np.array([self._numbers[track_id] for track_id in track_ids])
         measurements = [measurement.seen_by(self._motion) for measurement in measurements]
         times = self._all_times().at(self._ranks[tracks])
-        if self._settings.late == "raise" and (stamp_ns < times.start).any():
-            raise DataError(
-                f"a measurement at {stamp_ns} ns is {seconds(int(times.start.max()) - stamp_ns):g} s older than the "
-                "window: lengthen smoother.lag_s, or set smoother.late to fuse or drop"
-            )
+        if self._settings.late == "raise":
+            self._settings.refuse_older(stamp_ns, int(times.start.max()))
         young = times.oldest <= stamp_ns
         if young.all():
             return self._update(stamp_ns, tracks, measurements, times)

@@ -1,17 +1,13 @@
 """The smoother of one object, by name."""
 
-from dataclasses import fields
 from typing import Any
 
-from fgtrack.core.errors import CallError
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.banded.bank import BandedBank
 from fgtrack.estimation.base import Measurement, Start, UpdateResult
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
-
-_OPTIONS = (*(field.name for field in fields(SmootherSettings) if field.name != "lag_s"), "initiation")
 
 
 class BandedSmoother:
@@ -27,10 +23,8 @@ class BandedSmoother:
     def __init__(
         self, motion: MotionModel, start: Start, lag_s: float, initiation: str = DEFAULT, **options: Any
     ) -> None:
-        unknown = sorted(set(options) - set(_OPTIONS))
-        if unknown:
-            raise CallError(f"smoother-banded: unknown option {unknown[0]!r}; its options are {', '.join(_OPTIONS)}")
-        self._bank = BandedBank(motion, SmootherSettings(lag_s=lag_s, **{"lagged_s": (), **options}), initiation)
+        settings = SmootherSettings.of_options("smoother-banded", lag_s, options)
+        self._bank = BandedBank(motion, settings, initiation)
         self._bank.birth(0, start)
 
     @property

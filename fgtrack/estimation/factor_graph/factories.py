@@ -1,10 +1,8 @@
 """The smoother of one object, by name."""
 
 from collections.abc import Callable
-from dataclasses import fields
 from typing import Any
 
-from fgtrack.core.errors import CallError
 from fgtrack.estimation.base import Start
 from fgtrack.estimation.factor_graph.backends.batch import BatchBackend
 from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
@@ -12,29 +10,22 @@ from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
 
-_OPTIONS = (*(field.name for field in fields(SmootherSettings) if field.name != "lag_s"), "initiation")
-
 
 # Any: an option may be any value that `SmootherSettings` takes.
 def smoother(
     motion: MotionModel, start: Start, lag_s: float, initiation: str = DEFAULT, **options: Any
 ) -> FixedLagSmoother:
     """Fixed-lag smoother, a factor graph that iSAM2 solves incrementally."""
-    return FixedLagSmoother(motion, start, _settings(lag_s, options), initiation=initiation)
+    settings = SmootherSettings.of_options("smoother", lag_s, options)
+    return FixedLagSmoother(motion, start, settings, initiation=initiation)
 
 
 def smoother_batch(
     motion: MotionModel, start: Start, lag_s: float, initiation: str = DEFAULT, **options: Any
 ) -> FixedLagSmoother:
     """Fixed-lag smoother, a factor graph that Levenberg-Marquardt solves anew at every update: slow, for checks."""
-    return FixedLagSmoother(motion, start, _settings(lag_s, options), BatchBackend, initiation)
-
-
-def _settings(lag_s: float, options: dict[str, Any]) -> SmootherSettings:
-    unknown = sorted(set(options) - set(_OPTIONS))
-    if unknown:
-        raise CallError(f"smoother: unknown option {unknown[0]!r}; its options are {', '.join(_OPTIONS)}")
-    return SmootherSettings(lag_s=lag_s, **{"lagged_s": (), **options})
+    settings = SmootherSettings.of_options("smoother-batch", lag_s, options)
+    return FixedLagSmoother(motion, start, settings, BatchBackend, initiation)
 
 
 def _claim(factory: Callable[..., FixedLagSmoother], rounding: float, tolerance: float = 1e-9) -> None:

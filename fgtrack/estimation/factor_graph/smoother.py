@@ -5,8 +5,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from fgtrack.core.errors import DataError
-from fgtrack.core.time import nanoseconds, seconds
+from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.birth import initial_state
@@ -162,11 +161,7 @@ class FixedLagSmoother:
         Raises `DataError` where it is older than the window and the late policy is `raise`.
         """
         start_ns = self._start_ns
-        if stamp_ns < start_ns and self._settings.late == "raise":
-            raise DataError(
-                f"a measurement at {stamp_ns} ns is {seconds(start_ns - stamp_ns):g} s older than the window: "
-                "lengthen smoother.lag_s, or set smoother.late to fuse or drop"
-            )
+        self._settings.refuse_older(stamp_ns, start_ns)
         if stamp_ns < self._reach_ns or stamp_ns < self.window.reach_ns:
             return UpdateStatus.TOO_OLD
         if stamp_ns < start_ns:

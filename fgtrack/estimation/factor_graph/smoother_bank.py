@@ -2,8 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from fgtrack.core.errors import DataError
-from fgtrack.core.time import nanoseconds, seconds
+from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult
 from fgtrack.estimation.factor_graph import together
@@ -50,11 +49,7 @@ class SmootherBank(SmoothingBank):
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`. Raises `DataError` for a stamp before the window where the policy is `raise`."""
-        if self._settings.late == "raise" and stamp_ns < super().window_start_ns:
-            raise DataError(
-                f"detections at {stamp_ns} ns are {seconds(self.present_ns - stamp_ns):g} s late, older than the "
-                "window: lengthen smoother.lag_s, or set smoother.late to fuse or drop"
-            )
+        self._settings.refuse_older(stamp_ns, super().window_start_ns)
         self._look_up(stamp_ns)
         return super().states_at(stamp_ns)
 
