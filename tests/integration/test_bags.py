@@ -19,7 +19,7 @@ from support.messages import START_NS, drive, exact, message_lists, shared
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, TruthState
-from fgtrack.io.config import InputConfig, TopicInput
+from fgtrack.io.config import Filter, InputConfig, TopicInput
 from fgtrack.io.errors import TruncatedInput, UntilBreak
 from fgtrack.io.ros.bag import Bag
 from fgtrack.io.ros.bag_writer import write_bag
@@ -441,6 +441,32 @@ def test_an_ego_that_does_not_fit_is_one_line(tmp_path, item, error, complaint):
     write_bag(tmp_path / "bag", drive())
     with pytest.raises(error, match=complaint):
         open_input(tmp_path / "bag", InputConfig(ego=item))
+
+
+def test_a_topic_that_fgtrack_wrote_follows_the_keys_that_name_it(tmp_path):
+    near, far = Detection(x_m=5.0, y_m=0.0, score=0.9), Detection(x_m=9.0, y_m=0.0, score=0.2)
+    truth = TruthState(1, 2, 7, 1.0, 2.0)
+    write_bag(tmp_path / "bag", [truth, DetectionList("lidar", 1, 2, (near, far))])
+    item = TopicInput("/fgtrack/detections/lidar", frame="map", filters={"score": Filter(min=0.5)})
+    config = InputConfig(detections={"front": item}, truth=TopicInput("/fgtrack/truth"))
+    assert read(tmp_path / "bag", config) == [truth, DetectionList("front", 1, 2, (near,), "map")]
+    with pytest.raises(CallError, match="objects of type fgtrack_msgs/msg/Truth need fields"):
+        read(tmp_path / "bag", InputConfig(detections={"front": TopicInput("/fgtrack/truth")}))
+
+
+@pytest.mark.parametrize(
+    ("config", "complaint"),
+    [
+        (InputConfig(ego=TopicInput("/ego/odometry", scan_s=0.1)), "scan_s is of detections, the ego takes none"),
+        (InputConfig(ego=TopicInput("/ego/odometry", frame="ego")), "frame is of detections, the ego"),
+        (InputConfig(truth=TopicInput("/truth/poses", scan_s=0.1)), "scan_s is of detections, the truth"),
+        (InputConfig(detections={"lidar": TopicInput("/detections/lidar", object_id=1)}), "object_id is of truth"),
+    ],
+)
+def test_a_key_that_says_nothing_of_a_topic_is_refused(tmp_path, config, complaint):
+    write_bag(tmp_path / "bag", drive())
+    with pytest.raises(CallError, match=complaint):
+        open_input(tmp_path / "bag", config)
 
 
 def test_a_path_that_leads_nowhere_is_named(tmp_path):

@@ -21,7 +21,7 @@ from fgtrack.io.adapters.fields import (
     value_at,
 )
 from fgtrack.io.adapters.ids import object_id
-from fgtrack.io.adapters.native import NATIVE_ADAPTERS
+from fgtrack.io.adapters.native import DETECTIONS, EGO, NATIVE_ADAPTERS, TRUTH, detections
 from fgtrack.io.adapters.scans import grouped
 from fgtrack.io.config import InputConfig, TopicInput
 from fgtrack.io.errors import TruncatedInput
@@ -30,6 +30,9 @@ from fgtrack.io.source import FileFormat
 
 DETECTION_FIELDS = frozenset({*MEASURABLE, *DESCRIBING, "object_id"})
 """What a filter may go by, whatever the type of the message."""
+
+#: Keys of a topic that say something of one role only.
+_KEYS = {"frame": ("detections",), "filters": ("detections", "truth"), "scan_s": ("detections",), "object_id": ("truth",)}
 
 Convert = Callable[[RosMessage, int], Iterator[Message]]
 
@@ -75,12 +78,15 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
         )
     uses = []
     if config.ego:
+        _check_keys("ego", config.ego)
         topic = _find(bag, config.ego)
         uses.append(TopicUse(topic, "ego", _stamped(_ego(topic, config.ego), config.ego)))
     for sensor, item in config.detections.items():
+        _check_keys("detections", item)
         topic = _find(bag, item)
         uses.append(TopicUse(topic, f"detections {sensor}", _stamped(_detections(topic, item, sensor), item)))
     for number, item in enumerate(truth):
+        _check_keys("truth", item)
         topic = _find(bag, item)
         uses.append(TopicUse(topic, "truth", _stamped(_truths(topic, item, number, len(truth)), item)))
     return tuple(uses)
@@ -141,6 +147,12 @@ def _listed(topics: tuple[BagTopic, ...] | list[BagTopic]) -> str:
     return ", ".join(f"{topic.name} ({topic.type})" for topic in topics) or "no topic"
 
 
+def _check_keys(role: str, item: TopicInput) -> None:
+    for name, roles in _KEYS.items():
+        if role not in roles and getattr(item, name) not in (None, {}, "map"):
+            raise CallError(f"topic {item.topic}: {name} is of {' and '.join(roles)}, the {role} takes none: leave it out")
+
+
 def _check_filters(item: TopicInput) -> None:
     for name in item.filters if item.fields is None else ():
         if name not in DETECTION_FIELDS:
@@ -167,7 +179,7 @@ def _ego(topic: BagTopic, item: TopicInput) -> Convert:
     if fields is not None:
         _check_fields(item, EGO_FIELDS, ("x_m", "y_m", "yaw_rad", "speed_mps"))
         return lambda message, receipt_ns: iter((ego_by_fields(message, fields, receipt_ns),))
-    if topic.type in NATIVE_ADAPTERS:
+    if topic.type == EGO:
         return _native(topic.type)
     if topic.type != ODOMETRY:
         raise CallError(f"topic {topic.name}: an ego of type {topic.type} needs fields, known is {ODOMETRY}")
@@ -178,8 +190,6 @@ def _objects(
     topic: BagTopic, item: TopicInput, messages: Callable[[ObjectList, int, int], Iterator[Message]]
 ) -> Convert:
     """Makes `messages` of an object list, its stamp (without one the receipt) and its receipt."""
-    if topic.type in NATIVE_ADAPTERS:
-        return _native(topic.type)
     _check_filters(item)
     read = _object_list(topic, item)
 
@@ -195,12 +205,20 @@ def _object_list(topic: BagTopic, item: TopicInput) -> Callable[[RosMessage], Ob
     if item.fields is not None:
         _check_fields(item, OBJECT_FIELDS)
         read = partial(objects_by_fields, fields=item.fields)
+    elif topic.type == DETECTIONS:
+        read = _own_objects
     elif topic.type not in ADAPTERS:
         known = ", ".join(message_types())
         raise CallError(f"topic {topic.name}: objects of type {topic.type} need fields, known are {known}")
     else:
         read = ADAPTERS.load(topic.type)
     return partial(_passing, read, item) if item.filters else read
+
+
+def _own_objects(message: RosMessage) -> ObjectList:
+    """The objects of a list that fgtrack has written."""
+    found = detections(message, 0)
+    return ObjectList(found.stamp_ns, found.frame, tuple(found.objects))
 
 
 def _passing(read: Callable[[RosMessage], ObjectList], item: TopicInput, message: RosMessage) -> ObjectList:
@@ -229,6 +247,8 @@ def _detections(topic: BagTopic, item: TopicInput, sensor: str) -> Convert:
 
 def _truths(topic: BagTopic, item: TopicInput, number: int, topics: int) -> Convert:
     """Of several topics each has one object, which is known by the place of its topic if it has no other id."""
+    if topic.type == TRUTH and item.fields is None and item.object_id is None and not item.filters:
+        return _native(topic.type)
     if topics == 1 and item.object_id is None:
         return _objects(topic, item, _truth)
     own = object_id(number if item.object_id is None else item.object_id)
