@@ -163,6 +163,16 @@ def test_results_without_a_place_in_space_are_bearings(tmp_path):
     )
     with pytest.raises(DataError, match=r"camera/0001\.txt:2: .*in the image alone"):
         lists(folder(tmp_path, camera=[pose(0, 10.0, 0.0, 0.0), line]))
+    with pytest.raises(DataError, match=r"camera/0001\.txt:2: .*a box in space, where the file begins"):
+        lists(folder(tmp_path, camera=[line, pose(0, 10.0, 0.0, 0.0)]))
+
+
+def test_fields_may_be_any_spaces_apart(tmp_path):
+    line = label(0, 3, "Car", 10.0, 0.0, 0.3)
+    one, other = (
+        folder(tmp_path / name, label_02=[text]) for name, text in (("a", line), ("b", line.replace(" ", "  ")))
+    )
+    assert messages(one) == messages(other)
 
 
 def test_classes_are_named(tmp_path):

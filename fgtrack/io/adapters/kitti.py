@@ -84,13 +84,13 @@ def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator
     views = _views(folder, sequence)
     labels = folder / _LABELS / f"{sequence}.txt"
     truth = _rows(labels, len(views)) if labels.exists() else {}
-    detections = {place.parent.name: _rows(place, len(views)) for place in _detection_places(folder, sequence)}
+    rows_of = {place.parent.name: _rows(place, len(views)) for place in _detection_places(folder, sequence)}
+    detections = {sensor: (rows, _frame(rows)) for sensor, rows in rows_of.items()}
     for frame, view in enumerate(views):
         yield from _read(truth.get(frame, []), partial(_truth, view, settings))
         yield from _regions(view, truth.get(frame, []))
         yield view.ego
-        for sensor, rows in detections.items():
-            refers_to = _frame(rows)
+        for sensor, (rows, refers_to) in detections.items():
             parse = partial(_detection, view, sensor, settings, refers_to)
             found: Iterator[Detection | str] = _read(rows.get(frame, []), parse)
             objects, left_out = split(found)
@@ -209,6 +209,8 @@ def _detection(view: View, sensor: str, settings: KittiInput, frame: Frame, fiel
         if frame != "sensor":
             raise ValueError("a box in the image alone, where others of the file are in space: give it a folder")
         return _in_image(view, settings, list(map(float, image)), score, name)
+    if frame == "sensor":
+        raise ValueError("a box in space, where the file begins with one in the image alone: give it a folder")
     height_m, width_m, length_m, x_m, y_m, z_m, turned_rad = map(float, space)
     position_m, yaw_rad = view.pose(x_m, y_m, z_m, turned_rad)
     ahead_m, aside_m, bottom_m = position_m.tolist()
@@ -277,10 +279,10 @@ def _rows(place: Path, num_frames: int) -> Rows:
 
 def _of_file(file: Path) -> Iterator[tuple[str, list[str]]]:
     for number, line in enumerate(lines(file), 1):
-        yield f"{file}:{number}", line.split(",") if "," in line else line.split(" ")
+        yield f"{file}:{number}", line.split(",") if "," in line else line.split()
 
 
 def _of_frames(folder: Path) -> Iterator[tuple[str, list[str]]]:
     for file in sorted(folder.glob("*.txt")):
         for number, line in enumerate(lines(file), 1):
-            yield f"{file}:{number}", [file.stem, "-1", *line.split(" ")]
+            yield f"{file}:{number}", [file.stem, "-1", *line.split()]
