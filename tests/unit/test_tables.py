@@ -1,6 +1,7 @@
 """CSV files by a mapping of their columns."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -82,6 +83,12 @@ def test_one_file_may_hold_everything(tmp_path):
             "radar", 1_500_500_000, 1_500_500_000, (Detection(range_m=10.0, bearing_rad=bearing_rad),), "sensor"
         )
     ]
+
+
+def test_where_no_row_passes_an_empty_list_says_what_was_left_out(tmp_path):
+    write(tmp_path, radar=RADAR_TEXT)
+    (found,) = messages(tmp_path, detections={"radar": replace(RADAR, filters={"x": Filter(min=50.0)})})
+    assert (found.stamp_ns, found.objects, found.left_out) == (1_000_000_000, (), ("filters.x",) * 3)
 
 
 def test_an_empty_cell_is_not_given_and_a_row_without_a_measurement_is_a_scan_that_saw_nothing(tmp_path):
@@ -186,9 +193,16 @@ def test_a_byte_that_is_no_text_is_one_line(tmp_path):
             {"detections": {"radar": CsvTable({"stamp": "t", "speed": "v"}, "radar.csv")}},
             "unknown column 'speed', known",
         ),
-        ({"detections": {"radar": CsvTable({"stamp": ["t", "x"]}, "radar.csv")}}, "the name of one column is needed"),
-        ({"detections": {"radar": CsvTable({"stamp": "t"})}}, "is a folder, so .* must name its file"),
-        ({"detections": {"radar": CsvTable({"stamp": "t"}, "lidar.csv")}}, r"lidar\.csv: there is no such file"),
+        ({"detections": {"radar": CsvTable({"stamp": "t", "score": "x"}, "radar.csv")}}, "must name what is measured"),
+        (
+            {"detections": {"radar": CsvTable({"stamp": ["t", "x"], "x_m": "x"}, "radar.csv")}},
+            "the name of one column is needed",
+        ),
+        ({"detections": {"radar": CsvTable({"stamp": "t", "x_m": "x"})}}, "is a folder, so .* must name its file"),
+        (
+            {"detections": {"radar": CsvTable({"stamp": "t", "x_m": "x"}, "lidar.csv")}},
+            r"lidar\.csv: there is no such file",
+        ),
     ],
 )
 def test_a_mapping_that_does_not_fit_is_one_line(tmp_path, tables, complaint):

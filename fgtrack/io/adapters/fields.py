@@ -105,9 +105,14 @@ def _single(path: FieldPath) -> str:
 
 
 def _number(message: RosMessage, path: FieldPath, name: str) -> float:
+    return converted(_raw(message, path.path if isinstance(path, Field) else path), path, name)
+
+
+def converted(raw: float, path: FieldPath, name: str) -> float:
+    """What the component `name` is where `path` leads to `raw`."""
     if not isinstance(path, Field):
-        return _raw(message, path)
-    value = path.value(_raw(message, path.path))
+        return raw
+    value = path.value(raw)
     return wrap_angle(value) if name in ANGLES and math.isfinite(value) else value
 
 

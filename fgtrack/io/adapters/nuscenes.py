@@ -104,7 +104,7 @@ def _samples(tables: Path, file: Path, settings: NuscenesInput) -> dict[str, int
             raise CallError(f"{tables}: has no scene {settings.scene}, but {_some(names.values())}")
     if len(scenes) != 1:
         has = _some(names[token] for token in scenes) if scenes else "none of these tables"
-        raise CallError(f"the results are of {len(scenes)} scenes ({has}), name one as input.nuscenes.scene")
+        raise CallError(f"{file}: the results are of {len(scenes)} scenes ({has}), name one as input.nuscenes.scene")
     entries = list_entries(tables / "sample.json")
     chosen = sorted((each["timestamp"], each["token"]) for each in entries if each["scene_token"] in scenes)
     return {token: int(time_us) * _NS_PER_US for time_us, token in chosen}

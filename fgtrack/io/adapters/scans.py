@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 
 from fgtrack.core.errors import DataError
@@ -48,10 +48,7 @@ class _Scan:
 
 
 def _stamped(item: Detection, stamp_ns: int) -> Detection:
-    if item.stamp_ns is not None:
-        return item
-    values = {name: getattr(item, name) for name in Detection.__slots__}
-    return Detection(**values | {"stamp_ns": stamp_ns})
+    return item if item.stamp_ns is not None else replace(item, stamp_ns=stamp_ns)
 
 
 def grouped(messages: Iterable[Message], windows_ns: Mapping[str, int]) -> Iterator[Message]:

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import (
     DESCRIBING,
     MEASURABLE,
@@ -28,7 +27,7 @@ from fgtrack.core.types import (
     Message,
     TruthState,
 )
-from fgtrack.io.adapters.fields import ANGLES
+from fgtrack.io.adapters.fields import converted
 from fgtrack.io.adapters.fusiontracking import LOG_NAME
 from fgtrack.io.adapters.ids import object_id
 from fgtrack.io.config import CsvInput, CsvTable, Field, FieldPath, InputConfig
@@ -95,6 +94,7 @@ def _read(file: Path, table: CsvTable, role: str) -> tuple[list[Message], DataEr
     """All messages of a table, up to its end or to what is wrong with it."""
     rows: list[tuple[_Times, Any]] = []
     left_out: list[str] = []
+    first: Cells | None = None  # of those left out
     error = None
     make: Make = partial(_state, table, role) if role in ("ego", "truth") else partial(_detection, table)
     try:
@@ -102,16 +102,19 @@ def _read(file: Path, table: CsvTable, role: str) -> tuple[list[Message], DataEr
             refused = (name for name, each in table.filters.items() if not each.passes(_typed(cells.values[name])))
             if (name := next(refused, None)) is not None:
                 left_out.append(f"filters.{name}")
+                first = first or cells
                 continue
             times = _times(cells, table)
             rows.append((times, make(cells, times)))
+        if not rows and first is not None and role not in ("ego", "truth"):
+            rows.append((_times(first, table), None))  # an empty list, to say what was left out
     except DataError as found:
         error = found
     if role in ("ego", "truth"):
         return [state for _, state in rows], error
     lists = list(_lists(rows, role.removeprefix("detections "), table))
     if lists:
-        lists[0] = replace(lists[0], left_out=tuple(left_out))  # of no list: their times are not read
+        lists[0] = replace(lists[0], left_out=tuple(left_out))  # their own times are not read
     return [*lists], error
 
 
@@ -228,11 +231,7 @@ def _number(cells: Cells, path: FieldPath, name: str) -> float | None:
             parts.append(float(text))
         except ValueError as error:
             raise DataError(f"{cells.place}: {column}: {text[:40]!r} is no number") from error
-    raw = parts[0] if len(parts) == 1 else math.hypot(*parts)
-    if not isinstance(path, Field):
-        return raw
-    value = path.value(raw)
-    return wrap_angle(value) if name in ANGLES and math.isfinite(value) else value
+    return converted(parts[0] if len(parts) == 1 else math.hypot(*parts), path, name)
 
 
 def _typed(text: str) -> float | str:
@@ -272,6 +271,8 @@ def _tables(path: Path, config: CsvInput) -> Iterator[tuple[Path, CsvTable, str]
         for name in (*needed, *(("yaw_rad", "speed_mps") if role == "ego" else ())):
             if name not in table.columns:
                 raise CallError(f"{where}: must name {name}")
+        if known is _OBJECT and set(table.columns).isdisjoint(MEASURABLE):
+            raise CallError(f"{where}: must name what is measured, one of {', '.join(MEASURABLE)}")
         for name in (*_TIMES, *_TEXTS):
             if len(_names(table.columns.get(name, ""))) != 1 or isinstance(table.columns.get(name), Field):
                 raise CallError(f"{where}.{name}: the name of one column is needed")
