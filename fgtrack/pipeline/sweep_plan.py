@@ -349,9 +349,17 @@ def job_key(recipe: Recipe, files: Sequence[Value]) -> str:
 
 
 def _fingerprints(recording: Path | None, scenario: Value, config: Value) -> list[Value]:
-    """Size and time of change of every file that a job reads: the recording, maps, ticks; missing ones have none."""
+    """Size and time of change of every file that a job reads, where it is there.
+
+    The recording and what is named beside it, maps, exclusion areas, ticks, message definitions.
+    """
     names = [recording, None if scenario is None else scenario["map"]]
     names += [config["map"]["track"], config["map"]["pit"], config["clock"]["ticks_file"]]
+    names += [*config["map"]["excluded"], *config["input"]["message_definitions"]]
+    if recording is not None and recording.is_file():
+        tables = config["input"]["csv"]
+        beside = [tables["ego"], tables["truth"], *tables["detections"].values()]
+        names += [recording.parent / one["file"] for one in beside if one and one["file"]]
     found: list[Value] = []
     for place, name in enumerate(names):
         top = None if name is None else Path(name)

@@ -283,6 +283,19 @@ def test_a_changed_map_or_recording_changes_the_key(plan: Any, recording: str, t
         assert keys(plan(text, head)) != before
 
 
+def test_changed_areas_tables_or_definitions_change_the_key(plan: Any, recording: str, tmp_path: Path) -> None:
+    """What a configuration names is read by the job as well, be it beside the recording."""
+    shore, cars = tmp_path / "shore.csv", tmp_path / "cars.csv"
+    truth = "{file: cars.csv, columns: {stamp: t, x_m: x, y_m: y}}"
+    text = (
+        f"set: {{map.excluded: [{shore}], input.csv.truth: {truth}, input.message_definitions: [{tmp_path / 'a.msg'}]}}"
+    )
+    for file in (shore, cars, tmp_path / "a.msg"):
+        before = keys(plan(text, recording))
+        file.write_text("a")
+        assert keys(plan(text, recording)) != before
+
+
 def test_the_key_knows_the_versions(plan: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     before = keys(plan(""))
     monkeypatch.setattr("fgtrack.pipeline.sweep_plan.versions", lambda: {"fgtrack": "another"})
