@@ -172,8 +172,13 @@ def _lock(descriptor: int, folder: Path) -> None:
 
 def _rename(part: Path, path: Path, kind: Kind, overwrite: bool) -> None:
     if not overwrite:
-        with suppress(PermissionError):  # a file system without links
+        try:
             os.link(part, path)  # unlike a renaming this never replaces what was made meanwhile
+        except FileExistsError:
+            raise
+        except OSError:  # a file system without links, each says it in its own way
+            pass
+        else:
             part.unlink()
             return
     check_output(path, kind, overwrite)

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import zlib
 from collections.abc import Iterable, Iterator
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -67,7 +68,7 @@ def read_ticks(path: Path) -> list[int]:
         ticks = [int(json.loads(line)["now_ns"]) for line in text.splitlines()]
     except OSError as error:
         raise CallError(f"{path}: ticks cannot be read ({error.strerror or error})") from error
-    except (ValueError, KeyError, TypeError, EOFError) as error:
+    except (ValueError, KeyError, TypeError, EOFError, zlib.error) as error:
         raise CallError(f"{path}: no list of ticks, every line must be an object with now_ns") from error
     if not all(before < after for before, after in pairwise(ticks)):
         raise CallError(f"{path}: the ticks are not ascending")

@@ -1,5 +1,6 @@
 """What a command did not make it neither removes nor replaces."""
 
+import errno
 import json
 import os
 import shutil
@@ -494,6 +495,17 @@ def test_a_full_disk_is_no_fault_of_the_call(here: Path) -> None:
     with pytest.raises(DataError, match="free some space"), new_file(Path("new.jsonl"), STREAM, False):
         raise OSError(28, "No space left on device")
     assert not list(here.glob("new*"))
+
+
+def test_a_file_system_without_links_takes_files(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def link(source: Path, target: Path) -> None:
+        raise OSError(errno.EOPNOTSUPP, "Operation not supported")
+
+    monkeypatch.setattr(os, "link", link)
+    with new_file(Path("new.jsonl"), STREAM, False) as file:
+        file.write(b"{}")
+    assert Path("new.jsonl").read_bytes() == b"{}"
+    assert not list(here.glob("new*.part"))
 
 
 def test_what_is_left_of_a_run_that_was_killed_at_its_beginning_can_be_replaced(here: Path, call: Call) -> None:

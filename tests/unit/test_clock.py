@@ -83,9 +83,10 @@ def test_ticks_are_read_from_plain_and_gzipped_lines(tmp_path: Path, name: str) 
         (b"\xff\xfe", "no list of ticks"),
         (b"\x1f\x8bbroken", "ticks"),
         (gzip.compress(b'{"now_ns": 5}\n')[:-9], "no list of ticks"),
+        (b"\x1f\x8b\x08" + 7 * b"\0" + b"\xff", "no list of ticks"),
         (None, "cannot be read"),
     ],
-    ids=["not ascending", "no time", "no object", "no JSON", "no text", "no gzip", "cut off", "missing"],
+    ids=["not ascending", "no time", "no object", "no JSON", "no text", "no gzip", "cut off", "damaged", "missing"],
 )
 def test_a_file_that_is_no_list_of_ticks_is_named(tmp_path: Path, content: bytes | None, message: str) -> None:
     path = tmp_path / "ticks.jsonl"

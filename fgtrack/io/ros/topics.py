@@ -32,7 +32,12 @@ DETECTION_FIELDS = frozenset({*MEASURABLE, *DESCRIBING, "object_id"})
 """What a filter may go by, whatever the type of the message."""
 
 #: Keys of a topic that say something of one role only.
-_KEYS = {"frame": ("detections",), "filters": ("detections", "truth"), "scan_s": ("detections",), "object_id": ("truth",)}
+_KEYS = {
+    "frame": ("detections",),
+    "filters": ("detections", "truth"),
+    "scan_s": ("detections",),
+    "object_id": ("truth",),
+}
 
 Convert = Callable[[RosMessage, int], Iterator[Message]]
 
@@ -150,7 +155,9 @@ def _listed(topics: tuple[BagTopic, ...] | list[BagTopic]) -> str:
 def _check_keys(role: str, item: TopicInput) -> None:
     for name, roles in _KEYS.items():
         if role not in roles and getattr(item, name) not in (None, {}, "map"):
-            raise CallError(f"topic {item.topic}: {name} is of {' and '.join(roles)}, the {role} takes none: leave it out")
+            raise CallError(
+                f"topic {item.topic}: {name} is of {' and '.join(roles)}, the {role} takes none: leave it out"
+            )
 
 
 def _check_filters(item: TopicInput) -> None:
