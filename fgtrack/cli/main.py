@@ -73,11 +73,21 @@ def _options(
     """Options before the command; `main` reads --debug itself."""
 
 
+class _OneLine(logging.Formatter):
+    """Warnings of readers name what is in files."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """See `logging.Formatter.format`; as a terminal can show it."""
+        return one_line(super().format(record))
+
+
 def run(arguments: Sequence[str]) -> int:
     """Run one command; gives the exit code. Errors are one line on stderr."""
     debug = "--debug" in arguments
     words = [word for word in arguments if word != "--debug"]
-    logging.basicConfig(level=logging.WARNING, format="fgtrack: %(message)s", force=True)
+    logged = logging.StreamHandler()
+    logged.setFormatter(_OneLine("fgtrack: %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[logged], force=True)
     try:
         outcome = typer.main.get_command(app).main(words or ["--help"], prog_name="fgtrack", standalone_mode=False)
         if outcome == INTERRUPTED:  # typer turns the exception into this code

@@ -19,7 +19,7 @@ from rich.progress import (
 from rich.progress import Progress as RichProgress
 
 from fgtrack.cli.arguments import Form
-from fgtrack.core.errors import CallError, one_line, printable
+from fgtrack.core.errors import CallError, one_line, printable_lines
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Message
 from fgtrack.evaluation.tables import Table, Tables
@@ -42,7 +42,7 @@ def console() -> Console:
 
 def say(line: object) -> None:
     """Print a line as it is, however long."""
-    console().print("\n".join(map(printable, str(line).split("\n"))), highlight=False, soft_wrap=True, markup=False)
+    console().print(printable_lines(str(line)), highlight=False, soft_wrap=True, markup=False)
 
 
 def warn(line: str) -> None:

@@ -43,3 +43,8 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def printable_lines(text: str) -> str:
+    """`text` with escapes in place of what is no letter, sign or end of a line."""
+    return "\n".join(map(printable, text.split("\n")))

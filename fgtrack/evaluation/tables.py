@@ -13,7 +13,7 @@ import numpy.typing as npt
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from fgtrack.core.errors import printable
+from fgtrack.core.errors import printable, printable_lines
 from fgtrack.evaluation.terminal import Shown, bulleted, lines, of_rows
 from fgtrack.io.run import Table as RunTable
 
@@ -111,7 +111,7 @@ class Table(RunTable):
         detail: bool = False,
         detail_rows: Callable[[Row], bool] = lambda row: False,
     ) -> None:
-        self.title, self.row_keys, self.is_detail = title, row_keys, detail
+        self.title, self.row_keys, self.is_detail = printable(title), row_keys, detail
         data: dict[str, npt.NDArray[Any]] = {}  # Any: a column holds floats, integers or text
         shown = []
         for column in columns:
@@ -121,7 +121,7 @@ class Table(RunTable):
             cells = tuple(printable(column.cell(each)) for each in values)
             if column.heading:
                 bold = tuple(column.bold is not None and column.bold(row) for row in rows)
-                shown.append((column, Shown(column.heading, cells, column.left, bold)))
+                shown.append((column, Shown(printable_lines(column.heading), cells, column.left, bold)))
         super().__init__(data)
         self._shown, self._own_notes, self._full = shown, tuple(notes), False
         self._few_rows = [k for k, row in enumerate(rows) if not detail_rows(row)]
@@ -145,9 +145,9 @@ class Table(RunTable):
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The table, its columns arranged as the width of the terminal demands."""
-        yield Text(f"\n{printable(self.title)}")
+        yield Text(f"\n{self.title}")
         yield from lines(self._visible(), options.max_width)
-        yield from map(Text, map(printable, self._visible_notes()))
+        yield from map(Text, self._visible_notes())
 
     def _visible(self) -> list[Shown]:
         if self._full:
@@ -160,7 +160,7 @@ class Table(RunTable):
     def _notes(self, hidden: str) -> tuple[str, ...]:
         """The notes, without those of the columns that are `hidden`."""
         of_columns = (column.note for column, _ in self._shown if column.note and column.when != hidden)
-        return tuple(dict.fromkeys((*of_columns, *self._own_notes)))
+        return tuple(dict.fromkeys(map(printable, (*of_columns, *self._own_notes))))
 
     def to_markdown(self) -> str:
         """A table of GitHub Markdown under a heading, the notes below."""

@@ -10,6 +10,8 @@ from itertools import groupby, takewhile
 from rich.cells import cell_len
 from rich.text import Text
 
+from fgtrack.core.errors import printable
+
 _GAP = 2
 _INDENT = "  "  # of rows below their name
 _QUANTITY = re.compile(r"(\d) (%|mm?|m/s|rad|s)(?=\W|$)")
@@ -123,7 +125,7 @@ def of_rows(column: Shown, rows: Sequence[int]) -> Shown:
 def bulleted(sentences: Iterable[str], width: int) -> Iterator[Text]:
     """Sentences, each behind a dash, wrapped between words; a number and its unit stay together."""
     for sentence in sentences:
-        kept = _QUANTITY.sub("\\1\u00a0\\2", sentence)
+        kept = _QUANTITY.sub("\\1\u00a0\\2", printable(sentence))
         for line in textwrap.wrap(kept, width, initial_indent="- ", subsequent_indent="  ", break_on_hyphens=False):
             yield _line(line.replace("\u00a0", " "))
 

@@ -581,6 +581,31 @@ def test_names_in_a_recording_can_neither_move_the_cursor_nor_be_markup(fgtrack:
         assert "\x07" not in text
 
 
+@pytest.mark.parametrize(
+    "odd",
+    ["\u202e[bold]\u96f7\u9054[/bold][/]\x1b[31m $\\frac{", "x" * 5000],
+    ids=["turns, colours and calculates", "never ends"],
+)
+def test_whatever_a_recording_says_every_command_prints_lines_for_a_terminal(
+    fgtrack: Command, tmp_path: Path, odd: str
+) -> None:
+    """As the name of a sensor, and of a key that is not known."""
+    named = [replace(one, sensor=odd) if isinstance(one, DetectionList) else one for one in drive(100)]
+    write_stream(tmp_path / "odd.jsonl", named)
+    lines = (tmp_path / "odd.jsonl").read_text(encoding="utf-8").splitlines()
+    lines[1] = json.dumps({**json.loads(lines[1]), odd: 1})
+    (tmp_path / "odd.jsonl").write_text("\n".join(lines), encoding="utf-8")
+    called = [fgtrack("info", "odd.jsonl"), fgtrack("replay", "odd.jsonl", "-o", "run"), fgtrack("compare", "run")]
+    called += [fgtrack("compare", "run", "--all"), fgtrack("advise", "odd.jsonl"), fgtrack("offsets", "odd.jsonl")]
+    called += [fgtrack("convert", "odd.jsonl", "odd.mcap"), fgtrack("info", "odd.mcap")]
+    called += [fgtrack("report", "run", "-o", "run.html"), fgtrack("export", "run", "-o", "run.mcap")]
+    for one in called:
+        assert "internal error" not in one.err
+        for line in (one.out + one.err).splitlines():
+            assert line.isprintable()
+            assert len(line) < 2000
+
+
 @pytest.mark.parametrize("same_tick", [True, False])
 def test_an_unknown_sensor_in_mid_stream_is_a_break_up_to_which_the_run_is_complete(
     fgtrack: Command, tmp_path: Path, same_tick: bool

@@ -4,6 +4,7 @@ import base64
 import io
 import math
 import textwrap
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
 from pathlib import Path
@@ -15,10 +16,11 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.text import Text
 from matplotlib.ticker import LogLocator, NullFormatter
 from PIL import Image
 
-from fgtrack.core.errors import CallError
+from fgtrack.core.errors import CallError, printable_lines
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.palette import PALETTE as PALETTE
 
@@ -55,6 +57,7 @@ _STYLE = {
     "figure.constrained_layout.use": True,
     "figure.dpi": 100,
     "savefig.dpi": 150,
+    "text.parse_math": False,
     "path.simplify": True,
     "agg.path.chunksize": 20_000,
     "svg.hashsalt": "fgtrack",
@@ -75,8 +78,11 @@ class StyledFigure(Figure):
     """A figure with the style of fgtrack, whatever the user's settings are when it is drawn; notebooks show it."""
 
     def draw(self, renderer: Any) -> None:  # Any: matplotlib does not export the type
-        """Draw it, see `matplotlib.figure.Figure.draw`."""
-        with mpl.rc_context(_STYLE):
+        """Draw it, see `matplotlib.figure.Figure.draw`; what is no letter or sign, in a name out of a file, escaped."""
+        for text in self.findobj(Text):
+            text.set_text(printable_lines(text.get_text()))
+        with mpl.rc_context(_STYLE), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Glyph .* missing")  # of a script that the font lacks: an empty box
             super().draw(renderer)
 
     def _repr_html_(self) -> str:
