@@ -1,6 +1,7 @@
 """A bank of independent estimators, and the estimator of one object from a bank."""
 
 from collections.abc import Callable, Sequence
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -22,8 +23,10 @@ from fgtrack.estimation.present import PresentStates
 from fgtrack.estimation.propagation import track_state
 from fgtrack.models.motion import MotionModel
 
+_E = TypeVar("_E", bound=Estimator)
 
-class ObjectBank:
+
+class ObjectBank(Generic[_E]):
     """One `Estimator` per object.
 
     Parameters
@@ -36,11 +39,11 @@ class ObjectBank:
         Length of the estimators' windows.
     """
 
-    def __init__(self, motion: MotionModel, start: Callable[[Start], Estimator], lag_s: float) -> None:
+    def __init__(self, motion: MotionModel, start: Callable[[Start], _E], lag_s: float) -> None:
         self._motion = motion
         self._start = start
         self._lag_ns = nanoseconds(lag_s)
-        self._estimators: dict[int, Estimator] = {}
+        self._estimators: dict[int, _E] = {}
         self._now_ns = 0
 
     @property

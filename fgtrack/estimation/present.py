@@ -1,10 +1,12 @@
-"""The states that a bank gives for the present."""
+"""The kinematic states that a bank gives: those of the present, and smoothed ones."""
 
-from fgtrack.core.types import FloatArray, TrackState
+from collections.abc import Iterable
+
+from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.models.motion import MotionModel
 
-__all__ = ["PresentStates"]
+__all__ = ["PresentStates", "smoothed_reports"]
 
 
 class PresentStates(list[TrackState]):
@@ -21,7 +23,24 @@ class PresentStates(list[TrackState]):
     """
 
     def __init__(self, motion: MotionModel, stamp_ns: int, means: FloatArray, covariances: FloatArray) -> None:
-        means, self.covariances = motion.kinematic(means, covariances)
-        self.means = wrapped_yaw(means)
+        self.means, self.covariances = _kinematic(motion, means, covariances)
         rows = zip(self.means, self.covariances, strict=True)
         super().__init__([TrackState(stamp_ns, mean, covariance) for mean, covariance in rows])
+
+
+def smoothed_reports(
+    motion: MotionModel,
+    track_ids: Iterable[int],
+    stamps_ns: Iterable[int],
+    means: FloatArray,
+    covariances: FloatArray,
+    lag_s: float | None = None,
+) -> list[SmoothedReport]:
+    """Reports of m states of `motion`, shapes (m, n) and (m, n, n): final ones, or those `lag_s` before the present."""
+    rows = zip(track_ids, stamps_ns, *_kinematic(motion, means, covariances), strict=True)
+    return [SmoothedReport(track_id, TrackState(stamp_ns, x, P), lag_s) for track_id, stamp_ns, x, P in rows]
+
+
+def _kinematic(motion: MotionModel, means: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
+    means, covariances = motion.kinematic(means, covariances)
+    return wrapped_yaw(means), covariances

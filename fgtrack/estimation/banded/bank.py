@@ -14,8 +14,8 @@ from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, 
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
-from fgtrack.estimation.present import PresentStates
-from fgtrack.estimation.propagation import track_state, wrapped_yaw
+from fgtrack.estimation.present import PresentStates, smoothed_reports
+from fgtrack.estimation.propagation import track_state
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.estimation.whitening import Innovations, innovations
 from fgtrack.models.motion import MotionModel
@@ -180,7 +180,8 @@ class BandedBank:
         rest = self.take_rest(track_id)
         if rest:
             states = States(np.array([state.mean for state in rest]), np.array([state.covariance for state in rest]))
-            self._ended += self._reported([track_id] * len(rest), [state.stamp_ns for state in rest], states)
+            stamps_ns = [state.stamp_ns for state in rest]
+            self._ended += smoothed_reports(self._motion, [track_id] * len(rest), stamps_ns, *states)
         self._free.append(self._numbers.pop(track_id))
         self._renumbered()
 
@@ -201,12 +202,12 @@ class BandedBank:
             order = ranks.argsort(kind="stable")
             track_ids = [self._track_ids[rank] for rank in ranks[order].tolist()]
             states = States(final.states.means[order], final.states.covariances[order])
-            reports += self._reported(track_ids, final.stamps_ns[order].tolist(), states)
+            reports += smoothed_reports(self._motion, track_ids, final.stamps_ns[order].tolist(), *states)
         for lag_s in self._settings.lagged_s:
             stamp_ns = self.present_ns - nanoseconds(lag_s)
             known, _, states = self._known_at(stamp_ns)
             if known:
-                reports += self._reported(known, [stamp_ns] * len(known), states, lag_s)
+                reports += smoothed_reports(self._motion, known, [stamp_ns] * len(known), *states, lag_s)
         return reports
 
     # --- one track
@@ -368,14 +369,3 @@ class BandedBank:
         if len(known) < len(self._tracks):
             chosen = np.searchsorted(self._ranks[known], chosen)
         return States(states.means[chosen], states.covariances[chosen])
-
-    def _reported(
-        self, track_ids: Sequence[int], stamps_ns: Sequence[int], states: States, lag_s: float | None = None
-    ) -> list[SmoothedReport]:
-        means, covariances = self._motion.kinematic(*states)
-        return [
-            SmoothedReport(track_id, TrackState(stamp_ns, mean, covariance), lag_s)
-            for track_id, stamp_ns, mean, covariance in zip(
-                track_ids, stamps_ns, wrapped_yaw(means), covariances, strict=True
-            )
-        ]

@@ -16,7 +16,7 @@ from fgtrack.estimation.smoothing_bank import SmoothingBank
 from fgtrack.models.motion import MotionModel
 
 
-class SmootherBank(SmoothingBank):
+class SmootherBank(SmoothingBank[FixedLagSmoother]):
     """One `FixedLagSmoother` per object, and what they smooth.
 
     Parameters
@@ -58,10 +58,7 @@ class SmootherBank(SmoothingBank):
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
         if len(track_ids) > 1:
-            smoothers = [self._smoothers[track_id] for track_id in track_ids]
-            singles = [one for one in smoothers if isinstance(one, FixedLagSmoother)]
-            if len(singles) == len(smoothers):
-                return together.update(singles, measurements)
+            return together.update([self._estimators[track_id] for track_id in track_ids], measurements)
         return super().update(stamp_ns, track_ids, measurements)
 
     def present(self) -> list[TrackState]:
@@ -77,9 +74,6 @@ class SmootherBank(SmoothingBank):
 
     def _look_up(self, stamp_ns: int) -> None:
         """Find the states at `stamp_ns` of all objects that are known there, at once."""
-        if len(self._smoothers) < 2:
-            return
-        singles = [one for one in self._smoothers.values() if isinstance(one, FixedLagSmoother)]
-        known = [one for one in singles if one.window_ns[0] <= stamp_ns]
+        known = [one for one in self._estimators.values() if one.window_ns[0] <= stamp_ns]
         if len(known) > 1:
             together.look_up(known, [stamp_ns] * len(known))
