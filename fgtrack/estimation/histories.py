@@ -1,24 +1,41 @@
 """What has been fused of many tracks, in the order of the stamps: places in arrays, not lists for each track."""
 
+from typing import TypeVar
+
 import numpy as np
+import numpy.typing as npt
 
 from fgtrack.core.types import IntArray
 
 NEVER_NS = int(np.iinfo(np.int64).max)
 _FEW_TRACKS, _FEW_PLACES = 4, 4  # most tracks of a cluttered list have one entry, and end with it
 
+_Scalar = TypeVar("_Scalar", bound=np.generic)
+
+
+def grown(values: npt.NDArray[_Scalar], size: int) -> npt.NDArray[_Scalar]:
+    """A copy of `values` with zeros behind them, `size` rows in all; their pages are made when they are used."""
+    found = np.zeros((size, *values.shape[1:]), values.dtype)
+    found[: len(values)] = values
+    return found
+
 
 class Histories:
     """A row of places for each track, in order of stamps, and the number under which the values of each are kept.
 
     An entry keeps its number as long as it lives, so that an insertion moves no values.
+
+    Parameters
+    ----------
+    places
+        Of each track, at first.
     """
 
-    def __init__(self) -> None:
-        shape = _FEW_TRACKS, _FEW_PLACES
+    def __init__(self, places: int = _FEW_PLACES) -> None:
+        shape = _FEW_TRACKS, places
         self.stamps_ns: IntArray = np.full(shape, NEVER_NS)
         """Shape (tracks, places); `NEVER_NS` from `count` on."""
-        self.numbers: IntArray = np.arange(_FEW_TRACKS * _FEW_PLACES).reshape(shape)
+        self.numbers: IntArray = np.arange(_FEW_TRACKS * places).reshape(shape)
         """Shape (tracks, places); those from `count` on are free."""
         self.count: IntArray = np.zeros(_FEW_TRACKS, dtype=np.int64)
         """Number of entries of each track."""
@@ -47,13 +64,17 @@ class Histories:
         self.count[track] = 1
         return int(self.numbers[track, 0])
 
-    def reserve(self, tracks: IntArray) -> IntArray:
-        """Make room for one more entry of each of `tracks`; the numbers that `insert` will give them."""
+    def make_room(self, tracks: IntArray) -> None:
+        """Make room for one more entry of each of `tracks`."""
         if self.count[tracks].max(initial=0) >= self.stamps_ns.shape[1]:
             self._grow_places()
+
+    def reserve(self, tracks: IntArray) -> IntArray:
+        """`make_room`; the numbers that `insert` will give the entries."""
+        self.make_room(tracks)
         return self.numbers[tracks, self.count[tracks]]
 
-    def insert(self, tracks: IntArray, places: IntArray, stamp_ns: int) -> None:
+    def insert(self, tracks: IntArray, places: IntArray, stamp_ns: int) -> IntArray:
         """New entries at `places`, one for each of `tracks`, under the numbers of `reserve`; later ones move up."""
         count = self.count[tracks]
         numbers = self.numbers[tracks, count]
@@ -65,6 +86,7 @@ class Histories:
                 values[rows, columns] = values[rows, source]
         self.stamps_ns[tracks, places], self.numbers[tracks, places] = stamp_ns, numbers
         self.count[tracks] = count + 1
+        return numbers
 
     def drop(self, tracks: IntArray, many: IntArray) -> None:
         """Forget so `many` of the oldest entries of each of `tracks`."""
@@ -79,7 +101,7 @@ class Histories:
         size, (tracks, places) = self.size, self.stamps_ns.shape
         self.stamps_ns = np.concatenate([self.stamps_ns, np.full((tracks, places), NEVER_NS)])
         self.numbers = np.concatenate([self.numbers, size + np.arange(size).reshape(tracks, places)])
-        self.count = np.concatenate([self.count, np.zeros(tracks, dtype=np.int64)])
+        self.count = grown(self.count, 2 * tracks)
 
     def _grow_places(self) -> None:
         size, (tracks, places) = self.size, self.stamps_ns.shape

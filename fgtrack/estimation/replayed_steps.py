@@ -9,7 +9,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import NOTHING, Content, Measurement
 from fgtrack.estimation.ekf import Prediction, correct, innovations
-from fgtrack.estimation.histories import Histories
+from fgtrack.estimation.histories import Histories, grown
 from fgtrack.models.sensors import RobustLoss
 
 _FEW_COMPONENTS = 4
@@ -177,8 +177,7 @@ class ReplayedSteps:
         more = self.order.size - len(self.measurements)
         if more:
             for name in self._VALUES:
-                values = getattr(self, name)
-                setattr(self, name, np.concatenate([values, np.zeros((more, *values.shape[1:]))]))
+                setattr(self, name, grown(getattr(self, name), self.order.size))
             self.measurements += [None] * more
             self._kinds += [(0, 0, ())] * more
 

@@ -54,5 +54,5 @@ class SmoothingBank(ObjectBank[_S]):
         if not states:
             return []
         track_ids, found = zip(*states, strict=True)
-        means, covariances = (np.array([getattr(one, name) for one in found]) for name in ("mean", "covariance"))
+        means, covariances = np.array([one.mean for one in found]), np.array([one.covariance for one in found])
         return smoothed_reports(self._motion, track_ids, [one.stamp_ns for one in found], means, covariances, lag_s)

@@ -36,7 +36,8 @@ class CompiledNodes(Nodes):
         if not _observe(numbers, y, H.copy(), R, offsets, self.rows, self.num_rows):
             raise np.linalg.LinAlgError("a covariance is not positive definite")
 
-    def _place(self, tracks: IntArray, places: IntArray, stamp_ns: int) -> IntArray:
+    def insert(self, tracks: IntArray, places: IntArray, stamp_ns: int) -> IntArray:
+        """See `Histories.insert`."""
         numbers = np.empty(len(tracks), dtype=np.int64)
         _place(tracks, places, stamp_ns, self.stamps_ns, self.numbers, self.count, numbers)
         return numbers

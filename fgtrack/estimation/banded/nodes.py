@@ -11,15 +11,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.estimation.histories import Histories, grown
 from fgtrack.estimation.terms import MeasurementTerm
 from fgtrack.estimation.whitening import whitened
 
-_NEVER_NS = np.iinfo(np.int64).max
-_FEW_TRACKS, _FEW_NODES, _FEW_COMPONENTS = 4, 16, 4
+_FEW_NODES, _FEW_COMPONENTS = 16, 4
 _NEAR = 12  # so many of the newest nodes are looked at first
 
 
-class Nodes:
+class Nodes(Histories):
     """Arrays of shape (tracks, places) with the order of the nodes, and (nodes, ...) with what is known of each.
 
     Vectors stand as a last column beside the matrix that moves with them: [F | Q | f(x0)], [P | x], [A | b].
@@ -38,15 +38,10 @@ class Nodes:
     )
 
     def __init__(self, n: int) -> None:
-        self.dim = n
-        shape = _FEW_TRACKS, _FEW_NODES
-        size = _FEW_TRACKS * _FEW_NODES
-        self.stamps_ns: IntArray = np.full(shape, _NEVER_NS)
-        self.numbers: IntArray = np.arange(size).reshape(shape)
-        self.first: IntArray = np.zeros(_FEW_TRACKS, dtype=np.int64)
+        super().__init__(_FEW_NODES)
+        self.dim, size = n, self.size
+        self.first: IntArray = np.zeros_like(self.count)
         """Place of the oldest node of the window."""
-        self.count: IntArray = np.zeros(_FEW_TRACKS, dtype=np.int64)
-        """Number of nodes, with those behind the window."""
         self.origin = np.zeros((size, n))
         """Linearisation points x0."""
         self.segment = np.zeros((size, n, 2 * n + 1))
@@ -70,16 +65,10 @@ class Nodes:
         self.terms: list[list[MeasurementTerm]] = [[] for _ in range(size)]
         """What is measured at each node."""
 
-    def at(self, tracks: IntArray, places: IntArray) -> IntArray:
-        """Numbers of the nodes at `places`; both of one shape."""
-        return self.numbers[tracks, places]
-
     def place_before(self, tracks: IntArray, stamps_ns: IntArray) -> IntArray:
-        """Place of the newest node at or before `stamps_ns`, of each track; -1 where all are after it."""
+        """See `Histories.place_before`."""
         if len(tracks) < 2:
-            return (
-                np.array([self.stamps_ns[track].searchsorted(stamps_ns[0], "right") for track in tracks], np.int64) - 1
-            )
+            return super().place_before(tracks, stamps_ns)
         count = self.count[tracks]
         low = max(int(count.min()) - _NEAR, 0)
         near = self.stamps_ns[tracks, low : int(count.max())]
@@ -98,47 +87,22 @@ class Nodes:
                 return places
             places = places + later
 
-    def begin(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
+    def begin_window(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
         """The first node of a new track."""
-        while track >= len(self.first):
-            self._grow_tracks()
-        self.stamps_ns[track] = _NEVER_NS
-        self.stamps_ns[track, 0] = stamp_ns
-        self.first[track], self.count[track] = 0, 1
-        number = int(self.numbers[track, 0])
+        number = self.begin(track, stamp_ns)
+        self.first[track] = 0
         self._empty(np.array([number]))
         self.origin[number] = mean
         for values in (self.predicted, self.filtered):
             values[number, :, :-1], values[number, :, -1] = covariance, 0.0
         self.P[number], self.step[number] = covariance, 0.0
 
-    def reserve(self, place: int) -> None:
-        """Make room for a node at `place`."""
-        if place >= self.stamps_ns.shape[1]:
-            self._grow_nodes()
-
-    def insert(self, tracks: IntArray, places: IntArray, stamp_ns: int, origins: FloatArray) -> None:
-        """New nodes at `places`, one for each of `tracks`; those from there on move up."""
-        self.reserve(int(self.count[tracks].max()))
-        numbers = self._place(tracks, places, stamp_ns)
+    def insert_at(self, tracks: IntArray, places: IntArray, stamp_ns: int, origins: FloatArray) -> None:
+        """New nodes at `places`, one for each of `tracks`, linearised at `origins` (m, n); later ones move up."""
+        self.make_room(tracks)
+        numbers = self.insert(tracks, places, stamp_ns)
         self._empty(numbers)
         self.origin[numbers] = origins
-
-    def _place(self, tracks: IntArray, places: IntArray, stamp_ns: int) -> IntArray:
-        """The order of `insert`; gives the numbers of the new nodes."""
-        count = self.count[tracks]
-        numbers = self.numbers[tracks, count]
-        if (places < count).any():
-            columns = np.arange(int(places.min()), int(count.max()) + 1)
-            moved = (columns > places[:, None]) & (columns <= count[:, None])
-            source = columns - moved
-            for name in self._ORDER:
-                values = getattr(self, name)
-                values[tracks[:, None], columns] = values[tracks[:, None], source]
-        self.stamps_ns[tracks, places] = stamp_ns
-        self.numbers[tracks, places] = numbers
-        self.count[tracks] = count + 1
-        return numbers
 
     def shift(self, tracks: IntArray, numbers: IntArray, steps: FloatArray) -> None:
         """Move the linearisation points of nodes of `tracks`, one each, by `steps` (m, n): what is relative to them
@@ -156,16 +120,10 @@ class Nodes:
         rows = self.rows[numbers]
         self.rows[numbers, :, n] = rows[..., n] - np.matvec(rows[..., :n], steps)
 
-    def drop(self, tracks: IntArray, numbers: IntArray) -> None:
-        """Forget the oldest `numbers` nodes of each of `tracks`."""
-        columns = np.arange(self.stamps_ns.shape[1])
-        self.stamps_ns[tracks] = np.where(columns < numbers[:, None], _NEVER_NS, self.stamps_ns[tracks])
-        source = (columns + numbers[:, None]) % len(columns)
-        for name in self._ORDER:
-            values = getattr(self, name)
-            values[tracks] = np.take_along_axis(values[tracks], source, axis=1)
-        self.first[tracks] -= numbers
-        self.count[tracks] -= numbers
+    def drop(self, tracks: IntArray, many: IntArray) -> None:
+        """See `Histories.drop`: nodes behind the windows."""
+        super().drop(tracks, many)
+        self.first[tracks] -= many
 
     def measure(self, numbers: IntArray, rows: FloatArray) -> None:
         """Measurements [G | y] (m, k, n + 1) at m nodes, beside those that are there."""
@@ -189,7 +147,7 @@ class Nodes:
 
     def snapshot(self, tracks: IntArray) -> list[IntArray]:
         """The order of the nodes of `tracks`, for `restore` after at most one insertion in each."""
-        self.reserve(int(self.count[tracks].max()))
+        self.make_room(tracks)
         return [getattr(self, name).take(tracks, axis=0) for name in (*self._ORDER, *self._TRACKS)]
 
     def restore(self, tracks: IntArray, saved: Sequence[IntArray]) -> None:
@@ -206,29 +164,19 @@ class Nodes:
             self.terms[number] = []
 
     def _grow_tracks(self) -> None:
-        tracks, nodes = self.stamps_ns.shape
-        for name in (*self._ORDER, *self._TRACKS):
-            values = getattr(self, name)
-            setattr(self, name, np.concatenate([values, np.zeros_like(values)]))
-        self.stamps_ns[tracks:] = _NEVER_NS
-        self.numbers[tracks:] = self._more(tracks * nodes).reshape(tracks, nodes)
+        super()._grow_tracks()
+        self.first = grown(self.first, len(self.count))
+        self._fit()
 
-    def _grow_nodes(self) -> None:
-        tracks, nodes = self.stamps_ns.shape
-        more = self._more(tracks * nodes).reshape(tracks, nodes)
-        self.numbers = np.concatenate([self.numbers, more], axis=1)
-        self.stamps_ns = np.concatenate([self.stamps_ns, np.full((tracks, nodes), _NEVER_NS)], axis=1)
+    def _grow_places(self) -> None:
+        super()._grow_places()
+        self._fit()
 
-    def _more(self, size: int) -> IntArray:
-        """Numbers of `size` further nodes."""
-        begin = len(self.terms)
+    def _fit(self) -> None:
+        """As many values as there are numbers."""
         for name in self._VALUES:
-            values = getattr(self, name)
-            grown = np.zeros((begin + size, *values.shape[1:]), values.dtype)  # its pages are made when they are used
-            grown[:begin] = values
-            setattr(self, name, grown)
-        self.terms += [[] for _ in range(size)]
-        return np.arange(begin, begin + size)
+            setattr(self, name, grown(getattr(self, name), self.size))
+        self.terms += [[] for _ in range(self.size - len(self.terms))]
 
     def _grow_rows(self) -> None:
         self.rows = np.concatenate([self.rows, np.zeros_like(self.rows)], axis=1)

@@ -35,7 +35,7 @@ def fuse_behind(nodes: Nodes, motion: MotionModel, track: int, measurement: Meas
     found = past.fuse(measurement)
     for place, conditional in enumerate(past.ring):
         if nodes.stamps_ns[track, place] != conditional.stamp_ns:
-            nodes.insert(np.array([track]), np.array([place]), conditional.stamp_ns, conditional.mean[None])
+            nodes.insert_at(np.array([track]), np.array([place]), conditional.stamp_ns, conditional.mean[None])
             nodes.first[track] += 1
         number = nodes.numbers[track, place]
         nodes.back[number, :, :n], nodes.back[number, :, n] = conditional.A, conditional.b

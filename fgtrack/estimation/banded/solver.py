@@ -52,7 +52,7 @@ class Solver:
 
     def begin(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
         """Start the window of a track with its first node."""
-        self.nodes.begin(track, stamp_ns, mean, covariance)
+        self.nodes.begin_window(track, stamp_ns, mean, covariance)
         self._substitution.begin(track)
         more = len(self.nodes.first) - len(self.curved)
         if more:

@@ -232,7 +232,7 @@ class Windows:
         if new.any():
             all_new = bool(new.all())
             to, inner, origins = (tracks, places, guesses) if all_new else (tracks[new], places[new], guesses[new])
-            nodes.insert(to, inner, stamp_ns, origins)
+            nodes.insert_at(to, inner, stamp_ns, origins)
             if of.size:
                 inserted = np.full(len(nodes.first), _NEVER)
                 inserted[to] = inner
