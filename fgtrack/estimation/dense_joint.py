@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import seconds
-from fgtrack.core.types import YAW, FloatArray, TrackState
+from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult
 from fgtrack.estimation.birth import initial_state
+from fgtrack.estimation.propagation import wrapped
 from fgtrack.models.motion import MotionModel
 
 
@@ -27,9 +27,8 @@ def dense_joint(
     Every distinct stamp is a node, measured or not, so interpolating and predicting need no equation of their own.
     With x_0 = m_0 + L_0 u_0 and x_k = F x_(k-1) + L_k u_k (L L' = P_0 or Q) all states are x = m + M u, u ~ N(0, I).
     The rows u = 0 and W H M u = W (z - H m), W the inverse root of R, are solved by one QR, whose triangle also gives
-    the covariances, S S' with S = M R^-1. Beside the normal
-    equations of x itself this is the same least-squares problem, whose condition stays small where two stamps nearly
-    coincide and Q almost vanishes.
+    the covariances, S S' with S = M R^-1. This is the least-squares problem of x itself, but its condition stays small
+    where two stamps nearly coincide and Q almost vanishes.
 
     Raises `CallError` for a model that is not linear, or a stamp before the prior's.
     """
@@ -85,8 +84,7 @@ class Difference(NamedTuple):
 def difference(found: TrackState, expected: TrackState, motion: MotionModel | None = None) -> Difference:
     """How far `found` is from `expected`; a NaN stays one. The yaw of a state of `motion` goes the short way round."""
     sigma, off = np.sqrt(np.diag(expected.covariance)), found.mean - expected.mean
-    if motion is not None and not motion.cartesian:
-        off[YAW] = wrap_angle(off[YAW])
+    off = off if motion is None else wrapped(motion, off)
     mean = np.abs(off) / sigma
     covariance = np.abs(found.covariance - expected.covariance) / np.outer(sigma, sigma)
     return Difference(float(mean.max()), float(covariance.max()))

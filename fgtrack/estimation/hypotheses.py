@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.linalg import congruence, mahalanobis_squared, symmetrise
-from fgtrack.core.types import YAW, FloatArray, TrackState
+from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation import starts
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateResult
 from fgtrack.estimation.ekf import linearised
-from fgtrack.estimation.propagation import track_state
+from fgtrack.estimation.propagation import track_state, wrapped
 from fgtrack.models.motion import MotionModel
 
 #: A hypothesis is dropped once it is so much less likely than the best.
@@ -104,7 +103,7 @@ class Hypotheses:
         """Mean and covariance of all hypotheses at `stamp_ns`; the mean may lie where none of them is."""
         states = [each.estimator.state_at(stamp_ns) for each in self._alive]
         middle = self.best.state_at(stamp_ns).mean
-        off = np.array([self._difference(state.mean, middle) for state in states])
+        off = np.array([wrapped(self._motion, state.mean - middle) for state in states])
         mean = self.weights @ off
         spread = sum(
             (w * (state.covariance + np.outer(each - mean, each - mean)))
@@ -131,18 +130,12 @@ class Hypotheses:
             state = each.estimator.state_at(at_ns)
             for other in left:
                 kept = other.estimator.state_at(at_ns)
-                if mahalanobis_squared(self._difference(state.mean, kept.mean), kept.covariance) < SAME:
+                if mahalanobis_squared(wrapped(self._motion, state.mean - kept.mean), kept.covariance) < SAME:
                     other.log_weight = float(np.logaddexp(other.log_weight, each.log_weight))
                     break
             else:
                 left.append(each)
         self._alive = left
-
-    def _difference(self, mean: FloatArray, other: FloatArray) -> FloatArray:
-        off = mean - other
-        if not self._motion.cartesian:
-            off[YAW] = wrap_angle(off[YAW])
-        return off
 
 
 Wanted = int | Sequence[Start]

@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.linalg import mahalanobis_squared, symmetrise
 from fgtrack.core.time import seconds
-from fgtrack.core.types import YAW, FloatArray
+from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Order, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import OneCorrection, Prediction, correct_one, predict_one
 from fgtrack.estimation.initiation import DEFAULT
+from fgtrack.estimation.propagation import wrapped
 from fgtrack.estimation.recursion import EkfRecursion
 from fgtrack.estimation.registry import motion_model
 from fgtrack.estimation.replay import ReplayingFilter, Step
@@ -140,7 +140,7 @@ class ImmReplay(ReplayingFilter):
             for model, mean, covariance in zip(self._models, prior.means, prior.covariances, strict=True)
         ]
         posterior = Mixture(
-            tuple(_turned(model, each.mean) for model, each in zip(self._models, corrected, strict=True)),
+            tuple(wrapped(model, each.mean) for model, each in zip(self._models, corrected, strict=True)),
             tuple(each.covariance for each in corrected),
             _weighed(prior.probabilities, [_log_likelihood(each, measurement) for each in corrected]),
         )
@@ -190,7 +190,7 @@ class ImmReplay(ReplayingFilter):
         if len(states) == 1:
             return states[0]
         reference = states[int(weights.argmax())][0]
-        apart = [_turned(model, mean - reference) for mean, _ in states]
+        apart = [wrapped(model, mean - reference) for mean, _ in states]
         offset = weights @ np.array(apart)
         spread = [P + np.outer(d - offset, d - offset) for d, (_, P) in zip(apart, states, strict=True)]
         return reference + offset, symmetrise(np.tensordot(weights, np.array(spread), axes=1))
@@ -233,15 +233,6 @@ def _log_likelihood(found: OneCorrection, measurement: Measurement) -> float:
         raise np.linalg.LinAlgError("an innovation without a finite covariance")
     distance = math.sqrt(max(float(mahalanobis_squared(found.innovation, found.S)), 0.0))
     return -penalty(measurement.loss, distance) - 0.5 * float(np.linalg.slogdet(found.S)[1])
-
-
-def _turned(model: MotionModel, mean: FloatArray) -> FloatArray:
-    """`mean` (n,), or a difference of means, with its yaw in (-pi, pi]."""
-    if model.cartesian:
-        return mean
-    mean = mean.copy()
-    mean[YAW] = wrap_angle(mean[YAW])
-    return mean
 
 
 def _with(step: Step, mixture: Mixture) -> ImmStep:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgtrack.core.linalg import product, symmetrise
-from fgtrack.core.time import seconds
+from fgtrack.core.time import NS_PER_S, seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
@@ -181,7 +181,7 @@ class PosteriorLinearisationSmoother(WindowedFilter):
     def _filtered(self, nodes: Sequence[_Node]) -> list[_Node]:
         """The nodes with new `predicted` and `filtered`."""
         means, covariances = np.array([node.mean for node in nodes]), np.array([node.covariance for node in nodes])
-        gaps_s = np.diff([node.stamp_ns for node in nodes]) * 1e-9
+        gaps_s = np.diff([node.stamp_ns for node in nodes]) / NS_PER_S
         if len(nodes) > 1:
             steps = motion_regression(self._motion, means[:-1], covariances[:-1], gaps_s)
             Q = self._motion.process_noise(means[:-1], gaps_s)

@@ -38,7 +38,6 @@ class ExactPropagator:
 
     def __init__(self, motion: MotionModel) -> None:
         self.motion = motion
-        self._yawed = "yaw_rad" in motion.state_names
 
     def propagate(
         self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
@@ -48,7 +47,7 @@ class ExactPropagator:
 
     def wrap(self, mean: FloatArray) -> FloatArray:
         """See `Propagator.wrap`."""
-        return wrapped_yaw(mean) if self._yawed else mean
+        return wrapped(self.motion, mean)
 
     def residual(self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
         """See `Propagator.residual`: the model's own."""
@@ -172,7 +171,12 @@ class EulerCtrv:
 
 def track_state(motion: MotionModel, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> TrackState:
     """A state of `motion` as it is handed out, with the yaw in (-pi, pi]."""
-    return TrackState(stamp_ns, mean if motion.cartesian else wrapped_yaw(mean), covariance)
+    return TrackState(stamp_ns, wrapped(motion, mean), covariance)
+
+
+def wrapped(motion: MotionModel, mean: FloatArray) -> FloatArray:
+    """Means of `motion`, or differences of them, (..., n), with the yaw, if they have one, in (-pi, pi]."""
+    return mean if motion.cartesian else wrapped_yaw(mean)
 
 
 def wrapped_yaw(mean: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import Prediction, predict_all
 from fgtrack.estimation.initiation import DEFAULT, checked_initiation, sought
 from fgtrack.estimation.present import PresentStates
-from fgtrack.estimation.propagation import wrapped_yaw
+from fgtrack.estimation.propagation import wrapped
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.estimation.replayed_steps import LaterSteps, ReplayedSteps, Said
 from fgtrack.estimation.rts import rts_step
@@ -55,7 +55,6 @@ class ReplayBank:
 
     def __init__(self, motion: MotionModel, lag_s: float, initiation: str = DEFAULT) -> None:
         self._motion = motion
-        self._yawed = "yaw_rad" in motion.state_names
         self._lag_s, self._lag_ns = lag_s, nanoseconds(lag_s)
         self._initiation = checked_initiation(initiation)
         self._steps = ReplayedSteps(motion.dim)
@@ -316,7 +315,7 @@ class ReplayBank:
 
     def _corrected(self, numbers: IntArray, predicted: Prediction) -> tuple[FloatArray, FloatArray, list[Said]]:
         mean, covariance, said = self._steps.corrected(numbers, predicted.mean, predicted.covariance)
-        return self._wrapped(mean), covariance, said
+        return wrapped(self._motion, mean), covariance, said
 
     def _replayed(self, ahead: Prediction, later: LaterSteps) -> list[_Done]:
         """The measurements of `later` steps applied again; `ahead` are the states predicted to the first of them."""
@@ -346,7 +345,7 @@ class ReplayBank:
                 predicted = steps.predicted(numbers)
                 earlier = later.numbers[place - 1][:m]
                 before = before._replace(mean=steps.mean[earlier], covariance=steps.covariance[earlier])
-            shift = self._wrapped(mean[:m] - predicted.mean)
+            shift = wrapped(self._motion, mean[:m] - predicted.mean)
             found = rts_step(before.mean, before.covariance, predicted, shift, covariance[:m])
             moved = later.after_s[place] > 0.0  # else it is the same state
             mean[:m][moved], covariance[:m][moved] = found.mean[moved], found.covariance[moved]
@@ -375,6 +374,3 @@ class ReplayBank:
         old = many >= _MANY
         if old.any():
             self._steps.order.drop(tracks[old], many[old])
-
-    def _wrapped(self, mean: FloatArray) -> FloatArray:
-        return wrapped_yaw(mean) if self._yawed else mean

@@ -122,9 +122,9 @@ def covariances(
         carrying = [row for row, detection in enumerate(items.detections) if detection.covariance is not None]
         for row in carrying:
             measured = items.detections[row].measured
-            common = [name for name in names if name in measured and name in sensor.std]
-            here = [names.index(name) for name in common]
-            R[row][np.ix_(here, here)] = own_covariance(items.detections[row], common)
+            carried = [name for name in names if name in measured and name in sensor.std]
+            here = [names.index(name) for name in carried]
+            R[row][np.ix_(here, here)] = own_covariance(items.detections[row], carried)
     if "x_m" not in names:
         return R
     if frame != "map" and carrying:

@@ -113,11 +113,18 @@ class RestartingBank(ForwardingBank):
                 raise
             self.failures.note(error)
             self.failures.add(Failure.BIRTH_FAILED)
-            self._remove(track_id)
+            self.remove(track_id)
 
     def remove(self, track_id: int) -> None:
-        """See `TrackBank.remove`; a track that has ended by a failure need not be there."""
-        self._remove(track_id)
+        """See `TrackBank.remove`; if need be by a new bank. A track that a failure has ended need not be there."""
+        self._forget(track_id)
+        if track_id not in self._bank.track_ids:
+            return
+        try:
+            self._bank.remove(track_id)
+        except Exception as error:
+            self._raised(error)
+            self._rebuild([other for other in self._bank.track_ids if other != track_id])
 
     def present(self) -> list[TrackState]:
         """See `TrackBank.present`; all are sound."""
@@ -194,7 +201,7 @@ class RestartingBank(ForwardingBank):
             return  # it has ended with another one
         again = track_id in self._suspects
         start = self._start(track_id)
-        self._remove(track_id)
+        self.remove(track_id)
         if again:
             self.failures.end(track_id, self._now_ns, failure)
             return
@@ -208,7 +215,7 @@ class RestartingBank(ForwardingBank):
         except Exception as error:
             self.failures.note(error)
             self._ended(track_id, failure)
-            self._remove(track_id)
+            self.remove(track_id)
             return
         self.failures.add(Failure.TRACK_RESTARTED)
         self._suspects[track_id] = False
@@ -217,17 +224,6 @@ class RestartingBank(ForwardingBank):
     def _ended(self, track_id: int, failure: Failure) -> None:
         self.failures.end(track_id, self._now_ns, failure)
         self._forget(track_id)
-
-    def _remove(self, track_id: int) -> None:
-        """Take a track out of the bank, if need be by a new one."""
-        self._forget(track_id)
-        if track_id not in self._bank.track_ids:
-            return
-        try:
-            self._bank.remove(track_id)
-        except Exception as error:
-            self._raised(error)
-            self._rebuild([other for other in self._bank.track_ids if other != track_id])
 
     def _forget(self, track_id: int) -> None:
         for known in (self._starts, self._good, self._suspects):

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fgtrack.core.time import seconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import joseph, kalman_gain, propagated
@@ -81,7 +82,7 @@ class Innovations:
                 observation, size = step.observation, len(step.y)
                 sensor, components = observation.sensor, observation.measurement.model.components
                 self._there[k, t], self.counted[k, t] = True, counts(one, k)
-                self.since_start_s[k, t] = (observation.measurement.stamp_ns - one.start.stamp_ns) / 1e9
+                self.since_start_s[k, t] = seconds(observation.measurement.stamp_ns - one.start.stamp_ns)
                 self._since_s[k, t] = step.since_s
                 self._about[k, t], self._offset[k, t] = step.about, step.before - step.about
                 self._predicted[k, t], self._after[k, t] = step.predicted, step.after
