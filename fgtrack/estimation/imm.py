@@ -207,7 +207,7 @@ class ImmReplay(ReplayingFilter):
 def _beside(motion: MotionModel, other: str | MotionModel, accel_density_m2ps5: float) -> MotionModel | None:
     """The other model. Raises `CallError` where there is none of that name, or `motion` cannot be one of two."""
     if isinstance(motion, CorrelatedErrors):
-        raise CallError("imm-replay: takes no sensors with correlated errors")
+        raise CallError("takes no sensors with correlated errors")
     if isinstance(other, MotionModel):
         return other
     default = "ctrv" if isinstance(motion, CTRA) else "ctra" if isinstance(motion, CTRV) else ""

@@ -59,15 +59,15 @@ class SmootherSettings:
             raise ValueError(f"lagged_s: names a lag twice, is {list(self.lagged_s)}")
 
     @classmethod
-    def of_options(cls, name: str, lag_s: float, options: Mapping[str, Any]) -> "SmootherSettings":
-        """The settings of the estimator `name` of one object, which gives no lagged output unless told to.
+    def of_options(cls, lag_s: float, options: Mapping[str, Any]) -> "SmootherSettings":
+        """The settings of the estimator of one object, which gives no lagged output unless told to.
 
         Raises `CallError` for an option that does not exist.
         """
         taken = [each.name for each in fields(cls) if each.name != "lag_s"]
         unknown = sorted(set(options) - set(taken))
         if unknown:
-            raise CallError(f"{name}: unknown option {unknown[0]!r}; its options are {', '.join(taken)}, initiation")
+            raise CallError(f"unknown option {unknown[0]!r}; its options are {', '.join(taken)}, initiation")
         return cls(lag_s=lag_s, **{"lagged_s": (), **options})
 
     def refuse_older(self, stamp_ns: int, oldest_ns: int) -> None:

@@ -221,21 +221,8 @@ class Preprocess:
         self, items: Located, groups: Sequence[_Group], columns: tuple[int, ...], assumed: bool, view: _View
     ) -> list[Candidate]:
         """Candidates that measure the same: one detection each, or the average of several."""
-        batch, sensor, pose, _ = view
-        names = _names(columns)
-        leaders = np.array([group.leader for group in groups])
-        z, points_m = items.values[leaders].take(columns, axis=1), items.points_m[leaders]
-        order = leaders.tolist()
-        every = len(order) == len(items.indices) and order == sorted(order)
-        R = covariances(items if every else items.at(leaders), names, batch.frame, sensor, pose)
-        for place, group in enumerate(groups):
-            if len(group.parts) > 1:
-                parts = items.at(np.array(group.parts))
-                z[place] = [
-                    self._merge.mean(name, parts.values[:, column]) for name, column in zip(names, columns, strict=True)
-                ]
-                R[place] = covariances(parts, names, batch.frame, sensor, pose).mean(axis=0)
-                points_m[place] = parts.points_m.mean(axis=0)
+        names, pose = _names(columns), view.pose
+        z, R, points_m = self._measured(items, groups, columns, view)
         bearings = math.isnan(points_m[0, 0])  # all or none: what measures the same is placed or not
         curved = ("curvature_radpm",) if CURVATURE in columns else ()
         assumes = self._assumed(assumed) + curved
@@ -255,7 +242,7 @@ class Preprocess:
         own: Iterable[PoseError | None] = [None] * len(groups)
         if errors is not None:
             own = [PoseError(errors.covariance, *each) for each in zip(errors.placement, white, strict=True)]
-        stamp_ns, loss, indices = batch.stamp_ns, sensor.loss, items.indices.tolist()
+        stamp_ns, loss, indices = view.batch.stamp_ns, view.sensor.loss, items.indices.tolist()
         return [
             Candidate(
                 indices[group.leader],
@@ -270,6 +257,26 @@ class Preprocess:
                 groups, models, z, whole, places, spreads, z.tolist(), own, strict=True
             )
         ]
+
+    def _measured(
+        self, items: Located, groups: Sequence[_Group], columns: tuple[int, ...], view: _View
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """What `groups` measure, (m, k) and (m, k, k), and their positions, (m, 2): averages of what is merged."""
+        names, frame, sensor, pose = _names(columns), view.batch.frame, view.sensor, view.pose
+        leaders = np.array([group.leader for group in groups])
+        z, points_m = items.values[leaders].take(columns, axis=1), items.points_m[leaders]
+        order = leaders.tolist()
+        every = len(order) == len(items.indices) and order == sorted(order)
+        R = covariances(items if every else items.at(leaders), names, frame, sensor, pose)
+        for place, group in enumerate(groups):
+            if len(group.parts) > 1:
+                parts = items.at(np.array(group.parts))
+                z[place] = [
+                    self._merge.mean(name, parts.values[:, column]) for name, column in zip(names, columns, strict=True)
+                ]
+                R[place] = covariances(parts, names, frame, sensor, pose).mean(axis=0)
+                points_m[place] = parts.points_m.mean(axis=0)
+        return z, R, points_m
 
     def _models(
         self, names: tuple[str, ...], R: FloatArray, view: _View

@@ -40,7 +40,7 @@ class RestartingBank(ForwardingBank):
         self._make = make
         self._now_ns = 0
         self._starts: dict[int, Start] = {}  # by track: how it began
-        self._good: dict[int, TrackState] = {}  # by track: its last good state
+        self._good: tuple[tuple[int, ...], list[TrackState]] = (), []  # tracks, and their last good states
         self._suspects: dict[int, bool] = {}  # tracks that have failed: whether an update has succeeded since
         self._can_start = False
         self._divergence = Divergence()
@@ -79,7 +79,7 @@ class RestartingBank(ForwardingBank):
     ) -> list[UpdateResult]:
         try:
             results = self._bank.update(stamp_ns, track_ids, measurements)
-            self._count(track_ids, measurements, results)
+            diverged = self._divergence.count(track_ids, measurements, results)
         except DataError:
             raise
         except Exception as error:
@@ -88,19 +88,13 @@ class RestartingBank(ForwardingBank):
             for track_id in track_ids:
                 self._restart(track_id, Failure.UPDATE_FAILED)
             return [UpdateResult(UpdateStatus.FAILED) for _ in track_ids]
+        failed = len([one for one in results if one.nis is None and one.status is UpdateStatus.FAILED])
+        for failure, count in ((Failure.UPDATE_FAILED, failed), (Failure.DIVERGED, diverged)):
+            if count:
+                self.failures.add(failure, count)
         for track_id in self._suspects.keys() & set(track_ids):
             self._suspects[track_id] = True
         return results
-
-    def _count(
-        self, track_ids: Sequence[int], measurements: Sequence[Measurement], results: Sequence[UpdateResult]
-    ) -> None:
-        for result in results:
-            if result.status is UpdateStatus.FAILED:
-                self.failures.add(Failure.UPDATE_FAILED)
-        diverged = self._divergence.count(track_ids, measurements, results)
-        if diverged:
-            self.failures.add(Failure.DIVERGED, diverged)
 
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`; where it fails, there is no such track afterwards."""
@@ -139,7 +133,7 @@ class RestartingBank(ForwardingBank):
                 self.failures.note(f"the state of track {track_ids[place]} is {fault.value}")
             for place, fault in found.items():
                 self._restart(track_ids[place], fault)
-        self._good = dict(zip(track_ids, states, strict=True))
+        self._good = track_ids, states
         for track_id in [i for i, updated in self._suspects.items() if updated]:
             del self._suspects[track_id]
         return states
@@ -226,14 +220,14 @@ class RestartingBank(ForwardingBank):
         self._forget(track_id)
 
     def _forget(self, track_id: int) -> None:
-        for known in (self._starts, self._good, self._suspects):
-            known.pop(track_id, None)
+        self._starts.pop(track_id, None)
+        self._suspects.pop(track_id, None)
         self._divergence.forget(track_id)
 
     def _start(self, track_id: int) -> Start:
         """What is known of a track: its last good state, or how it began."""
-        state = self._good.get(track_id)
-        return self._starts[track_id] if state is None else _start_at(state)
+        track_ids, states = self._good
+        return _start_at(states[track_ids.index(track_id)]) if track_id in track_ids else self._starts[track_id]
 
     def _raised(self, error: Exception) -> None:
         self.failures.add(Failure.ESTIMATOR_RAISED)

@@ -174,7 +174,7 @@ def test_a_prior_that_says_nothing_costs_no_digits() -> None:
 
 
 def test_an_option_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(CallError, match="smoother-banded: unknown option 'lagg_s'; its options are"):
+    with pytest.raises(CallError, match="unknown option 'lagg_s'; its options are"):
         BandedSmoother(CV(), START, 1.0, lagg_s=1)
 
 

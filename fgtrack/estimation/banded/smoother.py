@@ -23,7 +23,7 @@ class BandedSmoother:
     def __init__(
         self, motion: MotionModel, start: Start, lag_s: float, initiation: str = DEFAULT, **options: Any
     ) -> None:
-        settings = SmootherSettings.of_options("smoother-banded", lag_s, options)
+        settings = SmootherSettings.of_options(lag_s, options)
         self._bank = BandedBank(motion, settings, initiation)
         self._bank.birth(0, start)
 

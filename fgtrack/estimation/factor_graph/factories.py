@@ -16,7 +16,7 @@ def smoother(
     motion: MotionModel, start: Start, lag_s: float, initiation: str = DEFAULT, **options: Any
 ) -> FixedLagSmoother:
     """Fixed-lag smoother, a factor graph that iSAM2 solves incrementally."""
-    settings = SmootherSettings.of_options("smoother", lag_s, options)
+    settings = SmootherSettings.of_options(lag_s, options)
     return FixedLagSmoother(motion, start, settings, initiation=initiation)
 
 
@@ -24,7 +24,7 @@ def smoother_batch(
     motion: MotionModel, start: Start, lag_s: float, initiation: str = DEFAULT, **options: Any
 ) -> FixedLagSmoother:
     """Fixed-lag smoother, a factor graph that Levenberg-Marquardt solves anew at every update: slow, for checks."""
-    settings = SmootherSettings.of_options("smoother-batch", lag_s, options)
+    settings = SmootherSettings.of_options(lag_s, options)
     return FixedLagSmoother(motion, start, settings, BatchBackend, initiation)
 
 
