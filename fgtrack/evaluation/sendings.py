@@ -1,7 +1,6 @@
 """When the messages of a run were sensed, sent, received and used, by topic, where its recording knows it."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -11,7 +10,7 @@ from fgtrack.core.types import IntArray
 from fgtrack.io.config import InputConfig
 from fgtrack.io.ros.bag import Bag
 from fgtrack.io.ros.topics import topic_uses
-from fgtrack.io.run import Run
+from fgtrack.io.run import Run, recording_of
 from fgtrack.io.source import input_kind
 
 _RECORDING = "recording"
@@ -40,18 +39,18 @@ def sendings(run: Run) -> list[Sendings]:
     None where the recording is not there any more or is damaged, and where it does not know: only MCAP files hold that
     time, and a recorder to which it was not told writes the time of receipt.
     """
-    origin = str((run.meta.get("input") or {}).get("path") or "")
+    origin = recording_of(run)
     try:
-        if not origin or not Path(origin).exists() or input_kind(Path(origin)) != _RECORDING:
+        if origin is None or input_kind(origin) != _RECORDING:
             return []
         config = TypeAdapter(InputConfig).validate_python(run.config.get("input") or {})
         bag = Bag(origin, config.message_definitions, config.largest_bytes)
         roles = {use.topic: use.role for use in topic_uses(bag, config)}
         times: dict[str, list[tuple[int, int, int]]] = {}
         by_name = {topic.name: role for topic, role in roles.items()}
-        for topic, *of in bag.sendings():
+        for topic, stamp_ns, sending_ns, receipt_ns in bag.sendings():
             if topic in roles:
-                times.setdefault(topic.name, []).append((of[0], of[1], of[2]))
+                times.setdefault(topic.name, []).append((stamp_ns, sending_ns, receipt_ns))
     except (FgtrackError, ValidationError):
         return []
     found = []

@@ -79,6 +79,14 @@ def test_a_recorder_that_was_not_told_does_not_know(tmp_path: Path) -> None:
     assert sendings(gone) == []
 
 
+def test_a_recording_is_found_from_the_run_folder(tmp_path: Path) -> None:
+    """Given relative to another working directory, or moved together with the run."""
+    told = recording(tmp_path, 30 * MS)
+    run = run_of(tmp_path / "run", told)
+    beside = {"path": "gone.mcap", "path_from_run": f"../{told.name}"}
+    assert len(sendings(replace(run, meta={**run.meta, "input": beside}))) == 3
+
+
 def test_a_recording_that_breaks_off_tells_nothing_wrong(tmp_path: Path) -> None:
     told = recording(tmp_path, 30 * MS)
     told.write_bytes(told.read_bytes()[:-700])
