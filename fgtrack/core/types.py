@@ -107,9 +107,13 @@ class DetectionList:
             object.__setattr__(self, "objects", tuple(self.objects))
 
 
+EGO_ID = -1
+"""Object id of the ego in truth."""
+
+
 @dataclass(frozen=True, slots=True)
 class TruthState:
-    """True state of an object in the map frame; object_id -1 is the ego."""
+    """True state of an object in the map frame, or of the ego, see `EGO_ID`."""
 
     stamp_ns: int
     receipt_ns: int
@@ -146,6 +150,11 @@ class Disposition(StrEnum):
     FAILED = "failed"
 
 
+#: Dispositions of detections that a track has fused out of sequence, and of all that one has fused.
+LATE = (Disposition.OUT_OF_SEQUENCE, Disposition.BEYOND_WINDOW)
+FUSED = (Disposition.BIRTH, Disposition.IN_SEQUENCE, *LATE)
+
+
 @dataclass(frozen=True, slots=True)
 class TrackState:
     """Gaussian state of one object at one stamp."""
@@ -161,7 +170,7 @@ class TrackStatus(StrEnum):
     """How far a track can be trusted."""
 
     TENTATIVE = "tentative"
-    """Measured less often than the confirmation threshold."""
+    """Not yet believed: measured too seldom, or too improbable, as the lifecycle says."""
     CONFIRMED = "confirmed"
     COASTING = "coasting"
     """Not matched by the newest batch that expected to see it."""

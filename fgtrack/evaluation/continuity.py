@@ -3,17 +3,11 @@
 import numpy as np
 
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import BoolArray, Disposition, FloatArray, IntArray
+from fgtrack.core.types import FUSED, LATE, BoolArray, Disposition, FloatArray, IntArray
 from fgtrack.evaluation.matching import Matching
 from fgtrack.evaluation.matching import confirmed as is_confirmed
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import NO_TRACK, Run, Table
-
-#: Dispositions of detections that were fused out of sequence.
-LATE = (Disposition.OUT_OF_SEQUENCE, Disposition.BEYOND_WINDOW)
-
-#: Dispositions of detections that were fused into a track.
-FUSED = (Disposition.BIRTH, Disposition.IN_SEQUENCE, *LATE)
 
 _SHORTEST_ABSENCE_NS = NS_PER_S
 

@@ -2,10 +2,9 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
-from fgtrack.core.types import Disposition
+from fgtrack.core.types import FUSED, LATE, Disposition
 from fgtrack.evaluation.cautions import USED
 from fgtrack.evaluation.consistency import Consistency
-from fgtrack.evaluation.continuity import FUSED, LATE
 from fgtrack.evaluation.innovations import FEWEST, LAGS, RESIDUAL_NAMES, Autocorrelation
 from fgtrack.evaluation.metrics import Metrics, SensorMetrics
 from fgtrack.evaluation.statistics import ChiSquareMean

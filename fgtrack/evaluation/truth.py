@@ -6,11 +6,8 @@ import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.core.types import EGO_ID, FloatArray, IntArray
 from fgtrack.io.run import Table
-
-EGO_ID = -1
-"""Object id of the ego in truth.csv."""
 
 #: What is interpolated, in the order of the columns of `TruePath.at`.
 TRUE_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")

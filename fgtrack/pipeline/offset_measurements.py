@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
-from fgtrack.core.types import DetectionList, Disposition
+from fgtrack.core.types import FUSED, DetectionList, Disposition
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.factor_graph.clock_calibration.time_shift import ShiftableMeasurement
 from fgtrack.io.run import NO_TRACK, Run
@@ -20,12 +20,6 @@ from fgtrack.tracking.preprocess import Preprocess
 #: Components that a wrong stamp moves by metres. Speed and yaw would add little, and as much error as their standard
 #: deviations are wrong by.
 _POSITION = ("x_m", "y_m", "range_m", "bearing_rad")
-_OF_A_TRACK = (
-    Disposition.BIRTH,
-    Disposition.IN_SEQUENCE,
-    Disposition.OUT_OF_SEQUENCE,
-    Disposition.BEYOND_WINDOW,
-)
 
 
 class Remeasure:
@@ -115,7 +109,7 @@ def _rows(run: Run) -> Iterator[_Row]:
     updates = run.updates
     columns = (updates[name].tolist() for name in (*_DETECTION, "track_id", "disposition"))
     for sensor, stamp_ns, receipt_ns, index, track_id, disposition in zip(*columns, strict=True):
-        leads = disposition in _OF_A_TRACK
+        leads = disposition in FUSED
         if track_id != NO_TRACK and (leads or disposition == Disposition.MERGED):
             yield _Row((sensor, stamp_ns, receipt_ns, index), track_id, leads)
 

@@ -10,6 +10,7 @@ from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import (
     EGO_COVARIANCE_STATES,
+    EGO_ID,
     YAW,
     DetectionList,
     EgoState,
@@ -28,7 +29,6 @@ from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.sensor import SimulatedSensor
 from fgtrack.sim.vehicles import AnyVehicle, DrawnVehicle, Trajectory
 
-EGO_ID = -1
 _MOST_STATES = 5e6  # three hours of the default scenario
 
 

@@ -35,6 +35,7 @@ from fgtrack.core.types import (
 )
 from fgtrack.evaluation.viewer.export import export, viewer_messages
 from fgtrack.evaluation.viewer.placement import placed
+from fgtrack.evaluation.viewer.surroundings import truth_messages
 from fgtrack.io.ros.bag import Bag, BagMessage
 from fgtrack.io.ros.viewer_bag import write_viewer_bag
 from fgtrack.io.run import Run, RunWriter, Table, load_run
@@ -117,6 +118,15 @@ def bag(runs: Path) -> dict[str, list[BagMessage]]:
     out = runs.parent / "rosbag"
     assert command(["export", str(runs / "smoother"), "-o", str(out), "--ros2"]) == 0
     return read_bag(out)
+
+
+def test_truth_of_a_negative_id_is_shown_and_the_ego_is_not() -> None:
+    columns = {"stamp_ns": 1, "object_id": 1, "x_m": 2.0, "y_m": 3.0, "yaw_rad": 0.1}
+    truth = Table(
+        {name: np.array([value] * 3) for name, value in columns.items()} | {"object_id": np.array([-1, -5, 0])}
+    )
+    [_, shown] = truth_messages(truth)
+    assert [one.object_id for one in shown.objects.objects] == [-5, 0]
 
 
 def test_every_topic_has_the_messages_and_both_times_of_the_run(topics: dict[str, list[Entry]], smoothed: Run) -> None:

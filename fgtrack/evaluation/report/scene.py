@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.core.types import EGO_ID, LATE, FloatArray, IntArray
 from fgtrack.evaluation.cautions import USED
 from fgtrack.evaluation.palette import PALETTE
 from fgtrack.evaluation.recordings import same_recording
@@ -23,7 +23,7 @@ from fgtrack.evaluation.report.packing import (
     time_form,
 )
 from fgtrack.evaluation.runs import JudgedRun
-from fgtrack.evaluation.viewer.detection_messages import LATE, track_positions
+from fgtrack.evaluation.viewer.detection_messages import track_positions
 from fgtrack.evaluation.viewer.ellipse import AROUND_95, ellipses
 from fgtrack.evaluation.viewer.look import NOMINAL_SIZE_M
 from fgtrack.evaluation.viewer.placement import placed, update_rows
@@ -176,7 +176,7 @@ def _recording(one: _Recording, packing: _Packing) -> Json:
     lines += [{"kind": "bound", **packing.place(*points_m.T)} for points_m in excluded_lines(run)]
     ego = packing.thinned(_placed(run.ego), "the ego")
     ego = _sorted(ego, ego["stamp_ns"])
-    truth = run.truth.where(run.truth["object_id"] >= 0)
+    truth = run.truth.where(run.truth["object_id"] != EGO_ID)
     truth = packing.thinned(_placed(truth), "the truth")
     truth = _sorted(truth, truth["stamp_ns"], truth["object_id"])
     return {

@@ -8,7 +8,7 @@ from operator import itemgetter
 import numpy as np
 
 from fgtrack.core.time import seconds
-from fgtrack.core.types import Detection, DetectionList, Disposition
+from fgtrack.core.types import FUSED, LATE, Detection, DetectionList, Disposition
 from fgtrack.evaluation.viewer.look import GREY, Look, faded
 from fgtrack.evaluation.viewer.placement import Placed, placed, update_rows
 from fgtrack.io.run import NO_TRACK, Run
@@ -18,9 +18,7 @@ from fgtrack.io.viewer.topics import token
 _SHOWN_S = 0.5  # how long a list is shown that no later one of its sensor replaces
 _DOT_M = 1.0
 _BEARING_M = 150.0  # length of the line of sight of a detection without a range
-LATE: frozenset[str] = frozenset({Disposition.OUT_OF_SEQUENCE, Disposition.BEYOND_WINDOW})
-_FUSED: frozenset[str] = frozenset({Disposition.BIRTH, Disposition.IN_SEQUENCE, *LATE})
-_COUNTED: frozenset[str] = frozenset({*_FUSED, Disposition.MERGED})
+_COUNTED = (*FUSED, Disposition.MERGED)
 
 
 def detection_messages(run: Run, look: Look) -> Iterator[ViewerMessage]:
@@ -51,7 +49,7 @@ def detection_messages(run: Run, look: Look) -> Iterator[ViewerMessage]:
             yaw_rad = float(where.yaw_rad[row])
             objects.append(Detection(x_m, y_m, yaw_rad if math.isfinite(yaw_rad) else None))
             end_m = None
-            if disposition in _FUSED:
+            if disposition in FUSED:
                 end_m = now_at.get((int(updates["tick"][became[row]]), int(updates["track_id"][became[row]])))
             if end_m is not None and receipt_ns > stamp_ns and end_m != (x_m, y_m):
                 arrows.append(Arrow((x_m, y_m), end_m, 0.3, faded(colour, 1.0 if disposition in LATE else 0.3)))

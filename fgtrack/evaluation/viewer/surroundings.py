@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgtrack.core.types import STATE_NAMES, Detection, DetectionList, EgoState, FloatArray, IntArray
+from fgtrack.core.types import EGO_ID, STATE_NAMES, Detection, DetectionList, EgoState, FloatArray, IntArray
 from fgtrack.evaluation.viewer.look import GREY, WHITE, car, faded
 from fgtrack.io.run import Run, Table
 from fgtrack.io.viewer.scene import EgoMotion, Entity, Line, Objects, Scene, ViewerMessage
@@ -93,7 +93,7 @@ def ego_messages(ego: Table, at_ns: int) -> Iterator[ViewerMessage]:
 
 def truth_messages(truth: Table) -> Iterator[ViewerMessage]:
     """True poses of the objects at every stamp; the ego is not among them."""
-    table = truth.where((truth["object_id"] >= 0) & np.isfinite(truth["x_m"]) & np.isfinite(truth["y_m"]))
+    table = truth.where((truth["object_id"] != EGO_ID) & np.isfinite(truth["x_m"]) & np.isfinite(truth["y_m"]))
     before: frozenset[str] = frozenset()
     colour = faded(WHITE, 0.35)
     for stamp_ns, rows in groups(table["stamp_ns"]):
