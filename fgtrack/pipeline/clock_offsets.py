@@ -128,12 +128,13 @@ def estimate_offsets(
     if reference is not None and reference not in sensors:
         hint = did_you_mean(reference, sensors)
         raise CallError(f"reference {reference!r} is no sensor of the input, which has {', '.join(sensors)}{hint}")
-    remeasure = Remeasure(config, _path(heard, raw, rules))
+    path = ego_path_of(heard, raw, rules)
+    remeasure = Remeasure(config, path)
     tracks = measurements_by_track(run, raw, raw, config.sensors, remeasure)
     reference = reference or max(sensors, key=_counts(tracks).__getitem__)
     used = _chosen(tracks, reference, rules)
     if rules.fit_noise and used:
-        remeasure = Remeasure(_with_noise(config, used, reference, rules), _path(heard, raw, rules))
+        remeasure = Remeasure(_with_noise(config, used, reference, rules), path)
         used = _chosen(measurements_by_track(run, raw, raw, config.sensors, remeasure), reference, rules)
     solution = _solution(used, reference, config, rules, {})
     known_s = {} if solution is None else _known(solution, rules)
@@ -190,11 +191,11 @@ def _lists(heard: Iterable[Delivered], config: Config) -> list[DetectionList]:
     return [one for one in heard if isinstance(one, DetectionList) and one.sensor in config.sensors]
 
 
-def _path(heard: Iterable[Delivered], raw: Iterable[DetectionList], rules: OffsetRules) -> EgoPath | None:
+def ego_path_of(heard: Iterable[Delivered], raw: Iterable[DetectionList], rules: OffsetRules) -> EgoPath | None:
     """The path of the ego; None where it is not needed."""
     if all(one.frame == "map" for one in raw):
         return None
-    return EgoPath((message for message in heard if isinstance(message, EgoState)), rules.ego_cutoff_hz)
+    return EgoPath((one for one in heard if isinstance(one, EgoState)), rules.ego_cutoff_hz)
 
 
 def _counts(tracks: Iterable[Track]) -> Counter[str]:

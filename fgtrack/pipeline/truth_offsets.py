@@ -18,13 +18,12 @@ import numpy as np
 
 from fgtrack.core.linalg import congruence, psd_solve
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import DetectionList, EgoState, FloatArray, IntArray, Message, TruthState
+from fgtrack.core.types import EGO_ID, DetectionList, EgoState, FloatArray, IntArray, Message, TruthState
 from fgtrack.estimation.factor_graph.clock_calibration.time_shift import ShiftableMeasurement
 from fgtrack.estimation.initiation import fix_of
 from fgtrack.pipeline.clock import Delivered
-from fgtrack.pipeline.clock_offsets import OffsetReport, OffsetRules, SensorOffset, unrefused
+from fgtrack.pipeline.clock_offsets import OffsetReport, OffsetRules, SensorOffset, ego_path_of, unrefused
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.ego_path import EgoPath
 from fgtrack.pipeline.offset_measurements import Remeasure, measurements_by_track
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.stamping import mended
@@ -81,26 +80,25 @@ def truth_offsets(messages: Sequence[Message], config: Config, rules: OffsetRule
     config = unrefused(config)
     run, broken = replay_in_memory(heard, config)
     raw = [one for one in heard if isinstance(one, DetectionList)]
-    path = None
-    if any(one.frame != "map" for one in raw):
-        path = EgoPath((one for one in heard if isinstance(one, EgoState)), rules.ego_cutoff_hz)
-    tracks = measurements_by_track(run, raw, raw, config.sensors, Remeasure(config, path))
+    tracks = measurements_by_track(run, raw, raw, config.sensors, Remeasure(config, ego_path_of(heard, raw, rules)))
     found: dict[str, list[tuple[ShiftableMeasurement, _Path]]] = defaultdict(list)
+    num_tracks = 0
     for track in tracks:
         nearest = _nearest(track, paths)
         if nearest is not None:
+            num_tracks += 1
             for item in track:
                 found[item.sensor].append((item, nearest))
     rows = tuple(
         _row(name, found.get(name, []), rules) for name in config.sensors if any(o.sensor == name for o in raw)
     )
-    return OffsetReport(TRUTH, rows, len(tracks), sum(row.num_detections for row in rows), broken)
+    return OffsetReport(TRUTH, rows, num_tracks, sum(row.num_detections for row in rows), broken)
 
 
 def _paths(messages: Iterable[Message]) -> list[_Path]:
     states: dict[int, dict[int, tuple[float, float]]] = defaultdict(dict)
     for message in messages:
-        if isinstance(message, TruthState) and not message.ignored:
+        if isinstance(message, TruthState) and not message.ignored and message.object_id != EGO_ID:
             states[message.object_id][message.stamp_ns] = (message.x_m, message.y_m)
     return [
         _Path(np.array(sorted(each)), np.array([each[stamp_ns] for stamp_ns in sorted(each)]))
@@ -129,7 +127,8 @@ def _nearest(track: Sequence[ShiftableMeasurement], paths: Sequence[_Path]) -> _
 
 
 def _row(name: str, pairs: Sequence[tuple[ShiftableMeasurement, _Path]], rules: OffsetRules) -> SensorOffset:
-    pairs = pairs[:: math.ceil(len(pairs) / _MOST) or 1]
+    some = pairs[:: math.ceil(len(pairs) / _MOST) or 1]
+    pairs = [(item, path) for item, path in some if np.isfinite(path.at(np.array([item.stamp_ns]))).all()]
     if len(pairs) < 3 * rules.min_detections:
         return SensorOffset(name, None, None, len(pairs), False, "too few detections of objects whose truth is known")
     stamps_ns = np.array([item.stamp_ns for item, _ in pairs])
