@@ -8,7 +8,7 @@ from fgtrack.cli.show import chosen_form, progress, say, sentences, show, warn
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.left_out import left_out
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value
-from fgtrack.io.info import InputInfo, TopicInfo, describe
+from fgtrack.io.info import OTHER_CLOCK_S, InputInfo, TopicInfo, describe
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.effective import effective
@@ -16,7 +16,6 @@ from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.trial import Trial, try_out
 
 _DELAYS = ("delay_mean_s", "delay_p50_s", "delay_p90_s", "delay_max_s")
-_OTHER_CLOCK_S = 3600.0  # nothing is that late: the stamps and the recorder have different clocks
 
 
 def info(recording: Input, config_file: ConfigFile = None, as_json: Json = False, form: FormOption = None) -> None:
@@ -94,4 +93,4 @@ def _delays(one: TopicInfo) -> tuple[Value, ...] | None:
 
 def _whole(value: Value) -> str:
     """Whole milliseconds; of a recorder with another clock than the sensor nothing."""
-    return f"{value:.0f}" if abs(float(value)) < 1e3 * _OTHER_CLOCK_S else NO_VALUE
+    return f"{value:.0f}" if abs(float(value)) < 1e3 * OTHER_CLOCK_S else NO_VALUE

@@ -64,8 +64,9 @@ def replay(
         )
     for line in dict.fromkeys(str(effective(replace(config, estimator=name))) for name in names):
         say(line)
+    runs = [load_run(result.path) for result in results]
     if not config.sensors:
-        assumed = load_run(results[0].path).config["sensors"]
+        assumed = runs[0].config["sensors"]
         text = "; ".join(f"{name}: {_listed(sensor['std'])}" for name, sensor in assumed.items())
         say(f"no sensors configured, assumed standard deviations: {text}")
     for result in results:
@@ -74,7 +75,6 @@ def replay(
         say(f"{result.path}: {what.format_map(result.meta)}{missed}")
     for line in left_out(results[0].meta):  # the same of all
         say(line)
-    runs = [load_run(result.path) for result in results]
     for line in dict.fromkeys([line for run in runs for line in cautions(run)] + noise_cautions(runs[0])):
         warn(line)
     if results[0].broken is not None:  # the others break off at the same place

@@ -10,12 +10,10 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import MEASURABLE, BoolArray, FloatArray, IntArray
 from fgtrack.evaluation.statistics import NORMAL_95
 from fgtrack.io.run import NO_TRACK, Run, Table
+from fgtrack.models.measurement import ANGULAR
 
 #: Every residual, in the order in which it is shown.
 RESIDUAL_NAMES = ("along_m", "across_m", *MEASURABLE)
-
-#: Residuals that are directions.
-ANGULAR = frozenset({"yaw_rad", "bearing_rad"})
 
 _TRACK_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps")
 

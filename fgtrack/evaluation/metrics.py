@@ -12,7 +12,7 @@ from fgtrack.core.types import BoolArray, Disposition, IntArray
 from fgtrack.evaluation.consistency import Consistency, consistency
 from fgtrack.evaluation.continuity import late_switches, times_to_confirm, tracked_visits
 from fgtrack.evaluation.deadlines import Deadlines
-from fgtrack.evaluation.innovations import ANGULAR, RESIDUAL_NAMES, message_delays, num_measured, residuals
+from fgtrack.evaluation.innovations import RESIDUAL_NAMES, message_delays, num_measured, residuals
 from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
 from fgtrack.evaluation.left_out import left_out
 from fgtrack.evaluation.matching import ERROR_NAMES, Matching, confirmed, match, track_errors
@@ -20,6 +20,7 @@ from fgtrack.evaluation.multi_object import MultiObjectMetrics, multi_object_met
 from fgtrack.evaluation.residual_samples import residual_samples
 from fgtrack.evaluation.statistics import ChiSquareMean, Distribution, Moments
 from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, evaluation_config
+from fgtrack.models.measurement import ANGULAR
 
 FALSE_TRACK_SHARE = 0.5
 """A track that is paired with a true object in less than this share of its rows is false."""

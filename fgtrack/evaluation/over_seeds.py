@@ -14,7 +14,8 @@ import numpy as np
 
 from fgtrack.evaluation.paired import Estimate, paired
 from fgtrack.evaluation.ranking import Entry, Standing, ranked, worse_columns
-from fgtrack.evaluation.sweep_table import SweepTable
+from fgtrack.evaluation.sweep_table import SweepTable, number, telling
+from fgtrack.evaluation.table_rows import PERCENT
 from fgtrack.evaluation.tables import Column, Table, Value
 
 #: Metrics that have a better and a worse, in the order in which they are asked for; the first is shown.
@@ -45,7 +46,6 @@ _MAIN: Mapping[str, str] = {
     "truth.overall.tracked_share_in_sight": "tracked\n[%]",
 }
 _SHARES = ("truth.overall.tracked_share_in_sight",)
-_PERCENT = 100.0
 
 _INTERVALS = "t intervals of paired differences over seeds; tie with the best: 0 is inside"
 _MOST_ROWS = 40
@@ -115,7 +115,7 @@ def shown_tables(contests: Sequence[SeedContest], axes: Sequence[str]) -> list[T
     metric, points = mine[0].metric, _point_texts(mine, axes)
     rows = [_Row(text, one.seeds, entry) for text, one in zip(points, mine, strict=True) for entry in one.entries]
     if len(rows) <= _MOST_ROWS:
-        return [_every_point(metric, rows, _axis_names(_places([one.point for one in mine], axes), axes))]
+        return [_every_point(metric, rows, _axis_names(telling((one.point for one in mine), len(axes)), axes))]
     return [_counts(metric, len(mine), rows)]
 
 
@@ -132,7 +132,7 @@ def summary_table(sweep: SweepTable, contests: Sequence[SeedContest]) -> Table:
     }
     rows = list(dict.fromkeys((tuple(row[axis] for axis in sweep.axes), row["estimator"]) for row in sweep.rows))
     points = list(dict.fromkeys(point for point, _ in rows))
-    places = _places(points, sweep.axes)
+    places = telling(points, len(sweep.axes))
     main = [name for name in _MAIN if name in means] or list(means)[: len(_MAIN)]
 
     def column(metric: str) -> Column[_Cell]:
@@ -145,7 +145,7 @@ def summary_table(sweep: SweepTable, contests: Sequence[SeedContest]) -> Table:
             (metric, f"{metric}.standard_error"),
             of,
             "{} ± {}",
-            _PERCENT if metric in _SHARES else 1.0,
+            PERCENT if metric in _SHARES else 1.0,
             bold=lambda row: (*row, metric) in best,
             when="always" if metric in main else "full",
         )
@@ -209,7 +209,7 @@ def _counts(metric: str, num_points: int, rows: Sequence[_Row]) -> Table:
 
 
 def _point_texts(contests: Sequence[SeedContest], axes: Sequence[str]) -> list[str]:
-    places = _places([one.point for one in contests], axes)
+    places = telling((one.point for one in contests), len(axes))
     return [", ".join(one.point[place] for place in places) for one in contests]
 
 
@@ -218,19 +218,12 @@ def _axis_names(places: Sequence[int], axes: Sequence[str]) -> str:
     return ",\n".join(axes[place].rpartition(".")[2] for place in places) or "point"
 
 
-def _places(points: Sequence[tuple[str, ...]], axes: Sequence[str]) -> list[int]:
-    """Axes that tell the points apart, without those of whole mappings where labels do it."""
-    plain = [k for k in range(len(axes)) if not any(point[k].startswith(("{", "[")) for point in points)]
-    told = {tuple(point[k] for k in plain) for point in points}
-    return plain if len(told) == len(points) else list(range(len(axes)))
-
-
 def _contest(point: tuple[str, ...], metric: str, rows: Sequence[Mapping[str, str]]) -> SeedContest | None:
     """The estimators over the seeds that all of them have; None of fewer than two, or without such a seed."""
     costs_of = _cost_of(metric)
     values: dict[str, dict[str, tuple[float, float]]] = {}
     for row in rows:
-        value, cost = _number(row[metric]), costs_of(row)
+        value, cost = number(row[metric]), costs_of(row)
         if math.isfinite(cost):
             values.setdefault(row["estimator"], {})[row["seed"]] = (value, cost)
     if len(values) < 2:
@@ -253,13 +246,9 @@ def _cost_of(metric: str) -> Callable[[Mapping[str, str]], float]:
     if better == "nearer":
         dof = metric.removesuffix("mean") + "dof"
         default = str(_POSITION_DOF) if "position_nees" in metric else ""
-        return lambda row: abs(_number(row[metric]) - _number(row.get(dof, default)))
+        return lambda row: abs(number(row[metric]) - number(row.get(dof, default)))
     sign = 1.0 if better == "less" else -1.0
-    return lambda row: sign * _number(row[metric])
-
-
-def _number(cell: str) -> float:
-    return float(cell) if cell else math.nan
+    return lambda row: sign * number(row[metric])
 
 
 def _cell(value: float) -> str:

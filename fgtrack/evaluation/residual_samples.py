@@ -9,12 +9,13 @@ import numpy.typing as npt
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.evaluation.innovations import ANGULAR, residuals, track_states
+from fgtrack.evaluation.innovations import residuals, track_states
 from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.sight import ego_states
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.evaluation.viewer.surroundings import roads
 from fgtrack.io.run import Run
+from fgtrack.models.measurement import ANGULAR
 
 #: Residuals of table I of Karle et al. 2023: x_loc, y_loc, psi and v.
 LOCAL_NAMES = ("along_m", "across_m", "yaw_rad", "speed_mps")

@@ -23,6 +23,7 @@ from fgtrack.evaluation.paired import UNKNOWN, by_stamp
 from fgtrack.evaluation.ranking import STANDING_NOTE, Entry, value_column, worse_columns
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.statistics import Distribution
+from fgtrack.evaluation.table_rows import MS, PERCENT
 from fgtrack.evaluation.tables import Column, Table, Tables
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.evaluation.verdict import who_is_best
@@ -33,7 +34,6 @@ same after its user has moved it to that moment."""
 
 _TITLES = {ASKED: "at its stamp", READY: "when ready", PREDICTED: "predicted to then"}
 _LARGE_SHARE = 0.9
-_PERCENT, _MS = 100.0, 1e3
 
 
 @dataclass(frozen=True)
@@ -177,16 +177,16 @@ def _load(runs: Sequence[JudgedRun]) -> Table:
             ("ready_after_p50_s", "ready_after_p99_s"),
             lambda one: (ages[one.label].p50, ages[one.label].p99),
             "{}/{}",
-            _MS,
+            MS,
         ),
-        Column("longest\n[ms]", ("ready_after_max_s",), lambda one: (deadlines(one).latest_s,), scale=_MS),
+        Column("longest\n[ms]", ("ready_after_max_s",), lambda one: (deadlines(one).latest_s,), scale=MS),
         Column(
             "late\nticks",
             ("deadline_misses", "ticks"),
             lambda one: (deadlines(one).misses, deadlines(one).ticks) if deadlines(one).are_known else None,
             "{}/{}",
         ),
-        Column("load\n[%]", ("load",), lambda one: (deadlines(one).load,), scale=_PERCENT),
+        Column("load\n[%]", ("load",), lambda one: (deadlines(one).load,), scale=PERCENT),
     ]
     notes = [
         "of all ticks, one after the other: a tick begins when it is due, or when the one before is done",

@@ -2,7 +2,7 @@
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,10 +42,8 @@ class SweepTable:
     def shown_axes(self) -> tuple[str, ...]:
         """Axes that vary and tell the points apart, without those of whole mappings where labels do it."""
         varying = [axis for axis in self.axes if len({row[axis] for row in self.rows}) > 1]
-        plain = [axis for axis in varying if not any(row[axis].startswith(("{", "[")) for row in self.rows)]
-        points = {tuple(row[axis] for axis in varying) for row in self.rows}
-        told = {tuple(row[axis] for axis in plain) for row in self.rows}
-        return tuple(plain if len(points) == len(told) else varying)
+        points = [tuple(row[axis] for axis in varying) for row in self.rows]
+        return tuple(varying[k] for k in telling(points, len(varying)))
 
     def means(self, metric: str, axes: Sequence[str] | None = None) -> list[PointMean]:
         """Mean and standard error of `metric` at every point and of every estimator, in the order of the table.
@@ -98,6 +96,14 @@ def read_sweep(folder: Path | str) -> SweepTable:
 def is_sweep(folder: Path) -> bool:
     """Whether `folder` holds the table of a sweep."""
     return (folder / SWEEP_FILE).is_file()
+
+
+def telling(points: Iterable[tuple[str, ...]], num_axes: int) -> list[int]:
+    """Which axes tell `points` apart, without those of whole mappings where labels do it."""
+    distinct = set(points)
+    plain = [k for k in range(num_axes) if not any(point[k].startswith(("{", "[")) for point in distinct)]
+    told = {tuple(point[k] for k in plain) for point in distinct}
+    return plain if len(told) == len(distinct) else list(range(num_axes))
 
 
 def number(cell: str) -> float:

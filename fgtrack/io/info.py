@@ -17,7 +17,8 @@ from fgtrack.io.ros.bag import Bag, BagTopic
 from fgtrack.io.ros.topics import topic_uses
 from fgtrack.io.source import input_kind, open_input
 
-_OTHER_CLOCK_S = 3600.0
+OTHER_CLOCK_S = 3600.0
+"""Nothing is that late: the stamps and the recorder have different clocks."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,7 @@ def _note(topic: BagTopic, times: dict[_Key, _Times]) -> str | None:
     delay = times[topic.name, topic.type].delay()
     if topic.problem:
         return topic.problem
-    if delay and abs(delay.p50_s) > _OTHER_CLOCK_S:
+    if delay and abs(delay.p50_s) > OTHER_CLOCK_S:
         return "its stamps are of another clock than the recorder's (simulated time?)"
     if topic.type == ODOMETRY:
         return "could be the ego"

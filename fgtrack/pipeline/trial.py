@@ -12,6 +12,7 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DESCRIBING, MEASURABLE, Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import Run
+from fgtrack.models.measurement import ANGULAR
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_in_memory
@@ -20,7 +21,6 @@ __all__ = ["TRIAL_S", "Trial", "beginning", "suspicions", "try_out"]
 
 TRIAL_S = 5.0
 _FULL_CIRCLE_RAD = 2.0 * math.pi + 0.01
-_ANGLES = ("yaw_rad", "bearing_rad")
 _FAR_M, _NEARER = 250.0, 0.3  # what is so far, and so much nearer in another frame, is in that one
 
 
@@ -98,7 +98,7 @@ def suspicions(messages: Sequence[Message], config: Config) -> Iterator[str]:
 
 
 def _degrees(name: str, states: Sequence[EgoState | TruthState | Detection]) -> Iterator[str]:
-    for angle in _ANGLES:
+    for angle in ANGULAR:
         values = [abs(value) for state in states if (value := getattr(state, angle, None)) is not None]
         largest = max((value for value in values if math.isfinite(value)), default=0.0)
         if largest > _FULL_CIRCLE_RAD:

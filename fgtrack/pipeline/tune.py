@@ -15,6 +15,7 @@ from fgtrack.estimation.likelihood.fit import Likelihood, Problem
 from fgtrack.estimation.likelihood.mixed import without_mixed
 from fgtrack.estimation.likelihood.reference import filtered
 from fgtrack.estimation.likelihood.series import Series
+from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
@@ -38,14 +39,11 @@ class _Recording:
 
     @classmethod
     def read(cls, name: str, messages: Iterable[Message]) -> "_Recording":
-        kept: list[Message] = []
-        try:
-            kept.extend(messages)
-        except DataError as error:
-            if not kept:
-                raise
-            return cls(name, tuple(kept), str(error))
-        return cls(name, tuple(kept), None)
+        readable = UntilBreak(messages)
+        kept = tuple(readable)
+        if not kept:
+            readable.raise_error()
+        return cls(name, kept, None if readable.error is None else str(readable.error))
 
 
 def tune(

@@ -16,22 +16,24 @@ from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import plain, validate
 from fgtrack.pipeline.shipped import find_file, read_config
 
-_MARK = "(fgtrack tune)"
-_ADVISED_MARK = "(fgtrack advise)"
+_TUNED_MARK, _ADVISED_MARK = "(fgtrack tune)", "(fgtrack advise)"
+_LONGEST_HEAD = 1000
 
 
-def _is_tuned(path: Path) -> bool:
-    return path.is_file() and _MARK in path.read_text(encoding="utf-8", errors="replace").partition("\n")[0]
+def _kind(name: str, mark: str) -> Kind:
+    def recognises(path: Path) -> bool:
+        if not path.is_file():
+            return False
+        with path.open("rb") as file:
+            return mark.encode() in file.readline(_LONGEST_HEAD)
 
-
-def _is_advised(path: Path) -> bool:
-    return path.is_file() and _ADVISED_MARK in path.read_text(encoding="utf-8", errors="replace").partition("\n")[0]
+    return Kind(name, recognises)
 
 
 #: A file that `fgtrack tune` has written.
-TUNED = Kind("a tuned configuration", _is_tuned)
+TUNED = _kind("a tuned configuration", _TUNED_MARK)
 #: A file that `fgtrack advise` has written.
-ADVISED = Kind("an advised configuration", _is_advised)
+ADVISED = _kind("an advised configuration", _ADVISED_MARK)
 
 
 def write_tuned(path: Path, base: str | Path | None, config: Config, comments: Sequence[str], overwrite: bool) -> None:
@@ -57,7 +59,7 @@ def write_advised(
 def tuned_text(base: str | Path | None, config: Config, comments: Sequence[str]) -> str:
     """The text that `write_tuned` writes."""
     origin = read_config(base)
-    return _text(base, replace(config, map=origin.map), comments, "The noise of {}, fitted to recordings", _MARK)
+    return _text(base, replace(config, map=origin.map), comments, "The noise of {}, fitted to recordings", _TUNED_MARK)
 
 
 def _text(base: str | Path | None, wanted: Config, comments: Sequence[str], title: str, mark: str) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from fgtrack.core.geometry import body_point, cartesian, rotations, wrap_angles
 from fgtrack.core.types import SPEED, YAW, YAW_RATE, BoolArray, Detection, FloatArray, IntArray, X, Y
-from fgtrack.models.measurement import measurement_model
+from fgtrack.models.measurement import ANGULAR, measurement_model
 from fgtrack.models.motion import CV
 from fgtrack.models.sensors import Mount, in_view
 from fgtrack.models.track_map import TrackMap
@@ -108,7 +108,7 @@ class Scanner:
             noise[:, :2] = _rotated(noise[:, :2], line_of_sight)
         z = self._measure(scan, states) + noise
         for column, name in enumerate(components):
-            if name in ("yaw_rad", "bearing_rad"):
+            if name in ANGULAR:
                 z[:, column] = wrap_angles(z[:, column])
         return z
 

@@ -33,9 +33,9 @@ def tracks_on_map(run: OneRun) -> Figure:
     """Ego, detections, tracks and truth on the map that `config.yaml` names as `map.track`.
 
     Truth is a broad pale line, so a stretch that nothing tracked stays visible; a track has the colour of the
-    object that it is paired with, and is black where it is paired with none. Without truth every track with
-    enough measurements has a colour. The picture holds map, ego, truth and the bulk of the tracks and detections;
-    what lies outside is counted.
+    object that it is paired with, and is black where it is paired with none. Without truth every confirmed
+    track has a colour. The picture holds map, ego, truth and the bulk of the tracks and detections; what lies
+    outside is counted.
 
     Raises
     ------

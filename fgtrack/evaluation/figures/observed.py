@@ -40,20 +40,18 @@ _SEEN: Mapping[str, Callable[[Sensed], FloatArray]] = {
 def transient(run: OneRun) -> Figure:
     """Residuals against the time since the first detection of their track: of all sensors (black) and of each.
 
-    Points are root mean squares over half a second, of the tracks with three measurements or more.
+    Points are root mean squares over half a second, of confirmed tracks.
 
     Raises
     ------
     DataError
-        The run has no innovations of such tracks.
+        The run has no innovations of confirmed tracks.
     """
     one = one_judged(run)
     samples = residual_samples(one.run)
     names = [name for name in LOCAL_NAMES if np.isfinite(samples.values[name]).any()]
     if not names:
-        raise DataError(
-            f"{one.label}: has no innovations of tracks with 3 measurements, so there is no transient to draw"
-        )
+        raise DataError(f"{one.label}: has no innovations of confirmed tracks, so there is no transient to draw")
     sensors = np.unique(samples.sensors).tolist()
     lines = [("all sensors", np.ones(len(samples.sensors), dtype=bool), WRONG, 3.0)]
     lines += [(sensor, samples.sensors == sensor, colour(k), 1.4) for k, sensor in enumerate(sensors)]

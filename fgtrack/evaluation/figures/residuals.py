@@ -8,9 +8,10 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation import innovations
 from fgtrack.evaluation.figures.ranges import bulk
 from fgtrack.evaluation.figures.style import StyledFigure, colour, legend_above, styled, title, titled
-from fgtrack.evaluation.innovations import ANGULAR, RESIDUAL_NAMES
+from fgtrack.evaluation.innovations import RESIDUAL_NAMES
 from fgtrack.evaluation.runs import OneRun, one_judged, start_ns
 from fgtrack.evaluation.statistics import Moments
+from fgtrack.models.measurement import ANGULAR
 
 _RESIDUALS = {
     "along_m": "along track [m]",

@@ -10,15 +10,13 @@ from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES, Detection, E
 from fgtrack.io.adapters.common import ObjectList, RosMessage, frame_of, stamp_ns, yaw_rad
 from fgtrack.io.adapters.ids import object_id
 from fgtrack.io.config import Field, FieldPath, Path
+from fgtrack.models.measurement import ANGULAR
 
 OBJECT_FIELDS = frozenset({"objects", "stamp", "object_stamp", "object_id", *MEASURABLE, *DESCRIBING})
 """What the `fields` of an object list may name: `objects` is the path of the list, `stamp` that of the
 message's time (default `header.stamp`); the others are paths in one object."""
 EGO_FIELDS = frozenset({"stamp", "in_pit", *STATE_NAMES})
 """What the `fields` of the ego may name."""
-
-ANGLES = frozenset({"yaw_rad", "bearing_rad"})
-"""What is wrapped to (-pi, pi] once it is converted."""
 
 _MOST_NAMES = 12  # of fields that a message about a wrong path lists
 
@@ -113,7 +111,7 @@ def converted(raw: float, path: FieldPath, name: str) -> float:
     if not isinstance(path, Field):
         return raw
     value = path.value(raw)
-    return wrap_angle(value) if name in ANGLES and math.isfinite(value) else value
+    return wrap_angle(value) if name in ANGULAR and math.isfinite(value) else value
 
 
 def _raw(message: RosMessage, path: Path) -> float:
