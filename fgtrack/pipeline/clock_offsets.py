@@ -15,9 +15,10 @@ from fgtrack.estimation.factor_graph.clock_calibration.time_shift import Shiftab
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.clock import Delivered
 from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.effective import with_sensors
 from fgtrack.pipeline.ego_path import EgoPath
 from fgtrack.pipeline.offset_measurements import Remeasure, measurements_by_track
-from fgtrack.pipeline.replay import replay_in_memory
+from fgtrack.pipeline.replay import again, replay_in_memory
 from fgtrack.pipeline.stamping import mended
 from fgtrack.sim.redelay import restamped
 
@@ -118,13 +119,15 @@ def estimate_offsets(
     """
     rules = rules or OffsetRules()
     heard: list[Delivered] = []
-    recorded = _recorded(messages, heard, config.sensors)
+    repeated = again(messages, config)
+    config = with_sensors(config, repeated)
+    recorded = _recorded(repeated(), heard, config.sensors)
     config = unrefused(config)
     run, broken = replay_in_memory(recorded, config)
     raw = _lists(heard, config)
     sensors = [name for name in config.sensors if any(one.sensor == name for one in raw)]
     if not sensors:
-        raise DataError("there are no detections of a sensor that the configuration has")
+        raise DataError("there are no detections of a sensor that the configuration names (sensors)")
     if reference is not None and reference not in sensors:
         hint = did_you_mean(reference, sensors)
         raise CallError(f"reference {reference!r} is no sensor of the input, which has {', '.join(sensors)}{hint}")

@@ -145,7 +145,7 @@ def replay(
         A sensor of the input has no model, or the input gives the tracker nothing.
     """
     runs = replay_each(
-        _again(messages, config),
+        again(messages, config),
         config,
         {config.estimator: out},
         origin=origin,
@@ -168,26 +168,26 @@ def replay_in_memory(
 
     Without files it takes less time. `observed` is that of `build_tracker`. Raises as `replay`.
     """
-    again = _again(messages, config)
-    config = with_sensors(config, again)
+    repeated = again(messages, config)
+    config = with_sensors(config, repeated)
     tracker = build_tracker(config, observed)
     memory = MemoryRun(*_opening(config, origin, kind))
-    _, broken, _ = _drive(tracker, again(), config, memory, origin=origin)
+    _, broken, _ = _drive(tracker, repeated(), config, memory, origin=origin)
     return memory.run, broken
 
 
-def _again(messages: Iterable[Message], config: Config) -> Callable[[], Iterable[Message]]:
+def again(messages: Iterable[Message], config: Config) -> Callable[[], Iterable[Message]]:
     """Gives `messages`; kept where they are needed twice, to find the sensors that `config` does not name."""
     if config.sensors:
         return lambda: messages
     readable = UntilBreak(messages)
     kept = list(readable)
 
-    def again() -> Iterator[Message]:
+    def repeated() -> Iterator[Message]:
         yield from kept
         readable.raise_error()
 
-    return again
+    return repeated
 
 
 def _drive(

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.effective import with_sensors
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config, settings_of
 from fgtrack.pipeline.tune_measurements import recorded
@@ -92,8 +93,9 @@ def tuned(
 ) -> TuneReport:
     """`tune` of messages in receipt order, by name of their recording; `on_step` is told what comes next."""
     rules = rules or TuneRules()
-    noise = ConfigNoise(for_tuning(config, rules))
     recordings = [_Recording.read(name, messages()) for name, messages in sources.items()]
+    config = with_sensors(config, lambda: chain.from_iterable(one.messages for one in recordings))
+    noise = ConfigNoise(for_tuning(config, rules))
     return _Tuning(noise, recordings, rules, on_step).report(config)
 
 

@@ -124,6 +124,11 @@ def test_one_modality_has_nothing_to_compare_it_with() -> None:
     assert lidar.why == "the only modality: nothing to compare it with"
 
 
+def test_without_configured_sensors_those_of_the_recording_are_taken() -> None:
+    report = estimate_offsets(iter(parked("ego")), replace(load(Config, CONFIG), sensors={}), "lidar")
+    assert [one.sensor for one in report.sensors] == ["lidar", "radar"]
+
+
 def test_sensors_that_share_no_track_have_nothing_to_compare() -> None:
     report = estimate_offsets(parked("ego"), two_sensors(), "lidar", OffsetRules(min_detections=100))
     radar = row(report, "radar")

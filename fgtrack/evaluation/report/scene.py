@@ -1,7 +1,7 @@
 """What the viewer of a report shows, as JSON values: recordings (map, ego, truth) and the runs of them."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +11,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import EGO_ID, LATE, FloatArray, IntArray
 from fgtrack.evaluation.cautions import USED
 from fgtrack.evaluation.palette import PALETTE
-from fgtrack.evaluation.recordings import same_recording
+from fgtrack.evaluation.recordings import by_recording
 from fgtrack.evaluation.report.packing import (
     ANGLE_RAD,
     CODE,
@@ -64,7 +64,7 @@ def scene(runs: Sequence[JudgedRun]) -> Scene:
     DataError
         A run or its map is damaged.
     """
-    recordings = _recordings([one.run for one in runs])
+    recordings = _recordings(runs)
     packer, notes = Packer(), dict[str, None]()
     times = time_form(
         max((_end_ns(run) - one.start_ns for one in recordings for run in one.runs), default=0) / NS_PER_S
@@ -134,15 +134,8 @@ class _Packing:
         return times_ns[::step]
 
 
-def _recordings(runs: Iterable[Run]) -> list[_Recording]:
-    found: list[_Recording] = []
-    for run in runs:
-        for one in found:
-            if same_recording(one.runs[0], run):
-                one.runs.append(run)
-                break
-        else:
-            found.append(_Recording([run]))
+def _recordings(runs: Sequence[JudgedRun]) -> list[_Recording]:
+    found = [_Recording([one.run for one in group]) for group in by_recording(runs)]
     for one in found:
         one.start_ns = min(map(start_ns, one.runs))
         one.origin_m = _origin_m(one.runs)
