@@ -96,8 +96,10 @@ def test_a_tuned_file_is_replayed_and_not_replaced_without_being_asked(
 
 
 def test_json_says_the_same_and_every_parameter_has_a_row(stream: Path, capsys: Capture, tmp_path: Path) -> None:
+    """Also of sensors that the configuration does not name."""
     out, kept = tmp_path / "tuned.yaml", "motion.std_per_s.speed"
-    assert run(["tune", str(stream), "-c", "open_space", "-o", str(out), "--json", "--keep", kept]) == 0
+    words = ["-c", "open_space", "--set", "sensors={}", "--keep", kept]
+    assert run(["tune", str(stream), *words, "-o", str(out), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     config = load(Config, out)
     values = {one["key"]: one["tuned"] for one in found["parameters"]}
