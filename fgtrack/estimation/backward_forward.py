@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fgtrack.core.grouping import equal_ones
 from fgtrack.core.time import nanoseconds, period_ns, seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
@@ -170,12 +171,8 @@ class BackwardForwardBank:
         """Correct the stored states nearest to `stamp_ns`; the present is predicted from them."""
         states = self.states_at(stamp_ns)
         rows = {track_id: row for row, track_id in enumerate(states.track_ids)}
-        groups: dict[tuple[int, int, tuple[str, ...]], list[int]] = {}
-        for position, measurement in enumerate(measurements):
-            alike = (id(measurement.model), id(measurement.pose), measurement.assumed)
-            groups.setdefault(alike, []).append(position)
         results: dict[int, UpdateResult] = {}
-        for positions in groups.values():
+        for positions in equal_ones([(id(one.model), id(one.pose), one.assumed) for one in measurements]):
             chosen = [rows[track_ids[position]] for position in positions]
             part = self._update_alike(
                 [track_ids[position] for position in positions],
@@ -205,7 +202,12 @@ class BackwardForwardBank:
             losses = [measurement.loss for measurement in measurements]
             corrected = correct(means, covariances, z, R, model, pose, residual, measured, losses)
         except np.linalg.LinAlgError:
-            return self._update_one_by_one(track_ids, means, covariances, measurements, back)
+            if len(track_ids) == 1:
+                return [UpdateResult(UpdateStatus.FAILED)]
+            return [  # one by one, to find that which cannot be fused
+                self._update_alike([track_id], means[row, None], covariances[row, None], [measurement], back)[0]
+                for row, (track_id, measurement) in enumerate(zip(track_ids, measurements, strict=True))
+            ]
         wrapped = self._propagator.wrap(corrected.mean)
         flat = corrected.covariance.reshape(len(wrapped), -1)
         finite = np.isfinite(np.vecdot(wrapped, wrapped) + np.vecdot(flat, flat)).tolist()
@@ -221,22 +223,6 @@ class BackwardForwardBank:
             status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
             results.append(UpdateResult(status, corrected.innovation[row], float(corrected.nis[row])))
         return results
-
-    def _update_one_by_one(
-        self,
-        track_ids: Sequence[int],
-        means: FloatArray,
-        covariances: FloatArray,
-        measurements: Sequence[Measurement],
-        back: int,
-    ) -> list[UpdateResult]:
-        """Find the measurement that cannot be fused, and fuse the others."""
-        if len(track_ids) == 1:
-            return [UpdateResult(UpdateStatus.FAILED)]
-        return [
-            self._update_alike([track_id], means[row, None], covariances[row, None], [measurement], back)[0]
-            for row, (track_id, measurement) in enumerate(zip(track_ids, measurements, strict=True))
-        ]
 
     def _visible_from(self, back: int) -> int:
         """Grid index from which a look-up finds a state corrected `back` steps ago."""

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fgtrack.core.grouping import equal_ones
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import NOTHING, Content, Measurement
@@ -104,7 +105,7 @@ class ReplayedSteps:
             model = measurement.model
             self.measurements[number] = measurement
             self._kinds[number] = id(model), 0 if model.linear else id(measurement.pose), measurement.assumed
-        for rows in _equal([len(measurement.z) for measurement in measurements]):
+        for rows in equal_ones([len(measurement.z) for measurement in measurements]):
             chosen = [measurements[row] for row in rows]
             k = len(chosen[0].z)
             while k > self.z.shape[1]:
@@ -154,7 +155,7 @@ class ReplayedSteps:
     def _alike(self, numbers: IntArray) -> Iterator[tuple[IntArray | slice, _Alike]]:
         """The measurements of steps, those alike together, and which they are."""
         numbered = numbers.tolist()
-        groups = _equal([self._kinds[number] for number in numbered])
+        groups = equal_ones([self._kinds[number] for number in numbered])
         for group in groups:
             rows = slice(None) if len(groups) == 1 else np.array(group)
             measurements = [each for row in group if (each := self.measurements[numbered[row]]) is not None]
@@ -186,13 +187,3 @@ class ReplayedSteps:
         k = self.z.shape[1]
         self.z = np.pad(self.z, ((0, 0), (0, k)))
         self.R = np.pad(self.R, ((0, 0), (0, k), (0, k)))
-
-
-def _equal(kinds: Sequence[object]) -> list[list[int]]:
-    """Positions of equal ones."""
-    if len(set(kinds)) == 1:
-        return [list(range(len(kinds)))]
-    groups: dict[object, list[int]] = {}
-    for position, kind in enumerate(kinds):
-        groups.setdefault(kind, []).append(position)
-    return list(groups.values())

@@ -5,13 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fgtrack.core.grouping import equal_ones
 from fgtrack.core.linalg import congruence, inverse_roots, mahalanobis_squared, product
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation import ekf
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.terms import MeasurementTerm, linearised
 from fgtrack.models.robust import weight
-from fgtrack.models.sensors import RobustLoss
 
 
 class Innovations(NamedTuple):
@@ -65,11 +65,7 @@ def _nis(y: FloatArray, S: FloatArray, entries: Sequence[int] | None) -> FloatAr
 
 def _alike(measurements: Sequence[Measurement]) -> list[list[int]]:
     """Positions of those that share a model, a sensor pose, what is assumed and a loss."""
-    groups: dict[tuple[int, int, tuple[str, ...], RobustLoss | None], list[int]] = {}
-    for position, measurement in enumerate(measurements):
-        kind = id(measurement.model), id(measurement.pose), measurement.assumed, measurement.loss
-        groups.setdefault(kind, []).append(position)
-    return list(groups.values())
+    return equal_ones([(id(one.model), id(one.pose), one.assumed, one.loss) for one in measurements])
 
 
 def whitened(y: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:

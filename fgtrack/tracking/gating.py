@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from fgtrack.core.grouping import equal_ones
 from fgtrack.core.linalg import congruence, mahalanobis_squared, symmetrise
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, StatesAt
@@ -70,12 +71,11 @@ class Alike(NamedTuple):
 
 def alike(candidates: Sequence[Candidate]) -> list[Alike]:
     """`candidates` in groups that can be compared with tracks at once."""
-    groups: dict[tuple[int, int, int], list[int]] = {}
-    for row, candidate in enumerate(candidates):
+    kinds = []
+    for candidate in candidates:
         own, error = candidate.measurement, candidate.pose_error
-        kind = id(own.model), id(own.pose), 0 if error is None else id(error.covariance)
-        groups.setdefault(kind, []).append(row)
-    return [_stacked([candidates[row] for row in rows], np.array(rows)) for rows in groups.values()]
+        kinds.append((id(own.model), id(own.pose), 0 if error is None else id(error.covariance)))
+    return [_stacked([candidates[row] for row in rows], np.array(rows)) for rows in equal_ones(kinds)]
 
 
 def _stacked(candidates: Sequence[Candidate], rows: IntArray) -> Alike:

@@ -1,0 +1,15 @@
+"""What is alike can be calculated at once: positions of equal items."""
+
+from collections.abc import Hashable, Sequence
+
+__all__ = ["equal_ones"]
+
+
+def equal_ones(items: Sequence[Hashable]) -> list[list[int]]:
+    """Positions of equal `items`, ascending, in the order of the first of each."""
+    if len(set(items)) == 1:
+        return [list(range(len(items)))]
+    groups: dict[Hashable, list[int]] = {}
+    for position, item in enumerate(items):
+        groups.setdefault(item, []).append(position)
+    return list(groups.values())
