@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgtrack.core.checks import not_negative
 from fgtrack.core.linalg import psd_solve
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.ekf import Update, updated_one
@@ -26,8 +27,7 @@ class Iteration:
     def __post_init__(self) -> None:
         if not 1 <= self.max_iterations <= 100:
             raise ValueError(f"max_iterations: must lie between 1 and 100, is {self.max_iterations}")
-        if not 0.0 <= self.tolerance < np.inf:
-            raise ValueError(f"tolerance: must be finite and not negative, is {self.tolerance}")
+        not_negative(tolerance=self.tolerance)
 
     def descended(
         self, cost: Callable[[FloatArray], float], limit: float, start: FloatArray, end: FloatArray

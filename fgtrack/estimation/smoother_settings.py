@@ -1,6 +1,5 @@
 """Settings of the fixed-lag smoothers."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from types import MappingProxyType
@@ -8,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from fgtrack.core.checks import not_negative
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
@@ -44,15 +44,10 @@ class SmootherSettings:
     """Whether the smoothed state of a node is given when it leaves the window."""
 
     def __post_init__(self) -> None:
-        for name in ("lag_s", "ring_s"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name}: must be finite and not negative, is {value}")
+        not_negative(lag_s=self.lag_s, ring_s=self.ring_s)
         if not 1 <= self.max_iterations <= 100:
             raise ValueError(f"max_iterations: must lie between 1 and 100, is {self.max_iterations}")
-        for name, value in self.relinearise.items():
-            if not value >= 0.0:
-                raise ValueError(f"relinearise.{name}: must not be negative, is {value}")
+        not_negative(**{f"relinearise.{name}": value for name, value in self.relinearise.items()})
         if any(not 0.0 <= lag_s <= self.lag_s for lag_s in self.lagged_s):
             raise ValueError(f"lagged_s: must lie between 0 and lag_s = {self.lag_s}, is {list(self.lagged_s)}")
         if len(set(self.lagged_s)) < len(self.lagged_s):

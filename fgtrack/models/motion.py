@@ -39,7 +39,7 @@ MIN_SPEED_MPS = 1e-3
 _FEW = 2  # so many states are faster one by one than as an array
 
 
-class Prediction(NamedTuple):
+class Step(NamedTuple):
     """One state after a duration: what `predict`, `jacobian` and `process_noise` give, at a fraction of the cost."""
 
     mean: list[float]
@@ -50,8 +50,8 @@ class Prediction(NamedTuple):
     """Covariance of the accumulated noise, shape (n, n)."""
 
 
-class Predictions(NamedTuple):
-    """`Prediction` of many states: shapes (..., n), (..., n, n) and (..., n, n)."""
+class Steps(NamedTuple):
+    """`Step` of many states: shapes (..., n), (..., n, n) and (..., n, n)."""
 
     mean: FloatArray
     F: FloatArray
@@ -104,13 +104,13 @@ class MotionModel(ABC):
             raise CallError(f"process_noise: dt_s is {t.min()} s; noise needs a duration >= 0, swap the stamps")
         return t
 
-    def step(self, x: Sequence[float], dt_s: float) -> Prediction:
+    def step(self, x: Sequence[float], dt_s: float) -> Step:
         """The one state `x` after `dt_s` >= 0; F and Q are new arrays. Raises `CallError` where `dt_s` is negative."""
-        return Prediction(*self.flow(x, dt_s), self.process_noise(np.array(x, dtype=np.float64), dt_s))
+        return Step(*self.flow(x, dt_s), self.process_noise(np.array(x, dtype=np.float64), dt_s))
 
-    def steps(self, x: FloatArray, dt_s: FloatArray) -> Predictions:
+    def steps(self, x: FloatArray, dt_s: FloatArray) -> Steps:
         """`step` of many states: what `predict`, `jacobian` and `process_noise` give."""
-        return Predictions(self.predict(x, dt_s), self.jacobian(x, dt_s), self.process_noise(x, dt_s))
+        return Steps(self.predict(x, dt_s), self.jacobian(x, dt_s), self.process_noise(x, dt_s))
 
     def flow(self, x: Sequence[float], dt_s: float) -> tuple[list[float], FloatArray]:
         """Mean and F of `step`, of any duration."""
@@ -224,23 +224,23 @@ class CTRV(WhiteNoise, MotionModel):
         root = np.swapaxes(roots, -3, -2).reshape(*roots.shape[:-3], self.dim, len(NODES) * self.dim)
         return symmetrise(root @ np.swapaxes(root, -1, -2))
 
-    def step(self, x: Sequence[float], dt_s: float) -> Prediction:
+    def step(self, x: Sequence[float], dt_s: float) -> Step:
         """See `MotionModel.step`; fast up to a turn of `MAX_SMALL_TURN_RAD`."""
         arc = small_turn(x[YAW], x[YAW_RATE], dt_s)
         if arc is None or dt_s < 0.0:
             return super().step(x, dt_s)
         mean, F = self._along(x, dt_s, arc.moments)
-        return Prediction(mean, F, small_turn_noise(arc, dt_s, self._densities, x[SPEED], *x[ACCEL:]))
+        return Step(mean, F, small_turn_noise(arc, dt_s, self._densities, x[SPEED], *x[ACCEL:]))
 
-    def steps(self, x: FloatArray, dt_s: FloatArray) -> Predictions:
+    def steps(self, x: FloatArray, dt_s: FloatArray) -> Steps:
         """See `MotionModel.steps`; fast where no state turns further than `MAX_SMALL_TURN_RAD`."""
         if x.ndim == 2 and 0 < len(x) <= _FEW:
-            return Predictions(*map(np.array, zip(*map(self.step, x.tolist(), dt_s.tolist()), strict=True)))
+            return Steps(*map(np.array, zip(*map(self.step, x.tolist(), dt_s.tolist()), strict=True)))
         turn = x[..., YAW_RATE] * dt_s
         small = np.abs(turn).max(initial=0.0) <= MAX_SMALL_TURN_RAD and (dt_s >= 0.0).all()
         if not (x.ndim == 2 and small and np.isfinite(x[:, YAW]).all()):
             return super().steps(x, dt_s)
-        return Predictions(*arc_series(self._densities, self.dim)(x, dt_s, turn))
+        return Steps(*arc_series(self._densities, self.dim)(x, dt_s, turn))
 
     def flow(self, x: Sequence[float], dt_s: float) -> tuple[list[float], FloatArray]:
         """See `MotionModel.flow`; fast up to a turn of `MAX_SMALL_TURN_RAD`."""
@@ -339,9 +339,9 @@ class CV(WhiteNoise, MotionModel):
         t = self.forward(dt_s)
         return self._noise(np.broadcast_shapes(x.shape[:-1], t.shape), t)
 
-    def step(self, x: Sequence[float], dt_s: float) -> Prediction:
+    def step(self, x: Sequence[float], dt_s: float) -> Step:
         """See `MotionModel.step`."""
-        return Prediction(*self.flow(x, dt_s), self._noise((), dt_s)) if dt_s >= 0.0 else super().step(x, dt_s)
+        return Step(*self.flow(x, dt_s), self._noise((), dt_s)) if dt_s >= 0.0 else super().step(x, dt_s)
 
     def flow(self, x: Sequence[float], dt_s: float) -> tuple[list[float], FloatArray]:
         """See `MotionModel.flow`."""

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from fgtrack.core.checks import between_0_and_1, not_negative, positive
 from fgtrack.core.geometry import body_point, polar, wrap_angles
 from fgtrack.core.types import DESCRIBING, MEASURABLE, BoolArray, Detection, FloatArray
 
@@ -64,8 +65,7 @@ class RobustLoss:
     """Where the loss leaves the square, in standard deviations (of the whole measurement)."""
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.width) and self.width > 0.0):
-            raise ValueError(f"width: must be positive and finite, is {self.width}")
+        positive(width=self.width)
 
 
 @dataclass(frozen=True)
@@ -78,10 +78,8 @@ class Correlation:
     """After this time the lasting part has fallen to 1/e: what the autocorrelation of the errors shows."""
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.share < 1.0:
-            raise ValueError(f"share: must lie between 0 and 1, is {self.share}")
-        if not (math.isfinite(self.time_s) and self.time_s > 0.0):
-            raise ValueError(f"time_s: must be positive and finite, is {self.time_s}")
+        between_0_and_1(share=self.share)
+        positive(time_s=self.time_s)
 
 
 @dataclass(frozen=True)
@@ -94,8 +92,9 @@ class Score:
     """What more of it makes an object e times more probable."""
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.even) and math.isfinite(self.scale) and self.scale > 0.0):
-            raise ValueError(f"even must be finite and scale positive, are {self.even} and {self.scale}")
+        if not math.isfinite(self.even):
+            raise ValueError(f"even: must be finite, is {self.even}")
+        positive(scale=self.scale)
 
     def log_ratio(self, score: float) -> float:
         """The logarithm of the ratio, at most 10 to either side."""
@@ -172,33 +171,26 @@ class SensorModel:
             raise ValueError(f"std: unknown component {sorted(unknown)[0]!r}, known are {', '.join(MEASURABLE)}")
         if not self.std:
             raise ValueError("std: name at least one measured component")
-        for name, value in self.std.items():
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"std.{name}: must be positive and finite, is {value}")
+        positive(**{f"std.{name}": value for name, value in self.std.items()})
         for name in self.filters:
             if name not in (*MEASURABLE, *DESCRIBING):
                 raise ValueError(f"filters: unknown {name!r}, known are {', '.join((*MEASURABLE, *DESCRIBING))}")
-        for name, value in self.std_growth.items():
+        for name in self.std_growth:
             if name not in self.std:
                 raise ValueError(f"std_growth.{name}: the sensor measures {', '.join(self.components)}")
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"std_growth.{name}: must be finite and not negative, is {value}")
+        not_negative(**{f"std_growth.{name}": value for name, value in self.std_growth.items()})
         if ("x_m" in self.std) != ("y_m" in self.std):
             raise ValueError("std: x_m and y_m are measured together")
-        for name in ("max_delay_s", "max_range_m", "view_range_m", "max_range_behind_m", *_FROM_MAP.values()):
-            value = getattr(self, name)
-            if value is not None and not value > 0.0:
-                raise ValueError(f"{name}: must be positive, is {value}")
+        ranges = "max_range_m", "view_range_m", "max_range_behind_m"
+        for name in ("max_delay_s", *ranges, *_FROM_MAP.values(), "clutter_per_m2"):
+            positive(**{name: getattr(self, name)})
+        between_0_and_1(detection_probability=self.detection_probability)
         if not math.isfinite(self.near_side_m):
             raise ValueError(f"near_side_m: must be finite, is {self.near_side_m}")
         if not abs(self.clock_offset_s) <= _LONGEST_OFFSET_S:
             raise ValueError(f"clock_offset_s: must lie within {_LONGEST_OFFSET_S:g} s, is {self.clock_offset_s}")
         if not 0.0 < self.field_of_view_rad <= math.tau:
             raise ValueError(f"field_of_view_rad: must lie in (0, 2 pi], is {self.field_of_view_rad}")
-        if not 0.0 < self.detection_probability < 1.0:
-            raise ValueError(f"detection_probability: must lie between 0 and 1, is {self.detection_probability}")
-        if not (math.isfinite(self.clutter_per_m2) and self.clutter_per_m2 > 0.0):
-            raise ValueError(f"clutter_per_m2: must be positive and finite, is {self.clutter_per_m2}")
         if self.counter_init < 1 or self.counter_add < 0:
             raise ValueError("counter_init must be at least 1 and counter_add not negative")
 

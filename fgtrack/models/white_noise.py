@@ -1,9 +1,10 @@
 """Noise parameters of a motion model."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Self
+
+from fgtrack.core.checks import not_negative, positive
 
 
 @dataclass(frozen=True)
@@ -11,10 +12,7 @@ class WhiteNoise:
     """Noise parameters: spectral densities, in fields `<what>_density_<unit>` in the order of the state."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{field.name}: must be finite and not negative, is {value}")
+        not_negative(**{field.name: getattr(self, field.name) for field in fields(self)})
 
     @classmethod
     def from_std_per_step(cls, std: Mapping[str, float], frequency_hz: float) -> Self:
@@ -27,8 +25,7 @@ class WhiteNoise:
         names = {name.partition("_density_")[0]: name for name in cls.density_names()}
         if set(std) != set(names):
             raise ValueError(f"std of {cls.__name__}: give {', '.join(names)}, not {', '.join(std) or 'nothing'}")
-        if not frequency_hz > 0.0:
-            raise ValueError(f"frequency_hz: must be positive, is {frequency_hz}")
+        positive(frequency_hz=frequency_hz)
         return cls(**{names[key]: value * value / frequency_hz for key, value in std.items()})
 
     @classmethod

@@ -1,6 +1,5 @@
 """Which candidate belongs to which track (Karle et al. 2023, section III-D)."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -9,6 +8,7 @@ from typing import Literal, Protocol
 import numpy as np
 from scipy.special import gammaincinv
 
+from fgtrack.core.checks import between_0_and_1, not_negative, positive
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import StatesAt
 from fgtrack.tracking.assignment import Assignment, assigned, cheapest
@@ -42,10 +42,7 @@ class GatedEuclidean:
     """Largest NIS of a pair; null for no limit."""
 
     def __post_init__(self) -> None:
-        if not self.gate_m > 0.0:
-            raise ValueError(f"gate_m: must be positive, is {self.gate_m}")
-        if self.max_nis is not None and not self.max_nis > 0.0:
-            raise ValueError(f"max_nis: must be positive, is {self.max_nis}")
+        positive(gate_m=self.gate_m, max_nis=self.max_nis)
 
     def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
         """See `Association`."""
@@ -96,12 +93,9 @@ class GatedMahalanobis:
     """A candidate that belongs to no track starts none nearer than this to one: it is the other end of a long hull."""
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.claim_m) and self.claim_m >= 0.0):
-            raise ValueError(f"claim_m: must be finite and not negative, is {self.claim_m}")
-        if not 0.0 < self.gate_probability < 1.0:
-            raise ValueError(f"gate_probability: must lie between 0 and 1, is {self.gate_probability}")
-        if not self.max_distance_m > 0.0:
-            raise ValueError(f"max_distance_m: must be positive, is {self.max_distance_m}")
+        not_negative(claim_m=self.claim_m)
+        between_0_and_1(gate_probability=self.gate_probability)
+        positive(max_distance_m=self.max_distance_m)
 
     def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
         """See `Association`; the cost adds log det S, so that a vague track does not win by being vague."""

@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 
+from fgtrack.core.checks import positive
 from fgtrack.core.geometry import rotation
 from fgtrack.core.types import EgoState, FloatArray
 from fgtrack.estimation.base import Start
@@ -32,9 +33,7 @@ class Birth(ABC):
     """Below this ego speed an object is assumed to accelerate as the ego does (models with acceleration)."""
 
     def __post_init__(self) -> None:
-        for name in (each.name for each in fields(self) if "_std_" in each.name):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name}: must be positive, is {getattr(self, name)}")
+        positive(**{each.name: getattr(self, each.name) for each in fields(self) if "_std_" in each.name})
 
     def prior(self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool) -> Start | None:
         """First state at the candidate's stamp; None where it has no position to start from.

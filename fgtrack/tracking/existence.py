@@ -21,6 +21,7 @@ from typing import Literal
 
 import numpy as np
 
+from fgtrack.core.checks import between_0_and_1, not_negative, positive
 from fgtrack.core.linalg import mahalanobis_squared
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray, TrackStatus
@@ -57,17 +58,13 @@ class ExistenceRules:
 
     def __post_init__(self) -> None:
         for name in ("birth_probability", "confirm_probability", "doubt_probability", "delete_probability"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise ValueError(f"{name}: must lie between 0 and 1, is {getattr(self, name)}")
+            between_0_and_1(**{name: getattr(self, name)})
         if not self.delete_probability < min(self.birth_probability, self.doubt_probability):
             raise ValueError("delete_probability: must be less than birth_probability and doubt_probability")
         if self.doubt_probability > self.confirm_probability:
             raise ValueError("doubt_probability: must not be more than confirm_probability")
-        if not 0.0 <= self.min_travel_m < math.inf:
-            raise ValueError(f"min_travel_m: must be finite and not negative, is {self.min_travel_m}")
-        for name in ("lifetime_s", "out_of_view_s", "memory_s"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                raise ValueError(f"{name}: must be positive and finite, is {getattr(self, name)}")
+        not_negative(min_travel_m=self.min_travel_m)
+        positive(lifetime_s=self.lifetime_s, out_of_view_s=self.out_of_view_s, memory_s=self.memory_s)
 
 
 @dataclass(slots=True)

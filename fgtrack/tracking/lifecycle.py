@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+from fgtrack.core.checks import not_negative, positive
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Detection, FloatArray, TrackStatus
 from fgtrack.models.sensors import SensorModel
@@ -102,8 +103,8 @@ class LifecycleRules:
             raise ValueError("counter_cap and confirm_count must be at least 1")
         if self.tentative_misses is not None and self.tentative_misses < 1:
             raise ValueError(f"tentative_misses: must be at least 1, is {self.tentative_misses}")
-        if not self.forget_s > 0.0 or not self.short_range_m >= 0.0:
-            raise ValueError("forget_s must be positive and short_range_m not negative")
+        positive(forget_s=self.forget_s)
+        not_negative(short_range_m=self.short_range_m)
 
 
 class CountingLifecycle:

@@ -147,7 +147,10 @@ class Preprocess:
         return self._candidates(items, view), records
 
     def _sensor_pose(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> SensorPose:
-        """Pose of the frame that the detections are given in, and the velocity of its origin."""
+        """Pose of the frame that the detections are given in, and the velocity of its origin.
+
+        Of detections in the map the pose that they are seen from: that of the ego, without one the map's origin.
+        """
         if ego is None:
             return SensorPose()
         yaw_rad = ego.yaw_rad

@@ -301,7 +301,7 @@ vary:
         *((what, name) for what in ("negative gate", "no map") for name in ("ekf-replay", "smoother")),
         ("refused", "smoother"),
     }
-    assert "gate_m: must be positive, is -1.0" in bad["negative gate", "smoother"]
+    assert "gate_m: must be positive and finite, is -1.0" in bad["negative gate", "smoother"]
     assert "missing.csv" in bad["no map", "ekf-replay"]
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 1

@@ -14,7 +14,7 @@ from fgtrack.models.motion import CTRV, CV
         ({"lag_s": -1.0}, "lag_s: must be finite and not negative"),
         ({"ring_s": float("inf")}, "ring_s: must be finite and not negative"),
         ({"max_iterations": 0}, "max_iterations: must lie between 1 and 100"),
-        ({"relinearise": {"yaw_rad": -0.1}}, r"relinearise\.yaw_rad: must not be negative"),
+        ({"relinearise": {"yaw_rad": -0.1}}, r"relinearise\.yaw_rad: must be finite and not negative"),
         ({"lag_s": 0.2, "lagged_s": (0.3,)}, "lagged_s: must lie between 0 and lag_s = 0.2"),
         ({"lagged_s": (0.1, 0.3, 0.1)}, "lagged_s: names a lag twice"),
     ],

@@ -20,6 +20,7 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 
+from fgtrack.core.checks import positive
 from fgtrack.core.linalg import congruence, psd_solve, symmetrise
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import YAW, BoolArray, FloatArray
@@ -72,11 +73,8 @@ class OffsetSettings:
     max_rounds: int = 10
 
     def __post_init__(self) -> None:
-        for name in ("prior_std_s", "node_s", "tolerance_s"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name}: must be positive, is {getattr(self, name)}")
-        if self.huber_width is not None and not self.huber_width > 0.0:
-            raise ValueError(f"huber_width: must be positive, is {self.huber_width}")
+        for name in ("prior_std_s", "huber_width", "node_s", "tolerance_s"):
+            positive(**{name: getattr(self, name)})
         if self.max_rounds < 1:
             raise ValueError(f"max_rounds: must be at least 1, is {self.max_rounds}")
 
