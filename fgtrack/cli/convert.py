@@ -1,6 +1,7 @@
 """`fgtrack convert`: from any input to a stream or a bag, with other delays if wanted."""
 
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +11,8 @@ import typer
 from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, StorageOption
 from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError
-from fgtrack.core.types import Message
+from fgtrack.core.types import DetectionList, Message
+from fgtrack.evaluation.left_out import left_out
 from fgtrack.io.recording import check_recording, write_recording
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.load import load
@@ -39,12 +41,23 @@ def convert(
         raise CallError(f"{out}: is the input or holds it, choose another name")
     check_recording(out, overwrite)
     source = open_input(recording, read_config(config_file).input)
+    unread: dict[str, Counter[str]] = {}
     with progress("convert"):
         messages = source.messages() if delays_file is None else _redelayed(source.messages, delays_file, seed or 0)
-        count = write_recording(out, messages, storage, overwrite=overwrite)
+        count = write_recording(out, _counted(messages, unread), storage, overwrite=overwrite)
     lost = messages.num_lost if isinstance(messages, Redelayed) else {}
     losses = ", ".join(f"{number} of {sensor}" for sensor, number in lost.items() if number)
     say(f"{out}: {count} messages{losses and f', lost {losses}'}")
+    for line in left_out({"left_out": unread}):
+        say(line)
+
+
+def _counted(messages: Iterable[Message], unread: dict[str, Counter[str]]) -> Iterator[Message]:
+    """`messages`; by sensor and setting what the reader has left out of them is added to `unread`."""
+    for message in messages:
+        if isinstance(message, DetectionList) and message.left_out:
+            unread.setdefault(message.sensor, Counter()).update(message.left_out)
+        yield message
 
 
 def _redelayed(read: Callable[[], Iterator[Message]], delays_file: Path, seed: int) -> Redelayed:

@@ -97,5 +97,16 @@ def test_what_a_reader_leaves_out_is_counted_and_stays_with_its_scan() -> None:
     assert list(left_out(run.meta)) == ["radar: 4 left out when read (4 by filters.rcs)"]
 
 
+def test_a_recording_that_is_converted_says_what_it_holds_no_more(tmp_path: Path) -> None:
+    table, config, out = tmp_path / "radar.csv", tmp_path / "config.yaml", tmp_path / "out.jsonl"
+    table.write_text("t,x,y,snr\n1,30,2,9\n1,40,2,3\n2,31,2,2\n")
+    columns = "{stamp: t, x_m: x, y_m: y}"
+    config.write_text(
+        f"input: {{csv: {{detections: {{radar: {{columns: {columns}, filters: {{snr: {{min: 6}}}}}}}}}}}}"
+    )
+    said = CliRunner().invoke(app, ["convert", str(table), str(out), "-c", str(config)])
+    assert "radar: 2 left out when read (2 by filters.snr)" in said.output.replace("\n", " "), said.output
+
+
 def test_the_most_frequent_reason_comes_first() -> None:
     assert because({"b": 1, "a": 3}) == "3 by a, 1 by b"
