@@ -27,6 +27,7 @@ from fgtrack.core.types import (
     DetectionList,
     Disposition,
     EgoState,
+    ObjectReport,
     TickReport,
     TrackReport,
     TrackState,
@@ -277,6 +278,38 @@ def test_an_arrow_leads_from_where_a_detection_was_sensed_to_its_track_now(by_ha
     assert topics["/outcomes"][0][2]["track_id"] == 4
     assert topics["/outcomes"][0][2]["nis"] == 1.5
     assert not {"track_id", "nis"} & set(topics["/outcomes"][1][2])
+
+
+@pytest.fixture(scope="module")
+def described(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two tracks: a car whose height nobody tells, and one of which nothing is told."""
+    path = tmp_path_factory.mktemp("described") / "run"
+    state = TrackState(TICK_NS, np.array([98.0, 68.0, 0.0, 20.0, 0.0]), np.eye(5))
+    car = ObjectReport("car", 1.0, 4.2, 1.7)
+    reports = tuple(TrackReport(k, TrackStatus.CONFIRMED, state, 4, object=told) for k, told in ((1, car), (2, None)))
+    with RunWriter(path, "{}") as writer:
+        writer.write_tick(TickReport(0, TICK_NS, reports, ()), 1, 0)
+        writer.finish({"estimator": "smoother"})
+    return path
+
+
+def test_a_box_has_the_size_that_detections_told_and_its_label_the_class(described: Path, tmp_path: Path) -> None:
+    export([described], tmp_path / "x.mcap")
+    topics = read(tmp_path / "x.mcap")
+    [(_, _, scene)] = topics["/tracks"]
+    car, unknown = scene["entities"]
+    assert car["cubes"][0]["size"] == {"x": 4.2, "y": 1.7, "z": 1.2}  # the height of a racing car
+    assert unknown["cubes"][0]["size"] == {"x": 4.8, "y": 2.0, "z": 1.2}
+    assert [one["texts"][0]["text"] for one in (car, unknown)] == ["1 car", "2"]
+    assert {"key": "class", "value": "car"} in car["metadata"]
+    assert "class" not in {one["key"] for one in unknown["metadata"]}
+
+
+def test_a_bag_has_the_size_and_class_of_a_track(described: Path, tmp_path: Path) -> None:
+    export([described], tmp_path / "bag", ros2=True)
+    car, unknown = read_bag(tmp_path / "bag")["/tracks"][0].data.detections
+    assert [(one.bbox.size.x, one.bbox.size.y, one.bbox.size.z) for one in (car, unknown)] == [(4.2, 1.7, 0), (0, 0, 0)]
+    assert [one.results[0].hypothesis.class_id for one in (car, unknown)] == ["car", ""]
 
 
 def test_an_ellipse_reaches_two_standard_deviations_along_its_axes(by_hand: Path, tmp_path: Path) -> None:

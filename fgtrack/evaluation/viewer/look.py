@@ -7,7 +7,7 @@ from fgtrack.core.types import Detection
 from fgtrack.evaluation.palette import PALETTE
 from fgtrack.io.viewer.scene import Arrow, Box, Colour, Ellipse, Label, Point, Shape
 
-#: Length, width and height of the box that stands for an object, a car's: no sensor here tells them.
+#: Length, width and height of the box of an object of which no detection tells them: a racing car's.
 NOMINAL_SIZE_M = (4.8, 2.0, 1.2)
 
 WHITE: Colour = (1.0, 1.0, 1.0, 1.0)
@@ -37,13 +37,15 @@ class Look:
         return palette(-1 - index)
 
     def track(self, track_id: int, state: Detection, speed_mps: float, status: str) -> tuple[Shape, ...]:
-        """The box of a track with its name, and an arrow to where it is a quarter of a second later."""
+        """The box of a track with its number and class, and an arrow to where it is a quarter of a second later."""
         assert state.x_m is not None
         assert state.y_m is not None
         centre_m, yaw_rad = (state.x_m, state.y_m), state.yaw_rad or 0.0
         colour = faded(self.of_track(track_id), _OPACITY.get(status, _CONFIRMED))
-        name = Label(centre_m, NOMINAL_SIZE_M[2] + _LABEL_ABOVE_M, str(track_id), WHITE)
-        box = car(centre_m, yaw_rad, colour)
+        size_m = size(state)
+        text = f"{track_id} {state.class_name}" if state.class_name else str(track_id)
+        name = Label(centre_m, size_m[2] + _LABEL_ABOVE_M, text, WHITE)
+        box = Box(centre_m, yaw_rad, size_m, colour)
         ahead_m = speed_mps * _SPEED_ARROW_S
         if not (math.isfinite(ahead_m) and ahead_m):
             return box, name
@@ -64,10 +66,17 @@ def faded(colour: Colour, opacity: float) -> Colour:
 
 
 def car(centre_m: Point, yaw_rad: float, colour: Colour) -> Box:
-    """The box of an object."""
+    """The box of an object of nominal size."""
     return Box(centre_m, yaw_rad, NOMINAL_SIZE_M, colour)
 
 
-def patch(centre_m: Point, axes: tuple[float, float, float], colour: Colour) -> Ellipse:
-    """The ellipse of a covariance, see `ellipses`, just above the box of its track."""
-    return Ellipse(centre_m, NOMINAL_SIZE_M[2] + 0.05, axes[2], (axes[0], axes[1]), colour)
+def size(state: Detection) -> tuple[float, float, float]:
+    """Length, width and height of the box of an object; nominal where `state` does not say."""
+    told = state.length_m, state.width_m, state.height_m
+    length_m, width_m, height_m = (own or nominal for own, nominal in zip(told, NOMINAL_SIZE_M, strict=True))
+    return length_m, width_m, height_m
+
+
+def patch(centre_m: Point, height_m: float, axes: tuple[float, float, float], colour: Colour) -> Ellipse:
+    """The ellipse of a covariance, see `ellipses`, just above the box of its track, which is `height_m` high."""
+    return Ellipse(centre_m, height_m + 0.05, axes[2], (axes[0], axes[1]), colour)

@@ -3,13 +3,14 @@
 import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Detection, DetectionList, FloatArray, IntArray
 from fgtrack.evaluation.viewer.ellipse import ellipses
-from fgtrack.evaluation.viewer.look import Look, faded, patch
+from fgtrack.evaluation.viewer.look import Look, faded, patch, size
 from fgtrack.evaluation.viewer.surroundings import groups
 from fgtrack.io.run import Run, Table
 from fgtrack.io.viewer.scene import Entity, Line, Objects, Point, Scene, ViewerMessage
@@ -24,7 +25,7 @@ _NO_ROWS = np.zeros(0, dtype=np.int64)
 def track_messages(run: Run, look: Look) -> Iterator[ViewerMessage]:
     """At every tick the boxes, names and speeds, the 2-sigma ellipses of the positions, and the poses."""
     tracks = _placed(run.tracks)
-    states, axes = _detections(tracks), ellipses(position_covariances(tracks)).tolist()
+    states, axes = _detections(tracks, run.objects), ellipses(position_covariances(tracks)).tolist()
     names = ("track_id", "stamp_ns", "status", "speed_mps", "num_measured")
     columns = [tracks[name].tolist() for name in names]
     by_tick = dict(groups(tracks["now_ns"]))
@@ -36,10 +37,13 @@ def track_messages(run: Run, look: Look) -> Iterator[ViewerMessage]:
             track_id, stamp_ns, status, speed_mps, num_measured = (column[row] for column in columns)
             name, colour = f"track {track_id}", look.of_track(track_id)
             facts = {"status": status, "speed": f"{speed_mps:.2f} m/s", "measured": str(num_measured)}
+            if class_name := states[row].class_name:
+                facts["class"] = class_name
             shapes = look.track(track_id, states[row], speed_mps, status)
             boxes.append(Entity(name, shapes, facts=facts))
             if math.isfinite(axes[row][0]):
-                patches.append(Entity(name, (patch(_point(states[row]), axes[row], faded(colour, 0.6)),)))
+                ellipse = patch(_point(states[row]), size(states[row])[2], axes[row], faded(colour, 0.6))
+                patches.append(Entity(name, (ellipse,)))
             poses[stamp_ns].append(states[row])
         present = frozenset(one.name for one in boxes)
         gone = tuple(sorted(before - present))
@@ -82,7 +86,7 @@ def smoothed_messages(run: Run, look: Look) -> Iterator[ViewerMessage]:
     A state is final when its stamp has left the window of `smoother.lag_s`, or when its track has ended.
     """
     final = _placed(run.smoothed.where(run.smoothed["kind"] == "final"))
-    states = _detections(final)
+    states = _detections(final, run.objects)
     stamps_ns, track_ids = final["stamp_ns"].tolist(), final["track_id"].tolist()
     lines: defaultdict[int, list[Point]] = defaultdict(list)
     for log_ns, rows in groups(final_ns(run, final)):
@@ -143,19 +147,34 @@ def _point(state: Detection) -> Point:
     return state.x_m, state.y_m
 
 
-def _detections(states: Table) -> list[Detection]:
-    """The pose of each row, with its covariance where that is known."""
+def _detections(states: Table, objects: Table) -> list[Detection]:
+    """The pose of each row, with its covariance where that is known, and what `objects` says of its track."""
     names = ("p_x_x", "p_x_y", "p_x_yaw", "p_x_y", "p_y_y", "p_y_yaw", "p_x_yaw", "p_y_yaw", "p_yaw_yaw")
     P = np.stack([states[name] for name in names], axis=-1)
     sure = np.isfinite(P).all(axis=1) & np.isfinite(states["yaw_rad"])
     columns = (states[name].tolist() for name in ("x_m", "y_m", "yaw_rad", "track_id"))
+    told = _told(objects)
     return [
-        Detection(
-            x_m,
-            y_m,
-            yaw_rad if math.isfinite(yaw_rad) else None,
+        replace(
+            told.get(track_id, Detection()),
+            x_m=x_m,
+            y_m=y_m,
+            yaw_rad=yaw_rad if math.isfinite(yaw_rad) else None,
             covariance=tuple(covariance) if known else None,
             object_id=track_id,
         )
         for x_m, y_m, yaw_rad, track_id, covariance, known in zip(*columns, P.tolist(), sure.tolist(), strict=True)
     ]
+
+
+def _told(objects: Table) -> dict[int, Detection]:
+    """Class and size of each track, where known."""
+    sizes_m = np.stack([objects[name] for name in ("length_m", "width_m", "height_m")], axis=-1).tolist()
+    rows = zip(objects["track_id"].tolist(), sizes_m, objects["class_name"].tolist(), strict=True)
+    found = {}
+    for track_id, size_m, class_name in rows:
+        length_m, width_m, height_m = (one if math.isfinite(one) else None for one in size_m)
+        found[track_id] = Detection(
+            length_m=length_m, width_m=width_m, height_m=height_m, class_name=class_name or None
+        )
+    return found

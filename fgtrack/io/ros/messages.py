@@ -139,7 +139,7 @@ class MessageFactory:
         pose = self._pose(item.x_m, item.y_m, item.yaw_rad)
         results = []
         if (covariance := _full_covariance(item)) is not None:
-            hypothesis = self._make("vision_msgs/msg/ObjectHypothesis", class_id="", score=1.0)
+            hypothesis = self._make("vision_msgs/msg/ObjectHypothesis", class_id=item.class_name or "", score=1.0)
             result = "vision_msgs/msg/ObjectHypothesisWithPose"
             results.append(
                 self._make(result, hypothesis=hypothesis, pose=self._with_covariance("Pose", pose, covariance[0]))
@@ -148,7 +148,7 @@ class MessageFactory:
             "vision_msgs/msg/Detection3D",
             header=self._header(item.stamp_ns or 0, ""),
             results=results,
-            bbox=self._make("vision_msgs/msg/BoundingBox3D", center=pose, size=self._vector(0.0, 0.0)),
+            bbox=self._make("vision_msgs/msg/BoundingBox3D", center=pose, size=self._size(item)),
             id="" if item.object_id is None else str(item.object_id),
         )
 
@@ -166,7 +166,7 @@ class MessageFactory:
             has_twist_covariance=twist is not None and item.speed_mps is not None,
         )
         footprint = self._make("geometry_msgs/msg/Polygon", points=[])
-        shape = self._make(f"{package}/Shape", type=0, footprint=footprint, dimensions=self._vector(0.0, 0.0))
+        shape = self._make(f"{package}/Shape", type=0, footprint=footprint, dimensions=self._size(item))
         return self._make(
             f"{package}/DetectedObject",
             existence_probability=1.0,
@@ -177,6 +177,9 @@ class MessageFactory:
 
     def _vector(self, x: float, y: float, z: float = 0.0) -> RosMessage:
         return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+    def _size(self, item: Detection) -> RosMessage:
+        return self._vector(item.length_m or 0.0, item.width_m or 0.0, item.height_m or 0.0)
 
     def _pose(self, x_m: float | None, y_m: float | None, yaw_rad: float | None) -> RosMessage:
         """A pose; an unknown yaw is the quaternion of norm 0, one that is not finite is not a number."""
