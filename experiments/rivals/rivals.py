@@ -21,7 +21,6 @@ import typer
 import fgtrack
 from fgtrack.core.types import Detection, DetectionList, Message
 from fgtrack.evaluation.paired import average, paired
-from fgtrack.evaluation.prediction import prediction_errors
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.models.oval import OVAL, make_oval
 from fgtrack.models.track_map import COLUMNS, TrackMap
@@ -171,8 +170,6 @@ def judged(scene: str, contestant: str, recording: str, run: fgtrack.Run) -> Res
     found = one.metrics
     assert found.truth is not None
     errors = found.truth.overall.errors
-    ahead = prediction_errors(run, one.matching)
-    [arc_m] = [each.final_m.mean for each in ahead if (each.predictor, each.horizon_s) == ("arc", 1.0)]
     return Result(
         scene,
         contestant,
@@ -181,7 +178,7 @@ def judged(scene: str, contestant: str, recording: str, run: fgtrack.Run) -> Res
         float(np.rad2deg(errors["yaw_rad"].rmse)),
         errors["speed_mps"].rmse,
         found.consistency.position_nees.mean,
-        arc_m,
+        found.predictions["arc"]["1s"].final_m.mean,
         100.0 * found.multi_object.clear.mota if found.multi_object else np.nan,
     )
 

@@ -5,8 +5,9 @@ bootstrap over time (`fgtrack.evaluation.paired`).
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -120,7 +121,19 @@ def is_best(found: Sequence[Contest], quantity: str, run: str) -> bool:
     return any(one.entries[0].name == run and one.entries[0].standing == "best" for one in quantities)
 
 
-def _contest(group: Sequence[JudgedRun]) -> Contest:
+class Paired(NamedTuple):
+    """What runs of one recording are compared by."""
+
+    samples: int
+    """Objects and stamps at which all runs have a paired track."""
+    most_samples: int
+    """Those of the run with most of them."""
+    sums: Mapping[str, FloatArray]
+    """By quantity: of every stamp the sum of each run, and in the last column the count, shape (n, runs + 1)."""
+
+
+def paired_sums(group: Sequence[JudgedRun]) -> Paired:
+    """The errors of `group`, runs of one recording, at the same objects and stamps, stamp by stamp."""
     codes, stamps_ns, values = _samples(group)
     common = functools.reduce(np.intersect1d, codes)
     rows = [np.searchsorted(code, common) for code in codes]
@@ -131,13 +144,14 @@ def _contest(group: Sequence[JudgedRun]) -> Contest:
     of_gospa = _gospa_sums(group)
     if of_gospa is not None:
         sums["gospa_in_sight_rms_m"] = of_gospa
+    return Paired(len(common), max(map(len, codes)), sums)
+
+
+def _contest(group: Sequence[JudgedRun]) -> Contest:
+    found = paired_sums(group)
     labels = tuple(one.label for one in group)
-    return Contest(
-        labels,
-        samples=len(common),
-        most_samples=max(map(len, codes)),
-        quantities=tuple(quantity(name, labels, ticks) for name, ticks in sums.items() if ticks[:, -1].any()),
-    )
+    quantities = [quantity(name, labels, ticks) for name, ticks in found.sums.items() if ticks[:, -1].any()]
+    return Contest(labels, found.samples, found.most_samples, tuple(quantities))
 
 
 def _samples(group: Sequence[JudgedRun]) -> tuple[list[IntArray], IntArray, list[dict[str, FloatArray]]]:

@@ -17,6 +17,7 @@ from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
 from fgtrack.evaluation.left_out import left_out
 from fgtrack.evaluation.matching import ERROR_NAMES, Matching, confirmed, match, track_errors
 from fgtrack.evaluation.multi_object import MultiObjectMetrics, multi_object_metrics
+from fgtrack.evaluation.prediction import PredictionErrors, prediction_errors
 from fgtrack.evaluation.residual_samples import residual_samples
 from fgtrack.evaluation.statistics import ChiSquareMean, Distribution, Moments
 from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, evaluation_config
@@ -145,6 +146,8 @@ class Metrics:
     """Present, lagged and final states, see `lag_metrics`."""
     multi_object: MultiObjectMetrics | None = None
     """None for a run without truth, and where they are not asked for."""
+    predictions: Mapping[str, Mapping[str, PredictionErrors]] = field(default_factory=dict)
+    """What states say of the next seconds, by predictor and horizon, see `prediction_errors`; empty without truth."""
     failures: Mapping[str, int] = field(default_factory=dict)
     """What failed while the run was made, by kind, zeros included; empty of runs that did not count it."""
     left_out: tuple[str, ...] = ()
@@ -198,6 +201,7 @@ def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationCon
         truth=None if matching is None else _truth_metrics(run, matching, options),
         lagged=lag_metrics(run, matching),
         multi_object=multi_object_metrics(run, matching, options),
+        predictions=prediction_errors(run, matching),
         failures=dict(run.meta.get("failures") or {}),
         left_out=tuple(left_out(run.meta)),
     )

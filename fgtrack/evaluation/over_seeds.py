@@ -36,6 +36,7 @@ _BETTER: Mapping[str, Literal["less", "more", "nearer"]] = {
     "multi_object.clear.mota": "more",
     "multi_object.identity.idf1": "more",
     "multi_object.hota.hota": "more",
+    "predictions.*.mean": "less",
 }
 
 #: Metrics that a summary shows first, and their headings.

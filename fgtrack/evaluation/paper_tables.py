@@ -9,7 +9,7 @@ import numpy as np
 
 from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.evaluation.metrics import Metrics
-from fgtrack.evaluation.prediction import predictions_table
+from fgtrack.evaluation.prediction import HORIZONS_S, PredictionErrors
 from fgtrack.evaluation.residual_samples import LOCAL_NAMES, ResidualSamples, residual_samples
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.sensed import Sensed, sensed
@@ -27,6 +27,7 @@ _AHEAD_M = (0.0, 50.0)
 
 R = TypeVar("R")
 _Moments = Mapping[str, Moments]
+_Predicted = tuple[str, str, Mapping[str, PredictionErrors]]
 
 
 def with_paper_tables(tables: Tables, runs: Sequence[JudgedRun]) -> Tables:
@@ -40,7 +41,7 @@ def with_paper_tables(tables: Tables, runs: Sequence[JudgedRun]) -> Tables:
         "residuals_by": _residuals_by(runs),
         "sensed": _sensed(by_sensor),
         "latency": _latency([Row(one.label, one.metrics) for one in runs]),
-        "predictions": predictions_table(runs),
+        "predictions": _predictions(runs),
     }
     return replace(tables, tables={**tables.tables, **more})
 
@@ -175,3 +176,28 @@ def _moments_column(name: str, get: Callable[[R], Mapping[str, Moments]]) -> Col
 
     scale = _DEGREES if name == "yaw_rad" else 1.0
     return Column(_HEADINGS[name], (named(name, "mean"), named(name, "std")), of, "{} ± {}", scale)
+
+
+def _predictions(runs: Sequence[JudgedRun]) -> Table:
+    """A row for each run and predictor: FDE and ADE at every horizon."""
+    rows = [(one.label, name, of) for one in runs for name, of in one.metrics.predictions.items()]
+
+    def displacement(horizon: str) -> Callable[[_Predicted], tuple[float, float]]:
+        return lambda row: (row[2][horizon].final_m.mean, row[2][horizon].average_m.mean)
+
+    columns: list[Column[_Predicted]] = [
+        Column("run", ("run",), lambda row: (row[0],), left=True),
+        Column("along", ("predictor",), lambda row: (row[1],), left=True),
+        Column("predic-\ntions", ("count",), lambda row: (next(iter(row[2].values())).final_m.count,)),
+    ]
+    for horizon_s in HORIZONS_S:
+        horizon = f"{horizon_s:g}s"
+        names = (f"fde_{horizon}_m", f"ade_{horizon}_m")
+        columns.append(Column(f"{horizon_s:g} s [m]\nFDE/ADE", names, displacement(horizon), "{}/{}"))
+    notes = [
+        "FDE: mean distance from the truth at that time ahead; ADE: the same, averaged up to it",
+        "arc: constant turn rate and speed; rail: the same for 0.2 s, then along the track",
+    ]
+    return Table(
+        "Predictions from the published states", columns, rows, row_keys=("run", "predictor"), notes=notes, detail=True
+    )

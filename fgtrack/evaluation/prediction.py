@@ -1,6 +1,6 @@
 """How good predictions from the published states are: displacement errors some seconds ahead (ADE, FDE)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +8,7 @@ import numpy as np
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.matching import Matching, confirmed
-from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.statistics import Moments
-from fgtrack.evaluation.tables import Column, Table
 from fgtrack.evaluation.truth import TRUE_STATE, true_paths
 from fgtrack.evaluation.viewer.surroundings import roads
 from fgtrack.io.run import Run
@@ -18,8 +16,6 @@ from fgtrack.models.predictor import ArcPredictor, Predictor, RailPredictor
 
 #: At which times ahead predictions are judged, in s.
 HORIZONS_S = (1.0, 2.0, 3.0, 5.0)
-
-_Row = tuple[str, str, Sequence["PredictionErrors"]]
 
 _STEP_S = 0.1
 _PERIOD_NS = NS_PER_S // 10  # of the published node's predictions
@@ -29,62 +25,55 @@ _PERIOD_NS = NS_PER_S // 10  # of the published node's predictions
 class PredictionErrors:
     """Distances of predicted and true positions, of the predictions whose truth is known up to the horizon."""
 
-    predictor: str
-    horizon_s: float
     final_m: Moments
     """At the horizon: the mean is the final displacement error, FDE."""
     average_m: Moments
     """Of each prediction the mean over every 0.1 s until then: the mean is the average displacement error, ADE."""
 
 
-def prediction_errors(run: Run, matching: Matching | None) -> tuple[PredictionErrors, ...]:
-    """Errors of what the states of `run` predict, ten times a second, by predictor and horizon; none without truth.
+@dataclass(frozen=True)
+class Displacements:
+    """How far predictions are off, ten times a second and for every tenth of a second ahead."""
+
+    stamps_ns: IntArray
+    """What is predicted from, shape (n,)."""
+    object_index: IntArray
+    """Object that is predicted, shape (n,)."""
+    distances_m: Mapping[str, FloatArray]
+    """By predictor, up to the last of `HORIZONS_S`, shape (n, m); NaN where the truth is not known."""
+
+    def at(self, horizon_s: float, predictor: str = "arc") -> FloatArray:
+        """Distances `horizon_s` ahead, shape (n,)."""
+        return self.distances_m[predictor][:, round(horizon_s / _STEP_S) - 1]
+
+
+def displacements(run: Run, matching: Matching) -> Displacements:
+    """Distances of what the states of `run` predict from the truth.
 
     Predictors are `arc` and, where the run has a map, `rail`. Judged are confirmed tracks that are paired with an
     object, against that object, wherever it goes. Raises `DataError` where the map that the run names is no map.
     """
-    if matching is None:
-        return ()
     states, stamps_ns, objects = _starts(matching)
     ahead_s: FloatArray = _STEP_S * np.arange(1, round(HORIZONS_S[-1] / _STEP_S) + 1, dtype=np.float64)
     truth = _truth(run, matching, stamps_ns, objects, ahead_s)
-    found = []
-    for name, predictor in _predictors(run).items():
-        distances_m = np.linalg.norm(predictor.positions(states, ahead_s) - truth, axis=-1)
+    found = {
+        name: np.asarray(np.linalg.norm(predictor.positions(states, ahead_s) - truth, axis=-1))
+        for name, predictor in _predictors(run).items()
+    }
+    return Displacements(stamps_ns, objects, found)
+
+
+def prediction_errors(run: Run, matching: Matching | None) -> dict[str, dict[str, PredictionErrors]]:
+    """Means of `displacements` by predictor and horizon, `1s` to `5s`; empty without truth."""
+    found: dict[str, dict[str, PredictionErrors]] = {}
+    for name, distances_m in displacements(run, matching).distances_m.items() if matching is not None else ():
+        found[name] = {}
         for horizon_s in HORIZONS_S:
             until = distances_m[:, : round(horizon_s / _STEP_S)]
             until = until[np.isfinite(until).all(axis=1)]
-            found.append(PredictionErrors(name, horizon_s, Moments.of(until[:, -1]), Moments.of(until.mean(axis=1))))
-    return tuple(found)
-
-
-def predictions_table(runs: Sequence[JudgedRun]) -> Table:
-    """A row for each run and predictor: FDE and ADE at every horizon."""
-    rows: list[_Row] = []
-    for one in runs:
-        by_predictor: dict[str, list[PredictionErrors]] = {}
-        for errors in prediction_errors(one.run, one.matching):
-            by_predictor.setdefault(errors.predictor, []).append(errors)
-        rows += [(one.label, name, errors) for name, errors in by_predictor.items()]
-
-    def displacement(k: int) -> Callable[[_Row], tuple[float, float]]:
-        return lambda row: (row[2][k].final_m.mean, row[2][k].average_m.mean)
-
-    columns: list[Column[_Row]] = [
-        Column("run", ("run",), lambda row: (row[0],), left=True),
-        Column("along", ("predictor",), lambda row: (row[1],), left=True),
-        Column("predic-\ntions", ("count",), lambda row: (row[2][0].final_m.count,)),
-    ]
-    for k, horizon_s in enumerate(HORIZONS_S):
-        names = (f"fde_{horizon_s:g}s_m", f"ade_{horizon_s:g}s_m")
-        columns.append(Column(f"{horizon_s:g} s [m]\nFDE/ADE", names, displacement(k), "{}/{}"))
-    notes = [
-        "FDE: mean distance from the truth at that time ahead; ADE: the same, averaged up to it",
-        "arc: constant turn rate and speed; rail: the same for 0.2 s, then along the track",
-    ]
-    return Table(
-        "Predictions from the published states", columns, rows, row_keys=("run", "predictor"), notes=notes, detail=True
-    )
+            errors = PredictionErrors(Moments.of(until[:, -1]), Moments.of(until.mean(axis=1)))
+            found[name][f"{horizon_s:g}s"] = errors
+    return found
 
 
 def _predictors(run: Run) -> dict[str, Predictor]:
