@@ -10,9 +10,8 @@ AUTOFERRY holds a folder for each scenario. Two tables:
   pairs, with the interval of a block bootstrap along each scenario.
 """
 
-import csv
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -20,11 +19,13 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import typer
 from joblib import Parallel, delayed
+from scores import autoferry_sources, nis_ratios, write
 
 import fgtrack
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import FloatArray, IntArray, Message
-from fgtrack.evaluation.contest import contests
+from fgtrack.evaluation.contest import paired_sums
+from fgtrack.evaluation.paired import UNKNOWN, Estimate, within_run
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.sight import ego_poses
 from fgtrack.evaluation.truth import true_paths
@@ -40,6 +41,7 @@ APART_RAD = 0.3  # vessels that are nearer to each other cannot be told apart
 LAGS_S = (1.0, 5.0, 20.0)
 SAME_S = 0.15  # times that differ by less are the same
 STD_RAD = 0.06
+SEED = 20040101  # of the bootstrap: the same runs give the same intervals
 ERRORS = {"white": None, "lasting": Correlation(share=0.9, time_s=5.0)}
 QUANTITIES = ("gospa_in_sight_rms_m", "position_rmse_m")
 OF_BEARINGS = (
@@ -137,14 +139,14 @@ def measured(source: Path, config: Config, seconds: float) -> tuple[list[list[st
     }
     rows = []
     for errors, run in runs.items():
-        changes = [change(runs["none"], run, quantity) for quantity in QUANTITIES]
+        changes = [UNKNOWN if errors == "none" else change(runs["none"], run, quantity) for quantity in QUANTITIES]
         metrics = run.metrics
         assert metrics.truth is not None
         assert metrics.multi_object is not None
-        nis = {sensor: found.mean / found.dof for sensor, found in metrics.consistency.nis.items() if found.count}
+        nis = nis_ratios(run)
         values = (
-            *(metrics.multi_object.gospa.in_sight_rms_m, *changes[0]),
-            *(metrics.truth.overall.errors["position_m"].rmse, *changes[1]),
+            *(metrics.multi_object.gospa.in_sight_rms_m, *bounds(changes[0])),
+            *(metrics.truth.overall.errors["position_m"].rmse, *bounds(changes[1])),
             *(100.0 * metrics.multi_object.clear.mota, 100.0 * metrics.multi_object.identity.idf1),
             *(metrics.truth.overall.breaks, metrics.truth.false_tracks),
             *(nis.get(camera, math.nan) for camera in CAMERAS),
@@ -153,16 +155,15 @@ def measured(source: Path, config: Config, seconds: float) -> tuple[list[list[st
     return list(bearings(source.name, runs["none"].run)), rows
 
 
-def change(without: JudgedRun, run: JudgedRun, quantity: str) -> tuple[float, float, float]:
-    """What the cameras change, less is better, and the 95 % interval; NaN of the run without."""
-    if run is without:
-        return (math.nan,) * 3
-    (contest,) = contests([without, run])
-    (found,) = (one for one in contest.quantities if one.name == quantity)
-    last = found.entries[-1]
-    assert last.worse_by is not None
-    worse = last.worse_by
-    return (worse.mean, worse.low, worse.high) if last.name == run.label else (-worse.mean, -worse.high, -worse.low)
+def bounds(one: Estimate) -> tuple[float, float, float]:
+    """Value and interval."""
+    return one.mean, one.low, one.high
+
+
+def change(without: JudgedRun, run: JudgedRun, quantity: str) -> Estimate:
+    """What the cameras change, less is better."""
+    ticks = paired_sums([without, run]).sums[quantity]
+    return within_run(ticks, lambda S: np.sqrt(S[1] / S[2]) - np.sqrt(S[0] / S[2]), np.random.default_rng(SEED))
 
 
 def main(
@@ -174,18 +175,12 @@ def main(
     jobs: Annotated[int, typer.Option(help="Recordings at a time.")] = 1,
 ) -> None:
     """Replay all scenarios without and with cameras, print both tables."""
-    out.mkdir(parents=True, exist_ok=True)
-    names = scenarios.split(",") if scenarios else sorted(each.name for each in autoferry.glob("scenario*"))
     config = read_config(configuration)
-    found = Parallel(n_jobs=jobs)(delayed(measured)(autoferry / name, config, seconds) for name in names)
-    _write(out / "bearings.csv", OF_BEARINGS, [row for rows, _ in found for row in rows])
-    _write(out / "gains.csv", OF_GAINS, [row for _, rows in found for row in rows])
-
-
-def _write(file: Path, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    with file.open("w", newline="") as opened:
-        csv.writer(opened).writerows([header, *rows])
-    print(f"{file.name}\n{file.read_text()}")
+    found = Parallel(n_jobs=jobs)(
+        delayed(measured)(source, config, seconds) for source in autoferry_sources(autoferry, scenarios).values()
+    )
+    write(out / "bearings.csv", OF_BEARINGS, [row for rows, _ in found for row in rows])
+    write(out / "gains.csv", OF_GAINS, [row for _, rows in found for row in rows])
 
 
 if __name__ == "__main__":

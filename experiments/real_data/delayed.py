@@ -1,89 +1,116 @@
-"""What does a late LiDAR cost, where a prompt camera overtakes it?
+"""What does a delay of 150 ms cost, where another sensor overtakes the late one?
 
     python experiments/real_data/delayed.py --kitti KITTI -o out/delayed --jobs 2
 
-KITTI is the folder of the tracking data set. Every list of PointRCNN is received 150 ms after it was sensed, the boxes
-of RRC at once, so that one or two of them overtake each list. Ticks are those of a node at 20 Hz. The error is that of
-the present positions, where all runs of a sequence, with and without the delay, track the same car at the same tick.
+KITTI is the folder of the tracking data set, whose detections come ten times a second. Three arrangements of the same
+detections; in each all lists of the prompt sensor between two arrivals are overtaken by a late one, so that
+backward-forward forgets them all (experiments/survival):
+
+- `late lidar`: PointRCNN is late, the boxes of RRC are prompt. What is forgotten are bearings, which say nothing of the
+  distance, where the error is, and err for a second: no difference is expected.
+- `late camera`: RRC is late, PointRCNN is prompt. What is forgotten are all positions: a difference is expected.
+- `halves`: every second list of PointRCNN is late, as of a second sensor alike; RRC is left out. Half of the positions
+  are forgotten: a difference is expected.
+
+Ticks are those of a node at 20 Hz. `costs.csv`: of the position now and 0.5 and 1 s ahead (constant turn rate and
+speed, ten times a second), where all runs of a sequence, with and without the delay, track the same car, and of GOSPA
+at all ticks. `scores.csv`: MOTA and switches of all ticks.
 """
 
-import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from statistics import fmean
+from typing import Annotated, NamedTuple
 
-import numpy as np
+import costs
 import typer
 from joblib import Parallel, delayed
+from scores import SEQUENCES, kitti_sources, write
 
 import fgtrack
-from fgtrack.core.types import Message
-from fgtrack.evaluation.matching import match
-from fgtrack.evaluation.paired import average
+from fgtrack.core.types import DetectionList, Message
+from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import ClockConfig, Config
 from fgtrack.pipeline.shipped import read_config
-from fgtrack.sim.delays import ConstantDelay
-from fgtrack.sim.redelay import SensorDelays, redelay
 
-SEQUENCES = ("0004", "0006", "0008", "0010", "0018")
 ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
-LATE = "pointrcnn_car"
+LIDAR, CAMERA, SECOND = "pointrcnn_car", "rrc_car", "second_lidar"
+LATE = {"late lidar": LIDAR, "late camera": CAMERA, "halves": SECOND}
+"""The late sensor of each arrangement."""
 NODE_HZ = 20.0
+HORIZONS_S = (0.5, 1.0)
+OF_SCORES = ("arrangement", "estimator", "mota_prompt", "mota_late", "switches_prompt", "switches_late")
 
-Squares = Mapping[tuple[int, int], float]
-"""Squared position error by tick and object."""
+
+class Found(NamedTuple):
+    """What is said of one sequence in one arrangement."""
+
+    compared: costs.Sums
+    scores: list[list[float]]
+    """Of each estimator MOTA and switches, as in `OF_SCORES`."""
 
 
-def squares(source: Path, config: Config, delay_s: float) -> Squares:
-    """Squared errors in m^2 of the present positions, with the LiDAR `delay_s` late."""
-    read = open_input(source, config.input).messages
-    delays = {LATE: SensorDelays(delay=ConstantDelay(delay_s))}
-    messages: Sequence[Message] = list(redelay(read, delays, np.random.default_rng(0)))
-    matching = match(fgtrack.replay(messages, config))
-    assert matching is not None
-    rows = np.flatnonzero(matching.paired)
-    objects = matching.object_index[rows]
-    found = matching.distances_m[rows, objects] ** 2
-    now_ns = matching.now_ns[matching.tick_index[rows]]
-    return dict(zip(zip(now_ns.tolist(), objects.tolist(), strict=True), found.tolist(), strict=True))
+def halves(messages: Iterable[Message]) -> Iterator[Message]:
+    """Every second list of the LiDAR as one of `SECOND`."""
+    count = 0
+    for one in messages:
+        if isinstance(one, DetectionList) and one.sensor == LIDAR:
+            count += 1
+            yield one if count % 2 else replace(one, sensor=SECOND)
+        else:
+            yield one
+
+
+def arranged(arrangement: str, config: Config) -> Config:
+    """`config` with the sensors of the arrangement."""
+    if arrangement != "halves":
+        return config
+    sensors = {**config.sensors, SECOND: config.sensors[LIDAR]}
+    return replace(config, sensors=sensors, ignore_sensors=(*config.ignore_sensors, CAMERA))
+
+
+def judged(arrangement: str, source: Path, config: Config, delay_s: float) -> Found:
+    """Replay a sequence with all estimators, without and with the delay."""
+    config = arranged(arrangement, config)
+    messages = list(open_input(source, config.input).messages())
+    if arrangement == "halves":
+        messages = list(halves(messages))
+    prompt, late = (
+        [JudgedRun(each, fgtrack.replay(received, replace(config, estimator=each))) for each in ESTIMATORS]
+        for received in (messages, costs.late(messages, LATE[arrangement], delay_s))
+    )
+    scores = []
+    for pair in zip(prompt, late, strict=True):
+        clear = [one.metrics.multi_object.clear for one in pair if one.metrics.multi_object is not None]
+        scores.append([*(100.0 * one.mota for one in clear), *(float(one.id_switches) for one in clear)])
+    return Found(costs.sums(prompt, late, HORIZONS_S), scores)
 
 
 def main(
     kitti: Annotated[Path, typer.Option(help="Folder of the KITTI tracking data set.")],
-    out: Annotated[Path, typer.Option("-o", help="Folder for the table.")] = Path("out/delayed"),
-    sequences: Annotated[str, typer.Option(help="Sequences, separated by commas.")] = ",".join(SEQUENCES),
-    delay_s: Annotated[float, typer.Option(help="Delay of the LiDAR.")] = 0.15,
+    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path("out/delayed"),
+    sequences: Annotated[str, typer.Option(help="Sequences, separated by commas.")] = SEQUENCES,
+    arrangements: Annotated[str, typer.Option(help="Arrangements, separated by commas.")] = ",".join(LATE),
+    delay_s: Annotated[float, typer.Option(help="Delay of the late sensor.")] = 0.15,
     config_name: Annotated[str, typer.Option("-c", help="Configuration.")] = "kitti",
-    jobs: Annotated[int, typer.Option(help="Replays at a time.")] = 1,
+    jobs: Annotated[int, typer.Option(help="Sequences at a time.")] = 1,
 ) -> None:
-    """Replay all sequences with and without the delay, print delayed.csv."""
-    out.mkdir(parents=True, exist_ok=True)
-    base = replace(read_config(config_name), clock=ClockConfig(node_hz=NODE_HZ))
-    names = sequences.split(",")
-    tasks = [(name, each, late_s) for name in names for each in ESTIMATORS for late_s in (0.0, delay_s)]
-    runs = Parallel(n_jobs=jobs)(
-        delayed(squares)(kitti / "oxts" / f"{name}.txt", replace(base, estimator=each), late_s)
-        for name, each, late_s in tasks
-    )
-    found = dict(zip(tasks, runs, strict=True))
-    rows, costs = [], {each: list[float]() for each in ESTIMATORS}
+    """Replay all sequences with and without the delay, print costs.csv and scores.csv."""
+    config = replace(read_config(config_name), clock=ClockConfig(node_hz=NODE_HZ))
+    sources, names = kitti_sources(kitti, sequences), arrangements.split(",")
+    tasks = [(name, source) for name in names for source in sources.values()]
+    found = Parallel(n_jobs=jobs)(delayed(judged)(*task, config, delay_s) for task in tasks)
+    cost_rows, score_rows = [], []
     for name in names:
-        common = sorted(set.intersection(*(set(found[task]) for task in tasks if task[0] == name)))
-        for each in ESTIMATORS:
-            prompt, late = (
-                float(np.sqrt(np.mean([found[name, each, late_s][place] for place in common])))
-                for late_s in (0.0, delay_s)
-            )
-            costs[each].append(late - prompt)
-            rows.append([name, each, str(len(common)), f"{prompt:.3f}", f"{late:.3f}", f"{late - prompt:.3f}"])
-    with (out / "delayed.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([["sequence", "estimator", "samples", "prompt_m", "late_m", "cost_m"], *rows])
-    print((out / "delayed.csv").read_text())
-    baseline = np.array(costs[ESTIMATORS[-1]])
-    for each in ESTIMATORS[:-1]:
-        print(f"{each}: costs less than {ESTIMATORS[-1]} by {average(baseline - np.array(costs[each]))}")
+        mine = [one for task, one in zip(tasks, found, strict=True) if task[0] == name]
+        cost_rows += [[name, *row] for row in costs.rows([one.compared for one in mine], ESTIMATORS)]
+        for k, estimator in enumerate(ESTIMATORS):
+            columns = zip(*(one.scores[k] for one in mine), strict=True)
+            score_rows.append([name, estimator, *(f"{fmean(column):.1f}" for column in columns)])
+    write(out / "costs.csv", ["arrangement", *costs.HEADER], cost_rows)
+    write(out / "scores.csv", OF_SCORES, score_rows)
 
 
 if __name__ == "__main__":

@@ -2,280 +2,48 @@
 
     python experiments/real_data/held_out.py AUTOFERRY -o out/held_out --jobs 2
 
-AUTOFERRY holds a folder for each scenario. For each of them the rules below give the numbers of the configuration
+AUTOFERRY holds a folder for each scenario. For each of them the rules (rules.py) give the numbers of the configuration
 from the truth of all others; the tracker is judged on the one left out. `rules.csv` has the numbers of every fold, and
-in its last row those of all scenarios, which `configs/autoferry.yaml` has. `scores.csv` and `nis.csv` are those of
-`real_data`.
+in its last row those of all scenarios, which `configs/autoferry.yaml` has. `scores.csv`, `nis.csv` and
+`differences.csv` are of the recorded delays; those of late lists begin with the delay, and `costs.csv` says what it
+costs.
 """
 
-import csv
-import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
-import numpy as np
+import costs
 import typer
 from joblib import Parallel, delayed
-from real_data import HEADER, Found, judged, summary
+from rules import numbers, recorded, ruled
+from scores import HEADER, Found, autoferry_sources, scored, write, write_scores
 
-from fgtrack.core.time import seconds
-from fgtrack.core.types import DetectionList, EgoState, FloatArray, TruthState
+import fgtrack
 from fgtrack.evaluation.paired import paired
-from fgtrack.io.recording import write_recording
+from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.io.source import open_input
-from fgtrack.models.sensors import Correlation
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
-from fgtrack.sim.delays import ConstantDelay
-from fgtrack.sim.redelay import SensorDelays, redelay
-from fgtrack.tracking.existence import ExistenceRules
-
-#: A jump between successive errors counts as one of so many standard deviations at most: larger ones are another end of
-#: the hull, which the robust loss is for.
-LARGEST_JUMP = 3.0
-#: Clutter is counted in discs of this radius around each false detection.
-CLUTTER_RADIUS_M = 50.0
-#: Ranges are counted in rings of this width that have so many looks at a vessel.
-RING_M, FEWEST = 20.0, 20
-#: The density of the process noise is what the velocity changes by in this time.
-MANOEUVRE_S = 5.0
-#: A sensor sees as far as it shows a vessel in this share of its lists, at least.
-LEAST_SEEN = 0.8
-SENSORS = ("lidar", "radar")
 
 
-class Seen(NamedTuple):
-    """One scan and one vessel: where it was, and the nearest detection up to the gate away."""
-
-    time_s: float
-    range_m: float
-    line_of_sight: FloatArray
-    """Unit vector from the ego to the vessel, shape (2,)."""
-    error_m: FloatArray | None
-    """Detection minus truth, shape (2,); None where nothing was detected."""
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """What a scenario says of its sensors and vessels."""
-
-    seen: Mapping[str, tuple[tuple[Seen, ...], ...]]
-    """By sensor, of each vessel."""
-    crowding_per_m2: Mapping[str, tuple[float, ...]]
-    """By sensor: of each false detection the density of others around it, in its list."""
-    speeds_mps: FloatArray
-    """Velocities of the vessels, both axes, over 2 s."""
-    changes_mps: FloatArray
-    """What they change by in `MANOEUVRE_S`, both axes."""
-
-
-def recorded(source: Path, config: Config) -> Recorded:
-    """Compare every list of LiDAR and RADAR in `source` with the interpolated truth."""
-    messages = list(open_input(source, config.input).messages())
-    fixes: dict[str, list[tuple[float, float, float]]] = {}
-    for one in messages:
-        if isinstance(one, TruthState):
-            fixes.setdefault(str(one.object_id), []).append((seconds(one.stamp_ns), one.x_m, one.y_m))
-    truth = [np.array(sorted(each)) for each in fixes.values()]
-    seen: dict[str, list[list[Seen]]] = {sensor: [[] for _ in truth] for sensor in SENSORS}
-    crowding: dict[str, list[float]] = {sensor: [] for sensor in SENSORS}
-    for sensor, time_s, points_m, ego_m in _scans(messages):
-        false = np.ones(len(points_m), dtype=bool)
-        far_m = config.sensors[sensor].max_range_m or math.inf
-        false &= np.hypot(*(points_m - ego_m).T) <= far_m
-        for vessel, track in zip(seen[sensor], truth, strict=True):
-            if not track[0, 0] <= time_s <= track[-1, 0]:
-                continue
-            at_m = _at(track, time_s)
-            distances_m = np.hypot(*(points_m - at_m).T)
-            false &= distances_m > config.evaluation.gate_m
-            away_m = at_m - ego_m
-            range_m = float(np.hypot(*away_m))
-            hit = len(points_m) > 0 and distances_m.min() <= config.evaluation.gate_m
-            error_m = points_m[distances_m.argmin()] - at_m if hit else None
-            vessel.append(Seen(time_s, range_m, away_m / range_m, error_m))
-        ghosts_m = points_m[false]
-        others = (np.hypot(*(ghosts_m[:, None] - ghosts_m).T) <= CLUTTER_RADIUS_M).sum(axis=0) - 1.0
-        crowding[sensor] += (others / (math.pi * CLUTTER_RADIUS_M**2)).tolist()
-    moved = [np.array([_velocity(one, time_s) for time_s in _inner_s(one, 0.0)]).reshape(-1, 2) for one in truth]
-    changes = [
-        np.array([_velocity(one, at_s + MANOEUVRE_S) - _velocity(one, at_s) for at_s in _inner_s(one, MANOEUVRE_S)])
-        for one in truth
-    ]
-    return Recorded(
-        {sensor: tuple(map(tuple, vessels)) for sensor, vessels in seen.items()},
-        {sensor: tuple(values) for sensor, values in crowding.items()},
-        np.concatenate(moved),
-        np.concatenate([one.reshape(-1, 2) for one in changes]),
-    )
-
-
-def ruled(config: Config, recordings: Sequence[Recorded]) -> Config:
-    """`config` with the numbers that `recordings` give by the rules."""
-    sensors = dict(config.sensors)
-    for name in SENSORS:
-        vessels = [vessel for one in recordings for vessel in one.seen[name]]
-        hits = [(one, one.error_m) for vessel in vessels for one in vessel if one.error_m is not None]
-        near_m = -float(np.mean([one.line_of_sight @ error_m for one, error_m in hits]))
-        tracks = [
-            [(one.time_s, _moved(one, near_m)) for one in vessel if one.error_m is not None] for vessel in vessels
-        ]
-        variance = float(np.mean([np.square(_moved(one, near_m)) for one, _ in hits]))
-        new = _variance_of_new(tracks)
-        time_s = _correlation_time_s(tracks, variance - new)
-        view_m = _view_range_m([one for vessel in vessels for one in vessel])
-        crowding = np.median([np.mean(one.crowding_per_m2[name]) for one in recordings if one.crowding_per_m2[name]])
-        sensors[name] = replace(
-            sensors[name],
-            std={"x_m": _digits(math.sqrt(variance)), "y_m": _digits(math.sqrt(variance))},
-            near_side_m=_digits(near_m),
-            correlation=Correlation(_digits(1.0 - new / variance, 3), _digits(time_s)),
-            detection_probability=_digits(_detection_probability(vessels, view_m)),
-            clutter_per_m2=_digits(float(crowding)),
-            view_range_m=None if math.isinf(view_m) else view_m,
-        )
-    speed_mps = _rms([one.speeds_mps for one in recordings])
-    per_root_s = _rms([one.changes_mps for one in recordings]) / math.sqrt(MANOEUVRE_S)
-    assert isinstance(config.lifecycle, ExistenceRules)
-    worst_m = max(sensors[name].std["x_m"] for name in SENSORS)
-    return replace(
-        config,
-        sensors=sensors,
-        motion=replace(config.motion, std_per_s={"velocity": _digits(per_root_s * math.sqrt(config.motion.noise_hz))}),
-        birth=replace(config.birth, speed_std_mps=_digits(speed_mps)),
-        lifecycle=replace(config.lifecycle, min_travel_m=_digits(3.0 * worst_m)),
-    )
-
-
-def _scans(messages: Sequence[object]) -> Iterator[tuple[str, float, FloatArray, FloatArray]]:
-    """Sensor, time, positions (m, 2) in the map and place of the ego of every list of positions."""
-    ego_m = np.zeros(2)
-    for one in messages:
-        if isinstance(one, EgoState):
-            ego_m = np.array([one.x_m, one.y_m])
-        elif isinstance(one, DetectionList) and one.sensor in SENSORS:
-            points_m = np.array([(each.x_m, each.y_m) for each in one.objects], dtype=np.float64).reshape(-1, 2)
-            yield one.sensor, seconds(one.stamp_ns), points_m, ego_m
-
-
-def _at(track: FloatArray, time_s: float) -> FloatArray:
-    return np.array([np.interp(time_s, track[:, 0], track[:, axis]) for axis in (1, 2)])
-
-
-def _velocity(track: FloatArray, time_s: float) -> FloatArray:
-    """Over 2 s, shape (2,)."""
-    return (_at(track, time_s + 1.0) - _at(track, time_s - 1.0)) / 2.0
-
-
-def _inner_s(track: FloatArray, ahead_s: float) -> list[float]:
-    """Times of the fixes at which, and so much later, a velocity is known."""
-    times_s = track[:, 0]
-    return times_s[(times_s >= times_s[0] + 1.0) & (times_s <= times_s[-1] - 1.0 - ahead_s)].tolist()
-
-
-def _moved(one: Seen, near_m: float) -> FloatArray:
-    """The error after the near side is moved back."""
-    assert one.error_m is not None
-    return np.asarray(one.error_m + near_m * one.line_of_sight)
-
-
-def _variance_of_new(tracks: Sequence[Sequence[tuple[float, FloatArray]]]) -> float:
-    """Half the mean square of what successive errors differ by; larger jumps count as the largest."""
-    jumps = np.concatenate([np.diff([error for _, error in one], axis=0).ravel() for one in tracks if len(one) > 1])
-    typical = 1.4826 * float(np.median(np.abs(jumps)))  # the standard deviation, were they normal
-    return 0.5 * float(np.mean(np.minimum(np.square(jumps), (LARGEST_JUMP * typical) ** 2)))
-
-
-def _correlation_time_s(tracks: Sequence[Sequence[tuple[float, FloatArray]]], lasting: float) -> float:
-    """The time after which the autocorrelation of the lasting part has fallen to 1/e, in steps of 5 s."""
-    lags: list[tuple[float, float]] = []
-    for one in tracks:
-        for k, (time_s, error) in enumerate(one):
-            lags += [(later_s - time_s, 0.5 * float(error @ later)) for later_s, later in one[k + 1 :]]
-    table = np.array(lags)
-    for low_s in range(5, 200, 5):
-        chosen = (table[:, 0] >= low_s - 2.5) & (table[:, 0] < low_s + 2.5)
-        if not chosen.any() or table[chosen, 1].mean() < lasting / math.e:
-            return float(low_s)
-    return 200.0
-
-
-def _view_range_m(seen: Sequence[Seen]) -> float:
-    """Where the sensor begins to show a vessel in less than `LEAST_SEEN` of its lists; infinite where it never does."""
-    for ring in range(int(max(one.range_m for one in seen) / RING_M) + 1):
-        hits = [one.error_m is not None for one in seen if ring <= one.range_m / RING_M < ring + 1]
-        if len(hits) >= FEWEST and np.mean(hits) < LEAST_SEEN:
-            return ring * RING_M
-    return math.inf
-
-
-def _detection_probability(vessels: Sequence[Sequence[Seen]], view_m: float) -> float:
-    """That a list shows a vessel which the list before did not: misses come in rows, and a row is what ends a track.
-
-    One hit and one miss are added to the counts (the rule of succession), so that it lies between 0 and 1.
-    """
-    pairs = [pair for vessel in vessels for pair in pairwise(vessel)]
-    after = [b for a, b in pairs if a.error_m is None and max(a.range_m, b.range_m) <= view_m]
-    return (sum(one.error_m is not None for one in after) + 1.0) / (len(after) + 2.0)
-
-
-def _rms(parts: Sequence[FloatArray]) -> float:
-    return float(np.sqrt(np.mean(np.square(np.concatenate(parts)))))
-
-
-def _digits(value: float, count: int = 2) -> float:
-    return float(f"{value:.{count}g}")
-
-
-def numbers(config: Config) -> dict[str, float]:
-    """What the rules have given, by key."""
-    found: dict[str, float] = {}
-    for name in SENSORS:
-        one = config.sensors[name]
-        assert one.correlation is not None
-        values = {"std": one.std["x_m"], "near_side_m": one.near_side_m, "share": one.correlation.share}
-        values |= {"time_s": one.correlation.time_s, "detection_probability": one.detection_probability}
-        values |= {"clutter_per_m2": one.clutter_per_m2, "view_range_m": one.view_range_m or math.inf}
-        found |= {f"{name}.{key}": value for key, value in values.items()}
-    found["motion.std_per_s.velocity"] = config.motion.std_per_s["velocity"]
-    found["birth.speed_std_mps"] = config.birth.speed_std_mps
-    found["lifecycle.min_travel_m"] = getattr(config.lifecycle, "min_travel_m", math.nan)
-    return found
-
-
-def main(
-    autoferry: Annotated[Path, typer.Argument(help="Folder with a folder per scenario.")],
-    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path("out/held_out"),
-    estimators: Annotated[str, typer.Option(help="Estimators, separated by commas.")] = "ekf-replay",
-    judge: Annotated[str, typer.Option(help="Scenarios to judge, all if empty.")] = "",
-    base: Annotated[str, typer.Option(help="Configuration that the numbers go into.")] = "autoferry",
-    late: Annotated[str, typer.Option(help="Sensor that is late.")] = "lidar",
-    delay_s: Annotated[float, typer.Option(help="How late; 0 keeps the recorded delays.")] = 0.0,
-    jobs: Annotated[int, typer.Option(help="Replays at a time.")] = 1,
-) -> None:
-    """Apply the rules with each scenario left out, judge it, print rules.csv, scores.csv and nis.csv."""
-    out.mkdir(parents=True, exist_ok=True)
-    config = read_config(base)
-    known = {source.name: recorded(source, config) for source in sorted(autoferry.glob("scenario*"))}
-    names = judge.split(",") if judge else list(known)
-
-    labels = [*names, "none"]
-    folds = {name: ruled(config, [one for other, one in known.items() if other != name]) for name in labels}
-    rows = [[name, *(f"{value:g}" for value in numbers(fold).values())] for name, fold in folds.items()]
-    _write(out / "rules.csv", ["held_out", *numbers(folds["none"])], rows)
-    sources = {name: autoferry / name for name in names}
-    if delay_s:
-        sources = {name: _delayed(source, out / f"{name}.jsonl", late, delay_s) for name, source in sources.items()}
-    tasks = [(name, replace(folds[name], estimator=each)) for each in estimators.split(",") for name in names]
-    found: list[Found] = Parallel(n_jobs=jobs)(delayed(judged)(name, sources[name], one) for name, one in tasks)
-    scores = [one.scores for one in found]
-    _write(out / "scores.csv", HEADER, [*scores, *summary(scores)])
-    _write(out / "differences.csv", ["estimator", "against", "metric", "difference"], differences(scores))
-    nis = [[*one.scores[:2], sensor, f"{ratio:.2f}"] for one in found for sensor, ratio in one.nis.items()]
-    _write(out / "nis.csv", ("recording", "estimator", "sensor", "nis_over_expected"), nis)
+def judged(
+    source: Path, config: Config, estimators: Sequence[str], sensor: str, delays_s: Sequence[float]
+) -> tuple[list[list[Found]], list[costs.Sums]]:
+    """Scores of one recording by delay and estimator, and what each delay but the first, which is 0, is compared by."""
+    found, compared, prompt = [], [], list[JudgedRun]()
+    recording = list(open_input(source, config.input).messages())
+    for delay_s in delays_s:
+        messages = costs.late(recording, sensor, delay_s) if delay_s else recording
+        configs = [replace(config, estimator=each) for each in estimators]
+        runs = [JudgedRun(one.estimator, fgtrack.replay(messages, one)) for one in configs]
+        found.append([scored(source.name, source, *each) for each in zip(configs, runs, strict=True)])
+        if delay_s:
+            compared.append(costs.sums(prompt, runs))
+        else:
+            prompt = runs
+    return found, compared
 
 
 def differences(scores: Sequence[Sequence[str]]) -> list[list[str]]:
@@ -290,17 +58,43 @@ def differences(scores: Sequence[Sequence[str]]) -> list[list[str]]:
     return rows
 
 
-def _delayed(source: Path, stream: Path, sensor: str, delay_s: float) -> Path:
-    """The recording as a stream in which the lists of `sensor` arrive so much later than they were sensed."""
-    delays = {sensor: SensorDelays(ConstantDelay(delay_s=delay_s))}
-    write_recording(stream, redelay(open_input(source).messages, delays, np.random.default_rng(0)), overwrite=True)
-    return stream
+def main(
+    autoferry: Annotated[Path, typer.Argument(help="Folder with a folder per scenario.")],
+    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path("out/held_out"),
+    estimators: Annotated[str, typer.Option(help="Estimators, separated by commas.")] = "ekf-replay",
+    judge: Annotated[str, typer.Option(help="Scenarios to judge, all if empty.")] = "",
+    base: Annotated[str, typer.Option(help="Configuration that the numbers go into.")] = "autoferry",
+    late: Annotated[str, typer.Option(help="Sensor that is late.")] = "lidar",
+    delays_s: Annotated[str, typer.Option(help="How late, separated by commas.")] = "",
+    jobs: Annotated[int, typer.Option(help="Scenarios at a time.")] = 1,
+) -> None:
+    """Apply the rules with each scenario left out, judge it, print all tables."""
+    config = read_config(base)
+    sources = autoferry_sources(autoferry, "")
+    known = {name: recorded(source, config) for name, source in sources.items()}
+    judge_names = judge.split(",") if judge else list(known)
 
+    labels = [*judge_names, "none"]
+    folds = {name: ruled(config, [one for other, one in known.items() if other != name]) for name in labels}
+    rows = [[name, *(f"{value:g}" for value in numbers(fold).values())] for name, fold in folds.items()]
+    write(out / "rules.csv", ["held_out", *numbers(folds["none"])], rows)
 
-def _write(file: Path, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    with file.open("w", newline="") as opened:
-        csv.writer(opened).writerows([header, *rows])
-    print(f"{file.name}\n{file.read_text()}")
+    names, lags_s = estimators.split(","), [0.0, *(float(each) for each in delays_s.split(",") if each)]
+    of_scenarios = Parallel(n_jobs=jobs)(
+        delayed(judged)(sources[name], folds[name], names, late, lags_s) for name in judge_names
+    )
+    cost_rows = []
+    for k, delay_s in enumerate(lags_s):
+        found = [one for each in zip(*(found[k] for found, _ in of_scenarios), strict=True) for one in each]
+        prefix = f"{delay_s:g}_s_" if delay_s else ""
+        write_scores(out, found, prefix)
+        header = ["estimator", "against", "metric", "difference"]
+        write(out / f"{prefix}differences.csv", header, differences([one.scores for one in found]))
+        if delay_s:
+            compared = [compared[k - 1] for _, compared in of_scenarios]
+            cost_rows += [[f"{delay_s:g}", *row] for row in costs.rows(compared, names)]
+    if cost_rows:
+        write(out / "costs.csv", ["delay_s", *costs.HEADER], cost_rows)
 
 
 if __name__ == "__main__":

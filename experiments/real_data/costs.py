@@ -1,0 +1,83 @@
+"""What late lists of a sensor cost each estimator, in pairs, with intervals."""
+
+import functools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from fgtrack.core.types import FloatArray, Message
+from fgtrack.evaluation.contest import paired_sums
+from fgtrack.evaluation.paired import Estimate, by_stamp, within_run
+from fgtrack.evaluation.prediction import displacements
+from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.sim.delays import ConstantDelay
+from fgtrack.sim.redelay import SensorDelays, redelay
+
+QUANTITIES = ("position_rmse_m", "gospa_in_sight_rms_m")
+HEADER = ("quantity", "estimator", "prompt_m", "late_m", "cost_m", "less_than_last_by_m")
+_SEED = 20040101  # of the bootstrap: the same runs give the same intervals
+
+Sums = Mapping[str, FloatArray]
+"""By quantity, of one recording: sums of squares of 2 e runs, prompt and late ones of e estimators, and their count, of
+every stamp, shape (n, 2 e + 1)."""
+
+
+def late(messages: Sequence[Message], sensor: str, delay_s: float) -> list[Message]:
+    """`messages` with the lists of `sensor` received `delay_s` after they were sensed."""
+    delays = {sensor: SensorDelays(ConstantDelay(delay_s))}
+    return list(redelay(lambda: iter(messages), delays, np.random.default_rng(0)))
+
+
+def sums(prompt: Sequence[JudgedRun], after: Sequence[JudgedRun], horizons_s: Sequence[float] = ()) -> Sums:
+    """What runs of one recording, of the same estimators in the same order, are compared by.
+
+    Positions where all runs track the same object at the same stamp, now and `horizons_s` ahead; GOSPA at all ticks.
+    """
+    runs = [*prompt, *after]
+    found = paired_sums(runs).sums
+    ahead = {f"position_{horizon_s:g}_s_ahead_rmse_m": _ahead(runs, horizon_s) for horizon_s in horizons_s}
+    return {**{name: found[name] for name in QUANTITIES if name in found}, **ahead}
+
+
+def _ahead(runs: Sequence[JudgedRun], horizon_s: float) -> FloatArray:
+    """Squared errors of what the states predict, where all runs predict the same object from the same stamp."""
+    found = [displacements(one.run, one.matching) for one in runs if one.matching is not None]
+    squares = [
+        dict(zip(zip(one.stamps_ns.tolist(), one.object_index.tolist(), strict=True), column, strict=True))
+        for one in found
+        for column in [np.square(one.at(horizon_s)).tolist()]
+    ]
+    places = sorted(functools.reduce(set.intersection, (set(each) for each in squares)))
+    values = np.array([[each[place] for each in squares] for place in places]).reshape(-1, len(runs))
+    return by_stamp(np.array([stamp_ns for stamp_ns, _ in places], dtype=np.int64), values)
+
+
+def rows(found: Iterable[Sums], estimators: Sequence[str]) -> Iterator[list[str]]:
+    """A row of `HEADER` for every quantity and estimator, of all recordings together.
+
+    Intervals are those of a block bootstrap along the recordings, one after the other. The last column is by how much
+    less the delay costs than with the last estimator.
+    """
+    found = list(found)
+    last = len(estimators) - 1
+    for quantity in found[0]:
+        ticks = np.concatenate([one[quantity] for one in found])
+        roots = np.sqrt(ticks[:, :-1].sum(axis=0) / ticks[:, -1].sum())
+        for k, name in enumerate(estimators):
+            pair = (f"{roots[k]:.3f}", f"{roots[k + last + 1]:.3f}")
+            saved = f"{_difference(ticks, last, k):.3f}" if k < last else ""
+            yield [quantity, name, *pair, f"{_difference(ticks, k):.3f}", saved]
+
+
+def _difference(ticks: FloatArray, one: int, other: int | None = None) -> Estimate:
+    """What the delay costs estimator `one`; less what it costs the `other`."""
+    num = ticks.shape[1] // 2
+
+    def root(S: FloatArray, k: int) -> FloatArray:
+        return np.sqrt(S[k] / S[-1])
+
+    def statistic(S: FloatArray) -> FloatArray:
+        cost = root(S, one + num) - root(S, one)
+        return cost if other is None else cost - root(S, other + num) + root(S, other)
+
+    return within_run(ticks, statistic, np.random.default_rng(_SEED))
