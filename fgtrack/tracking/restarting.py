@@ -236,9 +236,10 @@ class RestartingBank(ForwardingBank):
 
 def _present(bank: TrackBank) -> list[TrackState]:
     states, many = bank.present(), len(bank.track_ids)
-    if isinstance(states, PresentStates) and len(states) == many:
-        return states
-    shapes = {(*state.mean.shape, *state.covariance.shape) for state in states}
+    if isinstance(states, PresentStates):
+        shapes = {(*states.means.shape[1:], *states.covariances.shape[1:])} if states else set()
+    else:
+        shapes = {(*state.mean.shape, *state.covariance.shape) for state in states}
     if len(states) != many or not shapes <= _SHAPES:
         raise ValueError(f"{many} tracks have {len(states)} states of shapes {', '.join(map(str, shapes))}")
     return states
