@@ -21,6 +21,8 @@ from fgtrack.tracking.preprocess import Candidate
 
 _BELIEVED = 0.99
 """A detection whose NIS lies beyond this quantile may be no detection of its track: it says nothing to the others."""
+_SINGULAR = 1e-10
+"""A matrix of correlations with an eigenvalue below it is singular but for rounding."""
 
 
 class EgoErrors(Protocol):
@@ -218,10 +220,15 @@ class SharedErrors:
 def _equivalent(M: FloatArray, gain: FloatArray, across: FloatArray) -> tuple[FloatArray, FloatArray] | None:
     """M D^-1 and R' = M D^-1 M - M of the measurement that takes D = `gain` `across` off M, both of shape (k, k).
 
-    None where there is none: the batch says nothing of one of the measured components.
+    None where there is none: the batch says nothing of one of the measured components, or one of them follows from the
+    others, as the bearing of a position, so that D cannot be told from a singular one.
     """
+    D = symmetrise(gain @ across)
+    std = np.sqrt(np.maximum(np.diag(D), 0.0))
     try:
-        weight = psd_solve(symmetrise(gain @ across), M).T
+        if not (std.all() and np.linalg.eigvalsh(D / np.outer(std, std))[0] > _SINGULAR):
+            return None
+        weight = psd_solve(D, M).T
         R = symmetrise(weight @ M - M)
         np.linalg.cholesky(R)
     except np.linalg.LinAlgError:

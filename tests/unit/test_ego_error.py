@@ -29,16 +29,21 @@ EGO_COVARIANCE = np.diag([0.04, 0.09, 1e-4, 0.25, 0.0])
 
 
 def scene(
-    seed: int, count: int = 4, covariance: FloatArray | None = EGO_COVARIANCE
+    seed: int, count: int = 4, covariance: FloatArray | None = EGO_COVARIANCE, more: dict[str, float] | None = None
 ) -> tuple[list[Candidate], FloatArray, FloatArray]:
     """Candidates, and the means and covariances of their tracks, near to each other."""
     rng = np.random.default_rng(seed)
     ego = EgoPose(0.0, 0.0, 0.2, 20.0, 0.1, covariance)
-    objects = [Detection(x_m=x, y_m=y, speed_mps=15.0) for x, y in PLACES[:count]]
-    found, _ = Preprocess(OpenSpace(), NoMerge(), CTRV(), (-1.74, 0.0))(batch(*objects), SensorModel(std=STD), ego)
+    objects = [
+        Detection(x_m=x, y_m=y, speed_mps=15.0, bearing_rad=np.arctan2(y, x) if more else None)
+        for x, y in PLACES[:count]
+    ]
+    sensor = SensorModel(std={**STD, **(more or {})})
+    found, _ = Preprocess(OpenSpace(), NoMerge(), CTRV(), (-1.74, 0.0))(batch(*objects), sensor, ego)
     roots = rng.normal(size=(count, 5, 5)) * 0.3
     covariances = roots @ roots.mT + 0.01 * np.eye(5)
-    means = np.array([[*candidate.values.values(), 0.1, 0.0] for candidate in found])[:, [0, 1, 3, 2, 4]]
+    values = [(*(one.values[name] for name in STD), 0.1, 0.0) for one in found]
+    means = np.array(values)[:, [0, 1, 3, 2, 4]]
     return found, means + 0.3 * rng.normal(size=means.shape), covariances
 
 
@@ -118,6 +123,14 @@ def test_a_detection_that_its_track_does_not_explain_says_nothing_of_the_ego() -
     for one, other in zip(of_others, without, strict=True):
         np.testing.assert_allclose(one.z, other.z, rtol=1e-12)
         np.testing.assert_allclose(one.R, other.R, rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_component_that_follows_from_others_leaves_no_indefinite_covariance(seed: int) -> None:
+    candidates, means, covariances = scene(seed, more={"bearing_rad": 0.02})
+    for one, x, P in zip(shared(candidates, means, covariances), means, covariances, strict=True):
+        assert np.linalg.eigvalsh(correct_one(x, P, one).covariance)[0] > 0.0
+        assert np.linalg.eigvalsh(one.R)[0] > 1e-5
 
 
 def test_where_a_covariance_is_none_every_detection_stands_for_itself() -> None:
