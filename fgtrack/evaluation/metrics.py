@@ -18,7 +18,7 @@ from fgtrack.evaluation.left_out import left_out
 from fgtrack.evaluation.matching import ERROR_NAMES, Matching, confirmed, match, track_errors
 from fgtrack.evaluation.multi_object import MultiObjectMetrics, multi_object_metrics
 from fgtrack.evaluation.prediction import PredictionErrors, prediction_errors
-from fgtrack.evaluation.residual_samples import residual_samples
+from fgtrack.evaluation.residual_samples import ResidualSamples, residual_samples
 from fgtrack.evaluation.statistics import ChiSquareMean, Distribution, Moments
 from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, evaluation_config
 from fgtrack.models.measurement import ANGULAR
@@ -177,11 +177,13 @@ def evaluate(run: Run, options: EvaluationConfig | None = None) -> Metrics:
     Without `options` it is judged as its configuration says.
     """
     options = options or evaluation_config(run)
-    return evaluate_matched(run, match(run, options), options)
+    return evaluate_matched(run, match(run, options), options, residual_samples(run))
 
 
-def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationConfig) -> Metrics:
-    """Metrics of `run`, whose `match` by these `options` is known."""
+def evaluate_matched(
+    run: Run, matching: Matching | None, options: EvaluationConfig, samples: ResidualSamples
+) -> Metrics:
+    """Metrics of `run`, whose `match` by these `options` and `residual_samples` are known."""
     ids = run.tracks["track_id"]
     is_confirmed = confirmed(run.tracks)
     busy = run.timing["num_detections"] > 0
@@ -193,7 +195,7 @@ def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationCon
         num_tracks=len(np.unique(ids)),
         num_confirmed=len(np.unique(ids[is_confirmed])),
         sensors=_sensor_metrics(run),
-        residuals=residual_samples(run).moments(),
+        residuals=samples.moments(),
         time_per_tick_s=Distribution.of(time_s),
         time_per_detection_s=float(time_s.sum() / detections.sum()) if len(time_s) else math.nan,
         consistency=consistency(run, matching),

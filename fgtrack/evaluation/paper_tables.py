@@ -10,7 +10,7 @@ import numpy as np
 from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.evaluation.metrics import Metrics
 from fgtrack.evaluation.prediction import HORIZONS_S, PredictionErrors
-from fgtrack.evaluation.residual_samples import LOCAL_NAMES, ResidualSamples, residual_samples
+from fgtrack.evaluation.residual_samples import LOCAL_NAMES, ResidualSamples
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.sensed import Sensed, sensed
 from fgtrack.evaluation.statistics import Distribution, Moments
@@ -35,7 +35,7 @@ def with_paper_tables(tables: Tables, runs: Sequence[JudgedRun]) -> Tables:
 
     Raises `DataError` where the map that a run names is no map.
     """
-    by_sensor = [Row(one.label, of, sensor) for one in runs for sensor, of in sensed(one.run).items()]
+    by_sensor = [Row(one.label, of, sensor) for one in runs for sensor, of in sensed(one).items()]
     more = {
         "residuals": _residuals([Row(one.label, one.metrics) for one in runs]),
         "residuals_by": _residuals_by(runs),
@@ -67,7 +67,7 @@ def _residuals_by(runs: Sequence[JudgedRun]) -> Table:
     """A row for each run, group of samples and sensor."""
     rows: list[Row[_Moments]] = []
     for one in runs:
-        samples = residual_samples(one.run)
+        samples = one.samples
         sensors = np.unique(samples.sensors).tolist()
         for group, inside in _groups(samples):
             for sensor in sensors:

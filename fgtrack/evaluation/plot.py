@@ -28,7 +28,6 @@ from fgtrack.evaluation.figures.style import save
 from fgtrack.evaluation.figures.sweep import sweep, sweep_metrics
 from fgtrack.evaluation.figures.times import delays, timing
 from fgtrack.evaluation.matching import track_errors
-from fgtrack.evaluation.residual_samples import residual_samples
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged
 from fgtrack.evaluation.sendings import sendings
 from fgtrack.evaluation.statistics import Moments
@@ -134,7 +133,7 @@ def _arrivals(runs: Sequence[JudgedRun]) -> _Plans:
 
 def _transients(runs: Sequence[JudgedRun]) -> _Plans:
     for one in runs:
-        if len(residual_samples(one.run).sensors):
+        if len(one.samples.sensors):
             yield Planned(f"transient_{one.label}", partial(transient, one), is_extra=True)
 
 

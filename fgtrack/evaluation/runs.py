@@ -13,6 +13,7 @@ from fgtrack.core.types import IntArray
 from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
 from fgtrack.evaluation.matching import Matching, match, recorded
 from fgtrack.evaluation.metrics import Metrics, evaluate_matched
+from fgtrack.evaluation.residual_samples import ResidualSamples, residual_samples
 from fgtrack.io.run import EvaluationConfig, Run, evaluation_config, is_run_folder, load_run
 
 
@@ -42,6 +43,11 @@ class JudgedRun:
         return self.matching.now_ns[recorded(self.run, self.matching)]
 
     @cached_property
+    def samples(self) -> ResidualSamples:
+        """Innovations of the confirmed tracks. Raises `DataError` where the map that the run names is no map."""
+        return residual_samples(self.run)
+
+    @cached_property
     def lagged(self) -> tuple[LagMetrics, ...]:
         """Errors of present, lagged and final states; empty for a run without truth."""
         return lag_metrics(self.run, self.matching)
@@ -49,7 +55,7 @@ class JudgedRun:
     @cached_property
     def metrics(self) -> Metrics:
         """All metrics, judged as the run's configuration says."""
-        return evaluate_matched(self.run, self.matching, self.options)
+        return evaluate_matched(self.run, self.matching, self.options, self.samples)
 
 
 OneRun = Run | JudgedRun | Path | str

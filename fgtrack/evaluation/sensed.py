@@ -7,9 +7,8 @@ import numpy as np
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.innovations import message_delays
-from fgtrack.evaluation.residual_samples import residual_samples
+from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.sight import ego_states
-from fgtrack.io.run import Run
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +31,9 @@ class Sensed:
     """Fused detections of every track that has any of this sensor, shape (tracks,)."""
 
 
-def sensed(run: Run) -> dict[str, Sensed]:
+def sensed(one: JudgedRun) -> dict[str, Sensed]:
     """By sensor. Raises `DataError` where the map that the run names is no map."""
-    samples = residual_samples(run)
+    run, samples = one.run, one.samples
     found = {}
     for sensor in np.unique(run.updates["sensor"]).tolist():
         receipts_ns, delay_s = message_delays(run.updates.where(run.updates["sensor"] == sensor))

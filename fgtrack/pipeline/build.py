@@ -68,14 +68,13 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
     """
     road = build_road(config.map)
     motion, failures = config.motion_model(), Failures()
-    origin_m = (config.ego.detection_origin_x_m, config.ego.detection_origin_y_m)
     published_order = config.lifecycle.kind == "published"
     parts = TrackerParts(
         sensors=config.sensors,
         ego=_build_ego(config),
         inbox=_build_inbox(config),
         preprocess=(PublishedPreprocess if published_order else Preprocess)(
-            road, config.merge, motion, origin_m, ExclusionAreas.read(config.map.excluded)
+            road, config.merge, motion, config.ego.detection_origin_m, ExclusionAreas.read(config.map.excluded)
         ),
         association=config.association,
         bank=RestartingBank(lambda: build_bank(config, failures), failures),
@@ -93,9 +92,9 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
 
 def build_lifecycle(config: Config) -> Lifecycle:
     """What says which tracks are believed, and which end."""
-    rules, origin_m = config.lifecycle, (config.ego.detection_origin_x_m, config.ego.detection_origin_y_m)
+    rules = config.lifecycle
     if isinstance(rules, ExistenceRules):
-        return ExistenceLifecycle(rules, config.sensors, origin_m)
+        return ExistenceLifecycle(rules, config.sensors, config.ego.detection_origin_m)
     return (PublishedLifecycle if rules.kind == "published" else CountingLifecycle)(rules, config.sensors)
 
 
@@ -141,12 +140,10 @@ def _build_backward_forward(config: Config, failures: Failures) -> TrackBank:
     return ObjectBank(motion, one, config.filter.storage_s)
 
 
-def _build_incremental(config: Config, failures: Failures) -> TrackBank:
-    return SmootherBank(config.motion_model(), config.smoother, IncrementalBackend, config.initiation.method, failures)
-
-
-def _build_batch(config: Config, failures: Failures) -> TrackBank:
-    return SmootherBank(config.motion_model(), config.smoother, BatchBackend, config.initiation.method, failures)
+def _smoother(backend: type[IncrementalBackend] | type[BatchBackend]) -> Callable[[Config, Failures], TrackBank]:
+    return lambda config, failures: SmootherBank(
+        config.motion_model(), config.smoother, backend, config.initiation.method, failures
+    )
 
 
 def _build_banded(config: Config, failures: Failures) -> TrackBank:
@@ -156,8 +153,8 @@ def _build_banded(config: Config, failures: Failures) -> TrackBank:
 #: Banks that are built from settings of their own.
 _BANKS: Mapping[str, Callable[[Config, Failures], TrackBank]] = {
     "ekf-backward-forward": _build_backward_forward,
-    "smoother": _build_incremental,
-    "smoother-batch": _build_batch,
+    "smoother": _smoother(IncrementalBackend),
+    "smoother-batch": _smoother(BatchBackend),
     "smoother-banded": _build_banded,
 }
 

@@ -92,6 +92,11 @@ class EgoConfig:
     yaw_rate_std_radps: NonNegativeFloat = 0.0
     """The same of its yaw rate."""
 
+    @property
+    def detection_origin_m(self) -> tuple[float, float]:
+        """Origin of the detections' ego frame, ahead of the ego reference point and to its left."""
+        return self.detection_origin_x_m, self.detection_origin_y_m
+
 
 @dataclass(frozen=True)
 class InboxConfig:

@@ -101,11 +101,7 @@ def _on_the_birth_stamp(rng: np.random.Generator, name: str) -> Stream:
     return _open(rng, name, CTRV(), (*_at(0.0, 3), *_ROUNDS))
 
 
-def _called(name: str, draw: Callable[[np.random.Generator, str], Stream]) -> Draw:
-    return lambda rng: draw(rng, name)
-
-
-_NAMED: Mapping[str, Callable[[np.random.Generator, str], Stream]] = {
+_NAMED: Mapping[str, Callable[..., Stream]] = {
     "burst of 12 within 11 ms": partial(_in_a_burst, motion=CTRV(), apart_s=0.001),
     "12 on one stamp": partial(_in_a_burst, motion=CTRV(), apart_s=0.0),
     "12 on one stamp, CTRA": partial(_in_a_burst, motion=CTRA(), apart_s=0.0),
@@ -126,4 +122,4 @@ _NAMED: Mapping[str, Callable[[np.random.Generator, str], Stream]] = {
 }
 
 #: By name.
-NASTY: Mapping[str, Draw] = {name: _called(name, draw) for name, draw in _NAMED.items()}
+NASTY: Mapping[str, Draw] = {name: partial(draw, name=name) for name, draw in _NAMED.items()}

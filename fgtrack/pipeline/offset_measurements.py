@@ -28,8 +28,7 @@ class Remeasure:
     def __init__(self, config: Config, path: EgoPath | None) -> None:
         """`path`: that of the ego; None where all detections are in the map frame."""
         self._path = path
-        origin_m = (config.ego.detection_origin_x_m, config.ego.detection_origin_y_m)
-        self._preprocess = Preprocess(OpenSpace(), config.merge, config.motion.model(), origin_m)
+        self._preprocess = Preprocess(OpenSpace(), config.merge, config.motion.model(), config.ego.detection_origin_m)
         self._sensors = {name: _position_only(sensor) for name, sensor in config.sensors.items()}
 
     def measurement(

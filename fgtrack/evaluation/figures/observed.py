@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.figures.style import WRONG, StyledFigure, colour, legend_above, styled, title, titled
-from fgtrack.evaluation.residual_samples import LOCAL_NAMES, residual_samples
+from fgtrack.evaluation.residual_samples import LOCAL_NAMES
 from fgtrack.evaluation.runs import OneRun, one_judged
 from fgtrack.evaluation.sensed import Sensed
 from fgtrack.evaluation.sensed import sensed as of_sensors
@@ -48,7 +48,7 @@ def transient(run: OneRun) -> Figure:
         The run has no innovations of confirmed tracks.
     """
     one = one_judged(run)
-    samples = residual_samples(one.run)
+    samples = one.samples
     names = [name for name in LOCAL_NAMES if np.isfinite(samples.values[name]).any()]
     if not names:
         raise DataError(f"{one.label}: has no innovations of confirmed tracks, so there is no transient to draw")
@@ -87,7 +87,7 @@ def sensed(run: OneRun) -> Figure:
         The run has no detections.
     """
     one = one_judged(run)
-    found = of_sensors(one.run)
+    found = of_sensors(one)
     if not found:
         raise DataError(f"{one.label}: has no detections, so there is nothing to draw")
     figure = StyledFigure(figsize=(12.0, 4.2))
