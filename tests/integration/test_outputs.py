@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -481,11 +482,21 @@ def test_compare_tells_a_run_whose_tables_were_changed(here: Path, capfd: pytest
     ],
     ids=str,
 )
-def test_a_pipe_in_place_of_a_file_is_one_line_at_once(here: Path, words: tuple[str, ...]) -> None:
+def test_a_pipe_in_place_of_a_file_is_one_line_at_once(
+    here: Path, capfd: pytest.CaptureFixture[str], words: tuple[str, ...]
+) -> None:
+    def waits(*_: object) -> None:
+        pytest.fail("waits for the pipe")
+
     os.mkfifo("pipe.jsonl")
-    done = subprocess.run([sys.executable, "-m", "fgtrack", *words], capture_output=True, text=True, timeout=60)
-    assert done.returncode in (1, 2)
-    [line] = done.stderr.splitlines()
+    before = signal.signal(signal.SIGALRM, waits)
+    signal.alarm(60)
+    try:
+        assert run(words) in (1, 2)
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+    [line] = capfd.readouterr().err.splitlines()
     assert "pipe.jsonl" in line
     assert "internal error" not in line
     assert not Path("new").exists()
