@@ -4,12 +4,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from fgtrack.advice.arrivals import EGO, FEWEST, Arrivals, arrivals_of, overtaken
-from fgtrack.advice.clocks import offset_findings, stamp_findings
+from fgtrack.advice.arrivals import FEWEST, Arrivals, arrivals_of, overtaken
+from fgtrack.advice.clocks import offset_findings, receipt_findings, stamp_findings
 from fgtrack.advice.finding import Finding, milliseconds, percent
 from fgtrack.advice.noise import NoiseFit, noise_findings, noise_fits
-from fgtrack.advice.page import Advice, Change
-from fgtrack.advice.windows import beyond_lags, reach, window_findings
+from fgtrack.advice.page import Advice
+from fgtrack.advice.windows import beyond_lags, window_findings
+from fgtrack.core.caution import EGO
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Message
@@ -19,7 +20,7 @@ from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.clock_offsets import OffsetReport, OffsetRules, estimate_offsets
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.effective import with_sensors
+from fgtrack.pipeline.effective import effective, with_sensors
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.shipped import read_config, settings_of
 from fgtrack.pipeline.stamping import mended
@@ -103,55 +104,45 @@ class _Adviser:
         """All steps."""
         self._take(self._strangers())
         before = self._config
-        sensors = [name for name in self._arrivals if name != EGO and name not in self._config.ignore_sensors]
+        sensors = [name for name in self._arrivals if name != EGO and name not in before.ignore_sensors]
         if not sensors:
             raise DataError(f"{self._recording}: there are no detections of a sensor that the configuration has")
         for name in [*sensors, *([EGO] if EGO in self._arrivals else [])]:
             self._take(stamp_findings(self._arrivals[name]))
-        self._take(_receipts([self._arrivals[name] for name in sensors]))
-        first = list(beginning(self._messages, nanoseconds(TRIAL_S)))
-        self._take(
-            Finding("input", about, 45.0 if "never measures" in text else 94.0, f"{text}.")
-            for about, _, text in (_about(line) for line in suspicions(first, self._config))
-        )
+        self._take(receipt_findings([self._arrivals[name] for name in sensors]))
+        self._take(self._misread())
         self._take(self._offsets())
         seen = arrivals_of(
             mended(message, self._config.sensors)
             for message in self._messages
             if isinstance(message, DetectionList) and message.sensor in sensors
         )
-        arrivals = [seen[name] for name in sensors]
-        shares = overtaken(seen, sensors)
-        timed = [one for one in arrivals if abs(one.quantile_s(0.5)) < 3600.0]
+        shares, timed = overtaken(seen, sensors), [one for one in seen.values() if one.has_stamps]
         self._take(self._late(timed, shares))
         self._take(window_findings(timed, self._config))
         self._take(self._ego())
         self._on_step("tracking")
-        run_before, run_after = self._replayed(before), self._replayed(self._config)
+        run_before = self._replayed(before)
+        run_after = run_before if self._config == before else self._replayed(self._config)
+        if run_after is not None and self._take(self._cautions(run_after)):
+            run_after = self._replayed(self._config)
         fits = [] if run_after is None else noise_fits(run_after)
-        if run_after is not None:
-            known = {one.about for one in self._findings if one.weight >= _USELESS}
-            if self._take(_remaining(run_after, known)):
-                run_after = self._replayed(self._config) or run_after
-                fits = noise_fits(run_after)
-            if not self._is_useless:
-                self._take(noise_findings(run_after, fits))
-        changes = self._changes()
+        if run_after is not None and not self._is_useless:
+            self._take(noise_findings(run_after, fits))
         if tune and any(one.kind == "noise" for one in self._findings):
             self._on_step("tune")
             self._config = tuned({self._recording: lambda: iter(self._tracked)}, self._config).config
         return Advice(
-            self._recording,
-            tuple(sorted(self._findings, key=lambda one: -one.weight)),
-            tuple(self._fine(arrivals, fits)),
-            changes,
-            self._config,
-            tuple(arrivals),
-            shares,
-            tuple(beyond_lags(timed)),
-            tuple(fits),
-            _used(run_before, run_after),
-            broken,
+            recording=self._recording,
+            findings=tuple(sorted(self._findings, key=lambda one: -one.weight)),
+            fine=tuple(self._fine(seen, fits)),
+            config=self._config,
+            arrivals=tuple(seen.values()),
+            overtaken=shares,
+            beyond=tuple(beyond_lags(timed)),
+            noise=tuple(fits),
+            used=_used(run_before, run_after),
+            broken=broken,
         )
 
     def _take(self, findings: Iterator[Finding]) -> bool:
@@ -174,16 +165,26 @@ class _Adviser:
         strangers = [name for name in self._arrivals if name not in known]
         if not strangers:
             return
-        has = set[str]()
+        measured = dict.fromkeys(strangers, "nothing")
         for message in self._messages:
             if isinstance(message, DetectionList) and message.sensor in strangers and message.objects:
-                has.add(f"{message.sensor}: {', '.join(message.objects[0].measured)}")
-        text = (
-            f"no model of {', '.join(strangers)} ({'; '.join(sorted(has)) or 'without detections'}): give "
-            f"sensors.NAME.std, or leave them out. Set ignore_sensors: [{', '.join(strangers)}]."
-        )
+                measured[message.sensor] = ", ".join(message.objects[0].measured)
+        has = "; ".join(f"{name}: {components}" for name, components in measured.items())
+        text = f"no model of {', '.join(strangers)} ({has}): give sensors.NAME.std, or leave them out."
         ignored = sorted({*self._config.ignore_sensors, *strangers})
         yield Finding("model", "sensors", 98.0, text, {"ignore_sensors": ignored})
+
+    def _misread(self) -> Iterator[Finding]:
+        """What is suspicious in how the first seconds are read."""
+        for one in suspicions(list(beginning(self._messages, nanoseconds(TRIAL_S))), self._config):
+            yield Finding("input", one.about, 94.0 if one.spoils else 45.0, f"{one.text}.", one.settings)
+
+    def _cautions(self, run: Run) -> Iterator[Finding]:
+        """What a run with the settings warns of, but of sensors whose trouble is known."""
+        known = {one.about for one in self._findings if one.weight >= _USELESS}
+        for one in cautions(run):
+            if one.about not in known:
+                yield Finding("track", one.about, 70.0, f"{one.text}.", one.settings)
 
     def _offsets(self) -> Iterator[Finding]:
         """Clocks that do not agree, where that can be known."""
@@ -240,7 +241,7 @@ class _Adviser:
             named = ", ".join(f"{percent(share)} of {name}" for name, share in often.items())
             text = (
                 f"lists are overtaken by newer ones ({named}), and ekf-backward-forward forgets what was fused after "
-                "the stamp of a late list. Set estimator: ekf-replay, or smoother where the output may wait."
+                "the stamp of a late list; where the output may wait, smoother takes them, too."
             )
             yield Finding("late", "estimator", 60.0, text, {"estimator": "ekf-replay"})
 
@@ -273,27 +274,21 @@ class _Adviser:
         except DataError:
             return None
 
-    def _changes(self) -> tuple[Change, ...]:
-        whys = {
-            key: (value, f"{one.about}: {one.text}") for one in self._findings for key, value in one.settings.items()
-        }
-        return tuple(Change(key, value, why) for key, (value, why) in whys.items())
-
-    def _fine(self, arrivals: Sequence[Arrivals], fits: Sequence[NoiseFit]) -> Iterator[str]:
+    def _fine(self, seen: Mapping[str, Arrivals], fits: Sequence[NoiseFit]) -> Iterator[str]:
         wrong = {(one.kind, one.about) for one in self._findings}
         kinds = {kind for kind, _ in wrong}
         ego = self._arrivals.get(EGO)
         if ego is not None and not wrong & {("ego", EGO), ("clock", EGO), ("input", EGO)} and ego.period_s:
             longest, delay = milliseconds(ego.longest_gap_s), milliseconds(ego.quantile_s(0.5))
             yield f"the ego ({1.0 / ego.period_s:.0f} Hz, longest gap {longest}, delay {delay})"
-        clocks = [one.name for one in arrivals if ("clock", one.name) not in wrong]
+        clocks = [name for name in seen if ("clock", name) not in wrong]
         if clocks:
             yield f"stamps of {', '.join(clocks)}"
         if not kinds & {"input", "model"}:
             yield "frames, angles and fields"
-        if "window" not in kinds:
-            found = reach(self._config)
-            yield f"{found.key} ({found.length_s:g} s) and max_delay_s"
+        if not kinds & {"window", "receipt"}:
+            found = effective(self._config)
+            yield f"{found.lag_key} ({found.lag_s:g} s) and max_delay_s"
         if "track" not in kinds:
             yield "the life of tracks"
         noise = [one.sensor for one in fits if ("noise", one.sensor) not in wrong]
@@ -301,39 +296,10 @@ class _Adviser:
             yield f"noise of {', '.join(noise)}"
 
 
-def _receipts(arrivals: Sequence[Arrivals]) -> Iterator[Finding]:
-    """Sensors whose stamps are their receipts."""
-    names = [one.name for one in arrivals if one.is_receipt and len(one.counts) >= FEWEST]
-    if names:
-        text = (
-            "every stamp is the receipt: the recording has no times of receipt, or they were taken for stamps. "
-            "Nothing is known of the delay, and no advice on it is given"
-        )
-        text += "." if len(names) == len(arrivals) else "; its latency is sensors.NAME.clock_offset_s."
-        yield Finding("receipt", ", ".join(names), 20.0, text)
-
-
-def _about(line: str) -> tuple[str, str, str]:
-    """Whom a suspicion is of, and the rest."""
-    about, colon, text = line.partition(": ")
-    return (about, colon, text) if " " not in about else (EGO if "ego" in about else "input", "", line)
-
-
-def _remaining(run: Run, known: set[str]) -> Iterator[Finding]:
-    """What a run with the settings warns of, but of sensors whose trouble is `known`."""
-    for line in cautions(run):
-        about, _, text = _about(line)
-        if about not in known and not ("no state of the ego" in text and EGO in known):
-            mend = {"birth.ego_speed_factor": 0.0} if "birth.ego_speed_factor to 0" in text else {}
-            yield Finding("track", about, 70.0, f"{text}.", mend)
-
-
 def _used(before: Run | None, after: Run | None) -> dict[str, tuple[float, float]]:
     """Share of the detections of each sensor that took part."""
-    shares: list[dict[str, float]] = []
-    for run in (before, after):
-        counts = {} if run is None else run.meta["counts"]
-        shares.append(
-            {name: sum(one.get(fate, 0) for fate in USED) / (sum(one.values()) or 1) for name, one in counts.items()}
-        )
-    return {name: (shares[0].get(name, 0.0), share) for name, share in shares[1].items()}
+    old, new = (
+        {name: sum(one.get(fate, 0) for fate in USED) / (sum(one.values()) or 1) for name, one in counts.items()}
+        for counts in ({} if run is None else run.meta["counts"] for run in (before, after))
+    )
+    return {name: (old.get(name, 0.0), share) for name, share in new.items()}

@@ -6,12 +6,12 @@ from functools import cached_property
 
 import numpy as np
 
+from fgtrack.core.caution import EGO
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, DetectionList, EgoState, FloatArray, IntArray, Message
 
-__all__ = ["EGO", "Arrivals", "Bursts", "arrivals_of", "overtaken"]
+__all__ = ["FEWEST", "Arrivals", "Bursts", "arrivals_of", "overtaken"]
 
-EGO = "ego"
 FEWEST = 20
 """Messages of which something can be said."""
 _ONE_STD = 0.1587  # quantile of a normal variable one standard deviation below its median

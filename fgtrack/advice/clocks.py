@@ -1,44 +1,41 @@
 """Whether stamps can be believed: zeros, other clocks, the future, jumps, drifts, and offsets between sensors."""
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from scipy.special import stdtrit
 
-from fgtrack.advice.arrivals import EGO, FEWEST, Arrivals
+from fgtrack.advice.arrivals import FEWEST, Arrivals
 from fgtrack.advice.finding import Finding, milliseconds, percent
+from fgtrack.core.caution import EGO
 from fgtrack.pipeline.clock_offsets import OffsetReport, SensorOffset
 from fgtrack.pipeline.truth_offsets import TRUTH
 
-__all__ = ["OFFSET_STDS", "offset_findings", "offset_of", "stamp_findings"]
+__all__ = ["offset_findings", "receipt_findings", "stamp_findings"]
 
 _AHEAD_S = 1e-3  # rounding of stamps
 _AHEAD_SHARE = 0.005
 _JUMP_S, _JUMP_STDS, _JUMP_WINDOW_S = 0.1, 8.0, 3.0
 _DRIFT_BINS, _DRIFT_S, _DRIFT_STDS, _DRIFT_FIT = 10, 0.01, 5.0, 0.8
-_LONGEST_S = 3600.0
-OFFSET_STDS = 4.0
-"""An offset that is larger than so many of its standard deviations is believed ..."""
+_SURE = 0.99  # an offset is believed where 0 is outside of this interval of Student's t ...
+_OFFSET_STDS = 4.0  # ... or farther off than so many standard deviations, where these are of a model ...
 _SMALLEST_OFFSET_S = 0.01  # ... if it matters
 _LARGEST_STD_S = 0.05
 
 
 def stamp_findings(one: Arrivals) -> Iterator[Finding]:
     """What the stamps and receipts of one sensor, or of the ego, show by themselves."""
-    name, receipt = one.name, {f"sensors.{one.name}.stamp_from": "receipt"}
-    mend = "" if name == EGO else f" Set sensors.{name}.stamp_from: receipt; its delay is then unknown."
+    name, receipt = one.name, {} if one.name == EGO else {f"sensors.{one.name}.stamp_from": "receipt"}
     if not one.stamps_ns.any():
         if name != EGO:  # of the ego it is a suspicion of what is read
-            text = f"all {len(one.stamps_ns)} stamps are 0: its driver sets none.{mend}"
+            text = f"all {len(one.stamps_ns)} stamps are 0: its driver sets none, so its delay stays unknown."
             yield Finding("clock", name, 95.0, text, receipt)
         return
     if one.is_other_clock:
-        off_s = float(np.median(one.delays_s))
-        text = (
-            f"stamps and receipts are {abs(off_s):.3g} s apart: they are of clocks that have nothing in common.{mend}"
-        )
-        yield Finding("clock", name, 95.0, text, {} if name == EGO else receipt)
+        off_s = abs(float(np.median(one.delays_s)))
+        text = f"stamps and receipts are {off_s:.3g} s apart: they are of clocks that have nothing in common."
+        yield Finding("clock", name, 95.0, text, receipt)
         return
     if len(one.stamps_ns) < FEWEST:
         return
@@ -68,6 +65,18 @@ def stamp_findings(one: Arrivals) -> Iterator[Finding]:
             "synchronise the clock, or replay shorter pieces."
         )
         yield Finding("clock", name, 60.0, text)
+
+
+def receipt_findings(arrivals: Sequence[Arrivals]) -> Iterator[Finding]:
+    """Sensors whose stamps are their receipts."""
+    names = [one.name for one in arrivals if one.is_receipt and len(one.counts) >= FEWEST]
+    if names:
+        text = (
+            "every stamp is the receipt: the recording has no times of receipt, or they were taken for stamps. "
+            "Nothing is known of the delay, and no advice on it is given"
+        )
+        text += "." if len(names) == len(arrivals) else "; its latency is sensors.NAME.clock_offset_s."
+        yield Finding("receipt", ", ".join(names), 20.0, text)
 
 
 def _jump(one: Arrivals) -> tuple[float, float] | None:
@@ -110,37 +119,32 @@ def _drift(one: Arrivals) -> tuple[float, float, float] | None:
     return 1e6 * float(slope), 1e6 * std, change_s
 
 
-@dataclass(frozen=True)
-class _Offset:
-    """By how much stamps are late, and the standard deviation of that."""
-
-    value_s: float
-    std_s: float
-
-
-def offset_of(one: SensorOffset) -> _Offset | None:
-    """The offset of a sensor with a standard deviation that its residuals bear out; None where it is not known."""
+def _believed_s(one: SensorOffset) -> tuple[float, float] | None:
+    """The offset of a sensor and half of its 95 % interval; None where it may well be none."""
     if one.offset_s is None or not one.std_s or one.std_s > _LARGEST_STD_S:
         return None
-    return _Offset(one.offset_s, max(one.std_s * max(1.0, one.residual or 1.0), (one.spread_s or 0.0) * 2.0 / 3.0))
+    if one.dof is None:
+        std_s = max(one.std_s * max(1.0, one.residual or 1.0), (one.spread_s or 0.0) * 2.0 / 3.0)
+        least_s, half_s = _OFFSET_STDS * std_s, 2.0 * std_s
+    else:
+        least_s, half_s = (one.std_s * float(stdtrit(one.dof, 0.5 + share / 2.0)) for share in (_SURE, 0.95))
+    return None if abs(one.offset_s) < max(least_s, _SMALLEST_OFFSET_S) else (one.offset_s, half_s)
 
 
 def offset_findings(report: OffsetReport, configured_s: Mapping[str, float]) -> Iterator[Finding]:
     """Sensors whose clock does not agree with that of the reference; `configured_s` is what is taken off already."""
     for one in report.sensors:
-        found = offset_of(one)
-        if found is None or abs(found.value_s) < max(OFFSET_STDS * found.std_s, _SMALLEST_OFFSET_S):
+        found = _believed_s(one)
+        if found is None:
             continue
-        total_s = round(configured_s[one.sensor] + found.value_s, 4)
-        way = "later" if found.value_s > 0.0 else "earlier"
-        off = f"{milliseconds(abs(found.value_s))} (± {milliseconds(2.0 * found.std_s)})"
-        key = f"sensors.{one.sensor}.clock_offset_s"
+        offset_s, half_s = found
+        off = f"{milliseconds(abs(offset_s))} (± {milliseconds(half_s)}) {'later' if offset_s > 0.0 else 'earlier'}"
         if report.reference == TRUTH:
-            text = f"its stamps are {off} {way} than the truth of the recording says. Set {key}: {total_s:g}."
+            text = f"its stamps are {off} than the truth of the recording says."
         else:
             text = (
-                f"its stamps are {off} {way} than those of {report.reference}. Which of the two clocks is wrong the "
-                f"recording does not tell: {report.reference} is taken to be right (--reference takes another). Set "
-                f"{key}: {total_s:g}."
+                f"its stamps are {off} than those of {report.reference}. Which of the two clocks is wrong the "
+                f"recording does not tell: {report.reference} is taken to be right (--reference takes another)."
             )
-        yield Finding("clock", one.sensor, 90.0, text, {key: total_s})
+        total_s = round(configured_s[one.sensor] + offset_s, 4)
+        yield Finding("clock", one.sensor, 90.0, text, {f"sensors.{one.sensor}.clock_offset_s": total_s})

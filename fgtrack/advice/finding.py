@@ -11,7 +11,7 @@ _NICE = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 
 @dataclass(frozen=True)
 class Finding:
-    """A sentence or two with numbers, and settings."""
+    """A sentence or two with numbers, and settings; `str` tells all of it."""
 
     kind: str
     """What it is about: `input`, `model`, `clock`, `late`, `loss`, `window`, `ego`, `noise`, `track`."""
@@ -22,6 +22,16 @@ class Finding:
     text: str
     settings: Mapping[str, object] = field(default_factory=dict)
     """Values of keys of the configuration that mend it; empty where no setting does."""
+
+    def __str__(self) -> str:
+        mend = "".join(f" Set {key}: {_written(value)}." for key, value in self.settings.items())
+        return f"{self.about}: {self.text}{mend}"
+
+
+def _written(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:g}"
+    return f"[{', '.join(value)}]" if isinstance(value, list) else str(value)
 
 
 def nice_above(value: float) -> float:

@@ -34,7 +34,6 @@ class Advice:
     """The most important first."""
     fine: tuple[str, ...]
     """What nothing was found of."""
-    changes: tuple[Change, ...]
     config: Config = field(repr=False)
     """The configuration with these changes; with noise fitted to the recording where that was asked for."""
     arrivals: tuple[Arrivals, ...] = field(repr=False)
@@ -49,9 +48,17 @@ class Advice:
     """Why the recording breaks off, where it does; what came before was used."""
 
     @property
+    def changes(self) -> tuple[Change, ...]:
+        """The settings that the findings change, the most important first; fitted noise is not among them."""
+        found: dict[str, Change] = {}
+        for one in self.findings:
+            found |= {key: Change(key, value, f"{one.about}: {one.text}") for key, value in one.settings.items()}
+        return tuple(found.values())
+
+    @property
     def sentences(self) -> tuple[str, ...]:
         """The findings, and a line of what is fine."""
-        lines = [f"{one.about}: {one.text}" for one in self.findings]
+        lines = [str(one) for one in self.findings]
         if self.fine:
             lines.append(f"Fine: {', '.join(self.fine)}.")
         return tuple(lines)
@@ -112,7 +119,7 @@ class Advice:
         lines = [line for one in self.changes for line in _wrapped(f"{one.key} = {one.value}: {one.why}")]
         if not self.changes:
             lines = ["Nothing is changed."]
-        rest = [line for one in self.findings if not one.settings for line in _wrapped(f"{one.about}: {one.text}")]
+        rest = [line for one in self.findings if not one.settings for line in _wrapped(str(one))]
         return [*lines, *(["", "Without a setting that mends it:"] if rest else []), *rest]
 
 

@@ -52,8 +52,8 @@ def _try_out(recording: Path, config: Config) -> Trial:
         for line in left_out(trial.run.meta):
             say(f"first {trial.duration_s:g} s of {line}")
         say(f"first {trial.duration_s:g} s: {len(set(trial.run.tracks['track_id'].tolist()))} tracks")
-    for line in trial.suspicions:
-        warn(line)
+    for found in trial.suspicions:
+        warn(str(found))
     return trial
 
 

@@ -75,7 +75,7 @@ def replay(
         say(f"{result.path}: {what.format_map(result.meta)}{missed}")
     for line in left_out(results[0].meta):  # the same of all
         say(line)
-    for line in dict.fromkeys([line for run in runs for line in cautions(run)] + noise_cautions(runs[0])):
+    for line in dict.fromkeys(map(str, [*(one for run in runs for one in cautions(run)), *noise_cautions(runs[0])])):
         warn(line)
     if results[0].broken is not None:  # the others break off at the same place
         raise DataError(f"{located(results[0].broken, str(recording))}; replayed up to there")

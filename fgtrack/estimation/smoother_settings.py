@@ -53,6 +53,11 @@ class SmootherSettings:
         if len(set(self.lagged_s)) < len(self.lagged_s):
             raise ValueError(f"lagged_s: names a lag twice, is {list(self.lagged_s)}")
 
+    @property
+    def behind_s(self) -> float:
+        """How far behind the window detections are still fused."""
+        return self.ring_s if self.late == "fuse" else 0.0
+
     @classmethod
     def of_options(cls, lag_s: float, options: Mapping[str, Any]) -> "SmootherSettings":
         """The settings of the estimator of one object, which gives no lagged output unless told to.

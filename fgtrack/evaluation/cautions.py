@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
+from fgtrack.core.caution import EGO, Caution
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.failures import Failure
@@ -14,6 +15,7 @@ from fgtrack.evaluation.innovations import num_measured
 from fgtrack.evaluation.left_out import because
 from fgtrack.evaluation.statistics import ChiSquareMean
 from fgtrack.io.run import Run, Table, digest
+from fgtrack.tracking.soundness import IN_A_ROW
 
 USED = ("birth", "in_sequence", "out_of_sequence", "beyond_window", "merged")
 """Dispositions of detections that took part."""
@@ -34,22 +36,18 @@ _CURES = {
     "compare the keys of sensors.{sensor}.std with what `fgtrack info` shows",
     "failed": "no ego state near the stamp, or a numerical failure: check the clock of the ego",
 }
+_STANDING = {"birth.ego_speed_factor": 0.0}
+_NAME_EGO = "name its topic in the configuration (`fgtrack info` lists the topics)"
 
 
-_NO_EGO = (
-    "no state of the ego was received, so nothing in its frame can be placed: name its topic in the configuration "
-    "(`fgtrack info` lists the topics)"
-)
+def cautions(run: Run) -> list[Caution]:
+    """What is wrong with `run` as far as its files say."""
+    found = (_changed, _clocks, _ego, _map, _lost, _window, _failures)
+    return [one for of_kind in found for one in of_kind(run)]
 
 
-def cautions(run: Run) -> list[str]:
-    """What is wrong with `run` as far as its files say, a line each with cause and cure."""
-    found = (_changed, _clocks, _ego, _surroundings, _lost, _window, _failures)
-    return [line for of_kind in found for line in of_kind(run)]
-
-
-def noise_cautions(run: Run) -> list[str]:
-    """A line for each sensor whose innovations say that the noise does not fit; see also the verdict of `compare`.
+def noise_cautions(run: Run) -> list[Caution]:
+    """Sensors whose innovations say that the noise does not fit; see also the verdict of `compare`.
 
     The median must be off as the mean is: the mean alone may be that of a few outliers, or of the first innovations of
     new tracks.
@@ -57,10 +55,11 @@ def noise_cautions(run: Run) -> list[str]:
     found = []
     for sensor, nis in misfits(run):
         size = "small" if nis.mean > nis.dof else "large"
-        found.append(
-            f"{sensor}: mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}, as if "
+        text = (
+            f"mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}, as if "
             f"errors were {math.sqrt(nis.mean / nis.dof):.2g} times what is configured; `{_tune(run)}` fits it"
         )
+        found.append(Caution(sensor, text))
     return found
 
 
@@ -101,61 +100,77 @@ def unused(run: Run) -> str | None:
     return f"none of the {updates.num_rows} detections was used ({', '.join(f'{n} {fate}' for fate, n in fates)})"
 
 
-def _changed(run: Run) -> Iterator[str]:
+def _changed(run: Run) -> Iterator[Caution]:
     """Whether the files of a finished run are those that it has written."""
     if run.path is not None and run.meta.get("complete") and digest(run.path) != run.meta.get("digest"):
-        yield "tracks.csv or updates.csv has been changed since the run: its digest is another; repeat the run"
+        yield Caution("tracks.csv or updates.csv", "changed since the run: the digest is another; repeat the run")
 
 
-def _clocks(run: Run) -> Iterator[str]:
+def _clocks(run: Run) -> Iterator[Caution]:
     for sensor, mine in _by_sensor(run.updates):
         if (run.updates["stamp_ns"][mine] == 0).all():
-            yield (
-                f"{sensor}: all stamps are 0: its driver does not set them, so nothing is known of its delay; "
+            text = (
+                "all stamps are 0: its driver does not set them, so nothing is known of its delay; "
                 f"`stamp_from: receipt` on its topic, or sensors.{sensor}.stamp_from, takes the receipt for the stamp"
             )
+            yield Caution(sensor, text, {f"sensors.{sensor}.stamp_from": "receipt"})
 
 
-def _ego(run: Run) -> Iterator[str]:
-    """Reasons for which more than half of the states of the ego were refused."""
-    for reason, count in dict(run.meta.get("ego_refused") or {}).items():
-        if 2 * count > run.ego.num_rows:
-            yield f"ego: {count} of {run.ego.num_rows} states not used, {reason}: look at the clock of its driver"
-
-
-def _surroundings(run: Run) -> Iterator[str]:
-    """No ego, or no map, where the configuration takes from them what new objects do."""
-    if not run.updates.num_rows or not _section(run, "birth").get("ego_speed_factor"):
-        return
-    failed = run.updates["disposition"] == "failed"
-    if not run.ego.num_rows and 2 * failed.sum() <= len(failed):
-        yield (
-            "no state of the ego was received, so new objects are assumed to stand still, and what the sensors could "
-            "see is not known: name its topic in the configuration (`fgtrack info` lists the topics), or set "
-            "birth.ego_speed_factor to 0"
+def _ego(run: Run) -> Iterator[Caution]:
+    """No ego where it is needed, or reasons for which more than half of its states were refused."""
+    failed = [f"{count} of {total} of {sensor}" for sensor, fate, count, total in _mostly(run) if fate == "failed"]
+    if run.ego.num_rows:
+        for reason, count in dict(run.meta.get("ego_refused") or {}).items():
+            if 2 * count > run.ego.num_rows:
+                text = f"{count} of {run.ego.num_rows} states not used, {reason}: look at the clock of its driver"
+                yield Caution(EGO, text)
+    elif failed:
+        text = f"no state was received, so nothing in its frame can be placed ({', '.join(failed)} failed)"
+        yield Caution(EGO, f"{text}: {_NAME_EGO}")
+    elif _ego_speeds_births(run):
+        text = (
+            "no state was received, so new objects are assumed to stand still, and what the sensors could see is not "
+            f"known: {_NAME_EGO}, or set birth.ego_speed_factor to 0"
         )
-    if not _section(run, "map").get("track"):
-        measured = run.detections
-        blind = [sensor for sensor, mine in _by_sensor(measured) if not np.isfinite(measured["yaw_rad"][mine]).any()]
-        if blind:
-            yield (
-                f"no map, and no heading from {', '.join(blind)}: new objects may drive in any direction; name the map "
-                "with --map (`oval` for the simulated races), or set birth.ego_speed_factor to 0 for open space"
-            )
+        yield Caution(EGO, text, _STANDING)
 
 
-def _lost(run: Run) -> Iterator[str]:
-    """Dispositions that hit more than half of the detections of a sensor."""
+def _map(run: Run) -> Iterator[Caution]:
+    """No map where new objects are as fast as the ego, in its direction."""
+    if not _ego_speeds_births(run) or _section(run, "map").get("track"):
+        return
+    measured = run.detections
+    blind = [sensor for sensor, mine in _by_sensor(measured) if not np.isfinite(measured["yaw_rad"][mine]).any()]
+    if blind:
+        text = (
+            f"there is none, and no heading from {', '.join(blind)}: new objects may drive in any direction; name the "
+            "map with --map (`oval` for the simulated races), or set birth.ego_speed_factor to 0 for open space"
+        )
+        yield Caution("map", text, _STANDING)
+
+
+def _ego_speeds_births(run: Run) -> bool:
+    """Whether new objects are assumed to be as fast as the ego, or nearly."""
+    return bool(run.updates.num_rows and _section(run, "birth").get("ego_speed_factor"))
+
+
+def _mostly(run: Run) -> Iterator[tuple[str, str, int, int]]:
+    """Sensors of which more than half of the detections were not used for one reason: it, how many, and of how many."""
     for sensor, mine in _by_sensor(run.updates):
-        fates, counts = np.unique(run.updates["disposition"][mine], return_counts=True)
-        for fate, count in zip(fates.tolist(), counts.tolist(), strict=True):
-            unset = fate == "too_old" and not run.updates["stamp_ns"][mine].any()  # which is told already
-            if fate not in USED and 2 * count > mine.sum() and not unset:
-                told = {"sensor": sensor, "because": because((run.meta.get("out_of_bounds") or {}).get(sensor, {}))}
-                cure = _too_old(run, sensor) if fate == "too_old" else _CURES[fate].format_map(told)
-                if fate == "failed" and not run.ego.num_rows:
-                    cure = _NO_EGO
-                yield f"{sensor}: {count} of {mine.sum()} {fate}: {cure}"
+        for fate, count in zip(*np.unique(run.updates["disposition"][mine], return_counts=True), strict=True):
+            if fate not in USED and 2 * count > mine.sum():
+                yield sensor, str(fate), int(count), int(mine.sum())
+
+
+def _lost(run: Run) -> Iterator[Caution]:
+    """Dispositions that hit more than half of the detections of a sensor, where nothing else tells it already."""
+    for sensor, fate, count, total in _mostly(run):
+        unset = fate == "too_old" and not run.updates["stamp_ns"][run.updates["sensor"] == sensor].any()
+        if unset or (fate == "failed" and not run.ego.num_rows):
+            continue
+        told = {"sensor": sensor, "because": because((run.meta.get("out_of_bounds") or {}).get(sensor, {}))}
+        cure = _too_old(run, sensor) if fate == "too_old" else _CURES[fate].format_map(told)
+        yield Caution(sensor, f"{count} of {total} {fate}: {cure}")
 
 
 def _too_old(run: Run, sensor: str) -> str:
@@ -166,44 +181,39 @@ def _too_old(run: Run, sensor: str) -> str:
         return (
             f"median delay {delay_s:.3g} s, allowed {limit_s:g} s: raise sensors.{sensor}.max_delay_s or mend its clock"
         )
-    key, lag_s = _reach(run)
-    return f"median delay {delay_s:.3g} s, older than the window ({key} {lag_s:g} s): raise it, or mend the clock"
+    return f"median delay {delay_s:.3g} s, older than {_told_window(run)[0]}: raise it, or mend the clock"
 
 
-def _window(run: Run) -> Iterator[str]:
+def _window(run: Run) -> Iterator[Caution]:
     """A window that holds less than two lists of a sensor."""
-    key, lag_s = _reach(run)
+    window, lag_s = _told_window(run)
     for sensor, mine in _by_sensor(run.updates):
         stamps_ns = np.unique(run.updates["stamp_ns"][mine])
         if len(stamps_ns) < FEWEST:
             continue
         period_s = float(np.median(np.diff(stamps_ns))) / NS_PER_S
         if lag_s < period_s:
-            yield f"{sensor}: one list every {period_s:.3g} s, longer than the window ({key} {lag_s:g} s): raise it"
+            yield Caution(sensor, f"one list every {period_s:.3g} s, longer than {window}: raise it")
 
 
-def _failures(run: Run) -> Iterator[str]:
+def _failures(run: Run) -> Iterator[Caution]:
     """What failed inside the estimator; damped steps alone are none: with bearings they belong to the work."""
     counts = {kind: n for kind, n in dict(run.meta.get("failures") or {}).items() if n and kind != Failure.STEP_DAMPED}
     if counts:
         first = run.meta.get("first_failure")
-        yield (
-            f"failures inside the estimator: {', '.join(f'{n} {kind}' for kind, n in counts.items())}"
-            f"{f' (the first one: {first})' if first else ''}: {_what_to_do(counts)}"
-        )
+        cure = "what these tracks say is worth less; look at the noise and the starts, or take another estimator"
+        if counts.keys() == {Failure.DIVERGED}:
+            cure = f"{IN_A_ROW} measurements in a row contradicted a track: look at NIS by sensor, clocks and noise"
+        text = f"failures: {', '.join(f'{n} {kind}' for kind, n in counts.items())}"
+        yield Caution("estimator", f"{text}{f' (the first one: {first})' if first else ''}: {cure}")
 
 
-def _what_to_do(failed: Mapping[str, int]) -> str:
-    if not failed.keys() - {Failure.DIVERGED}:
-        return "8 measurements in a row contradicted a track: look at NIS by sensor, the clocks, and the noise"
-    return "what these tracks say is worth less; look at the noise and the starts, or take another estimator"
-
-
-def _reach(run: Run) -> tuple[str, float]:
-    """How far back the estimator reaches, and the key that says so."""
-    if str(run.meta.get("estimator")).startswith(("smoother", "ipls")):
-        return "smoother.lag_s", float(_section(run, "smoother").get("lag_s", np.inf))
-    return "filter.storage_s", float(_section(run, "filter").get("storage_s", np.inf))
+def _told_window(run: Run) -> tuple[str, float]:
+    """The window with the key that sets its length, and its length; runs of older versions do not say them."""
+    found = run.meta.get("effective") or {}
+    if "lag_key" not in found:
+        return "the window", np.inf
+    return f"the window ({found['lag_key']} {found['lag_s']:g} s)", float(found["lag_s"])
 
 
 def _section(run: Run, name: str) -> Mapping[str, Any]:

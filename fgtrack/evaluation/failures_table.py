@@ -6,9 +6,12 @@ from fgtrack.estimation.failures import Failure
 from fgtrack.evaluation.metrics import Metrics
 from fgtrack.evaluation.table_rows import Row, run_column
 from fgtrack.evaluation.tables import Column, Table
+from fgtrack.tracking.soundness import IN_A_ROW, RARE
 
 _NOTES = {
-    Failure.DIVERGED: "diverged: 8 measurements in a row with a NIS that fewer than 1 in 10,000 should have",
+    Failure.DIVERGED: (
+        f"diverged: {IN_A_ROW} measurements in a row with a NIS that fewer than 1 in {1.0 / RARE:,.0f} should have"
+    ),
     Failure.NOT_FINITE: "not finite: states that were not published, for that reason",
     Failure.NOT_DEFINITE: "not positive definite: covariances that were not published, for that reason",
     Failure.OUT_OF_BOUNDS: "out of bounds: states that were not published, as no object can have them",

@@ -23,13 +23,14 @@ from fgtrack.estimation.published import (
     SaturatedEulerCtrv,
     StalePresent,
 )
-from fgtrack.estimation.registry import ESTIMATORS, Claims, estimator_bank
+from fgtrack.estimation.registry import estimator_bank
 from fgtrack.models.areas import ExclusionAreas
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.published_map import CircularHeadingMap, PublishedMap
 from fgtrack.models.road import MappedRoad, OpenSpace, Road
 from fgtrack.models.track_map import TrackMap
 from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
+from fgtrack.pipeline.effective import effective
 from fgtrack.tracking.ego import EgoSource, EgoStd, EgoTrajectory
 from fgtrack.tracking.ego_error import IndependentErrors, SharedErrors
 from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules
@@ -167,8 +168,7 @@ def build_bank(config: Config, failures: Failures | None = None) -> TrackBank:
     build, options = _BANKS.get(config.estimator), config.options.get(config.estimator, {})
     if build is None:
         options = {"initiation": config.initiation.method, **options}
-        reports = Claims.of(ESTIMATORS.load(config.estimator)).reports
-        lag_s = config.smoother.lag_s if reports else config.filter.storage_s
+        lag_s = effective(config).lag_s
         return estimator_bank(config.estimator, config.motion_model(), lag_s, options, config.smoother.lagged_s)
     if options:
         raise CallError(f"options.{config.estimator}: set the keys of smoother or filter instead")

@@ -77,6 +77,8 @@ class SensorOffset:
     """RMS residual over the standard deviation used: `std_s` is as right as this is near 1."""
     spread_s: float | None = None
     """Standard deviation by how much stretches of 5 s disagree; errors that last make it larger than `std_s`."""
+    dof: float | None = None
+    """Degrees of freedom of `std_s`, where few stretches tell it."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,9 @@ from fgtrack.tracking.merge import NoMerge
 
 __all__ = ["ASSUMED_STD", "Effective", "effective", "with_sensors"]
 
+#: Estimators that take all settings of `smoother`.
+_SMOOTHERS = ("smoother", "smoother-batch", "smoother-banded")
+
 #: Standard deviations of a sensor of which nothing is known: a detector of cars by LiDAR or RADAR.
 ASSUMED_STD = {
     "x_m": 1.0,
@@ -32,6 +35,8 @@ class Effective:
     """Origin of the ego frame of detections, ahead of the ego reference point and to its left."""
     merge_distance_m: float | None
     """Up to which distance detections become one; None for no merge."""
+    lag_key: str
+    """Key of the configuration that sets the length of the window."""
     lag_s: float
     """Length of the window."""
     reach_s: float
@@ -50,13 +55,14 @@ class Effective:
 
 def effective(config: Config) -> Effective:
     """What `config` comes to."""
-    ego, merge, smoother = config.ego, config.merge, config.smoother
-    lag_s = reach_s = config.filter.storage_s
-    if config.estimator.startswith("smoother") or Claims.of(ESTIMATORS.load(config.estimator)).reports:
-        lag_s = smoother.lag_s
-        reach_s = lag_s + (smoother.ring_s if smoother.late == "fuse" else 0.0)
+    ego, merge = config.ego, config.merge
+    key, lag_s, behind_s = "filter.storage_s", config.filter.storage_s, 0.0
+    if config.estimator in _SMOOTHERS:
+        key, lag_s, behind_s = "smoother.lag_s", config.smoother.lag_s, config.smoother.behind_s
+    elif Claims.of(ESTIMATORS.load(config.estimator)).reports:
+        key, lag_s = "smoother.lag_s", config.smoother.lag_s
     distance_m = None if isinstance(merge, NoMerge) else merge.distance_m
-    return Effective((ego.detection_origin_x_m, ego.detection_origin_y_m), distance_m, lag_s, reach_s)
+    return Effective((ego.detection_origin_x_m, ego.detection_origin_y_m), distance_m, key, lag_s, lag_s + behind_s)
 
 
 def with_sensors(config: Config, messages: Callable[[], Iterable[Message]]) -> Config:

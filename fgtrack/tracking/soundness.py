@@ -13,7 +13,7 @@ from fgtrack.estimation.base import Measurement, UpdateResult
 from fgtrack.estimation.failures import Failure
 from fgtrack.estimation.present import PresentStates
 
-__all__ = ["Divergence", "are_finite", "faults"]
+__all__ = ["IN_A_ROW", "RARE", "Divergence", "are_finite", "faults"]
 
 _MOST = np.array([1e9, 1e9, 1e3, 1e5, 1e4, 1e6])
 """Largest x, y, yaw, speed, yaw rate and acceleration, in SI units: far beyond any vehicle on Earth."""
@@ -25,9 +25,8 @@ _ROUNDING = 1e-9
 """So much less than 0 an eigenvalue of a correlation matrix may be: rounding, where an entry is known for certain."""
 _TINY = 1e-300
 
-#: A track has diverged when so many measurements in a row have a NIS that is rarer than this.
-_IN_A_ROW = 8
-_RARE = 1e-4
+IN_A_ROW, RARE = 8, 1e-4
+"""A track has diverged when so many measurements in a row have a NIS that is rarer than this."""
 
 
 def are_finite(means: FloatArray, covariances: FloatArray) -> bool:
@@ -93,11 +92,11 @@ def _are_definite(covariances: FloatArray) -> bool:
 
 @cache
 def _limit(dof: int) -> float:
-    return float(chdtri(dof, _RARE))
+    return float(chdtri(dof, RARE))
 
 
 class Divergence:
-    """Counts how often a track diverges: 8 measurements in a row with a NIS that fewer than 1 in 10^4 should have.
+    """Counts how often a track diverges: `IN_A_ROW` measurements have a NIS that only the share `RARE` should have.
 
     With a noise that fits, this happens by chance once in 10^32 measurements; where the errors of positions are three
     times as large as the noise says, once in some 5000. A NIS is judged by the chi-square distribution of what was
@@ -122,7 +121,7 @@ class Divergence:
                     surprises.pop(track_id, None)
                 continue
             surprises[track_id] = surprises.get(track_id, 0) + 1
-            diverged += surprises[track_id] == _IN_A_ROW
+            diverged += surprises[track_id] == IN_A_ROW
         return diverged
 
     def forget(self, track_id: int) -> None:

@@ -86,15 +86,18 @@ def test_stamps_that_are_zero_are_told_once(call: Call) -> None:
 
 def test_no_ego(call: Call) -> None:
     code, (line,), _ = replayed(call, drive(ego=False))
-    assert (code, line.startswith("lidar: 100 of 100 failed: no state of the ego was received")) == (1, True)
+    assert (
+        code,
+        "ego: no state was received, so nothing in its frame can be placed (100 of 100" in line,
+    ) == (1, True)
     code, (line,), _ = replayed(call, drive(ego=False, frame="map"))
-    assert (code, line.startswith("no state of the ego was received, so new objects")) == (0, True)
+    assert (code, line.startswith("ego: no state was received, so new objects")) == (0, True)
     assert replayed(call, drive(ego=False, frame="map"), "birth.ego_speed_factor=0.0")[1] == []
 
 
 def test_no_map_where_it_says_where_objects_head(call: Call) -> None:
     code, (line,), _ = replayed(call, drive(yaw=False))
-    assert (code, line.startswith("no map, and no heading from lidar: ")) == (0, True)
+    assert (code, line.startswith("map: there is none, and no heading from lidar: ")) == (0, True)
     assert replayed(call, drive(yaw=False), "birth.ego_speed_factor=0.0")[1] == []
 
 

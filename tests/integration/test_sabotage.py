@@ -166,7 +166,7 @@ def check_told(run: Run) -> Counter[str]:
     """What failed is counted in meta.json, and said by `cautions` and `compare`."""
     failed = Counter({kind: count for kind, count in run.meta["failures"].items() if count})
     assert list(run.meta["failures"]) == [kind.value for kind in Failure]
-    [line] = [line for line in cautions(run) if line.startswith("failures inside the estimator")]
+    [line] = [str(one) for one in cautions(run) if one.about == "estimator"]
     tables = compare(run)
     for kind, count in failed.items():
         assert f"{count} {kind}" in line or kind == Failure.STEP_DAMPED
@@ -211,7 +211,7 @@ def test_a_healthy_estimator_fails_nowhere_and_compare_says_so_in_full(
     run = run_of(sabotaged("nothing"), tmp_path)
     assert set(run.meta["failures"].values()) == {0}
     assert run.meta["ended_by_failure"] == []
-    assert not [line for line in cautions(run) if "failures" in line]
+    assert not [one for one in cautions(run) if one.about == "estimator"]
     tables = compare(run)
     assert "Failures inside the estimator" not in str(tables)
     assert "Failures inside the estimator" in str(tables.in_full())

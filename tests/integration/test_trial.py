@@ -35,7 +35,7 @@ def with_objects(item: DetectionList, **fields: object) -> DetectionList:
 
 
 def found(messages: list[Message], config: Config = CONFIG) -> list[str]:
-    return list(suspicions(messages, config))
+    return list(map(str, suspicions(messages, config)))
 
 
 def test_nothing_is_said_of_a_healthy_drive():
@@ -60,7 +60,7 @@ def test_stamps_of_zero_are_found():
 def test_a_missing_ego_is_found():
     without = [item for item in drive() if not isinstance(item, EgoState)]
     (line,) = found(without)
-    assert line == "no state of the ego is read, but lidar is relative to it: name the ego's topic (input.ego)"
+    assert line == "ego: no state is read, but lidar is relative to it: name its topic (input.ego)"
     in_map = changed(lambda item: replace(item, frame="map"), without)
     assert found(in_map) == []
 

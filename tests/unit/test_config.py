@@ -58,7 +58,7 @@ def test_there_are_files_of_every_kind() -> None:
 def test_the_defaults_are_those_of_open_space_and_shift_join_and_expect_nothing() -> None:
     config = load(Config, None)
     assert config == Config()
-    assert effective(config) == Effective((0.0, 0.0), None, 3.0, 3.0)
+    assert effective(config) == Effective((0.0, 0.0), None, "filter.storage_s", 3.0, 3.0)
     assert (config.map.track, config.birth.ego_speed_factor, config.lifecycle.kind) == (None, 0.0, "existence")
     assert (config.ego.yaw_weight, config.ego.yaw_rate_weight) == (1.0, 1.0)
 

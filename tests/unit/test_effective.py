@@ -67,7 +67,7 @@ def test_messages_without_any_configuration_are_tracked() -> None:
             yield one
 
     run = replay(messages())
-    assert run.meta["effective"] == Effective((0.0, 0.0), None, 3.0, 3.0).values()
+    assert run.meta["effective"] == Effective((0.0, 0.0), None, "filter.storage_s", 3.0, 3.0).values()
     assert set(run.config["sensors"]) == {"odd"}
     assert set(run.tracks["track_id"].tolist()) == {0}
     newest = run.tracks["now_ns"] == run.tracks["now_ns"].max()

@@ -14,16 +14,18 @@ from fgtrack.io.run.reader import column
 
 CONFIG = """
 sensors: {lidar: {max_delay_s: 0.4}, radar: {}}
-smoother: {lag_s: 1.0}
-filter: {storage_s: 3.0}
 """
+SMOOTHER: dict[str, object] = {"lag_key": "smoother.lag_s", "lag_s": 1.0}
+FILTER: dict[str, object] = {"lag_key": "filter.storage_s", "lag_s": 3.0}
 
 
-def run_of(folder: Path, records: list[UpdateRecord], config: str = CONFIG, estimator: str = "smoother") -> Run:
+def run_of(
+    folder: Path, records: list[UpdateRecord], config: str = CONFIG, effective: dict[str, object] = SMOOTHER
+) -> Run:
     by_tick: dict[int, list[UpdateRecord]] = {}
     for tick, record in enumerate(records):
         by_tick.setdefault(tick, []).append(record)
-    return write_run(folder, [[]] * len(records), updates=by_tick, meta={"estimator": estimator}, config_text=config)
+    return write_run(folder, [[]] * len(records), updates=by_tick, meta={"effective": effective}, config_text=config)
 
 
 def lists(fate: Disposition, num: int = 40, **values: float) -> list[UpdateRecord]:
@@ -46,19 +48,27 @@ def test_a_healthy_run_has_none(tmp_path: Path) -> None:
         (Disposition.DUPLICATE, "repeats itself"),
         (Disposition.SUPERSEDED, "clock.node_hz"),
         (Disposition.INVALID, "sensors.lidar.std"),
-        (Disposition.FAILED, "no state of the ego was received"),
     ],
 )
 def test_what_most_detections_of_a_sensor_ended_in_is_told_with_a_cure(
     fate: Disposition, cure: str, tmp_path: Path
 ) -> None:
     run = run_of(tmp_path / "run", [*lists(fate, 30), *lists(Disposition.IN_SEQUENCE, 29)])
-    (line,) = cautions(run)
-    assert line.startswith(f"lidar: 30 of 59 {fate.value}: ")
-    assert cure in line
+    (found,) = cautions(run)
+    assert (found.about, found.settings) == ("lidar", {})
+    assert found.text.startswith(f"30 of 59 {fate.value}: ")
+    assert cure in found.text
     assert unused(run) is None
     (again,) = cautions(run_of(tmp_path / "other", lists(fate, 3)))
-    assert again.startswith("lidar: 3 of 3")
+    assert str(again).startswith("lidar: 3 of 3")
+
+
+def test_detections_that_fail_without_an_ego_are_the_trouble_of_the_ego_alone(tmp_path: Path) -> None:
+    failed = [update(sensor, tick=k, disposition=Disposition.FAILED) for k in range(5) for sensor in ("lidar", "radar")]
+    (found,) = cautions(run_of(tmp_path / "run", failed))
+    assert found.about == "ego"
+    assert "nothing in its frame can be placed (5 of 5 of lidar, 5 of 5 of radar" in found.text
+    assert found.settings == {}
 
 
 def test_half_is_not_most(tmp_path: Path) -> None:
@@ -69,30 +79,31 @@ def test_half_is_not_most(tmp_path: Path) -> None:
 def test_too_old_names_the_limit_that_was_passed(tmp_path: Path) -> None:
     late = [update(tick=k, disposition=Disposition.TOO_OLD, delay_ns=450_000_000) for k in range(5)]
     (by_sensor,) = cautions(run_of(tmp_path / "a", late))
-    assert "median delay 0.45 s, allowed 0.4 s: raise sensors.lidar.max_delay_s" in by_sensor
+    assert "median delay 0.45 s, allowed 0.4 s: raise sensors.lidar.max_delay_s" in by_sensor.text
     (by_window,) = cautions(run_of(tmp_path / "b", late, CONFIG.replace("max_delay_s: 0.4", "max_delay_s: 9.0")))
-    assert "the window (smoother.lag_s 1 s)" in by_window
+    assert "the window (smoother.lag_s 1 s)" in by_window.text
     unlimited = CONFIG.replace("{max_delay_s: 0.4}", "{}")
-    (by_storage,) = cautions(run_of(tmp_path / "c", late, unlimited, "ekf-replay"))
-    assert "the window (filter.storage_s 3 s)" in by_storage
+    (by_storage,) = cautions(run_of(tmp_path / "c", late, unlimited, FILTER))
+    assert "the window (filter.storage_s 3 s)" in by_storage.text
 
 
 def test_stamps_that_nobody_set_and_a_window_shorter_than_a_period_are_told(tmp_path: Path) -> None:
     unset = [UpdateRecord("lidar", 0, 10**18 + k, 0, Disposition.IN_SEQUENCE) for k in range(3)]
-    (line,) = cautions(run_of(tmp_path / "a", unset))
-    assert line.startswith("lidar: all stamps are 0")
+    (found,) = cautions(run_of(tmp_path / "a", unset))
+    assert str(found).startswith("lidar: all stamps are 0")
+    assert found.settings == {"sensors.lidar.stamp_from": "receipt"}
     slow = [update(tick=100 * k) for k in range(40)]
-    (line,) = cautions(run_of(tmp_path / "b", slow))
+    (found,) = cautions(run_of(tmp_path / "b", slow))
     period_s = 100 * TICK_NS / 1e9
-    assert line == f"lidar: one list every {period_s:g} s, longer than the window (smoother.lag_s 1 s): raise it"
-    assert cautions(run_of(tmp_path / "c", slow, estimator="ekf-replay")) == []
+    assert str(found) == f"lidar: one list every {period_s:g} s, longer than the window (smoother.lag_s 1 s): raise it"
+    assert cautions(run_of(tmp_path / "c", slow, effective=FILTER)) == []
 
 
 @pytest.mark.parametrize(("nis", "size"), [(26.0, "small"), (0.2, "large")])
 def test_noise_that_does_not_fit_is_told(nis: float, size: str, tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", [update(tick=k, nis=nis, x_m=0.1, y_m=0.1) for k in range(40)])
-    (line,) = noise_cautions(run)
-    assert line.startswith(f"lidar: mean NIS {nis:.3g}, expected 2: the configured noise is too {size}")
+    (found,) = noise_cautions(run)
+    assert str(found).startswith(f"lidar: mean NIS {nis:.3g}, expected 2: the configured noise is too {size}")
     burst = [26.0 if k % 10 == 0 else 1.4 for k in range(40)]
     born = run_of(tmp_path / "born", [update(tick=k, nis=each, x_m=0.1, y_m=0.1) for k, each in enumerate(burst)])
     assert noise_cautions(born) == []
@@ -110,8 +121,8 @@ def test_a_table_that_was_changed_after_the_run_is_told(tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", lists(Disposition.IN_SEQUENCE))
     table = tmp_path / "run/updates.csv"
     table.write_text(table.read_text().replace("lidar", "radar"))
-    assert cautions(run) == [
-        "tracks.csv or updates.csv has been changed since the run: its digest is another; repeat the run"
+    assert list(map(str, cautions(run))) == [
+        "tracks.csv or updates.csv: changed since the run: the digest is another; repeat the run"
     ]
 
 
@@ -124,4 +135,4 @@ def test_states_of_the_ego_that_were_refused_are_told_where_they_are_most(
     meta = {**run.meta, "ego_refused": {"stamp ahead of its receipt": refused}}
     found = cautions(replace(run, ego=ego, meta=meta))
     assert len(found) == told
-    assert not told or found[0].startswith(f"ego: {refused} of 4 states not used, stamp ahead of its receipt")
+    assert not told or str(found[0]).startswith(f"ego: {refused} of 4 states not used, stamp ahead of its receipt")

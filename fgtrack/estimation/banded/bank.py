@@ -79,8 +79,7 @@ class BandedBank:
             raise CallError(f"smoother.objective: {settings.objective} needs the estimator smoother or smoother-batch")
         self._motion = motion
         self._settings = settings
-        self._lag_ns, self._ring_ns = nanoseconds(settings.lag_s), nanoseconds(settings.ring_s)
-        self._behind_ns = self._ring_ns if settings.late == "fuse" else 0
+        self._lag_ns, self._behind_ns = nanoseconds(settings.lag_s), nanoseconds(settings.behind_s)
         self.windows = Windows(motion, settings, failures or Failures())
         self._numbers: dict[int, int] = {}
         """Where the arrays hold each track, in order of birth."""

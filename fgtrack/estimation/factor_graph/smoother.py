@@ -58,7 +58,7 @@ class FixedLagSmoother:
         failures: Failures | None = None,
     ) -> None:
         self._settings = settings
-        self._lag_ns, self._ring_ns = nanoseconds(settings.lag_s), nanoseconds(settings.ring_s)
+        self._lag_ns, self._behind_ns = nanoseconds(settings.lag_s), nanoseconds(settings.behind_s)
         self._first_ns = self._clock_ns = self._start_ns = self._reach_ns = prior.stamp_ns
         self.motion = motion
         self.failures = failures or Failures()
@@ -151,9 +151,8 @@ class FixedLagSmoother:
     def _move(self) -> None:
         """Where the window starts, by the clock and the newest stamp, and the oldest stamp that may be fused."""
         newest_ns = max(self._clock_ns, self.window.newest_ns)
-        behind_ns = self._ring_ns if self._settings.late == "fuse" else 0
         self._start_ns = max(newest_ns - self._lag_ns, self._first_ns)
-        self._reach_ns = max(self._start_ns - behind_ns, self._first_ns)
+        self._reach_ns = max(self._start_ns - self._behind_ns, self._first_ns)
 
     def status_of(self, stamp_ns: int) -> UpdateStatus:
         """What will become of a measurement at `stamp_ns` that can be fused.

@@ -38,8 +38,7 @@ class SmootherBank(SmoothingBank[FixedLagSmoother]):
         def one(prior: Start) -> FixedLagSmoother:
             return FixedLagSmoother(motion, prior, settings, make_backend, initiation, failures)
 
-        lag_s = settings.lag_s + (settings.ring_s if settings.late == "fuse" else 0.0)
-        super().__init__(motion, one, lag_s, settings.lagged_s)
+        super().__init__(motion, one, settings.lag_s + settings.behind_s, settings.lagged_s)
         self._settings = settings
 
     @property

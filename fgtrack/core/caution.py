@@ -1,0 +1,26 @@
+"""What a person must know before believing a recording or a run."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+__all__ = ["EGO", "Caution"]
+
+EGO = "ego"
+"""What a caution of the ego is about."""
+
+
+@dataclass(frozen=True)
+class Caution:
+    """Something that is wrong; `str` is a line of it."""
+
+    about: str
+    """Sensor, `ego`, or what else it concerns."""
+    text: str
+    """What is wrong, its cause and its cure, without the full stop."""
+    settings: Mapping[str, object] = field(default_factory=dict)
+    """Values of keys of the configuration that mend it; empty where none does for certain."""
+    spoils: bool = False
+    """Whether nothing can be judged before it is mended."""
+
+    def __str__(self) -> str:
+        return f"{self.about}: {self.text}"
