@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from fgtrack.advice.advise import advise as advised
-from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, Overwrite, PitMap, Settings, TrackMap
+from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, Overwrite, PitMap, Reference, Settings, TrackMap
 from fgtrack.cli.show import chosen_form, progress, say, show
 from fgtrack.core.errors import DataError
 from fgtrack.io.output import check_output
@@ -22,9 +22,7 @@ def advise(
         Path | None, typer.Option("-o", "--out", help="Configuration to write that follows the advice (YAML).")
     ] = None,
     tune: Annotated[bool, typer.Option("--tune", help="Fit noise that does not fit, too.")] = False,
-    reference: Annotated[
-        str | None, typer.Option("--reference", help="Sensor whose clock is right, where two do not agree.")
-    ] = None,
+    reference: Reference = None,
     track_map: TrackMap = None,
     pit_map: PitMap = None,
     settings: Settings = None,

@@ -28,6 +28,9 @@ Settings = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Override one key of the configuration; may be repeated."),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what such a command wrote there before.")]
+Reference = Annotated[
+    str | None, typer.Option("--reference", help="Sensor whose clock is right, where two do not agree.")
+]
 Runs = Annotated[list[Path], typer.Argument(help="Run folders, or folders of runs, as that of the demo.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 StorageOption = Annotated[Storage, typer.Option("--storage", help="Storage of a rosbag2 folder.")]

@@ -1,15 +1,12 @@
 """`fgtrack offsets`: how wrong the clocks of a recording are."""
 
-from typing import Annotated
-
-import typer
-
-from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, PitMap, Settings, TrackMap
-from fgtrack.cli.show import chosen_form, progress, show
+from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, PitMap, Reference, Settings, TrackMap
+from fgtrack.cli.show import chosen_form, progress, say, show
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.tables import Column, Table, Value
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.clock_offsets import OffsetReport, SensorOffset, estimate_offsets
+from fgtrack.pipeline.effective import told_std, with_sensors
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
 
@@ -17,9 +14,7 @@ from fgtrack.pipeline.shipped import read_config
 def offsets(
     recording: Input,
     config_file: ConfigFile = None,
-    reference: Annotated[
-        str | None, typer.Option("--reference", help="Sensor whose clock is right; else the one with most detections.")
-    ] = None,
+    reference: Reference = None,
     track_map: TrackMap = None,
     pit_map: PitMap = None,
     settings: Settings = None,
@@ -34,7 +29,11 @@ def offsets(
     config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
     source = open_input(recording, config.input)
     with progress("offsets"):
-        report = estimate_offsets(source.messages(), config, reference)
+        known = with_sensors(config, source.messages)
+        report = estimate_offsets(source.messages(), known, reference)
+    if form is None and not config.sensors:
+        assumed = {name: sensor.std for name, sensor in known.sensors.items()}
+        say(f"no sensors configured, assumed standard deviations: {told_std(assumed)}")
     show(_table(report), form, report.as_dict())
     if report.broken is not None:
         raise DataError(f"{located(report.broken, str(recording))}; used up to there")

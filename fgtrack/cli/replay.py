@@ -1,6 +1,5 @@
 """`fgtrack replay`: a recording through the tracker into a run folder."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +16,7 @@ from fgtrack.evaluation.left_out import left_out
 from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
 from fgtrack.io.span import end_ns
-from fgtrack.pipeline.effective import effective
+from fgtrack.pipeline.effective import effective, told_std
 from fgtrack.pipeline.replay import located, replay_each
 from fgtrack.pipeline.shipped import read_config
 
@@ -66,9 +65,8 @@ def replay(
         say(line)
     runs = [load_run(result.path) for result in results]
     if not config.sensors:
-        assumed = runs[0].config["sensors"]
-        text = "; ".join(f"{name}: {_listed(sensor['std'])}" for name, sensor in assumed.items())
-        say(f"no sensors configured, assumed standard deviations: {text}")
+        assumed = {name: one["std"] for name, one in runs[0].config["sensors"].items()}
+        say(f"no sensors configured, assumed standard deviations: {told_std(assumed)}")
     for result in results:
         what = "{estimator}, {detections_received} detections, {wall_s:.1f} s, digest {digest:.12}"
         missed = f", {result.deadline_misses} deadlines missed" if result.deadline_misses else ""
@@ -82,7 +80,3 @@ def replay(
     reason = unused(runs[0])
     if reason is not None:
         raise DataError(f"{recording}: {reason}")
-
-
-def _listed(values: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} {value:g}" for name, value in values.items())

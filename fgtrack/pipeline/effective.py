@@ -1,6 +1,6 @@
 """What a configuration comes to in a run: what is easily overlooked, and the sensors where it names none."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 
 from fgtrack.core.errors import DataError
@@ -10,7 +10,7 @@ from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
 from fgtrack.tracking.merge import NoMerge
 
-__all__ = ["ASSUMED_STD", "Effective", "effective", "with_sensors"]
+__all__ = ["ASSUMED_STD", "Effective", "effective", "told_std", "with_sensors"]
 
 #: Estimators that take all settings of `smoother`.
 _SMOOTHERS = ("smoother", "smoother-batch", "smoother-banded")
@@ -82,6 +82,12 @@ def with_sensors(config: Config, messages: Callable[[], Iterable[Message]]) -> C
     except DataError:  # the replay ends there, too, and says so
         pass
     return replace(config, sensors={name: _assumed(found) for name, found in sorted(measured.items())})
+
+
+def told_std(std: Mapping[str, Mapping[str, float]]) -> str:
+    """Standard deviations by sensor and component in words."""
+    listed = {name: ", ".join(f"{key} {value:g}" for key, value in one.items()) for name, one in std.items()}
+    return "; ".join(f"{name}: {text}" for name, text in listed.items())
 
 
 def _assumed(measured: set[str]) -> SensorModel:

@@ -95,8 +95,7 @@ def tuned(
     rules = rules or TuneRules()
     recordings = [_Recording.read(name, messages()) for name, messages in sources.items()]
     config = with_sensors(config, lambda: chain.from_iterable(one.messages for one in recordings))
-    noise = ConfigNoise(for_tuning(config, rules))
-    return _Tuning(noise, recordings, rules, on_step).report(config)
+    return _Tuning(ConfigNoise(for_tuning(config, rules)), recordings, rules, on_step).report(config)
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,14 @@ import pytest
 from support.messages import drive as support_drive
 
 import fgtrack
+from fgtrack.advice import advise as advise_module
 from fgtrack.cli.main import run as run_command
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.io.ros.bag_writer import write_bag
-from fgtrack.io.run import load_run
+from fgtrack.io.run import Run, load_run
 from fgtrack.io.stream import write_stream
+from fgtrack.pipeline.config import Config
 from fgtrack.sim.redelay import restamped
 
 MS = 1_000_000
@@ -137,6 +139,52 @@ def test_a_healthy_recording_is_fine_and_nothing_is_changed(call: Call) -> None:
     for name in ("c", "a"):
         assert call("replay", "drive.jsonl", "-c", f"{name}.yaml", "-o", f"runs/{name}")[0] == 0
     assert load_run("runs/a").meta["digest"] == load_run("runs/c").meta["digest"]
+
+
+def test_what_nothing_is_changed_of_is_tracked_once(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    tracked: list[Config] = []
+    real = advise_module.replay_in_memory
+
+    def counted(messages: Sequence[Message], config: Config) -> tuple[Run, str | None]:
+        tracked.append(config)
+        return real(messages, config)
+
+    monkeypatch.setattr(advise_module, "replay_in_memory", counted)
+    write("stream", drive(60))
+    assert not fgtrack.advise("drive.jsonl", "c.yaml").changes
+    assert len(tracked) == 1
+    Path("c.yaml").write_text(CONFIG.replace("lidar: {", "lidar: {max_delay_s: 0.05, "))
+    assert fgtrack.advise("drive.jsonl", "c.yaml").changes
+    assert len(tracked) == 3
+
+
+@pytest.mark.parametrize("command", ["advise", "tune", "offsets"])
+def test_without_a_configuration_the_sensors_are_those_of_the_recording(call: Call, command: str) -> None:
+    bare = changed(lambda item: replace(item, objects=[replace(one, yaw_rad=None) for one in item.objects]), drive(100))
+    write("stream", bare)
+    out = () if command == "offsets" else ("-o", "a.yaml")
+    code, text = call(command, "drive.jsonl", *out)
+    assert code == 0, text
+    if command != "tune":  # whose table has them
+        assert "assumed standard deviations: lidar: x_m 1, y_m 1; radar: x_m 1, y_m 1" in text
+    if out:
+        assert call("replay", "drive.jsonl", "-c", "a.yaml", "-o", "run")[0] == 0
+        assert set(load_run("run").config["sensors"]) == {"lidar", "radar"}
+
+
+def test_a_track_outlives_the_silence_of_the_slowest_sensor(call: Call) -> None:
+    def often(item: Message) -> bool:
+        every_ms = {"lidar": 3000, "radar": 1000}.get(getattr(item, "sensor", ""), 50)
+        return (item.stamp_ns - START_NS) % (every_ms * MS) == 0
+
+    seen_by_more = [
+        replace(item, sensor="camera") if isinstance(item, DetectionList) and item.sensor == "radar" else item
+        for item in drive(1200)
+    ]
+    write("stream", sorted([*filter(often, drive(1200)), *seen_by_more], key=lambda item: item.receipt_ns))
+    more = CONFIG.replace("sensors:\n", "sensors:\n  camera: {std: {x_m: 1.0, y_m: 1.0}}\n")
+    Path("c.yaml").write_text(more + "lifecycle: {out_of_view_s: 0.5}\n")
+    assert fgtrack.advise("drive.jsonl", "c.yaml").config.lifecycle.out_of_view_s == pytest.approx(10.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -61,6 +61,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert run(["replay", "other.jsonl", "-o", "run"]) == 0
         assert run(["figure", "run", "-o", "figures"]) == 0
         assert run(["demo", "-o", "demo"]) == 0
+        assert run(["advise", "other.jsonl", "--set", "filter.storage_s=2.5", "-o", "advice.yaml"]) == 0
     return folder
 
 
@@ -96,6 +97,7 @@ WRITERS = [
     (("replay", "drive.jsonl", "-o", "run"), "run"),
     (("replay", "drive.jsonl", "-o", "demo/runs", "-e", "ekf-replay,smoother"), "demo/runs"),
     (("demo", "-o", "demo"), "demo"),
+    (("advise", "drive.jsonl", "-o", "advice.yaml"), "advice.yaml"),
 ]
 
 
@@ -387,6 +389,7 @@ def test_an_output_that_cannot_be_written_is_a_bad_call_everywhere(here: Path, c
         ("export", "run", "-o", "file/x.mcap"),
         ("export", "run", "-o", "file/x", "--ros2"),
         ("tune", "drive.jsonl", "-o", "file/x.yaml"),
+        ("advise", "drive.jsonl", "-o", "file/x.yaml"),
         ("sweep", "sweep.yaml", "-o", "file/x"),
         ("demo", "-o", "file/x"),
     ):
@@ -403,6 +406,7 @@ def test_an_output_that_cannot_be_written_is_a_bad_call_everywhere(here: Path, c
         ("export", "run", "-o", "out.mcap"),
         ("export", "run", "-o", "out.mcap", "--ros2"),
         ("tune", "drive.jsonl", "-o", "out.yaml"),
+        ("advise", "drive.jsonl", "-o", "out.yaml"),
     ],
     ids=str,
 )
