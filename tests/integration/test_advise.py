@@ -12,6 +12,8 @@ from support.messages import drive as support_drive
 
 import fgtrack
 from fgtrack.advice import advise as advise_module
+from fgtrack.advice.arrivals import Arrivals
+from fgtrack.advice.windows import window_findings
 from fgtrack.cli.main import run as run_command
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.evaluation.metrics import evaluate
@@ -19,6 +21,7 @@ from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.run import Run, load_run
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.shipped import read_config
 from fgtrack.sim.redelay import restamped
 
 MS = 1_000_000
@@ -172,19 +175,16 @@ def test_without_a_configuration_the_sensors_are_those_of_the_recording(call: Ca
         assert set(load_run("run").config["sensors"]) == {"lidar", "radar"}
 
 
-def test_a_track_outlives_the_silence_of_the_slowest_sensor(call: Call) -> None:
-    def often(item: Message) -> bool:
-        every_ms = {"lidar": 3000, "radar": 1000}.get(getattr(item, "sensor", ""), 50)
-        return (item.stamp_ns - START_NS) % (every_ms * MS) == 0
-
-    seen_by_more = [
-        replace(item, sensor="camera") if isinstance(item, DetectionList) and item.sensor == "radar" else item
-        for item in drive(1200)
-    ]
-    write("stream", sorted([*filter(often, drive(1200)), *seen_by_more], key=lambda item: item.receipt_ns))
-    more = CONFIG.replace("sensors:\n", "sensors:\n  camera: {std: {x_m: 1.0, y_m: 1.0}}\n")
-    Path("c.yaml").write_text(more + "lifecycle: {out_of_view_s: 0.5}\n")
-    assert fgtrack.advise("drive.jsonl", "c.yaml").config.lifecycle.out_of_view_s == pytest.approx(10.0)
+def test_a_track_outlives_the_silence_of_the_slowest_sensor() -> None:
+    every_ms = {"camera": 50, "lidar": 3000, "radar": 1000}
+    stamps_ns = {
+        name: START_NS + np.arange(0, 60_000, period, dtype=np.int64) * MS for name, period in every_ms.items()
+    }
+    arrivals = [Arrivals(name, each, each, np.ones_like(each)) for name, each in stamps_ns.items()]
+    sensors = ", ".join(f"{name}: {{std: {{x_m: 1.0, y_m: 1.0}}}}" for name in every_ms)
+    config = read_config(None, [f"sensors={{{sensors}}}", "lifecycle.out_of_view_s=0.5", "filter.storage_s=10.0"])
+    (found,) = window_findings(arrivals, config)
+    assert (found.about, found.settings) == ("lidar", {"lifecycle.out_of_view_s": 10.0})
 
 
 @pytest.mark.parametrize("kind", KINDS)
