@@ -8,6 +8,7 @@ import re
 import sqlite3
 import tempfile
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -143,19 +144,20 @@ def _sqlite(rng: np.random.Generator, content: bytes) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "x.db3"
         path.write_bytes(content)
-        base = sqlite3.connect(path)
-        tables = [row[0] for row in base.execute("select name from sqlite_master where type = 'table'")]
-        table = str(rng.choice(tables))
-        columns = [row[1] for row in base.execute(f"pragma table_info({table})")]
-        rows = [row[0] for row in base.execute(f"select rowid from {table}")]
-        column, row = str(rng.choice(columns)), int(rng.choice(rows))
-        (old,) = base.execute(f"select {column} from {table} where rowid = ?", (row,)).fetchone()
-        new = _bytes(rng, old) if isinstance(old, bytes) and rng.integers(4) else _odd(rng)
-        if not isinstance(new, (int, float, str, bytes, type(None))) or (isinstance(new, int) and abs(new) >= 2**63):
-            new = str(new)
-        base.execute(f"update {table} set {column} = ? where rowid = ?", (new, row))
-        base.commit()
-        base.close()
+        with closing(sqlite3.connect(path)) as base:
+            tables = [row[0] for row in base.execute("select name from sqlite_master where type = 'table'")]
+            table = str(rng.choice(tables))
+            columns = [row[1] for row in base.execute(f"pragma table_info({table})")]
+            rows = [row[0] for row in base.execute(f"select rowid from {table}")]
+            column, row = str(rng.choice(columns)), int(rng.choice(rows))
+            (old,) = base.execute(f"select {column} from {table} where rowid = ?", (row,)).fetchone()
+            new = _bytes(rng, old) if isinstance(old, bytes) and rng.integers(4) else _odd(rng)
+            if not isinstance(new, (int, float, str, bytes, type(None))) or (
+                isinstance(new, int) and abs(new) >= 2**63
+            ):
+                new = str(new)
+            base.execute(f"update {table} set {column} = ? where rowid = ?", (new, row))
+            base.commit()
         return path.read_bytes()
 
 

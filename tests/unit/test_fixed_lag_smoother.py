@@ -155,5 +155,5 @@ def test_a_bank_refuses_late_data_where_that_is_an_error() -> None:
     bank.advance(1000 * MS)
     assert bank.window_start_ns == 0
     assert bank.states_at(700 * MS).track_ids == (0,)
-    with pytest.raises(DataError, match=r"0\.4 s late.*smoother\.lag_s"):
+    with pytest.raises(DataError, match=r"0\.1 s older than the window.*smoother\.lag_s"):
         bank.states_at(600 * MS)

@@ -3,6 +3,7 @@
 import json
 import sqlite3
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -114,7 +115,7 @@ def autoferry(folder: Path) -> Path:
 
 def sqlite(folder: Path) -> Path:
     write_bag(folder, drive(), "sqlite3", standard_topics=False)
-    with sqlite3.connect(next(folder.glob("*.db3"))) as database:
+    with closing(sqlite3.connect(next(folder.glob("*.db3")))) as database, database:
         database.execute("UPDATE messages SET timestamp = 'noon' WHERE id = 20")
     return folder
 
