@@ -6,12 +6,10 @@ from operator import itemgetter
 
 import numpy as np
 
-from fgtrack.io.run.reader import Column, Run, Table, column
+from fgtrack.io.run.reader import CHUNK, Column, Run, Table, column
 from fgtrack.io.run.rows import Row, text, text_header
 from fgtrack.io.run.schema import COLUMNS
 from fgtrack.io.run.sink import RunSink
-
-_CHUNK = 4096  # rows that wait for becoming columns, which take a tenth of the memory
 
 
 class MemoryRun(RunSink):
@@ -47,7 +45,7 @@ class MemoryRun(RunSink):
         elif table == "updates":
             self._updates += text(table, found).encode()
         self._waiting[table] += found
-        if len(self._waiting[table]) >= _CHUNK:
+        if len(self._waiting[table]) >= CHUNK:
             self._pack(table)
 
     def _pack(self, table: str) -> None:

@@ -1,14 +1,15 @@
 """Reads a run folder into columns."""
 
 import csv
-import io
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +31,9 @@ _INTEGER_COLUMNS = frozenset(
         *("index", "num_measured", "num_tracks", "num_detections"),
     }
 )
+
+CHUNK = 4096
+"""Rows that wait for becoming columns, which take a tenth of the memory."""
 
 NO_TRACK = -1
 """Track id of an update that belongs to no track."""
@@ -162,15 +166,21 @@ def load_run(path: Path | str) -> Run:
     return Run(path, meta, _read_text(path / "config.yaml"), **tables)
 
 
-def _read_text(path: Path, largest_mb: float = math.inf) -> str:
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
     try:
+        yield
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: is not UTF-8 text ({error.reason}), repeat the run") from error
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}), is this a run folder?") from error
+
+
+def _read_text(path: Path, largest_mb: float = math.inf) -> str:
+    with _reading(path):
         if path.stat().st_size > 1e6 * largest_mb:
             raise DataError(f"{path}: is larger than {largest_mb:g} MB, repeat the run")
         return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: is not UTF-8 text (byte {error.start}), repeat the run") from error
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}), is this a run folder?") from error
 
 
 def _read_meta(path: Path) -> Mapping[str, Any]:
@@ -195,25 +205,36 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
     names = COLUMNS[table]
     if table in OPTIONAL_TABLES and not path.exists():
         return Table({name: column(name, ()) for name in names})
-    text = _read_text(path)
-    if not text.endswith("\n"):
-        if complete:
-            raise DataError(f"{path}: breaks off in its last row, repeat the run")
-        text = text[: text.rfind("\n") + 1]
-    try:
-        rows = list(csv.reader(io.StringIO(text, newline="")))
-    except csv.Error as error:
-        raise DataError(f"{path}: is not CSV ({error}), repeat the run") from error
-    if not rows or tuple(rows[0]) != names:
-        raise DataError(f"{path}:1: the header must be {','.join(names)}")
-    for line, row in enumerate(rows, 1):
-        if len(row) != len(names):
-            raise DataError(f"{path}:{line}: {len(row)} cells instead of {len(names)}, repeat the run")
-    cells = zip(*rows[1:], strict=True) if len(rows) > 1 else ((),) * len(names)
-    try:
-        return Table({name: column(name, _values(name, of)) for name, of in zip(names, cells, strict=True)})
-    except (ValueError, OverflowError) as error:
-        raise DataError(f"{path}: holds a bad cell ({error}), repeat the run") from error
+    parts = {name: [column(name, ())] for name in names}
+    with _reading(path), path.open(encoding="utf-8", newline="\n") as file:
+        reader = csv.reader(_whole_lines(path, file, complete))
+        try:
+            if tuple(next(reader, ())) != names:
+                raise DataError(f"{path}:1: the header must be {','.join(names)}")
+            while rows := list(islice(reader, CHUNK)):
+                short = next((row for row in rows if len(row) != len(names)), None)
+                if short is not None:
+                    line = reader.line_num - len(rows) + 1 + rows.index(short)
+                    raise DataError(f"{path}:{line}: {len(short)} cells instead of {len(names)}, repeat the run")
+                for name, cells in zip(names, zip(*rows, strict=True), strict=True):
+                    parts[name].append(column(name, _values(name, cells)))
+        except csv.Error as error:
+            raise DataError(f"{path}: is not CSV ({error}), repeat the run") from error
+        except UnicodeDecodeError:  # which is a ValueError
+            raise
+        except (ValueError, OverflowError) as error:
+            raise DataError(f"{path}: holds a bad cell ({error}), repeat the run") from error
+    return Table({name: np.concatenate(of) for name, of in parts.items()})
+
+
+def _whole_lines(path: Path, file: TextIO, complete: bool) -> Iterator[str]:
+    """The lines of a table, without a half-written last one, which only a run that did not finish may have."""
+    for line in file:
+        if not line.endswith("\n"):
+            if complete:
+                raise DataError(f"{path}: breaks off in its last row, repeat the run")
+            return
+        yield line
 
 
 def column(name: str, cells: Sequence[str | int | float | None]) -> Column:
