@@ -23,6 +23,7 @@ from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.io.run import Run
+from fgtrack.io.source import open_input
 from fgtrack.models.sensors import Score
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
@@ -48,7 +49,7 @@ class Labelled(NamedTuple):
 
 def labelled(source: Path, config: Config, run: Run) -> Labelled:
     """What the labels say of the detections of a sequence."""
-    seen = list(scans(source, config))
+    seen = list(scans(open_input(source, config.input).messages(), config))
     matching = match(raw(run, seen), config.evaluation)
     assert matching is not None
     scores = np.concatenate([scan.scores for scan in seen])

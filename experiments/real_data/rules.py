@@ -1,16 +1,17 @@
 """The numbers of a configuration for LiDAR and RADAR on vessels, by rules from their truth."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scores import scans
 
 from fgtrack.core.time import seconds
-from fgtrack.core.types import DetectionList, EgoState, FloatArray, TruthState
+from fgtrack.core.types import FloatArray, TruthState
 from fgtrack.io.source import open_input
 from fgtrack.models.sensors import Correlation
 from fgtrack.pipeline.config import Config
@@ -67,10 +68,9 @@ def recorded(source: Path, config: Config) -> Recorded:
     truth = [np.array(sorted(each)) for each in fixes.values()]
     seen: dict[str, list[list[Seen]]] = {sensor: [[] for _ in truth] for sensor in SENSORS}
     crowding: dict[str, list[float]] = {sensor: [] for sensor in SENSORS}
-    for sensor, time_s, points_m, ego_m in _scans(messages):
-        false = np.ones(len(points_m), dtype=bool)
-        far_m = config.sensors[sensor].max_range_m or math.inf
-        false &= np.hypot(*(points_m - ego_m).T) <= far_m
+    for sensor, stamp_ns, ego_m, points_m, _ in scans(messages, config):
+        time_s, far_m = seconds(stamp_ns), config.sensors[sensor].max_range_m or math.inf
+        false = np.hypot(*(points_m - ego_m).T) <= far_m
         for vessel, track in zip(seen[sensor], truth, strict=True):
             if not track[0, 0] <= time_s <= track[-1, 0]:
                 continue
@@ -132,17 +132,6 @@ def ruled(config: Config, recordings: Sequence[Recorded]) -> Config:
         birth=replace(config.birth, speed_std_mps=_digits(speed_mps)),
         lifecycle=replace(config.lifecycle, min_travel_m=_digits(3.0 * worst_m)),
     )
-
-
-def _scans(messages: Sequence[object]) -> Iterator[tuple[str, float, FloatArray, FloatArray]]:
-    """Sensor, time, positions (m, 2) in the map and place of the ego of every list of positions."""
-    ego_m = np.zeros(2)
-    for one in messages:
-        if isinstance(one, EgoState):
-            ego_m = np.array([one.x_m, one.y_m])
-        elif isinstance(one, DetectionList) and one.sensor in SENSORS:
-            points_m = np.array([(each.x_m, each.y_m) for each in one.objects], dtype=np.float64).reshape(-1, 2)
-            yield one.sensor, seconds(one.stamp_ns), points_m, ego_m
 
 
 def _at(track: FloatArray, time_s: float) -> FloatArray:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.geometry import rotation
-from fgtrack.core.types import DetectionList, EgoState, FloatArray, TrackStatus
+from fgtrack.core.types import DetectionList, EgoState, FloatArray, Message, TrackStatus
 from fgtrack.evaluation.matching import match, scenes
 from fgtrack.evaluation.multi_object import Clear
 from fgtrack.evaluation.runs import JudgedRun
@@ -39,9 +39,12 @@ def autoferry_sources(autoferry: Path, scenarios: str) -> dict[str, Path]:
 
 
 class Scan(NamedTuple):
-    """Positions that one list gives, and its stamp."""
+    """Positions that one list gives."""
 
+    sensor: str
     stamp_ns: int
+    ego_m: FloatArray
+    """Where the ego is, shape (2,)."""
     positions_m: FloatArray
     """Shape (m, 2), in the map."""
     scores: FloatArray
@@ -57,19 +60,20 @@ class Found(NamedTuple):
     """As `nis_ratios`."""
 
 
-def scans(source: Path, config: Config) -> Iterator[Scan]:
-    """What each list of positions shows by itself; sensors without positions, and ignored ones, say nothing."""
+def scans(messages: Iterable[Message], config: Config) -> Iterator[Scan]:
+    """What each list of positions shows by itself; sensors without positions say nothing."""
     ego = None
-    for message in open_input(source, config.input).messages():
+    for message in messages:
         if isinstance(message, EgoState):
             ego = message
         elif isinstance(message, DetectionList) and "x_m" in getattr(config.sensors.get(message.sensor), "std", {}):
+            assert ego is not None
+            ego_m = np.array([ego.x_m, ego.y_m])
             points_m = np.array([(one.x_m, one.y_m) for one in message.objects], dtype=np.float64).reshape(-1, 2)
             if message.frame != "map":
-                assert ego is not None
-                points_m = points_m @ rotation(ego.yaw_rad).T + [ego.x_m, ego.y_m]
+                points_m = points_m @ rotation(ego.yaw_rad).T + ego_m
             scores = np.array([one.score for one in message.objects], dtype=np.float64)
-            yield Scan(message.stamp_ns, points_m, scores)
+            yield Scan(message.sensor, message.stamp_ns, ego_m, points_m, scores)
 
 
 def raw(run: Run, seen: Sequence[Scan]) -> Run:
@@ -86,7 +90,7 @@ def raw(run: Run, seen: Sequence[Scan]) -> Run:
 
 def raw_mota(source: Path, config: Config, run: Run) -> float:
     """MOTA of the detections themselves, each scan for itself: no miss filled, nothing suppressed, no identity."""
-    found = raw(run, list(scans(source, config)))
+    found = raw(run, list(scans(open_input(source, config.input).messages(), config)))
     matching = match(found, config.evaluation)
     assert matching is not None
     clear = Clear.of(scenes(found, matching), config.evaluation.gate_m)
