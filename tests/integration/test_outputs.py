@@ -467,7 +467,7 @@ def test_compare_tells_a_run_whose_tables_were_changed(here: Path, capfd: pytest
     rows = Path("run/updates.csv").read_text().splitlines(keepends=True)
     Path("run/updates.csv").write_text("".join(rows[:-1]))
     assert run(["compare", "run"]) == 0
-    assert "its digest is another; repeat the run" in capfd.readouterr().err
+    assert "the digest is another; repeat the run" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
