@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 
 import numpy as np
 
@@ -18,6 +19,8 @@ _PERSONS = ("pedestrian", "person", "person_sitting")
 _RIDERS = ("cyclist", "bicycle", "motorcycle", "rider")
 _UNKNOWN = 0
 _SIZES = ("length_m", "width_m", "height_m")
+_NO_SIZES = None, None, None
+_sizes_m = attrgetter(*_SIZES)
 
 
 @dataclass(frozen=True)
@@ -60,16 +63,17 @@ class Objects:
     def learn(self, track_id: int, detections: Iterable[Detection]) -> None:
         """These are detections of the track."""
         for one in detections:
-            sizes_m = [(name, value) for name in _SIZES if (value := getattr(one, name)) is not None]
-            if one.class_name is None and not sizes_m:
+            sizes_m = _sizes_m(one)
+            if one.class_name is None and sizes_m == _NO_SIZES:
                 continue
             seen = self._seen.setdefault(track_id, _Seen())
             if one.class_name is not None:
                 seen.classes[one.class_name] += 1
-            for name, value in sizes_m:
-                seen.num_sizes[name] += 1
-                mean = seen.sizes_m.get(name, 0.0)
-                seen.sizes_m[name] = mean + 1.0 / seen.num_sizes[name] * (value - mean)
+            for name, value in zip(_SIZES, sizes_m, strict=True):
+                if value is not None:
+                    seen.num_sizes[name] += 1
+                    mean = seen.sizes_m.get(name, 0.0)
+                    seen.sizes_m[name] = mean + 1.0 / seen.num_sizes[name] * (value - mean)
 
     def apart(self, named: Sequence[str | None], track_ids: Sequence[int]) -> Apart | None:
         """Which candidates of these classes are not these tracks; None where nothing speaks against any pair."""

@@ -7,7 +7,7 @@ score then has mean zero at the true parameters where the model is right, as tha
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -79,37 +79,39 @@ class Innovations:
         self._assumed_covariance = np.broadcast_to(np.eye(a), (*shape, a, a)).copy()
         for t, (track, one) in enumerate(zip(steps, series, strict=True)):
             for k, step in enumerate(track):
-                observation, size = step.observation, len(step.y)
-                sensor, components = observation.sensor, observation.measurement.model.components
-                self._there[k, t], self.counted[k, t] = True, counts(one, k)
-                self.since_start_s[k, t] = seconds(observation.measurement.stamp_ns - one.start.stamp_ns)
-                self._since_s[k, t] = step.since_s
-                self._about[k, t], self._offset[k, t] = step.about, step.before - step.about
-                self._predicted[k, t], self._after[k, t] = step.predicted, step.after
-                self._y[k, t, :size], self._H[k, t, :size] = step.y, step.H
-                self._foreign[k, t, :size, :size] = observation.foreign
-                if observation.tuned:
-                    self._axes[k, t, :size, :size] = observation.axes
-                    model = observation.measurement.model
-                    if isinstance(model, ErringMeasurement):
-                        self._lasting[k, t] = names[sensor, "share"]
-                        self._errors[k, t, range(size), model.columns] = 1.0
-                    self._std[k, t, :size] = [names[sensor, components[place]] for place in observation.measured]
-                self._own[k, t, :size, :size] = observation.own
-                self._odds[k, t] = names[sensor, ""]
-                self._padding[k, t] = d - size
-                size = len(step.assumed_innovation)
-                self._assumed_innovation[k, t, :size], self._assumed_jacobian[k, t, :size] = (
-                    step.assumed_innovation,
-                    step.assumed_jacobian,
-                )
-                self._assumed_covariance[k, t, :size, :size] = step.assumed_covariance
+                self.counted[k, t] = counts(one, k)
+                self.since_start_s[k, t] = seconds(step.observation.measurement.stamp_ns - one.start.stamp_ns)
+                self._set(k, t, step, names)
         fixed = 1.0 - self._errors.any(axis=-2, keepdims=True)
         self._H_fixed = self._H * fixed
         self._any_lasts: bool = np.any(self._errors).item()
         self._F = motion.jacobian(self._about, self._since_s)
         self._parts = space.noise_parts(self._about, self._since_s)
         self._has_assumed: list[bool] = np.any(self._assumed_jacobian, axis=(1, 2, 3)).tolist()
+
+    def _set(self, k: int, t: int, step: Step, names: Mapping[tuple[str, str], int]) -> None:
+        """Step k of series t; `names` are the places of the parameters."""
+        observation, size = step.observation, len(step.y)
+        model, sensor = observation.measurement.model, observation.sensor
+        self._there[k, t] = True
+        self._since_s[k, t] = step.since_s
+        self._about[k, t], self._offset[k, t] = step.about, step.before - step.about
+        self._predicted[k, t], self._after[k, t] = step.predicted, step.after
+        self._y[k, t, :size], self._H[k, t, :size] = step.y, step.H
+        self._foreign[k, t, :size, :size] = observation.foreign
+        if observation.tuned:
+            self._axes[k, t, :size, :size] = observation.axes
+            if isinstance(model, ErringMeasurement):
+                self._lasting[k, t] = names[sensor, "share"]
+                self._errors[k, t, range(size), model.columns] = 1.0
+            self._std[k, t, :size] = [names[sensor, model.components[place]] for place in observation.measured]
+        self._own[k, t, :size, :size] = observation.own
+        self._odds[k, t] = names[sensor, ""]
+        self._padding[k, t] -= size
+        size = len(step.assumed_innovation)
+        self._assumed_innovation[k, t, :size] = step.assumed_innovation
+        self._assumed_jacobian[k, t, :size] = step.assumed_jacobian
+        self._assumed_covariance[k, t, :size, :size] = step.assumed_covariance
 
     def evaluate(self, values: FloatArray) -> Evaluation:
         """The N innovations that count, at each row of `values`, (b, p)."""
