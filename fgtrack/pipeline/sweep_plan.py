@@ -100,9 +100,8 @@ class SweepConfig:
 
     @property
     def _redelays(self) -> bool:
-        return self.delays is not None or any(
-            key.startswith(f"{DELAYS}.") for axis in self.axes() for point in axis.points for key in point.changes
-        )
+        varied = (key for axis in self.axes() for point in axis.points for key in point.changes)
+        return self.delays is not None or any(key.startswith(f"{DELAYS}.") for key in (*self.set, *varied))
 
     def axes(self) -> "tuple[Axis, ...]":
         """The axes of the grid; raises `ValueError` with the key's path."""

@@ -234,6 +234,8 @@ def test_the_delays_of_a_recording_may_be_varied(plan: Any, recording: str) -> N
     made = plan("seeds: 2\nvary: {delays.radar.delay: [null, {kind: constant, delay_s: 0.3}]}", recording)
     kinds = [job.recipe.delays["radar"]["delay"] for job in made.jobs]
     assert [kind and kind["delay_s"] for kind in kinds] == [None, None, 0.3, 0.3]
+    made = plan("seeds: 2\nset: {delays.radar.loss_probability: 0.1}", recording)
+    assert [job.seed for job in made.jobs] == [0, 1]
 
 
 def test_a_recording_is_as_long_as_it_is(plan: Any, recording: str) -> None:
