@@ -167,7 +167,7 @@ class Table(RunTable):
         shown, notes = self._visible(), self._visible_notes()
         head = [_one_line(column.heading) for column in shown]
         rule = [":---" if column.left else "---:" for column in shown]
-        cells = _rows(shown, lambda cell, bold: f"**{cell.strip()}**" if bold else cell)
+        cells = cell_rows(shown, lambda cell, bold: f"**{cell.strip()}**" if bold else cell)
         rows = [[cell.replace("|", r"\|") for cell in row] for row in (head, rule, *cells)]
         text = [f"### {self.title}", "", *(f"| {' | '.join(row)} |" for row in rows), ""]
         return "\n".join([*text, *(f"- {note}" for note in notes), *([""] if notes else [])])
@@ -178,7 +178,7 @@ class Table(RunTable):
         """A table environment with the rules of the package booktabs; notes as comments."""
         shown = self._visible()
         head = [_latex(_one_line(column.heading)) for column in shown]
-        rows = _rows(shown, lambda cell, bold: f"\\textbf{{{_latex(cell)}}}" if bold else _latex(cell))
+        rows = cell_rows(shown, lambda cell, bold: f"\\textbf{{{_latex(cell)}}}" if bold else _latex(cell))
         body = [f"{' & '.join(row)} \\\\" for row in rows]
         spec = "".join("l" if column.left else "r" for column in shown)
         return "\n".join(
@@ -291,7 +291,7 @@ def _text(shown: Table | Text) -> str:
     return capture.get().removesuffix("\n")
 
 
-def _rows(columns: Sequence[Shown], form: Callable[[str, bool], Cell]) -> Iterator[list[Cell]]:
+def cell_rows(columns: Sequence[Shown], form: Callable[[str, bool], Cell]) -> Iterator[list[Cell]]:
     """Rows of cells as `form` makes them of the text and whether it is bold; the first cell only where it changes."""
     before = ""
     for marks, (first, *cells) in zip(

@@ -17,7 +17,7 @@ from fgtrack.evaluation.recordings import recordings_caution
 from fgtrack.evaluation.report.scene import scene
 from fgtrack.evaluation.report.settings import differing, flattened
 from fgtrack.evaluation.runs import JudgedRun
-from fgtrack.evaluation.tables import Table
+from fgtrack.evaluation.tables import Table, cell_rows
 
 _SCRIPTS = ("data.js", "drawing.js", "strip.js", "links.js", "controls.js", "viewer.js")
 _NONE = "–"
@@ -109,13 +109,9 @@ def _list(lines: Iterable[str], kind: str = "") -> str:
 def _table(table: Table) -> str:
     """A table as people read it; the name of a run is in its first row only."""
     head = "".join(_cell("th", column.heading, column.left) for column in table.shown)
-    rows, before = [], ""
-    for k in range(table.num_rows):
-        cells = []
-        for place, column in enumerate(table.shown):
-            text = column.cells[k]
-            cells.append(_cell("td", "" if not place and text == before else text, column.left, column.bold[k]))
-        before = table.shown[0].cells[k]
+    rows = []
+    for row in cell_rows(table.shown, lambda text, bold: (text, bold)):
+        cells = (_cell("td", text, column.left, bold) for column, (text, bold) in zip(table.shown, row, strict=True))
         rows.append(f"<tr>{''.join(cells)}</tr>\n")
     return _wide(table.title, head, "".join(rows)) + _list(table.notes, "soft")
 
