@@ -259,7 +259,7 @@ def test_an_empty_file_is_the_default_and_a_missing_one_an_error(tmp_path: Path)
         ("motion.std_per_s.yaw=-0.3", "std_per_s.yaw: must not be negative"),
         ("ego.storage_ticks=99999999999999999999", "has more than 64 bits"),
         ("inbox.max_future_s=-1", "inbox.max_future_s"),
-        ("sensors=" + "[" * 20_000, "nested too deeply"),
+        ("sensors=" + "[" * 1_000, "nested too deeply"),
     ],
 )
 def test_no_setting_is_beyond_reason(setting: str, message: str) -> None:
@@ -278,7 +278,7 @@ def test_no_setting_is_beyond_reason(setting: str, message: str) -> None:
             "more than 100000 values",
         ),
         ("a: &a [*a]\n", "nested too deeply"),
-        ("a: " + "[" * 10_000, "nested too deeply"),
+        ("a: " + "[" * 1_000, "nested too deeply"),
         ("a: [" + "1, " * 100_000 + "1]", "no configuration is longer than"),
     ],
     ids=["aliases", "itself", "brackets", "length"],
