@@ -15,6 +15,7 @@ from fgtrack.cli.figure import drawn_close_up
 from fgtrack.cli.report import REPORT, write_report
 from fgtrack.cli.show import TickProgress, progress, say, sentences, show, told
 from fgtrack.evaluation.comparison import compare
+from fgtrack.evaluation.figures.style import DRAWN
 from fgtrack.evaluation.plot import named_figures, save_named
 from fgtrack.evaluation.runs import judged
 from fgtrack.io.output import Kind, check_output, claimed, new_files
@@ -91,7 +92,7 @@ def demo(
             say(f"{title}:")
             sentences(compare(*part).verdict)
         show(replace(written_tables(every), verdict=()), None)
-        with progress("draw"), new_files(figures, overwrite) as folder:
+        with progress("draw"), new_files(figures, DRAWN, overwrite) as folder:
             drawn = list(chain(drawn_close_up(fitted)[0], named_figures(fitted)))
             files = save_named(drawn, folder, "png")
         with progress("report"):

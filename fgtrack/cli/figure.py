@@ -12,15 +12,13 @@ from fgtrack.cli.arguments import Overwrite
 from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
-from fgtrack.evaluation.figures.style import save_pages
+from fgtrack.evaluation.figures.style import DRAWN, save_pages
 from fgtrack.evaluation.plot import Planned, close_up, drawn, planned, planned_sweep, save_named
 from fgtrack.evaluation.recordings import by_recording
 from fgtrack.evaluation.runs import JudgedRun, judged, start_ns
 from fgtrack.evaluation.sweep_table import is_sweep, read_sweep
-from fgtrack.io.output import Kind, new_file, new_files
+from fgtrack.io.output import new_file, new_files
 from fgtrack.pipeline.close_up import close_ups
-
-PDF = Kind("a PDF file", lambda path: path.is_file() and path.read_bytes()[:4] == b"%PDF")
 
 
 def figure(
@@ -48,11 +46,11 @@ def figure(
         first, plans, missing = _of_sweep(runs, track, stamp) or _of_runs(runs, track, stamp)
         named = chain(first, drawn(plans, every))
         if one_file:
-            with new_file(out, PDF, overwrite) as file:
+            with new_file(out, DRAWN, overwrite) as file:
                 save_pages((each for _, each in named), file)
             files = [out]
         else:
-            with new_files(out, overwrite) as folder:
+            with new_files(out, DRAWN, overwrite) as folder:
                 files = [out / file.name for file in save_named(named, folder, form)]
     if missing is not None:
         say(f"no close-up: {missing}")

@@ -113,10 +113,10 @@ def new_folder(path: Path, kind: Kind, overwrite: bool) -> Iterator[Path]:
 
 
 @contextmanager
-def new_files(folder: Path, overwrite: bool) -> Iterator[Path]:
+def new_files(folder: Path, kind: Kind, overwrite: bool) -> Iterator[Path]:
     """A folder whose files are moved to `folder` when the block ends: all, or none where one must not be replaced.
 
-    An existing file may be replaced with `overwrite` where it starts with the same four bytes, or if it is equal.
+    An existing file may be replaced with `overwrite` where it is of this kind, or if it is equal.
     """
     with claimed(folder):
         part = folder / f"{secrets.token_hex(6)}.part"
@@ -127,10 +127,10 @@ def new_files(folder: Path, overwrite: bool) -> Iterator[Path]:
                 files = sorted(part.iterdir())
                 for file in files:
                     content = file.read_bytes()
-                    alike = Kind(f"a {file.suffix[1:].upper()} file", _starting_with(content[:4]))
                     place = folder / file.name
                     same = place.is_file() and not place.is_symlink() and place.read_bytes() == content
-                    check_output(place, alike, overwrite or same)
+                    if not same:
+                        check_output(place, kind, overwrite)
                 for file in files:
                     os.replace(file, folder / file.name)
             part.rmdir()
@@ -193,10 +193,6 @@ def part_of(name: str) -> str:
 def _part_of(path: Path) -> Path:
     path = Path(os.path.abspath(path))
     return path.with_name(f"{path.name}.{secrets.token_hex(6)}.part")
-
-
-def _starting_with(start: bytes) -> Callable[[Path], bool]:
-    return lambda path: path.is_file() and path.read_bytes()[: len(start)] == start
 
 
 @contextmanager

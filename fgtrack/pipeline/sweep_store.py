@@ -19,6 +19,7 @@ PART_FORMAT = "fgtrack-sweep-part/1"
 _PART_START = json.dumps({"format": PART_FORMAT})[:-1].encode()
 SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE = "sweep.csv", "timing.csv", "errors.csv"
 PAIRED_TABLE, SUMMARY_TABLE = "paired.csv", "summary.csv"
+_LONGEST_HEAD = 100_000
 
 Scalar = str | bool | int | float | None
 
@@ -56,7 +57,8 @@ class PartStore:
     """The parts of a sweep, each in a file named by the key of its job and written whole or not at all.
 
     Raises `CallError` where `folder` cannot be made one, or holds tables but no place of parts: those of another
-    program, which `overwrite` lets a sweep replace. Of a sweep that could not keep a single part, the place is there.
+    program, or of a sweep that has lost its parts, which `overwrite` replaces. Of a sweep that could not keep a single
+    part, the place is there.
     """
 
     def __init__(self, folder: Path, overwrite: bool = False) -> None:
@@ -64,7 +66,7 @@ class PartStore:
         parts = list(self._folder.glob("*.json"))
         if not any(map(_is_part, parts)) and (parts or not self._folder.is_dir()):
             for name in (SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE, PAIRED_TABLE, SUMMARY_TABLE):
-                check_output(folder / name, Kind("a table", Path.is_file), overwrite)
+                check_output(folder / name, _SWEPT, overwrite)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -93,6 +95,16 @@ class PartStore:
         """Keep the cells of a finished job."""
         content = {"format": PART_FORMAT, "cells": [asdict(cell) for cell in cells]}
         write_file(self._folder / f"{key}.json", json.dumps(content))
+
+
+def _is_swept(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return KEY_COLUMNS[1].encode() in file.readline(_LONGEST_HEAD).strip().split(b",")
+
+
+_SWEPT = Kind("a table of a sweep", _is_swept)
 
 
 def _is_part(path: Path) -> bool:

@@ -10,11 +10,13 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+from support import kitti
 from support.paper import paper
 
 from fgtrack.cli import demo
-from fgtrack.cli.main import run
+from fgtrack.cli.main import COMMANDS, _command, run
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TickReport
 from fgtrack.io import output
@@ -31,6 +33,17 @@ SWEEP = "format: fgtrack-sweep/1\nscenario: default\nestimators: [ekf-replay]\ns
 
 Call = Callable[..., tuple[int, str]]
 
+#: Files of other programs whose beginnings look alike.
+OTHERS = {
+    ".png": b"\x89PNG\r\n\x1a\n years of work",
+    ".pdf": b"%PDF-1.7 years of work",
+    ".html": b"<!DOCTYPE html><html>years of work",
+    ".mcap": b"\x89MCAP0\r\n years of work",
+    ".yaml": b"estimator: smoother\n",
+    ".csv": b"seed,yield_kg\n1,2\n",
+    ".jsonl": b'{"type": "header", "format": "years of work"}\n',
+}
+
 
 def drive(count: int = 30) -> list[Message]:
     """An ego at rest and one car ahead of it, seen by a lidar."""
@@ -42,6 +55,16 @@ def drive(count: int = 30) -> list[Message]:
     return messages
 
 
+def noisy(count: int = 120) -> list[Message]:
+    """The same without yaws, with noise that can be fitted."""
+    rng, messages = np.random.default_rng(1), list[Message]()
+    for k in range(count):
+        now_ns, (x_m, y_m) = START_NS + k * 50 * MS, rng.normal((20.0, 1.0), 0.5)
+        messages.append(EgoState(now_ns, now_ns, 0.0, 0.0, 0.0, 0.0))
+        messages.append(DetectionList("lidar", now_ns, now_ns, (Detection(x_m=x_m, y_m=y_m),)))
+    return messages
+
+
 def content(path: Path) -> dict[str, bytes | None]:
     """Every file below `path` with its bytes, and every folder."""
     below = [path, *sorted(path.rglob("*"))]
@@ -50,27 +73,42 @@ def content(path: Path) -> dict[str, bytes | None]:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with streams, a bag, a run, its figures and a demo."""
+    """A folder with recordings, runs, and what every command makes of them."""
     folder = tmp_path_factory.mktemp("made")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setattr(demo, "simulate", lambda scenario, rng: drive())
         write_stream("drive.jsonl", drive())
+        write_stream("noisy.jsonl", noisy())
         write_stream("other.jsonl", drive(10))
         write_bag("bag", drive(10))
-        assert run(["replay", "other.jsonl", "-o", "run"]) == 0
-        assert run(["figure", "run", "-o", "figures"]) == 0
-        assert run(["demo", "-o", "demo"]) == 0
-        assert run(["advise", "other.jsonl", "--set", "filter.storage_s=2.5", "-o", "advice.yaml"]) == 0
+        seen = [kitti.pose(frame, 20.0, 3.0, 0.0) for frame in range(30)]
+        kitti.folder(folder / "kitti", oxts=[kitti.oxts(speed_mps=10.0)] * 30, pointrcnn_car=seen)
+        Path("sweep.yaml").write_text(SWEEP)
+        for words in (
+            ("replay", "other.jsonl", "-o", "run"),
+            ("replay", "kitti/oxts/0001.txt", "-o", "kitti_run"),
+            ("demo", "-o", "demo"),
+            *(words for words, _ in WRITERS if words[0] in ("figure", "report", "export", "tune", "advise")),
+        ):
+            assert run(list(words)) == 0
     return folder
 
 
 @pytest.fixture
 def here(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, a copy of that one."""
+    """The current folder, a copy of that one; figures are copied, not drawn."""
     folder = shutil.copytree(made, tmp_path / "here")
     monkeypatch.chdir(folder)
     monkeypatch.setattr(demo, "simulate", lambda scenario, rng: drive())
+
+    def redraw(named: object, folder: Path, form: str) -> list[Path]:
+        return [Path(shutil.copy(picture, folder)) for picture in sorted((made / "figures").iterdir())]
+
+    monkeypatch.setattr("fgtrack.cli.figure.save_named", redraw)
+    monkeypatch.setattr(
+        "fgtrack.cli.figure.save_pages", lambda figures, file: file.write((made / "figures.pdf").read_bytes())
+    )
     return folder
 
 
@@ -88,6 +126,7 @@ def call(capfd: pytest.CaptureFixture[str]) -> Iterator[Call]:
     return called
 
 
+#: Commands with an output, and what they write of it: the path at which something else may be.
 WRITERS = [
     (("simulate", "default", "--duration", "1", "-o", "other.jsonl"), "other.jsonl"),
     (("simulate", "default", "--duration", "1", "-o", "bag"), "bag"),
@@ -95,16 +134,48 @@ WRITERS = [
     (("convert", "drive.jsonl", "bag"), "bag"),
     (("convert", "drive.jsonl", "bag", "--storage", "sqlite3"), "bag"),
     (("replay", "drive.jsonl", "-o", "run"), "run"),
-    (("replay", "drive.jsonl", "-o", "demo/runs", "-e", "ekf-replay,smoother"), "demo/runs"),
-    (("demo", "-o", "demo"), "demo"),
-    (("advise", "drive.jsonl", "-o", "advice.yaml"), "advice.yaml"),
+    (("replay", "drive.jsonl", "-o", "demo/runs", "-e", "ekf-replay,smoother"), "demo/runs/smoother"),
+    (("demo", "-o", "demo"), "demo/recording"),
+    (("figure", "run", "-o", "figures"), "figures/arrivals.png"),
+    (("figure", "run", "-o", "figures.pdf"), "figures.pdf"),
+    (("report", "run", "-o", "report.html"), "report.html"),
+    (("export", "run", "-o", "run.mcap"), "run.mcap"),
+    (("export", "run", "-o", "ros2.mcap", "--ros2"), "ros2.mcap"),
+    (("export", "run", "-o", "ros2", "--ros2"), "ros2"),
+    (("export", "kitti_run", "-o", "0001.txt", "--kitti", "kitti/oxts/0001.txt"), "0001.txt"),
+    (("tune", "noisy.jsonl", "-o", "tuned.yaml"), "tuned.yaml"),
+    (("advise", "drive.jsonl", "-o", "advised.yaml"), "advised.yaml"),
+]
+#: A sweep goes on where it was, and makes its tables anew.
+ONGOING = [
+    (("sweep", "sweep.yaml", "-o", "swept"), f"swept/{table}")
+    for table in ("sweep.csv", "timing.csv", "errors.csv", "paired.csv", "summary.csv")
 ]
 
 
-@pytest.mark.parametrize(("words", "out"), WRITERS, ids=str)
+def test_every_command_with_an_output_is_in_the_table() -> None:
+    tried: dict[str, set[str]] = {}
+    for words, _ in (*WRITERS, *ONGOING):
+        tried.setdefault(words[0], set()).update(words)
+    for name in COMMANDS:
+        parameters = _command(name).params
+        writes = {"out", "output", "overwrite"} & {each.name for each in parameters}
+        writes |= {"-o", "--out", "--output"} & {option for each in parameters for option in each.opts}
+        assert bool(writes) == (name in tried), name
+        kinds = [each for each in parameters if (getattr(each, "help", None) or "").startswith("Write ")]
+        assert not [each for each in kinds if not set(each.opts) & tried.get(name, set())], name
+
+
+@pytest.mark.parametrize(("words", "place"), WRITERS, ids=str)
 def test_what_exists_is_refused_at_once_and_replaced_with_overwrite(
-    here: Path, call: Call, words: tuple[str, ...], out: str
+    here: Path, call: Call, words: tuple[str, ...], place: str
 ) -> None:
+    out = words[words.index("-o") + 1] if "-o" in words else words[2]
+    own = here / place
+    if own.is_dir():
+        own = min(file for file in own.iterdir() if file.is_file())
+    if own.exists():
+        own.write_bytes(own.read_bytes() + b"\n")  # so that the same is not made again
     before = content(here)
     code, error = call(*words)
     assert code == 2
@@ -113,31 +184,31 @@ def test_what_exists_is_refused_at_once_and_replaced_with_overwrite(
     assert content(here) == before
     assert call(*words, "--overwrite")[0] == 0
     after = content(here)
-    assert after != before
-    assert {name for name in after if not name.startswith(str(here / out))} == {
-        name for name in before if not name.startswith(str(here / out))
+    assert after.get(str(own)) != before.get(str(own), b"")
+    assert {name: data for name, data in after.items() if not name.startswith(str(here / out))} == {
+        name: data for name, data in before.items() if not name.startswith(str(here / out))
     }
     assert not [name for name in after if "part" in name]
 
 
-@pytest.mark.parametrize(("words", "out"), WRITERS, ids=str)
-def test_something_else_in_the_way_is_left_alone_even_with_overwrite(
-    here: Path, call: Call, words: tuple[str, ...], out: str
+@pytest.mark.parametrize("more", [(), ("--overwrite",)], ids=["new", "overwrite"])
+@pytest.mark.parametrize(("words", "place"), [*WRITERS, *ONGOING], ids=str)
+def test_what_another_program_wrote_is_never_replaced(
+    here: Path, call: Call, words: tuple[str, ...], place: str, more: tuple[str, ...]
 ) -> None:
-    place = here / out
-    if out == "demo":
-        place = here / "demo/recording"
-    if out == "demo/runs":
-        place = here / "demo/runs/smoother"
-    place.rename(here / "old")
-    for thesis in (place, place / "thesis"):
-        thesis.parent.mkdir(exist_ok=True)
-        thesis.write_text("years of work")
-        code, error = call(*words, "--overwrite")
+    theirs = here / place
+    if theirs.exists():
+        theirs.rename(here / "old")
+    for thesis in (
+        (theirs,) if theirs.suffix == ".pdf" else (theirs, theirs / "thesis")
+    ):  # a folder x.pdf takes pictures
+        thesis.parent.mkdir(parents=True, exist_ok=True)
+        thesis.write_bytes(OTHERS.get(theirs.suffix, b"years of work"))
+        before = content(here)
+        code, error = call(*words, *more)
         assert code == 2
-        assert str(place.relative_to(here)) in error
-        assert content(place)[str(thesis)] == b"years of work"
-        assert len(content(place)) == 1 + (thesis != place)
+        assert place in error or not more
+        assert content(here) == before
         thesis.unlink()
 
 
@@ -222,18 +293,6 @@ def test_a_sweep_does_not_share_its_folder(here: Path, call: Call) -> None:
     Path("sweep.yaml").write_text(SWEEP)
     with claimed(Path("swept")):
         assert "another command is writing there" in call("sweep", "sweep.yaml", "-o", "swept")[1]
-
-
-@pytest.mark.parametrize("table", ["sweep.csv", "timing.csv", "errors.csv"])
-def test_a_sweep_does_not_replace_a_table_that_it_did_not_make(here: Path, call: Call, table: str) -> None:
-    Path("sweep.yaml").write_text(SWEEP)
-    Path("swept").mkdir()
-    Path("swept", table).write_text("mine")
-    code, error = call("sweep", "sweep.yaml", "-o", "swept")
-    assert code == 2
-    assert f"swept/{table}: already exists" in error
-    assert [file.name for file in Path("swept").iterdir()] == [table]
-    assert Path("swept", table).read_text() == "mine"
 
 
 def test_the_input_of_a_conversion_is_never_its_output(here: Path, call: Call) -> None:
@@ -350,16 +409,8 @@ def test_a_file_has_the_usual_permissions(here: Path) -> None:
     ] * 2
 
 
-def test_figures_are_replaced_all_or_none(here: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_figures_are_replaced_all_or_none(here: Path, call: Call) -> None:
     figures = sorted(Path("figures").iterdir())
-    drawn = {figure.name: figure.read_bytes() for figure in figures}
-
-    def redraw(named: object, folder: Path, form: str) -> list[Path]:
-        for name, picture in drawn.items():
-            (folder / name).write_bytes(picture)
-        return [folder / name for name in drawn]
-
-    monkeypatch.setattr("fgtrack.cli.figure.save_named", redraw)
     assert call("figure", "run", "-o", "figures")[0] == 0  # they would be the same
     figures[-1].write_bytes(figures[-1].read_bytes() + b"x")
     figures[0].unlink()
@@ -398,29 +449,6 @@ def test_an_output_that_cannot_be_written_is_a_bad_call_everywhere(here: Path, c
         assert "file/x" in error
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("report", "run", "-o", "out.html"),
-        ("figure", "run", "-o", "out.pdf"),
-        ("export", "run", "-o", "out.mcap"),
-        ("export", "run", "-o", "out.mcap", "--ros2"),
-        ("tune", "drive.jsonl", "-o", "out.yaml"),
-        ("advise", "drive.jsonl", "-o", "out.yaml"),
-    ],
-    ids=str,
-)
-def test_what_another_program_wrote_is_never_replaced(here: Path, call: Call, words: tuple[str, ...]) -> None:
-    out = Path(words[words.index("-o") + 1])
-    out.write_text("years of work")
-    before = content(here)
-    for more in ((), ("--overwrite",)):
-        code, error = call(*words, *more)
-        assert code == 2
-        assert str(out) in error
-        assert content(here) == before
-
-
 def test_two_replays_at_once_into_one_folder_are_one_run_and_one_refusal(here: Path) -> None:
     write_stream("long.jsonl", drive(1500))
     words = [sys.executable, "-m", "fgtrack", "replay", "long.jsonl", "-o", "both", "--overwrite"]
@@ -443,7 +471,7 @@ def test_a_folder_of_parts_of_another_program_is_no_sweep(here: Path, call: Call
     before = content(Path("swept"))
     code, error = call("sweep", "sweep.yaml", "-o", "swept")
     assert code == 2
-    assert "swept/sweep.csv: already exists" in error
+    assert "swept/sweep.csv: exists and is not a table of a sweep" in error
     assert content(Path("swept")) == before
 
 

@@ -112,6 +112,17 @@ def test_a_file_is_no_folder(tmp_path: Path) -> None:
         PartStore(tmp_path / "file")
 
 
+def test_tables_without_parts_are_replaced_with_overwrite_where_a_sweep_wrote_them(tmp_path: Path) -> None:
+    (tmp_path / "sweep.csv").write_text("lag_s,seed,estimator,rmse\n")
+    with pytest.raises(CallError, match=r"sweep\.csv: already exists"):
+        PartStore(tmp_path)
+    (tmp_path / "paired.csv").write_text("yield\n")
+    with pytest.raises(CallError, match=r"paired\.csv: exists and is not a table of a sweep"):
+        PartStore(tmp_path, overwrite=True)
+    (tmp_path / "paired.csv").unlink()
+    assert not PartStore(tmp_path, overwrite=True).keys()
+
+
 def test_a_part_without_all_its_cells_is_not_done(tmp_path: Path) -> None:
     store = PartStore(tmp_path)
     for key, cells in {"k0": [cell("a", x=1.0)], "k1": [cell("a", x=1.0), cell("a", x=1.0)]}.items():

@@ -23,6 +23,7 @@ from PIL import Image
 from fgtrack.core.errors import CallError, printable_lines
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.palette import PALETTE as PALETTE
+from fgtrack.io.output import Kind
 
 WRONG = "#000000"
 GREY = "#777777"
@@ -63,12 +64,21 @@ _STYLE = {
     "svg.hashsalt": "fgtrack",
 }
 
-#: Formats of files, and the entries that would differ from one writing to the next.
-FORMATS: Mapping[str, Mapping[str, None]] = {
-    "png": {"Software": None},
-    "svg": {"Date": None, "Creator": None},
-    "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+_MARK = "fgtrack figure"
+#: Formats of files, with who made them and without what would differ from one writing to the next.
+FORMATS: Mapping[str, Mapping[str, str | None]] = {
+    "png": {"Creator": _MARK, "Software": None},
+    "svg": {"Creator": _MARK, "Date": None},
+    "pdf": {"Creator": _MARK, "CreationDate": None, "Producer": None},
 }
+
+
+def _is_drawn(path: Path) -> bool:
+    return path.is_file() and _MARK.encode() in path.read_bytes()
+
+
+#: A picture, or a PDF of several.
+DRAWN = Kind("a figure of fgtrack", _is_drawn)
 
 P = ParamSpec("P")
 T = TypeVar("T")
