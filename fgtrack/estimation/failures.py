@@ -20,11 +20,11 @@ class Failure(StrEnum):
     NOT_DEFINITE = "not positive definite"
     """A covariance that was to be published was not."""
     OUT_OF_BOUNDS = "out of bounds"
-    """A state that was to be published was none that an object can have, see `faults`."""
+    """A state that was to be published was not one that an object can have, see `faults`."""
     UPDATE_FAILED = "update failed"
     """A measurement could not be fused; its disposition is `failed`."""
     ESTIMATOR_RAISED = "estimator raised"
-    """It raised an exception where it was asked for states, or told of the clock."""
+    """An estimator raised an exception when it was asked for states, or told of the clock."""
     GRAPH_REBUILT = "graph rebuilt"
     """A factor graph could not be solved with a new measurement, and was built anew without it."""
     STEP_DAMPED = "step damped"
@@ -47,7 +47,7 @@ class EndedTrack:
     now_ns: int
     """Time of the tick."""
     failure: Failure
-    """The last straw."""
+    """The failure after which it ended."""
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""A bank that stands before another one."""
+"""A bank that stands in front of another one."""
 
 from collections.abc import Sequence
 

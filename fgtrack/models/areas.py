@@ -21,7 +21,7 @@ __all__ = ["ExclusionAreas"]
 _LARGEST_MB = 10.0
 _MOST_CORNERS = 20_000
 _LARGEST_M = 1e9
-_SMALLEST_M = 0.1  # across: what is smaller is in degrees
+_SMALLEST_M = 0.1  # across: a smaller one is in degrees
 _PORTION = 1 << 20  # pairs of points and corners that are in memory at a time
 
 Json = Any  # parsed JSON, checked while it is read

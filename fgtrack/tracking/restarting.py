@@ -20,7 +20,7 @@ _SHAPES = {(n, n, n) for n in (5, 6)}
 
 
 class RestartingBank(ForwardingBank):
-    """Stands before a bank, and takes care of what it raises and of states that cannot be published (see `faults`).
+    """Stands in front of a bank, and handles what it raises and states that cannot be published (see `faults`).
 
     A track that fails begins anew from its last good state, under the same id; what it knew of the past is lost. If it
     fails again before an update has succeeded, it ends. Where it cannot be told which track failed, all begin anew in a

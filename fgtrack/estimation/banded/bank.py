@@ -246,12 +246,11 @@ class BandedBank:
     # --- inside
 
     def _update(
-        self, stamp_ns: int, tracks: IntArray, measurements: Sequence[Measurement], times: "_Times"
+        self, stamp_ns: int, tracks: IntArray, measurements: Sequence[Measurement], times: _Times
     ) -> list[UpdateResult]:
         """`update` of tracks that reach as far back as `stamp_ns`."""
         results = [_FAILED] * len(tracks)
-        status = UpdateStatus.IN_SEQUENCE
-        statuses = [status] * len(tracks)
+        statuses = [UpdateStatus.IN_SEQUENCE] * len(tracks)
         for late, status in (
             (stamp_ns < times.newest, UpdateStatus.OUT_OF_SEQUENCE),
             (stamp_ns < times.start, UpdateStatus.BEYOND_WINDOW),
@@ -275,7 +274,7 @@ class BandedBank:
         measurements: Sequence[Measurement],
         groups: Sequence[Innovations],
         guesses: FloatArray,
-        times: "_Times",
+        times: _Times,
     ) -> list[int]:
         """Fuse those of `measurements` that are in `groups`; gives the positions of those that cannot be."""
         positions = np.sort(np.concatenate([group.positions for group in groups]))
@@ -334,12 +333,12 @@ class BandedBank:
         self._states.clear()
         self._times = None
 
-    def _all_times(self) -> "_Times":
+    def _all_times(self) -> _Times:
         if self._times is None:
             self._times = self._times_ns(self._tracks)
         return self._times
 
-    def _times_ns(self, tracks: IntArray) -> "_Times":
+    def _times_ns(self, tracks: IntArray) -> _Times:
         newest, first = self.windows.newest_ns(tracks), self._first_ns[tracks]
         start = np.maximum(np.maximum(self._clock_ns[tracks], newest) - self._lag_ns, first)
         reach = np.maximum(start - self._behind_ns, first)

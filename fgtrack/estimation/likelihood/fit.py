@@ -46,7 +46,7 @@ class FitSettings:
     def counts(self, series: Series, place: int) -> bool:
         """Whether the observation at `place` has a part in the likelihood.
 
-        It has where it is late enough in its track, in its limits, and of one object.
+        It does where it is late enough in its track, within the limits of its series, and of one object.
         """
         stamp_ns = series.observations[place].measurement.stamp_ns
         settled = place >= series.num_opening + self.settle_steps and place not in series.mixed
