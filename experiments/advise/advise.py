@@ -25,7 +25,7 @@ from fgtrack.pipeline.shipped import read_config
 from fgtrack.sim.redelay import restamped
 
 OFFSET_S = 0.08
-SEEDS = 6
+SEEDS = 8
 
 
 @dataclass(frozen=True)

@@ -290,7 +290,7 @@ class _Adviser:
             yield f"stamps of {', '.join(clocks)}"
         if not kinds & {"input", "model"}:
             yield "frames, angles and fields"
-        if not kinds & {"window", "receipt"}:
+        if "window" not in kinds:
             found = effective(self._config)
             yield f"{found.lag_key} ({found.lag_s:g} s) and max_delay_s"
         if "track" not in kinds:
