@@ -24,7 +24,7 @@ from fgtrack.core.types import (
     TruthState,
     UpdateRecord,
 )
-from fgtrack.io.run import NO_TRACK, RunWriter, Table, digest, load_run
+from fgtrack.io.run import COLUMNS, NO_TRACK, RunWriter, Table, digest, load_run
 
 
 def track(track_id: int = 1, size: int = 5, stamp_ns: int = 990) -> TrackReport:
@@ -273,6 +273,25 @@ def test_ticks_that_do_not_increase_are_refused(tmp_path):
     with (tmp_path / "run/timing.csv").open("a") as file:
         file.write("0,1000,1,1,1\n")
     with pytest.raises(DataError, match=r"timing\.csv: its ticks do not increase, repeat the run"):
+        load_run(tmp_path / "run")
+
+
+def test_one_long_cell_does_not_widen_a_column_to_gigabytes(tmp_path):
+    write(tmp_path / "run", report())
+    rows = ["1,2,3.0,4.0,\n"] * 5000
+    (tmp_path / "run/ignored.csv").write_text("".join([",".join(COLUMNS["ignored"]), "\n", *rows]))
+    assert load_run(tmp_path / "run").ignored.num_rows == 5000
+    rows[4999] = f"1,2,3.0,4.0,{'1.5 ' * 10_000}\n"  # as a column 800 MB
+    (tmp_path / "run/ignored.csv").write_text("".join([",".join(COLUMNS["ignored"]), "\n", *rows]))
+    with pytest.raises(DataError, match=r"ignored\.csv: outline_m of 40000 characters, repeat the run"):
+        load_run(tmp_path / "run")
+
+
+def test_a_line_without_end_is_not_read_to_its_end(tmp_path):
+    write(tmp_path / "run", report())
+    with (tmp_path / "run/tracks.csv").open("a") as file:
+        file.write("1" * 1_000_001)
+    with pytest.raises(DataError, match=r"tracks\.csv: a line of 1000000 characters"):
         load_run(tmp_path / "run")
 
 

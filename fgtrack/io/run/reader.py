@@ -2,7 +2,6 @@
 
 import csv
 import json
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -34,6 +33,9 @@ _INTEGER_COLUMNS = frozenset(
 
 CHUNK = 4096
 """Rows that wait for becoming columns, which take a tenth of the memory."""
+
+_LONGEST_LINE = 1_000_000
+_WIDE_BYTES, _WIDER_THAN_FILE = 1e8, 100.0  # of a column of text, all cells of which are as wide as its longest
 
 NO_TRACK = -1
 """Track id of an update that belongs to no track."""
@@ -176,10 +178,10 @@ def _reading(path: Path) -> Iterator[None]:
         raise DataError(f"{path}: cannot be read ({error.strerror}), is this a run folder?") from error
 
 
-def _read_text(path: Path, largest_mb: float = math.inf) -> str:
+def _read_text(path: Path) -> str:
     with _reading(path):
-        if path.stat().st_size > 1e6 * largest_mb:
-            raise DataError(f"{path}: is larger than {largest_mb:g} MB, repeat the run")
+        if path.stat().st_size > 1e6 * LARGEST_META_MB:
+            raise DataError(f"{path}: is larger than {LARGEST_META_MB:g} MB, repeat the run")
         return path.read_text(encoding="utf-8")
 
 
@@ -188,7 +190,7 @@ def _read_meta(path: Path) -> Mapping[str, Any]:
     if not file.exists() and (path / "config.yaml").is_file():
         raise DataError(f"{path}: has no meta.json, what wrote it was killed at its beginning: repeat the run")
     try:
-        meta = json.loads(_read_text(file, LARGEST_META_MB))
+        meta = json.loads(_read_text(file))
     except ValueError as error:
         raise DataError(f"{file}: is not JSON ({error}), repeat the run") from error
     if not isinstance(meta, dict) or meta.get("format") != RUN_FORMAT:
@@ -206,6 +208,7 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
     if table in OPTIONAL_TABLES and not path.exists():
         return Table({name: column(name, ()) for name in names})
     parts = {name: [column(name, ())] for name in names}
+    num_rows, longest = 0, dict.fromkeys((name for name in names if name in _TEXT_COLUMNS), 1)
     with _reading(path), path.open(encoding="utf-8", newline="\n") as file:
         reader = csv.reader(_whole_lines(path, file, complete))
         try:
@@ -216,7 +219,12 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
                 if short is not None:
                     line = reader.line_num - len(rows) + 1 + rows.index(short)
                     raise DataError(f"{path}:{line}: {len(short)} cells instead of {len(names)}, repeat the run")
+                num_rows += len(rows)
                 for name, cells in zip(names, zip(*rows, strict=True), strict=True):
+                    if name in longest:
+                        longest[name] = max(longest[name], max(map(len, cells)))
+                        if 4.0 * num_rows * longest[name] > max(_WIDE_BYTES, _WIDER_THAN_FILE * path.stat().st_size):
+                            raise DataError(f"{path}: {name} of {longest[name]} characters, repeat the run")
                     parts[name].append(column(name, _values(name, cells)))
         except csv.Error as error:
             raise DataError(f"{path}: is not CSV ({error}), repeat the run") from error
@@ -229,7 +237,9 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
 
 def _whole_lines(path: Path, file: TextIO, complete: bool) -> Iterator[str]:
     """The lines of a table, without a half-written last one, which only a run that did not finish may have."""
-    for line in file:
+    while line := file.readline(_LONGEST_LINE):
+        if len(line) == _LONGEST_LINE:
+            raise DataError(f"{path}: a line of {_LONGEST_LINE} characters, repeat the run")
         if not line.endswith("\n"):
             if complete:
                 raise DataError(f"{path}: breaks off in its last row, repeat the run")

@@ -6,7 +6,7 @@ from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES
 
 RUN_FORMAT = "fgtrack-run/1"
 LARGEST_META_MB = 16.0
-"""Of meta.json, which has some kB."""
+"""Of meta.json and config.yaml, which have some kB."""
 
 #: States whose covariance is written.
 COVARIANCE_STATES = ("x", "y", "yaw", "speed", "yaw_rate")
