@@ -135,7 +135,10 @@ class _Adviser:
             self._take(noise_findings(run_after, fits))
         if tune and any(one.kind == "noise" for one in self._findings):
             self._on_step("tune")
-            self._config = tuned({self._recording: lambda: iter(self._tracked)}, self._config).config
+            try:
+                self._config = tuned({self._recording: lambda: iter(self._tracked)}, self._config).config
+            except DataError as error:
+                self._findings.append(Finding("noise", "tune", 35.0, f"no noise is changed: {error}."))
         return Advice(
             recording=self._recording,
             findings=tuple(sorted(self._findings, key=lambda one: -one.weight)),

@@ -391,6 +391,14 @@ def test_an_estimator_that_forgets_and_noise_that_does_not_fit(call: Call) -> No
     assert advice.config.sensors["radar"].std["x_m"] == pytest.approx(1.0, rel=0.3)
 
 
+def test_noise_that_cannot_be_fitted_leaves_the_other_advice(call: Call) -> None:
+    write("stream", drive(10))
+    code, text = call("advise", "drive.jsonl", "--tune")
+    assert code == 0
+    assert "- tune: no noise is changed: " in text
+    assert "- sensors: none is configured" in text
+
+
 def test_the_forms_of_the_page(call: Call, capsys: pytest.CaptureFixture[str]) -> None:
     write("stream", drive())
     assert run_command(["advise", "drive.jsonl", "-c", "c.yaml", "--json"]) == 0
