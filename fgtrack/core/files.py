@@ -15,6 +15,8 @@ def read_whole(path: Path, largest_mb: float) -> bytes:
     Raises `DataError` for a larger file, and where it cannot be read. What a parser makes of a byte can take thirty.
     """
     try:
+        if path.is_fifo():
+            raise DataError(f"{path}: is a pipe, give a file")
         if path.stat().st_size > largest_mb * _MEGABYTE:
             raise DataError(f"{path}: is larger than {largest_mb:g} MB, more than such a file holds")
         return path.read_bytes()

@@ -513,6 +513,7 @@ def test_compare_tells_a_run_whose_tables_were_changed(here: Path, capfd: pytest
         ("simulate", "pipe.jsonl", "-o", "new.jsonl"),
         ("sweep", "pipe.jsonl", "-o", "new"),
         ("compare", "pipe.jsonl"),
+        ("compare", "run_of_pipe.jsonl"),
     ],
     ids=str,
 )
@@ -523,6 +524,9 @@ def test_a_pipe_in_place_of_a_file_is_one_line_at_once(
         pytest.fail("waits for the pipe")
 
     os.mkfifo("pipe.jsonl")
+    shutil.copytree("run", "run_of_pipe.jsonl")
+    Path("run_of_pipe.jsonl/tracks.csv").unlink()
+    os.mkfifo("run_of_pipe.jsonl/tracks.csv")
     before = signal.signal(signal.SIGALRM, waits)
     signal.alarm(60)
     try:

@@ -406,6 +406,8 @@ def test_the_configuration_of_a_run_is_a_mapping(tmp_path):
         ("tracks.csv", lambda text: text.replace("confirmed", "confirmed,1", 1)),
         ("tracks.csv", lambda text: text + "\n"),
         ("timing.csv", lambda text: text.replace("1000", "soon")),
+        ("timing.csv", lambda text: text + "\udcff,1,1,1,1\n"),
+        ("meta.json", 100_000 * "["),
     ],
 )
 def test_a_missing_or_damaged_file_is_one_line_that_names_it(tmp_path, file, damage):
@@ -414,7 +416,7 @@ def test_a_missing_or_damaged_file_is_one_line_that_names_it(tmp_path, file, dam
     text = (path / file).read_text()
     (path / file).unlink()
     if damage is not None:
-        (path / file).write_text(damage if isinstance(damage, str) else damage(text))
+        (path / file).write_text(damage if isinstance(damage, str) else damage(text), errors="surrogateescape")
     with pytest.raises(DataError) as caught:
         load_run(path)
     assert file in str(caught.value)
@@ -430,6 +432,20 @@ def test_a_track_row_is_written_in_tens_of_microseconds(tmp_path):
             writer.write_tick(TickReport(tick, tick, tracks, ()), 1, 0)
             best_s = min(best_s, time.perf_counter() - start_s)
     assert best_s / 50 < 60e-6  # 9 us on the machine where it was written
+
+
+def test_a_table_of_several_parts_comes_back_whole(tmp_path):
+    write(tmp_path / "run", report())
+    rows = [f"{k},{k},1,1,{k % 7}\n" for k in range(1, 10_000)]
+    with (tmp_path / "run/timing.csv").open("a") as file:
+        file.writelines(rows)
+    timing = load_run(tmp_path / "run").timing
+    assert timing["tick"].tolist() == list(range(10_000))
+    assert timing["num_detections"].tolist()[1:] == [k % 7 for k in range(1, 10_000)]
+    with (tmp_path / "run/timing.csv").open("a") as file:
+        file.write("10000,1\n10001,1,1,1,1\n")
+    with pytest.raises(DataError, match=r"timing\.csv:10002: 2 cells instead of 5"):
+        load_run(tmp_path / "run")
 
 
 @pytest.mark.parametrize(

@@ -171,6 +171,8 @@ def load_run(path: Path | str) -> Run:
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
     try:
+        if path.is_fifo():
+            raise DataError(f"{path}: is a pipe, is this a run folder?")
         yield
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: is not UTF-8 text ({error.reason}), repeat the run") from error
@@ -191,7 +193,7 @@ def _read_meta(path: Path) -> Mapping[str, Any]:
         raise DataError(f"{path}: has no meta.json, what wrote it was killed at its beginning: repeat the run")
     try:
         meta = json.loads(_read_text(file))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{file}: is not JSON ({error}), repeat the run") from error
     if not isinstance(meta, dict) or meta.get("format") != RUN_FORMAT:
         raise DataError(f"{file}: does not say format {RUN_FORMAT!r}, so this is not a run folder")
