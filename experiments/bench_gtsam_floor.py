@@ -120,7 +120,7 @@ class Parts(NamedTuple):
 def record(ticks: Sequence[Tick]) -> tuple[list[Asked], float]:
     """What the window of one object asked of gtsam, and the whole time of its tracker, in us per update."""
     asked: list[Asked] = []
-    with patch.object(build, "IncrementalBackend", lambda: Recorder(asked)):
+    with patch.dict(build._BANKS, smoother=build._smoother(lambda: Recorder(asked))):
         _tracked(ticks)
     num_updates = sum(isinstance(each, Change) for each in asked)
     before = time.process_time_ns()

@@ -11,6 +11,7 @@ from fgtrack.estimation.backward_forward import BackwardForwardBank
 from fgtrack.estimation.banded.bank import BandedBank
 from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.factor_graph import BatchBackend, IncrementalBackend, SmootherBank
+from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.failures import Failures
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.opening import initiated
@@ -141,9 +142,9 @@ def _build_backward_forward(config: Config, failures: Failures) -> TrackBank:
     return ObjectBank(motion, one, config.filter.storage_s)
 
 
-def _smoother(backend: type[IncrementalBackend] | type[BatchBackend]) -> Callable[[Config, Failures], TrackBank]:
+def _smoother(make_backend: Callable[[], Backend]) -> Callable[[Config, Failures], TrackBank]:
     return lambda config, failures: SmootherBank(
-        config.motion_model(), config.smoother, backend, config.initiation.method, failures
+        config.motion_model(), config.smoother, make_backend, config.initiation.method, failures
     )
 
 

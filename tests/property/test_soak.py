@@ -105,7 +105,7 @@ def drive(num_detections: int, seed: int) -> Drive:
         if number in quarters:
             gc.collect()
             done.resident.append(int(STATM.read_text().split()[1]) if STATM.exists() else 0)
-    done.smoothers += bank._smoothers.values()
+    done.smoothers += bank._estimators.values()
     return done
 
 
