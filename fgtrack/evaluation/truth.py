@@ -8,6 +8,7 @@ from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import EGO_ID, FloatArray, IntArray
 from fgtrack.io.run import Table
+from fgtrack.tracking.inbox import LARGEST
 
 #: What is interpolated, in the order of the columns of `TruePath.at`.
 TRUE_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
@@ -59,9 +60,11 @@ class TruePath:
 def true_paths(truth: Table) -> list[TruePath]:
     """Every true object but the ego, by rising id.
 
-    Of several rows with one stamp the last counts; rows without a finite position are no truth.
+    Of several rows with one stamp the last counts. A value beyond `LARGEST`, as of a detection, is none; rows without a
+    position are no truth.
     """
     rows = np.stack([truth[name] for name in TRUE_STATE], axis=-1)
+    rows[~(np.abs(rows) <= LARGEST)] = np.nan
     usable = np.isfinite(rows[:, :2]).all(axis=1)
     paths = []
     for object_id in np.unique(truth["object_id"][usable]).tolist():

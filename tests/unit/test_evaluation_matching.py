@@ -78,6 +78,17 @@ def test_the_ego_and_rows_without_position_are_no_true_objects(tmp_path: Path) -
     assert [path.object_id for path in true_paths(run.truth)] == [7]
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_truth_beyond_all_distances_is_none(tmp_path: Path) -> None:
+    """As a detection there; a speed that is none leaves the position."""
+    far = [TruthState(START_NS + each * S_NS, START_NS, 5, 1e308 * (-1.0) ** each, 0.0) for each in range(4)]
+    fast = dataclasses.replace(WEST.truth(range(1))[0], object_id=6, speed_mps=-1e300)
+    run = write_run(tmp_path / "run", truth=[*far, fast, *WEST.truth(range(3))])
+    odd, usual = true_paths(run.truth)
+    assert (odd.object_id, usual.object_id) == (6, 7)
+    assert np.isnan(odd.at(np.array([fast.stamp_ns]))[0, 3])
+
+
 def test_truth_in_any_order_is_one_path_and_its_last_word_counts(tmp_path: Path) -> None:
     rows = WEST.truth(range(4))
     wrong = dataclasses.replace(rows[2], x_m=99.0)
