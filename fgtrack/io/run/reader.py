@@ -5,7 +5,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, TextIO
@@ -209,9 +209,11 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
     names = COLUMNS[table]
     if table in OPTIONAL_TABLES and not path.exists():
         return Table({name: column(name, ()) for name in names})
-    parts = {name: [column(name, ())] for name in names}
-    num_rows, longest = 0, dict.fromkeys((name for name in names if name in _TEXT_COLUMNS), 1)
+    texts = {name: [column(name, ())] for name in names if name in _TEXT_COLUMNS}
+    num_rows, longest = 0, dict.fromkeys(texts, 1)
     with _reading(path), path.open(encoding="utf-8", newline="\n") as file:
+        most = _most_rows(path, names)
+        numbers = {name: np.empty(most, column(name, ()).dtype) for name in names if name not in texts}
         reader = csv.reader(_whole_lines(path, file, complete))
         try:
             if tuple(next(reader, ())) != names:
@@ -221,20 +223,30 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
                 if short is not None:
                     line = reader.line_num - len(rows) + 1 + rows.index(short)
                     raise DataError(f"{path}:{line}: {len(short)} cells instead of {len(names)}, repeat the run")
-                num_rows += len(rows)
+                place = slice(num_rows, num_rows + len(rows))
+                num_rows = place.stop
                 for name, cells in zip(names, zip(*rows, strict=True), strict=True):
-                    if name in longest:
+                    if name in texts:
                         longest[name] = max(longest[name], max(map(len, cells)))
                         if 4.0 * num_rows * longest[name] > max(_WIDE_BYTES, _WIDER_THAN_FILE * path.stat().st_size):
                             raise DataError(f"{path}: {name} of {longest[name]} characters, repeat the run")
-                    parts[name].append(column(name, _values(name, cells)))
+                        texts[name].append(column(name, cells))
+                    else:
+                        numbers[name][place] = column(name, _values(name, cells))
         except csv.Error as error:
             raise DataError(f"{path}: is not CSV ({error}), repeat the run") from error
         except UnicodeDecodeError:  # which is a ValueError
             raise
         except (ValueError, OverflowError) as error:
             raise DataError(f"{path}: holds a bad cell ({error}), repeat the run") from error
-    return Table({name: np.concatenate(of) for name, of in parts.items()})
+    return Table({name: np.concatenate(texts[name]) if name in texts else numbers[name][:num_rows] for name in names})
+
+
+def _most_rows(path: Path, names: Sequence[str]) -> int:
+    """As many as there are lines and, as a row has as many bytes as cells at least, fit into the file."""
+    with path.open("rb") as file:
+        lines = sum(block.count(b"\n") for block in iter(partial(file.read, 1 << 20), b""))
+    return min(lines, path.stat().st_size // len(names))
 
 
 def _whole_lines(path: Path, file: TextIO, complete: bool) -> Iterator[str]:
@@ -258,9 +270,7 @@ def column(name: str, cells: Sequence[str | int | float | None]) -> Column:
     return np.array(cells, dtype=np.float64)
 
 
-def _values(name: str, cells: Sequence[str]) -> Sequence[str | int | float | None]:
-    """The cells of the column `name` from their text."""
-    if name in _TEXT_COLUMNS:
-        return cells
+def _values(name: str, cells: Sequence[str]) -> Sequence[int | float | None]:
+    """The numbers of the column `name` from their text."""
     convert: Callable[[str], float] = int if name in _INTEGER_COLUMNS else float
     return [convert(cell) if cell else None for cell in cells]
