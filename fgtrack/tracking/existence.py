@@ -30,6 +30,7 @@ from fgtrack.tracking.lifecycle import Look, Sighting
 
 #: Bounds of log-odds: a probability that differs from 0 or 1 by less says nothing more.
 _LARGEST_LOG_ODDS = 30.0
+_SINGULAR = 1e-12
 
 
 @dataclass(frozen=True)
@@ -231,13 +232,17 @@ class ExistenceLifecycle:
 
 
 def _position_density(sighting: Sighting) -> float | None:
-    """N(z - h(x); 0, S) of the position in 1/m^2; None where the detection gives none."""
+    """N(z - h(x); 0, S) of the position in 1/m^2; None where the detection gives none, or S is singular to rounding."""
     candidate, mean, P = sighting
     if candidate.position_m is None or candidate.position_covariance is None or mean is None or P is None:
         return None
     S = P[:2, :2] + candidate.position_covariance
+    variances = float(S[0, 0] * S[1, 1])
+    determinant = variances - float(S[0, 1] * S[1, 0])
+    if determinant <= _SINGULAR * variances:
+        return None
     squared = float(mahalanobis_squared(candidate.position_m - mean[:2], S))
-    return math.exp(-0.5 * squared) / (2.0 * math.pi * math.sqrt(float(S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0])))
+    return math.exp(-0.5 * squared) / (2.0 * math.pi * math.sqrt(determinant))
 
 
 def _bounded(log_odds: float) -> float:

@@ -126,6 +126,17 @@ def test_a_track_that_left_the_view_of_all_sensors_ends_although_it_is_believed(
         assert ended == ([0] if at_ms > 540.0 else [])
 
 
+@pytest.mark.parametrize("angle_rad", np.linspace(0.0, 3.0, 31))
+def test_a_position_on_an_endless_line_proves_nothing(angle_rad: float) -> None:
+    """As of a RADAR whose range is good to 1e9 m."""
+    life = lifecycle()
+    life.born(0, look(), Sighting(HERE))
+    along = np.array([math.cos(angle_rad), math.sin(angle_rad)])
+    far = replace(candidate(10.0, 0.0), position_covariance=1e18 * np.outer(along, along) + 0.01 * np.eye(2))
+    life.matched(0, look(at_ms=20.0), Sighting(far, MEAN, P))
+    assert 0.0 < probability(life, 20.0) < 0.2001
+
+
 def test_a_better_score_makes_an_object_more_probable() -> None:
     found = []
     for score in (2.0, None, 3.0, 5.0):
