@@ -259,34 +259,6 @@ def test_the_printed_configuration_is_one(fgtrack: Command, stream: Path) -> Non
     assert load_run("run").config_text == printed.out
 
 
-def test_the_demo_goes_from_scenario_to_figures(
-    fgtrack: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(demo, "read_scenario", lambda name: replace(read_scenario(name), duration_s=2.0))
-    shown = fgtrack("demo", "-o", "demo")
-    assert (shown.code, shown.err) == (0, "")
-    assert (tmp_path / "demo/recording/metadata.yaml").exists()
-    estimators = ["smoother", "ekf-replay", "ekf-backward-forward"]
-    names = [*estimators, *(f"{name}-tuned" for name in estimators)]
-    found = {name: load_run(tmp_path / "demo/runs" / name) for name in names}
-    assert {path.name for path in (tmp_path / "demo/runs").iterdir()} == set(names)
-    assert [one.meta["estimator"] for one in found.values()] == 2 * estimators
-    stds_mps = [one.config["sensors"]["radar"]["std"]["speed_mps"] for one in found.values()]
-    assert stds_mps[:3] == 3 * [0.2]
-    assert stds_mps[3:] == 3 * [pytest.approx(1.0, rel=0.1)]
-    verdict, tables = shown.out.split("Tracking (errors")
-    assert "at the newest stamp" in " ".join(verdict.split())
-    for text in tables.split("Error against lag"):
-        assert sorted(names, key=lambda name: text.index(f" {name} ")) == names
-    lags_s = found["smoother-tuned"].lagged["lag_s"].tolist()
-    assert sorted(set(lags_s)) == [0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 0.9]
-    assert found["smoother-tuned"].smoothed["kind"].tolist().count("lagged") == lags_s.count(0.1)
-    assert "final" in found["smoother-tuned"].smoothed["kind"]
-    assert {path.name for path in (tmp_path / "demo/figures").iterdir()} >= {"error_against_lag.png", "timing.png"}
-    assert "smoother-tuned" in (tmp_path / "demo/report.html").read_text(encoding="utf-8")
-    assert "report: demo/report.html" in shown.out
-
-
 # --- the call is bad: 2
 
 

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from fgtrack.io.run import load_run
+
 ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
 RUNS = (*ESTIMATORS, *(f"{name}-tuned" for name in ESTIMATORS))
 SHORT_DEMO = """
@@ -76,6 +78,29 @@ def test_the_demo_shows_every_name_in_80_columns(demo: Path) -> None:
     assert any("--all" in line for line in lines)
 
 
+def test_the_demo_goes_from_scenario_to_figures(demo: Path) -> None:
+    assert (demo / "recording/metadata.yaml").exists()
+    assert {path.name for path in (demo / "runs").iterdir()} == set(RUNS)
+    found = {name: load_run(demo / "runs" / name) for name in RUNS}
+    assert [one.meta["estimator"] for one in found.values()] == [*ESTIMATORS, *ESTIMATORS]
+    stds_mps = [one.config["sensors"]["radar"]["std"]["speed_mps"] for one in found.values()]
+    assert stds_mps[:3] == 3 * [0.2]
+    assert stds_mps[3:] == 3 * [pytest.approx(1.0, rel=0.1)]
+    shown = (demo / "shown.txt").read_text(encoding="utf-8")
+    verdict, tables = shown.split("Tracking (errors")
+    assert "at the newest stamp" in " ".join(verdict.split())
+    for text in tables.split("Error against lag"):
+        assert sorted(RUNS, key=lambda name: text.index(f" {name} ")) == list(RUNS)
+    lags_s = found["smoother-tuned"].lagged["lag_s"].tolist()
+    assert sorted(set(lags_s)) == [0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 0.9]
+    assert found["smoother-tuned"].smoothed["kind"].tolist().count("lagged") == lags_s.count(0.1)
+    assert "final" in found["smoother-tuned"].smoothed["kind"]
+    assert {path.name for path in (demo / "figures").iterdir()} >= {"error_against_lag.png", "timing.png"}
+    assert "smoother-tuned" in (demo / "report.html").read_text(encoding="utf-8")
+    assert "report.html" in shown
+
+
+@pytest.mark.slow
 def test_the_demo_shows_every_name_in_100_columns(tmp_path: Path) -> None:
     lines = lines_in_terminal(100, "demo", "-o", tmp_path, program=("-c", SHORT_DEMO))
     check([line for line in lines if str(tmp_path) not in line], 100)

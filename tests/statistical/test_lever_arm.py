@@ -38,7 +38,7 @@ def judged(mount: Mount, yaw_rate_radps: float, seed: int) -> tuple[float, float
         ego_messages=exact,
     )
     config = Config(
-        estimator="smoother",
+        estimator="smoother-banded",
         sensors={"radar": SensorModel(std=STD, mount=mount)},
         motion=MOTION,
         birth=MeasuredBirth(ego_speed_factor=0.0, speed_std_mps=20.0),
