@@ -13,7 +13,7 @@ from fuzz.cases import files_of, fuzz, healthy, problem_of, write
 from fuzz.targets import TARGETS, Target
 
 each_target = pytest.mark.parametrize("target", TARGETS, ids=[target.name for target in TARGETS])
-_A_FEW = 8
+_A_FEW = 4
 _SEED = 20_261
 
 

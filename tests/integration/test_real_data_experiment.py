@@ -109,7 +109,7 @@ def test_the_share_that_lasts_gives_the_differences_of_successive_errors() -> No
         lasting[k] = keep * lasting[k - 1] + math.sqrt(1.0 - keep**2) * drawn[k]
     errors_m = sigma_m * (math.sqrt(share) * lasting + math.sqrt(1.0 - share) * rng.normal(0.0, 1.0, (steps, 2)))
     track = [(period_s * k, error) for k, error in enumerate(errors_m)]
-    found_share, found_s = rules.lasting([track[k : k + 1000] for k in range(0, steps, 1000)], sigma_m**2)
+    found_share, found_s = rules.lasting([track[k : k + 100] for k in range(0, steps, 100)], sigma_m**2)
     assert found_share == pytest.approx(share, abs=0.02)
     assert found_s == pytest.approx(time_s, abs=5.0)
 
