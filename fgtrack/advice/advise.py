@@ -7,7 +7,7 @@ from pathlib import Path
 from fgtrack.advice.arrivals import FEWEST, Arrivals, arrivals_of, overtaken
 from fgtrack.advice.clocks import offset_findings, receipt_findings, stamp_findings
 from fgtrack.advice.finding import Finding, milliseconds, percent
-from fgtrack.advice.noise import NoiseFit, noise_findings, noise_fits
+from fgtrack.advice.noise import NoiseFit, noise_findings, noise_fits, objection
 from fgtrack.advice.page import Advice
 from fgtrack.advice.windows import beyond_lags, window_findings
 from fgtrack.core.caution import EGO
@@ -134,11 +134,7 @@ class _Adviser:
         if run_after is not None and not self._is_useless:
             self._take(noise_findings(run_after, fits))
         if tune and any(one.kind == "noise" for one in self._findings):
-            self._on_step("tune")
-            try:
-                self._config = tuned({self._recording: lambda: iter(self._tracked)}, self._config).config
-            except DataError as error:
-                self._findings.append(Finding("noise", "tune", 35.0, f"no noise is changed: {error}."))
+            self._findings.append(self._tuned(run_after))
         return Advice(
             recording=self._recording,
             findings=tuple(sorted(self._findings, key=lambda one: -one.weight)),
@@ -272,6 +268,24 @@ class _Adviser:
                 "rate, which a turn belies. Record it more often."
             )
             yield Finding("ego", EGO, 35.0, text)
+
+    def _tuned(self, before: Run | None) -> Finding:
+        """The noise that is fitted to the recording, unless nothing can be or it is no better than that of `before`."""
+        self._on_step("tune")
+        try:
+            report = tuned({self._recording: lambda: iter(self._tracked)}, self._config)
+        except DataError as error:
+            return Finding("tune", "tune", 76.0, f"no noise is changed: {error}.")
+        self._on_step("tracking")
+        after = self._replayed(report.config)
+        why = None if before is None or after is None else objection(before, after)
+        if why is not None:
+            return Finding("tune", "tune", 76.0, f"no noise is changed. With what is fitted, {why}.")
+        self._config = report.config
+        settings = {one.key: one.tuned for one in report.parameters if one.tuned != one.configured}
+        stay = ", ".join(one.key for one in report.parameters if one.key not in settings)
+        rest = f" As configured stay {stay}." if stay else ""
+        return Finding("tune", "tune", 76.0, f"fitted to the recording by maximum likelihood.{rest}", settings)
 
     def _replayed(self, config: Config) -> Run | None:
         """A run of the first minutes; None where nothing can be tracked."""

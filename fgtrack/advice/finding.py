@@ -14,7 +14,7 @@ class Finding:
     """A sentence or two with numbers, and settings; `str` tells all of it."""
 
     kind: str
-    """What it is about: `input`, `model`, `clock`, `late`, `loss`, `window`, `ego`, `noise`, `track`."""
+    """What it is about: `input`, `model`, `clock`, `late`, `loss`, `window`, `ego`, `noise`, `tune`, `track`."""
     about: str
     """Sensor, `ego`, or what else."""
     weight: float
@@ -24,8 +24,8 @@ class Finding:
     """Values of keys of the configuration that mend it; empty where no setting does."""
 
     def __str__(self) -> str:
-        mend = "".join(f" Set {key}: {_written(value)}." for key, value in self.settings.items())
-        return f"{self.about}: {self.text}{mend}"
+        mend = ", ".join(f"{key}: {_written(value)}" for key, value in self.settings.items())
+        return f"{self.about}: {self.text}{f' Set {mend}.' if mend else ''}"
 
 
 def _written(value: object) -> str:

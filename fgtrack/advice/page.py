@@ -49,7 +49,7 @@ class Advice:
 
     @property
     def changes(self) -> tuple[Change, ...]:
-        """The settings that the findings change, the most important first; fitted noise is not among them."""
+        """The settings that the findings change, the most important first."""
         found: dict[str, Change] = {}
         for one in self.findings:
             found |= {key: Change(key, value, f"{one.about}: {one.text}") for key, value in one.settings.items()}

@@ -8,7 +8,7 @@ import numpy as np
 from fgtrack.core.types import YAW, FloatArray, IntArray
 from fgtrack.evaluation.innovations import Autocorrelation, autocorrelations, num_measured
 from fgtrack.evaluation.matching import Matching, state_errors
-from fgtrack.evaluation.paired import UNKNOWN, Estimate, by_stamp, within_run
+from fgtrack.evaluation.paired import UNKNOWN, Estimate, by_stamp, mean_square
 from fgtrack.evaluation.statistics import ChiSquareMean, Moments, chi_square_band
 from fgtrack.evaluation.truth import TRUE_STATE
 from fgtrack.io.run import Run, Table
@@ -192,7 +192,7 @@ def _interval(nees: Nees | None) -> Estimate:
     if nees is None or not len(nees.values):
         return UNKNOWN
     ticks = by_stamp(nees.stamps_ns, nees.values[:, None])
-    return within_run(ticks, lambda S: S[0] / S[1], np.random.default_rng(_SEED))
+    return mean_square(ticks, np.random.default_rng(_SEED))
 
 
 def _one_each(nees: Nees) -> Nees:

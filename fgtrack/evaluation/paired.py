@@ -126,6 +126,17 @@ def within_run(ticks: FloatArray, statistic: Statistic, rng: np.random.Generator
     return _around(value, error, blocks)
 
 
+def mean_square(ticks: FloatArray, rng: np.random.Generator) -> Estimate:
+    """S[0] / S[1] of the sums S of `ticks`, as a mean NEES or NIS; see `within_run`.
+
+    The interval is that of the logarithm, so it is positive however few blocks it comes from.
+    """
+    found = within_run(ticks, lambda S: np.log(S[0] / S[1]), rng)
+    with np.errstate(over="ignore"):
+        mean, low, high = np.exp([found.mean, found.low, found.high]).tolist()
+    return Estimate(mean, low, high, found.count)
+
+
 def by_stamp(stamps_ns: IntArray, samples: FloatArray) -> FloatArray:
     """Sums of `samples`, shape (n, k), over those of each stamp in rising order, and their number: the last column.
 

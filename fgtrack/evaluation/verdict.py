@@ -28,6 +28,11 @@ class _Square:
     interval: Estimate = UNKNOWN
     """Of the mean, where the values are correlated."""
 
+    @property
+    def may_be_chance(self) -> bool:
+        """Whether what is expected is within the interval."""
+        return self.interval.is_known and self.interval.low <= self.expected <= self.interval.high
+
 
 def verdict(metrics: Mapping[str, Metrics], contests: Sequence[Contest]) -> tuple[str, ...]:
     """Sentences on the runs of `metrics`, by label; nothing on runs without errors and innovations."""
@@ -103,7 +108,8 @@ def _noise(metrics: Mapping[str, Metrics]) -> Iterator[str]:
     found = list(_squares(one))
     if not found:
         return
-    off = [square for square in found if square.is_far_off]
+    far = [square for square in found if square.is_far_off]
+    off = [square for square in far if not square.may_be_chance]
     if off:
         small = [square.mean > square.expected for square in off]
         size = "too small" if all(small) else "partly too small, partly too large" if any(small) else "too large"
@@ -112,8 +118,14 @@ def _noise(metrics: Mapping[str, Metrics]) -> Iterator[str]:
             "Fit it with `fgtrack tune` and compare again; the order of the runs may change."
         )
         return
+    if far:
+        yield f"Whether the noise fits (judged by {label}) so short a run does not tell: {_named(far)}."
+        return
     yield f"The noise fits (judged by {label}): {_named(found)}."
-    wrong = {other: [square for square in _squares(its) if square.is_far_off] for other, its in others}
+    wrong = {
+        other: [square for square in _squares(its) if square.is_far_off and not square.may_be_chance]
+        for other, its in others
+    }
     runs = [other for other, squares in wrong.items() if squares]
     if runs:
         yield f"Not so of {_listed(runs)}: {_ranges([square for other in runs for square in wrong[other]])}."
@@ -143,8 +155,7 @@ def _squares(one: Metrics) -> Iterator[_Square]:
     """NEES of the position, and NIS of every sensor with enough of them."""
     nees, interval = one.consistency.position_nees, one.consistency.position_nees_interval
     if nees.count:
-        outside = interval.low > nees.dof or interval.high < nees.dof
-        yield _Square("NEES of the position", nees.mean, nees.dof, outside and is_far_off(nees), interval)
+        yield _Square("NEES of the position", nees.mean, nees.dof, is_far_off(nees), interval)
     for sensor, nis in one.consistency.nis.items():
         if nis.count >= FEWEST:
             yield _Square(f"NIS of {sensor}", nis.mean, nis.dof, is_far_off(nis))

@@ -28,6 +28,7 @@ from fgtrack.pipeline.tune_rules import TuneRules, for_tuning, widened
 from fgtrack.pipeline.tune_space import ConfigNoise
 
 _LASTING = "an error that lasts looks like motion: only the part that does not is fitted, by the share"
+_ENDLESS = "no maximum: the likelihood still rises 10^4 times away, as where all errors are 0"
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,7 @@ class _Tuning:
             [name not in ("", "share") and one in self._space.lasting for one, name in self._space.names]
         )
         self._kept = np.isin(noise.keys, rules.keep)
+        self._endless = np.zeros(len(self._kept), dtype=np.bool_)
         for key in rules.keep:
             if key not in noise.keys:
                 raise CallError(
@@ -149,20 +151,19 @@ class _Tuning:
                 series = [[without_mixed(one, self._space, values) for one in tracks] for tracks in series]
             rounds += 1
             problem = self._problem(_until(series, splits))
-            free = self._free(problem)
             if rounds == 1:
-                values, optima = self._best_start(problem, free)
+                values, optima = self._best_start(problem)
             self._on_step(f"fit {rounds}")
             before = values
-            values, likelihood = problem.maximum(values, free)
+            values, likelihood, free = self._maximum(problem, values)
             moved = np.abs(np.log(values[free] / before[free]))
             still = (moved <= self._rules.settled * likelihood.spread(np.log(values[free]))).all()
             settled = rounds > 1 and bool(still)  # with the configured noise one cannot tell what is mixed
-        trained = self._found(problem, values, free)
+        trained = self._found(problem, values)
         held_out = self._held_out(trained.values, series, splits, runs_before)
         self._on_step("fit to everything")
         everything = self._problem([one for tracks in series for one in tracks])
-        found = self._found(everything, trained.values, self._free(everything))
+        found = self._found(everything, trained.values)
         return self._made(config, everything, found, held_out, rounds, optima, settled)
 
     def _associated(self, values: FloatArray) -> tuple[list[list[Series]], list[Run]]:
@@ -185,31 +186,48 @@ class _Tuning:
     def _problem(self, series: Sequence[Series]) -> Problem:
         problem = Problem(series, self._space, self._configured, self._rules.fit)
         if not problem.counts()[: self._space.num_motion].any():
-            names = ", ".join(recording.name for recording in self._recordings)
-            raise DataError(
-                f"{names}: nothing to fit noise to: no track has {self._rules.min_observations} measurements; "
-                "look at `fgtrack info` for sensors without a model, and at the gate"
+            raise self._nothing(
+                f"no track has {self._rules.min_observations} measurements; look at `fgtrack info` for sensors without "
+                "a model, and at the gate"
             )
         return problem
 
+    def _maximum(self, problem: Problem, start: FloatArray) -> tuple[FloatArray, Likelihood, BoolArray]:
+        """Parameters at the maximum, the likelihood, and which are free; what has no maximum is as configured."""
+        while True:
+            free = self._free(problem)
+            values, likelihood = problem.maximum(start, free)
+            endless = free & problem.endless(values)
+            if not endless.any():
+                return values, likelihood, free
+            self._endless |= endless
+            start = np.where(endless, self._configured, values)
+
     def _free(self, problem: Problem) -> BoolArray:
-        """Which parameters have enough measurements and can be told from others."""
-        free = np.asarray((problem.counts() >= self._rules.min_count) & ~self._lasting & ~self._kept)
-        if not free.any():
-            names = ", ".join(recording.name for recording in self._recordings)
-            raise DataError(
-                f"{names}: nothing to fit noise to: no parameter that may be fitted has {self._rules.min_count} "
-                "measurements on tracks; take a longer recording, or look at the gate"
+        """Which parameters have enough measurements, a maximum, and can be told from others."""
+        often = problem.counts() >= self._rules.min_count
+        free = np.asarray(often & ~self._lasting & ~self._kept & ~self._endless)
+        if not free[[bool(name) for _, name in self._space.names]].any():
+            raise self._nothing(
+                f"no parameter that may be fitted has {self._rules.min_count} measurements on tracks that have settled;"
+                " take a longer recording, of objects that move, or look at the gate"
             )
         return free
 
-    def _best_start(self, problem: Problem, free: BoolArray) -> tuple[FloatArray, int]:
+    def _nothing(self, why: str) -> DataError:
+        names = ", ".join(recording.name for recording in self._recordings)
+        if self._endless.any():
+            keys = ", ".join(np.array(self._noise.keys)[self._endless])
+            why = f"the errors behind {keys} are 0, or nearly so: was it simulated without noise?"
+        return DataError(f"{names}: nothing to fit noise to: {why}")
+
+    def _best_start(self, problem: Problem) -> tuple[FloatArray, int]:
         """The start, of three, from which the highest maximum is reached on a part of the data; how many there are."""
         self._on_step("starts")
         longest = sorted(problem.series, key=lambda one: -len(one.observations))[: self._rules.start_tracks]
         some = [replace(one, observations=one.observations[: self._rules.start_observations]) for one in longest]
         part = replace(problem, series=some)
-        free = free & (part.counts() >= self._rules.min_count)
+        free = self._free(problem) & (part.counts() >= self._rules.min_count)
         if not free.any():  # too little in the part to choose a start by
             return self._configured.copy(), 1
         moving = np.flatnonzero(free[: self._space.num_motion])
@@ -224,7 +242,7 @@ class _Tuning:
         optima = 1 + sum(upper - lower > 1.0 for upper, lower in pairwise(heights))
         return reached[0][1], optima
 
-    def _found(self, problem: Problem, start: FloatArray, free: BoolArray) -> _Found:
+    def _found(self, problem: Problem, start: FloatArray) -> _Found:
         """The maximum; in place of what is not known there, what is configured, or what is nearest to it.
 
         The rest is not fitted again: it would make up for what was put there, and with the yaw's noise too large the
@@ -232,12 +250,9 @@ class _Tuning:
         """
         count = len(start)
         known: list[Known] = ["no"] * count
-        few = f"fewer than {self._rules.min_count} measurements on tracks"
-        why = [
-            "kept as asked" if kept else _LASTING if lasting else few
-            for kept, lasting in zip(self._kept.tolist(), self._lasting.tolist(), strict=True)
-        ]
-        maximum, likelihood = problem.maximum(start, free)
+        maximum, likelihood, free = self._maximum(problem, start)
+        why = np.full(count, f"fewer than {self._rules.min_count} measurements on tracks", dtype=object)
+        why[self._endless], why[self._lasting], why[self._kept] = _ENDLESS, _LASTING, "kept as asked"
         values = maximum.copy()
         log_std = np.full(count, math.nan)
         log_std[free] = likelihood.log_std(np.log(values[free]))
@@ -258,7 +273,7 @@ class _Tuning:
             )
             values[place], log_std[place] = limit, math.nan
         if not {"yes", "roughly"} & set(known):
-            raise DataError("nothing to fit noise to: no parameter is identifiable in so few measurements")
+            raise self._nothing("no parameter is identifiable in so few measurements; take a longer recording")
         return _Found(values, log_std, tuple(known), tuple(why), likelihood)
 
     def _limit(self, likelihood: Likelihood, values: FloatArray, place: int) -> float:

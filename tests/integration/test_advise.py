@@ -389,6 +389,38 @@ def test_an_estimator_that_forgets_and_noise_that_does_not_fit(call: Call) -> No
     assert advice.config.estimator == "ekf-replay"
     assert [one.about for one in advice.findings if one.kind == "noise"] == ["radar"]
     assert advice.config.sensors["radar"].std["x_m"] == pytest.approx(1.0, rel=0.3)
+    told = {one.key: one.value for one in advice.changes}
+    assert told["sensors.radar.std.x_m"] == advice.config.sensors["radar"].std["x_m"]
+    assert set(told) <= {"estimator", *(key for key in told if ".std" in key)}
+    (tuned,) = [str(one) for one in advice.findings if one.about == "tune"]
+    assert tuned.startswith("tune: fitted to the recording by maximum likelihood. As configured stay ")
+    assert f"sensors.radar.std.x_m: {told['sensors.radar.std.x_m']}" in tuned
+    assert any(line.startswith("- sensors.radar.std.x_m = ") for line in advice.comments())
+    assert "Nothing is changed." not in advice.comments()
+
+
+def test_white_noise_is_not_fitted_to_errors_that_last(call: Call) -> None:
+    rng, error_m = np.random.default_rng(4), np.zeros(2)
+
+    def erring(item: DetectionList) -> DetectionList:
+        nonlocal error_m
+        if item.sensor != "lidar":
+            return item
+        error_m = 0.9 * error_m + 0.44 * rng.normal(0.0, 1.5, 2)  # for half a second
+        of = item.objects[0]
+        assert of.x_m is not None
+        assert of.y_m is not None
+        return replace(item, objects=(replace(of, x_m=of.x_m + error_m[0], y_m=of.y_m + error_m[1]),))
+
+    write_stream("drive.jsonl", changed(erring, drive(400)))
+    Path("c.yaml").write_text(CONFIG)
+    advice = fgtrack.advise("drive.jsonl", "c.yaml", tune=True)
+    assert any(one.kind == "noise" and one.about == "lidar" for one in advice.findings)
+    (tuned,) = [one for one in advice.findings if one.about == "tune"]
+    assert tuned.text.startswith("no noise is changed. With what is fitted, innovations of ")
+    assert "still resemble the one before (autocorrelation 0." in tuned.text
+    assert not advice.changes
+    assert advice.config == read_config("c.yaml")
 
 
 def test_noise_that_cannot_be_fitted_leaves_the_other_advice(call: Call) -> None:

@@ -9,7 +9,7 @@ from scipy.special import stdtrit
 from scipy.stats import ttest_rel
 
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.paired import Estimate, average, block_length, by_stamp, paired, within_run
+from fgtrack.evaluation.paired import Estimate, average, block_length, by_stamp, mean_square, paired, within_run
 
 
 def mean(sums: FloatArray) -> FloatArray:
@@ -157,3 +157,16 @@ def test_a_sum_of_zeros_and_a_short_run_do_no_harm() -> None:
     assert short.mean == 1.0
     assert not short.is_significant
     assert math.isnan(within_run(np.zeros((0, 2)), mean, np.random.default_rng(12)).mean)
+
+
+def test_the_interval_of_a_mean_square_is_positive_where_few_blocks_tell_it() -> None:
+    squares = np.full(40, 0.1)
+    squares[5:9] = 40.0  # one stretch
+    ticks = np.stack([squares, np.ones(40)], axis=-1)
+    rng = np.random.default_rng(1)
+    assert within_run(ticks, mean, rng).low < 0.0
+    found = mean_square(ticks, rng)
+    assert found.mean == pytest.approx(squares.mean())
+    assert 0.0 < found.low < found.mean < found.high
+    assert mean_square(np.tile([0.0, 1.0], (40, 1)), rng).mean == 0.0
+    assert not mean_square(np.tile([0.0, 1.0], (40, 1)), rng).is_known

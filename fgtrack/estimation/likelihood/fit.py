@@ -26,6 +26,9 @@ class FitSettings:
     do not know from running away."""
     share_log_std: float = 1.5
     """The same for the share of outliers."""
+    most_log: float = 9.2
+    """A parameter that the data drive farther than this from where it starts, a factor of 10^4, has no maximum: errors
+    that are exactly 0 are the likelier the smaller their standard deviation is."""
     settle_s: float = 1.0
     """Innovations in the first seconds of a track do not count: they are those of its first state. These seconds begin
     where its direction of travel is known."""
@@ -83,7 +86,7 @@ class Likelihood:
         self._prior_log, self._prior_log_std = prior_log[free], prior_log_std[free]
         self._h, self._curvature_h = settings.difference, settings.curvature_difference
         self._shares = np.flatnonzero([not name for (_, name), one in zip(names, free, strict=True) if one])
-        self._flat = settings.flat
+        self._flat, self._most_log = settings.flat, settings.most_log
         self._groups = _groups(innovations, settings.block_s)
         self._memory: list[_Evaluated] = []  # the last two: after a step that was none the one before is asked again
 
@@ -139,10 +142,13 @@ class Likelihood:
         middle = found.log_likelihoods[0]
         if not np.isfinite(middle).all():
             return _Evaluated(logs.copy(), math.inf, np.zeros_like(logs), np.eye(len(logs)))
-        off = (logs - self._prior_log) / self._prior_log_std
-        objective = 0.5 * float(off @ off) - float(middle.sum())
-        gradient = off / self._prior_log_std - scores.sum(axis=1)
-        information = self._expected(found) + np.diag(self._prior_log_std**-2)
+        moved = logs - self._prior_log
+        off = moved / self._prior_log_std
+        beyond = np.sign(moved) * np.maximum(np.abs(moved) - self._most_log, 0.0)
+        wall = float(middle.size)  # as steep as the data can be
+        objective = 0.5 * float(off @ off + wall * beyond @ beyond) - float(middle.sum())
+        gradient = off / self._prior_log_std + wall * beyond - scores.sum(axis=1)
+        information = self._expected(found) + np.diag(self._prior_log_std**-2 + wall * (beyond != 0.0))
         information[self._shares, self._shares] += np.square(scores[self._shares]).sum(axis=1)
         return _Evaluated(logs.copy(), objective, gradient, information)
 
@@ -236,6 +242,10 @@ class Problem:
                         if observation.sensor in self.space.lasting:
                             found[names[observation.sensor, "share"]] += 1
         return found
+
+    def endless(self, values: FloatArray) -> BoolArray:
+        """Which parameters have no maximum, shape (p,), as they have run off at `values` (p,)."""
+        return np.asarray(np.abs(np.log(values / self.prior)) >= self.settings.most_log)
 
     def likelihood(self, values: FloatArray, free: BoolArray) -> Likelihood:
         """The likelihood of the parameters `free`, shape (p,), about the trajectory at `values`, shape (p,).
