@@ -87,6 +87,8 @@ def _life(arrivals: Sequence[Arrivals], config: Config) -> Iterator[Finding]:
     else:
         key, limit_s = "lifecycle.forget_s", rules.forget_s
     placing = [one for one in arrivals if config.sensors[one.name].gives_position and one.period_s]
+    if isinstance(rules, ExistenceRules) and len(placing) == 1:
+        return  # only a list that could not show a track ends it
     fastest_s = min((one.period_s or math.inf for one in placing), default=math.inf)
     silent_s = {}
     for one in placing:
