@@ -44,11 +44,25 @@ def drive() -> tuple[fgtrack.EgoState | fgtrack.DetectionList, ...]:
     return tuple(fgtrack.simulate("single_opponent", seed=1, duration_s=2.0))
 
 
-def _stream() -> bytes:
+def _stream(messages: Sequence[fgtrack.Message] = ()) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.jsonl"
-        write_stream(path, drive())
+        write_stream(path, messages or drive())
         return path.read_bytes()
+
+
+def _straight() -> bytes:
+    """A car on a straight line, long enough for noise and offsets to be fitted."""
+    rng, messages = np.random.default_rng(1), list[fgtrack.Message]()
+    for k in range(60):
+        now_ns, at_m = 10**9 + k * 10**8, 20.0 + k
+        messages.append(fgtrack.EgoState(now_ns, now_ns, 0.0, 0.0, 0.0, 0.0))
+        messages.append(fgtrack.TruthState(now_ns, now_ns, 1, at_m, 5.0))
+        for name in ("lidar", "radar") if k % 3 == 0 else ("lidar",):
+            x_m, y_m = rng.normal((at_m, 5.0), 0.3).tolist()
+            seen = fgtrack.Detection(x_m=x_m, y_m=y_m)
+            messages.append(fgtrack.DetectionList(name, now_ns, now_ns + 10**7, (seen,), "map"))
+    return _stream(sorted(messages, key=lambda message: message.receipt_ns))
 
 
 def _bag(storage: str) -> bytes:
@@ -254,6 +268,8 @@ _CORNERS = b"area,x_m,y_m\nshore,0.0,0.0\nshore,90.0,0.5\nshore,90.0,90.0\npier,
 _DELAYS = b"radar: {delay: {kind: gamma, mean_s: 0.1, std_s: 0.05, least_s: 0.01}}\n"
 _NUSCENES = "sensors={detector: {std: {x_m: 0.5, y_m: 0.5}}}"
 _REPLAY = ("--overwrite", "-o", RUN, "-e")
+_EKF = (*_REPLAY, "ekf-replay")
+_CV = ("--set", "motion={kind: cv, std_per_s: {velocity: 3.0}}", "--set", "clock.node_hz=10")
 _MERGE = "merge={kind: connected, distance_m: 5.1}"
 
 
@@ -270,7 +286,7 @@ TARGETS = (
         "stream",
         lambda: [{"x.jsonl": _stream()}],
         _all,
-        [("info", "x.jsonl"), ("replay", "x.jsonl", "-c", "open_space", *_REPLAY, "ekf-replay")],
+        [("info", "x.jsonl"), ("replay", "x.jsonl", "-c", "open_space", *_EKF)],
     ),
     Target(
         "stream-smoother",
@@ -282,34 +298,31 @@ TARGETS = (
         "gzip",
         lambda: [{"x.jsonl.gz": gzip.compress(_stream(), mtime=0)}],
         _all,
-        [("info", "x.jsonl.gz"), ("replay", "x.jsonl.gz", "-c", "open_space", *_REPLAY, "ekf-replay")],
+        [("info", "x.jsonl.gz"), ("replay", "x.jsonl.gz", "-c", "open_space", *_EKF)],
     ),
     Target(
         "mcap",
         lambda: [{"x.mcap": _bag("mcap")}],
         _all,
-        [("info", "x.mcap"), ("replay", "x.mcap", "-c", "open_space", *_REPLAY, "ekf-replay")],
+        [("info", "x.mcap"), ("replay", "x.mcap", "-c", "open_space", *_EKF)],
     ),
     Target(
         "sqlite3",
         lambda: [{"x.db3": _bag("sqlite3")}],
         _all,
-        [("info", "x.db3"), ("replay", "x.db3", "-c", "open_space", *_REPLAY, "ekf-replay")],
+        [("info", "x.db3"), ("replay", "x.db3", "-c", "open_space", *_EKF)],
     ),
     Target(
         "ros1",
         lambda: [{"x.bag": _ros1()}],
         _all,
-        [
-            ("info", "x.bag"),
-            ("replay", "x.bag", "-c", "open_space", "--set", "input.ego.topic=/odom", *_REPLAY, "ekf-replay"),
-        ],
+        [("info", "x.bag"), ("replay", "x.bag", "-c", "open_space", "--set", "input.ego.topic=/odom", *_EKF)],
     ),
     Target(
         "autoferry",
         lambda: [_autoferry()],
         _all,
-        [("info", "in"), ("replay", "in", "-c", "autoferry", *_REPLAY, "ekf-replay"), ("compare", RUN)],
+        [("info", "in"), ("replay", "in", "-c", "autoferry", *_EKF), ("compare", RUN)],
     ),
     Target(
         "log-folder",
@@ -320,17 +333,12 @@ TARGETS = (
             ("replay", "in", "-c", "karle2023", "--set", "map.track=null", *_REPLAY, "ekf-backward-forward"),
         ],
     ),
-    Target(
-        "kitti",
-        lambda: [_kitti()],
-        _all,
-        [("info", "in"), ("replay", "in", "-c", "kitti", *_REPLAY, "ekf-replay")],
-    ),
+    Target("kitti", lambda: [_kitti()], _all, [("info", "in"), ("replay", "in", "-c", "kitti", *_EKF)]),
     Target(
         "kitti-forms",
         _kitti_forms,
         lambda name: "_car" in name,
-        [("info", "in"), ("replay", "in", "-c", "kitti", *_REPLAY, "ekf-replay")],
+        [("info", "in"), ("replay", "in", "-c", "kitti", *_EKF)],
     ),
     Target(
         "tables",
@@ -342,22 +350,19 @@ TARGETS = (
         "nuscenes",
         lambda: [_nuscenes()],
         _all,
-        [
-            ("info", "in/results.json"),
-            ("replay", "in/results.json", "-c", "open_space", "--set", _NUSCENES, *_REPLAY, "ekf-replay"),
-        ],
+        [("info", "in/results.json"), ("replay", "in/results.json", "-c", "open_space", "--set", _NUSCENES, *_EKF)],
     ),
     Target(
         "excluded",
         lambda: [{"x.json": _EXCLUDED, "x.jsonl": _stream()}, {"x.json": _CORNERS, "x.jsonl": _stream()}],
         _only("x.json"),
-        [("replay", "x.jsonl", "-c", "open_space", "--set", 'map.excluded=["x.json"]', *_REPLAY, "ekf-replay")],
+        [("replay", "x.jsonl", "-c", "open_space", "--set", 'map.excluded=["x.json"]', *_EKF)],
     ),
     Target(
         "configuration",
         lambda: [{"x.yaml": content, "x.jsonl": _stream()} for content in _shipped(".")],
         _only("x.yaml"),
-        [("config", "-c", "x.yaml"), ("replay", "x.jsonl", "-c", "x.yaml", *_REPLAY, "ekf-replay")],
+        [("config", "-c", "x.yaml"), ("replay", "x.jsonl", "-c", "x.yaml", *_EKF)],
     ),
     Target(
         "scenario",
@@ -365,18 +370,13 @@ TARGETS = (
         _only("x.yaml"),
         [("simulate", "x.yaml", "-o", "out.jsonl", "--overwrite", "--duration", "0.5")],
     ),
-    Target(
-        "sweep",
-        lambda: [{"x.yaml": _SWEEP}],
-        _only("x.yaml"),
-        [("sweep", "x.yaml", "-o", "swept", "--jobs", "1")],
-    ),
+    Target("sweep", lambda: [{"x.yaml": _SWEEP}], _only("x.yaml"), [("sweep", "x.yaml", "-o", "swept", "--jobs", "1")]),
     Target(
         "map",
         lambda: [{"x.csv": _map(), "x.jsonl": _stream()}],
         _only("x.csv"),
         [
-            ("replay", "x.jsonl", "-c", "smoother", "--map", "x.csv", *_REPLAY, "ekf-replay"),
+            ("replay", "x.jsonl", "-c", "smoother", "--map", "x.csv", *_EKF),
             ("replay", "x.jsonl", "-c", "karle2023_reference", "--map", "x.csv", "-o", RUN, "--overwrite"),
         ],
     ),
@@ -385,6 +385,15 @@ TARGETS = (
         lambda: [{"x.yaml": _DELAYS, "x.jsonl": _stream()}],
         _only("x.yaml"),
         [("convert", "x.jsonl", "out.jsonl", "--delays", "x.yaml", "--overwrite")],
+    ),
+    Target(
+        "tune", lambda: [{"x.jsonl": _straight()}], _all, [("tune", "x.jsonl", *_CV, "-o", "x.yaml", "--overwrite")]
+    ),
+    Target(
+        "advise",
+        lambda: [{"x.jsonl": _straight()}],
+        _all,
+        [("advise", "x.jsonl", *_CV, "--tune"), ("offsets", "x.jsonl", *_CV)],
     ),
     Target("run", lambda: [_run()], _all, [("compare", "in"), ("export", "in", "-o", "x.mcap", "--overwrite")]),
 )
