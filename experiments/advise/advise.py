@@ -60,23 +60,26 @@ def shifted(messages: Iterator[Message], sensor: str | None) -> Iterator[Message
 
 @dataclass(frozen=True)
 class Followed:
-    """Position RMSE and GOSPA in metres, before and after."""
+    """Position RMSE and GOSPA in metres, and identity switches, before and after."""
 
     rmse_m: float
     gospa_m: float
+    switches: int
     rmse_followed_m: float
     gospa_followed_m: float
+    switches_followed: int
     changes: str
     noise: str
     """Sensors whose noise does not fit."""
 
 
-def scores(run: Run) -> tuple[float, float]:
-    """Position RMSE and GOSPA in metres."""
+def scores(run: Run) -> tuple[float, float, int]:
+    """Position RMSE and GOSPA in metres, and identity switches."""
     found = evaluate(run)
     assert found.truth is not None
     assert found.multi_object is not None
-    return found.truth.overall.errors["position_m"].rmse, found.multi_object.gospa.rms_m
+    overall = found.truth.overall
+    return overall.errors["position_m"].rmse, found.multi_object.gospa.rms_m, overall.id_switches
 
 
 def followed(recording: Path, config: str | None, track_map: str | None, tune: bool) -> Followed:
@@ -110,7 +113,8 @@ def recorded(autoferry: Path | None, kitti: Path | None) -> Iterator[tuple[str, 
         yield f"Autoferry {number}, defaults", folder, None, True
         yield f"Autoferry {number}, autoferry", folder, "autoferry", True
     for file in sorted((kitti / "oxts").glob("*.txt")) if kitti is not None else ():
-        yield f"KITTI {file.stem}", file, "kitti", False
+        yield f"KITTI {file.stem}, defaults", file, None, True
+        yield f"KITTI {file.stem}, kitti", file, "kitti", True
 
 
 def main(
@@ -139,7 +143,8 @@ def main(
             writer.writerow([name, "", *(getattr(found, one) for one in names)])
             print(
                 f"{name}: RMSE {found.rmse_m:.3f} -> {found.rmse_followed_m:.3f} m, GOSPA {found.gospa_m:.3f} -> "
-                f"{found.gospa_followed_m:.3f} m, changed {found.changes}, noise {found.noise}",
+                f"{found.gospa_followed_m:.3f} m, switches {found.switches} -> {found.switches_followed}, "
+                f"changed {found.changes}, noise {found.noise}",
                 flush=True,
             )
     for case in CASES:
