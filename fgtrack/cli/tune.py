@@ -11,6 +11,7 @@ import numpy as np
 import typer
 from rich.console import Console
 
+from fgtrack.advice.noise import noise_fits
 from fgtrack.cli.arguments import ConfigFile, FormOption, Json, Overwrite, PitMap, Settings, TrackMap
 from fgtrack.cli.show import chosen_form, progress, say, show
 from fgtrack.core.errors import DataError
@@ -120,6 +121,14 @@ def _sensors(report: TuneReport) -> list[str]:
             lines.append(f"{one.sensor}: {one.count} measurements, {100.0 * one.outlier_share:.1f} % outliers")
         if one.own_covariance:
             lines.append(f"{one.sensor}: {one.own_covariance} measurements have a covariance of their own; it stays")
+    runs = () if report.held_out is None else report.held_out.runs_after
+    lines += [
+        f"{one.sensor}: innovations still resemble the one before (autocorrelation {one.lag1:.2f}): errors last, of it "
+        "or of what is believed more, and white noise is too small for them"
+        for run in runs
+        for one in noise_fits(run)
+        if one.lasts
+    ]
     settled = "" if report.settled else ", not settled"
     lines.append(f"{report.num_tracks} tracks, {report.rounds} associations{settled}")
     if report.num_mixed:

@@ -428,6 +428,10 @@ def test_white_noise_is_not_fitted_to_errors_that_last(call: Call) -> None:
     assert "still resemble the one before (autocorrelation 0." in tuned.text
     assert not advice.changes
     assert advice.config == read_config("c.yaml")
+    code, text = call("tune", "drive.jsonl", "-c", "c.yaml", "-o", "t.yaml")
+    assert code == 0
+    assert "innovations still resemble the one before (autocorrelation 0." in text
+    assert "white noise is too small for them" in text
 
 
 def test_noise_that_cannot_be_fitted_leaves_the_other_advice(call: Call) -> None:
