@@ -287,7 +287,7 @@ def rmse_m(path: str) -> float:
 def test_without_truth_only_the_difference_of_two_clocks_is_known(call: Call) -> None:
     off = changed(
         lambda item: restamped(item, item.stamp_ns + 80 * MS) if item.sensor == "lidar" else item,
-        drive(400, truth=False, wave_mps=12.0),
+        drive(250, truth=False, wave_mps=12.0),
     )
     write("stream", off)
     advice = fgtrack.advise("drive.jsonl", "c.yaml", reference="radar")
@@ -296,6 +296,7 @@ def test_without_truth_only_the_difference_of_two_clocks_is_known(call: Call) ->
     assert advice.config.sensors["lidar"].clock_offset_s == pytest.approx(0.08, abs=0.02)
 
 
+@pytest.mark.slow
 def test_what_an_advised_clock_leaves_is_nothing(call: Call) -> None:
     off = changed(lambda item: restamped(item, item.stamp_ns + 80 * MS) if item.sensor == "lidar" else item, drive(600))
     write("stream", off)
@@ -387,7 +388,7 @@ def test_a_sensor_without_a_model_is_left_out(call: Call) -> None:
 
 
 def test_an_estimator_that_forgets_and_noise_that_does_not_fit(call: Call) -> None:
-    write("stream", drive(400))
+    write("stream", drive(250))
     text = CONFIG.replace("ekf-replay", "ekf-backward-forward").replace(
         "radar: {std: {x_m: 1.0", "radar: {std: {x_m: 9.0"
     )
@@ -419,7 +420,7 @@ def test_white_noise_is_not_fitted_to_errors_that_last(call: Call) -> None:
         assert of.y_m is not None
         return replace(item, objects=(replace(of, x_m=of.x_m + error_m[0], y_m=of.y_m + error_m[1]),))
 
-    write_stream("drive.jsonl", changed(erring, drive(400)))
+    write_stream("drive.jsonl", changed(erring, drive(350)))
     Path("c.yaml").write_text(CONFIG)
     advice = fgtrack.advise("drive.jsonl", "c.yaml", tune=True)
     assert any(one.kind == "noise" and one.about == "lidar" for one in advice.findings)
