@@ -456,6 +456,8 @@ def test_a_table_of_several_parts_comes_back_whole(tmp_path):
         {"counts": {"radar": 3}},
         {"counts": {"radar": {"birth": "x"}}},
         {"complete": 1},
+        {"effective": 3},
+        {"effective": {"lag_key": "smoother.lag_s"}},
     ],
 )
 def test_a_meta_file_that_says_something_else_is_one_line(tmp_path, change):
@@ -464,3 +466,40 @@ def test_a_meta_file_that_says_something_else_is_one_line(tmp_path, change):
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
     with pytest.raises(DataError, match=rf"meta\.json: {next(iter(change))}\S* is not what a run writes there"):
         load_run(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("section", "text"),
+    [
+        ("sensors", "sensors: {radar: {mount: {x_m: ../x}}}"),
+        ("sensors", "sensors: {radar: {mount: {y_m: [1.0]}}}"),
+        ("sensors", "sensors: {radar: {mount: {yaw_rad: .inf}}}"),
+        ("sensors", "sensors: {radar: {max_delay_s: soon}}"),
+        ("sensors", "sensors: 3"),
+        ("clock", "clock: 7"),
+        ("birth", "birth: []"),
+        ("smoother", "smoother: 1.5"),
+        ("smoother", "smoother: {lag_s: [1.0]}"),
+        ("smoother", "smoother: {lag_s: .nan}"),
+        ("map", "map: {excluded: 3}"),
+        ("ego", "ego: {detection_origin_x_m: null}"),
+    ],
+)
+def test_a_configuration_of_another_kind_is_one_line(tmp_path, section, text):
+    write(tmp_path / "run", report())
+    (tmp_path / "run/config.yaml").write_text(text)
+    run = load_run(tmp_path / "run")
+    with pytest.raises(DataError, match=rf"config\.yaml: {section}\S* is not what a run writes there"):
+        assert run.config
+
+
+def test_numbers_beyond_all_that_a_run_writes_are_none(tmp_path):
+    write(tmp_path / "run", report())
+    file = tmp_path / "run/tracks.csv"
+    header, row, *_ = file.read_text().splitlines()
+    place = header.split(",").index("x_m")
+    for number in ("inf", "-1e300", "1e61"):
+        cells = row.split(",")
+        cells[place] = number
+        file.write_text(f"{header}\n{','.join(cells)}\n")
+        assert np.isnan(load_run(tmp_path / "run").tracks["x_m"]).all()

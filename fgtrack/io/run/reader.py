@@ -12,12 +12,12 @@ from typing import Any, TextIO
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import TypeAdapter, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import BoolArray
+from fgtrack.io.run.relied import check_config, check_meta
 from fgtrack.io.run.schema import COLUMNS, LARGEST_META_MB, OPTIONAL_TABLES, RUN_FORMAT
 
 # A column holds floats, integers or strings, as its name says; the reader of it knows which.
@@ -35,44 +35,18 @@ CHUNK = 4096
 """Rows that wait for becoming columns, which take a tenth of the memory."""
 
 _LONGEST_LINE = 1_000_000
+_LARGEST = 1e60  # its square is a number; more is no measurement, and no state
 _WIDE_BYTES, _WIDER_THAN_FILE = 1e8, 100.0  # of a column of text, all cells of which are as wide as its longest
 
 NO_TRACK = -1
 """Track id of an update that belongs to no track."""
 
 
-@dataclass(frozen=True)
-class _Input:
-    path: str = ""
-    kind: str = ""
-
-
-@dataclass(frozen=True)
-class _Meta:
-    """What is relied on in meta.json; other keys may hold anything."""
-
-    input: _Input = field(default_factory=_Input)
-    estimator: str = ""
-    versions: Mapping[str, str] = field(default_factory=dict)
-    complete: bool = False
-    digest: str = ""
-    detections_received: int = 0
-    counts: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
-    out_of_bounds: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
-    left_out: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
-    ego_refused: Mapping[str, int] = field(default_factory=dict)
-    failures: Mapping[str, int] = field(default_factory=dict)
-    first_failure: str | None = None
-    broken_off: str | None = None
-
-
-_META = TypeAdapter(_Meta)
-
-
 class Table(dict[str, Column]):
     """Columns by name, each of shape (rows,) and read-only: `pandas.DataFrame(table)` is the table.
 
-    An empty cell is NaN in a float column and `NO_TRACK` in an integer one. `len` is the number of columns.
+    An empty cell, and a number beyond 1e60, is NaN in a float column; an empty one is `NO_TRACK` in an integer one.
+    `len` is the number of columns.
     """
 
     def __init__(self, columns: Mapping[str, Column]) -> None:
@@ -128,13 +102,14 @@ class Run:
 
     @property
     def config(self) -> Mapping[str, Any]:
-        """Values of config.yaml. Raises `DataError` where it is no YAML mapping."""
+        """Values of config.yaml. Raises `DataError` where it is no YAML mapping, or not that of a run."""
         try:
             config = _parsed(self.config_text)
         except YAMLError as error:
             raise DataError(f"{self.config_path}: is not YAML, repeat the run") from error
         if not isinstance(config, dict | None):
             raise DataError(f"{self.config_path}: holds no settings, repeat the run")
+        check_config(config or {}, self.config_path)
         return config or {}
 
     @property
@@ -197,11 +172,7 @@ def _read_meta(path: Path) -> Mapping[str, Any]:
         raise DataError(f"{file}: is not JSON ({error}), repeat the run") from error
     if not isinstance(meta, dict) or meta.get("format") != RUN_FORMAT:
         raise DataError(f"{file}: does not say format {RUN_FORMAT!r}, so this is not a run folder")
-    try:
-        _META.validate_json(json.dumps(meta), strict=True)
-    except ValidationError as error:
-        where = ".".join(str(part) for part in error.errors()[0]["loc"])
-        raise DataError(f"{file}: {where} is not what a run writes there, repeat the run") from error
+    check_meta(meta, file)
     return meta
 
 
@@ -262,12 +233,14 @@ def _whole_lines(path: Path, file: TextIO, complete: bool) -> Iterator[str]:
 
 
 def column(name: str, cells: Sequence[str | int | float | None]) -> Column:
-    """The column `name` from its cells, shape (rows,); None is empty."""
+    """The column `name` from its cells, shape (rows,); None is empty, and a number beyond 1e60 is NaN."""
     if name in _TEXT_COLUMNS:
         return np.array(["" if cell is None else cell for cell in cells], dtype=np.str_)
     if name in _INTEGER_COLUMNS:
         return np.array([NO_TRACK if cell is None else cell for cell in cells], dtype=np.int64)
-    return np.array(cells, dtype=np.float64)
+    numbers = np.array(cells, dtype=np.float64)
+    numbers[np.abs(numbers) > _LARGEST] = np.nan
+    return numbers
 
 
 def _values(name: str, cells: Sequence[str]) -> Sequence[int | float | None]:

@@ -1,0 +1,122 @@
+"""What is relied on in the meta.json and config.yaml of a run; other keys may hold anything."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, TypeAdapter, ValidationError
+
+from fgtrack.core.errors import DataError
+
+__all__ = ["check_config", "check_meta"]
+
+_Number = Annotated[float, Field(ge=-1e9, le=1e9)]
+
+
+@dataclass(frozen=True)
+class _Input:
+    path: str = ""
+    kind: str = ""
+
+
+@dataclass(frozen=True)
+class _Effective:
+    lag_key: str
+    lag_s: _Number
+
+
+@dataclass(frozen=True)
+class _Meta:
+    input: _Input = field(default_factory=_Input)
+    effective: _Effective | None = None
+    estimator: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    complete: bool = False
+    digest: str = ""
+    detections_received: int = 0
+    messages_received: int = 0
+    counts: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    out_of_bounds: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    left_out: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    ego_refused: Mapping[str, int] = field(default_factory=dict)
+    failures: Mapping[str, int] = field(default_factory=dict)
+    first_failure: str | None = None
+    broken_off: str | None = None
+
+
+@dataclass(frozen=True)
+class _Mount:
+    x_m: _Number = 0.0
+    y_m: _Number = 0.0
+    yaw_rad: _Number = 0.0
+
+
+@dataclass(frozen=True)
+class _Sensor:
+    mount: _Mount | None = None
+    max_delay_s: _Number | None = None
+
+
+@dataclass(frozen=True)
+class _Ego:
+    detection_origin_x_m: _Number = 0.0
+    detection_origin_y_m: _Number = 0.0
+
+
+@dataclass(frozen=True)
+class _Map:
+    track: str | None = None
+    pit: str | None = None
+    excluded: Sequence[str] | None = None
+
+
+@dataclass(frozen=True)
+class _Birth:
+    ego_speed_factor: _Number | None = None
+
+
+@dataclass(frozen=True)
+class _Clock:
+    node_hz: Annotated[float, Field(gt=0.0, le=1e9)] | None = None
+
+
+@dataclass(frozen=True)
+class _Smoother:
+    lag_s: Annotated[float, Field(ge=0.0, le=1e9)] = 0.0
+
+
+@dataclass(frozen=True)
+class _Config:
+    sensors: Mapping[str, _Sensor | None] | None = None
+    ego: _Ego | None = None
+    map: _Map | None = None
+    birth: _Birth | None = None
+    clock: _Clock | None = None
+    smoother: _Smoother | None = None
+    input: Mapping[str, Any] | None = None
+    evaluation: Mapping[str, Any] | None = None
+
+
+_META, _CONFIG = TypeAdapter(_Meta), TypeAdapter(_Config)
+
+
+def check_meta(meta: Any, path: Path) -> None:
+    """Raise `DataError` where a value of meta.json at `path` is of another kind than what a run writes."""
+    _check(_META, meta, path)
+
+
+def check_config(config: Any, path: Path) -> None:
+    """Raise `DataError` where a value of config.yaml at `path` is of another kind than what a run writes."""
+    _check(_CONFIG, config, path)
+
+
+def _check(kind: TypeAdapter[Any], value: Any, path: Path) -> None:
+    try:
+        kind.validate_json(json.dumps(value, default=str, skipkeys=True), strict=True)
+    except ValidationError as error:
+        where = ".".join(str(part) for part in error.errors()[0]["loc"])
+        raise DataError(f"{path}: {where} is not what a run writes there, repeat the run") from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: is nested without end, repeat the run") from error
