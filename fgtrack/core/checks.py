@@ -6,7 +6,10 @@ All raise a `ValueError` that names the setting, its rule and its value.
 import math
 from collections.abc import Callable, Mapping
 
-__all__ = ["between_0_and_1", "not_negative", "positive"]
+__all__ = ["LARGEST", "between_0_and_1", "not_negative", "positive"]
+
+LARGEST = 1e9
+"""What is measured, mapped or configured is no larger, in any unit: its square is still far from the largest float."""
 
 
 def positive(**values: float | None) -> None:

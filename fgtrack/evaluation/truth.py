@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgtrack.core.checks import LARGEST
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import EGO_ID, FloatArray, IntArray
 from fgtrack.io.run import Table
-from fgtrack.tracking.inbox import LARGEST
 
 #: What is interpolated, in the order of the columns of `TruePath.at`.
 TRUE_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")

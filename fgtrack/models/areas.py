@@ -11,6 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import in_polygon
@@ -20,7 +21,6 @@ __all__ = ["ExclusionAreas"]
 
 _LARGEST_MB = 10.0
 _MOST_CORNERS = 20_000
-_LARGEST_M = 1e9
 _SMALLEST_M = 0.1  # across: a smaller one is in degrees
 _PORTION = 1 << 20  # pairs of points and corners that are in memory at a time
 
@@ -93,8 +93,8 @@ def _ring(path: Path, corners: Sequence[Sequence[float]]) -> FloatArray:
         ring = ring[:-1]
     if len(ring) < 3:
         raise DataError(f"{path}: a polygon has {len(ring)} corners, at least three are needed")
-    if not (np.abs(ring) <= _LARGEST_M).all():
-        raise DataError(f"{path}: a corner is not finite, or beyond {_LARGEST_M:g} m")
+    if not (np.abs(ring) <= LARGEST).all():
+        raise DataError(f"{path}: a corner is not finite, or beyond {LARGEST:g} m")
     if np.ptp(ring, axis=0).max() < _SMALLEST_M:
         raise DataError(
             f"{path}: a polygon is {np.ptp(ring, axis=0).max():.2g} m across: degrees? Metres in the map are needed"

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from scipy.spatial import cKDTree
 
+from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import wrap_angles
@@ -43,7 +44,6 @@ _ARCS = (_COLUMN["s_racetraj_m"], _COLUMN["s_ref_m"])
 _FILE_HEADING_OFFSET_RAD = math.pi / 2  # a file's heading is 0 along +y, REP-103 is 0 along +x
 _SAME_POINT_M = 1e-3
 _LARGEST_MB = 20.0  # some 100,000 rows
-_LARGEST = 1e9
 _MAX_GAP = 10.0  # closing segment, in lengths of the longest other segment
 _MAX_HEADING_ERROR_RAD = 1.0  # coarse maps turn much in a row; a wrong convention is off by pi / 2
 
@@ -322,9 +322,9 @@ def _fault(table: FloatArray) -> tuple[int, str] | None:
     """Row and reason why `table`, headings in REP-103, is no closed line in driving direction, or None."""
     if table.ndim != 2 or table.shape[1] != len(COLUMNS) or len(table) < 4:
         return max(len(table) - 1, 0), f"at least 4 rows of {len(COLUMNS)} columns are needed"
-    bad = np.argwhere(~(np.abs(table) <= _LARGEST))
+    bad = np.argwhere(~(np.abs(table) <= LARGEST))
     if len(bad):
-        return int(bad[0, 0]), f"{COLUMNS[bad[0, 1]]} is no number up to {_LARGEST:g}"
+        return int(bad[0, 0]), f"{COLUMNS[bad[0, 1]]} is no number up to {LARGEST:g}"
     closed = _closed(table)
     if len(closed) < 5:
         return len(table) - 1, "at least 4 rows besides the one that repeats the first are needed"

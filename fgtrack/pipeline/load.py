@@ -14,12 +14,13 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, ReusedAnchorWarning, YAMLError
 
+from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import CallError, did_you_mean
 
 T = TypeVar("T")
 
-LARGEST, SMALLEST = 1e9, 1e-12
-"""No configured number is larger than this, or nearer to 0, in any unit: their squares and products stay finite."""
+SMALLEST = 1e-12
+"""No configured number but 0 is nearer to it, in any unit: squares and products stay finite."""
 _LONGEST_TEXT = 250_000
 _MOST_NODES = 100_000
 

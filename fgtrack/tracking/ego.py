@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fgtrack.core.checks import LARGEST
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.linalg import congruence, symmetrise
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import EgoState, FloatArray
-from fgtrack.tracking.inbox import ASYMMETRY, LARGEST, is_number
+from fgtrack.tracking.inbox import ASYMMETRY, is_number
 
 LARGEST_STEP_BACK_S = 1.0
 """A state that is older than the newest one by more than this has a wrong stamp."""

@@ -8,12 +8,11 @@ from typing import Protocol
 
 import numpy as np
 
+from fgtrack.core.checks import LARGEST
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Detection, DetectionList, Disposition, FloatArray, Frame, UpdateRecord
 from fgtrack.models.sensors import SensorModel
 
-#: In any unit: beyond what is tracked, and its square is still far from the largest float.
-LARGEST = 1e9
 #: In any unit: no sensor is better than this.
 SMALLEST_STD = 1e-6
 #: Of the standard deviations' product: what rounding a covariance to single precision may leave.

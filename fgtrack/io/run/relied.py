@@ -8,11 +8,12 @@ from typing import Annotated, Any
 
 from pydantic import Field, TypeAdapter, ValidationError
 
+from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import DataError
 
 __all__ = ["check_config", "check_meta"]
 
-_Number = Annotated[float, Field(ge=-1e9, le=1e9)]
+_Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 
 
 @dataclass(frozen=True)
@@ -79,12 +80,12 @@ class _Birth:
 
 @dataclass(frozen=True)
 class _Clock:
-    node_hz: Annotated[float, Field(gt=0.0, le=1e9)] | None = None
+    node_hz: Annotated[float, Field(gt=0.0, le=LARGEST)] | None = None
 
 
 @dataclass(frozen=True)
 class _Smoother:
-    lag_s: Annotated[float, Field(ge=0.0, le=1e9)] = 0.0
+    lag_s: Annotated[float, Field(ge=0.0, le=LARGEST)] = 0.0
 
 
 @dataclass(frozen=True)
