@@ -160,15 +160,16 @@ def normalised_squares(states: Table, errors: FloatArray) -> FloatArray:
     total = np.zeros(len(errors))
     # One component after the other is taken out of all rows at once: what is left of the others is their error and
     # covariance given this one (Schur complement), so the squares add up.
-    while P:
-        (variance, *covariances), *P = P
-        variance = np.where(variance > 0.0, variance, np.nan)
-        first, *e = e
-        total += first**2 / variance
-        gains = [covariance / variance for covariance in covariances]
-        e = [error - gain * first for error, gain in zip(e, gains, strict=True)]
-        P = [[entry - gains[i] * c for entry, c in zip(row, covariances[i:], strict=True)] for i, row in enumerate(P)]
-    return total
+    with np.errstate(over="ignore", invalid="ignore"):  # of what is not definite
+        while P:
+            (variance, *covs), *P = P
+            variance = np.where(variance > 0.0, variance, np.nan)
+            first, *e = e
+            total += first**2 / variance
+            gains = [cov / variance for cov in covs]
+            e = [error - gain * first for error, gain in zip(e, gains, strict=True)]
+            P = [[entry - gains[i] * cov for entry, cov in zip(row, covs[i:], strict=True)] for i, row in enumerate(P)]
+    return np.where(np.isfinite(total), total, np.nan)
 
 
 def _nees(matching: Matching, size: int) -> Nees:

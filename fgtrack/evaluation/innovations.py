@@ -90,11 +90,11 @@ def autocorrelations(updates: Table) -> dict[str, Autocorrelation]:
         innovations = np.stack([updates[f"res_{name}"] for name in names], axis=-1)
         known = np.isfinite(innovations).all(axis=1) & (updates["track_id"] != NO_TRACK)
         ids = updates["track_id"][known]
-        counts = np.bincount(ids)
-        tracks = np.flatnonzero(counts >= FEWEST).tolist()
-        sums = np.array([_sums(innovations[known][ids == track_id]) for track_id in tracks])
+        tracks, counts = np.unique(ids, return_counts=True)
+        enough = counts >= FEWEST
+        sums = np.array([_sums(innovations[known][ids == track_id]) for track_id in tracks[enough].tolist()])
         if len(sums) and sums[:, 0, 0].all():
-            found[group] = _summary(sums, int(counts[tracks].sum()))
+            found[group] = _summary(sums, int(counts[enough].sum()))
     return found
 
 

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgtrack.core.checks import LARGEST
 from fgtrack.core.linalg import psd_solve
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import EGO_ID, DetectionList, EgoState, FloatArray, IntArray, Message, TruthState
@@ -103,7 +104,9 @@ def truth_offsets(messages: Sequence[Message], config: Config, rules: OffsetRule
 def _paths(messages: Iterable[Message]) -> list[_Path]:
     states: dict[int, dict[int, tuple[float, float]]] = defaultdict(dict)
     for message in messages:
-        if isinstance(message, TruthState) and not message.ignored and message.object_id != EGO_ID:
+        if not isinstance(message, TruthState) or message.ignored or message.object_id == EGO_ID:
+            continue
+        if abs(message.x_m) <= LARGEST and abs(message.y_m) <= LARGEST:  # what is compared with: detections
             states[message.object_id][message.stamp_ns] = (message.x_m, message.y_m)
     return [
         _Path(np.array(sorted(each)), np.array([each[stamp_ns] for stamp_ns in sorted(each)]))

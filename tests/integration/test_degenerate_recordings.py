@@ -1,7 +1,9 @@
 """Recordings in which something does not vary at all: a usable result, or one line that says what is wrong."""
 
 import json
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +51,14 @@ def one_detection() -> list[Message]:
     return [one for one in messages if not isinstance(one, DetectionList) or one is first]
 
 
+def boundless_truth() -> list[Message]:
+    messages = drive()
+    truth = [place for place, one in enumerate(messages) if isinstance(one, TruthState)]
+    for place, y_m in zip(truth[40:42], (math.inf, 1e308), strict=True):
+        messages[place] = replace(messages[place], y_m=y_m)
+    return messages
+
+
 NOISELESS = "was it simulated without noise?"
 FEW = "no track has 20 measurements"
 #: What `tune` says of each; None where it fits something.
@@ -56,6 +66,7 @@ KINDS = {
     "constant yaw": (lambda: drive(yaw_rad=0.0), None),
     "standing": (lambda: drive(speed_mps=0.0, yaw_rad=0.0), None),
     "truth of positions only": (lambda: drive(speed_is_truth=False), None),
+    "truth beyond all bounds": (boundless_truth, None),
     "noiseless": (lambda: drive(std_m=0.0), NOISELESS),
     "noiseless, standing": (lambda: drive(std_m=0.0, speed_mps=0.0, yaw_rad=0.0), NOISELESS),
     "all alike": (lambda: drive(alike=True, yaw_rad=0.0), NOISELESS),

@@ -55,6 +55,14 @@ def test_without_a_positive_definite_covariance_there_is_no_square() -> None:
     assert np.isnan(normalised_squares(table_of(covariances[:1]), np.array([[1.0, np.nan]])))[0]
 
 
+def test_entries_that_no_covariance_has_give_no_square() -> None:
+    """Out of 1e60 beside a variance of 1e-300 comes more than a number holds."""
+    covariances = np.tile(np.eye(5), (2, 1, 1))
+    covariances[0, 0, 0] = 1e-300
+    covariances[0, 0, 1] = covariances[0, 1, 0] = 1e60
+    assert np.isnan(normalised_squares(table_of(covariances), np.full((2, 2), 1e3))).tolist() == [True, False]
+
+
 # --- one run
 
 
@@ -225,6 +233,12 @@ def test_tracks_do_not_run_into_each_other(tmp_path: Path) -> None:
     found = whiteness(run)
     assert (found.tracks, found.count) == (2, 70)
     assert found.lag1 == pytest.approx(-(39 * 2 + 29 * 18) / (40 * 2 + 30 * 18))
+
+
+@pytest.mark.parametrize("track_id", [-7, 10**18])
+def test_a_track_may_have_any_number(tmp_path: Path, track_id: int) -> None:
+    flips = (-1.0) ** np.arange(FEWEST)[:, None] * np.ones(2)
+    assert whiteness(innovations_run(tmp_path / "run", {track_id: flips})).count == FEWEST
 
 
 def test_white_innovations_stay_inside_their_bands_whatever_their_covariance() -> None:
