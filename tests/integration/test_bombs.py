@@ -12,7 +12,6 @@ from pathlib import Path
 
 import lz4.frame
 import pytest
-from backports import zstd
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
@@ -28,6 +27,7 @@ from fgtrack.io.info import describe
 from fgtrack.io.ros.bag import Bag
 from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.ros.mcap_file import MCAP_MAGIC
+from fgtrack.io.ros.unpacking import zstd
 from fgtrack.io.source import open_input
 
 SMALL = InputConfig(largest_mb=1.0, most_objects=1000)

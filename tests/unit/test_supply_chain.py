@@ -1,7 +1,10 @@
 """What is installed: bounds in pyproject.toml, and the lock file that the Makefile and CI install from."""
 
+import ast
 import re
+import sys
 import tomllib
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -42,6 +45,28 @@ def locked() -> dict[str, tuple[Version, int]]:
         re.MULTILINE,
     )
     return {_name(name): (Version(version), len(hashes.splitlines())) for name, version, hashes in blocks}
+
+
+def test_what_is_imported_is_asked_for() -> None:
+    """Not only by another package, whose next or last version may do without it."""
+    asked = {_name(one.name) for one in REQUIRED}
+    asked |= {_name(Requirement(line).name) for extra in ("dask", "foxglove", "fast") for line in EXTRAS[extra]}
+    installed = packages_distributions()
+    imported = {
+        name.split(".")[0]
+        for path in (ROOT / "fgtrack").rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for name in _imported(node)
+    }
+    others = sorted(imported - sys.stdlib_module_names - {"fgtrack", "compression"})  # the latter of Python 3.14
+    assert len(others) > 10
+    assert [name for name in others if not asked & {_name(one) for one in installed.get(name, [])}] == []
+
+
+def _imported(node: ast.AST) -> list[str]:
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    return [node.module] if isinstance(node, ast.ImportFrom) and node.module and not node.level else []
 
 
 def test_every_dependency_has_a_lower_bound() -> None:
