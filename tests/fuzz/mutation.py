@@ -4,6 +4,7 @@ import csv
 import gzip
 import io
 import json
+import math
 import re
 import sqlite3
 import tempfile
@@ -38,6 +39,7 @@ ODD: tuple[Any, ...] = (
     *([], {}, [[]], [0], {"x": 0}, [None, None]),
 )
 _NUMBER = re.compile(rb"-?\d+(\.\d+)?([eE][-+]?\d+)?")
+_FACTORS = (0.0, -1.0, 1e-12, 1e-9, 1e-3, 0.1, 2.0, 57.3, 1e3, 1e6, 1e9, 1e20)
 Mutation = Callable[[np.random.Generator, bytes], bytes]
 
 
@@ -135,6 +137,82 @@ def _csv(rng: np.random.Generator, content: bytes) -> bytes:
     return out.getvalue().encode("utf-8", "replace")
 
 
+def _everywhere(rng: np.random.Generator, content: bytes) -> bytes:
+    """The numbers of a field changed in all lines, or in those of one sensor or object, in one way."""
+    lines = [json.loads(line) for line in content.splitlines()]
+    fields: dict[tuple[Any, ...], list[tuple[Any, Any]]] = {}
+    for line in lines:
+        _numbers(line, (line.get("type"), line.get("sensor"), line.get("object_id")), fields)
+    _change_all(rng, list(fields.values()))
+    return "\n".join(json.dumps(line) for line in lines).encode() + b"\n"
+
+
+def _json_everywhere(rng: np.random.Generator, content: bytes) -> bytes:
+    value = json.loads(content)
+    fields: dict[tuple[Any, ...], list[tuple[Any, Any]]] = {}
+    _numbers(value, (), fields)
+    _change_all(rng, list(fields.values()))
+    return json.dumps(value).encode()
+
+
+def _column(rng: np.random.Generator, content: bytes) -> bytes:
+    """The numbers of a column changed in all rows in one way."""
+    text = content.decode()
+    mark = ";" if ";" in text[:200] else "," if "," in text[:200] else " "
+    rows = list(csv.reader(io.StringIO(text), delimiter=mark))
+    columns: dict[int, list[tuple[Any, Any]]] = {}
+    for row in rows:
+        for place, cell in enumerate(row):
+            if _NUMBER.fullmatch(cell.encode()):
+                row[place] = float(cell) if "." in cell or "e" in cell else int(cell)
+                columns.setdefault(place, []).append((row, place))
+    _change_all(rng, list(columns.values()))
+    out = io.StringIO()
+    csv.writer(out, delimiter=mark, lineterminator="\n").writerows(rows)
+    return out.getvalue().encode()
+
+
+def _numbers(value: Any, path: tuple[Any, ...], fields: dict[tuple[Any, ...], list[tuple[Any, Any]]]) -> None:
+    """Put where numbers stand inside `value` into `fields`, by the keys that lead there; places of lists are one."""
+    for key in _keys(value):
+        inner = value[key]
+        below = (*path, key if isinstance(value, dict) and len(value) < 50 else None)
+        if isinstance(inner, (int, float)) and not isinstance(inner, bool):
+            fields.setdefault(below, []).append((value, key))
+        else:
+            _numbers(inner, below, fields)
+
+
+def _change_all(rng: np.random.Generator, fields: list[list[tuple[Any, Any]]]) -> None:
+    """Change the numbers at all places of one of `fields`: scaled, moved, noisy, equal, exchanged or left out."""
+    places = fields[rng.integers(len(fields))]
+    old = [inner[key] for inner, key in places]
+    match rng.integers(8):
+        case 0:
+            new = [value * float(rng.choice(_FACTORS)) for value in old]
+        case 1:
+            move = float(rng.choice([-1.0, 1.0])) * 10.0 ** float(rng.uniform(-9.0, 20.0))
+            new = [value + (round(move) if isinstance(value, int) else move) for value in old]
+        case 2:
+            size = 10.0 ** float(rng.uniform(-9.0, 12.0))
+            noise = rng.normal(0.0, size, len(old)).tolist()
+            new = [value + (round(e) if isinstance(value, int) else e) for value, e in zip(old, noise, strict=True)]
+        case 3:
+            new = [old[place] for place in rng.permutation(len(old)).tolist()]
+        case 4:
+            new = old[::-1]
+        case 5:
+            new = [old[rng.integers(len(old))]] * len(old)
+        case 6:
+            new = [_odd(rng)] * len(old)
+        case _:
+            others = [inner[key] for inner, key in fields[rng.integers(len(fields))]]
+            new = [others[place % len(others)] for place in range(len(old))]
+    for (inner, key), value in zip(places, new, strict=True):
+        whole = isinstance(inner[key], int) and isinstance(value, float) and math.isfinite(value) and rng.integers(50)
+        inner[key] = int(value) if whole else value
+
+
 def _gzip(rng: np.random.Generator, content: bytes) -> bytes:
     return gzip.compress(mutated(rng, "inner.jsonl", gzip.decompress(content)), mtime=0)
 
@@ -221,11 +299,11 @@ def _keys(value: Any) -> list[Any]:
 
 
 _BY_SUFFIX: dict[str, tuple[Mutation, ...]] = {
-    ".jsonl": (_json_line, _json_line, _json_line, _numbers_in_text, _lines),
-    ".json": (_json, _json, _json, _numbers_in_text),
+    ".jsonl": (_json_line, _json_line, _json_line, _everywhere, _everywhere, _numbers_in_text, _lines),
+    ".json": (_json, _json, _json, _json_everywhere, _numbers_in_text),
     ".yaml": (_yaml, _yaml, _yaml, _yaml, _numbers_in_text, _lines),
-    ".csv": (_csv, _csv, _csv, _numbers_in_text, _lines),
-    ".txt": (_numbers_in_text, _numbers_in_text, _lines),
+    ".csv": (_csv, _csv, _csv, _column, _column, _numbers_in_text, _lines),
+    ".txt": (_numbers_in_text, _numbers_in_text, _column, _lines),
     ".gz": (_gzip, _gzip, _gzip),
     ".db3": (_sqlite, _sqlite, _sqlite),
     ".mcap": (_mcap, _mcap, _mcap),
