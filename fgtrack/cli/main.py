@@ -104,9 +104,12 @@ def run(arguments: Sequence[str]) -> int:
         sys.stderr.close()  # the reader of a pipe has left: not an error worth a line
         return DONE
     except OSError as error:  # of files, the library makes its own errors
-        if error.errno not in FULL:
-            return _failed(f"internal error: {type(error).__name__}: {error} (run with --debug)", BAD_DATA, debug)
-        return _failed(f"what was to be printed cannot be written ({error.strerror}), free some space", BAD_DATA, debug)
+        if error.errno in FULL:
+            what = f"what was to be printed cannot be written ({error.strerror}), free some space"
+            return _failed(what, BAD_DATA, debug)
+        if error.filename is not None:  # of a path that was given, there or in a file
+            return _failed(f"{error.filename}: cannot be used, the system says: {error.strerror}", BAD_CALL, debug)
+        return _failed(f"internal error: {type(error).__name__}: {error} (run with --debug)", BAD_DATA, debug)
     except Exception as error:  # the last line of defence: a bug must not look like bad data
         return _failed(f"internal error: {type(error).__name__}: {error} (run with --debug)", BAD_DATA, debug)
 

@@ -516,6 +516,36 @@ def test_a_map_that_is_none_is_named(fgtrack: Command, stream: Path, tmp_path: P
     assert called.code == 1
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "replay LONG -o run",
+        "replay STREAM -o LONG",
+        "replay STREAM -o run -c LONG",
+        "replay STREAM -o run --map LONG",
+        "replay STREAM -o run --set map.excluded=[LONG]",
+        "replay STREAM -o run --set clock.ticks_file=LONG",
+        "simulate LONG -o run",
+        "simulate single_opponent -o LONG",
+        "sweep LONG -o run",
+        "compare LONG",
+        "info LONG",
+        "convert LONG run",
+        "convert STREAM LONG.mcap",
+        "report LONG -o run.html",
+        "export LONG -o run.mcap",
+        "tune LONG",
+        "advise LONG",
+        "offsets LONG",
+    ],
+)
+def test_a_path_that_no_file_can_have_is_a_line(fgtrack: Command, stream: Path, words: str) -> None:
+    """The system refuses to look for it."""
+    called = fgtrack(*words.replace("STREAM", str(stream)).replace("LONG", "x" * 5000).split())
+    assert len(called.error) < 2000
+    assert called.code in (1, 2)
+
+
 def test_a_bug_is_one_line_and_shows_its_traceback_on_demand(
     fgtrack: Command, stream: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
