@@ -104,7 +104,8 @@ class _Adviser:
         """All steps."""
         if self._assumed:
             std = told_std({name: sensor.std for name, sensor in self._config.sensors.items()})
-            text = f"none is configured; assumed standard deviations: {std}. `fgtrack tune` fits them (--tune)."
+            text = f"none is configured; assumed standard deviations: {std}."
+            text += "" if tune else " `fgtrack tune` fits them (--tune)."
             self._findings.append(Finding("noise", "sensors", 35.0, text))
         self._take(self._strangers())
         before = self._config
@@ -132,7 +133,7 @@ class _Adviser:
             run_after = self._replayed(self._config)
         fits = [] if run_after is None else noise_fits(run_after)
         if run_after is not None and not self._is_useless:
-            self._take(noise_findings(run_after, fits))
+            self._take(noise_findings(run_after, fits, tune))
         if tune and any(one.kind == "noise" for one in self._findings):
             self._findings.append(self._tuned(run_after))
         return Advice(

@@ -60,8 +60,11 @@ def noise_fits(run: Run) -> list[NoiseFit]:
     return fits
 
 
-def noise_findings(run: Run, fits: list[NoiseFit]) -> Iterator[Finding]:
-    """Sensors whose noise does not fit, and those of which a few innovations are far too large."""
+def noise_findings(run: Run, fits: list[NoiseFit], tune: bool) -> Iterator[Finding]:
+    """Sensors whose noise does not fit, and those of which a few innovations are far too large.
+
+    With `tune` noise is fitted afterwards, which need not be offered.
+    """
     off = dict(misfits(run))
     for one in fits:
         sensor = one.sensor
@@ -79,11 +82,13 @@ def noise_findings(run: Run, fits: list[NoiseFit]) -> Iterator[Finding]:
         if one.lasts:
             text += (
                 f"Innovations resemble the one before (autocorrelation {one.lag1:.2f}): errors last, or the process "
-                "noise is too small. --tune fits white noise, and takes it only if innovations are white then."
+                "noise is too small."
             )
+            text += "" if tune else " --tune fits white noise, and takes it only if innovations are white then."
         else:
             white = "" if one.lag1 is None else f" (autocorrelation {one.lag1:.2f})"
-            text += f"Innovations are white enough{white}: `fgtrack tune` fits it (--tune)."
+            text += f"Innovations are white enough{white}"
+            text += " to fit it." if tune else ": `fgtrack tune` fits it (--tune)."
         yield Finding("noise", sensor, min(30.0 + 10.0 * abs(math.log(max(one.ratio.mean, _SMALLEST))), 75.0), text)
 
 

@@ -426,6 +426,7 @@ def test_white_noise_is_not_fitted_to_errors_that_last(call: Call) -> None:
     assert tuned.text.startswith("no noise is changed. With what is fitted, innovations of ")
     assert "still resemble the one before (autocorrelation 0." in tuned.text
     assert not advice.changes
+    assert not [one.text for one in advice.findings if "--tune" in one.text]
     assert advice.config == read_config("c.yaml")
     code, text = call("tune", "drive.jsonl", "-c", "c.yaml", "-o", "t.yaml")
     assert code == 0
@@ -439,6 +440,8 @@ def test_noise_that_cannot_be_fitted_leaves_the_other_advice(call: Call) -> None
     assert code == 0
     assert "- tune: no noise is changed: " in text
     assert "- sensors: none is configured" in text
+    assert "--tune" not in text
+    assert "`fgtrack tune` fits them (--tune)" in call("advise", "drive.jsonl")[1]
 
 
 def test_the_forms_of_the_page(call: Call, capsys: pytest.CaptureFixture[str]) -> None:
