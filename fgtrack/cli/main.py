@@ -6,6 +6,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from importlib import import_module
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -85,6 +86,9 @@ def run(arguments: Sequence[str]) -> int:
     """Run one command; gives the exit code. Errors are one line on stderr."""
     debug = "--debug" in arguments
     words = [word for word in arguments if word != "--debug"]
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # not every terminal knows every letter
+            stream.reconfigure(errors="backslashreplace")
     logged = logging.StreamHandler()
     logged.setFormatter(_OneLine("fgtrack: %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[logged], force=True)

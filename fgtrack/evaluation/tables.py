@@ -251,12 +251,14 @@ class Tables(Mapping[str, Table]):
 
     def to_markdown(self, name: str | None = None) -> str:
         """The table `name`, or those that are shown."""
-        lines = "" if name or not self.verdict else "\n".join([*(f"- {line}" for line in self.verdict), "", ""])
+        lines = (
+            "" if name or not self.verdict else "\n".join([*(f"- {printable(line)}" for line in self.verdict), "", ""])
+        )
         return lines + "\n".join(table.to_markdown() for table in self._filled(name))
 
     def to_latex(self, name: str | None = None) -> str:
         """The table `name`, or those that are shown."""
-        lines = "" if name else "".join(f"% {line}\n" for line in self.verdict)
+        lines = "" if name else "".join(f"% {printable(line)}\n" for line in self.verdict)
         return lines + "\n".join(table.to_latex() for table in self._filled(name))
 
     def to_csv(self, name: str | None = None) -> str:

@@ -2,6 +2,8 @@
 
 import json
 import math
+import os
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -544,6 +546,20 @@ def test_a_path_that_no_file_can_have_is_a_line(fgtrack: Command, stream: Path, 
     called = fgtrack(*words.replace("STREAM", str(stream)).replace("LONG", "x" * 5000).split())
     assert len(called.error) < 2000
     assert called.code in (1, 2)
+
+
+def test_names_of_files_need_not_be_text(fgtrack: Command, stream: Path) -> None:
+    recording, made = Path(os.fsdecode(b"a\xff\nb.jsonl")), os.fsdecode(b"[bold]\xfe\x1b[31m")
+    shutil.copy(stream, recording)
+    called = [fgtrack("info", recording), fgtrack("replay", recording, "-o", made), fgtrack("compare", made)]
+    called += [fgtrack("compare", made, "--json"), fgtrack("compare", made, "--format", "md")]
+    called += [fgtrack("advise", recording, "-o", f"{made}.yaml"), fgtrack("offsets", recording)]
+    called += [fgtrack("report", made, "-o", f"{made}.html"), fgtrack("export", made, "-o", f"{made}.mcap")]
+    called += [fgtrack("convert", recording, f"{made}.jsonl"), fgtrack("figure", made, "-o", f"{made} figures")]
+    for one in called:
+        assert one.code == 0, one.err
+        odd = [line for line in (one.out + one.err).splitlines() if not line.isprintable()]
+        assert odd == []
 
 
 def test_a_bug_is_one_line_and_shows_its_traceback_on_demand(

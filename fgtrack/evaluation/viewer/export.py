@@ -6,7 +6,7 @@ from heapq import merge
 from operator import attrgetter
 from pathlib import Path
 
-from fgtrack.core.errors import CallError
+from fgtrack.core.errors import CallError, printable
 from fgtrack.evaluation.recordings import same_recording
 from fgtrack.evaluation.runs import Runs, judged
 from fgtrack.evaluation.viewer.detection_messages import detection_messages, outcome_messages
@@ -113,10 +113,12 @@ def _metadata(runs: Mapping[str, Run]) -> dict[str, dict[str, str]]:
     found = {}
     for name, run in runs.items():
         versions = run.meta.get("versions") or {}
-        found["fgtrack" if len(runs) == 1 else f"fgtrack {name}"] = {
-            "estimator": str(run.meta.get("estimator", "")),
-            "input": str((run.meta.get("input") or {}).get("path", "")),
-            "digest": str(run.meta.get("digest", "")),
-            "fgtrack": str(versions.get("fgtrack", "")),
+        told = {
+            "estimator": run.meta.get("estimator", ""),
+            "input": (run.meta.get("input") or {}).get("path", ""),
+            "digest": run.meta.get("digest", ""),
+            "fgtrack": versions.get("fgtrack", ""),
         }
+        kept = {key: printable(str(value)) for key, value in told.items()}  # names of files need not be UTF-8
+        found["fgtrack" if len(runs) == 1 else printable(f"fgtrack {name}")] = kept
     return found

@@ -115,7 +115,8 @@ def check_config(config: Any, path: Path) -> None:
 
 def _check(kind: TypeAdapter[Any], value: Any, path: Path) -> None:
     try:
-        kind.validate_json(json.dumps(value, default=str, skipkeys=True), strict=True)
+        text = json.dumps(value, default=str, skipkeys=True, ensure_ascii=False)
+        kind.validate_json(text.encode("utf-8", "replace"), strict=True)  # names of files need not be UTF-8
     except ValidationError as error:
         where = ".".join(str(part) for part in error.errors()[0]["loc"])
         raise DataError(f"{path}: {where} is not what a run writes there, repeat the run") from error
