@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from fgtrack.cli.arguments import Overwrite
 from fgtrack.cli.show import progress, say
+from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.evaluation.figures.style import DRAWN, save_pages
@@ -78,6 +79,8 @@ def _of_sweep(folders: Sequence[Path], track: int | None, stamp: float | None) -
 
 def _of_runs(folders: Sequence[Path], track: int | None, stamp: float | None) -> _Figures:
     found = judged(folders)
+    if stamp is not None and not abs(stamp) <= LARGEST:
+        raise CallError(f"--stamp {stamp}: is no time after the first tick, up to {LARGEST:g} s")
     stamp_ns = None if stamp is None else start_ns(found) + nanoseconds(stamp)
     first, missing = drawn_close_up(found, track, stamp_ns)
     if missing is not None and (track is not None or stamp is not None):

@@ -68,7 +68,8 @@ def effective(config: Config) -> Effective:
 def with_sensors(config: Config, messages: Callable[[], Iterable[Message]]) -> Config:
     """`config`; where it names no sensors, with those of `messages`, which measure what their detections hold.
 
-    A position counts once: a detection of x and y is not taken as range and bearing as well.
+    A position counts once: a detection of x and y is not taken as range and bearing as well. Sensors that only `input`
+    names are taken to measure positions.
     """
     if config.sensors:
         return config
@@ -81,6 +82,9 @@ def with_sensors(config: Config, messages: Callable[[], Iterable[Message]]) -> C
                     found.update(detection.measured)
     except DataError:  # the replay ends there, too, and says so
         pass
+    for name in (*config.input.detections, *config.input.csv.detections):
+        if name not in config.ignore_sensors:
+            measured.setdefault(name, set())
     return replace(config, sensors={name: _assumed(found) for name, found in sorted(measured.items())})
 
 

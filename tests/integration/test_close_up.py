@@ -151,6 +151,9 @@ def test_the_command_draws_it_and_goes_on_without_a_recording(
     runs = [str(folder / "runs" / name) for name in NAMES]
     assert command(["figure", *runs, "-o", str(tmp_path / "all"), "--stamp", "4"]) == 0
     assert (tmp_path / "all/close_up.png").stat().st_size > 10_000
+    for odd in ("nan", "-inf", "1e300"):
+        assert command(["figure", runs[0], "-o", str(tmp_path / "odd"), f"--stamp={odd}"]) == 2
+        assert "is no time after the first tick, up to 1e+09 s" in capsys.readouterr().err
     (folder / "drive.jsonl").rename(tmp_path / "drive.jsonl")
     try:
         assert command(["figure", runs[0], "-o", str(tmp_path / "rest")]) == 0

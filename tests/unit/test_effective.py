@@ -6,6 +6,7 @@ from support.tracking import message
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, EgoState
+from fgtrack.io.config import InputConfig, TopicInput
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.effective import ASSUMED_STD, Effective, effective, with_sensors
 from fgtrack.pipeline.public import replay
@@ -40,6 +41,18 @@ def test_a_sensor_without_a_name_in_the_configuration_measures_what_its_detectio
     [(name, sensor)] = with_sensors(Config(), lambda: [message(*objects, sensor="odd")]).sensors.items()
     assert name == "odd"
     assert sensor.std == {one: ASSUMED_STD[one] for one in measured}
+
+
+def test_what_the_input_names_and_the_recording_has_no_detection_of_is_taken_to_measure_positions() -> None:
+    named = InputConfig(
+        detections={"lidar": TopicInput("/lidar"), "radar": TopicInput("/radar"), "sonar": TopicInput("/sonar")}
+    )
+    config = replace(Config(), input=named, ignore_sensors=("sonar",))
+    found = with_sensors(config, lambda: [message(POINT, sensor="lidar")]).sensors
+    assert [(name, set(sensor.std)) for name, sensor in found.items()] == [
+        ("lidar", {"x_m", "y_m"}),
+        ("radar", {"x_m", "y_m"}),
+    ]
 
 
 def test_named_sensors_stay_the_only_ones() -> None:
