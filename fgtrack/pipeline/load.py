@@ -22,6 +22,7 @@ T = TypeVar("T")
 SMALLEST = 1e-12
 """No configured number but 0 is nearer to it, in any unit: squares and products stay finite."""
 _LONGEST_TEXT = 250_000
+_LONGEST_VALUE = 4096  # of a path
 _MOST_NODES = 100_000
 
 
@@ -139,6 +140,11 @@ def validate(kind: type[T], raw: Mapping[str, Any], origin: str) -> T:
         if isinstance(scalar, str):
             if not scalar.isprintable():
                 raise CallError(f"{origin}: {where}: {scalar!a} holds what is no letter or sign")
+            if len(scalar) > _LONGEST_VALUE:
+                raise CallError(
+                    f"{origin}: {where}: {scalar[:50]} ... has {len(scalar)} letters, at most {_LONGEST_VALUE} are "
+                    "allowed"
+                )
         elif isinstance(scalar, int):
             if abs(scalar) >= 2**63:
                 raise CallError(f"{origin}: {where}: {_name(scalar)} has more than 64 bits")

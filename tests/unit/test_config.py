@@ -292,6 +292,12 @@ def test_a_file_that_would_fill_the_memory_is_refused(tmp_path: Path, text: str,
     assert str(path) in str(caught.value)
 
 
+def test_a_text_of_the_configuration_is_no_longer_than_a_path() -> None:
+    assert load(Config, None, [f"map.track={'x' * 4096}"]).map.track == "x" * 4096
+    with pytest.raises(CallError, match=r"map\.track: x+ \.\.\. has 4097 letters, at most 4096 are allowed"):
+        load(Config, None, [f"map.track={'x' * 4097}"])
+
+
 @pytest.mark.parametrize(
     "setting", ['map.track="a\\0b"', 'ignore_sensors=["\\x1b[31m"]', 'input.ego={topic: "\\u202ex"}']
 )
