@@ -7,6 +7,8 @@ import numpy as np
 from fgtrack.core.types import IntArray
 from fgtrack.io.run.reader import Table
 
+_END_NS = int(np.iinfo(np.int64).max)
+
 
 @dataclass
 class Node:
@@ -33,4 +35,4 @@ class Node:
 def ready_times(timing: Table, node: Node) -> IntArray:
     """When the output of every tick of timing.csv was ready, shape (ticks,), with the times measured there."""
     ticks = zip(timing["now_ns"].tolist(), timing["process_ns"].tolist(), strict=True)
-    return np.array([node.done_ns(*tick) for tick in ticks], dtype=np.int64)
+    return np.array([min(node.done_ns(*tick), _END_NS) for tick in ticks], dtype=np.int64)
