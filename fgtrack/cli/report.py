@@ -55,9 +55,8 @@ def write_report(
     notes: Sequence[str] = (),
 ) -> int:
     """Write the report of `runs` with `figures` by name, and `notes` of what is missing; gives its size in bytes."""
-    text = page(runs, figures, fgtrack.__version__, notes).encode(
-        "utf-8", "backslashreplace"
-    )  # names of files need not be UTF-8
+    content = page(runs, figures, fgtrack.__version__, notes)
+    text = content.encode("utf-8", "backslashreplace")  # names of files need not be UTF-8
     with new_file(out, REPORT, overwrite) as file:
         file.write(text)
     return len(text)

@@ -251,9 +251,8 @@ class Tables(Mapping[str, Table]):
 
     def to_markdown(self, name: str | None = None) -> str:
         """The table `name`, or those that are shown."""
-        lines = (
-            "" if name or not self.verdict else "\n".join([*(f"- {printable(line)}" for line in self.verdict), "", ""])
-        )
+        verdict = [] if name else [f"- {printable(line)}" for line in self.verdict]
+        lines = "\n".join([*verdict, "", ""]) if verdict else ""
         return lines + "\n".join(table.to_markdown() for table in self._filled(name))
 
     def to_latex(self, name: str | None = None) -> str:
