@@ -113,9 +113,13 @@ def run(arguments: Sequence[str]) -> int:
             return _failed(what, BAD_DATA, debug)
         if error.filename is not None:  # of a path that was given, there or in a file
             return _failed(f"{error.filename}: cannot be used, the system says: {error.strerror}", BAD_CALL, debug)
-        return _failed(f"internal error: {type(error).__name__}: {error} (run with --debug)", BAD_DATA, debug)
+        return _bug(error, debug)
     except Exception as error:  # the last line of defence: a bug must not look like bad data
-        return _failed(f"internal error: {type(error).__name__}: {error} (run with --debug)", BAD_DATA, debug)
+        return _bug(error, debug)
+
+
+def _bug(error: Exception, debug: bool) -> int:
+    return _failed(f"internal error: {type(error).__name__}: {error} (run with --debug)", BAD_DATA, debug)
 
 
 def _failed(message: str, code: int, debug: bool) -> int:

@@ -184,7 +184,7 @@ def _numbers(value: Any, path: tuple[Any, ...], fields: dict[tuple[Any, ...], li
 
 
 def _change_all(rng: np.random.Generator, fields: list[list[tuple[Any, Any]]]) -> None:
-    """Change the numbers at all places of one of `fields`: scaled, moved, noisy, equal, exchanged or left out."""
+    """Change the numbers at all places of one of `fields`: scaled, moved, noisy, exchanged, equal, odd."""
     places = fields[rng.integers(len(fields))]
     old = [inner[key] for inner, key in places]
     match rng.integers(8):

@@ -48,15 +48,8 @@ class _Meta:
 
 
 @dataclass(frozen=True)
-class _Mount:
-    x_m: _Number = 0.0
-    y_m: _Number = 0.0
-    yaw_rad: _Number = 0.0
-
-
-@dataclass(frozen=True)
 class _Sensor:
-    mount: _Mount | None = None
+    mount: Mapping[str, _Number] | None = None
     max_delay_s: _Number | None = None
 
 
