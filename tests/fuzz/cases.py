@@ -18,8 +18,9 @@ import numpy as np
 
 from fgtrack.estimation.failures import Failure
 from fgtrack.io.run import load_run
+from fuzz.inputs import Files
 from fuzz.mutation import mutated
-from fuzz.targets import RUN, TARGETS, Files, Target, run
+from fuzz.targets import RUN, TARGETS, Target, run
 
 LONGEST_S = 20.0
 MOST_BYTES = 10**9
@@ -106,7 +107,11 @@ def _work(pipe: Connection, name: str, seed: int, first: int, last: int, ends: f
     target = next(target for target in TARGETS if target.name == name)
     warnings.simplefilter("error")
     warnings.simplefilter("ignore", ResourceWarning)
-    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+    with (
+        tempfile.TemporaryDirectory() as parent,
+        tempfile.TemporaryDirectory(dir=parent) as folder,
+        contextlib.chdir(folder),
+    ):
         pipe.send(_limit_memory(target))
         for case in range(first, last):
             if time.monotonic() > ends:
@@ -119,7 +124,7 @@ def _work(pipe: Connection, name: str, seed: int, first: int, last: int, ends: f
 def _limit_memory(target: Target) -> str:
     """So much on top of what healthy inputs take; gives what is wrong with one of those."""
     for files in healthy(target):
-        problem = problem_of(target, files)
+        problem = problem_of(target, files, right=True)
         if problem is not None:
             return problem
     taken = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
@@ -127,8 +132,8 @@ def _limit_memory(target: Target) -> str:
     return ""
 
 
-def problem_of(target: Target, files: Files) -> str | None:
-    """What is wrong with what the commands make of `files`, in the empty working directory."""
+def problem_of(target: Target, files: Files, right: bool = False) -> str | None:
+    """What is wrong with what the commands make of `files`, in the empty working directory; `right` ones end with 0."""
     write(Path(), files)
     try:
         for words in target.commands:
@@ -140,6 +145,8 @@ def problem_of(target: Target, files: Files) -> str | None:
             except BaseException as error:  # whatever it is, it is a finding
                 return f"{words[0]}: {type(error).__name__} {error}"
             problem = _problem(code, out.getvalue(), err.getvalue()) or _problem_of_run(Path(RUN))
+            if problem is None and right and code:
+                problem = f"exit code {code} for an input that is right: {err.getvalue().strip()}"
             if problem is None and time.monotonic() - started > LONGEST_S:
                 problem = f"takes {time.monotonic() - started:.0f} s"
             if problem is not None:
@@ -158,7 +165,7 @@ def _problem(code: int, out: str, err: str) -> str | None:
     if code and not err.strip():
         return f"exit code {code} without a word"
     for line in (out + err).splitlines():
-        if not line.isprintable() or len(line) > _LONGEST_LINE:
+        if not line.isprintable() or (line in err and len(line) > _LONGEST_LINE):
             return f"prints {line[:200]!r}"
     return None
 

@@ -21,7 +21,7 @@ _SEED = 20_261
 def test_a_few_spoilt_inputs_of_every_kind(target: Target, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for files in healthy(target):
-        assert problem_of(target, files) is None
+        assert problem_of(target, files, right=True) is None
     problems = {case: problem_of(target, files_of(target, _SEED, case)) for case in range(_A_FEW)}
     assert not {case: problem for case, problem in problems.items() if problem is not None}
 
@@ -49,7 +49,7 @@ def test_a_process_of_its_own_says_how_far_it_came() -> None:
 def test_what_is_looked_for_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The judge itself: an internal error, a silent failure, an endless line, an escape, a strange exit code."""
     target = next(target for target in TARGETS if target.name == "delays")
-    said = iter([(1, "fgtrack: error: internal error: Boom"), (1, ""), (0, "x" * 10_000), (0, "\x1b[31m"), (7, "what")])
+    said = iter([(1, "fgtrack: error: internal error: Boom"), (1, ""), (2, "x" * 10_000), (0, "\x1b[31m"), (7, "what")])
 
     def fake(words: object) -> int:
         code, text = next(said)
@@ -62,6 +62,15 @@ def test_what_is_looked_for_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyP
         problem = problem_of(target, healthy(target)[0])
         assert problem is not None
         assert expected in problem
+
+
+def test_an_input_that_is_right_must_be_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else nothing but its refusal is fuzzed."""
+    target = next(target for target in TARGETS if target.name == "delays")
+    wrong = {**healthy(target)[0], "x.yaml": b"radar: {delay: {kind: gamma}}\n"}
+    monkeypatch.chdir(tmp_path)
+    assert problem_of(target, wrong) is None
+    assert "for an input that is right" in str(problem_of(target, wrong, right=True))
 
 
 def test_a_kept_case_is_written_whole(tmp_path: Path) -> None:

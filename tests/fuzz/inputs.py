@@ -1,0 +1,353 @@
+"""What is spoilt: inputs of every kind that are right, as the contents of files by name."""
+
+import json
+import math
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.typesys import Stores, get_typestore
+from ruamel.yaml import YAML
+
+import fgtrack
+from fgtrack.io.ros.bag_writer import write_bag
+from fgtrack.io.stream import write_stream
+from fgtrack.models.oval import make_oval
+from fgtrack.pipeline.shipped import shipped_folder
+
+Files = Mapping[str, bytes]
+LINE = "line.json"
+"""File of the words of a command."""
+
+
+def _drive(duration_s: float) -> tuple[fgtrack.EgoState | fgtrack.DetectionList, ...]:
+    return tuple(fgtrack.simulate("single_opponent", seed=1, duration_s=duration_s))
+
+
+@cache
+def drive() -> tuple[fgtrack.EgoState | fgtrack.DetectionList, ...]:
+    """Two seconds of one car, with delays."""
+    return _drive(2.0)
+
+
+def stream(messages: Sequence[fgtrack.Message] = ()) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "drive.jsonl"
+        write_stream(path, messages or drive())
+        return path.read_bytes()
+
+
+def straight() -> bytes:
+    """A car on a straight line, long enough for noise and offsets to be fitted."""
+    rng, messages = np.random.default_rng(1), list[fgtrack.Message]()
+    for k in range(60):
+        now_ns, at_m = 10**9 + k * 10**8, 20.0 + k
+        messages.append(fgtrack.EgoState(now_ns, now_ns, 0.0, 0.0, 0.0, 0.0))
+        messages.append(fgtrack.TruthState(now_ns, now_ns, 1, at_m, 5.0))
+        for name in ("lidar", "radar") if k % 3 == 0 else ("lidar",):
+            x_m, y_m = rng.normal((at_m, 5.0), 0.3).tolist()
+            seen = fgtrack.Detection(x_m=x_m, y_m=y_m)
+            messages.append(fgtrack.DetectionList(name, now_ns, now_ns + 10**7, (seen,), "map"))
+    return stream(sorted(messages, key=lambda message: message.receipt_ns))
+
+
+def bag(storage: str) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        write_bag(Path(folder) / "bag", drive(), storage)
+        (file,) = (file for file in (Path(folder) / "bag").iterdir() if file.suffix != ".yaml")
+        return file.read_bytes()
+
+
+def ros1() -> bytes:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    types = store.types
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "drive.bag"
+        with Rosbag1Writer(path) as writer:
+            topic = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=store)
+            for k in range(40):
+                time = types["builtin_interfaces/msg/Time"](1000 + k // 20, (k % 20) * 50_000_000)
+                header = types["std_msgs/msg/Header"](k, time, "map")
+                pose = types["geometry_msgs/msg/Pose"](
+                    types["geometry_msgs/msg/Point"](1.0 * k, 0.0, 0.0),
+                    types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+                )
+                zero = types["geometry_msgs/msg/Vector3"](20.0, 0.0, 0.0)
+                message = types["nav_msgs/msg/Odometry"](
+                    header,
+                    "base",
+                    types["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36)),
+                    types["geometry_msgs/msg/TwistWithCovariance"](
+                        types["geometry_msgs/msg/Twist"](zero, zero), np.zeros(36)
+                    ),
+                )
+                receipt_ns = 1_000_000_000_000 + k * 50_000_000
+                writer.write(topic, receipt_ns, store.serialize_ros1(message, "nav_msgs/msg/Odometry"))
+        return path.read_bytes()
+
+
+def autoferry() -> Files:
+    records, truth = [], []
+    for k in range(40):
+        sensor, time = k % 4 + 1, round(1000.0 + 0.1 * k, 3)
+        points = [[10.0 + 0.1 * k, -20.0], [5.0, 30.0 - 0.1 * k]]
+        measurement = points if sensor < 3 else [0.3, -1.2]
+        records.append({"sensorID": sensor, "time": time, "ownshipPosition": [1.0, 2.0], "measurement": measurement})
+        truth.append([{"targetID": 1, "position": [11.0 + 0.1 * k, -18.0, 0.0], "time": time}])
+    return {
+        "in/scenario9_detections.json": json.dumps(records).encode(),
+        "in/scenario9_groundTruth.json": json.dumps(truth).encode(),
+    }
+
+
+def log_folder() -> Files:
+    columns = "time_ns;detection_input;ego_state;tracking_input;match_dict;filter_log;object_dict;pred_dict"
+    rows = [f"{columns};cycle_time_ns"]
+    for k in range(30):
+        now_ns = 10**12 + k * 20_000_000
+        ego = {"is_updated": True, "in_pit": False, "t": now_ns - 10**7, "state": [1.0 * k, 2.0, 3.0, 40.0, 0.1, -1.0]}
+        lidar = [[{"state": [20.0, 1.0, 0.1], "t": now_ns - 5 * 10**7, "keys": ["x", "y", "yaw"]}], now_ns - 5 * 10**7]
+        radar = [[{"state": [20.0, 1.0, 9.0], "t": now_ns - 3 * 10**7, "keys": ["x", "y", "v"]}], now_ns - 3 * 10**7]
+        cells = (now_ns, {"lidar": lidar, "radar": radar}, ego, [], {}, {}, {}, {}, 5)
+        rows.append(";".join(map(json.dumps, cells)))
+    return {"in/data_logs.csv": "\n".join(rows).encode()}
+
+
+def kitti() -> Files:
+    eye = "1 0 0 0 0 1 0 0 0 0 1 0"
+    camera = "700 0 600 0 0 700 180 0 0 0 1 0"
+    calib = "\n".join(
+        [*(f"P{k}: {camera}" for k in range(4)), "R_rect 1 0 0 0 1 0 0 0 1", "Tr_velo_cam 0 -1 0 0 0 0 -1 0 1 0 0 0"]
+    )
+    oxts, labels, poses = [], [], []
+    for k in range(20):
+        values = np.zeros(30)
+        values[:6] = 49.0 + 1e-5 * k, 8.0, 110.0, 0.0, 0.0, 0.1
+        values[8] = 10.0
+        oxts.append(" ".join(map(repr, values.tolist())))
+        labels.append(f"{k} 1 Car 0 0 0.0 1 2 3 4 1.5 1.6 4.0 2.0 1.5 {20.0 + 0.1 * k} {-0.5 * math.pi}")
+        poses.append(f"{k},2,1,2,3,4,9.0,1.5,1.6,4.0,2.0,1.5,{20.0 + 0.1 * k},{-0.5 * math.pi},0.0")
+    texts = {"oxts": oxts, "label_02": labels, "pointrcnn_car": poses, "calib": [f"{calib}\nTr_imu_velo {eye}", ""]}
+    return {f"in/{name}/0001.txt": "\n".join(lines).encode() for name, lines in texts.items()}
+
+
+def kitti_forms() -> list[Files]:
+    """The forms in which detectors and trackers publish, beside that of `kitti`."""
+    files = kitti()
+    other = {name: content for name, content in files.items() if "pointrcnn" not in name}
+    place = "1 2 3 4 1.5 1.6 4.0 2.0 1.5 20.0"
+    tracking = "\n".join(f"{k} 5 Car -1 -1 0.1 {place} -1.57 9.{k}" for k in range(20)).encode()
+    image = "\n".join(f"{k},100.5,150,180.25,200,0.9" for k in range(20)).encode()
+    frames = {f"in/pointrcnn_car/0001/{k:06d}.txt": f"Car 0 0 0.1 {place} -1.57 9.{k}\n".encode() for k in range(20)}
+    return [
+        {**other, "in/pointrcnn_car/0001.txt": tracking},
+        {**files, "in/rrc_car/0001.txt": image},
+        {**other, **frames},
+    ]
+
+
+def tables() -> Files:
+    """CSV in three files, with a mapping of their columns."""
+    ego, seen, cars = ["t;east;north;heading;kmh"], ["ms\tgot\trange\tazimuth\tkind\tsnr\tid"], ["t,id,x,y"]
+    for k in range(40):
+        t = f"{1000.0 + 0.05 * k:.2f}"
+        ego.append(f"{t};{k}.5;2;90.0;72")
+        seen.append(f"{1_000_000 + 50 * k}\t{1_000_090 + 50 * k}\t{20 + 0.1 * k}\t-1.5\tcar\t9\tcar_a")
+        cars.append(f'{t},"car_a",{k + 20},3')
+    texts = {"ego.csv": ego, "radar.tsv": seen, "cars.csv": cars}
+    return {"x.yaml": MAPPING} | {f"in/{name}": "\n".join(lines).encode() for name, lines in texts.items()}
+
+
+def nuscenes() -> Files:
+    north = [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
+    boxes: dict[str, object] = {}
+    tables: dict[str, list[dict[str, object]]] = {
+        "scene": [{"token": "a", "name": "scene-0001"}],
+        "category": [{"token": "c", "name": "vehicle.car"}],
+        "instance": [{"token": "i", "category_token": "c"}],
+    }
+    for k in range(10):
+        stamp_us, token, at = 10**15 + 500_000 * k, f"s{k}", [110.0, 2.0 + k, 1.0]
+        boxes[token] = [
+            {
+                "sample_token": token,
+                "translation": at,
+                "size": [1.9, 4.5, 1.6],
+                "rotation": north,
+                "velocity": [0.0, 2.0],
+                "tracking_name": "car",
+                "tracking_id": "7",
+                "tracking_score": 0.8,
+            }
+        ]
+        seen = {"num_lidar_pts": 5, "num_radar_pts": 0}
+        place = {"translation": [100.0, 1.0 * k, 0.0], "rotation": north}
+        for name, entry in {
+            "sample": {"token": token, "timestamp": stamp_us, "scene_token": "a"},
+            "sample_data": {"sample_token": token, "ego_pose_token": f"p{k}"},
+            "ego_pose": {"token": f"p{k}", "timestamp": stamp_us, **place},
+            "sample_annotation": {
+                "sample_token": token,
+                "instance_token": "i",
+                "translation": at,
+                "rotation": north,
+                **seen,
+            },
+        }.items():
+            tables.setdefault(name, []).append(entry)
+    files = {f"in/v1.0-mini/{name}.json": json.dumps(entries).encode() for name, entries in tables.items()}
+    return {"in/results.json": json.dumps({"meta": {}, "results": boxes}).encode(), **files}
+
+
+def track_map() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        make_oval().write(Path(folder) / "x.csv")
+        return (Path(folder) / "x.csv").read_bytes()
+
+
+def run_folder() -> Files:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run"
+        fgtrack.replay(iter(drive()), "smoother", out=path)
+        return {f"in/{file.name}": file.read_bytes() for file in path.iterdir()}
+
+
+def named() -> Files:
+    """What sweeps and `LINES` name."""
+    return {
+        "x.jsonl": stream(_drive(4.0)),
+        "x.csv": track_map(),
+        "x.yaml": RESWEEP,
+        "d.yaml": DELAYS,
+        "s.jsonl": straight(),
+    }
+
+
+def configurations() -> list[Files]:
+    """Each shipped one, beside a stream of lists of its sensors that measure places."""
+    found = []
+    for content in shipped("."):
+        ours = [message.sensor for message in drive() if isinstance(message, fgtrack.DetectionList)]
+        sensors = YAML(typ="safe").load(content)["sensors"]
+        theirs = [name for name, sensor in sensors.items() if "x_m" in sensor["std"]]
+        if not theirs:
+            continue
+        names = {name: name if name in theirs else theirs[k % len(theirs)] for k, name in enumerate(sorted({*ours}))}
+        messages = [
+            replace(message, sensor=names[message.sensor]) if isinstance(message, fgtrack.DetectionList) else message
+            for message in drive()
+        ]
+        found.append({"x.yaml": content, "x.jsonl": stream(messages)})
+    return found
+
+
+def lines() -> list[Files]:
+    """Each of `LINES`, beside all that it names."""
+    return [{LINE: json.dumps(line.split()).encode(), **named()} for line in LINES.strip().splitlines()]
+
+
+def words(content: bytes) -> list[str]:
+    """Words as a shell hands them over, whatever has become of those of a `LINE`."""
+    text = content.decode(errors="surrogateescape").replace("\0", "")
+    try:
+        found = json.loads(text)
+    except ValueError:
+        found = text.split()
+    return [str(word).replace("\0", "") for word in (found if isinstance(found, list) else [found])] or ["--help"]
+
+
+def shipped(kind: str) -> list[bytes]:
+    return [file.read_bytes() for file in sorted((shipped_folder() / kind).glob("*.yaml"))]
+
+
+SWEEP = b"""format: fgtrack-sweep/1
+scenario: single_opponent
+config: smoother
+duration_s: 0.5
+seeds: [1, 2]
+estimators: [ekf-replay]
+set: {map.track: null}
+vary: {association.gate_m: [3.0, 5.0], scenario.sensors.radar.rate_hz: [10.0]}
+metrics: ["truth.overall.errors.*"]
+"""
+LINES = """
+simulate single_opponent -o out.jsonl --seed 3 --duration 0.5
+simulate default -o bag --storage sqlite3 --duration 0.2 --overwrite
+replay x.jsonl -c open_space -e ekf-replay -o run --set clock.node_hz=10 --overwrite
+replay x.jsonl -e smoother,ekf-backward-forward -o run --map x.csv --pit-map oval --set map.track=null
+replay x.jsonl -c karle2023 -o run --realtime --set map.track=null --set lifecycle.confirm_count=3
+compare in --json --streaming
+compare in --format latex --all
+figure in -o figures --format svg --track 1 --stamp 1.5
+report in -o x.html --overwrite
+export in -o x.mcap --overwrite
+export in -o bag --ros2
+sweep x.yaml -o swept --jobs 1 --input x.jsonl --set map.track=null --format csv --all
+tune s.jsonl -o y.yaml --keep sensors.radar.std.x_m --set motion={"kind":"cv","std_per_s":{"velocity":3.0}} --json
+advise x.jsonl -c open_space -o y.yaml --reference radar --set clock.node_hz=10 --format md
+offsets x.jsonl -c open_space --reference radar --map oval --json
+info x.jsonl -c open_space --format md
+convert x.jsonl out.jsonl --delays d.yaml --seed 4 --overwrite
+convert x.jsonl bag -c open_space --storage mcap
+config -c smoother --set clock.node_hz=50
+config --list
+"""
+"""Calls of the commands."""
+RESWEEP = b"""format: fgtrack-sweep/1
+input: x.jsonl
+delays: d.yaml
+config: open_space
+seeds: 1
+estimators: [ekf-replay, ekf-backward-forward]
+set: {clock.node_hz: 20.0}
+one_at_a_time:
+  gate:
+    label: [narrow, wide]
+    association.gate_m: [2.0, 6.0]
+  delays.radar.loss_probability: [0.0, 0.5]
+"""
+MAPPING = b"""estimator: ekf-replay
+input:
+  csv:
+    ego:
+      file: ego.csv
+      columns:
+        {stamp: t, x_m: east, y_m: north, yaw_rad: {path: heading, scale: -1, offset: 90, degrees: true},
+         speed_mps: kmh}
+    detections:
+      radar:
+        file: radar.tsv
+        columns:
+          {stamp: ms, receipt: got, range_m: range, bearing_rad: {path: azimuth, degrees: true}, class_name: kind,
+           object_id: id}
+        time_unit: ms
+        frame: sensor
+        filters: {snr: {min: 6}}
+    truth: {file: cars.csv, columns: {stamp: t, object_id: id, x_m: x, y_m: y}}
+sensors:
+  radar: {std: {range_m: 0.5, bearing_rad: 0.02}, max_delay_s: 1.0}
+"""
+EXCLUDED = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {}, "geometry":
+{"type": "MultiPolygon", "coordinates":
+[[[[0.0, 0.0], [90.0, 0.0], [90.0, 90.5], [0.0, 0.0]]], [[[5, 5], [9, 5], [9, 9], [5, 5]]]]}}]}"""
+CORNERS = b"area,x_m,y_m\nshore,0.0,0.0\nshore,90.0,0.5\nshore,90.0,90.0\npier,5,5\npier,9,5\npier,9,9\n"
+DELAYS = b"""radar:
+  delay: {kind: gamma, min_s: 0.01, mean_s: 0.1, q90_s: 0.15}
+  clock: [{kind: offset, offset_s: -0.06}, {kind: drift, drift_ppm: 40.0}, {kind: quantised, step_s: 0.001}]
+  loss_probability: 0.1
+lidar_cluster:
+  delay:
+    kind: markov_time
+    good: {kind: burst, probability: 0.1, duration_s: 0.2, extra_s: 0.1, base: {kind: normal, mean_s: 0.1, std_s: 0.1}}
+    bad: {kind: loss, probability: 0.7, base: {kind: uniform, min_s: 0.08, max_s: 0.18}}
+    to_bad_per_s: 0.5
+    to_good_per_s: 2.0
+  clock: [{kind: arrival}, {kind: jitter, std_s: 0.002}]
+"*":
+  delay: {kind: markov, good: {kind: constant, delay_s: 0.1}, bad: {kind: none}, to_bad: 0.1, to_good: 0.5}
+"""
+NUSCENES = "sensors={detector: {std: {x_m: 0.5, y_m: 0.5}}}"
