@@ -9,12 +9,9 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from rosbags.rosbag1 import Writer as Rosbag1Writer
-from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
 import fgtrack
-from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.stream import write_stream
 from fgtrack.models.oval import make_oval
 from fgtrack.pipeline.shipped import shipped_folder
@@ -53,41 +50,6 @@ def straight() -> bytes:
             seen = fgtrack.Detection(x_m=x_m, y_m=y_m)
             messages.append(fgtrack.DetectionList(name, now_ns, now_ns + 10**7, (seen,), "map"))
     return stream(sorted(messages, key=lambda message: message.receipt_ns))
-
-
-def bag(storage: str) -> bytes:
-    with tempfile.TemporaryDirectory() as folder:
-        write_bag(Path(folder) / "bag", drive(), storage)
-        (file,) = (file for file in (Path(folder) / "bag").iterdir() if file.suffix != ".yaml")
-        return file.read_bytes()
-
-
-def ros1() -> bytes:
-    store = get_typestore(Stores.ROS1_NOETIC)
-    types = store.types
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "drive.bag"
-        with Rosbag1Writer(path) as writer:
-            topic = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=store)
-            for k in range(40):
-                time = types["builtin_interfaces/msg/Time"](1000 + k // 20, (k % 20) * 50_000_000)
-                header = types["std_msgs/msg/Header"](k, time, "map")
-                pose = types["geometry_msgs/msg/Pose"](
-                    types["geometry_msgs/msg/Point"](1.0 * k, 0.0, 0.0),
-                    types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
-                )
-                zero = types["geometry_msgs/msg/Vector3"](20.0, 0.0, 0.0)
-                message = types["nav_msgs/msg/Odometry"](
-                    header,
-                    "base",
-                    types["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36)),
-                    types["geometry_msgs/msg/TwistWithCovariance"](
-                        types["geometry_msgs/msg/Twist"](zero, zero), np.zeros(36)
-                    ),
-                )
-                receipt_ns = 1_000_000_000_000 + k * 50_000_000
-                writer.write(topic, receipt_ns, store.serialize_ros1(message, "nav_msgs/msg/Odometry"))
-        return path.read_bytes()
 
 
 def autoferry() -> Files:

@@ -7,13 +7,21 @@ import json
 import math
 import re
 import sqlite3
+import struct
+import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
 
 #: What numbers, texts and places are replaced by.
 ODD: tuple[Any, ...] = (
@@ -46,7 +54,9 @@ Mutation = Callable[[np.random.Generator, bytes], bytes]
 def mutated(rng: np.random.Generator, name: str, content: bytes) -> bytes:
     """`content` of the file `name` with one to four things spoilt."""
     for _ in range(int(rng.integers(1, 5))):
-        ways = [_bytes, _bytes, *_BY_SUFFIX.get(Path(name).suffix, (_numbers_in_text, _lines))]
+        text = (_numbers_in_text, _lines)
+        known = next((ways for suffix, ways in _BY_SUFFIX.items() if name.endswith(suffix)), text)
+        ways = [_bytes, _bytes, *known]
         try:
             content = ways[rng.integers(len(ways))](rng, content)
         except Exception:  # of the libraries that read what an earlier mutation has left
@@ -75,6 +85,19 @@ def _bytes(rng: np.random.Generator, content: bytes) -> bytes:
         case 4:
             return head + bytes(rng.integers(0, 256, len(part), dtype=np.uint8)) + tail
     return head
+
+
+def _packed(rng: np.random.Generator, content: bytes) -> bytes:
+    """A number of four or eight bytes overwritten by something odd."""
+    form = str(rng.choice(["<d", "<d", "<f", "<q", "<i"]))
+    value = rng.choice([0.0, -1.0, 1e-300, 1e19, 1e308, math.nan, math.inf, -math.inf]).item()
+    if form in ("<q", "<i"):
+        most = 2 ** (8 * struct.calcsize(form) - 1)
+        value = [0, -1, 1, 100_000, most // 2, most - 1, -most][rng.integers(7)]
+    elif form == "<f":
+        value = np.float32(min(max(value, -3e38), 3e38)).item()
+    new, place = struct.pack(form, value), 4 * int(rng.integers(len(content) // 4 + 1))
+    return (content[:place] + new + content[place + len(new) :])[: len(content)]
 
 
 def _numbers_in_text(rng: np.random.Generator, content: bytes) -> bytes:
@@ -217,6 +240,14 @@ def _gzip(rng: np.random.Generator, content: bytes) -> bytes:
     return gzip.compress(mutated(rng, "inner.jsonl", gzip.decompress(content)), mtime=0)
 
 
+def _zstd(rng: np.random.Generator, content: bytes, suffix: str) -> bytes:
+    return zstd.compress(mutated(rng, f"inner{suffix}", zstd.decompress(content)))
+
+
+def _message(rng: np.random.Generator, content: bytes) -> bytes:
+    return (_packed if rng.integers(2) else _bytes)(rng, content)
+
+
 def _sqlite(rng: np.random.Generator, content: bytes) -> bytes:
     """A cell of a table replaced, or the bytes of a message spoilt."""
     with tempfile.TemporaryDirectory() as folder:
@@ -229,7 +260,7 @@ def _sqlite(rng: np.random.Generator, content: bytes) -> bytes:
             rows = [row[0] for row in base.execute(f"select rowid from {table}")]
             column, row = str(rng.choice(columns)), int(rng.choice(rows))
             (old,) = base.execute(f"select {column} from {table} where rowid = ?", (row,)).fetchone()
-            new = _bytes(rng, old) if isinstance(old, bytes) and rng.integers(4) else _odd(rng)
+            new = _message(rng, old) if isinstance(old, bytes) and rng.integers(4) else _odd(rng)
             if not isinstance(new, (int, float, str, bytes, type(None))) or (
                 isinstance(new, int) and abs(new) >= 2**63
             ):
@@ -262,7 +293,7 @@ def _mcap(rng: np.random.Generator, content: bytes) -> bytes:
             )
         data, log_ns = message.data, message.log_time
         if place == chosen:
-            data, log_ns = _bytes(rng, data), int(rng.choice([log_ns, 0, 2**63 - 1, log_ns + 10**10]))
+            data, log_ns = _message(rng, data), int(rng.choice([log_ns, 0, 2**63 - 1, log_ns + 10**10]))
         writer.add_message(channels[channel.id], log_ns, data, message.publish_time, message.sequence)
     writer.finish()
     return out.getvalue()
@@ -307,5 +338,7 @@ _BY_SUFFIX: dict[str, tuple[Mutation, ...]] = {
     ".gz": (_gzip, _gzip, _gzip),
     ".db3": (_sqlite, _sqlite, _sqlite),
     ".mcap": (_mcap, _mcap, _mcap),
-    ".bag": (),
+    ".bag": (_packed, _packed),
+    ".mcap.zstd": (partial(_zstd, suffix=".mcap"),) * 3,
+    ".db3.zstd": (partial(_zstd, suffix=".db3"),) * 3,
 }

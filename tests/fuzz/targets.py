@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fgtrack.cli import main
-from fuzz import inputs
+from fuzz import bags, inputs
 from fuzz.inputs import LINE, Files
 
 RUN = "run"
@@ -34,6 +34,7 @@ def run(words: Sequence[str]) -> int:
 _REPLAY = ("--overwrite", "-o", RUN, "-e")
 _EKF = (*_REPLAY, "ekf-replay")
 _CV = ("--set", "motion={kind: cv, std_per_s: {velocity: 3.0}}", "--set", "clock.node_hz=10")
+_TOPICS = "input={ego: {topic: /ego}, detections: {radar: {topic: /seen}}}"
 _MERGE = "merge={kind: connected, distance_m: 5.1}"
 
 
@@ -66,21 +67,33 @@ TARGETS = (
     ),
     Target(
         "mcap",
-        lambda: [{"x.mcap": inputs.bag("mcap")}],
+        lambda: [{"x.mcap": bags.bag("mcap")}],
         _all,
         [("info", "x.mcap"), ("replay", "x.mcap", "-c", "open_space", *_EKF)],
     ),
     Target(
         "sqlite3",
-        lambda: [{"x.db3": inputs.bag("sqlite3")}],
+        lambda: [{"x.db3": bags.bag("sqlite3")}],
         _all,
         [("info", "x.db3"), ("replay", "x.db3", "-c", "open_space", *_EKF)],
     ),
     Target(
         "ros1",
-        lambda: [{"x.bag": inputs.ros1()}],
+        lambda: [{"x.bag": bags.ros1()}],
         _all,
         [("info", "x.bag"), ("replay", "x.bag", "-c", "open_space", "--set", "input.ego.topic=/odom", *_EKF)],
+    ),
+    Target(
+        "foreign",
+        lambda: [bags.foreign()],
+        _all,
+        [("info", "x.mcap", "-c", "x.yaml"), ("replay", "x.mcap", "-c", "x.yaml", "--overwrite", "-o", RUN)],
+    ),
+    Target(
+        "bag-folder",
+        bags.folders,
+        _all,
+        [("info", "in"), ("replay", "in", "-c", "open_space", "--set", _TOPICS, *_EKF)],
     ),
     Target(
         "autoferry",
@@ -175,6 +188,12 @@ TARGETS = (
     ),
     Target(
         "run", lambda: [inputs.run_folder()], _all, [("compare", "in"), ("export", "in", "-o", "x.mcap", "--overwrite")]
+    ),
+    Target(
+        "pictures",
+        lambda: [inputs.run_folder()],
+        _all,
+        [("report", "in", "-o", "x.html", "--overwrite"), ("export", "in", "-o", "bag", "--ros2", "--overwrite")],
     ),
     Target("line", inputs.lines, _only(LINE), [("replay", "x.jsonl", "-c", "open_space", "-o", "in"), (LINE,)]),
 )
