@@ -92,7 +92,8 @@ class ReplayingFilter(WindowedFilter):
         return Step((prior.stamp_ns, NOTHING), None, mean, covariance, predicted, opening)
 
     def _forget_before(self, stamp_ns: int) -> None:
-        del self._steps[: max(bisect.bisect_right(self._steps, stamp_ns, key=_stamp) - 1, 0)]
+        # what is measured at that very stamp may still come, and belongs behind the first step
+        del self._steps[: max(bisect.bisect_left(self._steps, stamp_ns, key=_stamp) - 1, 0)]
 
     def _fuse(self, measurement: Measurement) -> OneCorrection:
         order = measurement.order

@@ -355,22 +355,19 @@ class ReplayBank:
         self, stamp_ns: int, tracks: IntArray, measurements: Sequence[Measurement], newest: IntArray
     ) -> IntArray:
         """Where the measurements belong: at `newest`, behind all older ones and those of the same stamp, but among the
-        latter by content, and in any case behind the first of the window."""
+        latter by content; never before the first step, which is a prior or older than the window."""
         order, places = self._steps.order, newest.copy()
-        equal = np.flatnonzero(order.stamps_ns[tracks, places - 1] == stamp_ns)
-        if equal.size:
-            first = order.place_before(tracks[equal], self._start_ns[tracks[equal]])
-            for row, lowest in zip(equal.tolist(), first.tolist(), strict=True):
-                track, own = tracks[row], measurements[row].content
-                while places[row] - 1 > lowest and order.stamps_ns[track, places[row] - 1] == stamp_ns:
-                    if self._steps.content_of(int(order.numbers[track, places[row] - 1])) <= own:
-                        break
-                    places[row] -= 1
+        for row in np.flatnonzero(order.stamps_ns[tracks, places - 1] == stamp_ns).tolist():
+            track, own = tracks[row], measurements[row].content
+            while places[row] > 1 and order.stamps_ns[track, places[row] - 1] == stamp_ns:
+                if self._steps.content_of(int(order.numbers[track, places[row] - 1])) <= own:
+                    break
+                places[row] -= 1
         return places
 
     def _forget(self, tracks: IntArray) -> None:
-        """Drop what is not needed for the windows."""
-        many = self._steps.order.place_before(tracks, self._start_ns[tracks])
+        """Drop what is not needed for the windows; what is measured right at their starts may still come."""
+        many = self._steps.order.place_before(tracks, self._start_ns[tracks] - 1)
         old = many >= _MANY
         if old.any():
             self._steps.order.drop(tracks[old], many[old])

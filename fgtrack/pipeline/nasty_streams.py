@@ -13,7 +13,7 @@ from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
 from fgtrack.pipeline.oracle.sightings import Eye, Sighting
-from fgtrack.pipeline.verify_streams import FAST, Plan, Stream, drawn, observed, paper
+from fgtrack.pipeline.verify_streams import FAST, Plan, Stream, drawn, observed, onboard, paper
 
 #: Ten rounds of the LiDAR at 20 Hz.
 _ROUNDS = tuple((0.05 * k, "lidar_cluster") for k in range(1, 11))
@@ -101,11 +101,20 @@ def _on_the_birth_stamp(rng: np.random.Generator, name: str) -> Stream:
     return _open(rng, name, CTRV(), (*_at(0.0, 3), *_ROUNDS))
 
 
+def _radar_on_the_birth_stamp(rng: np.random.Generator, name: str) -> Stream:
+    """Three of which the first to be fused decides where the others are linearised: by content, for the oracle too."""
+    stream = onboard(rng, name, _plan((*((0.0, "radar") for _ in range(3)), *_ROUNDS)))
+    own = [*sorted(range(3), key=lambda k: stream.measurements[k].content), *range(3, len(stream.measurements))]
+    measurements, sightings = (tuple(each[k] for k in own) for each in (stream.measurements, stream.sightings))
+    return replace(stream, measurements=measurements, sightings=sightings)
+
+
 _NAMED: Mapping[str, Callable[..., Stream]] = {
     "burst of 12 within 11 ms": partial(_in_a_burst, motion=CTRV(), apart_s=0.001),
     "12 on one stamp": partial(_in_a_burst, motion=CTRV(), apart_s=0.0),
     "12 on one stamp, CTRA": partial(_in_a_burst, motion=CTRA(), apart_s=0.0),
     "three on the birth stamp": _on_the_birth_stamp,
+    "three RADARs on the birth stamp": _radar_on_the_birth_stamp,
     "birth, heading unknown": _unknown,
     "outliers of 2.5 sd": partial(_outliers, far_sd=2.5, share=0.3),
     "outliers of 20 sd, no gate": partial(_outliers, far_sd=20.0, share=0.2),

@@ -143,8 +143,12 @@ def observed(rng: np.random.Generator) -> Stream:
     """
     stamps_s, sensors = paper_stamps(0.6)
     stamps_s = np.where(stamps_s > 0.3, stamps_s + 0.7, stamps_s)  # nothing for a while
-    plan = stamps_s, sensors
-    return drawn(rng, "CTRV, from a turning ego", CTRV(), plan, 2.0, 1.9, start=_TURNING, sense=_Onboard(stamps_s))
+    return onboard(rng, "CTRV, from a turning ego", (stamps_s, sensors))
+
+
+def onboard(rng: np.random.Generator, name: str, plan: Plan) -> Stream:
+    """As `observed`, at other stamps."""
+    return drawn(rng, name, CTRV(), plan, lag_s=2.0, reach_s=1.9, start=_TURNING, sense=_Onboard(plan[0]))
 
 
 def robust(rng: np.random.Generator) -> Stream:

@@ -1,16 +1,29 @@
 """Filters that rewind and replay: what they say of a late measurement."""
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 
-from fgtrack.estimation.base import Estimator, Measurement
+from fgtrack.core.time import nanoseconds
+from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.dense_joint import dense_joint
 from fgtrack.estimation.oosm import ReorderBuffer
+from fgtrack.estimation.registry import estimator, estimator_bank
 from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRV, CV
 from fgtrack.testing.streams import LINEAR, MS, START, Stream, measured, shuffled
 
 POSITION = ("x_m", "y_m")
+LAG_S = 1.0
+HERE = SensorPose()
+SEEN = Start(stamp_ns=10**11, position_m=(6.0, 3.0), yaw_rad=0.3, yaw_std_rad=0.3, speed_mps=10.0, speed_std_mps=3.0)
+
+
+def radar(stamp_ns: int, range_m: float, bearing_rad: float, pose: SensorPose = HERE) -> Measurement:
+    std = {"range_m": 0.2, "bearing_rad": 0.03}
+    return Measurement.of(stamp_ns, range_m=range_m, bearing_rad=bearing_rad, std=std, pose=pose)
 
 
 def innovations(estimator: Estimator, stream: Stream) -> list[np.ndarray]:
@@ -37,8 +50,8 @@ def expected(stream: Stream) -> list[np.ndarray]:
 @pytest.mark.parametrize("seed", range(20))
 def test_innovations_are_predicted_from_everything_that_came_before_whatever_its_stamp(seed: int) -> None:
     stream = shuffled(LINEAR, np.random.default_rng(seed))
-    for estimator in (ReplayEkf(LINEAR, START, 1.0), ReorderBuffer(LINEAR, START, 1.0, 1.0)):
-        np.testing.assert_allclose(innovations(estimator, stream), expected(stream), rtol=1e-9, atol=1e-9)
+    for each in (ReplayEkf(LINEAR, START, 1.0), ReorderBuffer(LINEAR, START, 1.0, 1.0)):
+        np.testing.assert_allclose(innovations(each, stream), expected(stream), rtol=1e-9, atol=1e-9)
 
 
 def test_a_late_copy_of_what_was_measured_right_after_it_is_no_surprise() -> None:
@@ -70,3 +83,28 @@ def test_what_comes_in_sequence_is_predicted_from_the_newest_state() -> None:
         measurement = measured(rng, CV(), k * 100 * MS, POSITION)
         predicted = estimator.state_at(measurement.stamp_ns).mean[:2]
         np.testing.assert_array_equal(estimator.update(measurement).innovation, measurement.z - predicted)
+
+
+@pytest.mark.parametrize("name", ["ekf-replay", "iekf-replay", "ukf-replay", "iplf-replay", "imm-replay"])
+@pytest.mark.parametrize("after_s", [0.0, LAG_S], ids=["birth", "oldest"])
+def test_on_the_oldest_stamp_of_the_window_the_order_of_arrival_does_not_matter(name: str, after_s: float) -> None:
+    """Ranges and bearings, of which the first to be fused decides where the others are linearised."""
+    stamp_ns = SEEN.stamp_ns + nanoseconds(after_s)
+    poses = (HERE, SensorPose(1.0, 1.0, 0.1), HERE)
+    there = [radar(stamp_ns, r, b, pose) for r, b, pose in zip((6.5, 5.0, 6.0), (0.5, 0.35, 0.45), poses, strict=True)]
+    newest = radar(stamp_ns + nanoseconds(LAG_S), 17.0, 0.35)
+    found = []
+    for order in permutations(there):
+        arrived = (order[0], newest, *order[1:])
+        tracked, bank = estimator(name, CTRV(), SEEN, lag_s=LAG_S), estimator_bank(name, CTRV(), LAG_S, {})
+        tracks = range(8)  # in arrays, where the estimator has them
+        for track in tracks:
+            bank.birth(track, SEEN)
+        for measurement in arrived:
+            assert tracked.update(measurement).innovation is not None
+            bank.update(measurement.stamp_ns, tracks, [measurement] * len(tracks))
+        state, together = tracked.state_at(newest.stamp_ns), bank.states_at(newest.stamp_ns)
+        found.append((state.mean, state.covariance, together.means, together.covariances))
+    for later in found[1:]:
+        for one, other in zip(found[0], later, strict=True):
+            np.testing.assert_array_equal(one, other)

@@ -46,7 +46,7 @@ class Problem:
 def filtered(problem: Problem) -> dict[int, Estimate]:
     """The extended Kalman filter in the order of the stamps: the state at each stamp after all up to it.
 
-    Sightings of one stamp count together, linearised at the state before them.
+    Sightings of one stamp count one after the other, as they stand in the problem.
     """
     dynamics, names = problem.dynamics, problem.dynamics.names
     (mean, P), now_ns = problem.start, problem.start_ns
@@ -55,12 +55,11 @@ def filtered(problem: Problem) -> dict[int, Estimate]:
         if stamp_ns > now_ns:
             moved = dynamics.move(mean, (stamp_ns - now_ns) / _NS_PER_S)
             mean, P, now_ns = moved.mean, moved.F @ P @ moved.F.T + moved.Q, stamp_ns
-        here = [one for one in problem.sightings if one.stamp_ns == stamp_ns]
-        if here:
-            H = np.vstack([one.slope(mean, names) for one in here])
-            y = np.concatenate([one.residual(mean, names) for one in here])
-            K, P = _conditioned(P, H, np.eye(len(y)))
-            mean = mean + K @ y
+        for one in problem.sightings:
+            if one.stamp_ns == stamp_ns:
+                y = one.residual(mean, names)
+                K, P = _conditioned(P, one.slope(mean, names), np.eye(len(y)))
+                mean = mean + K @ y
         estimates[stamp_ns] = Estimate(mean, P)
     return estimates
 
