@@ -101,3 +101,20 @@ def inverse_roots(S: FloatArray) -> FloatArray:
     for i in range(1, n):
         W[..., i : i + 1, :i] = (L[..., i : i + 1, :i] @ W[..., :i, :i]) * -pivots[..., i, None, None]
     return W
+
+
+def noise_roots(Q: FloatArray) -> FloatArray:
+    """`inverse_roots` of process noise (..., n, n), which may be singular: there it is taken to be `regular`."""
+    try:
+        return inverse_roots(Q)
+    except np.linalg.LinAlgError:
+        return inverse_roots(regular(Q)) if Q.ndim == 2 else np.stack([noise_roots(one) for one in Q])
+
+
+def regular(Q: FloatArray) -> FloatArray:
+    """Process noise (..., n, n) with a millionth of each entry's standard deviation more, and at least 1e-9.
+
+    Without any noise of the position, that of an object that stands is singular: it cannot move sideways.
+    """
+    variances = np.maximum(np.diagonal(Q, axis1=-2, axis2=-1), 1e-6)
+    return Q + 1e-12 * variances[..., None] * identity(Q.shape[-1])

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.linalg import applied, product
+from fgtrack.core.linalg import applied, product, regular
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.ekf import joseph, kalman_gain
 from fgtrack.models.motion import MotionModel
@@ -58,6 +58,9 @@ def _given(
     right: FloatArray,
 ) -> Between:
     """See `between`."""
-    Psi, _ = kalman_gain(Q1, F2, Q2)
+    try:
+        Psi, _ = kalman_gain(Q1, F2, Q2)
+    except np.linalg.LinAlgError:  # of noise that leaves out a direction
+        Psi, _ = kalman_gain(regular(Q1), F2, regular(Q2))
     mean = first + applied(Psi, right - second)
     return Between(mean, F1 - product(Psi, product(F2, F1)), Psi, joseph(Q1, Psi, F2, Q2))

@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 from gtsam.noiseModel import mEstimator
 
-from fgtrack.core.linalg import identity, inverse_roots
+from fgtrack.core.linalg import identity, inverse_roots, noise_roots
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.following_noise import log_determinant, segment_rows
@@ -51,7 +51,7 @@ def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float, at: F
             jacobians[0], jacobians[1] = gradient, still
         return np.subtract(values.atVector(right), mean)
 
-    return gtsam.CustomFactor(_gaussian(step.Q), [left, right], error)
+    return gtsam.CustomFactor(_gaussian(noise_roots(step.Q)), [left, right], error)
 
 
 def map_motion_factor(motion: MotionModel, left: int, right: int, dt_s: float, at: FloatArray) -> gtsam.NonlinearFactor:
@@ -93,11 +93,11 @@ def _callback_factor(key: int, measurement: Measurement) -> gtsam.NonlinearFacto
             jacobians[0] = H
         return -y
 
-    noise, loss = _gaussian(measurement.R), measurement.loss
+    noise, loss = _gaussian(inverse_roots(measurement.R)), measurement.loss
     if loss is not None:
         noise = gtsam.noiseModel.Robust.Create(_LOSSES[loss.kind](loss.width), noise)
     return gtsam.CustomFactor(noise, [key], error)
 
 
-def _gaussian(covariance: FloatArray) -> gtsam.noiseModel.Base:
-    return gtsam.noiseModel.Gaussian.SqrtInformation(inverse_roots(covariance), smart=False)
+def _gaussian(root: FloatArray) -> gtsam.noiseModel.Base:
+    return gtsam.noiseModel.Gaussian.SqrtInformation(root, smart=False)

@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 import gtsam
 import numpy as np
 
-from fgtrack.core.linalg import inverse_roots
+from fgtrack.core.linalg import inverse_roots, noise_roots
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.factor_graph.factors import map_motion_factor, measurement_factor, motion_factor, prior_factor
 from fgtrack.estimation.following_noise import log_determinant, segment_rows
@@ -58,7 +58,7 @@ class Segment:
         if self._rows is None:
             left, right = self._at
             step = self._motion.step(left.tolist(), self._dt_s)
-            W = inverse_roots(step.Q)
+            W = noise_roots(step.Q)
             self._rows = Rows(self._keys, (-W.dot(step.F), W), W.dot(np.subtract(step.mean, right)), self._at)
         return self._rows
 
@@ -73,7 +73,7 @@ class Segment:
             return
         left, right = (np.array([segment._at[side] for segment in segments]) for side in (0, 1))
         step = segments[0]._motion.steps(left, np.array([segment._dt_s for segment in segments]))
-        W = inverse_roots(step.Q)
+        W = noise_roots(step.Q)
         b = np.vecdot(W, (step.mean - right)[:, None])
         for segment, by_left, by_right, ahead in zip(segments, -(W @ step.F), W, b, strict=True):
             segment._rows = Rows(segment._keys, (by_left, by_right), ahead, segment._at)
