@@ -120,6 +120,12 @@ def _ego(run: Run) -> Iterator[Caution]:
     """No ego where it is needed, or reasons for which more than half of its states were refused."""
     failed = [f"{count} of {total} of {sensor}" for sensor, fate, count, total in _mostly(run) if fate == "failed"]
     if run.ego.num_rows:
+        if jumps := run.meta.get("ego_jumps"):
+            text = (
+                f"its place jumps {jumps} times, as where a clock is set or a localisation starts anew: what is seen "
+                "from it is misplaced there, cut the recording in parts"
+            )
+            yield Caution(EGO, text.replace("1 times", "once") if jumps == 1 else text)
         for reason, count in dict(run.meta.get("ego_refused") or {}).items():
             if 2 * count > run.ego.num_rows:
                 text = f"{count} of {run.ego.num_rows} states not used, {reason}: look at the clock of its driver"

@@ -20,6 +20,7 @@ class EgoClock:
 
     def __init__(self) -> None:
         self._newest_ns: int | None = None
+        self._fitting = 0
         self._strays = 0  # in a row
         self._first_ns = 0
         self._jump = ""
@@ -32,6 +33,7 @@ class EgoClock:
         ahead_s = seconds(ego.stamp_ns - max(self._newest_ns, ego.receipt_ns))
         if max(back_s, ahead_s) <= LARGEST_STEP_BACK_S:
             self._newest_ns = max(self._newest_ns, ego.stamp_ns)
+            self._fitting += 1
             self._strays = 0
             return
         if not self._strays:
@@ -42,5 +44,9 @@ class EgoClock:
                 else f"ahead by {ahead_s:g} s at receipt {ego.receipt_ns} ns and stay there, as where a clock is set"
             )
         self._strays += 1
-        if self._strays >= _FEWEST and seconds(ego.receipt_ns - self._first_ns) >= _LONGEST_S:
+        if self._strays < _FEWEST:
+            return
+        if self._fitting < 2:
+            self._newest_ns, self._fitting, self._strays = ego.stamp_ns, self._strays, 0
+        elif seconds(ego.receipt_ns - self._first_ns) >= _LONGEST_S:
             raise DataError(f"ego stamps jump {self._jump}: cut it there")

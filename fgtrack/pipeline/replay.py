@@ -233,6 +233,7 @@ def _drive(
         "detections_received": feed.received_detections,
         "detections_ignored": feed.ignored_detections,
         "ego_refused": dict(tracker.refused_ego),
+        "ego_jumps": tracker.ego_jumps,
         **tracker.failures.as_meta(),
         "broken_off": feed.broken,
     }

@@ -37,6 +37,7 @@ class PublishedEgo(EgoSource):
         max_future_s: float = 1.0,
     ) -> None:
         super().__init__(yaw_weight, yaw_rate_weight, std, max_future_s)
+        self._straight = True
         self._half_step_ns = step_ns / 2
         self._length = storage_ticks
         self._stored: list[EgoState] = []  # newest last

@@ -91,6 +91,11 @@ class Tracker:
         self.refused_ego: Counter[str] = Counter()
         """Ego messages that were not used, by reason."""
 
+    @property
+    def ego_jumps(self) -> int:
+        """How often the ego's states went on at a place to which it cannot have driven."""
+        return self._parts.ego.jumps
+
     def receive(self, message: EgoState | DetectionList) -> None:
         """Take a message. Raises `DataError` for a sensor that has no model."""
         if isinstance(message, EgoState):

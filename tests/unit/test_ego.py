@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from support.tracking import START_NS, ms
 
 from fgtrack.core.types import EgoState
-from fgtrack.tracking.ego import EgoSource, EgoStd, EgoTrajectory, extrapolated
+from fgtrack.tracking.ego import EgoPose, EgoSource, EgoStd, EgoTrajectory, extrapolated
 from fgtrack.tracking.published import PublishedEgo
 
 
@@ -33,8 +33,8 @@ def test_a_stray_stamp_is_refused_and_the_next_ones_are_taken(source: EgoSource)
     assert source.receive(replace(ego(60_000.0), receipt_ns=START_NS + ms(10))) == "stamp ahead of its receipt"
     assert source.receive(ego(20.0)) is None
     assert source.receive(replace(ego(-60_000.0), receipt_ns=START_NS + ms(30))) == "stamp jumps back"
-    assert source.receive(ego(40.0, x_m=4.0)) is None
-    assert source.current.x_m == 4.0
+    assert source.receive(ego(40.0, x_m=0.4)) is None
+    assert source.current.x_m == 0.4
 
 
 def test_a_state_that_is_a_little_late_or_early_is_taken() -> None:
@@ -76,8 +76,11 @@ def test_between_two_states_the_pose_is_interpolated_the_short_way_round() -> No
     assert pose(source, 0.0).x_m == 10.0
 
 
-@pytest.mark.parametrize(("stamp_ms", "x_m"), [(1100, 20.0), (1100.000001, None), (-1000, -10.0), (-1000.000001, None)])
-def test_beyond_its_ends_the_trajectory_goes_straight_on_for_a_limited_time(stamp_ms: float, x_m: float | None) -> None:
+@pytest.mark.parametrize(
+    ("stamp_ms", "x_m"),
+    [(1100, 10.0 + 20.0 * math.sin(0.5)), (1100.000001, None), (-1000, -10.0), (-1000.000001, None)],
+)
+def test_beyond_its_ends_the_trajectory_goes_on_for_a_limited_time(stamp_ms: float, x_m: float | None) -> None:
     source = trajectory()
     source.receive(ego(0.0))
     source.receive(ego(100.0, x_m=10.0, yaw_rate_radps=0.5))
@@ -99,10 +102,10 @@ def test_without_any_state_there_is_no_pose() -> None:
 def test_states_that_come_out_of_order_stand_in_order(order: list[int]) -> None:
     source = trajectory()
     for k in order:
-        assert source.receive(ego(20.0 * k, x_m=float(k * k))) is None
+        assert source.receive(ego(20.0 * k, x_m=0.05 * k * k)) is None
     for k in range(5):
-        assert pose(source, 20.0 * k + 10.0).x_m == pytest.approx((k * k + (k + 1) ** 2) / 2)
-    assert source.current.x_m == 25.0
+        assert pose(source, 20.0 * k + 10.0).x_m == pytest.approx(0.05 * (k * k + (k + 1) ** 2) / 2)
+    assert source.current.x_m == 1.25
 
 
 def test_a_repeated_stamp_and_what_is_no_number_are_refused_with_the_reason() -> None:
@@ -243,11 +246,13 @@ def test_the_pose_is_as_uncertain_as_its_states_and_in_between_as_their_mean() -
 def test_ahead_of_the_states_it_grows_by_the_numeric_derivative(source: EgoSource) -> None:
     entries = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
     state = EgoState(START_NS, START_NS, 3.0, -2.0, 0.7, 20.0, 0.3, covariance=flat(COVARIANCE))
+    straight = isinstance(source, PublishedEgo)
     source.receive(state)
     source.start_tick()
     stamp_ns, columns = START_NS + ms(400), []
     for name in entries:
-        ends = [extrapolated(replace(state, **{name: getattr(state, name) + step}), stamp_ns) for step in (1e-6, -1e-6)]
+        near = [replace(state, **{name: getattr(state, name) + step}) for step in (1e-6, -1e-6)]
+        ends = [extrapolated(each, stamp_ns, straight=straight) for each in near]
         columns.append((np.array(ends[0][:5]) - np.array(ends[1][:5])) / 2e-6)
     F = np.stack(columns, axis=1)
     found = source.pose_at(stamp_ns, stamp_ns)
@@ -295,3 +300,22 @@ def test_a_covariance_that_is_none_is_refused_where_it_is_asked_for(given: tuple
     assert uncertain().receive(ego(0.0, covariance=given)) == "not a covariance"
     assert trajectory().receive(ego(0.0, covariance=given)) is None
     assert uncertain().receive(ego(0.0, covariance=flat(np.ones((5, 5))))) is None  # singular
+
+
+def test_a_trajectory_goes_on_along_the_circle_and_the_published_ego_along_its_heading() -> None:
+    state = EgoState(START_NS, START_NS, 3.0, -2.0, 0.7, 60.0, 0.4)
+    there = pose_of(EgoTrajectory(1.0, 1.0, 60.0, 2.0), state, 1000.0)
+    radius_m = 60.0 / 0.4
+    assert there.x_m == pytest.approx(3.0 + radius_m * (math.sin(1.1) - math.sin(0.7)))
+    assert there.y_m == pytest.approx(-2.0 - radius_m * (math.cos(1.1) - math.cos(0.7)))
+    assert there.yaw_rad == pytest.approx(1.1)
+    published = pose_of(PublishedEgo(1.0, 1.0, ms(10), 350), state, 1000.0)
+    assert (published.x_m, published.y_m) == pytest.approx((3.0 + 60.0 * math.cos(0.7), -2.0 + 60.0 * math.sin(0.7)))
+
+
+def pose_of(source: EgoSource, state: EgoState, after_ms: float) -> EgoPose:
+    source.receive(state)
+    source.start_tick()
+    found = source.pose_at(state.stamp_ns + ms(after_ms), state.stamp_ns)
+    assert found is not None
+    return found

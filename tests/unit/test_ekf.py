@@ -237,4 +237,4 @@ def test_the_replaying_filter_remembers_no_more_than_its_window() -> None:
     estimator = ReplayEkf(CV(), Start(), 1.0)
     for k in range(100):
         estimator.update(Measurement.of(k * 10**8, x_m=0.0, std={"x_m": 1.0}))
-    assert len(estimator.steps) == 11
+    assert len(estimator.steps) == 12  # those of the window, and the one before it

@@ -136,3 +136,11 @@ def test_states_of_the_ego_that_were_refused_are_told_where_they_are_most(
     found = cautions(replace(run, ego=ego, meta=meta))
     assert len(found) == told
     assert not told or str(found[0]).startswith(f"ego: {refused} of 4 states not used, stamp ahead of its receipt")
+
+
+@pytest.mark.parametrize(("jumps", "told"), [(0, None), (1, "jumps once"), (3, "jumps 3 times")])
+def test_jumps_of_the_ego_are_told(jumps: int, told: str | None, tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", lists(Disposition.IN_SEQUENCE))
+    ego = Table({name: column(name, [0, 1]) for name in run.ego})
+    found = list(map(str, cautions(replace(run, ego=ego, meta={**run.meta, "ego_jumps": jumps}))))
+    assert [f"ego: its place {told}" in each for each in found] == ([] if told is None else [True])

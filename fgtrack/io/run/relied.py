@@ -42,6 +42,7 @@ class _Meta:
     out_of_bounds: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     left_out: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     ego_refused: Mapping[str, int] = field(default_factory=dict)
+    ego_jumps: int = 0
     failures: Mapping[str, int] = field(default_factory=dict)
     first_failure: str | None = None
     broken_off: str | None = None
