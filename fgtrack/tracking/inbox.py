@@ -1,8 +1,10 @@
 """Detections on their way from receipt to the tick that processes them."""
 
+import marshal
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
+from operator import attrgetter
 from types import MappingProxyType
 from typing import Protocol
 
@@ -10,7 +12,7 @@ import numpy as np
 
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import Detection, DetectionList, Disposition, FloatArray, Frame, UpdateRecord
+from fgtrack.core.types import MEASURABLE, Detection, DetectionList, Disposition, FloatArray, Frame, UpdateRecord
 from fgtrack.models.sensors import SensorModel
 
 #: In any unit: no sensor is better than this.
@@ -135,18 +137,33 @@ def stamps(message: DetectionList, sensor: SensorModel) -> list[int]:
     return [message.stamp_ns] * len(own)
 
 
+_Contents = tuple[int, int, int]
+_measured = attrgetter(*MEASURABLE)
+
+
+def _contents(objects: Sequence[Detection]) -> _Contents:
+    """What tells a list from others, in whatever order, and takes no memory: how many objects, and hashes.
+
+    Those of the objects alone do not: Python gives -1 and -2 the same one.
+    """
+    try:
+        measured = frozenset([marshal.dumps(_measured(one), 2) for one in objects])  # 2: the same for equal numbers
+    except ValueError:  # numbers of other libraries
+        measured = frozenset([repr(_measured(one)).encode() for one in objects])
+    return len(objects), hash(frozenset(objects)), hash(measured)
+
+
 class _Seen:
     """Lists that were received not long ago, by sensor, stamp and contents."""
 
     def __init__(self, memory_ns: int) -> None:
         self._memory_ns = memory_ns
-        self._receipts_ns: dict[tuple[str, int, Frame, int], int] = {}  # in order of receipt
+        self._receipts_ns: dict[tuple[str, int, Frame, _Contents], int] = {}  # in order of receipt
 
     def is_copy(self, message: DetectionList, usable: Sequence[bool]) -> bool:
         """Whether `message` repeats one that is remembered; it is remembered from now on.
 
-        Those that are not `usable`, as with NaN, which equals nothing, are not compared. Contents are compared by
-        their hashes: two different lists of one stamp have the same one by chance once in 2^61 pairs.
+        Those that are not `usable`, as with NaN, which equals nothing, are not compared, nor is their order.
         """
         if message.objects and not any(usable):
             return False
@@ -154,7 +171,7 @@ class _Seen:
         while self._receipts_ns and self._receipts_ns[first := next(iter(self._receipts_ns))] < oldest_ns:
             del self._receipts_ns[first]
         contents = message.objects if all(usable) else tuple(compress(message.objects, usable))
-        key = (message.sensor, message.stamp_ns, message.frame, hash(contents))
+        key = (message.sensor, message.stamp_ns, message.frame, _contents(contents))
         if key in self._receipts_ns:
             return True
         self._receipts_ns[key] = message.receipt_ns

@@ -1,5 +1,7 @@
 import math
 from collections import Counter
+from collections.abc import Callable
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -61,6 +63,20 @@ def test_a_copy_is_recognised_behind_other_lists() -> None:
     assert said(inbox.put(message(CAR, stamp_ms=0.0, delay_ms=70.0))) == [(0, "duplicate")]
     assert inbox.put(message(Detection(x_m=10.5, y_m=1.0), stamp_ms=0.0, delay_ms=80.0)) == []
     assert inbox.put(message(CAR, sensor="radar", stamp_ms=0.0, delay_ms=80.0)) == []
+
+
+@pytest.mark.parametrize("number", [float, Fraction])
+def test_lists_of_one_stamp_that_differ_in_one_number_are_no_copies(number: Callable[[int], float]) -> None:
+    inbox = queue()
+    for y_m in range(-9, 9):  # -1 and -2 have the same hash
+        assert inbox.put(message(Detection(x_m=10.0, y_m=number(y_m)))) == []
+
+
+def test_a_copy_in_another_order_is_recognised() -> None:
+    inbox, other = queue(), Detection(x_m=20.0, y_m=1.0)
+    inbox.put(message(CAR, other))
+    assert said(inbox.put(message(other, CAR, delay_ms=5.0))) == [(0, "duplicate"), (1, "duplicate")]
+    assert inbox.put(message(CAR, other, other, delay_ms=10.0)) == []
 
 
 def test_a_copy_of_a_list_with_a_detection_that_is_none_is_recognised() -> None:
