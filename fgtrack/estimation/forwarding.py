@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult
 
-__all__ = ["ForwardingBank"]
+__all__ = ["ForwardingBank", "has"]
 
 
 class ForwardingBank:
@@ -34,6 +34,10 @@ class ForwardingBank:
     def track_ids(self) -> tuple[int, ...]:
         """See `TrackBank.track_ids`."""
         return self._bank.track_ids
+
+    def has(self, track_id: int) -> bool:
+        """Whether there is such a track: without a list of all."""
+        return has(self._bank, track_id)
 
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
@@ -64,3 +68,8 @@ class ForwardingBank:
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`."""
         return self._bank.smoothed()
+
+
+def has(bank: TrackBank, track_id: int) -> bool:
+    """Whether `bank` has the track."""
+    return bank.has(track_id) if isinstance(bank, ForwardingBank) else track_id in bank.track_ids

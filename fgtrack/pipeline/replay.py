@@ -24,7 +24,8 @@ from fgtrack.pipeline.pace import Clock, Pace, WallClock
 from fgtrack.pipeline.stamping import mended
 from fgtrack.tracking.tracker import Tracker, TrackerParts, check_sensor
 
-_LONGEST_GAP_S = 3600.0
+#: Ticks go on while nothing is received: a few messages must not make a recording of days.
+_GAP_S, _LONGEST_SILENCE_S = 10.0, 3600.0
 _PACKAGES = ("fgtrack", "gtsam", "numpy", "scipy", "rosbags")
 
 
@@ -55,6 +56,7 @@ class _Feed:
     ignored_detections: int = 0
     received_detections: int = 0
     num_messages: int = 0
+    silent_s: float = 0.0
     _ego_clock: EgoClock = field(default_factory=EgoClock, init=False)
     first_receipt_ns: int | None = field(default=None, init=False)
     last_receipt_ns: int | None = field(default=None, init=False)
@@ -103,9 +105,11 @@ class _Feed:
             raise DataError(
                 f"receipt time goes back by {-gap_s:g} s at {message.receipt_ns} ns: sort the input by receipt"
             )
-        if gap_s > _LONGEST_GAP_S:
+        self.silent_s += gap_s if gap_s > _GAP_S else 0.0
+        if self.silent_s > _LONGEST_SILENCE_S:
             raise DataError(
-                f"nothing was received for {gap_s:.0f} s before {message.receipt_ns} ns: cut the recording there"
+                f"nothing was received for {gap_s:.0f} s before {message.receipt_ns} ns, for {self.silent_s:.0f} s in "
+                "all: cut the recording there"
             )
         self.last_receipt_ns = message.receipt_ns
         if self.first_receipt_ns is None:

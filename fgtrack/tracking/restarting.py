@@ -96,6 +96,10 @@ class RestartingBank(ForwardingBank):
             self._suspects[track_id] = True
         return results
 
+    def has(self, track_id: int) -> bool:
+        """See `ForwardingBank.has`: whether its birth has succeeded, and nothing has ended it."""
+        return track_id in self._starts
+
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`; where it fails, there is no such track afterwards."""
         try:
@@ -111,8 +115,9 @@ class RestartingBank(ForwardingBank):
 
     def remove(self, track_id: int) -> None:
         """See `TrackBank.remove`; if need be by a new bank. A track that a failure has ended need not be there."""
+        known = self.has(track_id)
         self._forget(track_id)
-        if track_id not in self._bank.track_ids:
+        if not known and track_id not in self._bank.track_ids:
             return
         try:
             self._bank.remove(track_id)

@@ -23,6 +23,7 @@ from fgtrack.core.types import (
 from fgtrack.estimation.base import StatesAt, TrackBank, UpdateResult, no_states
 from fgtrack.estimation.ekf import propagated
 from fgtrack.estimation.failures import Failure, Failures
+from fgtrack.estimation.forwarding import has
 from fgtrack.estimation.object_bank import state_of, states_of
 from fgtrack.estimation.present import PresentStates
 from fgtrack.models.motion import MotionModel
@@ -295,7 +296,7 @@ class Tracker:
         track_id = self._next_id
         self._next_id += 1
         parts.bank.birth(track_id, prior)
-        if track_id not in parts.bank.track_ids:
+        if not has(parts.bank, track_id):
             self._conclude(batch, candidate, Disposition.FAILED)
             return
         parts.ego_errors.born(track_id, candidate, prior)

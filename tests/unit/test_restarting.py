@@ -9,6 +9,7 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import EndedTrack, Failure
+from fgtrack.estimation.forwarding import has
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.motion import CTRA, CTRV, MotionModel
@@ -203,3 +204,25 @@ def test_an_acceleration_is_kept() -> None:
     [after] = bank.present()
     kept: FloatArray = after.mean[5:]
     np.testing.assert_allclose(kept, before.mean[5:])
+
+
+def test_births_do_not_list_all_tracks() -> None:
+    """Else a list of many new objects takes the square of their number."""
+    listed = 0
+
+    class Listing(ObjectBank):
+        @property
+        def track_ids(self) -> tuple[int, ...]:
+            nonlocal listed
+            listed += 1
+            return super().track_ids
+
+    bank = RestartingBank(lambda: Listing(MOTION, lambda start: Moody(start, MOTION), 1.0))
+    for track_id in range(20):
+        bank.birth(track_id, Start(yaw_rad=0.0))
+        assert has(bank, track_id)
+    for track_id in range(10):
+        bank.remove(track_id)
+    assert not has(bank, 0)
+    assert listed == 0
+    assert bank.track_ids == tuple(range(10, 20))
