@@ -107,7 +107,7 @@ def apart_from(found: States, expected: States, stream: Stream) -> Difference:
 def oracle(stream: Stream, subject: Subject, stamps_ns: Sequence[int]) -> States:
     """What the estimator says that it solves, by other means; nothing where these do not reach.
 
-    The filter of the oracle linearises all of one stamp at once, so it is none for two bearings; the heading must be
+    The filter of the oracle takes those of one stamp as they stand, so it is none for two bearings; the heading must be
     known, and a loss that descends again may have another minimum next to the oracle's start.
     """
     if stream.motion.linear:

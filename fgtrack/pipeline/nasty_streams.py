@@ -12,8 +12,8 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
-from fgtrack.pipeline.oracle.sightings import Eye, Sighting
-from fgtrack.pipeline.verify_streams import FAST, Plan, Stream, drawn, observed, onboard, paper
+from fgtrack.pipeline.oracle.sightings import Eye, Sighting, seen
+from fgtrack.pipeline.verify_streams import FAST, Plan, Sense, Stream, drawn, observed, onboard, paper
 
 #: Ten rounds of the LiDAR at 20 Hz.
 _ROUNDS = tuple((0.05 * k, "lidar_cluster") for k in range(1, 11))
@@ -89,6 +89,49 @@ def _bearings(rng: np.random.Generator, name: str) -> Stream:
     return drawn(rng, name, CTRV(), _plan(times), _LAG_S, _REACH_S, sense=sense)
 
 
+def _sensing(names: tuple[str, ...], std: tuple[float, ...], eyes: Mapping[str, Eye]) -> Sense:
+    """Sensors that measure `names`, from `eyes` where they have one."""
+    model, R = measurement_model(names, CTRV()), np.diag(np.square(std))
+
+    def sense(rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str) -> tuple[Measurement, Sighting]:
+        eye = eyes.get(sensor, Eye())
+        z = seen(names, x, CTRV.state_names, eye) + std * rng.standard_normal(len(std))
+        return Measurement(stamp_ns, model, z, R, SensorPose(*eye)), Sighting(stamp_ns, names, z, R, eye)
+
+    return sense
+
+
+def _bearings_alone(rng: np.random.Generator, name: str) -> Stream:
+    """Bearings from two places by turns, of a car of which hardly more is known."""
+    eyes = {"lidar_cluster": Eye(-20.0, 30.0), "radar": Eye(10.0, -60.0)}
+    sense = _sensing(("bearing_rad",), (0.01,), eyes)
+    times = (*_ROUNDS, *((time_s + 0.02, "radar") for time_s, _ in _ROUNDS))
+    start = replace(FAST, position_std_m=15.0)
+    return drawn(rng, name, CTRV(), _plan(times), _LAG_S, _REACH_S, start=start, sense=sense)
+
+
+def _standing(rng: np.random.Generator, name: str) -> Stream:
+    """Positions of a car that stands, whose heading they do not tell."""
+    start = replace(FAST, speed_mps=0.0, yaw_rate_radps=0.0)
+    sense = _sensing(("x_m", "y_m"), (0.3, 0.3), {})
+    return drawn(
+        rng, name, CTRV(), _plan(_ROUNDS + tuple(_at(0.023, 10, 0.05))), _LAG_S, _REACH_S, start=start, sense=sense
+    )
+
+
+def spinning(rng: np.random.Generator) -> Stream:
+    """Positions and yaws of a car that turns by 0.2 rad from one to the next, and whose rate is not known.
+
+    Not among `NASTY`: where few of them are known, several numbers of turns explain them, and a smoother may stay with
+    that which the first to arrive suggest.
+    """
+    start = replace(FAST, speed_mps=12.0, yaw_rate_radps=2.5, yaw_rate_std_radps=3.0)
+    sense = _sensing(("x_m", "y_m", "yaw_rad"), (0.3, 0.3, 0.1), {})
+    times = tuple((0.08 * k, "lidar_cluster") for k in range(1, 19))
+    stream = drawn(rng, "spinning", CTRV(), _plan(times), _LAG_S, _REACH_S, start=start, sense=sense)
+    return replace(stream, prior=replace(start, yaw_rate_radps=0.0))
+
+
 def _seen_by_radar(rng: np.random.Generator, name: str) -> Stream:
     return replace(observed(rng), name=name)
 
@@ -123,6 +166,8 @@ _NAMED: Mapping[str, Callable[..., Stream]] = {
     "outliers, Tukey": partial(_outliers, far_sd=8.0, share=0.2, loss=RobustLoss("tukey", 5.0)),
     "two bearings alike": _bearings,
     "range, bearing, Doppler": _seen_by_radar,
+    "bearings alone": _bearings_alone,
+    "standing": _standing,
     "CV, 1 ns apart": partial(_near, motion=CV(), gap_s=1e-9),
     "CV, 100 ns apart": partial(_near, motion=CV(), gap_s=1e-7),
     "CV, 1 us apart": partial(_near, motion=CV(), gap_s=1e-6),

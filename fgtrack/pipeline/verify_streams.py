@@ -109,7 +109,7 @@ def dynamics_of(motion: MotionModel) -> Dynamics:
 
 
 # A sensor measures the state x at a stamp.
-_Sense = Callable[[np.random.Generator, FloatArray, int, str], tuple[Measurement, Sighting]]
+Sense = Callable[[np.random.Generator, FloatArray, int, str], tuple[Measurement, Sighting]]
 Plan = tuple[FloatArray, npt.NDArray[np.str_]]
 
 
@@ -209,7 +209,7 @@ class _Onboard:
     def __call__(
         self, rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str
     ) -> tuple[Measurement, Sighting]:
-        """See `_Sense`."""
+        """See `Sense`."""
         model, vehicle = _ONBOARD[sensor], _observer(stamp_ns)
         names, std = tuple(model.std), np.array(list(model.std.values()))
         noise, state_names = std * rng.standard_normal(len(std)), CTRV.state_names
@@ -256,7 +256,7 @@ def drawn(
     reach_s: float,
     late: bool = False,
     start: Start = FAST,
-    sense: _Sense = paper,
+    sense: Sense = paper,
 ) -> Stream:
     """Truth with the motion model's own noise, measured as `plan` says; in the random order up to `reach_s` late."""
     stamps_s, sensors = plan

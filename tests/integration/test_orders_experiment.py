@@ -9,14 +9,14 @@ from support.scripts import load
 
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Estimator
-from fgtrack.pipeline.nasty_streams import NASTY
+from fgtrack.pipeline.nasty_streams import NASTY, spinning
 from fgtrack.pipeline.verify import exact_estimators
 
 script = load("orders")
 
 FILTERS = ("ekf-replay", "iekf-replay", "ukf-replay", "iplf-replay")
 #: Where the default settings take one step per measurement, and one is not enough.
-STRONG = ("outliers of 20 sd, no gate", "outliers, Huber", "outliers, Cauchy", "outliers, Tukey")
+STRONG = ("standing", "outliers of 20 sd, no gate", "outliers, Huber", "outliers, Cauchy", "outliers, Tukey")
 
 
 def judged(name: str, estimator: str, orders: int, seed: int = 1) -> None:
@@ -39,6 +39,20 @@ def test_the_order_of_arrival_does_not_matter_on_a_nasty_stream(name: str, estim
 def test_it_does_not_in_two_dozen_orders_for_any_exact_estimator(name: str, estimator: str) -> None:
     if estimator in script.able(name):
         judged(name, estimator, 25, seed=2)
+
+
+@pytest.mark.parametrize("estimator", ["smoother", "smoother-banded"])
+@pytest.mark.parametrize("seed", range(1, 5))
+def test_a_fast_turn_is_found_whatever_is_late_by_as_much_as_it_likes(estimator: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    stream, subject = spinning(rng), exact_estimators()[estimator]
+    stamps_s = 1e-9 * np.array([one.stamp_ns for one in stream.measurements])
+    newest = [stream.newest_ns]
+    expected = script.states(script.fed(stream, subject, range(len(stamps_s))), newest)
+    for _ in range(4):
+        places = np.argsort(stamps_s + rng.uniform(0.0, 1.9, len(stamps_s))).tolist()
+        found = script.states(script.fed(stream, replace(subject, options={}), places), newest)
+        assert script.apart_from(found, expected, stream).mean_sigma < 0.15
 
 
 def test_solutions_that_the_order_decides_between_are_told_as_several_minima() -> None:
