@@ -98,8 +98,12 @@ def most_moved(run: Run, track_id: int | None = None, stamp_ns: int | None = Non
     moved_m = _moved_m(run, pairs[rows])
     rows, moved_m = rows[np.isfinite(moved_m)], moved_m[np.isfinite(moved_m)]
     if not len(rows):
-        of = "" if track_id is None else f" of track {track_id}"
-        raise DataError(f"{run.path or 'the run'}: no late detection{of} was fused by itself, so there is no close-up")
+        where, of = run.path or "the run", "" if track_id is None else f" of track {track_id}"
+        if track_id is not None and track_id not in run.tracks["track_id"]:
+            raise DataError(f"{where}: has no track {track_id}")
+        raise DataError(
+            f"{where}: no late detection{of} was fused by itself after {_SETTLED} others, so there is no close-up"
+        )
     row = rows[moved_m.argmax() if stamp_ns is None else np.abs(updates["stamp_ns"][rows] - stamp_ns).argmin()]
     found = (int(updates[name][row]) for name in ("stamp_ns", "receipt_ns", "index"))
     return Arrival(str(updates["sensor"][row]), *found)

@@ -90,7 +90,7 @@ def test_a_track_and_a_stamp_can_be_asked_for(folder: Path) -> None:
         arrival = most_moved(run, track, stamp_ns)
         assert abs(arrival.stamp_ns - stamp_ns) < 0.2 * NS_PER_S
         assert close_up_of(run, arrival).track_id == track
-    with pytest.raises(fgtrack.DataError, match="no late detection of track 99"):
+    with pytest.raises(fgtrack.DataError, match="has no track 99"):
         most_moved(run, 99)
 
 
