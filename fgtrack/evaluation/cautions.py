@@ -55,9 +55,10 @@ def noise_cautions(run: Run) -> list[Caution]:
     found = []
     for sensor, nis in misfits(run):
         size = "small" if nis.mean > nis.dof else "large"
+        factor = math.sqrt(max(nis.mean, 0.0) / nis.dof)  # below 0 by rounding, where one std is 1e9 of another
         text = (
             f"mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}, as if "
-            f"errors were {math.sqrt(nis.mean / nis.dof):.2g} times what is configured; `{_tune(run)}` fits it"
+            f"errors were {factor:.2g} times what is configured; `{_tune(run)}` fits it"
         )
         found.append(Caution(sensor, text))
     return found

@@ -99,7 +99,7 @@ def test_stamps_that_nobody_set_and_a_window_shorter_than_a_period_are_told(tmp_
     assert cautions(run_of(tmp_path / "c", slow, effective=FILTER)) == []
 
 
-@pytest.mark.parametrize(("nis", "size"), [(26.0, "small"), (0.2, "large")])
+@pytest.mark.parametrize(("nis", "size"), [(26.0, "small"), (0.2, "large"), (-1e-9, "large")])
 def test_noise_that_does_not_fit_is_told(nis: float, size: str, tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", [update(tick=k, nis=nis, x_m=0.1, y_m=0.1) for k in range(40)])
     (found,) = noise_cautions(run)
