@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fgtrack.core.errors import CallError, DataError, did_you_mean
+from fgtrack.core.files import open_text
 
 SWEEP_FILE = "sweep.csv"
 _SEED, _ESTIMATOR = "seed", "estimator"
@@ -80,7 +81,7 @@ def read_sweep(folder: Path | str) -> SweepTable:
     """
     path = Path(folder) / SWEEP_FILE
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with open_text(path, newline="") as file:
             rows = list(csv.DictReader(file))
     except OSError as error:
         raise CallError(f"{path}: cannot be read ({error.strerror}), make one with `fgtrack sweep`") from error

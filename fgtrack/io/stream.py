@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, get_args
 
 from fgtrack.core.errors import DataError
+from fgtrack.core.files import open_file
 from fgtrack.core.types import (
     EGO_COVARIANCE_STATES,
     Detection,
@@ -193,7 +194,7 @@ def _records(
     """Line number and JSON object of every line that is not blank."""
     line, num_records = 0, 0
     try:
-        with path.open("rb") as raw:
+        with open_file(path) as raw:
             packed = raw.read(2) == GZIP_MAGIC
             raw.seek(0)
             file: BinaryIO | gzip.GzipFile = gzip.GzipFile(fileobj=raw) if packed else raw

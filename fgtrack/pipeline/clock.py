@@ -6,13 +6,19 @@ import zlib
 from collections.abc import Iterable, Iterator
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 from fgtrack.core.errors import CallError
+from fgtrack.core.files import open_file
 from fgtrack.core.time import first_multiple, period_ns
 from fgtrack.core.types import DetectionList, EgoState
+from fgtrack.io.stream import GZIP_MAGIC
 
 Delivered = EgoState | DetectionList
+
+_LARGEST_BYTES = 1 << 28  # of ticks, unpacked: two days at 50 Hz
+_LONGEST_LINE = 1 << 20
+_INT64_LIMIT = 1 << 63
 
 
 class Tick(NamedTuple):
@@ -60,16 +66,41 @@ def listed_ticks(messages: Iterable[Delivered], ticks_ns: Iterable[int]) -> Iter
 def read_ticks(path: Path) -> list[int]:
     """The `now_ns` of every line of a JSON-lines file, plain or gzip, ascending.
 
-    Raises `CallError` where the file is missing or says something else.
+    Raises `CallError` where the file is missing or too large, or says something else.
     """
     try:
-        raw = path.read_bytes()
-        text = (gzip.decompress(raw) if raw[:2] == b"\x1f\x8b" else raw).decode("utf-8")
-        ticks = [int(json.loads(line)["now_ns"]) for line in text.splitlines()]
+        ticks = [_now_ns(line) for line in _lines(path)]
+    except CallError:
+        raise
     except OSError as error:
         raise CallError(f"{path}: ticks cannot be read ({error.strerror or error})") from error
-    except (ValueError, KeyError, TypeError, EOFError, zlib.error) as error:
-        raise CallError(f"{path}: no list of ticks, every line must be an object with now_ns") from error
+    except (ValueError, KeyError, TypeError, EOFError, RecursionError, zlib.error) as error:
+        raise CallError(
+            f"{path}: no list of ticks, every line must be an object with now_ns, an integer of 64 bits"
+        ) from error
     if not all(before < after for before, after in pairwise(ticks)):
         raise CallError(f"{path}: the ticks are not ascending")
     return ticks
+
+
+def _lines(path: Path) -> Iterator[bytes]:
+    """The lines of `path`, unpacked up to a size that fits into memory."""
+    with open_file(path) as raw:
+        packed = raw.read(len(GZIP_MAGIC)) == GZIP_MAGIC
+        raw.seek(0)
+        file: BinaryIO | gzip.GzipFile = gzip.GzipFile(fileobj=raw) if packed else raw
+        left = _LARGEST_BYTES
+        while line := file.readline(_LONGEST_LINE + 1):
+            left -= len(line)
+            if left < 0:
+                raise CallError(f"{path}: more than {_LARGEST_BYTES >> 20} MB of ticks, replay the recording in parts")
+            if len(line) > _LONGEST_LINE:
+                raise CallError(f"{path}: a line of ticks with more than {_LONGEST_LINE} bytes, only now_ns is needed")
+            yield line
+
+
+def _now_ns(line: bytes) -> int:
+    now_ns = json.loads(line.decode())["now_ns"]
+    if type(now_ns) is not int or not -_INT64_LIMIT <= now_ns < _INT64_LIMIT:
+        raise ValueError(f"{str(now_ns)[:50]} is no time")
+    return now_ns

@@ -16,6 +16,7 @@ from ruamel.yaml.error import MarkedYAMLError, ReusedAnchorWarning, YAMLError
 
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import CallError, did_you_mean
+from fgtrack.core.files import open_text
 
 T = TypeVar("T")
 
@@ -49,10 +50,8 @@ def with_settings(kind: type[T], raw: dict[str, Any], settings: Sequence[str], o
 
 def read_yaml(path: Path) -> dict[str, Any]:  # Any: what YAML says is only known after validation
     """The mapping that the YAML 1.2 file `path` holds; empty for an empty file."""
-    if path.exists() and not path.is_file():  # a pipe would be waited for
-        raise CallError(f"{path}: is no file")
     try:
-        with path.open(encoding="utf-8") as file:
+        with open_text(path) as file:
             value = _parse(file.read(_LONGEST_TEXT + 1), str(path))
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "is no text file"

@@ -4,7 +4,6 @@ import csv
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 from pydantic import ConfigDict, TypeAdapter
 
 from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.files import read_head, read_whole
 from fgtrack.io.output import Kind, check_output, write_file
 from fgtrack.pipeline.sweep_plan import KEY_COLUMNS, Plan, Value, compact
 
@@ -20,6 +20,7 @@ _PART_START = json.dumps({"format": PART_FORMAT})[:-1].encode()
 SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE = "sweep.csv", "timing.csv", "errors.csv"
 PAIRED_TABLE, SUMMARY_TABLE = "paired.csv", "summary.csv"
 _LONGEST_HEAD = 100_000
+_LARGEST_PART_MB = 64.0
 
 Scalar = str | bool | int | float | None
 
@@ -79,15 +80,13 @@ class PartStore:
     def read(self, key: str) -> tuple[Cell, ...] | None:
         """The cells of a job; None where it has no part."""
         path = self._folder / f"{key}.json"
+        if not path.exists():
+            return None
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = json.loads(read_whole(path, _LARGEST_PART_MB))
             if content["format"] != PART_FORMAT:
                 raise DataError(f"{path}: does not say format {PART_FORMAT!r}, delete it")
             return _CELLS.validate_json(json.dumps(content["cells"]))
-        except FileNotFoundError:
-            return None
-        except OSError as error:
-            raise DataError(f"{path}: cannot be read ({error.strerror})") from error
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise DataError(f"{path}: is no part of a sweep, delete it") from error
 
@@ -98,19 +97,14 @@ class PartStore:
 
 
 def _is_swept(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return KEY_COLUMNS[1].encode() in file.readline(_LONGEST_HEAD).strip().split(b",")
+    return KEY_COLUMNS[1].encode() in read_head(path, _LONGEST_HEAD).partition(b"\n")[0].strip().split(b",")
 
 
 _SWEPT = Kind("a table of a sweep", _is_swept)
 
 
 def _is_part(path: Path) -> bool:
-    with suppress(OSError), path.open("rb") as file:
-        return file.read(len(_PART_START)) == _PART_START
-    return False
+    return read_head(path, len(_PART_START)) == _PART_START
 
 
 def write_tables(folder: Path, plan: Plan, done: Mapping[str, Sequence[Cell]]) -> SweepResult:

@@ -9,6 +9,8 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +28,10 @@ from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.run import RunWriter, digest, load_run
 from fgtrack.io.source import open_input
 from fgtrack.io.stream import STREAM, read_stream, write_stream
+from fgtrack.pipeline.load import dump
 from fgtrack.pipeline.replay import replay_each
+from fgtrack.pipeline.shipped import read_scenario
+from fgtrack.pipeline.sweep_plan import load_plan
 
 MS = 1_000_000
 START_NS = 1_600_000_000_000_000_000
@@ -500,44 +505,99 @@ def test_compare_tells_a_run_whose_tables_were_changed(here: Path, capfd: pytest
     assert "the digest is another; repeat the run" in capfd.readouterr().err
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("info", "pipe.jsonl"),
-        ("replay", "pipe.jsonl", "-o", "new"),
-        ("convert", "pipe.jsonl", "new.jsonl"),
-        ("config", "-c", "pipe.jsonl"),
-        ("replay", "drive.jsonl", "-c", "pipe.jsonl", "-o", "new"),
-        ("replay", "drive.jsonl", "--map", "pipe.jsonl", "-o", "new"),
-        ("convert", "drive.jsonl", "new.jsonl", "--delays", "pipe.jsonl"),
-        ("simulate", "pipe.jsonl", "-o", "new.jsonl"),
-        ("sweep", "pipe.jsonl", "-o", "new"),
-        ("compare", "pipe.jsonl"),
-        ("compare", "run_of_pipe.jsonl"),
-    ],
-    ids=str,
-)
-def test_a_pipe_in_place_of_a_file_is_one_line_at_once(
-    here: Path, capfd: pytest.CaptureFixture[str], words: tuple[str, ...]
-) -> None:
-    def waits(*_: object) -> None:
-        pytest.fail("waits for the pipe")
+#: What is no file, and would be waited for or read for ever.
+ENDLESS: dict[str, Callable[[str], None]] = {
+    "pipe": os.mkfifo,
+    "device": lambda path: os.symlink("/dev/zero", path),
+}
 
-    os.mkfifo("pipe.jsonl")
-    shutil.copytree("run", "run_of_pipe.jsonl")
-    Path("run_of_pipe.jsonl/tracks.csv").unlink()
-    os.mkfifo("run_of_pipe.jsonl/tracks.csv")
+
+@contextmanager
+def at_once() -> Iterator[None]:
+    """What is done here waits for nobody."""
+
+    def waits(*_: object) -> None:
+        pytest.fail("waits for the pipe, or reads the device for ever")
+
     before = signal.signal(signal.SIGALRM, waits)
     signal.alarm(60)
     try:
-        assert run(words) in (1, 2)
+        yield
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("make", ENDLESS.values(), ids=ENDLESS)
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("info", "endless.jsonl"),
+        ("info", "endless_bag"),
+        ("replay", "endless.jsonl", "-o", "new"),
+        ("convert", "endless.jsonl", "new.jsonl"),
+        ("config", "-c", "endless.jsonl"),
+        ("replay", "drive.jsonl", "-c", "endless.jsonl", "-o", "new"),
+        ("replay", "drive.jsonl", "--map", "endless.jsonl", "-o", "new"),
+        ("replay", "drive.jsonl", "--set", "map.excluded=[endless.jsonl]", "-o", "new"),
+        ("replay", "drive.jsonl", "--set", "clock.ticks_file=endless.jsonl", "-o", "new"),
+        ("replay", "bag", "-c", "definitions_of_endless.yaml", "-o", "new"),
+        ("convert", "drive.jsonl", "new.jsonl", "--delays", "endless.jsonl"),
+        ("simulate", "endless.jsonl", "-o", "new.jsonl"),
+        ("simulate", "scenario_with_map_of_endless.yaml", "-o", "new.jsonl"),
+        ("sweep", "endless.jsonl", "-o", "new"),
+        ("compare", "endless.jsonl"),
+        *(("compare", f"run_of_endless/{name}") for name in ("meta.json", "config.yaml", "tracks.csv", "truth.csv")),
+    ],
+    ids=str,
+)
+def test_what_has_no_end_in_place_of_a_file_is_one_line_at_once(
+    here: Path, capfd: pytest.CaptureFixture[str], words: tuple[str, ...], make: Callable[[str], None]
+) -> None:
+    make("endless.jsonl")
+    Path("endless_bag").mkdir()
+    make("endless_bag/a.mcap")
+    Path("definitions_of_endless.yaml").write_text("input: {message_definitions: [endless.jsonl]}\n")
+    scenario = dump(replace(read_scenario("default"), map="endless.jsonl"))
+    Path("scenario_with_map_of_endless.yaml").write_text(scenario)
+    if words[1].startswith("run_of_endless/"):
+        folder, name = Path(words[1]).parent, Path(words[1]).name
+        shutil.copytree("run", folder)
+        (folder / name).unlink(missing_ok=True)
+        make(str(folder / name))
+        words = ("compare", str(folder))
+    with at_once():
+        assert run(words) in (1, 2)
     [line] = capfd.readouterr().err.splitlines()
-    assert "pipe.jsonl" in line
+    assert "endless" in line
     assert "internal error" not in line
     assert not Path("new").exists()
+
+
+@pytest.mark.parametrize("make", ENDLESS.values(), ids=ENDLESS)
+def test_a_run_of_somebody_whose_configuration_names_what_has_no_end_is_drawn_at_once(
+    here: Path, call: Call, make: Callable[[str], None]
+) -> None:
+    """What its close-up cannot replay is left out, or an error; nothing waits."""
+    make("endless.jsonl")
+    config = Path("run/config.yaml")
+    config.write_text(config.read_text().replace("ticks_file: null", "ticks_file: endless.jsonl"))
+    assert "endless.jsonl" in config.read_text()
+    with at_once():
+        assert call("figure", "run", "-o", "new_figures")[0] in (0, 1, 2)
+
+
+@pytest.mark.parametrize("make", ENDLESS.values(), ids=ENDLESS)
+def test_a_part_of_a_sweep_that_has_no_end_is_one_line_at_once(
+    here: Path, call: Call, make: Callable[[str], None]
+) -> None:
+    [job] = load_plan(Path("sweep.yaml")).jobs
+    Path("swept/parts").mkdir(parents=True)
+    make(f"swept/parts/{job.key}.json")
+    with at_once():
+        code, error = call("sweep", "sweep.yaml", "-o", "swept")
+    assert code == 1
+    assert f"{job.key}.json: cannot be read" in error
 
 
 def test_a_full_disk_is_no_fault_of_the_call(here: Path) -> None:

@@ -80,13 +80,24 @@ def test_ticks_are_read_from_plain_and_gzipped_lines(tmp_path: Path, name: str) 
         (b'{"later": 5}\n', "no list of ticks"),
         (b"5\n", "no list of ticks"),
         (b"text\n", "no list of ticks"),
+        (b'{"now_ns": 1e999}\n', "an integer of 64 bits"),
+        (b'{"now_ns": 5.5}\n', "an integer of 64 bits"),
+        (b'{"now_ns": true}\n', "an integer of 64 bits"),
+        (b'{"now_ns": "5"}\n', "an integer of 64 bits"),
+        (b'{"now_ns": %d}\n' % 10**30, "an integer of 64 bits"),
+        (b'{"now_ns": %b}\n' % (b"1" * 5000), "an integer of 64 bits"),
+        (b"[" * 100_000, "no list of ticks"),
+        (b'{"now_ns": 5, "more": "%b"}\n' % (b"x" * (1 << 20)), "a line of ticks with more than"),
         (b"\xff\xfe", "no list of ticks"),
         (b"\x1f\x8bbroken", "ticks"),
         (gzip.compress(b'{"now_ns": 5}\n')[:-9], "no list of ticks"),
         (b"\x1f\x8b\x08" + 7 * b"\0" + b"\xff", "no list of ticks"),
         (None, "cannot be read"),
     ],
-    ids=["not ascending", "no time", "no object", "no JSON", "no text", "no gzip", "cut off", "damaged", "missing"],
+    ids=[
+        *("not ascending", "no time", "no object", "no JSON", "infinite", "broken", "true", "a text", "too large"),
+        *("too long", "too deep", "a long line", "no text", "no gzip", "cut off", "damaged", "missing"),
+    ],
 )
 def test_a_file_that_is_no_list_of_ticks_is_named(tmp_path: Path, content: bytes | None, message: str) -> None:
     path = tmp_path / "ticks.jsonl"
@@ -96,3 +107,15 @@ def test_a_file_that_is_no_list_of_ticks_is_named(tmp_path: Path, content: bytes
         read_ticks(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_ticks_that_unpack_without_end_are_refused_in_little_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = b'{"now_ns": %d}' + b" " * 1000 + b"\n"
+    path = tmp_path / "ticks.jsonl.gz"
+    path.write_bytes(gzip.compress(b"".join(line % k for k in range(2000))))
+    assert len(read_ticks(path)) == 2000
+    monkeypatch.setattr("fgtrack.pipeline.clock._LARGEST_BYTES", 1 << 20)
+    with pytest.raises(CallError, match=r"more than 1 MB of ticks, replay the recording in parts"):
+        read_ticks(path)

@@ -242,8 +242,8 @@ def test_a_path_through_a_single_value_is_refused(tmp_path: Path) -> None:
 
 def test_an_empty_file_is_the_default_and_a_missing_one_an_error(tmp_path: Path) -> None:
     assert load(Config, written(tmp_path, "")) == load(Config, written(tmp_path, "# nothing\n")) == Config()
-    for path, reason in ((tmp_path / "missing.yaml", "configuration cannot be read"), (tmp_path, "is no file")):
-        with pytest.raises(CallError, match=reason):
+    for path in (tmp_path / "missing.yaml", tmp_path):
+        with pytest.raises(CallError, match="configuration cannot be read"):
             read_yaml(path)
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(CallError, match="is no text file"):

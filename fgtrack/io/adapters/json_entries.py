@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from fgtrack.core.errors import DataError
+from fgtrack.core.files import open_text
 
 __all__ = ["list_entries", "object_entries"]
 
@@ -51,7 +52,7 @@ def _opened(file: Path) -> TextIO:
     try:
         if file.stat().st_size > _LARGEST_FILE:
             raise DataError(f"{file}: is larger than {_LARGEST_FILE / 1e9:.1f} GB, give it in parts")
-        return file.open(encoding="utf-8")
+        return open_text(file)
     except OSError as error:
         raise DataError(f"{file}: cannot be read ({error.strerror})") from error
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
 from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.files import open_text
 from fgtrack.core.types import (
     DESCRIBING,
     MEASURABLE,
@@ -127,7 +128,7 @@ def _lists(rows: list[tuple[_Times, Detection | None]], sensor: str, table: CsvT
 
 def _rows(file: Path, table: CsvTable) -> Iterator[Cells]:
     try:
-        with file.open(encoding="utf-8-sig", newline="") as text:
+        with open_text(file, "utf-8-sig", newline="") as text:
             first = text.readline(_LONGEST_LINE)
             text.seek(0)
             delimiter = table.delimiter or max(",;\t", key=first.count)

@@ -11,6 +11,7 @@ from rosbags.interfaces import Connection
 from ruamel.yaml import YAML
 
 from fgtrack.core.errors import DataError
+from fgtrack.core.files import open_file, read_whole
 from fgtrack.io.ros.mcap_file import MCAP_MAGIC, McapFile
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
 from fgtrack.io.ros.sqlite3_file import Sqlite3File
@@ -19,7 +20,7 @@ from fgtrack.io.ros.unpacking import unpacked_file
 Record = tuple[Connection, int, bytes]
 """Connection, log time in ns, serialized message."""
 
-_LONGEST_METADATA = 1_000_000
+_LARGEST_METADATA_MB = 1.0
 _NEWEST_VERSION = 9
 SQLITE_MAGIC = b"SQLite format 3\x00"
 ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
@@ -50,9 +51,7 @@ def bag_folder(path: Path) -> Iterator[list[Path]]:
     Raises `DataError` where it does not say what a rosbag2 folder says.
     """
     file = path / "metadata.yaml"
-    if file.stat().st_size > _LONGEST_METADATA:
-        raise DataError(f"{file}: is longer than that of any recording")
-    known = YAML(typ="safe", pure=True).load(file.read_text(encoding="utf-8"))
+    known = YAML(typ="safe", pure=True).load(read_whole(file, _LARGEST_METADATA_MB).decode())
     try:
         metadata = known["rosbag2_bagfile_information"]
         files = [path / PurePath(name).name for name in metadata["relative_file_paths"]]
@@ -106,7 +105,7 @@ class EmptyFile:
 
 def storage_of(path: Path) -> type[McapFile | Sqlite3File | Rosbag1File] | None:
     """What reads the file `path`, by its first bytes."""
-    with path.open("rb") as file:
+    with open_file(path) as file:
         magic = file.read(len(SQLITE_MAGIC))
     for start, kind in ((MCAP_MAGIC, McapFile), (SQLITE_MAGIC, Sqlite3File), (ROSBAG1_MAGIC, Rosbag1File)):
         if magic.startswith(start):

@@ -1,5 +1,6 @@
 """The message types of a recording: rosbags', fgtrack's, the user's and those embedded in the recording."""
 
+import os
 import re
 from collections.abc import Iterable, Mapping
 from functools import cache
@@ -12,6 +13,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from fgtrack.core.errors import CallError
+from fgtrack.core.files import read_whole
 from fgtrack.io.ros.definitions import DEFINITIONS
 
 _TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*)+", re.ASCII)
@@ -20,6 +22,8 @@ _BASE_NAME = re.compile(r"[a-z]+[0-9]*", re.ASCII)
 _MOST_MEMBERS = 2_000
 _LONGEST_ARRAY = 1_000_000
 _LONGEST_TEXT = 1_000_000
+_LARGEST_FILE_MB = 1.0
+_MOST_FOLDERS = 10_000  # below a folder of definitions
 _IDL_SEPARATOR = "=" * 80 + "\n"
 
 
@@ -151,15 +155,28 @@ def _shipped_types(ros1: bool) -> Typesdict:
     return types
 
 
-def _user_types(path: Path) -> Typesdict:
-    files = sorted(path.rglob("*.msg")) if path.is_dir() else [path]
+def definition_files(path: Path) -> list[Path]:
+    """The `.msg` files at or below `path`. Raises `CallError` where there are none, or folders without end."""
+    if not path.is_dir():
+        return [path]
+    files: list[Path] = []
+    for count, (folder, _, names) in enumerate(os.walk(path), start=1):
+        if count > _MOST_FOLDERS:
+            raise CallError(f"{path}: has more than {_MOST_FOLDERS} folders, name that of the message definitions")
+        files += (Path(folder, name) for name in names if name.endswith(".msg"))
     if not files:
         raise CallError(f"{path}: holds no .msg file")
+    return sorted(files)
+
+
+def _user_types(path: Path) -> Typesdict:
     types: Typesdict = {}
-    for file in files:
+    for file in definition_files(path):
         package = file.parent.parent.name if file.parent.name == "msg" else file.parent.name
         try:
-            types |= _checked(get_types_from_msg(file.read_text(encoding="utf-8"), f"{package}/msg/{file.stem}"))
+            types |= _checked(
+                get_types_from_msg(read_whole(file, _LARGEST_FILE_MB).decode(), f"{package}/msg/{file.stem}")
+            )
         except Exception as error:  # whatever a foreign definition makes the parser raise
             raise CallError(f"{file}: is not a message definition ({one_line(error)})") from error
     return types

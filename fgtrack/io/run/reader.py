@@ -16,6 +16,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from fgtrack.core.errors import DataError
+from fgtrack.core.files import open_file, open_text, read_whole
 from fgtrack.core.types import BoolArray
 from fgtrack.io.run.relied import check_config, check_meta
 from fgtrack.io.run.schema import COLUMNS, LARGEST_META_MB, OPTIONAL_TABLES, RUN_FORMAT
@@ -146,8 +147,6 @@ def load_run(path: Path | str) -> Run:
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
     try:
-        if path.is_fifo():
-            raise DataError(f"{path}: is a pipe, is this a run folder?")
         yield
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: is not UTF-8 text ({error.reason}), repeat the run") from error
@@ -157,9 +156,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 def _read_text(path: Path) -> str:
     with _reading(path):
-        if path.stat().st_size > 1e6 * LARGEST_META_MB:
-            raise DataError(f"{path}: is larger than {LARGEST_META_MB:g} MB, repeat the run")
-        return path.read_text(encoding="utf-8")
+        return read_whole(path, LARGEST_META_MB).decode("utf-8")
 
 
 def _read_meta(path: Path) -> Mapping[str, Any]:
@@ -182,7 +179,7 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
         return Table({name: column(name, ()) for name in names})
     texts = {name: [column(name, ())] for name in names if name in _TEXT_COLUMNS}
     num_rows, longest = 0, dict.fromkeys(texts, 1)
-    with _reading(path), path.open(encoding="utf-8", newline="\n") as file:
+    with _reading(path), open_text(path, newline="\n") as file:
         most = _most_rows(path, names)
         numbers = {name: np.empty(most, column(name, ()).dtype) for name in names if name not in texts}
         reader = csv.reader(_whole_lines(path, file, complete))
@@ -215,7 +212,7 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
 
 def _most_rows(path: Path, names: Sequence[str]) -> int:
     """As many as there are lines and, as a row has as many bytes as cells at least, fit into the file."""
-    with path.open("rb") as file:
+    with open_file(path) as file:
         lines = sum(block.count(b"\n") for block in iter(partial(file.read, 1 << 20), b""))
     return min(lines, path.stat().st_size // len(names))
 

@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Self
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.files import read_whole
+from fgtrack.core.files import open_file, read_whole
 from fgtrack.io.output import Kind, check_output, claimed, part_of, write_error, write_file
 from fgtrack.io.run.rows import Row, text, text_header
 from fgtrack.io.run.schema import COLUMNS, LARGEST_META_MB, OPTIONAL_TABLES, RUN_FORMAT
@@ -137,7 +137,7 @@ def digest(path: Path) -> str:
     """SHA-256 of the bytes of tracks.csv and then updates.csv of the run folder `path`, in hex."""
     sha = hashlib.sha256()
     for name in ("tracks.csv", "updates.csv"):
-        with (path / name).open("rb") as file:
+        with open_file(path / name) as file:
             while block := file.read(1 << 20):
                 sha.update(block)
     return sha.hexdigest()
