@@ -6,12 +6,13 @@ instead: created, and locked until the command ends.
 """
 
 import errno
+import filecmp
 import importlib
 import os
 import re
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,8 @@ from typing import BinaryIO
 from fgtrack.core.errors import CallError, DataError, FgtrackError
 
 _PART = re.compile(r"\.[0-9a-f]{12}\.part$")
+#: Name of what is replaced, inside the `.part` of what replaces it.
+REPLACED = ".replaced"
 #: Of a disk that takes no more.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
@@ -54,6 +57,17 @@ def check_output(path: Path, kind: Kind, overwrite: bool) -> None:
         raise CallError(f"{path}: already exists, choose another name or replace it with --overwrite")
 
 
+def check_apart(out: Path, inputs: Iterable[Path]) -> None:
+    """Raise `CallError` where the output `out` is one of `inputs` (those that exist), holds one, or lies in one."""
+    place = out.resolve()
+    for source in inputs:
+        where = source.resolve()
+        if place == where or place in where.parents:
+            raise CallError(f"{out}: is the input or holds it ({source}), choose another name")
+        if where in place.parents:
+            raise CallError(f"{out}: lies in the input {source}, choose another place")
+
+
 def write_error(path: Path, error: OSError) -> FgtrackError:
     """The error to raise where `path` cannot be written: `DataError` for a full or broken disk, else `CallError`."""
     if error.errno in FULL:
@@ -62,11 +76,14 @@ def write_error(path: Path, error: OSError) -> FgtrackError:
 
 
 def write_file(path: Path, text: str) -> None:
-    """Write the text file `path` completely or not at all, replacing a former version."""
+    """Write the text file `path` completely or not at all, replacing a former version; a link there is an error."""
     part = _part_of(path)
     try:
+        if path.is_symlink():
+            raise FileExistsError(errno.EEXIST, "is a link")
         with _removed_on_error(part):
             with part.open("xb") as file:
+                keep_mode(path, part)
                 file.write(text.encode())
             os.replace(part, path)
     except OSError as error:
@@ -82,6 +99,7 @@ def new_file(path: Path, kind: Kind, overwrite: bool) -> Iterator[BinaryIO]:
         path.parent.mkdir(parents=True, exist_ok=True)
         with _removed_on_error(part):
             with part.open("xb") as file:
+                keep_mode(path, part)
                 yield file
             _rename(part, path, kind, overwrite)
     except OSError as error:
@@ -92,12 +110,15 @@ def new_file(path: Path, kind: Kind, overwrite: bool) -> Iterator[BinaryIO]:
 def new_folder(path: Path, kind: Kind, overwrite: bool) -> Iterator[Path]:
     """Path at which to make a folder that is renamed to `path` when the block ends; raises as `new_file`."""
     check_output(path, kind, overwrite)
-    part = _part_of(path)
-    new, old = part / Path(os.path.abspath(path)).name, part / ".replaced"
     try:
-        part.mkdir(parents=True)
-        with _removed_on_error(part):
+        with part_folder(path) as part:
+            keep_mode(path, part)
+            new, old = part / Path(os.path.abspath(path)).name, part / REPLACED
             yield new
+            if path.exists():
+                keep_mode(path, new)
+                for file in new.iterdir():
+                    keep_mode(path / file.name, file)
             if overwrite and path.exists():
                 check_output(path, kind, overwrite)
                 os.rename(path, old)
@@ -107,9 +128,25 @@ def new_folder(path: Path, kind: Kind, overwrite: bool) -> Iterator[Path]:
                 if old.exists():
                     os.rename(old, path)
                 raise
-        shutil.rmtree(part)
+            shutil.rmtree(part)
     except OSError as error:
         raise write_error(path, error) from error
+
+
+@contextmanager
+def part_folder(path: Path) -> Iterator[Path]:
+    """A new folder `<path>.*.part`, removed after an error unless something replaced is still in it."""
+    part = _part_of(path)
+    part.mkdir(parents=True)
+    with _removed_on_error(part):
+        yield part
+
+
+def keep_mode(old: Path, new: Path) -> None:
+    """Give `new` the permissions of what it replaces, where that is there: what was private stays private."""
+    with suppress(FileNotFoundError):
+        if not old.is_symlink():
+            shutil.copymode(old, new)
 
 
 @contextmanager
@@ -126,12 +163,11 @@ def new_files(folder: Path, kind: Kind, overwrite: bool) -> Iterator[Path]:
                 yield part
                 files = sorted(part.iterdir())
                 for file in files:
-                    content = file.read_bytes()
                     place = folder / file.name
-                    same = place.is_file() and not place.is_symlink() and place.read_bytes() == content
-                    if not same:
+                    if not (place.is_file() and not place.is_symlink() and filecmp.cmp(file, place, shallow=False)):
                         check_output(place, kind, overwrite)
                 for file in files:
+                    keep_mode(folder / file.name, file)
                     os.replace(file, folder / file.name)
             part.rmdir()
         except OSError as error:
@@ -201,6 +237,9 @@ def _removed_on_error(part: Path) -> Iterator[None]:
     try:
         yield
     except Exception:
+        replaced = part / REPLACED
+        if replaced.is_dir() and any(replaced.iterdir()):  # it could not be put back
+            raise
         if part.is_dir():
             shutil.rmtree(part, ignore_errors=True)
         else:

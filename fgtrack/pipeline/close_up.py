@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgtrack.core.errors import DataError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.io.run import Run, load_run, recording_of
@@ -54,15 +54,19 @@ def close_up_of(run: Run, arrival: Arrival) -> CloseUp:
     Raises
     ------
     DataError
-        The recording is not there any more, or does not hold the detection; or no track fused it.
+        The recording, or a file that the configuration names, is not there any more; or it does not hold the
+        detection; or no track fused it.
     """
     recording = recording_of(run)
     if recording is None:
         given = (run.meta.get("input") or {}).get("path") or "messages in memory"
         raise DataError(f"{given}: the recording of the run is not there, so no close-up")
-    config = validate(Config, run.config, f"configuration of {run.path or 'the run'}")
-    ticks = delivered(open_input(recording, config.input).messages(), config)
-    return close_up(lambda observed: build_tracker(config, observed), ticks, arrival)
+    try:
+        config = validate(Config, run.config, f"configuration of {run.path or 'the run'}")
+        ticks = delivered(open_input(recording, config.input).messages(), config)
+        return close_up(lambda observed: build_tracker(config, observed), ticks, arrival)
+    except CallError as error:  # nobody has called with it: it is what the run says
+        raise DataError(f"{error}, so no close-up") from error
 
 
 def most_moved(run: Run, track_id: int | None = None, stamp_ns: int | None = None) -> Arrival:

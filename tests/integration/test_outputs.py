@@ -26,12 +26,15 @@ from fgtrack.io import output
 from fgtrack.io.output import claimed, new_file, write_file
 from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.run import RunWriter, digest, load_run
+from fgtrack.io.run.schema import COLUMNS
 from fgtrack.io.source import open_input
 from fgtrack.io.stream import STREAM, read_stream, write_stream
+from fgtrack.pipeline.close_up import close_up_of
 from fgtrack.pipeline.load import dump
 from fgtrack.pipeline.replay import replay_each
 from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.pipeline.sweep_plan import load_plan
+from fgtrack.tracking.close_up import Arrival
 
 MS = 1_000_000
 START_NS = 1_600_000_000_000_000_000
@@ -226,6 +229,111 @@ def test_a_recording_with_something_else_in_its_folder_is_not_replaced(here: Pat
     before = content(here)
     assert call("convert", "drive.jsonl", "bag", "--overwrite")[0] == 2
     assert content(here) == before
+
+
+def test_a_folder_of_recordings_by_themselves_is_no_recording_to_replace(here: Path, call: Call) -> None:
+    """Only what a metadata.yaml lists belongs together."""
+    for folder in ("mine", "more", "damaged"):
+        shutil.copytree("bag", folder)
+    (storage,) = Path("bag").glob("*.mcap")
+    Path("mine/metadata.yaml").unlink()
+    shutil.copy(storage, "mine/monday.mcap")
+    shutil.copy(storage, "more/monday.mcap")
+    Path("damaged/metadata.yaml").write_text("rosbag2_bagfile_information: [")
+    before = content(here)
+    for folder in ("mine", "more", "damaged"):
+        for words in (("convert", "drive.jsonl", folder), ("simulate", "default", "--duration", "1", "-o", folder)):
+            code, error = call(*words, "--overwrite")
+            assert code == 2
+            assert f"{folder}: exists and is not a rosbag2 folder" in error
+    assert content(here) == before
+
+
+#: Tables of a recording that have the names of tables of a run.
+TABLES = {"ego.csv": "t,x,y\n", "truth.csv": "t,id,x,y\n", "detections.csv": "t,x,y\n", "config.yaml": "input: {}\n"}
+
+
+def test_a_recording_of_tables_is_no_run_to_replace(here: Path, call: Call) -> None:
+    """Nor is one with the header of a table that a run has too."""
+    header = Path("run/ego.csv").read_text().partition("\n")[0]
+    for folder, text in (("tables", TABLES["ego.csv"]), ("copied", f"{header}\n")):
+        Path(folder).mkdir()
+        for name, other in TABLES.items():
+            Path(folder, name).write_text(text if name == "ego.csv" else other)
+    shutil.copytree("copied", "all_copied")
+    for name in ("truth.csv", "detections.csv"):
+        Path("all_copied", name).write_text(",".join(COLUMNS[name.removesuffix(".csv")]) + "\n")
+    before = content(here)
+    for folder in ("tables", "copied", "all_copied"):
+        code, error = call("replay", "drive.jsonl", "-o", folder, "--overwrite")
+        assert code == 2
+        assert f"{folder}: exists and is not a run folder" in error
+    assert content(here) == before
+
+
+def test_a_table_of_somebody_in_a_run_folder_is_not_removed(here: Path, call: Call) -> None:
+    Path("run/ego.csv").write_text(TABLES["ego.csv"])
+    before = content(here)
+    code, error = call("replay", "drive.jsonl", "-o", "run", "--overwrite")
+    assert code == 2
+    assert "run/ego.csv: is not what a run has there, move it away" in error
+    assert content(here) == before
+
+
+def test_what_cannot_be_replaced_leaves_the_old_run_whole(here: Path, call: Call) -> None:
+    Path("run/lagged.csv").unlink(missing_ok=True)
+    Path("run/lagged.csv").mkdir()
+    before = content(here)
+    assert call("replay", "drive.jsonl", "-o", "run", "--overwrite")[0] == 2
+    assert content(here) == before
+    Path("run/lagged.csv").rmdir()
+    with RunWriter("run", overwrite=True) as writer:
+        Path("run/lagged.csv").mkdir()  # in the last moment
+        with pytest.raises(CallError, match=r"run/lagged\.csv: cannot be written"):
+            writer.write_tick(TickReport(0, 1, (), ()), 1, 0)
+    assert content(here) == before
+
+
+def test_a_disk_that_is_full_when_a_run_begins_leaves_the_old_run_whole(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, rename = content(here), os.rename
+
+    def full(source: Path, target: Path) -> None:
+        if Path(source).parent.name == "new" and Path(source).name == "config.yaml":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        rename(source, target)
+
+    monkeypatch.setattr(os, "rename", full)
+    with RunWriter("run", overwrite=True) as writer, pytest.raises(DataError, match="free some space"):
+        writer.write_tick(TickReport(0, 1, (), ()), 1, 0)
+    assert content(here) == before
+
+
+def test_what_was_private_stays_private(here: Path, call: Call) -> None:
+    """Permissions are those of what is replaced."""
+    Path("empty").mkdir(mode=0o700)
+    modes = {"empty": 0o700, "bag": 0o750, "other.jsonl": 0o600, "run/tracks.csv": 0o600, "run/metrics.json": 0o640}
+    assert call("compare", "run")[0] == 0
+    (storage,) = Path("bag").glob("*.mcap")
+    modes |= {str(storage): 0o600, "report.html": 0o600, "figures/arrivals.png": 0o600}
+    for name, mode in modes.items():
+        Path(name).chmod(mode)
+    for words in (
+        ("convert", "drive.jsonl", "empty"),
+        ("convert", "drive.jsonl", "bag", "--overwrite"),
+        ("convert", "drive.jsonl", "other.jsonl", "--overwrite"),
+        ("compare", "run"),
+        ("replay", "drive.jsonl", "-o", "run", "--overwrite"),
+        ("report", "run", "-o", "report.html", "--overwrite"),
+        ("figure", "run", "-o", "figures", "--overwrite"),
+    ):
+        assert call(*words)[0] == 0
+        if words[0] == "compare":
+            assert Path("run/metrics.json").stat().st_mode & 0o777 == modes.pop("run/metrics.json")
+    assert {name: oct(Path(name).stat().st_mode & 0o777) for name in modes} == {
+        name: oct(mode) for name, mode in modes.items()
+    }
 
 
 def test_other_files_beside_a_run_stay(here: Path, call: Call) -> None:
@@ -575,16 +683,15 @@ def test_what_has_no_end_in_place_of_a_file_is_one_line_at_once(
 
 
 @pytest.mark.parametrize("make", ENDLESS.values(), ids=ENDLESS)
-def test_a_run_of_somebody_whose_configuration_names_what_has_no_end_is_drawn_at_once(
-    here: Path, call: Call, make: Callable[[str], None]
+def test_what_has_no_end_in_the_configuration_of_a_run_is_a_reason_to_leave_out_its_close_up(
+    here: Path, make: Callable[[str], None]
 ) -> None:
-    """What its close-up cannot replay is left out, or an error; nothing waits."""
     make("endless.jsonl")
     config = Path("run/config.yaml")
     config.write_text(config.read_text().replace("ticks_file: null", "ticks_file: endless.jsonl"))
     assert "endless.jsonl" in config.read_text()
-    with at_once():
-        assert call("figure", "run", "-o", "new_figures")[0] in (0, 1, 2)
+    with at_once(), pytest.raises(DataError, match=r"endless\.jsonl: .* so no close-up"):
+        close_up_of(load_run("run"), Arrival("lidar", START_NS, START_NS, 0))
 
 
 @pytest.mark.parametrize("make", ENDLESS.values(), ids=ENDLESS)

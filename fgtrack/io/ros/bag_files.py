@@ -1,14 +1,15 @@
 """The files of a recording, each read in log-time order, and up to the break where it was cut off."""
 
 import heapq
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
-from typing import Protocol
+from typing import Any, Protocol
 
 from rosbags.interfaces import Connection
 from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file, read_whole
@@ -20,6 +21,7 @@ from fgtrack.io.ros.unpacking import unpacked_file
 Record = tuple[Connection, int, bytes]
 """Connection, log time in ns, serialized message."""
 
+METADATA = "metadata.yaml"
 _LARGEST_METADATA_MB = 1.0
 _NEWEST_VERSION = 9
 SQLITE_MAGIC = b"SQLite format 3\x00"
@@ -44,17 +46,37 @@ class BagFile(Protocol):
         """Records of `connections` in log-time order; equal times keep the order of writing."""
 
 
+def listed_files(path: Path) -> list[Path]:
+    """The storage files of the rosbag2 folder `path` that its metadata.yaml lists; raises as `bag_folder`."""
+    file = path / METADATA
+    try:
+        return [path / PurePath(name).name for name in _metadata(file)["relative_file_paths"]]
+    except (KeyError, TypeError) as error:
+        raise DataError(f"{file}: is no metadata of a recording ({type(error).__name__}: {error})") from error
+
+
+def _metadata(file: Path) -> Mapping[str, Any]:  # Any: YAML values, checked by who asks for them
+    try:
+        known = YAML(typ="safe", pure=True).load(read_whole(file, _LARGEST_METADATA_MB).decode())
+        metadata = known["rosbag2_bagfile_information"]
+    except (KeyError, TypeError, ValueError, RecursionError, YAMLError) as error:
+        what = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise DataError(f"{file}: is no metadata of a recording ({what})") from error
+    if not isinstance(metadata, Mapping):
+        raise DataError(f"{file}: is no metadata of a recording (a {type(metadata).__name__})")
+    return metadata
+
+
 @contextmanager
 def bag_folder(path: Path) -> Iterator[list[Path]]:
     """Files of the rosbag2 folder `path` by its metadata.yaml; unpacked, where each was packed.
 
     Raises `DataError` where it does not say what a rosbag2 folder says.
     """
-    file = path / "metadata.yaml"
-    known = YAML(typ="safe", pure=True).load(read_whole(file, _LARGEST_METADATA_MB).decode())
+    file = path / METADATA
+    metadata = _metadata(file)
     try:
-        metadata = known["rosbag2_bagfile_information"]
-        files = [path / PurePath(name).name for name in metadata["relative_file_paths"]]
+        files = listed_files(path)
         version = int(metadata["version"])
         mode = str(metadata.get("compression_mode") or "none").lower()
         form = metadata.get("compression_format") or "zstd"

@@ -1,7 +1,5 @@
 """Writes rosbag2 recordings: fgtrack's own messages, exact to the bit, and twins in standard types for other tools."""
 
-import os
-import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
@@ -16,6 +14,7 @@ from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.io.adapters.common import RosMessage
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.output import Kind, new_folder
+from fgtrack.io.ros.bag_files import METADATA, listed_files
 from fgtrack.io.ros.messages import DETECTED_OBJECTS, DETECTION3D_ARRAY, MessageFactory
 from fgtrack.io.ros.typestore import one_line
 from fgtrack.io.viewer.topics import token
@@ -23,7 +22,7 @@ from fgtrack.io.viewer.topics import token
 _CHECKPOINT = 1000  # messages; a killed writer loses no more than that
 _PLUGINS = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _INT64_LIMIT = 1 << 63
-_RECORDED = re.compile(r"metadata\.yaml|.*\.(mcap|db3(-wal|-shm|-journal)?)")
+_JOURNALS = ("-wal", "-shm", "-journal")  # that SQLite may leave beside a file
 
 
 def write_bag(
@@ -73,8 +72,15 @@ def write_bag(
 
 
 def _is_recording(path: Path) -> bool:
-    names = [file.name for file in path.iterdir() if file.is_file()] if path.is_dir() else []
-    return bool(names) and len(names) == len(os.listdir(path)) and all(map(_RECORDED.fullmatch, names))
+    """Whether `path` is a folder of what its metadata.yaml lists, and of nothing else."""
+    if not (path / METADATA).is_file():
+        return False
+    try:
+        listed = [file.name for file in listed_files(path)]
+    except DataError:
+        return False
+    known = {METADATA, *listed, *(f"{name}{journal}" for name in listed for journal in _JOURNALS)}
+    return bool(listed) and all(file.name in known and file.is_file() for file in path.iterdir())
 
 
 RECORDING = Kind("a rosbag2 folder with nothing else in it", _is_recording)

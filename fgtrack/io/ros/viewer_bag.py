@@ -13,6 +13,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.io.adapters.common import RosMessage
 from fgtrack.io.output import Kind, check_output, new_file, new_folder, write_error
+from fgtrack.io.ros.bag_files import METADATA
 from fgtrack.io.ros.bag_writer import RECORDING
 from fgtrack.io.ros.typestore import one_line
 from fgtrack.io.ros.viewer_messages import ViewerMessageFactory
@@ -38,8 +39,7 @@ def _reliable(durability: QosDurability) -> Qos:
 
 
 def _is_export_folder(path: Path) -> bool:
-    metadata = path / "metadata.yaml"
-    return RECORDING.recognises(path) and metadata.is_file() and _MARK[1].encode() in metadata.read_bytes()
+    return RECORDING.recognises(path) and _MARK[1].encode() in (path / METADATA).read_bytes()
 
 
 def _is_export_file(path: Path) -> bool:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from io import FileIO
@@ -9,14 +10,17 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from fgtrack.core.errors import DataError
-from fgtrack.core.files import open_file, read_whole
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.files import open_file, read_head, read_whole
+from fgtrack.io.exchange import EXCHANGED, exchanged
 from fgtrack.io.output import Kind, check_output, claimed, part_of, write_error, write_file
 from fgtrack.io.run.rows import Row, text, text_header
 from fgtrack.io.run.schema import COLUMNS, LARGEST_META_MB, OPTIONAL_TABLES, RUN_FORMAT
 from fgtrack.io.run.sink import RunSink
 
-_FILES = ("meta.json", "config.yaml", "metrics.json", *(f"{table}.csv" for table in COLUMNS))
+_FILES = (*(f"{table}.csv" for table in COLUMNS), "metrics.json", "config.yaml", "meta.json")
+#: Tables that every run has and no recording, whose files may have the names of other tables.
+_TELLING = ("tracks", "updates", "timing")
 
 
 class RunWriter(RunSink):
@@ -81,7 +85,7 @@ class RunWriter(RunSink):
         """See `RunSink`; rewrites `meta.json`."""
         self._begin()
         finished = super().finish(meta)
-        self._write_meta()
+        self._write_meta(self.path)
         return finished
 
     def _append(self, table: str, found: Sequence[Row]) -> None:
@@ -92,37 +96,32 @@ class RunWriter(RunSink):
         self._write(table, text(table, found))
 
     def _begin(self) -> None:
-        """Make the files; of an older run there, meta.json goes first and is new last."""
+        """Make the files; an older run stays until all of them are there."""
         if self._begun:
             return
         self._begun = True
-        try:
-            for name in _FILES if self._overwrite else ():
-                (self.path / name).unlink(missing_ok=True)
-        except OSError as error:
-            raise write_error(self.path, error) from error
-        write_file(self.path / "config.yaml", self._config_text)
-        for table in COLUMNS:
-            if table not in OPTIONAL_TABLES:
-                self._write(table, "")
-        for table, found in self._truth.items():
-            if found:
-                self._write(table, text(table, found))
-        self._write_meta()
+        with exchanged(self.path, _FILES, self._overwrite) as folder:
+            write_file(folder / "config.yaml", self._config_text)
+            for table in COLUMNS:
+                if table not in OPTIONAL_TABLES:
+                    self._write(table, "", folder)
+            for table, found in self._truth.items():
+                if found:
+                    self._write(table, text(table, found), folder)
+            self._write_meta(folder)
 
-    def _write(self, table: str, lines: str) -> None:
-        file = self._files.get(table)
-        path = self.path / f"{table}.csv"
+    def _write(self, table: str, lines: str, folder: Path | None = None) -> None:
+        file, name = self._files.get(table), f"{table}.csv"
         try:
             if file is None:
-                file = self._files[table] = FileIO(path, "x")
+                file = self._files[table] = FileIO((folder or self.path) / name, "x")
                 _write_all(file, text_header(table))
             _write_all(file, lines.encode())
         except OSError as error:
-            raise write_error(path, error) from error
+            raise write_error(self.path / name, error) from error
 
-    def _write_meta(self) -> None:
-        write_file(self.path / "meta.json", json.dumps(self._meta, indent=2) + "\n")
+    def _write_meta(self, folder: Path) -> None:
+        write_file(folder / "meta.json", json.dumps(self._meta, indent=2) + "\n")
 
     def _digest(self) -> str:
         return digest(self.path)
@@ -159,10 +158,33 @@ def _write_all(file: FileIO, data: bytes) -> None:
 
 
 def _is_run(path: Path) -> bool:
-    """Whether `path` holds a run, or what is left of one whose writer was killed at its beginning."""
+    """Whether `path` holds a run, or what is left of one whose writer was killed at its beginning.
+
+    Raises `CallError` where a run has another file in place of one of its own.
+    """
+    if not path.is_dir():
+        return False
+    there = [path / name for name in _FILES if os.path.lexists(path / name)]
+    foreign = next((file for file in there if not _is_of_run(file)), None)
     if is_run_folder(path):
+        if foreign is not None:
+            raise CallError(f"{foreign}: is not what a run has there, move it away or choose another folder")
         return True
-    return path.is_dir() and all(part_of(file.name) in _FILES for file in path.iterdir())
+    if foreign is not None or not all(part_of(name) in (*_FILES, EXCHANGED) for name in os.listdir(path)):
+        return False
+    return not there or any(_begins(path / f"{table}.csv", text_header(table)) for table in _TELLING)
+
+
+def _is_of_run(file: Path) -> bool:
+    """Whether `file`, which has the name of one of a run, may be it; what a link leads to is not touched."""
+    if file.is_symlink() or file.suffix != ".csv":
+        return file.is_symlink() or file.is_file()
+    header = text_header(file.stem)
+    return file.is_file() and (_begins(file, header) or header.startswith(read_head(file, len(header))))
+
+
+def _begins(file: Path, start: bytes) -> bool:
+    return read_head(file, len(start)) == start
 
 
 RUN = Kind("a run folder", _is_run)
