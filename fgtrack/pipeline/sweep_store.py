@@ -3,9 +3,12 @@
 import csv
 import io
 import json
+import logging
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
+from itertools import pairwise
 from pathlib import Path
 
 from pydantic import ConfigDict, TypeAdapter
@@ -19,8 +22,17 @@ PART_FORMAT = "fgtrack-sweep-part/1"
 _PART_START = json.dumps({"format": PART_FORMAT})[:-1].encode()
 SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE = "sweep.csv", "timing.csv", "errors.csv"
 PAIRED_TABLE, SUMMARY_TABLE = "paired.csv", "summary.csv"
+_PARTS = "parts"
+_TABLES = (SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE, PAIRED_TABLE, SUMMARY_TABLE)
+#: All that a sweep writes into its folder.
+PRODUCTS = (*_TABLES, _PARTS)
 _LONGEST_HEAD = 100_000
 _LARGEST_PART_MB = 64.0
+_LONGEST_NAME = 1000  # of a column, or a text in it
+_INT64_LIMIT = 1 << 63
+_RESERVED = (*KEY_COLUMNS, "error")
+
+_logger = logging.getLogger(__name__)
 
 Scalar = str | bool | int | float | None
 
@@ -57,18 +69,20 @@ _CELLS = TypeAdapter(tuple[Cell, ...], config=ConfigDict(strict=True, extra="for
 class PartStore:
     """The parts of a sweep, each in a file named by the key of its job and written whole or not at all.
 
-    Raises `CallError` where `folder` cannot be made one, or holds tables but no place of parts: those of another
-    program, or of a sweep that has lost its parts, which `overwrite` replaces. Of a sweep that could not keep a single
-    part, the place is there.
+    Raises `CallError` where `folder` cannot be made one, or has a table, or a link, that no sweep wrote; without
+    `overwrite` also for the tables of a sweep that has lost its parts. Of a sweep that could not keep a single part,
+    the place for them is there, and `sweep.csv` has no row.
     """
 
     def __init__(self, folder: Path, overwrite: bool = False) -> None:
-        self._folder = folder / "parts"
-        parts = list(self._folder.glob("*.json"))
-        if not any(map(_is_part, parts)) and (parts or not self._folder.is_dir()):
-            for name in (SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE, PAIRED_TABLE, SUMMARY_TABLE):
-                check_output(folder / name, _SWEPT, overwrite)
+        self._folder = folder / _PARTS
+        has_parts = any(map(_is_part, self._folder.glob("*.json")))
+        goes_on = has_parts or (_is_empty(self._folder) and not _has_rows(folder / SWEEP_TABLE))
+        for name in _TABLES:
+            check_output(folder / name, _SWEPT, overwrite or goes_on)
         try:
+            if self._folder.is_symlink():
+                raise CallError(f"{self._folder}: is a link, choose another folder")
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise CallError(f"{folder}: cannot be made a folder ({error.strerror}), choose another one") from error
@@ -78,7 +92,10 @@ class PartStore:
         return frozenset(path.stem for path in self._folder.glob("*.json"))
 
     def read(self, key: str) -> tuple[Cell, ...] | None:
-        """The cells of a job; None where it has no part."""
+        """The cells of a job; None where it has no part, or one with what no sweep writes, which a warning names.
+
+        Raises `DataError` for a file that is no part.
+        """
         path = self._folder / f"{key}.json"
         if not path.exists():
             return None
@@ -86,9 +103,14 @@ class PartStore:
             content = json.loads(read_whole(path, _LARGEST_PART_MB))
             if content["format"] != PART_FORMAT:
                 raise DataError(f"{path}: does not say format {PART_FORMAT!r}, delete it")
-            return _CELLS.validate_json(json.dumps(content["cells"]))
+            cells = _CELLS.validate_json(json.dumps(content["cells"]))
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise DataError(f"{path}: is no part of a sweep, delete it") from error
+        fault = next((fault for cell in cells for fault in _faults(cell)), None)
+        if fault is not None:
+            _logger.warning("%s: %s, which no sweep writes: its job is done again", path, fault)
+            return None
+        return cells
 
     def write(self, key: str, cells: Sequence[Cell]) -> None:
         """Keep the cells of a finished job."""
@@ -96,8 +118,39 @@ class PartStore:
         write_file(self._folder / f"{key}.json", json.dumps(content))
 
 
+def _faults(cell: Cell) -> Iterator[str]:
+    """What is in a cell that no sweep writes."""
+    if bool(cell.values) == (cell.error is not None):
+        yield "a cell needs either values or an error"
+    for name, value in (*cell.values.items(), *cell.times.items()):
+        if not _is_name(name) or name in _RESERVED:
+            yield f"a column named {name[:_LONGEST_NAME]!a}"
+        elif isinstance(value, str) and not _is_name(value):
+            yield f"{name} is {value[:_LONGEST_NAME]!a}"
+        elif isinstance(value, float) and math.isinf(value):
+            yield f"{name} is {value}"
+        elif isinstance(value, int) and abs(value) >= _INT64_LIMIT:
+            yield f"{name} has more than 64 bits"
+
+
+def _is_name(text: str) -> bool:
+    return 0 < len(text) <= _LONGEST_NAME and text.isprintable()
+
+
+def _is_empty(folder: Path) -> bool:
+    return folder.is_dir() and not any(folder.iterdir())
+
+
+def _has_rows(table: Path) -> bool:
+    return bool(read_head(table, _LONGEST_HEAD).partition(b"\n")[2])
+
+
 def _is_swept(path: Path) -> bool:
-    return KEY_COLUMNS[1].encode() in read_head(path, _LONGEST_HEAD).partition(b"\n")[0].strip().split(b",")
+    """Whether the header has the columns that every table of a sweep has; the summaries have no seed."""
+    columns = read_head(path, _LONGEST_HEAD).partition(b"\n")[0].decode(errors="replace").strip().split(",")
+    if path.name in (PAIRED_TABLE, SUMMARY_TABLE):
+        return KEY_COLUMNS[1] in columns
+    return KEY_COLUMNS in pairwise(columns)
 
 
 _SWEPT = Kind("a table of a sweep", _is_swept)

@@ -1,5 +1,6 @@
 """Parts and tables of a sweep."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -7,7 +8,7 @@ import pytest
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.pipeline.sweep import Sweep
 from fgtrack.pipeline.sweep_plan import Job, Plan, Recipe
-from fgtrack.pipeline.sweep_store import Cell, PartStore, write_tables
+from fgtrack.pipeline.sweep_store import Cell, PartStore, Scalar, write_tables
 
 RECIPE = Recipe(None, None, {}, {}, 0, ("a", "b"))
 PLAN = Plan(
@@ -104,6 +105,72 @@ def test_a_damaged_part_is_reported(tmp_path: Path, text: str) -> None:
     (tmp_path / "parts/key.json").write_text(text)
     with pytest.raises(DataError, match=r"key\.json: .*, delete it"):
         store.read("key")
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        *("{}", '{"x": 1e999}', '{"x": -Infinity}', f'{{"x": {10**400}}}', '{"x": ""}', '{"x": "a\\u001b[31m"}'),
+        *('{"x": "a\\u0000"}', '{"": 1}', '{"seed": 1}', '{"estimator": "a"}', '{"error": "a"}', '{"a\\nb": 1}'),
+    ],
+)
+def test_a_part_with_what_no_sweep_writes_is_done_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, values: str
+) -> None:
+    store = PartStore(tmp_path)
+    cells = ", ".join(f'{{"estimator": "{name}", "values": {values}, "times": {{"s": 1}}}}' for name in "ab")
+    (tmp_path / "parts/k0.json").write_text(f'{{"format": "fgtrack-sweep-part/1", "cells": [{cells}]}}')
+    assert store.read("k0") is None
+    assert "k0.json: " in caplog.text
+    assert "its job is done again" in caplog.text
+    assert [job.key for job in Sweep.open(PLAN, tmp_path).todo] == ["k0", "k1"]
+
+
+def test_a_part_may_hold_all_that_a_sweep_writes(tmp_path: Path) -> None:
+    values: dict[str, Scalar] = {"window": "window", "on": True, "none": None, "nan": math.nan, "n": 2**62, "x": -1e300}
+    PartStore(tmp_path).write("k0", [Cell(name, values, {"s": 0.5}) for name in "ab"])
+    assert list(Sweep.open(PLAN, tmp_path).done) == ["k0"]
+
+
+@pytest.mark.parametrize("beside", [(), ("notes.txt",)], ids=["empty", "notes"])
+def test_a_table_of_somebody_beside_a_folder_of_parts_stays(tmp_path: Path, beside: tuple[str, ...]) -> None:
+    """Also one that has a column `estimator`."""
+    (tmp_path / "parts").mkdir()
+    for name in beside:
+        (tmp_path / "parts" / name).write_text("mine")
+    for text in ("yield,estimator\n1,2\n", "seed,yield,estimator\n1,2,3\n", ""):
+        (tmp_path / "sweep.csv").write_text(text)
+        for overwrite in (False, True):
+            with pytest.raises(CallError, match=r"sweep\.csv: exists and is not a table of a sweep"):
+                PartStore(tmp_path, overwrite)
+
+
+def test_results_whose_parts_are_gone_are_replaced_with_overwrite_only(tmp_path: Path) -> None:
+    PartStore(tmp_path).write("k0", DONE["k0"])
+    write_tables(tmp_path, PLAN, DONE)
+    (tmp_path / "parts/k0.json").unlink()
+    with pytest.raises(CallError, match=r"sweep\.csv: already exists"):
+        PartStore(tmp_path)
+    PartStore(tmp_path, overwrite=True)
+    write_tables(tmp_path, PLAN, {})
+    PartStore(tmp_path)  # without a row there is nothing to lose
+
+
+def test_links_in_the_folder_of_a_sweep_are_neither_followed_nor_replaced(tmp_path: Path) -> None:
+    PartStore(tmp_path).write("k0", DONE["k0"])
+    write_tables(tmp_path, PLAN, DONE)
+    (tmp_path / "timing.csv").rename(tmp_path / "mine.csv")
+    (tmp_path / "timing.csv").symlink_to("mine.csv")
+    with pytest.raises(CallError, match=r"timing\.csv: exists and is not a table of a sweep"):
+        PartStore(tmp_path)
+    with pytest.raises(CallError, match=r"timing\.csv: cannot be written \(is a link\)"):
+        write_tables(tmp_path, PLAN, DONE)
+    assert (tmp_path / "timing.csv").is_symlink()
+    (tmp_path / "timing.csv").unlink()
+    (tmp_path / "parts").rename(tmp_path / "real")
+    (tmp_path / "parts").symlink_to("real")
+    with pytest.raises(CallError, match="parts: is a link"):
+        PartStore(tmp_path)
 
 
 def test_a_file_is_no_folder(tmp_path: Path) -> None:
