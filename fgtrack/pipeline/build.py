@@ -101,8 +101,12 @@ def build_lifecycle(config: Config) -> Lifecycle:
 
 
 def build_road(config: MapConfig) -> Road:
-    """The map that `config` names."""
+    """The map that `config` names. Raises `CallError` for a pit lane without a track, which it belongs to."""
     if config.track is None:
+        if config.pit is not None:
+            raise CallError(
+                f"{config.pit}: a pit lane (map.pit) needs the map of its track (map.track), give --map too"
+            )
         return OpenSpace()
     track = _read_map(config.track, make_oval)
     pit = None if config.pit is None else _read_map(config.pit, make_pit_lane)
