@@ -9,7 +9,8 @@ from fgtrack.advice.advise import advise as advised
 from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, Overwrite, PitMap, Reference, Settings, TrackMap
 from fgtrack.cli.show import chosen_form, progress, say, show
 from fgtrack.core.errors import DataError
-from fgtrack.io.output import check_output
+from fgtrack.io.output import check_apart, check_output
+from fgtrack.pipeline.inputs import inputs
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.tune_file import ADVISED, write_advised
@@ -38,6 +39,8 @@ def advise(
     if out is not None:
         check_output(out, ADVISED, overwrite)
     config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
+    if out is not None:
+        check_apart(out, inputs(config, [recording], config_file=config_file))
     with progress("advise") as tell:
         advice = advised(recording, config, reference=reference, tune=tune, on_step=tell)
     show(advice.tables, form, advice.as_dict())

@@ -13,8 +13,10 @@ from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.left_out import left_out
+from fgtrack.io.output import check_apart
 from fgtrack.io.recording import check_recording, write_recording
 from fgtrack.io.source import open_input
+from fgtrack.pipeline.inputs import inputs
 from fgtrack.pipeline.load import load
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.sim.redelay import Redelayed, SensorDelays, redelay
@@ -37,10 +39,10 @@ def convert(
     """Convert a recording into a stream or a rosbag2 folder."""
     if seed is not None and delays_file is None:
         raise CallError("--seed: only --delays draws random numbers, name its file")
-    if out.resolve() in (recording.resolve(), *recording.resolve().parents):
-        raise CallError(f"{out}: is the input or holds it, choose another name")
+    config = read_config(config_file)
+    check_apart(out, inputs(config, [recording], config_file=config_file, others=[delays_file]))
     check_recording(out, overwrite)
-    source = open_input(recording, read_config(config_file).input)
+    source = open_input(recording, config.input)
     unread: dict[str, Counter[str]] = {}
     with progress("convert"):
         messages = source.messages() if delays_file is None else _redelayed(source.messages, delays_file, seed or 0)

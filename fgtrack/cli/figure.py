@@ -16,9 +16,9 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.evaluation.figures.style import DRAWN, save_pages
 from fgtrack.evaluation.plot import Planned, close_up, drawn, planned, planned_sweep, save_named
 from fgtrack.evaluation.recordings import by_recording
-from fgtrack.evaluation.runs import JudgedRun, judged, start_ns
+from fgtrack.evaluation.runs import JudgedRun, judged, run_folders, start_ns
 from fgtrack.evaluation.sweep_table import is_sweep, read_sweep
-from fgtrack.io.output import new_file, new_files
+from fgtrack.io.output import check_apart, new_file, new_files
 from fgtrack.pipeline.close_up import close_ups
 
 
@@ -43,8 +43,9 @@ def figure(
     one_file = out.suffix.lower() == ".pdf" and not out.is_dir()
     if out.suffix.lower() in (".png", ".svg") and not out.is_dir():
         raise CallError(f"{out}: one picture cannot hold all figures, name a folder or a .pdf")
+    picture = out if one_file else out / f"figure.{form}"  # what else is in the folder stays
     with progress("draw"):
-        first, plans, missing = _of_sweep(runs, track, stamp) or _of_runs(runs, track, stamp)
+        first, plans, missing = _of_sweep(runs, track, stamp) or _of_runs(runs, picture, track, stamp)
         named = chain(first, drawn(plans, every))
         if one_file:
             with new_file(out, DRAWN, overwrite) as file:
@@ -77,8 +78,9 @@ def _of_sweep(folders: Sequence[Path], track: int | None, stamp: float | None) -
     return [], planned_sweep(read_sweep(sweeps[0])), None
 
 
-def _of_runs(folders: Sequence[Path], track: int | None, stamp: float | None) -> _Figures:
+def _of_runs(folders: Sequence[Path], out: Path, track: int | None, stamp: float | None) -> _Figures:
     found = judged(folders)
+    check_apart(out, run_folders(found))
     if stamp is not None and not abs(stamp) <= LARGEST:
         raise CallError(f"--stamp {stamp}: is no time after the first tick, up to {LARGEST:g} s")
     stamp_ns = None if stamp is None else start_ns(found) + nanoseconds(stamp)

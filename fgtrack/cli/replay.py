@@ -13,10 +13,12 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.evaluation.cautions import cautions, noise_cautions, unused
 from fgtrack.evaluation.left_out import left_out
+from fgtrack.io.output import check_apart
 from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
 from fgtrack.io.span import end_ns
 from fgtrack.pipeline.effective import effective, told_std
+from fgtrack.pipeline.inputs import inputs
 from fgtrack.pipeline.replay import located, replay_each
 from fgtrack.pipeline.shipped import read_config
 
@@ -49,12 +51,15 @@ def replay(
     for name in names:
         if names.count(name) > 1:
             raise CallError(f"estimator {name!r} is named twice")
+    folders = {name: out / name for name in names} if len(names) > 1 else {names[0]: out}
+    for folder in folders.values():
+        check_apart(folder, inputs(config, [recording], config_file=config_file))
     source = open_input(recording, config.input)
     with progress("replay") as tell:
         results = replay_each(
             source.messages,
             config,
-            {name: out / name for name in names} if len(names) > 1 else {names[0]: out},
+            folders,
             origin=str(recording),
             kind=source.kind,
             on_tick=TickProgress(tell, lambda: end_ns(source), len(names)),

@@ -15,8 +15,8 @@ from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.plot import named_figures
 from fgtrack.evaluation.report.page import page
-from fgtrack.evaluation.runs import JudgedRun, judged
-from fgtrack.io.output import Kind, check_output, new_file
+from fgtrack.evaluation.runs import JudgedRun, judged, run_folders
+from fgtrack.io.output import Kind, check_apart, check_output, new_file
 
 _SUFFIXES = (".html", ".htm")
 _MARK = b'<meta name="generator" content="fgtrack '
@@ -40,6 +40,7 @@ def report(
         raise CallError(f"{out}: a report is one HTML file, end the name with .html")
     check_output(out, REPORT, overwrite)
     every = judged(runs)
+    check_apart(out, run_folders(every))
     with progress("report"):
         close_up, missing = drawn_close_up(every)
         notes = [] if missing is None else [f"no close-up: {missing}"]

@@ -9,8 +9,10 @@ import typer
 from fgtrack.cli.arguments import Overwrite, StorageOption
 from fgtrack.cli.completion import scenarios
 from fgtrack.cli.show import progress, say, told
+from fgtrack.io.output import check_apart
 from fgtrack.io.recording import check_recording, write_recording
-from fgtrack.pipeline.shipped import read_scenario
+from fgtrack.pipeline.inputs import inputs
+from fgtrack.pipeline.shipped import find_file, read_scenario
 from fgtrack.sim.simulate import simulate as simulated
 
 
@@ -32,8 +34,9 @@ def simulate(
     overwrite: Overwrite = False,
 ) -> None:
     """Simulate a scenario into a stream or a rosbag2 folder."""
-    check_recording(out, overwrite)
     scenario = read_scenario(scenario_file, duration_s=duration_s)
+    check_apart(out, inputs(scenario=scenario, others=[find_file("scenario", scenario_file)]))
+    check_recording(out, overwrite)
     with progress("simulate") as tell:
         messages = simulated(scenario, np.random.default_rng(seed))
         count = write_recording(out, told(messages, tell), storage, overwrite=overwrite)

@@ -16,7 +16,7 @@ from fgtrack.core.errors import CallError, one_line
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.over_seeds import seed_contests, shown_tables, summary_table, to_csv
 from fgtrack.evaluation.sweep_table import SweepTable, read_sweep
-from fgtrack.io.output import write_file
+from fgtrack.io.output import check_apart, write_file
 from fgtrack.io.run import Run
 from fgtrack.pipeline.shipped import find_file
 from fgtrack.pipeline.sweep import Scores, Sweep
@@ -24,6 +24,7 @@ from fgtrack.pipeline.sweep_plan import load_plan
 from fgtrack.pipeline.sweep_store import (
     ERROR_TABLE,
     PAIRED_TABLE,
+    PRODUCTS,
     SUMMARY_TABLE,
     SWEEP_TABLE,
     Cell,
@@ -72,7 +73,10 @@ def sweep(
     if jobs is not None and dask is not None:
         raise CallError("--jobs, --dask: the cluster has its own number of workers, give one of them")
     sweep_file = find_file("sweep", sweep_name)
-    work = Sweep.open(load_plan(sweep_file, recording, settings or ()), out, overwrite)
+    plan = load_plan(sweep_file, recording, settings or ())
+    for name in PRODUCTS:  # what else is in the folder stays
+        check_apart(out / name, plan.inputs)
+    work = Sweep.open(plan, out, overwrite)
     left = len(work.todo)
     tell(f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {left}")
     if work.num_unused:

@@ -19,9 +19,10 @@ from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.consistency import position_nees
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
-from fgtrack.io.output import check_output
+from fgtrack.io.output import check_apart, check_output
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
+from fgtrack.pipeline.inputs import inputs
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.tune import tuned
 from fgtrack.pipeline.tune_file import TUNED, write_tuned
@@ -53,6 +54,7 @@ def tune(
     form = chosen_form(as_json, form)
     check_output(out, TUNED, overwrite)
     config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
+    check_apart(out, inputs(config, recordings, config_file=config_file))
     sources = {str(path): open_input(path, config.input).messages for path in recordings}
     with progress("tune") as tell:
         report = tuned(sources, config, TuneRules(keep=tuple(keep or ())), tell)

@@ -21,7 +21,7 @@ from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.viewer.placement import update_rows
 from fgtrack.io.adapters.kitti import CLASS_NAMES, is_sequence, view_of_sequence
 from fgtrack.io.adapters.kitti_view import PERIOD_NS, Box, View
-from fgtrack.io.output import Kind, new_file
+from fgtrack.io.output import Kind, check_apart, new_file
 from fgtrack.io.run import NO_TRACK, Run, evaluation_config
 
 __all__ = ["RESULT", "KittiResult", "write_kitti_result"]
@@ -74,12 +74,13 @@ def write_kitti_result(run: Run, sequence: Path, out: Path, *, overwrite: bool =
     Raises
     ------
     CallError
-        `sequence` is none, or something is at `out`.
+        `sequence` is none, something is at `out`, or it lies in an input.
     DataError
         A file of the sequence is damaged, or no detection of the run says how large its object is.
     """
     if not is_sequence(sequence):
         raise CallError(f"{sequence}: is no sequence of the KITTI data set, name its oxts/NNNN.txt")
+    check_apart(out, [sequence, *(() if run.path is None else (run.path,))])
     views = view_of_sequence(sequence)
     lines, tracks, without = _lines(run, views)
     if not lines and without:

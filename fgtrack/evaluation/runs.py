@@ -83,6 +83,11 @@ def judged(runs: Runs) -> list[JudgedRun]:
     return [JudgedRun(label, run) for label, run in labelled(read).items()]
 
 
+def run_folders(runs: Iterable[JudgedRun]) -> list[Path]:
+    """The folders of `runs`, of those that have one."""
+    return [one.run.path for one in runs if one.run.path is not None]
+
+
 def one_judged(run: OneRun) -> JudgedRun:
     """The one run that `run` stands for.
 

@@ -16,9 +16,10 @@ from fgtrack.core.errors import CallError
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.inputs import fingerprints, inputs
 from fgtrack.pipeline.load import key_and_value, load, plain, read_yaml, validate
 from fgtrack.pipeline.replay import versions
-from fgtrack.pipeline.shipped import read_config, read_scenario
+from fgtrack.pipeline.shipped import find_file, read_config, read_scenario
 from fgtrack.sim.redelay import SensorDelays
 from fgtrack.sim.scenario import Scenario
 
@@ -276,6 +277,8 @@ class Plan:
     jobs: tuple[Job, ...]
     estimators: tuple[str, ...]
     metrics: tuple[str, ...]
+    inputs: tuple[Path, ...] = ()
+    """Files and folders that it was made of, and that its jobs read."""
 
 
 def load_plan(path: Path, recording: Path | None = None, settings: Sequence[str] = ()) -> Plan:
@@ -307,7 +310,7 @@ def load_plan(path: Path, recording: Path | None = None, settings: Sequence[str]
     if all(job.recipe is None for job in jobs):
         raise CallError(f"{path}: {jobs[0].problem}")
     columns = tuple(column for axis in sweep.axes() for column in axis.columns)
-    return Plan(columns, jobs, sweep.estimators, sweep.metrics)
+    return Plan(columns, jobs, sweep.estimators, sweep.metrics, (path, *_inputs(sweep, base, path)))
 
 
 def _base(sweep: SweepConfig, path: Path) -> dict[str, Value]:
@@ -323,21 +326,31 @@ def _base(sweep: SweepConfig, path: Path) -> dict[str, Value]:
     return base
 
 
+def _inputs(sweep: SweepConfig, base: Mapping[str, Value], path: Path) -> list[Path]:
+    """What the sweep file names, and what is named there; a value of an axis may name more."""
+    folder = path.parent
+    others = [] if sweep.delays is None else [folder / sweep.delays]
+    others += [] if sweep.scenario is None else [find_file("scenario", sweep.scenario, folder)]
+    others += [] if sweep.config is None else [find_file("configuration", sweep.config, folder)]
+    config = validate(Config, base[CONFIG], "configuration")
+    return inputs(config, [] if sweep.input is None else [folder / sweep.input], others=others)
+
+
 def _jobs(sweep: SweepConfig, base: Mapping[str, Value], point: Point, recording: Path | None) -> Iterator[Job]:
     """The jobs of one grid point, one for each seed."""
     try:
         values = _with_keys(base, point.changes, "vary")
-        config = plain(validate(Config, values[CONFIG], "configuration"))
-        delays = plain(validate(dict[str, SensorDelays], values[DELAYS], DELAYS))
-        scenario = plain(validate(Scenario, values[SCENARIO], SCENARIO)) if SCENARIO in values else None
+        config = validate(Config, values[CONFIG], "configuration")
+        delays = validate(dict[str, SensorDelays], values[DELAYS], DELAYS)
+        scenario = validate(Scenario, values[SCENARIO], SCENARIO) if SCENARIO in values else None
     except CallError as error:
         problem = f"{point.description}: {error}" if point.description else str(error)
         yield from (Job(point.cells, seed, "", None, problem) for seed in sweep.seeds)
         return
-    files = _fingerprints(recording, scenario, config)
+    files = fingerprints(recording, scenario, config)
     for seed in sweep.seeds:
         name = None if recording is None else str(recording)
-        recipe = Recipe(scenario, name, delays, config, seed, sweep.estimators)
+        recipe = Recipe(plain(scenario), name, plain(delays), plain(config), seed, sweep.estimators)
         yield Job(point.cells, seed, job_key(recipe, files), recipe)
 
 
@@ -345,29 +358,6 @@ def job_key(recipe: Recipe, files: Sequence[Value]) -> str:
     """Hash of what decides the cells of a job, in hex; `files` are the fingerprints of what it reads."""
     content = {**plain(recipe), "recording": None, "files": files, "versions": versions()}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
-
-
-def _fingerprints(recording: Path | None, scenario: Value, config: Value) -> list[Value]:
-    """Size and time of change of every file that a job reads, where it is there.
-
-    The recording and what is named beside it, maps, exclusion areas, ticks, message definitions.
-    """
-    names = [recording, None if scenario is None else scenario["map"]]
-    names += [config["map"]["track"], config["map"]["pit"], config["clock"]["ticks_file"]]
-    names += [*config["map"]["excluded"], *config["input"]["message_definitions"]]
-    if recording is not None and recording.is_file():
-        tables = config["input"]["csv"]
-        beside = [tables["ego"], tables["truth"], *tables["detections"].values()]
-        names += [recording.parent / one["file"] for one in beside if one and one["file"]]
-    found: list[Value] = []
-    for place, name in enumerate(names):
-        top = None if name is None else Path(name)
-        if top is None or not top.exists():
-            continue
-        for file in [top] if top.is_file() else sorted(item for item in top.rglob("*") if item.is_file()):
-            stat = file.stat()
-            found.append([place, str(file.relative_to(top)), stat.st_size, stat.st_mtime_ns])
-    return found
 
 
 def _with_keys(base: Mapping[str, Value], changes: Mapping[str, Value], where: str) -> dict[str, Value]:

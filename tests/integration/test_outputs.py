@@ -29,16 +29,19 @@ from fgtrack.io.run import RunWriter, digest, load_run
 from fgtrack.io.run.schema import COLUMNS
 from fgtrack.io.source import open_input
 from fgtrack.io.stream import STREAM, read_stream, write_stream
+from fgtrack.models.oval import make_oval
 from fgtrack.pipeline.close_up import close_up_of
 from fgtrack.pipeline.load import dump
 from fgtrack.pipeline.replay import replay_each
-from fgtrack.pipeline.shipped import read_scenario
+from fgtrack.pipeline.shipped import read_scenario, shipped_folder
 from fgtrack.pipeline.sweep_plan import load_plan
 from fgtrack.tracking.close_up import Arrival
 
 MS = 1_000_000
 START_NS = 1_600_000_000_000_000_000
 SWEEP = "format: fgtrack-sweep/1\nscenario: default\nestimators: [ekf-replay]\nseeds: 1\n"
+
+SCENARIOS = shipped_folder() / "scenarios"
 
 Call = Callable[..., tuple[int, str]]
 
@@ -410,14 +413,89 @@ def test_a_sweep_does_not_share_its_folder(here: Path, call: Call) -> None:
         assert "another command is writing there" in call("sweep", "sweep.yaml", "-o", "swept")[1]
 
 
-def test_the_input_of_a_conversion_is_never_its_output(here: Path, call: Call) -> None:
+#: Commands whose output is an input, holds one or lies in one, and which.
+TANGLED = [
+    (("convert", "drive.jsonl", "./drive.jsonl"), "drive.jsonl"),
+    (("convert", "drive.jsonl", "same"), "drive.jsonl"),
+    (("convert", "bag", "bag"), "bag"),
+    (("convert", "bag/bag.mcap", "bag"), "bag/bag.mcap"),
+    (("convert", "bag", "bag/new.jsonl"), "bag"),
+    (("convert", "drive.jsonl", "other.jsonl", "--delays", "other.jsonl"), "other.jsonl"),
+    (("simulate", "more/scenario.yaml", "-o", "more"), "more/scenario.yaml"),
+    (("simulate", "more/scenario.yaml", "-o", "more/scenario.yaml"), "more/scenario.yaml"),
+    (("replay", "run/drive.jsonl", "-o", "run"), "run/drive.jsonl"),
+    (("replay", "drive.jsonl", "-c", "run/config.yaml", "-o", "run"), "run/config.yaml"),
+    (("replay", "bag", "-o", "bag/run"), "bag"),
+    (("replay", "drive.jsonl", "--map", "run/map.csv", "-o", "run"), "run/map.csv"),
+    (("replay", "drive.jsonl", "-e", "ekf-replay,smoother", "-o", "bag", "-c", "bag/smoother/x.yaml"), "bag/smoother"),
+    (("replay", "tables/lidar.csv", "-c", "tables.yaml", "-o", "run"), "run/ego.csv"),
+    (("figure", "run", "-o", "run"), "run"),
+    (("figure", "run", "-o", "run/figures"), "run"),
+    (("figure", "run", "-o", "run/figures.pdf"), "run"),
+    (("report", "run", "-o", "run/report.html"), "run"),
+    (("report", "demo/runs", "-o", "demo/runs/smoother/report.html"), "demo/runs/smoother"),
+    (("export", "run", "-o", "run/run.mcap"), "run"),
+    (("export", "run", "-o", "run/ros2", "--ros2"), "run"),
+    (("export", "kitti_run", "-o", "kitti/oxts/0001.txt", "--kitti", "kitti/oxts/0001.txt"), "kitti/oxts/0001.txt"),
+    (("export", "kitti_run", "-o", "kitti_run/0001.txt", "--kitti", "kitti/oxts/0001.txt"), "kitti_run"),
+    (("tune", "noisy.jsonl", "bag", "-o", "bag/tuned.yaml"), "bag"),
+    (("tune", "noisy.jsonl", "-c", "tuned.yaml", "-o", "tuned.yaml"), "tuned.yaml"),
+    (("advise", "bag", "-o", "bag/advised.yaml"), "bag"),
+    (("advise", "drive.jsonl", "-c", "advised.yaml", "-o", "advised.yaml"), "advised.yaml"),
+    (("sweep", "sweep.yaml", "--input", "bag", "-o", "bag"), "bag"),
+    (("sweep", "sweep.yaml", "--input", "bag", "-o", "bag/swept"), "bag"),
+    (("sweep", "swept/parts/sweep.yaml", "-o", "swept"), "swept/parts/sweep.yaml"),
+]
+
+
+@pytest.mark.parametrize(("words", "which"), TANGLED, ids=str)
+def test_an_input_is_never_the_output(here: Path, call: Call, words: tuple[str, ...], which: str) -> None:
     Path("same").symlink_to("drive.jsonl")
+    for folder in ("more", "swept/parts", "bag/smoother", "tables"):
+        Path(folder).mkdir(parents=True)
+    shutil.copy(SCENARIOS / "single_opponent.yaml", "more/scenario.yaml")
+    shutil.copy("drive.jsonl", "run/drive.jsonl")
+    shutil.copy("sweep.yaml", "swept/parts/sweep.yaml")
+    Path("bag/smoother/x.yaml").write_text("")
+    make_oval().write(Path("run/map.csv"))
+    Path("tables/lidar.csv").write_text("t,x,y\n1,2,3\n")
+    columns = {"stamp_ns": "t", "x_m": "x", "y_m": "y"}
+    csv = {"detections": {"lidar": {"columns": columns}}, "ego": {"file": "../run/ego.csv", "columns": columns}}
+    Path("tables.yaml").write_text(json.dumps({"input": {"csv": csv}}))
+    if which.startswith("bag/smoother"):
+        shutil.rmtree("demo")
+    elif words[0] != "sweep" and "bag" in words:
+        shutil.rmtree("bag/smoother")  # which belongs to no recording
     before = content(here)
-    (storage,) = (str(file) for file in Path("bag").glob("*.mcap"))
-    for recording, out in [("drive.jsonl", "./drive.jsonl"), ("drive.jsonl", "same"), ("bag", "bag"), (storage, "bag")]:
-        code, error = call("convert", recording, out, "--overwrite")
+    code, error = call(*words, *(() if words[0] == "sweep" else ("--overwrite",)))
+    assert code == 2
+    assert "is the input or holds it" in error or "lies in the input" in error
+    assert which in error
+    assert content(here) == before
+
+
+def test_every_command_with_an_input_and_an_output_is_in_that_table() -> None:
+    without = {"demo"}  # reads what it has written
+    assert {words[0] for words, _ in TANGLED} == {words[0] for words, _ in (*WRITERS, *ONGOING)} - without
+
+
+def test_a_folder_of_runs_may_hold_what_is_made_of_them(here: Path, call: Call) -> None:
+    """What else is in a shared folder stays, so pictures and tables may lie beside what they are made of."""
+    assert call("report", "demo/runs", "-o", "demo/runs/report.html")[0] == 0
+    assert call("figure", "run", "-o", ".")[0] == 0
+    Path("swept").mkdir()
+    shutil.copy("sweep.yaml", "swept")
+    assert call("sweep", "swept/sweep.yaml", "--input", "drive.jsonl", "-o", "swept", "--jobs", "1")[0] == 0
+
+
+@pytest.mark.parametrize("command", ["replay", "tune", "advise"])
+def test_a_pit_lane_without_a_track_is_a_bad_call(here: Path, call: Call, command: str) -> None:
+    out = {"replay": "new", "tune": "new.yaml", "advise": "new.yaml"}[command]
+    before = content(here)
+    for pit in ("nope.csv", "oval"):
+        code, error = call(command, "noisy.jsonl", "--pit-map", pit, "-o", out)
         assert code == 2
-        assert "is the input or holds it" in error
+        assert f"{pit}: a pit lane (map.pit) needs the map of its track" in error
     assert content(here) == before
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fgtrack.core.errors import CallError, printable
 from fgtrack.evaluation.recordings import same_recording
-from fgtrack.evaluation.runs import Runs, judged
+from fgtrack.evaluation.runs import Runs, judged, run_folders
 from fgtrack.evaluation.viewer.detection_messages import detection_messages, outcome_messages
 from fgtrack.evaluation.viewer.look import Look, palette
 from fgtrack.evaluation.viewer.surroundings import (
@@ -20,6 +20,7 @@ from fgtrack.evaluation.viewer.surroundings import (
     truth_messages,
 )
 from fgtrack.evaluation.viewer.track_messages import past_messages, smoothed_messages, track_messages
+from fgtrack.io.output import check_apart
 from fgtrack.io.ros.viewer_bag import check_viewer_bag, write_viewer_bag
 from fgtrack.io.run import Run
 from fgtrack.io.viewer.foxglove import check_foxglove, write_foxglove
@@ -46,13 +47,15 @@ def export(runs: Runs, out: Path, *, ros2: bool = False, overwrite: bool = False
     Raises
     ------
     CallError
-        The runs are not of the same recording, the package `mcap` is missing, `out` does not end in `.mcap`, or
-        something is there.
+        The runs are not of the same recording, the package `mcap` is missing, `out` does not end in `.mcap`, lies in
+        a run, or something is there.
     DataError
         A run or its map is damaged, or a time does not fit into the file.
     """
     (check_viewer_bag if ros2 else check_foxglove)(out, overwrite)
-    named = {one.label: one.run for one in judged(runs)}
+    every = judged(runs)
+    check_apart(out, run_folders(every))
+    named = {one.label: one.run for one in every}
     messages, notes = viewer_messages(named)
     if ros2:
         counts = write_viewer_bag(out, messages, overwrite=overwrite)
