@@ -13,17 +13,24 @@ from fgtrack.cli.arguments import Overwrite, Runs
 from fgtrack.cli.figure import drawn_close_up
 from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError
+from fgtrack.core.files import read_head
 from fgtrack.evaluation.plot import named_figures
 from fgtrack.evaluation.report.page import page
 from fgtrack.evaluation.runs import JudgedRun, judged, run_folders
 from fgtrack.io.output import Kind, check_apart, check_output, new_file
 
 _SUFFIXES = (".html", ".htm")
-_MARK = b'<meta name="generator" content="fgtrack '
+_START, _MARK = b"<!DOCTYPE html>", b'<meta name="generator" content="fgtrack '
 _HEAD = 1000
 _MEGABYTE = 1e6
 
-REPORT = Kind("a report of fgtrack", lambda path: path.is_file() and _MARK in path.read_bytes()[:_HEAD])
+
+def _is_report(path: Path) -> bool:
+    head = read_head(path, _HEAD)
+    return head.startswith(_START) and _MARK in head
+
+
+REPORT = Kind("a report of fgtrack", _is_report)
 
 
 def report(

@@ -8,6 +8,7 @@ sees it, cut at the borders.
 """
 
 import math
+import re
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.files import read_head
 from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.time import seconds
 from fgtrack.evaluation.matching import confirmed
@@ -26,7 +28,9 @@ from fgtrack.io.run import NO_TRACK, Run, evaluation_config
 
 __all__ = ["RESULT", "KittiResult", "write_kitti_result"]
 
-_FIELDS = 18
+#: As `_line` writes it: frame, track, type, not told how truncated and occluded, thirteen numbers.
+_LINE = re.compile(rb"\d+ \d+ .+ -1 -1( -?\d+\.\d{6}){13}")
+_LONGEST_LINE = 1000
 
 
 @dataclass(frozen=True)
@@ -94,11 +98,9 @@ def write_kitti_result(run: Run, sequence: Path, out: Path, *, overwrite: bool =
 
 
 def _is_result(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        first = file.readline(1000).split()
-    return not first or (len(first) == _FIELDS and first[0].isdigit())
+    first, end, _ = read_head(path, _LONGEST_LINE).partition(b"\n")
+    is_empty = path.is_file() and path.stat().st_size == 0  # of a run that saw nothing
+    return is_empty or (bool(end) and _LINE.fullmatch(first) is not None)
 
 
 RESULT = Kind("a result file of the KITTI data set", _is_result)

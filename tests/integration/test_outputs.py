@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from support import kitti
 from support.paper import paper
 
@@ -22,6 +24,7 @@ from fgtrack.cli import demo
 from fgtrack.cli.main import COMMANDS, _command, run
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TickReport
+from fgtrack.evaluation.figures.style import DRAWN, save
 from fgtrack.io import output
 from fgtrack.io.output import claimed, new_file, write_file
 from fgtrack.io.ros.bag_writer import write_bag
@@ -311,6 +314,56 @@ def test_a_disk_that_is_full_when_a_run_begins_leaves_the_old_run_whole(
     with RunWriter("run", overwrite=True) as writer, pytest.raises(DataError, match="free some space"):
         writer.write_tick(TickReport(0, 1, (), ()), 1, 0)
     assert content(here) == before
+
+
+#: Files of somebody that hold the words by which an output is known, but not where that has them.
+LOOKALIKES = {
+    "figures.pdf": [b"notes on fgtrack figure\n", b"%PDF-1.7\n(fgtrack figure)\nstartxref\n9\n%%EOF\n", b"%PDF-1.7"],
+    "figures/arrivals.png": [b"fgtrack figure", b"\x89PNG\r\n\x1a\n tEXtComment\0fgtrack figure"],
+    "report.html": [b'see <meta name="generator" content="fgtrack 1">', b"<!DOCTYPE html>" + b" " * 2000 + b"fgtrack "],
+    "ros2.mcap": [b"fgtrack export", b"\x89MCAP0\r\n made_by: fgtrack export"],
+    "run.mcap": [b"\x89MCAP0\r\n fgtrack"],
+    "0001.txt": [
+        b"\nmy notes\n",
+        b"0 0 Car 0 0 -1.570000 1 1 1 1 1 1 1 1 1 1 1 1\n",
+        b"0 1 Car -1 -1 0.1 1.0 1.0 1.0 1.0 1.0 1.0 1.0 1.0 1.0 1.0 1.0 1.0\n",
+        b"0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17\n",
+    ],
+}
+
+
+@pytest.mark.parametrize(("words", "place"), [one for one in WRITERS if one[1] in LOOKALIKES], ids=str)
+def test_an_output_is_known_by_its_form_not_by_a_word_in_it(
+    here: Path, call: Call, words: tuple[str, ...], place: str
+) -> None:
+    for text in LOOKALIKES[place]:
+        Path(place).write_bytes(text)
+        before = content(here)
+        assert call(*words, "--overwrite")[0] == 2, text
+        assert content(here) == before
+
+
+@pytest.mark.parametrize(("words", "place"), [one for one in WRITERS if one[1] in LOOKALIKES], ids=str)
+def test_a_large_file_in_place_of_an_output_is_not_read(
+    here: Path, call: Call, words: tuple[str, ...], place: str
+) -> None:
+    Path(place).unlink()
+    with Path(place).open("wb") as file:
+        file.write(OTHERS.get(Path(place).suffix, b"0 "))
+        file.truncate(100_000_000)
+    tracemalloc.start()
+    try:
+        assert call(*words)[0] == 2
+        assert tracemalloc.get_traced_memory()[1] < 50_000_000
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("form", ["png", "svg", "pdf"])
+def test_figures_of_every_form_are_known_again(tmp_path: Path, form: str) -> None:
+    figure = Figure()
+    figure.subplots().plot([0.0, 1.0])
+    assert DRAWN.recognises(save(figure, tmp_path / f"x.{form}"))
 
 
 def test_what_was_private_stays_private(here: Path, call: Call) -> None:

@@ -3,6 +3,8 @@
 import base64
 import io
 import math
+import os
+import re
 import textwrap
 import warnings
 from collections.abc import Callable, Iterable, Mapping
@@ -21,6 +23,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from PIL import Image
 
 from fgtrack.core.errors import CallError, printable_lines
+from fgtrack.core.files import open_file, read_head
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.palette import PALETTE as PALETTE
 from fgtrack.io.output import Kind
@@ -73,8 +76,33 @@ FORMATS: Mapping[str, Mapping[str, str | None]] = {
 }
 
 
+#: How the files begin, with the place where that stands.
+_BEGINNINGS = (
+    rb"\x89PNG\r\n\x1a\n.{0,500}?tEXtCreator\0%b" % _MARK.encode(),
+    rb"<\?xml .{0,1500}?<dc:creator>\s*<cc:Agent>\s*<dc:title>%b</dc:title>" % _MARK.encode(),
+)
+_HEAD = 3000
+_PDF_END = re.compile(rb"startxref\s+(\d+)\s+%%EOF\s*$")
+_PDF_INFO = b"<< /Creator (%b) >>\nendobj\n" % _MARK.encode()  # before the table that the end points to
+
+
 def _is_drawn(path: Path) -> bool:
-    return path.is_file() and _MARK.encode() in path.read_bytes()
+    head = read_head(path, _HEAD)
+    if head.startswith(b"%PDF-"):
+        return _is_drawn_pdf(path)
+    return any(re.match(beginning, head, re.DOTALL) for beginning in _BEGINNINGS)
+
+
+def _is_drawn_pdf(path: Path) -> bool:
+    with open_file(path) as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - _HEAD))
+        end = _PDF_END.search(file.read())
+        place = -1 if end is None else int(end[1]) - len(_PDF_INFO)
+        if not 0 <= place < size:
+            return False
+        file.seek(place)
+        return file.read(len(_PDF_INFO)) == _PDF_INFO
 
 
 #: A picture, or a PDF of several.

@@ -1,6 +1,7 @@
 """Writes what shows a run as a rosbag2 recording of standard messages, for RViz and whatever reads ROS."""
 
 import mmap
+import re
 import shutil
 import tempfile
 from collections import Counter
@@ -11,16 +12,23 @@ from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLi
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from fgtrack.core.errors import DataError, FgtrackError
+from fgtrack.core.files import read_head
 from fgtrack.io.adapters.common import RosMessage
 from fgtrack.io.output import Kind, check_output, new_file, new_folder, write_error
 from fgtrack.io.ros.bag_files import METADATA
 from fgtrack.io.ros.bag_writer import RECORDING
+from fgtrack.io.ros.mcap_file import MCAP_MAGIC
 from fgtrack.io.ros.typestore import one_line
 from fgtrack.io.ros.viewer_messages import ViewerMessageFactory
 from fgtrack.io.viewer.scene import EgoMotion, Facts, Objects, Scene, ViewerMessage
 
 _INT64_LIMIT = 1 << 63
-_MARK = ("made_by", "fgtrack export")  # stands in the metadata of the recording
+_MARK = ("made_by", "fgtrack export")  # stands in the metadata of the recording, which its file repeats
+_MARKED = rb"^ *custom_data:\n +%b: %b$" % (_MARK[0].encode(), _MARK[1].encode())
+_MARKED_FOLDER = re.compile(_MARKED, re.MULTILINE)
+_MARKED_FILE = re.compile(
+    rb"\x07\0\0\0rosbag2.{4}\x13\0\0\0serialized_metadata.{4}[^\0]{0,500}?" + _MARKED, re.DOTALL | re.MULTILINE
+)
 _FOREVER = QosTime(0, 0)
 
 
@@ -39,14 +47,14 @@ def _reliable(durability: QosDurability) -> Qos:
 
 
 def _is_export_folder(path: Path) -> bool:
-    return RECORDING.recognises(path) and _MARK[1].encode() in (path / METADATA).read_bytes()
+    return RECORDING.recognises(path) and bool(_MARKED_FOLDER.search((path / METADATA).read_bytes()))
 
 
 def _is_export_file(path: Path) -> bool:
-    if not path.is_file() or not path.stat().st_size:
+    if read_head(path, len(MCAP_MAGIC)) != MCAP_MAGIC:
         return False
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        return content.find(_MARK[1].encode()) >= 0
+        return _MARKED_FILE.search(content) is not None
 
 
 _FOLDER = Kind("a rosbag2 folder of `fgtrack export`", _is_export_folder)
