@@ -294,7 +294,7 @@ def foreign_folder(path: Path) -> None:
         ),
         (("simulate", "default", "-o", "x.jsonl", "--seed", "-1"), "--seed"),
         (("simulate", "default", "-o", "x", "--storage", "tape"), "--storage"),
-        (("replay", "drive.jsonl", "-o", "drive.jsonl"), "drive.jsonl: cannot be made a folder"),
+        (("replay", "drive.jsonl", "-o", "drive.jsonl"), "drive.jsonl: is the input or holds it"),
         (("replay", "drive.jsonl", "-o", "foreign"), "foreign: exists and is not a run folder"),
         (("replay", "drive.jsonl", "-o", "run", "-e", "magic"), "estimator 'magic' is unknown"),
         (("replay", "drive.jsonl", "-o", "run", "-e", ""), "estimator '' is unknown"),
