@@ -24,7 +24,7 @@ from fgtrack.pipeline import verify_streams as streams
 from fgtrack.pipeline.nasty_streams import gathered
 from fgtrack.pipeline.oracle.estimates import Estimate
 from fgtrack.pipeline.oracle.posterior import most_probable
-from fgtrack.pipeline.verify_models import MODEL_TOLERANCE, model_differences
+from fgtrack.pipeline.verify_models import MODEL_TOLERANCE, largest, model_differences
 from fgtrack.pipeline.verify_streams import Stream
 
 ORDER_TOLERANCE = 1e-9
@@ -190,7 +190,7 @@ def _reaches(subject: Subject, stream: Stream) -> bool:
 def _dense_joint_itself(stream: Stream) -> Check:
     probes_ns = [*stream.probes_ns(), stream.newest_ns, stream.newest_ns + NS_PER_S // 10]
     joint = dense_joint(stream.motion, stream.prior, stream.measurements, probes_ns)
-    apart = _largest(difference(joint[at], TrackState(at, *stream.solution.state_at(at))) for at in probes_ns)
+    apart = largest(difference(joint[at], TrackState(at, *stream.solution.state_at(at))) for at in probes_ns)
     return Check(stream.name, "(dense joint)", "-", "SciPy", *apart, 0, ORACLE_TOLERANCE)
 
 
@@ -204,7 +204,7 @@ def _against_dense_joint(
     """
     motion, prior = stream.motion, stream.prior
     running = {name: subject.start(stream) for name, subject in subjects.items()}
-    largest = dict.fromkeys(subjects, Difference(0.0, 0.0))
+    states = dict.fromkeys(subjects, Difference(0.0, 0.0))
     refused = dict.fromkeys(subjects, 0)
     innovations = dict.fromkeys(subjects, Difference(0.0, 0.0))
     arrived: list[Measurement] = []
@@ -219,17 +219,17 @@ def _against_dense_joint(
             refused[name] += result.status in _NOT_FUSED
             if sampled:
                 apart = innovation_difference(result, measurement, before[measurement.stamp_ns])
-                innovations[name] = _largest([innovations[name], apart])
+                innovations[name] = largest([innovations[name], apart])
         if len(arrived) in moments:
             newest_ns = max(m.stamp_ns for m in arrived)
             joint = dense_joint(motion, prior, arrived, [newest_ns, newest_ns + NS_PER_S // 10])
             for name, estimator in running.items():
                 expected = _held_back(stream, subjects[name], arrived, newest_ns) or joint
-                largest[name] = _largest([largest[name], *_differences(estimator, expected)])
+                states[name] = largest([states[name], *_differences(estimator, expected)])
     smoothed = dense_joint(motion, prior, arrived, stream.probes_ns())
     for name, estimator in running.items():
         if subjects[name].claims.smooths:
-            largest[name] = _largest([largest[name], *_differences(estimator, smoothed)])
+            states[name] = largest([states[name], *_differences(estimator, smoothed)])
     stamps_ns = [prior.stamp_ns, *(m.stamp_ns for m in stream.measurements)]
     tolerances = {
         name: max(subject.claims.tolerance, subject.claims.rounding * rounding_bound(motion, stamps_ns))
@@ -241,7 +241,7 @@ def _against_dense_joint(
         for name, tolerance in tolerances.items()
         if order == "time" or subjects[name].claims.smooths or subjects[name].claims.retrodicts
     }
-    parts = ("dense joint", largest, tolerances), ("innovations", innovations, told)
+    parts = ("dense joint", states, tolerances), ("innovations", innovations, told)
     return [
         Check(stream.name, name, order, against, *found[name], refused[name], allowed.get(name))
         for name in subjects
@@ -271,7 +271,7 @@ def _nonlinear(stream: Stream, name: str, subject: Subject, converged: float | N
 
     for order, run in runs.items():
         if order != "time" and (subject.claims.nonlinear != "never" or not subject.claims.is_exact):
-            apart = _largest(
+            apart = largest(
                 difference(run.states[at], state, stream.motion) for at, state in runs["time"].states.items()
             )
             add(order, "order of stamps", apart, ORDER_TOLERANCE if at_once else converged or math.inf)
@@ -310,7 +310,7 @@ def _oracle(stream: Stream, subject: Subject) -> _Oracle | None:
 def _from_oracle(states: Mapping[int, TrackState], oracle: _Oracle, motion: MotionModel) -> Difference:
     """Largest difference at the stamps at which the oracle has a state."""
     expected = {at: estimate for at in states if (estimate := oracle(at)) is not None}
-    return _largest(difference(states[at], TrackState(at, *one), motion) for at, one in expected.items())
+    return largest(difference(states[at], TrackState(at, *one), motion) for at, one in expected.items())
 
 
 @dataclass(frozen=True)
@@ -339,12 +339,6 @@ class _Run:
 
 def _differences(estimator: Estimator, expected: Mapping[int, TrackState]) -> list[Difference]:
     return [difference(estimator.state_at(at), state) for at, state in expected.items()]
-
-
-def _largest(differences: Iterable[Difference]) -> Difference:
-    """The largest of each; a NaN wins."""
-    means, covariances = np.array(list(differences)).T
-    return Difference(float(means.max()), float(covariances.max()))
 
 
 def _finite(value: object) -> object:

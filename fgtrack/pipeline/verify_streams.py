@@ -16,7 +16,8 @@ from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.road import OpenSpace
 from fgtrack.models.sensors import Mount, RobustLoss, SensorModel
 from fgtrack.pipeline.oracle.dynamics import Dynamics
-from fgtrack.pipeline.oracle.estimates import Estimate, Problem, Solution, filtered, kinematic_start, smoothed
+from fgtrack.pipeline.oracle.estimates import Estimate, Problem, Solution, filtered, smoothed
+from fgtrack.pipeline.oracle.kinematics import kinematic_start
 from fgtrack.pipeline.oracle.sightings import Eye, Sighting, Vehicle, mounted, seen
 from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY
 from fgtrack.tracking.ego import EgoTrajectory

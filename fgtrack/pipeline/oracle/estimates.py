@@ -1,6 +1,6 @@
 """Estimates of one object: least squares over the states at all stamps, and the extended Kalman filter."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -160,20 +160,3 @@ def _whitening(covariance: FloatArray) -> FloatArray:
     return np.asarray(
         linalg.solve_triangular(linalg.cholesky(covariance, lower=True), np.eye(len(covariance)), lower=True)
     )
-
-
-def kinematic_start(names: tuple[str, ...], values: Sequence[float], std: Sequence[float]) -> Estimate:
-    """The start of a state `names` from x, y, yaw, speed, yaw rate and acceleration that are not correlated.
-
-    A velocity (vx, vy) is linearised; across the heading it has the product of the errors of yaw and speed as well.
-    """
-    mean, P = np.array(values, dtype=np.float64), np.diag(np.square(std))
-    if "vx_mps" not in names:
-        return Estimate(mean[: len(names)], P[: len(names), : len(names)])
-    c, s, speed = np.cos(mean[2]), np.sin(mean[2]), mean[3]
-    by_yaw_speed = np.array([[-speed * s, c], [speed * c, s]])
-    across = np.array([-s, c])
-    cartesian = np.zeros((4, 4))
-    cartesian[:2, :2] = P[:2, :2]
-    cartesian[2:, 2:] = by_yaw_speed @ P[2:4, 2:4] @ by_yaw_speed.T + P[2, 2] * P[3, 3] * np.outer(across, across)
-    return Estimate(np.array([*mean[:2], speed * c, speed * s]), cartesian)

@@ -25,7 +25,7 @@ def most_probable(problem: Problem) -> FloatArray:
         return value, root.T @ gradient.ravel()
 
     found = optimize.minimize(cost, np.zeros(root.shape[0]), jac=True, method="BFGS", options={"gtol": _ACCURACY})
-    if np.abs(found.jac).max() > 1e3 * _ACCURACY:
+    if not np.abs(found.jac).max() <= 1e3 * _ACCURACY:  # nor where it is not a number
         raise ArithmeticError(f"the oracle's minimum is not found: {found.message}")
     return first.means + np.asarray(root @ found.x).reshape(shape)
 

@@ -1,6 +1,7 @@
 """What a sensor that moves and turns sees of a state."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -49,6 +50,12 @@ def mounted(vehicle: Vehicle, forward_m: float, left_m: float, yaw_rad: float) -
     )
 
 
+def slopes(function: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
+    """Derivative of `function`, (n,) -> (k,), at `x` (n,): difference quotients, shape (k, n)."""
+    steps = _STEP * np.eye(len(x))
+    return np.stack([(function(x + step) - function(x - step)) / (2.0 * _STEP) for step in steps], axis=-1)
+
+
 @dataclass(frozen=True)
 class Sighting:
     """z of `names` at a stamp, shape (k,), with covariance `R`, (k, k)."""
@@ -71,12 +78,7 @@ class Sighting:
 
     def slope(self, x: FloatArray, state_names: tuple[str, ...]) -> FloatArray:
         """Derivative of h by x, whitened, shape (k, n): difference quotients."""
-        columns = []
-        for k in range(len(x)):
-            step = np.zeros(len(x))
-            step[k] = _STEP
-            columns.append((self.residual(x - step, state_names) - self.residual(x + step, state_names)) / (2 * _STEP))
-        return np.stack(columns, axis=-1)
+        return -slopes(lambda there: self.residual(there, state_names), x)
 
     def weight(self, y: FloatArray) -> float:
         """What the sighting counts at the whitened residual `y`."""
@@ -114,3 +116,14 @@ def seen(names: tuple[str, ...], x: FloatArray, state_names: tuple[str, ...], ey
         "curvature_radpm": state.get("yaw_rate_radps", 0.0) * speed_mps / (1.0 + speed_mps * speed_mps),
     }
     return np.array([everything[name] for name in names])
+
+
+def located(names: tuple[str, ...], z: FloatArray, eye: Eye) -> FloatArray | None:
+    """Where in the map `eye` measured an object to be, shape (2,); None where `names` tell no position."""
+    own = dict(zip(names, z.tolist(), strict=True))
+    if "x_m" in own and "y_m" in own:
+        return np.array([own["x_m"], own["y_m"]])
+    if "range_m" not in own or "bearing_rad" not in own:
+        return None
+    there = own["range_m"] * np.exp(1j * (own["bearing_rad"] + eye.yaw_rad))
+    return np.array([eye.x_m + there.real, eye.y_m + there.imag])

@@ -1,0 +1,55 @@
+"""States as they are published: x, y, yaw, speed, yaw rate and, of a model that has one, acceleration."""
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from fgtrack.pipeline.oracle.dynamics import FloatArray
+from fgtrack.pipeline.oracle.estimates import Estimate
+from fgtrack.pipeline.oracle.sightings import slopes
+
+_NAMES = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2")
+
+
+def published(names: tuple[str, ...], x: FloatArray, P: FloatArray) -> Estimate:
+    """The state `x` (n,) of entries `names` with covariance `P` (n, n) as it is published; what it lacks is 0."""
+    wanted = _NAMES if "accel_mps2" in names else _NAMES[:5]
+    ahead = complex(x[2], x[3])
+
+    def shown(state: FloatArray) -> FloatArray:
+        own = dict(zip(names, state.tolist(), strict=True))
+        if "vx_mps" in own:
+            velocity = complex(own["vx_mps"], own["vy_mps"])
+            turned = velocity / ahead  # of no more than rounding, so no yaw jumps
+            own["yaw_rad"] = math.atan2(ahead.imag, ahead.real) + math.atan2(turned.imag, turned.real)
+            own["speed_mps"] = abs(velocity)
+        return np.array([own.get(name, 0.0) for name in wanted])
+
+    J = slopes(shown, x)
+    return Estimate(shown(x), J @ P @ J.T)
+
+
+def from_published(
+    names: tuple[str, ...], mean: FloatArray, P: FloatArray, unknown: Callable[[str], float] = lambda name: 0.0
+) -> Estimate:
+    """The state of entries `names` that is published as `mean` (m,) and `P` (m, m).
+
+    `unknown` is the variance of an entry that is not published; its mean is 0. A velocity (vx, vy) is linearised;
+    across the heading it has the product of the errors of yaw and speed as well.
+    """
+    own = dict(zip(_NAMES, mean.tolist(), strict=False))
+    c, s, speed = math.cos(own["yaw_rad"]), math.sin(own["yaw_rad"]), own["speed_mps"]
+    own.update(vx_mps=speed * c, vy_mps=speed * s)
+    J = np.array([[float(name == shown) for shown in _NAMES[: len(mean)]] for name in names])
+    covariance = np.diag([0.0 if name in own else unknown(name) for name in names])
+    if "vx_mps" in names:
+        J[2:4, 2:4] = [[-speed * s, c], [speed * c, s]]
+        across = np.array([-s, c])
+        covariance[2:4, 2:4] += (P[2, 2] * P[3, 3] + P[2, 3] ** 2) * np.outer(across, across)
+    return Estimate(np.array([own.get(name, 0.0) for name in names]), covariance + J @ P @ J.T)
+
+
+def kinematic_start(names: tuple[str, ...], values: Sequence[float], std: Sequence[float]) -> Estimate:
+    """The start of a state `names` from x, y, yaw, speed, yaw rate and acceleration that are not correlated."""
+    return from_published(names, np.array(values, dtype=np.float64), np.diag(np.square(std)))

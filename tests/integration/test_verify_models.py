@@ -1,0 +1,160 @@
+"""`fgtrack verify` finds a wrong equation of any motion or measurement model, also one that is no number."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fgtrack.core.types import FloatArray, X
+from fgtrack.estimation.dense_joint import Difference
+from fgtrack.models import arc, measurement
+from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel, Steps
+from fgtrack.pipeline import verify_measurements
+from fgtrack.pipeline.oracle import posterior
+from fgtrack.pipeline.verify_models import MODEL_TOLERANCE, model_differences
+
+MODELS = {"CTRV": CTRV, "CTRA": CTRA, "CV": CV}
+
+
+def twice_the_noise(kind: type[MotionModel], patch: pytest.MonkeyPatch) -> None:
+    for name in ("process_noise", "step"):
+        right = getattr(kind, name)
+
+        def wrong(self: MotionModel, x: Any, t: Any, right: Any = right) -> Any:
+            found = right(self, x, t)
+            return found._replace(Q=2.0 * found.Q) if hasattr(found, "Q") else 2.0 * found
+
+        patch.setattr(kind, name, wrong)
+
+
+def wrong_slope(kind: type[MotionModel], patch: pytest.MonkeyPatch) -> None:
+    right = kind.jacobian
+    patch.setattr(kind, "jacobian", lambda self, x, t: right(self, x, 1.01 * np.asarray(t)))
+
+
+def drifting(kind: type[MotionModel], patch: pytest.MonkeyPatch) -> None:
+    right = kind.predict
+
+    def wrong(self: MotionModel, x: FloatArray, t: float | FloatArray) -> FloatArray:
+        mean = right(self, x, t)
+        mean[..., X] += t
+        return mean
+
+    patch.setattr(kind, "predict", wrong)
+
+
+@pytest.mark.parametrize("change", [twice_the_noise, wrong_slope, drifting])
+@pytest.mark.parametrize("name", MODELS)
+def test_a_wrong_equation_of_any_motion_model_is_found_out(
+    name: str, change: Callable[[type[MotionModel], pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert max(dict(model_differences())[name]) < MODEL_TOLERANCE
+    change(MODELS[name], monkeypatch)
+    assert max(dict(model_differences())[name]) > 1e3 * MODEL_TOLERANCE
+
+
+Break = Callable[[pytest.MonkeyPatch], None]
+
+
+def component(name: str, cartesian: bool, **changed: Callable[[Any, Any], Any]) -> Break:
+    """Break parts of what is measured as `name`, of Cartesian states or of the others."""
+    known = measurement._COMPONENTS[name]
+
+    def broken(part: str, change: Callable[[Any, Any], Any]) -> Callable[[Any], Any]:
+        right = getattr(known, part)
+        return lambda scene: change(right(scene), 1.0) if scene.cartesian_motion is cartesian else right(scene)
+
+    wrong = known._replace(**{part: broken(part, change) for part, change in changed.items()})
+    return lambda patch: patch.setitem(measurement._COMPONENTS, name, wrong)
+
+
+def no_number(value: Any, _: float) -> Any:
+    return tuple(each * np.nan for each in value) if isinstance(value, tuple) else value * np.nan
+
+
+def method(kind: type, name: str, change: Callable[..., Any]) -> Break:
+    """Let a method give `change(what it gave, itself, *its arguments)`."""
+    right = getattr(kind, name)
+    return lambda patch: patch.setattr(kind, name, lambda self, *given: change(right(self, *given), self, *given))
+
+
+def reversed_beyond_4_rad(patch: pytest.MonkeyPatch) -> None:
+    def moments(x: FloatArray, t: FloatArray) -> tuple[Any, ...]:
+        far = np.abs(x[..., 4] * t) > 4.0
+        return tuple(np.where(far, -each, each) for each in arc.heading_moments(x, t))
+
+    patch.setattr("fgtrack.models.motion.heading_moments", moments)
+
+
+def densities_of_yaw_as_they_ever_were(patch: pytest.MonkeyPatch) -> None:
+    usual, right = CTRV(), CTRV._densities.func
+
+    def wrong(self: CTRV) -> tuple[float, ...]:
+        position, _, speed, _, accel = right(self)
+        return position, usual.yaw_density_rad2ps, speed, usual.yaw_rate_density_rad2ps3, accel
+
+    patch.setattr(CTRV, "_densities", property(wrong))
+
+
+def bearings_off(patch: pytest.MonkeyPatch) -> None:
+    right = measurement.position_gradient
+
+    def wrong(components: tuple[str, ...], *given: Any) -> Any:
+        found = right(components, *given)
+        return found if found is None or "bearing_rad" not in components else 0.1 * found
+
+    for where in (measurement, verify_measurements):
+        patch.setattr(where, "position_gradient", wrong)
+
+
+def shown_too_sure(given: tuple[FloatArray, FloatArray], model: MotionModel, *_: Any) -> tuple[FloatArray, FloatArray]:
+    return given[0], 0.01 * given[1] if model.cartesian else given[1]
+
+
+BROKEN: dict[str, Break] = {
+    "Jacobian of a Cartesian range rate is no number": component("range_rate_mps", True, gradient=no_number),
+    "value of a curvature is no number": component("curvature_radpm", False, value=no_number),
+    "Jacobian of a curvature is no number": component("curvature_radpm", False, by_yaw_rate=no_number),
+    "Cartesian yaw is no number": component("yaw_rad", True, value=no_number),
+    "densities of yaw that are set are not used": densities_of_yaw_as_they_ever_were,
+    "displacement reversed beyond 4 rad": reversed_beyond_4_rad,
+    "published covariance of a Cartesian state": method(MotionModel, "kinematic", shown_too_sure),
+    "covariance of a birth": method(MotionModel, "from_kinematic", lambda found, *_: (found[0], 2.0 * found[1])),
+    "derivative by the pose": method(measurement.MeasurementModel, "pose_jacobian", lambda found, *_: -3.0 * found),
+    "derivative of a position": bearings_off,
+    "noise of many states": method(
+        CTRV, "steps", lambda found, _, x, *t: Steps(found.mean, found.F, found.Q * (2.0 if len(x) > 2 else 1.0))
+    ),
+    "Jacobian back in time": method(CTRV, "jacobian", lambda F, _, x, t: F * np.where(np.min(t) < 0.0, 2.0, 1.0)),
+    "flow back in time": method(CTRV, "flow", lambda found, _, x, t: (found[0], found[1] * (2.0 if t < 0.0 else 1.0))),
+}
+
+
+def missed() -> Iterator[tuple[str, Difference]]:
+    for name, apart in model_differences():
+        if not max(map(abs, np.nan_to_num(apart, nan=np.inf))) < MODEL_TOLERANCE:
+            yield name, apart
+
+
+def test_all_models_are_right() -> None:
+    assert list(missed()) == []
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_what_is_broken_in_a_model_is_found_out(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    BROKEN[what](monkeypatch)
+    assert list(missed())
+
+
+def test_a_minimum_that_is_no_number_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Found:
+        x, jac, message = np.zeros(1), np.full(1, np.nan), "lost"
+
+    class Solved:
+        means, covariance = np.zeros((1, 1)), np.eye(1)
+
+    monkeypatch.setattr(posterior, "smoothed", lambda problem: Solved)
+    monkeypatch.setattr(posterior.optimize, "minimize", lambda *given, **named: Found)
+    with pytest.raises(ArithmeticError, match="not found: lost"):
+        posterior.most_probable(None)  # type: ignore[arg-type]  # never looked at
