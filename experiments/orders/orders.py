@@ -21,9 +21,10 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Estimator
 from fgtrack.estimation.dense_joint import Difference, dense_joint, difference
+from fgtrack.pipeline.certificate import Subject
 from fgtrack.pipeline.nasty_streams import NASTY
 from fgtrack.pipeline.oracle.estimates import smoothed
-from fgtrack.pipeline.verify import Subject, exact_estimators
+from fgtrack.pipeline.verify import exact_estimators
 from fgtrack.pipeline.verify_streams import Stream
 
 #: Estimates further apart, in standard deviations, are not one solution.

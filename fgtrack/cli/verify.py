@@ -11,7 +11,7 @@ from fgtrack.cli.completion import estimators
 from fgtrack.cli.show import chosen_form, progress, say, show
 from fgtrack.evaluation.tables import Column, Table, Value
 from fgtrack.pipeline import verify as pipeline
-from fgtrack.pipeline.verify import Certificate, Check
+from fgtrack.pipeline.certificate import Certificate, Check
 
 _SEED = 1
 _BAD = 1

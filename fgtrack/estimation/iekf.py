@@ -68,6 +68,8 @@ class IekfReplay(ReplayingFilter):
         See `ReplayingFilter`.
     """
 
+    solves = "iekf"
+
     def __init__(
         self,
         motion: MotionModel,

@@ -102,6 +102,7 @@ class ImmReplay(ReplayingFilter):
     """
 
     spreads = mixes = True
+    solves = "imm"
     retrodicts = False
 
     def __init__(

@@ -87,6 +87,7 @@ class IplfReplay(ReplayingFilter):
     """
 
     spreads = True
+    solves = "iplf"
 
     def __init__(
         self,

@@ -64,6 +64,7 @@ class PosteriorLinearisationSmoother(WindowedFilter):
     nonlinear = "at convergence"
     smooths = True
     spreads = True
+    solves = "ipls"
     initiates = True
     reports = True
 

@@ -107,10 +107,11 @@ class Claims:
     one that does has to initiate, too."""
     bank: bool = False
     """Whether the entry makes the estimators of all objects together."""
-    solves: Literal["", "ekf", "least squares"] = ""
-    """Of which equations an estimate in a nonlinear model is the solution: those of the extended Kalman filter in the
-    order of the stamps, or, at convergence, those of least squares over all states. `fgtrack verify` holds it to
-    them; empty for others."""
+    solves: Literal["", "ekf", "iekf", "ukf", "iplf", "imm", "ipls", "least squares"] = ""
+    """Of which equations an estimate in a nonlinear model is the solution: those of a filter in the order of the stamps
+    (extended, iterated, unscented, posterior linearisation, interacting models), or, at convergence, those of least
+    squares over all states or of the posterior linearisation smoother. `fgtrack verify` holds it to them; empty for
+    others."""
 
     @property
     def is_exact(self) -> bool:
@@ -179,7 +180,18 @@ def estimator_bank(
 
     Of one that hands out smoothed states, `lagged_s` says at which lags behind the present.
     """
-    factory = ESTIMATORS.load(name)
+    return start_bank(name, ESTIMATORS.load(name), motion, lag_s, options, lagged_s)
+
+
+def start_bank(
+    name: str,
+    factory: Factory,
+    motion: MotionModel,
+    lag_s: float,
+    options: Mapping[str, Any],
+    lagged_s: Sequence[float] = (),
+) -> TrackBank:
+    """`estimator_bank` of a factory that need not be registered; `name` stands in errors."""
     claims = Claims.of(factory)
     own = {key: options[key] for key in options if claims.initiates or key != "initiation"}
     if claims.bank:
@@ -204,6 +216,11 @@ def motion_model(name: str, parameters: Mapping[str, Any]) -> MotionModel:
     if not isinstance(model, MotionModel):
         raise CallError(f"motion model {name!r}: is a {type(model).__name__}, not a MotionModel")
     return model
+
+
+def works_together(factory: Factory) -> bool:
+    """Whether the estimators of several objects are made as one, by other code than those of a single object."""
+    return Claims.of(factory).bank or factory in _TOGETHER
 
 
 def _made(name: str, factory: Factory, *arguments: Any, **options: Any) -> Any:

@@ -61,6 +61,7 @@ class UkfReplay(ReplayingFilter):
     """
 
     spreads = True
+    solves = "ukf"
 
     def __init__(
         self,

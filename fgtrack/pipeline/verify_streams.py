@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +17,9 @@ from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.road import OpenSpace
 from fgtrack.models.sensors import Mount, RobustLoss, SensorModel
 from fgtrack.pipeline.oracle.dynamics import Dynamics
-from fgtrack.pipeline.oracle.estimates import Estimate, Problem, Solution, filtered, smoothed
+from fgtrack.pipeline.oracle.estimates import Solution, smoothed
 from fgtrack.pipeline.oracle.kinematics import kinematic_start
+from fgtrack.pipeline.oracle.problem import Problem
 from fgtrack.pipeline.oracle.sightings import Eye, Sighting, Vehicle, mounted, seen
 from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY
 from fgtrack.tracking.ego import EgoTrajectory
@@ -43,6 +45,15 @@ FAST = Start(
     yaw_rate_std_radps=0.1,
 )
 _TURNING = replace(FAST, position_m=(30.0, 12.0), yaw_rad=3.0, yaw_std_rad=0.2, speed_mps=12.0, yaw_rate_radps=0.5)
+
+_KNOWN = replace(
+    _TURNING,
+    position_std_m=0.3,
+    yaw_rad=3.05,
+    yaw_std_rad=0.03,
+    speed_std_mps=0.3,
+    yaw_rate_std_radps=0.05,
+)
 
 #: Seen from the observer: its detections' frame, and the pose of its RADAR in that frame. The object is behind it.
 _FRAME_M = (-1.2, 0.3)
@@ -86,21 +97,29 @@ class Stream:
     @cached_property
     def problem(self) -> Problem:
         """The same, for the oracle."""
-        names, prior = self.motion.state_names, self.prior
-        values = *prior.position_m, prior.yaw_rad or 0.0, prior.speed_mps, prior.yaw_rate_radps, prior.accel_mps2
-        std = prior.position_std_m, prior.position_std_m, prior.yaw_std_rad or 0.0, prior.speed_std_mps
-        start = kinematic_start(names, values, (*std, prior.yaw_rate_std_radps, prior.accel_std_mps2))
-        return Problem(dynamics_of(self.motion), prior.stamp_ns, start, self.sightings)
+        return self.problem_of(self.motion)
+
+    def problem_of(self, motion: MotionModel) -> Problem:
+        """The same under another motion model, for the oracle."""
+        return problem_of(motion, self.prior, self.sightings)
+
+    @cached_property
+    def references(self) -> dict[str, Any]:
+        """What is known of the oracle's other answers, by their equations."""
+        return {}
 
     @cached_property
     def solution(self) -> Solution:
         """The oracle's least squares."""
         return smoothed(self.problem)
 
-    @cached_property
-    def filtered(self) -> dict[int, Estimate]:
-        """The oracle's extended Kalman filter, by stamp."""
-        return filtered(self.problem)
+
+def problem_of(motion: MotionModel, prior: Start, sightings: Sequence[Sighting]) -> Problem:
+    """What the oracle is given: a model of fgtrack, a start whose entries are not correlated, sightings."""
+    values = *prior.position_m, prior.yaw_rad or 0.0, prior.speed_mps, prior.yaw_rate_radps, prior.accel_mps2
+    std = prior.position_std_m, prior.position_std_m, prior.yaw_std_rad or 0.0, prior.speed_std_mps
+    start = kinematic_start(motion.state_names, values, (*std, prior.yaw_rate_std_radps, prior.accel_std_mps2))
+    return Problem(dynamics_of(motion), prior.stamp_ns, start, tuple(sightings))
 
 
 def dynamics_of(motion: MotionModel) -> Dynamics:
@@ -150,6 +169,26 @@ def observed(rng: np.random.Generator) -> Stream:
 def onboard(rng: np.random.Generator, name: str, plan: Plan) -> Stream:
     """As `observed`, at other stamps."""
     return drawn(rng, name, CTRV(), plan, lag_s=2.0, reach_s=1.9, start=_TURNING, sense=_Onboard(plan[0]))
+
+
+def mild(rng: np.random.Generator) -> Stream:
+    """As `observed`, so well known from the start that all good approximations nearly agree."""
+    plan = paper_stamps(0.6)
+    return drawn(rng, "CTRV, mildly nonlinear", CTRV(), plan, 2.0, 1.9, start=_KNOWN, sense=_Onboard(plan[0]))
+
+
+def several(rng: np.random.Generator, count: int) -> list[Stream]:
+    """Objects as that of `mild`, side by side, seen together."""
+    plan = paper_stamps(0.4)
+    sense = _Onboard(plan[0])
+    starts = [replace(_KNOWN, position_m=(30.0 - 2.0 * k, 12.0 + 3.0 * k)) for k in range(count)]
+    return [drawn(rng, f"CTRV, {count} objects", CTRV(), plan, 2.0, 1.9, start=one, sense=sense) for one in starts]
+
+
+def mild_robust(rng: np.random.Generator) -> Stream:
+    """Outliers and a Huber loss, of an object that is as well known."""
+    plan = paper_stamps(0.45)
+    return drawn(rng, "CTRV, mild, Huber loss", CTRV(), plan, 2.0, 1.9, start=_KNOWN, sense=_with_outliers)
 
 
 def robust(rng: np.random.Generator) -> Stream:

@@ -4,7 +4,8 @@ import numpy as np
 from scipy import linalg, optimize
 
 from fgtrack.pipeline.oracle.dynamics import FloatArray
-from fgtrack.pipeline.oracle.estimates import Problem, smoothed
+from fgtrack.pipeline.oracle.estimates import smoothed
+from fgtrack.pipeline.oracle.problem import Problem
 
 _STEP = 1e-4
 _ACCURACY = 1e-7
