@@ -9,10 +9,11 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.types import STATE_NAMES, FloatArray
 from fgtrack.models.motion import CARTESIAN, POLAR, MotionModel
 from fgtrack.testing.broken import BrokenPromiseError, run_all
+from fgtrack.testing.kinematics import KINEMATIC_CHECKS, ModelCheck, apart
 
-_Check = Callable[[MotionModel, FloatArray, float], str | None]
 _NUM_STATES = 20
-_LONGEST_S = 0.5
+#: Of every other state a short duration as between two measurements, of the rest up to a long gap.
+_LONGEST_S = 0.5, 4.0
 
 
 def check_motion_model(model: MotionModel, seed: int = 0) -> None:
@@ -22,17 +23,18 @@ def check_motion_model(model: MotionModel, seed: int = 0) -> None:
 
 def motion_model_checks(model: MotionModel, seed: int = 0) -> dict[str, Callable[[], None]]:
     """The checks of `check_motion_model` one by one, by name of the promise: for `pytest.mark.parametrize`."""
-    return {check.__name__.removeprefix("_").replace("_", " "): partial(_run, check, model, seed) for check in _CHECKS}
+    checks = (*_CHECKS, *KINEMATIC_CHECKS)
+    return {check.__name__.removeprefix("_").replace("_", " "): partial(_run, check, model, seed) for check in checks}
 
 
-def _run(check: _Check, model: MotionModel, seed: int) -> None:
+def _run(check: ModelCheck, model: MotionModel, seed: int) -> None:
     rng = np.random.default_rng(seed)
     for number in range(_NUM_STATES):
         kinematic = rng.normal(size=6) * [50.0, 50.0, 2.0, 20.0, 0.3, 2.0]
         x = model.from_kinematic(kinematic, np.eye(6))[0]
         others = [float(name not in STATE_NAMES) for name in model.state_names[4:]]
         x[4:] += others * rng.normal(size=model.dim - 4)
-        dt_s = 0.0 if number == 0 else float(rng.uniform(1e-3, _LONGEST_S))
+        dt_s = 0.0 if number == 0 else float(rng.uniform(1e-3, _LONGEST_S[number % 2]))
         try:
             wrong = check(model, x, dt_s)
         except Exception as error:  # of a foreign model: anything
@@ -40,14 +42,6 @@ def _run(check: _Check, model: MotionModel, seed: int) -> None:
         if wrong:
             name = check.__name__.removeprefix("_").replace("_", " ")
             raise BrokenPromiseError(repr(model), {name: f"{wrong}\nx = {x.tolist()}, dt_s = {dt_s!r}"}) from None
-
-
-def _apart(found: FloatArray, expected: FloatArray, tolerance: float, what: str) -> str | None:
-    found = np.asarray(found)
-    if found.shape != expected.shape:
-        return f"{what} has shape {found.shape}, expected {expected.shape}"
-    off = np.abs(found - expected).max() / (1.0 + np.abs(expected).max())
-    return None if off < tolerance else f"{what} is\n{found}\nexpected\n{expected}"
 
 
 def _has_a_state_that_measurements_know(model: MotionModel, x: FloatArray, dt_s: float) -> str | None:
@@ -63,7 +57,7 @@ def _is_hashable_and_equal_to_itself(model: MotionModel, x: FloatArray, dt_s: fl
 
 def _flows_on_where_it_stopped(model: MotionModel, x: FloatArray, dt_s: float) -> str | None:
     after = model.predict(model.predict(x, 0.3 * dt_s), 0.7 * dt_s)
-    return _apart(after, model.predict(x, dt_s), 1e-9, "predict over two parts") or _apart(
+    return apart(after, model.predict(x, dt_s), 1e-9, "predict over two parts") or apart(
         model.predict(model.predict(x, dt_s), -dt_s), x, 1e-9, "predict forth and back"
     )
 
@@ -74,13 +68,13 @@ def _has_the_jacobian_of_its_prediction(model: MotionModel, x: FloatArray, dt_s:
         (model.predict(x + h * unit, dt_s) - model.predict(x - h * unit, dt_s)) / (2.0 * h[k])
         for k, unit in enumerate(np.eye(model.dim))
     ]
-    return _apart(model.jacobian(x, dt_s), np.column_stack(columns), 1e-6, "jacobian")
+    return apart(model.jacobian(x, dt_s), np.column_stack(columns), 1e-6, "jacobian")
 
 
 def _has_the_same_jacobian_everywhere_if_linear(model: MotionModel, x: FloatArray, dt_s: float) -> str | None:
     if not model.linear:
         return None
-    return _apart(model.jacobian(x, dt_s), model.jacobian(0.0 * x, dt_s), 1e-12, "jacobian of a linear model")
+    return apart(model.jacobian(x, dt_s), model.jacobian(0.0 * x, dt_s), 1e-12, "jacobian of a linear model")
 
 
 def _has_noise_that_composes(model: MotionModel, x: FloatArray, dt_s: float) -> str | None:
@@ -90,13 +84,13 @@ def _has_noise_that_composes(model: MotionModel, x: FloatArray, dt_s: float) -> 
     parts = F @ model.process_noise(x, a) @ F.T + model.process_noise(between, b)
     Q = model.process_noise(x, dt_s)
     scale = np.sqrt(np.outer(np.diag(Q), np.diag(Q))) + np.finfo(np.float64).tiny
-    return _apart(parts / scale, Q / scale, 1e-6, "F(b) Q(a) F(b)' + Q(b) scaled like Q(a + b),")
+    return apart(parts / scale, Q / scale, 1e-6, "F(b) Q(a) F(b)' + Q(b) scaled like Q(a + b),")
 
 
 def _has_noise_that_is_symmetric_and_positive_definite(model: MotionModel, x: FloatArray, dt_s: float) -> str | None:
     Q = model.process_noise(x, dt_s)
     if not dt_s:
-        return _apart(Q, np.zeros_like(Q), 1e-15, "process_noise over 0 s")
+        return apart(Q, np.zeros_like(Q), 1e-15, "process_noise over 0 s")
     scale = np.sqrt(np.abs(np.diag(Q)))
     if (Q != Q.T).any() or not scale.all() or np.linalg.eigvalsh(Q / np.outer(scale, scale)).min() <= 0.0:
         return f"process_noise is not symmetric and positive definite:\n{Q}"
@@ -114,19 +108,35 @@ def _refuses_noise_of_a_negative_duration(model: MotionModel, x: FloatArray, dt_
 def _steps_one_state_as_it_predicts_arrays(model: MotionModel, x: FloatArray, dt_s: float) -> str | None:
     step, (mean, F) = model.step(x.tolist(), dt_s), model.flow(x.tolist(), dt_s)
     return (
-        _apart(np.array(step.mean), model.predict(x, dt_s), 1e-9, "the mean of step")
-        or _apart(step.F, model.jacobian(x, dt_s), 1e-9, "F of step")
-        or _apart(step.Q, model.process_noise(x, dt_s), 1e-9, "Q of step")
-        or _apart(np.array(mean), np.array(step.mean), 1e-15, "the mean of flow")
-        or _apart(F, step.F, 1e-15, "F of flow")
+        apart(np.array(step.mean), model.predict(x, dt_s), 1e-9, "the mean of step")
+        or apart(step.F, model.jacobian(x, dt_s), 1e-9, "F of step")
+        or apart(step.Q, model.process_noise(x, dt_s), 1e-9, "Q of step")
+        or apart(np.array(mean), np.array(step.mean), 1e-15, "the mean of flow")
+        or apart(F, step.F, 1e-15, "F of flow")
     )
+
+
+def _steps_many_states_as_it_predicts_arrays(model: MotionModel, x: FloatArray, dt_s: float) -> str | None:
+    """Of several numbers of states, of which models may take different ways; each state and duration is another one."""
+    for count in (1, 2, 3, 24):
+        states = x + 0.05 * np.linspace(0.0, 1.0, count)[:, None] * np.cos(np.arange(model.dim))
+        for durations_s in (np.full(count, dt_s), np.linspace(0.1, 1.0, count) * dt_s):
+            mean, F, Q = model.steps(states, durations_s)
+            wrong = (
+                apart(mean, model.predict(states, durations_s), 1e-9, f"the mean of steps of {count} states")
+                or apart(F, model.jacobian(states, durations_s), 1e-9, f"F of steps of {count} states")
+                or apart(Q, model.process_noise(states, durations_s), 1e-9, f"Q of steps of {count} states")
+            )
+            if wrong:
+                return wrong
+    return None
 
 
 def _takes_arrays_of_states_and_durations(model: MotionModel, x: FloatArray, dt_s: float) -> str | None:
     states, durations_s = np.stack([x, x + 0.1, x - 0.1]), np.array([[dt_s], [0.5 * dt_s]])
     for function in (model.predict, model.jacobian, model.process_noise):
         one_by_one = np.array([[function(state, float(t)) for state in states] for t in durations_s[:, 0]])
-        wrong = _apart(function(states, durations_s), one_by_one, 1e-12, f"{function.__name__} of an array")
+        wrong = apart(function(states, durations_s), one_by_one, 1e-12, f"{function.__name__} of an array")
         if wrong or function(states[:0], durations_s).shape != (2, 0, *one_by_one.shape[2:]):
             return wrong or f"{function.__name__} of no state at all has the wrong shape"
     return None
@@ -141,15 +151,7 @@ def _keeps_its_inputs(model: MotionModel, x: FloatArray, dt_s: float) -> str | N
     return None
 
 
-def _is_as_it_was_after_a_kinematic_state(model: MotionModel, x: FloatArray, dt_s: float) -> str | None:
-    mean, P = model.kinematic(x, np.eye(model.dim))
-    back, covariance = model.from_kinematic(mean, P)
-    if back.shape != x.shape or covariance.shape != (model.dim, model.dim):
-        return f"from_kinematic gives shapes {back.shape} and {covariance.shape}"
-    return _apart(back[:4], x[:4], 1e-9, "from_kinematic of kinematic")
-
-
-_CHECKS: tuple[_Check, ...] = (
+_CHECKS: tuple[ModelCheck, ...] = (
     _has_a_state_that_measurements_know,
     _is_hashable_and_equal_to_itself,
     _flows_on_where_it_stopped,
@@ -159,7 +161,7 @@ _CHECKS: tuple[_Check, ...] = (
     _has_noise_that_is_symmetric_and_positive_definite,
     _refuses_noise_of_a_negative_duration,
     _steps_one_state_as_it_predicts_arrays,
+    _steps_many_states_as_it_predicts_arrays,
     _takes_arrays_of_states_and_durations,
     _keeps_its_inputs,
-    _is_as_it_was_after_a_kinematic_state,
 )

@@ -5,7 +5,7 @@ import pytest
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.registry import MOTION_MODELS
-from fgtrack.models.motion import CTRV, CV, MotionModel
+from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel, Steps
 from fgtrack.testing import BrokenPromiseError, check_motion_model, motion_model_checks
 
 
@@ -73,6 +73,53 @@ class _Offset(CTRV):
         return x + 1.0, P
 
 
+class _TooSure(CV):
+    def kinematic(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+        mean, covariance = super().kinematic(x, P)
+        return mean, 1e-4 * covariance
+
+
+class _Whirls(CV):
+    def kinematic(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+        mean, covariance = super().kinematic(x, P)
+        return mean + 5.0 * (np.arange(mean.shape[-1]) >= 4), covariance
+
+
+class _NoNumber(CV):
+    def kinematic(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+        mean, covariance = super().kinematic(x, P)
+        return mean, np.nan * covariance
+
+
+class _NegativeBirth(CV):
+    def from_kinematic(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        x, P = super().from_kinematic(mean, covariance)
+        return x, -P
+
+
+class _NegativeStart(CTRA):
+    def start_variance(self, name: str) -> float:
+        return -3.0
+
+
+class _OtherSteps(CV):
+    def steps(self, x: FloatArray, dt_s: FloatArray) -> Steps:
+        mean, F, Q = super().steps(x, dt_s)
+        return Steps(mean + 1.0, 2.0 * F, -Q)
+
+
+class _OtherNoiseOfMany(CTRV):
+    def steps(self, x: FloatArray, dt_s: FloatArray) -> Steps:
+        mean, F, Q = super().steps(x, dt_s)
+        return Steps(mean, F, Q * (2.0 if len(x) > 3 else 1.0))
+
+
+class _NegativeBeyondHalfASecond(CTRV):
+    def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
+        Q = super().process_noise(x, dt_s)
+        return Q * np.where(np.asarray(dt_s) > 0.5, -1.0, 1.0)[..., None, None]
+
+
 @pytest.mark.parametrize(
     ("model", "promise"),
     [
@@ -87,11 +134,20 @@ class _Offset(CTRV):
         (_Jumps(), "flows on where it stopped"),
         (_Polar(), "has a state that measurements know"),
         (_Offset(), "is as it was after a kinematic state"),
+        (_TooSure(), "publishes the entries of its state"),
+        (_Whirls(), "publishes the entries of its state"),
+        (_NoNumber(), "publishes the entries of its state"),
+        (_NegativeBirth(), "is as it was after a kinematic state"),
+        (_NegativeBirth(), "begins with a sound covariance"),
+        (_NegativeStart(), "begins with a sound covariance"),
+        (_OtherSteps(), "steps many states as it predicts arrays"),
+        (_OtherNoiseOfMany(), "steps many states as it predicts arrays"),
+        (_NegativeBeyondHalfASecond(), "has noise that is symmetric and positive definite"),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, MotionModel) else "",
 )
 def test_a_broken_model_is_found_out_by_the_promise_that_it_breaks(model: MotionModel, promise: str) -> None:
-    with pytest.raises(BrokenPromiseError, match=r"(?s)x = \[.*dt_s = 0\.") as error:
+    with pytest.raises(BrokenPromiseError, match=r"(?s)x = \[.*dt_s = \d") as error:
         motion_model_checks(model)[promise]()
     assert list(error.value.promises) == [promise]
 
