@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from fgtrack.estimation.base import UpdateResult as UpdateResult
     from fgtrack.estimation.base import UpdateStatus as UpdateStatus
     from fgtrack.estimation.birth import initial_state as initial_state
+    from fgtrack.estimation.ekf import robust_weight as robust_weight
     from fgtrack.estimation.registry import estimator as estimator
     from fgtrack.evaluation import plot as plot
     from fgtrack.evaluation.comparison import compare as compare

@@ -19,7 +19,7 @@ GROWN_TOLERANCE = 5e-2
 #: Of a filter that iterates its updates: where its steps are damped, it ends before they are solved to rounding.
 ITERATED_TOLERANCE = 1e-2
 #: In standard deviations: good approximations of a mildly nonlinear model.
-NEAR_TOLERANCE = 0.5
+NEAR_TOLERANCE = 0.7
 NOT_FUSED = (UpdateStatus.TOO_OLD, UpdateStatus.FAILED)
 
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -31,7 +31,7 @@ _START_NS = NS_PER_S
 _RADAR_PHASE_S = 0.023
 _POSITION = ("x_m", "y_m")
 _LOSS_WIDTH = 1.5
-_OUTLIERS = 0.2
+_OUTLIERS, _MANY_OUTLIERS = 0.2, 0.5
 
 #: A fast car that begins to turn; one that passes a yaw of pi before a turning observer.
 FAST = Start(
@@ -188,7 +188,8 @@ def several(rng: np.random.Generator, count: int) -> list[Stream]:
 def mild_robust(rng: np.random.Generator) -> Stream:
     """Outliers and a Huber loss, of an object that is as well known."""
     plan = paper_stamps(0.45)
-    return drawn(rng, "CTRV, mild, Huber loss", CTRV(), plan, 2.0, 1.9, start=_KNOWN, sense=_with_outliers)
+    sense = partial(_with_outliers, share=_MANY_OUTLIERS)
+    return drawn(rng, "CTRV, mild, Huber loss", CTRV(), plan, 2.0, 1.9, start=_KNOWN, sense=sense)
 
 
 def robust(rng: np.random.Generator) -> Stream:
@@ -228,10 +229,12 @@ def paper(rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str) -
     return measurement, Sighting(stamp_ns, names, z, np.diag(std**2))
 
 
-def _with_outliers(rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str) -> tuple[Measurement, Sighting]:
+def _with_outliers(
+    rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str, share: float = _OUTLIERS
+) -> tuple[Measurement, Sighting]:
     measurement, sighting = paper(rng, x, stamp_ns, sensor)
     outlier = np.sqrt(np.diag(sighting.R)) * rng.normal(0.0, 8.0, len(sighting.z))
-    z = sighting.z + outlier * (rng.random() < _OUTLIERS)
+    z = sighting.z + outlier * (rng.random() < share)
     measurement = replace(measurement, z=z, loss=RobustLoss("huber", _LOSS_WIDTH))
     return measurement, replace(sighting, z=z, loss=("huber", _LOSS_WIDTH))
 

@@ -11,13 +11,18 @@ import numpy as np
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
-from fgtrack.estimation.base import Estimator, Measurement, UpdateStatus
+from fgtrack.estimation.base import Estimator, Measurement, UpdateResult, UpdateStatus
 from fgtrack.estimation.dense_joint import dense_joint, difference, innovation_difference, rounding_bound
 from fgtrack.estimation.registry import ESTIMATORS, EXACT, Claims, Factory
 from fgtrack.estimation.terms import NEAR_NS
 from fgtrack.models.motion import MotionModel
+from fgtrack.testing.banks import (
+    gives_each_of_several_objects_what_it_gives_one_alone,
+    hands_out_sound_smoothed_states,
+)
 from fgtrack.testing.broken import run_all
-from fgtrack.testing.promise import Draw, Promise, Subject, require
+from fgtrack.testing.nonlinear import comes_near_the_posterior_of_a_nonlinear_model, mild_draws
+from fgtrack.testing.promise import Draw, Promise, Subject, require, sound
 from fgtrack.testing.streams import (
     LAG_S,
     LINEAR,
@@ -163,9 +168,25 @@ def _counts_each_measurement_as_what_it_is(subject: Subject, stream: Stream) -> 
         require(fused == (result.innovation is not None), f"place {place}: innovation {result.innovation}")
         require(fused == (result.nis is not None), f"place {place}: {result.status} with NIS {result.nis}")
         require(not fused or 0.0 <= (result.nis or 0.0) < np.inf, f"place {place}: NIS is {result.nis}")
+        _says_a_sound_innovation(result, measurement, place)
         newest_ns = max(newest_ns, measurement.stamp_ns)
     end_ns = estimator.window_ns[1]
     require(0 <= newest_ns - end_ns <= NEAR_NS, f"window_ns ends at {end_ns}, newest is {newest_ns}")
+
+
+def _says_a_sound_innovation(result: UpdateResult, measurement: Measurement, place: int) -> None:
+    """Its covariance, where it is given, is that by which the NIS is normalised."""
+    y, S = result.innovation, result.innovation_covariance
+    if y is None or result.nis is None:
+        return
+    require(y.shape == measurement.z.shape and np.isfinite(y).all(), f"place {place}: the innovation is {y}")
+    if S is not None:
+        require(S.shape == measurement.R.shape, f"place {place}: the innovation covariance has shape {S.shape}")
+        sound(y, (S + S.T) / 2.0, f"the innovation at place {place}")
+        require(np.allclose(S, S.T, 1e-9), f"place {place}: the innovation covariance is not symmetric")
+        nis = measurement.nis(y, S)
+        same = abs(nis - result.nis) <= 1e-6 * (1.0 + nis)
+        require(same, f"place {place}: the NIS is {result.nis}, of the innovation and its covariance {nis}")
 
 
 def _gives_symmetric_positive_definite_covariances(subject: Subject, stream: Stream) -> None:
@@ -173,12 +194,7 @@ def _gives_symmetric_positive_definite_covariances(subject: Subject, stream: Str
     for at_ns in _probes_ns(stream, estimator.window_ns[0]):
         state = estimator.state_at(at_ns)
         require(state.stamp_ns == at_ns, f"state_at({at_ns}) gives a state at {state.stamp_ns}")
-        require(np.isfinite(state.mean).all(), f"the mean at {at_ns} is {state.mean}")
-        P = state.covariance
-        require((P == P.T).all(), f"the covariance at {at_ns} is not symmetric")
-        scale = np.sqrt(np.diag(P))
-        least = np.linalg.eigvalsh(P / np.outer(scale, scale)).min() if (scale > 0.0).all() else -np.inf
-        require(least > 0.0, f"the covariance at {at_ns} is not positive definite")
+        sound(state.mean, state.covariance, f"the state at {at_ns}")
 
 
 def _gives_the_same_bits_for_the_same_input(subject: Subject, stream: Stream) -> None:
@@ -274,6 +290,8 @@ def _drawn(make: Callable[..., Stream], *what: MotionModel | int) -> tuple[Draw,
 
 
 _BOTH = (LINEAR, NONLINEAR)
+#: Longer than the window.
+_LONG = tuple(partial(regular, each, num=30) for each in _BOTH)
 _PROMISES = (
     Promise(_is_the_kalman_filter_in_sequence, _drawn(regular, LINEAR), lambda claims: not claims.mixes),
     Promise(
@@ -311,6 +329,9 @@ _PROMISES = (
     Promise(_moves_only_the_window_with_the_clock, _drawn(regular, *_BOTH)),
     Promise(_predicts_ahead_by_the_motion_model, _drawn(regular, *_BOTH), lambda claims: not claims.mixes),
     Promise(_keeps_a_heading_that_passes_half_a_turn, (across_pi,)),
+    Promise(comes_near_the_posterior_of_a_nonlinear_model, mild_draws(), lambda claims: not claims.mixes),
+    Promise(gives_each_of_several_objects_what_it_gives_one_alone, _drawn(regular, *_BOTH)),
+    Promise(hands_out_sound_smoothed_states, (*_drawn(regular, *_BOTH), *_LONG), lambda claims: claims.reports),
 )
 
 

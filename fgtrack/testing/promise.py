@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from fgtrack.estimation.base import Estimator, UpdateResult
-from fgtrack.estimation.registry import Claims, Factory, start_estimator
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import Estimator, TrackBank, UpdateResult
+from fgtrack.estimation.registry import Claims, Factory, start_bank, start_estimator
 from fgtrack.testing.broken import BrokenPromiseError
 from fgtrack.testing.streams import LAG_S, Stream
 
@@ -22,6 +23,16 @@ def require(condition: object, text: str) -> None:
         raise WrongError(text)
 
 
+def sound(mean: FloatArray, covariance: FloatArray, what: str) -> None:
+    """Raise `WrongError` unless a mean is finite and a covariance symmetric and positive definite."""
+    require(np.isfinite(mean).all(), f"the mean of {what} is {mean}")
+    require((covariance == covariance.T).all(), f"the covariance of {what} is not symmetric")
+    scale = np.sqrt(np.abs(np.diag(covariance)))
+    known = np.isfinite(scale).all() and (np.diag(covariance) > 0.0).all()
+    least = np.linalg.eigvalsh(covariance / np.outer(scale, scale)).min() if known else -np.inf
+    require(least > 0.0, f"the covariance of {what} is not positive definite")
+
+
 @dataclass(frozen=True)
 class Subject:
     """An estimator under test."""
@@ -34,6 +45,10 @@ class Subject:
     def start(self, stream: Stream) -> Estimator:
         """A new one for the object of `stream`."""
         return start_estimator(self.name, self.factory, stream.motion, stream.start, LAG_S, self.options)
+
+    def start_bank(self, stream: Stream) -> TrackBank:
+        """A new bank without any object, as the tracker has it."""
+        return start_bank(self.name, self.factory, stream.motion, LAG_S, self.options)
 
     def fed(self, stream: Stream) -> tuple[Estimator, list[UpdateResult]]:
         """A new one that has taken all of `stream`, and what it said."""

@@ -1,0 +1,153 @@
+"""What an estimator makes of several objects at once, and of what it has smoothed."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from fgtrack.core.types import STATE_NAMES, YAW, YAW_RATE, TrackState
+from fgtrack.estimation.base import Estimator, Measurement, Start, TrackBank, UpdateResult
+from fgtrack.estimation.dense_joint import dense_joint, difference
+from fgtrack.estimation.object_bank import state_of
+from fgtrack.estimation.propagation import wrapped_yaw
+from fgtrack.models.motion import MotionModel
+from fgtrack.pipeline.verify_banks import NUM_OBJECTS, List, born, fed, lists_of
+from fgtrack.testing.promise import Subject, require, sound
+from fgtrack.testing.streams import MS, Stream
+
+_TOGETHER = 1e-6
+_ROUNDING = 1e-6
+_GONE = 2
+
+
+def gives_each_of_several_objects_what_it_gives_one_alone(subject: Subject, stream: Stream) -> None:
+    """Each list has a measurement of most objects; half way one is removed and another one begins."""
+    objects = [_shifted(stream, number) for number in range(NUM_OBJECTS)]
+    lists = lists_of([one.measurements for one in objects])
+    half, new = (len(lists) + 1) // 2, len(objects)
+    later = [{new if number == _GONE else number: m for number, m in one.items()} for one in lists[half:]]
+    bank = subject.start_bank(stream)
+    born(bank, [one.start for one in objects])
+    said = fed(bank, lists[:half])
+    bank.remove(_GONE)
+    bank.birth(new, objects[_GONE].start)
+    said += fed(bank, later)
+    expected_ids = [number for number in range(new + 1) if number != _GONE]
+    require(sorted(bank.track_ids) == expected_ids, f"its objects are {bank.track_ids}, not {expected_ids}")
+    for number in expected_ids:
+        own = objects[_GONE if number == new else number]
+        begun = half if number == new else 0
+        estimator, results = _alone(subject, own, number, [*lists[:half], *later], begun)
+        _same_said(number, [one[number] for one in said if number in one], results)
+        for at_ns in (bank.present_ns - 120 * MS, bank.present_ns):
+            _same(state_of(bank, stream.motion, number, at_ns), estimator.state_at(at_ns), number, stream.motion)
+    _publishes_the_present(bank, stream.motion)
+    for report in bank.smoothed():
+        _sound_of(report.state, stream.motion, f"a smoothed state of object {report.track_id}")
+
+
+def hands_out_sound_smoothed_states(subject: Subject, stream: Stream) -> None:
+    """Final ones once each and in order, then the rest; in a linear model between the filtered and the best states."""
+    estimator, final = subject.start(stream), list[TrackState]()
+    for measurement in stream.measurements:
+        estimator.update(measurement)
+        final += estimator.take_final()  # type: ignore[attr-defined]  # the claim says that it has it
+    require(estimator.take_final() == [], "take_final gives states again")  # type: ignore[attr-defined]
+    rest = estimator.take_rest()  # type: ignore[attr-defined]
+    stamps = [state.stamp_ns for state in (*final, *rest)]
+    require(stamps == sorted(set(stamps)), f"stamps of final states and the rest are {stamps}: not in order, or twice")
+    missing = sorted({m.stamp_ns for m in stream.measurements} - set(stamps))
+    require(not missing, f"neither a final state nor one of the rest is at {missing}")
+    within = not stamps or (stream.start.stamp_ns <= stamps[0] and stamps[-1] <= stream.newest_ns)
+    require(within, f"stamps of final states and the rest are {stamps}, measured was up to {stream.newest_ns}")
+    for state in (*final, *rest):
+        sound(state.mean, state.covariance, f"the smoothed state at {state.stamp_ns}")
+        if stream.motion.linear:
+            _is_between(state, stream, _TOGETHER + subject.claims.tolerance)
+
+
+def _is_between(state: TrackState, stream: Stream, tolerance: float) -> None:
+    """Whether `state` knows what was measured up to its stamp at least, and all at most."""
+    motion, at_ns = stream.motion, state.stamp_ns
+    before = [m for m in stream.measurements if m.stamp_ns <= at_ns]
+    filtered = dense_joint(motion, stream.start, before, [at_ns])[at_ns]
+    best = dense_joint(motion, stream.start, stream.measurements, [at_ns])[at_ns]
+    least, own, most = (np.diag(each.covariance) for each in (best, state, filtered))
+    inside = (own >= (1.0 - tolerance) * least).all() and (own <= (1.0 + tolerance) * most).all()
+    require(inside, f"variances of the smoothed state at {at_ns} are {own}, not between {least} and {most}")
+    # of two estimates from nested data the difference has the difference of the covariances
+    off = np.abs(state.mean - best.mean)
+    require((off <= 6.0 * np.sqrt(most)).all(), f"the smoothed state at {at_ns} is {off} from that of all measurements")
+
+
+def _shifted(stream: Stream, number: int) -> Stream:
+    """The stream of another object, a little aside."""
+    shift = np.array([0.3, -0.2]) * number
+    start: Start = replace(stream.start, position_m=tuple(np.add(stream.start.position_m, shift).tolist()))
+    moved = []
+    for measurement in stream.measurements:
+        z = measurement.z.copy()
+        z[:2] += shift
+        moved.append(replace(measurement, z=z))
+    return replace(stream, measurements=tuple(moved), start=start)
+
+
+def _alone(
+    subject: Subject, own: Stream, number: int, lists: Sequence[List], begun: int
+) -> tuple[Estimator, list[UpdateResult]]:
+    """An estimator that is given what `lists` hold of the object `number`, which began with the list `begun`."""
+    estimator, results = subject.start(own), list[UpdateResult]()
+    now_ns = own.start.stamp_ns
+    for place, one in enumerate(lists):
+        now_ns = max(now_ns, *(measurement.stamp_ns for measurement in one.values()))
+        if place + 1 == begun:
+            estimator.advance(now_ns)
+        if place >= begun:
+            estimator.advance(now_ns)
+            given: Measurement | None = one.get(number)
+            if given is not None:
+                results.append(estimator.update(given))
+    return estimator, results
+
+
+def _same_said(number: int, found: Sequence[UpdateResult], expected: Sequence[UpdateResult]) -> None:
+    for one, other in zip(found, expected, strict=True):
+        require(one.status is other.status, f"of object {number} an update is {one.status}, alone it is {other.status}")
+        if other.innovation is not None and other.nis is not None:
+            same = one.innovation is not None and np.allclose(one.innovation, other.innovation, _TOGETHER, _TOGETHER)
+            same = same and one.nis is not None and abs(one.nis - other.nis) <= _TOGETHER * (1.0 + other.nis)
+            require(same, f"of object {number} the innovation is {one.innovation}, alone it is {other.innovation}")
+
+
+def _same(found: TrackState, expected: TrackState, number: int, motion: MotionModel) -> None:
+    off, covariance = difference(found, expected, motion)
+    require(
+        off < _TOGETHER and covariance < _TOGETHER,
+        f"the state of object {number} at {found.stamp_ns} differs from what it is alone by {off:.1e} standard "
+        f"deviations in the mean and {covariance:.1e} in the covariance",
+    )
+
+
+def _sound_of(shown: TrackState, motion: MotionModel, what: str) -> None:
+    """Whether a kinematic state is sound in the entries that `motion` has; the others are 0."""
+    known = [k for k, name in enumerate(STATE_NAMES[: len(shown.mean)]) if k < YAW_RATE or name in motion.state_names]
+    require(np.isfinite(shown.mean).all() and np.isfinite(shown.covariance).all(), f"{what} is not finite")
+    sound(shown.mean[known], shown.covariance[np.ix_(known, known)], what)
+
+
+def _publishes_the_present(bank: TrackBank, motion: MotionModel) -> None:
+    """The kinematic states of the objects now, in their order."""
+    shown = bank.present()
+    require(len(shown) == len(bank.track_ids), f"present() gives {len(shown)} states of {len(bank.track_ids)} objects")
+    for number, state in zip(bank.track_ids, shown, strict=True):
+        own = state_of(bank, motion, number, bank.present_ns)
+        mean, covariance = motion.kinematic(own.mean, own.covariance)
+        what = f"the present state of object {number}"
+        _sound_of(state, motion, what)
+        require(state.stamp_ns == bank.present_ns, f"{what} is at {state.stamp_ns}, the present at {bank.present_ns}")
+        off = np.asarray(state.mean - mean)
+        off[YAW] = wrapped_yaw(off)[YAW]
+        sigma = np.sqrt(np.diag(covariance))
+        apart = np.abs(state.covariance - covariance) <= _ROUNDING * np.outer(sigma, sigma)
+        require((np.abs(off) <= _ROUNDING * sigma + _ROUNDING).all(), f"{what} is {state.mean}, not {mean}")
+        require(apart.all(), f"the covariance of {what} is\n{state.covariance}\nnot\n{covariance}")

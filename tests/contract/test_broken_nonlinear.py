@@ -1,0 +1,259 @@
+"""What is wrong in a nonlinear model alone, with several objects, or in what is handed out, is found out as well."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fgtrack.core.time import seconds
+from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
+from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult
+from fgtrack.estimation.ekf import innovation_one, predict_one
+from fgtrack.estimation.ipls import PosteriorLinearisationSmoother
+from fgtrack.estimation.object_bank import ObjectBank
+from fgtrack.estimation.propagation import track_state
+from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.models.measurement import MeasurementModel
+from fgtrack.models.motion import CTRV, MotionModel, Step
+from fgtrack.testing import BrokenPromiseError, check_estimator, estimator_checks
+
+NEAR = "comes near the posterior of a nonlinear model"
+SEVERAL = "gives each of several objects what it gives one alone"
+COUNTS = "counts each measurement as what it is"
+SMOOTHED = "hands out sound smoothed states"
+
+
+class Sees(ReplayEkf):
+    """Fuses another measurement in a nonlinear model; linear ones it takes as they are."""
+
+    def update(self, measurement: Measurement) -> UpdateResult:
+        known = self.window_ns[0] <= measurement.stamp_ns and np.isfinite(measurement.z).all()
+        before = self.state_at(measurement.stamp_ns) if known else None
+        late = measurement.stamp_ns <= self.window_ns[1]
+        result = super().update(measurement if self._motion.linear else self.seen(measurement))
+        if result.nis is None or before is None or late:
+            return result
+        said = innovation_one(before.mean, before.covariance, measurement.seen_by(self._motion))
+        return replace(result, innovation=said.innovation, nis=said.nis, innovation_covariance=said.S)
+
+    def seen(self, measurement: Measurement) -> Measurement:
+        return measurement
+
+
+class WithQuadrupleNoise(Sees):
+    def seen(self, measurement: Measurement) -> Measurement:
+        return replace(measurement, R=4.0 * measurement.R)
+
+
+class WithoutPose(Sees):
+    def seen(self, measurement: Measurement) -> Measurement:
+        return replace(measurement, pose=type(measurement.pose)())
+
+
+class WithoutLoss(Sees):
+    def seen(self, measurement: Measurement) -> Measurement:
+        return replace(measurement, loss=None)
+
+
+class Unwrapped(MeasurementModel):
+    def residual(self, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
+        return np.asarray(z - z_predicted)
+
+
+class WithBearingsTheLongWay(Sees):
+    def seen(self, measurement: Measurement) -> Measurement:
+        if "bearing_rad" not in measurement.model.components:
+            return measurement
+        return replace(measurement, model=Unwrapped(measurement.model.components, measurement.model.state_names))
+
+
+class NineFold(CTRV):
+    def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
+        return 9.0 * super().process_noise(x, dt_s)
+
+    def step(self, x: Sequence[float], dt_s: float) -> Step:
+        found = super().step(x, dt_s)
+        return found._replace(Q=9.0 * found.Q)
+
+
+class WrongWay(CTRV):
+    def step(self, x: Sequence[float], dt_s: float) -> Step:
+        found = super().step(x, dt_s)
+        found.F[:2, [2, 4]] *= -1.0
+        return found
+
+
+class Believes(Sees):
+    """Between measurements it follows another model; ahead of them the right one."""
+
+    believed: type[CTRV]
+
+    def __init__(self, motion: MotionModel, start: Start, lag_s: float) -> None:
+        super().__init__(motion if motion.linear else self.believed(), start, lag_s)
+        self._right = motion
+
+    def state_at(self, stamp_ns: int) -> TrackState:
+        newest_ns = self.window_ns[1]
+        state = super().state_at(min(stamp_ns, newest_ns))
+        if stamp_ns <= newest_ns:
+            return state
+        ahead = predict_one(state.mean, state.covariance, self._right, seconds(stamp_ns - newest_ns))
+        return track_state(self._right, stamp_ns, *ahead)
+
+
+class BelievesInNoise(Believes):
+    believed = NineFold
+
+
+class BelievesInTheWrongWay(Believes):
+    believed = WrongWay
+
+
+class SaysMinusOne(ReplayEkf):
+    def update(self, measurement: Measurement) -> UpdateResult:
+        result = super().update(measurement)
+        return result if result.nis is None else replace(result, innovation_covariance=-np.eye(len(measurement.z)))
+
+
+class SaysAnotherCovariance(ReplayEkf):
+    def update(self, measurement: Measurement) -> UpdateResult:
+        result = super().update(measurement)
+        S = result.innovation_covariance
+        return result if S is None else replace(result, innovation_covariance=1.1 * S)
+
+
+class FilterBank(ObjectBank[ReplayEkf]):
+    """What the broken banks are made of."""
+
+    bank = True
+
+    def __init__(self, motion: MotionModel, lag_s: float) -> None:
+        super().__init__(motion, lambda start: ReplayEkf(motion, start, lag_s), lag_s)
+
+
+class FirstOfAll(FilterBank):
+    def update(self, stamp_ns: int, track_ids: Any, measurements: Any) -> list[UpdateResult]:
+        return super().update(stamp_ns, [self.track_ids[0]] * len(track_ids), measurements)
+
+
+class InAnotherOrder(FilterBank):
+    def update(self, stamp_ns: int, track_ids: Any, measurements: Any) -> list[UpdateResult]:
+        return super().update(stamp_ns, track_ids, measurements[::-1])
+
+
+class NeverRemoves(FilterBank):
+    def remove(self, track_id: int) -> None:
+        raise RuntimeError("no")
+
+
+class ForgetsToRemove(FilterBank):
+    def remove(self, track_id: int) -> None:
+        pass
+
+
+class RemovesTheNext(FilterBank):
+    def remove(self, track_id: int) -> None:
+        super().remove(track_id + 1)
+
+
+class ShowsNoNumber(FilterBank):
+    def present(self) -> list[TrackState]:
+        return [TrackState(one.stamp_ns, np.nan * one.mean, -one.covariance) for one in super().present()]
+
+
+class ShowsAnother(FilterBank):
+    def present(self) -> list[TrackState]:
+        return super().present()[::-1]
+
+
+class ShowsTooSure(FilterBank):
+    def present(self) -> list[TrackState]:
+        return [TrackState(one.stamp_ns, one.mean, 0.01 * one.covariance) for one in super().present()]
+
+
+class SmoothsToNoNumber(FilterBank):
+    def smoothed(self) -> list[SmoothedReport]:
+        return [SmoothedReport(0, TrackState(0, np.full(5, np.nan), -np.eye(5)), None)]
+
+
+class GivesOneForAll(FilterBank):
+    def states_at(self, stamp_ns: int) -> StatesAt:
+        states = super().states_at(stamp_ns)
+        return replace(states, means=np.repeat(states.means[:1], len(states.means), axis=0))
+
+
+class Reports(PosteriorLinearisationSmoother):
+    """What the broken smoothers are made of."""
+
+
+class ReportsNoNumber(Reports):
+    def take_final(self) -> list[TrackState]:
+        return [TrackState(one.stamp_ns, np.nan * one.mean, one.covariance) for one in super().take_final()]
+
+
+class ReportsNegative(Reports):
+    def take_rest(self) -> list[TrackState]:
+        return [TrackState(one.stamp_ns, one.mean, -one.covariance) for one in super().take_rest()]
+
+
+class ReportsTwice(Reports):
+    def take_rest(self) -> list[TrackState]:
+        return super().take_rest() * 2
+
+
+class ReportsTooSure(Reports):
+    def take_final(self) -> list[TrackState]:
+        return [TrackState(one.stamp_ns, one.mean, 0.5 * one.covariance) for one in super().take_final()]
+
+
+class ReportsNothing(Reports):
+    def take_final(self) -> list[TrackState]:
+        super().take_final()
+        return []
+
+
+class ReportsElsewhere(Reports):
+    def take_rest(self) -> list[TrackState]:
+        return [TrackState(one.stamp_ns, one.mean + 100.0, one.covariance) for one in super().take_rest()]
+
+
+@pytest.mark.parametrize(
+    ("broken", "promise"),
+    [
+        (WithQuadrupleNoise, NEAR),
+        (WithoutPose, NEAR),
+        (WithoutLoss, NEAR),
+        (WithBearingsTheLongWay, NEAR),
+        (BelievesInNoise, NEAR),
+        (BelievesInTheWrongWay, NEAR),
+        (SaysMinusOne, COUNTS),
+        (SaysAnotherCovariance, COUNTS),
+        (FirstOfAll, SEVERAL),
+        (InAnotherOrder, SEVERAL),
+        (NeverRemoves, SEVERAL),
+        (ForgetsToRemove, SEVERAL),
+        (RemovesTheNext, SEVERAL),
+        (ShowsNoNumber, SEVERAL),
+        (ShowsAnother, SEVERAL),
+        (ShowsTooSure, SEVERAL),
+        (SmoothsToNoNumber, SEVERAL),
+        (GivesOneForAll, SEVERAL),
+        (ReportsNoNumber, SMOOTHED),
+        (ReportsNegative, SMOOTHED),
+        (ReportsTwice, SMOOTHED),
+        (ReportsTooSure, SMOOTHED),
+        (ReportsNothing, SMOOTHED),
+        (ReportsElsewhere, SMOOTHED),
+    ],
+)
+def test_what_is_broken_is_found_out_by_its_promise(broken: type, promise: str) -> None:
+    with pytest.raises(BrokenPromiseError, match="measurements in the order of arrival") as error:
+        estimator_checks(broken)[promise]()
+    assert list(error.value.promises) == [promise]
+
+
+@pytest.mark.parametrize("kind", [Sees, FilterBank, Reports])
+def test_what_they_are_made_of_keeps_the_contract(kind: type) -> None:
+    check_estimator(kind, num_streams=2)
