@@ -24,6 +24,7 @@ from fgtrack.estimation.dense_joint import Difference, dense_joint, difference
 from fgtrack.pipeline.certificate import Subject
 from fgtrack.pipeline.nasty_streams import NASTY
 from fgtrack.pipeline.oracle.estimates import smoothed
+from fgtrack.pipeline.oracle.filters import filtered
 from fgtrack.pipeline.verify import exact_estimators
 from fgtrack.pipeline.verify_streams import Stream
 
@@ -108,8 +109,8 @@ def apart_from(found: States, expected: States, stream: Stream) -> Difference:
 def oracle(stream: Stream, subject: Subject, stamps_ns: Sequence[int]) -> States:
     """What the estimator says that it solves, by other means; nothing where these do not reach.
 
-    The filter of the oracle takes those of one stamp as they stand, so it is none for two bearings; the heading must be
-    known, and a loss that descends again may have another minimum next to the oracle's start.
+    The filter of the oracle takes the measurements of one stamp as they are drawn, so it is none for two bearings; the
+    heading must be known, and a loss that descends again may have another minimum next to the oracle's start.
     """
     if stream.motion.linear:
         known_ns = stamps_ns if subject.claims.smooths else [at for at in stamps_ns if at >= stream.newest_ns]
@@ -122,7 +123,8 @@ def oracle(stream: Stream, subject: Subject, stamps_ns: Sequence[int]) -> States
     bearings = any("x_m" not in one.names and len(one.names) == 1 for one in stream.sightings)
     if subject.claims.solves != "ekf" or robust or bearings:
         return {}
-    return {at: TrackState(at, *found) for at in stamps_ns if (found := stream.filtered.get(at)) is not None}
+    found = filtered(stream.problem)
+    return {at: TrackState(at, *found.state_at(at)) for at in stamps_ns}
 
 
 def solutions(stream: Stream, subject: Subject, runs: Sequence[Estimator]) -> list[States]:

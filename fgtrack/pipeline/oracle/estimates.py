@@ -60,7 +60,7 @@ def smoothed(problem: Problem, first: FloatArray | None = None, linearisation: L
     comes no closer is halved. What is not linear is affine about the result, and over its spread, as `linearisation`
     says: with averages it is the iterated posterior linearisation smoother.
     """
-    started = filtered(problem).estimates.values()
+    started = [problem.start] * len(problem.stamps_ns) if first is not None else filtered(problem).estimates.values()
     means = np.array([estimate.mean for estimate in started]) if first is None else first
     covariances = np.array([estimate.covariance for estimate in started])
     last, share = np.inf, 1.0

@@ -10,6 +10,8 @@ from fgtrack.pipeline.oracle.problem import NS_PER_S, Estimate, Problem, conditi
 from fgtrack.pipeline.oracle.sightings import Sighting
 
 _MAX_STEPS = 500
+#: Of a sighting that a loss ignores.
+_LEAST_WEIGHT = 1e-12
 #: Changes that are rounding: of a state, in standard deviations, after difference quotients; and of a weight.
 _AT_REST, _WEIGHT_AT_REST = 1e-9, 1e-12
 
@@ -87,7 +89,7 @@ def _with(prior: Estimate, one: Sighting, seen: Seen) -> Estimate:
     R, weight = np.eye(len(seen.y)) + seen.noise, 1.0
     W = whitening(R)
     for _ in range(_MAX_STEPS):
-        K, P = conditioned(prior.covariance, seen.H, R / weight)
+        K, P = conditioned(prior.covariance, seen.H, R / max(weight, _LEAST_WEIGHT))
         step = K @ seen.y
         last, weight = weight, one.weight(W @ (seen.y - seen.H @ step))
         if abs(weight - last) < _WEIGHT_AT_REST:
