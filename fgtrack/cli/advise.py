@@ -43,10 +43,10 @@ def advise(
         check_apart(out, inputs(config, [recording], config_file=config_file))
     with progress("advise") as tell:
         advice = advised(recording, config, reference=reference, tune=tune, on_step=tell)
-    show(advice.tables, form, advice.as_dict())
     if out is not None:
         write_advised(out, config_file, advice.config, advice.comments(), overwrite)
-        if form is None:
-            say(f"{out}: written; follow it by `fgtrack replay {recording} -c {out} -o RUN`")
+    show(advice.tables, form, advice.as_dict())
+    if out is not None and form is None:
+        say(f"{out}: written; follow it by `fgtrack replay {recording} -c {out} -o RUN`")
     if advice.broken is not None:
         raise DataError(f"{located(advice.broken, str(recording))}; used up to there")

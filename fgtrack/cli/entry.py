@@ -2,12 +2,20 @@
 
 import sys
 
+from fgtrack.cli.interrupts import INTERRUPTED, end_with, interrupted, watch
+
 
 def main() -> None:
     """Load the command line, run it and exit."""
+    watch()
     try:
         from fgtrack.cli.main import main as run
-    except KeyboardInterrupt:
+
+        code = run()
+    except (KeyboardInterrupt, Exception) as error:
+        if not isinstance(error, KeyboardInterrupt) and not interrupted():
+            raise
         print("fgtrack: error: interrupted", file=sys.stderr)
-        sys.exit(130)
-    run()
+        code = INTERRUPTED
+    end_with(code)
+    sys.exit(code)

@@ -2,11 +2,12 @@
 
 import ast
 import logging
+import os
 import sys
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
-from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,10 +15,12 @@ import typer
 from typer.core import TyperGroup
 
 import fgtrack
-from fgtrack.core.errors import CallError, FgtrackError, one_line
+from fgtrack.cli.interrupts import INTERRUPTED, interrupted
+from fgtrack.cli.streams import standard_streams
+from fgtrack.core.errors import CallError, DataError, FgtrackError, one_line
 from fgtrack.io.output import FULL
 
-DONE, BAD_DATA, BAD_CALL, INTERRUPTED = 0, 1, 2, 130
+DONE, BAD_DATA, BAD_CALL = 0, 1, 2
 
 #: Commands in the order of the help; each is a function in the module of its name.
 COMMANDS = (
@@ -30,14 +33,34 @@ _STYLE: dict[str, Any] = {"add_completion": False, "rich_markup_mode": None, "pr
 class _LazyCommands(TyperGroup):
     """Imports a command's module when the command is called; the help needs none of them."""
 
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; what Typer would end the program by, without a word, is an error."""
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError as error:
+            raise DataError(f"{error.filename or 'an output'}: who was to read it has left") from error
+        except SystemExit as error:
+            what = f"SystemExit: {error.code}"
+            raise CallError(
+                f"a plug-in, or what it loads, ends the program ({what}): repair or uninstall it"
+            ) from error
+
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         name, _, rest = super().resolve_command(ctx, args)
         return name, None if name is None else _command(name), rest
 
 
 def _command(name: str) -> Any:  # Any: Typer does not export the type of its commands
+    try:
+        module = import_module(f"fgtrack.cli.{name}")
+    except Exception as error:  # of a library, which may look at files and variables of the system
+        what = f"{type(error).__name__}: {error}"
+        raise CallError(
+            f"what {name} needs cannot be loaded ({what}): look at its environment variables and settings, or install "
+            "it anew"
+        ) from error
     single = typer.Typer(**_STYLE)
-    single.command(name)(getattr(import_module(f"fgtrack.cli.{name}"), name))
+    single.command(name)(getattr(module, name))
     return typer.main.get_command(single)
 
 
@@ -86,14 +109,17 @@ def run(arguments: Sequence[str]) -> int:
     """Run one command; gives the exit code. Errors are one line on stderr."""
     debug = "--debug" in arguments
     words = [word for word in arguments if word != "--debug"]
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # not every terminal knows every letter
-            stream.reconfigure(errors="backslashreplace")
+    with standard_streams():
+        return _run(words, debug)
+
+
+def _run(words: Sequence[str], debug: bool) -> int:
     logged = logging.StreamHandler()
     logged.setFormatter(_OneLine("fgtrack: %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[logged], force=True)
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # figures need nothing of what it looks for in the system
     try:
-        outcome = typer.main.get_command(app).main(words or ["--help"], prog_name="fgtrack", standalone_mode=False)
+        outcome = typer.main.get_command(app).main([*words] or ["--help"], prog_name="fgtrack", standalone_mode=False)
         if outcome == INTERRUPTED:  # typer turns the exception into this code
             return _failed("interrupted; what was computed so far is in the output folder", INTERRUPTED, debug)
         sys.stdout.flush()
@@ -104,18 +130,25 @@ def run(arguments: Sequence[str]) -> int:
         return _failed(str(error), BAD_CALL, debug)
     except FgtrackError as error:
         return _failed(str(error), BAD_DATA, debug)
-    except BrokenPipeError:
-        sys.stderr.close()  # the reader of a pipe has left: not an error worth a line
-        return DONE
     except OSError as error:  # of files, the library makes its own errors
         if error.errno in FULL:
             what = f"what was to be printed cannot be written ({error.strerror}), free some space"
             return _failed(what, BAD_DATA, debug)
         if error.filename is not None:  # of a path that was given, there or in a file
             return _failed(f"{error.filename}: cannot be used, the system says: {error.strerror}", BAD_CALL, debug)
+        if _is_nowhere():
+            return _failed("the working directory has been removed, change to another one", BAD_CALL, debug)
         return _bug(error, debug)
     except Exception as error:  # the last line of defence: a bug must not look like bad data
         return _bug(error, debug)
+
+
+def _is_nowhere() -> bool:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def _bug(error: Exception, debug: bool) -> int:
@@ -125,10 +158,14 @@ def _bug(error: Exception, debug: bool) -> int:
 def _failed(message: str, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
-    print(f"fgtrack: error: {one_line(message)}", file=sys.stderr)
+    if code != INTERRUPTED and interrupted():  # the error is what a library has made of it
+        message, code = "interrupted", INTERRUPTED
+    with suppress(OSError):  # where that cannot be written either, the code is all that can be said
+        print(f"fgtrack: error: {one_line(message)}", file=sys.stderr, flush=True)
     return code
 
 
-def main() -> None:
-    """Run the command line and exit."""
-    sys.exit(run(sys.argv[1:]))
+def main() -> int:
+    """Run the command line of this process; gives the exit code."""
+    os.environ["MPLBACKEND"] = "agg"  # nothing is shown in a window, so none of the system's is needed
+    return run(sys.argv[1:])

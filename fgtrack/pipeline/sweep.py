@@ -192,7 +192,8 @@ def _local(tasks: Sequence[_Task], score: Score, jobs: int) -> Iterator[_Result]
     Where a process dies (out of memory, a crash in a library) joblib gives up all that were handed out. These are
     tried again alone; what kills its process again is bad.
     """
-    count = joblib.effective_n_jobs(jobs)
+    with _told():
+        count = joblib.effective_n_jobs(jobs)
     left = dict(tasks)
     while left:
         try:
@@ -218,8 +219,22 @@ def _alone(key: str, recipe: Recipe, score: Score) -> Cell:
 def _in_processes(tasks: Sequence[_Task], score: Score, count: int) -> Iterator[_Result]:
     # With several jobs at once, threads of BLAS would only wait for each other.
     settings = {"inner_max_num_threads": 1, "initializer": _leave_with, "initargs": (os.getpid(),)}
-    with joblib.parallel_config("loky", n_jobs=count, **settings):
+    with joblib.parallel_config("loky", n_jobs=count, **settings), _told():
         yield from _results(tasks, score)
+
+
+@contextmanager
+def _told() -> Iterator[None]:
+    """What keeps processes from starting is said in a line; what goes wrong in a job is told by its cells."""
+    try:
+        yield
+    except FileNotFoundError:  # names the folder, or there is no working directory
+        raise
+    except (OSError, ValueError) as error:
+        raise CallError(
+            f"processes cannot be started ({_reason(error)}): look at the environment variables of joblib "
+            "(JOBLIB_..., LOKY_...) and at the limits of the system"
+        ) from error
 
 
 def _leave_with(parent: int) -> None:

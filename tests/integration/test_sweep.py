@@ -29,7 +29,7 @@ from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-FGTRACK = (sys.executable, "-c", "from fgtrack.cli.main import main; main()")
+FGTRACK = (sys.executable, "-c", "from fgtrack.cli.entry import main; main()")
 PATIENCE_S = 120.0
 POINT = ("lidar_delay_s", "association.gate_m", "seed")
 

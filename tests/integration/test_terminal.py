@@ -22,7 +22,7 @@ from dataclasses import replace
 from fgtrack.cli import demo, main
 read = demo.read_scenario
 demo.read_scenario = lambda name: replace(read(name), duration_s=3.0)
-main.main()
+raise SystemExit(main.main())
 """
 
 
