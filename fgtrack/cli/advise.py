@@ -7,7 +7,7 @@ import typer
 
 from fgtrack.advice.advise import advise as advised
 from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, Overwrite, PitMap, Reference, Settings, TrackMap
-from fgtrack.cli.show import chosen_form, progress, say, show
+from fgtrack.cli.show import chosen_form, command_line, progress, say, show
 from fgtrack.core.errors import DataError
 from fgtrack.io.output import check_apart, check_output
 from fgtrack.pipeline.inputs import inputs
@@ -47,6 +47,6 @@ def advise(
         write_advised(out, config_file, advice.config, advice.comments(), overwrite)
     show(advice.tables, form, advice.as_dict())
     if out is not None and form is None:
-        say(f"{out}: written; follow it by `fgtrack replay {recording} -c {out} -o RUN`")
+        say(f"{out}: written; follow it by `{command_line('fgtrack', 'replay', recording, '-c', out, '-o', 'RUN')}`")
     if advice.broken is not None:
         raise DataError(f"{located(advice.broken, str(recording))}; used up to there")

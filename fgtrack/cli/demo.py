@@ -13,7 +13,7 @@ from fgtrack.cli.arguments import Overwrite
 from fgtrack.cli.compare import written_tables
 from fgtrack.cli.figure import drawn_close_up
 from fgtrack.cli.report import REPORT, write_report
-from fgtrack.cli.show import TickProgress, progress, say, sentences, show, told
+from fgtrack.cli.show import TickProgress, command_line, progress, say, sentences, show, told
 from fgtrack.evaluation.comparison import compare
 from fgtrack.evaluation.figures.style import DRAWN
 from fgtrack.evaluation.plot import named_figures, save_named
@@ -97,7 +97,7 @@ def demo(
             files = save_named(drawn, folder, "png")
         with progress("report"):
             write_report(fitted, drawn, page, overwrite)
-        say(f"\nevery table and column: fgtrack compare {out / 'runs'} --all")
+        say(f"\nevery table and column: {command_line('fgtrack', 'compare', out / 'runs', '--all')}")
         say(f"recording: {bag}\nruns: {out / 'runs'}\nfigures: {figures}, {len(files)} pictures")
         say(f"report: {page}, open it in a browser")
 

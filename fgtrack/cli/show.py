@@ -1,6 +1,7 @@
 """What commands show: tables on stdout, progress on stderr where that is a terminal."""
 
 import json
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -43,6 +44,11 @@ def console() -> Console:
 def say(line: object) -> None:
     """Print a line as it is, however long."""
     console().print(printable_lines(str(line)), highlight=False, soft_wrap=True, markup=False)
+
+
+def command_line(*words: object) -> str:
+    """A command as a shell takes it, whatever is in the names of files."""
+    return shlex.join(map(str, words))
 
 
 def warn(line: str) -> None:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import StringIO
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,7 @@ from rich.console import Console
 
 from fgtrack.advice.noise import noise_fits
 from fgtrack.cli.arguments import ConfigFile, FormOption, Json, Overwrite, PitMap, Settings, TrackMap
-from fgtrack.cli.show import chosen_form, progress, say, show
+from fgtrack.cli.show import chosen_form, command_line, progress, say, show
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.consistency import position_nees
@@ -59,7 +60,7 @@ def tune(
     with progress("tune") as tell:
         report = tuned(sources, config, TuneRules(keep=tuple(keep or ())), tell)
     tables, found = Tables(_tables(report)), _sensors(report)
-    options = [*(f"--set '{setting}'" for setting in settings or []), *(f"--keep {key}" for key in keep or [])]
+    options = [*(("--set", setting) for setting in settings or []), *(("--keep", key) for key in keep or [])]
     lines = [_command(recordings, out, config_file, track_map, pit_map, options), ""]
     lines += [*_text(tables), "", *found]
     write_tuned(out, config_file, report.config, lines, overwrite)
@@ -76,12 +77,11 @@ def _command(
     config_file: str | None,
     track_map: str | None,
     pit_map: str | None,
-    options: Sequence[str],
+    options: Sequence[tuple[str, str]],
 ) -> str:
-    words = ["  fgtrack tune", *map(str, recordings)]
-    for flag, value in (("-c", config_file), ("-o", out), ("--map", track_map), ("--pit-map", pit_map)):
-        words += [] if value is None else [flag, str(value)]
-    return " ".join([*words, *options])
+    files = (("-c", config_file), ("-o", out), ("--map", track_map), ("--pit-map", pit_map))
+    given = [(flag, value) for flag, value in files if value is not None]
+    return f"  {command_line('fgtrack', 'tune', *recordings, *chain.from_iterable([*given, *options]))}"
 
 
 def _tables(report: TuneReport) -> dict[str, Table]:

@@ -25,6 +25,7 @@ NO_VALUE = "-"
 
 _MOST_DECIMALS = 5
 _WIDTH = 120  # of a table as text
+_MARKDOWN = {"\\": r"\\", "|": r"\|", "<": r"\<"}
 _LATEX = {char: f"\\{char}" for char in "&%$#_{}"} | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _LATEX |= {"\\": r"\textbackslash{}", "±": r"$\pm$", "<": r"$<$", ">": r"$>$"}
 
@@ -165,12 +166,11 @@ class Table(RunTable):
     def to_markdown(self) -> str:
         """A table of GitHub Markdown under a heading, the notes below."""
         shown, notes = self._visible(), self._visible_notes()
-        head = [_one_line(column.heading) for column in shown]
+        head = [_markdown(_one_line(column.heading)) for column in shown]
         rule = [":---" if column.left else "---:" for column in shown]
-        cells = cell_rows(shown, lambda cell, bold: f"**{cell.strip()}**" if bold else cell)
-        rows = [[cell.replace("|", r"\|") for cell in row] for row in (head, rule, *cells)]
-        text = [f"### {self.title}", "", *(f"| {' | '.join(row)} |" for row in rows), ""]
-        return "\n".join([*text, *(f"- {note}" for note in notes), *([""] if notes else [])])
+        cells = cell_rows(shown, lambda cell, bold: f"**{_markdown(cell.strip())}**" if bold else _markdown(cell))
+        text = [f"### {_markdown(self.title)}", "", *(f"| {' | '.join(row)} |" for row in (head, rule, *cells)), ""]
+        return "\n".join([*text, *(f"- {_markdown(note)}" for note in notes), *([""] if notes else [])])
 
     _repr_markdown_ = to_markdown  # what a notebook shows
 
@@ -179,7 +179,7 @@ class Table(RunTable):
         shown = self._visible()
         head = [_latex(_one_line(column.heading)) for column in shown]
         rows = cell_rows(shown, lambda cell, bold: f"\\textbf{{{_latex(cell)}}}" if bold else _latex(cell))
-        body = [f"{' & '.join(row)} \\\\" for row in rows]
+        body = [f"{'{}' if row[0][:1] in ('[', '*') else ''}{' & '.join(row)} \\\\" for row in rows]  # no option of \\
         spec = "".join("l" if column.left else "r" for column in shown)
         return "\n".join(
             [
@@ -251,7 +251,7 @@ class Tables(Mapping[str, Table]):
 
     def to_markdown(self, name: str | None = None) -> str:
         """The table `name`, or those that are shown."""
-        verdict = [] if name else [f"- {printable(line)}" for line in self.verdict]
+        verdict = [] if name else [f"- {_markdown(printable(line))}" for line in self.verdict]
         lines = "\n".join([*verdict, "", ""]) if verdict else ""
         return lines + "\n".join(table.to_markdown() for table in self._filled(name))
 
@@ -307,6 +307,11 @@ def cell_rows(columns: Sequence[Shown], form: Callable[[str, bool], Cell]) -> It
 
 def _one_line(heading: str) -> str:
     return heading.replace("-\n", "").replace("/\n", "/").replace("\n", " ")
+
+
+def _markdown(text: str) -> str:
+    """`text` without what Markdown, or HTML in it, would make of names: cells, elements, links."""
+    return "".join(_MARKDOWN.get(char, char) for char in text).replace("](", r"]\(")
 
 
 def _latex(text: str) -> str:

@@ -11,6 +11,7 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import CommentMark
 from ruamel.yaml.tokens import CommentToken
 
+from fgtrack.core.errors import printable
 from fgtrack.io.output import Kind, new_file
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import plain, validate
@@ -75,8 +76,8 @@ def _text(base: str | Path | None, wanted: Config, comments: Sequence[str], titl
     _change(document, origin, wanted)
     text = StringIO()
     yaml.dump(document, text)
-    head = [f"# {title.format(name)} {mark}.", "#", *(f"# {line}".rstrip() for line in comments)]
-    return "\n".join([*head, "#", text.getvalue()])
+    head = [f"{title.format(name)} {mark}.", "", *comments, ""]
+    return "\n".join([*(f"# {printable(line)}".rstrip() for line in head), text.getvalue()])
 
 
 def _change(document: Any, origin: object, wanted: object) -> None:  # Any: a mapping of ruamel's

@@ -1,6 +1,7 @@
 """`fgtrack tune`: from recordings of known noise to a configuration with that noise."""
 
 import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,13 +9,14 @@ import numpy as np
 import pytest
 
 from fgtrack.cli.main import run
+from fgtrack.cli.tune import _command
 from fgtrack.core.types import EgoState
 from fgtrack.io.run import load_run
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
 from fgtrack.pipeline.shipped import read_config, read_scenario
-from fgtrack.pipeline.tune_file import tuned_text
+from fgtrack.pipeline.tune_file import tuned_text, write_advised, write_tuned
 from fgtrack.pipeline.tune_measurements import recorded
 from fgtrack.pipeline.tune_space import ConfigNoise
 from fgtrack.sim.simulate import simulate
@@ -145,6 +147,24 @@ def test_without_a_file_the_text_holds_what_is_no_default() -> None:
     assert text.startswith("# The noise of the defaults, fitted to recordings (fgtrack tune).\n#\n# why\n")
     assert "estimator" not in text
     assert "    std: {x_m: 1.5, y_m: 3.0, speed_mps: 0.2}\n" in text
+
+
+@pytest.mark.parametrize("end", ["\n", "\r", "\x85", "\u2028", "\x0b"])
+def test_no_name_in_a_comment_becomes_a_setting(end: str, tmp_path: Path) -> None:
+    base = tmp_path / f"odd{end}ignore_sensors: [radar] #.yaml"
+    base.write_text("estimator: ekf-replay\n", encoding="utf-8")
+    config, comment = read_config(base), f"x{end}ignore_sensors: [radar] #.jsonl"
+    for write in (write_tuned, write_advised):
+        write(tmp_path / "out.yaml", base, config, [comment], overwrite=True)
+        assert load(Config, tmp_path / "out.yaml") == config
+        (tmp_path / "out.yaml").unlink()
+
+
+def test_the_command_in_a_tuned_file_is_one_that_a_shell_takes() -> None:
+    told = _command([Path("my drive.jsonl")], Path("a;b.yaml"), None, "it's", None, [("--set", "a.b=c d")])
+    assert shlex.split(told) == "fgtrack tune|my drive.jsonl|-o|a;b.yaml|--map|it's|--set|a.b=c d".replace(
+        " ", "|", 1
+    ).split("|")
 
 
 COMMENTED = """\

@@ -142,6 +142,21 @@ def test_what_means_something_in_latex_or_markdown_is_escaped() -> None:
     assert r"| 50%_a&b\|c |" in table.to_markdown().splitlines()
 
 
+def test_names_can_be_neither_cells_links_nor_elements() -> None:
+    rows = [r"a\|b", "<img src=x>", "[x](javascript:y)", "*z"]
+    table = Table("<t>", [Column("run", ("run",), lambda row: (row,), left=True)], rows, notes=["<n>"])
+    assert table.to_markdown().splitlines()[0] == r"### \<t>"
+    assert table.to_markdown().splitlines()[4:] == [
+        r"| a\\\|b |",
+        r"| \<img src=x> |",
+        r"| [x]\(javascript:y) |",
+        "| *z |",
+        "",
+        r"- \<n>",
+    ]
+    assert [row[:3] for row in table.to_latex().splitlines()[9:11]] == ["{}[", "{}*"]
+
+
 def test_a_column_has_several_numbers_in_a_cell_and_a_dash_for_none() -> None:
     rows: list[tuple[float, float] | None] = [(0.00123, 0.0156), None, (math.nan, 2.0)]
     table = Table("times", [Column("ms/\ntick", ("p50_s", "p99_s"), lambda row: row, "{}/{}", 1e3)], rows)
