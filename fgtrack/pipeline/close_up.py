@@ -62,7 +62,7 @@ def close_up_of(run: Run, arrival: Arrival) -> CloseUp:
         given = (run.meta.get("input") or {}).get("path") or "messages in memory"
         raise DataError(f"{given}: the recording of the run is not there, so no close-up")
     try:
-        config = validate(Config, run.config, f"configuration of {run.path or 'the run'}")
+        config = validate(Config, run.config, str(run.config_path))
         ticks = delivered(open_input(recording, config.input).messages(), config)
         return close_up(lambda observed: build_tracker(config, observed), ticks, arrival)
     except CallError as error:  # nobody has called with it: it is what the run says

@@ -226,8 +226,17 @@ def test_a_tick_is_contested_where_a_row_or_an_object_has_a_choice() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("evaluation: {gate_m: -1}", r"run.config\.yaml: evaluation: gate_m: must be positive, is -1"),
-        ("evaluation: {gate_m: wide}", r"run.config\.yaml: evaluation: "),
+        (
+            "evaluation: {gate_m: -1}",
+            r"run.config\.yaml: evaluation: gate_m: must be positive and at most 1e\+09, is -1",
+        ),
+        ("evaluation: {gate_m: wide}", r"run.config\.yaml: evaluation.gate_m is not"),
+        ("evaluation: {gate_m: .inf}", r"run.config\.yaml: evaluation: gate_m: must be positive"),
+        ("evaluation: {gospa_c_m: .nan}", r"run.config\.yaml: evaluation: gospa_c_m: must be positive"),
+        ("evaluation: {late_switch_s: 1.0e+300}", r"run.config\.yaml: evaluation: late_switch_s: must not be"),
+        ("evaluation: {confirmed_only: [1]}", r"run.config\.yaml: evaluation.confirmed_only is not"),
+        ("evaluation: {multi_object: maybe}", r"run.config\.yaml: evaluation.multi_object is not"),
+        ("evaluation: [1]", r"run.config\.yaml: evaluation is not"),
         ("evaluation: {", r"run.config\.yaml: is not YAML"),
     ],
 )

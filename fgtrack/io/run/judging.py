@@ -1,9 +1,12 @@
 """How a run is evaluated, as its configuration says."""
 
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
-from fgtrack.core.errors import DataError
-from fgtrack.io.run.reader import Run
+from fgtrack.core.checks import LARGEST
+
+if TYPE_CHECKING:  # reading a run checks its section by `EvaluationConfig`
+    from fgtrack.io.run.reader import Run
 
 
 @dataclass(frozen=True)
@@ -31,23 +34,21 @@ class EvaluationConfig:
     def __post_init__(self) -> None:
         for name in ("gate_m", "gospa_c_m"):
             value = getattr(self, name)
-            if value is not None and not value > 0.0:
-                raise ValueError(f"{name}: must be positive, is {value}")
-        if not self.late_switch_s >= 0.0:
-            raise ValueError(f"late_switch_s: must not be negative, is {self.late_switch_s}")
+            if value is not None and not 0.0 < value <= LARGEST:
+                raise ValueError(f"{name}: must be positive and at most {LARGEST:g}, is {value}")
+        if not 0.0 <= self.late_switch_s <= LARGEST:
+            raise ValueError(f"late_switch_s: must not be negative, nor above {LARGEST:g}, is {self.late_switch_s}")
 
 
-def evaluation_config(run: Run) -> EvaluationConfig:
+def evaluation_config(run: "Run") -> EvaluationConfig:
     """The section `evaluation` of the run's config.yaml; defaults for what it does not say.
 
     Raises
     ------
     DataError
-        config.yaml is not YAML, or a value is out of range.
+        config.yaml is not YAML, or a value is of another type or out of range.
     """
     found = run.config.get("evaluation") or {}
-    try:
-        known = {entry.name: found[entry.name] for entry in fields(EvaluationConfig) if entry.name in found}
-        return EvaluationConfig(**known)
-    except (TypeError, ValueError) as error:
-        raise DataError(f"{run.config_path}: evaluation: {error}") from error
+    return EvaluationConfig(
+        **{entry.name: found[entry.name] for entry in fields(EvaluationConfig) if entry.name in found}
+    )

@@ -10,6 +10,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import DataError
+from fgtrack.io.run.judging import EvaluationConfig
 
 __all__ = ["check_config", "check_meta"]
 
@@ -91,7 +92,7 @@ class _Config:
     clock: _Clock | None = None
     smoother: _Smoother | None = None
     input: Mapping[str, Any] | None = None
-    evaluation: Mapping[str, Any] | None = None
+    evaluation: EvaluationConfig | None = None
 
 
 _META, _CONFIG = TypeAdapter(_Meta), TypeAdapter(_Config)
@@ -112,7 +113,10 @@ def _check(kind: TypeAdapter[Any], value: Any, path: Path) -> None:
         text = json.dumps(value, default=str, skipkeys=True, ensure_ascii=False)
         kind.validate_json(text.encode("utf-8", "replace"), strict=True)  # names of files need not be UTF-8
     except ValidationError as error:
-        where = ".".join(str(part) for part in error.errors()[0]["loc"])
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "value_error":  # of a rule that says what is wrong
+            raise DataError(f"{path}: {where}: {first['ctx']['error']}") from error
         raise DataError(f"{path}: {where} is not what a run writes there, repeat the run") from error
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: is nested without end, repeat the run") from error
