@@ -5,6 +5,7 @@ import logging
 import os
 import sys
 import traceback
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
@@ -19,6 +20,8 @@ from fgtrack.cli.interrupts import INTERRUPTED, interrupted
 from fgtrack.cli.streams import standard_streams
 from fgtrack.core.errors import CallError, DataError, FgtrackError, one_line
 from fgtrack.io.output import FULL
+
+_logger = logging.getLogger(__name__)
 
 DONE, BAD_DATA, BAD_CALL = 0, 1, 2
 
@@ -109,8 +112,14 @@ def run(arguments: Sequence[str]) -> int:
     """Run one command; gives the exit code. Errors are one line on stderr."""
     debug = "--debug" in arguments
     words = [word for word in arguments if word != "--debug"]
-    with standard_streams():
+    with standard_streams(), warnings.catch_warnings():
+        warnings.showwarning = _told  # type: ignore[assignment]  # the rest is of no use here
         return _run(words, debug)
+
+
+def _told(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: object) -> None:
+    """A warning of a library or a plug-in, as a line."""
+    _logger.warning("%s:%d: %s: %s", filename, lineno, category.__name__, message)
 
 
 def _run(words: Sequence[str], debug: bool) -> int:

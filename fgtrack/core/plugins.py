@@ -2,11 +2,12 @@
 
 import logging
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from fgtrack.core.errors import CallError, did_you_mean
+from fgtrack.core.errors import CallError, FgtrackError, did_you_mean
 
 _logger = logging.getLogger(__name__)
 
@@ -70,14 +71,26 @@ class Registry:
     def load(self, name: str) -> Any:  # Any: what an entry point names is only known to its user
         """What `name` stands for. Raises `CallError` for an unknown name and for a plug-in that cannot be loaded."""
         entry = self._entries[self.resolve(name)]
-        if entry.dist is None:
+        with self.blamed(name, "cannot be loaded"):
             return entry.load()
+
+    @contextmanager
+    def blamed(self, name: str, what: str) -> Iterator[None]:
+        """Whatever is raised in the block is a `CallError` that names the plug-in `name`, of which it says `what`.
+
+        What is raised on purpose passes, and all of a built-in part: that is a bug.
+        """
         try:
-            return entry.load()
-        except Exception as error:  # of a foreign module: anything
-            what = " ".join(f"{type(error).__name__}: {error}".split())
+            yield
+        except FgtrackError:
+            raise
+        except (Exception, SystemExit) as error:  # of a foreign module: anything
+            entry = self._entries.get(name)
+            if entry is None or entry.dist is None:
+                raise
+            why = " ".join(f"{type(error).__name__}: {error}".split())
             raise CallError(
-                f"{self._noun} {name!r}: plug-in {entry.value} of {_package(entry)} cannot be loaded ({what}): "
+                f"{self._noun} {name!r}: plug-in {entry.value} of {_package(entry)} {what} ({why}): "
                 "repair or uninstall it"
             ) from error
 

@@ -8,6 +8,7 @@ function `(**parameters) -> MotionModel`.
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any, Literal
 
 from fgtrack.core.errors import CallError
@@ -164,8 +165,9 @@ def start_estimator(
 
     def plain(start: Start) -> Estimator:
         if claims.bank:
-            return OneObject(motion, _made(name, factory, motion, lag_s, **own), start)
-        return _checked(name, _made(name, factory, motion, start, lag_s, **own))
+            return OneObject(motion, _made_bank(name, factory, motion, lag_s, own), start)
+        one: Estimator = _checked(name, _made(ESTIMATORS, name, factory, motion, start, lag_s, **own), Estimator)
+        return one
 
     def made(start: Start) -> Estimator:
         return plain(start) if claims.initiates else initiated(motion, start, method, plain)
@@ -195,15 +197,14 @@ def start_bank(
     claims = Claims.of(factory)
     own = {key: options[key] for key in options if claims.initiates or key != "initiation"}
     if claims.bank:
-        bank: TrackBank = _made(name, factory, motion, lag_s, **own)
-        return bank
+        return _made_bank(name, factory, motion, lag_s, own)
     _check_options(name, factory, 3, own)
     if factory in _TOGETHER:
         return _TOGETHER[factory](motion, lag_s, **own)
     if claims.reports:
 
         def one(start: Start) -> Smoother:
-            smoother: Smoother = _made(name, factory, motion, start, lag_s, **own)
+            smoother: Smoother = _checked(name, _made(ESTIMATORS, name, factory, motion, start, lag_s, **own), Smoother)
             return smoother
 
         return SmoothingBank(motion, one, lag_s, lagged_s)
@@ -212,7 +213,7 @@ def start_bank(
 
 def motion_model(name: str, parameters: Mapping[str, Any]) -> MotionModel:
     """The motion model `name`. Raises `CallError` for an unknown name and for parameters that it does not take."""
-    model = _made(name, MOTION_MODELS.load(name), **parameters)
+    model = _made(MOTION_MODELS, name, MOTION_MODELS.load(name), **parameters)
     if not isinstance(model, MotionModel):
         raise CallError(f"motion model {name!r}: is a {type(model).__name__}, not a MotionModel")
     return model
@@ -223,16 +224,25 @@ def works_together(factory: Factory) -> bool:
     return Claims.of(factory).bank or factory in _TOGETHER
 
 
-def _made(name: str, factory: Factory, *arguments: Any, **options: Any) -> Any:
+def _made_bank(name: str, factory: Factory, motion: MotionModel, lag_s: float, options: Mapping[str, Any]) -> TrackBank:
+    bank: TrackBank = _checked(name, _made(ESTIMATORS, name, factory, motion, lag_s, **options), TrackBank)
+    return bank
+
+
+def _made(registry: Registry, name: str, factory: Factory, *arguments: Any, **options: Any) -> Any:
     _check_options(name, factory, len(arguments), options)
-    try:
-        return factory(*arguments, **options)
-    except ValueError as error:
-        raise CallError(f"{name}: {error}") from error
+    with registry.blamed(name, "cannot be made"):
+        try:
+            return factory(*arguments, **options)
+        except ValueError as error:
+            raise CallError(f"{name}: {error}") from error
 
 
 def _check_options(name: str, factory: Factory, num_arguments: int, options: Mapping[str, Any]) -> None:
-    signature = inspect.signature(factory)
+    try:
+        signature = inspect.signature(factory)
+    except (TypeError, ValueError) as error:  # not callable; of C, without a signature
+        raise CallError(f"{name}: {factory!r} is no class or function of Python: {error}") from error
     try:
         signature.bind(*[None] * num_arguments, **options)
     except TypeError as error:
@@ -240,8 +250,18 @@ def _check_options(name: str, factory: Factory, num_arguments: int, options: Map
         raise CallError(f"{name}: {error}; its options are {', '.join(taken) or 'none'}") from error
 
 
-def _checked(name: str, found: Estimator) -> Estimator:
-    lacking = [what for what in ("window_ns", "update", "state_at", "advance") if not hasattr(found, what)]
+def _checked(name: str, found: Any, protocol: type) -> Any:
+    """`found`, which has all that `protocol` names. What an attribute is, is seen when it is used."""
+    lacking = [what for what in _members(protocol) if not hasattr(found, what)]
     if lacking:
-        raise CallError(f"estimator {name!r}: {type(found).__name__} lacks {', '.join(lacking)}, see Estimator")
+        raise CallError(
+            f"estimator {name!r}: {type(found).__name__} lacks {', '.join(lacking)}, see {protocol.__name__}"
+        )
     return found
+
+
+@cache
+def _members(protocol: type) -> tuple[str, ...]:
+    """Names of the attributes and methods of a protocol, in the order in which they are written."""
+    named = [name for each in reversed(protocol.__mro__) if each is not object for name in vars(each)]
+    return tuple(name for name in dict.fromkeys(named) if not name.startswith("_"))

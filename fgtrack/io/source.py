@@ -54,7 +54,8 @@ def open_input(path: Path | str, config: InputConfig | None = None) -> InputSour
     path = Path(path)
     name = input_kind(path)
     config = config or InputConfig()
-    messages = file_format(name).open(path, config)
+    with ADAPTERS.blamed(name, f"cannot open {path}"):
+        messages = file_format(name).open(path, config)
     return InputSource(path, name, partial(checked, path, messages, config.most_objects))
 
 
@@ -69,10 +70,10 @@ def input_kind(path: Path) -> str:
         if path.is_file() and path.stat().st_size == 0:
             raise DataError(f"{path}: is empty")
         for name, form in formats.items():
-            if form.recognises(path):
+            if _recognises(name, form, path):
                 return name
-        for form in formats.values():
-            if not path.is_dir() and form.recognises(path.parent):
+        for name, form in formats.items():
+            if not path.is_dir() and _recognises(name, form, path.parent):
                 raise DataError(f"{path}: is no input by itself, name its folder {path.parent} ({form.description})")
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
@@ -84,10 +85,25 @@ def file_format(name: str) -> FileFormat:
     """The format `name`. Raises `CallError` where there is none."""
     found = ADAPTERS.load(name)
     if not isinstance(found, FileFormat) and callable(found):
-        found = found()
+        with ADAPTERS.blamed(name, "cannot be made"):
+            found = found()
     if not isinstance(found, FileFormat):
         raise CallError(f"adapter {name!r}: is a {type(found).__name__}, not a FileFormat")
+    if not (isinstance(found.description, str) and callable(found.recognises) and callable(found.open)):
+        raise CallError(f"adapter {name!r}: its description must be a text, `recognises` and `open` functions")
     return found
+
+
+def _recognises(name: str, form: FileFormat, path: Path) -> bool:
+    """Whether `path` is of this format; a plug-in that fails says nothing of it, but for a warning."""
+    try:
+        with ADAPTERS.blamed(name, f"cannot look at {path}"):
+            return bool(form.recognises(path))
+    except CallError as error:
+        if name not in ADAPTERS.plugins():
+            raise
+        _logger.warning("%s", error)
+        return False
 
 
 def _formats() -> dict[str, FileFormat]:

@@ -145,7 +145,10 @@ def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
     try:
         config = validate(Config, recipe.config, "configuration")
         messages = read_messages(recipe, config)
-    except Exception as error:  # one job out of hundreds must not end the sweep, whatever is wrong with it
+    except (
+        Exception,
+        SystemExit,
+    ) as error:  # whatever is wrong with one job out of hundreds
         return key, [Cell(name, {}, {}, _reason(error)) for name in recipe.estimators]
     source_s = time.perf_counter() - started
     return key, [_cell(messages, replace(config, estimator=name), score, source_s) for name in recipe.estimators]
@@ -170,13 +173,13 @@ def _cell(messages: Sequence[Message], config: Config, score: Score, source_s: f
             raise DataError(broken)
         replayed = time.perf_counter()
         scores = score(run)
-    except Exception as error:  # as in `run_job`
+    except (Exception, SystemExit) as error:  # as in `run_job`
         return Cell(config.estimator, {}, {}, _reason(error))
     times = {"source_s": source_s, "replay_s": replayed - started, "score_s": time.perf_counter() - replayed}
     return Cell(config.estimator, scores.values, {**times, **scores.times})
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: BaseException) -> str:
     """What went wrong, in a line; of a bug also what it is."""
     text = " ".join(str(error).split())
     return text if isinstance(error, FgtrackError) else f"{type(error).__name__}: {text}"

@@ -11,11 +11,12 @@ from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, Upd
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.forwarding import ForwardingBank
 from fgtrack.estimation.present import PresentStates
-from fgtrack.tracking.soundness import Divergence, are_finite, faults
+from fgtrack.tracking.soundness import Divergence, are_finite, check_real, faults
 
 __all__ = ["RestartingBank"]
 
 _T = TypeVar("_T")
+Faults = dict[int, Failure]
 _SHAPES = {(n, n, n) for n in (5, 6)}
 
 
@@ -54,7 +55,7 @@ class RestartingBank(ForwardingBank):
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`; states that are not finite are left out."""
-        states = self._ask(lambda bank: bank.states_at(stamp_ns))
+        states = self._ask(lambda bank: _states_at(bank, stamp_ns))
         if are_finite(states.means, states.covariances):
             return states
         rows = [row for row in range(len(states.means)) if are_finite(states.means[row], states.covariances[row])]
@@ -117,20 +118,19 @@ class RestartingBank(ForwardingBank):
         """See `TrackBank.remove`; if need be by a new bank. A track that a failure has ended need not be there."""
         known = self.has(track_id)
         self._forget(track_id)
-        if not known and track_id not in self._bank.track_ids:
+        if not known and track_id not in self._alive:
             return
         try:
             self._bank.remove(track_id)
         except Exception as error:
             self._raised(error)
-            self._rebuild([other for other in self._bank.track_ids if other != track_id])
+            self._rebuild([other for other in self._alive if other != track_id])
 
     def present(self) -> list[TrackState]:
         """See `TrackBank.present`; all are sound."""
         while True:  # a track that is not sound twice in a row ends
-            states = self._ask(_present)
+            states, found = self._ask(_present)
             track_ids = self._bank.track_ids
-            found = faults(states)
             if not found:
                 break
             for place, fault in found.items():
@@ -145,8 +145,7 @@ class RestartingBank(ForwardingBank):
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`; those that are not sound are left out."""
-        reports = self._ask(lambda bank: bank.smoothed())
-        found = faults([report.state for report in reports])
+        reports, found = self._ask(_smoothed)
         for fault in found.values():
             self.failures.add(fault)
         return [report for place, report in enumerate(reports) if place not in found] if found else reports
@@ -159,16 +158,25 @@ class RestartingBank(ForwardingBank):
             raise
         except Exception as error:
             self._raised(error)
-        self._rebuild(self._bank.track_ids)
+        self._rebuild(self._alive)
         try:
             return question(self._bank)
         except Exception as error:
             self._raised(error)
-        guilty = [track_id for track_id in self._bank.track_ids if not self._answers_alone(track_id, question)]
-        for track_id in guilty or self._bank.track_ids:
+        alive = self._alive
+        guilty = [track_id for track_id in alive if not self._answers_alone(track_id, question)]
+        for track_id in guilty or alive:
             self._ended(track_id, Failure.ESTIMATOR_RAISED)
-        self._rebuild([track_id for track_id in self._bank.track_ids if track_id in self._starts])
+        self._rebuild([track_id for track_id in alive if track_id in self._starts])
         return self._without_excuse(question)
+
+    @property
+    def _alive(self) -> tuple[int, ...]:
+        """The tracks of the bank; where it does not tell them, those that began and have not ended."""
+        try:
+            return tuple(self._bank.track_ids)
+        except Exception:
+            return tuple(self._starts)
 
     def _answers_alone(self, track_id: int, question: Callable[[TrackBank], object]) -> bool:
         bank = self._make()
@@ -196,7 +204,7 @@ class RestartingBank(ForwardingBank):
 
     def _restart(self, track_id: int, failure: Failure) -> None:
         """Begin a track anew in this bank; one that has failed before, without success since, ends."""
-        if track_id not in self._bank.track_ids:
+        if track_id not in self._alive:
             return  # it has ended with another one
         again = track_id in self._suspects
         start = self._start(track_id)
@@ -239,7 +247,16 @@ class RestartingBank(ForwardingBank):
         self.failures.note(error)
 
 
-def _present(bank: TrackBank) -> list[TrackState]:
+def _states_at(bank: TrackBank, stamp_ns: int) -> StatesAt:
+    states = bank.states_at(stamp_ns)
+    check_real(states.means, states.covariances)
+    if not len(states.track_ids) == len(states.means) == len(states.covariances):
+        raise ValueError(f"{len(states.track_ids)} tracks have {len(states.means)} states")
+    return states
+
+
+def _present(bank: TrackBank) -> tuple[list[TrackState], Faults]:
+    """The present states, and what is wrong with them."""
     states, many = bank.present(), len(bank.track_ids)
     if isinstance(states, PresentStates):
         shapes = {(*states.means.shape[1:], *states.covariances.shape[1:])} if states else set()
@@ -247,7 +264,13 @@ def _present(bank: TrackBank) -> list[TrackState]:
         shapes = {(*state.mean.shape, *state.covariance.shape) for state in states}
     if len(states) != many or not shapes <= _SHAPES:
         raise ValueError(f"{many} tracks have {len(states)} states of shapes {', '.join(map(str, shapes))}")
-    return states
+    return states, faults(states)
+
+
+def _smoothed(bank: TrackBank) -> tuple[list[SmoothedReport], Faults]:
+    """The smoothed states, and what is wrong with them."""
+    reports = bank.smoothed()
+    return reports, faults([report.state for report in reports])
 
 
 def _start_at(state: TrackState) -> Start:

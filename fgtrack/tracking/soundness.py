@@ -13,7 +13,7 @@ from fgtrack.estimation.base import Measurement, UpdateResult
 from fgtrack.estimation.failures import Failure
 from fgtrack.estimation.present import PresentStates
 
-__all__ = ["IN_A_ROW", "RARE", "Divergence", "are_finite", "faults"]
+__all__ = ["IN_A_ROW", "RARE", "Divergence", "are_finite", "check_real", "faults"]
 
 _MOST = np.array([1e9, 1e9, 1e3, 1e5, 1e4, 1e6])
 """Largest x, y, yaw, speed, yaw rate and acceleration, in SI units: far beyond any vehicle on Earth."""
@@ -29,6 +29,13 @@ IN_A_ROW, RARE = 8, 1e-4
 """A track has diverged when so many measurements in a row have a NIS that is rarer than this."""
 
 
+def check_real(*arrays: FloatArray) -> None:
+    """Raise `TypeError` where one of them does not hold real numbers."""
+    for array in arrays:
+        if array.dtype.kind not in "fiu":
+            raise TypeError(f"states must be real numbers, are of type {array.dtype}")
+
+
 def are_finite(means: FloatArray, covariances: FloatArray) -> bool:
     """Whether all states are, means (m, n) and covariances (m, n, n)."""
     if math.isfinite(np.vdot(means, means) + np.vdot(covariances, covariances)):  # one number instead of two masks
@@ -40,8 +47,8 @@ def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
     """What is wrong with kinematic states, by their place; nothing where all can be published.
 
     A state is sound where it is finite, no entry is larger than any vehicle's (10^9 m, 10^5 m/s, 10^4 rad/s,
-    10^6 m/s^2), and its covariance is positive definite: up to rounding, as an entry that the motion model does not
-    have is 0 with variance 0.
+    10^6 m/s^2), and its covariance is symmetric and positive definite: up to rounding, as an entry that the motion
+    model does not have is 0 with variance 0. Raises `TypeError` for what is no real number.
     """
     if not states:
         return {}
@@ -49,8 +56,9 @@ def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
         means, covariances = states.means, states.covariances
     else:
         means, covariances = np.array([one.mean for one in states]), np.array([one.covariance for one in states])
+    check_real(means, covariances)
     small = np.vdot(means, means) <= _SMALL or (np.abs(means) <= _MOST[: means.shape[1]]).all()
-    if small and (_are_definite(covariances) or _are_semidefinite(covariances)):
+    if small and (_are_definite(covariances) or _are_semidefinite(covariances)) and _are_symmetric(covariances):
         return {}
     found = ((place, _fault(mean, P)) for place, (mean, P) in enumerate(zip(means, covariances, strict=True)))
     return {place: fault for place, fault in found if fault is not None}
@@ -61,17 +69,30 @@ def _fault(mean: FloatArray, covariance: FloatArray) -> Failure | None:
         return Failure.NOT_FINITE
     if (np.abs(mean) > _MOST[: len(mean)]).any():
         return Failure.OUT_OF_BOUNDS
-    return None if _are_semidefinite(covariance[None]) else Failure.NOT_DEFINITE
+    sound = _are_semidefinite(covariance[None]) and _are_symmetric(covariance[None])
+    return None if sound else Failure.NOT_DEFINITE
+
+
+def _correlations(covariances: FloatArray) -> FloatArray:
+    variances = np.diagonal(covariances, axis1=-2, axis2=-1)
+    std = np.sqrt(np.maximum(variances, _TINY))
+    with np.errstate(over="ignore"):
+        return np.asarray(covariances / std[:, :, None] / std[:, None, :])
+
+
+def _are_symmetric(covariances: FloatArray) -> bool:
+    """Whether all of `covariances`, shape (m, n, n), are symmetric up to rounding; those of fgtrack are to the bit."""
+    if covariances.tobytes() == covariances.mT.tobytes():
+        return True
+    correlations = _correlations(covariances)
+    return bool((np.abs(correlations - correlations.mT) <= _ROUNDING).all())
 
 
 def _are_semidefinite(covariances: FloatArray) -> bool:
     """Whether all of `covariances`, shape (m, n, n), are finite and positive semidefinite up to rounding."""
-    variances = np.diagonal(covariances, axis1=-2, axis2=-1)
-    if not (np.isfinite(covariances).all() and (variances >= 0.0).all()):
+    if not (np.isfinite(covariances).all() and (np.diagonal(covariances, axis1=-2, axis2=-1) >= 0.0).all()):
         return False
-    std = np.sqrt(np.maximum(variances, _TINY))
-    with np.errstate(over="ignore"):
-        correlations = covariances / std[:, :, None] / std[:, None, :]
+    correlations = _correlations(covariances)
     n = covariances.shape[-1]
     correlations[:, range(n), range(n)] = 1.0 + _ROUNDING
     return _are_definite(correlations)

@@ -5,6 +5,7 @@ import math
 import os
 import shutil
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -573,6 +574,23 @@ def test_a_bug_is_one_line_and_shows_its_traceback_on_demand(
     assert called.err == "fgtrack: error: internal error: ZeroDivisionError: oh (run with --debug)\n"
     assert called.code == 1
     assert "Traceback" in fgtrack("--debug", "replay", stream, "-o", "run").err
+
+
+def test_a_warning_of_a_plug_in_is_a_line_and_its_exit_an_error(
+    fgtrack: Command, stream: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def leaves(*_: object, **__: object) -> None:
+        warnings.simplefilter("always")
+        warnings.warn("\x1b[31mdivide\nby zero", RuntimeWarning, stacklevel=1)
+        raise SystemExit(0)
+
+    monkeypatch.setattr("fgtrack.cli.replay.replay_each", leaves)
+    called = fgtrack("replay", stream, "-o", "run")
+    warned, error = called.err.splitlines()
+    assert warned.endswith("RuntimeWarning: \\x1b[31mdivide by zero")
+    assert "test_cli.py:" in warned
+    assert error.startswith("fgtrack: error: a plug-in, or what it loads, ends the program (SystemExit: 0)")
+    assert called.code == 2
 
 
 def test_an_interrupt_is_exit_code_130(fgtrack: Command, stream: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 import logging
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,9 +10,18 @@ import pytest
 from fgtrack.core.errors import CallError
 from fgtrack.core.plugins import Registry
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
-from fgtrack.estimation.registry import ESTIMATORS, Claims, estimator, motion_model, summary
+from fgtrack.estimation.registry import (
+    ESTIMATORS,
+    MOTION_MODELS,
+    Claims,
+    estimator,
+    estimator_bank,
+    motion_model,
+    summary,
+)
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV
+from fgtrack.pipeline.sweep import run_job
 
 GROUP = "fgtrack.tests"
 
@@ -27,18 +37,19 @@ def installed(folder: Path, package: str, **entries: str) -> None:
 @pytest.fixture
 def registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Registry:
     (tmp_path / "sound_plugin.py").write_text("class Part:\n    pass\n")
+    (tmp_path / "leaving_plugin.py").write_text("raise SystemExit(0)\n")
     (tmp_path / "broken_plugin.py").write_text("import no_such_module\n")
     installed(tmp_path, "sound", part="sound_plugin:Part", ours="sound_plugin:Part", old="sound_plugin:Part")
-    installed(tmp_path, "wrecked", wrong="broken_plugin:Part", part="broken_plugin:Part")
+    installed(tmp_path, "wrecked", wrong="broken_plugin:Part", part="broken_plugin:Part", zero="leaving_plugin:Part")
     monkeypatch.syspath_prepend(tmp_path)
     return Registry("part", {GROUP: {"ours": "pathlib:Path"}}, aliases={"old": "ours"})
 
 
 def test_built_in_parts_come_first_and_plug_ins_are_loaded_by_name(registry: Registry) -> None:
-    assert list(registry) == ["ours", "part", "wrong"]
+    assert list(registry) == ["ours", "part", "wrong", "zero"]
     assert registry.load("ours") is Path
     assert registry.load("part").__module__ == "sound_plugin"
-    assert registry.plugins() == {"part": "sound 1.0", "wrong": "wrecked 1.0"}
+    assert registry.plugins() == {"part": "sound 1.0", "wrong": "wrecked 1.0", "zero": "wrecked 1.0"}
 
 
 def test_a_name_that_is_taken_is_left_out_with_a_line(registry: Registry, caplog: pytest.LogCaptureFixture) -> None:
@@ -63,7 +74,7 @@ def test_a_broken_plug_in_is_named_and_does_not_disturb_the_others(
 
 
 def test_an_unknown_name_gives_the_nearest_and_all(registry: Registry) -> None:
-    with pytest.raises(CallError, match=r"^part 'prt' is unknown, did you mean 'part': there are ours, part, wrong$"):
+    with pytest.raises(CallError, match=r"^part 'prt' is unknown, did you mean 'part': there are ours, part, wrong"):
         registry.resolve("prt")
     assert registry.resolve("old") == "ours"
     assert "old" in registry
@@ -113,3 +124,65 @@ def test_options_that_an_estimator_does_not_take_are_refused() -> None:
 def test_what_an_estimator_does_not_say_of_itself_is_the_default() -> None:
     assert Claims.of(ESTIMATORS.load("drop")) == Claims()
     assert Claims.of(ESTIMATORS.load("asd")) == Claims("any lag, any number", "never", smooths=True, tolerance=1e-7)
+
+
+def test_a_plug_in_that_ends_the_program_is_named(registry: Registry) -> None:
+    with pytest.raises(CallError, match=r"^part 'zero': plug-in leaving_plugin:Part of wrecked 1\.0 .*SystemExit: 0"):
+        registry.load("zero")
+
+
+class Raising:
+    """A part that cannot be made."""
+
+    def __init__(self, *_: object) -> None:
+        raise RuntimeError("oh")
+
+
+class Leaving:
+    """A part that ends the program."""
+
+    def __init__(self, *_: object) -> None:
+        raise SystemExit(0)
+
+
+class LackingBank:
+    """A bank that is none."""
+
+    bank = True
+
+    def __init__(self, motion: object, lag_s: float) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        (Raising, r"plug-in x:Y of odd 1\.0 cannot be made \(RuntimeError: oh\)"),
+        (Leaving, r"plug-in x:Y of odd 1\.0 cannot be made \(SystemExit: 0\)"),
+        (5, r"odd: 5 is no class or function of Python"),
+        (LackingBank, r"estimator 'odd': LackingBank lacks present_ns, .*, smoothed, see TrackBank"),
+    ],
+    ids=["raises", "leaves", "number", "bank"],
+)
+def test_a_part_that_cannot_be_made_is_one_line(monkeypatch: pytest.MonkeyPatch, part: object, message: str) -> None:
+    package = SimpleNamespace(name="odd", version="1.0")
+    entry = SimpleNamespace(dist=package, load=lambda: part, group="fgtrack.estimators", value="x:Y")
+    for registry in (ESTIMATORS, MOTION_MODELS):
+        monkeypatch.setitem(registry._entries, "odd", entry)
+    with pytest.raises(CallError, match=message):
+        estimator("odd", CV(), Start())
+    with pytest.raises(CallError, match=message):
+        estimator_bank("odd", CV(), 1.0, {}).birth(0, Start())
+    if part is not LackingBank:
+        with pytest.raises(CallError, match=message):
+            motion_model("odd", {})
+
+
+def test_what_a_job_raises_is_the_error_of_a_cell(monkeypatch: pytest.MonkeyPatch) -> None:
+    def leaves(*_: object) -> None:
+        raise SystemExit(0)
+
+    monkeypatch.setattr("fgtrack.pipeline.sweep.read_messages", lambda *_: [])
+    recipe = SimpleNamespace(config={}, estimators=("ekf-replay",))
+    monkeypatch.setattr("fgtrack.pipeline.sweep.replay_in_memory", leaves)
+    assert [cell.error for cell in run_job("key", recipe, leaves)[1]] == ["SystemExit: 0"]

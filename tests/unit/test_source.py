@@ -8,7 +8,7 @@ import pytest
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from fgtrack.core.errors import DataError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState
 from fgtrack.io.adapters import ADAPTERS, message_types
 from fgtrack.io.config import InputConfig, TopicInput
@@ -30,7 +30,19 @@ def numbers():
     return FileFormat("numbers", lambda path: path.is_file() and path.read_bytes().startswith(b"{numbers}"), messages)
 
 nothing = "no format"
+
+def raises(*_):
+    raise KeyError("oh")
+
+def leaves(*_):
+    raise SystemExit(0)
+
+blind = FileFormat("blind", raises, raises)
+gone = FileFormat("gone", leaves, raises)
+mute = FileFormat("mute", None, raises)
+stuck = FileFormat("stuck", lambda path: path.is_file() and path.read_bytes().startswith(b"{stuck}"), raises)
 """
+BROKEN = ("raises", "leaves", "blind", "gone", "mute")
 
 
 @pytest.fixture
@@ -44,6 +56,7 @@ def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder / "numbers_plugin.py").write_text(PLUGIN)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: numbers\nVersion: 1.0\n")
     entries = f"{POINT} = numbers_plugin:read_point\nnumbers = numbers_plugin:numbers\nwrong = numbers_plugin:nothing\n"
+    entries += "".join(f"{name} = numbers_plugin:{name}\n" for name in (*BROKEN, "stuck"))
     (info / "entry_points.txt").write_text(f"[fgtrack.adapters]\n{entries}")
     monkeypatch.syspath_prepend(folder)
 
@@ -60,8 +73,24 @@ def test_a_format_of_a_plug_in_is_recognised_before_the_built_in_ones(
     write_stream(tmp_path / "y", [])
     assert open_input(tmp_path / "y").kind == "stream"
     (tmp_path / "z").write_text("text")
-    with pytest.raises(DataError, match=r"FusionTracking log folder \(data_logs\.csv\), .*, numbers$"):
+    with pytest.raises(DataError, match=r"FusionTracking log folder \(data_logs\.csv\), .*, numbers"):
         open_input(tmp_path / "z")
+
+
+@pytest.mark.usefixtures("plugin")
+def test_a_format_that_fails_is_named_and_disturbs_no_other_input(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_stream(tmp_path / "y", [])
+    assert open_input(tmp_path / "y").kind == "stream"
+    told = [record.getMessage() for record in caplog.records]
+    for name in BROKEN:
+        assert any(line.startswith(f"adapter '{name}': ") for line in told), name
+    for name in ("raises", "leaves", "blind", "gone"):
+        assert any(f"plug-in numbers_plugin:{name} of numbers 1.0 cannot " in line for line in told), name
+    (tmp_path / "x").write_text("{stuck}")
+    with pytest.raises(CallError, match=r"plug-in numbers_plugin:stuck of numbers 1\.0 cannot open .*x \(KeyError"):
+        open_input(tmp_path / "x")
 
 
 @pytest.mark.usefixtures("plugin")
