@@ -4,12 +4,47 @@ All raise a `ValueError` that names the setting, its rule and its value.
 """
 
 import math
+import os
 from collections.abc import Callable, Mapping
 
-__all__ = ["LARGEST", "between_0_and_1", "not_negative", "positive"]
+import numpy as np
+
+from fgtrack.core.errors import CallError
+
+__all__ = [
+    "LARGEST",
+    "LARGEST_NS",
+    "between_0_and_1",
+    "check_paths",
+    "is_number",
+    "is_stamp",
+    "not_negative",
+    "positive",
+]
 
 LARGEST = 1e9
 """What is measured, mapped or configured is no larger, in any unit: its square is still far from the largest float."""
+
+
+LARGEST_NS = 2**63 - 1
+"""No stamp is larger: it has 64 bits."""
+
+
+def is_number(value: object, least: float = -LARGEST, most: float = LARGEST) -> bool:
+    """Whether it is a real number between `least` and `most`."""
+    return isinstance(value, (float, int, np.floating, np.integer)) and bool(least <= value <= most)
+
+
+def is_stamp(value: object) -> bool:
+    """Whether it is an integer of up to 64 bits, as stamps in nanoseconds are."""
+    return isinstance(value, (int, np.integer)) and bool(-LARGEST_NS <= value <= LARGEST_NS)
+
+
+def check_paths(**values: object) -> None:
+    """Raise `CallError`, which names it, for an argument that is neither a text nor a path; None passes."""
+    for name, value in values.items():
+        if value is not None and not isinstance(value, (str, os.PathLike)):
+            raise CallError(f"{name}: must be a name or a path, is a {type(value).__name__}")
 
 
 def positive(**values: float | None) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from itertools import takewhile
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,7 @@ IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
 Frame = Literal["map", "ego", "sensor"]
+FRAMES: tuple[Frame, ...] = get_args(Frame)
 
 #: State columns of tracks.csv; a motion model's state is a leading part of them.
 STATE_NAMES = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2")

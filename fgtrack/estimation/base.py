@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from fgtrack.core.checks import LARGEST, is_number, is_stamp
 from fgtrack.core.errors import CallError
 from fgtrack.core.linalg import mahalanobis_squared
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
@@ -68,6 +69,9 @@ class Measurement:
             raise CallError(f"measurement of {', '.join(names)}: give either std or covariance")
         if std is not None and std.keys() != values.keys():
             raise CallError(f"measurement of {', '.join(names)}: std must name the same, names {', '.join(std)}")
+        _check("measurement: stamp_ns", stamp_ns, "an integer of up to 64 bits", is_stamp(stamp_ns))
+        for name, value in (*values.items(), *(std or {}).items()):
+            _check(f"measurement of {name}", value, "a number, finite and at most 1e9", is_number(value))
         z = np.array([values[name] for name in names], dtype=np.float64)
         R = np.diag([std[name] ** 2 for name in names]) if std is not None else np.array(covariance, dtype=np.float64)
         sound = R.shape == (len(z), len(z)) and np.isfinite(R).all() and (R == R.T).all() and np.isfinite(z).all()
@@ -146,7 +150,8 @@ KNOWN_YAW_STD_RAD = 0.1
 class Start:
     """What is known of a new object at its first stamp, with standard deviations.
 
-    Raises `CallError` for a value that is not finite, a negative standard deviation or a wrong shape.
+    Raises `CallError` for a value that is no number, not finite or beyond 10^18, a negative standard deviation, a wrong
+    shape, and a stamp that is no integer.
     """
 
     stamp_ns: int = 0
@@ -170,19 +175,45 @@ class Start:
     accel_std_mps2: float = 1.0
 
     def __post_init__(self) -> None:
-        for name, shape in (("position_m", (2,)), ("position_covariance", (2, 2))):
+        _check("Start: stamp_ns", self.stamp_ns, "an integer of up to 64 bits", is_stamp(self.stamp_ns))
+        for name, shape, largest in (("position_m", (2,), _MOST), ("position_covariance", (2, 2), _MOST**2)):
             given = getattr(self, name)
-            if given is not None and not (np.shape(given) == shape and np.isfinite(given).all()):
-                raise CallError(f"Start: {name}: must be finite and of shape {shape}, is {given}")
+            if given is not None:
+                _check(f"Start: {name}", given, f"finite and of shape {shape}", _is_array(given, shape, largest))
         for name, pair in self.position_cross.items():
-            if not (np.shape(pair) == (2,) and np.isfinite(pair).all()):
-                raise CallError(f"Start: position_cross of {name}: must be two finite numbers, is {pair}")
-        for name in ("yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2"):
-            if not math.isfinite(getattr(self, name) or 0.0):
-                raise CallError(f"Start: {name}: must be finite, is {getattr(self, name)}")
-        for name in ("position_std_m", "yaw_std_rad", "speed_std_mps", "yaw_rate_std_radps", "accel_std_mps2"):
-            if not 0.0 <= (getattr(self, name) or 0.0) < math.inf:
-                raise CallError(f"Start: {name}: must be finite and not negative, is {getattr(self, name)}")
+            _check(f"Start: position_cross of {name}", pair, "two finite numbers", _is_array(pair, (2,), _MOST**2))
+        for name, least in _START_NUMBERS:
+            value = getattr(self, name)
+            if type(value) is float and least <= value <= _MOST:  # nearly always
+                continue
+            if value is not None or name not in _MAY_BE_UNKNOWN:
+                rule = "finite" if least else "finite and not negative"
+                _check(f"Start: {name}", value, f"{rule}, and at most {_MOST:g}", is_number(value, least, _MOST))
+
+
+_MOST = LARGEST**2
+"""No number of a start is larger: products of what is measured and configured are not, and its square is finite."""
+_START_NUMBERS = (
+    *((name, -_MOST) for name in ("yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2")),
+    *((name, 0.0) for name in ("position_std_m", "yaw_std_rad", "speed_std_mps")),
+    *((name, 0.0) for name in ("yaw_rate_std_radps", "accel_std_mps2")),
+)
+"""Fields of `Start`, and the smallest value of each."""
+_MAY_BE_UNKNOWN = ("yaw_rad", "yaw_std_rad")
+
+
+def _check(name: str, value: object, rule: str, holds: bool) -> None:
+    if not holds:
+        raise CallError(f"{name}: must be {rule}, is {value!r}")
+
+
+def _is_array(value: object, shape: tuple[int, ...], largest: float) -> bool:
+    """Whether it has this shape, and numbers of a magnitude up to `largest`."""
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of several lengths
+        return False
+    return array.shape == shape and array.dtype.kind in "fiu" and bool((np.abs(array) <= largest).all())
 
 
 @dataclass(frozen=True, slots=True)

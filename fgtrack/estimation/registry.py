@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any, Literal
 
+from fgtrack.core.checks import is_number
 from fgtrack.core.errors import CallError
 from fgtrack.core.plugins import Registry
 from fgtrack.estimation.base import Estimator, Smoother, Start, TrackBank
@@ -153,6 +154,11 @@ def estimator(name: str, motion: MotionModel, start: Start, *, lag_s: float = 1.
     CallError
         The name is unknown, or the estimator does not take the options.
     """
+    for what, value, kind in (("name", name, str), ("motion", motion, MotionModel), ("start", start, Start)):
+        if not isinstance(value, kind):
+            raise CallError(f"{what}: must be a {kind.__name__}, is a {type(value).__name__}")
+    if not is_number(lag_s, 0.0):
+        raise CallError(f"lag_s: must be a number, finite and not negative, is {lag_s!r}")
     return start_estimator(name, ESTIMATORS.load(name), motion, start, lag_s, options)
 
 

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -74,8 +75,10 @@ def judged(runs: Runs) -> list[JudgedRun]:
     DataError
         A run folder is damaged.
     """
-    given = [runs] if isinstance(runs, OneRun) else runs
-    every = [one for entry in given for one in ([entry] if isinstance(entry, OneRun) else entry)]
+    every = [one for entry in _several(runs) for one in _several(entry)]
+    for one in every:
+        if not isinstance(one, OneRun):
+            raise CallError(f"runs: must be runs or paths of run folders, there is a {type(one).__name__}")
     if every and all(isinstance(run, JudgedRun) for run in every):
         return [run for run in every if isinstance(run, JudgedRun)]
     plain = [run.run if isinstance(run, JudgedRun) else run for run in every]
@@ -86,6 +89,10 @@ def judged(runs: Runs) -> list[JudgedRun]:
 def run_folders(runs: Iterable[JudgedRun]) -> list[Path]:
     """The folders of `runs`, of those that have one."""
     return [one.run.path for one in runs if one.run.path is not None]
+
+
+def _several(given: Any) -> list[Any]:  # Any: what a user gives
+    return [given] if isinstance(given, OneRun) or not isinstance(given, Iterable) else list(given)
 
 
 def one_judged(run: OneRun) -> JudgedRun:

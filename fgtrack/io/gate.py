@@ -8,19 +8,18 @@ what becomes of them is counted, one by one, where they are used.
 from collections.abc import Callable, Iterator
 from operator import attrgetter
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.types import (
     DESCRIBING,
+    FRAMES,
     MEASURABLE,
     STATE_NAMES,
     Detection,
     DetectionList,
     EgoState,
-    Frame,
     Message,
     TruthState,
 )
@@ -30,7 +29,6 @@ __all__ = ["checked"]
 
 _LONGEST_NAME = 200
 _FAR_M = 1e9
-_FRAMES = frozenset(get_args(Frame))
 _INT64 = range(-(1 << 63), 1 << 63)
 _PLAIN = {float, type(None)}
 _DETECTION_NUMBERS = (*MEASURABLE, *(name for name in DESCRIBING if name != "class_name"))
@@ -87,8 +85,8 @@ def _check(message: Message) -> None:
 def _check_list(message: DetectionList) -> None:
     _check_name("sensor", message.sensor)
     _check_times(message)
-    if message.frame not in _FRAMES:
-        raise _WrongError(f"frame: one of {', '.join(sorted(_FRAMES))} expected, not {_shown(message.frame)}")
+    if message.frame not in FRAMES:
+        raise _WrongError(f"frame: one of {', '.join(sorted(FRAMES))} expected, not {_shown(message.frame)}")
     for index, item in enumerate(message.objects):
         try:
             _check_detection(item)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from fgtrack.core.checks import check_paths
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Message
 from fgtrack.io.adapters import ADAPTERS
@@ -51,6 +52,7 @@ def open_input(path: Path | str, config: InputConfig | None = None) -> InputSour
     DataError
         It is nothing that fgtrack reads, or damaged.
     """
+    check_paths(recording=path)
     path = Path(path)
     name = input_kind(path)
     config = config or InputConfig()

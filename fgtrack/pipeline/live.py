@@ -8,7 +8,8 @@ from operator import index as whole
 from pathlib import Path
 from typing import Self
 
-from fgtrack.core.errors import DataError
+from fgtrack.core.checks import LARGEST_NS
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import period_ns
 from fgtrack.core.types import (
     DetectionList,
@@ -31,7 +32,6 @@ __all__ = ["TrackOutput", "Tracker", "TracksAt"]
 
 #: Name of the ego among the sensors of `Tracker.lateness`.
 EGO = "ego"
-_LARGEST_NS = 2**63 - 1
 
 
 class Tracker:
@@ -53,6 +53,9 @@ class Tracker:
     """
 
     def __init__(self, config: Config, clock: Clock | None = None) -> None:
+        if not isinstance(config, Config):
+            what = f"must be a Config, is a {type(config).__name__}"
+            raise CallError(f"config: {what}; Tracker.from_config takes names and paths")
         self.config = config
         self._tracker = build_tracker(config, lambda parts: replace(parts, answers=(DataError,)))
         self._refused: Counter[str] = Counter()
@@ -150,7 +153,7 @@ class Tracker:
         if not isinstance(message, EgoState | DetectionList):
             self._refused["neither ego state nor object list"] += 1
             return
-        if not all(0 <= whole(stamp_ns) <= _LARGEST_NS for stamp_ns in (message.stamp_ns, message.receipt_ns)):
+        if not all(0 <= whole(stamp_ns) <= LARGEST_NS for stamp_ns in (message.stamp_ns, message.receipt_ns)):
             raise OverflowError("stamps are nanoseconds since 1970")
         if isinstance(message, EgoState):
             self._receptions[EGO].add(message.stamp_ns, message.receipt_ns, 0)
@@ -165,11 +168,12 @@ class Tracker:
         self._tracker.receive(message)
 
     def tick(self, now_ns: int) -> TickReport:
-        """Process everything received, and bring all tracks to `now_ns`.
+        """Process everything received, and bring all tracks to `now_ns`. Raises `CallError` for what is no time.
 
         A tick before the last one is refused: it gives the tracks of the last one, without updates, and what was
         received waits for the next.
         """
+        now_ns = _stamp("now_ns", now_ns)
         with self._turn:
             if self._last.tick >= 0 and now_ns < self._last.now_ns:
                 self._refused["tick before the last one"] += 1
@@ -191,13 +195,15 @@ class Tracker:
     def state_at(self, track_id: int, stamp_ns: int) -> TrackReport:
         """A track at any stamp in or after its window; ahead of the last tick it is predicted.
 
-        Raises `CallError` for a track that does not exist and a stamp before its window.
+        Raises `CallError` for a track that does not exist and a stamp before its window, or that is none.
         """
+        stamp_ns = _stamp("stamp_ns", stamp_ns)
         with self._turn:
             return self._tracker.state_at(track_id, stamp_ns)
 
     def tracks_at(self, stamp_ns: int) -> tuple[TrackReport, ...]:
         """All tracks at any stamp, as `state_at` gives them; those whose window begins later are not among them."""
+        stamp_ns = _stamp("stamp_ns", stamp_ns)
         with self._turn:
             return self._tracker.tracks_at(stamp_ns)
 
@@ -209,6 +215,17 @@ class Tracker:
         """End all tracks; gives the smoothed states that were still inside a window."""
         with self._turn:
             return self._tracker.finish()
+
+
+def _stamp(name: str, value: int) -> int:
+    """`value` as an integer. Raises `CallError` for what is no time in nanoseconds since 1970."""
+    try:
+        stamp_ns = whole(value)
+    except TypeError:
+        stamp_ns = -1
+    if not 0 <= stamp_ns <= LARGEST_NS:
+        raise CallError(f"{name}: must be integer nanoseconds since 1970, is {value!r}")
+    return stamp_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,6 +256,7 @@ class TrackOutput:
 
     def at(self, stamp_ns: int) -> TracksAt | None:
         """The tracks at `stamp_ns`, see `Tracker.tracks_at`; None, counted, before the stamp published last."""
+        stamp_ns = _stamp("stamp_ns", stamp_ns)
         with self._turn:
             if self._last_ns is not None and stamp_ns < self._last_ns:
                 self.refused += 1

@@ -7,6 +7,8 @@ from typing import overload
 
 import numpy as np
 
+from fgtrack.core.checks import check_paths
+from fgtrack.core.errors import CallError
 from fgtrack.core.types import Message
 from fgtrack.io.recording import Storage, check_recording, write_recording
 from fgtrack.io.run import Run, load_run
@@ -59,13 +61,14 @@ def replay(
         The recording cannot be read, or a sensor of it has no model.
     """
     resolved = read_config(config, settings_of(set), track_map=map, pit_map=pit_map, estimator=estimator)
+    check_paths(out=out)
     origin, kind = "", "messages"
     if isinstance(recording, (str, Path)):
         source = open_input(recording, resolved.input)
         messages: Iterable[Message] = source.messages()
         origin, kind = str(recording), source.kind
     else:
-        messages = recording
+        messages = _messages(recording)
     if out is None:
         run, broken = pipeline.replay_in_memory(messages, resolved, origin=origin, kind=kind)
     else:
@@ -74,6 +77,16 @@ def replay(
     if broken is not None:
         warnings.warn(f"the input broke off, replayed up to there: {broken}", stacklevel=2)
     return run
+
+
+def _messages(recording: Iterable[Message]) -> Iterator[Message]:
+    """The messages of `recording`. Raises `CallError` for what holds none."""
+    if not isinstance(recording, Iterable):
+        raise CallError(f"recording: must be a path or messages, is a {type(recording).__name__}")
+    for message in recording:
+        if not isinstance(message, Message):
+            raise CallError(f"recording: a {type(message).__name__} is no message")
+        yield message
 
 
 @overload
@@ -125,6 +138,9 @@ def simulate(
     CallError
         The scenario or `out` does not fit.
     """
+    check_paths(out=out)
+    if not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise CallError(f"seed: must be an integer of 0 or more, is {seed!r}")
     if out is not None:
         check_recording(Path(out), overwrite)
     messages = simulated(read_scenario(scenario, duration_s=duration_s), np.random.default_rng(seed))

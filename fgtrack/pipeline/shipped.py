@@ -6,6 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
+from fgtrack.core.checks import check_paths
 from fgtrack.core.errors import CallError, did_you_mean
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load, plain, read_yaml, validate, with_settings
@@ -67,9 +70,13 @@ def read_config(
     `settings` are of the form a.b=value; maps and estimator replace those that the file names. Raises `CallError` for
     what does not fit.
     """
+    check_paths(map=track_map, pit_map=pit_map)
+    if not isinstance(estimator, str | None):
+        raise CallError(f"estimator: must be a name, is a {type(estimator).__name__}")
     if isinstance(name, Config):
         config = with_settings(Config, plain(name), settings, "the given configuration") if settings else name
     else:
+        check_paths(config=name)
         config = load(Config, None if name is None else find_file("configuration", name, folder), settings)
     track = str(track_map) if track_map else config.map.track
     pit = str(pit_map) if pit_map else config.map.pit
@@ -77,8 +84,22 @@ def read_config(
 
 
 def settings_of(values: Mapping[str, object] | None) -> list[str]:
-    """Settings of the form a.b=value from a mapping of keys to plain values."""
-    return [f"{key}={json.dumps(value)}" for key, value in (values or {}).items()]
+    """Settings of the form a.b=value from a mapping of keys to plain values, numbers of NumPy among them.
+
+    Raises `CallError` for what is no mapping, and no plain value.
+    """
+    if not isinstance(values, Mapping | None):
+        raise CallError(f"set: must be a mapping of keys to values, is a {type(values).__name__}")
+    try:
+        return [f"{key}={json.dumps(value, default=_number)}" for key, value in (values or {}).items()]
+    except (TypeError, ValueError) as error:
+        raise CallError(f"set: only plain values can be set ({error})") from error
+
+
+def _number(value: object) -> object:
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"a {type(value).__name__} is none")
 
 
 def read_scenario(name: str | Path | Scenario, folder: Path | None = None, duration_s: float | None = None) -> Scenario:
@@ -86,6 +107,7 @@ def read_scenario(name: str | Path | Scenario, folder: Path | None = None, durat
     if isinstance(name, Scenario):
         raw, origin = plain(name), "the given scenario"
     else:
+        check_paths(scenario=name)
         path = find_file("scenario", name, folder)
         raw, origin = read_yaml(path), str(path)
     return validate(Scenario, raw if duration_s is None else {**raw, "duration_s": duration_s}, origin)

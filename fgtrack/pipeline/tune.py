@@ -80,6 +80,8 @@ def tune(
         A recording cannot be read, a sensor of it has no model, or nothing can be fitted to it.
     """
     resolved = read_config(config, settings_of(set), track_map=map, pit_map=pit_map)
+    if not isinstance(recordings, (str, Path, Sequence)):
+        raise CallError(f"recordings: must be a path or several, is a {type(recordings).__name__}")
     paths = [recordings] if isinstance(recordings, (str, Path)) else list(recordings)
     return tuned(
         {str(path): open_input(path, resolved.input).messages for path in paths}, resolved, TuneRules(keep=tuple(keep))

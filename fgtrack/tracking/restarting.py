@@ -1,6 +1,7 @@
 """A bank that outlives the failures of its estimators: a track that fails begins anew, or ends, and is counted."""
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from typing import TypeVar
 
 import numpy as np
@@ -238,9 +239,12 @@ class RestartingBank(ForwardingBank):
         self._divergence.forget(track_id)
 
     def _start(self, track_id: int) -> Start:
-        """What is known of a track: its last good state, or how it began."""
+        """What is known of a track: its last good state, or how it began, where that was too uncertain for a start."""
         track_ids, states = self._good
-        return _start_at(states[track_ids.index(track_id)]) if track_id in track_ids else self._starts[track_id]
+        if track_id in track_ids:
+            with suppress(CallError):
+                return _start_at(states[track_ids.index(track_id)])
+        return self._starts[track_id]
 
     def _raised(self, error: Exception) -> None:
         self.failures.add(Failure.ESTIMATOR_RAISED)

@@ -10,6 +10,7 @@ import numpy as np
 from fgtrack.core.errors import CallError, DataError, FgtrackError, did_you_mean
 from fgtrack.core.time import seconds
 from fgtrack.core.types import (
+    FRAMES,
     DetectionList,
     Disposition,
     EgoState,
@@ -98,13 +99,15 @@ class Tracker:
         return self._parts.ego.jumps
 
     def receive(self, message: EgoState | DetectionList) -> None:
-        """Take a message. Raises `DataError` for a sensor that has no model."""
+        """Take a message. Raises `DataError` for a sensor that has no model, and for an unknown frame."""
         if isinstance(message, EgoState):
             reason = self._parts.ego.receive(message)
             if reason is not None:
                 self.refused_ego[reason] += 1
             return
         check_sensor(message.sensor, self._parts.sensors)
+        if message.frame not in FRAMES:
+            raise DataError(f"{message.sensor}: frame: one of {', '.join(FRAMES)} expected, not {message.frame!r}")
         self._records += self._parts.inbox.put(message)
 
     def tick(self, now_ns: int) -> TickReport:

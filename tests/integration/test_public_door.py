@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -105,3 +106,36 @@ def test_the_snippet_of_the_design_runs_as_written(drive: Path, monkeypatch: pyt
     assert Path("errors.pdf").read_bytes().startswith(b"%PDF")
     assert "tracking" in str(scope["tables"]).lower()
     assert Path("drive.jsonl").exists()
+
+
+@pytest.mark.parametrize("wrong", [5, b"x", 1j, np.array([1.0])], ids=repr)
+def test_an_argument_of_another_type_is_named(wrong: object) -> None:
+    """One line that says which, wherever a user comes in."""
+    calls: dict[str, Callable[[], object]] = {
+        "recording": lambda: fgtrack.replay(wrong),
+        "config": lambda: fgtrack.replay("x.jsonl", wrong),
+        "map": lambda: fgtrack.replay("x.jsonl", map=wrong),
+        "pit_map": lambda: fgtrack.advise("x.jsonl", pit_map=wrong),
+        "estimator": lambda: fgtrack.replay("x.jsonl", estimator=wrong),
+        "set": lambda: fgtrack.replay("x.jsonl", set=wrong),
+        "out": lambda: fgtrack.replay("x.jsonl", out=wrong),
+        "scenario": lambda: fgtrack.simulate(wrong),
+        "seed": lambda: fgtrack.simulate(seed=wrong if wrong != 5 else -5),
+        "runs": lambda: fgtrack.compare(wrong),
+        "recordings?": lambda: fgtrack.tune(wrong),
+        "name": lambda: fgtrack.estimator(wrong, fgtrack.CTRV(), fgtrack.Start()),
+        "motion": lambda: fgtrack.estimator("ekf-replay", wrong, fgtrack.Start()),
+        "start": lambda: fgtrack.estimator("ekf-replay", fgtrack.CTRV(), wrong),
+        "lag_s": lambda: fgtrack.estimator("ekf-replay", fgtrack.CTRV(), fgtrack.Start(), lag_s=[wrong]),
+    }
+    for name, call in calls.items():
+        with pytest.raises(fgtrack.CallError, match=f"^{name}: "):
+            call()
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    for value in (np.float32(4.0), np.float64(4.0), np.int64(4), np.array(4.0)):
+        tracker = fgtrack.Tracker.from_config("smoother", set={"association.gate_m": value})
+        assert tracker.config.association.gate_m == 4.0
+    with pytest.raises(fgtrack.CallError, match=r"^set: only plain values can be set"):
+        fgtrack.Tracker.from_config("smoother", set={"association.gate_m": object()})

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.types import Detection, DetectionList, EgoState, TickReport, TruthState
+from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, TickReport, TruthState
 from fgtrack.pipeline.live import Tracker
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.shipped import read_config, read_scenario
@@ -121,3 +121,28 @@ def test_it_gives_what_the_replay_of_the_same_messages_gives() -> None:
     np.testing.assert_array_equal(rows, np.stack([run.tracks[n] for n in ("x_m", "y_m", "speed_mps")], axis=1))
     received = Counter(m.sensor for m in messages if isinstance(m, DetectionList) for _ in m.objects)
     assert {sensor: sum(counts.values()) for sensor, counts in tracker.counts.items()} == received
+
+
+@pytest.mark.parametrize("now_ns", [math.nan, math.inf, 1.5, None, "x", -1, 2**63], ids=repr)
+def test_what_is_no_time_is_refused_at_once_and_changes_nothing(now_ns: object) -> None:
+    tracker = Tracker.from_config("smoother")
+    first = tracker.tick(NOW_NS)
+    for ask in (tracker.tick, tracker.tracks_at, tracker.output().at, lambda stamp_ns: tracker.state_at(0, stamp_ns)):
+        with pytest.raises(CallError, match=r"(now|stamp)_ns: must be integer nanoseconds since 1970, is"):
+            ask(now_ns)  # type: ignore[arg-type]  # wrong on purpose
+    assert tracker.tick(np.int64(NOW_NS + 1)).tick == first.tick + 1
+
+
+@pytest.mark.parametrize("frame", ["nonsense", None, 5, []])
+def test_a_list_in_a_frame_that_does_not_exist_is_invalid(frame: object) -> None:
+    tracker = Tracker.from_config("smoother")
+    odd = DetectionList("radar", NOW_NS, NOW_NS, [Detection(x_m=5.0, y_m=0.0)], frame)  # type: ignore[arg-type]  # the same
+    tracker.receive(odd)
+    assert [one.disposition for one in tracker.tick(NOW_NS).updates] == [Disposition.INVALID]
+    assert tracker.refused == {"message cannot be read (DataError)": 1}
+
+
+@pytest.mark.parametrize("config", [None, "smoother", 5])
+def test_a_tracker_is_made_of_a_config(config: object) -> None:
+    with pytest.raises(CallError, match=r"^config: must be a Config, .*Tracker\.from_config"):
+        Tracker(config)  # type: ignore[arg-type]  # the same

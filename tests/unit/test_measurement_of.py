@@ -37,7 +37,11 @@ def test_values_are_ordered_as_the_model_orders_them() -> None:
         ({"x_m": 1.0, "y_m": 2.0, "std": STD, "covariance": np.eye(2)}, "either std or covariance"),
         ({"x_m": 1.0, "y_m": 2.0, "std": {"x_m": 0.3}}, "std must name the same, names x_m"),
         ({"x_m": 1.0, "std": STD}, "std must name the same, names x_m, y_m"),
-        ({"x_m": np.nan, "y_m": 2.0, "std": STD}, "values must be finite"),
+        ({"x_m": np.nan, "y_m": 2.0, "std": STD}, "of x_m: must be a number, finite"),
+        ({"x_m": "1", "y_m": 2.0, "std": STD}, "of x_m: must be a number, finite and at most 1e9, is '1'"),
+        ({"x_m": None, "y_m": 2.0, "std": STD}, "of x_m: must be a number"),
+        ({"x_m": 1j, "y_m": 2.0, "std": STD}, "of x_m: must be a number"),
+        ({"x_m": 1.0, "std": {"x_m": 1e300}}, "of x_m: must be a number"),
         ({"x_m": 1.0, "std": {"x_m": 0.0}}, "symmetric, positive definite"),
         ({"x_m": 1.0, "covariance": np.eye(2)}, r"of shape \(1, 1\)"),
         ({"x_m": 1.0, "covariance": np.array([[np.inf]])}, "symmetric, positive definite"),
@@ -48,6 +52,15 @@ def test_what_makes_no_sense_is_one_line(given: dict, message: str) -> None:
     with pytest.raises(CallError, match=message) as raised:
         Measurement.of(0, **given)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("stamp_ns", [None, "x", np.nan, 1.5, np.array([1]), 2**63], ids=repr)
+def test_a_stamp_is_an_integer(stamp_ns: object) -> None:
+    with pytest.raises(CallError, match=r"^measurement: stamp_ns: must be an integer"):
+        Measurement.of(stamp_ns, x_m=1.0, std={"x_m": 1.0})
+    with pytest.raises(CallError, match=r"^Start: stamp_ns: must be an integer"):
+        Start(stamp_ns=stamp_ns)
+    assert Measurement.of(np.int64(5), x_m=np.float32(1.0), std={"x_m": 1}).z.tolist() == [1.0]
 
 
 @pytest.mark.parametrize("motion", MODELS, ids=lambda motion: type(motion).__name__)
