@@ -64,6 +64,8 @@ def test_the_bulk_of_a_sample_leaves_out_what_is_far_away() -> None:
     assert -0.2 < low < 0.0 < 1.0 < high < 3.0
     assert bulk([np.zeros(0)]) == (0.0, 1.0)
     assert bulk([np.zeros(3)], [np.array([-10.0, 10.0])]) == (-11.0, 11.0)
+    for value in (1e9, -1e18, 1e300):
+        assert (np.diff(np.linspace(*bulk([np.full(3, value)]), 41)) > 0.0).all()
 
 
 # --- along the track

@@ -28,5 +28,6 @@ def bulk(samples: Iterable[FloatArray], held: Iterable[FloatArray] = ()) -> tupl
             highs.append(float(known.max()))
     if not lows:
         return 0.0, 1.0
-    margin = max(_MARGIN * (max(highs) - min(lows)), 1e-6)
-    return min(lows) - margin, max(highs) + margin
+    low, high = min(lows), max(highs)
+    margin = max(_MARGIN * (high - low), 1e-6, 1e-9 * max(abs(low), abs(high)))  # wide enough for bins of it
+    return low - margin, high + margin
