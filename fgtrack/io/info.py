@@ -124,7 +124,7 @@ class _Times:
 
 def _read_bag(path: Path, config: InputConfig | None, times: dict[_Key, _Times]) -> _Found:
     given = config or InputConfig()
-    bag = Bag(path, given.message_definitions, given.largest_bytes)
+    bag = Bag(path, given.message_definitions, given.largest_bytes, given.most_objects)
     used: dict[_Key, str] = {}
     problem: str | None = None
     try:

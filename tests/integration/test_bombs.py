@@ -17,6 +17,7 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.typesys import Stores, get_typestore
+from support.mcap import record, text
 from support.messages import drive
 
 from fgtrack.core.errors import DataError
@@ -93,14 +94,6 @@ def test_a_list_with_more_objects_than_allowed(tmp_path: Path) -> None:
     path.write_bytes(HEADER + json.dumps(record).encode())
     with pytest.raises(DataError, match=r"a list of 1001 objects, more than input\.most_objects allows"):
         list(open_input(path, SMALL).messages())
-
-
-def record(opcode: int, content: bytes) -> bytes:
-    return struct.pack("<BQ", opcode, len(content)) + content
-
-
-def text(value: str) -> bytes:
-    return struct.pack("<I", len(value)) + value.encode()
 
 
 @pytest.mark.parametrize("stated", [0, 100, len(BOMB), 2**63])

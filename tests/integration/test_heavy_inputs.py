@@ -10,10 +10,10 @@ import pytest
 from faults.cases import Server
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
+from support.mcap import END, HEADER, record, text
 from support.messages import drive
 
 from fgtrack.io.ros.bag_writer import write_bag
-from fgtrack.io.ros.mcap_file import MCAP_MAGIC
 from fgtrack.models.oval import make_oval
 
 MOST_MB, LONGEST_S = 1000.0, 20.0
@@ -216,18 +216,6 @@ def blob(folder: Path) -> None:
     base.execute("update messages set data = zeroblob(900000000) where id = 5")
     base.commit()
     base.close()
-
-
-def record(opcode: int, content: bytes) -> bytes:
-    return struct.pack("<BQ", opcode, len(content)) + content
-
-
-def text(value: str) -> bytes:
-    return struct.pack("<I", len(value)) + value.encode()
-
-
-HEADER = MCAP_MAGIC + record(0x01, text("ros2") + text(""))
-END = record(0x0F, bytes(4)) + record(0x02, bytes(20)) + MCAP_MAGIC
 
 
 def mcap_of(item: Callable[[int], bytes], count: int) -> Callable[[Path], None]:

@@ -2,9 +2,14 @@
 
 import pytest
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
+from rosbags.interfaces.typing import Typesdict
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from support.mcap import poses
 
-from fgtrack.io.ros.typestore import build_typestore, check_definition
+from fgtrack.core.errors import DataError
+from fgtrack.io.ros.definition_text import DefinitionReader
+from fgtrack.io.ros.type_checks import check_definition, load_of, named_types
+from fgtrack.io.ros.typestore import MessageTypes, build_typestore
 
 NUMBER = (Nodetype.BASE, ("float64", 0))
 NAME = "a_msgs/msg/B"
@@ -33,6 +38,12 @@ def test_every_definition_of_ros_passes(store: Stores) -> None:
         (NAME, ([], [("x", (Nodetype.ARRAY, (NUMBER, 10**9)))]), "longer than"),
         (NAME, ([], [("x", (Nodetype.SEQUENCE, ((Nodetype.NAME, "x;y"), 0)))]), "no name of a message type"),
         (NAME, ([], [(f"x{k}", NUMBER) for k in range(3000)]), "more than 2000 members"),
+        (NAME, ([("A", "float64", float("inf"))], []), "no plain value"),
+        (NAME, ([("A", "int64", 1 << 64)], []), "no plain value"),
+        (NAME, ([], [("class", NUMBER), ("class_", NUMBER)]), "class_ twice"),
+        (NAME, ([("x", "int8", 1)], [("x", NUMBER)]), "x twice"),
+        (NAME, ([], [("__class__", NUMBER)]), "no name of a member"),
+        ("a/" + "b" * 300, ([], []), "no name of a message type"),
     ],
 )
 def test_what_is_no_name_and_no_number_is_refused(name: str, definition, problem: str) -> None:
@@ -43,7 +54,7 @@ def test_what_is_no_name_and_no_number_is_refused(name: str, definition, problem
 def test_a_definition_that_is_refused_is_a_problem_of_its_type_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the parser makes of a text."""
     evil = {NAME: ([], [("x);import os;(", NUMBER)])}
-    monkeypatch.setattr("fgtrack.io.ros.typestore._embedded_types", lambda *of: evil)
+    monkeypatch.setattr("fgtrack.io.ros.definition_text.get_types_from_msg", lambda *of: evil)
     given = {NAME: MessageDefinition(MessageDefinitionFormat.MSG, "float64 x"), "nav_msgs/msg/Odometry": None}
     store, problems = build_typestore(given, ros1=False)
     assert "no name of a member" in problems[NAME]
@@ -64,3 +75,111 @@ def test_both_parsers_give_what_is_checked() -> None:
     ):
         for name, definition in types.items():
             check_definition(name, definition)
+
+
+IDL = """// generated from rosidl_adapter/resource/msg.idl.em
+#include "builtin_interfaces/msg/Time.idl"
+
+module a_msgs {
+  module msg {
+    typedef double double__36[36];
+    module B_Constants {
+      const uint8 CAR = 1;
+      const int8 NONE = -1;
+      const double SMALL = -1.5e-3;
+      @verbatim (language="comment", text="an example (of" "\\n" "1 << 99 \\" things")
+      const string NAME = "a * (b << c";
+    };
+    @verbatim (language="comment", text=
+      "One (thing" "\\n" " more)")
+    struct B {
+      builtin_interfaces::msg::Time stamp;
+      /* here ( and * there */
+      @default (value=3)
+      @unit (value="m")
+      long x;
+      double__36 covariance;
+      sequence<string<10>> names;
+      sequence<a_msgs::msg::C, 4> parts;
+    };
+  };
+};
+"""
+
+
+def test_what_ros_generates_in_idl_is_read() -> None:
+    types = DefinitionReader().read(NAME, MessageDefinition(MessageDefinitionFormat.IDL, IDL))
+    constants, members = types[NAME]
+    assert [(name, value) for name, _, value in constants][:3] == [("CAR", 1), ("NONE", -1), ("SMALL", -1.5e-3)]
+    assert [name for name, _ in members] == ["stamp", "x", "covariance", "names", "parts"]
+    assert dict(members)["covariance"] == (Nodetype.ARRAY, (NUMBER, 36))
+    assert dict(members)["names"][0] == Nodetype.SEQUENCE
+
+
+@pytest.mark.parametrize("store", Stores)
+@pytest.mark.parametrize("ros1", [True, False])
+def test_every_type_of_ros_is_light_enough(store: Stores, ros1: bool) -> None:
+    types = get_typestore(store).fielddefs
+    for name in types:
+        assert load_of(name, closure(types, name), ros1).values < 1_000
+
+
+def closure(types: Typesdict, name: str) -> Typesdict:
+    found, pending = {}, [name]
+    while pending:
+        current = pending.pop()
+        if current not in found and current in types:
+            found[current] = types[current]
+            pending += [part for _, field in types[current][1] for part in named_types(field)]
+    return found
+
+
+def embedded(**texts: str) -> list[tuple[str, MessageDefinition]]:
+    return [(f"a/msg/{name}", MessageDefinition(MessageDefinitionFormat.MSG, text)) for name, text in texts.items()]
+
+
+PART = "a/C c\n" + "=" * 80 + "\nMSG: a/C\n"
+
+
+def test_topics_that_contradict_each_other_are_each_read_by_their_own_definition() -> None:
+    keys = embedded(A=f"{PART}uint8 x\n", B=f"{PART}uint16 y\n")
+    types = MessageTypes(keys, ros1=False)
+    assert not types.problems
+    assert types.decode(keys[0], b"\0\1\0\0\7", "it").c.x == 7
+    assert types.decode(keys[1], b"\0\1\0\0\0\1", "it").c.y == 256
+
+
+def test_one_name_for_two_types_is_read_by_what_each_topic_says() -> None:
+    keys = embedded(A="uint8 x\n") + embedded(A="uint16 y\n")
+    types = MessageTypes(keys, ros1=False)
+    assert types.decode(keys[0], b"\0\1\0\0\7", "it").x == 7
+    assert types.decode(keys[1], b"\0\1\0\0\0\1", "it").y == 256
+
+
+def test_a_type_that_only_others_define_must_be_the_same_in_all_of_them() -> None:
+    keys = [*embedded(A=f"{PART}uint8 x\n", B=f"{PART}uint16 y\n"), ("a/msg/C", None)]
+    assert "defines a/msg/C in several ways" in MessageTypes(keys, ros1=False).problems["a/msg/C", None]
+    keys = [*embedded(A=f"{PART}uint8 x\n", B=f"{PART}uint8 x # m\n"), ("a/msg/C", None)]
+    assert not MessageTypes(keys, ros1=False).problems
+
+
+@pytest.mark.parametrize("evil", ["float64 A=1e999\n", "int32 class\nint32 class_\n", f"int64 A=0x{'f' * 6000}\n"])
+def test_a_definition_that_nobody_needs_leaves_the_others_readable(evil: str) -> None:
+    keys = [*embedded(A=f"{evil}int32 x\n"), ("nav_msgs/msg/Odometry", None)]
+    types = MessageTypes(keys, ros1=False)
+    assert list(types.problems) == keys[:1]
+    with pytest.raises(DataError, match="is not a nav_msgs/msg/Odometry"):
+        types.decode(keys[1], b"\0\1\0\0", "it")
+
+
+def test_a_large_message_is_decoded_as_a_small_one() -> None:
+    key = ("geometry_msgs/msg/PoseArray", None)
+    few = MessageTypes([key], ros1=False, most_objects=3)
+    many = MessageTypes([key], ros1=False)
+    for count in (1, 3):
+        assert few.decode(key, poses(count), "it") == few.decode(key, poses(count), "it")
+        assert repr(few.decode(key, poses(count), "it")) == repr(many.decode(key, poses(count), "it"))
+    with pytest.raises(DataError, match=r"a list of 4 objects, more than input\.most_objects allows"):
+        few.decode(key, poses(4), "it")
+    with pytest.raises(DataError, match=r"more values than .* input\.most_objects allows"):
+        few.decode(key, poses(40), "it")

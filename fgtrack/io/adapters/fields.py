@@ -4,6 +4,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES, Detection, EgoState
@@ -37,10 +39,10 @@ def items_by_fields(message: RosMessage, fields: Mapping[str, FieldPath]) -> lis
     path = fields.get("objects")
     if path is None:
         return [message]
-    try:
-        return list(value_at(message, _single(path)))
-    except TypeError as error:
-        raise FieldError(f"{path}: is not a list") from error
+    found = value_at(message, _single(path))
+    if not isinstance(found, list | tuple):  # numbers in a row are no objects, nor are the letters of a text
+        raise FieldError(f"{path}: is not a list of objects")
+    return list(found)
 
 
 def ego_by_fields(message: RosMessage, fields: Mapping[str, FieldPath], receipt_ns: int) -> EgoState:
@@ -82,10 +84,17 @@ def _object(item: RosMessage, fields: Mapping[str, FieldPath]) -> Detection:
     }
     return Detection(
         **values,
-        class_name=str(value_at(item, _single(fields["class_name"]))) if "class_name" in fields else None,
+        class_name=_text(item, _single(fields["class_name"])) if "class_name" in fields else None,
         stamp_ns=_time(item, _single(fields["object_stamp"])) if "object_stamp" in fields else None,
         object_id=object_id(value_at(item, _single(fields["object_id"]))) if "object_id" in fields else None,
     )
+
+
+def _text(item: RosMessage, path: str) -> str:
+    value = value_at(item, path)
+    if not isinstance(value, str | int | float | np.generic):
+        raise FieldError(f"{path}: is no text and no number")
+    return str(value)
 
 
 def _message_stamp(message: RosMessage, fields: Mapping[str, FieldPath]) -> int | None:

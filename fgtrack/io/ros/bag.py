@@ -13,11 +13,11 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2
 
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S
-from fgtrack.io.errors import LARGEST_BYTES, TruncatedInput
+from fgtrack.io.errors import LARGEST_BYTES, MOST_OBJECTS, TruncatedInput
 from fgtrack.io.ros.bag_files import BagFile, EmptyFile, bag_folder, check_serialization, merged, storage_of
 from fgtrack.io.ros.mcap_file import McapFile
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
-from fgtrack.io.ros.typestore import build_typestore, one_line, type_name
+from fgtrack.io.ros.typestore import Key, MessageTypes, one_line, type_name
 from fgtrack.io.ros.unpacking import unpacked
 
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -59,6 +59,8 @@ class Bag:
         name of the folder (or of the one above a folder `msg`).
     largest_bytes
         A chunk or message that unpacks to more is refused.
+    most_objects
+        A message with a longer list of objects is refused.
 
     Raises
     ------
@@ -67,7 +69,11 @@ class Bag:
     """
 
     def __init__(
-        self, path: Path | str, message_definitions: Collection[str] = (), largest_bytes: int = LARGEST_BYTES
+        self,
+        path: Path | str,
+        message_definitions: Collection[str] = (),
+        largest_bytes: int = LARGEST_BYTES,
+        most_objects: int = MOST_OBJECTS,
     ) -> None:
         self.path = Path(path)
         self._largest_bytes = largest_bytes
@@ -77,10 +83,10 @@ class Bag:
                 if isinstance(item.ext, ConnectionExtRosbag2):
                     check_serialization(self.path, item.topic, item.ext.serialization_format)
             self._ros1 = any(isinstance(file, Rosbag1File) for file in files)
-            definitions = {item.msgtype: item.msgdef for item in connections}
-            self._store, problems = build_typestore(definitions, self._ros1, message_definitions)
+            self._types = MessageTypes(map(_key, connections), self._ros1, message_definitions, most_objects)
+            self._stamped = {key for key in set(map(_key, connections)) if self._starts_with_header(key)}
             self.break_off = _break_off(files)
-        self.topics = _topics(connections, problems)
+        self.topics = _topics(connections, self._types.problems)
         """Topics by name; a topic with two types is listed twice."""
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
@@ -96,15 +102,9 @@ class Bag:
         for topic in self.topics:
             if topic.name in topics and topic.problem:
                 raise DataError(f"{self.path}: topic {topic.name} cannot be read: {topic.problem}")
-        decode = self._store.deserialize_ros1 if self._ros1 else self._store.deserialize_cdr
         for connection, log_ns, data in self._records(topics):
-            try:
-                message = decode(data, connection.msgtype)
-            except Exception as error:  # whatever foreign bytes make the decoder raise
-                raise DataError(
-                    f"{self.path}: the message on {connection.topic} at {log_ns} ns is not a "
-                    f"{connection.msgtype} ({one_line(error)})"
-                ) from error
+            what = f"{self.path}: the message on {connection.topic} at {log_ns} ns"
+            message = self._types.decode(_key(connection), data, what)
             yield BagMessage(connection.topic, connection.msgtype, log_ns, message)
 
     def stamps(self) -> Iterator[tuple[BagTopic, int, int | None]]:
@@ -113,10 +113,9 @@ class Bag:
         The stamp is None where the type does not start with a header or is not known.
         """
         by_key = {(topic.name, topic.type): topic for topic in self.topics}
-        stamped = {topic: self._starts_with_header(topic) for topic in self.topics}
         for connection, log_ns, data in self._records({topic.name for topic in self.topics}):
             topic = by_key[connection.topic, connection.msgtype]
-            yield topic, log_ns, self._stamp_ns(data) if stamped[topic] else None
+            yield topic, log_ns, self._stamp_ns(data) if _key(connection) in self._stamped else None
 
     def sendings(self) -> Iterator[tuple[BagTopic, int, int, int]]:
         """Topic, header stamp, time of sending and log time of every message that has a header, file by file.
@@ -124,14 +123,14 @@ class Bag:
         Only MCAP keeps when a message was sent (its publish time); a recorder that did not know it writes the log
         time. Compression of single messages is not undone, such recordings give nothing.
         """
-        stamped = {(topic.name, topic.type): topic for topic in self.topics if self._starts_with_header(topic)}
+        by_key = {(topic.name, topic.type): topic for topic in self.topics}
         with self._files() as files:
             for file in files:
                 for connection, sent_ns, log_ns, data in file.sendings() if isinstance(file, McapFile) else ():
-                    topic = stamped.get((connection.topic, connection.msgtype))
-                    stamp_ns = None if topic is None or data[:4] == _ZSTD_MAGIC else self._stamp_ns(data)
-                    if topic is not None and stamp_ns is not None:
-                        yield topic, stamp_ns, sent_ns, log_ns
+                    if _key(connection) not in self._stamped or data[:4] == _ZSTD_MAGIC:
+                        continue
+                    if (stamp_ns := self._stamp_ns(data)) is not None:
+                        yield by_key[connection.topic, connection.msgtype], stamp_ns, sent_ns, log_ns
 
     def end_ns(self) -> int | None:
         """The end of the log times as the indexes of the files say it, without reading messages; None without any."""
@@ -147,10 +146,10 @@ class Bag:
         sec, nanosec = struct.unpack_from(">iI" if not self._ros1 and data[1] == 0 else "<iI", data, offset)
         return int(sec * NS_PER_S + nanosec)
 
-    def _starts_with_header(self, topic: BagTopic) -> bool:
-        if topic.problem:
+    def _starts_with_header(self, key: Key) -> bool:
+        if key in self._types.problems:
             return False
-        fields = self._store.fielddefs[topic.type][1]
+        fields = self._types.fields(key)
         return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
 
     @contextmanager
@@ -187,13 +186,18 @@ def is_bag(path: Path) -> bool:
     return storage_of(path) is not None
 
 
-def _topics(connections: list[Connection], problems: Mapping[str, str]) -> tuple[BagTopic, ...]:
+def _key(connection: Connection) -> Key:
+    return connection.msgtype, connection.msgdef
+
+
+def _topics(connections: list[Connection], problems: Mapping[Key, str]) -> tuple[BagTopic, ...]:
     counts: Counter[tuple[str, str]] = Counter()
+    found: dict[tuple[str, str], str] = {}
     for item in connections:
         counts[item.topic, item.msgtype] += item.msgcount
-    return tuple(
-        BagTopic(name, msgtype, count, problems.get(msgtype)) for (name, msgtype), count in sorted(counts.items())
-    )
+        if _key(item) in problems:
+            found.setdefault((item.topic, item.msgtype), problems[_key(item)])
+    return tuple(BagTopic(*topic, count, found.get(topic)) for topic, count in sorted(counts.items()))
 
 
 def _break_off(files: list[BagFile]) -> str | None:

@@ -98,7 +98,7 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
 
 
 def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
-    bag = Bag(path, config.message_definitions, config.largest_bytes)
+    bag = Bag(path, config.message_definitions, config.largest_bytes, config.most_objects)
     uses = topic_uses(bag, config)
     windows_ns = {name: nanoseconds(each.scan_s) for name, each in config.detections.items() if each.scan_s is not None}
     return lambda: grouped(bag_messages(bag, uses), windows_ns) if windows_ns else bag_messages(bag, uses)

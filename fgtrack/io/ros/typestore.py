@@ -1,30 +1,35 @@
 """The message types of a recording: rosbags', fgtrack's, the user's and those embedded in the recording."""
 
 import os
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import cast
+from typing import Any, TypeVar
 
-from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
-from rosbags.interfaces.typing import Constdefs, Fielddefs, FieldDesc, Typesdict
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.interfaces import MessageDefinition
+from rosbags.interfaces.typing import Fielddefs, Typesdict
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from fgtrack.core.errors import CallError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.files import read_whole
+from fgtrack.io.errors import MOST_OBJECTS
+from fgtrack.io.ros.counting import CountingStore, TooManyError, longest_list
+from fgtrack.io.ros.definition_text import DefinitionReader, one_line
 from fgtrack.io.ros.definitions import DEFINITIONS
+from fgtrack.io.ros.type_checks import Load, check_definition, load_of, named_types
 
-_TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*)+", re.ASCII)
-_MEMBER_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
-_BASE_NAME = re.compile(r"[a-z]+[0-9]*", re.ASCII)
-_MOST_MEMBERS = 2_000
-_LONGEST_ARRAY = 1_000_000
-_LONGEST_TEXT = 1_000_000
+__all__ = ["Key", "MessageTypes", "build_typestore", "one_line", "type_name"]
+
 _LARGEST_FILE_MB = 1.0
 _MOST_FOLDERS = 10_000  # below a folder of definitions
-_IDL_SEPARATOR = "=" * 80 + "\n"
+_VALUES_PER_OBJECT = 50
+"""Those of Autoware have 40."""
+
+AnyStore = TypeVar("AnyStore", bound=Typestore)
+
+Key = tuple[str, MessageDefinition | None]
+"""A message type, and what the recording says of it: two topics may know different types by one name."""
 
 
 def type_name(name: str) -> str:
@@ -33,117 +38,179 @@ def type_name(name: str) -> str:
     return name if "/" in base else f"{package}/msg/{base}"
 
 
-def build_typestore(
-    definitions: Mapping[str, MessageDefinition | None], ros1: bool, message_definitions: Iterable[str] = ()
-) -> tuple[Typestore, Mapping[str, str]]:
-    """Types for messages of the types that are the keys of `definitions`, and of those which cannot be read why.
+class MessageTypes:
+    """Decodes messages of the given types, each by the definition that came with it.
 
-    Precedence: definitions embedded in the recording, the user's, fgtrack's, rosbags'.
+    Precedence: the definition embedded for the type, those embedded for others, the user's, fgtrack's, rosbags'.
 
     Parameters
     ----------
-    definitions
-        What the recording carries, by type name.
+    keys
+        The types, with what the recording carries of them.
     ros1
         Whether the messages are serialized as ROS 1 does.
     message_definitions
         The user's `.msg` files, or folders of them.
+    most_objects
+        A message with a longer list, or with more values than such lists have, is refused.
 
     Raises
     ------
     CallError
         One of the user's `message_definitions` cannot be read.
     """
-    types: Typesdict = dict(_shipped_types(ros1))
-    for path in message_definitions:
-        types |= _user_types(Path(path))
-    problems: dict[str, str] = {}
-    for name, definition in definitions.items():
+
+    def __init__(
+        self,
+        keys: Iterable[Key],
+        ros1: bool,
+        message_definitions: Iterable[str] = (),
+        most_objects: int = MOST_OBJECTS,
+    ) -> None:
+        self._ros1 = ros1
+        self._most_objects = most_objects
+        self._types: dict[Key, Typesdict] = {}
+        self._loads: dict[Key, Load] = {}
+        self._stores: dict[Key, Typestore] = {}
+        self._counting: dict[Key, CountingStore] = {}
+        self.problems: dict[Key, str] = {}
+        """Why messages of a type cannot be decoded."""
+        keys = sorted(set(keys), key=_length)  # what is too much for all of them is the longest
+        embedded = self._embedded(keys)
+        known = _known_types(ros1, message_definitions)
+        shared, ambiguous = _shared(embedded.values())
+        for key in keys:
+            if key not in self.problems:
+                try:
+                    types = _closure(key[0], [embedded[key], shared, known], ambiguous)
+                    self._loads[key] = load_of(key[0], types, ros1)
+                    self._types[key] = types
+                except ValueError as error:
+                    self.problems[key] = str(error)
+
+    def _embedded(self, keys: list[Key]) -> dict[Key, Typesdict]:
+        reader = DefinitionReader()
+        found: dict[Key, Typesdict] = {}
+        for key in keys:
+            try:
+                found[key] = reader.read(*key)
+            except ValueError as error:
+                self.problems[key] = f"its embedded definition cannot be read ({one_line(error)})"
+        return found
+
+    def fields(self, key: Key) -> Fielddefs:
+        """The members of a type that has no problem."""
+        return self._types[key][key[0]][1]
+
+    def types(self, key: Key) -> Typesdict:
+        """A type that has no problem, with all that it is made of."""
+        return self._types[key]
+
+    def decode(self, key: Key, data: bytes, what: str) -> Any:  # a message has the attributes of its type
+        """The message that is serialized in `data`.
+
+        Raises
+        ------
+        DataError
+            It is none of the type, or has more than `most_objects` allows; `what` says which message it is.
+        """
+        load = self._loads[key]
         try:
-            types |= _checked(_embedded_types(name, definition)) if definition else {}
-        except Exception as error:  # whatever a foreign definition makes the parser raise
-            problems[name] = f"its embedded definition cannot be read ({one_line(error)})"
-    needed: Typesdict = {}
-    for name in definitions:
-        missing = _collect(types, name, needed)
-        if missing is not None and name not in problems:
-            problems[name] = (
-                f"the definition of {missing or 'a type without a name'} is neither in the recording nor known, "
-                "name its .msg file in message_definitions"
-            )
-    store = get_typestore(Stores.EMPTY)
-    store.register({name: fields for name, fields in needed.items() if name not in store.fielddefs})
-    return store, problems
+            if load.most_texts(len(data)) > _VALUES_PER_OBJECT * self._most_objects:
+                raise TooManyError
+            is_large = load.most_values(len(data)) > self._most_objects
+            message = self._counted(key, data) if is_large else self._decoded(self._store(key), key, data)
+        except TooManyError:
+            raise DataError(
+                f"{what}: a {key[0]} of {len(data) / 1e6:.1f} MB with more values than lists of as many objects have "
+                "as input.most_objects allows: raise it, if that is right"
+            ) from None
+        except Exception as error:  # whatever foreign bytes make the decoder raise
+            raise DataError(f"{what} is not a {key[0]} ({one_line(error)})") from error
+        if is_large and (length := longest_list(message)) > self._most_objects:
+            raise DataError(f"{what}: a list of {length} objects, more than input.most_objects allows")
+        return message
+
+    def _store(self, key: Key) -> Typestore:
+        if key not in self._stores:
+            self._stores[key] = _registered(Typestore(), self._types[key])
+        return self._stores[key]
+
+    def _counted(self, key: Key, data: bytes) -> Any:
+        if key not in self._counting:
+            store = CountingStore(_VALUES_PER_OBJECT * self._most_objects)
+            self._counting[key] = _registered(store, self._types[key])
+        self._counting[key].restart()
+        return self._decoded(self._counting[key], key, data)
+
+    def _decoded(self, store: Typestore, key: Key, data: bytes) -> Any:
+        return (store.deserialize_ros1 if self._ros1 else store.deserialize_cdr)(data, key[0])
 
 
-def check_definition(name: str, definition: tuple[Constdefs, Fielddefs]) -> None:
-    """Raise `ValueError` unless all names of a definition are such, and its values plain.
+def build_typestore(
+    definitions: Mapping[str, MessageDefinition | None], ros1: bool, message_definitions: Iterable[str] = ()
+) -> tuple[Typestore, Mapping[str, str]]:
+    """One store of the types that are the keys of `definitions`, and of those which cannot be read why.
 
-    rosbags generates Python code from a definition, with these names in it, and runs it: what a recording brings must
-    not become anything but names and numbers there.
+    Arguments and errors as of `MessageTypes`, by type name.
     """
-    constants, members = definition
-    if not _TYPE_NAME.fullmatch(name):
-        raise ValueError(f"{name!a} is no name of a message type")
-    if len(constants) + len(members) > _MOST_MEMBERS:
-        raise ValueError(f"{name} has more than {_MOST_MEMBERS} members")
-    for member in (*(constant[0] for constant in constants), *(one[0] for one in members)):
-        if not _MEMBER_NAME.fullmatch(member):
-            raise ValueError(f"{member!a} is no name of a member")
-    for member, kind, value in constants:
-        if type(value) not in (bool, int, float, str) or not _BASE_NAME.fullmatch(kind):
-            raise ValueError(f"the constant {member} is no plain value")
-    for member, description in members:
-        _check_description(member, description)
+    found = MessageTypes(definitions.items(), ros1, message_definitions)
+    needed: Typesdict = {}
+    for key in definitions.items():
+        needed |= {} if key in found.problems else found.types(key)
+    return _registered(Typestore(), needed), {name: problem for (name, _), problem in found.problems.items()}
 
 
-def _check_description(member: str, description: FieldDesc) -> None:
-    kind, value = description
-    if kind == Nodetype.BASE:
-        base, size = cast("tuple[str, int]", value)
-        if not _BASE_NAME.fullmatch(base) or not 0 <= int(size) <= _LONGEST_ARRAY:
-            raise ValueError(f"{member} is of no known type")
-    elif kind == Nodetype.NAME:
-        if not _TYPE_NAME.fullmatch(cast("str", value)):
-            raise ValueError(f"{value!a} is no name of a message type")
-    else:
-        inner, size = cast("tuple[FieldDesc, int]", value)
-        if not 0 <= int(size) <= _LONGEST_ARRAY:
-            raise ValueError(f"{member} is longer than {_LONGEST_ARRAY}")
-        _check_description(member, inner)
+def _registered(store: AnyStore, types: Typesdict) -> AnyStore:
+    store.register(types)
+    return store
 
 
-def _checked(types: Typesdict) -> Typesdict:
-    for name, definition in types.items():
-        check_definition(name, definition)
-    return types
+def _length(key: Key) -> tuple[int, str]:
+    name, definition = key
+    return (len(definition.data) if definition else 0), name
 
 
-def one_line(error: BaseException) -> str:
-    """What `error` says, in one line of at most 200 characters."""
-    return " ".join(str(error).split())[:200] or type(error).__name__
+def _shared(embedded: Collection[Typesdict]) -> tuple[Typesdict, frozenset[str]]:
+    """What the definitions of any type say, and the names of which they say different things."""
+    shared: Typesdict = {}
+    ambiguous = set()
+    for types in embedded:
+        for name, definition in types.items():
+            if shared.setdefault(name, definition)[1] != definition[1]:
+                ambiguous.add(name)
+    return shared, frozenset(ambiguous)
 
 
-def _collect(types: Typesdict, name: str, needed: Typesdict) -> str | None:
-    """Add `name` and all that it is made of to `needed`; gives the name of one that is missing in `types`."""
-    pending, missing = [name], None
+def _closure(name: str, sources: list[Typesdict], ambiguous: frozenset[str]) -> Typesdict:
+    """The type `name` with all that it is made of, each from the first of `sources` that has it.
+
+    Raises `ValueError` where none has, or where it is to be taken from other topics which contradict each other.
+    """
+    needed: Typesdict = {}
+    pending = [name]
     while pending:
         current = pending.pop()
-        if current not in types:
-            missing = current
-        elif current not in needed:
-            needed[current] = types[current]
-            pending += [part for _, field in types[current][1] for part in _named_types(field)]
-    return missing
+        if current in needed:
+            continue
+        found = next((types[current] for types in sources if current in types), None)
+        if found is None:
+            raise ValueError(
+                f"the definition of {current or 'a type without a name'} is neither in the recording nor known, "
+                "name its .msg file in message_definitions"
+            )
+        if current in ambiguous and current not in sources[0]:
+            raise ValueError(f"the recording defines {current} in several ways, and for this type in none of its own")
+        needed[current] = found
+        pending += [part for _, field in found[1] for part in named_types(field)]
+    return needed
 
 
-def _named_types(description: FieldDesc) -> list[str]:
-    kind, value = description
-    if kind == Nodetype.NAME:
-        return [cast("str", value)]
-    if kind == Nodetype.BASE:
-        return []
-    return _named_types(cast("tuple[FieldDesc, int]", value)[0])  # an array or a sequence, with its size
+def _known_types(ros1: bool, message_definitions: Iterable[str]) -> Typesdict:
+    types = dict(_shipped_types(ros1))
+    for path in message_definitions:
+        types |= _user_types(Path(path))
+    return types
 
 
 @cache
@@ -174,26 +241,10 @@ def _user_types(path: Path) -> Typesdict:
     for file in definition_files(path):
         package = file.parent.parent.name if file.parent.name == "msg" else file.parent.name
         try:
-            types |= _checked(
-                get_types_from_msg(read_whole(file, _LARGEST_FILE_MB).decode(), f"{package}/msg/{file.stem}")
-            )
+            found = get_types_from_msg(read_whole(file, _LARGEST_FILE_MB).decode(), f"{package}/msg/{file.stem}")
+            for name, definition in found.items():
+                check_definition(name, definition)
         except Exception as error:  # whatever a foreign definition makes the parser raise
             raise CallError(f"{file}: is not a message definition ({one_line(error)})") from error
+        types |= found
     return types
-
-
-def _embedded_types(name: str, definition: MessageDefinition) -> Typesdict:
-    if len(definition.data) > _LONGEST_TEXT:
-        raise ValueError(f"it has more than {_LONGEST_TEXT} characters")
-    match definition.format:
-        case MessageDefinitionFormat.MSG if definition.data.strip():
-            return get_types_from_msg(definition.data, name)
-        case MessageDefinitionFormat.IDL if definition.data.startswith(f"{_IDL_SEPARATOR}IDL: "):
-            types: Typesdict = {}
-            for part in definition.data.split(_IDL_SEPARATOR)[1:]:
-                types |= get_types_from_idl(part.partition("\n")[2])
-            return types
-        case MessageDefinitionFormat.IDL:
-            return get_types_from_idl(definition.data)
-        case _:
-            return {}
