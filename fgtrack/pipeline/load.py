@@ -1,22 +1,21 @@
 """YAML files to validated dataclasses and back; every error names the file and the key."""
 
 import json
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from io import StringIO
-from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError, ReusedAnchorWarning, YAMLError
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import CallError, did_you_mean
 from fgtrack.core.files import open_text
+from fgtrack.io.yaml_text import YamlSizeError, safe_yaml
 
 T = TypeVar("T")
 
@@ -24,7 +23,6 @@ SMALLEST = 1e-12
 """No configured number but 0 is nearer to it, in any unit: squares and products stay finite."""
 _LONGEST_TEXT = 250_000
 _LONGEST_VALUE = 4096  # of a path
-_MOST_NODES = 100_000
 
 
 def load(kind: type[T], path: Path | None, settings: Sequence[str] = ()) -> T:
@@ -62,15 +60,10 @@ def read_yaml(path: Path) -> dict[str, Any]:  # Any: what YAML says is only know
 
 
 def _parse(text: str, origin: str) -> Any:
-    if len(text) > _LONGEST_TEXT:
-        raise CallError(f"{origin}: no configuration is longer than {_LONGEST_TEXT} characters")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ReusedAnchorWarning)  # YAML allows it
-            value = YAML(typ="safe", pure=True).load(text)
-        if next(islice(_nodes(value), _MOST_NODES, None), None) is not None:
-            raise CallError(f"{origin}: more than {_MOST_NODES} values, counting what its aliases repeat")
-        return value
+        return safe_yaml(text, _LONGEST_TEXT)
+    except YamlSizeError as error:
+        raise CallError(f"{origin}: {error}, no configuration is so long") from error
     except RecursionError as error:
         raise CallError(f"{origin}: nested too deeply, or an alias that contains itself") from error
     except MarkedYAMLError as error:
@@ -79,14 +72,6 @@ def _parse(text: str, origin: str) -> Any:
         raise CallError(f"{origin}{line}: no valid YAML, {problem.split(' To suppress')[0]}") from error
     except YAMLError as error:
         raise CallError(f"{origin}: no valid YAML, {' '.join(str(error).split())}") from error
-
-
-def _nodes(value: object) -> Iterator[object]:
-    """`value` and all that is in it, as often as it is in it."""
-    yield value
-    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    for item in inner:
-        yield from _nodes(item)
 
 
 def key_and_value(setting: str) -> tuple[str, Any]:  # Any: what YAML says

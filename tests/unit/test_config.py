@@ -277,11 +277,17 @@ def test_no_setting_is_beyond_reason(setting: str, message: str) -> None:
             + "".join(f"{chr(98 + i)}: &{chr(98 + i)} [{', '.join(9 * ['*' + chr(97 + i)])}]\n" for i in range(8)),
             "more than 100000 values",
         ),
+        (
+            "m0: &m0 {a: 1, b: 1}\n"
+            + "".join(f"m{k}: &m{k}\n  <<: [{', '.join([f'*m{k - 1}'] * 10)}]\n" for k in range(1, 9)),
+            "more than 100000 values",
+        ),
+        (f"a: &a {'x' * 100_000}\nb: [{'*a, ' * 10_000}]\n", "more than 100000 values"),
         ("a: &a [*a]\n", "nested too deeply"),
         ("a: " + "[" * 1_000, "nested too deeply"),
-        ("a: [" + "1, " * 100_000 + "1]", "no configuration is longer than"),
+        ("a: [" + "1, " * 100_000 + "1]", "is longer than 250000 characters"),
     ],
-    ids=["aliases", "itself", "brackets", "length"],
+    ids=["aliases", "merges", "texts", "itself", "brackets", "length"],
 )
 def test_a_file_that_would_fill_the_memory_is_refused(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "bomb.yaml"
