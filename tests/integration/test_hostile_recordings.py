@@ -9,6 +9,9 @@ from faults.cases import Server
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from support.mcap import CDR, END, HEADER, SEPARATOR, channel, chunk, mcap_of_type, message, poses, schema
+from support.messages import drive
+
+from fgtrack.io.ros.bag_writer import write_bag
 
 MOST_MB, LONGEST_S = 1000.0, 20.0
 _SENSOR = ("--set", "sensors={s: {std: {x_m: 1.0, y_m: 1.0}}}", "-o", "run")
@@ -205,3 +208,41 @@ def test_a_ros1_list_of_what_has_no_bytes(server: Server, tmp_path: Path) -> Non
         topic = writer.add_connection("/x", "a/msg/B", msgdef=definition, md5sum="0" * 32)
         writer.write(topic, 10**9, struct.pack("<I", 2**32 - 1))
     read_in_little(server, tmp_path, replay("x.bag", OBJECTS), "a list of what has no bytes")
+
+
+_ALIASES = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 9)
+)
+_MERGES = "m0: &m0 {a: 1, b: 1, c: 1, d: 1, e: 1}\n" + "".join(
+    f"m{k}: &m{k}\n  <<: [{', '.join([f'*m{k - 1}'] * 10)}]\n" for k in range(1, 9)
+)
+_TOPIC = "name: /fgtrack/truth"
+METADATA: dict[str, tuple[Callable[[str], str], str]] = {
+    "a name of aliases": (
+        lambda text: _ALIASES + text.replace(_TOPIC, "name: *a8"),
+        "counting what its aliases repeat",
+    ),
+    "a name that is a list": (lambda text: text.replace(_TOPIC, "name: [a, b]"), "a text expected"),
+    "merges of merges": (lambda text: _MERGES + text, "counting what its aliases repeat"),
+    "an alias in itself": (lambda text: f"{text}x: &a [*a]\n", "contains itself"),
+    "240,000 items": (lambda text: text + "x:\n" + "- a\n" * 240_000, "lines, commas and brackets"),
+    "99,000 items": (lambda text: text + "x:\n" + "- a\n" * 99_000, "fgtrack/truth"),
+    "brackets": (lambda text: f"{text}x: {'[' * 99_000}", "nested too deeply"),
+    "two megabytes": (lambda text: f"{text}x: {'a' * 2_000_000}", "is longer than 1000000 characters"),
+    "a file twice": (lambda text: text.replace("- bag.mcap\n", "- bag.mcap\n  - bag.mcap\n"), "names a file twice"),
+    "a version without end": (lambda text: text.replace("version: 9", "version: 1e400"), "is no metadata"),
+}
+
+
+@pytest.mark.parametrize("name", METADATA)
+def test_a_hostile_metadata_file(server: Server, tmp_path: Path, name: str) -> None:
+    write_bag(tmp_path / "bag", drive())
+    file, (change, said) = tmp_path / "bag/metadata.yaml", METADATA[name]
+    before = file.read_text()
+    file.write_text(change(before))
+    assert file.read_text() != before
+    read_in_little(server, tmp_path, ("info", "bag"), said)
+    if "fgtrack/truth" in said:
+        read_in_little(
+            server, tmp_path, ("replay", "bag", "-c", "open_space", "-e", "smoother,ekf-replay", "-o", "run"), ""
+        )

@@ -1,6 +1,5 @@
 """Reads recordings without ROS: rosbag2 folders, single MCAP and SQLite files, ROS 1 bags."""
 
-import re
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
@@ -14,14 +13,22 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.io.errors import LARGEST_BYTES, MOST_OBJECTS, TruncatedInput
-from fgtrack.io.ros.bag_files import BagFile, EmptyFile, bag_folder, check_serialization, merged, storage_of
+from fgtrack.io.ros.bag_files import (
+    BagFile,
+    EmptyFile,
+    Parts,
+    bags_in,
+    check_serialization,
+    merged,
+    parts_of,
+    storage_of,
+)
 from fgtrack.io.ros.mcap_file import McapFile
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
 from fgtrack.io.ros.typestore import Key, MessageTypes, one_line, type_name
 from fgtrack.io.ros.unpacking import unpacked
 
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-_BAG_SUFFIXES = (".mcap", ".db3")
 
 
 @dataclass(frozen=True)
@@ -77,6 +84,8 @@ class Bag:
     ) -> None:
         self.path = Path(path)
         self._largest_bytes = largest_bytes
+        with _as_data_error(self.path):
+            self._parts = parts_of(self.path)
         with self._files() as files:
             connections = [item for file in files for item in file.connections]
             for item in connections:
@@ -154,7 +163,7 @@ class Bag:
 
     @contextmanager
     def _files(self) -> Iterator[list[BagFile]]:
-        with _as_data_error(self.path), _opened(self.path, self._largest_bytes) as files:
+        with _as_data_error(self.path), _opened(self._parts, self._largest_bytes) as files:
             yield files
 
     def _records(self, topics: Collection[str]) -> Iterator[tuple[Connection, int, bytes]]:
@@ -182,7 +191,7 @@ class Bag:
 def is_bag(path: Path) -> bool:
     """Whether the folder `path` holds a rosbag2 recording, or the file `path` starts as one."""
     if path.is_dir():
-        return (path / "metadata.yaml").is_file() or bool(_bag_files(path))
+        return (path / "metadata.yaml").is_file() or bool(bags_in(path))
     return storage_of(path) is not None
 
 
@@ -204,15 +213,6 @@ def _break_off(files: list[BagFile]) -> str | None:
     return next((f"{file.path} {file.break_off}" for file in files if file.break_off), None)
 
 
-def _bag_files(path: Path) -> list[Path]:
-    """Storage files of a folder without metadata.yaml, `x_2` before `x_10`."""
-
-    def natural(file: Path) -> list[tuple[int, str]]:
-        return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", file.name)]
-
-    return sorted((file for file in path.iterdir() if file.suffix in _BAG_SUFFIXES), key=natural)
-
-
 def _bag_file(path: Path, alone: bool, largest_bytes: int) -> BagFile:
     empty = path.stat().st_size == 0
     if empty and not alone:
@@ -224,15 +224,12 @@ def _bag_file(path: Path, alone: bool, largest_bytes: int) -> BagFile:
 
 
 @contextmanager
-def _opened(path: Path, largest_bytes: int) -> Iterator[list[BagFile]]:
+def _opened(parts: Parts, largest_bytes: int) -> Iterator[list[BagFile]]:
     with ExitStack() as stack:
-        if (path / "metadata.yaml").is_file():
-            parts = stack.enter_context(bag_folder(path))
-        else:
-            parts = _bag_files(path) if path.is_dir() else [path]
+        paths = stack.enter_context(parts.unpacked())
         files: list[BagFile] = []
-        for part in parts:
-            file = _bag_file(part, len(parts) == 1, largest_bytes)
+        for path in paths:
+            file = _bag_file(path, len(paths) == 1, largest_bytes)
             stack.callback(file.close)
             file.open()
             files.append(file)

@@ -1,15 +1,16 @@
 """The files of a recording, each read in log-time order, and up to the break where it was cut off."""
 
 import heapq
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+import re
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 from rosbags.interfaces import Connection
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file, read_whole
@@ -17,12 +18,14 @@ from fgtrack.io.ros.mcap_file import MCAP_MAGIC, McapFile
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
 from fgtrack.io.ros.sqlite3_file import Sqlite3File
 from fgtrack.io.ros.unpacking import unpacked_file
+from fgtrack.io.yaml_text import YamlSizeError, safe_yaml
 
 Record = tuple[Connection, int, bytes]
 """Connection, log time in ns, serialized message."""
 
 METADATA = "metadata.yaml"
-_LARGEST_METADATA_MB = 1.0
+_LONGEST_METADATA = 1_000_000
+_BAG_SUFFIXES = (".mcap", ".db3")
 _NEWEST_VERSION = 9
 SQLITE_MAGIC = b"SQLite format 3\x00"
 ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
@@ -46,58 +49,88 @@ class BagFile(Protocol):
         """Records of `connections` in log-time order; equal times keep the order of writing."""
 
 
-def listed_files(path: Path) -> list[Path]:
-    """The storage files of the rosbag2 folder `path` that its metadata.yaml lists; raises as `bag_folder`."""
-    file = path / METADATA
-    try:
-        return [path / PurePath(name).name for name in _metadata(file)["relative_file_paths"]]
-    except (KeyError, TypeError) as error:
-        raise DataError(f"{file}: is no metadata of a recording ({type(error).__name__}: {error})") from error
+@dataclass(frozen=True)
+class Parts:
+    """The files of a recording."""
+
+    files: tuple[Path, ...]
+    packed: bool = False
+    """Whether each is a zstd file."""
+
+    @contextmanager
+    def unpacked(self) -> Iterator[tuple[Path, ...]]:
+        """The files, where each is packed in a temporary folder."""
+        if not self.packed:
+            yield self.files
+            return
+        with TemporaryDirectory() as folder:
+            targets = tuple(Path(folder) / file.stem for file in self.files)
+            for source, target in zip(self.files, targets, strict=True):
+                with target.open("wb") as out:
+                    unpacked_file(source, out)
+            yield targets
 
 
-def _metadata(file: Path) -> Mapping[str, Any]:  # Any: YAML values, checked by who asks for them
-    try:
-        known = YAML(typ="safe", pure=True).load(read_whole(file, _LARGEST_METADATA_MB).decode())
-        metadata = known["rosbag2_bagfile_information"]
-    except (KeyError, TypeError, ValueError, RecursionError, YAMLError) as error:
-        what = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise DataError(f"{file}: is no metadata of a recording ({what})") from error
-    if not isinstance(metadata, Mapping):
-        raise DataError(f"{file}: is no metadata of a recording (a {type(metadata).__name__})")
-    return metadata
+def parts_of(path: Path) -> Parts:
+    """The files of the recording at `path`: itself, those that metadata.yaml names, or those of the folder.
 
-
-@contextmanager
-def bag_folder(path: Path) -> Iterator[list[Path]]:
-    """Files of the rosbag2 folder `path` by its metadata.yaml; unpacked, where each was packed.
-
-    Raises `DataError` where it does not say what a rosbag2 folder says.
+    Raises `DataError` where metadata.yaml does not say what that of a rosbag2 folder says.
     """
+    if (path / METADATA).is_file():
+        return _named_parts(path)
+    return Parts(tuple(bags_in(path)) if path.is_dir() else (path,))
+
+
+def bags_in(path: Path) -> list[Path]:
+    """Storage files of a folder, `x_2` before `x_10`."""
+
+    def natural(file: Path) -> list[tuple[int, str]]:
+        return [(int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"([0-9]+)", file.name)]
+
+    return sorted((file for file in path.iterdir() if file.suffix in _BAG_SUFFIXES), key=natural)
+
+
+def _named_parts(path: Path) -> Parts:
     file = path / METADATA
-    metadata = _metadata(file)
     try:
-        files = listed_files(path)
-        version = int(metadata["version"])
-        mode = str(metadata.get("compression_mode") or "none").lower()
-        form = metadata.get("compression_format") or "zstd"
+        text = read_whole(file, 1e-6 * _LONGEST_METADATA).decode()
+        metadata = _parsed(text)["rosbag2_bagfile_information"]
+        files = [path / PurePath(_text(name)).name for name in metadata["relative_file_paths"]]
+        version = int(_text(metadata["version"], int))
+        mode = _text(metadata.get("compression_mode") or "none").lower()
+        form = _text(metadata.get("compression_format") or "zstd")
         topics = [item["topic_metadata"] for item in metadata.get("topics_with_message_count") or ()]
-        serializations = {str(topic["name"]): str(topic["serialization_format"]) for topic in topics}
+        serializations = {_text(topic["name"]): _text(topic["serialization_format"]) for topic in topics}
+    except RecursionError as error:
+        raise DataError(f"{file}: is nested too deeply, or has an alias that contains itself") from error
+    except YamlSizeError as error:
+        raise DataError(f"{file}: {error}, that of no recording is so long") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(f"{file}: is no metadata of a recording ({type(error).__name__}: {error})") from error
+        raise DataError(
+            f"{file}: is no metadata of a recording ({type(error).__name__}: {str(error)[:100]})"
+        ) from error
     if missing := [file for file in files if not file.is_file()]:
         raise DataError(f"{missing[0]}: is missing, {file} names it")
+    if len(set(files)) < len(files):
+        raise DataError(f"{file}: names a file twice")
     if version > _NEWEST_VERSION or (mode != "none" and form != "zstd"):
         what = f"version {version}" if version > _NEWEST_VERSION else f"compression {form!r}"
         raise DataError(f"{file}: {what} of a recording is not known")
     for topic, serialization in serializations.items():
         check_serialization(file, topic, serialization)
-    with TemporaryDirectory() if mode == "file" else nullcontext("") as folder:
-        if folder:
-            packed, files = files, [Path(folder) / file.stem for file in files]
-            for source, target in zip(packed, files, strict=True):
-                with target.open("wb") as out:
-                    unpacked_file(source, out)
-        yield files
+    return Parts(tuple(files), mode == "file")
+
+
+@lru_cache(maxsize=4)
+def _parsed(text: str) -> Any:  # what YAML says is checked where it is used
+    """What a metadata.yaml says. Cached: a command opens its recording several times."""
+    return safe_yaml(text, _LONGEST_METADATA)
+
+
+def _text(value: object, *also: type) -> str:
+    if not isinstance(value, (str, *also)) or isinstance(value, bool):
+        raise TypeError(f"a text expected, not a {type(value).__name__}")
+    return str(value)
 
 
 def check_serialization(path: Path, topic: str, serialization: str) -> None:

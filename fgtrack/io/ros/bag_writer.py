@@ -14,7 +14,7 @@ from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.io.adapters.common import RosMessage
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.output import Kind, new_folder
-from fgtrack.io.ros.bag_files import METADATA, listed_files
+from fgtrack.io.ros.bag_files import METADATA, parts_of
 from fgtrack.io.ros.messages import DETECTED_OBJECTS, DETECTION3D_ARRAY, MessageFactory
 from fgtrack.io.ros.typestore import one_line
 from fgtrack.io.viewer.topics import token
@@ -76,7 +76,7 @@ def _is_recording(path: Path) -> bool:
     if not (path / METADATA).is_file():
         return False
     try:
-        listed = [file.name for file in listed_files(path)]
+        listed = [file.name for file in parts_of(path).files]
     except DataError:
         return False
     known = {METADATA, *listed, *(f"{name}{journal}" for name in listed for journal in _JOURNALS)}
