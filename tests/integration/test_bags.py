@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from support import mcap
 from support.messages import START_NS, drive, exact, message_lists, shared
 
 from fgtrack.core.errors import CallError, DataError
@@ -293,6 +294,39 @@ def test_a_ros1_bag_is_read(tmp_path):
         data = store.serialize_ros1(make_odometry(store, 5, ros1=True), "nav_msgs/msg/Odometry")
         writer.write(connection, 9, bytes(data))
     assert read(tmp_path / "a.bag", InputConfig(ego=TopicInput("/odom"))) == [ODOMETRY_STATE]
+
+
+@pytest.mark.parametrize("rest", ["itself", "garbage"])
+@pytest.mark.parametrize("name", ["x.mcap", "x.bag"])
+def test_what_follows_the_end_of_a_recording_is_a_break(tmp_path, name, rest):
+    if name == "x.mcap":
+        write_bag(tmp_path / "bag", drive(), "mcap")
+        whole, topic = storage_file(tmp_path / "bag").read_bytes(), "/fgtrack/ego"
+    else:
+        with Rosbag1Writer(tmp_path / "y.bag") as writer:
+            connection = writer.add_connection("/n", "std_msgs/msg/UInt8", typestore=get_typestore(Stores.ROS1_NOETIC))
+            for k in range(9):
+                writer.write(connection, k, b"\1")
+        whole, topic = (tmp_path / "y.bag").read_bytes(), "/n"
+    (tmp_path / name).write_bytes(whole)
+    expected = [message.log_ns for message in Bag(tmp_path / name).messages([topic])]
+    (tmp_path / name).write_bytes(whole + (whole if rest == "itself" else b"x" * 1000))
+    found = []
+    with pytest.raises(TruncatedInput, match=f"is followed by something else from byte {len(whole)} on"):
+        found.extend(message.log_ns for message in Bag(tmp_path / name).messages([topic]))
+    assert found == expected
+
+
+def test_messages_outside_of_chunks_and_of_overlapping_chunks_come_in_the_order_of_time(tmp_path):
+    def of(log_ns: int) -> bytes:
+        return mcap.message(1, log_ns, mcap.poses(1 + log_ns % 3))
+
+    start = mcap.schema(1, "geometry_msgs/msg/PoseArray", "", "") + mcap.channel(1, 1, "/x")
+    chunks = [mcap.chunk(b"".join(map(of, times)), min(times), max(times)) for times in ([8, 2], [5, 3], [4, 9])]
+    path = tmp_path / "x.mcap"
+    path.write_bytes(mcap.HEADER + start + of(7) + of(1) + b"".join(chunks) + of(6) + mcap.END)
+    found = [(message.log_ns, len(message.data.poses)) for message in Bag(path).messages(["/x"])]
+    assert found == [(log_ns, 1 + log_ns % 3) for log_ns in range(1, 10)]
 
 
 @pytest.mark.parametrize("compression", [None, *Rosbag1Writer.CompressionFormat])

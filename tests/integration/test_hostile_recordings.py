@@ -164,12 +164,30 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], tuple[str, ...], str]] = {
         LIST,
         "not a list of objects",
     ),
+    "15 chunks of 100 MB at once": (
+        lambda: overlapping(15, lambda k: message(1, 10**9 + k, poses(2) + bytes(100_000_000))),
+        INFO,
+        "overlaps with the chunk at byte",
+    ),
+    "a chunk of two million messages": (
+        lambda: overlapping(1, lambda k: message(1, 10**9, CDR) * 2_000_000),
+        INFO,
+        "2000000",
+    ),
     "a covariance of 9 million numbers": (
         lambda: HEADER + chunk(_EGO + message(1, 10, _ego(9_000_000)), 10, 10) + END,
         ("replay", "x.mcap", "-c", "open_space", "-o", "run"),
         "no more than 100000 are read",
     ),
 }
+
+
+def overlapping(count: int, records: Callable[[int], bytes]) -> bytes:
+    """Chunks that all say the same times."""
+    start = schema(1, "geometry_msgs/msg/PoseArray", "", "") + channel(1, 1, "/x")
+    return HEADER + b"".join(chunk(start + records(k), 10**9, 2 * 10**9) for k in range(count)) + END
+
+
 _EGO = schema(1, "fgtrack_msgs/msg/Ego", "", "") + channel(1, 1, "/fgtrack/ego")
 
 

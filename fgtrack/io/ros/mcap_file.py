@@ -2,6 +2,7 @@
 
 import heapq
 import struct
+from array import array
 from binascii import crc32
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -10,6 +11,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+import numpy as np
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
 from fgtrack.core.errors import DataError
@@ -23,6 +25,11 @@ _CHUNK_HEADER = struct.Struct("<QQQI")  # first and last log time, size, checksu
 _MESSAGE_HEADER = struct.Struct("<HIQQ")  # channel, sequence, log and publish time
 _STATISTICS_HEADER = struct.Struct("<QHIIIIQQ")
 _LONGEST_COMPRESSION = 100
+_CHUNKS_AT_ONCE = 2
+_KEPT_BYTES = 40  # of a message that is kept, besides its own
+
+Content = bytes | memoryview
+"""Of a record."""
 _FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
     "ros2idl": MessageDefinitionFormat.IDL,
@@ -56,6 +63,40 @@ class _Chunk:
     data_size: int
     """As packed; of a chunk that is cut in two what there is."""
     cut: bool
+
+
+class _Kept:
+    """Messages of a chunk, in one piece: each by itself would take several times its bytes."""
+
+    def __init__(self, messages: Iterator[Sending]) -> None:
+        self._data = bytearray()
+        self._times, self._sent, self._ends = array("Q"), array("Q"), array("Q", [0])
+        self._connections: list[Connection] = []
+        for connection, sent_ns, log_ns, data in messages:
+            self._data += data
+            self._times.append(log_ns)
+            self._sent.append(sent_ns)
+            self._ends.append(len(self._data))
+            self._connections.append(connection)
+
+    @property
+    def num_bytes(self) -> int:
+        """What they take."""
+        return len(self._data) + _KEPT_BYTES * len(self._times)
+
+    def by_time(self) -> Iterator[tuple[int, int]]:
+        """Log time and place of each, in the order of log time, of equal times in that of writing."""
+        return ((self._times[index], index) for index in _order(self._times))
+
+    def at(self, index: int) -> Sending:
+        """The message at a place."""
+        data = bytes(memoryview(self._data)[self._ends[index] : self._ends[index + 1]])
+        return Sending(self._connections[index], self._sent[index], self._times[index], data)
+
+
+def _order(times: "array[int]") -> Iterator[int]:
+    """Places of `times`, the earliest first."""
+    return map(int, np.argsort(np.frombuffer(times, np.uint64), kind="stable")) if times else iter(())
 
 
 class McapFile:
@@ -103,16 +144,32 @@ class McapFile:
     def messages(self, connections: Collection[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
         """Records of `connections` in log-time order; equal times keep the order of writing."""
         wanted = {connection.id: connection for connection in connections}
+        held = 0  # bytes of the chunks that are unpacked at once, because their times overlap
 
-        def of(chunk: _Chunk) -> Iterator[tuple[int, Sending | None]]:
-            yield chunk.first_ns, None  # the chunk is unpacked when its time has come
-            found = [(one.log_ns, one) for one in self._sendings(self._chunk_records(chunk), wanted)]
-            yield from sorted(found, key=itemgetter(0))
+        def of(chunk: _Chunk) -> Iterator[tuple[int, _Kept | None, int]]:
+            nonlocal held
+            yield chunk.first_ns, None, 0  # the chunk is unpacked when its time has come
+            kept = _Kept(self._sendings(self._chunk_records(chunk), wanted))
+            held += kept.num_bytes
+            what = f"{self.path}: what overlaps with the chunk at byte {chunk.place}, at once"
+            refuse_larger(held, what, _CHUNKS_AT_ONCE * self._largest_bytes)
+            yield from ((log_ns, kept, index) for log_ns, index in kept.by_time())
+            held -= kept.num_bytes
 
-        loose = sorted(((one.log_ns, one) for one in self._sendings(self._loose(), wanted)), key=itemgetter(0))
-        for log_ns, one in heapq.merge(*map(of, self._chunks), loose, key=itemgetter(0)):
-            if one is not None:
-                yield one.connection, log_ns, one.data
+        loose = ((one.log_ns, one, 0) for one in self._loose_by_time(wanted))
+        for _, source, index in heapq.merge(*map(of, self._chunks), loose, key=itemgetter(0)):
+            if source is not None:
+                one = source if isinstance(source, Sending) else source.at(index)
+                yield one.connection, one.log_ns, one.data
+
+    def _loose_by_time(self, wanted: dict[int, Connection]) -> Iterator[Sending]:
+        """The messages outside of chunks; of them only times and places are kept."""
+        times, places = array("Q"), array("Q")
+        for place, content in self._loose():
+            times.append(_MESSAGE_HEADER.unpack_from(content)[2])
+            places.append(place)
+        for index in _order(times):
+            yield from self._sendings(iter([(_MESSAGE, self._content(places[index]))]), wanted)
 
     def sendings(self) -> Iterator[Sending]:
         """Every message, in the order of the file."""
@@ -130,6 +187,9 @@ class McapFile:
             self._file.seek(place)
             opcode, length = _RECORD_HEADER.unpack(self._file.read(_RECORD_HEADER.size))
             if opcode == _FOOTER:
+                end = place + _RECORD_HEADER.size + length + len(MCAP_MAGIC)
+                if end < size:
+                    self.break_off = f"is followed by something else from byte {end} on, split it there"
                 return num_channels
             end = place + _RECORD_HEADER.size + length
             if opcode == _CHUNK:
@@ -163,7 +223,7 @@ class McapFile:
         data_size = min(data_size, end - data_place)
         yield _Chunk(place, first_ns, last_ns, size, checksum, compression, data_place, data_size, cut)
 
-    def _note(self, opcode: int, content: bytes) -> int | None:
+    def _note(self, opcode: int, content: Content) -> int | None:
         """Keep what a record says of the messages; gives the number of channels, where it is that of the statistics."""
         if opcode == _SCHEMA:
             (number,) = struct.unpack_from("<H", content)
@@ -185,13 +245,14 @@ class McapFile:
             return int(num_channels)
         return None
 
-    def _inner_records(self) -> Iterator[tuple[int, bytes]]:
+    def _inner_records(self) -> Iterator[tuple[int, Content]]:
         """Opcode and content of the records in all chunks, and of the messages outside of chunks."""
         for chunk in self._chunks:
             yield from self._chunk_records(chunk)
-        yield from self._loose()
+        for _, content in self._loose():
+            yield _MESSAGE, content
 
-    def _chunk_records(self, chunk: _Chunk) -> Iterator[tuple[int, bytes]]:
+    def _chunk_records(self, chunk: _Chunk) -> Iterator[tuple[int, Content]]:
         assert self._file
         what = f"{self.path}: the chunk at byte {chunk.place}"
         for num_bytes in (chunk.size, chunk.data_size):
@@ -201,37 +262,44 @@ class McapFile:
         whole = len(data) == chunk.size and not (chunk.checksum and crc32(data) != chunk.checksum)
         if not whole and not chunk.cut:
             raise DataError(f"{what}: is damaged, its size or checksum is wrong")
-        place = 0
+        place, inside = 0, memoryview(data)
         while place + _RECORD_HEADER.size <= len(data):
             opcode, length = _RECORD_HEADER.unpack_from(data, place)
             begin = place + _RECORD_HEADER.size
             place = begin + length
             if place > len(data):
                 break
-            yield opcode, data[begin:place]
+            yield opcode, inside[begin:place]
 
     def _loose(self) -> Iterator[tuple[int, bytes]]:
-        """The messages outside of chunks."""
+        """Place and content of the messages outside of chunks."""
         assert self._file
         place = len(MCAP_MAGIC)
         while self._loose_end and place < self._loose_end:
             self._file.seek(place)
             opcode, length = _RECORD_HEADER.unpack(self._file.read(_RECORD_HEADER.size))
             if opcode == _MESSAGE:
-                refuse_larger(length, f"{self.path}: the message at byte {place}", self._largest_bytes)
-                yield opcode, self._file.read(length)
+                yield place, self._content(place)
             place += _RECORD_HEADER.size + length
 
+    def _content(self, place: int) -> bytes:
+        """Content of the record at `place`."""
+        assert self._file
+        self._file.seek(place)
+        _, length = _RECORD_HEADER.unpack(self._file.read(_RECORD_HEADER.size))
+        refuse_larger(length, f"{self.path}: the message at byte {place}", self._largest_bytes)
+        return self._file.read(length)
+
     @staticmethod
-    def _sendings(records: Iterator[tuple[int, bytes]], wanted: dict[int, Connection]) -> Iterator[Sending]:
+    def _sendings(records: Iterator[tuple[int, Content]], wanted: dict[int, Connection]) -> Iterator[Sending]:
         for opcode, content in records:
             if opcode == _MESSAGE:
                 channel, _, log_ns, sent_ns = _MESSAGE_HEADER.unpack_from(content)
                 if channel in wanted:
-                    yield Sending(wanted[channel], sent_ns, log_ns, content[_MESSAGE_HEADER.size :])
+                    yield Sending(wanted[channel], sent_ns, log_ns, bytes(content[_MESSAGE_HEADER.size :]))
 
 
-def _texts(content: bytes, place: int, count: int) -> list[str]:
+def _texts(content: Content, place: int, count: int) -> list[str]:
     """So many texts, each behind its length, from `place` on."""
     found = []
     for _ in range(count):
@@ -239,5 +307,5 @@ def _texts(content: bytes, place: int, count: int) -> list[str]:
         place += 4 + length
         if place > len(content):
             raise DataError("a text is longer than its record")
-        found.append(content[place - length : place].decode())
+        found.append(bytes(content[place - length : place]).decode())
     return found

@@ -33,6 +33,7 @@ class Rosbag1File(Reader):
     def __init__(self, path: Path, largest_bytes: int = LARGEST_BYTES) -> None:
         super().__init__(path)
         self._largest_bytes = largest_bytes
+        self._index_end = 0
         self._cut: set[int] = set()  # where the data of chunks are that the file does not hold whole
 
     def read_chunk(self) -> Chunk:
@@ -56,8 +57,10 @@ class Rosbag1File(Reader):
 
     def read_chunk_info(self) -> ChunkInfo:
         """What the index at this place of the file says of a chunk."""
-        self._before_headers(1)
-        return super().read_chunk_info()
+        file = self._before_headers(1)
+        found = super().read_chunk_info()
+        self._index_end = file.tell()
+        return found
 
     def _before_headers(self, count: int) -> BinaryIO:
         """The file at this place, where so many headers begin that are not too long to be read."""
@@ -79,8 +82,14 @@ class Rosbag1File(Reader):
         self.bio = None
         try:
             super().open()
+            self._note_what_follows()
         except Exception:  # rosbags reads indexed files only; whatever it raises, index from the start
             self._index_by_walking()
+
+    def _note_what_follows(self) -> None:
+        """The index is the last of a bag, and what it says of its chunks the last of the index."""
+        if 0 < self._index_end < self.path.stat().st_size:
+            self.break_off = f"is followed by something else from byte {self._index_end} on, split it there"
 
     def _index_by_walking(self) -> None:
         self.bio = self.path.open("rb")
