@@ -170,5 +170,5 @@ def test_the_command_draws_it_and_goes_on_without_a_recording(
 def test_a_configuration_of_a_run_that_is_none_is_bad_data(folder: Path, found: list[CloseUp]) -> None:
     run = fgtrack.load_run(folder / "runs" / NAMES[0])
     spoilt = replace(run, config_text="estimator: [1]")
-    with pytest.raises(fgtrack.DataError, match=r"config\.yaml: estimator: .*; repeat the run$"):
+    with pytest.raises(fgtrack.DataError, match=r"config\.yaml: estimator: .*, so no close-up$"):
         close_up_of(spoilt, found[0].arrival)

@@ -15,7 +15,7 @@ from fgtrack.estimation.registry import ESTIMATORS, Claims, start_estimator
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.pipeline.build import build_bank
 from fgtrack.pipeline.config import Config, InitiationConfig, MapConfig, MotionConfig
-from fgtrack.testing import check_estimator
+from fgtrack.testing import estimator_checks
 
 PERIOD_NS, STD = 50_000_000, {"x_m": 0.3, "y_m": 0.3}
 START = Start(position_std_m=0.3, speed_std_mps=40.0)
@@ -106,7 +106,10 @@ def test_the_contract_holds_with_an_unknown_direction(name: str) -> None:
         return start_estimator(name, made, motion, start, lag_s, {})
 
     vars(unknown).update({**vars(Claims.of(made)), "bank": False, "initiates": True})
-    check_estimator(unknown, seed=3, num_streams=3)
+    checks = estimator_checks(unknown, seed=3, num_streams=3)
+    del checks["comes near the posterior of a nonlinear model"]  # of which the heading is known at the start
+    for check in checks.values():
+        check()
 
 
 @pytest.mark.parametrize("name", ["ekf-replay", "smoother", "rts", "ekf-backward-forward"])
