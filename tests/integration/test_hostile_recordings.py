@@ -246,7 +246,7 @@ METADATA: dict[str, tuple[Callable[[str], str], str]] = {
     "240,000 items": (lambda text: text + "x:\n" + "- a\n" * 240_000, "lines, commas and brackets"),
     "99,000 items": (lambda text: text + "x:\n" + "- a\n" * 99_000, "fgtrack/truth"),
     "brackets": (lambda text: f"{text}x: {'[' * 99_000}", "nested too deeply"),
-    "two megabytes": (lambda text: f"{text}x: {'a' * 2_000_000}", "is longer than 1000000 characters"),
+    "two megabytes": (lambda text: f"{text}x: {'a' * 2_000_000}", "is larger than 1 MB"),
     "a file twice": (lambda text: text.replace("- bag.mcap\n", "- bag.mcap\n  - bag.mcap\n"), "names a file twice"),
     "a version without end": (lambda text: text.replace("version: 9", "version: 1e400"), "is no metadata"),
 }

@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 from rosbags.interfaces import Connection
+from ruamel.yaml.error import YAMLError
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file, read_whole
@@ -105,10 +106,9 @@ def _named_parts(path: Path) -> Parts:
         raise DataError(f"{file}: is nested too deeply, or has an alias that contains itself") from error
     except YamlSizeError as error:
         raise DataError(f"{file}: {error}, that of no recording is so long") from error
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(
-            f"{file}: is no metadata of a recording ({type(error).__name__}: {str(error)[:100]})"
-        ) from error
+    except (KeyError, TypeError, ValueError, AttributeError, YAMLError) as error:
+        what = " ".join(f"{type(error).__name__}: {error}".split())[:120]
+        raise DataError(f"{file}: is no metadata of a recording ({what})") from error
     if missing := [file for file in files if not file.is_file()]:
         raise DataError(f"{missing[0]}: is missing, {file} names it")
     if len(set(files)) < len(files):
