@@ -503,3 +503,23 @@ def test_numbers_beyond_all_that_a_run_writes_are_none(tmp_path):
         cells[place] = number
         file.write_text(f"{header}\n{','.join(cells)}\n")
         assert np.isnan(load_run(tmp_path / "run").tracks["x_m"]).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "a0: &m0 {x: 1}\n" + "".join(f"a{k}: &m{k} {{<<: [*m{k - 1}, *m{k - 1}]}}\n" for k in range(1, 40)),
+            "more than",
+        ),
+        ("x: " + "[" * 5000, "is not YAML"),
+        ("x: &a [*a]\n", "is not YAML"),
+        (f"x: {'a' * 2_000_000}", "is longer than 1000000 characters"),
+    ],
+    ids=["merges of merges", "deep", "in itself", "long"],
+)
+def test_a_configuration_that_would_take_for_ever_is_refused(tmp_path, text, said):
+    write(tmp_path / "run", report())
+    (tmp_path / "run/config.yaml").write_text(text)
+    with pytest.raises(DataError, match=said):
+        _ = load_run(tmp_path / "run").config
