@@ -20,6 +20,7 @@ from fgtrack.models.motion import MotionModel
 from fgtrack.models.sensors import SensorModel
 
 _AT_ORIGIN = SensorPose()
+_MOST = 30.0  # exponent of an error that is moved back in time, in which it would grow beyond all numbers
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class CorrelatedErrors(MotionModel):
         return np.array([1.0 / time_s for _, time_s in self.times_s])
 
     def _exponents(self, dt_s: float | FloatArray) -> FloatArray:
-        return -np.asarray(dt_s, dtype=np.float64)[..., None] * self._rates_hz
+        return np.minimum(-np.asarray(dt_s, dtype=np.float64)[..., None] * self._rates_hz, _MOST)
 
     def _decay(self, dt_s: float | FloatArray) -> FloatArray:
         """Shape (..., errors)."""

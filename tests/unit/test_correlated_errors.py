@@ -217,3 +217,11 @@ def test_an_entry_that_the_state_lacks_is_refused() -> None:
         initial_state(CV(), Start(position_cross={"radar.x_m": (1.0, 0.0)}))
     with pytest.raises(CallError, match="position_cross of a: must be two finite numbers"):
         Start(position_cross={"a": (float("nan"), 0.0)})
+
+
+def test_errors_that_last_for_less_than_a_moment_stay_numbers_when_moved_back() -> None:
+    short = replace(LIDAR, correlation=Correlation(0.5, 1e-9))
+    motion = with_correlated_errors(CTRV(), {"lidar": short})
+    x = np.zeros(motion.dim)
+    for found in (motion.predict(x, -1.0), motion.jacobian(x, -1.0), motion.process_noise(x, -1.0)):
+        assert np.isfinite(found).all()

@@ -326,6 +326,18 @@ def test_an_exception_leaves_the_run_marked_as_incomplete(tmp_path):
     assert load_run(tmp_path / "run").meta["complete"] is False
 
 
+@pytest.mark.parametrize("text", ["", "stamp_ns,receipt", "stamp_ns,receipt_ns\n"])
+def test_a_table_that_a_kill_left_without_its_header_has_no_rows(tmp_path, text):
+    with suppress(ZeroDivisionError), RunWriter(tmp_path / "run"):
+        raise ZeroDivisionError
+    (tmp_path / "run/ego.csv").write_text(text)
+    if text.endswith("\n"):
+        with pytest.raises(DataError, match="the header must be"):
+            load_run(tmp_path / "run")
+    else:
+        assert load_run(tmp_path / "run").ego.num_rows == 0
+
+
 def test_an_older_run_is_replaced_and_nothing_of_it_is_left(tmp_path):
     path = tmp_path / "run"
     with RunWriter(path) as writer:
