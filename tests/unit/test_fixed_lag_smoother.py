@@ -72,15 +72,29 @@ class Counted(IncrementalBackend):
 
 
 def test_further_iterations_are_taken_only_while_a_state_moves() -> None:
+    for_prior = 1
     smoother = FixedLagSmoother(CV(), Start(), SmootherSettings(max_iterations=5), Counted)
     Counted.num_updates = 0
     smoother.update(at(100, 3.0))
-    assert Counted.num_updates == 1
+    assert Counted.num_updates == for_prior + 1
     settings = SmootherSettings(max_iterations=5, relinearise=dict.fromkeys(CTRV().state_names, 1e-9))
     smoother = FixedLagSmoother(CTRV(), Start(yaw_rad=0.5, speed_mps=20.0), settings, Counted)
     Counted.num_updates = 0
     smoother.update(at(100, 3.0))
-    assert Counted.num_updates == 5
+    assert Counted.num_updates == for_prior + 5
+
+
+def test_an_object_that_is_never_seen_again_has_no_graph() -> None:
+    """So 10^5 detections of clutter in one list are 10^5 states."""
+    start = Start(yaw_rad=0.5, speed_mps=20.0)
+    Counted.num_updates = 0
+    states = [FixedLagSmoother(CTRV(), start, make_backend=Counted).state_at(k * MS) for k in (0, 100)]
+    assert Counted.num_updates == 0
+    smoother = FixedLagSmoother(CTRV(), start)
+    smoother.update(Measurement.of(200 * MS, x_m=4.0, y_m=0.0, std={"x_m": 1e7, "y_m": 1e7}))
+    for state, seen in zip(states, [smoother.state_at(state.stamp_ns) for state in states], strict=True):
+        np.testing.assert_allclose(state.mean, seen.mean, atol=1e-9)
+        np.testing.assert_allclose(state.covariance, seen.covariance, rtol=1e-6, atol=1e-9)
 
 
 def test_the_oldest_state_keeps_the_linearisation_point_of_its_prior() -> None:

@@ -72,7 +72,16 @@ class Window:
         self._covariances: dict[tuple[int, ...], FloatArray] = {}
         self._states: dict[int, State] = {}
         self._failures = failures
-        self._rebuild({FIRST_KEY: prior.mean})
+        self._anchored = False
+        self._solver: Backend | None = None
+
+    @property
+    def _backend(self) -> Backend:
+        """The graph, which is not made before something is fused: most tracks of clutter end as they began."""
+        if self._solver is None:
+            self._solver, prior = self._make_backend(), self._past.prior
+            self._solver.update(Change({FIRST_KEY: prior.mean}, {FIRST_KEY: 0.0}, [PriorOf(FIRST_KEY, prior)], []))
+        return self._solver
 
     @property
     def stamps_ns(self) -> list[int]:
@@ -273,14 +282,14 @@ class Window:
     def _rebuild(self, means: Mapping[int, FloatArray], make_backend: Callable[[], Backend] | None = None) -> None:
         """Build the graph anew from the window's own records, near `means` by key, if wanted in another backend."""
         nodes = self._chain.nodes
-        self._backend, self._anchored = (make_backend or self._make_backend)(), False
+        self._solver, self._anchored = (make_backend or self._make_backend)(), False
         for place, node in enumerate(nodes):
             self._chain.move(place, means[node.key])
         factors: list[Factor] = [self._segment(left, right) for left, right in pairwise(nodes)]
         factors.append(PriorOf(nodes[0].key, self._past.prior))
         factors += [Term(node.key, item, node.origin) for node in nodes for item in node.terms]
         stamps_s = {node.key: self._seconds(node.stamp_ns) for node in nodes}
-        slots = self._backend.update(Change(dict(means), stamps_s, factors, []))
+        slots = self._solver.update(Change(dict(means), stamps_s, factors, []))
         terms = iter(slots[len(nodes) :])
         for place, node in enumerate(nodes):
             node.slot = slots[place] if node is not nodes[-1] else None
@@ -367,7 +376,7 @@ class Window:
         """Of all nodes, shape (nodes, n)."""
         if self._means is None:
             keys = self._chain.keys
-            self._means = self._backend.means(keys)
+            self._means = self._chain.origins.copy() if self._solver is None else self._solver.means(keys)
             self._places = dict(zip(keys, range(len(keys)), strict=True))
         return self._means
 
@@ -375,7 +384,9 @@ class Window:
         keys = tuple(node.key for node in nodes)
         covariance = self._covariances.get(keys)
         if covariance is None:
-            covariance = self._covariances[keys] = self._backend.covariance(keys)
+            unfused = self._solver is None
+            covariance = self._past.prior.covariance.copy() if unfused else self._backend.covariance(keys)
+            self._covariances[keys] = covariance
         return covariance
 
     def _forget_estimates(self) -> None:
