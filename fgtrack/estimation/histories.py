@@ -14,10 +14,17 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
 def grown(values: npt.NDArray[_Scalar], size: int) -> npt.NDArray[_Scalar]:
-    """A copy of `values` with zeros behind them, `size` rows in all; their pages are made when they are used."""
+    """A copy of `values` with zeros behind them, `size` rows in all."""
     found = np.zeros((size, *values.shape[1:]), values.dtype)
     found[: len(values)] = values
     return found
+
+
+def _numbered(first: int, tracks: int, places: int) -> IntArray:
+    """Numbers from `first` on, shape (tracks, places). Those of one place are neighbours: what is kept of places that
+    no track has reached takes no memory.
+    """
+    return np.ascontiguousarray(first + np.arange(tracks * places).reshape(places, tracks).T)
 
 
 class Histories:
@@ -35,7 +42,7 @@ class Histories:
         shape = _FEW_TRACKS, places
         self.stamps_ns: IntArray = np.full(shape, NEVER_NS)
         """Shape (tracks, places); `NEVER_NS` from `count` on."""
-        self.numbers: IntArray = np.arange(_FEW_TRACKS * places).reshape(shape)
+        self.numbers: IntArray = _numbered(0, *shape)
         """Shape (tracks, places); those from `count` on are free."""
         self.count: IntArray = np.zeros(_FEW_TRACKS, dtype=np.int64)
         """Number of entries of each track."""
@@ -44,6 +51,16 @@ class Histories:
     def size(self) -> int:
         """How many numbers there are."""
         return self.numbers.size
+
+    def fitted(self, values: npt.NDArray[_Scalar]) -> npt.NDArray[_Scalar]:
+        """A copy of `values` by number with room for all numbers; only what belongs to entries is kept, and only the
+        pages of that are made.
+        """
+        found = np.zeros((self.size, *values.shape[1:]), values.dtype)
+        kept = self.numbers[np.arange(self.numbers.shape[1]) < self.count[:, None]]
+        kept = kept[kept < len(values)]
+        found[kept] = values[kept]
+        return found
 
     def at(self, tracks: IntArray, places: IntArray) -> IntArray:
         """Numbers of the entries at `places`; both of one shape."""
@@ -100,10 +117,10 @@ class Histories:
     def _grow_tracks(self) -> None:
         size, (tracks, places) = self.size, self.stamps_ns.shape
         self.stamps_ns = np.concatenate([self.stamps_ns, np.full((tracks, places), NEVER_NS)])
-        self.numbers = np.concatenate([self.numbers, size + np.arange(size).reshape(tracks, places)])
+        self.numbers = np.concatenate([self.numbers, _numbered(size, tracks, places)])
         self.count = grown(self.count, 2 * tracks)
 
     def _grow_places(self) -> None:
         size, (tracks, places) = self.size, self.stamps_ns.shape
         self.stamps_ns = np.concatenate([self.stamps_ns, np.full((tracks, places), NEVER_NS)], axis=1)
-        self.numbers = np.concatenate([self.numbers, size + np.arange(size).reshape(tracks, places)], axis=1)
+        self.numbers = np.concatenate([self.numbers, _numbered(size, tracks, places)], axis=1)

@@ -10,7 +10,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import NOTHING, Content, Measurement
 from fgtrack.estimation.ekf import Prediction, correct, innovations
-from fgtrack.estimation.histories import Histories, grown
+from fgtrack.estimation.histories import Histories
 from fgtrack.models.sensors import RobustLoss
 
 _FEW_COMPONENTS = 4
@@ -178,7 +178,7 @@ class ReplayedSteps:
         more = self.order.size - len(self.measurements)
         if more:
             for name in self._VALUES:
-                setattr(self, name, grown(getattr(self, name), self.order.size))
+                setattr(self, name, self.order.fitted(getattr(self, name)))
             self.measurements += [None] * more
             self._kinds += [(0, 0, ())] * more
 

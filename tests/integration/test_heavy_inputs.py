@@ -52,6 +52,16 @@ def stream(folder: Path) -> None:
     write_stream(folder / "x.jsonl", drive())
 
 
+def crowd(folder: Path) -> None:
+    """One list of 30,000 objects, none seen again."""
+    from fgtrack.core.types import Detection, DetectionList, EgoState
+    from fgtrack.io.stream import write_stream
+
+    ego = [EgoState(10**7 * k, 10**7 * k, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0) for k in range(20)]
+    objects = tuple(Detection(x_m=10.0 * (k % 200), y_m=10.0 * (k // 200)) for k in range(30_000))
+    write_stream(folder / "x.jsonl", [*ego, DetectionList("radar", 15 * 10**7, 19 * 10**7, objects)])
+
+
 def nuscenes_zeros(folder: Path) -> None:
     sparse(folder / "results.json", b'{"meta": {}, "results": {', 3_000 * MILLION)
     nuscenes_tables(folder)
@@ -355,6 +365,19 @@ BOMBS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     ),
     "mcap with 20,000 topics": (mcap_many_topics, ("info", "x.mcap")),
     "ros1, record of 3 GB": (ros1_large_record, ("info", "x.bag")),
+    **{
+        f"crowd of 30,000, {estimator}": (crowd, ("replay", "x.jsonl", "-e", estimator, "-o", "run"))
+        for estimator in (
+            "ekf-backward-forward",
+            "ekf-replay",
+            "ukf-replay",
+            "imm-replay",
+            "ipls",
+            "smoother",
+            "smoother-batch",
+            "smoother-banded",
+        )
+    },
     "stream of 3 GB": (stream_zeros, ("info", "x.jsonl")),
     "run with large meta": (
         run_folder("meta.json", b'{"format":"fgtrack-run/1","x":[0', b",{}", 20 * MILLION, b"]}"),
@@ -365,8 +388,16 @@ BOMBS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
 
 
 #: Those that take the longest to make or to read.
-_SLOW = ("million", "3 GB", "blob", "long line", "log folder", "kitti, ")
-_QUICK = ("nuscenes of 3 GB", "table of 3 GB", "map of 3 GB", "yaml of 3 GB", "stream of 3 GB", "mcap, message of 3 GB")
+_SLOW = ("million", "3 GB", "blob", "long line", "log folder", "kitti, ", "crowd")
+_QUICK = (
+    "nuscenes of 3 GB",
+    "table of 3 GB",
+    "map of 3 GB",
+    "yaml of 3 GB",
+    "stream of 3 GB",
+    "mcap, message of 3 GB",
+    "crowd of 30,000, smoother-banded",
+)
 
 
 def _marks(name: str) -> list[pytest.MarkDecorator]:

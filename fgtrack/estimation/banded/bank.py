@@ -13,6 +13,7 @@ from fgtrack.estimation.banded.windows import Leaving, States, Windows
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.failures import Failure, Failures
+from fgtrack.estimation.histories import grown
 from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
 from fgtrack.estimation.present import PresentStates, smoothed_reports
 from fgtrack.estimation.propagation import track_state
@@ -21,6 +22,16 @@ from fgtrack.estimation.whitening import Innovations, innovations
 from fgtrack.models.motion import MotionModel
 
 _TOO_OLD, _FAILED = UpdateResult(UpdateStatus.TOO_OLD), UpdateResult(UpdateStatus.FAILED)
+
+
+class _Births(NamedTuple):
+    """The m tracks in order of birth."""
+
+    track_ids: tuple[int, ...]
+    tracks: IntArray
+    """Where the arrays hold them, shape (m,)."""
+    ranks: IntArray
+    """Position in that order of each track of the arrays."""
 
 
 class _Times(NamedTuple):
@@ -83,11 +94,8 @@ class BandedBank:
         self.windows = Windows(motion, settings, failures or Failures())
         self._numbers: dict[int, int] = {}
         """Where the arrays hold each track, in order of birth."""
-        self._track_ids: tuple[int, ...] = ()
-        self._tracks: IntArray = np.zeros(0, dtype=np.int64)
-        """Both in order of birth."""
-        self._ranks: IntArray = np.zeros(0, dtype=np.int64)
-        """Position in that order of each track of the arrays."""
+        self._known_births: _Births | None = None
+        """Until a track begins or ends."""
         self._free: list[int] = []
         self._now_ns = 0
         self._clock_ns: IntArray = np.zeros(0, dtype=np.int64)
@@ -121,7 +129,7 @@ class BandedBank:
     @property
     def track_ids(self) -> tuple[int, ...]:
         """See `TrackBank.track_ids`."""
-        return self._track_ids
+        return self._births.track_ids
 
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
@@ -145,7 +153,7 @@ class BandedBank:
             return []
         tracks = np.array([self._numbers[track_id] for track_id in track_ids])
         measurements = [measurement.seen_by(self._motion) for measurement in measurements]
-        times = self._all_times().at(self._ranks[tracks])
+        times = self._all_times().at(self._births.ranks[tracks])
         if self._settings.late == "raise":
             self._settings.refuse_older(stamp_ns, int(times.start.max()))
         young = times.oldest <= stamp_ns
@@ -164,8 +172,9 @@ class BandedBank:
         """See `TrackBank.birth`."""
         track = self._free.pop() if self._free else len(self._numbers)
         self.windows.solver.begin(track, prior.stamp_ns, *initial_state(self._motion, prior))
-        if track == len(self._clock_ns):
-            self._clock_ns, self._first_ns = (np.append(values, 0) for values in (self._clock_ns, self._first_ns))
+        if track >= len(self._clock_ns):
+            size = len(self.windows.nodes.first)
+            self._clock_ns, self._first_ns = grown(self._clock_ns, size), grown(self._first_ns, size)
         self._clock_ns[track] = self._first_ns[track] = prior.stamp_ns
         self._searches.pop(track, None)
         search = Search.of(self._motion, prior, self._initiation)
@@ -188,7 +197,7 @@ class BandedBank:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
         if not self._numbers:
             return []
-        tracks = self._tracks
+        tracks = self._births.tracks
         states = self.windows.states_at(tracks, np.maximum(self._now_ns, self._all_times().oldest))
         return PresentStates(self._motion, self._now_ns, *states)
 
@@ -197,9 +206,10 @@ class BandedBank:
         reports, self._ended = self._ended, []
         if self._final:
             final, self._final = _joined(self._final), []
-            ranks = self._ranks[final.tracks]
+            births = self._births
+            ranks = births.ranks[final.tracks]
             order = ranks.argsort(kind="stable")
-            track_ids = [self._track_ids[rank] for rank in ranks[order].tolist()]
+            track_ids = [births.track_ids[rank] for rank in ranks[order].tolist()]
             states = States(final.states.means[order], final.states.covariances[order])
             reports += smoothed_reports(self._motion, track_ids, final.stamps_ns[order].tolist(), *states)
         for lag_s in self._settings.lagged_s:
@@ -321,11 +331,17 @@ class BandedBank:
             self.windows.restart(track, line)
             self.windows.solver.iterate(np.array([track]), SMOOTHER_ITERATIONS)
 
+    @property
+    def _births(self) -> _Births:
+        if self._known_births is None:
+            tracks = np.fromiter(self._numbers.values(), dtype=np.int64, count=len(self._numbers))
+            ranks = np.zeros(len(self._clock_ns), dtype=np.int64)
+            ranks[tracks] = np.arange(len(tracks))
+            self._known_births = _Births(tuple(self._numbers), tracks, ranks)
+        return self._known_births
+
     def _renumbered(self) -> None:
-        self._track_ids = tuple(self._numbers)
-        self._tracks = np.fromiter(self._numbers.values(), dtype=np.int64, count=len(self._numbers))
-        self._ranks = np.zeros(len(self._clock_ns), dtype=np.int64)
-        self._ranks[self._tracks] = np.arange(len(self._tracks))
+        self._known_births = None
         self._changed()
 
     def _changed(self) -> None:
@@ -335,7 +351,7 @@ class BandedBank:
 
     def _all_times(self) -> _Times:
         if self._times is None:
-            self._times = self._times_ns(self._tracks)
+            self._times = self._times_ns(self._births.tracks)
         return self._times
 
     def _times_ns(self, tracks: IntArray) -> _Times:
@@ -348,7 +364,7 @@ class BandedBank:
         """States at `stamp_ns` of the tracks that are known there."""
         found = self._states.get(stamp_ns)
         if found is None:
-            track_ids, tracks = self._track_ids, self._tracks
+            track_ids, tracks = self._births.track_ids, self._births.tracks
             known = self._all_times().oldest <= stamp_ns
             if not known.all():
                 track_ids, tracks = tuple(track_ids[row] for row in known.nonzero()[0].tolist()), tracks[known]
@@ -363,7 +379,7 @@ class BandedBank:
         _, known, states = found
         if len(known) == len(tracks) and (known == tracks).all():
             return states
-        chosen = self._ranks[tracks]
-        if len(known) < len(self._tracks):
-            chosen = np.searchsorted(self._ranks[known], chosen)
+        chosen = self._births.ranks[tracks]
+        if len(known) < len(self._births.tracks):
+            chosen = np.searchsorted(self._births.ranks[known], chosen)
         return States(states.means[chosen], states.covariances[chosen])

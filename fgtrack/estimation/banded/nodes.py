@@ -62,7 +62,7 @@ class Nodes(Histories):
         """Mean relative to x0, and covariance, given everything."""
         self.far = np.zeros(size, dtype=bool)
         """Whether `step` is longer than it may be."""
-        self.terms: list[list[MeasurementTerm]] = [[] for _ in range(size)]
+        self.terms: dict[int, list[MeasurementTerm]] = {}
         """What is measured at each node."""
 
     def place_before(self, tracks: IntArray, stamps_ns: IntArray) -> IntArray:
@@ -175,8 +175,7 @@ class Nodes(Histories):
     def _fit(self) -> None:
         """As many values as there are numbers."""
         for name in self._VALUES:
-            setattr(self, name, grown(getattr(self, name), self.size))
-        self.terms += [[] for _ in range(self.size - len(self.terms))]
+            setattr(self, name, self.fitted(getattr(self, name)))
 
     def _grow_rows(self) -> None:
         self.rows = np.concatenate([self.rows, np.zeros_like(self.rows)], axis=1)
