@@ -4,7 +4,7 @@ import warnings
 from typing import Any
 
 from ruamel.yaml import YAML
-from ruamel.yaml.error import ReusedAnchorWarning
+from ruamel.yaml.error import MarkedYAMLError, ReusedAnchorWarning, YAMLError
 from ruamel.yaml.nodes import MappingNode, ScalarNode, SequenceNode
 
 __all__ = ["MOST_VALUES", "YamlSizeError", "safe_yaml"]
@@ -25,7 +25,7 @@ def safe_yaml(text: str, longest: int) -> Any:  # Any: what YAML says is only kn
     YamlSizeError
         It has more than `longest` characters, or `MOST_VALUES` lines or values; long texts count as several.
     YAMLError
-        It is no YAML.
+        It is no YAML, a key of it is a list or a mapping, or a value is none of the type that it looks like.
     RecursionError
         It is nested too deeply, or has an alias that contains itself.
     """
@@ -41,7 +41,10 @@ def safe_yaml(text: str, longest: int) -> Any:  # Any: what YAML says is only kn
             return None
         if _count(node, {}) > MOST_VALUES:
             raise YamlSizeError(f"has more than {MOST_VALUES} values, counting what its aliases repeat")
-        return yaml.constructor.construct_document(node)
+        try:
+            return yaml.constructor.construct_document(node)
+        except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+            raise YAMLError(f"a value cannot be read ({error})") from error
 
 
 def _count(node: Any, counts: dict[Any, int | None]) -> int:  # nodes of ruamel.yaml have no types
@@ -59,5 +62,8 @@ def _count(node: Any, counts: dict[Any, int | None]) -> int:  # nodes of ruamel.
             found = 1 + sum(_count(item, counts) for item in node.value)
         case MappingNode():
             found = 1 + sum(_count(part, counts) for pair in node.value for part in pair)
+            for key, _ in node.value:
+                if not isinstance(key, ScalarNode):
+                    raise MarkedYAMLError(problem="a key is a list or a mapping", problem_mark=key.start_mark)
     counts[node] = found
     return found

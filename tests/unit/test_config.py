@@ -200,7 +200,7 @@ def test_a_setting_does_not_change_what_it_stands_on() -> None:
         ("- 1\n", "a mapping of keys to values is needed, this is [1]"),
         ("text\n", 'a mapping of keys to values is needed, this is "text"'),
         ("1: 2\n", "unknown key"),
-        ("? [1, 2]\n: 3\n", "config.yaml: "),
+        ("? [1, 2]\n: 3\n", "config.yaml:1: no valid YAML, a key is a list or a mapping"),
         ("!!python/object:os.system {}\n", "config.yaml"),
     ],
 )

@@ -1,0 +1,52 @@
+"""YAML of strangers."""
+
+from pathlib import Path
+
+import pytest
+from ruamel.yaml.error import YAMLError
+
+from fgtrack.core.errors import CallError
+from fgtrack.io.yaml_text import safe_yaml
+from fgtrack.pipeline.load import read_yaml
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{kind: track, [[0.0, 65.5]]}",
+        "[1, 2]: a",
+        "? {a: 1}\n: b",
+        "? &a [x]\n: *a",
+        "a: 2001-99-99",
+        "a: 2001-01-01T25:61:00Z",
+        "a: 2001-01-01T00:00:00+99:00",
+        "a: !!int x",
+        "a: !!float x",
+        "a: !!timestamp x",
+        "a: !!binary é",
+        "a: !!set [1]",
+        "a: !!omap {b: 1}",
+        "a: !!pairs 3",
+        "a: !!bool 3",
+        "a: !!python/object:os.system {}",
+        "<<: 3",
+        "<<: [3]",
+        "a: 0o9",
+        "a: !!int 0b",
+        "a: !!int ''",
+        f"a: {'9' * 5000}",
+        "a: 1:99:99",
+    ],
+)
+def test_what_is_no_plain_value_is_an_error_of_yaml_or_a_text(text: str) -> None:
+    try:
+        value = safe_yaml(text, 100_000)
+    except YAMLError:
+        return
+    assert isinstance(value, dict)
+
+
+def test_a_key_that_is_a_list_is_named_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "x.yaml").write_text("a: 1\nb: {c: 2, [[0.0, 65.5]]}\n")
+    with pytest.raises(CallError, match=r"x\.yaml:2: no valid YAML, a key is a list or a mapping"):
+        read_yaml(tmp_path / "x.yaml")
