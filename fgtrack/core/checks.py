@@ -26,8 +26,8 @@ LARGEST = 1e9
 """What is measured, mapped or configured is no larger, in any unit: its square is still far from the largest float."""
 
 
-LARGEST_NS = 2**63 - 1
-"""No stamp is larger: it has 64 bits."""
+LARGEST_NS = 4 * 10**18
+"""No clock is further from 0, which in times since 1970 are the years 1843 and 2096: differences have 64 bits too."""
 
 
 def is_number(value: object, least: float = -LARGEST, most: float = LARGEST) -> bool:
@@ -36,7 +36,7 @@ def is_number(value: object, least: float = -LARGEST, most: float = LARGEST) -> 
 
 
 def is_stamp(value: object) -> bool:
-    """Whether it is an integer of up to 64 bits, as stamps in nanoseconds are."""
+    """Whether it is an integer of at most `LARGEST_NS`."""
     return isinstance(value, (int, np.integer)) and bool(-LARGEST_NS <= value <= LARGEST_NS)
 
 

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from fgtrack.core.checks import LARGEST, is_number, is_stamp
+from fgtrack.core.checks import LARGEST, LARGEST_NS, is_number, is_stamp
 from fgtrack.core.errors import CallError
 from fgtrack.core.linalg import mahalanobis_squared
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
@@ -17,6 +17,7 @@ from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.sensors import RobustLoss
 
 _AT_ORIGIN = SensorPose()
+_STAMP = f"an integer of at most {LARGEST_NS:.0g}"
 
 Content = tuple[tuple[str, ...], tuple[float, ...], tuple[str, ...]]
 """Names of what is measured, numbers, names of what is assumed and of the loss; it has an order."""
@@ -69,7 +70,7 @@ class Measurement:
             raise CallError(f"measurement of {', '.join(names)}: give either std or covariance")
         if std is not None and std.keys() != values.keys():
             raise CallError(f"measurement of {', '.join(names)}: std must name the same, names {', '.join(std)}")
-        _check("measurement: stamp_ns", stamp_ns, "an integer of up to 64 bits", is_stamp(stamp_ns))
+        _check("measurement: stamp_ns", stamp_ns, _STAMP, is_stamp(stamp_ns))
         for name, value in (*values.items(), *(std or {}).items()):
             _check(f"measurement of {name}", value, "a number, finite and at most 1e9", is_number(value))
         z = np.array([values[name] for name in names], dtype=np.float64)
@@ -175,7 +176,7 @@ class Start:
     accel_std_mps2: float = 1.0
 
     def __post_init__(self) -> None:
-        _check("Start: stamp_ns", self.stamp_ns, "an integer of up to 64 bits", is_stamp(self.stamp_ns))
+        _check("Start: stamp_ns", self.stamp_ns, _STAMP, is_stamp(self.stamp_ns))
         for name, shape, largest in (("position_m", (2,), _MOST), ("position_covariance", (2, 2), _MOST**2)):
             given = getattr(self, name)
             if given is not None:

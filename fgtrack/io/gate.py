@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fgtrack.core.checks import LARGEST_NS, is_stamp
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.types import (
     DESCRIBING,
@@ -109,6 +110,8 @@ def _check_detection(item: Detection) -> None:
 def _check_times(message: Message) -> None:
     _check_integer("stamp_ns", message.stamp_ns)
     _check_integer("receipt_ns", message.receipt_ns)
+    if not is_stamp(message.receipt_ns):  # all windows are counted from it
+        raise _WrongError(f"receipt_ns: at most {LARGEST_NS:.0g} ns from 0 expected, not {_shown(message.receipt_ns)}")
 
 
 def _check_integer(name: str, value: object) -> None:

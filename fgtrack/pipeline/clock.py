@@ -8,6 +8,7 @@ from itertools import groupby, pairwise
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+from fgtrack.core.checks import is_stamp
 from fgtrack.core.errors import CallError
 from fgtrack.core.files import open_file
 from fgtrack.core.time import first_multiple, period_ns
@@ -18,7 +19,6 @@ Delivered = EgoState | DetectionList
 
 _LARGEST_BYTES = 1 << 28  # of ticks, unpacked: two days at 50 Hz
 _LONGEST_LINE = 1 << 20
-_INT64_LIMIT = 1 << 63
 
 
 class Tick(NamedTuple):
@@ -101,6 +101,6 @@ def _lines(path: Path) -> Iterator[bytes]:
 
 def _now_ns(line: bytes) -> int:
     now_ns = json.loads(line.decode())["now_ns"]
-    if type(now_ns) is not int or not -_INT64_LIMIT <= now_ns < _INT64_LIMIT:
+    if type(now_ns) is not int or not is_stamp(now_ns):
         raise ValueError(f"{str(now_ns)[:50]} is no time")
     return now_ns

@@ -16,7 +16,7 @@ from fgtrack.core.linalg import congruence, symmetrise
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import EgoState, FloatArray
 from fgtrack.tracking.ego_continuity import Continuity
-from fgtrack.tracking.inbox import ASYMMETRY, is_number
+from fgtrack.tracking.inbox import ASYMMETRY, is_bounded
 
 LARGEST_STEP_BACK_S = 1.0
 """A state that is older than the newest one by more than this has a wrong stamp."""
@@ -41,8 +41,8 @@ class EgoPose(NamedTuple):
 
 
 def is_finite(ego: EgoState) -> bool:
-    """Whether every number of `ego` is one (see `is_number`)."""
-    return all(map(is_number, (ego.x_m, ego.y_m, ego.yaw_rad, ego.speed_mps, ego.yaw_rate_radps, ego.accel_mps2)))
+    """Whether every number of `ego` is one (see `is_bounded`)."""
+    return all(map(is_bounded, (ego.x_m, ego.y_m, ego.yaw_rad, ego.speed_mps, ego.yaw_rate_radps, ego.accel_mps2)))
 
 
 def extrapolated(ego: EgoState, stamp_ns: int, covariance: FloatArray | None = None, straight: bool = False) -> EgoPose:

@@ -84,7 +84,7 @@ class Inbox(Protocol):
 def is_usable(detection: Detection, sensor: SensorModel) -> bool:
     """Whether `detection` has sound values, says where it is, and is no empty slot (x = y = 0) of a fixed list."""
     measured = {name: value for name in sensor.std if (value := getattr(detection, name)) is not None}
-    if not all(map(is_number, measured.values())) or not is_covariance(detection, sensor):
+    if not all(map(is_bounded, measured.values())) or not is_covariance(detection, sensor):
         return False
     if detection.x_m == 0.0 and detection.y_m == 0.0:
         return False
@@ -93,7 +93,7 @@ def is_usable(detection: Detection, sensor: SensorModel) -> bool:
     return "bearing_rad" in measured
 
 
-def is_number(value: float) -> bool:
+def is_bounded(value: float) -> bool:
     """Whether `value` is finite and at most `LARGEST`."""
     return abs(value) <= LARGEST
 

@@ -15,7 +15,7 @@ from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.assignment import Assignment, assigned_densely
 from fgtrack.tracking.ego import EgoPose, EgoSource, EgoStd
 from fgtrack.tracking.gating import euclidean_distances
-from fgtrack.tracking.inbox import Batch, is_covariance, is_number, record, records
+from fgtrack.tracking.inbox import Batch, is_bounded, is_covariance, record, records
 from fgtrack.tracking.lifecycle import CountingLifecycle, Life, Look, Sighting
 from fgtrack.tracking.merge import Merge
 from fgtrack.tracking.objects import Apart
@@ -101,7 +101,7 @@ class SlotInbox:
             values = [getattr(detection, name) for name in sensor.components]
             if (detection.x_m or 0.0) == 0.0 and (detection.y_m or 0.0) == 0.0:
                 ended.append(record(message, index, Disposition.INVALID))
-            elif all(value is not None and is_number(value) for value in values) and is_covariance(detection, sensor):
+            elif all(value is not None and is_bounded(value) for value in values) and is_covariance(detection, sensor):
                 kept.append(index)
             else:
                 broken = True

@@ -54,7 +54,7 @@ def test_what_makes_no_sense_is_one_line(given: dict, message: str) -> None:
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("stamp_ns", [None, "x", np.nan, 1.5, np.array([1]), 2**63], ids=repr)
+@pytest.mark.parametrize("stamp_ns", [None, "x", np.nan, 1.5, np.array([1]), 2**63, -(2**62)], ids=repr)
 def test_a_stamp_is_an_integer(stamp_ns: object) -> None:
     with pytest.raises(CallError, match=r"^measurement: stamp_ns: must be an integer"):
         Measurement.of(stamp_ns, x_m=1.0, std={"x_m": 1.0})
