@@ -12,6 +12,8 @@ from fgtrack.tracking.gating import MOST_PAIRS, Pairs
 
 _REFUSED = 1e9  # cost of a pair outside its gate: any number of good pairs is cheaper
 _FEW_COSTS = 1 << 12  # so many are solved at once sooner than they are taken apart
+_MOST_COSTS = 1 << 20  # of more, as of a thousand candidates that a thousand tracks share, the cheapest go first
+_MOST_LINKS = 1 << 24  # of tracks by a candidate, to be counted
 
 
 class Assignment(NamedTuple):
@@ -30,7 +32,8 @@ class Assignment(NamedTuple):
 def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:
     """Of `pairs`, whose values are costs, as many as possible at least cost; each candidate and track once.
 
-    Those linked by pairs are a problem of their own: its size is what memory and time depend on, not that of all.
+    Those linked by pairs are a problem of their own: its size is what memory and time depend on, not that of all. In
+    one with more than `_MOST_COSTS` costs the cheapest pair goes first, and so on.
     """
     rows, columns = _solved(pairs, num_candidates, num_tracks)
     return _outcome(rows, columns, num_candidates, num_tracks)
@@ -106,6 +109,11 @@ def _solved(pairs: Pairs, num_candidates: int, num_tracks: int) -> tuple[IntArra
                 rows.append(found[0])
                 columns.append(found[1])
                 continue
+        if part.size > _MOST_COSTS:
+            found = _cheapest_first(part.pairs)
+            rows.append(found[0])
+            columns.append(found[1])
+            continue
         cost = np.full((len(part.rows), len(part.columns)), _REFUSED)
         inside = np.zeros(cost.shape, dtype=bool)
         cost[part.i, part.j], inside[part.i, part.j] = part.pairs.values, True
@@ -114,6 +122,17 @@ def _solved(pairs: Pairs, num_candidates: int, num_tracks: int) -> tuple[IntArra
         rows.append(part.rows[first[good]])
         columns.append(part.columns[second[good]])
     return np.concatenate(rows), np.concatenate(columns)
+
+
+def _cheapest_first(pairs: Pairs) -> tuple[IntArray, IntArray]:
+    """Candidates and tracks of the cheapest pair, of the cheapest of the rest, and so on."""
+    order = np.lexsort((pairs.columns, pairs.rows, pairs.values))
+    of_row, taken = dict[int, int](), set[int]()
+    for row, column in zip(pairs.rows[order].tolist(), pairs.columns[order].tolist(), strict=True):
+        if row not in of_row and column not in taken:
+            of_row[row] = column
+            taken.add(column)
+    return np.array(list(of_row)), np.array(list(of_row.values()))
 
 
 def _least_cost(cost: FloatArray) -> tuple[IntArray, IntArray]:
@@ -133,6 +152,13 @@ def _components(pairs: Pairs, num_candidates: int, num_tracks: int) -> list[Pair
 
 
 def _rivals(pairs: Pairs, num_candidates: int, num_tracks: int) -> IntArray:
-    """How many tracks share a candidate with each track, itself included, shape (tracks,); 0 of one without pairs."""
+    """How many tracks share a candidate with each track, itself included, shape (tracks,); 0 of one without pairs.
+
+    Where there are too many to be counted, a number that is not smaller.
+    """
+    shared = np.bincount(pairs.rows, minlength=num_candidates)
+    if float(shared.dot(shared)) > _MOST_LINKS:
+        at_most = np.bincount(pairs.columns, shared[pairs.rows], num_tracks).astype(np.int64)
+        return np.minimum(at_most, np.count_nonzero(at_most))
     links = csr_array((np.ones(len(pairs.rows), np.int32), (pairs.rows, pairs.columns)), (num_candidates, num_tracks))
     return np.diff((links.T @ links).tocsr().indptr).astype(np.int64)

@@ -15,8 +15,10 @@ from fgtrack.estimation.ekf import linearised
 from fgtrack.tracking.pose_error import PoseError
 from fgtrack.tracking.preprocess import Candidate
 
-#: So many pairs are in memory at a time, unless one candidate alone has more.
+#: So many pairs are in memory at a time.
 MOST_PAIRS = 1 << 17
+#: A candidate is compared with so many tracks at most, the nearest ones: no real scene has as many inside one gate.
+MOST_NEAR = 128
 _FEW_DISTANCES = 1 << 14  # so many are calculated sooner than a tree is built
 _NOWHERE = np.full(2, np.nan)  # in place of a position that a bearing does not give
 _MARGIN = 1.0 + 1e-9  # a tree rounds in another way
@@ -99,7 +101,8 @@ def positions_m(candidates: Sequence[Candidate]) -> FloatArray:
 def near(candidates: Sequence[Candidate], means: FloatArray, reach_m: float | FloatArray) -> Iterator[Pairs]:
     """Pairs at most `reach_m` apart, a number or one for each track, in portions; the values are distances.
 
-    Distances are in the map; that of a bearing is from the track to the line of sight. Candidates ascend.
+    Of a candidate with more than `MOST_NEAR` tracks so near, those with the nearest of them. Distances are in the map;
+    that of a bearing is from the track to the line of sight. Candidates ascend.
     """
     if not candidates or not len(means):
         return
@@ -116,17 +119,25 @@ def near(candidates: Sequence[Candidate], means: FloatArray, reach_m: float | Fl
     counts = np.zeros(len(points), dtype=np.int64)
     counts[placed] = tracks.query_ball_point(points[placed], farthest_m, return_length=True)
     counts[np.isnan(points[:, 0])] = len(means)
-    for part in _portions(counts):
-        here = part[~np.isnan(points[part, 0])]
+    crowded = counts > MOST_NEAR
+    for part in _portions(np.minimum(counts, MOST_NEAR)):
+        seen = ~np.isnan(points[part, 0])
+        here, crowd = part[seen & ~crowded[part]], part[seen & crowded[part]]
         found = [_near_ray(candidates[row], row, means) for row in part[np.isnan(points[part, 0])].tolist()]
         if len(here):
             close = cKDTree(points[here]).sparse_distance_matrix(tracks, farthest_m, output_type="ndarray")
-            rows, columns = here[close["i"]], close["j"].astype(np.int64)
-            offsets = points[rows] - means[columns, :2]
-            found.append(Pairs(rows, columns, np.sqrt(np.vecdot(offsets, offsets))))
+            found.append(_apart(points, means, here[close["i"]], close["j"].astype(np.int64)))
+        if len(crowd):
+            nearest = tracks.query(points[crowd], MOST_NEAR)[1]
+            found.append(_apart(points, means, np.repeat(crowd, MOST_NEAR), nearest.ravel()))
         pairs = Pairs.joined(found)
         pairs = pairs.at(pairs.values <= reach_m[pairs.columns])
         yield pairs.at(np.lexsort((pairs.columns, pairs.rows)))
+
+
+def _apart(points: FloatArray, means: FloatArray, rows: IntArray, columns: IntArray) -> Pairs:
+    offsets = points[rows] - means[columns, :2]
+    return Pairs(rows, columns, np.sqrt(np.vecdot(offsets, offsets)))
 
 
 def _portions(counts: IntArray) -> list[IntArray]:
@@ -156,7 +167,9 @@ def euclidean_distances(
 
 
 def _near_ray(candidate: Candidate, row: int, means: FloatArray) -> Pairs:
-    return Pairs(np.full(len(means), row), np.arange(len(means)), _distances_to_ray(candidate, means))
+    distances = _distances_to_ray(candidate, means)
+    nearest = np.argpartition(distances, MOST_NEAR)[:MOST_NEAR] if len(means) > MOST_NEAR else np.arange(len(means))
+    return Pairs(np.full(len(nearest), row), nearest, distances[nearest])
 
 
 def _distances_to_ray(candidate: Candidate, means: FloatArray) -> FloatArray:

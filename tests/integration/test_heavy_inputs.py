@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from faults.cases import Server
 from mcap.writer import CompressionType
@@ -60,6 +61,25 @@ def crowd(folder: Path) -> None:
     ego = [EgoState(10**7 * k, 10**7 * k, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0) for k in range(20)]
     objects = tuple(Detection(x_m=10.0 * (k % 200), y_m=10.0 * (k // 200)) for k in range(30_000))
     write_stream(folder / "x.jsonl", [*ego, DetectionList("radar", 15 * 10**7, 19 * 10**7, objects)])
+
+
+def spot(folder: Path) -> None:
+    """Two lists of 4,000 objects in one place."""
+    from fgtrack.core.types import Detection, DetectionList, EgoState
+    from fgtrack.io.stream import write_stream
+
+    rng = np.random.default_rng(1)
+    ego = [EgoState(10**7 * k, 10**7 * k, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0) for k in range(40)]
+    lists = [
+        DetectionList(
+            "radar",
+            stamp_ns,
+            stamp_ns + 5 * 10**7,
+            tuple(Detection(x_m=x, y_m=y) for x, y in rng.normal(20.0, 0.3, size=(4_000, 2)).tolist()),
+        )
+        for stamp_ns in (10**8, 2 * 10**8)
+    ]
+    write_stream(folder / "x.jsonl", sorted([*ego, *lists], key=lambda message: message.receipt_ns))
 
 
 def nuscenes_zeros(folder: Path) -> None:
@@ -365,6 +385,7 @@ BOMBS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     ),
     "mcap with 20,000 topics": (mcap_many_topics, ("info", "x.mcap")),
     "ros1, record of 3 GB": (ros1_large_record, ("info", "x.bag")),
+    "all in one place": (spot, ("replay", "x.jsonl", "-e", "ekf-replay", "-o", "run")),
     **{
         f"crowd of 30,000, {estimator}": (crowd, ("replay", "x.jsonl", "-e", estimator, "-o", "run"))
         for estimator in (

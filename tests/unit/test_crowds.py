@@ -82,9 +82,13 @@ def test_among_equal_costs_as_many_pairs_at_the_same_cost_are_found(seed: int) -
 
 
 @pytest.mark.usefixtures("small_portions")
+@pytest.mark.parametrize("counted", [True, False])
 @pytest.mark.parametrize("seed", range(40))
-def test_what_is_left_out_of_a_large_part_changes_nothing(seed: int) -> None:
+def test_what_is_left_out_of_a_large_part_changes_nothing(
+    seed: int, counted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """More candidates than rivals for each track, some of one cost: the dearer ones cannot be needed."""
+    monkeypatch.setattr(assignment, "_MOST_LINKS", assignment._MOST_LINKS if counted else 0)
     rng = np.random.default_rng(seed)
     cost = rng.uniform(0.0, 5.0, size=(40, rng.integers(1, 5)))
     if seed % 2:
@@ -94,6 +98,23 @@ def test_what_is_left_out_of_a_large_part_changes_nothing(seed: int) -> None:
     assert outcome(cost, found.pairs) == pytest.approx(outcome(cost, dense.pairs), abs=1e-6)
     if not seed % 2:
         assert found == dense
+
+
+@pytest.mark.usefixtures("small_portions")
+def test_where_too_many_share_too_many_the_cheapest_go_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(assignment, "_MOST_COSTS", 8)
+    cost = np.array([[1.0, 2.0, np.inf], [3.0, 9.0, 4.0], [0.5, 7.0, 8.0]])
+    found = assigned(pairs_of(cost), 3, 3)
+    assert found.pairs == [(0, 1), (1, 2), (2, 0)]
+    assert not found.new
+    assert not found.missed
+    rng = np.random.default_rng(1)
+    cost = rng.uniform(0.0, 5.0, size=(30, 20))
+    found = assigned(pairs_of(cost), 30, 20)
+    best = outcome(cost, assigned_densely(cost, np.isfinite(cost)).pairs)
+    assert best[1] <= outcome(cost, found.pairs)[1] < 4.0 * best[1]
+    assert len(found.pairs) == len({j for _, j in found.pairs}) == best[0] == 20
+    assert found.new == sorted(set(range(30)) - {i for i, _ in found.pairs})
 
 
 # --- gates
@@ -152,6 +173,37 @@ def test_a_portion_has_few_pairs_unless_one_candidate_has_many() -> None:
     whole = Pairs.joined(parts)
     np.testing.assert_array_equal(whole.rows, rows)
     np.testing.assert_array_equal(whole.columns, columns)
+
+
+@pytest.mark.parametrize("bearings", [False, True])
+def test_a_candidate_among_too_many_tracks_sees_the_nearest(bearings: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gating, "MOST_NEAR", 5)
+    monkeypatch.setattr(gating, "_FEW_DISTANCES", 0)
+    rng = np.random.default_rng(2)
+    candidates = [each for each in mixed(rng, 40, 6.0) if bearings or each.position_m is not None]
+    tracks = states([(x, y) for x, y in rng.uniform(0.0, 6.0, size=(30, 2))])
+    distances = euclidean_distances(candidates, tracks.means)
+    found = Pairs.joined(list(near(candidates, tracks.means, 2.0)))
+    most = 0
+    for row, of_row in enumerate(distances):
+        nearest = np.sort(of_row[of_row <= 2.0])[:5]
+        most = max(most, np.count_nonzero(of_row <= 2.0))
+        np.testing.assert_array_equal(np.sort(found.values[found.rows == row]), nearest)
+    assert most > 5
+
+
+@pytest.mark.parametrize("association", [GatedEuclidean(gate_m=5.0), GatedMahalanobis()])
+def test_detections_and_tracks_all_in_one_place_are_not_all_compared(
+    association: GatedEuclidean | GatedMahalanobis,
+) -> None:
+    """3,000 of each: their pairs, and the distances of one kind alone, have 72 MB each."""
+    rng = np.random.default_rng(0)
+    candidates = [candidate(x, y) for x, y in rng.normal(0.0, 0.3, size=(3_000, 2)).tolist()]
+    tracks = states([(x, y) for x, y in rng.normal(0.0, 0.3, size=(3_000, 2)).tolist()])
+    found: list[assignment.Assignment] = []
+    peak = peak_bytes(lambda: found.append(association(candidates, tracks)))
+    assert peak < 90 * MB, f"{peak / MB:.0f} MB"
+    assert len(found[0].pairs) > 2_700
 
 
 @pytest.mark.parametrize(
