@@ -341,7 +341,7 @@ def draw(estimators: Mapping[str, Sequence[Part]], path: Path) -> None:
     for each in axes:
         each.grid(alpha=0.3)
         if each is not axes[3]:
-            each.set_ylim(bottom=0.0)
+            each.set_ylim(0.0, 1.15 * each.dataLim.ymax)  # a flat line is seen below the edge
     figure.savefig(path, dpi=90, pil_kwargs={"optimize": True})
     plt.close(figure)
 
