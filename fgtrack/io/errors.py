@@ -10,6 +10,8 @@ LARGEST_BYTES = 128 * _MEGABYTE
 """Of a chunk, a message or a line, where nothing else is said."""
 MOST_OBJECTS = 100_000
 """In a list, where nothing else is said."""
+MOST_SENSORS = 100
+"""Of a recording or a configuration. Each is a row of figures and tables, and 30 lines of a run folder."""
 
 
 class TruncatedInput(DataError):  # noqa: N818 - it names what the input is; the readers have given all before it

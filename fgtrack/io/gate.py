@@ -24,7 +24,7 @@ from fgtrack.core.types import (
     Message,
     TruthState,
 )
-from fgtrack.io.errors import MOST_OBJECTS
+from fgtrack.io.errors import MOST_OBJECTS, MOST_SENSORS
 
 __all__ = ["checked"]
 
@@ -40,21 +40,28 @@ _detection_numbers = attrgetter(*_DETECTION_NUMBERS)
 def checked(
     path: Path, messages: Callable[[], Iterator[Message]], most_objects: int = MOST_OBJECTS
 ) -> Iterator[Message]:
-    """The messages of the input at `path`; a list with more than `most_objects` is refused.
+    """The messages of the input at `path`.
+
+    A list with more than `most_objects` is refused, and one of a sensor beyond `MOST_SENSORS`.
 
     Raises
     ------
     DataError
         The reader failed, or gave what is no message; raised after everything before that.
     """
-    count = 0
+    count, sensors = 0, set[str]()
     try:
         for message in messages():
             _check(message)
-            if isinstance(message, DetectionList) and len(message.objects) > most_objects:
-                raise _WrongError(
-                    f"{message.sensor}: a list of {len(message.objects)} objects, more than input.most_objects allows"
-                )
+            if isinstance(message, DetectionList):
+                sensors.add(message.sensor)
+                if len(sensors) > MOST_SENSORS:
+                    raise _WrongError(f"{message.sensor}: the lists before it are of {MOST_SENSORS} other sensors")
+                if len(message.objects) > most_objects:
+                    raise _WrongError(
+                        f"{message.sensor}: a list of {len(message.objects)} objects, more than input.most_objects "
+                        "allows"
+                    )
             yield message
             count += 1
     except _WrongError as error:

@@ -3,9 +3,10 @@
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 
-from fgtrack.core.errors import DataError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import MEASURABLE, DetectionList, Message
 from fgtrack.estimation.registry import ESTIMATORS, Claims
+from fgtrack.io.errors import MOST_SENSORS
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
 from fgtrack.tracking.merge import NoMerge
@@ -85,6 +86,10 @@ def with_sensors(config: Config, messages: Callable[[], Iterable[Message]]) -> C
     for name in (*config.input.detections, *config.input.csv.detections):
         if name not in config.ignore_sensors:
             measured.setdefault(name, set())
+    if len(measured) > MOST_SENSORS:
+        raise CallError(
+            f"input: {len(measured)} sensors with those of the recording, at most {MOST_SENSORS} can be used"
+        )
     return replace(config, sensors={name: _assumed(found) for name, found in sorted(measured.items())})
 
 

@@ -4,9 +4,10 @@ import pytest
 from support.paper import paper
 from support.tracking import message
 
-from fgtrack.core.errors import DataError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, EgoState
 from fgtrack.io.config import InputConfig, TopicInput
+from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.effective import ASSUMED_STD, Effective, effective, with_sensors
 from fgtrack.pipeline.public import replay
@@ -87,3 +88,13 @@ def test_messages_without_any_configuration_are_tracked() -> None:
     assert run.tracks["x_m"][newest] == pytest.approx([39.0], abs=0.5)
     assert run.tracks["speed_mps"][newest] == pytest.approx([10.0], abs=1.0)
     assert run.tracks["status"][newest].tolist() == ["confirmed"]
+
+
+def test_more_sensors_than_anyone_has_are_refused() -> None:
+    sensors = {f"radar{k}": SensorModel(std={"x_m": 1.0, "y_m": 1.0}) for k in range(101)}
+    with pytest.raises(ValueError, match=r"^sensors: 101 of them, at most 100"):
+        Config(sensors=sensors)
+    lists = [message(POINT, sensor=name) for name in sensors]
+    with pytest.raises(CallError, match=r"^input: 101 sensors with those of the recording, at most 100"):
+        with_sensors(Config(), lambda: iter(lists))
+    assert len(with_sensors(Config(), lambda: iter(lists[1:])).sensors) == 100

@@ -77,6 +77,15 @@ def test_what_is_no_message_ends_the_input_in_one_short_line(message: object, co
     assert str(caught.value).isprintable()
 
 
+def test_a_recording_of_more_sensors_than_anyone_has_ends_there() -> None:
+    """A name that counts, as a frame with a number: the run of 10,000 could be written, and not read again."""
+    lists = [replace(LIST, sensor=f"radar{k}") for k in range(1_000)]
+    readable = UntilBreak(checked(Path("drive"), lambda: iter(lists)))
+    assert len(list(readable)) == 100
+    with pytest.raises(DataError, match=r"^drive: message 101: radar100: the lists before it are of 100 other sensors"):
+        readable.raise_error()
+
+
 def test_numbers_that_are_not_finite_and_those_of_numpy_pass() -> None:
     passing = [
         replace(EGO, x_m=float("nan")),
