@@ -16,7 +16,15 @@ import pytest
 
 import fgtrack
 from fgtrack.cli.main import run as command
-from fgtrack.evaluation.report.packing import ANGLE_RAD, CODE, POSITION_M, Packer, identity_form, time_form, unpacked
+from fgtrack.evaluation.report.packing import (
+    ANGLE_RAD,
+    POSITION_M,
+    Packer,
+    code_form,
+    identity_form,
+    time_form,
+    unpacked,
+)
 from fgtrack.evaluation.report.scene import scene
 from fgtrack.evaluation.report.settings import differing, flattened
 from fgtrack.evaluation.runs import judged
@@ -273,7 +281,10 @@ def test_equal_columns_are_held_once_and_what_does_not_fit_is_missing() -> None:
     for numbers in (np.array([-1, 2**31 - 1]), np.array([-1, 2**40])):
         np.testing.assert_array_equal(unpacked(packer.column(numbers, identity_form(numbers)), packer.blobs), numbers)
     with pytest.raises(ValueError, match="does not fit"):
-        packer.column([256], CODE)
+        packer.column([256], code_form(range(256)))
+    for count in (1, 256, 257, 70_000):  # of sensors, as a folder of strangers may name them
+        last = packer.column([count - 1], code_form(range(count)))
+        assert unpacked(last, packer.blobs).tolist() == [count - 1]
 
 
 @pytest.mark.parametrize("duration_s", [1.0, 1e5, 1e6, 1e8])

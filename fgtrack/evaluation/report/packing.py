@@ -7,7 +7,7 @@ high bytes of neighbours are alike.
 import base64
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sized
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -40,8 +40,11 @@ _MISSING_I32 = -(2**31)
 POSITION_M = Form("i32", 1e-3, _MISSING_I32)
 #: In tenths of a milliradian, wrapped angles.
 ANGLE_RAD = Form("i16", 1e-4, -(2**15))
-#: Places in a list of up to 255 names.
-CODE = Form("u8")
+
+
+def code_form(names: Sized) -> Form:
+    """Of places among `names`."""
+    return Form("u8" if len(names) <= 1 << 8 else "u16" if len(names) <= 1 << 16 else "i32")
 
 
 def identity_form(numbers: npt.NDArray[np.int64]) -> Form:

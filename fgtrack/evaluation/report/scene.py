@@ -14,11 +14,11 @@ from fgtrack.evaluation.palette import PALETTE
 from fgtrack.evaluation.recordings import by_recording
 from fgtrack.evaluation.report.packing import (
     ANGLE_RAD,
-    CODE,
     POSITION_M,
     Form,
     Packed,
     Packer,
+    code_form,
     identity_form,
     time_form,
 )
@@ -205,7 +205,7 @@ def _run(run: Run, packing: _Packing) -> Json:
         "tracks": {
             "t": packing.time(tracks["now_ns"]),
             "track": packing.identity(tracks["track_id"]),
-            "status": column(_codes(tracks["status"], statuses), CODE),
+            "status": column(_codes(tracks["status"], statuses), code_form(statuses)),
             **_pose(tracks, packing),
             **packing.ellipse(tracks),
         },
@@ -249,8 +249,8 @@ def _detections(run: Run, packing: _Packing) -> Json:
     found = {
         "stamp": packing.time(table["stamp_ns"][order]),
         "receipt": packing.time(table["receipt_ns"][order]),
-        "sensor": column(_codes(table["sensor"][order], sensors), CODE),
-        "disposition": column(_codes(fates[order], dispositions), CODE),
+        "sensor": column(_codes(table["sensor"][order], sensors), code_form(sensors)),
+        "disposition": column(_codes(fates[order], dispositions), code_form(dispositions)),
         "track": packing.identity(ids[order]),
         **packing.place(*where.position_m[order].T),
         "track_x": track["x"],
