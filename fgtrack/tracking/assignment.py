@@ -12,7 +12,7 @@ from fgtrack.tracking.gating import MOST_PAIRS, Pairs
 
 _REFUSED = 1e9  # cost of a pair outside its gate: any number of good pairs is cheaper
 _FEW_COSTS = 1 << 12  # so many are solved at once sooner than they are taken apart
-_MOST_COSTS = 1 << 20  # of more, as of a thousand candidates that a thousand tracks share, the cheapest go first
+_MOST_COSTS = 1 << 22  # of more, as of 2,100 candidates that 2,100 tracks share, the cheapest go first
 _MOST_LINKS = 1 << 24  # of tracks by a candidate, to be counted
 
 
