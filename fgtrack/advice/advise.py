@@ -18,9 +18,10 @@ from fgtrack.evaluation.cautions import USED, cautions
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
+from fgtrack.pipeline.assumed import assumed, source_of
 from fgtrack.pipeline.clock_offsets import OffsetReport, OffsetRules, estimate_offsets
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.effective import effective, told_std, with_sensors
+from fgtrack.pipeline.effective import effective
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.shipped import read_config, settings_of
 from fgtrack.pipeline.stamping import mended
@@ -95,16 +96,16 @@ class _Adviser:
         on_step: Callable[[str], None],
     ) -> None:
         self._recording, self._messages, self._reference, self._on_step = recording, messages, reference, on_step
-        self._config, self._assumed = with_sensors(config, lambda: messages), not config.sensors
+        self._assumed = assumed(config, source_of(lambda: messages))
+        self._config = self._assumed.config
         self._findings: list[Finding] = []
         self._arrivals = arrivals_of(messages)
         self._tracked = list(beginning(messages, nanoseconds(TRACKED_S)))
 
     def advice(self, broken: str | None, tune: bool) -> Advice:
         """All steps."""
-        if self._assumed:
-            std = told_std({name: sensor.std for name, sensor in self._config.sensors.items()})
-            text = f"none is configured; assumed standard deviations: {std}."
+        if self._assumed.assumptions:
+            text = f"none is configured; assumed: {'; '.join(map(str, self._assumed.assumptions))}."
             text += "" if tune else " `fgtrack tune` fits them (--tune)."
             self._findings.append(Finding("noise", "sensors", 35.0, text))
         self._take(self._strangers())

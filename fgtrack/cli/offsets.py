@@ -5,8 +5,8 @@ from fgtrack.cli.show import chosen_form, progress, say, show
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.tables import Column, Table, Value
 from fgtrack.io.source import open_input
+from fgtrack.pipeline.assumed import assumed
 from fgtrack.pipeline.clock_offsets import OffsetReport, SensorOffset, estimate_offsets
-from fgtrack.pipeline.effective import told_std, with_sensors
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
 
@@ -29,11 +29,10 @@ def offsets(
     config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
     source = open_input(recording, config.input)
     with progress("offsets"):
-        known = with_sensors(config, source.messages)
-        report = estimate_offsets(source.messages(), known, reference)
-    if form is None and not config.sensors:
-        assumed = {name: sensor.std for name, sensor in known.sensors.items()}
-        say(f"no sensors configured, assumed standard deviations: {told_std(assumed)}")
+        found = assumed(config, source)
+        report = estimate_offsets(source.messages(), found.config, reference)
+    for assumption in found.assumptions if form is None else ():
+        say(f"assumed {assumption}")
     show(_table(report), form, report.as_dict())
     if report.broken is not None:
         raise DataError(f"{located(report.broken, str(recording))}; used up to there")

@@ -17,7 +17,8 @@ from fgtrack.io.output import check_apart
 from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
 from fgtrack.io.span import end_ns
-from fgtrack.pipeline.effective import effective, told_std
+from fgtrack.pipeline.assumed import assumed
+from fgtrack.pipeline.effective import effective
 from fgtrack.pipeline.inputs import inputs
 from fgtrack.pipeline.replay import located, replay_each
 from fgtrack.pipeline.shipped import read_config
@@ -56,9 +57,10 @@ def replay(
         check_apart(folder, inputs(config, [recording], config_file=config_file))
     source = open_input(recording, config.input)
     with progress("replay") as tell:
+        found = assumed(config, source)
         results = replay_each(
             source.messages,
-            config,
+            found.config,
             folders,
             origin=str(recording),
             kind=source.kind,
@@ -69,9 +71,8 @@ def replay(
     for line in dict.fromkeys(str(effective(replace(config, estimator=name))) for name in names):
         say(line)
     runs = [load_run(result.path) for result in results]
-    if not config.sensors:
-        assumed = {name: one["std"] for name, one in runs[0].config["sensors"].items()}
-        say(f"no sensors configured, assumed standard deviations: {told_std(assumed)}")
+    for assumption in found.assumptions:
+        say(f"assumed {assumption}")
     for result in results:
         what = "{estimator}, {detections_received} detections, {wall_s:.1f} s, digest {digest:.12}"
         missed = f", {result.deadline_misses} deadlines missed" if result.deadline_misses else ""

@@ -13,9 +13,9 @@ from fgtrack.core.types import DetectionList, EgoState, Message
 from fgtrack.estimation.factor_graph.clock_calibration.offsets import OffsetSettings, OffsetSolution, solve_offsets
 from fgtrack.estimation.factor_graph.clock_calibration.time_shift import ShiftableMeasurement
 from fgtrack.models.sensors import SensorModel
+from fgtrack.pipeline.assumed import assumed, source_of
 from fgtrack.pipeline.clock import Delivered
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.effective import with_sensors
 from fgtrack.pipeline.ego_path import EgoPath
 from fgtrack.pipeline.offset_measurements import Remeasure, measurements_by_track
 from fgtrack.pipeline.replay import again, replay_in_memory
@@ -122,7 +122,7 @@ def estimate_offsets(
     rules = rules or OffsetRules()
     heard: list[Delivered] = []
     repeated = again(messages, config)
-    config = with_sensors(config, repeated)
+    config = assumed(config, source_of(repeated)).config
     recorded = _recorded(repeated(), heard, config.sensors)
     config = unrefused(config)
     run, broken = replay_in_memory(recorded, config)

@@ -14,10 +14,11 @@ from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import MemoryRun, Node, Run, RunWriter, path_from_run
 from fgtrack.models.sensors import SensorModel
+from fgtrack.pipeline.assumed import assumed, source_of
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, Tick, listed_ticks, message_ticks, node_ticks, read_ticks
 from fgtrack.pipeline.config import ClockConfig, Config
-from fgtrack.pipeline.effective import effective, with_sensors
+from fgtrack.pipeline.effective import effective
 from fgtrack.pipeline.ego_clock import EgoClock
 from fgtrack.pipeline.load import dump
 from fgtrack.pipeline.pace import Clock, Pace, WallClock
@@ -173,7 +174,7 @@ def replay_in_memory(
     Without files it takes less time. `observed` is that of `build_tracker`. Raises as `replay`.
     """
     repeated = again(messages, config)
-    config = with_sensors(config, repeated)
+    config = assumed(config, source_of(repeated)).config
     tracker = build_tracker(config, observed)
     memory = MemoryRun(*_opening(config, origin, kind))
     _, broken, _ = _drive(tracker, repeated(), config, memory, origin=origin)
@@ -272,7 +273,7 @@ def replay_each(
     In real time each tick waits until it is due; the runs are the same.
     """
     results = []
-    config = with_sensors(config, messages)
+    config = assumed(config, source_of(messages)).config
     with ExitStack() as claims:
         runs = []
         for estimator, folder in folders.items():

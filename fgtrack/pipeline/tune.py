@@ -18,8 +18,8 @@ from fgtrack.estimation.likelihood.series import Series
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
+from fgtrack.pipeline.assumed import assumed, source_of
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.effective import with_sensors
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config, settings_of
 from fgtrack.pipeline.tune_measurements import recorded
@@ -97,7 +97,7 @@ def tuned(
     """`tune` of messages in receipt order, by name of their recording; `on_step` is told what comes next."""
     rules = rules or TuneRules()
     recordings = [_Recording.read(name, messages()) for name, messages in sources.items()]
-    config = with_sensors(config, lambda: chain.from_iterable(one.messages for one in recordings))
+    config = assumed(config, source_of(lambda: chain.from_iterable(one.messages for one in recordings))).config
     return _Tuning(ConfigNoise(for_tuning(config, rules)), recordings, rules, on_step).report(config)
 
 
