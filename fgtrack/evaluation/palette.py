@@ -1,4 +1,64 @@
-"""The colours of figures and viewers."""
+"""Colours of figures, reports and viewers: an estimator has the same one everywhere, by its name."""
 
-#: Colours of Okabe and Ito, which the colour-blind can distinguish as well.
-PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+from zlib import crc32
+
+_BLUE, _ORANGE, _GREEN, _PURPLE, _SKY, _RED = "#0072B2", "#CC7A00", "#009E73", "#B65CA8", "#2F93C6", "#D1495B"
+#: Distinguishable by the colour-blind; each has a contrast of 3 or more to a white and to a dark page (WCAG 2.1).
+PALETTE = (_BLUE, _ORANGE, _GREEN, _PURPLE, _SKY, _RED)
+#: Of the sensors of a recording in order of their names: none is the colour of a common estimator.
+SENSORS = (_PURPLE, "#8C7A1F", "#6F6F6F", "#A0622D", _SKY)
+_LINES = ("-", "--", "-.", ":")
+_MARKERS = "os^vDP"
+
+
+class Look(NamedTuple):
+    """Colour, line style and marker of a curve."""
+
+    colour: str
+    line: str
+    marker: str
+
+
+#: Those that are compared most. A dashed line on a solid one shows both where two estimators tie.
+_ESTIMATORS: Mapping[str, Look] = {
+    "smoother": Look(_BLUE, "-", "o"),
+    "smoother-batch": Look(_BLUE, "-.", "o"),
+    "smoother-banded": Look(_BLUE, ":", "o"),
+    "ekf-replay": Look(_ORANGE, "--", "s"),
+    "ekf-backward-forward": Look(_GREEN, "-", "^"),
+    "rewind-forget": Look(_GREEN, "--", "^"),
+    "drop": Look(_RED, "-", "v"),
+    "as-current": Look(_PURPLE, "-", "D"),
+    "reorder-buffer": Look(_SKY, "-", "P"),
+}
+
+
+def look(estimator: str) -> Look:
+    """Return how the curves of `estimator` look; of an unknown one as well, always the same."""
+    number = crc32(estimator.encode())
+    unknown = Look((_PURPLE, _SKY)[number % 2], _LINES[1:][number // 2 % 3], _MARKERS[number // 8 % len(_MARKERS)])
+    return _ESTIMATORS.get(estimator, unknown)
+
+
+def looks(estimators: Sequence[str]) -> list[Look]:
+    """Return one look for each of `estimators`, in their order; equal colours get different lines."""
+    found: list[Look] = []
+    for one in map(look, estimators):
+        lines = (one.line, *_LINES)
+        free = (line for line in lines if all((one.colour, line) != (other.colour, other.line) for other in found))
+        found.append(one._replace(line=next(free, one.line)))
+    return found
+
+
+def distinct_colours(estimators: Sequence[str]) -> list[str]:
+    """Return one colour for each of `estimators`, in their order, where there are no line styles.
+
+    The first of a name has the name's colour, a further one takes a free colour of the palette while there is one.
+    """
+    found: list[str] = []
+    for own in (look(name).colour for name in estimators):
+        free = (colour for colour in (own, *PALETTE) if colour not in found)
+        found.append(next(free, own))
+    return found

@@ -7,10 +7,11 @@ from operator import attrgetter
 from pathlib import Path
 
 from fgtrack.core.errors import CallError, printable
+from fgtrack.evaluation.palette import distinct_colours
 from fgtrack.evaluation.recordings import same_recording
 from fgtrack.evaluation.runs import Runs, judged, run_folders
 from fgtrack.evaluation.viewer.detection_messages import detection_messages, outcome_messages
-from fgtrack.evaluation.viewer.look import Look, palette
+from fgtrack.evaluation.viewer.look import Look, rgba
 from fgtrack.evaluation.viewer.surroundings import (
     ego_messages,
     excluded_lines,
@@ -101,7 +102,8 @@ def _looks(runs: Mapping[str, Run]) -> list[Look]:
         while (unique := name if same == 1 else f"{name}_{same}") in names:
             same += 1
         names.append(unique)
-    return [Look(f"/{name}", palette(k)) for k, name in enumerate(names)]
+    colours = distinct_colours([str(run.meta.get("estimator", "")) for run in runs.values()])
+    return [Look(f"/{name}", rgba(colour)) for name, colour in zip(names, colours, strict=True)]
 
 
 def _check_same_recording(runs: Mapping[str, Run]) -> None:

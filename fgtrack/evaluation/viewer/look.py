@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from fgtrack.core.types import Detection
-from fgtrack.evaluation.palette import PALETTE
+from fgtrack.evaluation.palette import PALETTE, SENSORS
 from fgtrack.io.viewer.scene import Arrow, Box, Colour, Ellipse, Label, Point, Shape
 
 #: Length, width and height of the box of an object of which no detection tells them: a racing car's.
@@ -33,8 +33,8 @@ class Look:
         return palette(track_id) if self.colour is None else self.colour
 
     def of_sensor(self, index: int) -> Colour:
-        """Colour of the detections of a sensor; from the other end, so that few tracks and sensors differ."""
-        return palette(-1 - index)
+        """Colour of the detections of a sensor."""
+        return rgba(SENSORS[index % len(SENSORS)])
 
     def track(self, track_id: int, state: Detection, speed_mps: float, status: str) -> tuple[Shape, ...]:
         """The box of a track with its number and class, and an arrow to where it is a quarter of a second later."""
@@ -55,7 +55,11 @@ class Look:
 
 def palette(index: int, opacity: float = 1.0) -> Colour:
     """The colour number `index`, from the beginning again after the last one."""
-    text = PALETTE[index % len(PALETTE)]
+    return rgba(PALETTE[index % len(PALETTE)], opacity)
+
+
+def rgba(text: str, opacity: float = 1.0) -> Colour:
+    """Return the colour `text` (#RRGGBB) as shares of 1."""
     r, g, b = (round(int(text[place : place + 2], 16) / 255.0, 3) for place in (1, 3, 5))
     return r, g, b, opacity
 
