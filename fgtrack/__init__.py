@@ -3,14 +3,72 @@
 Everything that a user imports is here, loaded when it is first used; the subpackages are private.
 """
 
-import ast
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 __version__ = "0.2.0.dev0"
 
-if TYPE_CHECKING:
+#: Module (or package, of a module) that each public name is loaded from on first use.
+_HOMES = {
+    "Advice": "fgtrack.advice.page",
+    "CTRA": "fgtrack.models.motion",
+    "CTRV": "fgtrack.models.motion",
+    "CV": "fgtrack.models.motion",
+    "CallError": "fgtrack.core.errors",
+    "Config": "fgtrack.pipeline.config",
+    "DataError": "fgtrack.core.errors",
+    "Detection": "fgtrack.core.types",
+    "DetectionList": "fgtrack.core.types",
+    "Disposition": "fgtrack.core.types",
+    "EgoState": "fgtrack.core.types",
+    "Estimator": "fgtrack.estimation.base",
+    "FgtrackError": "fgtrack.core.errors",
+    "Lateness": "fgtrack.pipeline.lateness",
+    "Measurement": "fgtrack.estimation.base",
+    "MeasurementModel": "fgtrack.models.measurement",
+    "Message": "fgtrack.core.types",
+    "MotionModel": "fgtrack.models.motion",
+    "ObjectList": "fgtrack.io.adapters.common",
+    "RobustLoss": "fgtrack.models.sensors",
+    "Run": "fgtrack.io.run",
+    "SensorModel": "fgtrack.models.sensors",
+    "SensorPose": "fgtrack.models.measurement",
+    "SmoothedReport": "fgtrack.core.types",
+    "Start": "fgtrack.estimation.base",
+    "StatesAt": "fgtrack.estimation.base",
+    "Tables": "fgtrack.evaluation.tables",
+    "TickReport": "fgtrack.core.types",
+    "TickTiming": "fgtrack.pipeline.lateness",
+    "TrackBank": "fgtrack.estimation.base",
+    "TrackOutput": "fgtrack.pipeline.live",
+    "TrackReport": "fgtrack.core.types",
+    "TrackState": "fgtrack.core.types",
+    "Tracker": "fgtrack.pipeline.live",
+    "TracksAt": "fgtrack.pipeline.live",
+    "TruthState": "fgtrack.core.types",
+    "TuneReport": "fgtrack.pipeline.tune_report",
+    "UpdateRecord": "fgtrack.core.types",
+    "UpdateResult": "fgtrack.estimation.base",
+    "UpdateStatus": "fgtrack.estimation.base",
+    "advise": "fgtrack.advice.advise",
+    "close_ups": "fgtrack.pipeline.close_up",
+    "compare": "fgtrack.evaluation.comparison",
+    "estimator": "fgtrack.estimation.registry",
+    "initial_state": "fgtrack.estimation.birth",
+    "load_run": "fgtrack.io.run",
+    "measurement_model": "fgtrack.models.measurement",
+    "plot": "fgtrack.evaluation",
+    "replay": "fgtrack.pipeline.public",
+    "robust_weight": "fgtrack.estimation.ekf",
+    "simulate": "fgtrack.pipeline.public",
+    "starts": "fgtrack.estimation",
+    "testing": "fgtrack",
+    "tune": "fgtrack.pipeline.tune",
+}
+
+__all__ = sorted(_HOMES)
+
+if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two lists equal
     from fgtrack import testing as testing
     from fgtrack.advice.advise import advise as advise
     from fgtrack.advice.page import Advice as Advice
@@ -66,25 +124,15 @@ if TYPE_CHECKING:
     from fgtrack.pipeline.tune import tune as tune
     from fgtrack.pipeline.tune_report import TuneReport as TuneReport
 
-# The imports above are for type checkers and are the one list of public names: where each name is at home.
-_HOMES = {
-    alias.asname: (node.module, alias.name)
-    for node in ast.walk(ast.parse(Path(__file__).read_text(encoding="utf-8")))
-    if isinstance(node, ast.ImportFrom) and node.module is not None
-    for alias in node.names
-    if alias.asname is not None
-}
-
 
 def __getattr__(name: str) -> object:
     if name not in _HOMES:
         raise AttributeError(f"module 'fgtrack' has no attribute {name!r}")
-    module_name, attribute = _HOMES[name]
-    known = vars(import_module(module_name))
-    value = known[attribute] if attribute in known else import_module(f"{module_name}.{attribute}")
+    members = vars(import_module(_HOMES[name]))
+    value = members[name] if name in members else import_module(f"{_HOMES[name]}.{name}")
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
-    return sorted([*_HOMES, "__version__"])
+    return [*__all__, "__version__"]

@@ -35,7 +35,6 @@ from fgtrack.evaluation.sweep_table import SweepTable
 from fgtrack.evaluation.viewer.surroundings import roads
 
 __all__ = [
-    "FIGURES",
     "anatomy",
     "arrivals",
     "close_up",
@@ -47,13 +46,17 @@ __all__ = [
     "lag",
     "map",
     "residuals",
-    "save",
-    "save_figures",
     "sensed",
     "sweep",
     "timing",
     "transient",
 ]
+
+
+def __dir__() -> list[str]:
+    """Return the names of the figures: what `fgtrack.plot.` completes to."""
+    return sorted(__all__)
+
 
 _FEW = 3  # of objects, and of runs where they are many: the worst are drawn
 _MOST_RUNS = 6  # that have figures of their own

@@ -1,5 +1,8 @@
 """The public names of `import fgtrack`: what the commands do, in a few lines, without importing more than is used."""
 
+import ast
+import inspect
+import pydoc
 import subprocess
 import sys
 from collections.abc import Callable
@@ -7,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import fgtrack
 
@@ -46,6 +50,30 @@ def test_every_public_name_is_there_and_documented() -> None:
         assert getattr(fgtrack, name).__doc__, name
     with pytest.raises(AttributeError, match="no attribute 'reply'"):
         _ = fgtrack.reply
+
+
+def test_type_checkers_see_the_names_that_are_loaded() -> None:
+    nodes = ast.walk(ast.parse(Path(fgtrack.__file__).read_text(encoding="utf-8")))
+    imports = [node for node in nodes if isinstance(node, ast.ImportFrom) and node.module.startswith("fgtrack")]
+    seen = {alias.asname: node.module for node in imports for alias in node.names}
+    assert seen == fgtrack._HOMES
+    assert sorted(seen) == fgtrack.__all__
+
+
+def test_a_star_import_and_the_help_show_the_public_names_alone() -> None:
+    names: dict[str, object] = {}
+    exec("from fgtrack import *", names)
+    assert sorted(names.keys() - {"__builtins__"}) == fgtrack.__all__
+    page = pydoc.plain(pydoc.render_doc(fgtrack))
+    assert [name for name in fgtrack.__all__ if name not in page] == []
+    assert "_HOMES" not in page
+    assert "import_module" not in page
+
+
+def test_plot_completes_to_figures_only() -> None:
+    assert {"errors", "map", "timing"} <= set(dir(fgtrack.plot))
+    for name in dir(fgtrack.plot):
+        assert inspect.signature(getattr(fgtrack.plot, name)).return_annotation is Figure, name
 
 
 def test_a_run_in_memory_a_run_folder_and_the_command_give_the_same_run(drive: Path, tmp_path: Path) -> None:
