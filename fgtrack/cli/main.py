@@ -134,7 +134,7 @@ def _run(words: Sequence[str], debug: bool) -> int:
         sys.stdout.flush()
         return BAD_CALL if not words else outcome if isinstance(outcome, int) else DONE
     except typer.TyperException as error:
-        return _failed(error.format_message(), BAD_CALL, debug)
+        return _failed(_wrong_call(error), BAD_CALL, debug)
     except CallError as error:
         return _failed(str(error), BAD_CALL, debug)
     except FgtrackError as error:
@@ -150,6 +150,17 @@ def _run(words: Sequence[str], debug: bool) -> int:
         return _bug(error, debug)
     except Exception as error:  # the last line of defence: a bug must not look like bad data
         return _bug(error, debug)
+
+
+def _wrong_call(error: typer.TyperException) -> str:
+    """Message of `error`; of arguments that are too many, what the command takes."""
+    text, context = error.format_message(), getattr(error, "ctx", None)
+    _, is_extra, extra = text.partition("unexpected extra argument(s) ")
+    if not is_extra or context is None:
+        return text
+    arguments = [each for each in context.command.params if each.param_type_name == "argument"]
+    takes = " and ".join(f"one {each.metavar or each.name.upper()}" for each in arguments) or "no argument"
+    return f"{context.info_name}: takes {takes}, {extra.strip('()')} is too many"
 
 
 def _is_nowhere() -> bool:

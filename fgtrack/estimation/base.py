@@ -48,7 +48,7 @@ class Measurement:
         cls,
         stamp_ns: int,
         *,
-        std: Mapping[str, float] | None = None,
+        std: Mapping[str, float] | float | None = None,
         covariance: FloatArray | None = None,
         pose: SensorPose = _AT_ORIGIN,
         loss: RobustLoss | None = None,
@@ -57,6 +57,7 @@ class Measurement:
     ) -> "Measurement":
         """The measurement of `values`, by name of `COMPONENTS`, with a standard deviation each or a covariance.
 
+        `std` is a mapping by the same names, or one number for values of one unit (x and y).
         `covariance`, shape (k, k), is in the order of `COMPONENTS`. Raises `CallError` for an unknown or missing name
         and a value or covariance that makes no sense.
         """
@@ -68,6 +69,11 @@ class Measurement:
             raise CallError(f"measurement of {', '.join(names)}: assumed must name some of them, is {assumed!r}")
         if (std is None) == (covariance is None):
             raise CallError(f"measurement of {', '.join(names)}: give either std or covariance")
+        if std is not None and not isinstance(std, Mapping):
+            rule = f"a mapping of {', '.join(names)} to numbers, or one number for values of one unit"
+            is_one_unit = len({name.rpartition("_")[2] for name in names}) == 1
+            _check(f"measurement of {', '.join(names)}: std", std, rule, is_one_unit and is_number(std))
+            std = dict.fromkeys(names, std)
         if std is not None and std.keys() != values.keys():
             raise CallError(f"measurement of {', '.join(names)}: std must name the same, names {', '.join(std)}")
         _check("measurement: stamp_ns", stamp_ns, _STAMP, is_stamp(stamp_ns))

@@ -1,6 +1,7 @@
 """YAML files to validated dataclasses and back; every error names the file and the key."""
 
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
@@ -74,17 +75,31 @@ def _parse(text: str, origin: str) -> Any:
         raise CallError(f"{origin}: no valid YAML, {' '.join(str(error).split())}") from error
 
 
+def names_of(key: str) -> list[str]:
+    """Names of the path `key`; one that contains a dot stands in double quotes: `sensors."cam.top".std.x_m`.
+
+    Empty where `key` is not a path.
+    """
+    quoted = r'(?:"[^"]+"|[^".]+)'
+    if not re.fullmatch(rf"{quoted}(?:\.{quoted})*", key):
+        return []
+    return [name.strip('"') for name in re.findall(quoted, key)]
+
+
 def key_and_value(setting: str) -> tuple[str, Any]:  # Any: what YAML says
     """The key and the value of a setting of the form a.b=value. Raises `CallError` for another form."""
     key, equals, text = setting.partition("=")
-    if not equals or not all(key.strip().split(".")):
-        raise CallError(f"--set {setting}: write key=value, with dots between the keys of a path")
+    if not equals or not names_of(key.strip()):
+        raise CallError(
+            f"--set {setting}: write key=value, with dots between the keys of a path and a name that contains a dot "
+            "in double quotes (--set 'sensors.\"cam.top\".std.x_m=1')"
+        )
     return key.strip(), _parse(text, f"--set {setting}")
 
 
 def _with_setting(raw: dict[str, Any], setting: str, defaults: object) -> dict[str, Any]:
     key, value = key_and_value(setting)
-    names = key.split(".")
+    names = names_of(key)
     changed = dict(raw)
     inner = changed
     for name in names[:-1]:

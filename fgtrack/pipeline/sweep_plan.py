@@ -17,7 +17,7 @@ from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.inputs import fingerprints, inputs
-from fgtrack.pipeline.load import key_and_value, load, plain, read_yaml, validate
+from fgtrack.pipeline.load import key_and_value, load, names_of, plain, read_yaml, validate
 from fgtrack.pipeline.replay import versions
 from fgtrack.pipeline.shipped import find_file, read_config, read_scenario
 from fgtrack.sim.redelay import SensorDelays
@@ -129,9 +129,10 @@ class SweepConfig:
             )
 
     def _check_key(self, where: str, key: str) -> None:
-        root = key.split(".")[0]
-        if not all(key.split(".")):
-            raise ValueError(f"{where}: {key!r} is no key, write names with dots between them")
+        names = names_of(key)
+        if not names:
+            raise ValueError(f"{where}: {key!r} is not a key, write names with dots between them")
+        root = names[0]
         if root == "estimator":
             raise ValueError(f"{where}: name estimators under `estimators`")
         if (root == SCENARIO and self.scenario is None) or (root == DELAYS and self.input is None):
@@ -364,7 +365,7 @@ def _with_keys(base: Mapping[str, Value], changes: Mapping[str, Value], where: s
     """`base` with `changes`: dotted keys, those of the configuration without its name in front."""
     changed = dict(base)
     for key, value in changes.items():
-        names = key.split(".")
+        names = names_of(key)
         if names[0] not in (SCENARIO, DELAYS):
             names = [CONFIG, *names]
         try:

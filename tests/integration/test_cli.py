@@ -318,6 +318,8 @@ def foreign_folder(path: Path) -> None:
             ("simulate", "default", "-o", "drive.mcap"),
             "drive.mcap: is written as .jsonl, as .jsonl.gz, or as a rosbag2",
         ),
+        (("replay", "drive.jsonl", "b", "-o", "run"), "replay: takes one RECORDING, b is too many"),
+        (("convert", "drive.jsonl", "b", "c", "d"), "convert: takes one RECORDING and one OUT, c d is too many"),
         (("replay", "drive.jsonl"), "--out"),
         (("replay", "-o", "run"), "ecording"),
         (("fly",), "fly"),

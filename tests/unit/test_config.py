@@ -213,7 +213,15 @@ def test_every_error_is_one_line_with_the_file_and_the_key(tmp_path: Path, text:
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("setting", ["", "=", "=1", "a", "a.=1", ".a=1", "a..b=1"])
+def test_a_name_with_a_dot_stands_in_quotes() -> None:
+    sensors = load(Config, None, ['sensors."cam.top".std.bearing_rad=0.1', "sensors.lidar.std.bearing_rad=0.2"]).sensors
+    assert [(name, dict(one.std)) for name, one in sensors.items()] == [
+        ("cam.top", {"bearing_rad": 0.1}),
+        ("lidar", {"bearing_rad": 0.2}),
+    ]
+
+
+@pytest.mark.parametrize("setting", ["", "=", "=1", "a", "a.=1", ".a=1", "a..b=1", 'a."b=1', 'a""b=1'])
 def test_a_setting_that_is_no_setting_says_how_to_write_it(setting: str) -> None:
     with pytest.raises(CallError, match="write key=value"):
         load(Config, None, [setting])

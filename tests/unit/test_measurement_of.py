@@ -26,6 +26,7 @@ def test_values_are_ordered_as_the_model_orders_them() -> None:
     assert found.R.tolist() == np.diag([0.3**2, 0.1**2]).tolist()
     R = [[2.0, 0.5], [0.5, 1.0]]
     assert Measurement.of(5, y_m=1.0, x_m=2.0, covariance=np.array(R)).R.tolist() == R
+    assert Measurement.of(5, y_m=1.0, x_m=2.0, std=0.5).R.tolist() == (0.25 * np.eye(2)).tolist()
 
 
 @pytest.mark.parametrize(
@@ -37,6 +38,8 @@ def test_values_are_ordered_as_the_model_orders_them() -> None:
         ({"x_m": 1.0, "y_m": 2.0, "std": STD, "covariance": np.eye(2)}, "either std or covariance"),
         ({"x_m": 1.0, "y_m": 2.0, "std": {"x_m": 0.3}}, "std must name the same, names x_m"),
         ({"x_m": 1.0, "std": STD}, "std must name the same, names x_m, y_m"),
+        ({"x_m": 1.0, "yaw_rad": 2.0, "std": 0.3}, "std: must be a mapping of x_m, yaw_rad to numbers, or one number"),
+        ({"x_m": 1.0, "std": "0.3"}, "std: must be a mapping of x_m to numbers, or one number .*, is '0.3'"),
         ({"x_m": np.nan, "y_m": 2.0, "std": STD}, "of x_m: must be a number, finite"),
         ({"x_m": "1", "y_m": 2.0, "std": STD}, "of x_m: must be a number, finite and at most 1e9, is '1'"),
         ({"x_m": None, "y_m": 2.0, "std": STD}, "of x_m: must be a number"),

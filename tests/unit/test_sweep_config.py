@@ -155,7 +155,7 @@ def test_every_point_of_a_grid_has_one_setting_at_a_time(plan: Any) -> None:
         ("vary: {seed: [1]}", "vary: 'seed' is named twice, or is a column"),
         ("vary: {estimator: [smoother]}", "vary: 'estimator' is named twice, or is"),
         ("set: {estimator: smoother}", "set: name estimators under `estimators`"),
-        ("vary: {clock..node_hz: [5.0]}", "vary.clock..node_hz: 'clock..node_hz' is no key"),
+        ("vary: {clock..node_hz: [5.0]}", "vary.clock..node_hz: 'clock..node_hz' is not a key"),
         ("vary: {delays.radar.delay: [null]}", "delays.radar.delay changes the delays, of which this sweep has none"),
         ("one_at_a_time: {association.gate_m: 5.0}", "one_at_a_time.association.gate_m: a list of values is needed"),
         ("one_at_a_time: {clock.node_hz: [5.0], seed: [1], estimator: [x]}", "one_at_a_time: name estimators under"),
