@@ -169,7 +169,7 @@ def test_without_a_configuration_the_sensors_are_those_of_the_recording(call: Ca
     code, text = call(command, "drive.jsonl", *out)
     assert code == 0, text
     if command != "tune":  # whose table has them
-        assert "assumed: sensors.lidar.std: x_m 1, y_m 1 (" in text
+        assert "sensors.lidar.std: x_m 1, y_m 1 (" in text
     if out:
         assert call("replay", "drive.jsonl", "-c", "a.yaml", "-o", "run")[0] == 0
         assert set(load_run("run").config["sensors"]) == {"lidar", "radar"}
