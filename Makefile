@@ -2,91 +2,107 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.installed
 TOOLS := .venv-tools
-QUIET := --quiet --disable-pip-version-check
+PIP := $(BIN)/python -m pip install --disable-pip-version-check
 # The matrices are small; more threads only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
 # A file stays in one process, so what its tests share is made once.
 BY_FILE := --dist loadfile --no-loadscope-reorder
+# What is installed for which purpose, as requirements/PURPOSE.txt lists it.
+RUN := $(VENV)/.run
+TEST := $(VENV)/.test
+DEV := $(TEST) $(VENV)/.dev
+DOCS := $(TEST) $(VENV)/.docs
 
 .PHONY: demo test test-slow test-matrix lock audit fuzz faults coverage mutants check docs bench bench-full soak soak-live contest clean
 
-demo: $(STAMP)
-	$(BIN)/fgtrack demo -o out/demo --overwrite
+demo: $(RUN)
+	@$(BIN)/fgtrack demo -o out/demo --overwrite
 
-test: $(STAMP)
+test: $(TEST)
 	$(BIN)/python -m pytest -n auto $(BY_FILE)
 
 # The tests marked slow, and the others with many more random examples.
-test-slow: $(STAMP)
+test-slow: $(TEST)
 	$(BIN)/python -m pytest -n auto $(BY_FILE) -m slow
 	$(BIN)/python -m pytest -n auto $(BY_FILE) --hypothesis-profile=thorough
 
 # Half an hour for each of the kinds of input; what is found is kept in out/fuzz. SECONDS=60 SEED=1 for others.
-fuzz: $(STAMP)
+fuzz: $(TEST)
 	$(BIN)/python -m pytest tests/fuzz -n auto -m slow --fuzz-seconds $(or $(SECONDS),1800) --fuzz-seed $(or $(SEED),0)
 
 # Some 20 minutes: 400 kills, full disks, folders of others, workers and schedulers that die. KILLS=1000 SEED=1 for others.
-faults: $(STAMP)
+faults: $(TEST)
 	$(BIN)/python -m pytest tests/faults -n auto -m 'slow or not slow' --kills $(or $(KILLS),100) --fuzz-seed $(or $(SEED),0)
 
-coverage: $(STAMP)
+coverage: $(DEV)
 	$(BIN)/python -m pytest -n auto $(BY_FILE) --cov --cov-report=term-missing:skip-covered
 
 # Hours; docs/testing.md tells how to take a sample.
-mutants: $(STAMP)
+mutants: $(DEV)
 	$(BIN)/mutmut run
 	$(BIN)/mutmut results
 
-check: $(STAMP)
+check: $(DEV)
 	$(BIN)/ruff check fgtrack tests experiments
 	$(BIN)/ruff format --check fgtrack tests experiments
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-docs: $(STAMP)
+docs: $(DOCS)
 	$(BIN)/python -m sphinx -W --keep-going -q -c docs . out/docs
 
-contest: $(STAMP)
+contest: $(TEST)
 	$(BIN)/python experiments/contest.py -o out/contest --jobs 2
 
 # Some 5 minutes; docs/speed.md tells how to read it. OLDER=CHECKOUT compares gtsam's smoother with that of a checkout.
-bench: $(STAMP)
+bench: $(TEST)
 	$(BIN)/python experiments/bench_speed.py -o out/speed $(if $(OLDER),--against $(OLDER))
 
 # Every estimator, number of objects, lag and delay, memory: takes several times as long.
-bench-full: $(STAMP)
+bench-full: $(TEST)
 	$(BIN)/python experiments/bench_speed.py -o out/speed --full $(if $(OLDER),--against $(OLDER))
 
 # A day of race, as fast as it goes, twice: hours. HOURS=6 ESTIMATOR=smoother-banded for others.
-soak: $(STAMP)
+soak: $(TEST)
 	$(BIN)/python experiments/bench_soak.py -o out/soak --hours $(or $(HOURS),24) --estimator $(or $(ESTIMATOR),ekf-replay)
 
 # An hour, by the clock.
-soak-live: $(STAMP)
+soak-live: $(TEST)
 	$(BIN)/python experiments/bench_live.py -o out/live
 
-# Every package in the version, and with the content, that requirements.lock says.
-$(STAMP): pyproject.toml requirements.lock
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fgtrack needs Python 3.11 or newer")'
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install $(QUIET) --require-hashes -r requirements.lock
-	$(BIN)/python -m pip install $(QUIET) --no-deps --no-build-isolation -e .
-	touch $@
+# uv unpacks packages within seconds; where it cannot reach an index that pip is configured for, pip does it.
+$(BIN)/uv: requirements/install.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fgtrack needs Python 3.11 or newer")'
+	@echo "making the environment $(VENV)"
+	@$(PYTHON) -m venv $(VENV)
+	@$(PIP) --quiet --no-compile --require-hashes -r $<
+	@touch $@
+
+$(VENV)/.%: requirements/%.txt pyproject.toml $(BIN)/uv
+	@echo "installing the packages of $< into $(VENV)"
+	@$(BIN)/uv pip install --python $(VENV) --require-hashes -r $< || $(PIP) --require-hashes -r $<
+	@$(BIN)/uv pip install --quiet --python $(VENV) --no-deps --no-build-isolation -e . || $(PIP) --no-deps --no-build-isolation -e .
+	@touch $@
 
 $(TOOLS):
 	$(PYTHON) -m venv $(TOOLS)
-	$(TOOLS)/bin/python -m pip install $(QUIET) uv pip-audit
+	$(TOOLS)/bin/python -m pip install --quiet --disable-pip-version-check uv pip-audit
 
-# The newest versions that pyproject.toml allows, for every platform and Python from 3.11 on.
+# The newest versions that pyproject.toml allows, for every platform and Python from 3.11 on, the same in every file.
+COMPILE = $(TOOLS)/bin/uv pip compile --universal --python-version 3.11 --generate-hashes --no-annotate \
+    --no-emit-index-url --quiet --custom-compile-command "make lock"
 lock: $(TOOLS)
-	$(TOOLS)/bin/uv pip compile pyproject.toml --extra test --extra dev --extra docs --universal --python-version 3.11 \
-	    --generate-hashes --no-emit-index-url --upgrade --quiet --custom-compile-command "make lock" -o requirements.lock
+	rm -f $(TOOLS)/all.txt
+	$(COMPILE) requirements/install.in pyproject.toml --extra test --extra dev --extra docs -o $(TOOLS)/all.txt
+	$(COMPILE) -c $(TOOLS)/all.txt requirements/install.in -o requirements/install.txt
+	$(COMPILE) -c $(TOOLS)/all.txt pyproject.toml -o requirements/run.txt
+	for extra in test dev docs; do \
+	    $(COMPILE) -c $(TOOLS)/all.txt pyproject.toml --extra $$extra -o requirements/$$extra.txt || exit 1; done
 
 # Known weaknesses of what is locked; asks pypi.org.
 audit: $(TOOLS)
-	$(TOOLS)/bin/pip-audit --require-hashes --disable-pip -r requirements.lock
+	for lock in requirements/*.txt; do $(TOOLS)/bin/pip-audit --require-hashes --disable-pip -r $$lock || exit 1; done
 
 # The tests with the oldest and newest versions allowed, and with those locked on every Python that is installed.
 test-matrix: $(TOOLS)

@@ -16,6 +16,7 @@ release = fgtrack.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_gallery.gen_gallery", "reference"]
 root_doc = "docs/index"
+html_extra_path = ["_ext/index.html"]  # leads from out/docs/index.html to the root page
 include_patterns = ["CHANGELOG.md", "docs/**.md", "docs/generated/**.rst", "experiments/**.md"]
 exclude_patterns = [".venv", ".git", "out", "build", "tests", "fgtrack", "docs/tutorials"]
 html_theme = "furo"

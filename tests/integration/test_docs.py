@@ -11,6 +11,7 @@ from functools import cache
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
+from runpy import run_path
 from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 from urllib.parse import urlsplit
 
@@ -298,6 +299,13 @@ def test_every_public_name_is_on_the_page_of_the_api() -> None:
 def test_every_section_of_the_configuration_is_on_its_page() -> None:
     page = (ROOT / "docs/configuration.md").read_text(encoding="utf-8")
     assert [field.name for field in fields(Config) if f"| `{field.name}` |" not in page] == []
+
+
+def test_the_built_documentation_opens_at_its_index() -> None:
+    settings = run_path(str(ROOT / "docs/conf.py"))
+    (page,) = [name for name in settings["html_extra_path"] if Path(name).name == "index.html"]
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    assert f'url={settings["root_doc"]}.html"' in text
 
 
 def test_every_setting_of_a_run_has_a_meaning_in_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:

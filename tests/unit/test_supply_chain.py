@@ -1,4 +1,4 @@
-"""What is installed: bounds in pyproject.toml, and the lock file that the Makefile and CI install from."""
+"""What is installed: bounds in pyproject.toml, and the lock files that the Makefile installs from."""
 
 import ast
 import re
@@ -6,6 +6,7 @@ import sys
 import tomllib
 from importlib.metadata import packages_distributions
 from pathlib import Path
+from typing import Any
 
 import pytest
 from packaging.requirements import Requirement
@@ -36,15 +37,26 @@ def _name(text: str) -> str:
     return re.sub(r"[-_.]+", "-", text).lower()
 
 
-@pytest.fixture(scope="module")
-def locked() -> dict[str, tuple[Version, int]]:
-    """Version and number of hashes of every package of the lock file."""
+LOCKS = ("install", "run", *LOCKED_EXTRAS)
+
+
+def _packages(lock: str) -> dict[str, tuple[set[Version], int]]:
+    """Versions (one for each range of Pythons) and number of hashes of every package of a lock file."""
     blocks = re.findall(
         r"^([A-Za-z0-9._-]+)(?:\[[^]]*\])?==([^ ;\\\n]+)[^\n]*\n((?:    --hash=[^\n]+\n)*)",
-        (ROOT / "requirements.lock").read_text(encoding="utf-8"),
+        (ROOT / "requirements" / f"{lock}.txt").read_text(encoding="utf-8"),
         re.MULTILINE,
     )
-    return {_name(name): (Version(version), len(hashes.splitlines())) for name, version, hashes in blocks}
+    packages: dict[str, tuple[set[Version], int]] = {}
+    for name, version, hashes in blocks:
+        versions, count = packages.get(_name(name), (set(), len(hashes.splitlines())))
+        packages[_name(name)] = versions | {Version(version)}, min(count, len(hashes.splitlines()))
+    return packages
+
+
+@pytest.fixture(scope="module")
+def locked() -> dict[str, dict[str, tuple[set[Version], int]]]:
+    return {lock: _packages(lock) for lock in LOCKS}
 
 
 def test_what_is_imported_is_asked_for() -> None:
@@ -79,24 +91,46 @@ def test_what_may_change_without_notice_is_bound_above() -> None:
     assert bound == BOUND_ABOVE
 
 
-def test_the_lock_file_holds_what_the_project_asks_for(locked: dict[str, tuple[Version, int]]) -> None:
-    lines = [*REQUIRED, *(Requirement(line) for extra in LOCKED_EXTRAS for line in EXTRAS[extra])]
-    assert [one.name for one in lines if _name(one.name) not in locked] == []
-    assert [str(one) for one in lines if locked[_name(one.name)][0] not in one.specifier] == []
+@pytest.mark.parametrize("lock", LOCKS[1:])
+def test_a_lock_file_holds_what_the_project_asks_for(lock: str, locked: dict[str, Any]) -> None:
+    lines = [*REQUIRED, *(Requirement(line) for line in EXTRAS.get(lock, []))]
+    assert [one.name for one in lines if _name(one.name) not in locked[lock]] == []
+    outside = [one for one in lines if not all(v in one.specifier for v in locked[lock][_name(one.name)][0])]
+    assert outside == []
 
 
-def test_every_locked_package_has_hashes(locked: dict[str, tuple[Version, int]]) -> None:
-    assert len(locked) > len(REQUIRED)
-    assert [name for name, (_, hashes) in locked.items() if not hashes] == []
+@pytest.mark.parametrize("lock", LOCKS)
+def test_every_locked_package_has_hashes(lock: str, locked: dict[str, Any]) -> None:
+    assert len(locked[lock]) > 4
+    assert [name for name, (_, hashes) in locked[lock].items() if not hashes] == []
+
+
+def test_lock_files_agree_on_versions(locked: dict[str, Any]) -> None:
+    """They are installed into one environment."""
+    versions: dict[str, set[frozenset[Version]]] = {}
+    for packages in locked.values():
+        for name, (found, _) in packages.items():
+            versions.setdefault(name, set()).add(frozenset(found))
+    assert [name for name, found in versions.items() if len(found) > 1] == []
+
+
+def test_the_demo_installs_nothing_of_tests_and_tools(locked: dict[str, Any]) -> None:
+    asked = {_name(one.name) for one in REQUIRED}
+    others = {_name(Requirement(line).name) for extra in LOCKED_EXTRAS for line in EXTRAS[extra]} - asked
+    assert others & set(locked["run"]) <= {"packaging", "pytest"}  # matplotlib and gtsam ask for them
 
 
 def test_the_makefile_installs_what_is_locked() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    recipe = makefile.split("$(STAMP): pyproject.toml requirements.lock\n")[1].split("\n\n")[0]
-    installs = [line for line in recipe.splitlines() if "pip install" in line]
-    assert ["--require-hashes -r requirements.lock" in line or "--no-deps" in line for line in installs] == [True, True]
+    recipes = makefile.split("$(BIN)/uv: requirements/install.txt\n")[1].split("$(TOOLS):")[0]
+    installs = [
+        part for line in recipes.splitlines() for part in line.split("||") if re.search(r"pip install|PIP", part)
+    ]
+    assert len(installs) == 5
+    assert [part for part in installs if "--require-hashes -r $<" not in part and "--no-deps" not in part] == []
+    assert re.search(r"^demo: \$\(RUN\)\n", makefile, re.MULTILINE)
 
 
-def test_packages_of_the_extras_are_locked(locked: dict[str, tuple[Version, int]]) -> None:
+def test_packages_of_the_extras_are_locked(locked: dict[str, Any]) -> None:
     asked = {_name(Requirement(line).name) for extra in ("dask", "foxglove", "fast") for line in EXTRAS[extra]}
-    assert asked <= set(locked)
+    assert asked <= set(locked["test"])
