@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from itertools import takewhile
-from types import MappingProxyType
 from typing import Literal, get_args
 
 import numpy as np
@@ -251,7 +250,7 @@ class UpdateRecord:
     disposition: Disposition
     track_id: int | None = None
     nis: float | None = None
-    innovation: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    innovation: Mapping[str, float] = field(default_factory=dict)
     """Measured minus predicted, by name of `MEASURABLE`."""
     reason: str | None = None
     """The setting by which it is out of bounds; None of other dispositions."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -15,8 +14,8 @@ from fgtrack.models.motion import MotionModel
 
 _NEVER = 1e9
 
-_RELINEARISE = MappingProxyType({"yaw_rad": 0.02, "speed_mps": 1.0, "yaw_rate_radps": 0.05, "accel_mps2": 1.0})
-_CURVED = MappingProxyType({"x_m": 0.05, "y_m": 0.05, "vx_mps": 0.2, "vy_mps": 0.2})
+_RELINEARISE = {"yaw_rad": 0.02, "speed_mps": 1.0, "yaw_rate_radps": 0.05, "accel_mps2": 1.0}
+_CURVED = {"x_m": 0.05, "y_m": 0.05, "vx_mps": 0.2, "vy_mps": 0.2}
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class SmootherSettings:
     (counted as `beyond_window`), dropped (`too_old`), or an error."""
     ring_s: float = 2.0
     """How far behind the window `fuse` reaches; older detections are `too_old`."""
-    relinearise: Mapping[str, float] = field(default_factory=lambda: _RELINEARISE)
+    relinearise: Mapping[str, float] = field(default_factory=_RELINEARISE.copy)
     """An entry of the state that moved further than this from its linearisation point is relinearised (iSAM2); see
     `thresholds` for entries that are not named."""
     max_iterations: int = 1

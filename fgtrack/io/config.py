@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Annotated, Literal
 
 from pydantic import NonNegativeFloat, StringConstraints
@@ -56,7 +55,7 @@ class TopicInput:
     paths for one component are a vector, whose length is meant: `speed_mps: [velocity.x, velocity.y]`. A quaternion
     gives its yaw. A mapping converts: `{path: angle, scale: -1, offset: 0, degrees: true}`.
     """
-    filters: Mapping[str, Filter] = field(default_factory=lambda: MappingProxyType({}))
+    filters: Mapping[str, Filter] = field(default_factory=dict)
     """Which objects are taken: by what a detection has (`score`, `class_name`, `speed_mps` ...), or with `fields` by
     the path of any field in one object: `{rcs_dbsm: {min: -5}, status: {one_of: [1, 3]}}`."""
     scan_s: NonNegativeFloat | None = None
@@ -83,7 +82,7 @@ class CsvTable:
     """Character between the cells; by default what the first line has most of: comma, semicolon or tab."""
     frame: Frame | None = None
     """Frame of the positions of detections; by default `ego`. Truth and the ego are in the map."""
-    filters: Mapping[str, Filter] = field(default_factory=lambda: MappingProxyType({}))
+    filters: Mapping[str, Filter] = field(default_factory=dict)
     """Which rows are read, by column: `{sensor: {one_of: [radar]}, snr: {min: 6}}`."""
     stamp_from: Literal["message", "receipt"] = "message"
     """As of a topic; `columns` must name `stamp` all the same."""
@@ -95,7 +94,7 @@ class CsvInput:
 
     ego: CsvTable | None = None
     """The ego: `x_m`, `y_m`, `yaw_rad` and `speed_mps` must be there."""
-    detections: Mapping[str, CsvTable] = field(default_factory=lambda: MappingProxyType({}))
+    detections: Mapping[str, CsvTable] = field(default_factory=dict)
     """Detections of every sensor; rows of one stamp and receipt are one list."""
     truth: CsvTable | None = None
     """True objects: `x_m`, `y_m`, and where there are several `object_id`."""
@@ -109,7 +108,7 @@ class KittiInput:
     """The sequence, where the input is a folder of several: `6` or `0006`."""
     classes: tuple[str, ...] = ("Car",)
     """Classes of the data set that are read: `Car`, `Pedestrian`, `Cyclist` ..."""
-    min_score: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    min_score: Mapping[str, float] = field(default_factory=dict)
     """By sensor, the folder of its detections: those of a lower score are left out."""
     image_width_px: float = 1242.0
     """A box in the image that touches the left or right border is left out: its middle is not that of the car."""
@@ -139,7 +138,7 @@ class InputConfig:
     """The topics that a replay reads; a recording that fgtrack wrote needs none of it."""
 
     ego: TopicInput | None = None
-    detections: Mapping[str, TopicInput] = field(default_factory=lambda: MappingProxyType({}))
+    detections: Mapping[str, TopicInput] = field(default_factory=dict)
     """Topic of every sensor."""
     truth: TopicInput | tuple[TopicInput, ...] | None = None
     """Topic of the true objects, or a list of topics with an object each."""

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
-from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -137,7 +136,7 @@ class SensorModel:
     """Use a detection's own covariance where the message carries one."""
     max_range_m: float | None = None
     """A detection further from the sensor than this is out of bounds: beyond it clutter outweighs objects."""
-    filters: Mapping[str, Filter] = field(default_factory=lambda: MappingProxyType({}))
+    filters: Mapping[str, Filter] = field(default_factory=dict)
     """Which detections are used, by anything that they say: `{score: {min: 0.5}, class_name: {one_of: [car]}}`. The
     others are out of bounds."""
     view_range_m: float | None = None

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat, PositiveInt, Tag
@@ -162,7 +161,7 @@ class InitiationConfig:
 
 
 #: Of traffic: 1.5 m/s and 0.2 rad/s of change within a second.
-_STD_PER_S = MappingProxyType({"position": 0.3, "yaw": 0.1, "speed": 15.0, "yaw_rate": 2.0})
+_STD_PER_S = {"position": 0.3, "yaw": 0.1, "speed": 15.0, "yaw_rate": 2.0}
 _BUILT_IN_MOTION: Mapping[str, type[CTRV | CV]] = {"ctrv_euler": CTRV, "ctrv": CTRV, "ctra": CTRA, "cv": CV}
 
 
@@ -172,7 +171,7 @@ class MotionConfig:
 
     kind: str = "ctrv"
     """`ctrv`, `ctra`, `cv`, `ctrv_euler` (the paper's steps), or the name of a plug-in."""
-    std_per_s: Mapping[str, float] = field(default_factory=lambda: _STD_PER_S)
+    std_per_s: Mapping[str, float] = field(default_factory=_STD_PER_S.copy)
     """Process noise as the paper gives it: each step of 1 / noise_hz adds (std_per_s / noise_hz)^2, hence the density
     std_per_s^2 / noise_hz. `ctra` takes `accel` as well, `cv` takes `velocity` alone."""
     noise_hz: float = 100.0
@@ -218,7 +217,7 @@ class Config:
 
     estimator: str = "ekf-replay"
     """Name of the estimator of all tracks."""
-    sensors: Mapping[str, SensorModel] = field(default_factory=lambda: MappingProxyType({}))
+    sensors: Mapping[str, SensorModel] = field(default_factory=dict)
     """The sensors by name; where none is named, a replay takes those of the recording, with `ASSUMED_STD`."""
     ignore_sensors: tuple[str, ...] = ()
     """Sensors of the input that are left out on purpose, also where they are under `sensors`."""

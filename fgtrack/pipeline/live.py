@@ -8,10 +8,13 @@ from operator import index as whole
 from pathlib import Path
 from typing import Self
 
+import numpy as np
+
 from fgtrack.core.checks import LARGEST_NS
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import period_ns
 from fgtrack.core.types import (
+    Detection,
     DetectionList,
     Disposition,
     EgoState,
@@ -20,6 +23,7 @@ from fgtrack.core.types import (
     TrackReport,
     UpdateRecord,
 )
+from fgtrack.io.gate import WrongError, checked_detection
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.lateness import Lateness, Receptions, TickTimes, TickTiming
@@ -158,7 +162,8 @@ class Tracker:
         if isinstance(message, EgoState):
             self._receptions[EGO].add(message.stamp_ns, message.receipt_ns, 0)
         elif message.sensor in self.config.sensors:
-            message = mended(message, self.config.sensors)
+            objects = tuple(map(self._usable, message.objects))
+            message = mended(replace(message, objects=objects), self.config.sensors)
             self._receptions[message.sensor].add(message.stamp_ns, message.receipt_ns, len(message.objects))
         else:
             if message.sensor not in self.config.ignore_sensors:
@@ -166,6 +171,19 @@ class Tracker:
                 self._records += records(message, Disposition.INVALID)
             return
         self._tracker.receive(message)
+
+    def _usable(self, item: Detection) -> Detection:
+        """`item` as a reader of files would give it; where its values have wrong types one without any: it is invalid.
+
+        A covariance may be a list or an array, of one or two dimensions.
+        """
+        try:
+            if isinstance(item, Detection) and isinstance(item.covariance, list | np.ndarray):
+                item = replace(item, covariance=tuple(np.ravel(item.covariance).tolist()))
+            return checked_detection(item)
+        except (WrongError, ValueError) as error:
+            self._refused[f"detection: {str(error).partition(', not ')[0]}"] += 1
+            return Detection()
 
     def tick(self, now_ns: int) -> TickReport:
         """Process everything received, and bring all tracks to `now_ns`. Raises `CallError` for what is no time.

@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator
@@ -70,11 +69,11 @@ class SweepConfig:
     """Length of the simulated runs, instead of the scenario's."""
     seeds: Annotated[tuple[int, ...], BeforeValidator(_seeds)] = (0,)
     """Seeds, or how many from 0 on."""
-    set: Mapping[str, Value] = field(default_factory=lambda: MappingProxyType({}))
+    set: Mapping[str, Value] = field(default_factory=dict)
     """Keys that are changed for all runs alike."""
-    vary: Mapping[str, Value] = field(default_factory=lambda: MappingProxyType({}))
+    vary: Mapping[str, Value] = field(default_factory=dict)
     """Axes of the grid: a key and its values, or a name and a group of keys with equally many values each."""
-    one_at_a_time: Mapping[str, Value] = field(default_factory=lambda: MappingProxyType({}))
+    one_at_a_time: Mapping[str, Value] = field(default_factory=dict)
     """Written as `vary`: the base, and then every value alone, all other keys as in the base."""
     metrics: tuple[str, ...] = ()
     """Columns of metrics, `*` matches anything; all of them where none is named."""

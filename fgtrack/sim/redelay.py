@@ -5,7 +5,6 @@ What was sensed stays as it was recorded; so the same drive can be replayed unde
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 
@@ -94,7 +93,7 @@ def redelay(
     num_lost = {}
     for rank, (sensor, child) in enumerate(zip(chosen, rng.spawn(len(chosen)), strict=True), 1):
         num_lost[sensor] = plan.draw(chosen[sensor], plan.places[sensor], rank, child)
-    return Redelayed(MappingProxyType(num_lost), read, plan.order(), plan.receipts_ns, plan.reported_ns)
+    return Redelayed(num_lost, read, plan.order(), plan.receipts_ns, plan.reported_ns)
 
 
 def _chosen(delays: Mapping[str, SensorDelays], known: Iterable[str]) -> dict[str, SensorDelays]:

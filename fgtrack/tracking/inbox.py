@@ -2,24 +2,22 @@
 
 import marshal
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import compress
 from operator import attrgetter
-from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
 
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import MEASURABLE, Detection, DetectionList, Disposition, FloatArray, Frame, UpdateRecord
+from fgtrack.core.types import Detection, DetectionList, Disposition, FloatArray, Frame, UpdateRecord
 from fgtrack.models.sensors import SensorModel
 
 #: In any unit: no sensor is better than this.
 SMALLEST_STD = 1e-6
 #: Of the standard deviations' product: what rounding a covariance to single precision may leave.
 ASYMMETRY = 1e-6
-NO_INNOVATION: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +48,7 @@ def record(
     disposition: Disposition,
     track_id: int | None = None,
     nis: float | None = None,
-    innovation: Mapping[str, float] = NO_INNOVATION,
+    innovation: Mapping[str, float] | None = None,
 ) -> UpdateRecord:
     """What became of detection `index` of `message`."""
     stamp_ns = message.objects[index].stamp_ns
@@ -62,7 +60,7 @@ def record(
         disposition,
         track_id,
         nis,
-        innovation,
+        innovation or {},
     )
 
 
@@ -137,20 +135,16 @@ def stamps(message: DetectionList, sensor: SensorModel) -> list[int]:
     return [message.stamp_ns] * len(own)
 
 
-_Contents = tuple[int, int, int]
-_measured = attrgetter(*MEASURABLE)
+_values = attrgetter(*(each.name for each in fields(Detection)))
 
 
-def _contents(objects: Sequence[Detection]) -> _Contents:
-    """What tells a list from others, in whatever order, and takes no memory: how many objects, and hashes.
-
-    Those of the objects alone do not: Python gives -1 and -2 the same one.
-    """
+def _contents(objects: Sequence[Detection]) -> int:
+    """Hash of the detections in any order. It is that of their bits, for NaN equals nothing, and hash(-1) hash(-2)."""
     try:
-        measured = frozenset([marshal.dumps(_measured(one), 2) for one in objects])  # 2: the same for equal numbers
+        values = [marshal.dumps(_values(one), 2) for one in objects]  # 2: without references to what is shared
     except ValueError:  # numbers of other libraries
-        measured = frozenset([repr(_measured(one)).encode() for one in objects])
-    return len(objects), hash(frozenset(objects)), hash(measured)
+        values = [repr(_values(one)).encode() for one in objects]
+    return hash((len(objects), *sorted(values)))
 
 
 class _Seen:
@@ -158,12 +152,12 @@ class _Seen:
 
     def __init__(self, memory_ns: int) -> None:
         self._memory_ns = memory_ns
-        self._receipts_ns: dict[tuple[str, int, Frame, _Contents], int] = {}  # in order of receipt
+        self._receipts_ns: dict[tuple[str, int, Frame, int], int] = {}  # in order of receipt
 
     def is_copy(self, message: DetectionList, usable: Sequence[bool]) -> bool:
         """Whether `message` repeats one that is remembered; it is remembered from now on.
 
-        Those that are not `usable`, as with NaN, which equals nothing, are not compared, nor is their order.
+        Those that are not `usable` are not compared, nor is their order.
         """
         if message.objects and not any(usable):
             return False

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 
 import numpy as np
 
@@ -35,7 +34,7 @@ from fgtrack.tracking.association import Association
 from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.ego import EgoPose, EgoSource
 from fgtrack.tracking.ego_error import EgoErrors, IndependentErrors
-from fgtrack.tracking.inbox import NO_INNOVATION, Batch, Inbox, record
+from fgtrack.tracking.inbox import Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Lifecycle, Look, Sighting
 from fgtrack.tracking.objects import ObjectRules, Objects
 from fgtrack.tracking.preprocess import Candidate, Preprocess
@@ -321,11 +320,11 @@ class Tracker:
         result: UpdateResult | None = None,
     ) -> None:
         """Record the outcome of a candidate, and of the detections that were merged into it."""
-        nis, innovation = None, NO_INNOVATION
+        nis, innovation = None, dict[str, float]()
         if result is not None and result.innovation is not None:
             nis, measurement = result.nis, candidate.measurement
             by_name = zip(measurement.model.components, result.innovation.tolist(), strict=True)
-            innovation = MappingProxyType({name: y for name, y in by_name if name not in measurement.assumed})
+            innovation = {name: y for name, y in by_name if name not in measurement.assumed}
         self._records.append(record(batch.message, candidate.index, disposition, track_id, nis, innovation))
         self._records += [record(batch.message, index, Disposition.MERGED, track_id) for index in candidate.merged]
 
