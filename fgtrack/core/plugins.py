@@ -1,10 +1,13 @@
 """Parts by name: built-in ones, and those of installed packages (entry points), loaded on first use."""
 
+import hashlib
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 from fgtrack.core.errors import CallError, FgtrackError, did_you_mean
@@ -59,6 +62,13 @@ class Registry:
     def plugins(self) -> dict[str, str]:
         """Names of the plug-ins, and the package of each."""
         return {name: _package(entry) for name, entry in self._entries.items() if entry.dist is not None}
+
+    def sources(self) -> dict[str, str]:
+        """Names of the plug-ins with the package of each and a hash of its code, which may change without its version.
+
+        That is all of the package that the entry names, or its one module.
+        """
+        return {name: f"{package} {_hash_of(self._entries[name])}" for name, package in self.plugins().items()}
 
     def resolve(self, name: str) -> str:
         """The present form of `name`. Raises `CallError` for one that does not exist."""
@@ -119,3 +129,12 @@ class Registry:
 
 def _package(entry: EntryPoint) -> str:
     return "fgtrack" if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"
+
+
+def _hash_of(entry: EntryPoint) -> str:
+    found, spec = hashlib.sha256(), find_spec(entry.module.partition(".")[0])
+    places = [] if spec is None else [Path(each) for each in spec.submodule_search_locations or [spec.origin or ""]]
+    for place in places:
+        for file in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
+            found.update(file.read_bytes() if file.is_file() else b"")
+    return found.hexdigest()

@@ -120,7 +120,7 @@ def checked_detection(item: Detection) -> Detection:
     for name in ("stamp_ns", "object_id"):
         if (value := getattr(item, name)) is not None:
             _check_integer(name, value)
-    if item.class_name or item.class_name is not None and not isinstance(item.class_name, str):
+    if item.class_name not in (None, ""):
         _check_name("class_name", item.class_name)
     _check_several("covariance", item)
     described = _described(item)

@@ -1,11 +1,11 @@
 """What is read besides what is named: maps, areas, ticks, message definitions, tables beside a recording."""
 
+import hashlib
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from pathlib import Path
 
-from fgtrack.core.errors import CallError
-from fgtrack.io.ros.typestore import definition_files
+from fgtrack.core.errors import FgtrackError
+from fgtrack.io.source import open_input
 from fgtrack.models.oval import OVAL
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import find_file
@@ -33,19 +33,25 @@ def inputs(
     return [path for path in dict.fromkeys(named) if path is not None and path.exists()]
 
 
-def fingerprints(recording: Path | None, scenario: Scenario | None, config: Config) -> list[tuple[int, str, int, int]]:
-    """Place, name, size and time of change of every file that a run reads, where it is there."""
-    found = []
-    tops = [recording, *_files_of(config, recording, scenario), *map(Path, config.input.message_definitions)]
-    for place, top in enumerate(tops):
-        if top is None:
-            continue
-        for file in _files_at(top, place == 0):
-            stat = file.stat()
-            found.append(
-                (place, file.name if file == top else str(file.relative_to(top)), stat.st_size, stat.st_mtime_ns)
-            )
-    return found
+def fingerprints(recording: Path | None, scenario: Scenario | None, config: Config) -> list[object]:
+    """Hashes of what a run reads: of all messages of its recording, whatever files they come from, and of its files."""
+    found: list[object] = []
+    if recording is not None:
+        found += [_hash_of_messages(recording, config)]
+        files = [recording] if recording.is_file() else sorted(one for one in recording.rglob("*") if one.is_file())
+        found += [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]  # for what is no message
+    tops = _files_of(config, None, scenario)
+    return found + [None if top is None else hashlib.sha256(top.read_bytes()).hexdigest() for top in tops]
+
+
+def _hash_of_messages(recording: Path, config: Config) -> str:
+    found = hashlib.sha256()
+    try:
+        for message in open_input(recording, config.input).messages():
+            found.update(repr(message).encode())
+    except FgtrackError as error:
+        found.update(str(error).encode())
+    return found.hexdigest()
 
 
 def _files_of(config: Config | None, recording: Path | None, scenario: Scenario | None) -> list[Path | None]:
@@ -73,14 +79,3 @@ def _folders_of(config: Config | None, recordings: Sequence[Path]) -> list[Path]
 
 def _map(name: str | None) -> Path | None:
     return None if name is None or name == OVAL else Path(name)
-
-
-def _files_at(top: Path, is_recording: bool) -> list[Path]:
-    """A file alone; all files of a recording that is a folder, and the definitions in a folder of them."""
-    if not top.is_dir():
-        return [top] if top.is_file() else []
-    if is_recording:
-        return sorted(file for file in top.rglob("*") if file.is_file())
-    with suppress(CallError):
-        return definition_files(top)
-    return []

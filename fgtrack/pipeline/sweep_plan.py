@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator
 
 from fgtrack.core.errors import CallError
-from fgtrack.estimation.registry import ESTIMATORS
+from fgtrack.estimation.registry import ESTIMATORS, MOTION_MODELS
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.inputs import fingerprints, inputs
@@ -262,7 +262,7 @@ class Job:
     """Content of the axes' columns."""
     seed: int
     key: str
-    """Hash of all that decides the result: settings, seed, estimators, versions, and the files that are read."""
+    """Hash of all that decides the result: settings, seed, estimators, versions, plug-ins, and what is read."""
     recipe: Recipe | None
     problem: str | None = None
     """Why the grid point cannot be run, where there is no recipe."""
@@ -306,7 +306,8 @@ def load_plan(path: Path, recording: Path | None = None, settings: Sequence[str]
         raise CallError(f"{path}: estimators: {error}") from error
     base = _with_keys(_base(sweep, path), sweep.set, f"{path}: set")
     source = None if sweep.input is None else (path.parent / sweep.input).resolve()
-    jobs = tuple(job for point in sweep.grid() for job in _jobs(sweep, base, point, source))
+    reads = _Reads(source)
+    jobs = tuple(job for point in sweep.grid() for job in _jobs(sweep, base, point, reads))
     if all(job.recipe is None for job in jobs):
         raise CallError(f"{path}: {jobs[0].problem}")
     columns = tuple(column for axis in sweep.axes() for column in axis.columns)
@@ -336,7 +337,23 @@ def _inputs(sweep: SweepConfig, base: Mapping[str, Value], path: Path) -> list[P
     return inputs(config, [] if sweep.input is None else [folder / sweep.input], others=others)
 
 
-def _jobs(sweep: SweepConfig, base: Mapping[str, Value], point: Point, recording: Path | None) -> Iterator[Job]:
+class _Reads:
+    """What decides the results of jobs besides their settings; `recording` is read once for each way to read it."""
+
+    def __init__(self, recording: Path | None) -> None:
+        self.recording = recording
+        self._plugins: list[Value] = [ESTIMATORS.sources(), MOTION_MODELS.sources()]
+        self._known: dict[str, list[Value]] = {}
+
+    def __call__(self, scenario: Scenario | None, config: Config) -> list[Value]:
+        """Fingerprints of what such a job reads and runs."""
+        key = compact(plain([config.input, config.map, config.clock, scenario and scenario.map]))
+        if key not in self._known:
+            self._known[key] = [*fingerprints(self.recording, scenario, config), *self._plugins]
+        return self._known[key]
+
+
+def _jobs(sweep: SweepConfig, base: Mapping[str, Value], point: Point, reads: _Reads) -> Iterator[Job]:
     """The jobs of one grid point, one for each seed."""
     try:
         values = _with_keys(base, point.changes, "vary")
@@ -347,15 +364,15 @@ def _jobs(sweep: SweepConfig, base: Mapping[str, Value], point: Point, recording
         problem = f"{point.description}: {error}" if point.description else str(error)
         yield from (Job(point.cells, seed, "", None, problem) for seed in sweep.seeds)
         return
-    files = fingerprints(recording, scenario, config)
+    files = reads(scenario, config)
     for seed in sweep.seeds:
-        name = None if recording is None else str(recording)
+        name = None if reads.recording is None else str(reads.recording)
         recipe = Recipe(plain(scenario), name, plain(delays), plain(config), seed, sweep.estimators)
         yield Job(point.cells, seed, job_key(recipe, files), recipe)
 
 
 def job_key(recipe: Recipe, files: Sequence[Value]) -> str:
-    """Hash of what decides the cells of a job, in hex; `files` are the fingerprints of what it reads."""
+    """Hash of what decides the cells of a job, in hex; `files` are the fingerprints of what it reads and runs."""
     content = {**plain(recipe), "recording": None, "files": files, "versions": versions()}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
 

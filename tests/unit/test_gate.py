@@ -77,6 +77,15 @@ def test_what_is_no_message_ends_the_input_in_one_short_line(message: object, co
     assert str(caught.value).isprintable()
 
 
+def test_descriptions_that_are_not_finite_are_none_and_measurements_pass_as_they_are() -> None:
+    given = Detection(x_m=float("inf"), score=float("nan"), length_m=float("-inf"), width_m=2.0, class_name="car")
+    (found,) = checked(Path("drive"), lambda: iter([replace(LIST, objects=(given,))]))
+    assert isinstance(found, DetectionList)
+    assert found.objects == (Detection(x_m=float("inf"), width_m=2.0, class_name="car"),)
+    (same,) = checked(Path("drive"), lambda: iter([LIST]))
+    assert same is LIST
+
+
 def test_a_recording_of_more_sensors_than_anyone_has_ends_there() -> None:
     """A name that counts, as a frame with a number: the run of 10,000 could be written, and not read again."""
     lists = [replace(LIST, sensor=f"radar{k}") for k in range(1_000)]

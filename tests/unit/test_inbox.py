@@ -72,9 +72,10 @@ def test_lists_of_one_stamp_that_differ_in_one_number_are_no_copies(number: Call
         assert inbox.put(message(Detection(x_m=10.0, y_m=number(y_m)))) == []
 
 
-def test_a_copy_in_another_order_is_recognised() -> None:
+def test_a_copy_in_another_order_is_recognised_and_another_number_of_each_is_no_copy() -> None:
     inbox, other = queue(), Detection(x_m=20.0, y_m=1.0)
     inbox.put(message(CAR, other))
+    assert inbox.put(message(CAR, CAR, other)) == []
     assert said(inbox.put(message(other, CAR, delay_ms=5.0))) == [(0, "duplicate"), (1, "duplicate")]
     assert inbox.put(message(CAR, other, other, delay_ms=10.0)) == []
 
@@ -85,6 +86,13 @@ def test_a_copy_of_a_list_with_a_detection_that_is_none_is_recognised() -> None:
     assert said(inbox.put(message(CAR, nan))) == [(1, "invalid")]
     again = message(CAR, Detection(x_m=float("nan") * 2.0, y_m=1.0), delay_ms=5.0)
     assert said(inbox.put(again)) == [(0, "duplicate"), (1, "duplicate")]
+
+
+def test_a_copy_is_recognised_by_its_bits_where_a_number_that_is_not_used_is_nan() -> None:
+    inbox = queue()
+    for delay_ms, refused in ((0.0, []), (5.0, [(0, "duplicate")])):
+        nan = Detection(x_m=10.0, y_m=1.0, z_m=float("nan"), class_name="".join(("c", "ar")))
+        assert said(inbox.put(message(nan, delay_ms=delay_ms))) == refused
 
 
 def test_lists_are_forgotten_once_they_are_too_old_anyway() -> None:

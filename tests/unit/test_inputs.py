@@ -1,8 +1,10 @@
 """What a command reads: its output must be none of it, and the key of a job follows it."""
 
+import os
 from pathlib import Path
 
 import pytest
+from support import kitti
 
 from fgtrack.core.errors import CallError
 from fgtrack.io.ros.typestore import definition_files
@@ -29,23 +31,30 @@ def test_a_folder_in_place_of_a_file_is_not_walked(folder: Path) -> None:
     given = config(
         map={"track": str(folder), "pit": str(folder), "excluded": [str(folder)]}, clock={"ticks_file": str(folder)}
     )
-    assert fingerprints(None, None, given) == []
+    assert set(fingerprints(None, None, given)) == {None}
     assert inputs(given) == []
 
 
-def test_of_a_recording_every_file_counts_of_definitions_these_of_the_others_the_file(folder: Path) -> None:
+def test_inputs_are_the_files_that_are_named(folder: Path) -> None:
     given = config(map={"track": str(folder / "a.csv")}, input={"message_definitions": [str(folder)]})
-    found = fingerprints(folder, None, given)
-    names = [[name for place, name, _, _ in found if place == one] for one in dict.fromkeys(row[0] for row in found)]
-    assert names == [["a.csv", "b.msg", "below/c.csv", "below/d.msg"], ["a.csv"], ["b.msg", "below/d.msg"]]
     assert set(inputs(given, [folder])) == {folder, folder / "a.csv"}
 
 
-def test_a_fingerprint_follows_its_file(folder: Path) -> None:
-    given = config(map={"track": str(folder / "a.csv")})
-    before = fingerprints(None, None, given)
-    (folder / "a.csv").write_text("another")
+def test_a_fingerprint_follows_the_content_of_a_file_whatever_its_size_and_time(folder: Path) -> None:
+    given, file = config(map={"track": str(folder / "a.csv")}), folder / "a.csv"
+    before, time_ns = fingerprints(None, None, given), file.stat().st_mtime_ns
+    file.write_text("b.csv")
+    os.utime(file, ns=(time_ns, time_ns))
     assert fingerprints(None, None, given) != before
+
+
+def test_a_fingerprint_follows_the_files_beside_the_one_that_is_named(tmp_path: Path) -> None:
+    """A sequence of KITTI is named by its file of `oxts/`, and its detections lie elsewhere."""
+    sequence = kitti.folder(tmp_path, rrc=[kitti.pose(0, 20.0, 1.0, 0.0)]) / "oxts/0001.txt"
+    before = fingerprints(sequence, None, config())
+    assert fingerprints(sequence, None, config()) == before
+    (tmp_path / "rrc/0001.txt").write_text(kitti.pose(0, 21.0, 1.0, 0.0))
+    assert fingerprints(sequence, None, config()) != before
 
 
 def test_folders_of_definitions_have_an_end(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

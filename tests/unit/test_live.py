@@ -1,14 +1,18 @@
 """The tracker in a running system: nothing that arrives may end it, and nothing is lost without a count."""
 
+import copy
+import json
 import math
+import pickle
 from collections import Counter
-from dataclasses import replace
+from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, TickReport, TruthState
+from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, ObjectReport, TickReport, TruthState
 from fgtrack.pipeline.live import Tracker
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.shipped import read_config, read_scenario
@@ -140,6 +144,74 @@ def test_a_list_in_a_frame_that_does_not_exist_is_invalid(frame: object) -> None
     tracker.receive(odd)
     assert [one.disposition for one in tracker.tick(NOW_NS).updates] == [Disposition.INVALID]
     assert tracker.refused == {"message cannot be read (DataError)": 1}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        ({"class_name": 7}, "class_name: a name of up to 200 characters expected"),
+        ({"length_m": "4.5"}, "length_m: a number expected"),
+        ({"covariance": {}}, "covariance: a tuple of numbers expected"),
+        ({"covariance": [[1.0], [1.0, 2.0]]}, None),
+    ],
+)
+def test_a_detection_of_wrong_types_is_invalid_with_a_reason_and_the_others_of_its_list_stay(
+    wrong: Any, reason: str | None
+) -> None:
+    tracker, report = started()
+    at_ns = report.now_ns + 10 * MS
+    good = seen(at_ns, at_ns).objects[0]
+    tracker.receive(replace(seen(at_ns, at_ns), objects=(replace(good, **wrong), good)))
+    rows = tracker.tick(at_ns).updates
+    assert [(row.index, row.disposition) for row in rows] == [(0, "invalid"), (1, "in_sequence")]
+    assert len(tracker.refused) == 1
+    assert reason is None or tracker.refused == {f"detection: {reason}": 1}
+    assert tracker.failures == {}
+
+
+@pytest.mark.parametrize("given", [[0.1, 0.0, 0.0, 0.2], np.diag([0.1, 0.2])], ids=["list", "array"])
+def test_a_covariance_may_be_a_list_or_an_array(given: Any) -> None:
+    found = []
+    for covariance in (given, (0.1, 0.0, 0.0, 0.2)):
+        tracker = Tracker.from_config("open_space", estimator="ekf-replay")
+        tracker.receive(DetectionList("radar", NOW_NS, NOW_NS, [Detection(5.0, 2.0, covariance=covariance)], "map"))
+        [track] = tracker.tick(NOW_NS).tracks
+        found.append(track.covariance)
+    np.testing.assert_array_equal(*found)
+    assert found[0][1, 1] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_description_that_is_not_finite_is_none(bad: float) -> None:
+    """One score of NaN made a track immortal, one length its size NaN for good, and a filter let it pass."""
+    sensor = {"score": {"even": 0.5, "scale": 0.2}, "filters": {"score": {"min": 0.5}}}
+    rules = {"lifecycle": {"kind": "existence"}, **{f"sensors.radar.{key}": value for key, value in sensor.items()}}
+    tracker = Tracker.from_config("open_space", estimator="ekf-replay", set=rules)
+    for k in range(60):
+        at_ns = NOW_NS + 100 * k * MS
+        tracker.receive(EgoState(at_ns, at_ns, 0.0, 0.0, 0.0, 0.0))
+        far = Detection(300.0, 300.0, score=bad)
+        near = Detection(10.0 + k, 1.0, score=0.9, length_m=bad if k == 3 else 4.5, height_m=bad)
+        tracker.receive(DetectionList("radar", at_ns, at_ns, [far, near] if k < 20 else [far], "map"))
+        report = tracker.tick(at_ns)
+        if k == 19:
+            [track] = report.tracks
+            assert track.object == ObjectReport(length_m=pytest.approx(4.5))
+    assert report.tracks == ()
+    assert tracker.counts["radar"]["out_of_bounds"] == 60
+
+
+def test_reports_and_configurations_pickle_copy_and_turn_into_dicts() -> None:
+    tracker, report = started()
+    at_ns = report.now_ns + 10 * MS
+    tracker.receive(seen(at_ns, at_ns))
+    report = tracker.tick(at_ns)
+    for value in (report.updates[0], tracker.config):
+        assert pickle.loads(pickle.dumps(value)) == copy.deepcopy(value) == value
+        assert asdict(value)
+    assert json.dumps(asdict(report.updates[0])["innovation"])
+    assert repr(pickle.loads(pickle.dumps(report))) == repr(copy.deepcopy(report)) == repr(report)
+    assert asdict(report)["tracks"][0]["track_id"] == report.tracks[0].track_id
 
 
 @pytest.mark.parametrize("config", [None, "smoother", 5])

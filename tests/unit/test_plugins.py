@@ -1,6 +1,7 @@
 """Names of built-in parts and of plug-ins, and what is said where one of them is wrong."""
 
 import logging
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -50,6 +51,18 @@ def test_built_in_parts_come_first_and_plug_ins_are_loaded_by_name(registry: Reg
     assert registry.load("ours") is Path
     assert registry.load("part").__module__ == "sound_plugin"
     assert registry.plugins() == {"part": "sound 1.0", "wrong": "wrecked 1.0", "zero": "wrecked 1.0"}
+
+
+def test_the_source_of_a_plug_in_follows_its_code(
+    registry: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its version may stay, as where it is being written."""
+    monkeypatch.delitem(sys.modules, "sound_plugin", raising=False)  # of another test
+    before = registry.sources()
+    (tmp_path / "sound_plugin.py").write_text("class Part:\n    better = True\n")
+    after = registry.sources()
+    assert {name for name in before if before[name] != after[name]} == {"part"}
+    assert after["wrong"].startswith("wrecked 1.0 ")
 
 
 def test_a_name_that_is_taken_is_left_out_with_a_line(registry: Registry, caplog: pytest.LogCaptureFixture) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from fgtrack.core.errors import CallError
+from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.load import dump, plain
 from fgtrack.pipeline.shipped import read_scenario
@@ -285,17 +286,11 @@ def test_a_changed_map_or_recording_changes_the_key(plan: Any, recording: str, t
         assert keys(plan(text, head)) != before
 
 
-def test_changed_areas_tables_or_definitions_change_the_key(plan: Any, recording: str, tmp_path: Path) -> None:
-    """What a configuration names is read by the job as well, be it beside the recording."""
-    shore, cars = tmp_path / "shore.csv", tmp_path / "cars.csv"
-    truth = "{file: cars.csv, columns: {stamp: t, x_m: x, y_m: y}}"
-    text = (
-        f"set: {{map.excluded: [{shore}], input.csv.truth: {truth}, input.message_definitions: [{tmp_path / 'a.msg'}]}}"
-    )
-    for file in (shore, cars, tmp_path / "a.msg"):
-        before = keys(plan(text, recording))
-        file.write_text("a")
-        assert keys(plan(text, recording)) != before
+def test_changed_areas_change_the_key(plan: Any, recording: str, tmp_path: Path) -> None:
+    shore = tmp_path / "shore.csv"
+    before = keys(plan(text := f"set: {{map.excluded: [{shore}]}}", recording))
+    shore.write_text("a")
+    assert keys(plan(text, recording)) != before
 
 
 def test_the_key_knows_the_versions(plan: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -339,3 +334,10 @@ def test_a_sweep_of_the_scenario_cannot_take_a_recording(tmp_path: Path) -> None
     (tmp_path / "sweep.yaml").write_text(f"{HEAD}\nvary: {{scenario.sensors.radar.rate_hz: [20.0]}}")
     with pytest.raises(CallError, match="changes the scenario, of which this sweep has none"):
         load_plan(tmp_path / "sweep.yaml", tmp_path / "drive.jsonl")
+
+
+def test_the_key_of_a_job_follows_the_code_of_plug_ins(plan: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    (before,) = plan("").jobs
+    assert plan("").jobs == (before,)
+    monkeypatch.setattr(ESTIMATORS, "sources", lambda: {"mine": "package 1.0 of other code"})
+    assert plan("").jobs[0].key != before.key
