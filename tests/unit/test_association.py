@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 from support.tracking import bearing, candidate, states
 
+from fgtrack.core.types import BoolArray, IntArray
 from fgtrack.models.measurement import SensorPose
 from fgtrack.tracking.assignment import Assignment
 from fgtrack.tracking.association import Association, GatedEuclidean, GatedMahalanobis, chi_square_quantile
@@ -210,6 +211,16 @@ def test_a_candidate_near_a_track_that_is_not_its_own_starts_none() -> None:
     claimed = GatedMahalanobis(claim_m=20.0)(seen, tracks)
     assert (claimed.pairs, claimed.new, claimed.missed, claimed.refused) == ([(0, 0)], [2], [1], (1, 3))
     assert GatedMahalanobis(claim_m=20.0)(seen[1:2], states([])).new == [0]
+
+
+def test_a_track_claims_no_candidate_of_another_class() -> None:
+    tracks, seen = states([(0.0, 0.0)]), [candidate(12.0, 0.0), candidate(0.0, 12.0)]
+
+    def of_another_class(rows: IntArray, columns: IntArray) -> BoolArray:
+        return np.asarray(rows == 1)
+
+    found = GatedMahalanobis(claim_m=20.0)(seen, tracks, of_another_class)
+    assert (found.new, found.refused) == ([1], (0,))
 
 
 @pytest.mark.parametrize("claim_m", [-1.0, math.inf, math.nan])

@@ -137,6 +137,28 @@ def test_a_position_on_an_endless_line_proves_nothing(angle_rad: float) -> None:
     assert 0.0 < probability(life, 20.0) < 0.2001
 
 
+def test_a_late_list_takes_nothing_back_of_when_the_track_was_last_in_view() -> None:
+    life = lifecycle(replace(STILL, out_of_view_s=0.5))
+    life.born(0, look("ahead"), Sighting(HERE))
+    for at_ms in (400.0, 100.0):  # the second one late
+        life.matched(0, look("ahead", at_ms, ego=ego()), Sighting(HERE, MEAN, P))
+    elsewhere = look("ahead", 800.0, ego=ego(x_m=100.0))
+    assert life.missed(elsewhere, [0], np.array([[10.0, 0.0]]), np.array([90.0])) == []
+
+
+def test_the_score_of_a_match_counts_as_much_as_its_place() -> None:
+    found = []
+    for score in (3.0, 2.5):
+        life = lifecycle()
+        life.born(0, look("scored"), Sighting(HERE))
+        seen = (Detection(x_m=12.0, y_m=0.0, score=score),)
+        life.matched(0, look("scored", 10.0, objects=seen), Sighting(candidate(12.0, 0.0), MEAN, P))
+        found.append(probability(life, 10.0))
+    odds = [4.0 * p / (1.0 - p) for p in found]  # at birth 1 / 4
+    missed = 1.0 - SENSORS["scored"].detection_probability
+    assert (odds[0] - missed) / (odds[1] - missed) == pytest.approx(math.e, rel=1e-6)
+
+
 def test_a_better_score_makes_an_object_more_probable() -> None:
     found = []
     for score in (2.0, None, 3.0, 5.0):

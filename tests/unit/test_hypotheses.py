@@ -48,7 +48,8 @@ def joint_density(motion: MotionModel, start: Start, measurements: list[Measurem
 def test_the_weights_are_those_of_the_joint_density_in_any_order(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fgtrack.estimation.hypotheses.SAME", 0.0)
     motion = CV(2.0)
-    given = [replace(START, position_m=(x_m, 0.0)) for x_m in (0.0, 0.7, -0.4)]
+    spreads = (0.0, 0.5), (0.7, 2.0), (-0.4, 1.0)
+    given = [replace(START, position_m=(x_m, 0.0), position_std_m=std_m) for x_m, std_m in spreads]
     measurements = [at(100, 0.5, 0.2), at(250, 1.2, 0.1), at(400, 1.4, -0.6)]
     logs = np.array([joint_density(motion, start, measurements) for start in given])
     expected = np.exp(logs - logs.max()) / np.exp(logs - logs.max()).sum()
@@ -145,6 +146,20 @@ def test_two_that_have_become_the_same_are_one() -> None:
     estimator.update(at(100, 1.5, 0.0))
     assert isinstance(estimator, Hypotheses)
     assert len(estimator.estimators) == 1
+
+
+def test_two_that_have_become_the_same_are_as_probable_as_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = [replace(START, yaw_rad=0.0, speed_mps=speed_mps) for speed_mps in (15.0, 15.1, 30.0)]
+    found = []
+    for same in (0.0, 1.0):
+        monkeypatch.setattr("fgtrack.estimation.hypotheses.SAME", same)
+        estimator = fgtrack.estimator("ekf-replay", CTRV(), START, hypotheses=given)
+        estimator.update(at(100, 1.5, 0.0))
+        assert isinstance(estimator, Hypotheses)
+        found.append(estimator.weights)
+    separate, joined = found
+    assert separate[2] < 0.1  # the third is another one, and less probable
+    np.testing.assert_allclose(joined, [separate[0] + separate[1], separate[2]], rtol=1e-9)
 
 
 def test_a_measurement_that_no_hypothesis_takes_changes_nothing() -> None:

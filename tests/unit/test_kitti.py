@@ -130,6 +130,14 @@ def test_a_neighbouring_class_and_regions_are_ignored(tmp_path):
     assert corners == pytest.approx(np.column_stack([ahead, aside]))
 
 
+def test_a_region_too_flat_to_hold_a_car_near_by_begins_at_half_of_the_distance_where_it_ends(tmp_path):
+    """1 px high a car of 1.5 m is half inside it at 525 m, behind its end at 150 m."""
+    region = f"0 -1 DontCare -1 -1 -10 {CENTRE_PX[0]} 180 {CENTRE_PX[0] + 10} 181 -1 -1 -1 -1000 -1000 -1000 -10"
+    dont_care, *_ = messages(folder(tmp_path, label_02=[region]))
+    distances_m = np.hypot(*(np.reshape(dont_care.outline_m, (4, 2)) - [2.0, 0.5]).T)
+    assert distances_m == pytest.approx([75.0, 75.0, 150.0, 150.0])
+
+
 KITTI = "0 7 Car 0 0 0.1 400 170 460 190 1.5 1.6 4.0"
 
 

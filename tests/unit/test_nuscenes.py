@@ -9,6 +9,7 @@ import pytest
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.io.adapters.ids import object_id
+from fgtrack.io.adapters.nuscenes import _motion
 from fgtrack.io.config import InputConfig, NuscenesInput
 from fgtrack.io.source import input_kind, open_input
 
@@ -156,3 +157,13 @@ def test_without_tables_the_setting_is_named(tmp_path):
         messages(path, tables="elsewhere")
     (tmp_path / "v1.0-mini").rename(tmp_path / "meta")
     assert len(messages(path, tables="meta")) == 6
+
+
+@pytest.mark.parametrize(
+    ("yaws_rad", "course_rad"), [((0.0, 3.0), 2.9), ((0.0, 3.0), 0.1), ((3.0, -3.0), math.pi)], ids=repr
+)
+def test_an_ego_that_turns_drives_forward_where_it_goes_along_its_mean_heading(yaws_rad, course_rad):
+    """Neither the first heading nor the last says so, nor their mean across the cut at pi."""
+    ahead = 5.0 * math.cos(course_rad), 5.0 * math.sin(course_rad)
+    speed_mps, _ = _motion((0.0, 0.0, yaws_rad[0]), (*ahead, yaws_rad[1]), 0.5)
+    assert speed_mps == pytest.approx(10.0)

@@ -265,6 +265,12 @@ def test_merged_detections_keep_what_all_of_them_measure() -> None:
     assert found.values == pytest.approx({"x_m": 1.0, "y_m": 0.00005})
 
 
+def test_the_covariance_of_merged_detections_is_the_mean_of_theirs() -> None:
+    own = [Detection(x_m=float(k), y_m=0.0, covariance=(1.0 + k, 0.0, 0.0, 4.0 * k + 1.0)) for k in range(3)]
+    [found] = candidates(*own, sensor=POINTS, merge=ConnectedMerge(5.1), frame="map")
+    assert pytest.approx(np.diag([2.0, 5.0])) == found.measurement.R
+
+
 @pytest.mark.parametrize("merge", [ConnectedMerge(5.1), NeighbourhoodMerge()])
 def test_detections_that_say_in_different_ways_where_they_are_merge_into_the_first(merge: Merge) -> None:
     both = SensorModel(std={"x_m": 0.3, "y_m": 0.3, "range_m": 0.5, "bearing_rad": 0.02})
