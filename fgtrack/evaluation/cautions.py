@@ -185,10 +185,19 @@ def _too_old(run: Run, sensor: str) -> str:
     delay_s = float(np.median(run.updates["receipt_ns"][mine] - run.updates["stamp_ns"][mine])) / NS_PER_S
     limit_s = (_section(run, "sensors").get(sensor) or {}).get("max_delay_s")
     if limit_s is not None and delay_s > limit_s:
+        return f"median delay {delay_s:.3g} s, allowed {limit_s:g} s: raise sensors.{sensor}.max_delay_s or correct its clock"
+    window, lag_s = _told_window(run)
+    if delay_s > lag_s:
+        return f"median delay {delay_s:.3g} s, older than {window}: raise it, or correct the clock"
+    if run.meta.get("estimator") == "drop":
         return (
-            f"median delay {delay_s:.3g} s, allowed {limit_s:g} s: raise sensors.{sensor}.max_delay_s or mend its clock"
+            f"median delay {delay_s:.3g} s, and `drop` ignores by design what is older than the newest detection that "
+            "a track has fused, whatever the window: use an estimator that fuses it, such as ekf-replay"
         )
-    return f"median delay {delay_s:.3g} s, older than {_told_window(run)[0]}: raise it, or mend the clock"
+    return (
+        f"median delay {delay_s:.3g} s, within {window}: no track is as old as these detections, check births, gate "
+        "and clock"
+    )
 
 
 def _window(run: Run) -> Iterator[Caution]:

@@ -77,14 +77,23 @@ def test_half_is_not_most(tmp_path: Path) -> None:
 
 
 def test_too_old_names_the_limit_that_was_passed(tmp_path: Path) -> None:
-    late = [update(tick=k, disposition=Disposition.TOO_OLD, delay_ns=450_000_000) for k in range(5)]
+    late = [update(tick=k, disposition=Disposition.TOO_OLD, delay_ns=3_500_000_000) for k in range(5)]
     (by_sensor,) = cautions(run_of(tmp_path / "a", late))
-    assert "median delay 0.45 s, allowed 0.4 s: raise sensors.lidar.max_delay_s" in by_sensor.text
+    assert "median delay 3.5 s, allowed 0.4 s: raise sensors.lidar.max_delay_s" in by_sensor.text
     (by_window,) = cautions(run_of(tmp_path / "b", late, CONFIG.replace("max_delay_s: 0.4", "max_delay_s: 9.0")))
-    assert "the window (smoother.lag_s 1 s)" in by_window.text
+    assert "older than the window (smoother.lag_s 1 s)" in by_window.text
     unlimited = CONFIG.replace("{max_delay_s: 0.4}", "{}")
     (by_storage,) = cautions(run_of(tmp_path / "c", late, unlimited, FILTER))
-    assert "the window (filter.storage_s 3 s)" in by_storage.text
+    assert "older than the window (filter.storage_s 3 s)" in by_storage.text
+
+
+def test_what_drop_ignores_is_not_blamed_on_the_window(tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", lists(Disposition.TOO_OLD, 5), effective=FILTER)
+    (dropped,) = cautions(replace(run, meta={**run.meta, "estimator": "drop"}))
+    assert dropped.text.startswith("5 of 5 too_old: median delay 0.15 s, and `drop` ignores by design")
+    assert "raise" not in dropped.text
+    (young,) = cautions(run)
+    assert "within the window (filter.storage_s 3 s): no track is as old" in young.text
 
 
 def test_stamps_that_nobody_set_and_a_window_shorter_than_a_period_are_told(tmp_path: Path) -> None:
