@@ -32,6 +32,8 @@ def info(recording: Input, config_file: ConfigFile = None, as_json: Json = False
     show(topics, form, {**_values(found, topics), "effective": comes_to.values()})
     if form is None:
         sentences([f"{config_file or 'without a configuration'}: {comes_to}"])
+    for one in found.cautions:
+        warn(str(one))
     trial = None
     if config is not None and found.problem is None and form is None:
         trial = _try_out(recording, config)
@@ -60,7 +62,7 @@ def _try_out(recording: Path, config: Config) -> Trial:
 def _values(found: InputInfo, topics: Table) -> dict[str, object]:
     """JSON values."""
     about = {"path": str(found.path), "kind": found.kind, "start_ns": found.start_ns, "duration_s": found.duration_s}
-    return {**about, "problem": found.problem, "topics": topics.records()}
+    return {**about, "problem": found.problem, "cautions": list(map(str, found.cautions)), "topics": topics.records()}
 
 
 def _heading(found: InputInfo) -> str:

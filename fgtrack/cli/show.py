@@ -1,6 +1,7 @@
 """What commands show: tables on stdout, progress on stderr where that is a terminal."""
 
 import json
+import os
 import shlex
 import sys
 import time
@@ -36,9 +37,9 @@ _SPEED_PERIOD_S = 600.0  # over which the time of the rest is estimated: jobs di
 
 
 def console() -> Console:
-    """Stdout; wide enough for every table where it is a file or a pipe."""
+    """Stdout; a file or a pipe is as wide as COLUMNS says, by default wide enough for nearly every table."""
     probe = Console()
-    return probe if probe.is_terminal else Console(width=_WIDTH_WITHOUT_TERMINAL)
+    return probe if probe.is_terminal or os.environ.get("COLUMNS") else Console(width=_WIDTH_WITHOUT_TERMINAL)
 
 
 def say(line: object) -> None:

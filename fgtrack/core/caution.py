@@ -1,9 +1,12 @@
 """What a person must know before believing a recording or a run."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-__all__ = ["EGO", "Caution"]
+__all__ = ["EGO", "Caution", "in_degrees"]
+
+_LARGEST_ANGLE_RAD = 2.0 * math.pi + 0.01
 
 EGO = "ego"
 """What a caution of the ego is about."""
@@ -24,3 +27,11 @@ class Caution:
 
     def __str__(self) -> str:
         return f"{self.about}: {self.text}"
+
+
+def in_degrees(about: str, name: str, largest: float) -> Caution | None:
+    """Caution that the angle `name`, whose largest magnitude is given, is in degrees; None below a full circle."""
+    if not largest > _LARGEST_ANGLE_RAD:
+        return None
+    text = f"{name} goes up to {largest:.4g}: degrees? Convert it by `{{path: ..., degrees: true}}`"
+    return Caution(about, text, spoils=True)

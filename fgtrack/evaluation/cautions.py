@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from fgtrack.core.caution import EGO, Caution
-from fgtrack.core.time import NS_PER_S
+from fgtrack.core.caution import EGO, Caution, in_degrees
+from fgtrack.core.time import NS_PER_S, wrong_unit
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.failures import Failure
 from fgtrack.evaluation.innovations import num_measured
 from fgtrack.evaluation.left_out import because
 from fgtrack.evaluation.statistics import ChiSquareMean
 from fgtrack.io.run import Run, Table, digest
+from fgtrack.models.measurement import ANGULAR
 from fgtrack.tracking.soundness import IN_A_ROW
 
 USED = ("birth", "in_sequence", "out_of_sequence", "beyond_window", "merged")
@@ -42,7 +43,7 @@ _NAME_EGO = "name its topic in the configuration (`fgtrack info` lists the topic
 
 def cautions(run: Run) -> list[Caution]:
     """What is wrong with `run` as far as its files say."""
-    found = (_changed, _clocks, _ego, _map, _lost, _window, _failures)
+    found = (_changed, _clocks, _angles, _ego, _map, _lost, _window, _failures)
     return [one for of_kind in found for one in of_kind(run)]
 
 
@@ -115,6 +116,19 @@ def _clocks(run: Run) -> Iterator[Caution]:
                 f"`stamp_from: receipt` on its topic, or sensors.{sensor}.stamp_from, takes the receipt for the stamp"
             )
             yield Caution(sensor, text, {f"sensors.{sensor}.stamp_from": "receipt"})
+        receipts_ns = np.unique(run.updates["receipt_ns"][mine])
+        if unit := wrong_unit(len(receipts_ns), int(receipts_ns[0]), int(receipts_ns[-1])):
+            yield Caution(sensor, unit)
+
+
+def _angles(run: Run) -> Iterator[Caution]:
+    """Angles that were recorded in degrees and read as radians."""
+    by_sensor = ((sensor, run.detections, mine) for sensor, mine in _by_sensor(run.detections))
+    for about, table, mine in [(EGO, run.ego, slice(None)), *by_sensor]:
+        for name in ANGULAR:
+            values = np.abs(table[name][mine]) if name in table else np.empty(0)
+            found = in_degrees(about, name, float(values[np.isfinite(values)].max(initial=0.0)))
+            yield from () if found is None else (found,)
 
 
 def _ego(run: Run) -> Iterator[Caution]:
@@ -185,7 +199,8 @@ def _too_old(run: Run, sensor: str) -> str:
     delay_s = float(np.median(run.updates["receipt_ns"][mine] - run.updates["stamp_ns"][mine])) / NS_PER_S
     limit_s = (_section(run, "sensors").get(sensor) or {}).get("max_delay_s")
     if limit_s is not None and delay_s > limit_s:
-        return f"median delay {delay_s:.3g} s, allowed {limit_s:g} s: raise sensors.{sensor}.max_delay_s or correct its clock"
+        cure = f"raise sensors.{sensor}.max_delay_s or correct its clock"
+        return f"median delay {delay_s:.3g} s, allowed {limit_s:g} s: {cure}"
     window, lag_s = _told_window(run)
     if delay_s > lag_s:
         return f"median delay {delay_s:.3g} s, older than {window}: raise it, or correct the clock"

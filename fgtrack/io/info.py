@@ -1,21 +1,26 @@
 """What is in an input: its topics or sensors with counts, rates and delays."""
 
+import math
 from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from fgtrack.core.caution import Caution, in_degrees
 from fgtrack.core.errors import DataError
-from fgtrack.core.time import seconds
-from fgtrack.core.types import DetectionList, EgoState
+from fgtrack.core.time import seconds, wrong_unit
+from fgtrack.core.types import Detection, DetectionList, EgoState, TruthState
 from fgtrack.io.adapters import ADAPTERS
 from fgtrack.io.adapters.ego import ODOMETRY
+from fgtrack.io.adapters.native import TRUTH
 from fgtrack.io.config import InputConfig
 from fgtrack.io.errors import TruncatedInput, UntilBreak
 from fgtrack.io.ros.bag import Bag, BagTopic
 from fgtrack.io.ros.topics import topic_uses
 from fgtrack.io.source import input_kind, open_input
+from fgtrack.models.measurement import ANGULAR
 
 OTHER_CLOCK_S = 3600.0
 """Nothing is that late: the stamps and the recorder have different clocks."""
@@ -61,6 +66,8 @@ class InputInfo:
     topics: tuple[TopicInfo, ...]
     problem: str | None
     """Where the input breaks off, or why a replay with the configuration would refuse it."""
+    cautions: tuple[Caution, ...] = ()
+    """Times and angles that are probably in another unit."""
 
 
 def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
@@ -80,16 +87,19 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
     used, notes, problem = read(path, config, times)
     topics = tuple(
         TopicInfo(
-            *(*key, len(times[key].receipts_ns), times[key].rate_hz(), times[key].delay()),
+            *(*key, times[key].count, times[key].rate_hz(), times[key].delay()),
             used_as=used.get(key),
             note=notes.get(key),
         )
         for key in sorted(times)
     )
-    receipts_ns = [receipt for item in times.values() for receipt in item.receipts_ns]
-    start_ns = min(receipts_ns, default=None)
-    duration_s = 0.0 if start_ns is None else seconds(max(receipts_ns) - start_ns)
-    return InputInfo(path, kind, start_ns, duration_s, topics, problem)
+    start_ns = min((item.first_ns for item in times.values() if item.count), default=None)
+    end_ns = max((item.last_ns for item in times.values() if item.count), default=0)
+    duration_s = 0.0 if start_ns is None else seconds(end_ns - start_ns)
+    found = [one for (name, _), item in sorted(times.items()) for one in item.cautions(name)]
+    if start_ns is not None and not found and (text := wrong_unit(2, start_ns, end_ns)):
+        found = [Caution(str(path), text)]
+    return InputInfo(path, kind, start_ns, duration_s, topics, problem, tuple(found))
 
 
 _Key = tuple[str, str]  # name and type of a topic
@@ -97,22 +107,56 @@ _Found = tuple[dict[_Key, str], dict[_Key, str | None], str | None]  # uses, not
 
 
 class _Times:
-    """Receipts and delays of one topic."""
+    """Receipts, delays and angles of one topic."""
 
     def __init__(self) -> None:
-        self.receipts_ns: list[int] = []
+        self.receipts_ns: dict[int | None, list[int]] = defaultdict(list)  # by object, of truth
         self.delays_ns: list[int] = []
+        self._largest: dict[str, float] = {}  # magnitude of angles
+        self._same: tuple[int | None, int] = (None, 0)
 
-    def add(self, receipt_ns: int, stamp_ns: int | None) -> None:
-        self.receipts_ns.append(receipt_ns)
+    @property
+    def count(self) -> int:
+        return sum(map(len, self.receipts_ns.values()))
+
+    @property
+    def first_ns(self) -> int:
+        return min(map(min, self.receipts_ns.values()))
+
+    @property
+    def last_ns(self) -> int:
+        return max(map(max, self.receipts_ns.values()))
+
+    def add(self, receipt_ns: int, stamp_ns: int | None, object_id: int | None = None) -> None:
+        self.receipts_ns[object_id].append(receipt_ns)
         if stamp_ns is not None:
             self.delays_ns.append(receipt_ns - stamp_ns)
 
+    def at_this_stamp(self, stamp_ns: int | None) -> int:
+        """Number of messages of `stamp_ns` in a row before this one: of truth they are of as many other objects."""
+        self._same = (stamp_ns, self._same[1] + 1) if stamp_ns == self._same[0] else (stamp_ns, 0)
+        return self._same[1]
+
+    def add_angles(self, one: EgoState | TruthState | Detection) -> None:
+        for name in ANGULAR:
+            value = getattr(one, name, None)
+            if value is not None and self._largest.get(name, 0.0) < abs(value) < math.inf:
+                self._largest[name] = abs(value)
+
     def rate_hz(self) -> float | None:
-        if not self.receipts_ns:
-            return None
-        span_s = seconds(max(self.receipts_ns) - min(self.receipts_ns))
-        return (len(self.receipts_ns) - 1) / span_s if span_s > 0.0 else None
+        """Mean rate of one object, where there are several."""
+        spans_s = [seconds(max(found) - min(found)) for found in self.receipts_ns.values()]
+        intervals = self.count - len(spans_s)
+        return intervals / sum(spans_s) if sum(spans_s) > 0.0 else None
+
+    def cautions(self, name: str) -> Iterator[Caution]:
+        for found in self.receipts_ns.values():
+            if (text := wrong_unit(len(found), min(found), max(found))) is not None:
+                yield Caution(name, text)
+                break
+        for angle, largest in self._largest.items():
+            if (caution := in_degrees(name, angle, largest)) is not None:
+                yield caution
 
     def delay(self) -> DelayInfo | None:
         if not self.delays_ns:
@@ -135,7 +179,8 @@ def _read_bag(path: Path, config: InputConfig | None, times: dict[_Key, _Times])
         times[topic.name, topic.type] = _Times()
     try:
         for topic, log_ns, stamp_ns in bag.stamps():
-            times[topic.name, topic.type].add(log_ns, stamp_ns)
+            found = times[topic.name, topic.type]
+            found.add(log_ns, stamp_ns, found.at_this_stamp(stamp_ns) if topic.type == TRUTH else None)
     except TruncatedInput as error:
         problem = str(error)
     return used, {(topic.name, topic.type): _note(topic, times) for topic in bag.topics}, problem
@@ -162,5 +207,8 @@ def _read_messages(path: Path, config: InputConfig | None, times: dict[_Key, _Ti
             use = "ego" if isinstance(message, EgoState) else "truth"
             key = (use, use)
         used[key] = use
-        times[key].add(message.receipt_ns, message.stamp_ns)
+        own_id = message.object_id if isinstance(message, TruthState) else None
+        times[key].add(message.receipt_ns, message.stamp_ns, own_id)
+        for one in message.objects if isinstance(message, DetectionList) else (message,):
+            times[key].add_angles(one)
     return used, {}, None if messages.error is None else str(messages.error)

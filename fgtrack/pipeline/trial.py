@@ -7,7 +7,7 @@ from itertools import takewhile
 
 import numpy as np
 
-from fgtrack.core.caution import EGO, Caution
+from fgtrack.core.caution import EGO, Caution, in_degrees
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DESCRIBING, MEASURABLE, Detection, DetectionList, EgoState, Message, TruthState
@@ -21,7 +21,6 @@ from fgtrack.pipeline.replay import replay_in_memory
 __all__ = ["TRIAL_S", "Trial", "beginning", "suspicions", "try_out"]
 
 TRIAL_S = 5.0
-_FULL_CIRCLE_RAD = 2.0 * math.pi + 0.01
 _FAR_M, _NEARER = 250.0, 0.3  # what is so far, and so much nearer in another frame, is in that one
 
 
@@ -102,9 +101,8 @@ def _degrees(name: str, states: Sequence[EgoState | TruthState | Detection]) -> 
     for angle in ANGULAR:
         values = [abs(value) for state in states if (value := getattr(state, angle, None)) is not None]
         largest = max((value for value in values if math.isfinite(value)), default=0.0)
-        if largest > _FULL_CIRCLE_RAD:
-            text = f"{angle} goes up to {largest:.4g}: degrees? Convert it by `{{path: ..., degrees: true}}`"
-            yield Caution(name, text, spoils=True)
+        if (found := in_degrees(name, angle, largest)) is not None:
+            yield found
 
 
 def _frames(name: str, lists: Sequence[DetectionList], egos: Sequence[EgoState]) -> Iterator[Caution]:

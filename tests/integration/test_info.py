@@ -1,8 +1,12 @@
+from shutil import copyfile
+
 import pytest
 from mcap.writer import Writer as McapWriter
 from support.messages import START_NS, drive, shared
 
+from fgtrack.cli.main import run
 from fgtrack.core.errors import DataError
+from fgtrack.core.types import DetectionList, EgoState, TruthState
 from fgtrack.io.config import InputConfig, TopicInput
 from fgtrack.io.info import describe
 from fgtrack.io.ros.bag_writer import write_bag
@@ -48,6 +52,41 @@ def test_a_stream_is_described_by_its_sensors_up_to_the_break(tmp_path):
     assert topics["ego"].delay.max_s == 0.0
 
 
+def test_the_rate_of_truth_is_that_of_an_object(tmp_path):
+    truth = [TruthState(k * 100_000_000, k * 100_000_000, own_id, 0.0, 0.0) for k in range(11) for own_id in range(3)]
+    write_stream(tmp_path / "a.jsonl", truth)
+    (topic,) = describe(tmp_path / "a.jsonl").topics
+    assert (topic.count, topic.rate_hz) == (33, pytest.approx(10.0))
+    write_bag(tmp_path / "bag", truth)
+    assert by_name(describe(tmp_path / "bag"))["/fgtrack/truth"].rate_hz == pytest.approx(10.0)
+
+
+def test_times_and_angles_in_another_unit_are_pointed_out(tmp_path):
+    """Seconds for nanoseconds, degrees for radians, and a clock that begins in 1970 beside one of today."""
+    write_stream(tmp_path / "fine.jsonl", drive())
+    assert describe(tmp_path / "fine.jsonl").cautions == ()
+    seconds = [EgoState(1_700_000_000 + k // 100, 1_700_000_000 + k // 100, k, 0.0, 67.0, 1.0) for k in range(900)]
+    write_stream(tmp_path / "s.jsonl", seconds)
+    by_time, by_angle = map(str, describe(tmp_path / "s.jsonl").cautions)
+    assert by_time.startswith("ego: 900 times within 8e-09 s, which no sensor sends: they are not in nanoseconds, they")
+    assert by_time.endswith("look like s since 1970")
+    assert by_angle.startswith("ego: yaw_rad goes up to 67: degrees?")
+    clocks = [EgoState(0, 0, 0.0, 0.0, 0.0, 0.0), DetectionList("radar", START_NS, START_NS, ())]
+    write_stream(tmp_path / "clocks.jsonl", clocks)
+    (one,) = describe(tmp_path / "clocks.jsonl").cautions
+    assert "years long: its times are of several units or clocks (`time_unit` of CSV tables)" in str(one)
+
+
+def test_a_copy_of_a_file_beside_it_is_refused(tmp_path):
+    write_bag(tmp_path / "bag", drive())
+    (file,) = (tmp_path / "bag").glob("*.mcap")
+    (tmp_path / "two").mkdir()
+    for name in ("a.mcap", "b.mcap"):
+        copyfile(file, tmp_path / "two" / name)
+    with pytest.raises(DataError, match=r"two: a\.mcap and b\.mcap are copies of one recording: remove or name one"):
+        describe(tmp_path / "two")
+
+
 def test_every_shared_recording_is_described_or_refused_in_one_line():
     root = shared("data/bags")
     paths = [*root.rglob("*.mcap"), *root.rglob("*.db3"), *(file.parent for file in root.rglob("metadata.yaml"))]
@@ -91,3 +130,13 @@ def test_a_channel_without_a_type_is_listed_with_its_problem(tmp_path):
     (topic,) = describe(tmp_path / "x.mcap", InputConfig()).topics
     assert topic.name == "/plain"
     assert "a type without a name is neither in the recording nor known" in topic.note
+
+
+def test_a_pipe_is_as_wide_as_columns_says(tmp_path, monkeypatch, capsys):
+    write_bag(tmp_path / "bag", drive())
+    for columns, widest in ((None, 120), ("80", 80)):
+        monkeypatch.delenv("COLUMNS", raising=False) if columns is None else monkeypatch.setenv("COLUMNS", columns)
+        monkeypatch.chdir(tmp_path)
+        assert run(["info", "bag"]) == 0
+        longest = max(map(len, capsys.readouterr().out.splitlines()))
+        assert widest - 40 < longest <= widest

@@ -153,3 +153,22 @@ def test_jumps_of_the_ego_are_told(jumps: int, told: str | None, tmp_path: Path)
     ego = Table({name: column(name, [0, 1]) for name in run.ego})
     found = list(map(str, cautions(replace(run, ego=ego, meta={**run.meta, "ego_jumps": jumps}))))
     assert [f"ego: its place {told}" in each for each in found] == ([] if told is None else [True])
+
+
+def test_seconds_in_place_of_nanoseconds_are_told(tmp_path: Path) -> None:
+    times = [UpdateRecord("lidar", 1_700_000_000 + k, 1_700_000_000 + k, 0, Disposition.IN_SEQUENCE) for k in range(20)]
+    (found,) = cautions(run_of(tmp_path / "run", times))
+    assert "20 times within 1.9e-08 s, which no sensor sends" in found.text
+    assert "they look like s since 1970" in found.text
+
+
+def test_angles_in_degrees_are_told(tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", [update(tick=k) for k in range(40)])
+    ego = {"yaw_rad": np.array([0.1, 67.0, np.nan])}
+    of_radar = {"sensor": np.array(["radar", "radar"]), "bearing_rad": np.array([-12.0, 6.0])}
+    found = cautions(replace(run, ego=Table(ego), detections=Table(of_radar)))
+    assert [str(one).split(":")[:2] for one in found[:2]] == [
+        ["ego", " yaw_rad goes up to 67"],
+        ["radar", " bearing_rad goes up to 12"],
+    ]
+    assert all("`{path: ..., degrees: true}`" in str(one) for one in found[:2])

@@ -150,10 +150,10 @@ def test_a_drive_survives_csv_to_the_bit(tmp_path):
         ("t,seen,x\n1,1,2\n", r"radar\.csv:1: has no column 'y', but t, seen, x"),
         ("t,seen,x,y,x\n", r"radar\.csv:1: has the column 'x' twice"),
         (RADAR_TEXT + "2,2,far,1\n", r"radar\.csv:5: x: 'far' is no number"),
-        (RADAR_TEXT + "noon,2,1,1\n", r"radar\.csv:5: t: 'noon' is no time"),
-        (RADAR_TEXT + "1e999999999,2,1,1\n", r"radar\.csv:5: t: '1e999999999' is no time"),
-        (RADAR_TEXT + "nan,2,1,1\n", r"radar\.csv:5: t: 'nan' is no time"),
-        (RADAR_TEXT + "1e15,2,1,1\n", "64 bit integer"),
+        (RADAR_TEXT + "noon,2,1,1\n", r"radar\.csv:5: t: 'noon' is not a time"),
+        (RADAR_TEXT + "1e999999999,2,1,1\n", r"radar\.csv:5: t: '1e999999999' is not a time"),
+        (RADAR_TEXT + "nan,2,1,1\n", r"radar\.csv:5: t: 'nan' is not a time"),
+        (RADAR_TEXT + "1e15,2,1,1\n", r"radar\.csv:5: t: 1e15 s is beyond the year 2096: set `time_unit: us`"),
         (RADAR_TEXT + "2,2,1\n", r"radar\.csv:5: has 3 cells, the header has 4"),
         (RADAR_TEXT + '2,2,"' + "1" * 200_000 + '",1\n', r"radar\.csv:5: is no CSV"),
         ("", r"radar\.csv:1: has no column 't'"),
@@ -174,6 +174,48 @@ def test_a_damaged_file_is_one_line_and_what_is_before_it_is_replayed(tmp_path, 
         assert run.detections.num_rows == 3
 
 
+@pytest.mark.parametrize(
+    ("unit", "times", "complaint"),
+    [
+        (
+            "ns",
+            [f"{1_700_000_000 + 0.05 * k:.2f}" for k in range(30)],
+            r"radar\.csv:2: t: 1700000000\.00 .*`time_unit: s`",
+        ),
+        ("ms", [f"{1_700_000_000 + 0.05 * k:.2f}" for k in range(30)], r"radar\.csv:2: t: .*set `time_unit: s`"),
+        (
+            "ns",
+            [f"{0.05 * k:.2f}" for k in range(100)],
+            r"radar\.csv:2: t: 0\.00 .*change `time_unit` \(input\.csv\.detec",
+        ),
+        ("s", [f"{1_700_000_000_000 + 50 * k}" for k in range(30)], r"radar\.csv:2: t: .*2096: set `time_unit: ms`"),
+        ("us", [f"{1_700_000_000_000_000_000 + 50 * k}" for k in range(3)], r"radar\.csv:2: t: .*set `time_unit: ns`"),
+    ],
+)
+def test_times_in_another_unit_name_file_row_column_and_unit(tmp_path, unit, times, complaint):
+    write(tmp_path, radar="t,x,y\n" + "".join(f"{time},1,2\n" for time in times))
+    with pytest.raises(DataError, match=complaint):
+        messages(tmp_path, detections={"radar": CsvTable({"stamp": "t", "x_m": "x", "y_m": "y"}, "radar.csv", unit)})
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+@pytest.mark.parametrize("start_s", [0.0, 1.7, 1_700_000_000.0])
+def test_times_in_their_unit_are_read(tmp_path, unit, factor, start_s):
+    write(tmp_path, radar="t,x,y\n" + "".join(f"{(start_s + 0.05 * k) * factor!r},1,2\n" for k in range(30)))
+    table = CsvTable({"stamp": "t", "x_m": "x", "y_m": "y"}, "radar.csv", unit)
+    assert len(messages(tmp_path, detections={"radar": table})) == 30
+
+
+def test_an_angle_of_many_turns_is_not_wrapped_as_it_may_be_in_degrees(tmp_path):
+    write(tmp_path, radar="t,a\n1,10\n2,290\n")
+    compass = Field("a", scale=-1.0, offset=90.0)
+    table = CsvTable({"stamp": "t", "bearing_rad": compass}, "radar.csv")
+    assert [item.objects[0].bearing_rad for item in messages(tmp_path, detections={"radar": table})] == [80.0, -200.0]
+    table = replace(table, columns={"stamp": "t", "bearing_rad": replace(compass, degrees=True)})
+    (north, south) = [item.objects[0].bearing_rad for item in messages(tmp_path, detections={"radar": table})]
+    assert (north, south) == pytest.approx((math.radians(80.0), math.radians(160.0)))
+
+
 def test_a_byte_that_is_no_text_is_one_line(tmp_path):
     (tmp_path / "radar.csv").write_bytes(RADAR_TEXT.encode() + b"2,2,\xff,1\n")
     with pytest.raises(DataError, match=r"radar\.csv: is no UTF-8 text"):
@@ -183,7 +225,7 @@ def test_a_byte_that_is_no_text_is_one_line(tmp_path):
 @pytest.mark.parametrize(
     ("tables", "complaint"),
     [
-        ({}, r"is CSV, so the configuration must say what its columns are \(input\.csv\.detections"),
+        ({}, r"name its columns in input\.csv: radar\.csv has t, seen, x, y"),
         ({"ego": CsvTable({"stamp": "t"}, "radar.csv")}, r"input\.csv\.ego\.columns: must name x_m"),
         (
             {"detections": {"radar": CsvTable({"x_m": "x"}, "radar.csv")}},

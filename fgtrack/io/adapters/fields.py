@@ -116,11 +116,15 @@ def _number(message: RosMessage, path: FieldPath, name: str) -> float:
 
 
 def converted(raw: float, path: FieldPath, name: str) -> float:
-    """What the component `name` is where `path` leads to `raw`."""
+    """Value of the component `name` where `path` leads to `raw`; an angle is wrapped.
+
+    An angle of more than 1.5 turns stays as it is: it may be in degrees, which wrapping would hide.
+    """
     if not isinstance(path, Field):
         return raw
     value = path.value(raw)
-    return wrap_angle(value) if name in ANGULAR and math.isfinite(value) else value
+    is_angle = name in ANGULAR and (path.degrees or abs(value) <= 3.0 * math.pi)
+    return wrap_angle(value) if is_angle and math.isfinite(value) else value
 
 
 def _raw(message: RosMessage, path: Path) -> float:

@@ -16,8 +16,10 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
+from fgtrack.core.checks import is_stamp
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.files import open_text
+from fgtrack.core.time import NS_PER_UNIT, epoch_unit
 from fgtrack.core.types import (
     DESCRIBING,
     MEASURABLE,
@@ -34,7 +36,7 @@ from fgtrack.io.adapters.ids import object_id
 from fgtrack.io.config import CsvInput, CsvTable, Field, FieldPath, InputConfig
 from fgtrack.io.source import FileFormat
 
-__all__ = ["FORMAT", "read_tables"]
+__all__ = ["FORMAT", "headers", "read_tables", "rows"]
 
 _ENDINGS = (".csv", ".tsv")
 _TIMES = ("stamp", "receipt")
@@ -42,7 +44,8 @@ _TEXTS = frozenset({"class_name", "object_id"})
 _EGO = frozenset({*_TIMES, *STATE_NAMES})
 _OBJECT = frozenset({*_TIMES, "object_id", *MEASURABLE, *DESCRIBING})
 _TRUTH = frozenset({*_TIMES, "object_id", *STATE_NAMES})
-_NS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
+_SHORTEST_NS = 100_000  # between two times of a table: 10 kHz
+_FEWEST = 10  # rows whose times have a period
 _LONGEST_LINE = 1_000_000
 _MOST_ROWS = 1_000_000
 _LONGEST_TIME = 25  # digits of a time before and behind the point
@@ -93,9 +96,10 @@ def read_tables(tables: Sequence[tuple[Path, CsvTable, str]]) -> Iterator[Messag
 
 def _read(file: Path, table: CsvTable, role: str) -> tuple[list[Message], DataError | None]:
     """All messages of a table, up to its end or to what is wrong with it."""
-    rows: list[tuple[_Times, Any]] = []
+    read: list[tuple[_Times, Any]] = []
     left_out: list[str] = []
     first: Cells | None = None  # of those left out
+    sample: Cells | None = None  # of those read
     error = None
     make: Make = partial(_state, table, role) if role in ("ego", "truth") else partial(_detection, table)
     try:
@@ -106,14 +110,17 @@ def _read(file: Path, table: CsvTable, role: str) -> tuple[list[Message], DataEr
                 first = first or cells
                 continue
             times = _times(cells, table)
-            rows.append((times, make(cells, times)))
-        if not rows and first is not None and role not in ("ego", "truth"):
-            rows.append((_times(first, table), None))  # an empty list, to say what was left out
+            sample = sample or cells
+            read.append((times, make(cells, times)))
+        if not read and first is not None and role not in ("ego", "truth"):
+            read.append((_times(first, table), None))  # an empty list, to say what was left out
     except DataError as found:
         error = found
+    if sample is not None and (wrong := _wrong_unit([times for times, _ in read], sample, table, role)):
+        return [], DataError(wrong)
     if role in ("ego", "truth"):
-        return [state for _, state in rows], error
-    lists = list(_lists(rows, role.removeprefix("detections "), table))
+        return [state for _, state in read], error
+    lists = list(_lists(read, role.removeprefix("detections "), table))
     if lists:
         lists[0] = replace(lists[0], left_out=tuple(left_out))  # their own times are not read
     return [*lists], error
@@ -127,14 +134,31 @@ def _lists(rows: list[tuple[_Times, Detection | None]], sensor: str, table: CsvT
 
 
 def _rows(file: Path, table: CsvTable) -> Iterator[Cells]:
+    found = rows(file, table.delimiter)
+    _check_columns(file, table, list(next(found).values))
+    return found
+
+
+def rows(file: Path, delimiter: str | None = None) -> Iterator[Cells]:
+    """Cells of every line of `file` by column, the header first; without a delimiter the likeliest of `,`, `;` and tab.
+
+    Raises
+    ------
+    DataError
+        The file is not a table, or has too many rows.
+    """
     try:
         with open_text(file, "utf-8-sig", newline="") as text:
             first = text.readline(_LONGEST_LINE)
             text.seek(0)
-            delimiter = table.delimiter or max(",;\t", key=first.count)
-            reader = csv.reader(_lines(file, text), delimiter=delimiter, skipinitialspace=True)
+            reader = csv.reader(
+                _lines(file, text), delimiter=delimiter or max(",;\t", key=first.count), skipinitialspace=True
+            )
             header = [name.strip() for name in next(reader, [])]
-            _check_columns(file, table, header)
+            twice = next((name for name in header if header.count(name) > 1), None)
+            if twice is not None:
+                raise DataError(f"{file}:1: has the column {twice!r} twice")
+            yield Cells(f"{file}:1", dict(zip(header, header, strict=True)))
             for count, cells in enumerate(reader):
                 if count >= _MOST_ROWS:
                     raise DataError(f"{file}: has more than {_MOST_ROWS} rows, give it in parts")
@@ -159,9 +183,6 @@ def _lines(file: Path, text: TextIO) -> Iterator[str]:
 
 
 def _check_columns(file: Path, table: CsvTable, header: list[str]) -> None:
-    twice = next((name for name in header if header.count(name) > 1), None)
-    if twice is not None:
-        raise DataError(f"{file}:1: has the column {twice!r} twice")
     for name in [*chain.from_iterable(map(_names, table.columns.values())), *table.filters]:
         if name not in header:
             raise DataError(f"{file}:1: has no column {name!r}, but {', '.join(header)}")
@@ -186,9 +207,35 @@ def _time(cells: Cells, table: CsvTable, name: str) -> int:
         value = Decimal(text)
         if not value.is_finite() or abs(value.adjusted()) > _LONGEST_TIME:
             raise InvalidOperation
-        return round(value.scaleb(_NS[table.time_unit]))
+        time_ns = round(value * NS_PER_UNIT[table.time_unit])
     except InvalidOperation as error:
-        raise DataError(f"{cells.place}: {column}: {text[:40]!r} is no time") from error
+        raise DataError(f"{cells.place}: {column}: {text[:40]!r} is not a time") from error
+    if not is_stamp(time_ns):
+        unit = epoch_unit(float(value))
+        meant = f"set `time_unit: {unit}`" if unit else "change `time_unit`"
+        raise DataError(
+            f"{cells.place}: {column}: {text[:40]} {table.time_unit} is beyond the year 2096: {meant} of this table"
+        )
+    return time_ns
+
+
+def _wrong_unit(times: Sequence[_Times], sample: Cells, table: CsvTable, role: str) -> str | None:
+    """Sentence about the unit of `times`, where rows follow each other faster than any sensor sends.
+
+    `sample` is the first of the rows.
+    """
+    stamps_ns = {one.stamp_ns for one in times}
+    span_ns = max(stamps_ns) - min(stamps_ns)
+    (column,) = _names(table.columns["stamp"])
+    unit = epoch_unit(float(sample.values[column]))
+    is_other = unit not in (None, table.time_unit)
+    if len(times) < _FEWEST or span_ns >= _SHORTEST_NS * len(stamps_ns) or not (is_other or len(stamps_ns) > 2):
+        return None
+    return (
+        f"{sample.place}: {column}: {sample.values[column][:40]} and the times after it in {table.time_unit} are "
+        f"{span_ns * 1e-9:.3g} s long, {len(times)} rows that no sensor sends so fast: "
+        f"{f'set `time_unit: {unit}`' if is_other else 'change `time_unit`'} (input.csv.{role.replace(' ', '.')})"
+    )
 
 
 def _state(table: CsvTable, role: str, cells: Cells, times: _Times) -> EgoState | TruthState:
@@ -252,10 +299,17 @@ def _recognises(path: Path) -> bool:
 def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
     tables = list(_tables(path, config.csv))
     if not tables:
+        found = "; ".join(f"{file.name} has {', '.join(columns)}" for file, columns in headers(path).items())
         raise CallError(
-            f"{path}: is CSV, so the configuration must say what its columns are (input.csv.detections ...)"
+            f"{path}: is CSV, name its columns in input.csv: {found} (`fgtrack info {path} --write my.yaml` guesses)"
         )
     return partial(read_tables, tables)
+
+
+def headers(path: Path) -> dict[Path, list[str]]:
+    """Columns of the CSV file `path`, or of every one in the folder, by file. Raises `DataError` as `read_tables`."""
+    files = sorted(file for file in path.iterdir() if file.suffix in _ENDINGS) if path.is_dir() else [path]
+    return {file: list(next(rows(file)).values) for file in files}
 
 
 def _tables(path: Path, config: CsvInput) -> Iterator[tuple[Path, CsvTable, str]]:

@@ -1,11 +1,13 @@
 """The files of a recording, each read in log-time order, and up to the break where it was cut off."""
 
+import filecmp
 import heapq
 import re
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
@@ -75,11 +77,15 @@ class Parts:
 def parts_of(path: Path) -> Parts:
     """The files of the recording at `path`: itself, those that metadata.yaml names, or those of the folder.
 
-    Raises `DataError` where metadata.yaml does not say what that of a rosbag2 folder says.
+    Raises `DataError` where metadata.yaml does not say what that of a rosbag2 folder says, and for copies of one file.
     """
     if (path / METADATA).is_file():
         return _named_parts(path)
-    return Parts(tuple(bags_in(path)) if path.is_dir() else (path,))
+    files = tuple(bags_in(path)) if path.is_dir() else (path,)
+    for one, other in combinations(files, 2):
+        if one.stat().st_size and filecmp.cmp(one, other, shallow=False):
+            raise DataError(f"{path}: {one.name} and {other.name} are copies of one recording: remove or name one")
+    return Parts(files)
 
 
 def bags_in(path: Path) -> list[Path]:
