@@ -232,7 +232,7 @@ def tables(results: Results) -> str:
 def _tick_cells(row: Row) -> tuple[str, ...]:
     one = row.cell
     delay = "paper's" if one.delay_s is None else f"{one.delay_s:g}"
-    lag = f"{one.lag_s:g}" if "smoother" in one.label or one.label == "ipls" else "-"
+    lag = f"{one.lag_s:g}" if "smoother" in one.label else "-"
     numbers = (row.median_ms, row.p99_ms, row.largest_ms, row.per_detection_us, row.published_ratio, row.memory_mb)
     return (one.label, str(one.count), lag, delay, *map(_short, numbers))
 

@@ -57,7 +57,6 @@ CONTESTANTS: Mapping[str, Contestant] = {
     "iterated EKF, initiated": Contestant("iekf-replay", options=_REGRESSION),
     "unscented, initiated": Contestant("ukf-replay", options=_REGRESSION),
     "IPLF, initiated": Contestant("iplf-replay", options=_REGRESSION),
-    "IPLS, initiated": Contestant("ipls", options=_REGRESSION),
     "smoother": Contestant("smoother"),
     "smoother, robust": Contestant("smoother", HUBER),
 }
@@ -70,7 +69,6 @@ STEPS: Mapping[str, tuple[str, str]] = {
     "iterating the update": ("EKF, initiated", "iterated EKF, initiated"),
     "linearising by sigma points": ("EKF, initiated", "IPLF, initiated"),
     "smoothing, now": ("iterated EKF, initiated", "smoother"),
-    "smoothing by sigma points, now": ("IPLF, initiated", "IPLS, initiated"),
     "smoothing and robust loss, now": ("EKF, initiated, robust", "smoother, robust"),
 }
 

@@ -101,7 +101,6 @@ CASES: dict[str, tuple[str, Options]] = {
     "iekf-replay": ("iekf-replay", {}),
     "ukf-replay": ("ukf-replay", {}),
     "iplf-replay": ("iplf-replay", {}),
-    "ipls": ("ipls", {}),
     "smoother": ("smoother", {}),
     f"ekf-replay, {RANGES} ranges": ("ekf-replay", {}),
     f"smoother, {RANGES} ranges": ("smoother", {}),

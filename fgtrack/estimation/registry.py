@@ -36,7 +36,6 @@ ESTIMATORS = Registry(
             "ekf-replay": "fgtrack.estimation.replay:ReplayEkf",
             "iekf-replay": "fgtrack.estimation.iekf:IekfReplay",
             "imm-replay": "fgtrack.estimation.imm:ImmReplay",
-            "ipls": "fgtrack.estimation.ipls:PosteriorLinearisationSmoother",
             "iplf-replay": "fgtrack.estimation.iplf:IplfReplay",
             "smoother": "fgtrack.estimation.factor_graph.factories:smoother",
             "smoother-batch": "fgtrack.estimation.factor_graph.factories:smoother_batch",
@@ -109,11 +108,10 @@ class Claims:
     one that does has to initiate, too."""
     bank: bool = False
     """Whether the entry makes the estimators of all objects together."""
-    solves: Literal["", "ekf", "iekf", "ukf", "iplf", "imm", "ipls", "least squares"] = ""
+    solves: Literal["", "ekf", "iekf", "ukf", "iplf", "imm", "least squares"] = ""
     """Of which equations an estimate in a nonlinear model is the solution: those of a filter in the order of the stamps
     (extended, iterated, unscented, posterior linearisation, interacting models), or, at convergence, those of least
-    squares over all states or of the posterior linearisation smoother. `fgtrack verify` holds it to them; empty for
-    others."""
+    squares over all states. `fgtrack verify` holds it to them; empty for others."""
 
     @property
     def is_exact(self) -> bool:

@@ -6,7 +6,6 @@ from types import MappingProxyType
 from typing import Any
 
 from fgtrack.models.motion import CTRA, CTRV
-from fgtrack.pipeline.oracle.estimates import smoothed
 from fgtrack.pipeline.oracle.filters import filtered
 from fgtrack.pipeline.oracle.linearised import AVERAGES, TANGENTS
 from fgtrack.pipeline.oracle.mixture import mixed
@@ -28,7 +27,6 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "smoother": {"ring_s": _RING_S, "relinearise": _TINY, "max_iterations": 20},
     "smoother-batch": {"ring_s": _RING_S, "relinearise": _TINY},
     "smoother-banded": {"ring_s": _RING_S, "relinearise": _TINY, "max_iterations": 20},
-    "ipls": {"max_iterations": 10, "tolerance": 1e-7},
     "iekf-replay": {"max_iterations": 100, "tolerance": 1e-10},
     "iplf-replay": {"max_iterations": 100, "tolerance": 1e-10},
     "imm-replay": {
@@ -65,6 +63,5 @@ _EQUATIONS: Mapping[str, Callable[[Stream], Reference]] = {
     "ukf": lambda stream: filtered(stream.problem, AVERAGES).state_at,
     "iplf": lambda stream: filtered(stream.problem, AVERAGES, iterated=True).state_at,
     "imm": _imm,
-    "ipls": lambda stream: smoothed(stream.problem, linearisation=AVERAGES).at_nodes_and_ahead,
     "least squares": lambda stream: stream.solution.state_at,
 }

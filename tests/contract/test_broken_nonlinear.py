@@ -11,7 +11,7 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult
 from fgtrack.estimation.ekf import innovation_one, predict_one
-from fgtrack.estimation.ipls import PosteriorLinearisationSmoother
+from fgtrack.estimation.banded.smoother import BandedSmoother
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.propagation import track_state
 from fgtrack.estimation.replay import ReplayEkf
@@ -184,8 +184,10 @@ class GivesOneForAll(FilterBank):
         return replace(states, means=np.repeat(states.means[:1], len(states.means), axis=0))
 
 
-class Reports(PosteriorLinearisationSmoother):
+class Reports(BandedSmoother):
     """What the broken smoothers are made of."""
+
+    reports = True
 
 
 class ReportsNoNumber(Reports):

@@ -393,7 +393,6 @@ BOMBS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
             "ekf-replay",
             "ukf-replay",
             "imm-replay",
-            "ipls",
             "smoother",
             "smoother-batch",
             "smoother-banded",

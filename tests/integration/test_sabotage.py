@@ -329,6 +329,6 @@ def test_an_estimator_that_fails_even_without_a_track_is_one_line(
 
 
 def test_meta_json_has_a_count_of_every_kind_for_every_estimator(tmp_path: Path) -> None:
-    for estimator in (*BUILT_IN, "ipls", "ukf-replay", "larsen"):
+    for estimator in (*BUILT_IN, "ukf-replay", "larsen"):
         run = run_of(read_config("smoother", SETTINGS, estimator=estimator), tmp_path / estimator)
         assert run.meta["failures"] == dict.fromkeys(Failure, 0), estimator

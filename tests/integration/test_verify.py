@@ -166,7 +166,6 @@ def test_the_tolerances_are_those_of_the_promise(certificate: Certificate) -> No
     assert tolerances["CTRV, from a turning ego", "iekf-replay", "SciPy"] == 1e-2
     assert tolerances["CTRV, from a turning ego", "iplf-replay", "SciPy"] == 1e-2
     assert tolerances["CTRV, from a turning ego", "imm-replay", "SciPy"] == 1e-7
-    assert tolerances["CTRV, from a turning ego", "ipls", "SciPy"] == 1e-5
 
 
 DRAWS = (

@@ -76,7 +76,7 @@ def chain_too_fast(patch: pytest.MonkeyPatch) -> None:
 
 
 BROKEN: dict[str, tuple[Break, Draw, tuple[str, ...]]] = {
-    "slopes over sigma points": (slopes_halved, verify_streams.whole, ("ukf-replay", "iplf-replay", "ipls")),
+    "slopes over sigma points": (slopes_halved, verify_streams.whole, ("ukf-replay", "iplf-replay")),
     "updates of the iterated filter": (updates_moved, verify_streams.observed, ("iekf-replay",)),
     "covariance of the iterated filter": (too_sure, verify_streams.observed, ("iekf-replay",)),
     "likelihood of a model": (unlikely_is_likely, verify_streams.whole, ("imm-replay",)),

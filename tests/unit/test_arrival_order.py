@@ -50,7 +50,7 @@ def test_equal_values_of_one_stamp_count_the_same_whichever_came_first(name: str
 
 
 @pytest.mark.parametrize("what", ALIKE)
-@pytest.mark.parametrize("name", ["ipls", "smoother", "smoother-batch", "smoother-banded"])
+@pytest.mark.parametrize("name", ["smoother", "smoother-batch", "smoother-banded"])
 def test_a_smoother_that_has_converged_counts_them_the_same_too(name: str, what: str) -> None:
     first, *others = (fed(name, order) for order in permutations((*ALIKE[what], POSITION)))
     assert max(max(difference(other, first, CTRV())) for other in others) < 1e-5

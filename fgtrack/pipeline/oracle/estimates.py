@@ -40,11 +40,6 @@ class Solution:
         after = self.problem.dynamics.move(until.mean, (stamps[place + 1] - stamp_ns) / NS_PER_S)
         return self._between(slice(place * n, (place + 2) * n), until, after, self.means[place + 1])
 
-    def at_nodes_and_ahead(self, stamp_ns: int) -> Estimate | None:
-        """`state_at`, but None between two nodes."""
-        stamps = self.problem.stamps_ns
-        return self.state_at(stamp_ns) if stamp_ns in stamps or stamp_ns > stamps[-1] else None
-
     def _between(self, both: slice, until: Flow, after: Flow, right: FloatArray) -> Estimate:
         """Condition N(until.mean, until.Q), given the left state, on the right one."""
         by_right, C = conditioned(until.Q, after.F, after.Q)
