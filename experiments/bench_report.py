@@ -1,7 +1,6 @@
 """What the benchmark has measured: rows, promises, tables and the figure."""
 
 import importlib.metadata
-import importlib.util
 import os
 import platform
 import sys
@@ -161,9 +160,7 @@ def machine() -> dict[str, str]:
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    versions = {name: importlib.metadata.version(name) for name in ("numpy", "scipy", "gtsam")}
-    compiled = importlib.util.find_spec("numba") is not None
-    versions["numba"] = importlib.metadata.version("numba") if compiled else "not installed"
+    versions = {name: importlib.metadata.version(name) for name in ("numpy", "scipy", "gtsam", "numba")}
     return {
         "processor": names[0] if names else platform.processor(),
         "cores": str(os.cpu_count()),

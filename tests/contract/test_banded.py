@@ -10,10 +10,7 @@ import pytest
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
-from fgtrack.estimation.banded import solver
 from fgtrack.estimation.banded.bank import BandedBank
-from fgtrack.estimation.banded.methods import IN_NUMPY, Methods, fastest
-from fgtrack.estimation.banded.nodes import Nodes
 from fgtrack.estimation.banded.smoother import BandedSmoother
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
 from fgtrack.estimation.dense_joint import Difference, dense_joint, difference
@@ -27,17 +24,6 @@ from fgtrack.testing.streams import COMPONENTS, MS, START, measured, shuffled
 
 LINEAR = (("x_m", "y_m"), ("x_m", "y_m", "speed_mps"), ("x_m", "y_m", "yaw_rad"))
 KINDS = ("huber", "cauchy", "tukey", "geman_mcclure", "dcs")
-
-
-@pytest.fixture(params=["numpy", "compiled"], autouse=True)
-def methods(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Methods:
-    """All that is promised holds for the solvers in NumPy and for those compiled by numba."""
-    if request.param == "compiled":
-        pytest.importorskip("numba", reason="numba is not installed: pip install fgtrack[fast]")
-        assert fastest() is not IN_NUMPY
-    methods = IN_NUMPY if request.param == "numpy" else fastest()
-    monkeypatch.setattr(solver, "fastest", lambda: methods)
-    return methods
 
 
 def arriving(
@@ -304,7 +290,7 @@ def test_in_a_linear_model_the_final_states_are_the_same_as_well() -> None:
 
 
 def test_a_track_whose_window_cannot_be_solved_fails_alone_and_stays_as_it_was(
-    methods: Methods, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The solver gives up on track 1 once for all together and once alone, after it has changed the arrays."""
     motion, rng = CTRV(), np.random.default_rng(3)
@@ -317,16 +303,15 @@ def test_a_track_whose_window_cannot_be_solved_fails_alone_and_stays_as_it_was(
         for bank in (hit, spared):
             bank.advance(START.stamp_ns + 50 * k * MS)
             bank.update(START.stamp_ns + 50 * k * MS, [0, 1, 2], measurements)
+    eliminate = hit.windows.solver.eliminate
     for ms in (430, 275, 100, 600):
         stamp_ns = START.stamp_ns + ms * MS
         measurements = [measured(rng, motion, ms * MS) for _ in range(3)]
         expected = spared.update(stamp_ns, [0, 2], measurements[::2])
         calls = []
-
         period, hits = (3, 2) if ms == 100 else (2, 1)  # one call more behind the window, before its nodes change
 
         def gives_up(
-            nodes: Nodes,
             tracks: IntArray,
             places: IntArray,
             calls: list[bool] = calls,
@@ -334,14 +319,14 @@ def test_a_track_whose_window_cannot_be_solved_fails_alone_and_stays_as_it_was(
             hits: int = hits,
         ) -> None:
             """At every update with track 1, but not where the window is built again after that."""
-            methods.eliminate(nodes, tracks, places)
+            eliminate(tracks, places)
             if 1 in tracks:
                 calls.append(True)
                 if len(calls) % period == hits:
                     raise np.linalg.LinAlgError("gave up")
 
         with monkeypatch.context() as patch:
-            patch.setattr(hit.windows.solver, "_methods", methods._replace(eliminate=gives_up))
+            patch.setattr(hit.windows.solver, "eliminate", gives_up)
             found = hit.update(stamp_ns, [0, 1, 2], measurements)
         assert found[1].status is UpdateStatus.FAILED
         assert [found[0].status, found[2].status] == [result.status for result in expected]

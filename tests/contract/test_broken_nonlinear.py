@@ -9,9 +9,9 @@ import pytest
 
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
+from fgtrack.estimation.banded.smoother import BandedSmoother
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult
 from fgtrack.estimation.ekf import innovation_one, predict_one
-from fgtrack.estimation.banded.smoother import BandedSmoother
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.propagation import track_state
 from fgtrack.estimation.replay import ReplayEkf

@@ -10,13 +10,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.estimation.banded import node_kernels
 from fgtrack.estimation.histories import Histories, grown
 from fgtrack.estimation.terms import MeasurementTerm
-from fgtrack.estimation.whitening import whitened
 
 _FEW_NODES, _FEW_COMPONENTS = 16, 4
-_NEAR = 12  # so many of the newest nodes are looked at first
 
 
 class Nodes(Histories):
@@ -34,7 +33,7 @@ class Nodes(Histories):
     _TRACKS = ("first", "count")
     _VALUES = (
         *("origin", "segment", "rows", "num_rows", "predicted", "filtered", "back", "C"),
-        *("leap", "leap_C", "limit", "limit_at", "step", "P", "far"),
+        *("step", "P", "far"),
     )
 
     def __init__(self, n: int) -> None:
@@ -42,6 +41,10 @@ class Nodes(Histories):
         self.dim, size = n, self.size
         self.first: IntArray = np.zeros_like(self.count)
         """Place of the oldest node of the window."""
+        self.known: IntArray = np.zeros_like(self.count)
+        """From this place on `P` is known."""
+        self.any_far: BoolArray = np.zeros(len(self.count), dtype=bool)
+        """True if a node of the track is marked as `far`."""
         self.origin = np.zeros((size, n))
         """Linearisation points x0."""
         self.segment = np.zeros((size, n, 2 * n + 1))
@@ -54,43 +57,36 @@ class Nodes(Histories):
         """Covariances and means relative to x0, before and after the node's own measurements."""
         self.back, self.C = np.zeros((size, n, n + 1)), np.zeros((size, n, n))
         """The node given the next one: x - x0 = A (next - its x0) + b + N(0, C); A and b."""
-        self.leap, self.leap_C = np.zeros((size, n, n + 1)), np.zeros((size, n, n))
-        """The same given the end of its block, see `Blocks`."""
-        self.limit, self.limit_at = np.zeros((size, n, n)), np.zeros((size, n))
-        """Of the end of a block, see `Blocks`."""
         self.step, self.P = np.zeros((size, n)), np.zeros((size, n, n))
         """Mean relative to x0, and covariance, given everything."""
         self.far = np.zeros(size, dtype=bool)
-        """Whether `step` is longer than it may be."""
+        """True if `step` is longer than it may be."""
         self.terms: dict[int, list[MeasurementTerm]] = {}
         """What is measured at each node."""
 
     def place_before(self, tracks: IntArray, stamps_ns: IntArray) -> IntArray:
         """See `Histories.place_before`."""
-        if len(tracks) < 2:
-            return super().place_before(tracks, stamps_ns)
-        count = self.count[tracks]
-        low = max(int(count.min()) - _NEAR, 0)
-        near = self.stamps_ns[tracks, low : int(count.max())]
-        places = (near <= stamps_ns[:, None]).sum(axis=1) + (low - 1)
-        if low and (places < low).any():
-            return np.asarray((self.stamps_ns[tracks] <= stamps_ns[:, None]).sum(axis=1) - 1)
-        return np.asarray(places)
+        places = np.empty(len(tracks), dtype=np.int64)
+        node_kernels.place_before(tracks, stamps_ns, self.stamps_ns, self.count, places)
+        return places
 
     def last_before(self, tracks: IntArray, places: IntArray, stamps_ns: IntArray) -> IntArray:
-        """`place_before`, or the nodes at `places` where these are later; step by step from there."""
-        last = self.stamps_ns.shape[1] - 1
-        while True:
-            after = np.minimum(places + 1, last)
-            later = (self.stamps_ns[tracks, after] <= stamps_ns) & (after > places)
-            if not later.any():
-                return places
-            places = places + later
+        """`place_before`, or `places` where these are later."""
+        last = np.empty(len(tracks), dtype=np.int64)
+        node_kernels.last_before(tracks, places, stamps_ns, self.stamps_ns, self.count, last)
+        return last
+
+    def insert(self, tracks: IntArray, places: IntArray, stamp_ns: int) -> IntArray:
+        """See `Histories.insert`."""
+        numbers = np.empty(len(tracks), dtype=np.int64)
+        node_kernels.insert(tracks, places, stamp_ns, self.stamps_ns, self.numbers, self.count, numbers)
+        return numbers
 
     def begin_window(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
         """The first node of a new track."""
         number = self.begin(track, stamp_ns)
-        self.first[track] = 0
+        self.first[track] = self.known[track] = 0
+        self.any_far[track] = False
         self._empty(np.array([number]))
         self.origin[number] = mean
         for values in (self.predicted, self.filtered):
@@ -108,32 +104,20 @@ class Nodes(Histories):
         """Move the linearisation points of nodes of `tracks`, one each, by `steps` (m, n): what is relative to them
         follows, measurements as if they were linear.
         """
-        n = self.dim
-        self.origin[numbers] += steps
-        self.predicted[numbers, :, n] -= steps
-        self.step[numbers] -= steps
-        first = self.first[tracks]
-        oldest = (first > 0) & (numbers == self.numbers[tracks, first])
-        if oldest.any():  # what is known of the node behind it is relative to its linearisation point
-            behind = self.at(tracks[oldest], first[oldest] - 1)
-            self.back[behind, :, n] += np.matvec(self.back[behind, :, :n], steps[oldest])
-        rows = self.rows[numbers]
-        self.rows[numbers, :, n] = rows[..., n] - np.matvec(rows[..., :n], steps)
+        order = self.first, self.numbers
+        node_kernels.shift(tracks, numbers, steps, *order, self.origin, self.step, self.predicted, self.back, self.rows)
 
     def drop(self, tracks: IntArray, many: IntArray) -> None:
         """See `Histories.drop`: nodes behind the windows."""
         super().drop(tracks, many)
         self.first[tracks] -= many
+        self.known[tracks] -= many
 
     def measure(self, numbers: IntArray, rows: FloatArray) -> None:
         """Measurements [G | y] (m, k, n + 1) at m nodes, beside those that are there."""
         used, k = self.num_rows[numbers], rows.shape[-2]
-        while int(used.max(initial=0)) + k > self.rows.shape[1]:
-            self._grow_rows()
-        if used.any():
-            self.rows[numbers[:, None], used[:, None] + np.arange(k)] = rows
-        else:
-            self.rows[numbers, :k] = rows
+        self._fit_rows(int(used.max(initial=0)) + k)
+        self.rows[numbers[:, None], used[:, None] + np.arange(k)] = rows
         self.num_rows[numbers] = used + k
 
     def observe(self, numbers: IntArray, y: FloatArray, H: FloatArray, R: FloatArray, offsets: FloatArray) -> None:
@@ -141,9 +125,9 @@ class Nodes(Histories):
 
         Raises `numpy.linalg.LinAlgError` for an R that is not positive definite.
         """
-        rows = whitened(y, H, R)
-        rows[..., -1] += np.matvec(rows[..., :-1], offsets)
-        self.measure(numbers, rows)
+        self._fit_rows(int(self.num_rows[numbers].max(initial=0)) + y.shape[1])
+        if not node_kernels.observe(numbers, y, H.copy(), R, offsets, self.rows, self.num_rows):
+            raise np.linalg.LinAlgError("a covariance is not positive definite")
 
     def snapshot(self, tracks: IntArray) -> list[IntArray]:
         """The order of the nodes of `tracks`, for `restore` after at most one insertion in each."""
@@ -165,7 +149,9 @@ class Nodes(Histories):
 
     def _grow_tracks(self) -> None:
         super()._grow_tracks()
-        self.first = grown(self.first, len(self.count))
+        size = len(self.count)
+        self.first, self.known = grown(self.first, size), grown(self.known, size)
+        self.any_far = grown(self.any_far, size)
         self._fit()
 
     def _grow_places(self) -> None:
@@ -177,5 +163,6 @@ class Nodes(Histories):
         for name in self._VALUES:
             setattr(self, name, self.fitted(getattr(self, name)))
 
-    def _grow_rows(self) -> None:
-        self.rows = np.concatenate([self.rows, np.zeros_like(self.rows)], axis=1)
+    def _fit_rows(self, most: int) -> None:
+        while most > self.rows.shape[1]:
+            self.rows = np.concatenate([self.rows, np.zeros_like(self.rows)], axis=1)

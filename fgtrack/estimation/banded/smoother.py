@@ -11,7 +11,7 @@ from fgtrack.models.motion import MotionModel
 
 
 class BandedSmoother:
-    """Fixed-lag smoother, solved in covariance form by NumPy, many objects together where a tracker uses it."""
+    """Fixed-lag smoother, solved in covariance form by compiled code, all objects of a tracker together."""
 
     exact = "any lag, any number"
     nonlinear = "at convergence"

@@ -5,8 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.estimation.banded import kernels
 from fgtrack.estimation.banded.linearisation import linearise_segments, linearise_terms, move
-from fgtrack.estimation.banded.methods import fastest
+from fgtrack.estimation.banded.nodes import Nodes
 from fgtrack.estimation.banded.undo import Undo
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
@@ -40,10 +41,7 @@ class Solver:
     def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
         self._motion = motion
         self._settings = settings
-        self._methods = fastest()
-        self.nodes = self._methods.nodes(motion.dim)
-        self._substitution = self._methods.substitution(self.nodes)
-        self.smoothed = self._substitution.smoothed
+        self.nodes = Nodes(motion.dim)
         self._thresholds = np.empty((0, motion.dim))
         self.curved: BoolArray = np.zeros(0, dtype=bool)
         """Whether a track has a measurement that is not linear."""
@@ -53,7 +51,6 @@ class Solver:
     def begin(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
         """Start the window of a track with its first node."""
         self.nodes.begin_window(track, stamp_ns, mean, covariance)
-        self._substitution.begin(track)
         more = len(self.nodes.first) - len(self.curved)
         if more:
             self._thresholds = np.concatenate([self._thresholds, np.zeros((more, self._motion.dim))])
@@ -62,18 +59,32 @@ class Solver:
         self._thresholds[track] = self._settings.thresholds(self._motion, curved=False)
         self.curved[track], self.anchored[track] = False, 0
 
-    def dropped(self, tracks: IntArray, numbers: IntArray) -> None:
-        """So many of the oldest nodes of `tracks` have been forgotten."""
-        self._substitution.moved(tracks, -numbers)
-
     def eliminate(self, tracks: IntArray, places: IntArray) -> None:
         """Eliminate the nodes of `tracks` from `places` on. Raises `numpy.linalg.LinAlgError` where it fails."""
-        self._substitution.cut(tracks, places)
-        self._methods.eliminate(self.nodes, tracks, places)
+        nodes = self.nodes
+        given = nodes.origin, nodes.segment, nodes.rows, nodes.num_rows
+        result = nodes.predicted, nodes.filtered, nodes.back, nodes.C
+        if not kernels.eliminate(tracks, places, *self._order, *given, *result):
+            raise np.linalg.LinAlgError("a state is not finite")
 
     def solve_means(self, tracks: IntArray) -> None:
         """Find out how far the states of `tracks` are from their linearisation points."""
-        self._substitution.solve_means(tracks, self._thresholds, self.anchored)
+        nodes = self.nodes
+        limits, given = (self._thresholds, self.anchored), (nodes.filtered, nodes.back)
+        kernels.solve_means(tracks, *self._order, *limits, *given, nodes.step, nodes.far, nodes.any_far)
+        nodes.known[tracks] = nodes.count[tracks]
+
+    def smoothed(self, tracks: IntArray, places: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Steps (m, n) and covariances (m, n, n) of the nodes at `places` of `tracks`."""
+        nodes, n = self.nodes, self._motion.dim
+        steps, covariances = np.empty((len(tracks), n)), np.empty((len(tracks), n, n))
+        given = nodes.filtered, nodes.back, nodes.C, nodes.step, nodes.P
+        kernels.smoothed(tracks, places, nodes.known, *self._order, *given, steps, covariances)
+        return steps, covariances
+
+    @property
+    def _order(self) -> tuple[IntArray, IntArray, IntArray]:
+        return self.nodes.first, self.nodes.count, self.nodes.numbers
 
     def iterate(self, tracks: IntArray, max_iterations: int) -> None:
         """Take Gauss-Newton steps while a state is further than a threshold from its linearisation point."""
@@ -110,7 +121,10 @@ class Solver:
 
     def far(self, tracks: IntArray) -> tuple[IntArray, IntArray]:
         """Nodes that are too far from their linearisation points: positions of their tracks, and their places."""
-        return self._substitution.find_far(tracks, self.anchored)
+        nodes = self.nodes
+        rows, places = np.empty((2, int((nodes.count - nodes.first)[tracks].sum())), dtype=np.int64)
+        num = kernels.find_far(tracks, *self._order, self.anchored, nodes.far, nodes.any_far, rows, places)
+        return rows[:num], places[:num]
 
     # --- one track
 
@@ -131,9 +145,8 @@ class Solver:
 
     def estimates(self, track: int) -> FloatArray:
         """Means of all nodes in the window, shape (m, n)."""
-        places = np.arange(int(self.nodes.first[track]), int(self.nodes.count[track]))
-        steps = self._substitution.steps(np.full(len(places), track), places)
-        return np.asarray(self.nodes.origin[self.window(track)] + steps)
+        at = self.window(track)
+        return np.asarray(self.nodes.origin[at] + self.nodes.step[at])
 
     def solve_at(self, track: int, means: FloatArray) -> None:
         """Linearise the whole window at `means`, shape (m, n), and solve it."""

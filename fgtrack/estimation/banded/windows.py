@@ -301,7 +301,6 @@ class Windows:
         many = numbers >= _MANY
         if many.any():
             nodes.drop(tracks[many], numbers[many])
-            self.solver.dropped(tracks[many], numbers[many])
 
     # --- one track
 

@@ -1,59 +1,24 @@
-"""Looking up, inserting and moving nodes, compiled by numba; see `compiled`."""
+"""Compiled loops that look up, insert and move nodes; arguments are those arrays of `Nodes` that have their names."""
 
 import numpy as np
-from numba import njit
 
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.banded.nodes import Nodes
-
-_TRACKS, _ORDER, _STATES, _TABLES = "int64[::1]", "int64[:, ::1]", "float64[:, ::1]", "float64[:, :, ::1]"
+from fgtrack.estimation.banded.kernels import MATRICES, ORDER, TRACKS, VECTORS, njit
 
 
-class CompiledNodes(Nodes):
-    """The same arrays."""
-
-    def place_before(self, tracks: IntArray, stamps_ns: IntArray) -> IntArray:
-        """See `Nodes.place_before`."""
-        places = np.empty(len(tracks), dtype=np.int64)
-        _place_before(tracks, stamps_ns, self.stamps_ns, self.count, places)
-        return places
-
-    def last_before(self, tracks: IntArray, places: IntArray, stamps_ns: IntArray) -> IntArray:
-        """See `Nodes.last_before`."""
-        last = np.empty(len(tracks), dtype=np.int64)
-        _last_before(tracks, places, stamps_ns, self.stamps_ns, self.count, last)
-        return last
-
-    def shift(self, tracks: IntArray, numbers: IntArray, steps: FloatArray) -> None:
-        """See `Nodes.shift`."""
-        order = self.first, self.numbers
-        _shift(tracks, numbers, steps, *order, self.origin, self.step, self.predicted, self.back, self.rows)
-
-    def observe(self, numbers: IntArray, y: FloatArray, H: FloatArray, R: FloatArray, offsets: FloatArray) -> None:
-        """See `Nodes.observe`."""
-        while int(self.num_rows[numbers].max(initial=0)) + y.shape[1] > self.rows.shape[1]:
-            self._grow_rows()
-        if not _observe(numbers, y, H.copy(), R, offsets, self.rows, self.num_rows):
-            raise np.linalg.LinAlgError("a covariance is not positive definite")
-
-    def insert(self, tracks: IntArray, places: IntArray, stamp_ns: int) -> IntArray:
-        """See `Histories.insert`."""
-        numbers = np.empty(len(tracks), dtype=np.int64)
-        _place(tracks, places, stamp_ns, self.stamps_ns, self.numbers, self.count, numbers)
-        return numbers
-
-
-@njit(f"void(int64[:], int64[:], {_ORDER}, {_TRACKS}, {_TRACKS})", cache=True)
-def _place_before(tracks: IntArray, stamps_ns: IntArray, all_ns: IntArray, count: IntArray, places: IntArray) -> None:
+@njit(f"void(int64[:], int64[:], {ORDER}, {TRACKS}, {TRACKS})")
+def place_before(tracks: IntArray, stamps_ns: IntArray, all_ns: IntArray, count: IntArray, places: IntArray) -> None:
+    """Write the places of the newest nodes at or before `stamps_ns`; -1 if there is none."""
     for t in range(len(tracks)):
         track = tracks[t]
         places[t] = np.searchsorted(all_ns[track, : count[track]], stamps_ns[t], side="right") - 1
 
 
-@njit(f"void(int64[:], int64[:], int64[:], {_ORDER}, {_TRACKS}, {_TRACKS})", cache=True)
-def _last_before(
+@njit(f"void(int64[:], int64[:], int64[:], {ORDER}, {TRACKS}, {TRACKS})")
+def last_before(
     tracks: IntArray, places: IntArray, stamps_ns: IntArray, all_ns: IntArray, count: IntArray, last: IntArray
 ) -> None:
+    """Write the same, or `places` where these are later; searches step by step from there."""
     for t in range(len(tracks)):
         track, place = tracks[t], places[t]
         while place + 1 < count[track] and all_ns[track, place + 1] <= stamps_ns[t]:
@@ -61,8 +26,8 @@ def _last_before(
         last[t] = place
 
 
-@njit(f"void(int64[:], int64[:], int64, {_ORDER}, {_ORDER}, {_TRACKS}, {_TRACKS})", cache=True)
-def _place(
+@njit(f"void(int64[:], int64[:], int64, {ORDER}, {ORDER}, {TRACKS}, {TRACKS})")
+def insert(
     tracks: IntArray,
     places: IntArray,
     stamp_ns: int,
@@ -71,6 +36,7 @@ def _place(
     count: IntArray,
     placed: IntArray,
 ) -> None:
+    """Insert nodes at `places`, whose numbers are written to `placed`; later nodes move up."""
     for t in range(len(tracks)):
         track = tracks[t]
         placed[t] = numbers[track, count[track]]
@@ -80,11 +46,8 @@ def _place(
         count[track] += 1
 
 
-@njit(
-    f"void(int64[:], int64[:], float64[:, :], {_TRACKS}, {_ORDER}, {_STATES}, {_STATES}, {', '.join([_TABLES] * 3)})",
-    cache=True,
-)
-def _shift(
+@njit(f"void(int64[:], int64[:], float64[:, :], {TRACKS}, {ORDER}, {VECTORS}, {VECTORS}, {', '.join([MATRICES] * 3)})")
+def shift(
     tracks: IntArray,
     shifted: IntArray,
     steps: FloatArray,
@@ -96,6 +59,7 @@ def _shift(
     back: FloatArray,
     rows: FloatArray,
 ) -> None:
+    """Move the linearisation points of the nodes `shifted` by `steps`, and all that is relative to them."""
     n = origin.shape[1]
     for t in range(len(tracks)):
         at, oldest = shifted[t], first[tracks[t]]
@@ -113,12 +77,8 @@ def _shift(
                     back[behind, i, n] += back[behind, i, j] * steps[t, j]
 
 
-@njit(
-    f"b1(int64[:], float64[:, :], {_TABLES}, float64[:, :, :], float64[:, :], {_TABLES}, {_TRACKS})",
-    cache=True,
-    error_model="numpy",
-)
-def _observe(
+@njit(f"b1(int64[:], float64[:, :], {MATRICES}, float64[:, :, :], float64[:, :], {MATRICES}, {TRACKS})")
+def observe(
     numbers: IntArray,
     y: FloatArray,
     H: FloatArray,
@@ -127,7 +87,7 @@ def _observe(
     rows: FloatArray,
     num_rows: IntArray,
 ) -> bool:
-    """Whether all covariances are positive definite."""
+    """Append whitened rows of measurements to the nodes `numbers`; False if an R is not positive definite."""
     k, n = H.shape[1:]
     L = np.empty((k, k))
     for t in range(len(numbers)):

@@ -1,87 +1,41 @@
-"""Elimination and back-substitution compiled by numba: what `elimination` and `substitution` do in NumPy.
+"""Compiled loops that solve windows: elimination forwards in time and back-substitution, track by track, node by node.
 
-Track by track, node by node, by the same formulas; measurements are fused one row after another.
-`pip install fgtrack[fast]` installs numba, without which this module cannot be imported. It is compiled when it is
-imported for the first time, in 10 to 20 s, and kept for later processes where numba keeps it (`NUMBA_CACHE_DIR`).
+The windows are block-tridiagonal. Elimination is the Kalman filter; what it leaves of each node, given the next one, is
+the gain and the covariance of the Rauch-Tung-Striebel smoother. No process noise is divided by, which vanishes between
+stamps 1 us apart. Arguments are those arrays of `Nodes` that have their names.
 """
 
+from collections.abc import Callable
+from typing import Any
+
+import numba
 import numpy as np
-from numba import njit
 
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation.banded.elimination import LEAST_SHARE
-from fgtrack.estimation.banded.nodes import Nodes
 
-_ORDER = "int64[::1], int64[::1], int64[:, ::1]"  # first, count, numbers
-_TABLES = "float64[:, :, ::1]"
-
-
-class Substitution:
-    """Smoothed means and covariances, as `Blocks` finds them, node by node."""
-
-    def __init__(self, nodes: Nodes) -> None:
-        self._nodes = nodes
-        self._known: IntArray = np.zeros(0, dtype=np.int64)
-        """From this place on covariances are known."""
-        self.any_far: BoolArray = np.zeros(0, dtype=bool)
-        """See `Blocks.any_far`."""
-
-    def begin(self, track: int) -> None:
-        """See `Blocks.begin`."""
-        more = len(self._nodes.first) - len(self._known)
-        if more:
-            self._known = np.concatenate([self._known, np.zeros(more, dtype=np.int64)])
-            self.any_far = np.concatenate([self.any_far, np.zeros(more, dtype=bool)])
-        self._known[track], self.any_far[track] = 0, False
-
-    def cut(self, tracks: IntArray, places: IntArray) -> None:
-        """See `Blocks.cut`; here nothing is kept that must be cut."""
-
-    def moved(self, tracks: IntArray, numbers: IntArray) -> None:
-        """See `Blocks.moved`."""
-        self._known[tracks] += numbers
-
-    def solve_means(self, tracks: IntArray, thresholds: FloatArray, anchored: IntArray) -> None:
-        """See `Blocks.solve_means`."""
-        nodes = self._nodes
-        order = nodes.first, nodes.count, nodes.numbers
-        found = nodes.step, nodes.far, self.any_far
-        _solve_means(tracks, *order, thresholds, anchored, nodes.filtered, nodes.back, *found)
-        self._known[tracks] = nodes.count[tracks]
-
-    def find_far(self, tracks: IntArray, anchored: IntArray) -> tuple[IntArray, IntArray]:
-        """See `Blocks.find_far`."""
-        nodes = self._nodes
-        rows, places = np.empty((2, int((nodes.count - nodes.first)[tracks].sum())), dtype=np.int64)
-        num = _find_far(
-            tracks, nodes.first, nodes.count, nodes.numbers, anchored, nodes.far, self.any_far, rows, places
-        )
-        return rows[:num], places[:num]
-
-    def smoothed(self, tracks: IntArray, places: IntArray) -> tuple[FloatArray, FloatArray]:
-        """See `Blocks.smoothed`."""
-        nodes = self._nodes
-        order = nodes.first, nodes.count, nodes.numbers
-        steps, covariances = np.empty((len(tracks), nodes.dim)), np.empty((len(tracks), nodes.dim, nodes.dim))
-        given = nodes.filtered, nodes.back, nodes.C
-        _smoothed(tracks, places, self._known, *order, *given, nodes.step, nodes.P, steps, covariances)
-        return steps, covariances
-
-    def steps(self, tracks: IntArray, places: IntArray) -> FloatArray:
-        """See `Blocks.steps`."""
-        return self._nodes.step[self._nodes.at(tracks, places)]
+#: Where a measurement leaves less than this of a variance, the short form of its update keeps too few digits.
+_LEAST_SHARE = 1e-6
+TRACKS, ORDER, VECTORS, MATRICES = "int64[::1]", "int64[:, ::1]", "float64[:, ::1]", "float64[:, :, ::1]"
+_WINDOWS = f"{TRACKS}, {TRACKS}, {ORDER}"  # first, count, numbers
 
 
-def eliminate(nodes: Nodes, tracks: IntArray, places: IntArray) -> None:
-    """See `elimination.eliminate`."""
-    order = nodes.first, nodes.count, nodes.numbers
-    given = nodes.segment, nodes.rows
-    found = nodes.predicted, nodes.filtered, nodes.back, nodes.C
-    if not _eliminate(tracks, places, *order, nodes.origin, *given, nodes.num_rows, *found):
-        raise np.linalg.LinAlgError("a state is not finite")
+# Any: numba has no types.
+def njit(signature: str) -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator that compiles a function once: it is stored in a cache folder, if one can be written."""
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        try:
+            return numba.njit(signature, cache=True, error_model="numpy")(function)
+        except RuntimeError:  # no folder to store it in
+            return numba.njit(signature, error_model="numpy")(function)
+
+    return compiled
 
 
-@njit(error_model="numpy")
+_inlined = numba.njit(error_model="numpy")
+
+
+@_inlined
 def _congruence(A: FloatArray, B: FloatArray, product: FloatArray, found: FloatArray) -> None:
     """Add A B A' to the lower triangle of `found`."""
     n = A.shape[0]
@@ -98,7 +52,7 @@ def _congruence(A: FloatArray, B: FloatArray, product: FloatArray, found: FloatA
             found[i, j] = value
 
 
-@njit(error_model="numpy")
+@_inlined
 def _mirror(lower: FloatArray) -> None:
     """Write the lower triangle above the diagonal."""
     for i in range(lower.shape[0]):
@@ -106,9 +60,9 @@ def _mirror(lower: FloatArray) -> None:
             lower[j, i] = lower[i, j]
 
 
-@njit(error_model="numpy")
+@_inlined
 def _solve(matrix: FloatArray, rhs: FloatArray) -> bool:
-    """Gaussian elimination with pivots, as LAPACK's gesv; the solution replaces `rhs`. Whether it exists."""
+    """Gaussian elimination with pivots, as LAPACK's gesv; the solution replaces `rhs`. False if there is none."""
     n = matrix.shape[0]
     for k in range(n):
         pivot = k
@@ -136,7 +90,7 @@ def _solve(matrix: FloatArray, rhs: FloatArray) -> bool:
     return True
 
 
-@njit(error_model="numpy")
+@_inlined
 def _predict(left: FloatArray, segment: FloatArray, origin: FloatArray, moved: FloatArray, ahead: FloatArray) -> None:
     """[F P F' + Q | F x + f - x0] to `ahead`, and F P to `moved`."""
     n = len(origin)
@@ -151,7 +105,7 @@ def _predict(left: FloatArray, segment: FloatArray, origin: FloatArray, moved: F
     _mirror(ahead[:, :n])
 
 
-@njit(error_model="numpy")
+@_inlined
 def _condition(
     left: FloatArray,
     segment: FloatArray,
@@ -162,7 +116,7 @@ def _condition(
     back: FloatArray,
     C: FloatArray,
 ) -> bool:
-    """A = P F' (F P F' + Q)^-1, b, and C = E P E' + A Q A' with E = I - A F; `gain` holds F P. Whether A exists."""
+    """A = P F' (F P F' + Q)^-1, b, C = E P E' + A Q A', E = I - A F; `gain` holds F P. False if there is no A."""
     n = gain.shape[0]
     E[:] = ahead[:, :n]
     if not _solve(E, gain):
@@ -184,7 +138,7 @@ def _condition(
     return True
 
 
-@njit(error_model="numpy")
+@_inlined
 def _correct(
     state: FloatArray, row: FloatArray, gain: FloatArray, E: FloatArray, P: FloatArray, product: FloatArray
 ) -> None:
@@ -197,7 +151,7 @@ def _correct(
             gain[i] += state[i, j] * row[j]
         S += row[i] * gain[i]
         y -= row[i] * state[i, n]
-    precise = S > 1.0 / LEAST_SHARE
+    precise = S > 1.0 / _LEAST_SHARE
     if precise:
         P[:] = state[:, :n]
     for i in range(n):
@@ -214,12 +168,8 @@ def _correct(
     _mirror(state[:, :n])
 
 
-@njit(
-    f"b1(int64[:], int64[:], {_ORDER}, float64[:, ::1], {_TABLES}, {_TABLES}, int64[::1], {', '.join([_TABLES] * 4)})",
-    cache=True,
-    error_model="numpy",
-)
-def _eliminate(
+@njit(f"b1(int64[:], int64[:], {_WINDOWS}, {VECTORS}, {MATRICES}, {MATRICES}, {TRACKS}, {', '.join([MATRICES] * 4)})")
+def eliminate(
     tracks: IntArray,
     places: IntArray,
     first: IntArray,
@@ -234,7 +184,7 @@ def _eliminate(
     back: FloatArray,
     C: FloatArray,
 ) -> bool:
-    """See `elimination.eliminate`; whether all is finite."""
+    """Eliminate the nodes of `tracks` from `places` on, one each; True if all is finite."""
     n = origin.shape[1]
     A, E, P, product, gain = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(n)
     for t in range(len(tracks)):
@@ -257,12 +207,8 @@ def _eliminate(
     return True
 
 
-@njit(
-    f"void(int64[:], {_ORDER}, float64[:, ::1], int64[::1], {_TABLES}, {_TABLES}, float64[:, ::1], b1[::1], b1[::1])",
-    cache=True,
-    error_model="numpy",
-)
-def _solve_means(
+@njit(f"void(int64[:], {_WINDOWS}, {VECTORS}, {TRACKS}, {MATRICES}, {MATRICES}, {VECTORS}, b1[::1], b1[::1])")
+def solve_means(
     tracks: IntArray,
     first: IntArray,
     count: IntArray,
@@ -275,7 +221,10 @@ def _solve_means(
     far: BoolArray,
     any_far: BoolArray,
 ) -> None:
-    """Write `step`, `far` and `any_far`; see `Blocks.solve_means`."""
+    """Find `step` of the nodes in the windows, and mark with `far` those longer than `thresholds` (tracks, n).
+
+    The first `anchored` nodes of each window are never marked.
+    """
     n = step.shape[1]
     for track in tracks:
         any_far[track] = False
@@ -295,8 +244,8 @@ def _solve_means(
             later = at
 
 
-@njit(f"int64(int64[:], {_ORDER}, int64[::1], b1[::1], b1[::1], int64[::1], int64[::1])", cache=True)
-def _find_far(
+@njit(f"int64(int64[:], {_WINDOWS}, {TRACKS}, b1[::1], b1[::1], {TRACKS}, {TRACKS})")
+def find_far(
     tracks: IntArray,
     first: IntArray,
     count: IntArray,
@@ -307,7 +256,7 @@ def _find_far(
     rows: IntArray,
     places: IntArray,
 ) -> int:
-    """Write `rows` and `places`; how many."""
+    """Write the marked nodes as rows of `tracks` and places; return their number."""
     num = 0
     for t in range(len(tracks)):
         track = tracks[t]
@@ -320,12 +269,10 @@ def _find_far(
 
 
 @njit(
-    f"void(int64[:], int64[:], int64[::1], {_ORDER}, {_TABLES}, {_TABLES}, {_TABLES}, float64[:, ::1], {_TABLES},"
-    f" float64[:, ::1], {_TABLES})",
-    cache=True,
-    error_model="numpy",
+    f"void(int64[:], int64[:], {TRACKS}, {_WINDOWS}, {MATRICES}, {MATRICES}, {MATRICES}, {VECTORS}, {MATRICES},"
+    f" {VECTORS}, {MATRICES})"
 )
-def _smoothed(
+def smoothed(
     tracks: IntArray,
     places: IntArray,
     known: IntArray,
@@ -340,7 +287,10 @@ def _smoothed(
     steps: FloatArray,
     covariances: FloatArray,
 ) -> None:
-    """Write `steps` and `covariances`, see `Blocks.smoothed`; what is computed on the way stays in `step` and `P`."""
+    """Write `steps` and `covariances` of the nodes at `places`; those computed on the way stay in `step` and `P`.
+
+    From the places `known` on covariances are known.
+    """
     n = step.shape[1]
     product = np.empty((n, n))
     for t in range(len(tracks)):
