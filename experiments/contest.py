@@ -2,7 +2,7 @@
 
     python experiments/contest.py -o out/contest --jobs 2
 
-Runs the experiments on the noise, the initiation, the losses, the objective, the ego and bearings, and measures here
+Runs the experiments on the noise, the initiation, the losses, the ego and bearings, and measures here
 what needs no script of its own: the sensor's lever arm and the whiteness of the innovations. Prints every table and
 writes them to contest.md.
 """
@@ -29,7 +29,6 @@ SCRIPTS: Mapping[str, tuple[str, Sequence[str]]] = {
     "fitted_noise/fitted_noise.py": ("noise that does not fit", ("--seeds", "2", "--duration-s", "10")),
     "births/births.py": ("initiation", ("--objects", "20")),
     "outliers/outliers.py": ("robust losses", ("--runs", "2")),
-    "objective/objective.py": ("objective of the smoother", ("--runs", "2")),
     "ego_uncertainty/ego_uncertainty.py": ("uncertainty of the ego", ("--runs", "2")),
     "attribution/attribution.py": ("what every ingredient is worth", ("--runs", "2")),
     "doppler/doppler.py": ("range, bearing and range rate", ("--runs", "2")),

@@ -13,7 +13,6 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.ekf import joseph, kalman_gain, propagated
-from fgtrack.estimation.following_noise import log_determinant, segment_rows
 from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.terms import (
     NEAR_NS,
@@ -58,13 +57,10 @@ class MarginalisedPast:
     ----------
     motion, stamp_ns, prior
         Motion model, and the first node.
-    follows
-        Whether the process noise counts as a function of the state (objective `map`).
     """
 
-    def __init__(self, motion: MotionModel, stamp_ns: int, prior: Prior, follows: bool = False) -> None:
+    def __init__(self, motion: MotionModel, stamp_ns: int, prior: Prior) -> None:
         self._motion = motion
-        self._follows = follows
         self._ring: list[Conditional] = []
         self._stamp_ns = stamp_ns
         self._origin = prior.mean
@@ -84,9 +80,7 @@ class MarginalisedPast:
 
     def copy(self) -> "MarginalisedPast":
         """An independent copy."""
-        other = self.resumed(self._motion, self._ring, self._stamp_ns, self._origin, self.prior)
-        other._follows = self._follows
-        return other
+        return self.resumed(self._motion, self._ring, self._stamp_ns, self._origin, self.prior)
 
     @property
     def ring(self) -> tuple[Conditional, ...]:
@@ -106,17 +100,13 @@ class MarginalisedPast:
         """
         dt_s = seconds(next_ns - self._stamp_ns)
         step = self._motion.step(mean.tolist(), dt_s)
-        F, weighed = step.F, [_weighed(term, mean) for term in terms]
-        if self._follows:
-            F, noise = _following(self._motion, mean, next_mean, dt_s)
-            weighed.append(noise)
         filtered, P = self.prior.mean, self.prior.covariance
-        for y, H, R in weighed:
+        for y, H, R in [_weighed(term, mean) for term in terms]:
             K, _ = kalman_gain(P, H, R)
             filtered, P = filtered + K.dot(y - H.dot(filtered - mean)), joseph(P, K, H, R)
-        predicted = step.mean + F.dot(filtered - mean)
-        A, P_next = kalman_gain(P, F, step.Q)  # the next node measures F x + N(0, Q)
-        C = joseph(P, A, F, step.Q)
+        predicted = step.mean + step.F.dot(filtered - mean)
+        A, P_next = kalman_gain(P, step.F, step.Q)  # the next node measures F x + N(0, Q)
+        C = joseph(P, A, step.F, step.Q)
         b = filtered - mean + A.dot(next_mean - predicted)
         if self._ring:
             last = self._ring[-1]
@@ -189,15 +179,6 @@ class MarginalisedPast:
         spread = joseph(left.C, gain, inner.Lambda, inner.Sigma)
         outer = Conditional(left.stamp_ns, left.mean, gain, left.b - gain @ b, spread)
         return [*self._ring[:place], outer], [Conditional(stamp_ns, inner.mean, A, b, C), *self._ring[place + 1 :]]
-
-
-def _following(
-    motion: MotionModel, mean: FloatArray, next_mean: FloatArray, dt_s: float
-) -> tuple[FloatArray, Linearised]:
-    """F of a segment whose noise follows its start, and what log det Q says about that start; see `segment_rows`."""
-    rows = segment_rows(motion, mean, next_mean, dt_s, log_determinant(motion, mean, dt_s))
-    noise = Linearised(-rows.value[-1:], rows.by_left[-1:], np.eye(1))
-    return -rows.root @ rows.by_left[:-1], noise
 
 
 def _weighed(term: MeasurementTerm, x: FloatArray) -> Linearised:

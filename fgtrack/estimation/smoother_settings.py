@@ -34,9 +34,6 @@ class SmootherSettings:
     `thresholds` for entries that are not named."""
     max_iterations: int = 1
     """Gauss-Newton steps per update; further ones are taken only while a state moves."""
-    objective: Literal["reweighted", "map"] = "reweighted"
-    """What is minimised where the process noise Q follows the state (CTRV, CTRA): `reweighted` least squares, Q frozen
-    at the states that it gives, or the `map`, with log det Q and all derivatives of Q; see docs/smoother.md."""
     lagged_s: tuple[float, ...] = (0.3,)
     """Lags of the lagged output; the first one goes to smoothed.csv."""
     final: bool = True

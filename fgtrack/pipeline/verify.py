@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import NS_PER_S, nanoseconds
-from fgtrack.core.types import YAW, TrackState
+from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Estimator, Measurement
 from fgtrack.estimation.dense_joint import Difference, dense_joint, difference, innovation_difference, rounding_bound
 from fgtrack.estimation.registry import ESTIMATORS, Claims, Factory
@@ -33,7 +32,6 @@ from fgtrack.pipeline.certificate import (
     Subject,
 )
 from fgtrack.pipeline.nasty_streams import gathered
-from fgtrack.pipeline.oracle.posterior import most_probable
 from fgtrack.pipeline.verify_banks import bank_checks
 from fgtrack.pipeline.verify_models import MODEL_TOLERANCE, largest, model_differences
 from fgtrack.pipeline.verify_references import DEFAULTS_IN_A_RING, OPTIONS, Reference, reference
@@ -93,8 +91,6 @@ def verify(rng: np.random.Generator, subjects: Mapping[str, Subject]) -> Certifi
             claims = replace(subjects["smoother"].claims, nonlinear="at once")
             configured = replace(subjects["smoother"], claims=claims, options=DEFAULTS_IN_A_RING)
             checks += _nonlinear(stream, "smoother (defaults)", configured, None)
-        if "smoother" in subjects and draw is streams.whole:
-            checks.append(_most_probable(stream, subjects["smoother"]))
     for draw in _MILD:
         stream = draw(rng)
         for name, subject in subjects.items():
@@ -230,19 +226,6 @@ def _nearby(stream: Stream, name: str, subject: Subject) -> list[Check]:
     now = {at: state for at, state in run.states.items() if at >= stream.newest_ns}
     apart = _from_oracle(now, expected, stream.motion)
     return [Check(stream.name, name, "time", "SciPy, nearby", *apart, run.num_refused, NEAR_TOLERANCE)]
-
-
-def _most_probable(stream: Stream, smoother: Subject) -> Check:
-    """The smoother with objective `map`, at the nodes; means only, because a minimum has no covariance."""
-    subject = replace(smoother, options={**smoother.options, "objective": "map"})
-    estimator, sigma = subject.start(stream), np.sqrt(np.diag(stream.solution.covariance))
-    for place in stream.orders["random"]:
-        estimator.update(stream.measurements[place])
-    found = np.array([estimator.state_at(stamp_ns).mean for stamp_ns in stream.problem.stamps_ns])
-    off = found - most_probable(stream.problem)
-    off[:, YAW] = wrap_angles(off[:, YAW])
-    apart = float(np.abs(off.ravel() / sigma).max())
-    return Check(stream.name, "smoother (map)", "random", "SciPy", apart, 0.0, 0, WHOLE_TOLERANCE)
 
 
 def _from_oracle(states: Mapping[int, TrackState], oracle: Reference, motion: MotionModel) -> Difference:

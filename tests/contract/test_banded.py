@@ -164,12 +164,6 @@ def test_an_option_that_does_not_exist_is_refused() -> None:
         BandedSmoother(CV(), START, 1.0, lagg_s=1)
 
 
-def test_another_objective_is_refused_where_it_makes_a_difference() -> None:
-    with pytest.raises(CallError, match=r"smoother\.objective: map needs the estimator smoother or smoother-batch"):
-        BandedSmoother(CTRV(), START, 1.0, objective="map")
-    BandedSmoother(CV(), START, 1.0, objective="map")
-
-
 def test_late_data_may_be_an_error_and_the_estimator_stays_as_it_was() -> None:
     found = BandedSmoother(CV(), START, 0.3, late="raise")
     rng = np.random.default_rng(0)

@@ -11,7 +11,6 @@ from fgtrack.estimation.dense_joint import Difference
 from fgtrack.models import arc, measurement
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel, Steps
 from fgtrack.pipeline import verify_measurements
-from fgtrack.pipeline.oracle import posterior
 from fgtrack.pipeline.verify_models import MODEL_TOLERANCE, model_differences
 
 MODELS = {"CTRV": CTRV, "CTRA": CTRA, "CV": CV}
@@ -145,16 +144,3 @@ def test_all_models_are_right() -> None:
 def test_what_is_broken_in_a_model_is_found_out(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
     BROKEN[what](monkeypatch)
     assert list(missed())
-
-
-def test_a_minimum_that_is_no_number_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Found:
-        x, jac, message = np.zeros(1), np.full(1, np.nan), "lost"
-
-    class Solved:
-        means, covariance = np.zeros((1, 1)), np.eye(1)
-
-    monkeypatch.setattr(posterior, "smoothed", lambda problem: Solved)
-    monkeypatch.setattr(posterior.optimize, "minimize", lambda *given, **named: Found)
-    with pytest.raises(ArithmeticError, match="not found: lost"):
-        posterior.most_probable(None)  # type: ignore[arg-type]  # never looked at

@@ -12,7 +12,7 @@ from fgtrack.estimation.base import Measurement, Start, UpdateStatus
 from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherBank, SmootherSettings, together
 from fgtrack.estimation.factor_graph.backends.base import Change
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
-from fgtrack.estimation.factor_graph.rows import Factor, MapSegment, PriorOf, Segment, Term
+from fgtrack.estimation.factor_graph.rows import Factor, PriorOf, Segment, Term
 from fgtrack.estimation.marginalised_past import Prior
 from fgtrack.estimation.terms import EquivalentMeasurement
 from fgtrack.models.measurement import SensorPose, measurement_model
@@ -33,7 +33,6 @@ def seen(*names: str, loss: RobustLoss | None = None) -> Measurement:
 
 FACTORS: dict[str, Factor] = {
     "segment": Segment(MOTION, (1, 2), 0.1, (LEFT, RIGHT)),
-    "segment of the map": MapSegment(MOTION, (1, 2), 0.1, (LEFT, RIGHT)),
     "prior": PriorOf(1, Prior(LEFT + 0.1, np.diag([1.0, 2.0, 0.1, 3.0, 0.2]) + 0.01)),
     "position": Term(1, seen("x_m", "y_m"), LEFT),
     "range, bearing": Term(1, seen("range_m", "bearing_rad"), LEFT),

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.errors import CallError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
 from fgtrack.estimation.banded.windows import Leaving, States, Windows
@@ -75,8 +74,6 @@ class BandedBank:
         How the direction of travel of a new object is found where nothing else gives one, see `Initiation`.
     failures
         Counts how often windows are built anew and steps are damped.
-
-    Raises `CallError` for an objective other than `reweighted`.
     """
 
     def __init__(
@@ -86,8 +83,6 @@ class BandedBank:
         initiation: str = DEFAULT,
         failures: Failures | None = None,
     ) -> None:
-        if settings.objective != "reweighted" and not motion.linear:
-            raise CallError(f"smoother.objective: {settings.objective} needs the estimator smoother or smoother-batch")
         self._motion = motion
         self._settings = settings
         self._lag_ns, self._behind_ns = nanoseconds(settings.lag_s), nanoseconds(settings.behind_s)

@@ -10,7 +10,6 @@ from gtsam.noiseModel import mEstimator
 from fgtrack.core.linalg import identity, inverse_roots, noise_roots
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.following_noise import log_determinant, segment_rows
 from fgtrack.estimation.terms import EquivalentMeasurement, Linearised, MeasurementTerm, linearised
 from fgtrack.models.motion import MotionModel
 
@@ -52,19 +51,6 @@ def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float, at: F
         return np.subtract(values.atVector(right), mean)
 
     return gtsam.CustomFactor(_gaussian(noise_roots(step.Q)), [left, right], error)
-
-
-def map_motion_factor(motion: MotionModel, left: int, right: int, dt_s: float, at: FloatArray) -> gtsam.NonlinearFactor:
-    """As `motion_factor`, with the process noise of wherever `left` is, and its log determinant."""
-    level, size = log_determinant(motion, at, dt_s), motion.dim + 1
-
-    def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
-        rows = segment_rows(motion, values.atVector(left), values.atVector(right), dt_s, level)
-        if jacobians is not None:
-            jacobians[0], jacobians[1] = rows.by_left, rows.by_right
-        return rows.value
-
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), [left, right], error)
 
 
 def measurement_factor(key: int, term: MeasurementTerm, mean: FloatArray) -> gtsam.NonlinearFactor:

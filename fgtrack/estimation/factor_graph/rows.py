@@ -8,8 +8,7 @@ import numpy as np
 
 from fgtrack.core.linalg import inverse_roots, noise_roots
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.factor_graph.factors import map_motion_factor, measurement_factor, motion_factor, prior_factor
-from fgtrack.estimation.following_noise import log_determinant, segment_rows
+from fgtrack.estimation.factor_graph.factors import measurement_factor, motion_factor, prior_factor
 from fgtrack.estimation.marginalised_past import Prior
 from fgtrack.estimation.terms import MeasurementTerm
 from fgtrack.estimation.whitening import whitened_term
@@ -77,25 +76,6 @@ class Segment:
         b = np.vecdot(W, (step.mean - right)[:, None])
         for segment, by_left, by_right, ahead in zip(segments, -(W @ step.F), W, b, strict=True):
             segment._rows = Rows(segment._keys, (by_left, by_right), ahead, segment._at)
-
-
-class MapSegment:
-    """A `Segment` with the noise of wherever its first state is, and its log determinant; see `following_noise`."""
-
-    def __init__(
-        self, motion: MotionModel, keys: tuple[int, int], dt_s: float, at: tuple[FloatArray, FloatArray]
-    ) -> None:
-        self._motion, self._keys, self._dt_s, self._at = motion, keys, dt_s, at
-
-    def rows(self) -> Rows:
-        """See `Factor.rows`."""
-        level = log_determinant(self._motion, self._at[0], self._dt_s)
-        found = segment_rows(self._motion, *self._at, self._dt_s, level)
-        return Rows(self._keys, (found.by_left, found.by_right), -found.value, self._at)
-
-    def nonlinear(self) -> gtsam.NonlinearFactor:
-        """See `Factor.nonlinear`."""
-        return map_motion_factor(self._motion, *self._keys, self._dt_s, self._at[0])
 
 
 class Term:

@@ -13,7 +13,7 @@ from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.factor_graph.backends.base import Backend, Change, Marginalised
 from fgtrack.estimation.factor_graph.backends.batch import BatchBackend
 from fgtrack.estimation.factor_graph.chain import Chain, Node
-from fgtrack.estimation.factor_graph.rows import Factor, MapSegment, PriorOf, Segment, Term
+from fgtrack.estimation.factor_graph.rows import Factor, PriorOf, Segment, Term
 from fgtrack.estimation.factor_graph.states import Around, State, state
 from fgtrack.estimation.factor_graph.window_update import Update
 from fgtrack.estimation.failures import Failure, Failures
@@ -60,12 +60,11 @@ class Window:
         self._motion = motion
         self._settings = settings
         self._make_backend = make_backend
-        self._follows = settings.objective == "map" and not motion.linear
         self._thresholds = settings.thresholds(motion, curved=False)
         self._curved = False
         self._first_ns = stamp_ns
         self._chain = Chain(Node(stamp_ns, FIRST_KEY, prior.mean))
-        self._past = MarginalisedPast(motion, stamp_ns, prior, self._follows)
+        self._past = MarginalisedPast(motion, stamp_ns, prior)
         self._means: FloatArray | None = None
         self._places: dict[int, int] = {}
         self._far: list[tuple[Node, FloatArray]] | None = None
@@ -276,7 +275,7 @@ class Window:
         mean = prior.mean.copy()
         if not self._motion.cartesian:
             mean[YAW] = means[nodes[0].key][YAW]
-        self._past = MarginalisedPast(self._motion, self._first_ns, Prior(mean, prior.covariance), self._follows)
+        self._past = MarginalisedPast(self._motion, self._first_ns, Prior(mean, prior.covariance))
         self._rebuild(means)
 
     def _rebuild(self, means: Mapping[int, FloatArray], make_backend: Callable[[], Backend] | None = None) -> None:
@@ -314,7 +313,7 @@ class Window:
         for node, mean in moved:
             place = chain.place(node.stamp_ns)
             chain.move(place, mean)
-            lefts.update((place - 1, place) if self._follows else (place,))
+            lefts.add(place)
         for place in sorted(lefts.intersection(range(len(chain.nodes) - 1))):
             left, right = chain.nodes[place : place + 2]
             update.replace(self._segment(left, right), left, left.slot)
@@ -349,10 +348,9 @@ class Window:
             self._far = [(nodes[place], means[place]) for place in places if place >= self._anchored]
         return self._far
 
-    def _segment(self, left: Node, right: Node) -> Segment | MapSegment:
+    def _segment(self, left: Node, right: Node) -> Segment:
         dt_s = seconds(right.stamp_ns - left.stamp_ns)
-        make = MapSegment if self._follows else Segment
-        return make(self._motion, (left.key, right.key), dt_s, (left.origin, right.origin))
+        return Segment(self._motion, (left.key, right.key), dt_s, (left.origin, right.origin))
 
     def _seconds(self, stamp_ns: int) -> float:
         return seconds(stamp_ns - self._first_ns)
