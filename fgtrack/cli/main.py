@@ -3,6 +3,7 @@
 import ast
 import logging
 import os
+import resource
 import sys
 import traceback
 import warnings
@@ -96,8 +97,16 @@ def _options(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
     ] = False,
+    max_memory_gb: Annotated[
+        float,
+        typer.Option("--max-memory", min=0.0, metavar="GIB", help="Most memory that the command may use; 0: all."),
+    ] = 4.0,
 ) -> None:
     """Options before the command; `main` reads --debug itself."""
+    if max_memory_gb and sys.platform == "linux":  # elsewhere the system does not hold to it
+        _, most = resource.getrlimit(resource.RLIMIT_AS)
+        limit = int(max_memory_gb * 2**30)
+        resource.setrlimit(resource.RLIMIT_AS, (limit if most == resource.RLIM_INFINITY else min(limit, most), most))
 
 
 class _OneLine(logging.Formatter):
@@ -139,6 +148,8 @@ def _run(words: Sequence[str], debug: bool) -> int:
         return _failed(str(error), BAD_CALL, debug)
     except FgtrackError as error:
         return _failed(str(error), BAD_DATA, debug)
+    except MemoryError:
+        return _failed("more memory needed than --max-memory allows: raise it, or split the input", BAD_DATA, debug)
     except OSError as error:  # of files, the library makes its own errors
         if error.errno in FULL:
             what = f"what was to be printed cannot be written ({error.strerror}), free some space"
@@ -188,4 +199,5 @@ def _failed(message: str, code: int, debug: bool) -> int:
 def main() -> int:
     """Run the command line of this process; gives the exit code."""
     os.environ["MPLBACKEND"] = "agg"  # nothing is shown in a window, so none of the system's is needed
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, each thread would reserve memory
     return run(sys.argv[1:])

@@ -71,7 +71,7 @@ def checked(
             count += 1
     except WrongError as error:
         raise DataError(f"{path}: message {count + 1}: {error}") from error
-    except FgtrackError:
+    except (FgtrackError, MemoryError):
         raise
     except Exception as error:  # whatever a foreign input makes a reader raise
         what = " ".join(f"{type(error).__name__}: {error}".split())[:_LONGEST_NAME]

@@ -1,69 +1,38 @@
-"""YAML of strangers: plain values only, and counted before they are made, with what aliases and merges repeat."""
+"""YAML 1.2 of users and recordings: plain values only."""
 
+import re
 import warnings
 from typing import Any
 
 from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError, ReusedAnchorWarning, YAMLError
-from ruamel.yaml.nodes import MappingNode, ScalarNode, SequenceNode
+from ruamel.yaml.error import ReusedAnchorWarning, YAMLError
 
-__all__ = ["MOST_VALUES", "YamlSizeError", "safe_yaml"]
+__all__ = ["safe_yaml"]
 
-MOST_VALUES = 100_000
-_CHARACTERS_PER_VALUE = 100
-
-
-class YamlSizeError(ValueError):
-    """A text is longer, or stands for more values, than allowed; says which."""
+_LONGEST = 2_000_000
+_MOST_ALIASES = 25
+_ALIAS = re.compile(r"(?:^|[\s\[{,:-])\*[\w-]", re.MULTILINE)
 
 
-def safe_yaml(text: str, longest: int) -> Any:  # Any: what YAML says is only known after validation
-    """What the YAML 1.2 `text` says.
+def safe_yaml(text: str) -> Any:  # Any: the type is known after validation only
+    """Value of the YAML 1.2 document `text`.
 
     Raises
     ------
-    YamlSizeError
-        It has more than `longest` characters, or `MOST_VALUES` lines or values; long texts count as several.
     YAMLError
-        It is no YAML, a key of it is a list or a mapping, or a value is none of the type that it looks like.
-    RecursionError
-        It is nested too deeply, or has an alias that contains itself.
+        Invalid YAML, longer than `_LONGEST` characters, nested too deeply, or with so many aliases that they could
+        repeat each other without end.
     """
-    if len(text) > longest:
-        raise YamlSizeError(f"is longer than {longest} characters")
-    if sum(map(text.count, "\n,[{")) > MOST_VALUES:  # each takes some 0.1 ms
-        raise YamlSizeError(f"has more than {MOST_VALUES} lines, commas and brackets")
+    if len(text) > _LONGEST:
+        raise YAMLError(f"is longer than {_LONGEST} characters")
+    if len(_ALIAS.findall(text)) > _MOST_ALIASES:
+        raise YAMLError(f"has more than {_MOST_ALIASES} aliases")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ReusedAnchorWarning)  # YAML allows it
-        yaml = YAML(typ="safe", pure=True)
-        node = yaml.compose(text)
-        if node is None:
-            return None
-        if _count(node, {}) > MOST_VALUES:
-            raise YamlSizeError(f"has more than {MOST_VALUES} values, counting what its aliases repeat")
         try:
-            return yaml.constructor.construct_document(node)
+            return YAML(typ="safe", pure=True).load(text)
+        except RecursionError as error:
+            raise YAMLError("is nested too deeply, or has an alias that contains itself") from error
         except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-            raise YAMLError(f"a value cannot be read ({error})") from error
-
-
-def _count(node: Any, counts: dict[Any, int | None]) -> int:  # nodes of ruamel.yaml have no types
-    """Values in `node`, as often as they are in it; `counts` keeps those of nodes, None while it counts them."""
-    if node in counts:
-        known = counts[node]
-        if known is None:
-            raise RecursionError
-        return known
-    counts[node] = None
-    match node:
-        case ScalarNode():
-            found = 1 + len(node.value) // _CHARACTERS_PER_VALUE
-        case SequenceNode():
-            found = 1 + sum(_count(item, counts) for item in node.value)
-        case MappingNode():
-            found = 1 + sum(_count(part, counts) for pair in node.value for part in pair)
-            for key, _ in node.value:
-                if not isinstance(key, ScalarNode):
-                    raise MarkedYAMLError(problem="a key is a list or a mapping", problem_mark=key.start_mark)
-    counts[node] = found
-    return found
+            what = "a key is a list or a mapping" if "unhashable" in str(error) else f"a value cannot be read ({error})"
+            raise YAMLError(what) from error

@@ -16,13 +16,12 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import CallError, did_you_mean
 from fgtrack.core.files import open_text
-from fgtrack.io.yaml_text import YamlSizeError, safe_yaml
+from fgtrack.io.yaml_text import safe_yaml
 
 T = TypeVar("T")
 
 SMALLEST = 1e-12
 """No configured number but 0 is nearer to it, in any unit: squares and products stay finite."""
-_LONGEST_TEXT = 250_000
 _LONGEST_VALUE = 4096  # of a path
 
 
@@ -51,7 +50,7 @@ def read_yaml(path: Path) -> dict[str, Any]:  # Any: what YAML says is only know
     """The mapping that the YAML 1.2 file `path` holds; empty for an empty file."""
     try:
         with open_text(path) as file:
-            value = _parse(file.read(_LONGEST_TEXT + 1), str(path))
+            value = _parse(file.read(), str(path))
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "is no text file"
         raise CallError(f"{path}: configuration cannot be read ({reason})") from error
@@ -62,17 +61,13 @@ def read_yaml(path: Path) -> dict[str, Any]:  # Any: what YAML says is only know
 
 def _parse(text: str, origin: str) -> Any:
     try:
-        return safe_yaml(text, _LONGEST_TEXT)
-    except YamlSizeError as error:
-        raise CallError(f"{origin}: {error}, no configuration is so long") from error
-    except RecursionError as error:
-        raise CallError(f"{origin}: nested too deeply, or an alias that contains itself") from error
+        return safe_yaml(text)
     except MarkedYAMLError as error:
         line = "" if error.problem_mark is None else f":{error.problem_mark.line + 1}"
         problem = " ".join(str(error.problem or error.context).split())
-        raise CallError(f"{origin}{line}: no valid YAML, {problem.split(' To suppress')[0]}") from error
+        raise CallError(f"{origin}{line}: invalid YAML, {problem.split(' To suppress')[0]}") from error
     except YAMLError as error:
-        raise CallError(f"{origin}: no valid YAML, {' '.join(str(error).split())}") from error
+        raise CallError(f"{origin}: invalid YAML, {' '.join(str(error).split())}") from error
 
 
 def names_of(key: str) -> list[str]:

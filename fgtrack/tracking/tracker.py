@@ -60,7 +60,7 @@ class TrackerParts:
     objects: Objects = field(default_factory=lambda: Objects(ObjectRules()))
     failures: Failures = field(default_factory=Failures)
     """Counts what fails inside, shared with `bank`."""
-    answers: tuple[type[Exception], ...] = (FgtrackError,)
+    answers: tuple[type[Exception], ...] = (FgtrackError, MemoryError)
     """Exceptions that the processing of a batch lets out; after any other one, it ends as failed."""
 
 

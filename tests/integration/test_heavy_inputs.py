@@ -1,4 +1,4 @@
-"""Inputs made to fill memory or time, each read by a command in a process of its own: below 1 GB and 20 s."""
+"""Inputs made to fill memory or time, each read by a command in a process of its own: below --max-memory and 20 s."""
 
 import json
 import sqlite3
@@ -17,7 +17,7 @@ from support.messages import drive
 from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.models.oval import make_oval
 
-MOST_MB, LONGEST_S = 1000.0, 20.0
+MOST_MB, LONGEST_S = 4096.0, 20.0
 MILLION = 1_000_000
 
 

@@ -2,8 +2,9 @@
 
 import struct
 
+import zstandard
+
 from fgtrack.io.ros.mcap_file import MCAP_MAGIC
-from fgtrack.io.ros.unpacking import zstd
 
 SEPARATOR = "=" * 80 + "\n"
 
@@ -29,7 +30,7 @@ def message(number: int, log_ns: int, data: bytes) -> bytes:
 
 
 def chunk(records: bytes, first_ns: int, last_ns: int) -> bytes:
-    packed = zstd.compress(records)
+    packed = zstandard.compress(records)
     head = struct.pack("<QQQI", first_ns, last_ns, len(records), 0)
     return record(0x06, head + text("zstd") + struct.pack("<Q", len(packed)) + packed)
 

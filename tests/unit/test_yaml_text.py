@@ -40,13 +40,13 @@ from fgtrack.pipeline.load import read_yaml
 )
 def test_what_is_no_plain_value_is_an_error_of_yaml_or_a_text(text: str) -> None:
     try:
-        value = safe_yaml(text, 100_000)
+        value = safe_yaml(text)
     except YAMLError:
         return
     assert isinstance(value, dict)
 
 
-def test_a_key_that_is_a_list_is_named_with_its_line(tmp_path: Path) -> None:
+def test_a_key_that_is_a_list_is_named(tmp_path: Path) -> None:
     (tmp_path / "x.yaml").write_text("a: 1\nb: {c: 2, [[0.0, 65.5]]}\n")
-    with pytest.raises(CallError, match=r"x\.yaml:2: no valid YAML, a key is a list or a mapping"):
+    with pytest.raises(CallError, match=r"x\.yaml: invalid YAML, a key is a list or a mapping"):
         read_yaml(tmp_path / "x.yaml")

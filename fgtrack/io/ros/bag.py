@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import zstandard
 from rosbags.interfaces import Connection, ConnectionExtRosbag2
 
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S
-from fgtrack.io.errors import LARGEST_BYTES, MOST_OBJECTS, TruncatedInput
+from fgtrack.io.errors import LARGEST_BYTES, MOST_OBJECTS, TruncatedInput, refuse_larger
 from fgtrack.io.ros.bag_files import (
     BagFile,
     EmptyFile,
@@ -26,7 +27,6 @@ from fgtrack.io.ros.bag_files import (
 from fgtrack.io.ros.mcap_file import McapFile
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
 from fgtrack.io.ros.typestore import Key, MessageTypes, one_line, type_name
-from fgtrack.io.ros.unpacking import unpacked
 
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
@@ -144,8 +144,7 @@ class Bag:
     def end_ns(self) -> int | None:
         """The end of the log times as the indexes of the files say it, without reading messages; None without any."""
         with self._files() as files:
-            ends = [getattr(getattr(file, "metadata", file), "end_time", 0) for file in files]
-        return max(ends, default=0) or None
+            return max((file.end_time for file in files), default=0) or None
 
     def _stamp_ns(self, data: bytes) -> int | None:
         """Stamp of the header with which the message `data` begins."""
@@ -161,6 +160,11 @@ class Bag:
         fields = self._types.fields(key)
         return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
 
+    def _decompressed(self, data: bytes, what: str) -> bytes:
+        """Message that a recorder has compressed; its name in errors is `what`."""
+        refuse_larger(zstandard.frame_content_size(data), what, self._largest_bytes)
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=self._largest_bytes)
+
     @contextmanager
     def _files(self) -> Iterator[list[BagFile]]:
         with _as_data_error(self.path), _opened(self._parts, self._largest_bytes) as files:
@@ -171,16 +175,12 @@ class Bag:
         with self._files() as files:
             try:
                 for connection, log_ns, data in merged(files, topics):
-                    if type(log_ns) is not int or not isinstance(data, bytes | bytearray | memoryview):
-                        raise TruncatedInput(
-                            f"{self.path}: message {count + 1} on {connection.topic} has no time or no bytes"
-                        )
                     if data[:4] == _ZSTD_MAGIC and not self._ros1:
                         what = f"{self.path}: the message on {connection.topic} at {log_ns} ns"
-                        data = unpacked("zstd", bytes(data), what, self._largest_bytes)
+                        data = self._decompressed(data, what)
                     yield connection, log_ns, data
                     count += 1
-            except FgtrackError:
+            except (FgtrackError, MemoryError):
                 raise
             except Exception as error:  # whatever damaged bytes make rosbags or its decompressors raise
                 raise TruncatedInput(f"{self.path}: breaks off after {count} messages ({one_line(error)})") from error
@@ -220,13 +220,13 @@ def _bag_file(path: Path, alone: bool, largest_bytes: int) -> BagFile:
     kind = storage_of(path)
     if kind is None:
         raise DataError(f"{path}: {'is empty' if empty else 'is not a bag file'}")
-    return kind(path, largest_bytes)
+    return Rosbag1File(path) if kind is Rosbag1File else kind(path, largest_bytes)
 
 
 @contextmanager
 def _opened(parts: Parts, largest_bytes: int) -> Iterator[list[BagFile]]:
     with ExitStack() as stack:
-        paths = stack.enter_context(parts.unpacked())
+        paths = stack.enter_context(parts.decompressed())
         files: list[BagFile] = []
         for path in paths:
             file = _bag_file(path, len(paths) == 1, largest_bytes)
@@ -240,7 +240,7 @@ def _opened(parts: Parts, largest_bytes: int) -> Iterator[list[BagFile]]:
 def _as_data_error(path: Path) -> Iterator[None]:
     try:
         yield
-    except FgtrackError:
+    except (FgtrackError, MemoryError):
         raise
     except Exception as error:  # rosbags raises its own, assertions, struct, SQLite, YAML, Unicode errors
         raise DataError(f"{path}: cannot be read as a recording ({one_line(error)})") from error

@@ -1,4 +1,4 @@
-"""The files of a recording, each read in log-time order, and up to the break where it was cut off."""
+"""Files of a recording, each read in log-time order and up to the place where it is truncated."""
 
 import filecmp
 import heapq
@@ -6,30 +6,30 @@ import re
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import combinations
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
-from typing import Any, Protocol
+from typing import Protocol
 
+import zstandard
 from rosbags.interfaces import Connection
 from ruamel.yaml.error import YAMLError
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file, read_whole
+from fgtrack.io.errors import LARGEST_BYTES
 from fgtrack.io.ros.mcap_file import MCAP_MAGIC, McapFile
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
 from fgtrack.io.ros.sqlite3_file import Sqlite3File
-from fgtrack.io.ros.unpacking import unpacked_file
-from fgtrack.io.yaml_text import YamlSizeError, safe_yaml
+from fgtrack.io.yaml_text import safe_yaml
 
 Record = tuple[Connection, int, bytes]
 """Connection, log time in ns, serialized message."""
 
 METADATA = "metadata.yaml"
-_LONGEST_METADATA = 1_000_000
 _BAG_SUFFIXES = (".mcap", ".db3")
 _NEWEST_VERSION = 9
+_LARGEST_RATIO = 100
 SQLITE_MAGIC = b"SQLite format 3\x00"
 ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
 
@@ -41,6 +41,10 @@ class BagFile(Protocol):
     connections: list[Connection]
     break_off: str | None
     """How the file breaks off in the middle; None when it is whole."""
+
+    @property
+    def end_time(self) -> int:
+        """Last log time in ns, or a little later, according to the index; 0 without one."""
 
     def open(self) -> None:
         """Open the file and read which connections it holds."""
@@ -54,30 +58,40 @@ class BagFile(Protocol):
 
 @dataclass(frozen=True)
 class Parts:
-    """The files of a recording."""
+    """Files of a recording."""
 
     files: tuple[Path, ...]
-    packed: bool = False
-    """Whether each is a zstd file."""
+    compressed: bool = False
+    """True if each is a zstd file."""
 
     @contextmanager
-    def unpacked(self) -> Iterator[tuple[Path, ...]]:
-        """The files, where each is packed in a temporary folder."""
-        if not self.packed:
+    def decompressed(self) -> Iterator[tuple[Path, ...]]:
+        """Files as the recorder wrote them; compressed ones are decompressed into a temporary folder."""
+        if not self.compressed:
             yield self.files
             return
         with TemporaryDirectory() as folder:
             targets = tuple(Path(folder) / file.stem for file in self.files)
             for source, target in zip(self.files, targets, strict=True):
-                with target.open("wb") as out:
-                    unpacked_file(source, out)
+                _decompress(source, target)
             yield targets
 
 
-def parts_of(path: Path) -> Parts:
-    """The files of the recording at `path`: itself, those that metadata.yaml names, or those of the folder.
+def _decompress(source: Path, target: Path) -> None:
+    """Write the decompressed zstd file `source` to `target`. Raises `DataError` for one that fills the disk."""
+    allowed = max(LARGEST_BYTES, _LARGEST_RATIO * source.stat().st_size)
+    with source.open("rb") as file, target.open("wb") as out:
+        for portion in zstandard.ZstdDecompressor().read_to_iter(file):
+            allowed -= len(portion)
+            if allowed < 0:
+                raise DataError(f"{source}: decompresses to more than {_LARGEST_RATIO} times its size")
+            out.write(portion)
 
-    Raises `DataError` where metadata.yaml does not say what that of a rosbag2 folder says, and for copies of one file.
+
+def parts_of(path: Path) -> Parts:
+    """Files of the recording at `path`: itself, those that metadata.yaml names, or those of the folder.
+
+    Raises `DataError` for an invalid metadata.yaml, and for copies of one file.
     """
     if (path / METADATA).is_file():
         return _named_parts(path)
@@ -100,43 +114,26 @@ def bags_in(path: Path) -> list[Path]:
 def _named_parts(path: Path) -> Parts:
     file = path / METADATA
     try:
-        text = read_whole(file, 1e-6 * _LONGEST_METADATA).decode()
-        metadata = _parsed(text)["rosbag2_bagfile_information"]
-        files = [path / PurePath(_text(name)).name for name in metadata["relative_file_paths"]]
-        version = int(_text(metadata["version"], int))
-        mode = _text(metadata.get("compression_mode") or "none").lower()
-        form = _text(metadata.get("compression_format") or "zstd")
+        metadata = safe_yaml(read_whole(file, 1.0).decode())["rosbag2_bagfile_information"]
+        files = [path / PurePath(name).name for name in metadata["relative_file_paths"]]
+        version = int(metadata["version"])
+        mode = (metadata.get("compression_mode") or "none").lower()
+        form = metadata.get("compression_format") or "zstd"
         topics = [item["topic_metadata"] for item in metadata.get("topics_with_message_count") or ()]
-        serializations = {_text(topic["name"]): _text(topic["serialization_format"]) for topic in topics}
-    except RecursionError as error:
-        raise DataError(f"{file}: is nested too deeply, or has an alias that contains itself") from error
-    except YamlSizeError as error:
-        raise DataError(f"{file}: {error}, that of no recording is so long") from error
-    except (KeyError, TypeError, ValueError, AttributeError, YAMLError) as error:
+        serializations = {str(topic["name"]): str(topic["serialization_format"]) for topic in topics}
+    except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError, YAMLError) as error:
         what = " ".join(f"{type(error).__name__}: {error}".split())[:120]
-        raise DataError(f"{file}: is no metadata of a recording ({what})") from error
+        raise DataError(f"{file}: is not the metadata of a recording ({what})") from error
     if missing := [file for file in files if not file.is_file()]:
         raise DataError(f"{missing[0]}: is missing, {file} names it")
     if len(set(files)) < len(files):
         raise DataError(f"{file}: names a file twice")
     if version > _NEWEST_VERSION or (mode != "none" and form != "zstd"):
         what = f"version {version}" if version > _NEWEST_VERSION else f"compression {form!r}"
-        raise DataError(f"{file}: {what} of a recording is not known")
+        raise DataError(f"{file}: {what} of a recording is not supported")
     for topic, serialization in serializations.items():
         check_serialization(file, topic, serialization)
     return Parts(tuple(files), mode == "file")
-
-
-@lru_cache(maxsize=4)
-def _parsed(text: str) -> Any:  # what YAML says is checked where it is used
-    """What a metadata.yaml says. Cached: a command opens its recording several times."""
-    return safe_yaml(text, _LONGEST_METADATA)
-
-
-def _text(value: object, *also: type) -> str:
-    if not isinstance(value, (str, *also)) or isinstance(value, bool):
-        raise TypeError(f"a text expected, not a {type(value).__name__}")
-    return str(value)
 
 
 def check_serialization(path: Path, topic: str, serialization: str) -> None:
@@ -152,6 +149,7 @@ class EmptyFile:
         self.path = path
         self.connections: list[Connection] = []
         self.break_off: str | None = "is empty"
+        self.end_time = 0
 
     def open(self) -> None:
         """Open the file, of which nothing can be read."""
@@ -165,7 +163,7 @@ class EmptyFile:
 
 
 def storage_of(path: Path) -> type[McapFile | Sqlite3File | Rosbag1File] | None:
-    """What reads the file `path`, by its first bytes."""
+    """Reader of the file `path`, by its first bytes; None for other files."""
     with open_file(path) as file:
         magic = file.read(len(SQLITE_MAGIC))
     for start, kind in ((MCAP_MAGIC, McapFile), (SQLITE_MAGIC, Sqlite3File), (ROSBAG1_MAGIC, Rosbag1File)):

@@ -4,7 +4,7 @@ import os
 from collections.abc import Collection, Iterable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from rosbags.interfaces import MessageDefinition
 from rosbags.interfaces.typing import Fielddefs, Typesdict
@@ -13,21 +13,17 @@ from rosbags.typesys.store import Typestore
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.files import read_whole
-from fgtrack.io.errors import MOST_OBJECTS
-from fgtrack.io.ros.counting import CountingStore, TooManyError, longest_list
+from fgtrack.io.errors import MOST_OBJECTS, refuse_larger
 from fgtrack.io.ros.definition_text import DefinitionReader, one_line
 from fgtrack.io.ros.definitions import DEFINITIONS
-from fgtrack.io.ros.type_checks import Load, check_definition, load_of, named_types
+from fgtrack.io.ros.type_checks import check_definition, check_size, named_types
 
 __all__ = ["Key", "MessageTypes", "build_typestore", "one_line", "type_name"]
 
 _LARGEST_FILE_MB = 1.0
+_LARGEST_MESSAGE = 32_000_000
+"""Of a message that is decoded: an object list or a state, never an image; each byte takes up to a hundred."""
 _MOST_FOLDERS = 10_000  # below a folder of definitions
-_VALUES_PER_OBJECT = 50
-"""Those of Autoware have 40."""
-
-AnyStore = TypeVar("AnyStore", bound=Typestore)
-
 Key = tuple[str, MessageDefinition | None]
 """A message type, and what the recording says of it: two topics may know different types by one name."""
 
@@ -52,7 +48,7 @@ class MessageTypes:
     message_definitions
         The user's `.msg` files, or folders of them.
     most_objects
-        A message with a longer list, or with more values than such lists have, is refused.
+        A message with a longer list is refused.
 
     Raises
     ------
@@ -70,12 +66,10 @@ class MessageTypes:
         self._ros1 = ros1
         self._most_objects = most_objects
         self._types: dict[Key, Typesdict] = {}
-        self._loads: dict[Key, Load] = {}
         self._stores: dict[Key, Typestore] = {}
-        self._counting: dict[Key, CountingStore] = {}
         self.problems: dict[Key, str] = {}
         """Why messages of a type cannot be decoded."""
-        keys = sorted(set(keys), key=_length)  # what is too much for all of them is the longest
+        keys = sorted(set(keys), key=str)
         embedded = self._embedded(keys)
         known = _known_types(ros1, message_definitions)
         shared, ambiguous = _shared(embedded.values())
@@ -83,9 +77,9 @@ class MessageTypes:
             if key not in self.problems:
                 try:
                     types = _closure(key[0], [embedded[key], shared, known], ambiguous)
-                    self._loads[key] = load_of(key[0], types, ros1)
+                    check_size(key[0], types)
                     self._types[key] = types
-                except ValueError as error:
+                except (ValueError, RecursionError) as error:
                     self.problems[key] = str(error)
 
     def _embedded(self, keys: list[Key]) -> dict[Key, Typesdict]:
@@ -107,44 +101,38 @@ class MessageTypes:
         return self._types[key]
 
     def decode(self, key: Key, data: bytes, what: str) -> Any:  # a message has the attributes of its type
-        """The message that is serialized in `data`.
+        """Message that is serialized in `data`; `what` names it in errors.
 
         Raises
         ------
         DataError
-            It is none of the type, or has more than `most_objects` allows; `what` says which message it is.
+            The bytes are not of the type, or hold a list of more than `most_objects`.
         """
-        load = self._loads[key]
+        refuse_larger(len(data), what, _LARGEST_MESSAGE)
         try:
-            if load.most_texts(len(data)) > _VALUES_PER_OBJECT * self._most_objects:
-                raise TooManyError
-            is_large = load.most_values(len(data)) > self._most_objects
-            message = self._counted(key, data) if is_large else self._decoded(self._store(key), key, data)
-        except TooManyError:
-            raise DataError(
-                f"{what}: a {key[0]} of {len(data) / 1e6:.1f} MB with more values than lists of as many objects have "
-                "as input.most_objects allows: raise it, if that is right"
-            ) from None
-        except Exception as error:  # whatever foreign bytes make the decoder raise
+            store = self._store(key)
+            message = (store.deserialize_ros1 if self._ros1 else store.deserialize_cdr)(data, key[0])
+        except Exception as error:  # whatever bytes of another type make the decoder raise
             raise DataError(f"{what} is not a {key[0]} ({one_line(error)})") from error
-        if is_large and (length := longest_list(message)) > self._most_objects:
+        if len(data) > self._most_objects and (length := _longest_list(message)) > self._most_objects:
             raise DataError(f"{what}: a list of {length} objects, more than input.most_objects allows")
         return message
 
     def _store(self, key: Key) -> Typestore:
         if key not in self._stores:
-            self._stores[key] = _registered(Typestore(), self._types[key])
+            self._stores[key] = _registered(self._types[key])
         return self._stores[key]
 
-    def _counted(self, key: Key, data: bytes) -> Any:
-        if key not in self._counting:
-            store = CountingStore(_VALUES_PER_OBJECT * self._most_objects)
-            self._counting[key] = _registered(store, self._types[key])
-        self._counting[key].restart()
-        return self._decoded(self._counting[key], key, data)
 
-    def _decoded(self, store: Typestore, key: Key, data: bytes) -> Any:
-        return (store.deserialize_ros1 if self._ros1 else store.deserialize_cdr)(data, key[0])
+def _longest_list(message: Any) -> int:  # a message has the attributes of its type
+    """Length of the longest list in `message`, not looking into lists."""
+    lengths = [0]
+    for value in vars(message).values():
+        if isinstance(value, list):
+            lengths.append(len(value))
+        elif hasattr(value, "__msgtype__"):
+            lengths.append(_longest_list(value))
+    return max(lengths)
 
 
 def build_typestore(
@@ -158,17 +146,13 @@ def build_typestore(
     needed: Typesdict = {}
     for key in definitions.items():
         needed |= {} if key in found.problems else found.types(key)
-    return _registered(Typestore(), needed), {name: problem for (name, _), problem in found.problems.items()}
+    return _registered(needed), {name: problem for (name, _), problem in found.problems.items()}
 
 
-def _registered(store: AnyStore, types: Typesdict) -> AnyStore:
+def _registered(types: Typesdict) -> Typestore:
+    store = Typestore()
     store.register(types)
     return store
-
-
-def _length(key: Key) -> tuple[int, str]:
-    name, definition = key
-    return (len(definition.data) if definition else 0), name
 
 
 def _shared(embedded: Collection[Typesdict]) -> tuple[Typesdict, frozenset[str]]:

@@ -19,7 +19,7 @@ from fgtrack.core.files import open_file, open_text, read_whole
 from fgtrack.core.types import BoolArray
 from fgtrack.io.run.relied import check_config, check_meta
 from fgtrack.io.run.schema import COLUMNS, LARGEST_META_MB, OPTIONAL_TABLES, RUN_FORMAT
-from fgtrack.io.yaml_text import YamlSizeError, safe_yaml
+from fgtrack.io.yaml_text import safe_yaml
 
 # A column holds floats, integers or strings, as its name says; the reader of it knows which.
 Column = npt.NDArray[Any]
@@ -35,7 +35,7 @@ _INTEGER_COLUMNS = frozenset(
 CHUNK = 4096
 """Rows that wait for becoming columns, which take a tenth of the memory."""
 
-_LONGEST_LINE = _LONGEST_CONFIG = 1_000_000
+_LONGEST_LINE = 1_000_000
 _LARGEST = 1e60  # its square is a number; more is no measurement, and no state
 _WIDE_BYTES, _WIDER_THAN_FILE = 1e8, 100.0  # of a column of text, all cells of which are as wide as its longest
 
@@ -106,10 +106,8 @@ class Run:
         """Values of config.yaml. Raises `DataError` where it is no YAML mapping, or not that of a run."""
         try:
             config = _parsed(self.config_text)
-        except (YAMLError, RecursionError) as error:
+        except YAMLError as error:
             raise DataError(f"{self.config_path}: is not YAML, repeat the run") from error
-        except YamlSizeError as error:
-            raise DataError(f"{self.config_path}: {error}, which no run writes: repeat the run") from error
         if not isinstance(config, dict | None):
             raise DataError(f"{self.config_path}: holds no settings, repeat the run")
         check_config(config or {}, self.config_path)
@@ -124,7 +122,7 @@ class Run:
 @lru_cache(maxsize=64)
 def _parsed(text: str) -> Any:
     """The YAML values of `text`. Cached: parsing takes longer than evaluating a run of 20 s, and sweeps repeat it."""
-    return safe_yaml(text, _LONGEST_CONFIG)
+    return safe_yaml(text)
 
 
 def load_run(path: Path | str) -> Run:
