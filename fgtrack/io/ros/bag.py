@@ -220,7 +220,7 @@ def _bag_file(path: Path, alone: bool, largest_bytes: int) -> BagFile:
     kind = storage_of(path)
     if kind is None:
         raise DataError(f"{path}: {'is empty' if empty else 'is not a bag file'}")
-    return Rosbag1File(path) if kind is Rosbag1File else kind(path, largest_bytes)
+    return kind(path) if issubclass(kind, Rosbag1File) else kind(path, largest_bytes)
 
 
 @contextmanager

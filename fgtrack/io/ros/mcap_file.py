@@ -5,6 +5,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
+from functools import partial
 from io import BytesIO
 from operator import itemgetter
 from pathlib import Path
@@ -78,10 +79,9 @@ class McapFile:
             found = [one for one in records() if isinstance(one, Message) and one.channel_id in by_id]
             yield from ((one.log_time, one) for one in sorted(found, key=lambda one: one.log_time))
 
-        sources = [of(first_ns, lambda at=offset: self._inner(self._chunk_at(at))) for first_ns, offset in self._chunks]
+        sources = [of(first_ns, partial(self._inner_at, offset)) for first_ns, offset in self._chunks]
         if self._cut_chunk:
-            cut = self._cut_chunk
-            sources.append(of(cut.message_start_time, lambda: self._inner(cut)))
+            sources.append(of(self._cut_chunk.message_start_time, partial(self._inner, self._cut_chunk)))
         loose = sorted(self._loose, key=itemgetter(0))
         sources.append((log_ns, self._message_at(offset)) for log_ns, offset in loose)
         for log_ns, message in heapq.merge(*sources, key=itemgetter(0)):
@@ -92,7 +92,7 @@ class McapFile:
         """Connection, publish time, log time and data of every message, in the order of the file."""
         by_id = {connection.id: connection for connection in self.connections}
         for records in (
-            *(self._inner(self._chunk_at(offset)) for _, offset in self._chunks),
+            *(self._inner_at(offset) for _, offset in self._chunks),
             (self._message_at(offset) for _, offset in self._loose),
         ):
             for one in records:
@@ -101,6 +101,7 @@ class McapFile:
 
     def _summary(self) -> Statistics | None:
         """Statistics of a whole file whose messages are all in chunks with an index; notes its channels and chunks."""
+        assert self._file
         try:
             summary = SeekingReader(self._file, record_size_limit=self._largest_bytes).get_summary()
         except Exception:  # whatever the end of a truncated file raises
@@ -145,7 +146,7 @@ class McapFile:
         self._counts.clear()
         for k, (_, offset) in enumerate(self._chunks):
             try:
-                inner = self._inner(self._chunk_at(offset))
+                inner = self._inner_at(offset)
             except Exception as error:  # whatever damaged bytes raise
                 self._chunks, self._cut_chunk = self._chunks[:k], None
                 self.break_off = f"is damaged ({error})"
@@ -177,10 +178,10 @@ class McapFile:
         reader = StreamReader(self._file, skip_magic=True, emit_chunks=True, record_size_limit=self._largest_bytes)
         return iter(reader.records)
 
-    def _chunk_at(self, offset: int) -> Chunk:
+    def _inner_at(self, offset: int) -> list[McapRecord]:
         chunk = next(self._records(offset))
         assert isinstance(chunk, Chunk)
-        return chunk
+        return self._inner(chunk)
 
     def _message_at(self, offset: int) -> Message:
         message = next(self._records(offset))
