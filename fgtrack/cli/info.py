@@ -2,29 +2,53 @@
 
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Annotated
 
-from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json
+import typer
+
+from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, Overwrite
 from fgtrack.cli.show import chosen_form, progress, say, sentences, show, warn
-from fgtrack.core.errors import DataError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.evaluation.left_out import left_out
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value
 from fgtrack.io.info import OTHER_CLOCK_S, InputInfo, TopicInfo, describe
+from fgtrack.io.output import check_apart, check_output
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.effective import effective
 from fgtrack.pipeline.shipped import read_config
+from fgtrack.pipeline.starting import STARTING, write_starting
 from fgtrack.pipeline.trial import Trial, try_out
 
 _DELAYS = ("delay_mean_s", "delay_p50_s", "delay_p90_s", "delay_max_s")
 
 
-def info(recording: Input, config_file: ConfigFile = None, as_json: Json = False, form: FormOption = None) -> None:
+def info(
+    recording: Input,
+    config_file: ConfigFile = None,
+    write: Annotated[
+        Path | None,
+        typer.Option("--write", metavar="MY.yaml", help="Write a commented starting configuration for the recording."),
+    ] = None,
+    overwrite: Overwrite = False,
+    as_json: Json = False,
+    form: FormOption = None,
+) -> None:
     """Show topics, rates and delays of a recording.
 
-    With a configuration also what it would take from them, what a message of each is read as, and what a replay of the
-    first seconds makes of them.
+    With a configuration (or with the one of --write, which guesses what topics, fields and columns are) also what it
+    would take from them, what a message of each is read as, and what a replay of the first seconds makes of them.
     """
     form = chosen_form(as_json, form)
+    if write is not None:
+        if config_file is not None:
+            raise CallError("--write, -c: a starting configuration is made from the recording alone, give one of them")
+        check_output(write, STARTING, overwrite)
+        check_apart(write, [recording])
+        write_starting(write, recording, overwrite)
+        if form is None:
+            say(f"{write}: written; check its guesses, they are applied below")
+        config_file = str(write)
     config = None if config_file is None else read_config(config_file)
     found = describe(recording, None if config is None else config.input)
     topics = _table(found, NO_VALUE if config is None else "ignored")
