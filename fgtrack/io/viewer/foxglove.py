@@ -39,12 +39,6 @@ def check_foxglove(path: Path, overwrite: bool) -> None:
     """Raise `CallError` where `write_foxglove` would before the first message."""
     if path.suffix != ".mcap":
         raise CallError(f"{path}: viewers know such a file by its name, let it end in .mcap")
-    try:
-        import mcap.writer  # noqa: F401
-    except ImportError as error:
-        raise CallError(
-            "the package mcap is missing: pip install 'fgtrack[foxglove]', or give --ros2, which needs nothing more"
-        ) from error
     check_output(path, EXPORT, overwrite)
 
 
