@@ -39,7 +39,8 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.factor_graph import SmootherBank, SmootherSettings
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.replay import ReplayEkf
-from fgtrack.evaluation.figures.style import colour, log_axis, save, styled
+from fgtrack.evaluation.figures.paper import styled
+from fgtrack.evaluation.figures.style import colour, log_axis, save
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.sim.draw import drawn

@@ -31,7 +31,9 @@ from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.registry import ESTIMATORS, OOSM_GROUP, estimator
 from fgtrack.evaluation.bounds import ScheduledMeasurement, bounds, bounds_along
-from fgtrack.evaluation.figures.style import GREY, WRONG, colour, save, styled
+from fgtrack.evaluation.figures.paper import styled
+from fgtrack.evaluation.figures.style import GREY, WRONG, save
+from fgtrack.evaluation.palette import look
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
 from fgtrack.sim.draw import drawn
@@ -296,9 +298,9 @@ def _draw_bounds(axes: Axes, lines: Sequence[Entry]) -> None:
         "arrived": {"color": WRONG, "linestyle": "-", "label": "bound: what has arrived"},
         "dropped": {"color": GREY, "linestyle": "--", "label": "bound: late data dropped"},
     }
-    for name, look in looks.items():
+    for name, its in looks.items():
         own = [e for e in lines if e.name == f"bound: {name}"]
-        axes.plot([1e3 * e.delay_s for e in own], [e.rmse_m for e in own], linewidth=1.5, **look)
+        axes.plot([1e3 * e.delay_s for e in own], [e.rmse_m for e in own], linewidth=1.5, **its)
 
 
 def _draw_estimators(axes: Axes, entries: Sequence[Entry], shown_m: tuple[float, float]) -> None:
@@ -308,9 +310,15 @@ def _draw_estimators(axes: Axes, entries: Sequence[Entry], shown_m: tuple[float,
         if not own:
             continue  # not asked for
         delays_s = np.array([e.delay_s for e in own]) + (index - len(DRAWN) // 2) * DODGE_S
-        look = {"color": colour(index), "marker": MARKERS[index], "markersize": 4.5, "linestyle": "", "capsize": 2.0}
+        its = {
+            "color": look(name).colour,
+            "marker": MARKERS[index],
+            "markersize": 4.5,
+            "linestyle": "",
+            "capsize": 2.0,
+        }
         bars_m = [2.0 * e.rmse_error_m for e in own]
-        axes.errorbar(1e3 * delays_s, [e.rmse_m for e in own], bars_m, label=name, **look)
+        axes.errorbar(1e3 * delays_s, [e.rmse_m for e in own], bars_m, label=name, **its)
     axes.set_ylim(*shown_m)
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Unpack
 
 import typer
 from matplotlib.figure import Figure
@@ -13,6 +13,7 @@ from fgtrack.cli.show import progress, say
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
+from fgtrack.evaluation.figures.paper import Paper, settings
 from fgtrack.evaluation.figures.style import DRAWN, save_pages
 from fgtrack.evaluation.plot import Planned, close_up, drawn, planned, planned_sweep, save_named
 from fgtrack.evaluation.recordings import by_recording
@@ -28,6 +29,12 @@ def figure(
     form: Annotated[Literal["png", "svg", "pdf"], typer.Option("--format", help="Format of the pictures.")] = "png",
     track: Annotated[int | None, typer.Option(help="Track of the close-up, in the first run.")] = None,
     stamp: Annotated[float | None, typer.Option(help="Stamp of the close-up: s after the first tick.")] = None,
+    width: Annotated[
+        str | None,
+        typer.Option(metavar="3.4in", help="Width on paper (in, cm, mm), without title."),
+    ] = None,
+    font: Annotated[str | None, typer.Option(metavar="NAME", help='Font, as "Times New Roman".')] = None,
+    style: Annotated[str | None, typer.Option(metavar="FILE", help="Style of matplotlib (.mplstyle).")] = None,
     every: Annotated[bool, typer.Option("--all", help="Draw every object, run and metric, not the few.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -43,10 +50,11 @@ def figure(
     one_file = out.suffix.lower() == ".pdf" and not out.is_dir()
     if out.suffix.lower() in (".png", ".svg") and not out.is_dir():
         raise CallError(f"{out}: one picture cannot hold all figures, name a folder or a .pdf")
+    paper = _paper(width, font, style)
     picture = out if one_file else out / f"figure.{form}"  # what else is in the folder stays
     with progress("draw"):
-        first, plans, missing = _of_sweep(runs, track, stamp) or _of_runs(runs, picture, track, stamp)
-        named = chain(first, drawn(plans, every))
+        first, plans, missing = _of_sweep(runs, track, stamp) or _of_runs(runs, picture, track, stamp, paper)
+        named = chain(first, drawn(plans, every, **paper))
         if one_file:
             with new_file(out, DRAWN, overwrite) as file:
                 save_pages((each for _, each in named), file)
@@ -61,6 +69,19 @@ def figure(
     left_out = 0 if every else sum(one.is_extra for one in plans)
     if left_out:
         say(f"{left_out} more with --all")
+
+
+def _paper(width: str | None, font: str | None, style: str | None) -> Paper:
+    """Return the options as keywords of the figures. Raises `CallError` where one is not usable."""
+    paper: Paper = {}
+    if width is not None:
+        paper["width"] = width
+    if font is not None:
+        paper["font"] = font
+    if style is not None:
+        paper["style"] = style
+    settings(paper)
+    return paper
 
 
 _Figures = tuple[list[tuple[str, Figure]], list[Planned], DataError | None]  # the close-up, the others, why it is none
@@ -78,24 +99,24 @@ def _of_sweep(folders: Sequence[Path], track: int | None, stamp: float | None) -
     return [], planned_sweep(read_sweep(sweeps[0])), None
 
 
-def _of_runs(folders: Sequence[Path], out: Path, track: int | None, stamp: float | None) -> _Figures:
+def _of_runs(folders: Sequence[Path], out: Path, track: int | None, stamp: float | None, paper: Paper) -> _Figures:
     found = judged(folders)
     check_apart(out, run_folders(found))
     if stamp is not None and not abs(stamp) <= LARGEST:
         raise CallError(f"--stamp {stamp}: is no time after the first tick, up to {LARGEST:g} s")
     stamp_ns = None if stamp is None else start_ns(found) + nanoseconds(stamp)
-    first, missing = drawn_close_up(found, track, stamp_ns)
+    first, missing = drawn_close_up(found, track, stamp_ns, **paper)
     if missing is not None and (track is not None or stamp is not None):
         raise missing
     return first, planned(found), missing
 
 
 def drawn_close_up(
-    runs: Sequence[JudgedRun], track_id: int | None = None, stamp_ns: int | None = None
+    runs: Sequence[JudgedRun], track_id: int | None = None, stamp_ns: int | None = None, **paper: Unpack[Paper]
 ) -> tuple[list[tuple[str, Figure]], DataError | None]:
     """The close-up of those of `runs` that are of the first one's recording, by its name; where it is none, why."""
     same = by_recording(runs)[0]
     try:
-        return [("close_up", close_up(same, close_ups([one.run for one in same], track_id, stamp_ns)))], None
+        return [("close_up", close_up(same, close_ups([one.run for one in same], track_id, stamp_ns), **paper))], None
     except DataError as error:
         return [], error

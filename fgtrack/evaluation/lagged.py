@@ -9,7 +9,7 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.consistency import normalised_squares
-from fgtrack.evaluation.matching import Matching, state_errors
+from fgtrack.evaluation.matching import Matching, TrackErrors, state_errors
 from fgtrack.evaluation.paired import UNKNOWN, Estimate, by_stamp, within_run
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.evaluation.truth import TRUE_STATE, TruePath, true_paths
@@ -80,15 +80,7 @@ def _present(matching: Matching) -> LagMetrics:
 def _judged(
     matching: Matching, paths: Sequence[TruePath], lag_s: float | Literal["window"], states: Table
 ) -> LagMetrics:
-    rows = _rows_at(matching, states)
-    alive = rows != _NO_ROW
-    states, rows = states.where(alive), rows[alive]
-    truth = np.full((len(rows), len(TRUE_STATE)), np.nan)
-    for index, path in enumerate(paths):
-        mine = matching.object_index[rows] == index
-        truth[mine] = path.at(states["stamp_ns"][mine])
-    known = np.isfinite(truth[:, 0]) & np.isfinite(states["x_m"])  # no truth is known of a row without a pair
-    states, truth, rows = states.where(known), truth[known], rows[known]
+    states, truth, rows = _with_truth(matching, paths, states)
     present = Table({name: column[rows] for name, column in matching.tracks.items()})
     errors, present_errors = state_errors(states, truth), state_errors(present, matching.true_states[rows])
     return LagMetrics(
@@ -98,6 +90,27 @@ def _judged(
         _moments(present_errors),
         _reduction(states["stamp_ns"], errors["position_m"], present_errors["position_m"]),
     )
+
+
+def final_errors(run: Run, matching: Matching) -> TrackErrors:
+    """Errors of the final states, each against the object that its track was paired with at that stamp."""
+    final = run.smoothed.where(run.smoothed["kind"] == "final")
+    states, truth, rows = _with_truth(matching, true_paths(run.truth), final)
+    index = matching.object_index[rows]
+    return TrackErrors(states["stamp_ns"], index, states["track_id"], state_errors(states, truth))
+
+
+def _with_truth(matching: Matching, paths: Sequence[TruePath], states: Table) -> tuple[Table, FloatArray, IntArray]:
+    """Return those of `states` that belong to an object, its true states there, shape (n, 5), and their judged rows."""
+    rows = _rows_at(matching, states)
+    alive = rows != _NO_ROW
+    states, rows = states.where(alive), rows[alive]
+    truth = np.full((len(rows), len(TRUE_STATE)), np.nan)
+    for index, path in enumerate(paths):
+        mine = matching.object_index[rows] == index
+        truth[mine] = path.at(states["stamp_ns"][mine])
+    known = np.isfinite(truth[:, 0]) & np.isfinite(states["x_m"])  # no truth is known of a row without a pair
+    return states.where(known), truth[known], rows[known]
 
 
 def _reduction(stamps_ns: IntArray, errors: FloatArray, present_errors: FloatArray) -> Estimate:

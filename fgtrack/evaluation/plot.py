@@ -8,48 +8,45 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation import innovations
-from fgtrack.evaluation.figures.anatomy import anatomy
 from fgtrack.evaluation.figures.arrivals import arrivals
 from fgtrack.evaluation.figures.close_up import close_up
 from fgtrack.evaluation.figures.consistency import consistency, has_squares
 from fgtrack.evaluation.figures.errors import errors, lag
 from fgtrack.evaluation.figures.frenet import frenet
 from fgtrack.evaluation.figures.map import tracks_on_map as map  # noqa: A004  # the name that users know
-from fgtrack.evaluation.figures.observed import sensed, transient
+from fgtrack.evaluation.figures.paper import Paper
 from fgtrack.evaluation.figures.residuals import residuals
 from fgtrack.evaluation.figures.seeds import error_bands, has_seeds
 from fgtrack.evaluation.figures.style import save
-from fgtrack.evaluation.figures.sweep import sweep, sweep_metrics
+from fgtrack.evaluation.figures.sweep import error_against_delay, sweep, sweep_metrics
 from fgtrack.evaluation.figures.times import delays, timing
 from fgtrack.evaluation.matching import track_errors
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged
-from fgtrack.evaluation.sendings import sendings
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.evaluation.sweep_table import SweepTable
 from fgtrack.evaluation.viewer.surroundings import roads
 
 __all__ = [
-    "anatomy",
     "arrivals",
     "close_up",
     "consistency",
     "delays",
+    "error_against_delay",
     "error_bands",
     "errors",
     "frenet",
     "lag",
     "map",
     "residuals",
-    "sensed",
     "sweep",
     "timing",
-    "transient",
 ]
 
 
@@ -68,7 +65,8 @@ class Planned:
     """A figure that can be drawn."""
 
     name: str
-    draw: Callable[[], Figure]
+    draw: Callable[..., Figure]
+    """Takes the keywords of `Paper`."""
     is_extra: bool = False
     """Whether it is one of many, and drawn on request only."""
 
@@ -77,7 +75,7 @@ _Plans = Iterator[Planned]
 
 
 def _of_each(
-    runs: Sequence[JudgedRun], name: str, has_data: Callable[[JudgedRun], bool], draw: Callable[[JudgedRun], Figure]
+    runs: Sequence[JudgedRun], name: str, has_data: Callable[[JudgedRun], bool], draw: Callable[..., Figure]
 ) -> _Plans:
     """One for each run with data; of many the worst come first."""
     found = [one for one in runs if has_data(one)]
@@ -87,25 +85,25 @@ def _of_each(
 
 
 def _maps(runs: Sequence[JudgedRun]) -> _Plans:
-    return _of_each(runs, "map", lambda one: bool(one.run.tracks.num_rows), lambda one: map(one))
+    return _of_each(runs, "map", lambda one: bool(one.run.tracks.num_rows), map)
 
 
 def _along(runs: Sequence[JudgedRun]) -> _Plans:
     def has_data(one: JudgedRun) -> bool:
         return bool(one.run.tracks.num_rows) and "track" in roads(one.run)[0]
 
-    return _of_each(runs, "frenet", has_data, lambda one: frenet(one))
+    return _of_each(runs, "frenet", has_data, frenet)
 
 
 def _residuals(runs: Sequence[JudgedRun]) -> _Plans:
     def has_data(one: JudgedRun) -> bool:
         return any(np.isfinite(values).any() for values in innovations.residuals(one.run).values())
 
-    return _of_each(runs, "residuals", has_data, lambda one: residuals(one))
+    return _of_each(runs, "residuals", has_data, residuals)
 
 
 def _consistency(runs: Sequence[JudgedRun]) -> _Plans:
-    return _of_each(runs, "consistency", has_squares, lambda one: consistency(one))
+    return _of_each(runs, "consistency", has_squares, consistency)
 
 
 def _alike(runs: Sequence[JudgedRun], *names: str) -> list[list[JudgedRun]]:
@@ -120,7 +118,7 @@ def _alike(runs: Sequence[JudgedRun], *names: str) -> list[list[JudgedRun]]:
     return list(groups.values())
 
 
-def _of_groups(groups: Sequence[Sequence[JudgedRun]], name: str, draw: Callable[[JudgedRun], Figure]) -> _Plans:
+def _of_groups(groups: Sequence[Sequence[JudgedRun]], name: str, draw: Callable[..., Figure]) -> _Plans:
     """One for each of `groups`; of many the first."""
     for place, group in enumerate(groups):
         label = "" if len(groups) == 1 else ", ".join(one.label for one in group)
@@ -131,29 +129,13 @@ def _of_groups(groups: Sequence[Sequence[JudgedRun]], name: str, draw: Callable[
 
 def _arrivals(runs: Sequence[JudgedRun]) -> _Plans:
     """One for all runs in which the same became of every detection."""
-    return _of_groups(_alike(runs, "disposition"), "arrivals", lambda one: arrivals(one))
-
-
-def _transients(runs: Sequence[JudgedRun]) -> _Plans:
-    for one in runs:
-        if len(one.samples.sensors):
-            yield Planned(f"transient_{one.label}", partial(transient, one), is_extra=True)
-
-
-def _sensed(runs: Sequence[JudgedRun]) -> _Plans:
-    for plan in _of_groups(_alike(runs), "sensed", lambda one: sensed(one)):
-        yield replace(plan, is_extra=True)
+    return _of_groups(_alike(runs, "disposition"), "arrivals", arrivals)
 
 
 def _delays(runs: Sequence[JudgedRun]) -> _Plans:
     """One for each recording, but for those without any delay."""
     late = [one for one in runs if (one.run.updates["receipt_ns"] != one.run.updates["stamp_ns"]).any()]
-    return _of_groups(_alike(late), "delays", lambda one: delays(one))
-
-
-def _anatomy(runs: Sequence[JudgedRun]) -> _Plans:
-    known = [group for group in _alike(runs) if sendings(group[0].run)]
-    return _of_groups(known, "anatomy", lambda one: anatomy(one))
+    return _of_groups(_alike(late), "delays", delays)
 
 
 def _errors(runs: Sequence[JudgedRun]) -> _Plans:
@@ -163,7 +145,7 @@ def _errors(runs: Sequence[JudgedRun]) -> _Plans:
     ids = sorted({k for one in runs if one.matching for k in one.matching.object_ids})
     many = len(ids) > _FEW
     if many:
-        yield Planned("errors_all_objects", lambda: errors(runs))
+        yield Planned("errors_all_objects", partial(errors, runs))
     kept = _worst_objects(runs, ids)[:_FEW]
     for object_id in ids:
         yield Planned(f"errors_object_{object_id}", partial(errors, runs, object_id), many and object_id not in kept)
@@ -171,17 +153,17 @@ def _errors(runs: Sequence[JudgedRun]) -> _Plans:
 
 def _error_bands(runs: Sequence[JudgedRun]) -> _Plans:
     if has_seeds(runs):
-        yield Planned("error_bands", lambda: error_bands(runs))
+        yield Planned("error_bands", partial(error_bands, runs))
 
 
 def _lag(runs: Sequence[JudgedRun]) -> _Plans:
     if any(entry.is_lagged for one in runs for entry in one.lagged):
-        yield Planned("error_against_lag", lambda: lag(runs))
+        yield Planned("error_against_lag", partial(lag, runs))
 
 
 def _timing(runs: Sequence[JudgedRun]) -> _Plans:
     if any((one.run.timing["num_detections"] > 0).any() for one in runs):
-        yield Planned("timing", lambda: timing(runs))
+        yield Planned("timing", partial(timing, runs))
 
 
 #: By the name of the function that draws them: the figures that runs have data for, each with the name of its file.
@@ -191,10 +173,7 @@ FIGURES: Mapping[str, Callable[[Sequence[JudgedRun]], _Plans]] = {
     "residuals": _residuals,
     "consistency": _consistency,
     "arrivals": _arrivals,
-    "anatomy": _anatomy,
     "delays": _delays,
-    "transient": _transients,
-    "sensed": _sensed,
     "errors": _errors,
     "error_bands": _error_bands,
     "lag": _lag,
@@ -231,10 +210,12 @@ def _worst_objects(runs: Sequence[JudgedRun], ids: Sequence[int]) -> list[int]:
     return sorted(ids, key=lambda object_id: max(_rmse_m(one, object_id) for one in runs), reverse=True)
 
 
-def save_figures(runs: Runs, out_dir: Path | str, form: str = "png", every: bool = False) -> list[Path]:
+def save_figures(
+    runs: Runs, out_dir: Path | str, form: str = "png", every: bool = False, **paper: Unpack[Paper]
+) -> list[Path]:
     """Write the figures that `runs` have data for into `out_dir`, as png, svg or pdf; gives the files.
 
-    Of many objects and runs the worst few are drawn, all where `every` is set.
+    Of many objects and runs the worst few are drawn, all where `every` is set. `paper`: `width`, `font`, `style`.
 
     Raises
     ------
@@ -248,7 +229,7 @@ def save_figures(runs: Runs, out_dir: Path | str, form: str = "png", every: bool
         out_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise CallError(f"{out_dir}: cannot be made ({error.strerror}), choose another folder") from error
-    return save_named(drawn(planned(found), every), out_dir, form)
+    return save_named(drawn(planned(found), every, **paper), out_dir, form)
 
 
 def save_named(named: Iterable[tuple[str, Figure]], folder: Path, form: str) -> list[Path]:
@@ -272,9 +253,9 @@ def planned_sweep(table: SweepTable) -> list[Planned]:
     return [Planned(f"sweep_{metric}", partial(sweep, table, metric), metric in rest) for metric in (*first, *rest)]
 
 
-def drawn(plans: Iterable[Planned], every: bool = False) -> Iterator[tuple[str, Figure]]:
+def drawn(plans: Iterable[Planned], every: bool = False, **paper: Unpack[Paper]) -> Iterator[tuple[str, Figure]]:
     """The figures of `plans`, with their names; extras only where `every` is set."""
-    return ((one.name, one.draw()) for one in plans if every or not one.is_extra)
+    return ((one.name, one.draw(**paper)) for one in plans if every or not one.is_extra)
 
 
 def _slug(name: str) -> str:

@@ -109,7 +109,7 @@ def dispositions_table(rows: Sequence[Row[SensorMetrics]], left_out: Iterable[st
         *(Column("" if k in absent else k.replace("_", "\n"), (k.value,), count(k), when="full") for k in Disposition),
         Column("sum", ("detections",), lambda row: (row.of.detections,)),
     ]
-    own = [f"none: {', '.join(name.replace('_', ' ') for name in absent)}"] if absent else []
+    own = [f"no detection was {' or '.join(name.replace('_', ' ') for name in absent)}"] if absent else []
     own += left_out
     title = "Dispositions (what became of every detection)"
     return Table(title, columns, rows, row_keys=("run", "sensor"), notes=own)

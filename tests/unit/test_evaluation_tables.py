@@ -430,7 +430,7 @@ def test_a_residual_table_has_mean_standard_deviation_nis_and_delay(tables: Tabl
 def test_the_disposition_table_sums_up_and_names_what_never_occurred(tables: Tables) -> None:
     table = tables["dispositions"]
     assert rows_of(table)[-2:] == ["smoother lidar_cluster 1 1 2", "smoother radar_long_range 0 1 1"]
-    assert table.notes[0].startswith("none: out of sequence, beyond window, too old, gated")
+    assert table.notes[0].startswith("no detection was out of sequence or beyond window or too old or gated")
     assert sum(int(table[name.value].sum()) for name in Disposition) == table["detections"].sum() == 9
 
 

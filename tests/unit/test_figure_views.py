@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from evaluation_runs import ROUND, START_NS, TICK_NS, WEST, Car, update, write_run
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray
 from fgtrack.evaluation import plot
+from fgtrack.evaluation.figures.errors import moving_rms
 from fgtrack.evaluation.figures.ranges import bulk
+from fgtrack.evaluation.palette import look
 from fgtrack.evaluation.runs import judged
 from fgtrack.io.run import Run, Table
 from fgtrack.models.oval import make_oval
@@ -140,33 +141,26 @@ def test_the_nees_of_a_tick_is_the_mean_over_its_objects(tmp_path: Path) -> None
 # --- differences
 
 
-def errors_of(tmp_path: Path, *along_m: float) -> Figure:
+def test_curves_that_coincide_are_both_seen_for_one_is_dashed(tmp_path: Path) -> None:
     runs = []
-    for index, error_m in enumerate(along_m):
-        tracks = [[WEST.track(k, 1, along_m=error_m, speed_mps=0.5 + index)] for k in TICKS]
-        meta = {"estimator": f"run{index}"}
-        runs.append(write_run(tmp_path / f"run{index}", tracks, truth=WEST.truth(TICKS), meta=meta))
-    return plot.errors(runs)
+    for name in ("smoother", "ekf-replay"):
+        tracks = [[WEST.track(k, 1, along_m=0.5)] for k in TICKS]
+        later = {k: [WEST.later(k - 5, 1, along_m=0.1)] for k in TICKS[5:]} if name == "smoother" else {}
+        meta = {"estimator": name}
+        runs.append(write_run(tmp_path / name, tracks, truth=WEST.truth(TICKS), meta=meta, smoothed=later))
+    position, *_ = plot.errors(runs).axes
+    smoother, replay, final = position.lines
+    np.testing.assert_allclose(y_of(smoother), y_of(replay))
+    assert (smoother.get_linestyle(), replay.get_linestyle()) == ("-", "--")
+    assert final.get_color() == smoother.get_color() == look("smoother").colour != replay.get_color()
+    assert str(final.get_label()).startswith("smoother, final state: RMSE 0.1")
 
 
-def test_curves_that_nearly_coincide_are_told_apart_by_their_difference(tmp_path: Path) -> None:
-    figure = errors_of(tmp_path, 0.5, 0.51, 2.0)
-    position, difference, speed, *_ = figure.axes
-    assert len(position.lines) == 3
-    (line,) = difference.lines
-    assert line.get_label() == "run1 minus run0"
-    np.testing.assert_allclose(y_of(line), 0.01, atol=1e-6)
-    assert line.get_color() == position.lines[1].get_color()
-    low, high = difference.get_ylim()
-    assert low < 0.0 < 0.01 < high
-    assert speed.get_ylabel() == "speed error [m/s]"  # those of the speeds are far apart
-
-
-def test_equal_curves_are_said_to_be_equal(tmp_path: Path) -> None:
-    figure = errors_of(tmp_path, 0.5, 0.5)
-    labels = [str(line.get_label()) for line in figure.axes[0].lines]
-    assert labels == ["run0: RMSE 0.5 m", "run1: RMSE 0.5 m, same as run0"]
-    assert "larger by" not in "".join(axes.get_ylabel() for axes in figure.axes)
+def test_an_error_is_the_root_mean_square_of_those_around_it() -> None:
+    stamps_ns = np.array([0, 0, 10, 20, 30, 1000])
+    found_ns, rms = moving_rms(stamps_ns, np.array([3.0, 4.0, 1.0, np.nan, 2.0, 7.0]), 20)
+    assert found_ns.tolist() == [0, 10, 30, 1000]
+    np.testing.assert_allclose(rms, [np.sqrt(26 / 3), np.sqrt(26 / 3), 2.0, 7.0])
 
 
 def test_runs_of_another_day_begin_at_zero_as_well(tmp_path: Path) -> None:

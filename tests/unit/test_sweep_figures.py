@@ -10,6 +10,8 @@ from support.pictures import faults
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.evaluation import plot
+from fgtrack.evaluation.figures.sweep import metric_words
+from fgtrack.evaluation.palette import look
 from fgtrack.evaluation.sweep_table import SWEEP_FILE, is_sweep, read_sweep
 from fgtrack.pipeline.sweep_store import SWEEP_TABLE
 
@@ -52,8 +54,8 @@ def test_the_figure_has_a_line_with_bars_for_each_estimator(tmp_path: Path) -> N
     assert not np.allclose(first.lines[0].get_xdata(), second.lines[0].get_xdata(), atol=1e-6)  # bars side by side
     (bars,) = first.lines[2]
     low, high = bars.get_segments()[0][:, 1]
-    assert (high - low) / 2.0 == pytest.approx(0.1 / np.sqrt(3.0))
-    assert axes.get_xlabel() == "delay_s"
+    assert (high - low) / 2.0 == pytest.approx(4.302653 * 0.1 / np.sqrt(3.0))  # t(2) at 97.5 %
+    assert axes.get_xlabel() == "delay [s]"
     assert "mean over 2 to 3 seeds" in figure.get_suptitle()
     assert faults(figure) == []
 
@@ -61,8 +63,8 @@ def test_the_figure_has_a_line_with_bars_for_each_estimator(tmp_path: Path) -> N
 def test_the_axis_with_the_most_numbers_is_horizontal_and_the_others_have_panels(tmp_path: Path) -> None:
     figure = plot.sweep(a_sweep(tmp_path / "sweep", gates=("5.0", "3.0", "2.0", "1.0")), NEES)
     seen = [axes for axes in figure.axes if axes.get_visible()]
-    assert {axes.get_xlabel() for axes in seen} == {"gate_m"}
-    assert [axes.get_title(loc="left") for axes in seen] == [f"delay_s {delay}" for delay in DELAYS]
+    assert {axes.get_xlabel() for axes in seen} == {"gate [m]"}
+    assert [axes.get_title(loc="left") for axes in seen] == [f"delay [s]: {delay}" for delay in DELAYS]
     assert faults(figure) == []
 
 
@@ -92,3 +94,44 @@ def test_what_is_no_sweep_is_one_clear_error(tmp_path: Path) -> None:
     assert is_sweep(tmp_path / "sweep")
     assert not is_sweep(tmp_path / "nowhere")
     assert SWEEP_FILE == SWEEP_TABLE
+
+
+def test_an_estimator_has_the_colour_of_its_name_in_sweeps_and_in_runs(tmp_path: Path) -> None:
+    folder = a_sweep(tmp_path / "sweep")
+    text = (folder / SWEEP_FILE).read_text().replace("estimator-0", "ekf-replay").replace("estimator-1", "smoother")
+    (folder / SWEEP_FILE).write_text(text)
+    (axes,) = plot.sweep(folder).axes
+    colours = {each.get_label(): each.lines[0].get_color() for each in axes.containers}
+    assert colours == {name: look(name).colour for name in ("ekf-replay", "smoother")}
+
+
+@pytest.mark.parametrize(
+    ("key", "expected"),
+    [
+        ("lidar_delay_s", "LiDAR delay [s]"),
+        ("scenario.sensors.radar.rate_hz", "RADAR rate [Hz]"),
+        ("truth.overall.errors.yaw_rate_radps.rmse", "yaw rate RMSE [rad/s]"),
+        ("lagged.0.3.errors.position_m.rmse", "position RMSE [m], output 0.3 s later"),
+        ("consistency.nis.lidar_cluster.mean", "mean NIS of lidar cluster"),
+    ],
+)
+def test_labels_are_words_with_units_not_keys(key: str, expected: str) -> None:
+    assert metric_words(key) == expected
+
+
+def test_error_against_delay_needs_no_sweep_and_rises_for_every_method() -> None:
+    figure = plot.error_against_delay()
+    (axes,) = figure.axes
+    lines = {str(line.get_label()): np.asarray(line.get_ydata()) for line in axes.lines}
+    assert list(lines) == ["smoother", "ekf-replay", "ekf-backward-forward", "drop", "smoother, output 0.3 s later"]
+    assert axes.get_xlabel() == "LiDAR delay, mean [ms]"
+    assert len(axes.collections) == len(lines)  # a band each
+    for y in lines.values():
+        assert y[-1] > y[1]
+    assert (lines["ekf-backward-forward"][1:] > lines["smoother"][1:]).all()
+    assert faults(figure) == []
+
+
+def test_what_is_not_over_delays_is_not_drawn_against_them(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="not over one axis of delays"):
+        plot.error_against_delay(a_sweep(tmp_path / "sweep", gates=("5.0", "3.0")))

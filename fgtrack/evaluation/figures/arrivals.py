@@ -1,6 +1,7 @@
 """The figure of arrivals: what was sensed when, received when, and what became of it."""
 
 from collections.abc import Mapping
+from typing import Unpack
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,27 +11,20 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, IntArray
-from fgtrack.evaluation.figures.style import (
-    GREY,
-    PALETTE,
-    StyledFigure,
-    legend_above,
-    styled,
-    title,
-    titled,
-    usual_step_ns,
-)
+from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
+from fgtrack.evaluation.figures.style import legend_above, titled, usual_step_ns
 from fgtrack.evaluation.runs import OneRun, one_judged, start_ns
 from fgtrack.io.run import Table
 from fgtrack.io.run.reader import Column
 
+#: None is the colour of an estimator that is compared often.
 _COLOURS = {
-    "not used": GREY,
-    "merged": PALETTE[4],
-    "fused in sequence": PALETTE[2],
-    "fused out of sequence": PALETTE[1],
-    "fused beyond the window": PALETTE[3],
-    "started a track": PALETTE[0],
+    "fused in sequence": "#8A8F98",
+    "fused out of sequence": "#B65CA8",
+    "fused beyond the window": "#A0622D",
+    "started a track": "#2F93C6",
+    "merged": "#8C7A1F",
+    "not used": "#000000",
 }
 #: What became of a detection, by disposition; every other one is `not used`.
 _FATES: Mapping[str, str] = {
@@ -40,13 +34,13 @@ _FATES: Mapping[str, str] = {
     "beyond_window": "fused beyond the window",
     "birth": "started a track",
 }
-_SENSOR_IN, _DELAYS_IN = 1.3, 2.2  # heights: of a sensor in the upper panel, of the lower panel
+_SENSOR_IN, _DELAYS_IN = 1.1, 1.2  # heights of a sensor: in the upper panel, and of its delays
 _SHOWN_LISTS = 20  # of the fastest sensor in the upper panel
 
 
 @styled
-def arrivals(run: OneRun) -> Figure:
-    """Above a part of the run, a line for each detection from sensing to receipt; below the delays of all.
+def arrivals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
+    """Above a part of the run, a line for each detection from stamp to receipt; below the delays, sensor by sensor.
 
     A line that crosses another was overtaken: it is out of sequence. The part shown is that in which the most
     detections were fused out of sequence; the fastest sensor sends twenty lists in it. Colours say what became of a
@@ -61,25 +55,33 @@ def arrivals(run: OneRun) -> Figure:
     updates = one.run.updates
     if not updates.num_rows:
         raise DataError(f"{one.label}: has no detections, so there are no arrivals to draw")
-    flow_in = _SENSOR_IN * len(np.unique(updates["sensor"]))
-    figure = StyledFigure(figsize=(10.0, flow_in + _DELAYS_IN + 1.5))
-    flow, delays = figure.subplots(2, 1, height_ratios=(flow_in, _DELAYS_IN))
+    sensors = np.unique(updates["sensor"]).tolist()
+    heights = [_SENSOR_IN * len(sensors), *[_DELAYS_IN] * len(sensors)]
+    sheet = Sheet(9.0, sum(heights) + 1.5, paper)
+    flow, *rows = sheet.plots(len(heights), heights=heights)[:, 0]
     first_ns = start_ns([one])
     fates = _fates(updates)
     _draw_flow(flow, updates, fates, first_ns)
+    for name, color in _COLOURS.items():
+        count = int((fates == name).sum())
+        if count:
+            flow.plot([], [], "o", ms=4.0, color=color, label=f"{name}: {count} of {len(fates)}")
     delay_ms = (updates["receipt_ns"] - updates["stamp_ns"]) / (NS_PER_S / 1e3)
     received_s = (updates["receipt_ns"] - first_ns) / NS_PER_S
-    for name, color in _COLOURS.items():
-        mine = fates == name
-        if mine.any():
-            delays.plot(received_s[mine], delay_ms[mine], ".", ms=4.0, mew=0, alpha=0.8, color=color)
-            flow.plot([], [], ".", ms=3.0, color=color, label=f"{name}: {mine.sum()} of {len(mine)}")
-    delays.set(xlabel="received at [s]", ylabel="delay [ms]")
-    low_ms, high_ms = min(0.0, float(delay_ms.min())), max(1.0, float(delay_ms.max()))
-    delays.set_ylim(low_ms - 0.05 * (high_ms - low_ms), high_ms + 0.05 * (high_ms - low_ms))
-    legend_above(flow, figure.get_figwidth())
-    title(figure, titled(one.label, "detections from sensing to receipt"))
-    return figure
+    for axes, sensor in zip(rows, sensors, strict=True):
+        for name, color in _COLOURS.items():
+            mine = (fates == name) & (updates["sensor"] == sensor)
+            axes.plot(received_s[mine], delay_ms[mine], ".", ms=4.0, mew=0, color=color)
+        low_ms, high_ms = min(0.0, float(delay_ms.min())), max(1.0, float(delay_ms.max()))
+        axes.set_ylim(low_ms, high_ms + 0.05 * (high_ms - low_ms))
+        axes.set_title(sensor.replace("_", " "), loc="left", y=0.98, pad=1.0)
+        axes.sharex(rows[0])
+        axes.tick_params(labelbottom=axes is rows[-1])
+    rows[len(rows) // 2].set_ylabel("delay [ms]")
+    rows[-1].set_xlabel("time of receipt [s]")
+    legend_above(flow)
+    sheet.title(titled(one.label, "detections from stamp to receipt"))
+    return sheet.figure
 
 
 def _draw_flow(axes: Axes, updates: Table, fates: Column, first_ns: int) -> None:
@@ -100,7 +102,7 @@ def _draw_flow(axes: Axes, updates: Table, fates: Column, first_ns: int) -> None
             axes.plot(sensed_s, tops[:, 1], "o", ms=3.5, color=color, zorder=4)
             axes.plot(received_s, ends[:, 1], "v", ms=4.5, color=color, zorder=4)
     axes.set_yticks([level + at for level in range(len(sensors)) for at in (0.1, 0.9)])
-    axes.set_yticklabels([text for sensor in sensors for text in ("received", f"{sensor}: sensed")])
+    axes.set_yticklabels([text for sensor in sensors for text in ("received", f"{sensor.replace('_', ' ')}: stamp")])
     from_s = (start_ns - first_ns) / NS_PER_S
     axes.set(xlim=(from_s, from_s + length_ns / NS_PER_S), ylim=(0.0, len(sensors)), xlabel="time [s]")
 

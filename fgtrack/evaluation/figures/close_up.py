@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Unpack
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -14,7 +15,9 @@ from fgtrack.core.geometry import rotation
 from fgtrack.core.linalg import congruence
 from fgtrack.core.time import NS_PER_S, seconds
 from fgtrack.core.types import YAW, FloatArray, IntArray
-from fgtrack.evaluation.figures.style import GREY, PALETTE, StyledFigure, colour, styled
+from fgtrack.evaluation.figures.paper import Paper, styled
+from fgtrack.evaluation.figures.style import GREY, StyledFigure, colour
+from fgtrack.evaluation.palette import PALETTE
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.evaluation.viewer.ellipse import AROUND_95, ellipses
@@ -27,7 +30,7 @@ _SINCE = "fused since it was sensed"
 
 
 @styled
-def close_up(runs: Runs, close_ups: Sequence[CloseUp]) -> Figure:
+def close_up(runs: Runs, close_ups: Sequence[CloseUp], **paper: Unpack[Paper]) -> Figure:
     """A late detection and what it does to a track, one panel for each run, and the factor graph around it.
 
     Panels have the direction of travel to the right, in true proportion. Ellipses hold 95 %.

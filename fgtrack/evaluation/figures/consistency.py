@@ -1,5 +1,7 @@
 """The figure of NEES and NIS over time, with their chi-square bands."""
 
+from typing import Unpack
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -8,15 +10,14 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.consistency import position_nees
+from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
 from fgtrack.evaluation.figures.style import (
     GREY,
-    StyledFigure,
     broken_line,
-    colour,
     legend_above,
     log_axis,
-    styled,
-    title,
+    run_looks,
+    sensor_colour,
     titled,
     usual_step_ns,
 )
@@ -30,7 +31,7 @@ _LOWEST = 0.02  # of the axis, as a share of the expected value
 
 
 @styled
-def consistency(run: OneRun) -> Figure:
+def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     """NEES of the position, averaged over the objects of a tick, and NIS by sensor, each in its 95 % band.
 
     A consistent estimator is inside of the band at 95 % of the ticks, and around the expected value; above it the
@@ -46,23 +47,25 @@ def consistency(run: OneRun) -> Figure:
     panels = _panels(one)
     if not panels:
         raise DataError(f"{one.label}: has no errors and no innovations, so there is no consistency to draw")
-    figure = StyledFigure(figsize=(10.0, 1.0 + 2.1 * len(panels)))
-    rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    sheet = Sheet(10.0, 1.0 + 2.1 * len(panels), paper)
+    rows = sheet.plots(len(panels), sharex=True)[:, 0]
+    sensors = np.unique(one.run.updates["sensor"]).tolist()
     first_ns = start_ns([one])
     for place, (axes, (name, (stamps_ns, values, dof))) in enumerate(zip(rows, panels.items(), strict=True)):
         time_s = (stamps_ns - first_ns) / NS_PER_S
         if name == _NEES:
-            _draw_nees(axes, stamps_ns, time_s, values, dof)
+            _draw_nees(axes, stamps_ns, time_s, values, dof, run_looks([one])[one.label].colour)
         else:
-            _draw_nis(axes, time_s, values, dof, colour(place), name)
-        axes.set_ylabel(name)
+            color = sensor_colour(sensors.index(name.removeprefix("NIS of ")))
+            _draw_nis(axes, time_s, values, dof, color, name)
+        axes.set_ylabel(name.replace(" of ", " of\n").replace("_", " "))
         if not place:
             axes.fill_between([], [], color=GREY, alpha=0.25, lw=0, label="95 % band")
             axes.plot([], color="black", lw=0.9, ls="--", label="expected")
-        legend_above(axes, figure.get_figwidth())
+        legend_above(axes)
     rows[-1].set_xlabel("time [s]")
-    title(figure, titled(one.label, "normalised squares of errors and innovations, and their 95 % bands"))
-    return figure
+    sheet.title(titled(one.label, "consistency: normalised squares of errors and innovations, with their 95 % bands"))
+    return sheet.figure
 
 
 _NEES = "NEES of the position"
@@ -91,14 +94,16 @@ def has_squares(one: JudgedRun) -> bool:
     return bool(_panels(one))
 
 
-def _draw_nees(axes: Axes, stamps_ns: IntArray, time_s: FloatArray, values: FloatArray, dof: IntArray) -> None:
+def _draw_nees(
+    axes: Axes, stamps_ns: IntArray, time_s: FloatArray, values: FloatArray, dof: IntArray, color: str
+) -> None:
     """The mean over the objects of each stamp."""
     distinct_ns, first, index, count = np.unique(stamps_ns, return_index=True, return_inverse=True, return_counts=True)
     mean = np.bincount(index, values) / count
     total_dof = np.bincount(index, dof).astype(np.float64)
     low, high = chi_square_band(total_dof, count)
     text = _said("position", values, dof, float(((mean >= low) & (mean <= high)).mean()), "ticks")
-    _draw(axes, distinct_ns, time_s[first], mean, (low, high), total_dof / count, colour(0), text, 0.9)
+    _draw(axes, distinct_ns, time_s[first], mean, (low, high), total_dof / count, color, text, 0.9)
 
 
 def _draw_nis(axes: Axes, time_s: FloatArray, values: FloatArray, dof: IntArray, color: str, name: str) -> None:

@@ -1,244 +1,197 @@
 """Figures of errors against truth: over time, and against the lag."""
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Unpack
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.time import NS_PER_S
+from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.figures.ranges import bulk
-from fgtrack.evaluation.figures.seeds import grouped
-from fgtrack.evaluation.figures.style import (
-    StyledFigure,
-    broken_line,
-    colour,
-    legend_above,
-    line_style,
-    styled,
-    title,
-    usual_step_ns,
-)
-from fgtrack.evaluation.lagged import LagMetrics
-from fgtrack.evaluation.matching import Matching, track_errors
-from fgtrack.evaluation.runs import Runs, judged, starts_ns
+from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
+from fgtrack.evaluation.figures.seeds import group_looks, grouped
+from fgtrack.evaluation.figures.style import broken_line, legend_above, run_looks, usual_step_ns
+from fgtrack.evaluation.lagged import final_errors
+from fgtrack.evaluation.matching import TrackErrors, track_errors
+from fgtrack.evaluation.palette import Look
+from fgtrack.evaluation.runs import JudgedRun, Runs, judged, starts_ns
 from fgtrack.evaluation.statistics import Moments
 
-_QUANTITIES = {"position_m": "position error [m]", "speed_mps": "speed error [m/s]", "yaw_rad": "yaw error [rad]"}
-_LAG_PANELS = {"position_m": "position RMSE [m]", "speed_mps": "speed RMSE [m/s]"}
-_COINCIDE = 0.25  # median distance of two curves, as a share of the median error, below which one hides the other
-_SAME = 1e-6  # largest distance, as such a share, below which there is nothing to tell apart
+#: What is drawn, with its name, its unit, and that unit over the one of the values.
+_QUANTITIES = {
+    "position_m": ("position", "m", 1.0),
+    "speed_mps": ("speed", "m/s", 1.0),
+    "yaw_rad": ("yaw", "deg", 180.0 / math.pi),
+}
+_WINDOWS = 60  # moving means in the time that is shown
+_SHORTEST_S = 0.2  # of these
 
 
-class _Curve(NamedTuple):
-    """The error of one run over time."""
+@dataclass(frozen=True)
+class _Curve:
+    """The errors of one run over time."""
 
-    stamps_ns: IntArray
-    values: FloatArray
+    label: str
+    look: Look
+    first_ns: int
+    """Where its time begins."""
     step_ns: float
     """Usual step between its ticks."""
+    stamps_ns: IntArray
+    values: Mapping[str, FloatArray]
 
 
 @styled
-def errors(runs: Runs, object_id: int | None = None) -> Figure:
-    """Error in position, speed and yaw over time, a line for each run, with the RMSE in the legend.
+def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> Figure:
+    """Moving RMS error in position, speed and yaw over time, a line for each run; in the legend the RMSE of all.
 
-    Lines are broken where nothing was tracked; quantities that the truth does not hold are left out. Where two lines
-    nearly coincide, a panel below shows by how much the one error is larger than the other, in absolute value.
+    The present states are solid or dashed, the final states of a smoother dotted. Each point is the root mean square
+    over a sixtieth of the time shown. Lines are broken where nothing was tracked; quantities that the truth does not
+    hold are left out.
 
     Parameters
     ----------
     runs
         One run or several.
     object_id
-        The true object; without it the only one, or of several the root mean square over those tracked at a stamp.
+        The true object; without it the only one, or all together.
+    **paper
+        `width`, `font`, `style`, `ax`.
 
     Raises
     ------
     DataError
         No run has truth, or none of this object.
     """
-    every = judged(runs)
-    first_ns = starts_ns(every)
-    matchings = {one.label: one.matching for one in every if one.matching is not None}
-    known = sorted({k for one in matchings.values() for k in one.object_ids})
+    every = [one for one in judged(runs) if one.matching is not None]
+    known = sorted({k for one in every if one.matching for k in one.matching.object_ids})
     if not known:
         raise DataError("no run has truth, so there are no errors to draw")
     if object_id is not None and object_id not in known:
         raise DataError(f"object {object_id}: no run has truth of it, there are {', '.join(map(str, known))}")
     wanted = known[0] if len(known) == 1 else object_id
-    found = {
-        label: _errors_of(matching, wanted)
-        for label, matching in matchings.items()
-        if wanted is None or wanted in matching.object_ids
-    }
-    names = [name for name in _QUANTITIES if any(np.isfinite(values[name]).any() for _, values in found.values())]
-    curves = {
-        name: {label: _curve(*of, name, wanted is None, matchings[label]) for label, of in found.items()}
-        for name in names or ["position_m"]
-    }
-    panels: list[tuple[str, bool]] = []
-    for name, lines in curves.items():
-        differ = any(not same for _, same in _hidden(lines).values())
-        panels += [(name, False), (name, True)] if differ else [(name, False)]
-    figure = StyledFigure(figsize=(10.0, 1.4 + 1.9 * len(panels)))
-    rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, (name, is_difference) in zip(rows, panels, strict=True):
-        if is_difference:
-            _draw_differences(axes, curves[name], first_ns)
-            axes.set_ylabel(_QUANTITIES[name].replace("error", "error,\nlarger by"))
-        else:
-            _draw_errors(
-                axes, curves[name], first_ns, name, {label: values[name] for label, (_, values) in found.items()}
-            )
-        legend_above(axes, figure.get_figwidth())
+    curves = _curves(every, wanted)
+    names = [name for name in _QUANTITIES if any(np.isfinite(one.values[name]).any() for one in curves)]
+    window_s = max(
+        max((float(np.ptp(one.stamps_ns)) for one in curves if len(one.stamps_ns)), default=0.0) / NS_PER_S / _WINDOWS,
+        _SHORTEST_S,
+    )
+    sheet = Sheet(9.0, 1.5 + 2.0 * len(names or ["position_m"]), paper)
+    rows = sheet.plots(len(names or ["position_m"]), sharex=True)[:, 0]
+    for axes, name in zip(rows, names or ["position_m"], strict=True):
+        what, unit, factor = _QUANTITIES[name]
+        for one in curves:
+            _draw_moving(axes, one, factor * one.values[name], unit, nanoseconds(window_s), has_label=axes is rows[0])
+        axes.set_ylabel(f"{what} error [{unit}]")
+        axes.set_ylim(0.0, None)
+        legend_above(axes)
     rows[-1].set_xlabel("time [s]")
-    whose = "all objects (root mean square)" if wanted is None else f"object {wanted}"
-    title(figure, f"Errors of the tracks of {whose}")
-    return figure
+    whose = "all objects" if wanted is None else f"object {wanted}"
+    sheet.title(f"Errors of the tracks of {whose} (moving RMS over {window_s:.2g} s)")
+    return sheet.figure
 
 
-def _draw_errors(
-    axes: Axes, lines: Mapping[str, _Curve], first_ns: Mapping[str, int], name: str, samples: Mapping[str, FloatArray]
-) -> None:
-    unit = _QUANTITIES[name].rpartition("[")[2][:-1]
-    hidden, labels = _hidden(lines), list(lines)
-    for k, (label, curve) in enumerate(lines.items()):
-        moments = Moments.of(samples[label])
-        rmse = f"RMSE {moments.rmse:.3g} {unit}" if moments.count else "never tracked"
-        other, is_same = hidden.get(k, (0, False))
-        rmse += f", same as {labels[other]}" if is_same else ""
-        points = broken_line(
-            curve.stamps_ns, (curve.stamps_ns - first_ns[label]) / NS_PER_S, curve.values, curve.step_ns
-        )
-        axes.plot(*points, color=colour(k), ls=line_style(k), lw=0.9, alpha=0.85, label=f"{label}: {rmse}")
-    axes.set_ylabel(_QUANTITIES[name])
+def _curves(runs: Sequence[JudgedRun], object_id: int | None) -> list[_Curve]:
+    """Errors of the present states of every run, then of the final ones of those that have them."""
+    first_ns, styles = starts_ns(runs), run_looks(runs)
+    present: list[_Curve] = []
+    final: list[_Curve] = []
+    for one in runs:
+        matching = one.matching
+        if matching is None or (object_id is not None and object_id not in matching.object_ids):
+            continue
+        index = None if object_id is None else matching.object_ids.index(object_id)
+        step_ns = usual_step_ns(matching.tracks["now_ns"])
+        for found, label, its, group in (
+            (track_errors(matching), one.label, styles[one.label], present),
+            (final_errors(one.run, matching), f"{one.label}, final state", styles[one.label]._replace(line=":"), final),
+        ):
+            stamps_ns, values = _of_object(found, index)
+            if group is present or len(stamps_ns):
+                group.append(_Curve(label, its, first_ns[one.label], step_ns, stamps_ns, values))
+    return [*present, *final]
 
 
-def _draw_differences(axes: Axes, lines: Mapping[str, _Curve], first_ns: Mapping[str, int]) -> None:
-    """How much larger the errors are than those of the curve that nearly coincides, at the stamps of both."""
-    curves = list(lines.items())
-    pairs = [(k, other) for k, (other, is_same) in _hidden(lines).items() if not is_same]
-    common = [_common(curves[k][1], curves[other][1]) for k, other in pairs]
-    differences = [np.abs(mine) - np.abs(its) for _, mine, its in common]
-    low, high = bulk(differences)
-    low, high = min(low, -0.1 * high), max(high, -0.1 * low)
-    for (k, other), (stamps_ns, *_), more in zip(pairs, common, differences, strict=True):
-        label, curve = curves[k]
-        outside = int(((more < low) | (more > high)).sum())
-        text = f"{label} minus {curves[other][0]}" + (f" ({outside} outside)" if outside else "")
-        points = broken_line(stamps_ns, (stamps_ns - first_ns[label]) / NS_PER_S, more, curve.step_ns)
-        axes.plot(*points, color=colour(k), ls=line_style(k), lw=0.9, label=text)
-    axes.set_ylim(low, high)
-    axes.yaxis.set_major_formatter("{x:g}")  # an offset would hide the legend
-
-
-def _common(curve: _Curve, other: _Curve) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Common stamps of two curves, and the values of both there."""
-    stamps_ns, mine, its = np.intersect1d(curve.stamps_ns, other.stamps_ns, return_indices=True)
-    return stamps_ns, curve.values[mine], other.values[its]
-
-
-def _hidden(lines: Mapping[str, _Curve]) -> dict[int, tuple[int, bool]]:
-    """Places of the curves that nearly coincide with one before, each with the place of the nearest of those.
-
-    And whether the two are the same.
-    """
-    found: dict[int, tuple[int, bool]] = {}
-    curves = list(lines.values())
-    for k, curve in enumerate(curves):
-        apart = [_apart(curve, other) for other in curves[:k]]
-        if min(apart, default=(np.inf, np.inf))[0] < _COINCIDE:
-            nearest = min(range(k), key=lambda place: apart[place])
-            found[k] = nearest, apart[nearest][1] < _SAME
-    return found
-
-
-def _apart(curve: _Curve, other: _Curve) -> tuple[float, float]:
-    """Median and largest distance of two curves over the median size of the other; infinite without a common stamp."""
-    _, mine, its = _common(curve, other)
-    known = np.isfinite(mine) & np.isfinite(its)
-    if not known.any():
-        return np.inf, np.inf
-    distances, size = np.abs(mine - its)[known], float(np.median(np.abs(its[known])))
-    if size == 0.0:
-        return (0.0, 0.0) if not distances.any() else (np.inf, np.inf)
-    return float(np.median(distances)) / size, float(distances.max()) / size
-
-
-def _curve(
-    stamps_ns: IntArray, values: Mapping[str, FloatArray], name: str, is_mean: bool, matching: Matching
-) -> _Curve:
-    """The error `name`; its root mean square over all objects where `is_mean`."""
-    line = _over_objects(stamps_ns, values[name]) if is_mean else (stamps_ns, values[name])
-    return _Curve(*line, usual_step_ns(matching.tracks["now_ns"]))
-
-
-def _errors_of(matching: Matching, object_id: int | None) -> tuple[IntArray, Mapping[str, FloatArray]]:
-    """Stamps and errors by name of the tracks of one object, or of all."""
-    found = track_errors(matching)
-    if object_id is None:
-        return found.stamps_ns, found.values
-    mine = found.object_index == matching.object_ids.index(object_id)
+def _of_object(found: TrackErrors, index: int | None) -> tuple[IntArray, Mapping[str, FloatArray]]:
+    """Stamps and errors by name of the object `index`, or of all, by rising stamp."""
+    mine = np.flatnonzero(np.ones(len(found.stamps_ns), dtype=bool) if index is None else found.object_index == index)
+    mine = mine[np.argsort(found.stamps_ns[mine], kind="stable")]
     return found.stamps_ns[mine], {name: values[mine] for name, values in found.values.items()}
 
 
-def _over_objects(stamps_ns: IntArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Distinct stamps and the root mean square of the values there; those without a value are left out."""
+def _draw_moving(axes: Axes, one: _Curve, values: FloatArray, unit: str, window_ns: int, has_label: bool) -> None:
+    moments = Moments.of(values)
+    rmse = f"RMSE {moments.rmse:.3g} {unit}" if moments.count else "never tracked"
+    stamps_ns, rms = moving_rms(one.stamps_ns, values, window_ns)
+    points = broken_line(stamps_ns, (stamps_ns - one.first_ns) / NS_PER_S, rms, one.step_ns)
+    label = f"{one.label}: {rmse}" if has_label else rmse
+    above = 2.0 if one.look.line == "-" else 2.5  # a dashed line shows what it lies on
+    axes.plot(*points, color=one.look.colour, ls=one.look.line, lw=1.4, label=label, zorder=above)
+
+
+def moving_rms(stamps_ns: IntArray, values: FloatArray, window_ns: int) -> tuple[IntArray, FloatArray]:
+    """Distinct stamps with a value, and the root mean square of the values within half a window around each."""
     known = np.isfinite(values)
-    distinct_ns, index, counts = np.unique(stamps_ns[known], return_inverse=True, return_counts=True)
-    return distinct_ns, np.sqrt(np.bincount(index, values[known] ** 2, len(distinct_ns)) / counts)
+    stamps_ns, below = stamps_ns[known], np.concatenate([[0.0], np.cumsum(np.square(values[known]))])
+    distinct_ns = np.unique(stamps_ns)
+    first = np.searchsorted(stamps_ns, distinct_ns - window_ns // 2, side="left")
+    last = np.searchsorted(stamps_ns, distinct_ns + window_ns // 2, side="right")
+    return distinct_ns, np.sqrt(np.maximum(below[last] - below[first], 0.0) / (last - first))
 
 
 @styled
-def lag(runs: Runs) -> Figure:
-    """RMSE of position and speed against the lag, a line for each run; level where a run has no lagged states.
+def lag(runs: Runs, quantity: str = "position_m", **paper: Unpack[Paper]) -> Figure:
+    """RMSE against the lag, a line for each run; level where a run has no lagged states.
 
-    Of a track that ended there are no lagged states of its last moments, so the dotted line beside shows the present
+    Of a track that ended there are no lagged states of its last moments, so the thin dotted line shows the present
     states of the same tracks at the same stamps: the distance between the two is what waiting brings. Runs that differ
-    by their seed only have a common colour.
+    by their seed only look alike.
+
+    Parameters
+    ----------
+    runs
+        One run or several.
+    quantity
+        `position_m`, `speed_mps` or `yaw_rad`.
+    **paper
+        `width`, `font`, `style`, `ax`.
 
     Raises
     ------
     DataError
-        No run has truth.
+        No run has truth of this quantity.
     """
     groups = grouped(judged(runs))
     every = [one for group in groups for one in group.runs]
-    names = [name for name in _LAG_PANELS if any(entry.errors[name].count for one in every for entry in one.lagged)]
-    if not names:
-        raise DataError("no run has tracks with truth, so there are no errors to draw")
-    figure = StyledFigure(figsize=(8.0, 1.4 + 2.6 * len(names)))
-    panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, name in zip(panels, names, strict=True):
-        for k, group in enumerate(groups):
-            for place, one in enumerate(group.runs):
-                width = 1.4 if len(group.runs) == 1 else 0.8
-                _draw_lags(axes, one.lagged, name, "" if place else group.label, k, width)
-        axes.set_ylabel(_LAG_PANELS[name])
-        axes.set_ylim(0.0, 1.08 * axes.dataLim.y1 or 1.0)
-    legend_above(panels[0], figure.get_figwidth())
-    panels[-1].set_xlabel("lag [s] (how long the output waits)")
-    title(figure, "Error against lag")
-    return figure
-
-
-def _draw_lags(axes: Axes, lagged: Sequence[LagMetrics], name: str, label: str, index: int, width: float) -> None:
-    color = colour(index)
-
-    def named(what: str) -> str:
-        return f"{label}{what}" if label else ""
-
-    curve = [lagged[0], *(entry for entry in lagged if entry.is_lagged)] if lagged else []
-    if len(curve) > 1:
-        lags_s = [float(entry.lag_s) for entry in curve]
-        rmse = [entry.errors[name].rmse for entry in curve]
-        axes.plot(lags_s, rmse, ls=line_style(index), lw=width, color=color, label=label)
-        axes.plot(lags_s, rmse, "o", ms=3.5, color=color)
-        present = [entry.present_errors[name].rmse for entry in curve]
-        axes.plot(lags_s, present, ls=":", lw=width, color=color, label=named(": present states, same stamps"))
-    elif curve:
-        axes.axhline(curve[0].errors[name].rmse, ls="--", lw=width, color=color, label=named(": present, has no lag"))
+    if quantity not in _QUANTITIES or not any(entry.errors[quantity].count for one in every for entry in one.lagged):
+        raise DataError(f"no run has tracks with truth of {quantity}, so there are no errors to draw")
+    what, unit, factor = _QUANTITIES[quantity]
+    sheet = Sheet(7.0, 4.2, paper)
+    axes: Axes = sheet.plots()[0, 0]
+    has_lags = False
+    for group, its in zip(groups, group_looks(groups), strict=True):
+        for place, one in enumerate(group.runs):
+            curve = [one.lagged[0], *(entry for entry in one.lagged if entry.is_lagged)] if one.lagged else []
+            rmse = [factor * entry.errors[quantity].rmse for entry in curve]
+            label, width = "" if place else group.label, 1.6 if len(group.runs) == 1 else 0.8
+            if len(curve) > 1:
+                has_lags = True
+                lags_s = [float(entry.lag_s) for entry in curve]
+                present = [factor * entry.present_errors[quantity].rmse for entry in curve]
+                axes.plot(lags_s, rmse, color=its.colour, ls=its.line, lw=width, marker=its.marker, ms=4, label=label)
+                axes.plot(lags_s, present, color=its.colour, ls=":", lw=0.8)
+            elif curve:
+                axes.axhline(
+                    rmse[0], color=its.colour, ls=its.line, lw=width, label=f"{label} (no lag)" if label else ""
+                )
+    if has_lags:
+        axes.plot([], [], color="black", ls=":", lw=0.8, label="present states at the stamps of the lagged ones")
+    axes.set(xlabel="lag of the output [s]", ylabel=f"{what} RMSE [{unit}]")
+    axes.set_ylim(0.0, 1.08 * axes.dataLim.y1 or 1.0)
+    legend_above(axes)
+    sheet.title("Error against lag: what it gains to wait")
+    return sheet.figure

@@ -1,6 +1,7 @@
 """The figure of a run along its track: where everything is on the road, over time."""
 
 from collections.abc import Iterator
+from typing import Unpack
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -9,16 +10,14 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
 from fgtrack.evaluation.figures.ranges import bulk
 from fgtrack.evaluation.figures.style import (
     GREY,
     WRONG,
-    StyledFigure,
     broken_line,
     colour,
     legend_above,
-    styled,
-    title,
     titled,
     usual_step_ns,
 )
@@ -34,7 +33,7 @@ _TRACK, _FEW_TRUE, _MANY_TRUE, _PALE = 1.2, 5.0, 2.5, 0.3  # widths of lines, an
 
 
 @styled
-def frenet(run: OneRun) -> Figure:
+def frenet(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     """Along the track, ahead of the ego and to the left of the reference line, over time: truth, tracks, ego.
 
     The three are the Frenet coordinates of the map that `config.yaml` names as `map.track`; the first jumps where a
@@ -53,8 +52,8 @@ def frenet(run: OneRun) -> Figure:
     if not lines:
         raise DataError(f"{one.label}: has no tracks and no truth, so there is nothing along a track to draw")
     ego = _ego(one.run.ego, road)
-    figure = StyledFigure(figsize=(10.0, 6.2 if ego is None else 8.0))
-    along, *middle, lateral = figure.subplots(2 if ego is None else 3, 1, sharex=True)
+    sheet = Sheet(10.0, 6.2 if ego is None else 8.0, paper)
+    along, *middle, lateral = sheet.plots(2 if ego is None else 3, sharex=True)[:, 0]
     first_ns = start_ns([one])
     for line in lines:
         line.draw(along, line.s_m, first_ns, road.length_m)
@@ -72,9 +71,9 @@ def frenet(run: OneRun) -> Figure:
     lateral.set_ylim(*bulk([line.lateral_m for line in lines], [np.array([bounds_m[0].max(), -bounds_m[1].max()])]))
     along.set_ylabel("along the track [m]")
     lateral.set(ylabel="left of the reference\nline [m] (grey: bounds)", xlabel="time [s]")
-    legend_above(along, figure.get_figwidth())
-    title(figure, titled(one.label, "along the track"))
-    return figure
+    legend_above(along)
+    sheet.title(titled(one.label, "along the track"))
+    return sheet.figure
 
 
 class _Line:

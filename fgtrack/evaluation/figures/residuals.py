@@ -1,13 +1,16 @@
 """The figure of the innovations."""
 
+from typing import Unpack
+
 import numpy as np
 from matplotlib.figure import Figure
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation import innovations
+from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
 from fgtrack.evaluation.figures.ranges import bulk
-from fgtrack.evaluation.figures.style import StyledFigure, colour, legend_above, styled, title, titled
+from fgtrack.evaluation.figures.style import legend_above, sensor_colour, titled
 from fgtrack.evaluation.innovations import RESIDUAL_NAMES
 from fgtrack.evaluation.runs import OneRun, one_judged, start_ns
 from fgtrack.evaluation.statistics import Moments
@@ -28,7 +31,7 @@ _DENSITIES = {"m": "1/m", "rad": "1/rad", "mps": "s/m"}
 
 
 @styled
-def residuals(run: OneRun) -> Figure:
+def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     """Residuals (innovations) per sensor, a row per component: over time, and how they are distributed.
 
     Bins and axes cover the bulk of every sensor's residuals; the legend says how many lie outside.
@@ -47,8 +50,8 @@ def residuals(run: OneRun) -> Figure:
         names = [name for name in names if name not in ("x_m", "y_m")]
     if not names:
         raise DataError(f"{one.label}: has no innovations, so there are no residuals to draw")
-    figure = StyledFigure(figsize=(10.0, 0.8 + 2.4 * len(names)))
-    rows = figure.subplots(len(names), 2, squeeze=False, sharey="row", width_ratios=(2, 1))
+    sheet = Sheet(10.0, 0.8 + 2.4 * len(names), paper)
+    rows = sheet.plots(len(names), 2, widths=(2, 1))
     for (over_time, histogram), name in zip(rows, names, strict=True):
         known = {sensor: np.isfinite(values[name]) & (updates["sensor"] == sensor) for sensor in sensors}
         low, high = bulk([values[name][mine] for mine in known.values()])
@@ -62,14 +65,17 @@ def residuals(run: OneRun) -> Figure:
             mean = round(moments.mean, 3) + 0.0  # no negative zero
             label = f"{sensor}: mean {mean:.3f}, std {moments.std:.3f}, n {moments.count}"
             label += f" ({outside} outside)" if outside else ""
-            over_time.plot(time_s[mine], sample, ".", ms=3.0, alpha=0.6, mew=0, color=colour(k), label=label)
+            over_time.plot(time_s[mine], sample, ".", ms=3.0, alpha=0.6, mew=0, color=sensor_colour(k), label=label)
             density = np.histogram(sample, bins)[0] / (len(sample) * np.diff(bins))
-            histogram.stairs(density, bins, orientation="horizontal", color=colour(k), lw=1.4)
+            histogram.stairs(density, bins, orientation="horizontal", color=sensor_colour(k), lw=1.4)
         over_time.set_ylim(low, high)
         over_time.set_ylabel(_RESIDUALS[name])
         histogram.set_xlabel(f"density [{_DENSITIES[name.rpartition('_')[2]]}]")
-        over_time.set_xlabel("time [s]")
+        histogram.set_ylim(low, high)
+        histogram.tick_params(labelleft=False)
         over_time.sharex(rows[0][0])
-        legend_above(over_time, 2.0 * figure.get_figwidth() / 3.0)
-    title(figure, titled(one.label, "residuals (measured minus predicted)"))
-    return figure
+        over_time.tick_params(labelbottom=name == names[-1])
+        over_time.set_xlabel("time [s]" if name == names[-1] else "")
+        legend_above(over_time, 2.0 / 3.0, markerscale=3.0)
+    sheet.title(titled(one.label, "innovations (measured minus predicted)"))
+    return sheet.figure

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Unpack
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,19 +12,10 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.consistency import nees_over_runs, position_nees
-from fgtrack.evaluation.figures.style import (
-    GREY,
-    StyledFigure,
-    broken_line,
-    colour,
-    legend_above,
-    line_style,
-    log_axis,
-    styled,
-    title,
-    usual_step_ns,
-)
+from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
+from fgtrack.evaluation.figures.style import GREY, broken_line, legend_above, log_axis, usual_step_ns
 from fgtrack.evaluation.matching import Matching, track_errors
+from fgtrack.evaluation.palette import Look, looks
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged, start_ns
 from fgtrack.evaluation.statistics import chi_square_band
 
@@ -38,6 +30,16 @@ class Group:
 
     label: str
     runs: tuple[JudgedRun, ...]
+
+    @property
+    def estimator(self) -> str:
+        """Name of the estimator."""
+        return str(self.runs[0].run.meta.get("estimator") or self.label)
+
+
+def group_looks(groups: Sequence[Group]) -> list[Look]:
+    """Return how the curves of each of `groups` look: colours are those of the estimators."""
+    return looks([one.estimator for one in groups])
 
 
 def grouped(runs: Sequence[JudgedRun]) -> list[Group]:
@@ -67,7 +69,7 @@ def has_seeds(runs: Sequence[JudgedRun]) -> bool:
 
 
 @styled
-def error_bands(runs: Runs) -> Figure:
+def error_bands(runs: Runs, **paper: Unpack[Paper]) -> Figure:
     """Errors over time of runs that differ by their seed only: RMSE over the runs, and 10 to 90 % of them.
 
     Runs of the same estimator and configuration, of as many ticks and with the same objects, are a line and a band;
@@ -83,12 +85,12 @@ def error_bands(runs: Runs) -> Figure:
     groups = [group for group in grouped(judged(runs)) if len(group.runs) > 1 and group.runs[0].matching is not None]
     if not groups:
         raise DataError("no runs with truth differ by their seed only, so there are no error bands to draw")
-    figure = StyledFigure(figsize=(10.0, 1.2 + 2.1 * (len(_QUANTITIES) + 1)))
-    *rows, below = figure.subplots(len(_QUANTITIES) + 1, 1, sharex=True)
-    for place, group in enumerate(groups):
+    sheet = Sheet(10.0, 1.2 + 2.1 * (len(_QUANTITIES) + 1), paper)
+    *rows, below = sheet.plots(len(_QUANTITIES) + 1, sharex=True)[:, 0]
+    for group, its in zip(groups, group_looks(groups), strict=True):
         for axes, name in zip(rows, _QUANTITIES, strict=True):
-            _draw_band(axes, group, name, place)
-        _draw_nees(below, group, place)
+            _draw_band(axes, group, name, its)
+        _draw_nees(below, group, its, group is groups[0])
     below.fill_between([], [], color=GREY, alpha=0.25, lw=0, label="95 % band")
     for axes, label in zip(rows, _QUANTITIES.values(), strict=True):
         axes.set_ylabel(label)
@@ -96,12 +98,12 @@ def error_bands(runs: Runs) -> Figure:
     below.set(ylabel="NEES of the position", yscale="log", xlabel="time since the first tick [s]")
     log_axis(below.yaxis)
     for axes in (rows[0], below):
-        legend_above(axes, figure.get_figwidth())
-    title(figure, "Errors over seeds: RMSE over the runs, shaded 10 to 90 % of the runs")
-    return figure
+        legend_above(axes)
+    sheet.title("Errors over seeds: RMSE over the runs, shaded 10 to 90 % of the runs")
+    return sheet.figure
 
 
-def _draw_band(axes: Axes, group: Group, name: str, place: int) -> None:
+def _draw_band(axes: Axes, group: Group, name: str, its: Look) -> None:
     times_s, errors = _by_time(group, name)
     known = np.isfinite(errors).any(axis=0)
     if not known.any():
@@ -112,8 +114,8 @@ def _draw_band(axes: Axes, group: Group, name: str, place: int) -> None:
     times_ns = np.round(NS_PER_S * times_s).astype(np.int64)
     step_ns = usual_step_ns(times_ns)
     (x_s, low), (_, high), (_, rmse) = (broken_line(times_ns, times_s, y, step_ns) for y in (low, high, rmse))
-    axes.fill_between(x_s, low, high, color=colour(place), alpha=0.2, lw=0)
-    axes.plot(x_s, rmse, color=colour(place), ls=line_style(place), lw=1.2, label=group.label)
+    axes.fill_between(x_s, low, high, color=its.colour, alpha=0.2, lw=0)
+    axes.plot(x_s, rmse, color=its.colour, ls=its.line, lw=1.2, label=group.label)
 
 
 def _by_time(group: Group, name: str) -> tuple[FloatArray, FloatArray]:
@@ -138,7 +140,7 @@ def _by_time(group: Group, name: str) -> tuple[FloatArray, FloatArray]:
     return np.arange(errors.shape[1]) * step_ns / NS_PER_S, errors
 
 
-def _draw_nees(axes: Axes, group: Group, place: int) -> None:
+def _draw_nees(axes: Axes, group: Group, its: Look, has_band: bool) -> None:
     """The mean over runs and objects at every stamp."""
     samples = [position_nees(_matching(one)) for one in group.runs]
     shifted = [
@@ -155,8 +157,8 @@ def _draw_nees(axes: Axes, group: Group, place: int) -> None:
     lines = [broken_line(stamps_ns, time_s, y, step_ns) for y in (mean, low, high)]
     inside = float(((mean >= low) & (mean <= high)).mean())
     text = f"{group.label}: mean {found.overall.mean:.3g}, expected 2; {100.0 * inside:.0f} % of the stamps in the band"
-    axes.plot(*lines[0], color=colour(place), ls=line_style(place), lw=1.0, label=text)
-    if not place:
+    axes.plot(*lines[0], color=its.colour, ls=its.line, lw=1.0, label=text)
+    if has_band:
         axes.fill_between(lines[0][0], lines[1][1], lines[2][1], color=GREY, alpha=0.25, lw=0)
         axes.axhline(2.0, color="black", lw=0.9, ls="--")
 

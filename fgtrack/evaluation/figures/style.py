@@ -1,4 +1,4 @@
-"""How figures look, and how they are saved: the same bytes every time, whatever the user's own settings."""
+"""How figures look, and how they are saved: equal figures, equal bytes."""
 
 import base64
 import io
@@ -7,10 +7,9 @@ import os
 import re
 import textwrap
 import warnings
-from collections.abc import Callable, Iterable, Mapping
-from functools import wraps
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, ParamSpec, TypeVar
+from typing import Any, BinaryIO
 
 import matplotlib as mpl
 import numpy as np
@@ -18,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.font_manager import FontProperties
 from matplotlib.text import Text
 from matplotlib.ticker import LogLocator, NullFormatter
 from PIL import Image
@@ -25,47 +25,20 @@ from PIL import Image
 from fgtrack.core.errors import CallError, printable_lines
 from fgtrack.core.files import open_file, read_head
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.palette import PALETTE as PALETTE
+from fgtrack.evaluation.palette import PALETTE, SENSORS, Look, looks
+from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.io.output import Kind
 
+_RC: Any = mpl.rcParams  # Any: its keys are a Literal of all names
 WRONG = "#000000"
 GREY = "#777777"
 
 _PAUSE_STEPS = 3  # a line is not drawn across a pause that is longer than as many usual steps
 
-_LINES = ("-", "--", ":", "-.")
-
-_TITLE_CHARACTERS_PER_IN = 10  # of a title; a legend has more, its letters are smaller
-_LEGEND_CHARACTERS_PER_IN = 13
+_LETTER = 0.58  # width of a letter over the size of the font
 _MOST_ENTRIES = 12  # of a legend
-_HANDLE = 6  # characters that the line before an entry and the space around it take
+_HANDLE = 8  # characters that the line before an entry and the space around it take
 _FREE_LINES = 2  # of a legend for which figures have room
-_LINE_IN = 0.17  # height of a line of text
-
-# The defaults of matplotlib, not those of a file in the home folder; backends are not a matter of style.
-_STYLE = {
-    **{key: value for key, value in mpl.rcParamsDefault.items() if "backend" not in key},
-    "axes.grid": True,
-    "grid.color": "#dddddd",
-    "grid.linewidth": 0.6,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.titlesize": 10,
-    "axes.labelsize": 9,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-    "legend.fontsize": 8,
-    "legend.framealpha": 0.9,
-    "figure.titlesize": 11,
-    "figure.constrained_layout.use": True,
-    "figure.dpi": 100,
-    "savefig.dpi": 150,
-    "text.parse_math": False,
-    "path.simplify": True,
-    "agg.path.chunksize": 20_000,
-    "svg.hashsalt": "fgtrack",
-}
 
 _MARK = "fgtrack figure"
 #: Formats of files, with who made them and without what would differ from one writing to the next.
@@ -108,20 +81,34 @@ def _is_drawn_pdf(path: Path) -> bool:
 #: A picture, or a PDF of several.
 DRAWN = Kind("a figure of fgtrack", _is_drawn)
 
-P = ParamSpec("P")
-T = TypeVar("T")
-
 
 class StyledFigure(Figure):
-    """A figure with the style of fgtrack, whatever the user's settings are when it is drawn; notebooks show it."""
+    """A figure that keeps the settings with which it was made; title and legends are fitted to its width."""
+
+    def __init__(self, figsize: tuple[float, float]) -> None:
+        super().__init__(figsize=figsize)
+        self._settings: Any = {key: value for key, value in _RC.items() if "backend" not in key}
+        self.long_title = ""
+        self.fitted_legends: list[tuple[Axes, float, float]] = []
+        self._fitted_in = self.get_figwidth()
 
     def draw(self, renderer: Any) -> None:  # Any: matplotlib does not export the type
         """Draw it, see `matplotlib.figure.Figure.draw`; what is no letter or sign, in a name out of a file, escaped."""
         for text in self.findobj(Text):
             text.set_text(printable_lines(text.get_text()))
-        with mpl.rc_context(_STYLE), warnings.catch_warnings():
+        with mpl.rc_context(self._settings), warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Glyph .* missing")  # of a script that the font lacks: an empty box
+            if self.get_figwidth() != self._fitted_in:  # resized since
+                self._fitted_in = self.get_figwidth()
+                _fit_title(self)
+                for axes, share, markerscale in self.fitted_legends:
+                    _fit_legend(axes, share, markerscale)
             super().draw(renderer)
+
+    def savefig(self, *args: Any, **kwargs: Any) -> None:  # Any: those of matplotlib
+        """Write it, see `matplotlib.figure.Figure.savefig`."""
+        with mpl.rc_context(self._settings):
+            super().savefig(*args, **kwargs)
 
     def _repr_html_(self) -> str:
         picture = io.BytesIO()
@@ -129,33 +116,36 @@ class StyledFigure(Figure):
         return f'<img src="data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}">'
 
 
-def styled(function: Callable[P, T]) -> Callable[P, T]:
-    """`function` run with the style of fgtrack; settings are as before afterwards."""
-
-    @wraps(function)
-    def run(*args: P.args, **kwargs: P.kwargs) -> T:
-        with mpl.rc_context(_STYLE):
-            return function(*args, **kwargs)
-
-    return run
-
-
 def colour(index: int) -> str:
-    """Colour of the entry `index` of a legend."""
+    """Colour of the object or track number `index`."""
     return PALETTE[index % len(PALETTE)]
 
 
-def line_style(index: int) -> str:
-    """Line style of the entry `index`: it changes when the colours repeat."""
-    return _LINES[index // len(PALETTE) % len(_LINES)]
+def sensor_colour(index: int) -> str:
+    """Colour of the sensor number `index` by name."""
+    return SENSORS[index % len(SENSORS)]
+
+
+def run_looks(runs: Sequence[JudgedRun]) -> dict[str, Look]:
+    """Return how the curves of each run look, by label: colours are those of the estimators."""
+    found = looks([str(one.run.meta.get("estimator") or one.label) for one in runs])
+    return {one.label: each for one, each in zip(runs, found, strict=True)}
 
 
 def title(figure: Figure, text: str) -> None:
     """Write `text` above `figure`, broken into lines that are no wider than it."""
-    width = int(_TITLE_CHARACTERS_PER_IN * figure.get_figwidth())
-    lines = [line for part in text.split("\n") for line in textwrap.wrap(part, width)]
-    figure.suptitle("\n".join(lines))
-    _grow(figure, _LINE_IN * (len(lines) - 1))
+    if isinstance(figure, StyledFigure):
+        figure.long_title = text
+        _grow(figure, _line_in("figure.titlesize") * (_fit_title(figure) - 1))
+
+
+def _fit_title(figure: StyledFigure) -> int:
+    """Break the title into lines, and return how many."""
+    width = max(10, int(figure.get_figwidth() / (_LETTER * _size_in("figure.titlesize"))))
+    lines = [line for part in figure.long_title.split("\n") for line in textwrap.wrap(part, width)]
+    if lines:
+        figure.suptitle("\n".join(lines))
+    return len(lines)
 
 
 def titled(label: str, what: str) -> str:
@@ -163,30 +153,64 @@ def titled(label: str, what: str) -> str:
     return f"{label}: {what}" if label else what[0].upper() + what[1:]
 
 
-def legend_above(axes: Axes, width_in: float) -> None:
-    """Legend above a plot that is `width_in` wide, where it hides nothing; of many entries the first."""
-    handles, labels = axes.get_legend_handles_labels()
-    if not handles:
+def legend_above(axes: Axes, share: float = 1.0, markerscale: float = 1.0) -> None:
+    """Legend above a plot, where it hides nothing; of many entries the first.
+
+    It takes `share` of the width of the figure; small markers are shown larger by `markerscale`.
+    """
+    num_lines = _fit_legend(axes, share, markerscale)
+    if not num_lines:
         return
+    figure = axes.get_figure(root=True)
+    if isinstance(figure, StyledFigure):
+        figure.fitted_legends.append((axes, share, markerscale))
+        _grow(figure, _line_in("legend.fontsize") * max(0, num_lines - _FREE_LINES))
+
+
+def _fit_legend(axes: Axes, share: float, markerscale: float) -> int:
+    """Write the legend in as many columns as there is room for, and return its lines."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure = axes.get_figure(root=True)
+    if not handles or figure is None:
+        return 0
     more = len(labels) - _MOST_ENTRIES
     if more > 1:
         handles, labels = handles[:_MOST_ENTRIES], [*labels[: _MOST_ENTRIES - 1], f"{labels[_MOST_ENTRIES - 1]} ..."]
         labels[-1] += f" and {more} more"
-    width = int(_LEGEND_CHARACTERS_PER_IN * width_in)
+    width = max(_HANDLE + 10, int(share * figure.get_figwidth() / (_LETTER * _size_in("legend.fontsize"))))
     broken = [textwrap.wrap(label, width - _HANDLE) for label in labels]
-    columns = max(1, width // (_HANDLE + max(len(line) for lines in broken for line in lines)))
-    labels = ["\n".join(lines) for lines in broken]
-    _grow(axes.figure, _LINE_IN * (math.ceil(sum(map(len, broken)) / columns) - _FREE_LINES))
+    lengths = [_HANDLE + max(map(len, lines)) for lines in broken]
+    columns = next(k for k in range(len(broken), 0, -1) if k == 1 or sum(_column_widths(lengths, k)) <= width)
     axes.legend(
         handles,
-        labels,
+        ["\n".join(lines) for lines in broken],
         loc="lower left",
         bbox_to_anchor=(0.0, 1.0),
         ncols=columns,
         frameon=False,
         borderaxespad=0.2,
-        markerscale=3.0,
+        markerscale=markerscale,
+        columnspacing=1.2,
+        handlelength=1.8,
     )
+    return math.ceil(sum(map(len, broken)) / columns)
+
+
+def _column_widths(lengths: Sequence[int], columns: int) -> list[int]:
+    """Widths of the columns in which a legend puts entries of these lengths: one after the other, the first longer."""
+    rows, longer = divmod(len(lengths), columns)
+    ends = np.cumsum([rows + (k < longer) for k in range(columns)]).tolist()
+    return [max(lengths[start:end]) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+
+
+def _size_in(name: str) -> float:
+    """Return the size in inches of the texts of this setting."""
+    size_pt = FontProperties(size=_RC[name]).get_size_in_points()
+    return float(size_pt) / 72.0
+
+
+def _line_in(name: str) -> float:
+    return 1.5 * _size_in(name)
 
 
 def _grow(figure: Figure | SubFigure, more_in: float) -> None:
@@ -215,7 +239,6 @@ def broken_line(stamps_ns: IntArray, x: FloatArray, y: FloatArray, step_ns: floa
     return np.insert(x[order], pauses, np.nan), np.insert(y[order], pauses, np.nan)
 
 
-@styled
 def save_pages(figures: Iterable[Figure], file: BinaryIO) -> None:
     """Write `figures` as the pages of one PDF, without date and version."""
     with PdfPages(file, metadata=dict(FORMATS["pdf"])) as pages:
@@ -223,7 +246,6 @@ def save_pages(figures: Iterable[Figure], file: BinaryIO) -> None:
             pages.savefig(figure)
 
 
-@styled
 def png(figure: Figure, dpi: float) -> bytes:
     """`figure` as a small PNG of 256 colours, without date and version."""
     drawn, small = io.BytesIO(), io.BytesIO()
@@ -233,7 +255,6 @@ def png(figure: Figure, dpi: float) -> bytes:
     return small.getvalue()
 
 
-@styled
 def save(figure: Figure, path: Path | str) -> Path:
     """Write `figure` as PNG, SVG or PDF, as the suffix says, without date and version: equal figures, equal files.
 

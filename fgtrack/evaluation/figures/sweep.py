@@ -1,23 +1,22 @@
-"""Figures of a sweep: a metric over the grid, mean and standard error over the seeds."""
+"""Figures of a sweep: a metric over the grid, mean and 95 % interval over the seeds; and error against delay."""
 
 import math
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
+from importlib.resources import as_file, files
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.special import stdtrit
 
 from fgtrack.core.errors import DataError
-from fgtrack.evaluation.figures.style import (
-    StyledFigure,
-    colour,
-    line_style,
-    log_axis,
-    styled,
-    title,
-)
+from fgtrack.core.types import FloatArray
+from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
+from fgtrack.evaluation.figures.style import legend_above, log_axis
+from fgtrack.evaluation.palette import Look, look, looks
 from fgtrack.evaluation.sweep_table import PointMean, SweepTable, number, read_sweep
 
 #: Metrics with a name for people; the others are called by their column.
@@ -25,7 +24,7 @@ _NAMES: Mapping[str, str] = {
     "truth.overall.errors.position_m.rmse": "position RMSE [m]",
     "truth.overall.errors.speed_mps.rmse": "speed RMSE [m/s]",
     "truth.overall.errors.yaw_rad.rmse": "yaw RMSE [rad]",
-    "consistency.position_nees.mean": "mean NEES of the position (dashed: expected)",
+    "consistency.position_nees.mean": "mean NEES of the position",
     "multi_object.gospa.in_sight_rms_m": "GOSPA of objects in sight [m]",
     "multi_object.gospa.rms_m": "GOSPA [m]",
     "truth.overall.tracked_share_in_sight": "share of the time in sight that is tracked",
@@ -35,6 +34,18 @@ _NAMES: Mapping[str, str] = {
     "multi_object.clear.mota": "MOTA",
     "multi_object.identity.idf1": "IDF1",
     "multi_object.hota.hota": "HOTA",
+}
+_POSITION, _LAGGED = "truth.overall.errors.position_m.rmse", "lagged.*.errors.position_m.rmse"
+_UNITS = {
+    "s": "s",
+    "ms": "ms",
+    "ns": "ns",
+    "m": "m",
+    "hz": "Hz",
+    "rad": "rad",
+    "mps": "m/s",
+    "radps": "rad/s",
+    "mps2": "m/s²",
 }
 _EXPECTED: Mapping[str, float] = {"consistency.position_nees.mean": 2.0}
 #: Those that are drawn where nothing else is asked for.
@@ -63,8 +74,10 @@ def sweep_metrics(table: SweepTable) -> tuple[list[str], list[str]]:
 
 
 @styled
-def sweep(table: SweepTable | Path | str, metric: str = "truth.overall.errors.position_m.rmse") -> Figure:
-    """A metric of a sweep over its grid: mean over the seeds and its standard error, a line for each estimator.
+def sweep(
+    table: SweepTable | Path | str, metric: str = "truth.overall.errors.position_m.rmse", **paper: Unpack[Paper]
+) -> Figure:
+    """A metric of a sweep over its grid: mean over the seeds and 95 % interval, a line for each estimator.
 
     The axis with the most numbers is the horizontal one; of the others every combination has a panel.
 
@@ -74,11 +87,13 @@ def sweep(table: SweepTable | Path | str, metric: str = "truth.overall.errors.po
         The sweep or its folder.
     metric
         Column of sweep.csv.
+    **paper
+        `width`, `font`, `style`, `ax`.
 
     Raises
     ------
     CallError
-        There is no sweep, or no such metric.
+        There is no such sweep, or no such metric.
     DataError
         The sweep has no value of the metric.
     """
@@ -93,39 +108,130 @@ def sweep(table: SweepTable | Path | str, metric: str = "truth.overall.errors.po
         panels.setdefault(_without(one.point, across), []).append(one)
     columns = min(_WIDE, len(panels))
     rows = math.ceil(len(panels) / columns)
-    figure = StyledFigure(figsize=(max(7.0, 1.2 + 3.8 * columns), 1.5 + 3.0 * rows))
-    grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    sheet = Sheet(max(7.0, 1.2 + 3.8 * columns), 1.5 + 3.0 * rows, paper)
+    grid = sheet.plots(rows, columns, sharex=True, sharey=True)
     estimators = list(dict.fromkeys(one.estimator for one in means))
-    values = [row[axes[across]] for row in table.rows] if axes else [""]
-    steps = _Steps(values)
-    for place, (rest, found) in enumerate(panels.items()):
-        panel = grid[divmod(place, columns)]
-        for k, estimator in enumerate(estimators):
+    steps = _Steps([row[axes[across]] for row in table.rows] if axes else [""])
+    for panel, (rest, found) in zip(grid.flat, panels.items(), strict=False):
+        for k, (estimator, its) in enumerate(zip(estimators, looks(estimators), strict=True)):
             mine = [one for one in found if one.estimator == estimator]
-            _draw(panel, steps, mine, across if axes else None, k, len(estimators), estimator)
+            _draw(panel, steps, mine, across if axes else None, k - (len(estimators) - 1) / 2.0, its, estimator)
         named = zip(_without(axes, across), rest, strict=True)
-        panel.set_title("\n".join(f"{_short(axis)} {cell}" for axis, cell in named), loc="left")
-    for place in range(len(panels), rows * columns):
-        grid[divmod(place, columns)].set_visible(False)
-    for panel in grid.flat[: len(panels)]:
+        panel.set_title("\n".join(f"{words(axis)}: {cell}" for axis, cell in named), loc="left")
         if metric in _EXPECTED:
-            panel.axhline(_EXPECTED[metric], color="black", lw=0.9, ls="--")
+            panel.axhline(_EXPECTED[metric], color="black", lw=0.9, ls="--", label="expected")
+    for panel in grid.flat[len(panels) :]:
+        panel.set_visible(False)
     _scale(grid[0, 0], means, steps)
-    for place in range(len(panels)):
-        if place + columns >= len(panels):
-            panel = grid[divmod(place, columns)]
-            panel.set_xlabel(_short(axes[across]) if axes else "")
-            panel.tick_params(labelbottom=True)
-    figure.supylabel(_NAMES.get(metric, metric), fontsize=9)
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    wide = max(1, int(14 * figure.get_figwidth()) // (6 + max(map(len, labels))))
-    figure.legend(handles, labels, loc="outside lower center", ncols=wide, frameon=False)
+    for panel in grid.flat[max(0, len(panels) - columns) : len(panels)]:
+        panel.set_xlabel(words(axes[across]) if axes else "")
+        panel.tick_params(labelbottom=True)
+    for panel in grid[:, 0]:
+        panel.set_ylabel(metric_words(metric))
+    if len(panels) == 1:
+        legend_above(grid[0, 0])
+    else:
+        sheet.figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     seeds = {one.seeds for one in means}
-    of = f"{min(seeds)} to {max(seeds)}" if len(seeds) > 1 else str(seeds.pop())
-    bars = f"mean over {of} seeds; bars: its standard error" if max(one.seeds for one in means) > 1 else "one seed"
-    name = _NAMES.get(metric, metric)
-    title(figure, f"{name.partition(' [')[0].partition(' (')[0]}: {bars}")
-    return figure
+    of = f"{min(seeds)} to {max(seeds)}" if len(seeds) > 1 else str(max(seeds))
+    bars = f"mean over {of} seeds, bars: 95 % interval" if max(seeds) > 1 else "one seed"
+    sheet.title(f"{metric_words(metric).partition(' [')[0]}: {bars}")
+    return sheet.figure
+
+
+@styled
+def error_against_delay(table: SweepTable | Path | str | None = None, **paper: Unpack[Paper]) -> Figure:
+    """Position error against the mean delay of a sensor, with 95 % intervals: what each method makes of late data.
+
+    Parameters
+    ----------
+    table
+        A sweep (or its folder) over delays alone, in seconds. By default the result of the shipped sweep
+        `error_against_delay`: a car, a LiDAR that is late and a RADAR, ten seeds; nothing is replayed.
+    **paper
+        `width`, `font`, `style`, `ax`.
+
+    Raises
+    ------
+    CallError
+        There is no such sweep.
+    DataError
+        The sweep has no position errors, or is not over one axis of numbers.
+    """
+    if table is None:
+        with as_file(files(__package__) / "error_against_delay") as folder:
+            table = read_sweep(folder)
+    table = table if isinstance(table, SweepTable) else read_sweep(table)
+    means = table.means(_POSITION)
+    if len(table.shown_axes) != 1 or not means or not all(math.isfinite(number(one.point[0])) for one in means):
+        raise DataError(
+            "the sweep is not over one axis of delays with position errors, so it is not drawn against delay"
+        )
+    sheet = Sheet(7.0, 4.2, paper)
+    axes: Axes = sheet.plots()[0, 0]
+    curves = [(name, look(name), means) for name in dict.fromkeys(one.estimator for one in means)]
+    waits = [name for name in table.metrics if fnmatchcase(name, _LAGGED)][:1]
+    for metric in waits:
+        lagged = table.means(metric)
+        wait_s = metric.removeprefix("lagged.").partition(".errors")[0]
+        curves += [
+            (f"{name}, output {wait_s} s later", look(name)._replace(line=":", marker="."), lagged)
+            for name in dict.fromkeys(one.estimator for one in lagged)
+        ]
+    for label, its, found in curves:
+        mine = sorted(
+            (one for one in found if one.estimator == label.partition(",")[0]), key=lambda one: number(one.point[0])
+        )
+        delay_ms = np.array([1e3 * number(one.point[0]) for one in mine])
+        mean, half = np.array([one.mean for one in mine]), half_widths(mine)
+        axes.fill_between(delay_ms, mean - half, mean + half, color=its.colour, alpha=0.18, lw=0)
+        axes.plot(delay_ms, mean, ls=its.line, marker=its.marker, ms=4, lw=1.6, color=its.colour, label=label)
+    axes.set(
+        xlabel=f"{words(table.shown_axes[0]).partition(' [')[0]}, mean [ms]",
+        ylabel="position RMSE [m]",
+        ylim=(0.0, None),
+    )
+    axes.margins(x=0.02)
+    legend_above(axes)
+    sheet.title("Error against delay (shaded: 95 % interval over the seeds)")
+    return sheet.figure
+
+
+def half_widths(means: Sequence[PointMean]) -> FloatArray:
+    """Half widths of the 95 % intervals (t) of `means`, shape (n,); 0 of one seed, which has none."""
+    seeds = np.array([one.seeds for one in means])
+    errors = np.array([one.standard_error for one in means])
+    return np.asarray(np.nan_to_num(stdtrit(np.maximum(seeds - 1, 1), 0.975) * errors))
+
+
+def metric_words(metric: str) -> str:
+    """Name of a metric for people, with its unit."""
+    if metric in _NAMES:
+        return _NAMES[metric]
+    parts = metric.split(".")
+    if parts[0] == "lagged" and parts[-1] == "rmse":
+        return f"{words(parts[-2]).replace(' [', ' RMSE [')}, output {'.'.join(parts[1:-3])} s later"
+    if metric.endswith(".rmse"):
+        return words(parts[-2]).replace(" [", " RMSE [")
+    if parts[:2] == ["consistency", "nis"]:
+        return f"mean NIS of {parts[2].replace('_', ' ')}"
+    return words(metric)
+
+
+def words(name: str) -> str:
+    """Words for the key `name` of a configuration or a table, with its unit: "delay [s]" for "sensors.x.delay_s"."""
+    plain = ".".join(name.split(".")[-2:]).replace(".", " ")
+    stem, _, unit = plain.rpartition("_")
+    if stem and unit in _UNITS:
+        return f"{_proper(stem)} [{_UNITS[unit]}]"
+    return _proper(plain)
+
+
+def _proper(text: str) -> str:
+    plain = text.replace("_", " ")
+    for name in ("LiDAR", "RADAR", "NEES", "NIS"):
+        plain = " ".join(name if word == name.lower() else word for word in plain.split(" "))
+    return plain
 
 
 class _Steps:
@@ -140,19 +246,18 @@ class _Steps:
 
 
 def _draw(
-    panel: Axes, steps: _Steps, means: Sequence[PointMean], across: int | None, index: int, count: int, label: str
+    panel: Axes, steps: _Steps, means: Sequence[PointMean], across: int | None, aside: float, its: Look, label: str
 ) -> None:
-    shift = _DODGE * steps.width * (index - (count - 1) / 2.0)  # so that bars do not hide each other
+    shift = _DODGE * steps.width * aside  # so that bars do not hide each other
     at = np.array([steps.at["" if across is None else one.point[across]] + shift for one in means])
     order = np.argsort(at, kind="stable")
-    mean, error = (np.array([getattr(one, name) for one in means]) for name in ("mean", "standard_error"))
     panel.errorbar(
         at[order],
-        mean[order],
-        np.nan_to_num(error[order]),
-        color=colour(index),
-        ls=line_style(index) if steps.are_numbers else "none",
-        marker="os^vDP"[index % 6],
+        np.array([one.mean for one in means])[order],
+        half_widths(means)[order],
+        color=its.colour,
+        ls=its.line if steps.are_numbers else "none",
+        marker=its.marker,
         ms=4,
         lw=1.2,
         capsize=_CAP,
@@ -185,8 +290,3 @@ def _horizontal(table: SweepTable, axes: Sequence[str]) -> int:
 
 def _without(cells: Sequence[str], place: int) -> tuple[str, ...]:
     return (*cells[:place], *cells[place + 1 :])
-
-
-def _short(axis: str) -> str:
-    """The last part of the name of an axis."""
-    return axis.rpartition(".")[2]

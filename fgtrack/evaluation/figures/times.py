@@ -1,24 +1,18 @@
 """Figures of times: delays of messages, processing time."""
 
+from typing import Unpack
+
 import numpy as np
 from matplotlib.figure import Figure
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.figures.seeds import grouped
-from fgtrack.evaluation.figures.style import (
-    StyledFigure,
-    colour,
-    legend_above,
-    line_style,
-    log_axis,
-    styled,
-    title,
-    titled,
-)
+from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
+from fgtrack.evaluation.figures.seeds import group_looks, grouped
+from fgtrack.evaluation.figures.style import legend_above, log_axis, sensor_colour, titled
 from fgtrack.evaluation.innovations import message_delays
-from fgtrack.evaluation.runs import OneRun, Runs, judged, one_judged, starts_ns
+from fgtrack.evaluation.runs import OneRun, Runs, judged, one_judged
 from fgtrack.evaluation.statistics import Distribution
 from fgtrack.io.run import Run
 
@@ -26,8 +20,8 @@ _MS = 1e3
 
 
 @styled
-def delays(run: OneRun) -> Figure:
-    """Delay of the messages from stamp to receipt, per sensor: histogram and share that has arrived.
+def delays(run: OneRun, **paper: Unpack[Paper]) -> Figure:
+    """Share of the messages that has arrived against the delay from stamp to receipt, a line for each sensor.
 
     Raises
     ------
@@ -37,29 +31,18 @@ def delays(run: OneRun) -> Figure:
     one = one_judged(run)
     if not one.run.updates.num_rows:
         raise DataError(f"{one.label}: has no detections, so there are no delays to draw")
-    figure = StyledFigure(figsize=(10.0, 4.0))
-    histogram, arrived = figure.subplots(1, 2)
-    delays_ms = {sensor: delay_s * _MS for sensor, (_, delay_s) in sensor_delays(one.run).items()}
-    everything = np.concatenate(list(delays_ms.values()))
-    low, high = min(0.0, float(everything.min())), max(float(everything.max()), 1.0)
-    bins = np.linspace(low, high, 61)
-    for k, (sensor, delay_ms) in enumerate(delays_ms.items()):
-        spread = Distribution.of(delay_ms)
-        share = np.histogram(delay_ms, bins)[0] / len(delay_ms)
-        label = f"{sensor}: mean {spread.mean:.0f} ms, p90 {spread.p90:.0f} ms, max {spread.max:.0f} ms"
-        histogram.stairs(share, bins, color=colour(k), lw=1.4, label=label)
-        arrived.ecdf(delay_ms, color=colour(k), lw=1.4)
-        for axes in (histogram, arrived):
-            axes.axvline(spread.mean, color=colour(k), lw=1.0, ls="-", alpha=0.5)
-            axes.axvline(spread.p90, color=colour(k), lw=1.0, ls="--", alpha=0.5)
-    histogram.set_ylabel("share of the messages per bin")
-    arrived.set_ylabel("share of the messages received")
-    for axes in (histogram, arrived):
-        axes.set_xlabel("delay [ms] (lines: mean; dashed: p90)")
-        axes.set_xlim(low, high)
-    legend_above(histogram, figure.get_figwidth() / 2.0)
-    title(figure, titled(one.label, "delay of the messages with detections"))
-    return figure
+    sheet = Sheet(7.0, 3.8, paper)
+    axes = sheet.plots()[0, 0]
+    for k, (sensor, (_, delay_s)) in enumerate(sensor_delays(one.run).items()):
+        spread = Distribution.of(_MS * delay_s)
+        label = f"{sensor}: mean {spread.mean:.0f} ms, 90 % within {spread.p90:.0f} ms, all within {spread.max:.0f} ms"
+        axes.ecdf(_MS * delay_s, color=sensor_colour(k), lw=1.6, label=label)
+        axes.plot(spread.p90, 0.9, "o", ms=4, color=sensor_colour(k))
+    axes.set(xlabel="delay from stamp to receipt [ms]", ylabel="share of the messages received")
+    axes.margins(x=0.02)
+    legend_above(axes)
+    sheet.title(titled(one.label, "delay of the messages with detections"))
+    return sheet.figure
 
 
 def sensor_delays(run: Run) -> dict[str, tuple[IntArray, FloatArray]]:
@@ -69,8 +52,8 @@ def sensor_delays(run: Run) -> dict[str, tuple[IntArray, FloatArray]]:
 
 
 @styled
-def timing(runs: Runs) -> Figure:
-    """Wall time of the ticks with detections: over the run, and the share of ticks done by then.
+def timing(runs: Runs, **paper: Unpack[Paper]) -> Figure:
+    """Share of the ticks with detections that are done within a wall time, a line for each run.
 
     Runs that differ by their seed only are taken together.
 
@@ -82,27 +65,18 @@ def timing(runs: Runs) -> Figure:
     every = judged(runs)
     if not any((one.run.timing["num_detections"] > 0).any() for one in every):
         raise DataError("no run has detections, so there are no processing times to draw")
-    figure = StyledFigure(figsize=(10.0, 4.0))
-    over_time, done = figure.subplots(1, 2)
-    first_ns = starts_ns(every)
-    for k, group in enumerate(grouped(every)):
-        busy = [(one.label, one.run.timing.where(one.run.timing["num_detections"] > 0)) for one in group.runs]
-        time_ms = np.concatenate([ticks["process_ns"] / NS_PER_S * _MS for _, ticks in busy])
-        if not len(time_ms):
-            continue
-        spread = Distribution.of(time_ms)
-        text = f"{group.label}: median {spread.p50:.3g} ms, p99 {spread.p99:.3g} ms"
-        time_s = np.concatenate([(ticks["now_ns"] - first_ns[label]) / NS_PER_S for label, ticks in busy])
-        over_time.plot(time_s, time_ms, ".", ms=3.0, alpha=0.5, mew=0, color=colour(k), label=text, rasterized=True)
-        done.ecdf(time_ms, color=colour(k), ls=line_style(k), lw=1.4)
-    over_time.set_yscale("log")
-    over_time.set_xlabel("time [s]")
-    over_time.set_ylabel("time per tick with detections [ms]")
-    done.set_xscale("log")
-    done.set_xlabel("time per tick with detections [ms]")
-    done.set_ylabel("share of the ticks")
-    for axis in (over_time.yaxis, done.xaxis):
-        log_axis(axis)
-    legend_above(over_time, figure.get_figwidth() / 2.0)
-    title(figure, "Processing time")
-    return figure
+    sheet = Sheet(7.0, 3.8, paper)
+    axes = sheet.plots()[0, 0]
+    groups = grouped(every)
+    for group, its in zip(groups, group_looks(groups), strict=True):
+        busy = [one.run.timing.where(one.run.timing["num_detections"] > 0) for one in group.runs]
+        time_ms = np.concatenate([ticks["process_ns"] / NS_PER_S * _MS for ticks in busy])
+        if len(time_ms):
+            spread = Distribution.of(time_ms)
+            text = f"{group.label}: median {spread.p50:.3g} ms, 99 % within {spread.p99:.3g} ms"
+            axes.ecdf(time_ms, color=its.colour, ls=its.line, lw=1.6, label=text)
+    axes.set(xscale="log", xlabel="time per tick with detections [ms]", ylabel="share of the ticks")
+    log_axis(axes.xaxis)
+    legend_above(axes)
+    sheet.title("Processing time")
+    return sheet.figure
