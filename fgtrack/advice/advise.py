@@ -1,42 +1,54 @@
 """The advice of `fgtrack advise`: findings in order of importance, and a configuration that follows it."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from fgtrack.advice.arrivals import FEWEST, Arrivals, arrivals_of, overtaken
-from fgtrack.advice.clocks import offset_findings, receipt_findings, stamp_findings
+from fgtrack.advice.clocks import (
+    bias_findings,
+    clock_findings,
+    clock_verdicts,
+    estimated_clocks,
+    receipt_findings,
+    stamp_findings,
+)
 from fgtrack.advice.finding import Finding, milliseconds, percent
-from fgtrack.advice.noise import NoiseFit, noise_findings, noise_fits, objection
+from fgtrack.advice.noise import noise_findings
+from fgtrack.advice.outcome import Outcome, harm, objection
 from fgtrack.advice.page import Advice
 from fgtrack.advice.windows import beyond_lags, window_findings
 from fgtrack.core.caution import EGO
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Message
-from fgtrack.evaluation.cautions import USED, cautions
+from fgtrack.evaluation.cautions import cautions
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumed import assumed, source_of
-from fgtrack.pipeline.clock_offsets import OffsetReport, OffsetRules, estimate_offsets
+from fgtrack.pipeline.clock_offsets import OffsetReport
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.effective import effective
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.shipped import read_config, settings_of
 from fgtrack.pipeline.stamping import mended
 from fgtrack.pipeline.trial import TRIAL_S, beginning, suspicions
-from fgtrack.pipeline.truth_offsets import truth_offsets
 from fgtrack.pipeline.tune import tuned
+from fgtrack.pipeline.tune_rules import TuneRules
 
 __all__ = ["advise"]
 
 TRACKED_S = 300.0
 """So much of a recording is tracked, to judge clocks and noise; delays are those of all of it."""
+TUNED_S = 60.0
+"""Noise is fitted to so much of it."""
+_TUNE_RULES = TuneRules(train_share=1.0, max_rounds=3, max_observations=1500)  # the replay judges the result
+_LONGEST_STORAGE_S = 60.0
 _USELESS = 90.0  # what weighs more leaves nothing to be judged
+_FIRST = 45.0  # what weighs more comes before noise
 _OFTEN = 0.05  # share of lists that are overtaken
 _LOST = 0.02
-_MOST_OFFSET_DETECTIONS = 2500
 
 
 def advise(
@@ -48,9 +60,11 @@ def advise(
     set: Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
     reference: str | None = None,
     tune: bool = False,
-    on_step: Callable[[str], None] = lambda text: None,
+    on_step: Callable[[str, float], None] = lambda text, share: None,
 ) -> Advice:
-    """Say what is late, wrong or does not fit, and which settings mend it; `advice.config` follows the advice.
+    """Return what is late, wrong or inconsistent, and the settings that correct it; `advice.config` has them.
+
+    The recording is replayed before and after, and settings that make the tracks worse are not given.
 
     Parameters
     ----------
@@ -67,7 +81,7 @@ def advise(
     tune
         Whether noise that does not fit is fitted to the recording.
     on_step
-        Is told what comes next.
+        Called before each step with its name and the share that is done.
 
     Raises
     ------
@@ -77,7 +91,7 @@ def advise(
         The recording cannot be read, or holds nothing to track.
     """
     resolved = read_config(config, settings_of(set), track_map=map, pit_map=pit_map)
-    on_step("reading")
+    on_step("reading", 0.0)
     readable = UntilBreak(open_input(recording, resolved.input).messages())
     messages = list(readable)
     broken = None if readable.error is None else str(readable.error)
@@ -93,7 +107,7 @@ class _Adviser:
         messages: Sequence[Message],
         config: Config,
         reference: str | None,
-        on_step: Callable[[str], None],
+        on_step: Callable[[str, float], None],
     ) -> None:
         self._recording, self._messages, self._reference, self._on_step = recording, messages, reference, on_step
         self._assumed = assumed(config, source_of(lambda: messages))
@@ -101,13 +115,15 @@ class _Adviser:
         self._findings: list[Finding] = []
         self._arrivals = arrivals_of(messages)
         self._tracked = list(beginning(messages, nanoseconds(TRACKED_S)))
+        self._runs: list[tuple[Config, Run | None]] = []
+        self._clocks: OffsetReport | None = None
 
     def advice(self, broken: str | None, tune: bool) -> Advice:
-        """All steps."""
+        """Return the advice after all steps."""
+        work = 0.35 if tune else 1.0  # share of the work without the tuning
         if self._assumed.assumptions:
-            text = f"none is configured; assumed: {'; '.join(map(str, self._assumed.assumptions))}."
-            text += "" if tune else " `fgtrack tune` fits them (--tune)."
-            self._findings.append(Finding("noise", "sensors", 35.0, text))
+            text = f"assumed, as nothing is configured: {'; '.join(map(str, self._assumed.assumptions))}."
+            self._findings.append(Finding("assumed", "sensors", 35.0, text))
         self._take(self._strangers())
         before = self._config
         sensors = [name for name in self._arrivals if name != EGO and name not in before.ignore_sensors]
@@ -117,6 +133,7 @@ class _Adviser:
             self._take(stamp_findings(self._arrivals[name]))
         self._take(receipt_findings([self._arrivals[name] for name in sensors]))
         self._take(self._misread())
+        self._on_step("clocks", 0.2 * work)
         self._take(self._offsets())
         seen = arrivals_of(
             mended(message, self._config.sensors)
@@ -127,37 +144,59 @@ class _Adviser:
         self._take(self._late(timed, shares))
         self._take(window_findings(timed, self._config))
         self._take(self._ego())
-        self._on_step("tracking")
-        run_before = self._replayed(before)
-        run_after = run_before if self._config == before else self._replayed(self._config)
-        if run_after is not None and self._take(self._cautions(run_after)):
-            run_after = self._replayed(self._config)
-        fits = [] if run_after is None else noise_fits(run_after)
-        if run_after is not None and not self._is_useless:
-            self._take(noise_findings(run_after, fits, tune))
-        if tune and any(one.kind == "noise" for one in self._findings):
-            self._findings.append(self._tuned(run_after))
+        self._on_step("tracking", 0.6 * work)
+        run = self._run(self._config)
+        if run is not None:
+            self._take(self._cautions(run))
+        self._withdraw_harm(before)
+        run = self._run(self._config)
+        if run is not None and not self._is_useless:
+            self._take(noise_findings(run, Outcome.of(run).noise, tune))
+        if tune and run is not None:
+            self._take(self._tuned(run, work))
+        old, new = (None if found is None else Outcome.of(found) for found in map(self._run, (before, self._config)))
+        if new is not None and new.shortfall is not None:
+            text = f"{new.shortfall}: settle first what is said above, then look at the sectors and ranges of sensors "
+            text += "(`fgtrack info`) and at the gate of association."
+            self._findings.append(Finding("track", "tracks", 32.0, text))
         return Advice(
             recording=self._recording,
             findings=tuple(sorted(self._findings, key=lambda one: -one.weight)),
-            fine=tuple(self._fine(seen, fits)),
+            fine=tuple(self._fine(seen, new)),
             config=self._config,
             arrivals=tuple(seen.values()),
             overtaken=shares,
             beyond=tuple(beyond_lags(timed)),
-            noise=tuple(fits),
-            used=_used(run_before, run_after),
+            before=old,
+            after=new,
             broken=broken,
         )
 
-    def _take(self, findings: Iterator[Finding]) -> bool:
-        """Keep findings, and follow them; whether that has changed a setting."""
-        found = list(findings)
-        self._findings += found
-        values = {key: value for one in found for key, value in one.settings.items()}
-        if values:
-            self._config = read_config(self._config, settings_of(values))
-        return bool(values)
+    def _take(self, findings: Iterable[Finding]) -> None:
+        """Keep findings, and follow them."""
+        for one in findings:
+            self._findings.append(one)
+            self._config = _with(self._config, one)
+
+    def _withdraw_harm(self, before: Config) -> None:
+        """Take back settings that make the replay worse than without them; facts of the recording stay said."""
+        if self._is_harm(before, self._config) is None:
+            return
+        self._config = before
+        for one in sorted(filter(lambda one: one.settings, self._findings), key=lambda one: -one.weight):
+            config = _with(self._config, one)
+            worse = self._is_harm(self._config, config)
+            if worse is None:
+                self._config = config
+                continue
+            text = f"{one.text} {', '.join(one.settings)} would correct it, but then {worse}: left as it is."
+            self._findings[self._findings.index(one)] = replace(one, text=text, settings={})
+
+    def _is_harm(self, old: Config, new: Config) -> str | None:
+        """Return what gets worse from one configuration to the other; None where nothing does."""
+        runs = [self._run(old), self._run(new)]
+        before, after = (None if run is None else Outcome.of(run) for run in runs)
+        return None if old == new or before is None or after is None else harm(before, after)
 
     @property
     def _is_useless(self) -> bool:
@@ -192,36 +231,20 @@ class _Adviser:
                 yield Finding("track", one.about, 70.0, f"{one.text}.", one.settings)
 
     def _offsets(self) -> Iterator[Finding]:
-        """Clocks that do not agree, where that can be known."""
+        """Clocks that do not agree, and positions that are off, where that can be known."""
         if self._is_useless:
             return
-        self._on_step("clock offsets")
-        config = replace(self._config, estimator="ekf-replay")
+        doubtful = {one.about for one in self._findings if one.kind == "clock"}
         try:
-            report = None if self._reference is not None else truth_offsets(self._tracked, config)
-            if report is None:
-                report = self._between_sensors(config)
+            self._clocks = estimated_clocks(self._tracked, self._config, self._reference, doubtful, self._replayed)
         except (DataError, CallError) as error:
             if self._reference is not None and isinstance(error, CallError):
                 raise
             return
-        if report is not None:
-            configured_s = {name: sensor.clock_offset_s for name, sensor in self._config.sensors.items()}
-            yield from offset_findings(report, configured_s)
-
-    def _between_sensors(self, config: Config) -> OffsetReport | None:
-        placing = [name for name, one in config.sensors.items() if one.gives_position and name in self._arrivals]
-        placing = [name for name in placing if name not in config.ignore_sensors]
-        if len(placing) < 2:
-            return None
-        reference = self._reference
-        if reference is None:  # a clock that is wrong by itself is none to go by
-            doubtful = {one.about for one in self._findings if one.kind == "clock"}
-            trusted = [name for name in placing if name not in doubtful]
-            if trusted and len(trusted) < len(placing):
-                reference = max(trusted, key=lambda name: int(self._arrivals[name].counts.sum()))
-        rules = OffsetRules(fit_noise=True, max_detections=_MOST_OFFSET_DETECTIONS)
-        return estimate_offsets(self._tracked, config, reference, rules)
+        yield from clock_findings(
+            self._clocks, {name: sensor.clock_offset_s for name, sensor in self._config.sensors.items()}
+        )
+        yield from bias_findings(self._clocks, self._config.ego)
 
     def _late(self, arrivals: Sequence[Arrivals], shares: Mapping[str, float]) -> Iterator[Finding]:
         """Bursts, losses, and an estimator that cannot deal with what is overtaken."""
@@ -271,58 +294,97 @@ class _Adviser:
             )
             yield Finding("ego", EGO, 35.0, text)
 
-    def _tuned(self, before: Run | None) -> Finding:
-        """The noise that is fitted to the recording, unless nothing can be or it is no better than that of `before`."""
-        self._on_step("tune")
+    def _tuned(self, before: Run, begun: float) -> Iterator[Finding]:
+        """The noise that is fitted to the recording, unless nothing can be, or it does harm."""
+        if not any(one.kind == "noise" for one in self._findings) and not self._assumed.assumptions:
+            return
+        steps = iter(range(1, 100))
+        messages = list(beginning(self._tracked, nanoseconds(TUNED_S)))
         try:
-            report = tuned({self._recording: lambda: iter(self._tracked)}, self._config)
+            report = tuned(
+                {self._recording: lambda: iter(messages)},
+                self._config,
+                _TUNE_RULES,
+                lambda text: self._on_step(f"tune: {text}", begun + 0.55 * (1.0 - 0.8 ** next(steps))),
+            )
         except DataError as error:
-            return Finding("tune", "tune", 76.0, f"no noise is changed: {error}.")
-        self._on_step("tracking")
-        after = self._replayed(report.config)
-        why = None if before is None or after is None else objection(before, after)
+            yield Finding("tune", "tune", 76.0, f"no noise is changed: {error}. {self._first}")
+            return
+        self._on_step("tracking", 0.9)
+        after = self._run(report.config)
+        why = None if after is None else objection(before, after)
         if why is not None:
-            return Finding("tune", "tune", 76.0, f"no noise is changed. With what is fitted, {why}.")
-        self._config = report.config
+            yield Finding("tune", "tune", 76.0, f"no noise is changed. With what is fitted, {why}. {self._first}")
+            return
         settings = {one.key: one.tuned for one in report.parameters if one.tuned != one.configured}
         stay = ", ".join(one.key for one in report.parameters if one.key not in settings)
         rest = f" As configured stay {stay}." if stay else ""
-        return Finding("tune", "tune", 76.0, f"fitted to the recording by maximum likelihood.{rest}", settings)
+        yield Finding("tune", "tune", 76.0, f"fitted to the recording by maximum likelihood.{rest}", settings)
 
-    def _replayed(self, config: Config) -> Run | None:
-        """A run of the first minutes; None where nothing can be tracked."""
-        config = replace(config, clock=replace(config.clock, ticks_file=None))
+    @property
+    def _first(self) -> str:
+        """What has to be done before noise can be fitted."""
+        first = [one for one in self._findings if one.weight > _FIRST and not one.settings and one.kind != "noise"]
+        if first:
+            return f"First settle what is said of {max(first, key=lambda one: one.weight).about}, then tune."
+        return "Keep the configured noise: tuning this recording once more gives the same."
+
+    def _run(self, config: Config) -> Run | None:
+        """A run of the first minutes, of the replaying EKF for a smoother; None where nothing can be tracked."""
+        for known, run in self._runs:
+            if known == config:
+                return run
+        storage_s = min(effective(config).reach_s, _LONGEST_STORAGE_S)
+        fast = replace(config, clock=replace(config.clock, ticks_file=None))
+        if config.estimator.startswith("smoother"):
+            fast = replace(fast, estimator="ekf-replay", filter=replace(config.filter, storage_s=storage_s))
         try:
-            return replay_in_memory(self._tracked, config)[0]
+            found = replay_in_memory(self._tracked, fast)[0]
         except DataError:
-            return None
+            found = None
+        self._runs.append((config, found))
+        return found
 
-    def _fine(self, seen: Mapping[str, Arrivals], fits: Sequence[NoiseFit]) -> Iterator[str]:
+    def _replayed(self, messages: Iterable[Message], config: Config) -> tuple[Run, str | None]:
+        """`replay_in_memory`; the run of the present settings where these refuse nothing for its delay."""
+        kept = list(messages)
+        unlimited = all(sensor.max_delay_s is None for sensor in self._config.sensors.values())
+        if unlimited and self._config.estimator != "ekf-backward-forward":
+            run = self._run(self._config)
+            if run is not None:
+                return run, run.meta.get("broken_off")
+        return replay_in_memory(kept, config)
+
+    def _fine(self, seen: Mapping[str, Arrivals], outcome: Outcome | None) -> Iterator[str]:
+        """What was looked at and is fine."""
         wrong = {(one.kind, one.about) for one in self._findings}
         kinds = {kind for kind, _ in wrong}
         ego = self._arrivals.get(EGO)
         if ego is not None and not wrong & {("ego", EGO), ("clock", EGO), ("input", EGO)} and ego.period_s:
             longest, delay = milliseconds(ego.longest_gap_s), milliseconds(ego.quantile_s(0.5))
             yield f"the ego ({1.0 / ego.period_s:.0f} Hz, longest gap {longest}, delay {delay})"
-        clocks = [name for name in seen if ("clock", name) not in wrong]
+        stamps = [name for name, one in seen.items() if ("clock", name) not in wrong and len(one.stamps_ns) >= FEWEST]
+        if stamps:
+            yield f"stamps of {', '.join(stamps)}"
+        verdicts = [] if self._clocks is None else clock_verdicts(self._clocks)
+        clocks = [one.sensor for one in verdicts if one.is_known and one.offset_s is None]
         if clocks:
-            yield f"stamps of {', '.join(clocks)}"
+            yield f"clock of {', '.join(clocks)}"
         if not kinds & {"input", "model"}:
             yield "frames, angles and fields"
-        if "window" not in kinds:
+        if "window" not in kinds and any(one.has_stamps for one in seen.values()):
             found = effective(self._config)
             yield f"{found.lag_key} ({found.lag_s:g} s) and max_delay_s"
-        if "track" not in kinds:
-            yield "the life of tracks"
-        noise = [one.sensor for one in fits if ("noise", one.sensor) not in wrong]
+        if outcome is None:
+            return
+        if "track" not in kinds and outcome.truth is not None:
+            tracked = percent(outcome.truth.tracked_share_in_sight)
+            yield f"tracks ({outcome.births} beginnings, {tracked} tracked where a sensor could see)"
+        noise = [one.sensor for one in outcome.noise if ("noise", one.sensor) not in wrong and one.is_consistent]
         if noise:
             yield f"noise of {', '.join(noise)}"
 
 
-def _used(before: Run | None, after: Run | None) -> dict[str, tuple[float, float]]:
-    """Share of the detections of each sensor that took part."""
-    old, new = (
-        {name: sum(one.get(fate, 0) for fate in USED) / (sum(one.values()) or 1) for name, one in counts.items()}
-        for counts in ({} if run is None else run.meta["counts"] for run in (before, after))
-    )
-    return {name: (old.get(name, 0.0), share) for name, share in new.items()}
+def _with(config: Config, finding: Finding) -> Config:
+    """`config` with the settings of a finding."""
+    return read_config(config, settings_of(finding.settings)) if finding.settings else config

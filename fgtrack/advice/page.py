@@ -1,12 +1,13 @@
 """The page of `fgtrack advise`: sentences, two tables, and the configuration that follows them."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from textwrap import wrap
 
 from fgtrack.advice.arrivals import Arrivals
 from fgtrack.advice.finding import Finding
-from fgtrack.advice.noise import NoiseFit
+from fgtrack.advice.outcome import Outcome
 from fgtrack.advice.windows import BeyondLag
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
 from fgtrack.pipeline.config import Config
@@ -40,10 +41,10 @@ class Advice:
     """Of the sensors that are used, with the stamps that the advice gives them."""
     overtaken: Mapping[str, float] = field(repr=False)
     beyond: tuple[BeyondLag, ...] = field(repr=False)
-    noise: tuple[NoiseFit, ...] = field(repr=False)
-    """With these changes, but the noise as it was configured."""
-    used: Mapping[str, tuple[float, float]] = field(repr=False)
-    """Share of the detections of each sensor that took part in tracking, before and after the changes."""
+    before: Outcome | None = field(repr=False)
+    """What the configuration makes of the recording; None where nothing can be tracked."""
+    after: Outcome | None = field(repr=False)
+    """The same with these changes."""
     broken: str | None
     """Why the recording breaks off, where it does; what came before was used."""
 
@@ -65,11 +66,23 @@ class Advice:
 
     @property
     def tables(self) -> Tables:
-        """`lateness` of each sensor, and `beyond`: what windows of several lengths would lose."""
-        return Tables({"lateness": self._lateness(), "beyond": self._beyond()}, verdict=self.sentences)
+        """`outcome` of the replays, `lateness` of each sensor, and `beyond`: what shorter windows would lose."""
+        tables = {"outcome": self._outcome(), "lateness": self._lateness(), "beyond": self._beyond()}
+        return Tables(tables, verdict=self.sentences)
 
     def __str__(self) -> str:
         return str(self.tables)
+
+    def _outcome(self) -> Table:
+        before, after = (dict(() if one is None else one.rows()) for one in (self.before, self.after))
+        names = tuple({**before, **after})
+        columns: list[Column[str]] = [
+            Column("replayed", ("replayed",), lambda name: (name,), left=True),
+            Column("before", ("before",), lambda name: (before.get(name, math.nan),)),
+        ]
+        if self.changes:
+            columns.append(Column("advised", ("advised",), lambda name: (after.get(name, math.nan),)))
+        return Table("What the settings make of the recording", columns, names, row_keys=("replayed",))
 
     def _lateness(self) -> Table:
         def quantiles(one: Arrivals) -> tuple[Value, ...]:
@@ -87,15 +100,8 @@ class Advice:
             Column("overtaken\n[%]", ("overtaken",), lambda one: (self.overtaken[one.name],), scale=100.0),
             Column("lost\n[%]", ("lost",), lambda one: _known(one.lost), scale=100.0),
             Column("bursts\n[s]", ("bursts", "burst_s"), bursts, "{} of {}"),
-            Column(
-                "used [%]\nnow/followed", ("used", "used_followed"), lambda one: self.used.get(one.name), "{}/{}", 100.0
-            ),
-            Column("NIS\n/ expected", ("nis_ratio",), lambda one: _known(self._ratio(one.name))),
         ]
         return Table("Lists by sensor, with the stamps advised", columns, self.arrivals, row_keys=("sensor",))
-
-    def _ratio(self, sensor: str) -> float | None:
-        return next((one.ratio.mean for one in self.noise if one.sensor == sensor), None)
 
     def _beyond(self) -> Table:
         columns: list[Column[BeyondLag]] = [Column("lag [s]", ("lag_s",), lambda row: (row.lag_s,), text=str)]

@@ -125,8 +125,8 @@ def _sensors(report: TuneReport) -> list[str]:
             lines.append(f"{one.sensor}: {one.own_covariance} measurements have a covariance of their own; it stays")
     runs = () if report.held_out is None else report.held_out.runs_after
     lines += [
-        f"{one.sensor}: innovations still resemble the one before (autocorrelation {one.lag1:.2f}): errors last, of it "
-        "or of what is believed more, and white noise is too small for them"
+        f"{one.sensor}: innovations still correlated in time (autocorrelation {one.lag1:.2f}): so are errors, of it or "
+        "of the sensor that is trusted more, and white noise is too small for them"
         for run in runs
         for one in noise_fits(run)
         if one.lasts

@@ -11,7 +11,7 @@ from fgtrack.core.caution import EGO, Caution, in_degrees
 from fgtrack.core.time import NS_PER_S, wrong_unit
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.failures import Failure
-from fgtrack.evaluation.innovations import num_measured
+from fgtrack.evaluation.innovations import autocorrelations, num_measured
 from fgtrack.evaluation.left_out import because
 from fgtrack.evaluation.statistics import ChiSquareMean
 from fgtrack.io.run import Run, Table, digest
@@ -24,6 +24,8 @@ FAR_OFF = 1.5
 """A mean NIS farther from its expected value than by this factor says that the noise does not fit."""
 FEWEST = 30
 """Updates of a sensor whose NIS says something."""
+LASTING = 0.3
+"""Autocorrelation of innovations at lag 1 above which their errors are correlated in time."""
 
 #: Cause and cure of what can happen to most detections of a sensor, by disposition.
 _CURES = {
@@ -59,10 +61,24 @@ def noise_cautions(run: Run) -> list[Caution]:
         factor = math.sqrt(max(nis.mean, 0.0) / nis.dof)  # below 0 by rounding, where one std is 1e9 of another
         text = (
             f"mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}, as if "
-            f"errors were {factor:.2g} times what is configured; `{_tune(run)}` fits it"
+            f"errors were {factor:.2g} times what is configured"
         )
-        found.append(Caution(sensor, text))
+        lag1 = innovation_lag1(run, sensor)
+        if lag1 is not None and lag1 > LASTING:
+            text += f", and errors are correlated in time ({lag1:.2f}), which fitted white noise cannot express"
+        found.append(Caution(sensor, f"{text}; `{_advise(run)}` fits it, or says what has to be done first"))
     return found
+
+
+def innovation_lag1(run: Run, sensor: str) -> float | None:
+    """Autocorrelation of the position innovations of a sensor at lag 1; None where no track has enough of them.
+
+    It is near 0 where its errors are white and the noise is consistent. Of a sensor without positions it is that of the
+    first component.
+    """
+    found = autocorrelations(run.updates.where(run.updates["sensor"] == sensor))
+    first = next(iter(found.values()), None)
+    return None if first is None else first.lag1
 
 
 def misfits(run: Run) -> Iterator[tuple[str, ChiSquareMean]]:
@@ -74,12 +90,12 @@ def misfits(run: Run) -> Iterator[tuple[str, ChiSquareMean]]:
             yield sensor, nis
 
 
-def _tune(run: Run) -> str:
-    """The command that fits the noise of `run` to its recording."""
+def _advise(run: Run) -> str:
+    """The command that judges the noise of `run` and fits it where that helps."""
     source = str((run.meta.get("input") or {}).get("path") or "")
     if run.path is None or not source:
-        return "fgtrack tune"
-    return f"fgtrack tune {source} -c {run.path / 'config.yaml'} -o tuned.yaml"
+        return "fgtrack advise --tune"
+    return f"fgtrack advise {source} -c {run.path / 'config.yaml'} --tune -o advised.yaml"
 
 
 def _median_is_off(values: FloatArray, nis: ChiSquareMean) -> bool:

@@ -115,7 +115,7 @@ def _noise(metrics: Mapping[str, Metrics]) -> Iterator[str]:
         size = "too small" if all(small) else "partly too small, partly too large" if any(small) else "too large"
         yield (
             f"The configured noise is {size} (judged by {label}): {_named(off)}. "
-            "Fit it with `fgtrack tune` and compare again; the order of the runs may change."
+            "`fgtrack advise --tune` fits it, or says what comes first; the order of the runs may change then."
         )
         return
     if far:

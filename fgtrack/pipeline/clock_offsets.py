@@ -2,8 +2,9 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import DetectionList, EgoState, Message
 from fgtrack.estimation.factor_graph.clock_calibration.offsets import OffsetSettings, OffsetSolution, solve_offsets
 from fgtrack.estimation.factor_graph.clock_calibration.time_shift import ShiftableMeasurement
+from fgtrack.io.run import Run
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.assumed import assumed, source_of
 from fgtrack.pipeline.clock import Delivered
@@ -23,6 +25,8 @@ from fgtrack.pipeline.stamping import mended
 from fgtrack.sim.redelay import restamped
 
 Track = Sequence[ShiftableMeasurement]
+Replayed = Callable[[Iterable[Message], Config], tuple[Run, str | None]]
+"""A function that replays messages, and says why they broke off: `replay_in_memory`, or one that remembers."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,18 @@ class OffsetRules:
 
 
 @dataclass(frozen=True)
+class Bias:
+    """A constant error of the positions of a sensor, detections minus truth; 0 in a direction without one."""
+
+    EGO: ClassVar[str] = "ego"
+    VEHICLE: ClassVar[str] = "vehicle"
+    of: str
+    """Whose directions are meant: those of the `ego`, or of the `vehicle` that is seen."""
+    ahead_m: float
+    left_m: float
+
+
+@dataclass(frozen=True)
 class SensorOffset:
     """One sensor: reported stamp = time at which it sensed + offset."""
 
@@ -79,6 +95,8 @@ class SensorOffset:
     """Standard deviation by how much stretches of 5 s disagree; errors that last make it larger than `std_s`."""
     dof: float | None = None
     """Degrees of freedom of `std_s`, where few stretches tell it."""
+    bias: Bias | None = None
+    """Of its positions against the truth; None where there is none, or no truth."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +110,9 @@ class OffsetReport:
     num_detections: int
     broken: str | None
     """Why the input broke off, where it did; what came before was used."""
+    least_delays_s: Mapping[str, float] = field(default_factory=dict)
+    """The shortest delay of each sensor: its stamps are not earlier than the truth by more than that, for nothing is
+    received before it was sensed."""
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""
@@ -99,7 +120,11 @@ class OffsetReport:
 
 
 def estimate_offsets(
-    messages: Iterable[Message], config: Config, reference: str | None = None, rules: OffsetRules | None = None
+    messages: Iterable[Message],
+    config: Config,
+    reference: str | None = None,
+    rules: OffsetRules | None = None,
+    replayed: Replayed = replay_in_memory,
 ) -> OffsetReport:
     """Estimate the clock offsets of the sensors in `messages`, from tracks that the tracker of `config` makes.
 
@@ -125,7 +150,7 @@ def estimate_offsets(
     config = assumed(config, source_of(repeated)).config
     recorded = _recorded(repeated(), heard, config.sensors)
     config = unrefused(config)
-    run, broken = replay_in_memory(recorded, config)
+    run, broken = replayed(recorded, config)
     raw = _lists(heard, config)
     sensors = [name for name in config.sensors if any(one.sensor == name for one in raw)]
     if not sensors:
@@ -152,7 +177,15 @@ def estimate_offsets(
         solution = _solution(used, reference, config, rules, known_s)
     counts = _counts(used)
     rows = tuple(_row(name, reference, counts[name], solution, len(sensors), rules) for name in sensors)
-    return OffsetReport(reference, rows, len(used), counts.total(), broken)
+    return OffsetReport(reference, rows, len(used), counts.total(), broken, least_delays_s(raw))
+
+
+def least_delays_s(lists: Iterable[DetectionList]) -> dict[str, float]:
+    """Return the shortest delay of each sensor."""
+    found: dict[str, float] = {}
+    for one in lists:
+        found[one.sensor] = min(found.get(one.sensor, math.inf), seconds(one.receipt_ns - one.stamp_ns))
+    return found
 
 
 def unrefused(config: Config) -> Config:

@@ -144,7 +144,7 @@ class _Tuning:
     def report(self, config: Config) -> TuneReport:
         """Rounds of association and fit to the first part, the judgement of the rest, and the fit to everything."""
         series, runs_before = self._associated(self._configured)
-        splits = [self._split_ns(tracks) for tracks in series]
+        splits = [self._split_ns(tracks) for tracks in series] if self._rules.train_share < 1.0 else None
         values, optima, rounds, settled = self._configured, 0, 0, False
         while not settled and rounds < self._rules.max_rounds:
             if rounds:
@@ -152,7 +152,7 @@ class _Tuning:
                 series, _ = self._associated(values)
                 series = [[without_mixed(one, self._space, values) for one in tracks] for tracks in series]
             rounds += 1
-            problem = self._problem(_until(series, splits))
+            problem = self._problem(_all(series) if splits is None else _until(series, splits))
             if rounds == 1:
                 values, optima = self._best_start(problem)
             self._on_step(f"fit {rounds}")
@@ -161,12 +161,13 @@ class _Tuning:
             moved = np.abs(np.log(values[free] / before[free]))
             still = (moved <= self._rules.settled * likelihood.spread(np.log(values[free]))).all()
             settled = rounds > 1 and bool(still)  # with the configured noise one cannot tell what is mixed
-        trained = self._found(problem, values)
-        held_out = self._held_out(trained.values, series, splits, runs_before)
-        self._on_step("fit to everything")
-        everything = self._problem([one for tracks in series for one in tracks])
-        found = self._found(everything, trained.values)
-        return self._made(config, everything, found, held_out, rounds, optima, settled)
+        found, held_out = self._found(problem, values), None
+        if splits is not None:
+            held_out = self._held_out(found.values, series, splits, runs_before)
+            self._on_step("fit to everything")
+            problem = self._problem(_all(series))
+            found = self._found(problem, found.values)
+        return self._made(config, problem, found, held_out, rounds, optima, settled)
 
     def _associated(self, values: FloatArray) -> tuple[list[list[Series]], list[Run]]:
         """The series of long tracks and the run of each recording, with the noise of `values`."""
@@ -174,7 +175,10 @@ class _Tuning:
         all_series, runs = [], []
         for recording in self._recordings:
             series, run = recorded(recording.messages, config, recording.name, self._rules.gate_stds)
-            all_series.append([one for one in series if len(one.observations) >= self._rules.min_observations])
+            long = [one for one in series if len(one.observations) >= self._rules.min_observations]
+            all_series.append(
+                [replace(one, observations=one.observations[: self._rules.max_observations]) for one in long]
+            )
             runs.append(run)
         return all_series, runs
 
@@ -392,6 +396,10 @@ class _Tuning:
         )
         share = float(outlier_share(found.values[places[name, ""]])) if count else None
         return SensorNoise(name, count, own, share)
+
+
+def _all(series: Sequence[Sequence[Series]]) -> list[Series]:
+    return [one for tracks in series for one in tracks]
 
 
 def _until(series: Sequence[Sequence[Series]], splits: Sequence[int]) -> list[Series]:

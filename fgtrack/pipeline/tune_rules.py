@@ -15,13 +15,16 @@ class TuneRules:
     keep: tuple[str, ...] = ()
     """Keys of the configuration that stay as they are."""
     train_share: float = 0.7
-    """Part of the time of each recording, from its start, that the noise which is judged is fitted to."""
+    """Part of the time of each recording, from its start, that the noise which is judged is fitted to; 1: no part is
+    left to judge it by."""
     max_rounds: int = 4
     """How often detections are associated at most."""
     settled: float = 0.2
     """Rounds end where no parameter moves by more than this share of its standard deviation."""
     min_observations: int = 20
     """Shorter tracks are left out: most of them are clutter."""
+    max_observations: int | None = None
+    """Longer tracks are cut to so many measurements; null: none is."""
     min_count: int = 30
     """Measured components that a parameter needs at least."""
     known_std_error: float = 0.05

@@ -137,6 +137,8 @@ def test_a_healthy_recording_is_fine_and_nothing_is_changed(call: Call) -> None:
     assert code == 0
     assert "Fine: the ego (20 Hz" in text
     assert "stamps of lidar, radar, frames, angles and fields" in text
+    assert "tracks (2 beginnings, 99 % tracked where a sensor could see)" in text
+    assert "lidar: its clock offset is not known: objects move" in text  # too short a drive: neither wrong nor fine
     assert "noise of lidar, radar" in text
     assert "# Nothing is changed." in Path("a.yaml").read_text()
     for name in ("c", "a"):
@@ -158,7 +160,7 @@ def test_what_nothing_is_changed_of_is_tracked_once(call: Call, monkeypatch: pyt
     assert len(tracked) == 1
     Path("c.yaml").write_text(CONFIG.replace("lidar: {", "lidar: {max_delay_s: 0.05, "))
     assert fgtrack.advise("drive.jsonl", "c.yaml").changes
-    assert len(tracked) == 3
+    assert len(tracked) == 1 + 3  # before, after, and for the clocks once without the limit
 
 
 @pytest.mark.parametrize("command", ["advise", "tune", "offsets"])
@@ -290,7 +292,14 @@ def test_without_truth_only_the_difference_of_two_clocks_is_known(call: Call) ->
     write("stream", off)
     advice = fgtrack.advise("drive.jsonl", "c.yaml", reference="radar")
     (clock,) = [one for one in advice.findings if one.kind == "clock"]
-    assert "later than those of radar. Which of the two clocks is wrong the recording does not tell" in clock.text
+    assert "later than those of radar. radar is received 40 ms after its stamps at least" in clock.text
+    assert "of it is the clock of lidar. To tell which of the two clocks is wrong takes truth" in clock.text
+    code, text = call("offsets", "drive.jsonl", "-c", "c.yaml", "--reference", "radar", "--json")
+    assert code == 0
+    offsets = json.loads(text)
+    (verdict,) = offsets["verdicts"]
+    assert " ".join(verdict[name] for name in ("known", "bound", "missing")) == clock.text
+    assert verdict["offset_s"] == pytest.approx(advice.config.sensors["lidar"].clock_offset_s, abs=1e-4)
     assert advice.config.sensors["lidar"].clock_offset_s == pytest.approx(0.08, abs=0.02)
 
 
@@ -316,7 +325,10 @@ def test_bursts_and_a_limit_that_refuses_them(call: Call) -> None:
     assert lidar.bursts is not None
     assert (lidar.bursts.count, lidar.bursts.mean_length_s) == (6, pytest.approx(1.0, abs=0.1))
     assert advice.config.sensors["lidar"].max_delay_s == pytest.approx(0.8)
-    assert advice.used["lidar"] == (pytest.approx(0.8, abs=0.02), pytest.approx(1.0, abs=0.01))
+    assert advice.before is not None
+    assert advice.after is not None
+    assert advice.before.used["lidar"] == pytest.approx(0.8, abs=0.02)
+    assert advice.after.used["lidar"] == pytest.approx(1.0, abs=0.01)
     assert [row.share["lidar"] for row in advice.beyond if row.lag_s in (0.05, 0.3, 0.75)] == [
         1.0,
         pytest.approx(0.2),
@@ -424,13 +436,14 @@ def test_white_noise_is_not_fitted_to_errors_that_last(call: Call) -> None:
     assert any(one.kind == "noise" and one.about == "lidar" for one in advice.findings)
     (tuned,) = [one for one in advice.findings if one.about == "tune"]
     assert tuned.text.startswith("no noise is changed. With what is fitted, innovations of ")
-    assert "still resemble the one before (autocorrelation 0." in tuned.text
+    assert "Keep the configured noise" in tuned.text
+    assert "still correlated in time (autocorrelation 0." in tuned.text
     assert not advice.changes
     assert not [one.text for one in advice.findings if "--tune" in one.text]
     assert advice.config == read_config("c.yaml")
     code, text = call("tune", "drive.jsonl", "-c", "c.yaml", "-o", "t.yaml")
     assert code == 0
-    assert "innovations still resemble the one before (autocorrelation 0." in text
+    assert "innovations still correlated in time (autocorrelation 0." in text
     assert "white noise is too small for them" in text
 
 
@@ -439,9 +452,8 @@ def test_noise_that_cannot_be_fitted_leaves_the_other_advice(call: Call) -> None
     code, text = call("advise", "drive.jsonl", "--tune")
     assert code == 0
     assert "- tune: no noise is changed: " in text
-    assert "- sensors: none is configured" in text
+    assert "- sensors: assumed, as nothing is configured: " in text
     assert "--tune" not in text
-    assert "`fgtrack tune` fits them (--tune)" in call("advise", "drive.jsonl")[1]
 
 
 def test_the_forms_of_the_page(call: Call, capsys: pytest.CaptureFixture[str]) -> None:
@@ -453,6 +465,22 @@ def test_the_forms_of_the_page(call: Call, capsys: pytest.CaptureFixture[str]) -
     for form, expected in (("md", "|"), ("csv", "lateness,lidar,,lists,150"), ("latex", "tabular")):
         assert run_command(["advise", "drive.jsonl", "-c", "c.yaml", "--format", form]) == 0
         assert expected in capsys.readouterr().out
+
+
+def test_an_origin_that_is_wrong_is_found_by_the_truth(call: Call) -> None:
+    def moved(item: DetectionList) -> DetectionList:
+        return replace(item, objects=[replace(of, x_m=of.x_m + 1.5) for of in item.objects if of.x_m is not None])
+
+    write("stream", changed(moved, drive(600)))
+    advice = fgtrack.advise("drive.jsonl", "c.yaml")
+    (bias,) = [one for one in advice.findings if one.kind == "bias"]
+    assert bias.text.startswith("detections of all sensors lie 1.")
+    assert "m ahead of the truth, in the frame of the ego" in bias.text
+    assert advice.config.ego.detection_origin_x_m == pytest.approx(-1.5, abs=0.1)
+    assert advice.before is not None
+    assert advice.after is not None
+    rmse_m = [one.truth.errors["position_m"].rmse for one in (advice.before, advice.after) if one.truth is not None]
+    assert rmse_m[1] < 0.5 < rmse_m[0]
 
 
 def test_bad_calls(call: Call) -> None:

@@ -112,7 +112,7 @@ def test_noise_that_does_not_fit_names_the_command_that_fits_it(call: Call) -> N
     _, warned, _ = replayed(call, drive(160), "sensors.lidar.std={x_m: 0.1, y_m: 0.1, yaw_rad: 0.1}")
     (line,) = [line for line in warned if "the configured noise is too small, as if errors were" in line]
     command = line.split("`")[1]
-    assert command == "fgtrack tune drive.jsonl -c run/config.yaml -o tuned.yaml"
+    assert command == "fgtrack advise drive.jsonl -c run/config.yaml --tune -o advised.yaml"
     assert call(*command.split()[1:])[0] == 0, "it can be called as it stands"
 
 

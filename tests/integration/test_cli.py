@@ -223,7 +223,7 @@ def test_a_replay_warns_of_noise_that_does_not_fit(fgtrack: Command, stream: Pat
     assert told.code == 0
     assert "lidar: mean NIS" in told.err
     assert "the configured noise is too large" in told.err
-    assert "`fgtrack tune" in told.err
+    assert "`fgtrack advise" in told.err
 
 
 def test_streaming_is_compared_when_it_is_asked_for(fgtrack: Command, runs: dict[str, Path]) -> None:

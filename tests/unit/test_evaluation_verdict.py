@@ -94,7 +94,7 @@ def test_noise_that_does_not_fit_is_named_with_its_cure(plain: Metrics) -> None:
     assert noise == (
         "The configured noise is too small (judged by a): NEES of the position 13.4 "
         "(expected 2, 95 % interval 9.0 to 18), NIS of radar 26.5 (expected 4). "
-        "Fit it with `fgtrack tune` and compare again; the order of the runs may change."
+        "`fgtrack advise --tune` fits it, or says what comes first; the order of the runs may change then."
     )
     large = replace(FITS, nis={"radar": ChiSquareMean(500, 1.0, 4.0)})
     both = replace(TOO_SMALL, nis=large.nis)

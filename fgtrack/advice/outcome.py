@@ -1,0 +1,149 @@
+"""How well a run has tracked, in the few numbers that advice is judged by."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgtrack.advice.finding import percent
+from fgtrack.advice.noise import NoiseFit, noise_fits
+from fgtrack.core.time import NS_PER_S
+from fgtrack.evaluation.cautions import FAR_OFF, USED, misfits
+from fgtrack.evaluation.contest import POSITION_NEES, contests
+from fgtrack.evaluation.matching import confirmed
+from fgtrack.evaluation.metrics import ObjectMetrics, evaluate
+from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.io.run import Run
+
+__all__ = ["Outcome", "harm", "objection"]
+
+_CHANCE = 2.0  # standard deviations of the difference of two counts
+_MORE_USED = 0.05  # share of the detections of a sensor
+_LESS = 0.02  # share of states that fewer are tracked by where it counts
+_FEWEST_TRACKED, _MOST_BREAKS = 0.95, 2.0
+_POSITION_DOF = 2.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a configuration makes of a recording."""
+
+    births: int
+    """Beginnings of tracks."""
+    confirmed: int
+    """Tracks that were ever confirmed."""
+    life_s: float
+    """Median life of these; NaN without any."""
+    used: Mapping[str, float]
+    """Share of the detections of each sensor that took part."""
+    noise: tuple[NoiseFit, ...]
+    """NIS over what is expected, by sensor."""
+    truth: ObjectMetrics | None
+    """All true objects together; None for a recording without truth."""
+    tick_s: float
+    """Time between two ticks."""
+
+    @classmethod
+    def of(cls, run: Run) -> "Outcome":
+        """Return the numbers of `run`."""
+        counts = dict(run.meta["counts"])
+        used = {name: sum(one.get(fate, 0) for fate in USED) / (sum(one.values()) or 1) for name, one in counts.items()}
+        rows = confirmed(run.tracks)
+        ids, inverse = np.unique(run.tracks["track_id"][rows], return_inverse=True)
+        now_ns = run.tracks["now_ns"][rows]
+        life_s = [float(np.ptp(now_ns[inverse == place])) / NS_PER_S for place in range(len(ids))]
+        truth, ticks_ns = evaluate(run).truth, run.timing["now_ns"]
+        return cls(
+            births=int(np.count_nonzero(run.updates["disposition"] == "birth")),
+            confirmed=len(ids),
+            life_s=float(np.median(life_s)) if life_s else math.nan,
+            used=used,
+            noise=tuple(noise_fits(run)),
+            truth=None if truth is None else truth.overall,
+            tick_s=float(np.ptp(ticks_ns)) / NS_PER_S / max(len(ticks_ns) - 1, 1) if len(ticks_ns) else 0.0,
+        )
+
+    @property
+    def breaks_per_minute(self) -> float:
+        """Breaks of tracking per true object and minute; NaN without truth."""
+        minutes = 0.0 if self.truth is None else self.truth.ticks_present * self.tick_s / 60.0
+        return math.nan if self.truth is None or not minutes else self.truth.breaks / minutes
+
+    @property
+    def shortfall(self) -> str | None:
+        """A clause that says how objects are lost; None where they are not, or where there is no truth to say so."""
+        if self.truth is None or not self.truth.ticks_in_sight:
+            return None
+        tracked = self.truth.tracked_share_in_sight
+        if tracked >= _FEWEST_TRACKED and self.breaks_per_minute <= _MOST_BREAKS:
+            return None
+        return (
+            f"true objects are tracked {percent(tracked)} of the time in which a sensor could see them, with "
+            f"{self.breaks_per_minute:.2g} breaks per object and minute ({self.births} beginnings of tracks)"
+        )
+
+    def rows(self) -> Iterator[tuple[str, float]]:
+        """Yield what a page shows, with units."""
+        yield "beginnings of tracks", self.births
+        yield "tracks confirmed", self.confirmed
+        yield "their median life [s]", self.life_s
+        if self.truth is not None:
+            yield "tracked [%]", 100.0 * self.truth.tracked_share_in_sight
+            yield "breaks per object and minute", self.breaks_per_minute
+            yield "identity switches", self.truth.id_switches
+            yield "position RMSE [m]", self.truth.errors["position_m"].rmse
+        for name, share in self.used.items():
+            yield f"detections used, {name} [%]", 100.0 * share
+        for one in self.noise:
+            yield f"NIS / expected, {one.sensor}", one.ratio.mean
+
+
+def harm(before: Outcome, after: Outcome) -> str | None:
+    """Return what gets worse from one run to another, with its numbers; None where nothing does.
+
+    Counts get worse where they rise by more than two standard deviations of their difference (Poisson). Where clearly
+    more detections of a sensor are used, the two runs are not of the same data, and nothing is harm.
+    """
+    if any(share > before.used.get(name, 0.0) + _MORE_USED for name, share in after.used.items()):
+        return None
+    for name, share in after.used.items():
+        if share < before.used.get(name, 0.0) - _LESS:
+            return f"detections of {name} that are used go from {percent(before.used[name])} to {percent(share)}"
+    old, new = before.truth, after.truth
+    if old is not None and new is not None:
+        was_share, share = old.tracked_share_in_sight, new.tracked_share_in_sight
+        if share < was_share - _LESS:
+            return f"the share of time tracked goes from {percent(was_share)} to {percent(share)}"
+        if share > was_share + _LESS:
+            return None
+        counts = ("identity switches", old.id_switches, new.id_switches), ("breaks", old.breaks, new.breaks)
+        for what, was, now in counts:
+            if now - was > _CHANCE * math.sqrt(now + was):
+                return f"{what} go from {was} to {now}"
+    if after.births - before.births > _CHANCE * math.sqrt(after.births + before.births):
+        return f"beginnings of tracks go from {before.births} to {after.births}"
+    return None
+
+
+def objection(before: Run, after: Run) -> str | None:
+    """Return why the fitted noise of the run `after` is not taken, in words; None where nothing speaks against it."""
+    for one in noise_fits(after):
+        if one.lasts:
+            return (
+                f"innovations of {one.sensor} are still correlated in time (autocorrelation {one.lag1:.2f}): so are "
+                "errors, of it or of the sensor that is trusted more, and white noise cannot express that; "
+                "sensors.NAME.correlation can, with std and time_s from truth or a data sheet"
+            )
+    for sensor, nis in misfits(after):
+        return f"mean NIS of {sensor} is {nis.mean:.3g} then, expected {nis.dof:.3g}"
+    if (worse := harm(Outcome.of(before), Outcome.of(after))) is not None:
+        return f"{worse}: tracks break at errors that the noise does not expect"
+    runs = [JudgedRun("before", before), JudgedRun("after", after)]
+    for quantity in (each for contest in contests(runs) for each in contest.quantities):
+        found = {entry.name: entry for entry in quantity.entries}
+        was, now = found["before"].value, found["after"].value
+        fits = quantity.name == POSITION_NEES and 1.0 / FAR_OFF <= now / _POSITION_DOF <= FAR_OFF
+        if found["after"].standing == "worse" and not fits:
+            return f"{quantity.name} against the truth of the recording goes from {was:.3g} to {now:.3g}"
+    return None
