@@ -5,7 +5,9 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from traceback import format_exception
 
-__all__ = ["EndedTrack", "Failure", "Failures"]
+from fgtrack.estimation.base import UpdateResult
+
+__all__ = ["EndedTrack", "EstimatorError", "Failure", "Failures"]
 
 _MOST_ENDED = 100
 
@@ -33,10 +35,24 @@ class Failure(StrEnum):
     """A detection could not start a track."""
     LIST_FAILED = "list failed"
     """The processing of an object list raised an exception; what was left of it is `failed`."""
-    TRACK_RESTARTED = "track restarted"
-    """A track that failed began anew from its last sound state, under the same id."""
     TRACK_ENDED = "track ended"
-    """A track that failed again before an update had succeeded ended."""
+    """A track that failed ended."""
+
+
+class EstimatorError(Exception):
+    """Estimators of single tracks raised; those of the others did what was asked of them.
+
+    Parameters
+    ----------
+    causes
+        Exceptions by track.
+    results
+        Of an update, of all tracks.
+    """
+
+    def __init__(self, causes: dict[int, Exception], results: list[UpdateResult]) -> None:
+        super().__init__(f"estimators of the tracks {', '.join(map(str, causes))} raised")
+        self.causes, self.results = causes, results
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from fgtrack.core.errors import CallError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import (
@@ -19,15 +19,18 @@ from fgtrack.estimation.base import (
     no_states,
 )
 from fgtrack.estimation.ekf import predict
+from fgtrack.estimation.failures import EstimatorError
 from fgtrack.estimation.present import PresentStates
 from fgtrack.estimation.propagation import track_state
 from fgtrack.models.motion import MotionModel
 
 _E = TypeVar("_E", bound=Estimator)
+_T = TypeVar("_T")
+_FAILED = UpdateResult(UpdateStatus.FAILED)
 
 
 class ObjectBank(Generic[_E]):
-    """One `Estimator` per object.
+    """One `Estimator` per object. What they raise, but `DataError`, becomes an `EstimatorError` that names the tracks.
 
     Parameters
     ----------
@@ -64,28 +67,32 @@ class ObjectBank(Generic[_E]):
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
         self._now_ns = now_ns
-        for estimator in self._estimators.values():
-            estimator.advance(now_ns)
+        self._ask(lambda estimator: estimator.advance(now_ns))
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`."""
-        known = [i for i, estimator in self._estimators.items() if estimator.window_ns[0] <= stamp_ns]
+        states = self._ask(lambda one: self._state(one, stamp_ns) if one.window_ns[0] <= stamp_ns else None)
+        known = {track_id: state for track_id, state in states.items() if state is not None}
         if not known:
             return no_states(self._motion.dim)
-        states = [self._estimators[track_id].state_at(stamp_ns) for track_id in known]
-        if len(states) == 1:
-            return StatesAt(tuple(known), states[0].mean[None], states[0].covariance[None])
-        means = np.array([state.mean for state in states])
-        return StatesAt(tuple(known), means, np.array([state.covariance for state in states]))
+        means = np.array([state.mean for state in known.values()])
+        return StatesAt(tuple(known), means, np.array([state.covariance for state in known.values()]))
 
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
-        return [
-            self._estimators[track_id].update(measurement)
-            for track_id, measurement in zip(track_ids, measurements, strict=True)
-        ]
+        results, causes = [_FAILED] * len(track_ids), dict[int, Exception]()
+        for row, (track_id, measurement) in enumerate(zip(track_ids, measurements, strict=True)):
+            try:
+                results[row] = _checked(self._estimators[track_id].update(measurement))
+            except DataError:
+                raise
+            except Exception as error:
+                causes[track_id] = error
+        if causes:
+            raise EstimatorError(causes, results)
+        return results
 
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
@@ -99,13 +106,39 @@ class ObjectBank(Generic[_E]):
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
         if not self._estimators:
             return []
-        states = [one.state_at(max(self._now_ns, one.window_ns[0])) for one in self._estimators.values()]
+        states = self._ask(lambda one: self._state(one, max(self._now_ns, one.window_ns[0]))).values()
         means, covariances = zip(*((state.mean, state.covariance) for state in states), strict=True)
         return PresentStates(self._motion, self._now_ns, np.array(means), np.array(covariances))
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`: none."""
         return []
+
+    def _ask(self, question: Callable[[_E], _T], track_ids: Sequence[int] | None = None) -> dict[int, _T]:
+        """Return the answers of all estimators, or of some, by track. Raises `EstimatorError` if some raise."""
+        answers, causes = dict[int, _T](), dict[int, Exception]()
+        for track_id in self._estimators if track_ids is None else track_ids:
+            try:
+                answers[track_id] = question(self._estimators[track_id])
+            except DataError:
+                raise
+            except Exception as error:
+                causes[track_id] = error
+        if causes:
+            raise EstimatorError(causes, [])
+        return answers
+
+    def _state(self, estimator: _E, stamp_ns: int) -> TrackState:
+        state, n = estimator.state_at(stamp_ns), self._motion.dim
+        if state.mean.shape != (n,) or state.covariance.shape != (n, n):
+            raise ValueError(f"a state has the shapes {state.mean.shape} and {state.covariance.shape}")
+        return state
+
+
+def _checked(result: UpdateResult) -> UpdateResult:
+    if not isinstance(result, UpdateResult):
+        raise TypeError(f"update must return an UpdateResult, returned a {type(result).__name__}")
+    return result
 
 
 class OneObject:

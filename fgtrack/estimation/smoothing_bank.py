@@ -35,24 +35,28 @@ class SmoothingBank(ObjectBank[_S]):
 
     def remove(self, track_id: int) -> None:
         """See `TrackBank.remove`; what was still inside the window becomes final."""
-        self._ended += self._reports([(track_id, state) for state in self._estimators[track_id].take_rest()])
-        super().remove(track_id)
+        try:
+            rest = self._ask(lambda one: one.take_rest(), [track_id])[track_id]
+            self._ended += self._reports([(track_id, state) for state in rest])
+        finally:
+            super().remove(track_id)
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`."""
+        final = self._ask(lambda one: one.take_final())
         reports, self._ended = self._ended, []
-        final = [(track_id, state) for track_id, one in self._estimators.items() for state in one.take_final()]
-        reports += self._reports(final)
+        reports += self._reports([(track_id, state) for track_id, states in final.items() for state in states])
         for lag_s in self._lagged_s:
             stamp_ns = self.present_ns - nanoseconds(lag_s)
-            known = [each for each in self._estimators.items() if each[1].window_ns[0] <= stamp_ns]
-            reports += self._reports([(track_id, one.state_at(stamp_ns)) for track_id, one in known], lag_s)
+            known = super().states_at(stamp_ns)
+            stamps_ns = [stamp_ns] * len(known.track_ids)
+            reports += smoothed_reports(self._motion, known.track_ids, stamps_ns, known.means, known.covariances, lag_s)
         return reports
 
-    def _reports(self, states: Sequence[tuple[int, TrackState]], lag_s: float | None = None) -> list[SmoothedReport]:
-        """Reports of states in the motion model's own form, each with its track."""
+    def _reports(self, states: Sequence[tuple[int, TrackState]]) -> list[SmoothedReport]:
+        """Reports of final states in the motion model's own form, each with its track."""
         if not states:
             return []
         track_ids, found = zip(*states, strict=True)
         means, covariances = np.array([one.mean for one in found]), np.array([one.covariance for one in found])
-        return smoothed_reports(self._motion, track_ids, [one.stamp_ns for one in found], means, covariances, lag_s)
+        return smoothed_reports(self._motion, track_ids, [one.stamp_ns for one in found], means, covariances)

@@ -15,8 +15,7 @@ _NOTES = {
     Failure.NOT_FINITE: "not finite: states that were not published, for that reason",
     Failure.NOT_DEFINITE: "not positive definite: covariances that were not published, for that reason",
     Failure.OUT_OF_BOUNDS: "out of bounds: states that were not published, as no object can have them",
-    Failure.TRACK_RESTARTED: "restarted: from the last sound state, under the same id",
-    Failure.TRACK_ENDED: "ended: failed again before an update had succeeded",
+    Failure.TRACK_ENDED: "ended: tracks that failed; their objects may be born again as new tracks",
 }
 
 

@@ -35,6 +35,7 @@ from fgtrack.pipeline.effective import effective
 from fgtrack.tracking.ego import EgoSource, EgoStd, EgoTrajectory
 from fgtrack.tracking.ego_error import IndependentErrors, SharedErrors
 from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules
+from fgtrack.tracking.guarded_bank import GuardedBank
 from fgtrack.tracking.inbox import Inbox, QueueInbox
 from fgtrack.tracking.lifecycle import CountingLifecycle, Lifecycle
 from fgtrack.tracking.objects import Objects
@@ -46,7 +47,6 @@ from fgtrack.tracking.published import (
     PublishedTracker,
     SlotInbox,
 )
-from fgtrack.tracking.restarting import RestartingBank
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
 _EULER = {
@@ -79,7 +79,7 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
             road, config.merge, motion, config.ego.detection_origin_m, ExclusionAreas.read(config.map.excluded)
         ),
         association=config.association,
-        bank=RestartingBank(lambda: build_bank(config, failures), failures),
+        bank=GuardedBank(lambda: build_bank(config, failures), failures),
         failures=failures,
         motion=motion,
         objects=Objects(config.objects),

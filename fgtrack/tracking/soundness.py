@@ -1,11 +1,10 @@
-"""Whether states can be those of an object, and whether measurements bear a track out."""
+"""Faults of states that no object can have, and of tracks that their measurements contradict."""
 
 import math
 from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf
 from scipy.special import chdtri
 
 from fgtrack.core.types import FloatArray, TrackState
@@ -17,10 +16,6 @@ __all__ = ["IN_A_ROW", "RARE", "Divergence", "are_finite", "check_real", "faults
 
 _MOST = np.array([1e9, 1e9, 1e3, 1e5, 1e4, 1e6])
 """Largest x, y, yaw, speed, yaw rate and acceleration, in SI units: far beyond any vehicle on Earth."""
-_SMALL = float(_MOST.min()) ** 2
-"""Where the sum of all squares is below it, no entry is too large."""
-_FEW = 4
-"""So many matrices are factorised faster one by one."""
 _ROUNDING = 1e-9
 """So much less than 0 an eigenvalue of a correlation matrix may be: rounding, where an entry is known for certain."""
 _TINY = 1e-300
@@ -37,31 +32,35 @@ def check_real(*arrays: FloatArray) -> None:
 
 
 def are_finite(means: FloatArray, covariances: FloatArray) -> bool:
-    """Whether all states are, means (m, n) and covariances (m, n, n)."""
+    """True if all states are, means (m, n) and covariances (m, n, n)."""
     if math.isfinite(np.vdot(means, means) + np.vdot(covariances, covariances)):  # one number instead of two masks
         return True
     return bool(np.isfinite(means).all() and np.isfinite(covariances).all())
 
 
 def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
-    """What is wrong with kinematic states, by their place; nothing where all can be published.
+    """Return what is wrong with kinematic states, by their index; nothing where all can be published.
 
     A state is sound where it is finite, no entry is larger than any vehicle's (10^9 m, 10^5 m/s, 10^4 rad/s,
     10^6 m/s^2), and its covariance is symmetric and positive definite: up to rounding, as an entry that the motion
-    model does not have is 0 with variance 0. Raises `TypeError` for what is no real number.
+    model does not have is 0 with variance 0. Raises `TypeError` for what is not a real number, `ValueError` for
+    wrong shapes.
     """
     if not states:
         return {}
     if isinstance(states, PresentStates):
         means, covariances = states.means, states.covariances
     else:
-        means, covariances = np.array([one.mean for one in states]), np.array([one.covariance for one in states])
+        means = np.array([state.mean for state in states])
+        covariances = np.array([state.covariance for state in states])
     check_real(means, covariances)
-    small = np.vdot(means, means) <= _SMALL or (np.abs(means) <= _MOST[: means.shape[1]]).all()
-    if small and (_are_definite(covariances) or _are_semidefinite(covariances)) and _are_symmetric(covariances):
+    n = means.shape[1]
+    if not 5 <= n <= len(_MOST) or covariances.shape[1:] != (n, n):
+        raise ValueError(f"states have the shapes {means.shape} and {covariances.shape}")
+    if (np.abs(means) <= _MOST[:n]).all() and _are_covariances(covariances):
         return {}
-    found = ((place, _fault(mean, P)) for place, (mean, P) in enumerate(zip(means, covariances, strict=True)))
-    return {place: fault for place, fault in found if fault is not None}
+    each = ((row, _fault(mean, P)) for row, (mean, P) in enumerate(zip(means, covariances, strict=True)))
+    return {row: fault for row, fault in each if fault is not None}
 
 
 def _fault(mean: FloatArray, covariance: FloatArray) -> Failure | None:
@@ -69,41 +68,30 @@ def _fault(mean: FloatArray, covariance: FloatArray) -> Failure | None:
         return Failure.NOT_FINITE
     if (np.abs(mean) > _MOST[: len(mean)]).any():
         return Failure.OUT_OF_BOUNDS
-    sound = _are_semidefinite(covariance[None]) and _are_symmetric(covariance[None])
-    return None if sound else Failure.NOT_DEFINITE
+    return None if _are_covariances(covariance[None]) else Failure.NOT_DEFINITE
 
 
-def _correlations(covariances: FloatArray) -> FloatArray:
+def _are_covariances(covariances: FloatArray) -> bool:
+    """True if all, shape (m, n, n), are finite, symmetric and positive semidefinite up to rounding."""
+    if covariances.tobytes() == covariances.mT.tobytes() and _are_definite(covariances):  # nearly always
+        return True
     variances = np.diagonal(covariances, axis1=-2, axis2=-1)
+    if not (np.isfinite(covariances).all() and (variances >= 0.0).all()):
+        return False
     std = np.sqrt(np.maximum(variances, _TINY))
     with np.errstate(over="ignore"):
-        return np.asarray(covariances / std[:, :, None] / std[:, None, :])
-
-
-def _are_symmetric(covariances: FloatArray) -> bool:
-    """Whether all of `covariances`, shape (m, n, n), are symmetric up to rounding; those of fgtrack are to the bit."""
-    if covariances.tobytes() == covariances.mT.tobytes():
-        return True
-    correlations = _correlations(covariances)
-    return bool((np.abs(correlations - correlations.mT) <= _ROUNDING).all())
-
-
-def _are_semidefinite(covariances: FloatArray) -> bool:
-    """Whether all of `covariances`, shape (m, n, n), are finite and positive semidefinite up to rounding."""
-    if not (np.isfinite(covariances).all() and (np.diagonal(covariances, axis1=-2, axis2=-1) >= 0.0).all()):
+        correlations = np.asarray(covariances / std[:, :, None] / std[:, None, :])
+    if not (np.abs(correlations - correlations.mT) <= _ROUNDING).all():
         return False
-    correlations = _correlations(covariances)
     n = covariances.shape[-1]
     correlations[:, range(n), range(n)] = 1.0 + _ROUNDING
     return _are_definite(correlations)
 
 
 def _are_definite(covariances: FloatArray) -> bool:
-    """Whether all of `covariances`, shape (m, n, n), are finite and positive definite; their lower halves count."""
+    """True if all, shape (m, n, n), are finite and positive definite; their lower halves count."""
     if not math.isfinite(np.vdot(covariances, covariances)):
         return False
-    if len(covariances) <= _FEW:
-        return not any(dpotrf(P, lower=1)[1] for P in covariances)
     try:
         np.linalg.cholesky(covariances)
     except np.linalg.LinAlgError:
@@ -131,7 +119,7 @@ class Divergence:
     def count(
         self, track_ids: Sequence[int], measurements: Sequence[Measurement], results: Sequence[UpdateResult]
     ) -> int:
-        """How many tracks diverge with these updates."""
+        """Return the number of tracks that diverge with these updates."""
         least, surprises, diverged = _limit(1), self._surprises, 0
         for track_id, measurement, result in zip(track_ids, measurements, results, strict=True):
             nis = result.nis
@@ -146,5 +134,5 @@ class Divergence:
         return diverged
 
     def forget(self, track_id: int) -> None:
-        """A track has ended, or begun anew."""
+        """Forget a track that has ended."""
         self._surprises.pop(track_id, None)

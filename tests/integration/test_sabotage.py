@@ -174,10 +174,10 @@ def check_told(run: Run) -> Counter[str]:
     assert not tables["failures"].is_detail
     assert "Failures inside the estimator" in str(tables)
     ended = run.meta["ended_by_failure"]
-    assert len(ended) == failed[Failure.TRACK_ENDED]
+    assert len(ended) == min(failed[Failure.TRACK_ENDED], 100)
     for one in ended:
         mine = run.tracks["track_id"] == one["track_id"]
-        assert (run.tracks["now_ns"][mine] < one["now_ns"]).all()
+        assert (run.tracks["now_ns"][mine] <= one["now_ns"]).all()
     return failed
 
 
@@ -194,7 +194,7 @@ def test_what_a_plug_in_estimator_does_wrong_is_not_published_and_counted(
 
 
 @pytest.mark.parametrize("wrong", [*STATES, "state raises"])
-def test_a_track_that_cannot_be_mended_ends_and_the_run_says_when_and_why(
+def test_a_track_that_fails_at_once_ends_and_the_run_says_when_and_why(
     sabotaged: Callable[[str], Config], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wrong: str
 ) -> None:
     monkeypatch.setattr(Sabotaged, "healthy", 0)
@@ -324,7 +324,7 @@ def test_an_estimator_that_fails_even_without_a_track_is_one_line(
         "fgtrack.pipeline.build.build_bank",
         lambda config, failures: NeverBank(motion, lambda start: ReplayEkf(motion, start, 1.0), 1.0),
     )
-    with pytest.raises(DataError, match=r"fails whatever its tracks are \(RuntimeError: never\)"):
+    with pytest.raises(DataError, match=r"fails even without tracks \(RuntimeError: never\)"):
         run_of(read_config("smoother", SETTINGS), tmp_path)
 
 

@@ -164,13 +164,13 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Iterator[Tracker]:
 @pytest.mark.parametrize(
     ("method", "failures", "dispositions"),
     [
-        ("update", {"update failed": 2, "track restarted": 2}, {"birth": 2, "in_sequence": 76, "failed": 2}),
-        ("advance", {"estimator raised": 1, "track restarted": 2}, {"birth": 2, "in_sequence": 76, "too_old": 2}),
-        ("states_at", {"estimator raised": 1, "track restarted": 2}, {"birth": 2, "in_sequence": 76, "too_old": 2}),
-        ("present", {"estimator raised": 1, "track restarted": 2}, {"birth": 2, "in_sequence": 78}),
+        ("update", {"update failed": 2, "track ended": 2}, {"birth": 4, "in_sequence": 74, "failed": 2}),
+        ("advance", {"estimator raised": 1, "track ended": 2}, {"birth": 4, "in_sequence": 76}),
+        ("states_at", {"estimator raised": 1, "track ended": 2}, {"birth": 4, "in_sequence": 76}),
+        ("present", {"estimator raised": 1, "track ended": 2}, {"birth": 4, "in_sequence": 76}),
     ],
 )
-def test_what_an_estimator_raises_neither_ends_the_tracker_nor_the_tracks(
+def test_what_an_estimator_raises_ends_its_tracks_which_are_born_again(
     failing: Tracker, method: str, failures: dict[str, int], dispositions: dict[str, int]
 ) -> None:
     for number, message in enumerate(messages(40)):
@@ -178,7 +178,7 @@ def test_what_an_estimator_raises_neither_ends_the_tracker_nor_the_tracks(
         if number == 41:
             FailingBank.fails = {method}
         tracks = failing.tick(message.receipt_ns).tracks
-    assert [track.track_id for track in tracks] == [0, 1]
+    assert [track.track_id for track in tracks] == [2, 3]
     undisturbed = run(tracker_of(), 40)
     assert [track.x_m for track in tracks] == pytest.approx([track.x_m for track in undisturbed], abs=0.3)
     assert failing.failures == failures
