@@ -7,31 +7,34 @@ import numpy as np
 
 from fgtrack.core.types import STATE_NAMES, YAW, YAW_RATE, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start, TrackBank, UpdateResult
-from fgtrack.estimation.dense_joint import dense_joint, difference
 from fgtrack.estimation.object_bank import state_of
 from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.models.motion import MotionModel
-from fgtrack.pipeline.verify_banks import NUM_OBJECTS, List, born, fed, lists_of
 from fgtrack.testing.promise import Subject, require, sound
+from fgtrack.testing.references import dense_joint, difference
 from fgtrack.testing.streams import MS, Stream
 
 _TOGETHER = 1e-6
 _ROUNDING = 1e-6
+_NUM_OBJECTS = 8  # more than are fused one by one
 _GONE = 2
+
+List = dict[int, Measurement]
+"""Measurements of one stamp, by object."""
 
 
 def gives_each_of_several_objects_what_it_gives_one_alone(subject: Subject, stream: Stream) -> None:
     """Each list has a measurement of most objects; half way one is removed and another one begins."""
-    objects = [_shifted(stream, number) for number in range(NUM_OBJECTS)]
-    lists = lists_of([one.measurements for one in objects])
+    objects = [_shifted(stream, number) for number in range(_NUM_OBJECTS)]
+    lists = _lists_of([one.measurements for one in objects])
     half, new = (len(lists) + 1) // 2, len(objects)
     later = [{new if number == _GONE else number: m for number, m in one.items()} for one in lists[half:]]
     bank = subject.start_bank(stream)
-    born(bank, [one.start for one in objects])
-    said = fed(bank, lists[:half])
+    _born(bank, [one.start for one in objects])
+    said = _fed(bank, lists[:half])
     bank.remove(_GONE)
     bank.birth(new, objects[_GONE].start)
-    said += fed(bank, later)
+    said += _fed(bank, later)
     expected_ids = [number for number in range(new + 1) if number != _GONE]
     require(sorted(bank.track_ids) == expected_ids, f"its objects are {bank.track_ids}, not {expected_ids}")
     for number in expected_ids:
@@ -151,3 +154,29 @@ def _publishes_the_present(bank: TrackBank, motion: MotionModel) -> None:
         apart = np.abs(state.covariance - covariance) <= _ROUNDING * np.outer(sigma, sigma)
         require((np.abs(off) <= _ROUNDING * sigma + _ROUNDING).all(), f"{what} is {state.mean}, not {mean}")
         require(apart.all(), f"the covariance of {what} is\n{state.covariance}\nnot\n{covariance}")
+
+
+def _born(bank: TrackBank, starts: Sequence[Start]) -> None:
+    """Let objects begin, numbered from 0."""
+    for number, start in enumerate(starts):
+        bank.advance(max(bank.present_ns, start.stamp_ns))
+        bank.birth(number, start)
+
+
+def _fed(bank: TrackBank, lists: Sequence[List]) -> list[dict[int, UpdateResult]]:
+    """Give `lists` to a bank as the tracker does; what it said of each object."""
+    said = []
+    for one in lists:
+        stamp_ns = next(iter(one.values())).stamp_ns
+        bank.advance(max(bank.present_ns, stamp_ns))
+        bank.states_at(stamp_ns)
+        said.append(dict(zip(one, bank.update(stamp_ns, list(one), list(one.values())), strict=True)))
+    return said
+
+
+def _lists_of(objects: Sequence[Sequence[Measurement]]) -> list[List]:
+    """Measurements of objects that were sensed together; each object is missing in every fourth list."""
+    return [
+        {k: one[place] for k, one in enumerate(objects) if (place + k) % 4}
+        for place in range(min(len(one) for one in objects))
+    ]

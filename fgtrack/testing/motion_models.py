@@ -8,8 +8,8 @@ import numpy as np
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import STATE_NAMES, FloatArray
 from fgtrack.models.motion import CARTESIAN, POLAR, MotionModel
-from fgtrack.testing.broken import BrokenPromiseError, run_all
 from fgtrack.testing.kinematics import KINEMATIC_CHECKS, ModelCheck, apart
+from fgtrack.testing.promise import BrokenPromiseError, run_all
 
 _NUM_STATES = 20
 #: Of every other state a short duration as between two measurements, of the rest up to a long gap.

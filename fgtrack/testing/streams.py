@@ -7,10 +7,12 @@ import numpy as np
 
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S, seconds
-from fgtrack.core.types import YAW
+from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.models.measurement import measurement_model
+from fgtrack.estimation.birth import initial_state
+from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
+from fgtrack.models.sensors import RobustLoss
 
 MS, US = 1_000_000, 1_000
 LAG_S = 1.0
@@ -111,6 +113,56 @@ def across_pi(rng: np.random.Generator) -> Stream:
         z[YAW] = wrap_angle(z[YAW])
         measurements.append(Measurement(start.stamp_ns + ms * MS, model, z, 0.05**2 * np.eye(3)))
     return Stream(NONLINEAR, tuple(measurements), start)
+
+
+def mild(rng: np.random.Generator) -> Stream:
+    """A car that is well known from the start and passes a yaw of pi, seen by LiDAR and RADAR of a turning observer.
+
+    The LiDAR measures position and yaw, the RADAR range, bearing and Doppler from a pose with an arm and a velocity.
+    """
+    start = replace(
+        START,
+        position_m=(30.0, 12.0),
+        position_std_m=0.3,
+        yaw_rad=3.05,
+        yaw_std_rad=0.03,
+        speed_mps=12.0,
+        speed_std_mps=0.3,
+        yaw_rate_radps=0.5,
+        yaw_rate_std_radps=0.05,
+    )
+    noise = {"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.15}, {"range_m": 0.5, "bearing_rad": 0.02, "range_rate_mps": 0.1}
+    x, measurements = _drawn_start(rng, start), list[Measurement]()
+    for k in range(1, 25):
+        x = _drawn_step(rng, x, 0.025)
+        std = np.array(list(noise[k % 2].values()))
+        turned_rad = 0.01 * k - 0.3
+        pose = SensorPose(np.sin(turned_rad) * 50.0, -np.cos(turned_rad) * 50.0, turned_rad - 1.86, 19.0, -6.0)
+        model, pose = measurement_model(tuple(noise[k % 2]), NONLINEAR), pose if k % 2 else SensorPose()
+        z = model.residual(model.predict(x, pose) + std * rng.standard_normal(3), np.zeros(3))
+        measurements.append(Measurement(start.stamp_ns + k * 25 * MS, model, z, np.diag(std**2), pose))
+    return Stream(NONLINEAR, tuple(measurements), start)
+
+
+def mild_robust(rng: np.random.Generator) -> Stream:
+    """The same with positions of which every other one is an outlier, under a Huber loss."""
+    stream = mild(rng)
+    measurements = []
+    for one in stream.measurements[1::2]:
+        off = np.sqrt(np.diag(one.R)) * rng.normal(0.0, 8.0, len(one.z)) * (rng.random() < 0.5)
+        off[2:] = 0.0
+        measurements.append(replace(one, z=one.z + off, loss=RobustLoss("huber", 1.5)))
+    return replace(stream, measurements=tuple(measurements))
+
+
+def _drawn_start(rng: np.random.Generator, start: Start) -> FloatArray:
+    mean, P = initial_state(NONLINEAR, start)
+    return np.asarray(mean + np.linalg.cholesky(P) @ rng.standard_normal(len(mean)))
+
+
+def _drawn_step(rng: np.random.Generator, x: FloatArray, dt_s: float) -> FloatArray:
+    root = np.linalg.cholesky(NONLINEAR.process_noise(x, dt_s))
+    return np.asarray(NONLINEAR.predict(x, dt_s) + root @ rng.standard_normal(len(x)))
 
 
 def _names(rng: np.random.Generator, motion: MotionModel) -> tuple[str, ...]:

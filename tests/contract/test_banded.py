@@ -13,13 +13,13 @@ from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
 from fgtrack.estimation.banded.bank import BandedBank
 from fgtrack.estimation.banded.smoother import BandedSmoother
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
-from fgtrack.estimation.dense_joint import Difference, dense_joint, difference
 from fgtrack.estimation.factor_graph import SmootherBank
 from fgtrack.estimation.registry import estimator
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
+from fgtrack.testing.references import Difference, dense_joint, difference
 from fgtrack.testing.streams import COMPONENTS, MS, START, measured, shuffled
 
 LINEAR = (("x_m", "y_m"), ("x_m", "y_m", "speed_mps"), ("x_m", "y_m", "yaw_rad"))

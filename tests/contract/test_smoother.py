@@ -10,11 +10,11 @@ import pytest
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, UpdateStatus
-from fgtrack.estimation.dense_joint import dense_joint, difference
 from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherSettings
 from fgtrack.estimation.factor_graph.backends.base import Backend, Change
 from fgtrack.estimation.failures import Failure
 from fgtrack.models.motion import CTRV, CV, MotionModel
+from fgtrack.testing.references import dense_joint, difference
 from fgtrack.testing.streams import COMPONENTS, MS, START, US, Stream, measured, shuffled
 
 START_NS = START.stamp_ns

@@ -10,13 +10,13 @@ import pytest
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.dense_joint import difference
 from fgtrack.estimation.initiation import Fix, Search
 from fgtrack.estimation.registry import ESTIMATORS, estimator
 from fgtrack.estimation.replay_bank import ReplayBank
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRV, CV
 from fgtrack.models.sensors import RobustLoss
+from fgtrack.testing.references import difference
 
 MS = 1_000_000
 START = Start(position_m=(20.0, 5.0), yaw_rad=0.4, yaw_std_rad=0.3, speed_mps=20.0, speed_std_mps=5.0)

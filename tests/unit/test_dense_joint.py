@@ -6,8 +6,8 @@ import pytest
 from fgtrack.core.errors import CallError
 from fgtrack.estimation.base import Measurement, Start, no_states
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.dense_joint import dense_joint
 from fgtrack.models.motion import CTRV, CV
+from fgtrack.testing.references import dense_joint
 
 NS = 10**9
 START = Start(position_m=(1.0, 2.0), position_std_m=0.7, yaw_rad=0.3, yaw_std_rad=0.2, speed_mps=10.0)

@@ -9,12 +9,12 @@ from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.dense_joint import dense_joint
 from fgtrack.estimation.oosm import RewindForget
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
 from fgtrack.pipeline.information_value import ReceivedMeasurement, information_values
+from fgtrack.testing.references import dense_joint
 
 MOTION = CV(velocity_density_m2ps3=5.0)
 POSITION = measurement_model(("x_m", "y_m"), MOTION)

@@ -9,10 +9,10 @@ import pytest
 import fgtrack
 from fgtrack.core.types import YAW_RATE, FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.dense_joint import difference
 from fgtrack.models.motion import CTRV
 from fgtrack.pipeline.config import Config, MotionConfig
 from fgtrack.pipeline.shipped import read_config
+from fgtrack.testing.references import difference
 
 RADIUS_M, SPEED_MPS, STD_M, CURVATURE_STD = 150.0, 60.0, 0.3, 0.001
 START = Start(speed_mps=55.0, speed_std_mps=5.0, yaw_rad=0.0, yaw_std_rad=0.2)

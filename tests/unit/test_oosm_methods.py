@@ -31,7 +31,6 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
-from fgtrack.estimation.dense_joint import dense_joint
 from fgtrack.estimation.oosm import (
     A1,
     CovarianceIntersection,
@@ -44,6 +43,7 @@ from fgtrack.estimation.oosm.crossing import Past, fuse_across
 from fgtrack.estimation.registry import estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
+from fgtrack.testing.references import dense_joint
 
 
 @pytest.mark.parametrize("part", [0.0, 1e-8, 0.3, 0.999999])

@@ -6,9 +6,9 @@ import pytest
 from fgtrack.core.linalg import inverse_roots, noise_roots
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.dense_joint import difference
 from fgtrack.estimation.registry import estimator
 from fgtrack.models.motion import CTRV
+from fgtrack.testing.references import difference
 
 STEP_NS = 50_000_000
 DENSITIES = CTRV().density_names()

@@ -12,13 +12,13 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.dense_joint import dense_joint, difference
 from fgtrack.estimation.factor_graph.chain import Chain, Node
 from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.marginalised_past import MarginalisedPast, Prior
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
+from fgtrack.testing.references import dense_joint, difference
 
 MS, US = 1_000_000, 1_000
 START_NS = 1_790_000_000_000_000_000

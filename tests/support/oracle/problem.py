@@ -5,9 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg
-
-from fgtrack.pipeline.oracle.dynamics import Dynamics, FloatArray
-from fgtrack.pipeline.oracle.sightings import Sighting
+from support.oracle.dynamics import Dynamics, FloatArray
+from support.oracle.sightings import Sighting
 
 NS_PER_S = 1e9
 

@@ -3,15 +3,15 @@
 from collections.abc import Iterable, Iterator
 
 import numpy as np
+from support.oracle.dynamics import Flow
+from support.oracle.kinematics import from_published, published
+from support.oracle_measurements import measurement_differences
+from support.oracle_streams import dynamics_of
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import ACCEL, SPEED, YAW, FloatArray
-from fgtrack.estimation.dense_joint import Difference
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
-from fgtrack.pipeline.oracle.dynamics import Flow
-from fgtrack.pipeline.oracle.kinematics import from_published, published
-from fgtrack.pipeline.verify_measurements import measurement_differences
-from fgtrack.pipeline.verify_streams import dynamics_of
+from fgtrack.testing.references import Difference
 
 MODEL_TOLERANCE = 1e-8
 _KINDS: tuple[type[CTRV] | type[CV], ...] = (CTRV, CTRA, CV)

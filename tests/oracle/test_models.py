@@ -1,17 +1,17 @@
-"""`fgtrack verify` finds a wrong equation of any motion or measurement model, also one that is no number."""
+"""A wrong equation of any motion or measurement model is found by the oracle, also one that is no number."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
+from support import oracle_measurements
+from support.oracle_models import MODEL_TOLERANCE, model_differences
 
 from fgtrack.core.types import FloatArray, X
-from fgtrack.estimation.dense_joint import Difference
 from fgtrack.models import arc, measurement
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel, Steps
-from fgtrack.pipeline import verify_measurements
-from fgtrack.pipeline.verify_models import MODEL_TOLERANCE, model_differences
+from fgtrack.testing.references import Difference
 
 MODELS = {"CTRV": CTRV, "CTRA": CTRA, "CV": CV}
 
@@ -103,7 +103,7 @@ def bearings_off(patch: pytest.MonkeyPatch) -> None:
         found = right(components, *given)
         return found if found is None or "bearing_rad" not in components else 0.1 * found
 
-    for where in (measurement, verify_measurements):
+    for where in (measurement, oracle_measurements):
         patch.setattr(where, "position_gradient", wrong)
 
 

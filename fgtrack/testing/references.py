@@ -1,7 +1,7 @@
-"""The dense joint posterior of a linear chain: the oracle that exact estimators are held to.
+"""Answers that estimators are held to: plain calculations that share no recursion, graph or factor with any of them.
 
-It conditions on all measurements at once, so there is no order of arrival in it; it shares neither recursion nor
-graph with any estimator.
+All take the measurements in the order of the stamps or all at once, so there is no order of arrival in them. They share
+the motion and measurement models, which have checks of their own (`check_motion_model`).
 """
 
 import math
@@ -17,6 +17,10 @@ from fgtrack.estimation.base import Measurement, Start, UpdateResult
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.propagation import wrapped
 from fgtrack.models.motion import MotionModel
+
+_WEIGHT_STEPS, _NEWTON_STEPS = 50, 50
+_STEP_TOLERANCE, _QUOTIENT_STEP = 1e-6, 1e-6
+_LEAST_ROOT = 1e-6  # of the weight of a measurement that a loss ignores
 
 
 def dense_joint(
@@ -70,6 +74,109 @@ def _moments(motion: MotionModel, prior: Start, stamps_ns: Sequence[int]) -> tup
         M[k] = motion.jacobian(m[k - 1], dt_s) @ M[k - 1]
         M[k, :, k * n : (k + 1) * n] = np.linalg.cholesky(motion.process_noise(m[k - 1], dt_s))
     return m, M
+
+
+def kalman_filter(motion: MotionModel, prior: Start, measurements: Sequence[Measurement], stamp_ns: int) -> TrackState:
+    """State at `stamp_ns` of the extended Kalman filter given `measurements` up to it, in the order of their stamps.
+
+    Measurement Jacobians are difference quotients; a robust loss weighs a measurement by what is left of its innovation
+    after the update.
+    """
+    (x, P), now_ns = initial_state(motion, prior), prior.stamp_ns
+    for one in sorted(measurements, key=lambda m: m.stamp_ns):
+        if one.stamp_ns > stamp_ns:
+            break
+        x, P = _moved(motion, x, P, one.stamp_ns - now_ns)
+        y, H = _residual(one, x), _slope(one, x)
+        step, weight = np.zeros(len(x)), 1.0
+        for _ in range(_WEIGHT_STEPS if one.loss else 1):
+            S = H @ P @ H.T + one.R / weight
+            step = P @ H.T @ np.linalg.solve(S, y)
+            weight = _weight(one, y - H @ step)
+        x, P, now_ns = x + step, P - P @ H.T @ np.linalg.solve(S, H @ P), one.stamp_ns
+    x, P = _moved(motion, x, P, stamp_ns - now_ns)
+    return TrackState(stamp_ns, x, P)
+
+
+def least_squares(
+    motion: MotionModel, prior: Start, measurements: Sequence[Measurement], stamps_ns: Iterable[int]
+) -> dict[int, TrackState]:
+    """States at `stamps_ns` that minimise the weighted squares of all residuals of a nonlinear model, by stamp.
+
+    Gauss-Newton over the states of all stamps, from those of `kalman_filter`; noise and robust weights are those at the
+    last states. Stamps that nearly coincide are for `dense_joint`.
+    """
+    wanted = set(stamps_ns)
+    stamps = sorted({prior.stamp_ns, *wanted, *(m.stamp_ns for m in measurements)})
+    means = np.array([kalman_filter(motion, prior, measurements, at_ns).mean for at_ns in stamps])
+    for _ in range(_NEWTON_STEPS):
+        R = np.asarray(np.linalg.qr(_equations(motion, prior, measurements, stamps, means), mode="r"))
+        root = np.linalg.inv(R[: means.size, : means.size])
+        step = (root @ R[: means.size, -1]).reshape(means.shape)
+        means = means + step
+        if np.abs(step).max() < _STEP_TOLERANCE:
+            break
+    covariance, n = root @ root.T, motion.dim
+    blocks = {at_ns: slice(k * n, (k + 1) * n) for k, at_ns in enumerate(stamps)}
+    return {
+        at: TrackState(at, means[k], covariance[blocks[at], blocks[at]]) for k, at in enumerate(stamps) if at in wanted
+    }
+
+
+def _equations(
+    motion: MotionModel, prior: Start, measurements: Sequence[Measurement], stamps_ns: list[int], means: FloatArray
+) -> FloatArray:
+    """Whitened equations A step = b at `means` (N, n), as rows (A, b): prior, motion, measurements."""
+    n, rows = motion.dim, list[FloatArray]()
+
+    def add(R: FloatArray, y: FloatArray, blocks: Sequence[tuple[int, FloatArray]]) -> None:
+        row = np.zeros((len(y), means.size + 1))
+        row[:, -1] = y
+        for k, block in blocks:
+            row[:, k * n : (k + 1) * n] = block
+        rows.append(np.linalg.solve(np.linalg.cholesky(R), row))
+
+    start, covariance = initial_state(motion, prior)
+    add(covariance, start - means[0], [(0, np.eye(n))])
+    for k in range(1, len(stamps_ns)):
+        x, dt_s = means[k - 1], seconds(stamps_ns[k] - stamps_ns[k - 1])
+        y = motion.predict(x, dt_s) - means[k]
+        add(motion.process_noise(x, dt_s), y, [(k - 1, -motion.jacobian(x, dt_s)), (k, np.eye(n))])
+    for one in measurements:
+        k = stamps_ns.index(one.stamp_ns)
+        y = _residual(one, means[k])
+        add(one.R / _weight(one, y), y, [(k, _slope(one, means[k]))])
+    return np.vstack(rows)
+
+
+def _moved(motion: MotionModel, x: FloatArray, P: FloatArray, ahead_ns: int) -> tuple[FloatArray, FloatArray]:
+    if not ahead_ns:
+        return x, P
+    F, Q = motion.jacobian(x, seconds(ahead_ns)), motion.process_noise(x, seconds(ahead_ns))
+    return motion.predict(x, seconds(ahead_ns)), F @ P @ F.T + Q
+
+
+def _residual(one: Measurement, x: FloatArray) -> FloatArray:
+    return one.model.residual(one.z, one.model.predict(x, one.pose))
+
+
+def _slope(one: Measurement, x: FloatArray) -> FloatArray:
+    """Jacobian of the measurement at `x` (n,) by difference quotients, shape (k, n)."""
+    steps = _QUOTIENT_STEP * (1.0 + np.abs(x)) * np.eye(len(x))
+    columns = [(_residual(one, x - step) - _residual(one, x + step)) / (2.0 * step.sum()) for step in steps]
+    return np.column_stack(columns)
+
+
+def _weight(one: Measurement, y: FloatArray) -> float:
+    """What the robust loss of a measurement leaves of its weight at the residual `y` (k,)."""
+    if one.loss is None:
+        return 1.0
+    far = float(np.sqrt(y @ np.linalg.solve(one.R, y))) / one.loss.width
+    if one.loss.kind == "cauchy":
+        return 1.0 / (1.0 + far**2)
+    if one.loss.kind == "tukey":
+        return max(1.0 - far**2, _LEAST_ROOT) ** 2
+    return 1.0 / max(far, 1.0)
 
 
 class Difference(NamedTuple):

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import integrate, linalg
-
-from fgtrack.pipeline.oracle.dynamics import FloatArray
-from fgtrack.pipeline.oracle.filters import corrected, innovation_of, moved
-from fgtrack.pipeline.oracle.linearised import TANGENTS
-from fgtrack.pipeline.oracle.problem import NS_PER_S, Estimate, Problem
-from fgtrack.pipeline.oracle.sightings import Sighting
+from support.oracle.dynamics import FloatArray
+from support.oracle.filters import corrected, innovation_of, moved
+from support.oracle.linearised import TANGENTS
+from support.oracle.problem import NS_PER_S, Estimate, Problem
+from support.oracle.sightings import Sighting
 
 
 @dataclass(frozen=True)

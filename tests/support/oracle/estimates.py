@@ -5,11 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg
-
-from fgtrack.pipeline.oracle.dynamics import FloatArray, Flow
-from fgtrack.pipeline.oracle.filters import filtered, moved
-from fgtrack.pipeline.oracle.linearised import TANGENTS, Linearisation
-from fgtrack.pipeline.oracle.problem import NS_PER_S, Estimate, Problem, conditioned, whitening
+from support.oracle.dynamics import FloatArray, Flow
+from support.oracle.filters import filtered, moved
+from support.oracle.linearised import TANGENTS, Linearisation
+from support.oracle.problem import NS_PER_S, Estimate, Problem, conditioned, whitening
 
 _MAX_STEPS = 500
 #: A step of a state, in m, rad, m/s or rad/s, that is rounding.

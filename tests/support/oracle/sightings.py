@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg
-
-from fgtrack.pipeline.oracle.dynamics import FloatArray
+from support.oracle.dynamics import FloatArray
 
 _STEP = 1e-5
 _ANGLES = ("yaw_rad", "bearing_rad")

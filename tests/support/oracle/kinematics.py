@@ -4,10 +4,9 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-
-from fgtrack.pipeline.oracle.dynamics import FloatArray
-from fgtrack.pipeline.oracle.problem import Estimate
-from fgtrack.pipeline.oracle.sightings import slopes
+from support.oracle.dynamics import FloatArray
+from support.oracle.problem import Estimate
+from support.oracle.sightings import slopes
 
 _NAMES = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2")
 

@@ -3,6 +3,7 @@
 from itertools import product
 
 import numpy as np
+from support.oracle.sightings import Eye, Sighting, located, seen, slopes
 
 from fgtrack.core.types import MEASURABLE, FloatArray
 from fgtrack.models.measurement import (
@@ -13,7 +14,6 @@ from fgtrack.models.measurement import (
     position_gradient,
 )
 from fgtrack.models.motion import MotionModel
-from fgtrack.pipeline.oracle.sightings import Eye, Sighting, located, seen, slopes
 
 _EYE = Eye(-3.0, 8.0, 2.5, 11.0, -7.0)
 

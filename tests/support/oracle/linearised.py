@@ -3,9 +3,8 @@
 from typing import NamedTuple, Protocol
 
 import numpy as np
-
-from fgtrack.pipeline.oracle.dynamics import Dynamics, FloatArray, Flow
-from fgtrack.pipeline.oracle.sightings import Sighting
+from support.oracle.dynamics import Dynamics, FloatArray, Flow
+from support.oracle.sightings import Sighting
 
 
 class Seen(NamedTuple):

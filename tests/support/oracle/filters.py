@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-
-from fgtrack.pipeline.oracle.dynamics import FloatArray
-from fgtrack.pipeline.oracle.linearised import TANGENTS, Linearisation, Seen
-from fgtrack.pipeline.oracle.problem import NS_PER_S, Estimate, Problem, conditioned, whitening
-from fgtrack.pipeline.oracle.sightings import Sighting
+from support.oracle.dynamics import FloatArray
+from support.oracle.linearised import TANGENTS, Linearisation, Seen
+from support.oracle.problem import NS_PER_S, Estimate, Problem, conditioned, whitening
+from support.oracle.sightings import Sighting
 
 _MAX_STEPS = 500
 #: Of a sighting that a loss ignores.

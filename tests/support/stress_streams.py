@@ -1,4 +1,4 @@
-"""Streams on which the order of arrival is most likely to matter, for `fgtrack verify` and experiments/orders."""
+"""Streams on which the order of arrival is most likely to matter."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -6,14 +6,14 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from support.oracle.sightings import Eye, Sighting, seen
+from support.oracle_streams import FAST, Plan, Sense, Stream, drawn, observed, onboard, paper
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
-from fgtrack.pipeline.oracle.sightings import Eye, Sighting, seen
-from fgtrack.pipeline.verify_streams import FAST, Plan, Sense, Stream, drawn, observed, onboard, paper
 
 #: Ten rounds of the LiDAR at 20 Hz.
 _ROUNDS = tuple((0.05 * k, "lidar_cluster") for k in range(1, 11))

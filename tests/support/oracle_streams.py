@@ -1,13 +1,17 @@
-"""The simulated streams of `fgtrack verify`: each as measurements for estimators, and as sightings for the oracle."""
+"""Simulated streams, each as measurements for estimators, and as sightings for the oracle."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from support.oracle.dynamics import Dynamics
+from support.oracle.estimates import Solution, smoothed
+from support.oracle.kinematics import kinematic_start
+from support.oracle.problem import Problem
+from support.oracle.sightings import Eye, Sighting, Vehicle, mounted, seen
 
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray, Frame
@@ -16,11 +20,6 @@ from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.road import OpenSpace
 from fgtrack.models.sensors import Mount, RobustLoss, SensorModel
-from fgtrack.pipeline.oracle.dynamics import Dynamics
-from fgtrack.pipeline.oracle.estimates import Solution, smoothed
-from fgtrack.pipeline.oracle.kinematics import kinematic_start
-from fgtrack.pipeline.oracle.problem import Problem
-from fgtrack.pipeline.oracle.sightings import Eye, Sighting, Vehicle, mounted, seen
 from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY
 from fgtrack.tracking.ego import EgoTrajectory
 from fgtrack.tracking.inbox import Batch
@@ -104,11 +103,6 @@ class Stream:
         return problem_of(motion, self.prior, self.sightings)
 
     @cached_property
-    def references(self) -> dict[str, Any]:
-        """What is known of the oracle's other answers, by their equations."""
-        return {}
-
-    @cached_property
     def solution(self) -> Solution:
         """The oracle's least squares."""
         return smoothed(self.problem)
@@ -169,27 +163,6 @@ def observed(rng: np.random.Generator) -> Stream:
 def onboard(rng: np.random.Generator, name: str, plan: Plan) -> Stream:
     """As `observed`, at other stamps."""
     return drawn(rng, name, CTRV(), plan, lag_s=2.0, reach_s=1.9, start=_TURNING, sense=_Onboard(plan[0]))
-
-
-def mild(rng: np.random.Generator) -> Stream:
-    """As `observed`, so well known from the start that all good approximations nearly agree."""
-    plan = paper_stamps(0.6)
-    return drawn(rng, "CTRV, mildly nonlinear", CTRV(), plan, 2.0, 1.9, start=_KNOWN, sense=_Onboard(plan[0]))
-
-
-def several(rng: np.random.Generator, count: int) -> list[Stream]:
-    """Objects as that of `mild`, side by side, seen together."""
-    plan = paper_stamps(0.4)
-    sense = _Onboard(plan[0])
-    starts = [replace(_KNOWN, position_m=(30.0 - 2.0 * k, 12.0 + 3.0 * k)) for k in range(count)]
-    return [drawn(rng, f"CTRV, {count} objects", CTRV(), plan, 2.0, 1.9, start=one, sense=sense) for one in starts]
-
-
-def mild_robust(rng: np.random.Generator) -> Stream:
-    """Outliers and a Huber loss, of an object that is as well known."""
-    plan = paper_stamps(0.45)
-    sense = partial(_with_outliers, share=_MANY_OUTLIERS)
-    return drawn(rng, "CTRV, mild, Huber loss", CTRV(), plan, 2.0, 1.9, start=_KNOWN, sense=sense)
 
 
 def robust(rng: np.random.Generator) -> Stream:

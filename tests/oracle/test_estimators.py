@@ -1,0 +1,169 @@
+"""Every exact estimator against a calculation with SciPy that shares no code with it, in random orders of arrival."""
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+from support import oracle_streams as streams
+from support.oracle_references import reference, start
+from support.oracle_streams import Stream
+from support.stress_streams import NASTY, gathered, spinning
+
+from fgtrack.core import geometry
+from fgtrack.core.types import TrackState
+from fgtrack.estimation.base import Estimator
+from fgtrack.estimation.registry import ESTIMATORS, Claims, start_estimator
+from fgtrack.models.sensors import SensorModel
+from fgtrack.testing.references import Difference, dense_joint, difference, rounding_bound
+
+Draw = Callable[[np.random.Generator], Stream]
+SMOOTHERS = ("smoother", "smoother-banded", "smoother-batch")
+FILTERS = ("ekf-replay", "iekf-replay", "ukf-replay", "iplf-replay", "imm-replay")
+AHEAD_NS = 100_000_000
+#: Once converged, and where what has left the window keeps its linearisation: more the shorter the window.
+SMOOTHED: dict[Draw, float] = {
+    streams.whole: 1e-5,
+    streams.observed: 1e-5,
+    gathered: 1e-5,
+    streams.robust: 1e-5,
+    streams.accelerated: 1e-5,
+    streams.leaving: 5e-3,
+    streams.short: 5e-2,
+}
+FILTERED = (streams.whole, streams.observed, gathered, streams.robust, streams.accelerated, streams.leaving)
+SLOW = ("smoother-batch", "iekf-replay", "ukf-replay", "iplf-replay", "imm-replay")
+
+
+@cache
+def drawn(draw: Draw) -> Stream:
+    return draw(np.random.default_rng(1))
+
+
+def fed(estimator: Estimator, stream: Stream, order: str = "random") -> Estimator:
+    """`estimator` after all of `stream`, every measurement fused, converged where it has to be asked for that."""
+    for place in stream.orders[order]:
+        assert estimator.update(stream.measurements[place]).innovation is not None
+    converge = getattr(estimator, "converge", None)
+    if converge is not None:
+        converge(100)
+    return estimator
+
+
+def probes_ns(name: str, stream: Stream) -> list[int]:
+    past = stream.probes_ns() if name in SMOOTHERS else []
+    return [*past, stream.newest_ns, stream.newest_ns + AHEAD_NS]
+
+
+def largest(differences: list[Difference]) -> float:
+    """A NaN wins."""
+    return float(np.max(differences))
+
+
+def apart(name: str, draw: Draw) -> float:
+    stream = drawn(draw)
+    found, expected = fed(start(name, stream), stream), reference(name, stream)
+    stamps = probes_ns(name, stream)
+    return largest([difference(found.state_at(at), TrackState(at, *expected(at)), stream.motion) for at in stamps])
+
+
+@pytest.mark.parametrize("draw", [streams.linear, streams.late])
+def test_the_dense_joint_of_a_linear_model_is_that_of_scipy(draw: Draw) -> None:
+    stream = drawn(draw)
+    stamps = [*stream.probes_ns(), stream.newest_ns, stream.newest_ns + AHEAD_NS]
+    joint = dense_joint(stream.motion, stream.prior, stream.measurements, stamps)
+    expected = stream.solution.state_at
+    assert largest([difference(joint[at], TrackState(at, *expected(at))) for at in stamps]) < 1e-7
+
+
+@pytest.mark.parametrize("draw", [streams.linear, streams.close, streams.late])
+@pytest.mark.parametrize("name", [name for name in ESTIMATORS if Claims.of(ESTIMATORS.load(name)).is_exact])
+def test_the_paper_s_stream_in_a_linear_model_gives_the_dense_joint(name: str, draw: Draw) -> None:
+    """With its delays, with stamps 1 us apart, and, for smoothers, with a window shorter than the delays."""
+    if draw is streams.late and name not in SMOOTHERS:
+        pytest.skip("what is older than the window of a filter is refused")
+    stream, claims = drawn(draw), Claims.of(ESTIMATORS.load(name))
+    tolerance = max(
+        claims.tolerance, claims.rounding * rounding_bound(stream.motion, [m.stamp_ns for m in stream.measurements])
+    )
+    joint = dense_joint(stream.motion, stream.prior, stream.measurements, probes_ns(name, stream))
+    for order in ("arrival", "random"):
+        found = fed(start(name, stream), stream, order)
+        assert largest([difference(found.state_at(at), expected) for at, expected in joint.items()]) < tolerance
+
+
+@pytest.mark.parametrize("draw", SMOOTHED)
+@pytest.mark.parametrize("name", SMOOTHERS[:2])
+def test_a_converged_smoother_solves_least_squares(name: str, draw: Draw) -> None:
+    assert apart(name, draw) < SMOOTHED[draw]
+
+
+@pytest.mark.parametrize("draw", [streams.observed, streams.robust])
+def test_the_slow_smoother_does_as_well(draw: Draw) -> None:
+    assert apart("smoother-batch", draw) < SMOOTHED[draw]
+
+
+@pytest.mark.parametrize("draw", FILTERED)
+def test_the_replaying_filter_is_the_extended_kalman_filter(draw: Draw) -> None:
+    assert apart("ekf-replay", draw) < 1e-7
+
+
+@pytest.mark.parametrize("draw", [streams.whole, streams.observed])
+@pytest.mark.parametrize("name", FILTERS[1:])
+def test_the_other_replaying_filters_solve_equations_of_their_own(name: str, draw: Draw) -> None:
+    """Those that iterate their updates shorten oscillating steps, and end before they are solved to rounding."""
+    assert apart(name, draw) < (1e-2 if name in ("iekf-replay", "iplf-replay") else 1e-7)
+
+
+@pytest.mark.parametrize("name", NASTY)
+@pytest.mark.parametrize("estimator", ["ekf-replay", "smoother", "smoother-banded"])
+def test_the_order_of_arrival_does_not_matter_on_a_stream_made_to_show_it(name: str, estimator: str) -> None:
+    stream, rng = NASTY[name](np.random.default_rng(1)), np.random.default_rng(2)
+    count = len(stream.measurements)
+    orders = {"time": range(count), "one": rng.permutation(count).tolist(), "other": rng.permutation(count).tolist()}
+    object.__setattr__(stream, "orders", orders)
+    runs = [fed(start(estimator, stream), stream, order) for order in orders]
+    for at in probes_ns(estimator, stream):
+        for run in runs[1:]:
+            off = max(difference(run.state_at(at), runs[0].state_at(at), stream.motion))
+            assert off < (1e-9 if estimator == "ekf-replay" else 1e-5)
+
+
+@pytest.mark.parametrize("name", ["smoother", "smoother-banded"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_fast_turn_is_found_whatever_is_late_by_as_much_as_it_likes(name: str, seed: int) -> None:
+    """With the default settings; several numbers of turns would explain a part of the yaws."""
+    rng = np.random.default_rng(seed)
+    stream = spinning(rng)
+    expected = fed(start(name, stream), stream, "time").state_at(stream.newest_ns)
+    made = ESTIMATORS.load(name)
+    plain = start_estimator(name, made, stream.motion, stream.prior, stream.lag_s, {})
+    for place in stream.orders["random"]:
+        plain.update(stream.measurements[place])
+    assert difference(plain.state_at(stream.newest_ns), expected, stream.motion).mean_sigma < 0.15
+
+
+def without_arm(patch: pytest.MonkeyPatch) -> None:
+    def wrong(x_m: float, y_m: float, yaw_rad: float, speed_mps: float, _: float, *arm: float) -> object:
+        return geometry.body_point(x_m, y_m, yaw_rad, speed_mps, 0.0, *arm)
+
+    patch.setattr("fgtrack.tracking.preprocess.body_point", wrong)
+
+
+def scaled_noise(patch: pytest.MonkeyPatch) -> None:
+    right = SensorModel.noise
+    patch.setattr(SensorModel, "noise", lambda self, names: 1.1 * right(self, names))
+
+
+@pytest.mark.parametrize(("broken", "draw"), [(without_arm, streams.observed), (scaled_noise, streams.whole)])
+@pytest.mark.parametrize("name", ["ekf-replay", "smoother"])
+def test_what_is_wrong_before_the_estimator_shows(
+    name: str, broken: Callable[[pytest.MonkeyPatch], None], draw: Draw, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Detections reach the estimators through the preparation of the tracker, and the oracle by its own."""
+    broken(monkeypatch)
+    drawn.cache_clear()
+    try:
+        assert apart(name, draw) > 1e-3
+    finally:
+        drawn.cache_clear()
