@@ -68,8 +68,6 @@ class IekfReplay(ReplayingFilter):
         See `ReplayingFilter`.
     """
 
-    solves = "iekf"
-
     def __init__(
         self,
         motion: MotionModel,

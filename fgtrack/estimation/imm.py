@@ -102,7 +102,6 @@ class ImmReplay(ReplayingFilter):
     """
 
     spreads = mixes = True
-    solves = "imm"
     retrodicts = False
 
     def __init__(

@@ -87,7 +87,6 @@ class IplfReplay(ReplayingFilter):
     """
 
     spreads = True
-    solves = "iplf"
 
     def __init__(
         self,

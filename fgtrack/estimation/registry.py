@@ -89,7 +89,7 @@ class Claims:
     tolerance: float = 1e-9
     """Largest difference to the dense joint posterior, in standard deviations."""
     rounding: float = 0.0
-    """Where stamps nearly coincide, the tolerance grows to this many times `dense_joint.rounding_bound`."""
+    """Where stamps nearly coincide, the tolerance grows to this many times `fgtrack.testing.references.rounding_bound`."""
     retrodicts: bool = False
     """Whether a filter predicts the innovation of a late measurement from everything that has been fused, also what was
     sensed after it. One that smooths does so anyway."""
@@ -108,10 +108,6 @@ class Claims:
     one that does has to initiate, too."""
     bank: bool = False
     """Whether the entry makes the estimators of all objects together."""
-    solves: Literal["", "ekf", "iekf", "ukf", "iplf", "imm", "least squares"] = ""
-    """Of which equations an estimate in a nonlinear model is the solution: those of a filter in the order of the stamps
-    (extended, iterated, unscented, posterior linearisation, interacting models), or, at convergence, those of least
-    squares over all states. `fgtrack verify` holds it to them; empty for others."""
 
     @property
     def is_exact(self) -> bool:

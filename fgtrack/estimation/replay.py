@@ -171,8 +171,6 @@ class ReplayEkf(ReplayingFilter):
         See `ReplayingFilter`.
     """
 
-    solves = "ekf"
-
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float, initiation: str = DEFAULT) -> None:
         super().__init__(motion, prior, lag_s, EkfRecursion(motion), initiation)
 

@@ -61,7 +61,6 @@ class UkfReplay(ReplayingFilter):
     """
 
     spreads = True
-    solves = "ukf"
 
     def __init__(
         self,

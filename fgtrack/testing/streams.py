@@ -137,7 +137,7 @@ def mild(rng: np.random.Generator) -> Stream:
         x = _drawn_step(rng, x, 0.025)
         std = np.array(list(noise[k % 2].values()))
         turned_rad = 0.01 * k - 0.3
-        pose = SensorPose(np.sin(turned_rad) * 50.0, -np.cos(turned_rad) * 50.0, turned_rad - 1.86, 19.0, -6.0)
+        pose = SensorPose(np.sin(turned_rad) * 50.0, -np.cos(turned_rad) * 50.0, turned_rad - 1.95, 19.0, -6.0)
         model, pose = measurement_model(tuple(noise[k % 2]), NONLINEAR), pose if k % 2 else SensorPose()
         z = model.residual(model.predict(x, pose) + std * rng.standard_normal(3), np.zeros(3))
         measurements.append(Measurement(start.stamp_ns + k * 25 * MS, model, z, np.diag(std**2), pose))

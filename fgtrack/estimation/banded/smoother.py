@@ -17,7 +17,6 @@ class BandedSmoother:
     nonlinear = "at convergence"
     smooths = True
     initiates = True
-    solves = "least squares"
 
     # Any: an option may be any value that `SmootherSettings` takes.
     def __init__(

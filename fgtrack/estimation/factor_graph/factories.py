@@ -33,7 +33,6 @@ def _claim(factory: Callable[..., FixedLagSmoother], rounding: float, tolerance:
     vars(factory).update(
         exact="any lag, any number",
         nonlinear="at convergence",
-        solves="least squares",
         smooths=True,
         initiates=True,
         tolerance=tolerance,
