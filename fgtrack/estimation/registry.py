@@ -89,7 +89,7 @@ class Claims:
     tolerance: float = 1e-9
     """Largest difference to the dense joint posterior, in standard deviations."""
     rounding: float = 0.0
-    """Where stamps nearly coincide, the tolerance grows to this many times `fgtrack.testing.references.rounding_bound`."""
+    """Where stamps nearly coincide, the tolerance grows to this many times `rounding_bound` of the suite."""
     retrodicts: bool = False
     """Whether a filter predicts the innovation of a late measurement from everything that has been fused, also what was
     sensed after it. One that smooths does so anyway."""
