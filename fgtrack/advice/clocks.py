@@ -207,7 +207,7 @@ def _verdict(one: SensorOffset, report: OffsetReport) -> ClockVerdict:
     if one.offset_s is None or half_s is None:
         return ClockVerdict(one.sensor, None, False, f"its clock offset is not known: {one.why}.")
     if abs(one.offset_s) < max(_least_s(one), _SMALLEST_OFFSET_S):
-        is_known = one.identifiable or half_s < _LARGEST_STD_S
+        is_known = half_s < _LARGEST_STD_S
         text = f"its stamps agree with {what} (offset {_with_sign(one.offset_s)} ± {milliseconds(half_s)})."
         if not is_known:
             text = f"its clock offset from {what} is not known: {_with_sign(one.offset_s)} ± {milliseconds(half_s)}."

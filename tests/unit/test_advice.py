@@ -1,0 +1,85 @@
+"""Advice: what is harm, which of two clocks can be wrong, and when a change of the delay is one of the clock."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fgtrack.advice.arrivals import Arrivals
+from fgtrack.advice.clocks import clock_findings, clock_verdicts, stamp_findings
+from fgtrack.advice.noise import NoiseFit
+from fgtrack.advice.outcome import Outcome, harm
+from fgtrack.evaluation.metrics import NOTHING_TRACKED
+from fgtrack.evaluation.paired import Estimate
+from fgtrack.pipeline.clock_offsets import OffsetReport, SensorOffset
+
+SECOND_NS = 1_000_000_000
+TRUTH = replace(NOTHING_TRACKED, ticks_present=6000, ticks_in_sight=6000, ticks_tracked_in_sight=5900)
+GOOD = Outcome(births=20, confirmed=3, life_s=30.0, used={"radar": 0.9}, noise=(), truth=TRUTH, tick_s=0.02)
+
+
+def test_harm_is_more_breaks_more_births_and_less_that_is_tracked_or_used() -> None:
+    assert harm(GOOD, GOOD) is None
+    assert harm(GOOD, replace(GOOD, births=30)) is None, "may be chance"
+    assert harm(GOOD, replace(GOOD, births=40)) == "beginnings of tracks go from 20 to 40"
+    less = replace(TRUTH, ticks_tracked_in_sight=5000)
+    assert harm(GOOD, replace(GOOD, truth=less)) == "the share of time tracked goes from 98 % to 83 %"
+    broken = replace(TRUTH, breaks=12)
+    assert harm(GOOD, replace(GOOD, truth=broken)) == "breaks go from 0 to 12"
+    assert harm(replace(GOOD, truth=less), replace(GOOD, births=60)) is None, "more of the objects is tracked"
+    assert "radar that are used go from 90 % to 50 %" in str(harm(GOOD, replace(GOOD, used={"radar": 0.5})))
+    assert harm(GOOD, replace(GOOD, used={"radar": 1.0}, births=60)) is None, "of other detections"
+
+
+def test_objects_that_are_lost_or_break_up_are_a_shortfall_and_without_truth_nothing_is() -> None:
+    assert GOOD.shortfall is None
+    assert replace(GOOD, truth=None).shortfall is None
+    text = replace(GOOD, truth=replace(TRUTH, breaks=10)).shortfall
+    assert text is not None
+    assert "tracked 98 % of the time in which a sensor could see them, with 5 breaks per object and minute" in text
+
+
+@pytest.mark.parametrize(("at_s", "is_jump"), [(2.0, False), (30.0, True), (58.0, False)])
+def test_a_change_in_the_last_seconds_is_no_jump_of_the_clock(at_s: float, is_jump: bool) -> None:
+    stamps_ns = np.arange(0, 60 * SECOND_NS, SECOND_NS // 20)
+    late_ns = np.where(stamps_ns > at_s * SECOND_NS, 300_000_000, 50_000_000)
+    found = list(
+        stamp_findings(Arrivals("radar", stamps_ns + SECOND_NS, stamps_ns + SECOND_NS + late_ns, np.ones(1200, int)))
+    )
+    assert any("its delay changes by 250 ms" in one.text for one in found) == is_jump
+
+
+def report(offset_s: float, least_s: float, std_s: float = 0.005) -> OffsetReport:
+    radar = SensorOffset("radar", offset_s, std_s, 500, True, "")
+    lidar = SensorOffset("lidar", 0.0, 0.0, 500, False, "the reference")
+    return OffsetReport("lidar", (lidar, radar), 3, 1000, None, {"lidar": least_s, "radar": least_s})
+
+
+def test_delays_tell_which_clock_is_wrong_where_the_other_cannot_be_so_early() -> None:
+    (surely,) = clock_verdicts(report(0.08, 0.02))
+    assert surely.offset_s == 0.08
+    assert "not earlier by more: at least 60 ms of it is the clock of radar." in surely.bound
+    (open_,) = clock_verdicts(report(0.08, 0.1))
+    assert open_.bound.endswith("either clock may be wrong.")
+    assert "takes truth, or a sensor whose clock is known" in open_.missing
+    (reference,) = clock_verdicts(report(-0.08, 0.02))
+    assert "radar is received 20 ms after its stamps at least" in reference.bound
+    assert "at least 60 ms of it is the clock of lidar." in reference.bound
+
+
+def test_an_offset_is_set_where_it_is_known_and_not_0_and_said_where_it_is_not_known() -> None:
+    (set_,) = clock_findings(report(0.08, 0.1), {"radar": 0.01})
+    assert set_.settings == {"sensors.radar.clock_offset_s": 0.09}
+    assert not list(clock_findings(report(0.004, 0.1), {"radar": 0.0}))
+    (unknown,) = clock_findings(report(0.133, 0.1, std_s=0.045), {"radar": 0.0})
+    assert (unknown.kind, dict(unknown.settings)) == ("offset", {})
+    assert "is not known: +133 ms ± 90 ms" in unknown.text
+
+
+@pytest.mark.parametrize(
+    ("mean", "count", "consistent"), [(1.2, 500, True), (3.16, 500, False), (0.5, 500, False), (1.0, 5, False)]
+)
+def test_noise_is_fine_only_where_its_mean_is_that_expected(mean: float, count: int, consistent: bool) -> None:
+    fit = NoiseFit("radar", count, Estimate(mean, math.nan, math.nan, 1), None)
+    assert fit.is_consistent == consistent
