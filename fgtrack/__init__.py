@@ -36,6 +36,7 @@ _HOMES = {
     "SmoothedReport": "fgtrack.core.types",
     "Start": "fgtrack.estimation.base",
     "StatesAt": "fgtrack.estimation.base",
+    "Study": "fgtrack.advice.study",
     "Tables": "fgtrack.evaluation.tables",
     "TickReport": "fgtrack.core.types",
     "TickTiming": "fgtrack.pipeline.lateness",
@@ -62,6 +63,7 @@ _HOMES = {
     "robust_weight": "fgtrack.estimation.ekf",
     "simulate": "fgtrack.pipeline.public",
     "starts": "fgtrack.estimation",
+    "study": "fgtrack.advice.study",
     "testing": "fgtrack",
     "tune": "fgtrack.pipeline.tune",
 }
@@ -72,6 +74,8 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack import testing as testing
     from fgtrack.advice.advise import advise as advise
     from fgtrack.advice.page import Advice as Advice
+    from fgtrack.advice.study import Study as Study
+    from fgtrack.advice.study import study as study
     from fgtrack.core.errors import CallError as CallError
     from fgtrack.core.errors import DataError as DataError
     from fgtrack.core.errors import FgtrackError as FgtrackError

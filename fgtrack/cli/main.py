@@ -28,7 +28,7 @@ DONE, BAD_DATA, BAD_CALL = 0, 1, 2
 
 #: Commands in the order of the help; each is a function in the module of its name.
 COMMANDS = (
-    *("demo", "simulate", "replay", "compare", "figure", "report", "export", "sweep"),
+    *("demo", "study", "simulate", "replay", "compare", "figure", "report", "export", "sweep"),
     *("tune", "advise", "verify", "info", "convert", "offsets", "config"),
 )
 _STYLE: dict[str, Any] = {"add_completion": False, "rich_markup_mode": None, "pretty_exceptions_enable": False}

@@ -16,15 +16,7 @@ import pytest
 
 import fgtrack
 from fgtrack.cli.main import run as command
-from fgtrack.evaluation.report.packing import (
-    ANGLE_RAD,
-    POSITION_M,
-    Packer,
-    code_form,
-    identity_form,
-    time_form,
-    unpacked,
-)
+from fgtrack.evaluation.palette import look
 from fgtrack.evaluation.report.scene import scene
 from fgtrack.evaluation.report.settings import differing, flattened
 from fgtrack.evaluation.runs import judged
@@ -86,6 +78,11 @@ def elements(page: str) -> list[tuple[str, dict[str, str | None]]]:
     return parser.found
 
 
+def numbers(column: dict[str, Any]) -> Any:
+    """A column as the page's own script reads it."""
+    return np.array([np.nan if value is None else value * column["step"] for value in column["values"]])
+
+
 def embedded(page: str) -> dict[str, Any]:
     found = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page, re.DOTALL)
     assert found is not None
@@ -95,10 +92,13 @@ def embedded(page: str) -> dict[str, Any]:
 def test_it_has_every_part_and_every_run(page: str, folder: Path) -> None:
     ids = [attributes["id"] for _, attributes in elements(page) if "id" in attributes]
     assert len(ids) == len(set(ids))
-    parts = ("verdict", "viewer", "tables", "figures", "dispositions", "configuration", "runs")
+    parts = ("verdict", "viewer", "figures", "tables", "more-figures", "configuration", "runs")
     assert [one for one in ids if one and one.startswith("part-") and one != "part-warnings"] == [
         f"part-{part}" for part in parts
     ]
+    opened = page[: page.index('<details id="part-tables">')]
+    assert opened.count("<figure ") == 3
+    assert "<table" not in opened
     assert {"figure-close_up", "figure-map_smoother", "figure-error_against_lag"} <= set(ids)
     tables = fgtrack.compare(folder / "runs")
     for table in tables.values():
@@ -127,7 +127,7 @@ def test_what_is_embedded_is_what_the_run_folders_hold(page: str, folder: Path) 
 
     def check(table: dict[str, Any], rows: Any, time: str, order: Any, column: str = "t") -> None:
         def read(name: str) -> Any:
-            return unpacked(table[name], shown["blobs"])
+            return numbers(table[name])
 
         np.testing.assert_allclose(read(column), (rows[time][order] - start_ns) / 1e9, atol=ATOL_S)
         for k, name in enumerate(("x", "y")):
@@ -140,12 +140,10 @@ def test_what_is_embedded_is_what_the_run_folders_hold(page: str, folder: Path) 
         tracks = run.tracks
         order = np.lexsort((tracks["track_id"], tracks["now_ns"]))
         check(one["tracks"], tracks, "now_ns", order)
-        np.testing.assert_array_equal(unpacked(one["tracks"]["track"], shown["blobs"]), tracks["track_id"][order])
-        codes = unpacked(one["tracks"]["status"], shown["blobs"]).astype(int)
+        np.testing.assert_array_equal(numbers(one["tracks"]["track"]), tracks["track_id"][order])
+        codes = numbers(one["tracks"]["status"]).astype(int)
         assert [one["statuses"][code] for code in codes] == tracks["status"][order].tolist()
-        long_m, short_m, direction_rad = (
-            unpacked(one["tracks"][name], shown["blobs"]) for name in ("long", "short", "direction")
-        )
+        long_m, short_m, direction_rad = (numbers(one["tracks"][name]) for name in ("long", "short", "direction"))
         c, s = np.cos(direction_rad), np.sin(direction_rad)
         factor = -2.0 * np.log(0.05)  # chi-square with two degrees of freedom
         variances = (long_m**2 * c**2 + short_m**2 * s**2, long_m**2 * s**2 + short_m**2 * c**2)
@@ -160,13 +158,11 @@ def test_what_is_embedded_is_what_the_run_folders_hold(page: str, folder: Path) 
         rows = {**detections, **dict(zip(("x_m", "y_m"), placed(run).position_m.T, strict=True))}
         for time in ("stamp", "receipt"):
             check(one["detections"], rows, f"{time}_ns", order, time)
-        fates = unpacked(one["detections"]["disposition"], shown["blobs"]).astype(int)
+        fates = numbers(one["detections"]["disposition"]).astype(int)
         told = sorted(one["dispositions"][fate] for fate in fates)
         assert told == sorted(run.updates["disposition"].tolist())
-        assert unpacked(one["ticks"], shown["blobs"]) == pytest.approx(
-            (run.timing["now_ns"] - start_ns) / 1e9, abs=ATOL_S
-        )
-    assert len(unpacked(shown["runs"][1]["past"]["t"], shown["blobs"])) > 100
+        assert numbers(one["ticks"]) == pytest.approx((run.timing["now_ns"] - start_ns) / 1e9, abs=ATOL_S)
+    assert len(numbers(shown["runs"][1]["past"]["t"])) > 100
     truth = run.truth.where(run.truth["object_id"] >= 0)
     check(recording["truth"], truth, "stamp_ns", np.lexsort((truth["object_id"], truth["stamp_ns"])))
     check(recording["ego"], run.ego, "stamp_ns", np.argsort(run.ego["stamp_ns"], kind="stable"))
@@ -195,7 +191,7 @@ def test_old_runs_without_detections_and_ego_are_shown_and_noted(folder: Path, t
         (tmp_path / name).write_bytes((folder / "runs" / NAMES[0] / name).read_bytes())
     found = scene(judged(tmp_path))
     assert any("no detections.csv" in note for note in found.notes)
-    assert len(unpacked(found.values["runs"][0]["tracks"]["t"], found.values["blobs"])) > 100
+    assert len(numbers(found.values["runs"][0]["tracks"]["t"])) > 100
 
 
 def test_a_sensor_whose_clock_is_years_off_has_no_stamps(folder: Path) -> None:
@@ -204,8 +200,8 @@ def test_a_sensor_whose_clock_is_years_off_has_no_stamps(folder: Path) -> None:
     detections, updates = Table({**run.detections, **off}), Table({**run.updates, **off})
     shown = scene(judged(replace(run, detections=detections, updates=updates))).values
     found = shown["runs"][0]["detections"]
-    assert np.isnan(unpacked(found["stamp"], shown["blobs"])).all()
-    assert np.isfinite(unpacked(found["receipt"], shown["blobs"])).all()
+    assert np.isnan(numbers(found["stamp"])).all()
+    assert np.isfinite(numbers(found["receipt"])).all()
 
 
 def test_long_runs_are_thinned_and_it_is_said(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -214,10 +210,10 @@ def test_long_runs_are_thinned_and_it_is_said(folder: Path, monkeypatch: pytest.
     run, (shown,) = fgtrack.load_run(folder / "runs" / NAMES[0]), found.values["runs"]
     step = -(-run.tracks.num_rows // 200)
     assert step > 1
-    ticks_s = unpacked(shown["ticks"], found.values["blobs"])
+    ticks_s = numbers(shown["ticks"])
     start_ns = int(found.values["recordings"][0]["start_ns"])
     np.testing.assert_allclose(ticks_s, (run.timing["now_ns"][::step] - start_ns) / 1e9, atol=ATOL_S)
-    assert set(unpacked(shown["tracks"]["t"], found.values["blobs"])) <= set(ticks_s)
+    assert set(numbers(shown["tracks"]["t"])) <= set(ticks_s)
     assert (
         f"{NAMES[0]}: the viewer shows one of {step} times of the ticks, as there are {run.tracks.num_rows} rows"
         in (found.notes)
@@ -233,7 +229,7 @@ def test_names_from_outside_are_text(folder: Path, tmp_path: Path) -> None:
     assert command(["report", str(strange), "-o", str(out)]) == 0
     text = out.read_text(encoding="utf-8")
     assert "<script>alert" not in text
-    assert sum(tag == "script" for tag, _ in elements(text)) == 7
+    assert sum(tag == "script" for tag, _ in elements(text)) == 2
     assert embedded(text)["runs"][0]["label"].startswith("<script>alert(1)<!-- & x")
 
 
@@ -270,27 +266,22 @@ def test_a_report_is_replaced_only_when_told(page: str, folder: Path, capsys: py
     assert "--overwrite" in capsys.readouterr().err
 
 
-def test_equal_columns_are_held_once_and_what_does_not_fit_is_missing() -> None:
-    packer = Packer()
-    first = packer.column([1.0, np.nan, 1e9, -2.5], POSITION_M)
-    assert packer.column([1.0, np.nan, 1e9, -2.5], POSITION_M) == first
-    assert len(packer.blobs) == 1
-    np.testing.assert_array_equal(unpacked(first, packer.blobs), [1.0, np.nan, np.nan, -2.5])
-    angles = np.array([np.pi, -np.pi, 0.0])
-    np.testing.assert_allclose(unpacked(packer.column(angles, ANGLE_RAD), packer.blobs), angles, atol=ATOL_RAD)
-    for numbers in (np.array([-1, 2**31 - 1]), np.array([-1, 2**40])):
-        np.testing.assert_array_equal(unpacked(packer.column(numbers, identity_form(numbers)), packer.blobs), numbers)
-    with pytest.raises(ValueError, match="does not fit"):
-        packer.column([256], code_form(range(256)))
-    for count in (1, 256, 257, 70_000):  # of sensors, as a folder of strangers may name them
-        last = packer.column([count - 1], code_form(range(count)))
-        assert unpacked(last, packer.blobs).tolist() == [count - 1]
+def test_the_viewer_opens_at_the_late_detection_of_the_close_up(page: str, folder: Path) -> None:
+    moment, runs = embedded(page)["moment"], [folder / "runs" / name for name in NAMES]
+    late = fgtrack.close_ups(runs)[0]
+    (recording,) = embedded(page)["recordings"]
+    assert moment["t"] == pytest.approx((late.now_ns - int(recording["start_ns"])) / 1e9)
+    place_m = np.array([moment["x"], moment["y"]]) + recording["origin_m"]
+    np.testing.assert_allclose(place_m, late.position_m, atol=1e-9)
 
 
-@pytest.mark.parametrize("duration_s", [1.0, 1e5, 1e6, 1e8])
-def test_times_fit_however_long_a_run_is(duration_s: float) -> None:
-    packer, form = Packer(), time_form(duration_s)
-    assert unpacked(packer.column([duration_s], form), packer.blobs)[0] == pytest.approx(duration_s, abs=form.scale)
+def test_an_estimator_has_its_colour_of_the_figures_light_and_dark(page: str) -> None:
+    assert embedded(page)["colours"] == [look(name).colour for name in NAMES]
+    assert not {look(name).colour for name in NAMES} & set(embedded(page)["sensor_colours"])
+    style = re.search(r"<style>(.*?)</style>", page, re.DOTALL)[1]
+    assert "filter:" not in style
+    assert "min-width: 720px" not in style
+    assert re.search(r"\.figure img \{[^}]*width: 100%", style)
 
 
 def test_settings_that_differ_are_found_by_their_path() -> None:
@@ -312,5 +303,5 @@ def test_the_wheel_holds_the_templates(tmp_path: Path) -> None:
     templates = [
         path for path in (ROOT / "fgtrack/evaluation/report").iterdir() if path.suffix in (".js", ".css", ".html")
     ]
-    assert len(templates) == 9
+    assert len(templates) == 4
     assert {f"fgtrack/evaluation/report/{path.name}" for path in templates} <= set(names)

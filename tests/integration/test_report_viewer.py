@@ -77,6 +77,18 @@ def test_every_screen_shows_it_without_scrolling_sideways(page: Browser, phone: 
     assert len(drawn(page)) > 1.5 * len(empty)
 
 
+@pytest.mark.parametrize("width", [1280, 390])
+def test_figures_are_as_wide_as_the_page_and_five_screens_hold_what_is_open(page: Browser, width: int) -> None:
+    page.screen(width, 800)
+    page.until("viewer.size.width < innerWidth")
+    widths = page.value("[...document.querySelectorAll('section img')].map((one) => one.getBoundingClientRect().width)")
+    assert len(widths) == 3
+    if width == 390:
+        assert widths == [390 - 2 * 16] * 3
+    else:
+        assert page.value("document.documentElement.scrollHeight") < 5 * 800
+
+
 def test_the_scrubber_moves_by_mouse(page: Browser) -> None:
     before = drawn(page)
     box = page.box("[data-part=scrubber]")

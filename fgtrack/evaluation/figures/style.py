@@ -246,7 +246,7 @@ def save_pages(figures: Iterable[Figure], file: BinaryIO) -> None:
             pages.savefig(figure)
 
 
-def png(figure: Figure, dpi: float) -> bytes:
+def png(figure: Figure, dpi: float = 150.0) -> bytes:
     """`figure` as a small PNG of 256 colours, without date and version."""
     drawn, small = io.BytesIO(), io.BytesIO()
     figure.savefig(drawn, format="png", dpi=dpi, metadata=dict(FORMATS["png"]))

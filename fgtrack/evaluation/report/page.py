@@ -3,66 +3,122 @@
 import base64
 import json
 import re
+import struct
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-
+from fgtrack.core.files import read_head
 from fgtrack.evaluation.cautions import cautions, noise_cautions
-from fgtrack.evaluation.comparison import compare
-from fgtrack.evaluation.figures.style import png
 from fgtrack.evaluation.recordings import recordings_caution
-from fgtrack.evaluation.report.scene import scene
+from fgtrack.evaluation.report.scene import Moment, scene
 from fgtrack.evaluation.report.settings import differing, flattened
 from fgtrack.evaluation.runs import JudgedRun
-from fgtrack.evaluation.tables import Table, cell_rows
+from fgtrack.evaluation.tables import Table, Tables, cell_rows
+from fgtrack.io.output import Kind, new_file
 
-_SCRIPTS = ("data.js", "drawing.js", "strip.js", "links.js", "controls.js", "viewer.js")
+#: Kinds of figures that are open; of some of them there are several, by object or run.
+_FIRST = ("close_up", "errors", "error_against_lag", "map")
+_MOST_OPEN, _MOST_WARNINGS = 3, 3
+_START, _MARK, _HEAD = b"<!DOCTYPE html>", b'<meta name="generator" content="fgtrack ', 1000
 _NONE = "–"
 _LONG = 40  # characters of a cell that may be broken
-_DPI = 110.0  # of figures: sharp at the width at which they are shown
+_PNG_SIZE = slice(16, 24)  # of its header
+
+
+def _is_report(path: Path) -> bool:
+    head = read_head(path, _HEAD)
+    return head.startswith(_START) and _MARK in head
+
+
+REPORT = Kind("a report of fgtrack", _is_report)
+
+
+@dataclass(frozen=True)
+class Opening:
+    """How a report begins."""
+
+    sentences: Sequence[str] = ()
+    """Its verdict; none for that of the comparison."""
+    assumptions: Sequence[str] = ()
+    """Settings that the user has not given."""
+    advice: Sequence[str] = ()
+    moment: Moment | None = None
+    """What the viewer shows first; None for an early late detection."""
+    missing: Sequence[str] = ()
+    """What the report leaves out, a line each."""
+
+
+def write_report(
+    runs: Sequence[JudgedRun],
+    tables: Tables,
+    pictures: Iterable[tuple[str, bytes]],
+    out: Path,
+    version: str,
+    opening: Opening,
+    overwrite: bool,
+) -> int:
+    """Write the report of `runs` into the file `out`; returns its size in bytes. Raises as `page` and `new_file`."""
+    text = page(runs, tables, pictures, version, opening).encode("utf-8", "backslashreplace")  # names need not be UTF-8
+    with new_file(out, REPORT, overwrite) as file:
+        file.write(text)
+    return len(text)
 
 
 def page(
-    runs: Sequence[JudgedRun], figures: Iterable[tuple[str, Figure]], version: str, notes: Sequence[str] = ()
+    runs: Sequence[JudgedRun],
+    tables: Tables,
+    pictures: Iterable[tuple[str, bytes]],
+    version: str,
+    opening: Opening = Opening(),
 ) -> str:
-    """The report of `runs` as one HTML file: the same runs and figures give the same text.
+    """Return the report of `runs` as one HTML file: the same runs and figures give the same text.
+
+    Verdict, warnings, viewer and three figures are open, the rest is folded.
 
     Parameters
     ----------
     runs
-        What it is about, under their labels.
-    figures
-        By name, in the order in which they are shown.
+        Runs under their labels.
+    tables
+        Their comparison.
+    pictures
+        Figures as PNG by name, in the order in which they are shown.
     version
-        Of fgtrack.
-    notes
-        What is not in the report, a line each.
+        Version of fgtrack.
+    opening
+        How the page begins.
 
     Raises
     ------
     DataError
         A run or its map is damaged.
     """
-    tables = compare(*runs)
-    shown = scene(runs)
+    shown = scene(runs, opening.moment)
     warnings = recordings_caution(runs)
     warnings += [f"{one.label}: {line}" for one in runs for line in (*cautions(one.run), *noise_cautions(one.run))]
-    filled = {name: table for name, table in tables.items() if table.num_rows}
-    dispositions = filled.pop("dispositions", None)
-    parts = {
-        "Verdict": _list(tables.verdict) or "<p>Nothing to judge: no errors and no innovations.</p>",
-        "Warnings": _list(dict.fromkeys((*warnings, *shown.notes, *notes)), "warnings"),
+    warnings = list(dict.fromkeys((*warnings, *shown.notes, *opening.missing)))
+    figures = [(name, _figure(name, picture)) for name, picture in pictures]
+    first = _chosen([name for name, _ in figures])
+    verdict = _list(opening.sentences or tables.verdict)
+    open_parts = {
+        "Verdict": verdict or "<p>Nothing to judge: no errors and no innovations.</p>",
+        "Warnings": _list(warnings[:_MOST_WARNINGS], "warnings")
+        + _folded("More warnings", _list(warnings[_MOST_WARNINGS:])),
         "Viewer": _template("viewer.html"),
-        "Tables": "".join(map(_table, filled.values())),
-        "Figures": _figures(figures),
-        "Dispositions": _table(dispositions) if dispositions is not None else "",
+        "Figures": _figures(text for name, text in figures if name in first),
+    }
+    folded_parts = {
+        "Assumptions": _list(opening.assumptions),
+        "Advice": _list(opening.advice),
+        "Tables": "".join(_table(table) for table in tables.values() if table.num_rows),
+        "More figures": _figures(text for name, text in figures if name not in first),
         "Configuration": _configuration(runs),
         "Runs": _runs(runs),
     }
-    parts = {name: content for name, content in parts.items() if content}
     labels = ", ".join(one.label for one in runs)
     return _filled(
         _template("page.html"),
@@ -71,15 +127,28 @@ def page(
             "title": escape(f"fgtrack report: {labels}" if len(runs) == 1 else f"fgtrack report of {len(runs)} runs"),
             "subtitle": escape(labels),
             "style": _template("page.css"),
-            "contents": " ".join(f'<a href="#{_anchor(name)}">{name}</a>' for name in parts),
             "parts": "".join(
                 f'<section id="{_anchor(name)}">\n<h2>{name}</h2>\n{content}</section>\n'
-                for name, content in parts.items()
-            ),
+                for name, content in open_parts.items()
+                if content
+            )
+            + "".join(_folded(name, content, _anchor(name)) for name, content in folded_parts.items()),
             "scene": _json(shown.values),
-            "scripts": "".join(f"<script>\n{_template(name)}</script>\n" for name in _SCRIPTS),
+            "script": _template("viewer.js"),
         },
     )
+
+
+def _chosen(names: Sequence[str]) -> list[str]:
+    """The figures that are open: of each kind of `_FIRST` the first one, or else whatever is there."""
+    found = [next((name for name in names if name.startswith(kind)), None) for kind in _FIRST]
+    return list(dict.fromkeys([*(name for name in found if name), *names]))[:_MOST_OPEN]
+
+
+def _folded(title: str, content: str, name: str = "") -> str:
+    """Content behind a line that opens it; nothing without content."""
+    anchor = f' id="{name}"' if name else ""
+    return f"<details{anchor}><summary>{title}</summary>\n{content}</details>\n" if content else ""
 
 
 def _template(name: str) -> str:
@@ -97,7 +166,7 @@ def _json(values: Any) -> str:  # Any: JSON values
 
 
 def _anchor(name: str) -> str:
-    return f"part-{name.lower()}"
+    return f"part-{name.lower().replace(' ', '-')}"
 
 
 def _list(lines: Iterable[str], kind: str = "") -> str:
@@ -132,18 +201,17 @@ def _cell(tag: str, text: str, is_left: bool, is_bold: bool = False) -> str:
     return f"<{tag}{kind}>{f'<b>{content}</b>' if is_bold else content}</{tag}>"
 
 
-def _figures(figures: Iterable[tuple[str, Figure]]) -> str:
-    content = "".join(_figure(name, figure) for name, figure in figures)
+def _figures(texts: Iterable[str]) -> str:
+    content = "".join(texts)
     return f'<div class="figures">\n{content}</div>\n' if content else ""
 
 
-def _figure(name: str, figure: Figure) -> str:
-    text, picture = escape(name), base64.b64encode(png(figure, _DPI)).decode()
-    width, height = (round(inches * _DPI) for inches in figure.get_size_inches())
+def _figure(name: str, picture: bytes) -> str:
+    text, data = escape(name), base64.b64encode(picture).decode()
+    width, height = struct.unpack(">II", picture[_PNG_SIZE])
     return (
         f'<figure class="figure" id="figure-{text}" tabindex="0"><img alt="{text}" width="{width}" height="{height}" '
-        f'decoding="async" loading="lazy" '
-        f'src="data:image/png;base64,{picture}"><figcaption>{text}</figcaption></figure>\n'
+        f'src="data:image/png;base64,{data}"><figcaption>{text.replace("_", " ")}</figcaption></figure>\n'
     )
 
 

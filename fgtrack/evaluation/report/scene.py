@@ -6,22 +6,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import EGO_ID, LATE, FloatArray, IntArray
 from fgtrack.evaluation.cautions import USED
-from fgtrack.evaluation.palette import PALETTE
+from fgtrack.evaluation.palette import SENSORS, distinct_colours
 from fgtrack.evaluation.recordings import by_recording
-from fgtrack.evaluation.report.packing import (
-    ANGLE_RAD,
-    POSITION_M,
-    Form,
-    Packed,
-    Packer,
-    code_form,
-    identity_form,
-    time_form,
-)
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.viewer.detection_messages import track_positions
 from fgtrack.evaluation.viewer.ellipse import AROUND_95, ellipses
@@ -31,11 +22,13 @@ from fgtrack.evaluation.viewer.surroundings import excluded_lines, road_lines, r
 from fgtrack.evaluation.viewer.track_messages import final_ns, position_covariances
 from fgtrack.io.run import Run, Table
 
-FORMAT = "fgtrack-report/1"
-MOST_ROWS = 200_000
+FORMAT = "fgtrack-report/2"
+MOST_ROWS = 60_000
 """Rows of a table that the viewer shows of all runs together; of more every second tick or stamp, every third ..."""
 
 Json = dict[str, Any]  # Any: JSON values
+_TIME_S, _POSITION_M, _ANGLE_RAD = 1e-4, 1e-3, 1e-4  # steps that numbers are rounded to
+_LONGEST_S = 1e7  # times farther from the start are of another clock, and missing
 
 
 @dataclass
@@ -48,6 +41,15 @@ class _Recording:
 
 
 @dataclass(frozen=True)
+class Moment:
+    """A time and a position in the map that are worth a look."""
+
+    now_ns: int
+    x_m: float
+    y_m: float
+
+
+@dataclass(frozen=True)
 class Scene:
     """What the viewer shows."""
 
@@ -56,69 +58,77 @@ class Scene:
     """What it does not show, a line each."""
 
 
-def scene(runs: Sequence[JudgedRun]) -> Scene:
-    """Everything that the viewer shows of `runs`; times are seconds from the start of the recording.
+def scene(runs: Sequence[JudgedRun], moment: Moment | None = None) -> Scene:
+    """Return everything that the viewer shows of `runs`, first `moment`; times are seconds from the start.
 
     Raises
     ------
     DataError
         A run or its map is damaged.
     """
-    recordings = _recordings(runs)
-    packer, notes = Packer(), dict[str, None]()
-    times = time_form(
-        max((_end_ns(run) - one.start_ns for one in recordings for run in one.runs), default=0) / NS_PER_S
-    )
+    recordings, notes = _recordings(runs), dict[str, None]()
     shown = []
     for one in runs:
-        place = next(k for k, recording in enumerate(recordings) if any(one.run is its for its in recording.runs))
-        packing = _Packing(packer, times, recordings[place], notes, one.label, len(runs))
-        shown.append({"label": one.label, "recording": place, **_run(one.run, packing)})
+        index = next(k for k, recording in enumerate(recordings) if any(one.run is its for its in recording.runs))
+        packing = _Packing(recordings[index], notes, one.label, len(runs))
+        shown.append({"label": one.label, "recording": index, **_run(one.run, packing)})
     values = {
         "format": FORMAT,
-        "palette": PALETTE,
+        "colours": distinct_colours([str(one.run.meta.get("estimator", "")) for one in runs]),
+        "sensor_colours": SENSORS,
+        "moment": None if moment is None else _first(moment, recordings[0]),
         "size_m": NOMINAL_SIZE_M[:2],
         "used": USED,
         "late": sorted(LATE),
-        "recordings": [_recording(one, _Packing(packer, times, one, notes, "", len(recordings))) for one in recordings],
+        "recordings": [_recording(one, _Packing(one, notes, "", len(recordings))) for one in recordings],
         "runs": shown,
-        "blobs": packer.blobs,
     }
     return Scene(values, tuple(notes))
+
+
+def _first(moment: Moment, of: _Recording) -> Json:
+    x0_m, y0_m = of.origin_m.tolist()
+    return {"t": (moment.now_ns - of.start_ns) / NS_PER_S, "x": moment.x_m - x0_m, "y": moment.y_m - y0_m}
+
+
+def _column(values: npt.ArrayLike, step: float = 1.0) -> Json:
+    """Return a column as whole steps, with null for what is not finite."""
+    steps = np.rint(np.asarray(values, dtype=np.float64) / step)
+    finite = np.isfinite(steps)
+    whole = np.where(finite, steps, 0.0).astype(np.int64).tolist()
+    if not finite.all():
+        whole = [value if known else None for value, known in zip(whole, finite.tolist(), strict=True)]
+    return {"step": step, "values": whole}
 
 
 @dataclass(frozen=True)
 class _Packing:
     """Packs columns of a recording."""
 
-    packer: Packer
-    times: Form
     recording: _Recording
     notes: dict[str, None]
     label: str
     num_runs: int
 
-    def time(self, ns: IntArray) -> Packed:
-        return self.packer.column((ns - self.recording.start_ns) / NS_PER_S, self.times)
+    def time(self, ns: IntArray) -> Json:
+        times_s = (ns - self.recording.start_ns) / NS_PER_S
+        return _column(np.where(np.abs(times_s) < _LONGEST_S, times_s, math.nan), _TIME_S)
 
     def place(self, x_m: FloatArray, y_m: FloatArray) -> Json:
         x0_m, y0_m = self.recording.origin_m
-        return {"x": self.packer.column(x_m - x0_m, POSITION_M), "y": self.packer.column(y_m - y0_m, POSITION_M)}
+        return {"x": _column(x_m - x0_m, _POSITION_M), "y": _column(y_m - y0_m, _POSITION_M)}
 
     def ellipse(self, states: Table) -> Json:
         """Half axes and direction of the ellipses that hold 95 %."""
         found = ellipses(position_covariances(states), AROUND_95)
         return {
-            "long": self.packer.column(0.5 * found[:, 0], POSITION_M),
-            "short": self.packer.column(0.5 * found[:, 1], POSITION_M),
-            "direction": self.packer.column(found[:, 2], ANGLE_RAD),
+            "long": _column(0.5 * found[:, 0], _POSITION_M),
+            "short": _column(0.5 * found[:, 1], _POSITION_M),
+            "direction": self.angle(found[:, 2]),
         }
 
-    def identity(self, numbers: IntArray) -> Packed:
-        return self.packer.column(numbers, identity_form(numbers))
-
-    def angle(self, angles_rad: FloatArray) -> Packed:
-        return self.packer.column(angles_rad, ANGLE_RAD)
+    def angle(self, angles_rad: FloatArray) -> Json:
+        return _column(angles_rad, _ANGLE_RAD)
 
     def thinned(self, table: Table, what: str) -> Table:
         """`table`, or the rows of every k-th of its stamps where it has too many."""
@@ -152,11 +162,6 @@ def _origin_m(runs: Sequence[Run]) -> FloatArray:
     return np.zeros(2)
 
 
-def _end_ns(run: Run) -> int:
-    columns = (run.timing["now_ns"], run.ego["receipt_ns"], run.detections["receipt_ns"], run.truth["stamp_ns"])
-    return max((int(column.max()) for column in columns if len(column)), default=0)
-
-
 def _recording(one: _Recording, packing: _Packing) -> Json:
     run = one.runs[0]
     maps, notes = roads(run)
@@ -178,7 +183,7 @@ def _recording(one: _Recording, packing: _Packing) -> Json:
         "map": lines,
         "ego": {"t": packing.time(ego["stamp_ns"]), **_pose(ego, packing)},
         "truth": {
-            "object": packing.identity(truth["object_id"]),
+            "object": _column(truth["object_id"]),
             "t": packing.time(truth["stamp_ns"]),
             **_pose(truth, packing),
         },
@@ -186,7 +191,6 @@ def _recording(one: _Recording, packing: _Packing) -> Json:
 
 
 def _run(run: Run, packing: _Packing) -> Json:
-    column = packing.packer.column
     statuses = np.unique(run.tracks["status"]).tolist()
     tracks, lagged = _placed(run.tracks), _placed(run.lagged.where(run.lagged["lag_s"] > 0.0))
     ticks_ns = packing.thinned_times(
@@ -204,19 +208,19 @@ def _run(run: Run, packing: _Packing) -> Json:
         "ticks": packing.time(ticks_ns),
         "tracks": {
             "t": packing.time(tracks["now_ns"]),
-            "track": packing.identity(tracks["track_id"]),
-            "status": column(_codes(tracks["status"], statuses), code_form(statuses)),
+            "track": _column(tracks["track_id"]),
+            "status": _column(_codes(tracks["status"], statuses)),
             **_pose(tracks, packing),
             **packing.ellipse(tracks),
         },
         "past": {
             "t": packing.time(past["now_ns"]),
-            "track": packing.identity(past["track_id"]),
+            "track": _column(past["track_id"]),
             **packing.place(past["x_m"], past["y_m"]),
             **packing.ellipse(past),
         },
         "final": {
-            "track": packing.identity(final["track_id"]),
+            "track": _column(final["track_id"]),
             "t": packing.time(final["stamp_ns"]),
             "known": packing.time(final_ns(run, final)),
             **packing.place(final["x_m"], final["y_m"]),
@@ -228,7 +232,7 @@ def _run(run: Run, packing: _Packing) -> Json:
 
 def _detections(run: Run, packing: _Packing) -> Json:
     """Detections in order of receipt: where they were, when, what became of them, where their track was then."""
-    column, table, updates = packing.packer.column, run.detections, run.updates
+    table, updates = run.detections, run.updates
     if updates.num_rows and not table.num_rows:
         packing.notes[f"{packing.label}: has no detections.csv, so no detections are shown; repeat the run"] = None
     where, became = placed(run), update_rows(run)
@@ -249,9 +253,9 @@ def _detections(run: Run, packing: _Packing) -> Json:
     found = {
         "stamp": packing.time(table["stamp_ns"][order]),
         "receipt": packing.time(table["receipt_ns"][order]),
-        "sensor": column(_codes(table["sensor"][order], sensors), code_form(sensors)),
-        "disposition": column(_codes(fates[order], dispositions), code_form(dispositions)),
-        "track": packing.identity(ids[order]),
+        "sensor": _column(_codes(table["sensor"][order], sensors)),
+        "disposition": _column(_codes(fates[order], dispositions)),
+        "track": _column(ids[order]),
         **packing.place(*where.position_m[order].T),
         "track_x": track["x"],
         "track_y": track["y"],

@@ -1,0 +1,256 @@
+"""A recording in one call: advice, three methods on the same stream, their comparison, figures, and a page."""
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+import fgtrack
+from fgtrack.advice.advise import advise
+from fgtrack.advice.page import Advice
+from fgtrack.advice.summary import summary
+from fgtrack.core.errors import DataError
+from fgtrack.core.files import read_head
+from fgtrack.evaluation.comparison import compare
+from fgtrack.evaluation.figures.style import DRAWN, png
+from fgtrack.evaluation.plot import close_up, drawn, planned
+from fgtrack.evaluation.recordings import by_recording
+from fgtrack.evaluation.report.page import REPORT, Opening, write_report
+from fgtrack.evaluation.report.scene import Moment
+from fgtrack.evaluation.runs import JudgedRun, judged
+from fgtrack.evaluation.tables import Tables
+from fgtrack.io.output import Kind, check_apart, check_output, claimed, new_file, new_files
+from fgtrack.io.run import RUN, Run, load_run, write_metrics
+from fgtrack.io.source import InputSource, open_input
+from fgtrack.io.span import end_ns
+from fgtrack.pipeline.assumed import Assumed, Assumption, assumed
+from fgtrack.pipeline.close_up import close_ups
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.inputs import inputs
+from fgtrack.pipeline.replay import ReplayResult, replay_each
+from fgtrack.pipeline.shipped import read_config, settings_of
+
+__all__ = ["ESTIMATORS", "Study", "study"]
+
+ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
+"""Estimators of a study."""
+_MARK = "(fgtrack study)"
+_SETTINGS = Kind("settings of a study", lambda path: _MARK.encode() in read_head(path, 500))
+#: Share of the work that is done when a step begins.
+_ADVICE, _REPLAY, _COMPARE, _DRAW, _DONE = 0.02, 0.3, 0.85, 0.9, 1.0
+_TICKS = 50  # between two signs of progress
+
+OnStep = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Study:
+    """A recording studied; `str` gives the summary, the assumptions and where the files are.
+
+    Attributes
+    ----------
+    path
+        Folder of `report.html`, `settings.yaml`, `runs/` and `figures/`.
+    summary
+        About five sentences: the recording, the tracks, the best method, the noise, what to do.
+    assumptions
+        Settings that neither the configuration nor the advice gives.
+    advice
+        None where it was not asked for, or nothing could be judged.
+    tables
+        Comparison of the runs.
+    broken
+        Why the recording breaks off, where it does.
+    """
+
+    path: Path
+    summary: tuple[str, ...]
+    assumptions: tuple[Assumption, ...] = field(repr=False)
+    advice: Advice | None = field(repr=False)
+    runs: tuple[Run, ...] = field(repr=False)
+    tables: Tables = field(repr=False)
+    broken: str | None
+
+    @property
+    def report(self) -> Path:
+        """The page, to be opened in a browser."""
+        return self.path / "report.html"
+
+    @property
+    def settings(self) -> Path:
+        """The configuration of the runs with what was assumed and why, to be changed and run again."""
+        return self.path / "settings.yaml"
+
+    def __str__(self) -> str:
+        lines = [*self.summary, *(f"assumed {one}" for one in self.assumptions)]
+        return "\n".join([*lines, f"settings: {self.settings}", f"report: {self.report}"])
+
+
+def study(
+    recording: str | Path,
+    out: str | Path,
+    config: str | Path | Config | None = None,
+    *,
+    map: str | Path | None = None,  # noqa: A002 - the name of the option
+    pit_map: str | Path | None = None,
+    set: Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
+    advice: bool = True,
+    overwrite: bool = False,
+    on_step: OnStep = lambda text, share: None,
+) -> Study:
+    """Return a recording studied: advised, replayed by three estimators, compared, drawn and reported into a folder.
+
+    Parameters
+    ----------
+    recording
+        Path of anything that fgtrack reads.
+    out
+        Folder to write to.
+    config
+        Name of a shipped configuration, path of a YAML file, or a `Config`; None for the defaults.
+    map, pit_map
+        CSV files of the track and of the pit lane, or `oval`; instead of those of the configuration.
+    set
+        Values of single settings: `{"smoother.lag_s": 3.0}`.
+    advice
+        True to follow the settings of `fgtrack.advise`.
+    overwrite
+        True to replace a study in `out`.
+    on_step
+        Called with the name of each step, and the share of the work that is done.
+
+    Raises
+    ------
+    CallError
+        The configuration or `out` is invalid.
+    DataError
+        The recording cannot be read, or holds nothing to track.
+    """
+    out, source_path = Path(out), Path(recording)
+    resolved = read_config(config, settings_of(set), track_map=map, pit_map=pit_map)
+    folders = {name: out / "runs" / name for name in ESTIMATORS}
+    figures, settings, page = out / "figures", out / "settings.yaml", out / "report.html"
+    config_file = str(config) if isinstance(config, (str, Path)) else None
+    for path in (*folders.values(), figures, settings, page):
+        check_apart(path, inputs(resolved, [source_path], config_file=config_file))
+    with claimed(out):
+        for folder in folders.values():
+            check_output(folder, RUN, overwrite)
+        check_output(figures, DRAWN, overwrite)
+        check_output(settings, _SETTINGS, overwrite)
+        check_output(page, REPORT, overwrite)
+        on_step("reading", 0.0)
+        source = open_input(source_path, resolved.input)
+        known = assumed(resolved, source)
+        advised = _advised(source_path, known.config, on_step) if advice else None
+        known = known if advised is None else _following(known, advised)
+        with new_file(settings, _SETTINGS, overwrite) as file:
+            file.write(_settings_text(source_path, known, advised).encode())
+        results = _replayed(source_path, source, known.config, folders, overwrite, on_step)
+        on_step("compare", _COMPARE)
+        every = judged([load_run(result.path) for result in results])
+        tables = compare(*every)
+        for one in every:
+            if one.run.path is not None:
+                write_metrics(one.run.path, one.metrics.as_dict())
+        lines = summary(every, tables, advised)
+        on_step("draw", _DRAW)
+        opening = Opening(
+            sentences=lines,
+            assumptions=tuple(str(one) for one in known.assumptions),
+            advice=() if advised is None else advised.sentences,
+        )
+        _pictured(every, tables, opening, figures, page, overwrite)
+        on_step("done", _DONE)
+    return Study(out, lines, known.assumptions, advised, tuple(o.run for o in every), tables, results[0].broken)
+
+
+def _advised(recording: Path, config: Config, on_step: OnStep) -> Advice | None:
+    """Return the advice on `recording`; None where nothing can be judged, which the runs report as well."""
+    steps: list[str] = []
+
+    def on_part(text: str = "", *_: object) -> None:
+        steps.append(text)
+        on_step(f"advice, {text}", _REPLAY - (_REPLAY - _ADVICE) * 0.8 ** len(steps))
+
+    with suppress(DataError):
+        return advise(recording, config, on_step=on_part)
+    return None
+
+
+def _following(known: Assumed, advice: Advice) -> Assumed:
+    """Return `known` with the advice followed; what the advice changes is not assumed any more."""
+    changed = {one.key for one in advice.changes}
+    return Assumed(advice.config, tuple(one for one in known.assumptions if one.key not in changed))
+
+
+def _settings_text(recording: Path, known: Assumed, advice: Advice | None) -> str:
+    comments = [f"Settings of {recording.name} {_MARK}: change them and run again with -c."]
+    comments += [] if advice is None else advice.comments()
+    return "".join(f"# {line}".rstrip() + "\n" for text in comments for line in text.splitlines()) + known.to_yaml()
+
+
+def _replayed(
+    recording: Path,
+    source: InputSource,
+    config: Config,
+    folders: Mapping[str, Path],
+    overwrite: bool,
+    on_step: OnStep,
+) -> list[ReplayResult]:
+    end, each = end_ns(source), (_COMPARE - _REPLAY) / len(folders)
+
+    def replayed(name: str, folder: Path, before: float) -> ReplayResult:
+        ticks_ns: list[int] = []
+
+        def on_tick(now_ns: int, num_tracks: int) -> None:
+            ticks_ns.append(now_ns)
+            if len(ticks_ns) % _TICKS == 1:
+                length_ns = max((end or 0) - ticks_ns[0], 1)
+                done = min((now_ns - ticks_ns[0]) / length_ns, 1.0) if end is not None else 0.0
+                on_step(f"replay, {name}, {num_tracks} tracks", before + each * done)
+
+        (result,) = replay_each(
+            source.messages,
+            config,
+            {name: folder},
+            origin=str(recording),
+            kind=source.kind,
+            on_tick=on_tick,
+            overwrite=overwrite,
+        )
+        return result
+
+    return [replayed(name, folder, _REPLAY + each * k) for k, (name, folder) in enumerate(folders.items())]
+
+
+def _pictured(
+    runs: list[JudgedRun], tables: Tables, opening: Opening, figures: Path, page: Path, overwrite: bool
+) -> None:
+    late, moment = late_case(runs)
+    others = tuple(f"_{one.label}" for one in runs[1:])  # figures of single runs are drawn of the first
+    plans = (one for one in planned(runs) if not one.name.endswith(others))
+    pictures = [(name, png(figure)) for name, figure in chain(late, drawn(plans))]
+    with new_files(figures, DRAWN, overwrite) as folder:
+        for name, picture in pictures:
+            (folder / f"{name}.png").write_bytes(picture)
+    opening = replace(opening, moment=moment.moment, missing=moment.missing)
+    write_report(runs, tables, pictures, page, fgtrack.__version__, opening, overwrite)
+
+
+def late_case(runs: Sequence[JudgedRun]) -> tuple[list[tuple[str, Figure]], Opening]:
+    """Return the close-up of a late detection by its name, and how a report opens at that moment.
+
+    Without such a detection, or without the recording, there is no figure and the opening says why.
+    """
+    same = by_recording(runs)[0]
+    try:
+        late = close_ups([one.run for one in same])
+    except DataError as error:
+        return [], Opening(missing=(f"no close-up: {error}",))
+    first = late[0]
+    moment = Moment(first.now_ns, *first.position_m.tolist())
+    return [("close_up", close_up(same, late))], Opening(moment=moment)
