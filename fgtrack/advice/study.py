@@ -131,15 +131,15 @@ def study(
     """
     out, source_path = Path(out), Path(recording)
     resolved = read_config(config, settings_of(set), track_map=map, pit_map=pit_map)
-    folders = {name: out / "runs" / name for name in ESTIMATORS}
-    figures, settings, page = out / "figures", out / "settings.yaml", out / "report.html"
+    *runs, figures, settings, page = outputs(out)
+    folders = dict(zip(ESTIMATORS, runs, strict=True))
     config_file = str(config) if isinstance(config, (str, Path)) else None
-    for path in (*folders.values(), figures, settings, page):
+    for path in outputs(out):
         check_apart(path, inputs(resolved, [source_path], config_file=config_file))
     with claimed(out):
         for folder in folders.values():
             check_output(folder, RUN, overwrite)
-        check_output(figures, DRAWN, overwrite)
+        check_output(figures, Kind("a folder", Path.is_dir), overwrite)
         check_output(settings, _SETTINGS, overwrite)
         check_output(page, REPORT, overwrite)
         on_step("reading", 0.0)
@@ -166,6 +166,14 @@ def study(
         _pictured(every, tables, opening, figures, page, overwrite)
         on_step("done", _DONE)
     return Study(out, lines, known.assumptions, advised, tuple(o.run for o in every), tables, results[0].broken)
+
+
+def outputs(out: Path) -> list[Path]:
+    """Return what a study in `out` writes: the run of every estimator, figures, settings, report."""
+    return [
+        *(out / "runs" / name for name in ESTIMATORS),
+        *(out / n for n in ("figures", "settings.yaml", "report.html")),
+    ]
 
 
 def _advised(recording: Path, config: Config, on_step: OnStep) -> Advice | None:

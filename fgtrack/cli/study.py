@@ -6,12 +6,14 @@ from typing import Annotated
 
 import typer
 
-from fgtrack.advice.study import Study
+from fgtrack.advice.study import Study, outputs
 from fgtrack.advice.study import study as studied
 from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Settings, TrackMap
 from fgtrack.cli.show import command_line, progress, say, sentences, show, warn
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.cautions import cautions
+from fgtrack.io.output import check_apart
+from fgtrack.pipeline.inputs import inputs
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
 
@@ -31,8 +33,12 @@ def study(
     and run again.
     """
     config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
+    for path in outputs(out):
+        check_apart(path, inputs(config, [recording], config_file=config_file))
     with progress("study") as tell:
         found = studied(recording, out, config, overwrite=overwrite, on_step=tell)
+    for line in dict.fromkeys(str(one) for run in found.runs for one in cautions(run)):
+        warn(line)
     show_study(found, recording)
 
 
@@ -40,8 +46,6 @@ def show_study(found: Study, recording: Path) -> None:
     """Print a study. Raises `DataError` where the recording breaks off."""
     sentences(found.summary)
     show(replace(found.tables, verdict=()), None)
-    for line in dict.fromkeys(str(one) for run in found.runs for one in cautions(run)):
-        warn(line)
     say("")
     for assumption in found.assumptions:
         say(f"assumed {assumption}")

@@ -152,6 +152,7 @@ WRITERS = [
     (("replay", "drive.jsonl", "-o", "run"), "run"),
     (("replay", "drive.jsonl", "-o", "demo/runs", "-e", "ekf-replay,smoother"), "demo/runs/smoother"),
     (("demo", "-o", "demo"), "demo/recording"),
+    (("study", "drive.jsonl", "-o", "demo"), "demo/settings.yaml"),
     (("figure", "run", "-o", "figures"), "figures/arrivals.png"),
     (("figure", "run", "-o", "figures.pdf"), "figures.pdf"),
     (("report", "run", "-o", "report.html"), "report.html"),
@@ -486,6 +487,8 @@ TANGLED = [
     (("figure", "run", "-o", "run/figures"), "run"),
     (("figure", "run", "-o", "run/figures.pdf"), "run"),
     (("report", "run", "-o", "run/report.html"), "run"),
+    (("study", "bag", "-o", "bag"), "bag"),
+    (("study", "demo/recording", "-c", "demo/settings.yaml", "-o", "demo"), "demo/settings.yaml"),
     (("report", "demo/runs", "-o", "demo/runs/smoother/report.html"), "demo/runs/smoother"),
     (("export", "run", "-o", "run/run.mcap"), "run"),
     (("export", "run", "-o", "run/ros2", "--ros2"), "run"),
@@ -689,6 +692,7 @@ def test_an_output_that_cannot_be_written_is_a_bad_call_everywhere(here: Path, c
         ("advise", "drive.jsonl", "-o", "file/x.yaml"),
         ("sweep", "sweep.yaml", "-o", "file/x"),
         ("demo", "-o", "file/x"),
+        ("study", "drive.jsonl", "-o", "file/x"),
     ):
         code, error = call(*words)
         assert code == 2, words

@@ -21,6 +21,7 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.text import Text
 from matplotlib.ticker import LogLocator, NullFormatter
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from fgtrack.core.errors import CallError, printable_lines
 from fgtrack.core.files import open_file, read_head
@@ -251,7 +252,10 @@ def png(figure: Figure, dpi: float = 150.0) -> bytes:
     drawn, small = io.BytesIO(), io.BytesIO()
     figure.savefig(drawn, format="png", dpi=dpi, metadata=dict(FORMATS["png"]))
     with Image.open(drawn) as picture:
-        picture.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
+        made_by = PngInfo()
+        made_by.add_text("Creator", _MARK)
+        few = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+        few.save(small, "PNG", optimize=True, pnginfo=made_by)
     return small.getvalue()
 
 
