@@ -1,33 +1,44 @@
 """The iterated extended Kalman filter: Gauss-Newton on each update."""
 
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from fgtrack.core.checks import not_negative
+from fgtrack.core.linalg import psd_solve
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.ekf import OneCorrection, linearised
+from fgtrack.estimation.ekf import OneCorrection, Update, linearised, updated_one
 from fgtrack.estimation.initiation import DEFAULT
-from fgtrack.estimation.iteration import Iteration, largest_move, negative_log_posterior, reweighted
 from fgtrack.estimation.recursion import EkfRecursion
 from fgtrack.estimation.replay import ReplayingFilter
 from fgtrack.models.motion import MotionModel
+from fgtrack.models.robust import penalty, weight
+from fgtrack.models.sensors import RobustLoss
+
+_MAX_HALVINGS = 8
 
 
 class IekfRecursion(EkfRecursion):
-    """An EKF that linearises the measurement again at the state that it gave, until that stays where it is.
+    """An EKF that relinearises the measurement at the updated state until that no longer moves.
 
     Bell and Cathey, The iterated Kalman filter update as a Gauss-Newton method, IEEE Transactions on Automatic Control
-    38(2), 1993: the update minimises half of |x - x_0|^2 in P^-1 and |z - h(x)|^2 in R^-1, or a robust loss in place of
+    38(2), 1993: the update minimises half of |x - x_0|^2 in P^-1 and |z - h(x)|^2 in R^-1, or a robust loss instead of
     the latter. A step that does not lower this sum is halved.
 
     Parameters
     ----------
     motion
         Motion model.
-    iteration
-        When it ends.
+    max_iterations, tolerance
+        When it ends; the tolerance is in standard deviations. Raises `ValueError` for a value out of range.
     """
 
-    def __init__(self, motion: MotionModel, iteration: Iteration) -> None:
+    def __init__(self, motion: MotionModel, max_iterations: int, tolerance: float) -> None:
         super().__init__(motion)
-        self._iteration = iteration
+        check_iteration(max_iterations, tolerance)
+        self._max_iterations, self._tolerance = max_iterations, tolerance
 
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
         """See `EkfRecursion.correct`."""
@@ -39,13 +50,13 @@ class IekfRecursion(EkfRecursion):
             return negative_log_posterior(x - mean, covariance, y, measurement.R, measurement.loss)
 
         x = mean
-        for _ in range(self._iteration.max_iterations):
+        for _ in range(self._max_iterations):
             last = x
             y, H = linearised(measurement.z, x, measurement.model, measurement.pose)
             update = reweighted(mean, covariance, y, H, measurement.R, measurement.loss, x - mean)
             limit = negative_log_posterior(x - mean, covariance, y, measurement.R, measurement.loss)
-            x = self._iteration.descended(cost, limit, last, update.mean)
-            if largest_move(x - last, covariance) < self._iteration.tolerance:
+            x = update.mean if self._max_iterations == 1 else descended(cost, limit, last, update.mean)
+            if largest_move(x - last, covariance) < self._tolerance:
                 break
         found = self.innovation(mean, covariance, measurement)
         return OneCorrection(x, update.covariance, found.innovation, found.nis, update.weight, found.S)
@@ -77,5 +88,67 @@ class IekfReplay(ReplayingFilter):
         tolerance: float = 1e-6,
         initiation: str = DEFAULT,
     ) -> None:
-        recursion = IekfRecursion(motion, Iteration(max_iterations, tolerance))
+        recursion = IekfRecursion(motion, max_iterations, tolerance)
         super().__init__(motion, prior, lag_s, recursion, initiation)
+
+
+def check_iteration(max_iterations: int, tolerance: float) -> None:
+    """Raise `ValueError` for a number of iterations or a tolerance out of range."""
+    if not 1 <= max_iterations <= 100:
+        raise ValueError(f"max_iterations: must lie between 1 and 100, is {max_iterations}")
+    not_negative(tolerance=tolerance)
+
+
+def descended(cost: Callable[[FloatArray], float], limit: float, start: FloatArray, end: FloatArray) -> FloatArray:
+    """Farthest point from `start` (n,) to `end` (n,), halving the way, at which `cost` is at most `limit`.
+
+    `start`, where it is that, if there is no such point.
+    """
+    step = end - start
+    for _ in range(_MAX_HALVINGS):
+        if cost(start + step) <= limit:
+            return start + step
+        step = 0.5 * step
+    return start
+
+
+def largest_move(step: FloatArray, covariance: FloatArray) -> float:
+    """Largest entry of `step` (n,) in standard deviations of `covariance` (n, n)."""
+    sigma = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
+    return float(np.divide(np.abs(step), sigma, out=np.zeros(len(step)), where=sigma > 0.0).max())
+
+
+def negative_log_posterior(
+    off: FloatArray, P: FloatArray, residual: FloatArray, R: FloatArray, loss: RobustLoss | None
+) -> float:
+    """What an update minimises, but for a constant: half of off' P^-1 off, and the loss of the whitened residual.
+
+    `off` (n,) is the way from the prior, whose covariance is P (n, n); `residual` (k,) that of the measurement there,
+    with R (k, k). Raises `numpy.linalg.LinAlgError` for a singular P or R.
+    """
+    return 0.5 * float(off.dot(psd_solve(P, off))) + penalty(loss, _length(residual, R))
+
+
+def reweighted(
+    mean: FloatArray,
+    covariance: FloatArray,
+    residual: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+    loss: RobustLoss | None,
+    off: FloatArray,
+) -> Update:
+    """`updated_one` with a measurement that is linearised `off` (n,) from the prior, where it leaves `residual` (k,).
+
+    Its innovation for the prior is residual + H off. The weight under a robust loss is that of the residual, which
+    makes the step one that lowers `negative_log_posterior`; at the prior itself it is that of the whole update.
+    """
+    y = residual + H.dot(off)
+    if loss is None or not off.any():
+        return updated_one(mean, covariance, y, H, R, loss)
+    w = weight(loss, _length(residual, R))
+    return updated_one(mean, covariance, y, H, R / w)._replace(weight=w)
+
+
+def _length(residual: FloatArray, R: FloatArray) -> float:
+    return math.sqrt(max(float(residual.dot(psd_solve(R, residual))), 0.0))

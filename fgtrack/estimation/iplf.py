@@ -7,11 +7,10 @@ import numpy as np
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.ekf import OneCorrection
+from fgtrack.estimation.iekf import check_iteration, descended, largest_move, negative_log_posterior, reweighted
 from fgtrack.estimation.initiation import DEFAULT
-from fgtrack.estimation.iteration import Iteration, largest_move, negative_log_posterior, reweighted
 from fgtrack.estimation.replay import ReplayingFilter
-from fgtrack.estimation.sigma_points import measurement_regression
-from fgtrack.estimation.ukf import UkfRecursion
+from fgtrack.estimation.ukf import UkfRecursion, measurement_regression
 from fgtrack.models.motion import MotionModel
 
 
@@ -19,7 +18,7 @@ class IplfRecursion(UkfRecursion):
     """An unscented filter whose update takes the measurement as what it is over the spread of the posterior.
 
     Garcia-Fernandez, Svensson, Morelande and Sarkka, Posterior linearization filter: principles and implementation
-    using sigma points, IEEE Transactions on Signal Processing 63(20), 2015. The regression is done again over each
+    using sigma points, IEEE Transactions on Signal Processing 63(20), 2015. The regression is repeated over each
     posterior that the prior and the last regression give. With the spread and noise of a regression held, a step of
     the mean that does not lower prior plus loss is halved (Raitoharju et al., Damped posterior linearization filter,
     IEEE Signal Processing Letters 25(4), 2018).
@@ -28,29 +27,32 @@ class IplfRecursion(UkfRecursion):
     ----------
     motion
         See `UkfRecursion`.
-    iteration
-        When it ends.
+    max_iterations, tolerance
+        When it ends; the tolerance is in standard deviations. Raises `ValueError` for a value out of range.
     """
 
-    def __init__(self, motion: MotionModel, iteration: Iteration) -> None:
+    def __init__(self, motion: MotionModel, max_iterations: int, tolerance: float) -> None:
         super().__init__(motion)
-        self._iteration = iteration
+        check_iteration(max_iterations, tolerance)
+        self._max_iterations, self._tolerance = max_iterations, tolerance
 
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
         """See `EkfRecursion.correct`."""
         if measurement.model.linear:
             return super().correct(mean, covariance, measurement)
         x, P = mean, covariance
-        for _ in range(self._iteration.max_iterations):
+        for _ in range(self._max_iterations):
             last, spread = x, P
             z, A, noise = measurement_regression(measurement, x, P)
             y, R = measurement.model.residual(measurement.z, z), measurement.R + noise
             update = reweighted(mean, covariance, y, A, R, measurement.loss, x - mean)
             cost = partial(self._cost, (mean, covariance), measurement, spread, R)
             limit = negative_log_posterior(x - mean, covariance, y, R, measurement.loss)
-            x, P = self._iteration.descended(cost, limit, last, update.mean), update.covariance
+            x, P = update.mean, update.covariance
+            if self._max_iterations > 1:
+                x = descended(cost, limit, last, x)
             narrowed = np.abs(1.0 - spread.diagonal() / P.diagonal()).max()
-            if max(largest_move(x - last, P), narrowed) < self._iteration.tolerance:
+            if max(largest_move(x - last, P), narrowed) < self._tolerance:
                 break
         found = self.innovation(mean, covariance, measurement)
         return OneCorrection(x, P, found.innovation, found.nis, update.weight, found.S)
@@ -97,5 +99,5 @@ class IplfReplay(ReplayingFilter):
         tolerance: float = 1e-2,
         initiation: str = DEFAULT,
     ) -> None:
-        recursion = IplfRecursion(motion, Iteration(max_iterations, tolerance))
+        recursion = IplfRecursion(motion, max_iterations, tolerance)
         super().__init__(motion, prior, lag_s, recursion, initiation)

@@ -1,14 +1,96 @@
-"""The unscented Kalman filter."""
+"""The unscented Kalman filter, by statistical linear regression.
 
-from fgtrack.core.linalg import congruence, product, symmetrise
+The sigma points are those of the cubature rule of third degree (Arasaratnam and Haykin, Cubature Kalman filters, IEEE
+Transactions on Automatic Control 54(6), 2009): 2 n of equal weight, sqrt(n) standard deviations to both sides along the
+columns of the covariance's root. They give no weight to the mean, so every covariance stays positive semidefinite.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.linalg import congruence, identity, product, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.ekf import Innovation, OneCorrection, Prediction, updated_one
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.recursion import EkfRecursion
 from fgtrack.estimation.replay import ReplayingFilter
-from fgtrack.estimation.sigma_points import measurement_regression, motion_regression
+from fgtrack.models.measurement import MeasurementModel
 from fgtrack.models.motion import MotionModel
+
+_JITTER = 1e-12
+
+
+class Regression(NamedTuple):
+    """g(x) = mean + A (x - m) + e for x ~ N(m, P), with the least mean square of e, which is uncorrelated with x."""
+
+    mean: FloatArray
+    """E[g(x)], shape (..., k)."""
+    A: FloatArray
+    """Shape (..., k, n)."""
+    noise: FloatArray
+    """Covariance of e, shape (..., k, k)."""
+
+
+def regression(
+    g: Callable[[FloatArray], FloatArray],
+    mean: FloatArray,
+    covariance: FloatArray,
+    difference: Callable[[FloatArray, FloatArray], FloatArray] = np.subtract,
+) -> Regression:
+    """Statistical linear regression of `g`, (..., n) -> (..., k), over N(mean, covariance), (..., n) and (..., n, n).
+
+    See Arasaratnam, Haykin and Elliott 2007; Garcia-Fernandez et al. 2015, eqs. 9 to 11. With the points m +- c L_i of
+    the root P = L L', c^2 = n, and what g differs there from g(m), d+ and d-: A L_i = (d+ - d-) / 2c, and the noise
+    comes from the bends (d+ + d-) / 2, so that it is zero of a linear g. `difference` may bring angles to their range.
+    Raises `numpy.linalg.LinAlgError` for a covariance that is not positive semidefinite.
+    """
+    n, L = mean.shape[-1], _root(covariance)
+    centre, offsets = mean[..., None, :], n**0.5 * L.mT
+    values = g(np.concatenate([centre, centre + offsets, centre - offsets], axis=-2))
+    d = difference(values[..., 1:, :], values[..., :1, :])
+    ahead, behind = d[..., :n, :], d[..., n:, :]
+    bends, slopes = 0.5 * (ahead + behind), (ahead - behind) / (2.0 * n**0.5)
+    shift = bends.sum(axis=-2) / n
+    noise = bends.mT @ bends / n - shift[..., :, None] * shift[..., None, :]
+    return Regression(values[..., 0, :] + shift, np.linalg.solve(L.mT, slopes).mT, symmetrise(noise))
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """L with L L' = covariance; of one that is only semidefinite after a tiny increase."""
+    try:
+        return np.asarray(np.linalg.cholesky(covariance))
+    except np.linalg.LinAlgError:
+        n = covariance.shape[-1]
+        scale = np.maximum(np.trace(covariance, axis1=-2, axis2=-1) / n, _JITTER)
+        return np.asarray(np.linalg.cholesky(covariance + _JITTER * scale[..., None, None] * identity(n)))
+
+
+def motion_regression(motion: MotionModel, mean: FloatArray, covariance: FloatArray, dt_s: float) -> Regression:
+    """Regression of the flow over `dt_s`, without process noise; yaws are not wrapped."""
+    return regression(lambda x: motion.predict(x, dt_s), mean, covariance)
+
+
+def measurement_regression(measurement: Measurement, mean: FloatArray, covariance: FloatArray) -> Regression:
+    """Regression of what `measurement` measures. Angles are averaged on the circle, but for entries of the state."""
+    model, pose = measurement.model, measurement.pose
+    return regression(lambda x: model.predict(x, pose), mean, covariance, _difference(model))
+
+
+@cache
+def _difference(model: MeasurementModel) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    """What differs between measurements, angles in their range, but for entries of the state."""
+    direct = np.array([k for k, name in enumerate(model.components) if name in model.state_names], dtype=np.int64)
+
+    def difference(z: FloatArray, centre: FloatArray) -> FloatArray:
+        y = model.residual(z, centre)
+        y[..., direct] = z[..., direct] - centre[..., direct]
+        return y
+
+    return difference
 
 
 class UkfRecursion(EkfRecursion):

@@ -9,9 +9,8 @@ from scipy.optimize import minimize
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.iekf import IekfRecursion
+from fgtrack.estimation.iekf import IekfRecursion, negative_log_posterior
 from fgtrack.estimation.iplf import IplfRecursion
-from fgtrack.estimation.iteration import Iteration, negative_log_posterior
 from fgtrack.estimation.recursion import EkfRecursion
 from fgtrack.estimation.registry import estimator
 from fgtrack.estimation.ukf import UkfRecursion
@@ -31,12 +30,11 @@ def seen(loss: RobustLoss | None = None) -> Measurement:
 
 
 def recursions() -> dict[str, EkfRecursion]:
-    iteration = Iteration(100, 1e-9)
     return {
         "ekf": EkfRecursion(MOTION),
-        "iekf": IekfRecursion(MOTION, iteration),
+        "iekf": IekfRecursion(MOTION, 100, 1e-9),
         "ukf": UkfRecursion(MOTION),
-        "iplf": IplfRecursion(MOTION, iteration),
+        "iplf": IplfRecursion(MOTION, 100, 1e-9),
     }
 
 
@@ -132,7 +130,7 @@ def test_the_unscented_prediction_is_the_mean_over_the_spread() -> None:
 
 
 def test_one_iteration_is_the_filter_without_any() -> None:
-    once = IekfRecursion(MOTION, Iteration(1, 0.0)), IplfRecursion(MOTION, Iteration(1, 0.0))
+    once = IekfRecursion(MOTION, 1, 0.0), IplfRecursion(MOTION, 1, 0.0)
     for one, name in zip(once, ("ekf", "ukf"), strict=True):
         np.testing.assert_array_equal(
             one.correct(MEAN, P, seen()).mean, recursions()[name].correct(MEAN, P, seen()).mean

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.sigma_points import measurement_regression, motion_regression, regression
+from fgtrack.estimation.ukf import measurement_regression, motion_regression, regression
 from fgtrack.models.motion import CTRV
 
 MEAN = np.array([1.0, -2.0, 0.5])
@@ -49,18 +49,6 @@ def test_the_regression_is_that_of_many_samples() -> None:
     found = regression(g, mean, P)
     np.testing.assert_allclose(found.mean, values.mean(axis=0), atol=5e-3)
     np.testing.assert_allclose(found.A, A, atol=6e-3)
-
-
-def test_a_stack_is_taken_one_by_one() -> None:
-    motion, rng = CTRV(), np.random.default_rng(1)
-    x, dt_s = rng.normal(size=(4, 5)), np.array([0.1, 0.0, 0.3, 0.05])
-    roots = 0.1 * rng.normal(size=(4, 5, 5))
-    covariances = roots @ roots.mT + 0.01 * np.eye(5)
-    stack = motion_regression(motion, x, covariances, dt_s)
-    for k in range(4):
-        one = motion_regression(motion, x[k], covariances[k], float(dt_s[k]))
-        for found, expected in zip(stack, one, strict=True):
-            np.testing.assert_allclose(found[k], expected, rtol=1e-9, atol=1e-12)
 
 
 def test_a_narrow_spread_gives_the_derivative() -> None:
