@@ -1,5 +1,6 @@
 """`fgtrack info`: what is in a recording."""
 
+from collections.abc import Set
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -60,13 +61,13 @@ def info(
         warn(str(one))
     trial = None
     if config is not None and found.problem is None and form is None:
-        trial = _try_out(recording, config)
+        trial = _try_out(recording, config, {(one.about, one.text.split()[0]) for one in found.cautions})
     problem = found.problem if trial is None else trial.problem
     if problem is not None:
         raise DataError(problem)
 
 
-def _try_out(recording: Path, config: Config) -> Trial:
+def _try_out(recording: Path, config: Config, warned: Set[tuple[str, str]]) -> Trial:
     with progress("first seconds"):
         trial = try_out(open_input(recording, config.input).messages(), config)
     for name, text in trial.samples.items():
@@ -79,7 +80,8 @@ def _try_out(recording: Path, config: Config) -> Trial:
             say(f"first {trial.duration_s:g} s of {line}")
         say(f"first {trial.duration_s:g} s: {len(set(trial.run.tracks['track_id'].tolist()))} tracks")
     for found in trial.suspicions:
-        warn(str(found))
+        if (found.about, found.text.split()[0]) not in warned:
+            warn(str(found))
     return trial
 
 

@@ -1,12 +1,11 @@
 """What a person must know before believing a recording or a run."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-__all__ = ["EGO", "Caution", "in_degrees"]
+from fgtrack.core.geometry import may_be_radians
 
-_LARGEST_ANGLE_RAD = 2.0 * math.pi + 0.01
+__all__ = ["EGO", "Caution", "in_degrees"]
 
 EGO = "ego"
 """What a caution of the ego is about."""
@@ -29,9 +28,9 @@ class Caution:
         return f"{self.about}: {self.text}"
 
 
-def in_degrees(about: str, name: str, largest: float) -> Caution | None:
-    """Caution that the angle `name`, whose largest magnitude is given, is in degrees; None below a full circle."""
-    if not largest > _LARGEST_ANGLE_RAD:
+def in_degrees(about: str, name: str, least: float, most: float) -> Caution | None:
+    """Caution that the angle `name` between `least` and `most` is in degrees; None where it may be in radians."""
+    if may_be_radians(least, most):
         return None
-    text = f"{name} goes up to {largest:.4g}: degrees? Convert it by `{{path: ..., degrees: true}}`"
+    text = f"{name} goes up to {max(-least, most):.4g}: degrees? Convert it by `{{path: ..., degrees: true}}`"
     return Caution(about, text, spoils=True)

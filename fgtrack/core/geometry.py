@@ -12,6 +12,12 @@ TWO_PI = 2.0 * math.pi
 Real = TypeVar("Real", float, FloatArray)
 
 
+def may_be_radians(least: float, most: float) -> bool:
+    """True if angles from `least` to `most` lie within one turn, and none is larger than a turn."""
+    turn_rad = 2.0 * math.pi + 0.01
+    return most - least <= turn_rad and max(-least, most) <= turn_rad
+
+
 def wrap_angle(angle_rad: float) -> float:
     """Angle in (-pi, pi]; exact (unchanged to the bit) where it lies there already."""
     if -math.pi < angle_rad <= math.pi:

@@ -142,8 +142,9 @@ def _angles(run: Run) -> Iterator[Caution]:
     by_sensor = ((sensor, run.detections, mine) for sensor, mine in _by_sensor(run.detections))
     for about, table, mine in [(EGO, run.ego, slice(None)), *by_sensor]:
         for name in ANGULAR:
-            values = np.abs(table[name][mine]) if name in table else np.empty(0)
-            found = in_degrees(about, name, float(values[np.isfinite(values)].max(initial=0.0)))
+            values = table[name][mine] if name in table else np.empty(0)
+            finite = values[np.isfinite(values)]
+            found = in_degrees(about, name, float(finite.min(initial=0.0)), float(finite.max(initial=0.0)))
             yield from () if found is None else (found,)
 
 

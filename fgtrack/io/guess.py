@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgtrack.core.geometry import may_be_radians
 from fgtrack.core.time import NS_PER_S, NS_PER_UNIT, epoch_unit
 from fgtrack.core.types import FloatArray
 from fgtrack.io.config import Field, FieldPath
@@ -51,8 +52,6 @@ _NAMES = {
     "object_id": "id|uid|uuid|(track|object|obj|target|car|vehicle)_?id|mmsi|icao24|track|object|target",
     "class_name": "class|class_name|label|category|type|kind|classification",
 }
-_SMALL_RAD = 0.01
-_HALF_RAD = math.pi + _SMALL_RAD
 _PERIOD_S = (5e-4, 20.0)  # of a source
 _MOVED_M = 0.05  # between two states that have a direction
 _FEWEST_STEPS = 10
@@ -175,19 +174,15 @@ def _converted(component: str, unit: str, name: str, samples: Sequence[float]) -
         return Guess(name, "by its name")
     is_rate = component in ("speed_mps", "range_rate_mps", "velocity x", "velocity y")
     scale = _SCALES["mps" if is_rate else "m"].get(unit, 1.0)
-    if component in ANGULAR and (unit in _DEGREES or not _may_be_radians(finite)):
+    if component in ANGULAR and (
+        unit in _DEGREES or not may_be_radians(min(finite, default=0.0), max(finite, default=0.0))
+    ):
         return Guess(Field(name, degrees=True), f"{spread}: degrees")
     if component == "yaw_rate_radps" and unit in _DEGREES:
         return Guess(Field(name, degrees=True), f"{spread}: degrees by its name")
     if scale != 1.0:
         return Guess(Field(name, scale), f"{spread} {unit}")
     return Guess(name, spread)
-
-
-def _may_be_radians(values: Sequence[float]) -> bool:
-    """True if all lie in one of the usual ranges of an angle, up to a half or a full turn."""
-    least, most = min(values, default=0.0), max(values, default=0.0)
-    return (least >= -_HALF_RAD and most <= _HALF_RAD) or (least >= -_SMALL_RAD and most <= 2.0 * _HALF_RAD)
 
 
 def _name(guess: Guess) -> str:

@@ -112,7 +112,7 @@ class _Times:
     def __init__(self) -> None:
         self.receipts_ns: dict[int | None, list[int]] = defaultdict(list)  # by object, of truth
         self.delays_ns: list[int] = []
-        self._largest: dict[str, float] = {}  # magnitude of angles
+        self._angles: dict[str, tuple[float, float]] = {}  # from the least to the most
         self._same: tuple[int | None, int] = (None, 0)
 
     @property
@@ -140,8 +140,9 @@ class _Times:
     def add_angles(self, one: EgoState | TruthState | Detection) -> None:
         for name in ANGULAR:
             value = getattr(one, name, None)
-            if value is not None and self._largest.get(name, 0.0) < abs(value) < math.inf:
-                self._largest[name] = abs(value)
+            if value is not None and math.isfinite(value):
+                least, most = self._angles.get(name, (value, value))
+                self._angles[name] = min(least, value), max(most, value)
 
     def rate_hz(self) -> float | None:
         """Mean rate of one object, where there are several."""
@@ -154,8 +155,8 @@ class _Times:
             if (text := wrong_unit(len(found), min(found), max(found))) is not None:
                 yield Caution(name, text)
                 break
-        for angle, largest in self._largest.items():
-            if (caution := in_degrees(name, angle, largest)) is not None:
+        for angle, (least, most) in self._angles.items():
+            if (caution := in_degrees(name, angle, least, most)) is not None:
                 yield caution
 
     def delay(self) -> DelayInfo | None:

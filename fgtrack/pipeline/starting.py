@@ -64,13 +64,16 @@ def starting_config(recording: Path) -> str:
         with_sensors = assumed(config, source)
         checks = [str(one) for one in suspicions(list(beginning(source.messages(), _TRIAL_NS)), with_sensors.config)]
     except FgtrackError as error:  # of a recording in which nothing can be taken
-        with_sensors, checks = Assumed(Config(), ()), [str(error)]
+        with_sensors, checks = Assumed(Config(), ()), [str(error)] if taken else []
     lines = [
         f"# Starting configuration for {recording.name} {_MARK}",
         "# Guesses from names and values: check units, frames and noise, then",
         f"#   fgtrack info {recording} -c THIS.yaml; fgtrack replay {recording} -c THIS.yaml -o RUN",
         *(f"# {line}" for line in _contents(found)),
-        *(f"# Check: {line}" for line in [*map(str, found.cautions), *checks]),
+        *(
+            f"# Check: {line}"
+            for line in [*map(str, found.cautions), *checks, *([found.problem] if found.problem else [])]
+        ),
         *(f"# Not taken: {line}" for line in [*left, *refused]),
     ]
     head = "".join(f"{printable(line)}\n" for line in lines)

@@ -99,9 +99,9 @@ def suspicions(messages: Sequence[Message], config: Config) -> Iterator[Caution]
 
 def _degrees(name: str, states: Sequence[EgoState | TruthState | Detection]) -> Iterator[Caution]:
     for angle in ANGULAR:
-        values = [abs(value) for state in states if (value := getattr(state, angle, None)) is not None]
-        largest = max((value for value in values if math.isfinite(value)), default=0.0)
-        if (found := in_degrees(name, angle, largest)) is not None:
+        values = [value for state in states if (value := getattr(state, angle, None)) is not None]
+        finite = [value for value in values if math.isfinite(value)]
+        if (found := in_degrees(name, angle, min(finite, default=0.0), max(finite, default=0.0))) is not None:
             yield found
 
 

@@ -116,15 +116,15 @@ def _number(message: RosMessage, path: FieldPath, name: str) -> float:
 
 
 def converted(raw: float, path: FieldPath, name: str) -> float:
-    """Value of the component `name` where `path` leads to `raw`; an angle is wrapped.
+    """Value of the component `name` where `path` leads to `raw`; an angle in degrees or with an offset is wrapped.
 
-    An angle of more than 1.5 turns stays as it is: it may be in degrees, which wrapping would hide.
+    More than 1.5 turns of radians stay as they are: they may be degrees, which wrapping would hide.
     """
     if not isinstance(path, Field):
         return raw
     value = path.value(raw)
-    is_angle = name in ANGULAR and (path.degrees or abs(value) <= 3.0 * math.pi)
-    return wrap_angle(value) if is_angle and math.isfinite(value) else value
+    wraps = path.degrees or (path.offset != 0.0 and abs(value) <= 3.0 * math.pi)
+    return wrap_angle(value) if wraps and name in ANGULAR and math.isfinite(value) else value
 
 
 def _raw(message: RosMessage, path: Path) -> float:
