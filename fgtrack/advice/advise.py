@@ -156,8 +156,10 @@ class _Adviser:
             self._take(self._tuned(run, work))
         old, new = (None if found is None else Outcome.of(found) for found in map(self._run, (before, self._config)))
         if new is not None and new.shortfall is not None:
-            text = f"{new.shortfall}: settle first what is said above, then look at the sectors and ranges of sensors "
-            text += "(`fgtrack info`) and at the gate of association."
+            text = (
+                f"{new.shortfall}. {self._first('look at')} the sectors and ranges of sensors (`fgtrack info`) and the "
+            )
+            text += "gate of association."
             self._findings.append(Finding("track", "tracks", 32.0, text))
         return Advice(
             recording=self._recording,
@@ -308,13 +310,15 @@ class _Adviser:
                 lambda text: self._on_step(f"tune: {text}", begun + 0.55 * (1.0 - 0.8 ** next(steps))),
             )
         except DataError as error:
-            yield Finding("tune", "tune", 76.0, f"no noise is changed: {error}. {self._first}")
+            yield Finding(
+                "tune", "tune", 76.0, f"no noise is changed: {error}. {self._first('keep')} the configured noise."
+            )
             return
         self._on_step("tracking", 0.9)
         after = self._run(report.config)
         why = None if after is None else objection(before, after)
         if why is not None:
-            yield Finding("tune", "tune", 76.0, f"no noise is changed. With what is fitted, {why}. {self._first}")
+            yield Finding("tune", "tune", 76.0, f"no noise is changed. With what is fitted, {why}. {self._kept}")
             return
         settings = {one.key: one.tuned for one in report.parameters if one.tuned != one.configured}
         stay = ", ".join(one.key for one in report.parameters if one.key not in settings)
@@ -322,12 +326,14 @@ class _Adviser:
         yield Finding("tune", "tune", 76.0, f"fitted to the recording by maximum likelihood.{rest}", settings)
 
     @property
-    def _first(self) -> str:
-        """What has to be done before noise can be fitted."""
+    def _kept(self) -> str:
+        """What to do where no noise is fitted: what is wrong besides noise comes first."""
         first = [one for one in self._findings if one.weight > _FIRST and not one.settings and one.kind != "noise"]
-        if first:
-            return f"First settle what is said of {max(first, key=lambda one: one.weight).about}, then tune."
-        return "Keep the configured noise: tuning this recording once more gives the same."
+        if not first:
+            return "Keep the configured noise."
+        return (
+            f"First settle what is said of {max(first, key=lambda one: one.weight).about}; until then keep the noise."
+        )
 
     def _run(self, config: Config) -> Run | None:
         """A run of the first minutes, of the replaying EKF for a smoother; None where nothing can be tracked."""
@@ -363,7 +369,8 @@ class _Adviser:
         if ego is not None and not wrong & {("ego", EGO), ("clock", EGO), ("input", EGO)} and ego.period_s:
             longest, delay = milliseconds(ego.longest_gap_s), milliseconds(ego.quantile_s(0.5))
             yield f"the ego ({1.0 / ego.period_s:.0f} Hz, longest gap {longest}, delay {delay})"
-        stamps = [name for name, one in seen.items() if ("clock", name) not in wrong and len(one.stamps_ns) >= FEWEST]
+        stamps = [name for name, one in seen.items() if len(one.stamps_ns) >= FEWEST and not one.is_receipt]
+        stamps = [name for name in stamps if ("clock", name) not in wrong]
         if stamps:
             yield f"stamps of {', '.join(stamps)}"
         verdicts = [] if self._clocks is None else clock_verdicts(self._clocks)

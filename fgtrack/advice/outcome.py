@@ -102,7 +102,8 @@ class Outcome:
 def harm(before: Outcome, after: Outcome) -> str | None:
     """Return what gets worse from one run to another, with its numbers; None where nothing does.
 
-    Counts get worse where they rise by more than two standard deviations of their difference (Poisson). Where clearly
+    Counts get worse where they rise by more than two standard deviations of their difference (Poisson); a
+    track that is never confirmed does no harm. Where clearly
     more detections of a sensor are used, the two runs are not of the same data, and nothing is harm.
     """
     if any(share > before.used.get(name, 0.0) + _MORE_USED for name, share in after.used.items()):
@@ -121,8 +122,8 @@ def harm(before: Outcome, after: Outcome) -> str | None:
         for what, was, now in counts:
             if now - was > _CHANCE * math.sqrt(now + was):
                 return f"{what} go from {was} to {now}"
-    if after.births - before.births > _CHANCE * math.sqrt(after.births + before.births):
-        return f"beginnings of tracks go from {before.births} to {after.births}"
+    if after.confirmed - before.confirmed > _CHANCE * math.sqrt(after.confirmed + before.confirmed):
+        return f"confirmed tracks go from {before.confirmed} to {after.confirmed}"
     return None
 
 

@@ -19,17 +19,18 @@ TRUTH = replace(NOTHING_TRACKED, ticks_present=6000, ticks_in_sight=6000, ticks_
 GOOD = Outcome(births=20, confirmed=3, life_s=30.0, used={"radar": 0.9}, noise=(), truth=TRUTH, tick_s=0.02)
 
 
-def test_harm_is_more_breaks_more_births_and_less_that_is_tracked_or_used() -> None:
+def test_harm_is_more_breaks_more_tracks_and_less_that_is_tracked_or_used() -> None:
     assert harm(GOOD, GOOD) is None
-    assert harm(GOOD, replace(GOOD, births=30)) is None, "may be chance"
-    assert harm(GOOD, replace(GOOD, births=40)) == "beginnings of tracks go from 20 to 40"
+    assert harm(GOOD, replace(GOOD, confirmed=7)) is None, "may be chance"
+    assert harm(GOOD, replace(GOOD, births=60)) is None, "of clutter"
+    assert harm(GOOD, replace(GOOD, confirmed=20)) == "confirmed tracks go from 3 to 20"
     less = replace(TRUTH, ticks_tracked_in_sight=5000)
     assert harm(GOOD, replace(GOOD, truth=less)) == "the share of time tracked goes from 98 % to 83 %"
     broken = replace(TRUTH, breaks=12)
     assert harm(GOOD, replace(GOOD, truth=broken)) == "breaks go from 0 to 12"
-    assert harm(replace(GOOD, truth=less), replace(GOOD, births=60)) is None, "more of the objects is tracked"
+    assert harm(replace(GOOD, truth=less), replace(GOOD, confirmed=60)) is None, "more of the objects is tracked"
     assert "radar that are used go from 90 % to 50 %" in str(harm(GOOD, replace(GOOD, used={"radar": 0.5})))
-    assert harm(GOOD, replace(GOOD, used={"radar": 1.0}, births=60)) is None, "of other detections"
+    assert harm(GOOD, replace(GOOD, used={"radar": 1.0}, confirmed=60)) is None, "of other detections"
 
 
 def test_objects_that_are_lost_or_break_up_are_a_shortfall_and_without_truth_nothing_is() -> None:
