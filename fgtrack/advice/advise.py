@@ -156,10 +156,7 @@ class _Adviser:
             self._take(self._tuned(run, work))
         old, new = (None if found is None else Outcome.of(found) for found in map(self._run, (before, self._config)))
         if new is not None and new.shortfall is not None:
-            text = (
-                f"{new.shortfall}. {self._first('look at')} the sectors and ranges of sensors (`fgtrack info`) and the "
-            )
-            text += "gate of association."
+            text = f"{new.shortfall}: look at the sectors and ranges of sensors (`fgtrack info`) and at the gate."
             self._findings.append(Finding("track", "tracks", 32.0, text))
         return Advice(
             recording=self._recording,
@@ -310,9 +307,7 @@ class _Adviser:
                 lambda text: self._on_step(f"tune: {text}", begun + 0.55 * (1.0 - 0.8 ** next(steps))),
             )
         except DataError as error:
-            yield Finding(
-                "tune", "tune", 76.0, f"no noise is changed: {error}. {self._first('keep')} the configured noise."
-            )
+            yield Finding("tune", "tune", 76.0, f"no noise is changed: {error}. {self._kept}")
             return
         self._on_step("tracking", 0.9)
         after = self._run(report.config)
