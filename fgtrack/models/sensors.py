@@ -151,8 +151,10 @@ class SensorModel:
     loss: RobustLoss | None = None
     """Robust loss of its measurements; null is the Gaussian. A smoother weighs them anew while they are in its
     window, a filter once, at the state that the update gives."""
-    detection_probability: float = 0.9
-    """That a list shows an object which is in range and in the field of view (`lifecycle.kind: existence`)."""
+    detection_probability: float = 0.5
+    """Probability that a list shows an object in range and in the field of view (`lifecycle.kind: existence`). By
+    default a list that lacks an object is as likely as one that shows it: RADAR and occluded objects come near that,
+    and successive misses are correlated. A value too large ends tracks, one too small delays their end by some lists."""
     clutter_per_m2: float = 1e-4
     """False detections in a list for each square metre (`lifecycle.kind: existence`)."""
     score: Score | None = None

@@ -81,14 +81,15 @@ class GatedEuclidean:
 class GatedMahalanobis:
     """Hungarian assignment on squared Mahalanobis distances of the innovation, gated by the chi-square quantile.
 
-    `max_distance_m` keeps a track of wide covariance from taking every detection.
+    The gate widens with the time since the last detection and the speed that is possible, so that it serves sensors of
+    any rate; the log-determinant in the cost keeps a track of wide covariance from taking what fits another.
     """
 
     kind: Literal["mahalanobis"] = "mahalanobis"
     gate_probability: float = 0.999
     """Probability with which a true pair passes the gate."""
-    max_distance_m: float = 50.0
-    """Largest distance of a pair."""
+    max_distance_m: float = 5000.0
+    """Largest distance of a pair: as far as an airliner flies in 20 s. The chi-square gate decides below it."""
     claim_m: float = 0.0
     """A candidate that belongs to no track starts none nearer than this to one: it is the other end of a long hull."""
 

@@ -1,15 +1,18 @@
 """What is assumed of a new object (Karle et al. 2023, section III-E)."""
 
+import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import numpy as np
 
 from fgtrack.core.checks import positive
 from fgtrack.core.geometry import rotation
-from fgtrack.core.types import EgoState, FloatArray
-from fgtrack.estimation.base import Start
+from fgtrack.core.time import seconds
+from fgtrack.core.types import YAW, EgoState, FloatArray
+from fgtrack.estimation.base import Start, StatesAt
 from fgtrack.models.correlated_errors import position_cross, whole_error
 from fgtrack.models.road import Road
 from fgtrack.tracking.preprocess import Candidate
@@ -23,8 +26,9 @@ class Birth(ABC):
     """An object is assumed as fast as the ego times this; 0 for traffic that has nothing to do with the ego."""
     yaw_std_rad: float = 0.5
     """Standard deviation of a yaw from the map."""
-    speed_std_mps: float = 10.0
-    """Standard deviation of a speed that is not measured."""
+    speed_std_mps: float = 50.0
+    """Standard deviation of a speed that is not measured. The default is that of all speeds from 0 to 90 m/s being
+    alike (90 / sqrt(3)): pedestrians, traffic and race cars; two positions make it irrelevant."""
     yaw_rate_std_radps: float = 0.5
     """Standard deviation of the yaw rate."""
     accel_std_mps2: float = 1.0
@@ -95,6 +99,25 @@ class MeasuredBirth(Birth):
         """See `Birth.position_cross`; an object stands where its first detection says, but for what that errs."""
         measurement = candidate.measurement
         return position_cross(measurement.model, measurement.z, measurement.pose)
+
+
+def in_any_direction(states: StatesAt, stamp_ns: int, starts: Mapping[int, Start]) -> StatesAt:
+    """Return `states` at `stamp_ns` with the positions of the tracks of `starts` as uncertain in any direction.
+
+    A state with a yaw that is unknown is linearised along that yaw, and its predicted position spreads along it alone.
+    Until a second position gives the direction of travel, the position gets the same variance, (speed_std dt)^2, across.
+    """
+    rows = [row for row, track_id in enumerate(states.track_ids) if track_id in starts]
+    if not rows:
+        return states
+    covariances = states.covariances.copy()
+    for row in rows:
+        start, yaw_rad = starts[states.track_ids[row]], float(states.means[row, YAW])
+        across = (
+            start.speed_std_mps * seconds(stamp_ns - start.stamp_ns) * np.array([-math.sin(yaw_rad), math.cos(yaw_rad)])
+        )
+        covariances[row, :2, :2] += np.outer(across, across)
+    return replace(states, covariances=covariances)
 
 
 @dataclass(frozen=True)

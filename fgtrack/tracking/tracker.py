@@ -20,7 +20,7 @@ from fgtrack.core.types import (
     TrackState,
     UpdateRecord,
 )
-from fgtrack.estimation.base import StatesAt, TrackBank, UpdateResult, no_states
+from fgtrack.estimation.base import Start, StatesAt, TrackBank, UpdateResult, no_states
 from fgtrack.estimation.ekf import propagated
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.forwarding import has
@@ -31,7 +31,7 @@ from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.assignment import Assignment
 from fgtrack.tracking.association import Association
-from fgtrack.tracking.birth import Birth
+from fgtrack.tracking.birth import Birth, in_any_direction
 from fgtrack.tracking.ego import EgoPose, EgoSource
 from fgtrack.tracking.ego_error import EgoErrors, IndependentErrors
 from fgtrack.tracking.inbox import Batch, Inbox, record
@@ -86,6 +86,7 @@ class Tracker:
         self._tick = -1
         self._next_id = 0
         self._records: list[UpdateRecord] = []
+        self._undirected: dict[int, Start] = {}  # of tracks with one position and an unknown heading, by id
         self._seen: dict[int, set[int]] = {}  # in this tick, by message: tracks that it has matched or started
         self.failures = parts.failures
         """What has failed inside, and what was done about it."""
@@ -225,7 +226,8 @@ class Tracker:
             return no_states(motion.dim)
         x, F = now.means[rows], motion.jacobian(now.means[rows], -back_s)
         P = propagated(F, now.covariances[rows], motion.process_noise(x, back_s))
-        return StatesAt(tuple(now.track_ids[row] for row in rows), motion.predict(x, -back_s), P)
+        states = StatesAt(tuple(now.track_ids[row] for row in rows), motion.predict(x, -back_s), P)
+        return in_any_direction(states, stamp_ns, self._undirected)
 
     def _is_too_old(self, batch: Batch) -> bool:
         """Whether no track could fuse anything of `batch`."""
@@ -233,7 +235,7 @@ class Tracker:
 
     def _offered(self, batch: Batch) -> StatesAt:
         """The tracks that `batch` may be associated with, at its stamp."""
-        return self._parts.bank.states_at(batch.stamp_ns)
+        return in_any_direction(self._parts.bank.states_at(batch.stamp_ns), batch.stamp_ns, self._undirected)
 
     def _ranges_m(self, track_ids: Sequence[int], positions_m: FloatArray, ego: EgoPose | None) -> FloatArray:
         """Distances from the ego to tracks at `positions_m` (n, 2), both at the stamp of the batch."""
@@ -285,6 +287,8 @@ class Tracker:
         for candidate, track_id, result in zip(matched, track_ids, results, strict=True):
             if result.innovation is not None:
                 self._parts.lifecycle.fused(track_id, candidate.position_m is not None)
+                if candidate.position_m is not None:
+                    self._undirected.pop(track_id, None)
             self._conclude(batch, candidate, Disposition(result.status.value), track_id, result)
 
     def _give_birth(self, batch: Batch, candidate: Candidate, sensor: SensorModel, ego: EgoPose | None) -> None:
@@ -301,6 +305,8 @@ class Tracker:
         if not has(parts.bank, track_id):
             self._conclude(batch, candidate, Disposition.FAILED)
             return
+        if prior.yaw_rad is None and not parts.motion.cartesian:
+            self._undirected[track_id] = prior
         parts.ego_errors.born(track_id, candidate, prior)
         self._seen[id(batch.message)].add(track_id)
         parts.lifecycle.born(track_id, self._look(batch, ego), Sighting(candidate))
@@ -333,6 +339,7 @@ class Tracker:
             self._parts.bank.remove(track_id)
             self._parts.ego_errors.ended(track_id)
             self._parts.objects.forget(track_id)
+            self._undirected.pop(track_id, None)
             self._parts.lifecycle.forget(track_id)
 
     def _report(self, track_id: int, state: TrackState) -> TrackReport:
