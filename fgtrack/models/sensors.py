@@ -146,6 +146,9 @@ class SensorModel:
     """How far it sees in the half behind it, where that is less; for existence and evaluation."""
     field_of_view_rad: float = math.tau
     """Full angle that it sees, centred on its axis; for existence and evaluation, as these ranges."""
+    scan: bool = True
+    """Whether a list shows all objects in view, so that it misses those that it lacks. False where objects are reported
+    one by one, as by ADS-B, AIS or V2X; without a configuration a replay finds it in the recording."""
     births: bool = True
     """Whether an unmatched detection of this sensor starts a track."""
     loss: RobustLoss | None = None
@@ -154,7 +157,7 @@ class SensorModel:
     detection_probability: float = 0.5
     """Probability that a list shows an object in range and in the field of view (`lifecycle.kind: existence`). By
     default a list that lacks an object is as likely as one that shows it: RADAR and occluded objects come near that,
-    and successive misses are correlated. A value too large ends tracks, one too small delays their end by some lists."""
+    and successive misses are correlated. A value too large ends tracks, one too small only delays their end."""
     clutter_per_m2: float = 1e-4
     """False detections in a list for each square metre (`lifecycle.kind: existence`)."""
     score: Score | None = None

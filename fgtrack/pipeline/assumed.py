@@ -15,6 +15,7 @@ from fgtrack.io.errors import MOST_SENSORS
 from fgtrack.io.source import InputSource
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.list_statistics import ListStatistics
 from fgtrack.pipeline.load import plain
 
 __all__ = ["ASSUMED_STD", "Assumed", "Assumption", "assumed", "source_of"]
@@ -93,10 +94,12 @@ def assumed(config: Config, source: InputSource) -> Assumed:
     if config.sensors:
         return Assumed(config, ())
     measured: dict[str, set[str]] = {}
+    lists: dict[str, ListStatistics] = {}
     try:
         for message in source.messages():
             if isinstance(message, DetectionList) and message.sensor not in config.ignore_sensors:
                 found = measured.setdefault(message.sensor, set())
+                lists.setdefault(message.sensor, ListStatistics()).add(message)
                 for detection in message.objects:
                     found.update(detection.measured)
     except DataError:  # the replay ends there, too, and says so
@@ -111,12 +114,27 @@ def assumed(config: Config, source: InputSource) -> Assumed:
     sensors = {name: SensorModel(std=_std(found)) for name, found in sorted(measured.items())}
     reason = "usual of a detector of cars by LiDAR or RADAR"
     assumptions = [Assumption(f"sensors.{name}.std", dict(sensor.std), reason) for name, sensor in sensors.items()]
+    for name, statistics in sorted(lists.items()):
+        sensors[name], more = _with_lists(name, sensors[name], statistics)
+        assumptions += more
     return Assumed(replace(config, sensors=sensors), tuple(assumptions))
 
 
 def source_of(messages: Callable[[], Iterable[Message]]) -> InputSource:
     """Messages in memory as an input."""
     return InputSource(Path(), "messages", lambda: iter(messages()))
+
+
+def _with_lists(name: str, sensor: SensorModel, lists: ListStatistics) -> tuple[SensorModel, list[Assumption]]:
+    """`sensor` with what its lists show of scans and clutter, where that differs from the defaults."""
+    found: dict[str, tuple[Any, str]] = {}
+    if not lists.scans:
+        found["scan"] = False, "its lists hold one object, and none is empty"
+    if lists.largest_clutter_per_m2 < sensor.clutter_per_m2:
+        density = float(f"{lists.largest_clutter_per_m2:.2g}")
+        found["clutter_per_m2"] = density, "all detections of a list over the area that they cover"
+    sensor = replace(sensor, **{key: value for key, (value, _) in found.items()})
+    return sensor, [Assumption(f"sensors.{name}.{key}", *each) for key, each in found.items()]
 
 
 def _std(measured: set[str]) -> dict[str, float]:

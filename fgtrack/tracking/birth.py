@@ -105,7 +105,7 @@ def in_any_direction(states: StatesAt, stamp_ns: int, starts: Mapping[int, Start
     """Return `states` at `stamp_ns` with the positions of the tracks of `starts` as uncertain in any direction.
 
     A state with a yaw that is unknown is linearised along that yaw, and its predicted position spreads along it alone.
-    Until a second position gives the direction of travel, the position gets the same variance, (speed_std dt)^2, across.
+    Until a second position gives the direction, the position gets the same variance across, (speed_std dt)^2.
     """
     rows = [row for row, track_id in enumerate(states.track_ids) if track_id in starts]
     if not rows:
@@ -113,9 +113,8 @@ def in_any_direction(states: StatesAt, stamp_ns: int, starts: Mapping[int, Start
     covariances = states.covariances.copy()
     for row in rows:
         start, yaw_rad = starts[states.track_ids[row]], float(states.means[row, YAW])
-        across = (
-            start.speed_std_mps * seconds(stamp_ns - start.stamp_ns) * np.array([-math.sin(yaw_rad), math.cos(yaw_rad)])
-        )
+        std_m = start.speed_std_mps * seconds(stamp_ns - start.stamp_ns)
+        across = std_m * np.array([-math.sin(yaw_rad), math.cos(yaw_rad)])
         covariances[row, :2, :2] += np.outer(across, across)
     return replace(states, covariances=covariances)
 

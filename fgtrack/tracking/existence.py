@@ -47,8 +47,8 @@ class ExistenceRules:
     delete_probability: float = 0.02
     """A track below this ends."""
     lifetime_s: float = 60.0
-    """Mean time for which an object stays. A minute is a vehicle in the surroundings of another, in traffic as in a race;
-    what leaves earlier is ended by the lists that miss it."""
+    """Mean time for which an object stays. A minute is a vehicle near another one, in traffic as in a race; what
+    leaves earlier is ended by the lists that miss it."""
     out_of_view_s: float = 2.0
     """A track ends where the newest list that could not show it is so much newer than the last one that could."""
     min_travel_m: float = 0.0

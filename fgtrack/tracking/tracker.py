@@ -265,7 +265,8 @@ class Tracker:
                 lifecycle.matched(states.track_ids[track], look, sighting)
             self._describe(batch, candidates[place], states.track_ids[track])
         rows = [track for track in assignment.missed if states.track_ids[track] not in seen]
-        if not rows or not batch.last or not self._parts.sensors[batch.sensor].gives_position:
+        sensor = self._parts.sensors[batch.sensor]
+        if not rows or not batch.last or not (sensor.gives_position and sensor.scan):
             return
         missed = [states.track_ids[track] for track in rows]
         positions_m = states.means[rows, :2]

@@ -3,16 +3,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.models import MODELS
-from support.tracking import START_NS, StraightRoad, bearing
+from support.tracking import START_NS, StraightRoad, bearing, ms
 
 from fgtrack.core.geometry import rotation
 from fgtrack.core.types import EgoState
-from fgtrack.estimation.base import Measurement
+from fgtrack.estimation.base import Measurement, StatesAt
 from fgtrack.estimation.birth import initial_state
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.models.road import OpenSpace
-from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
+from fgtrack.tracking.birth import FixedBirth, MeasuredBirth, in_any_direction
 from fgtrack.tracking.preprocess import Candidate
 
 EGO = EgoState(START_NS, START_NS, 0.0, 0.0, 0.0, speed_mps=50.0, accel_mps2=-2.0)
@@ -43,6 +43,17 @@ def test_what_is_not_measured_comes_from_the_map_and_the_ego(birth) -> None:
     assert birth().prior(seen(), ROAD, EGO, ego_in_pit=False).speed_mps == 0.0
 
 
+def test_a_position_of_unknown_heading_is_as_uncertain_across_as_along() -> None:
+    start = MeasuredBirth(speed_std_mps=50.0).prior(seen(), OpenSpace(), None, ego_in_pit=False)
+    motion, dt_s = CTRV(), 0.5
+    x, P = initial_state(motion, start)
+    F = motion.jacobian(x, dt_s)
+    ahead = StatesAt((3, 4), np.stack([motion.predict(x, dt_s)] * 2), np.stack([F @ P @ F.T] * 2))
+    found = in_any_direction(ahead, START_NS + ms(1e3 * dt_s), {4: start})
+    assert (found.covariances[0] == ahead.covariances[0]).all()
+    assert found.covariances[1, :2, :2] == pytest.approx(POSITION_COVARIANCE + 25.0**2 * np.eye(2))
+
+
 @pytest.mark.parametrize("birth", [FixedBirth(), MeasuredBirth()])
 def test_what_is_measured_stays(birth) -> None:
     prior = birth.prior(seen(yaw_rad=1.0, speed_mps=20.0), ROAD, EGO, ego_in_pit=False)
@@ -56,7 +67,7 @@ def test_a_measured_component_starts_with_its_own_deviation_or_a_fixed_one() -> 
     assert (measured.yaw_std_rad, measured.speed_std_mps) == pytest.approx((0.7, 0.7))
     assert measured.position_covariance == pytest.approx(POSITION_COVARIANCE)
     fixed = FixedBirth(along_std_m=2.0, across_std_m=0.5).prior(candidate, ROAD, EGO, ego_in_pit=False)
-    assert (fixed.yaw_std_rad, fixed.speed_std_mps) == (0.5, 10.0)
+    assert (fixed.yaw_std_rad, fixed.speed_std_mps) == (0.5, 50.0)
     turn = rotation(1.0)
     assert fixed.position_covariance == pytest.approx(turn @ np.diag([4.0, 0.25]) @ turn.T)
 

@@ -1,0 +1,63 @@
+"""What the lists of a sensor show of scans and clutter, and what a replay takes from it."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+import fgtrack
+from fgtrack.core.types import Detection, DetectionList
+from fgtrack.pipeline.list_statistics import ListStatistics
+
+SECOND_NS = 10**9
+
+
+def statistics(*sizes: int) -> ListStatistics:
+    found = ListStatistics()
+    for number, size in enumerate(sizes):
+        objects = [Detection(x_m=10.0 * number, y_m=float(k + number % 2)) for k in range(size)]
+        found.add(DetectionList("any", number, number, objects))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("sizes", "scans"),
+    [([1] * 20, False), ([1] * 18 + [2] * 2, False), ([1] * 19 + [0], True), ([1, 2] * 10, True), ([1] * 9, True)],
+)
+def test_lists_of_one_object_are_no_scans_unless_one_is_empty(sizes: list[int], scans: bool) -> None:
+    assert statistics(*sizes).scans == scans
+
+
+def test_clutter_is_at_most_as_dense_as_all_detections() -> None:
+    assert statistics(*[1] * 11).largest_clutter_per_m2 == pytest.approx(1.0 / 100.0)
+    assert statistics(*[1] * 9).largest_clutter_per_m2 == math.inf
+    on_a_line = ListStatistics()
+    for k in range(20):
+        on_a_line.add(DetectionList("any", k, k, [Detection(range_m=float(k), bearing_rad=0.0)]))
+    assert on_a_line.largest_clutter_per_m2 == math.inf
+
+
+def reports() -> list[DetectionList]:
+    """Six aircraft that report every 10 s, each in a list of its own, for two minutes."""
+    found = []
+    for k in range(72):
+        number, at_s = k % 6, k * 10.0 / 6.0
+        x_m, y_m = 30e3 * number + 200.0 * at_s, 20e3 * (number % 3) - 100.0 * at_s * (number % 2)
+        stamp_ns = SECOND_NS * 1000 + round(at_s * SECOND_NS)
+        found.append(DetectionList("adsb", stamp_ns, stamp_ns, [Detection(x_m=x_m, y_m=y_m)], frame="map"))
+    return found
+
+
+def test_objects_that_report_one_by_one_are_tracked_each_under_one_id() -> None:
+    run = fgtrack.replay(reports(), set={"clock.node_hz": 1.0})
+    assert run.config["sensors"]["adsb"]["scan"] is False
+    assert sum(run.updates["disposition"] == "birth") == 6
+    last = run.tracks["tick"] == run.tracks["tick"].max()
+    assert list(run.tracks["status"][last]) == ["confirmed"] * 6
+
+
+def test_a_scan_misses_what_it_lacks_whatever_the_recording_looks_like() -> None:
+    empty = replace(reports()[-1], stamp_ns=SECOND_NS * 1130, receipt_ns=SECOND_NS * 1130, objects=[])
+    run = fgtrack.replay([*reports(), empty], set={"clock.node_hz": 1.0})
+    assert run.config["sensors"]["adsb"]["scan"] is True
+    assert sum(run.updates["disposition"] == "birth") > 6
