@@ -26,9 +26,9 @@ class Birth(ABC):
     """An object is assumed as fast as the ego times this; 0 for traffic that has nothing to do with the ego."""
     yaw_std_rad: float = 0.5
     """Standard deviation of a yaw from the map."""
-    speed_std_mps: float = 50.0
-    """Standard deviation of a speed that is not measured. The default is that of all speeds from 0 to 90 m/s being
-    alike (90 / sqrt(3)): pedestrians, traffic and race cars; two positions make it irrelevant."""
+    speed_std_mps: float = 100.0
+    """Standard deviation of a speed that is not measured. The default excludes no vehicle: the gate of 3.7 standard
+    deviations passes airliners, race cars lie within one; a second position makes it irrelevant."""
     yaw_rate_std_radps: float = 0.5
     """Standard deviation of the yaw rate."""
     accel_std_mps2: float = 1.0

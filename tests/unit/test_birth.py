@@ -67,7 +67,7 @@ def test_a_measured_component_starts_with_its_own_deviation_or_a_fixed_one() -> 
     assert (measured.yaw_std_rad, measured.speed_std_mps) == pytest.approx((0.7, 0.7))
     assert measured.position_covariance == pytest.approx(POSITION_COVARIANCE)
     fixed = FixedBirth(along_std_m=2.0, across_std_m=0.5).prior(candidate, ROAD, EGO, ego_in_pit=False)
-    assert (fixed.yaw_std_rad, fixed.speed_std_mps) == (0.5, 50.0)
+    assert (fixed.yaw_std_rad, fixed.speed_std_mps) == (0.5, 100.0)
     turn = rotation(1.0)
     assert fixed.position_covariance == pytest.approx(turn @ np.diag([4.0, 0.25]) @ turn.T)
 

@@ -38,13 +38,15 @@ def test_clutter_is_at_most_as_dense_as_all_detections() -> None:
 
 
 def reports() -> list[DetectionList]:
-    """Six aircraft that report every 10 s, each in a list of its own, for two minutes."""
+    """Six aircraft that report position and velocity every 10 s, each in a list of its own, for two minutes."""
     found = []
     for k in range(72):
         number, at_s = k % 6, k * 10.0 / 6.0
-        x_m, y_m = 30e3 * number + 200.0 * at_s, 20e3 * (number % 3) - 100.0 * at_s * (number % 2)
+        south_mps = 100.0 * (number % 2)
+        x_m, y_m = 1e3 + 30e3 * number + 200.0 * at_s, 20e3 * (number % 3) - south_mps * at_s
+        velocity = {"yaw_rad": -math.atan2(south_mps, 200.0), "speed_mps": math.hypot(south_mps, 200.0)}
         stamp_ns = SECOND_NS * 1000 + round(at_s * SECOND_NS)
-        found.append(DetectionList("adsb", stamp_ns, stamp_ns, [Detection(x_m=x_m, y_m=y_m)], frame="map"))
+        found.append(DetectionList("adsb", stamp_ns, stamp_ns, [Detection(x_m=x_m, y_m=y_m, **velocity)], frame="map"))
     return found
 
 
