@@ -75,6 +75,9 @@ class ObjectBank(Generic[_E]):
         known = {track_id: state for track_id, state in states.items() if state is not None}
         if not known:
             return no_states(self._motion.dim)
+        if len(known) == 1:
+            [(track_id, state)] = known.items()
+            return StatesAt((track_id,), state.mean[None], state.covariance[None])
         means = np.array([state.mean for state in known.values()])
         return StatesAt(tuple(known), means, np.array([state.covariance for state in known.values()]))
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf
 from scipy.special import chdtri
 
 from fgtrack.core.types import FloatArray, TrackState
@@ -16,6 +17,10 @@ __all__ = ["IN_A_ROW", "RARE", "Divergence", "are_finite", "check_real", "faults
 
 _MOST = np.array([1e9, 1e9, 1e3, 1e5, 1e4, 1e6])
 """Largest x, y, yaw, speed, yaw rate and acceleration, in SI units: far beyond any vehicle on Earth."""
+_SMALL = float(_MOST.min()) ** 2
+"""Where the sum of all squares is below it, no entry is too large."""
+_FEW = 4
+"""So many matrices are factorised faster one by one."""
 _ROUNDING = 1e-9
 """So much less than 0 an eigenvalue of a correlation matrix may be: rounding, where an entry is known for certain."""
 _TINY = 1e-300
@@ -57,7 +62,8 @@ def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
     n = means.shape[1]
     if not 5 <= n <= len(_MOST) or covariances.shape[1:] != (n, n):
         raise ValueError(f"states have the shapes {means.shape} and {covariances.shape}")
-    if (np.abs(means) <= _MOST[:n]).all() and _are_covariances(covariances):
+    small = np.vdot(means, means) <= _SMALL or (np.abs(means) <= _MOST[:n]).all()
+    if small and _are_covariances(covariances):
         return {}
     each = ((row, _fault(mean, P)) for row, (mean, P) in enumerate(zip(means, covariances, strict=True)))
     return {row: fault for row, fault in each if fault is not None}
@@ -92,6 +98,8 @@ def _are_definite(covariances: FloatArray) -> bool:
     """True if all, shape (m, n, n), are finite and positive definite; their lower halves count."""
     if not math.isfinite(np.vdot(covariances, covariances)):
         return False
+    if len(covariances) <= _FEW:
+        return not any(dpotrf(P, lower=1)[1] for P in covariances)
     try:
         np.linalg.cholesky(covariances)
     except np.linalg.LinAlgError:
