@@ -75,7 +75,7 @@ def replay(
         say(f"assumed {assumption}")
     for result in results:
         what = "{estimator}, {detections_received} detections, {wall_s:.1f} s, digest {digest:.12}"
-        missed = f", {result.deadline_misses} deadlines missed" if result.deadline_misses else ""
+        missed = f", {result.deadline_misses} ticks slower than real time" if result.deadline_misses else ""
         say(f"{result.path}: {what.format_map(result.meta)}{missed}")
     for line in left_out(results[0].meta):  # the same of all
         say(line)

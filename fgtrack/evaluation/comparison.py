@@ -157,7 +157,8 @@ def _tracking(rows: Sequence[Row[Metrics]], found: Sequence[Contest], notes: Seq
         late = [
             f"{row.run} {row.of.deadlines.misses}/{row.of.deadlines.ticks}" for row in known if row.of.deadlines.misses
         ]
-        own.append(f"deadlines missed (ticks not done when the next one was due): {', '.join(late) or 'none'}")
+        if late:
+            own.append(f"slower than real time, on a machine that may have been busy (ticks late): {', '.join(late)}")
     title = "Tracking" + (" (errors: RMSE against truth)" if with_truth else "")
     return Table(title, columns, rows, notes=[*own, *notes])
 

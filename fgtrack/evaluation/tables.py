@@ -6,6 +6,7 @@ import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from html import escape
 from typing import Any, Generic, Literal, Self, TypeVar
 
 import numpy as np
@@ -25,6 +26,7 @@ NO_VALUE = "-"
 
 _MOST_DECIMALS = 5
 _WIDTH = 120  # of a table as text
+_MOST_SENTENCES = 10  # of the verdict in a repr
 _MARKDOWN = {"\\": r"\\", "|": r"\|", "<": r"\<"}
 _LATEX = {char: f"\\{char}" for char in "&%$#_{}"} | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _LATEX |= {"\\": r"\textbackslash{}", "±": r"$\pm$", "<": r"$<$", ">": r"$>$"}
@@ -172,7 +174,15 @@ class Table(RunTable):
         text = [f"### {_markdown(self.title)}", "", *(f"| {' | '.join(row)} |" for row in (head, rule, *cells)), ""]
         return "\n".join([*text, *(f"- {_markdown(note)}" for note in notes), *([""] if notes else [])])
 
-    _repr_markdown_ = to_markdown  # what a notebook shows
+    def _repr_html_(self) -> str:
+        """The table as a notebook shows it."""
+        shown = self._visible()
+        head = "".join(f"<th>{escape(_one_line(column.heading))}</th>" for column in shown)
+        cells = cell_rows(shown, lambda cell, bold: f"<td>{f'<b>{escape(cell)}</b>' if bold else escape(cell)}</td>")
+        rows = "".join(f"<tr>{''.join(row)}</tr>" for row in cells)
+        notes = "".join(f"<li>{escape(note)}</li>" for note in self._visible_notes())
+        table = f"<table><caption>{escape(self.title)}</caption><tr>{head}</tr>{rows}</table>"
+        return table + f"<ul>{notes}</ul>" * bool(notes)
 
     def to_latex(self) -> str:
         """A table environment with the rules of the package booktabs; notes as comments."""
@@ -240,10 +250,14 @@ class Tables(Mapping[str, Table]):
         return "\n".join(map(_text, parts))
 
     def __repr__(self) -> str:
-        return f"<Tables: {', '.join(self)}>"
+        filled = [name for name, table in self.items() if table.num_rows]
+        return "\n".join(
+            ["Tables", *(f"  {line}" for line in self.verdict[:_MOST_SENTENCES]), f"  {', '.join(filled)}"]
+        )
 
-    def _repr_markdown_(self) -> str:
-        return self.to_markdown()
+    def _repr_html_(self) -> str:
+        verdict = "".join(f"<li>{escape(printable(line))}</li>" for line in self.verdict)
+        return f"<ul>{verdict}</ul>" * bool(verdict) + "".join(table._repr_html_() for table in self._filled())
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield from bulleted(self.verdict, options.max_width)

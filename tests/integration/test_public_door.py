@@ -3,6 +3,7 @@
 import ast
 import inspect
 import pydoc
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -167,3 +168,19 @@ def test_numbers_of_numpy_are_numbers() -> None:
         assert tracker.config.association.gate_m == 4.0
     with pytest.raises(fgtrack.CallError, match=r"^set: only plain values can be set"):
         fgtrack.Tracker.from_config("smoother", set={"association.gate_m": object()})
+
+
+def test_a_run_and_a_comparison_show_themselves_in_a_few_lines(drive: Path, tmp_path: Path) -> None:
+    run = fgtrack.load_run(drive / "runs/x")
+    tables = fgtrack.compare(run)
+    for one in (run, tables):
+        lines = repr(one).splitlines()
+        assert 3 <= len(lines) <= 12
+        assert max(map(len, lines)) < 300
+    assert "estimator: smoother" in repr(run)
+    assert run.meta["digest"] in run._repr_html_()
+    strange = shutil.copytree(drive / "runs/x", tmp_path / "<b>&")
+    html = fgtrack.compare(strange)._repr_html_() + fgtrack.load_run(strange)._repr_html_()
+    assert "<b>&" not in html
+    assert "&lt;b&gt;&amp;" in html
+    assert html.count("<table>") == html.count("</table>") > 2

@@ -138,10 +138,10 @@ def test_streaming_is_asked_for(tmp_path: Path) -> None:
 def test_deadlines_and_load_come_from_the_times_and_the_node_period(tmp_path: Path) -> None:
     found = Deadlines.of(made(tmp_path / "run", [50, 10, 10, 0]))
     assert (found.period_s, found.ticks, found.misses) == (0.02, 60, 3)
-    line = "deadlines missed (ticks not done when the next one was due): "
+    line = "slower than real time, on a machine that may have been busy (ticks late): "
     missing, keeping = made(tmp_path / "late", [50, 10, 10, 0]), made(tmp_path / "timely", [1])
     assert f"{line}late (smoother) 3/60" in compare(missing, keeping)["tracking"].notes
-    assert f"{line}none" in compare(keeping)["tracking"].notes
+    assert not any("real time" in note for note in compare(keeping)["tracking"].notes)
     assert found.load == pytest.approx(0.07 / (59 * 0.02))
     assert found.latest_s == pytest.approx(0.05)
 

@@ -297,7 +297,7 @@ def test_what_is_printed_is_what_the_console_shows(tables: Tables) -> None:
     assert f"{tables}\n" == capture.get()
     assert str(tables["lag"]) in str(tables)
     assert str(tables["lag"].in_full()) in str(tables.in_full())
-    assert tables._repr_markdown_() == tables.to_markdown()
+    assert tables._repr_html_().count("<table>") == len(tables._filled())
     assert repr(tables) == f"<Tables: {', '.join(TABLES)}>"
 
 

@@ -20,6 +20,7 @@ LOCKED_EXTRAS = ("test", "dev", "docs")
 
 # Bound above because fgtrack builds on more than their documented interface, or they promise none yet.
 BOUND_ABOVE = {
+    "mcap",
     "gtsam",
     "numpy",
     "scipy",

@@ -2,10 +2,12 @@
 
 import csv
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
+from html import escape
 from itertools import islice
 from pathlib import Path
 from typing import Any, TextIO
@@ -16,6 +18,7 @@ from ruamel.yaml.error import YAMLError
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file, open_text, read_whole
+from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray
 from fgtrack.io.run.relied import check_config, check_meta
 from fgtrack.io.run.schema import COLUMNS, LARGEST_META_MB, OPTIONAL_TABLES, RUN_FORMAT
@@ -77,7 +80,12 @@ class Table(dict[str, Column]):
         return f"<Table of {self.num_rows} rows: {', '.join(self)}>"
 
 
-@dataclass(frozen=True)
+def _length_s(timing: Table) -> float:
+    now_ns = timing["now_ns"]
+    return (int(now_ns[-1]) - int(now_ns[0])) / NS_PER_S if len(now_ns) else 0.0
+
+
+@dataclass(frozen=True, repr=False)
 class Run:
     """A run as evaluation sees it."""
 
@@ -100,6 +108,27 @@ class Run:
     """Objects and regions at which a track is neither right nor false."""
     objects: Table = field(default_factory=lambda: Table({name: column(name, ()) for name in COLUMNS["objects"]}))
     """Class and size of the objects of tracks, as far as detections say them."""
+
+    def __repr__(self) -> str:
+        meta = self.meta
+        fates = Counter(self.updates["disposition"].tolist())
+        lines = {
+            "estimator": meta.get("estimator"),
+            "folder": self.path or "in memory",
+            "recording": (meta.get("input") or {}).get("path"),
+            "time": f"{self.timing.num_rows} ticks, {_length_s(self.timing):.1f} s",
+            "tracks": f"{len(np.unique(self.tracks['track_id']))}, {self.tracks.num_rows} states",
+            "detections": ", ".join(f"{count} {fate}" for fate, count in fates.most_common()),
+            "truth": f"{len(np.unique(self.truth['object_id']))} objects" if self.truth.num_rows else None,
+            "digest": meta.get("digest"),
+        }
+        return "\n".join(["Run", *(f"  {name}: {value}" for name, value in lines.items() if value)])
+
+    def _repr_html_(self) -> str:
+        _, *lines = repr(self).splitlines()
+        cells = (line.strip().split(": ", 1) for line in lines)
+        rows = (f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in cells)
+        return f"<table>{''.join(rows)}</table>"
 
     @property
     def config(self) -> Mapping[str, Any]:
