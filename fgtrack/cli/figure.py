@@ -42,10 +42,10 @@ def figure(
 
     Of runs: a late detection in close-up, the map, the way along the track, residuals, NEES and NIS, arrivals, delays,
     errors over time (bands where runs differ by their seed only) and against lag, time per tick. Of many objects or
-    runs the worst few. Of a sweep: its metrics over the grid, mean and standard error over the seeds.
+    runs the worst few. Of a sweep: its metrics over the grid, mean and 95 % interval over the seeds.
 
-    The close-up replays the recording up to the late detection that moved the present of the first run most; where the
-    recording is not there any more it is left out.
+    The close-up replays the recording up to a late detection that is typical of those that lower the error of the first
+    run's present; where the recording is not there any more it is left out.
     """
     one_file = out.suffix.lower() == ".pdf" and not out.is_dir()
     if out.suffix.lower() in (".png", ".svg") and not out.is_dir():

@@ -1,14 +1,15 @@
 """Close-ups of runs: which late detection to look at, and their recordings replayed up to it."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import seconds
-from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.io.run import Run, load_run, recording_of
+from fgtrack.core.types import FloatArray
+from fgtrack.io.run import Run, Table, load_run, recording_of
 from fgtrack.io.source import open_input
 from fgtrack.models.motion import CTRV
 from fgtrack.pipeline.build import build_tracker
@@ -26,8 +27,9 @@ def close_ups(
 ) -> list[CloseUp]:
     """One late detection in slow motion, in each of `runs`: its track before and after it was fused.
 
-    The detection is the one of the first run after which the present moved most, see `most_moved`. The recording is
-    replayed up to there for every run; `fgtrack.plot.close_up` draws the result.
+    The detection is a typical one of those that lower the error of the first run's present, see `chosen`; `rule` of
+    the result says by what rule. The recording is replayed up to there for every run; `fgtrack.plot.close_up` draws
+    the result.
 
     Parameters
     ----------
@@ -44,8 +46,8 @@ def close_ups(
         The first run fused no such detection, a run did not fuse it, or a recording is not there any more.
     """
     read = [run if isinstance(run, Run) else load_run(Path(run)) for run in runs]
-    arrival = most_moved(read[0], track_id, stamp_ns)
-    return [close_up_of(run, arrival) for run in read]
+    arrival, rule = chosen(read, track_id, stamp_ns)
+    return [replace(close_up_of(run, arrival), rule=rule) for run in read]
 
 
 def close_up_of(run: Run, arrival: Arrival) -> CloseUp:
@@ -69,63 +71,101 @@ def close_up_of(run: Run, arrival: Arrival) -> CloseUp:
         raise DataError(f"{error}, so no close-up") from error
 
 
-def most_moved(run: Run, track_id: int | None = None, stamp_ns: int | None = None) -> Arrival:
-    """The out-of-sequence detection after which the present state of its track moved most.
+@dataclass(frozen=True)
+class _Late:
+    """A late detection that its track fused by itself: what it did to the present of one run."""
 
-    Moved is the distance from where the state of the tick before would be by now. Ticks at which a track fused several
-    detections, and tracks with fewer than twenty, are left out.
+    stamp_ns: int
+    track_id: int
+    moved_m: float
+    """From where the tick before it expected the present."""
+    errors_m: tuple[float, float]
+    """Of the present before and after it; NaN without truth."""
+
+
+def chosen(runs: Sequence[Run], track_id: int | None = None, stamp_ns: int | None = None) -> tuple[Arrival, str]:
+    """Return a typical out-of-sequence detection that every run fused, and a sentence with the rule of the choice.
+
+    Of those that lower the error of the first run's present, it is the one with errors nearest to their root mean
+    squares: before it in the first run, after it in all of them; nearest is the largest of the ratios. Without truth
+    it is the one that moves the present by the median. Ticks at which a track fused several detections, and tracks
+    with fewer than twenty, are left out.
 
     Parameters
     ----------
-    run
-        The run.
+    runs
+        Runs of one recording.
     track_id
-        Only detections that this track fused; None for any.
+        Only detections that this track of the first run fused; None for any.
     stamp_ns
-        The detection with the stamp nearest to this one, in place of that which moved most.
+        Choose the detection with the stamp nearest to this one instead.
 
     Raises
     ------
     DataError
-        The run has no such detection.
+        The runs have no such detection.
     """
-    updates = run.updates
-    late = updates["disposition"] == "out_of_sequence"
-    if track_id is not None:
-        late &= updates["track_id"] == track_id
+    first, *others = (_late_detections(run) for run in runs)
+    common = [one for one in first if all(one in other for other in others)]
+    common = [one for one in common if track_id is None or first[one].track_id == track_id]
+    if not common:
+        where, of = runs[0].path or "the run", "" if track_id is None else f" of track {track_id}"
+        if track_id is not None and track_id not in runs[0].tracks["track_id"]:
+            raise DataError(f"{where}: has no track {track_id}")
+        raise DataError(
+            f"{where}: no late detection{of} was fused by itself after {_SETTLED} others, so there is no close-up"
+        )
+    if stamp_ns is not None:
+        return min(common, key=lambda one: abs(one.stamp_ns - stamp_ns)), "Chosen by its stamp."
+    errors_m = np.array([[*first[one].errors_m, *(late[one].errors_m[1] for late in others)] for one in common])
+    lowered = errors_m[:, 1] < errors_m[:, 0]
+    if not lowered.any():
+        moved_m = np.array([first[one].moved_m for one in common])
+        row = int(np.abs(moved_m - np.median(moved_m)).argmin())
+        return common[row], f"Of {len(common)} late detections, the one that moves the present by the median."
+    rms_m = np.sqrt(np.nanmean(errors_m[lowered] ** 2, axis=0))
+    with np.errstate(divide="ignore"):
+        apart = np.abs(np.log(errors_m / rms_m)).max(axis=1)
+    row = int(np.where(lowered & np.isfinite(apart), apart, np.inf).argmin())
+    share = 100.0 * float(lowered.mean())
+    rms_all_m = np.sqrt(np.nanmean(errors_m[:, :2] ** 2, axis=0))
+    return common[row], (
+        f"{share:.0f} % of {len(common)} late detections lower the error of the present; this one is nearest to their "
+        f"root mean square ({rms_m[0]:.2f} to {rms_m[1]:.2f} m; of all {rms_all_m[0]:.2f} to {rms_all_m[1]:.2f} m)."
+    )
+
+
+def _late_detections(run: Run) -> dict[Arrival, _Late]:
+    updates, tracks = run.updates, run.tracks
     used = np.isin(updates["disposition"], ("in_sequence", "out_of_sequence", "beyond_window"))
     pairs = np.stack([updates["tick"], updates["track_id"]], axis=-1)
     _, group, sizes = np.unique(pairs[used], axis=0, return_inverse=True, return_counts=True)
     alone = np.zeros(len(used), dtype=bool)
     alone[used] = sizes[group.reshape(-1)] == 1
-    rows = np.flatnonzero(late & alone)
-    moved_m = _moved_m(run, pairs[rows])
-    rows, moved_m = rows[np.isfinite(moved_m)], moved_m[np.isfinite(moved_m)]
-    if not len(rows):
-        where, of = run.path or "the run", "" if track_id is None else f" of track {track_id}"
-        if track_id is not None and track_id not in run.tracks["track_id"]:
-            raise DataError(f"{where}: has no track {track_id}")
-        raise DataError(
-            f"{where}: no late detection{of} was fused by itself after {_SETTLED} others, so there is no close-up"
-        )
-    row = rows[moved_m.argmax() if stamp_ns is None else np.abs(updates["stamp_ns"][rows] - stamp_ns).argmin()]
-    found = (int(updates[name][row]) for name in ("stamp_ns", "receipt_ns", "index"))
-    return Arrival(str(updates["sensor"][row]), *found)
-
-
-def _moved_m(run: Run, wanted: IntArray) -> FloatArray:
-    """By how much each of `wanted` (n, 2), ticks and tracks, moved against the tick before; NaN where unknown, (n,)."""
-    tracks = run.tracks
-    order = np.lexsort((tracks["tick"], tracks["track_id"]))
-    keys = np.stack([tracks["tick"], tracks["track_id"]], axis=-1)[order]
-    states = np.stack([tracks[name] for name in _STATE], axis=-1)[order]
-    settled = tracks["num_measured"][order] >= _SETTLED
-    index = {key: row for row, key in enumerate(map(tuple, keys.tolist()))}
-    found = np.full(len(wanted), np.nan)
-    now_ns, motion = tracks["now_ns"][order], CTRV()
-    for place, (tick, track) in enumerate(wanted.tolist()):
-        row = index.get((tick, track))
-        if row is not None and row and settled[row] and keys[row - 1, 1] == track:
-            expected = motion.predict(states[row - 1], seconds(int(now_ns[row] - now_ns[row - 1])))
-            found[place] = np.hypot(*(states[row, :2] - expected[:2]))
+    index = {key: row for row, key in enumerate(zip(tracks["track_id"].tolist(), tracks["tick"].tolist(), strict=True))}
+    states, motion = np.stack([tracks[name] for name in _STATE], axis=-1), CTRV()
+    found: dict[Arrival, _Late] = {}
+    for update in np.flatnonzero(alone & (updates["disposition"] == "out_of_sequence")).tolist():
+        tick, track_id = pairs[update].tolist()
+        row, before = index.get((track_id, tick)), index.get((track_id, tick - 1))
+        if row is None or before is None or tracks["num_measured"][row] < _SETTLED:
+            continue
+        now_ns = int(tracks["now_ns"][row])
+        expected_m = motion.predict(states[before], seconds(now_ns - int(tracks["now_ns"][before])))[:2]
+        true_m = _true_m(run.truth, now_ns, states[row, :2])
+        errors_m = tuple(float(np.hypot(*(at_m - true_m))) for at_m in (expected_m, states[row, :2]))
+        stamp_ns, receipt_ns, place = (int(updates[name][update]) for name in ("stamp_ns", "receipt_ns", "index"))
+        arrival = Arrival(str(updates["sensor"][update]), stamp_ns, receipt_ns, place)
+        moved_m = float(np.hypot(*(states[row, :2] - expected_m)))
+        found[arrival] = _Late(stamp_ns, track_id, moved_m, (errors_m[0], errors_m[1]))
     return found
+
+
+def _true_m(truth: Table, now_ns: int, near_m: FloatArray) -> FloatArray:
+    """Position of the true object nearest to `near_m`, shape (2,); NaN where none is known."""
+    found = [np.full(2, np.nan)]
+    for object_id in np.unique(truth["object_id"]).tolist():
+        own = truth.where(truth["object_id"] == object_id)
+        since_ns = (own["stamp_ns"] - now_ns).astype(np.float64)  # differences are exact as floats
+        found.append(np.array([np.interp(0.0, since_ns, own[name], np.nan, np.nan) for name in ("x_m", "y_m")]))
+    return min(found, key=lambda at_m: float(np.nan_to_num(np.hypot(*(at_m - near_m)), nan=np.inf)))

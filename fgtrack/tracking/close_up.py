@@ -14,9 +14,10 @@ from fgtrack.tracking.inbox import Batch
 from fgtrack.tracking.preprocess import Candidate, Preprocess
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
-BACK_S = 0.1
+BACK_S = 0.15
 """How long before the detection the states begin."""
-STEP_S = 0.005
+STEP_S = 0.01
+"""Between states; that of the grid of the backward-forward EKF, whose states are held in between."""
 _FUSED = (Disposition.IN_SEQUENCE, Disposition.OUT_OF_SEQUENCE, Disposition.BEYOND_WINDOW)
 
 
@@ -43,8 +44,8 @@ class Arrival:
 
 
 @dataclass(frozen=True)
-class Believed:
-    """What a tracker holds of one track at several stamps."""
+class Estimates:
+    """Estimates of one track at several stamps."""
 
     stamps_ns: IntArray
     """Rising, shape (m,); the last one is the present."""
@@ -54,7 +55,7 @@ class Believed:
     """Shape (m, n, n)."""
 
     def at(self, stamp_ns: int) -> int:
-        """Place of the stamp nearest to `stamp_ns`."""
+        """Row of the stamp nearest to `stamp_ns`."""
         return int(np.abs(self.stamps_ns - stamp_ns).argmin())
 
 
@@ -70,10 +71,12 @@ class CloseUp:
     """Where the detection says that the object is, in the map, shape (2,)."""
     position_covariance: FloatArray
     """Shape (2, 2)."""
-    before: Believed
-    after: Believed
+    before: Estimates
+    after: Estimates
     fused: tuple[UpdateRecord, ...]
     """What the track had fused from `BACK_S` before the detection on, without it, by rising stamp."""
+    rule: str = ""
+    """By what rule the detection was chosen, in a sentence."""
 
 
 def close_up(
@@ -116,7 +119,7 @@ def close_up(
             continue
         start_ns = arrival.stamp_ns - nanoseconds(BACK_S)
         span_ns = start_ns, arrival.stamp_ns, now_ns
-        before = {one.track_id: _believed(tracker, one.track_id, *span_ns) for one in report.tracks}
+        before = {one.track_id: _estimates(tracker, one.track_id, *span_ns) for one in report.tracks}
         tracker.receive(messages[place])
         found = [
             one for one in tracker.tick(now_ns).updates if (one.sensor, one.index) == (arrival.sensor, arrival.index)
@@ -135,7 +138,7 @@ def close_up(
             candidate.position_m,
             candidate.position_covariance,
             before[taken.track_id],
-            _believed(tracker, taken.track_id, *span_ns),
+            _estimates(tracker, taken.track_id, *span_ns),
             tuple(sorted(fused, key=lambda one: one.stamp_ns)),
         )
     raise DataError(f"{arrival}: there is no such list")
@@ -159,7 +162,7 @@ class _Watched(Preprocess):
         return candidates, records
 
 
-def _believed(tracker: Tracker, track_id: int, start_ns: int, sensed_ns: int, now_ns: int) -> Believed:
+def _estimates(tracker: Tracker, track_id: int, start_ns: int, sensed_ns: int, now_ns: int) -> Estimates:
     """States every `STEP_S` from `start_ns`, or where the track's window begins, to `now_ns`, and at `sensed_ns`."""
     found = []
     for stamp_ns in sorted({*range(now_ns, start_ns - 1, -nanoseconds(STEP_S)), sensed_ns}, reverse=True):
@@ -169,4 +172,4 @@ def _believed(tracker: Tracker, track_id: int, start_ns: int, sensed_ns: int, no
             break
     found.reverse()
     stamps_ns = np.array([state.stamp_ns for state in found], dtype=np.int64)
-    return Believed(stamps_ns, np.array([state.mean for state in found]), np.array([s.covariance for s in found]))
+    return Estimates(stamps_ns, np.array([state.mean for state in found]), np.array([s.covariance for s in found]))

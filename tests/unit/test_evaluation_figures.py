@@ -71,7 +71,7 @@ EXPECTED: dict[str, tuple[bool, set[str], list[str]]] = {
     "lag": (
         True,
         {"position RMSE [m]", "lag of the output [s]"},
-        ["smoother", "ekf-replay (no lag)", "present states at the stamps of the lagged ones"],
+        ["smoother", "ekf-replay (no lag)", "present, at the same stamps"],
     ),
     "timing": (
         True,

@@ -187,7 +187,7 @@ def test_the_figure_has_a_line_per_run_and_a_level_one_for_a_filter(tmp_path: Pa
     assert [text.get_text() for text in legend.get_texts()] == [
         "smoother",
         "ekf-replay (no lag)",
-        "present states at the stamps of the lagged ones",
+        "present, at the same stamps",
     ]
     lines = {str(line.get_label()): line for line in speed.lines}
     assert np.asarray(lines["smoother"].get_xdata()).tolist() == [0.0, 0.1, 0.2]

@@ -1,39 +1,39 @@
-"""The figure of one late detection: the past that it corrects, and the present that follows from it."""
+"""The figure of one late detection: where it comes in, and what it does to the errors of past and present."""
 
-import math
-from collections.abc import Callable, Sequence
+import textwrap
+from collections.abc import Mapping, Sequence
 from typing import Unpack
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
+from matplotlib.patches import Circle
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import rotation
-from fgtrack.core.linalg import congruence
-from fgtrack.core.time import NS_PER_S, seconds
+from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import YAW, FloatArray, IntArray
-from fgtrack.evaluation.figures.paper import Paper, styled
-from fgtrack.evaluation.figures.style import GREY, StyledFigure, colour
-from fgtrack.evaluation.palette import PALETTE
+from fgtrack.evaluation.figures.paper import Paper, Sheet, is_column, styled
+from fgtrack.evaluation.figures.style import GREY, legend_above, run_looks
+from fgtrack.evaluation.palette import Look
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged
 from fgtrack.evaluation.truth import true_paths
-from fgtrack.evaluation.viewer.ellipse import AROUND_95, ellipses
-from fgtrack.tracking.close_up import CloseUp
+from fgtrack.tracking.close_up import STEP_S, CloseUp, Estimates
 
-_WIDTH_IN = 10.0
-_AROUND_M = 1.0
 _FORGET = ("ekf-backward-forward", "rewind-forget", "backward-forward")
-_SINCE = "fused since it was sensed"
+_RING_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+_MS = NS_PER_S / 1e3
+_STAMP = "stamp relative to now [ms]"
 
 
 @styled
 def close_up(runs: Runs, close_ups: Sequence[CloseUp], **paper: Unpack[Paper]) -> Figure:
-    """A late detection and what it does to a track, one panel for each run, and the factor graph around it.
+    """A late detection and what it does to the estimates of each run.
 
-    Panels have the direction of travel to the right, in true proportion. Ellipses hold 95 %.
+    Above, for each run, the present seen from the true position, in the direction of travel to the right: nearer to
+    the centre is better. Below the error of the estimates at the stamps up to now, before the detection arrived (grey)
+    and after it. In a column of a paper all errors are in one plot. Without truth the estimate of the first run
+    afterwards takes its role.
 
     Parameters
     ----------
@@ -41,6 +41,8 @@ def close_up(runs: Runs, close_ups: Sequence[CloseUp], **paper: Unpack[Paper]) -
         The runs.
     close_ups
         That of each run, of the same detection: `fgtrack.close_ups`.
+    **paper
+        `width`, `font`, `style`, `ax`.
 
     Raises
     ------
@@ -50,159 +52,132 @@ def close_up(runs: Runs, close_ups: Sequence[CloseUp], **paper: Unpack[Paper]) -
     every = judged(runs)
     if len(every) != len(close_ups) or len({one.arrival for one in close_ups}) != 1:
         raise CallError(f"{len(every)} runs need as many close-ups of one detection")
-    view = _View(close_ups)
-    heights = [view.height_in + 0.5] * len(every) + [2.1]
-    figure = StyledFigure(figsize=(_WIDTH_IN, sum(heights) + 1.0))
-    *panels, graph = figure.subplots(len(heights), 1, height_ratios=heights)
-    for place, (axes, run, one) in enumerate(zip(panels, every, close_ups, strict=True)):
-        _draw_panel(axes, view, run, one, colour(place))
-    for axes in panels[:-1]:
-        axes.tick_params(labelbottom=False)
-    panels[-1].set_xlabel("along the direction of travel [m]; ellipses hold 95 %")
-    panels[len(panels) // 2].set_ylabel("across [m]")
-    _draw_graph(graph, close_ups[0])
-    late_ms = 1e3 * seconds(view.now_ns - view.arrival.stamp_ns)
-    figure.suptitle(
-        f"A {view.arrival.sensor} detection, sensed {late_ms:.0f} ms ago, arrives now. It corrects the state where it "
-        "was sensed,\nand all that follows up to now: dashed what was believed before, solid what is believed after."
-    )
-    entries: dict[str, Artist] = {}
-    for axes in (*panels, graph):
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
-    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=4, frameon=False)
-    return figure
+    view = _View(every, close_ups)
+    styles = run_looks(every)
+    if is_column(paper):
+        return _errors_in_one(every, close_ups, view, styles, Sheet(7.0, 4.2, paper))
+    sheet = Sheet(max(9.0, 3.0 * len(every)), 7.4, paper)
+    rows = sheet.plots(2, len(every), heights=(1.35, 1.0))
+    for column, (run, one) in enumerate(zip(every, close_ups, strict=True)):
+        colour = styles[run.label].colour
+        _draw_present(rows[0, column], view, run, one, colour)
+        _draw_errors(rows[1, column], view, run, one, colour)
+        for axes in rows[:, column]:
+            axes.tick_params(labelleft=not column)
+    rows[0, 0].set_ylabel("to the left [m]")
+    rows[1, 0].set_ylabel(view.quantity)
+    first = close_ups[0]
+    late_ms = (first.now_ns - first.arrival.stamp_ns) / _MS
+    sensor = first.arrival.sensor.replace("_", " ")
+    sheet.title(f"A {sensor} detection arrives {late_ms:.0f} ms late: nearer to the centre is better")
+    sheet.caption("\n".join(textwrap.wrap(first.rule, int(17 * sheet.figure.get_figwidth()))))
+    return sheet.figure
+
+
+def _errors_in_one(
+    runs: Sequence[JudgedRun], close_ups: Sequence[CloseUp], view: "_View", styles: Mapping[str, Look], sheet: Sheet
+) -> Figure:
+    """The errors of all runs in one plot: thin dotted before, after in the line of the estimator."""
+    axes: Axes = sheet.plots()[0, 0]
+    for run, one in zip(runs, close_ups, strict=True):
+        its = styles[run.label]
+        before, after = (view.errors(each, one.now_ns) for each in (one.before, one.after))
+        axes.plot(*before, color=its.colour, ls=":", lw=0.9)
+        label = f"{run.label}: {before[1][-1]:.2f} m before, {after[1][-1]:.2f} m after"
+        axes.plot(*after, color=its.colour, ls=its.line, lw=1.5, label=label)
+    axes.axvline((close_ups[0].arrival.stamp_ns - close_ups[0].now_ns) / _MS, color="black", lw=0.8)
+    axes.set(xlabel=_STAMP, ylabel=view.quantity, ylim=(0.0, 1.05 * view.highest_m))
+    legend_above(axes)
+    return sheet.figure
 
 
 class _View:
-    """The frame of all panels: origin where the detection was sensed, first axis along the direction of travel."""
+    """The reference of all panels: the true path, or that of the first run; first axis in the direction of travel."""
 
-    def __init__(self, close_ups: Sequence[CloseUp]) -> None:
-        first = close_ups[0]
-        self.arrival, self.now_ns = first.arrival, first.now_ns
-        state = first.after.means[first.after.at(self.arrival.stamp_ns)]
-        self.origin_m: FloatArray = state[:2]
-        self.turn = rotation(-float(state[YAW]))
-        shown = np.concatenate([self.seen(b.means[:, :2]) for one in close_ups for b in (one.before, one.after)])
-        reach_m = max(_reach_m(b.covariances) for one in close_ups for b in (one.before, one.after))
-        across_m = float(np.abs(shown[:, 1]).max()) + reach_m
-        detection_m = float(np.abs(self.seen(first.position_m)[1]))
-        self.across_m = max(across_m, detection_m) + 0.3
-        self.along_m = float(shown[:, 0].min()) - _AROUND_M, float(shown[:, 0].max()) + reach_m + _AROUND_M
-        self.height_in = 0.9 * _WIDTH_IN * 2.0 * self.across_m / (self.along_m[1] - self.along_m[0])
-
-    def seen(self, positions_m: FloatArray) -> FloatArray:
-        """Positions in the map, shape (..., 2), in the frame of the panels."""
-        return np.asarray((positions_m - self.origin_m) @ self.turn.T)
-
-    def ellipse(self, position_m: FloatArray, covariance: FloatArray) -> Ellipse:
-        """The 95 % ellipse of a position."""
-        turned = congruence(self.turn, covariance[:2, :2])
-        ((long_m, short_m, direction_rad),) = ellipses(turned[None], AROUND_95).tolist()
-        return Ellipse(tuple(self.seen(position_m[:2])), long_m, short_m, angle=math.degrees(direction_rad), fill=False)
-
-
-def _reach_m(covariances: FloatArray) -> float:
-    """How far the longest of the 95 % ellipses reaches from its middle."""
-    return float(ellipses(covariances[:, :2, :2], AROUND_95)[:, 0].max()) / 2.0
-
-
-def _draw_panel(axes: Axes, view: _View, run: JudgedRun, one: CloseUp, color: str) -> None:
-    arrival, stamp_ns = one.arrival, one.arrival.stamp_ns
-    true_m = _true_m(run, one)
-    if true_m is not None:
-        axes.plot(*view.seen(true_m(one.after.stamps_ns)).T, color="#cccccc", lw=7.0, label="truth", zorder=1)
-    for believed, style, shade, label in (
-        (one.before, "--", GREY, "believed before"),
-        (one.after, "-", color, "believed after"),
-    ):
-        axes.plot(*view.seen(believed.means[:, :2]).T, style, color=shade, lw=1.6, label=label, zorder=3)
-        for at_ns in (stamp_ns, one.now_ns):
-            place = believed.at(at_ns)
-            ring = view.ellipse(believed.means[place], believed.covariances[place])
-            ring.set(edgecolor=shade, linestyle=style, linewidth=1.1, zorder=3)
-            axes.add_patch(ring)
-            axes.plot(*view.seen(believed.means[place, :2]), "o", color=shade, ms=4.5, zorder=5)
-    _draw_fused(axes, view, run, one)
-    ring = view.ellipse(one.position_m, one.position_covariance)
-    ring.set(edgecolor="black", linestyle=":", linewidth=1.0)
-    axes.add_patch(ring)
-    axes.plot(*view.seen(one.position_m), "kx", ms=9, mew=2.2, label=f"late {arrival.sensor} detection", zorder=6)
-    start, end = (view.seen(b.means[-1, :2]) for b in (one.before, one.after))
-    axes.annotate("", tuple(end), tuple(start), arrowprops={"arrowstyle": "-|>", "color": "black", "lw": 1.2}, zorder=7)
-    moved_m = float(np.linalg.norm(end - start))
-    text = f"{run.label}: the present moves by {moved_m:.2f} m"
-    if true_m is not None:
-        errors = [np.linalg.norm(b.means[-1, :2] - true_m(b.stamps_ns[-1:])[0]) for b in (one.before, one.after)]
-        text += f"; its error was {errors[0]:.2f} m and is {errors[1]:.2f} m"
-    axes.set_title(text, loc="left")
-    axes.set(xlim=view.along_m, ylim=(-view.across_m, view.across_m), aspect="equal")
-    for at_ns, name in ((stamp_ns, "sensed"), (one.now_ns, "now")):
-        along_m = view.seen(one.after.means[one.after.at(at_ns), :2])[0]
-        axes.annotate(name, (along_m, -view.across_m), (0, 3), textcoords="offset points", ha="center", fontsize=8)
-
-
-def _draw_fused(axes: Axes, view: _View, run: JudgedRun, one: CloseUp) -> None:
-    """What had been fused since the detection was sensed, on the path believed before; crossed out if now lost."""
-    since = [record for record in one.fused if record.stamp_ns > one.arrival.stamp_ns]
-    if not since:
-        return
-    places = [one.before.at(record.stamp_ns) for record in since]
-    points = view.seen(one.before.means[places, :2]).T
-    axes.plot(*points, "^", color=PALETTE[3], ms=8, label=_SINCE, zorder=5)
-    if run.run.meta.get("estimator") in _FORGET:
-        axes.plot(*points, "x", color="black", ms=14, mew=1.2, label="... and forgotten by this method", zorder=4)
-
-
-def _true_m(run: JudgedRun, one: CloseUp) -> Callable[[IntArray], FloatArray] | None:
-    """Position of the true object nearest to the track now, as a function of stamps; None without truth."""
-    now = np.array([one.now_ns])
-    paths = [path for path in true_paths(run.run.truth) if np.isfinite(path.at(now)[0, 0])]
-    if not paths:
-        return None
-    nearest = min(paths, key=lambda path: float(np.linalg.norm(path.at(now)[0, :2] - one.after.means[-1, :2])))
-    return lambda stamps_ns: nearest.at(stamps_ns)[:, :2]
-
-
-def _draw_graph(axes: Axes, one: CloseUp) -> None:
-    """The factor graph around the detection before (above) and after (below) its state is inserted."""
-    sensors = sorted({record.sensor for record in one.fused} | {one.arrival.sensor})
-    others = [(record.stamp_ns, record.sensor) for record in one.fused]
-    late = (one.arrival.stamp_ns, one.arrival.sensor)
-    for row, factors, name in ((1.0, others, "before"), (0.0, sorted([*others, late]), "after")):
-        nodes_ms = _ms(np.unique([stamp_ns for stamp_ns, _ in factors]), one.now_ns)
-        axes.plot(nodes_ms, np.full(len(nodes_ms), row), color=GREY, lw=1.2, zorder=1)
-        middles_ms = (nodes_ms[1:] + nodes_ms[:-1]) / 2.0
-        axes.plot(middles_ms, np.full(len(middles_ms), row), "s", color="black", ms=4, zorder=2, label="motion factor")
-        axes.plot(
-            *(nodes_ms, np.full(len(nodes_ms), row)), "o", ms=10, mfc="white", mec="black", zorder=3, label="state"
+    def __init__(self, runs: Sequence[JudgedRun], close_ups: Sequence[CloseUp]) -> None:
+        one = close_ups[0]
+        self._turn = rotation(-float(one.after.means[-1, YAW]))
+        now_ns = np.array([one.now_ns])
+        paths = [path for path in true_paths(runs[0].run.truth) if np.isfinite(path.at(now_ns)[0, 0])]
+        self._path = min(
+            paths, key=lambda path: float(np.hypot(*(path.at(now_ns)[0, :2] - one.after.means[-1, :2]))), default=None
         )
-        for place, sensor in enumerate(sensors):
-            at_ms = _ms(np.array([stamp_ns for stamp_ns, of in factors if of == sensor], dtype=np.int64), one.now_ns)
-            axes.vlines(at_ms, row, row + 0.36, color=GREY, lw=0.8, zorder=1)
-            label = f"{sensor} factor"
-            axes.plot(
-                at_ms, np.full(len(at_ms), row + 0.36), "s", color=PALETTE[2 + place], ms=7, label=label, zorder=3
-            )
-        axes.annotate(
-            name,
-            (0.0, row),
-            (-2, 0),
-            xycoords=("axes fraction", "data"),
-            textcoords="offset points",
-            ha="right",
-            va="center",
-            fontsize=9,
+        self._instead = one.after
+        self.has_truth = self._path is not None
+        self.quantity = "position error [m]" if self.has_truth else f"distance to {runs[0].label}\nafterwards [m]"
+        reach_m = max(float(np.abs(self.off(each)[-1]).max()) for c in close_ups for each in (c.before, c.after))
+        self.half_m = 1.25 * max(reach_m, 0.05)
+        self.highest_m = max(
+            float(self.errors(each, c.now_ns)[1].max()) for c in close_ups for each in (c.before, c.after)
         )
-    new_ms = _ms(np.array([late[0]]), one.now_ns)
-    axes.plot(new_ms, [0.0], "o", ms=15, mfc="none", mec=PALETTE[5], mew=2.0, zorder=4, label="new state")
-    axes.set(yticks=[], ylim=(-0.35, 1.6), xlabel="stamp before now [ms]")
-    axes.set_title(
-        "The factor graph of that moment: the motion factor across the new state is split in two", loc="left"
+
+    def off(self, estimates: Estimates) -> FloatArray:
+        """Return how far the estimates are ahead and to the left of the reference at their stamps, shape (m, 2)."""
+        return np.asarray((estimates.means[:, :2] - self._reference_m(estimates.stamps_ns)) @ self._turn.T)
+
+    def errors(self, estimates: Estimates, now_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Return stamps before now in ms, in steps of `STEP_S`, and the distances to the reference, shape (m,)."""
+        regular = (now_ns - estimates.stamps_ns) % nanoseconds(STEP_S) == 0
+        return (estimates.stamps_ns[regular] - now_ns) / _MS, np.hypot(*self.off(estimates)[regular].T)
+
+    def _reference_m(self, stamps_ns: IntArray) -> FloatArray:
+        if self._path is not None:
+            return self._path.at(stamps_ns)[:, :2]
+        known_ns = (self._instead.stamps_ns - stamps_ns[-1]).astype(np.float64)
+        wanted_ns = (stamps_ns - stamps_ns[-1]).astype(np.float64)
+        return np.stack([np.interp(wanted_ns, known_ns, self._instead.means[:, k]) for k in range(2)], axis=-1)
+
+
+def _draw_present(axes: Axes, view: _View, run: JudgedRun, one: CloseUp, colour: str) -> None:
+    """The present before and after, seen from where the car is."""
+    ring_m = max([each for each in _RING_M if each < 0.8 * view.half_m], default=0.5 * view.half_m)
+    for times in (1, 2, 3):
+        axes.add_patch(Circle((0.0, 0.0), times * ring_m, fill=False, ec="#d0d0d0", lw=0.8, zorder=1))
+    axes.plot(0.0, 0.0, "+", color="black", ms=12, mew=1.4, zorder=3)
+    axes.annotate(
+        "truth" if view.has_truth else "reference", (0.0, 0.0), (5, -11), textcoords="offset points", fontsize="small"
     )
+    before, after = (view.off(each)[-1] for each in (one.before, one.after))
+    for end, tint in ((before, GREY), (after, colour)):
+        axes.plot([0.0, end[0]], [0.0, end[1]], color=tint, lw=1.0, ls=":", zorder=3)
+    axes.annotate("", after, before, arrowprops={"arrowstyle": "-|>", "color": "black", "lw": 1.2}, zorder=4)
+    axes.plot(*before, "o", color=GREY, ms=8, mfc="white", mew=1.8, zorder=5)
+    axes.plot(*after, "o", color=colour, ms=9, zorder=6)
+    for end, word in ((before, "before"), (after, "after")):
+        axes.annotate(word, end, (0, 8), textcoords="offset points", ha="center", fontsize="small", zorder=7)
+    lengths_m = [float(np.hypot(*each)) for each in (before, after)]
+    axes.set_title(f"{run.label}\n{lengths_m[0]:.2f} m before, {lengths_m[1]:.2f} m after", color=colour, loc="left")
+    axes.set(
+        xlim=(-view.half_m, view.half_m),
+        ylim=(-view.half_m, view.half_m),
+        xlabel="ahead [m]",
+    )
+    axes.set_aspect("equal")
     axes.grid(visible=False)
-    axes.spines["left"].set_visible(False)
 
 
-def _ms(stamps_ns: IntArray, now_ns: int) -> FloatArray:
-    return np.asarray((stamps_ns - now_ns) / (NS_PER_S / 1e3))
+def _draw_errors(axes: Axes, view: _View, run: JudgedRun, one: CloseUp, colour: str) -> None:
+    """Errors at the stamps up to now, before and after; at the bottom what was fused since that of the detection."""
+    before, after = (view.errors(each, one.now_ns) for each in (one.before, one.after))
+    axes.plot(*before, color=GREY, ls="--", lw=1.4, label="before it arrives")
+    axes.plot(*after, color=colour, lw=1.8, label="after")
+    at_ms, error_m = after
+    was_m = np.interp(at_ms, *before)
+    axes.fill_between(at_ms, error_m, was_m, where=error_m <= was_m, color=colour, alpha=0.18, lw=0)
+    late_ms = (one.arrival.stamp_ns - one.now_ns) / _MS
+    axes.axvline(late_ms, ymax=0.66, color="black", lw=0.9)
+    axes.plot(
+        late_ms, 0.0, "x", color="black", ms=8, mew=2.0, clip_on=False, zorder=6, label="late detection: its stamp"
+    )
+    since_ms = np.array(
+        [(each.stamp_ns - one.now_ns) / _MS for each in one.fused if each.stamp_ns > one.arrival.stamp_ns]
+    )
+    forgets = run.run.meta.get("estimator") in _FORGET
+    if len(since_ms):
+        label = "fused meanwhile, now forgotten" if forgets else "fused meanwhile, kept"
+        face = "white" if forgets else "black"
+        axes.plot(
+            since_ms, np.zeros(len(since_ms)), "^", color="black", mfc=face, ms=7, clip_on=False, zorder=6, label=label
+        )
+    axes.set(xlabel=_STAMP, ylim=(0.0, 1.6 * view.highest_m))
+    axes.legend(loc="upper left", frameon=False, handlelength=1.6, borderaxespad=0.1, labelspacing=0.2)

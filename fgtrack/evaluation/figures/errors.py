@@ -189,7 +189,7 @@ def lag(runs: Runs, quantity: str = "position_m", **paper: Unpack[Paper]) -> Fig
                     rmse[0], color=its.colour, ls=its.line, lw=width, label=f"{label} (no lag)" if label else ""
                 )
     if has_lags:
-        axes.plot([], [], color="black", ls=":", lw=0.8, label="present states at the stamps of the lagged ones")
+        axes.plot([], [], color="black", ls=":", lw=0.8, label="present, at the same stamps")
     axes.set(xlabel="lag of the output [s]", ylabel=f"{what} RMSE [{unit}]")
     axes.set_ylim(0.0, 1.08 * axes.dataLim.y1 or 1.0)
     legend_above(axes)

@@ -109,6 +109,11 @@ def styled(function: Callable[P, T]) -> Callable[P, T]:
     return run
 
 
+def is_column(paper: Mapping[str, Any]) -> bool:
+    """True if the figure is as narrow as a column. Raises `CallError` as `inches`."""
+    return "width" in paper and inches(paper["width"]) < _COLUMN_IN
+
+
 def settings(paper: Mapping[str, Any]) -> Any:  # Any: keys of rcParams are a Literal of all names
     """Return the rcParams of a figure on `paper`: the user's own, else those of fgtrack; then its style and font.
 
@@ -117,8 +122,7 @@ def settings(paper: Mapping[str, Any]) -> Any:  # Any: keys of rcParams are a Li
     CallError
         The width, the style or the font is not usable.
     """
-    is_column = "width" in paper and inches(paper["width"]) < _COLUMN_IN
-    wanted = {**_STYLE, **(_COLUMN if is_column else {})}
+    wanted = {**_STYLE, **(_COLUMN if is_column(paper) else {})}
     current: Any = mpl.rcParams
     usual: Any = mpl.rcParamsDefault
     found = {key: value for key, value in wanted.items() if current[key] == usual[key]}
@@ -196,3 +200,8 @@ class Sheet:
         """Write `text` above the figure, where it has a title."""
         if self._has_title:
             title(self.figure, text)
+
+    def caption(self, text: str) -> None:
+        """Write `text` below the figure, where it has a title."""
+        if self._has_title:
+            self.figure.supxlabel(text, fontsize="small", ha="left", x=0.01)

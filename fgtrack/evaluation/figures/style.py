@@ -39,6 +39,8 @@ _PAUSE_STEPS = 3  # a line is not drawn across a pause that is longer than as ma
 _LETTER = 0.58  # width of a letter over the size of the font
 _MOST_ENTRIES = 12  # of a legend
 _HANDLE = 8  # characters that the line before an entry and the space around it take
+_BESIDE_IN = 0.6  # what the labels of an axis take of the width
+_COLUMN_IN = 5.0  # a figure as narrow as a column has no title: there is a caption
 _FREE_LINES = 2  # of a legend for which figures have room
 
 _MARK = "fgtrack figure"
@@ -144,9 +146,11 @@ def _fit_title(figure: StyledFigure) -> int:
     """Break the title into lines, and return how many."""
     width = max(10, int(figure.get_figwidth() / (_LETTER * _size_in("figure.titlesize"))))
     lines = [line for part in figure.long_title.split("\n") for line in textwrap.wrap(part, width)]
-    if lines:
+    if figure.get_figwidth() < _COLUMN_IN:
+        lines = []
+    if lines or figure.get_suptitle():
         figure.suptitle("\n".join(lines))
-    return len(lines)
+    return max(1, len(lines))
 
 
 def titled(label: str, what: str) -> str:
@@ -178,7 +182,9 @@ def _fit_legend(axes: Axes, share: float, markerscale: float) -> int:
     if more > 1:
         handles, labels = handles[:_MOST_ENTRIES], [*labels[: _MOST_ENTRIES - 1], f"{labels[_MOST_ENTRIES - 1]} ..."]
         labels[-1] += f" and {more} more"
-    width = max(_HANDLE + 10, int(share * figure.get_figwidth() / (_LETTER * _size_in("legend.fontsize"))))
+    width = max(
+        _HANDLE + 10, int((share * figure.get_figwidth() - _BESIDE_IN) / (_LETTER * _size_in("legend.fontsize")))
+    )
     broken = [textwrap.wrap(label, width - _HANDLE) for label in labels]
     lengths = [_HANDLE + max(map(len, lines)) for lines in broken]
     columns = next(k for k in range(len(broken), 0, -1) if k == 1 or sum(_column_widths(lengths, k)) <= width)

@@ -1,0 +1,88 @@
+"""Figures for a page: width, font, style, axes of one's own; nothing collapses or is cut off."""
+
+from pathlib import Path
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import pytest
+from support.pictures import faults
+from test_figure_texts import a_run
+
+from fgtrack.core.errors import CallError
+from fgtrack.evaluation import plot
+from fgtrack.evaluation.figures.paper import inches
+from fgtrack.evaluation.runs import JudgedRun, judged
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[JudgedRun]:
+    folder = tmp_path_factory.mktemp("paper")
+    return judged([a_run(folder / name) for name in ("smoother", "ekf-replay", "ekf-backward-forward")])
+
+
+@pytest.mark.parametrize("name", ["errors", "lag", "timing", "delays"])
+def test_a_figure_in_a_column_is_readable(name: str, runs: list[JudgedRun]) -> None:
+    figure = getattr(plot, name)(runs if name != "delays" else runs[0], width="3.4in")
+    assert figure.get_figwidth() == pytest.approx(3.4)
+    assert figure.get_suptitle() == ""  # a paper has captions
+    assert faults(figure) == []
+    for axes in figure.axes:
+        assert axes.get_window_extent().width > 0.7 * figure.bbox.width
+
+
+def test_a_figure_resized_afterwards_does_not_collapse(runs: list[JudgedRun]) -> None:
+    figure = plot.lag(runs)
+    figure.set_size_inches(3.4, 2.4)
+    assert faults(figure) == []
+    (axes,) = figure.axes
+    assert axes.get_window_extent().width > 0.7 * figure.bbox.width
+    assert axes.get_window_extent().height > 0.35 * figure.bbox.height
+
+
+def test_settings_of_the_user_are_kept_and_a_font_is_that_of_every_text(runs: list[JudgedRun]) -> None:
+    with mpl.rc_context({"font.family": "DejaVu Serif", "axes.grid": False}):
+        figure = plot.timing(runs)
+    assert figure.axes[0].xaxis.label.get_fontfamily() == ["DejaVu Serif"]
+    assert plot.timing(runs, font="DejaVu Sans Mono").axes[0].xaxis.label.get_fontfamily() == ["DejaVu Sans Mono"]
+    assert mpl.rcParams["font.family"] == ["sans-serif"]
+
+
+def test_a_style_is_a_file_or_a_name(runs: list[JudgedRun], tmp_path: Path) -> None:
+    (tmp_path / "mine.mplstyle").write_text("axes.facecolor: black\n")
+    assert plot.timing(runs, style=tmp_path / "mine.mplstyle").axes[0].get_facecolor() == (0.0, 0.0, 0.0, 1.0)
+    assert plot.timing(runs, style="dark_background").axes[0].get_facecolor() == (0.0, 0.0, 0.0, 1.0)
+
+
+def test_axes_of_ones_own_are_drawn_into(runs: list[JudgedRun]) -> None:
+    figure, (left, right) = plt.subplots(1, 2)
+    assert plot.lag(runs, ax=left) is figure
+    assert left.get_xlabel() == "lag of the output [s]"
+    plot.errors(runs, ax=right)
+    assert [axes.get_ylabel() for axes in figure.axes[2:]] == [
+        *("position error [m]", "speed error [m/s]", "yaw error [deg]"),
+    ]
+    with pytest.raises(CallError, match="needs axes made by"):
+        plot.errors(runs, ax=figure.add_axes((0.0, 0.0, 1.0, 1.0)))
+    plt.close(figure)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"), [("3.4in", 3.4), ("86mm", 86 / 25.4), ("8.6 cm", 8.6 / 2.54), (3.4, 3.4)]
+)
+def test_a_width_has_a_unit_or_is_in_inches(text: str | float, expected: float) -> None:
+    assert inches(text) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("paper", "message"),
+    [
+        ({"width": "3.4 feet"}, "write 3.4in"),
+        ({"width": "nan"}, "write 3.4in"),
+        ({"width": 0.1}, "not between 1.5 and 40 inches"),
+        ({"font": "No Such Font"}, "not installed"),
+        ({"style": "nowhere.mplstyle"}, "cannot be used"),
+    ],
+)
+def test_what_is_not_usable_is_one_clear_error(paper: dict[str, str], message: str, runs: list[JudgedRun]) -> None:
+    with pytest.raises(CallError, match=message):
+        plot.timing(runs, **paper)
