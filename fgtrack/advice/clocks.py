@@ -27,7 +27,7 @@ __all__ = [
     "stamp_findings",
 ]
 
-RULES = OffsetRules(fit_noise=True, max_detections=2500)
+RULES = OffsetRules(fit_noise=True, max_detections=1200)
 """How clocks are compared, in `advise` as in `offsets`."""
 
 _AHEAD_S = 1e-3  # rounding of stamps

@@ -43,7 +43,7 @@ class OffsetRules:
     min_detections: int = 10
     """Of a sensor on a track, for the track to be used for the sensor."""
     max_detections: int = 10_000
-    """Tracks with the most detections come first; what exceeds this is left out."""
+    """Tracks with the most detections come first; what exceeds this is left out, of the first one its end."""
     ego_cutoff_hz: float = 2.0
     """See `EgoPath`."""
     repeat_above_s: float = 0.005
@@ -245,7 +245,8 @@ def _chosen(tracks: Sequence[Track], reference: str, rules: OffsetRules) -> list
     """Tracks that live long enough and were seen by the reference and another sensor, the longest ones first."""
     chosen: list[Track] = []
     total = 0
-    for track in sorted(tracks, key=len, reverse=True):
+    for whole in sorted(tracks, key=len, reverse=True):
+        track = whole[: rules.max_detections]
         seen = {name for name, count in _counts([track]).items() if count >= rules.min_detections}
         if reference not in seen or len(seen) == 1:
             continue
