@@ -26,7 +26,7 @@ from fgtrack.evaluation.cautions import cautions
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.assumed import assumed, source_of
+from fgtrack.pipeline.assumed import Assumed, assumed, source_of
 from fgtrack.pipeline.clock_offsets import OffsetReport
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.effective import effective
@@ -92,10 +92,12 @@ def advise(
     """
     resolved = read_config(config, settings_of(set), track_map=map, pit_map=pit_map)
     on_step("reading", 0.0)
-    readable = UntilBreak(open_input(recording, resolved.input).messages())
+    source = open_input(recording, resolved.input)
+    readable = UntilBreak(source.messages())
     messages = list(readable)
     broken = None if readable.error is None else str(readable.error)
-    return _Adviser(str(recording), messages, resolved, reference, on_step).advice(broken, tune)
+    found = assumed(resolved, replace(source, messages=lambda: iter(messages)))
+    return _Adviser(str(recording), messages, found, reference, on_step).advice(broken, tune)
 
 
 class _Adviser:
@@ -105,13 +107,12 @@ class _Adviser:
         self,
         recording: str,
         messages: Sequence[Message],
-        config: Config,
+        found: Assumed,
         reference: str | None,
         on_step: Callable[[str, float], None],
     ) -> None:
         self._recording, self._messages, self._reference, self._on_step = recording, messages, reference, on_step
-        self._assumed = assumed(config, source_of(lambda: messages))
-        self._config = self._assumed.config
+        self._assumed, self._config = found, found.config
         self._findings: list[Finding] = []
         self._arrivals = arrivals_of(messages)
         self._tracked = list(beginning(messages, nanoseconds(TRACKED_S)))
@@ -122,7 +123,7 @@ class _Adviser:
         """Return the advice after all steps."""
         work = 0.35 if tune else 1.0  # share of the work without the tuning
         if self._assumed.assumptions:
-            text = f"assumed, as nothing is configured: {'; '.join(map(str, self._assumed.assumptions))}."
+            text = f"assumed, as not configured: {'; '.join(map(str, self._assumed.assumptions))}."
             self._findings.append(Finding("assumed", "sensors", 35.0, text))
         self._take(self._strangers())
         before = self._config
@@ -295,13 +296,15 @@ class _Adviser:
 
     def _tuned(self, before: Run, begun: float) -> Iterator[Finding]:
         """The noise that is fitted to the recording, unless nothing can be, or it does harm."""
-        if not any(one.kind == "noise" for one in self._findings) and not self._assumed.assumptions:
+        if not any(one.kind == "noise" for one in self._findings) and not any(
+            one.key.endswith(".std") for one in self._assumed.assumptions
+        ):
             return
         steps = iter(range(1, 100))
         messages = list(beginning(self._tracked, nanoseconds(TUNED_S)))
         try:
             report = tuned(
-                {self._recording: lambda: iter(messages)},
+                {self._recording: source_of(lambda: messages)},
                 self._config,
                 _TUNE_RULES,
                 lambda text: self._on_step(f"tune: {text}", begun + 0.55 * (1.0 - 0.8 ** next(steps))),

@@ -301,8 +301,8 @@ def bias_findings(report: OffsetReport, ego: EgoConfig) -> Iterator[Finding]:
         ahead_m, left_m = (float(np.mean([getattr(one, name) for one in of_ego])) for name in ("ahead_m", "left_m"))
         text = f"detections of all sensors lie {_where(ahead_m, left_m)} of the truth, in the frame of the ego: "
         text += "the origin of that frame is another."
-        origin_m = {"ego.detection_origin_x_m": (ego.detection_origin_x_m, ahead_m)}
-        origin_m |= {"ego.detection_origin_y_m": (ego.detection_origin_y_m, left_m)}
+        now_x_m, now_y_m = ego.detection_origin_m
+        origin_m = {"ego.detection_origin_x_m": (now_x_m, ahead_m), "ego.detection_origin_y_m": (now_y_m, left_m)}
         settings = {key: round(now_m - off_m, 2) for key, (now_m, off_m) in origin_m.items() if off_m}
         yield Finding("bias", EGO, 88.0, text, settings)
         return

@@ -46,7 +46,9 @@ def convert(
     unread: dict[str, Counter[str]] = {}
     with progress("convert"):
         messages = source.messages() if delays_file is None else _redelayed(source.messages, delays_file, seed or 0)
-        count = write_recording(out, _counted(messages, unread), storage, overwrite=overwrite)
+        count = write_recording(
+            out, _counted(messages, unread), storage, settings=source.settings(), overwrite=overwrite
+        )
     lost = messages.num_lost if isinstance(messages, Redelayed) else {}
     losses = ", ".join(f"{number} of {sensor}" for sensor, number in lost.items() if number)
     say(f"{out}: {count} messages{losses and f', lost {losses}'}")

@@ -14,6 +14,7 @@ from fgtrack.cli.study import show_study
 from fgtrack.io.output import check_output, claimed
 from fgtrack.io.ros.bag_writer import RECORDING, write_bag
 from fgtrack.models.oval import OVAL
+from fgtrack.pipeline.recorded import recorded_of
 from fgtrack.pipeline.shipped import read_config, read_scenario
 from fgtrack.sim.delays import AnyDelay, ConstantDelay, GammaDelay
 from fgtrack.sim.scenario import Scenario
@@ -44,7 +45,8 @@ def demo(
         bag = out / "recording"
         check_output(bag, RECORDING, overwrite)
         with progress("simulate") as tell:
-            write_bag(bag, told(simulate(scenario, np.random.default_rng(seed)), tell), overwrite=overwrite)
+            messages = told(simulate(scenario, np.random.default_rng(seed)), tell)
+            write_bag(bag, messages, overwrite=overwrite, settings=recorded_of(scenario))
         config = read_config(_CONFIG, settings, track_map=OVAL, pit_map=OVAL)
     with progress("study") as tell:
         found = study(bag, out, config, advice=False, overwrite=overwrite, on_step=tell)

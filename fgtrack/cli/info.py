@@ -15,6 +15,7 @@ from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value
 from fgtrack.io.info import OTHER_CLOCK_S, InputInfo, TopicInfo, describe
 from fgtrack.io.output import check_apart, check_output
 from fgtrack.io.source import open_input
+from fgtrack.pipeline.assumed import assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.effective import effective
 from fgtrack.pipeline.shipped import read_config
@@ -69,7 +70,8 @@ def info(
 
 def _try_out(recording: Path, config: Config, warned: Set[tuple[str, str]]) -> Trial:
     with progress("first seconds"):
-        trial = try_out(open_input(recording, config.input).messages(), config)
+        source = open_input(recording, config.input)
+        trial = try_out(source.messages(), assumed(config, source).config)
     for name, text in trial.samples.items():
         say(f"first of {name}: {text}")
     if trial.run is not None:

@@ -38,8 +38,8 @@ def offsets(
         readable = UntilBreak(source.messages())
         report = estimated_clocks(list(readable), found.config, reference)
         report = report if readable.error is None else replace(report, broken=str(readable.error))
-    for assumption in found.assumptions if form is None else ():
-        say(f"assumed {assumption}")
+    for line in found.lines() if form is None else ():
+        say(line)
     verdicts = clock_verdicts(report)
     known = {one.sensor for one in verdicts if one.is_known}
     show(_table(report, known), form, report.as_dict() | {"verdicts": [asdict(one) for one in verdicts]})

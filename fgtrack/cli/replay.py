@@ -68,11 +68,11 @@ def replay(
             overwrite=overwrite,
             realtime=realtime,
         )
-    for line in dict.fromkeys(str(effective(replace(config, estimator=name))) for name in names):
+    for line in dict.fromkeys(str(effective(replace(found.config, estimator=name))) for name in names):
         say(line)
     runs = [load_run(result.path) for result in results]
-    for assumption in found.assumptions:
-        say(f"assumed {assumption}")
+    for line in found.lines():
+        say(line)
     for result in results:
         what = "{estimator}, {detections_received} detections, {wall_s:.1f} s, digest {digest:.12}"
         missed = f", {result.deadline_misses} ticks slower than real time" if result.deadline_misses else ""

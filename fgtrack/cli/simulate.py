@@ -12,6 +12,7 @@ from fgtrack.cli.show import progress, say, told
 from fgtrack.io.output import check_apart
 from fgtrack.io.recording import check_recording, write_recording
 from fgtrack.pipeline.inputs import inputs
+from fgtrack.pipeline.recorded import recorded_of
 from fgtrack.pipeline.shipped import find_file, read_scenario
 from fgtrack.sim.simulate import simulate as simulated
 
@@ -39,5 +40,5 @@ def simulate(
     check_recording(out, overwrite)
     with progress("simulate") as tell:
         messages = simulated(scenario, np.random.default_rng(seed))
-        count = write_recording(out, told(messages, tell), storage, overwrite=overwrite)
+        count = write_recording(out, told(messages, tell), storage, settings=recorded_of(scenario), overwrite=overwrite)
     say(f"{out}: {count} messages")

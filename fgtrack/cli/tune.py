@@ -56,7 +56,7 @@ def tune(
     check_output(out, TUNED, overwrite)
     config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
     check_apart(out, inputs(config, recordings, config_file=config_file))
-    sources = {str(path): open_input(path, config.input).messages for path in recordings}
+    sources = {str(path): open_input(path, config.input) for path in recordings}
     with progress("tune") as tell:
         report = tuned(sources, config, TuneRules(keep=tuple(keep or ())), tell)
     tables, found = Tables(_tables(report)), _sensors(report)

@@ -16,6 +16,7 @@ from fgtrack.evaluation.left_out import because
 from fgtrack.evaluation.statistics import ChiSquareMean
 from fgtrack.io.run import Run, Table, digest
 from fgtrack.models.measurement import ANGULAR
+from fgtrack.models.road import OPEN_SPACE
 from fgtrack.tracking.soundness import IN_A_ROW
 
 USED = ("birth", "in_sequence", "out_of_sequence", "beyond_window", "merged")
@@ -175,7 +176,7 @@ def _ego(run: Run) -> Iterator[Caution]:
 
 def _map(run: Run) -> Iterator[Caution]:
     """No map where new objects are as fast as the ego, in its direction."""
-    if not _ego_speeds_births(run) or _section(run, "map").get("track"):
+    if not _ego_speeds_births(run) or _section(run, "map").get("track") not in (None, OPEN_SPACE):
         return
     measured = run.detections
     blind = [sensor for sensor, mine in _by_sensor(measured) if not np.isfinite(measured["yaw_rad"][mine]).any()]

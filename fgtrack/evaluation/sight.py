@@ -67,7 +67,7 @@ def ego_states(ego: Table, stamps_ns: IntArray) -> FloatArray | None:
 
 def _is_limited(sensor: SensorModel) -> bool:
     limits_m = (sensor.max_range_m, sensor.view_range_m, sensor.max_range_behind_m)
-    return any(limit_m is not None for limit_m in limits_m) or sensor.field_of_view_rad < math.tau
+    return any(limit_m is not None for limit_m in limits_m) or (sensor.field_of_view_rad or math.tau) < math.tau
 
 
 def _sensors(run: Run) -> list[SensorModel]:

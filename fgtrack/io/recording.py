@@ -1,7 +1,7 @@
 """Writes a recording: a stream or a rosbag2 folder, as its name says."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -9,7 +9,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.types import Message
 from fgtrack.io.output import check_output
 from fgtrack.io.ros.bag_writer import RECORDING, write_bag
-from fgtrack.io.stream import STREAM, write_stream
+from fgtrack.io.stream import SETTINGS, STREAM, write_stream
 
 Storage = Literal["mcap", "sqlite3"]
 """Storage of a rosbag2 folder."""
@@ -18,15 +18,21 @@ _FILE_ENDING = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,5}$")
 
 
 def write_recording(
-    out: Path, messages: Iterable[Message], storage: Storage = "mcap", *, overwrite: bool = False
+    out: Path,
+    messages: Iterable[Message],
+    storage: Storage = "mcap",
+    *,
+    settings: Mapping[str, object] | None = None,
+    overwrite: bool = False,
 ) -> int:
     """Write a stream where `out` ends in .jsonl or .jsonl.gz, else a rosbag2 folder; gives the message count.
 
+    `settings` are what it carries of a configuration, plain values by the names of its keys.
     Raises `CallError` where something is at `out` that must not be replaced.
     """
     if _is_stream(out):
-        return write_stream(out, messages, overwrite=overwrite)
-    return write_bag(out, messages, storage, overwrite=overwrite)
+        return write_stream(out, messages, {SETTINGS: settings} if settings else None, overwrite)
+    return write_bag(out, messages, storage, settings=settings, overwrite=overwrite)
 
 
 def check_recording(out: Path, overwrite: bool) -> None:

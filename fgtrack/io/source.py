@@ -1,7 +1,7 @@
 """Opens an input, whatever it is: a recording, a stream or a data set, recognised by its content."""
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -28,6 +28,11 @@ class InputSource:
 
     Raises `TruncatedInput` behind the last message before a break, `DataError` for all else that is wrong.
     """
+    settings: Callable[[], Mapping[str, object]] = dict
+    """Gives what the recording carries of a configuration, by the names of its keys; see `fgtrack.pipeline.recorded`.
+
+    Raises `DataError` where the input cannot be read.
+    """
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,8 @@ class FileFormat:
     """Whether an existing file that is not empty, or a folder, is one, by its content; may raise `OSError`."""
     open: Callable[[Path, InputConfig], Callable[[], Iterator[Message]]]
     """Opens the input at a path: gives what `InputSource.messages` is, and raises as `open_input`."""
+    settings: Callable[[Path], Mapping[str, object]] = lambda path: {}
+    """What the input at a path carries of a configuration, as `InputSource.settings`."""
 
 
 def open_input(path: Path | str, config: InputConfig | None = None) -> InputSource:
@@ -57,8 +64,9 @@ def open_input(path: Path | str, config: InputConfig | None = None) -> InputSour
     name = input_kind(path)
     config = config or InputConfig()
     with ADAPTERS.blamed(name, f"cannot open {path}"):
-        messages = file_format(name).open(path, config)
-    return InputSource(path, name, partial(checked, path, messages, config.most_objects))
+        form = file_format(name)
+        messages = form.open(path, config)
+    return InputSource(path, name, partial(checked, path, messages, config.most_objects), partial(form.settings, path))
 
 
 def input_kind(path: Path) -> str:

@@ -29,6 +29,8 @@ from fgtrack.io.output import Kind, new_file
 from fgtrack.io.source import FileFormat
 
 STREAM_FORMAT = "fgtrack-stream/1"
+SETTINGS = "settings"
+"""Entry of the header record with what the recording carries of a configuration."""
 GZIP_MAGIC = b"\x1f\x8b"
 
 _logger = logging.getLogger(__name__)
@@ -97,7 +99,13 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
     return partial(read_stream, path, config.largest_bytes, config.most_objects)
 
 
-FORMAT = FileFormat("an fgtrack stream (.jsonl, .jsonl.gz)", _recognises, _open)
+def _settings(path: Path) -> Mapping[str, object]:
+    """What the header carries of a configuration."""
+    found = read_header(path).get(SETTINGS)
+    return found if isinstance(found, dict) else {}
+
+
+FORMAT = FileFormat("an fgtrack stream (.jsonl, .jsonl.gz)", _recognises, _open, _settings)
 
 
 def read_header(path: Path | str) -> Mapping[str, Any]:

@@ -20,6 +20,10 @@ class Road(Protocol):
         """The map at `points_m`, shape (n, 2)."""
 
 
+OPEN_SPACE = "none"
+"""Name of open space in the place of the file of a track."""
+
+
 class OpenSpace:
     """No map: objects may be anywhere, and no heading is known."""
 

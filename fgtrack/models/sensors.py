@@ -25,6 +25,9 @@ class Mount:
     yaw_rad: float = 0.0
 
 
+_AT_ORIGIN = Mount()
+
+
 @dataclass(frozen=True)
 class Filter:
     """Which values pass; all that is given must hold."""
@@ -144,8 +147,9 @@ class SensorModel:
     bounds by it."""
     max_range_behind_m: float | None = None
     """How far it sees in the half behind it, where that is less; for existence and evaluation."""
-    field_of_view_rad: float = math.tau
-    """Full angle that it sees, centred on its axis; for existence and evaluation, as these ranges."""
+    field_of_view_rad: float | None = None
+    """Full angle that it sees, centred on its axis; for existence and evaluation, as these ranges. null: in a replay
+    that of the recording, or where it detects in it, if no range is given either; else all around."""
     scan: bool = True
     """Whether a list shows all objects in view, so that it misses those that it lacks. False where objects are reported
     one by one, as by ADS-B, AIS or V2X; without a configuration a replay finds it in the recording."""
@@ -165,7 +169,8 @@ class SensorModel:
     near_side_m: float = 0.0
     """How much nearer than its reference point the sensor sees an object, along the line of sight: the near side of a
     hull or a car. Positions are moved away from the sensor by it."""
-    mount: Mount = field(default_factory=Mount)
+    mount: Mount | None = None
+    """Pose of the sensor in the ego's detection frame; null: in a replay that of the recording, else the origin."""
     correlation: Correlation | None = None
     """Errors that are correlated in time, estimated with each object; null: every detection errs anew."""
 
@@ -193,7 +198,7 @@ class SensorModel:
             raise ValueError(f"near_side_m: must be finite, is {self.near_side_m}")
         if not abs(self.clock_offset_s) <= _LONGEST_OFFSET_S:
             raise ValueError(f"clock_offset_s: must lie within {_LONGEST_OFFSET_S:g} s, is {self.clock_offset_s}")
-        if not 0.0 < self.field_of_view_rad <= math.tau:
+        if self.field_of_view_rad is not None and not 0.0 < self.field_of_view_rad <= math.tau:
             raise ValueError(f"field_of_view_rad: must lie in (0, 2 pi], is {self.field_of_view_rad}")
         if self.counter_init < 1 or self.counter_add < 0:
             raise ValueError("counter_init must be at least 1 and counter_add not negative")
@@ -212,6 +217,17 @@ class SensorModel:
         """Whether its detections say where an object is: x and y, or range and bearing."""
         return "x_m" in self.std or {"range_m", "bearing_rad"} <= self.std.keys()
 
+    @property
+    def placed(self) -> Mount:
+        """Its mount, the origin where none is given."""
+        return self.mount or _AT_ORIGIN
+
+    @property
+    def is_view_given(self) -> bool:
+        """True if its field of view or a range is given."""
+        limits = (self.field_of_view_rad, self.max_range_m, self.view_range_m, self.max_range_behind_m)
+        return any(limit is not None for limit in limits)
+
     def sees(self, positions_m: FloatArray, ego_poses: FloatArray, origin_m: tuple[float, float]) -> BoolArray:
         """Whether an object there is in range and in the field of view, shape (...); nothing hides it.
 
@@ -219,7 +235,7 @@ class SensorModel:
         `origin_m` is the origin of the detection frame seen from the ego (`ego.detection_origin_*`).
         """
         x_m, y_m, yaw_rad = np.moveaxis(ego_poses, -1, 0)
-        still, mount = np.zeros_like(x_m), self.mount
+        still, mount = np.zeros_like(x_m), self.placed
         at_x_m, at_y_m, _, _ = body_point(
             x_m, y_m, yaw_rad, still, still, origin_m[0] + mount.x_m, origin_m[1] + mount.y_m
         )
@@ -227,7 +243,7 @@ class SensorModel:
         return in_view(
             direction_range[..., 1],
             direction_range[..., 0] - yaw_rad - mount.yaw_rad,
-            self.field_of_view_rad,
+            self.field_of_view_rad or math.tau,
             max_range_m=min((m for m in (self.max_range_m, self.view_range_m) if m is not None), default=math.inf),
             max_range_behind_m=self.max_range_behind_m,
         )

@@ -1,6 +1,8 @@
-"""What a replay assumes where the configuration does not say it: the sensors of a recording and what they measure."""
+"""What a replay assumes where the configuration leaves it open: what a recording carries, and what it shows."""
 
-from collections.abc import Callable, Iterable, Mapping
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from io import StringIO
 from pathlib import Path
@@ -13,12 +15,14 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import MEASURABLE, DetectionList, Message
 from fgtrack.io.errors import MOST_SENSORS
 from fgtrack.io.source import InputSource
-from fgtrack.models.sensors import SensorModel
+from fgtrack.models.sensors import Mount, SensorModel
 from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.coverage import Coverage, coverages
 from fgtrack.pipeline.list_statistics import ListStatistics
 from fgtrack.pipeline.load import plain
+from fgtrack.pipeline.recorded import RecordedSensor, recorded
 
-__all__ = ["ASSUMED_STD", "Assumed", "Assumption", "assumed", "source_of"]
+__all__ = ["ASSUMED_STD", "Assumed", "Assumption", "assumed", "is_open", "source_of"]
 
 #: Standard deviations of a sensor of which nothing is known: a detector of cars by LiDAR or RADAR.
 ASSUMED_STD = {
@@ -30,6 +34,9 @@ ASSUMED_STD = {
     "bearing_rad": 0.02,
     "range_rate_mps": 0.5,
 }
+
+RECORDED, USUAL = "recorded", "usual of a detector of cars by LiDAR or RADAR"
+"""Reasons."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +55,24 @@ class Assumption:
         if isinstance(value, Mapping):
             value = ", ".join(f"{name} {one:g}" for name, one in value.items())
         return f"{self.key}: {value} ({self.reason})"
+
+    @property
+    def text(self) -> str:
+        """The setting in words, without its sensor and its reason."""
+        value: Any = self.value  # Any: of its key
+        match self.key.rpartition(".")[2]:
+            case "std":
+                return f"standard deviations {', '.join(f'{name} {one:g}' for name, one in value.items())}"
+            case "field_of_view_rad":
+                return "sees all around" if value >= math.tau else f"sees {math.degrees(value):.0f} degrees"
+            case "view_range_m":
+                return f"up to {value:g} m"
+            case "max_range_behind_m":
+                return f"behind it up to {value:g} m"
+            case "mount":
+                axis = f", axis {math.degrees(value['yaw_rad']):.0f} degrees" if value["yaw_rad"] else ""
+                return f"mounted at {value['x_m']:g} m, {value['y_m']:g} m{axis}"
+        return f"{self.key} {value}"
 
 
 @dataclass(frozen=True)
@@ -76,6 +101,19 @@ class Assumed:
         yaml.dump(tree, text)
         return text.getvalue()
 
+    def lines(self) -> list[str]:
+        """What was assumed in words: a line for each sensor, and one for the rest."""
+        found: dict[str, dict[str, list[str]]] = {}
+        for one in self.assumptions:
+            path = self._path(one.key)
+            about = path[1] if path[0] == "sensors" else "recording"
+            found.setdefault(about, {}).setdefault(one.reason, []).append(one.text)
+        lines = []
+        for about, reasons in found.items():
+            parts = [f"{', '.join(texts)} ({reason})" for reason, texts in reasons.items()]
+            lines.append(f"assumed, {about}: {'; '.join(parts)}")
+        return lines
+
     def _path(self, key: str) -> list[str]:
         """The names of `key`; that of a sensor may hold dots itself."""
         for name in self.config.sensors:
@@ -85,39 +123,106 @@ class Assumed:
 
 
 def assumed(config: Config, source: InputSource) -> Assumed:
-    """`config` with what `source` shows where `config` leaves it open; a key that is set stays as it is.
+    """`config` with nothing left open, and what of it was assumed; a key that is set stays as it is.
 
-    Where `config` has no sensors they are those of the recording, which measure what their detections hold. A position
-    counts once: a detection of x and y is not taken as range and bearing as well. Sensors that only `input` names are
-    taken to measure positions.
+    Three sources, the first that gives a key decides:
+
+    - What `source` carries: origin of detections, track, and of each sensor mount, field of view and ranges.
+    - What its detections show (`coverages`): the sensors, where `config` has none, with what they measure; field of
+      view and range of those of which neither the configuration nor the recording gives any of both. A position counts
+      once: a detection of x and y is not taken as range and bearing as well.
+    - Usual values: standard deviations, and a sensor that looks all around from the origin.
     """
-    if config.sensors:
-        return Assumed(config, ())
-    measured: dict[str, set[str]] = {}
+    carried = recorded(source)
+    found: list[Assumption] = []
+    ego, road = config.ego, config.map
+    if ego.detection_origin_x_m is None:
+        origin_m = carried.ego.detection_origin_x_m
+        if origin_m is not None:
+            found.append(Assumption("ego.detection_origin_x_m", origin_m, RECORDED))
+        ego = replace(ego, detection_origin_x_m=origin_m or 0.0)
+    if road.track is None and carried.map.track is not None:
+        found.append(Assumption("map.track", carried.map.track, RECORDED))
+        road = replace(road, track=carried.map.track)
+    sensors = {
+        name: _with_recorded(name, sensor, carried.sensors.get(name, RecordedSensor()), found)
+        for name, sensor in config.sensors.items()
+    }
+    if is_open(replace(config, sensors=sensors)):
+        mounts = {name: one.mount for name, one in (sensors or carried.sensors).items() if one.mount is not None}
+        covered, lists = _seen(source, config, mounts)
+        if not sensors:
+            for name, one in covered.items():
+                std = _std(one.measured)
+                found.append(Assumption(f"sensors.{name}.std", std, USUAL))
+                sensor, more = _with_lists(name, SensorModel(std=std), lists.get(name, ListStatistics()))
+                found += more
+                sensors[name] = _with_recorded(name, sensor, carried.sensors.get(name, RecordedSensor()), found)
+        for name, sensor in sensors.items():
+            if sensor.scan and not sensor.is_view_given and name in covered:
+                sensors[name] = _with_coverage(name, sensor, covered[name], found)
+    sensors = {
+        name: replace(sensor, field_of_view_rad=sensor.field_of_view_rad or math.tau)
+        for name, sensor in sensors.items()
+    }
+    return Assumed(replace(config, ego=ego, map=road, sensors=sensors), tuple(found))
+
+
+def is_open(config: Config) -> bool:
+    """True if `config` has no sensors, or nothing of where one of them sees: then `assumed` reads the messages."""
+    return not config.sensors or not all(sensor.is_view_given for sensor in config.used_sensors.values())
+
+
+def _with_recorded(name: str, sensor: SensorModel, carried: RecordedSensor, found: list[Assumption]) -> SensorModel:
+    """`sensor` with what the recording carries where it is open; each key is appended to `found`."""
+    given = {
+        one.name: value
+        for one in fields(carried)
+        if (value := getattr(carried, one.name)) is not None and getattr(sensor, one.name) is None
+    }
+    found += [Assumption(f"sensors.{name}.{key}", plain(value), RECORDED) for key, value in given.items()]
+    return replace(sensor, **given)
+
+
+def _with_coverage(name: str, sensor: SensorModel, seen: Coverage, found: list[Assumption]) -> SensorModel:
+    """`sensor` with the sector and the range in which it detects; each key is appended to `found`."""
+    given: dict[str, Any] = {}  # Any: values of different keys
+    if seen.axis_rad:
+        given["mount"] = Mount(yaw_rad=seen.axis_rad)
+    if seen.field_of_view_rad is not None:
+        given["field_of_view_rad"] = seen.field_of_view_rad
+    if seen.range_m is not None:
+        given["view_range_m"] = seen.range_m
+    reason = f"where it detects, of {seen}"
+    found += [Assumption(f"sensors.{name}.{key}", plain(value), reason) for key, value in given.items()]
+    return replace(sensor, **given)
+
+
+def _seen(
+    source: InputSource, config: Config, mounts: Mapping[str, Mount]
+) -> tuple[dict[str, Coverage], dict[str, ListStatistics]]:
+    """Coverage and lists of the sensors of `source` that are not ignored; coverage of those that only `input` names.
+
+    Raises `CallError` where there are too many.
+    """
     lists: dict[str, ListStatistics] = {}
-    try:
-        for message in source.messages():
-            if isinstance(message, DetectionList) and message.sensor not in config.ignore_sensors:
-                found = measured.setdefault(message.sensor, set())
-                lists.setdefault(message.sensor, ListStatistics()).add(message)
-                for detection in message.objects:
-                    found.update(detection.measured)
-    except DataError:  # the replay ends there, too, and says so
-        pass
+
+    def readable() -> Iterator[Message]:
+        with suppress(DataError):  # the replay ends there, too, and reports it
+            for message in source.messages():
+                if not isinstance(message, DetectionList):
+                    yield message
+                elif message.sensor not in config.ignore_sensors:
+                    lists.setdefault(message.sensor, ListStatistics()).add(message)
+                    yield message
+
+    found = coverages(readable(), mounts)
     for name in (*config.input.detections, *config.input.csv.detections):
         if name not in config.ignore_sensors:
-            measured.setdefault(name, set())
-    if len(measured) > MOST_SENSORS:
-        raise CallError(
-            f"input: {len(measured)} sensors with those of the recording, at most {MOST_SENSORS} can be used"
-        )
-    sensors = {name: SensorModel(std=_std(found)) for name, found in sorted(measured.items())}
-    reason = "usual of a detector of cars by LiDAR or RADAR"
-    assumptions = [Assumption(f"sensors.{name}.std", dict(sensor.std), reason) for name, sensor in sensors.items()]
-    for name, statistics in sorted(lists.items()):
-        sensors[name], more = _with_lists(name, sensors[name], statistics)
-        assumptions += more
-    return Assumed(replace(config, sensors=sensors), tuple(assumptions))
+            found.setdefault(name, Coverage(frozenset(), 0, 0, None))
+    if len(found) > MOST_SENSORS:
+        raise CallError(f"input: {len(found)} sensors with those of the recording, at most {MOST_SENSORS} can be used")
+    return dict(sorted(found.items())), lists
 
 
 def source_of(messages: Callable[[], Iterable[Message]]) -> InputSource:
@@ -137,7 +242,7 @@ def _with_lists(name: str, sensor: SensorModel, lists: ListStatistics) -> tuple[
     return sensor, [Assumption(f"sensors.{name}.{key}", *each) for key, each in found.items()]
 
 
-def _std(measured: set[str]) -> dict[str, float]:
+def _std(measured: Set[str]) -> dict[str, float]:
     cartesian = {"x_m", "y_m"}
     left = measured - ({"range_m", "bearing_rad"} if cartesian <= measured else cartesian) or cartesian
     return {name: ASSUMED_STD[name] for name in MEASURABLE if name in left}

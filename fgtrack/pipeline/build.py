@@ -102,13 +102,13 @@ def build_lifecycle(config: Config) -> Lifecycle:
 
 def build_road(config: MapConfig) -> Road:
     """The map that `config` names. Raises `CallError` for a pit lane without a track, which it belongs to."""
-    if config.track is None:
+    if config.track_file is None:
         if config.pit is not None:
             raise CallError(
                 f"{config.pit}: a pit lane (map.pit) needs the map of its track (map.track), give --map too"
             )
         return OpenSpace()
-    track = _read_map(config.track, make_oval)
+    track = _read_map(config.track_file, make_oval)
     pit = None if config.pit is None else _read_map(config.pit, make_pit_lane)
     buffers = (config.inner_buffer_m, config.outer_buffer_m, config.pit_buffer_m)
     if config.lookup == "frenet":
@@ -136,7 +136,7 @@ def _build_backward_forward(config: Config, failures: Failures) -> TrackBank:
     def bank() -> TrackBank:
         return storage(build_propagator(config, seconds(step_ns)), step_ns, steps)
 
-    if config.map.track is not None or storage is not BackwardForwardBank:
+    if config.map.track_file is not None or storage is not BackwardForwardBank:
         return bank()
     motion = config.motion_model()  # without a map a track may begin in any direction, each at its own time
 

@@ -14,6 +14,7 @@ from fgtrack.io.errors import MOST_SENSORS
 from fgtrack.io.run import EvaluationConfig
 from fgtrack.models.correlated_errors import with_correlated_errors
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
+from fgtrack.models.road import OPEN_SPACE
 from fgtrack.models.sensors import SensorModel
 from fgtrack.sim.settings import settings
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
@@ -45,7 +46,8 @@ class MapConfig:
     """The map, and how far from it an object may be. A negative buffer keeps away from the wall."""
 
     track: str | None = None
-    """CSV file of the track, `oval` for the built-in one, or null for open space."""
+    """CSV file of the track, `oval` for the built-in one, `none` for open space; null: in a replay that of the
+    recording, else open space."""
     pit: str | None = None
     """CSV file of the pit lane, `oval` for the built-in one, or null."""
     lookup: Literal["frenet", "published", "published_circular_heading"] = "frenet"
@@ -59,6 +61,11 @@ class MapConfig:
     excluded: tuple[str, ...] = ()
     """Files of polygons in which no object is, as shore and buildings: GeoJSON or CSV, in metres of the map."""
 
+    @property
+    def track_file(self) -> str | None:
+        """File of the track; None of open space."""
+        return None if self.track == OPEN_SPACE else self.track
+
 
 @settings
 class EgoConfig:
@@ -70,8 +77,9 @@ class EgoConfig:
     """Weight of the new yaw in the low-pass; 1 leaves it as it is."""
     yaw_rate_weight: _Weight = 1.0
     """Weight of the new yaw rate."""
-    detection_origin_x_m: float = 0.0
-    """Origin of the detections' ego frame, ahead of the ego reference point."""
+    detection_origin_x_m: float | None = None
+    """Origin of the detections' ego frame, ahead of the ego reference point; null: in a replay that of the recording,
+    else 0."""
     detection_origin_y_m: float = 0.0
     """The same to the left."""
     memory_s: PositiveFloat = 5.0
@@ -95,7 +103,7 @@ class EgoConfig:
     @property
     def detection_origin_m(self) -> tuple[float, float]:
         """Origin of the detections' ego frame, ahead of the ego reference point and to its left."""
-        return self.detection_origin_x_m, self.detection_origin_y_m
+        return self.detection_origin_x_m or 0.0, self.detection_origin_y_m
 
 
 @dataclass(frozen=True)

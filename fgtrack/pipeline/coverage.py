@@ -18,8 +18,8 @@ __all__ = ["Coverage", "coverages"]
 _OUTSIDE, _FEWEST = 0.01, 100
 #: Cells in which a detection must come back: at least so long, so many periods of the sensor, and so wide.
 _CELL_S, _CELL_PERIODS, _CELL_M, _CELL_MPS, _CELL_BEARING = 0.25, 5.0, 3.0, 30.0, 0.3
-#: Margins: an edge of the sector is that of the sensor to some degrees, and a range to a tenth.
-_EDGE_RAD, _RANGE_FACTOR = 0.05, 1.1
+#: How near detections follow one another up to the edges of a sector, and the margin of a range.
+_LINK_RAD, _RANGE_FACTOR = 0.2, 1.1
 #: No sensor of vehicles has a narrower sector (20 degrees, long-range RADAR); wider ones are not told from traffic.
 _NARROWEST_RAD, _WIDEST_RAD = 0.35, 2.8
 #: Axes are multiples of 45 degrees, where the middle of the sector is so near to one.
@@ -59,6 +59,9 @@ def coverages(messages: Iterable[Message], mounts: Mapping[str, Mount] | None = 
     - The sector is the rest of the circle beside the widest arc with at most 1 % of these detections. It is taken up
       to 160 degrees: one car that overtakes has a sensor which looks all around detect in nearly half a circle, so
       that a wider sector cannot be told from traffic on one side.
+    - Cars pass its edges within a few lists. So it goes on as far as the detections in that arc follow one another
+      within 12 degrees and a third of what they would if they were spread evenly over it, as clutter is. The noise
+      of the outermost ones is its margin.
     - The range is the quantile of 99 %, and a tenth more.
     - With fewer than 100 such detections, of which 1 % is not one, nothing is estimated.
 
@@ -127,7 +130,7 @@ class _Detections:
         sector = _sector(np.arctan2(offsets_m[:, 1], offsets_m[:, 0]), "sensor" in self.frames or mount is not None)
         range_m = float(np.quantile(np.hypot(*offsets_m.T), 1.0 - _OUTSIDE)) if has_range.any() else None
         axis_rad, full_rad = sector or (0.0, None)
-        limit_m = None if range_m is None else float(math.ceil(_RANGE_FACTOR * range_m))
+        limit_m = None if range_m is None else float(round(_RANGE_FACTOR * range_m))
         return replace(found, axis_rad=axis_rad, field_of_view_rad=full_rad, range_m=limit_m)
 
     def _offsets_m(self, rows: FloatArray, path: FloatArray, mount: Mount | None) -> FloatArray:
@@ -183,8 +186,11 @@ def _sector(bearings_rad: FloatArray, axis_known: bool) -> tuple[float, float] |
     widest = int(np.argmax(gaps_rad))
     if gaps_rad[widest] < math.tau - _WIDEST_RAD:
         return None
-    half_rad = 0.5 * (math.tau - float(gaps_rad[widest])) + _EDGE_RAD
-    middle_rad = wrap_angle(float(ends[widest + skip]) + half_rad - _EDGE_RAD)
+    blind_rad = ends[widest : widest + skip + 1]  # its edges, and the detections in it
+    apart = np.flatnonzero(np.diff(blind_rad) > min(_LINK_RAD, float(gaps_rad[widest]) / (3.0 * skip)))
+    left_rad, right_rad = float(blind_rad[apart[0]]), float(blind_rad[apart[-1] + 1])
+    half_rad = 0.5 * (math.tau - (right_rad - left_rad))
+    middle_rad = wrap_angle(right_rad + half_rad)
     nearest_rad = 0.0 if axis_known else _AXES_RAD * round(middle_rad / _AXES_RAD)
     off_rad = abs(wrap_angle(middle_rad - nearest_rad))
     if axis_known or off_rad <= _AXIS_TOLERANCE_RAD:

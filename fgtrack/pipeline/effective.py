@@ -47,4 +47,4 @@ def effective(config: Config) -> Effective:
     elif Claims.of(ESTIMATORS.load(config.estimator)).reports:
         key, lag_s = "smoother.lag_s", config.smoother.lag_s
     distance_m = None if isinstance(merge, NoMerge) else merge.distance_m
-    return Effective((ego.detection_origin_x_m, ego.detection_origin_y_m), distance_m, key, lag_s, lag_s + behind_s)
+    return Effective(ego.detection_origin_m, distance_m, key, lag_s, lag_s + behind_s)

@@ -14,7 +14,9 @@ from fgtrack.io.recording import Storage, check_recording, write_recording
 from fgtrack.io.run import Run, load_run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline import replay as pipeline
+from fgtrack.pipeline.assumed import assumed
 from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.recorded import recorded_of
 from fgtrack.pipeline.shipped import read_config, read_scenario, settings_of
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate as simulated
@@ -65,6 +67,7 @@ def replay(
     origin, kind = "", "messages"
     if isinstance(recording, (str, Path)):
         source = open_input(recording, resolved.input)
+        resolved = assumed(resolved, source).config
         messages: Iterable[Message] = source.messages()
         origin, kind = str(recording), source.kind
     else:
@@ -143,8 +146,9 @@ def simulate(
         raise CallError(f"seed: must be an integer of 0 or more, is {seed!r}")
     if out is not None:
         check_recording(Path(out), overwrite)
-    messages = simulated(read_scenario(scenario, duration_s=duration_s), np.random.default_rng(seed))
+    resolved = read_scenario(scenario, duration_s=duration_s)
+    messages = simulated(resolved, np.random.default_rng(seed))
     if out is None:
         return iter(messages)
-    write_recording(Path(out), messages, storage, overwrite=overwrite)
+    write_recording(Path(out), messages, storage, settings=recorded_of(resolved), overwrite=overwrite)
     return Path(out)

@@ -14,7 +14,7 @@ from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import MemoryRun, Node, Run, RunWriter, path_from_run
 from fgtrack.models.sensors import SensorModel
-from fgtrack.pipeline.assumed import assumed, source_of
+from fgtrack.pipeline.assumed import assumed, is_open, source_of
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, Tick, listed_ticks, message_ticks, node_ticks, read_ticks
 from fgtrack.pipeline.config import ClockConfig, Config
@@ -182,8 +182,8 @@ def replay_in_memory(
 
 
 def again(messages: Iterable[Message], config: Config) -> Callable[[], Iterable[Message]]:
-    """Gives `messages`; kept where they are needed twice, to find the sensors that `config` does not name."""
-    if config.sensors:
+    """Gives `messages`; kept where they are needed twice, to find what `config` leaves open."""
+    if not is_open(config):
         return lambda: messages
     readable = UntilBreak(messages)
     kept = list(readable)

@@ -22,6 +22,7 @@ from fgtrack.core.types import Message
 from fgtrack.io.output import claimed
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
+from fgtrack.pipeline.assumed import assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import validate
 from fgtrack.pipeline.replay import replay_in_memory
@@ -145,6 +146,9 @@ def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
     try:
         config = validate(Config, recipe.config, "configuration")
         messages = read_messages(recipe, config)
+        if recipe.recording is not None:
+            source = open_input(recipe.recording, config.input)
+            config = assumed(config, replace(source, messages=lambda: iter(messages))).config
     except (
         Exception,
         SystemExit,

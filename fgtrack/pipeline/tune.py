@@ -1,7 +1,7 @@
 """Noise from recordings: process and measurement noise by maximum likelihood of the innovations, without truth."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from pathlib import Path
@@ -17,8 +17,8 @@ from fgtrack.estimation.likelihood.reference import filtered
 from fgtrack.estimation.likelihood.series import Series
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import Run
-from fgtrack.io.source import open_input
-from fgtrack.pipeline.assumed import assumed, source_of
+from fgtrack.io.source import InputSource, open_input
+from fgtrack.pipeline.assumed import assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config, settings_of
@@ -83,21 +83,22 @@ def tune(
     if not isinstance(recordings, (str, Path, Sequence)):
         raise CallError(f"recordings: must be a path or several, is a {type(recordings).__name__}")
     paths = [recordings] if isinstance(recordings, (str, Path)) else list(recordings)
-    return tuned(
-        {str(path): open_input(path, resolved.input).messages for path in paths}, resolved, TuneRules(keep=tuple(keep))
-    )
+    return tuned({str(path): open_input(path, resolved.input) for path in paths}, resolved, TuneRules(keep=tuple(keep)))
 
 
 def tuned(
-    sources: Mapping[str, Callable[[], Iterator[Message]]],
+    sources: Mapping[str, InputSource],
     config: Config,
     rules: TuneRules | None = None,
     on_step: Callable[[str], None] = lambda text: None,
 ) -> TuneReport:
     """`tune` of messages in receipt order, by name of their recording; `on_step` is told what comes next."""
     rules = rules or TuneRules()
-    recordings = [_Recording.read(name, messages()) for name, messages in sources.items()]
-    config = assumed(config, source_of(lambda: chain.from_iterable(one.messages for one in recordings))).config
+    recordings = [_Recording.read(name, source.messages()) for name, source in sources.items()]
+    together = replace(
+        next(iter(sources.values())), messages=lambda: chain.from_iterable(one.messages for one in recordings)
+    )
+    config = assumed(config, together).config
     return _Tuning(ConfigNoise(for_tuning(config, rules)), recordings, rules, on_step).report(config)
 
 

@@ -156,8 +156,8 @@ class Preprocess:
         yaw_rad = ego.yaw_rad
         x_m, y_m = self._origin_m
         if batch.frame == "sensor":
-            x_m, y_m = x_m + sensor.mount.x_m, y_m + sensor.mount.y_m
-            yaw_rad += sensor.mount.yaw_rad
+            x_m, y_m = x_m + sensor.placed.x_m, y_m + sensor.placed.y_m
+            yaw_rad += sensor.placed.yaw_rad
         x_m, y_m, vx_mps, vy_mps = body_point(*ego[:5], x_m, y_m)
         return SensorPose(float(x_m), float(y_m), yaw_rad, float(vx_mps), float(vy_mps))
 

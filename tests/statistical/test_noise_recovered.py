@@ -11,6 +11,7 @@ from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
 from fgtrack.models.motion import CTRV, CV
+from fgtrack.pipeline.assumed import source_of
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config, read_scenario
 from fgtrack.pipeline.tune import tuned
@@ -183,7 +184,7 @@ def test_every_identifiable_standard_deviation_is_found(
     messages, config, truth = scene(seed)
     kept = list(messages)
     kept = [one for one in kept if one.receipt_ns < kept[0].receipt_ns + nanoseconds(SECONDS)]
-    report = tuned({"scene": lambda: iter(kept)}, config)
+    report = tuned({"scene": source_of(lambda: kept)}, config)
     assert wrong(report, truth) == []
     measured = [one for one in report.parameters if one.key.startswith("sensors")]
     assert all(one.identifiable for one in measured), [one.key for one in measured if not one.identifiable]

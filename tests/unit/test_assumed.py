@@ -1,18 +1,24 @@
+import math
 from dataclasses import replace
 
 import pytest
 from support.paper import paper
-from support.tracking import message
+from support.tracking import START_NS, message
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, EgoState
 from fgtrack.io.config import InputConfig, TopicInput
-from fgtrack.models.sensors import SensorModel
+from fgtrack.io.recording import write_recording
+from fgtrack.io.source import open_input
+from fgtrack.models.road import OpenSpace
+from fgtrack.models.sensors import Mount, SensorModel
 from fgtrack.pipeline.assumed import ASSUMED_STD, assumed, source_of
+from fgtrack.pipeline.build import build_road
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.effective import Effective
-from fgtrack.pipeline.public import replay
-from fgtrack.pipeline.shipped import read_config
+from fgtrack.pipeline.public import replay, simulate
+from fgtrack.pipeline.recorded import recorded_of
+from fgtrack.pipeline.shipped import read_config, read_scenario
 from fgtrack.tracking.tracker import check_sensor
 
 POINT = Detection(x_m=20.0, y_m=1.0)
@@ -49,7 +55,8 @@ def test_what_the_input_names_and_the_recording_has_no_detection_of_is_taken_to_
 
 def test_named_sensors_stay_the_only_ones() -> None:
     named = paper()
-    assert assumed(named, source_of(lambda: [message(POINT, sensor="odd")])).config.sensors == named.sensors
+    found = assumed(named, source_of(lambda: [message(POINT, sensor="odd")])).config
+    assert found.sensors.keys() == named.sensors.keys()
     with pytest.raises(DataError, match="'odd' has no model"):
         check_sensor("odd", named.sensors)
 
@@ -101,3 +108,134 @@ def test_what_was_assumed_is_a_configuration_that_assumes_nothing_and_says_why(t
     loaded = read_config(path)
     assert loaded == found.config
     assert assumed(loaded, source_of(lambda: lists)).assumptions == ()
+
+
+CARRIED = {
+    "ego": {"detection_origin_x_m": -1.74, "of a later version": 1},
+    "map": {"track": "oval"},
+    "sensors": {"lidar": {"field_of_view_rad": 2.0, "view_range_m": 80.0, "mount": {"x_m": 2.0}}, "unheard": {}},
+}
+
+
+def carrying(settings, *objects, sensor="lidar"):
+    return replace(source_of(lambda: [message(*objects, sensor=sensor)]), settings=lambda: settings)
+
+
+def test_what_a_recording_carries_is_taken_where_the_configuration_is_open() -> None:
+    found = assumed(Config(), carrying(CARRIED, POINT))
+    lidar = found.config.sensors["lidar"]
+    assert (found.config.ego.detection_origin_x_m, found.config.map.track) == (-1.74, "oval")
+    assert (lidar.field_of_view_rad, lidar.view_range_m, lidar.mount) == (2.0, 80.0, Mount(2.0))
+    assert list(found.config.sensors) == ["lidar"]
+    assert {one.key for one in found.assumptions if one.reason == "recorded"} == {
+        "ego.detection_origin_x_m",
+        "map.track",
+        "sensors.lidar.mount",
+        "sensors.lidar.field_of_view_rad",
+        "sensors.lidar.view_range_m",
+    }
+    assert found.lines() == [
+        "assumed, recording: ego.detection_origin_x_m -1.74, map.track oval (recorded)",
+        "assumed, lidar: standard deviations x_m 1, y_m 1 (usual of a detector of cars by LiDAR or RADAR); "
+        "mounted at 2 m, 0 m, sees 115 degrees, up to 80 m (recorded)",
+    ]
+
+
+@pytest.mark.parametrize("as_file", [True, False])
+def test_a_key_that_the_user_has_set_wins_also_where_it_is_set_to_its_default(tmp_path, as_file) -> None:
+    settings = [
+        "ego.detection_origin_x_m=0.0",
+        "map.track=none",
+        "sensors.lidar={std: {x_m: 1.0, y_m: 1.0}, mount: {}, field_of_view_rad: 6.28}",
+    ]
+    if as_file:
+        path = tmp_path / "c.yaml"
+        path.write_text("\n".join(one.replace(".", ": {", 1).replace("=", ": ") + "}" for one in settings))
+        config = read_config(path)
+    else:
+        config = read_config(None, settings)
+    found = assumed(config, carrying(CARRIED, POINT))
+    assert [one.key for one in found.assumptions] == ["sensors.lidar.view_range_m"]
+    lidar = found.config.sensors["lidar"]
+    assert (lidar.mount, lidar.field_of_view_rad, lidar.view_range_m) == (Mount(), 6.28, 80.0)
+    assert (found.config.ego.detection_origin_x_m, found.config.map.track_file) == (0.0, None)
+    assert isinstance(build_road(found.config.map), OpenSpace)
+
+
+@pytest.mark.parametrize(
+    ("settings", "warning"),
+    [
+        ({"ego": {"detection_origin_x_m": "far"}}, "the recorded settings are not used, ego.detection_origin_x_m"),
+        ({"sensors": {"lidar": {"mount": 3}}}, "the recorded settings are not used, sensors.lidar.mount"),
+        ({"map": {"track": "gone.csv"}}, "the recorded map gone.csv is not there, name it by --map"),
+        ({"by another program": [1]}, None),
+    ],
+)
+def test_what_is_not_valid_of_what_a_recording_carries_is_left_out_with_a_warning(settings, warning, caplog) -> None:
+    found = assumed(Config(), carrying(settings, POINT))
+    assert [one.key for one in found.assumptions] == ["sensors.lidar.std"]
+    assert (found.config.ego.detection_origin_x_m, found.config.map.track) == (0.0, None)
+    assert [warning in one for one in caplog.messages] == ([] if warning is None else [True])
+
+
+def forward(num_scans=400):
+    """A car that swings within 57 degrees ahead, 30 m off, in front of a standing ego."""
+    for k in range(num_scans):
+        bearing_rad = 0.5 * math.sin(0.05 * k)
+        point = Detection(x_m=30.0 * math.cos(bearing_rad), y_m=30.0 * math.sin(bearing_rad))
+        yield EgoState(START_NS + 50_000_000 * k, START_NS + 50_000_000 * k, 0.0, 0.0, 0.0, 0.0)
+        yield message(point, sensor="radar", stamp_ms=50.0 * k)
+
+
+def test_a_sensor_is_taken_to_see_where_it_detects_unless_any_of_it_is_given() -> None:
+    radar = assumed(Config(), source_of(forward)).config.sensors["radar"]
+    assert (radar.field_of_view_rad, radar.view_range_m) == (pytest.approx(1.0, abs=0.03), 33.0)
+    named = replace(Config(), sensors={"radar": SensorModel(std={"x_m": 2.0, "y_m": 2.0})})
+    assert assumed(named, source_of(forward)).config.sensors["radar"] == replace(radar, std={"x_m": 2.0, "y_m": 2.0})
+    for given in ({"field_of_view_rad": 3.0}, {"view_range_m": 90.0}, {"max_range_m": 90.0}):
+        config = replace(Config(), sensors={"radar": SensorModel(std={"x_m": 2.0, "y_m": 2.0}, **given)})
+        assert assumed(config, source_of(forward)).assumptions == ()
+
+
+def test_a_rear_sensor_gets_a_mount_that_looks_back() -> None:
+    def rear():
+        for one in forward():
+            objects = [Detection(x_m=-each.x_m, y_m=each.y_m) for each in getattr(one, "objects", ())]
+            yield replace(one, objects=objects) if objects else one
+
+    found = assumed(Config(), source_of(rear))
+    assert found.config.sensors["radar"].mount == Mount(yaw_rad=pytest.approx(math.pi, abs=0.01))
+    assert "axis 180 degrees, sees 57 degrees, up to 33 m (where it detects, of 400 detections" in found.lines()[0]
+
+
+def test_the_run_of_a_list_of_messages_and_of_an_iterator_are_the_same_and_hold_what_was_assumed() -> None:
+    named = replace(Config(), sensors={"radar": SensorModel(std={"x_m": 2.0, "y_m": 2.0})})
+    runs = [replay(list(forward()), named), replay(forward(), named)]
+    assert runs[0].meta["digest"] == runs[1].meta["digest"]
+    assert runs[0].config["sensors"]["radar"]["field_of_view_rad"] == pytest.approx(1.0, abs=0.03)
+    assert runs[0].config["ego"]["detection_origin_x_m"] == 0.0
+
+
+@pytest.mark.parametrize("name", ["stream.jsonl", "stream.jsonl.gz", "mcap", "sqlite3"])
+def test_what_a_recording_carries_survives_writing_and_converting(tmp_path, name) -> None:
+    settings = recorded_of(read_scenario("default", duration_s=1.0))
+    assert settings["sensors"]["radar"]["mount"] == {"x_m": 3.0, "y_m": 0.0, "yaw_rad": 0.0}
+    storage = "sqlite3" if name == "sqlite3" else "mcap"
+    written = simulate("default", duration_s=1.0, out=tmp_path / name, storage=storage)
+    assert open_input(written).settings() == settings
+    bag = tmp_path / "converted"
+    assert write_recording(bag, open_input(written).messages(), settings=open_input(written).settings())
+    assert open_input(bag).settings() == settings
+    bare = tmp_path / "bare"
+    write_recording(bare, open_input(written).messages())
+    assert open_input(bare).settings() == {}
+
+
+def test_without_a_configuration_a_recording_is_tracked_as_with_what_it_carries(tmp_path) -> None:
+    recording = simulate("default", duration_s=5.0, seed=1, out=tmp_path / "drive.jsonl")
+    bare = replay(recording)
+    path = tmp_path / "assumed.yaml"
+    path.write_text(assumed(Config(), open_input(recording)).to_yaml())
+    messages = list(open_input(recording).messages())
+    assert replay(messages, path).meta["digest"] == bare.meta["digest"] != replay(messages).meta["digest"]
+    assert bare.config["ego"]["detection_origin_x_m"] == -1.74

@@ -196,6 +196,6 @@ def test_what_a_job_raises_is_the_error_of_a_cell(monkeypatch: pytest.MonkeyPatc
         raise SystemExit(0)
 
     monkeypatch.setattr("fgtrack.pipeline.sweep.read_messages", lambda *_: [])
-    recipe = SimpleNamespace(config={}, estimators=("ekf-replay",))
+    recipe = SimpleNamespace(config={}, recording=None, estimators=("ekf-replay",))
     monkeypatch.setattr("fgtrack.pipeline.sweep.replay_in_memory", leaves)
     assert [cell.error for cell in run_job("key", recipe, leaves)[1]] == ["SystemExit: 0"]

@@ -11,6 +11,7 @@ from fgtrack.io.run import Run, Table
 from fgtrack.io.viewer.scene import EgoMotion, Entity, Line, Objects, Scene, ViewerMessage
 from fgtrack.models.areas import ExclusionAreas
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
+from fgtrack.models.road import OPEN_SPACE
 from fgtrack.models.track_map import TrackMap
 
 _BOUND_STEP_M = 2.0
@@ -38,7 +39,7 @@ def roads(run: Run) -> tuple[dict[str, TrackMap], list[str]]:
             found[key] = built_in()
         elif name and Path(str(name)).is_file():
             found[key] = TrackMap.read(Path(str(name)))
-        elif name:
+        elif name and name != OPEN_SPACE:
             notes.append(f"map.{key}: {name} is not there any more, so it is not shown")
     lost = [name for name in config.get("excluded") or () if not Path(str(name)).is_file()]
     notes += [f"map.excluded: {name} is not there any more, so it is not shown" for name in lost]

@@ -2,8 +2,9 @@
 
 import filecmp
 import heapq
+import json
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import combinations
@@ -27,6 +28,8 @@ Record = tuple[Connection, int, bytes]
 """Connection, log time in ns, serialized message."""
 
 METADATA = "metadata.yaml"
+SETTINGS = "fgtrack"
+"""Entry of its custom data with what the recording carries of a configuration, as JSON."""
 _BAG_SUFFIXES = (".mcap", ".db3")
 _NEWEST_VERSION = 9
 _LARGEST_RATIO = 100
@@ -100,6 +103,18 @@ def parts_of(path: Path) -> Parts:
         if one.stat().st_size and filecmp.cmp(one, other, shallow=False):
             raise DataError(f"{path}: {one.name} and {other.name} are copies of one recording: remove or name one")
     return Parts(files)
+
+
+def settings_of(path: Path) -> Mapping[str, object]:
+    """What the recording at `path` carries of a configuration: nothing without a metadata.yaml that has it."""
+    if not (path / METADATA).is_file():
+        return {}
+    try:
+        metadata = safe_yaml(read_whole(path / METADATA, 1.0).decode())
+        found = json.loads(metadata["rosbag2_bagfile_information"]["custom_data"][SETTINGS])
+    except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError, YAMLError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def bags_in(path: Path) -> list[Path]:

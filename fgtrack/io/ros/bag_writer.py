@@ -1,6 +1,7 @@
 """Writes rosbag2 recordings: fgtrack's own messages, exact to the bit, and twins in standard types for other tools."""
 
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -14,7 +15,7 @@ from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.io.adapters.common import RosMessage
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.output import Kind, new_folder
-from fgtrack.io.ros.bag_files import METADATA, parts_of
+from fgtrack.io.ros.bag_files import METADATA, SETTINGS, parts_of
 from fgtrack.io.ros.messages import DETECTED_OBJECTS, DETECTION3D_ARRAY, MessageFactory
 from fgtrack.io.ros.typestore import one_line
 from fgtrack.io.viewer.topics import token
@@ -31,6 +32,7 @@ def write_bag(
     storage: Literal["mcap", "sqlite3"] = "mcap",
     standard_topics: bool = True,
     overwrite: bool = False,
+    settings: Mapping[str, object] | None = None,
 ) -> int:
     """Write `messages` to the rosbag2 folder `path`; gives their number. With `overwrite` a recording is replaced.
 
@@ -39,7 +41,8 @@ def write_bag(
     `/ego/odometry` (nav_msgs/Odometry), `/detections/SENSOR` (vision_msgs/Detection3DArray, or with speeds
     autoware_perception_msgs/DetectedObjects) and `/truth/poses` (geometry_msgs/PoseArray); an object
     without a position is not in them. What is written reaches the disk every thousand messages: a killed
-    writer leaves a recording (`<path>.*.part`) that `Bag` reads up to there.
+    writer leaves a recording (`<path>.*.part`) that `Bag` reads up to there. `settings`, what the recording carries of
+    a configuration, are in the custom data of metadata.yaml.
 
     Raises
     ------
@@ -56,6 +59,8 @@ def write_bag(
             new_folder(path, RECORDING, overwrite) as folder,
             Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=_PLUGINS[storage]) as bag,
         ):
+            if settings:
+                bag.set_custom_data(SETTINGS, json.dumps(settings))
             writer = _MessageWriter(bag, standard_topics)
             readable = UntilBreak(messages)
             for message in readable:

@@ -26,6 +26,7 @@ from fgtrack.io.adapters.scans import grouped
 from fgtrack.io.config import InputConfig, TopicInput
 from fgtrack.io.errors import TruncatedInput
 from fgtrack.io.ros.bag import Bag, BagTopic, is_bag, type_name
+from fgtrack.io.ros.bag_files import settings_of
 from fgtrack.io.source import FileFormat
 
 DETECTION_FIELDS = frozenset({*MEASURABLE, *DESCRIBING, "object_id"})
@@ -104,7 +105,7 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
     return lambda: grouped(bag_messages(bag, uses), windows_ns) if windows_ns else bag_messages(bag, uses)
 
 
-FORMAT = FileFormat("a rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file", is_bag, _open)
+FORMAT = FileFormat("a rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file", is_bag, _open, settings_of)
 
 
 def bag_messages(bag: Bag, uses: tuple[TopicUse, ...]) -> Iterator[Message]:

@@ -1,0 +1,85 @@
+"""What a recording carries of a configuration, so that it is replayed as it was made."""
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from fgtrack.core.errors import DataError
+from fgtrack.io.source import InputSource
+from fgtrack.models.oval import OVAL
+from fgtrack.models.sensors import Mount
+from fgtrack.pipeline.load import plain
+from fgtrack.sim.scenario import Scenario
+
+__all__ = ["Recorded", "RecordedSensor", "recorded", "recorded_of"]
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RecordedSensor:
+    """What is known of a sensor, by the keys of `sensors.NAME`; None of what is not."""
+
+    mount: Mount | None = None
+    field_of_view_rad: float | None = None
+    view_range_m: float | None = None
+    max_range_behind_m: float | None = None
+
+
+@dataclass(frozen=True)
+class _Ego:
+    detection_origin_x_m: float | None = None
+
+
+@dataclass(frozen=True)
+class _Map:
+    track: str | None = None
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """The keys of a configuration that a recording may carry; None of what it does not."""
+
+    ego: _Ego = field(default_factory=_Ego)
+    map: _Map = field(default_factory=_Map)
+    sensors: Mapping[str, RecordedSensor] = field(default_factory=dict)
+
+
+_RECORDED = TypeAdapter(Recorded | None, config=ConfigDict(allow_inf_nan=False))
+
+
+def recorded(source: InputSource) -> Recorded:
+    """What `source` carries of a configuration; a warning is logged where that is not valid.
+
+    A track whose file is not there is left out, with a warning as well.
+    """
+    try:
+        found = _RECORDED.validate_python(source.settings()) or Recorded()
+    except DataError:  # reading the messages says it
+        return Recorded()
+    except ValidationError as error:
+        (first, *_) = error.errors(include_url=False)
+        where = ".".join(str(part) for part in first["loc"])
+        _logger.warning("%s: the recorded settings are not used, %s: %s", source.path, where, first["msg"])
+        return Recorded()
+    track = found.map.track
+    if track is not None and track != OVAL and not Path(track).is_file():
+        _logger.warning("%s: the recorded map %s is not there, name it by --map", source.path, track)
+        return Recorded(found.ego, _Map(), found.sensors)
+    return found
+
+
+def recorded_of(scenario: Scenario) -> dict[str, Any]:  # Any: plain values, as the header of a stream has them
+    """What a recording of `scenario` carries of a configuration."""
+    sensors = {
+        one.name: RecordedSensor(
+            None if one.mount == Mount() else one.mount, one.field_of_view_rad, one.max_range_m, one.max_range_behind_m
+        )
+        for one in scenario.sensors
+    }
+    found: dict[str, Any] = plain(Recorded(_Ego(scenario.detection_origin_x_m), _Map(scenario.map), sensors))
+    return found
