@@ -1,6 +1,7 @@
 """`fgtrack info`: what is in a recording."""
 
 from collections.abc import Set
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -9,7 +10,7 @@ import typer
 
 from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, Overwrite
 from fgtrack.cli.show import chosen_form, progress, say, sentences, show, warn
-from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.evaluation.left_out import left_out
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value
 from fgtrack.io.info import OTHER_CLOCK_S, InputInfo, TopicInfo, describe
@@ -63,6 +64,9 @@ def info(
     trial = None
     if config is not None and found.problem is None and form is None:
         trial = _try_out(recording, config, {(one.about, one.text.split()[0]) for one in found.cautions})
+    elif form is None:
+        with suppress(FgtrackError), progress("detections"):  # whose topics and columns nothing names
+            sentences(assumed(Config(), open_input(recording)).lines())
     problem = found.problem if trial is None else trial.problem
     if problem is not None:
         raise DataError(problem)
@@ -71,7 +75,9 @@ def info(
 def _try_out(recording: Path, config: Config, warned: Set[tuple[str, str]]) -> Trial:
     with progress("first seconds"):
         source = open_input(recording, config.input)
-        trial = try_out(source.messages(), assumed(config, source).config)
+        open_settings = assumed(config, source)
+        trial = try_out(source.messages(), open_settings.config)
+    sentences(open_settings.lines())
     for name, text in trial.samples.items():
         say(f"first of {name}: {text}")
     if trial.run is not None:
