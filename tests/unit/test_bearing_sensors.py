@@ -97,7 +97,7 @@ def test_a_bias_that_is_a_state_pulls_no_track_and_is_found_whatever_arrives_fir
     for name, correlation in (("white", None), ("lasting", Correlation(share=0.99, time_s=100.0))):
         white_rad = std_rad * 0.1  # what of the error is new in every detection
         camera = SensorModel(std={"bearing_rad": std_rad if correlation else white_rad}, correlation=correlation)
-        one = tracker(ExistenceRules(lifetime_s=100.0), estimator, camera)
+        one = tracker(LIVES[0], estimator, camera)
         rng = np.random.default_rng(3)
         for k in range(100):
             now_ns = START_NS + ms(100.0 * k)

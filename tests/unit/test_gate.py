@@ -150,7 +150,7 @@ def sqlite(folder: Path) -> Path:
         (lambda path: log(path, time="noon"), r"message 5: receipt_ns: .* not 'noon'", 4),
         (lambda path: log(path, time=float("inf")), "message 5: receipt_ns: .* not inf", 4),
         (autoferry, "message 5: stamp_ns: a 64 bit integer", 4),
-        (sqlite, "has no time or no bytes", 19),
+        (sqlite, "holds a message without a valid time", 19),
     ],
 )
 def test_a_damaged_input_is_replayed_converted_and_described_up_to_there(tmp_path, make, complaint, least) -> None:

@@ -2,12 +2,10 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from evaluation_runs import WEST, run_beside, write_run
 
 from fgtrack.core.types import TrackReport
-from fgtrack.evaluation import plot
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.prediction import prediction_errors
@@ -36,15 +34,3 @@ def test_an_error_of_the_speed_grows_with_the_horizon(tmp_path: Path) -> None:
         horizon_s = float(horizon.removesuffix("s"))
         assert one.final_m.mean == pytest.approx(horizon_s)
         assert one.average_m.mean == pytest.approx((horizon_s + 0.1) / 2.0)
-
-
-def test_figures_show_the_transient_and_what_the_sensors_saw(run: Run) -> None:
-    shown = plot.transient(run)
-    assert [axes.get_ylabel() for axes in shown.axes] == ["along track [m]", "across track [m]", "speed [m/s]"]
-    assert not shown.axes[2].lines  # two are too few
-    lidar = next(line for line in shown.axes[0].lines if line.get_label() == "lidar")
-    assert np.asarray(lidar.get_ydata())[:6] == pytest.approx(0.3)
-    assert not np.isfinite(np.asarray(lidar.get_ydata())[6:]).any()
-    titles = [axes.get_title() for axes in plot.sensed(run).axes]
-    assert titles[0] == "delay [ms]"
-    assert titles[-1] == "detections per\nobject"

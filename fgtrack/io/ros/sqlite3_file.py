@@ -123,8 +123,10 @@ class Sqlite3File:
             for topic_id, log_ns, number in self._rows("SELECT topic_id, timestamp, id FROM messages NOT INDEXED"):
                 self._readable.append((int(log_ns), int(number)))
                 counts[topic_id] = counts.get(topic_id, 0) + 1
-        except (apsw.Error, TypeError, ValueError) as error:
+        except apsw.Error as error:
             self.break_off = f"is truncated ({error})"
+        except (TypeError, ValueError) as error:
+            self.break_off = f"holds a message without a valid time ({error})"
         self._read_topics(counts)
 
     def _whole_pages(self) -> Path:
