@@ -15,7 +15,7 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import MEASURABLE, DetectionList, Message
 from fgtrack.io.errors import MOST_SENSORS
 from fgtrack.io.source import InputSource
-from fgtrack.models.sensors import Mount, SensorModel
+from fgtrack.models.sensors import Mount, Score, SensorModel
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.coverage import Coverage, coverages
 from fgtrack.pipeline.list_statistics import ListStatistics
@@ -34,6 +34,9 @@ ASSUMED_STD = {
     "bearing_rad": 0.02,
     "range_rate_mps": 0.5,
 }
+
+_LEAST_CLUTTER = 0.05
+"""False detections of a list that can never be excluded."""
 
 RECORDED, USUAL = "recorded", "usual of a detector of cars by LiDAR or RADAR"
 """Reasons."""
@@ -155,7 +158,7 @@ def assumed(config: Config, source: InputSource) -> Assumed:
             for name, one in covered.items():
                 std = _std(one.measured)
                 found.append(Assumption(f"sensors.{name}.std", std, USUAL))
-                sensor, more = _with_lists(name, SensorModel(std=std), lists.get(name, ListStatistics()))
+                sensor, more = _with_lists(name, SensorModel(std=std), one, lists.get(name, ListStatistics()))
                 found += more
                 sensors[name] = _with_recorded(name, sensor, carried.sensors.get(name, RecordedSensor()), found)
         for name, sensor in sensors.items():
@@ -230,16 +233,26 @@ def source_of(messages: Callable[[], Iterable[Message]]) -> InputSource:
     return InputSource(Path(), "messages", lambda: iter(messages()))
 
 
-def _with_lists(name: str, sensor: SensorModel, lists: ListStatistics) -> tuple[SensorModel, list[Assumption]]:
-    """`sensor` with what its lists show of scans and clutter, where that differs from the defaults."""
+def _with_lists(
+    name: str, sensor: SensorModel, seen: Coverage, lists: ListStatistics
+) -> tuple[SensorModel, list[Assumption]]:
+    """`sensor` with what its lists show of scans, misses, clutter and scores."""
     found: dict[str, tuple[Any, str]] = {}
     if not lists.scans:
         found["scan"] = False, "its lists hold one object, and none is empty"
-    if lists.largest_clutter_per_m2 < sensor.clutter_per_m2:
+    elif seen.persistence is not None and seen.area_m2:
+        reason = f"how its detections persist, of {seen.persistence.num_triples} in three lists running"
+        clutter_per_m2 = max(seen.persistence.clutter_per_list, _LEAST_CLUTTER) / seen.area_m2
+        found["detection_probability"] = round(seen.persistence.detection_probability, 2), reason
+        found["clutter_per_m2"] = float(f"{clutter_per_m2:.2g}"), reason
+        if seen.persistence.score is not None:
+            score = seen.persistence.score
+            found["score"] = Score(float(f"{score.even:.3g}"), float(f"{score.scale:.3g}")), reason
+    elif lists.largest_clutter_per_m2 < sensor.clutter_per_m2:
         density = float(f"{lists.largest_clutter_per_m2:.2g}")
         found["clutter_per_m2"] = density, "all detections of a list over the area that they cover"
     sensor = replace(sensor, **{key: value for key, (value, _) in found.items()})
-    return sensor, [Assumption(f"sensors.{name}.{key}", *each) for key, each in found.items()]
+    return sensor, [Assumption(f"sensors.{name}.{key}", plain(value), why) for key, (value, why) in found.items()]
 
 
 def _std(measured: Set[str]) -> dict[str, float]:

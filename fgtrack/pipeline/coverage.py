@@ -11,6 +11,7 @@ from fgtrack.core.geometry import wrap_angle, wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, Detection, DetectionList, EgoState, FloatArray, IntArray, Message
 from fgtrack.models.sensors import Mount
+from fgtrack.pipeline.persistence import Persistence, persistence
 
 __all__ = ["Coverage", "coverages"]
 
@@ -42,6 +43,10 @@ class Coverage:
     """Full angle of its sector; None where it detects all around, or too seldom to tell."""
     range_m: float | None = None
     """Up to where it detects; None where it measures no range, or too seldom."""
+    persistence: Persistence | None = None
+    """How its detections persist from list to list; None where too few do."""
+    area_m2: float | None = None
+    """Area over which its detections with a range are spread."""
 
     def __str__(self) -> str:
         rate = "" if self.rate_hz is None else f" at {self.rate_hz:.3g} Hz"
@@ -90,15 +95,18 @@ class _Detections:
     num_detections: int = 0
     receipts_s: "array[float]" = field(default_factory=lambda: array("d"))
     """Of every list."""
+    stamps_s: "array[float]" = field(default_factory=lambda: array("d"))
+    """Of every list."""
     rows: "array[float]" = field(default_factory=lambda: array("d"))
     """Of every detection with a bearing: number of its list, stamp, x, y (of a bearing alone those of a unit vector),
-    whether it has a range."""
+    whether it has a range, score (NaN without one)."""
     frames: set[str] = field(default_factory=set)
 
     def add(self, message: DetectionList, first_ns: int) -> None:
         """Take the detections of a list; stamps are seconds since `first_ns`."""
         number, stamp_s = len(self.receipts_s), (message.stamp_ns - first_ns) / NS_PER_S
         self.receipts_s.append((message.receipt_ns - first_ns) / NS_PER_S)
+        self.stamps_s.append(stamp_s)
         self.num_detections += len(message.objects)
         if message.objects:
             self.frames.add(message.frame)
@@ -106,7 +114,8 @@ class _Detections:
             self.measured.update(detection.measured)
             x_m, y_m, has_range = _position(detection)
             if math.isfinite(x_m) and math.isfinite(y_m):
-                self.rows.extend((number, stamp_s, x_m, y_m, has_range))
+                score = math.nan if detection.score is None else detection.score
+                self.rows.extend((number, stamp_s, x_m, y_m, has_range, score))
 
     def coverage(self, path: FloatArray, mount: Mount | None) -> Coverage:
         """What they give, with the ego's `path`: times, x, y and yaw, shape (n, 4)."""
@@ -114,12 +123,15 @@ class _Detections:
         span_s = float(np.ptp(receipts_s))
         rate_hz = (len(receipts_s) - 1) / span_s if span_s > 0.0 else None
         found = Coverage(frozenset(self.measured), len(receipts_s), self.num_detections, rate_hz)
-        rows = np.array(self.rows).reshape(-1, 5)
+        rows = np.array(self.rows).reshape(-1, 6)
         has_range = rows[:, 4] > 0.0
         rows = rows[has_range] if has_range.any() else rows
         if len(self.frames) != 1 or len(rows) < _FEWEST or ("map" in self.frames and not len(path)):
             return found
         numbers, offsets_m = rows[:, 0].astype(np.int64), self._offsets_m(rows, path, mount)
+        if has_range.any():
+            extent_m = np.quantile(offsets_m, 1.0 - _OUTSIDE, axis=0) - np.quantile(offsets_m, _OUTSIDE, axis=0)
+            found = replace(found, persistence=self._persistence(rows, path), area_m2=float(np.prod(extent_m)))
         period_s = float(np.median(np.diff(receipts_s))) if len(receipts_s) > 1 else 0.0
         span_s = max(_CELL_S, _CELL_PERIODS * period_s)
         reach = _CELL_M + _CELL_MPS * span_s if has_range.any() else _CELL_BEARING
@@ -132,6 +144,17 @@ class _Detections:
         axis_rad, full_rad = sector or (0.0, None)
         limit_m = None if range_m is None else float(round(_RANGE_FACTOR * range_m))
         return replace(found, axis_rad=axis_rad, field_of_view_rad=full_rad, range_m=limit_m)
+
+    def _persistence(self, rows: FloatArray, path: FloatArray) -> Persistence | None:
+        """Persistence of positions, in the map where the ego's `path` is known."""
+        points_m = rows[:, 2:4]
+        if "map" not in self.frames and len(path):
+            x_m, y_m, yaw_rad = (np.interp(rows[:, 1], path[:, 0], column) for column in path[:, 1:].T)
+            points_m = _turned(points_m, yaw_rad) + np.column_stack([x_m, y_m])
+        stamps_s = np.array(self.stamps_s)
+        begins = np.searchsorted(rows[:, 0], np.arange(len(stamps_s) + 1))  # rows stand list by list
+        lists = [slice(begins[k], begins[k + 1]) for k in np.argsort(stamps_s, kind="stable")]
+        return persistence(np.sort(stamps_s), [points_m[one] for one in lists], [rows[one, 5] for one in lists])
 
     def _offsets_m(self, rows: FloatArray, path: FloatArray, mount: Mount | None) -> FloatArray:
         """Positions seen from the sensor or, where its mount is not known, from the ego, shape (n, 2)."""

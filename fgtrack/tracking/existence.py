@@ -49,8 +49,9 @@ class ExistenceRules:
     lifetime_s: float = 60.0
     """Mean time for which an object stays. A minute is a vehicle near another one, in traffic as in a race; what
     leaves earlier is ended by the lists that miss it."""
-    out_of_view_s: float = 2.0
-    """A track ends where the newest list that could not show it is so much newer than the last one that could."""
+    out_of_view_s: float = 0.5
+    """A track ends where the newest list that could not show it is so much newer than the last one that could: half a
+    second bridges a gap between two fields of view, and little is known of an object that nothing sees for longer."""
     min_travel_m: float = 0.0
     """A track is not confirmed before it was so far from where it began: what never moves is shore, or moored."""
     memory_s: float = 5.0

@@ -1,0 +1,144 @@
+"""How detections persist from list to list: detection probability, clutter and score of a sensor, without tracks."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.spatial import cKDTree
+from scipy.special import expit, log_expit
+
+from fgtrack.core.types import BoolArray, FloatArray
+from fgtrack.models.sensors import Score
+
+__all__ = ["Persistence", "persistence"]
+
+_FASTEST_MPS = 90.0
+_LARGEST_ERROR_M = 3.0
+"""Between two detections of one object, beside what it moves."""
+_MOST_CENTRES = 3_000
+"""Detections whose neighbours are looked for; of longer recordings every n-th list is a centre."""
+_FEWEST = 30
+_CORE = 3.5
+"""Second differences up to so many times their scale belong to one object: all but 0.2 % of a Rayleigh distribution."""
+_PROBABILITY = (0.1, 0.9)
+"""Bounds of the detection probability: what hides an object hides it from several lists in a row."""
+
+
+@dataclass(frozen=True)
+class Persistence:
+    """What triples of detections in three successive lists show of a sensor.
+
+    Three detections on a line at constant speed are of one object. How often the fourth list continues the line is the
+    detection probability; detections in no triple, beyond those that misses explain, are clutter.
+    """
+
+    detection_probability: float
+    clutter_per_list: float
+    score: Score | None
+    """Model of the scores; None if they are absent, or higher ones are not more often of an object."""
+    num_triples: int
+
+
+def persistence(
+    stamps_s: FloatArray, points_m: Sequence[FloatArray], scores: Sequence[FloatArray]
+) -> Persistence | None:
+    """Persistence of detections; None where too few detections follow one another.
+
+    Parameters
+    ----------
+    stamps_s
+        Stamps of the lists, rising, shape (n,).
+    points_m
+        Positions of each list in a frame that does not turn, shape (m, 2) each.
+    scores
+        Scores of each list, NaN where absent, shape (m,) each.
+    """
+    trees = [cKDTree(points) if len(points) else None for points in points_m]
+    every = max(1, math.ceil(sum(map(len, points_m)) / _MOST_CENTRES))
+    misfits, lines, found_scores = [], [], []
+    for k in range(1, len(stamps_s) - 3, every):
+        before_s, after_s = float(stamps_s[k] - stamps_s[k - 1]), float(stamps_s[k + 1] - stamps_s[k])
+        if min(before_s, after_s) <= 0.0:
+            continue
+        for centre_m, score in zip(points_m[k], scores[k], strict=True):
+            best = _best(centre_m, trees[k - 1], trees[k + 1], before_s, after_s)
+            misfits.append(math.inf if best is None else best[0])
+            lines.append((k, None if best is None else best[1]))
+            found_scores.append(score)
+    misfit = np.array(misfits)
+    scale = _scale(misfit[np.isfinite(misfit)])
+    in_triple = misfit <= _CORE * scale
+    num_triples, reach_m = int(in_triple.sum()), _CORE * scale * math.sqrt(6.0)
+    if num_triples < _FEWEST:
+        return None
+    hits, of_object = np.zeros(2, dtype=int), np.zeros(len(misfit), dtype=bool)
+    for row, (k, line) in enumerate(lines):
+        if line is None or not in_triple[row]:
+            continue
+        ahead_s = stamps_s[k + 2 : k + 4] - stamps_s[k + 1]
+        seen = [
+            tree is not None and tree.query(line[0] + line[1] * dt_s)[0] <= (1.0 + n) * reach_m
+            for n, (dt_s, tree) in enumerate(zip(ahead_s.tolist(), trees[k + 2 : k + 4], strict=True))
+        ]
+        hits += seen
+        of_object[row] = all(seen)
+    trials = 2 * num_triples
+    hits = int(hits.sum())
+    probability = min(max((hits + 1) / (trials + 2), _PROBABILITY[0]), _PROBABILITY[1])
+    of_objects = min(num_triples / probability**2, float(len(misfit)))
+    centres = len(range(1, len(stamps_s) - 3, every))
+    clutter = (len(misfit) - of_objects) / centres
+    return Persistence(probability, clutter, _score(np.array(found_scores), of_object, misfit > _CORE * scale), num_triples)
+
+
+def _best(
+    centre_m: FloatArray, before: cKDTree | None, after: cKDTree | None, before_s: float, after_s: float
+) -> tuple[float, tuple[FloatArray, FloatArray]] | None:
+    """Misfit of the straightest triple about a detection, and the position and velocity at its end; None without one.
+
+    The misfit has the standard deviation of a detection, per axis.
+    """
+    if before is None or after is None:
+        return None
+    near = before.query_ball_point(centre_m, _FASTEST_MPS * before_s + _LARGEST_ERROR_M)
+    if not near:
+        return None
+    firsts_m, ratio = np.asarray(before.data)[near], after_s / before_s
+    distances_m, ends = after.query(centre_m + ratio * (centre_m - firsts_m))
+    best = int(np.argmin(distances_m))
+    end_m = np.asarray(after.data)[ends[best]]
+    velocity_mps = (end_m - firsts_m[best]) / (before_s + after_s)
+    return float(distances_m[best]) / math.sqrt(1.0 + ratio**2 + (1.0 + ratio) ** 2), (end_m, velocity_mps)
+
+
+def _scale(misfits: FloatArray) -> float:
+    """Scale of the Rayleigh distribution of the small misfits: their median, without the outliers."""
+    if not len(misfits):
+        return 0.0
+    scale = float(np.median(misfits)) / math.sqrt(2.0 * math.log(2.0))
+    for _ in range(30):
+        scale = float(np.median(misfits[misfits <= _CORE * scale])) / math.sqrt(2.0 * math.log(2.0))
+    return scale
+
+
+def _score(scores: FloatArray, of_object: BoolArray, of_clutter: BoolArray) -> Score | None:
+    """Logistic fit to the scores of detections of objects and of clutter, less the odds of their numbers."""
+    known = np.isfinite(scores) & (of_object | of_clutter)
+    x, y = scores[known], of_object[known]
+    if min(y.sum(), (~y).sum()) < _FEWEST or np.ptp(x) == 0.0:
+        return None
+    middle, width = float(np.median(x)), float(np.std(x))
+    z, sign = (x - middle) / width, np.where(y, 1.0, -1.0)
+
+    def cost(p: FloatArray) -> tuple[float, FloatArray]:
+        margin = sign * (p[0] + p[1] * z)
+        slope = -sign * expit(-margin)
+        return -float(log_expit(margin).sum()), np.array([slope.sum(), (slope * z).sum()])
+
+    intercept, slope = minimize(cost, np.zeros(2), jac=True, method="BFGS").x
+    if slope <= 0.0:
+        return None
+    prior = math.log(y.sum() / (~y).sum())
+    return Score(even=middle + width * (prior - intercept) / slope, scale=width / slope)
