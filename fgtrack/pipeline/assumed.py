@@ -16,11 +16,12 @@ from fgtrack.core.types import MEASURABLE, DetectionList, Message
 from fgtrack.io.errors import MOST_SENSORS
 from fgtrack.io.source import InputSource
 from fgtrack.models.sensors import Mount, Score, SensorModel
-from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.config import Config, LifecycleConfig
 from fgtrack.pipeline.coverage import Coverage, coverages
 from fgtrack.pipeline.list_statistics import ListStatistics
 from fgtrack.pipeline.load import plain
 from fgtrack.pipeline.recorded import RecordedSensor, recorded
+from fgtrack.tracking.existence import ExistenceRules
 
 __all__ = ["ASSUMED_STD", "Assumed", "Assumption", "assumed", "is_open", "source_of"]
 
@@ -35,6 +36,8 @@ ASSUMED_STD = {
     "range_rate_mps": 0.5,
 }
 
+_LISTS_OUT_OF_VIEW = 2.5
+"""Periods of the slowest sensor for which a track that is out of view lives on."""
 _LEAST_CLUTTER = 0.05
 """False detections of a list that can never be excluded."""
 
@@ -151,6 +154,7 @@ def assumed(config: Config, source: InputSource) -> Assumed:
         name: _with_recorded(name, sensor, carried.sensors.get(name, RecordedSensor()), found)
         for name, sensor in config.sensors.items()
     }
+    lifecycle = config.lifecycle
     if is_open(replace(config, sensors=sensors)):
         mounts = {name: one.mount for name, one in (sensors or carried.sensors).items() if one.mount is not None}
         covered, lists = _seen(source, config, mounts)
@@ -164,11 +168,12 @@ def assumed(config: Config, source: InputSource) -> Assumed:
         for name, sensor in sensors.items():
             if sensor.scan and not sensor.is_view_given and name in covered:
                 sensors[name] = _with_coverage(name, sensor, covered[name], found)
+        lifecycle = _with_slow_lists(config.lifecycle, covered.values(), found)
     sensors = {
         name: replace(sensor, field_of_view_rad=sensor.field_of_view_rad or math.tau)
         for name, sensor in sensors.items()
     }
-    return Assumed(replace(config, ego=ego, map=road, sensors=sensors), tuple(found))
+    return Assumed(replace(config, ego=ego, map=road, lifecycle=lifecycle, sensors=sensors), tuple(found))
 
 
 def is_open(config: Config) -> bool:
@@ -185,6 +190,16 @@ def _with_recorded(name: str, sensor: SensorModel, carried: RecordedSensor, foun
     }
     found += [Assumption(f"sensors.{name}.{key}", plain(value), RECORDED) for key, value in given.items()]
     return replace(sensor, **given)
+
+
+def _with_slow_lists(rules: LifecycleConfig, seen: Iterable[Coverage], found: list[Assumption]) -> LifecycleConfig:
+    """`rules` in which a track outlives two lists of the slowest sensor that do not see it, unless that is set."""
+    slowest_s = max((1.0 / one.rate_hz for one in seen if one.rate_hz), default=0.0)
+    key, at_least_s = "out_of_view_s", float(f"{_LISTS_OUT_OF_VIEW * slowest_s:.2g}")
+    if not isinstance(rules, ExistenceRules) or not rules.out_of_view_s == ExistenceRules.out_of_view_s < at_least_s:
+        return rules
+    found.append(Assumption(f"lifecycle.{key}", at_least_s, "two lists of the slowest sensor"))
+    return replace(rules, out_of_view_s=at_least_s)
 
 
 def _with_coverage(name: str, sensor: SensorModel, seen: Coverage, found: list[Assumption]) -> SensorModel:
@@ -240,7 +255,7 @@ def _with_lists(
     found: dict[str, tuple[Any, str]] = {}
     if not lists.scans:
         found["scan"] = False, "its lists hold one object, and none is empty"
-    elif seen.persistence is not None and seen.area_m2:
+    if lists.scans and seen.persistence is not None and seen.area_m2:
         reason = f"how its detections persist, of {seen.persistence.num_triples} in three lists running"
         clutter_per_m2 = max(seen.persistence.clutter_per_list, _LEAST_CLUTTER) / seen.area_m2
         found["detection_probability"] = round(seen.persistence.detection_probability, 2), reason

@@ -90,7 +90,9 @@ def persistence(
     of_objects = min(num_triples / probability**2, float(len(misfit)))
     centres = len(range(1, len(stamps_s) - 3, every))
     clutter = (len(misfit) - of_objects) / centres
-    return Persistence(probability, clutter, _score(np.array(found_scores), of_object, misfit > _CORE * scale), num_triples)
+    return Persistence(
+        probability, clutter, _score(np.array(found_scores), of_object, misfit > _CORE * scale), num_triples
+    )
 
 
 def _best(

@@ -46,9 +46,9 @@ class ExistenceRules:
     """A confirmed track below this is published as tentative until it is seen again."""
     delete_probability: float = 0.02
     """A track below this ends."""
-    lifetime_s: float = 60.0
-    """Mean time for which an object stays. A minute is a vehicle near another one, in traffic as in a race; what
-    leaves earlier is ended by the lists that miss it."""
+    lifetime_s: float = 20.0
+    """Mean time for which an object stays: oncoming traffic is near for seconds, a car ahead for minutes. It matters
+    where few lists could show an object; elsewhere those that miss it end its track."""
     out_of_view_s: float = 0.5
     """A track ends where the newest list that could not show it is so much newer than the last one that could: half a
     second bridges a gap between two fields of view, and little is known of an object that nothing sees for longer."""
