@@ -22,6 +22,8 @@ _MOST_CENTRES = 3_000
 _FEWEST = 30
 _CORE = 3.5
 """Second differences up to so many times their scale belong to one object: all but 0.2 % of a Rayleigh distribution."""
+_Line = tuple[FloatArray, FloatArray]
+"""Position and velocity, shape (2,) each."""
 _PROBABILITY = (0.1, 0.9)
 """Bounds of the detection probability: what hides an object hides it from several lists in a row."""
 
@@ -73,31 +75,32 @@ def persistence(
     num_triples, reach_m = int(in_triple.sum()), _CORE * scale * math.sqrt(6.0)
     if num_triples < _FEWEST:
         return None
-    hits, of_object = np.zeros(2, dtype=int), np.zeros(len(misfit), dtype=bool)
-    for row, (k, line) in enumerate(lines):
-        if line is None or not in_triple[row]:
-            continue
-        ahead_s = stamps_s[k + 2 : k + 4] - stamps_s[k + 1]
-        seen = [
-            tree is not None and tree.query(line[0] + line[1] * dt_s)[0] <= (1.0 + n) * reach_m
-            for n, (dt_s, tree) in enumerate(zip(ahead_s.tolist(), trees[k + 2 : k + 4], strict=True))
-        ]
-        hits += seen
-        of_object[row] = all(seen)
-    trials = 2 * num_triples
-    hits = int(hits.sum())
-    probability = min(max((hits + 1) / (trials + 2), _PROBABILITY[0]), _PROBABILITY[1])
-    of_objects = min(num_triples / probability**2, float(len(misfit)))
-    centres = len(range(1, len(stamps_s) - 3, every))
-    clutter = (len(misfit) - of_objects) / centres
-    return Persistence(
-        probability, clutter, _score(np.array(found_scores), of_object, misfit > _CORE * scale), num_triples
-    )
+    hits, of_object = 0, np.zeros(len(misfit), dtype=bool)
+    for row in np.flatnonzero(in_triple).tolist():
+        k, line = lines[row]
+        if line is not None:
+            seen = _continued(line, stamps_s[k + 2 : k + 4] - stamps_s[k + 1], trees[k + 2 : k + 4], reach_m)
+            hits += sum(seen)
+            of_object[row] = all(seen)
+    share = (hits + 1) / (2 * num_triples + 2)
+    probability = float(np.clip(share, *_PROBABILITY))
+    of_objects = min(num_triples / probability**2, float(len(misfit)))  # the others' neighbours were missed
+    clutter = (len(misfit) - of_objects) / len(range(1, len(stamps_s) - 3, every))
+    return Persistence(probability, clutter, _score(np.array(found_scores), of_object, ~in_triple), num_triples)
+
+
+def _continued(line: _Line, ahead_s: FloatArray, trees: Sequence[cKDTree | None], reach_m: float) -> list[bool]:
+    """True for each of the next lists, `ahead_s` after the triple, that has a detection on its line."""
+    point_m, velocity_mps = line
+    return [
+        tree is not None and float(np.min(tree.query(point_m + velocity_mps * dt_s)[0])) <= n * reach_m
+        for n, (dt_s, tree) in enumerate(zip(ahead_s.tolist(), trees, strict=True), start=1)
+    ]
 
 
 def _best(
     centre_m: FloatArray, before: cKDTree | None, after: cKDTree | None, before_s: float, after_s: float
-) -> tuple[float, tuple[FloatArray, FloatArray]] | None:
+) -> tuple[float, _Line] | None:
     """Misfit of the straightest triple about a detection, and the position and velocity at its end; None without one.
 
     The misfit has the standard deviation of a detection, per axis.
@@ -108,7 +111,8 @@ def _best(
     if not near:
         return None
     firsts_m, ratio = np.asarray(before.data)[near], after_s / before_s
-    distances_m, ends = after.query(centre_m + ratio * (centre_m - firsts_m))
+    found = after.query(centre_m + ratio * (centre_m - firsts_m))
+    distances_m, ends = np.asarray(found[0]), np.asarray(found[1])
     best = int(np.argmin(distances_m))
     end_m = np.asarray(after.data)[ends[best]]
     velocity_mps = (end_m - firsts_m[best]) / (before_s + after_s)
