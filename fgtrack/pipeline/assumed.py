@@ -21,6 +21,7 @@ from fgtrack.pipeline.coverage import Coverage, coverages
 from fgtrack.pipeline.list_statistics import ListStatistics
 from fgtrack.pipeline.load import plain
 from fgtrack.pipeline.recorded import RecordedSensor, recorded
+from fgtrack.pipeline.revisits import for_slow_revisits
 from fgtrack.tracking.existence import ExistenceRules
 
 __all__ = ["ASSUMED_STD", "Assumed", "Assumption", "assumed", "is_open", "source_of"]
@@ -137,6 +138,7 @@ def assumed(config: Config, source: InputSource) -> Assumed:
     - What its detections show (`coverages`): the sensors, where `config` has none, with what they measure; field of
       view and range of those of which neither the configuration nor the recording gives any of both. A position counts
       once: a detection of x and y is not taken as range and bearing as well.
+    - How often they come back: motion and clock of objects that are measured every few seconds (`for_slow_revisits`).
     - Usual values: standard deviations, and a sensor that looks all around from the origin.
     """
     carried = recorded(source)
@@ -159,6 +161,8 @@ def assumed(config: Config, source: InputSource) -> Assumed:
         mounts = {name: one.mount for name, one in (sensors or carried.sensors).items() if one.mount is not None}
         covered, lists = _seen(source, config, mounts)
         if not sensors:
+            config, more = _for_revisits(config, lists)
+            found += more
             for name, one in covered.items():
                 std = _std(one.measured)
                 found.append(Assumption(f"sensors.{name}.std", std, USUAL))
@@ -268,6 +272,14 @@ def _with_lists(
         found["clutter_per_m2"] = density, "all detections of a list over the area that they cover"
     sensor = replace(sensor, **{key: value for key, (value, _) in found.items()})
     return sensor, [Assumption(f"sensors.{name}.{key}", plain(value), why) for key, (value, why) in found.items()]
+
+
+def _for_revisits(config: Config, lists: Mapping[str, ListStatistics]) -> tuple[Config, list[Assumption]]:
+    """`config` with what suits objects that are seldom measured, see `for_slow_revisits`."""
+    sections, reason = for_slow_revisits(config, [one.revisits for one in lists.values()])
+    given = {name: _departures(section, getattr(config, name)) for name, section in sections.items()}
+    found = [Assumption(f"{name}.{key}", value, reason) for name, one in given.items() for key, value in one.items()]
+    return replace(config, **sections), found
 
 
 def _std(measured: Set[str]) -> dict[str, float]:

@@ -5,6 +5,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from fgtrack.core.types import DetectionList
+from fgtrack.pipeline.revisits import Revisits
 
 REPORTS_SHARE = 0.75
 """Share of lists with one object from which on a sensor reports objects one by one, if none of its lists is empty."""
@@ -22,10 +23,13 @@ class ListStatistics:
     """Smallest x and y of a detection, in its frame."""
     high_m: tuple[float, float] = (-math.inf, -math.inf)
     """Largest x and y."""
+    revisits: Revisits = field(default_factory=Revisits)
+    """How often an object is measured."""
 
     def add(self, message: DetectionList) -> None:
         """Count a list."""
         self.num_objects[len(message.objects)] += 1
+        self.revisits.add(message)
         for one in message.objects:
             x_m, y_m = one.x_m, one.y_m
             if (x_m is None or y_m is None) and one.range_m is not None and one.bearing_rad is not None:

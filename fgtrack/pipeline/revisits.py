@@ -1,0 +1,95 @@
+"""How often the objects of a recording are measured, and what is assumed of their motion where that is seldom."""
+
+import math
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from statistics import median
+from typing import Any  # of sections of the configuration
+
+import numpy as np
+
+from fgtrack.core.time import seconds
+from fgtrack.core.types import DetectionList, FloatArray
+from fgtrack.estimation.smoother_settings import SmootherSettings
+from fgtrack.pipeline.config import ClockConfig, Config, FilterConfig, MotionConfig
+
+__all__ = ["Revisits", "for_slow_revisits"]
+
+#: No vehicle is faster than an airliner [m/s], and no position of one is worse than this [m].
+_FASTEST_MPS, _POSITION_M = 300.0, 10.0
+#: How far back one looks for an object, of how many detections, and how many are too few.
+_MEMORY_S, _MOST, _FEWEST = 60.0, 5000, 20
+
+#: Standard deviation per step at 100 Hz, hence a density of 225 m^2/s^3. Singer's model (Estimating optimal tracking
+#: filter performance for manned maneuvering targets, IEEE T-AES 1970) has 2 sigma^2 tau: an aircraft that banks by at
+#: most 25 degrees accelerates by 4.6 m/s^2, evenly distributed sigma = 2.6 m/s^2, for some 17 s. Ships do less.
+_MANOEUVRES = {"velocity": 150.0}
+_NODE_HZ, _LONGEST_S = 1.0, 60.0
+
+
+@dataclass
+class Revisits:
+    """Times from one detection of an object to its next one by the same sensor, for one sensor."""
+
+    times_s: list[float] = field(default_factory=list)
+    """One for each detection that an earlier one could be of, within reach of the fastest vehicle."""
+    _recent: deque[tuple[int, FloatArray]] = field(default_factory=deque)
+
+    def add(self, message: DetectionList) -> None:
+        """Learn from a list; those of a sensor come in order of receipt."""
+        if len(self.times_s) >= _MOST:
+            return
+        found_m = np.array(list(_positions_m(message)), dtype=np.float64).reshape(-1, 2)
+        oldest_ns = message.stamp_ns - round(_MEMORY_S * 1e9)
+        while self._recent and self._recent[0][0] < oldest_ns:
+            self._recent.popleft()
+        for position_m in found_m:
+            for stamp_ns, points_m in reversed(self._recent):
+                elapsed_s = seconds(message.stamp_ns - stamp_ns)
+                reach_m = _FASTEST_MPS * elapsed_s + _POSITION_M
+                if elapsed_s > 0.0 and (np.abs(points_m - position_m).max(axis=1) <= reach_m).any():
+                    self.times_s.append(elapsed_s)
+                    break
+        if len(found_m):
+            self._recent.append((message.stamp_ns, found_m))
+
+    @property
+    def typical_s(self) -> float | None:
+        """Median; None of a sensor that gives no positions, or too few."""
+        return median(self.times_s) if len(self.times_s) >= _FEWEST else None
+
+
+def for_slow_revisits(config: Config, revisits: Iterable[Revisits]) -> tuple[dict[str, Any], str]:
+    """Sections of `config` for objects that every sensor measures too seldom for the defaults, by name, and the reason.
+
+    The default motion model is linearised along the heading, whose standard deviation after a time t without a
+    measurement is sqrt(q t^3 / 3), q the density of the yaw rate. Where it exceeds 1 rad the heading is unknown, and a
+    straight line with the noise of `_MANOEUVRES`, which is linear, predicts better. Windows then hold two
+    measurements of an object, and ticks are as many times rarer. Sections that are not the default stay as they are.
+    """
+    typical_s = [found.typical_s for found in revisits]
+    known_s = [each for each in typical_s if each is not None]
+    default = MotionConfig()
+    density = default.std_per_s["yaw_rate"] ** 2 / default.noise_hz
+    limit_s = math.cbrt(3.0 / density)
+    if len(known_s) < len(typical_s) or not known_s or min(known_s) <= limit_s:
+        return {}, ""
+    window_s = min(float(math.ceil(2.0 * min(known_s))), _LONGEST_S)
+    sections = {
+        "motion": MotionConfig(kind="cv", std_per_s=_MANOEUVRES),
+        "clock": ClockConfig(node_hz=_NODE_HZ),
+        "filter": FilterConfig(storage_s=window_s),
+        "smoother": SmootherSettings(lag_s=window_s),
+    }
+    reason = f"an object is measured every {min(known_s):.2g} s, the default model loses its heading in {limit_s:.2g} s"
+    open_ones = {name: section for name, section in sections.items() if getattr(config, name) == type(section)()}
+    return open_ones, reason
+
+
+def _positions_m(message: DetectionList) -> Iterator[tuple[float, float]]:
+    for one in message.objects:
+        if one.x_m is not None and one.y_m is not None:
+            yield one.x_m, one.y_m
+        elif one.range_m is not None and one.bearing_rad is not None:
+            yield one.range_m * math.cos(one.bearing_rad), one.range_m * math.sin(one.bearing_rad)
