@@ -70,6 +70,16 @@ class Assumption:
         match self.key.rpartition(".")[2]:
             case "std":
                 return f"standard deviations {', '.join(f'{name} {one:g}' for name, one in value.items())}"
+            case "detection_probability":
+                return f"detection probability {value:g}"
+            case "clutter_per_m2":
+                return f"clutter {value:g} per m2"
+            case "score":
+                return f"score {value['even']:g} as often of objects as of clutter, e times per {value['scale']:g}"
+            case "scan":
+                return "reports objects one by one"
+            case "out_of_view_s":
+                return f"tracks out of view end after {value:g} s"
             case "field_of_view_rad":
                 return "sees all around" if value >= math.tau else f"sees {math.degrees(value):.0f} degrees"
             case "view_range_m":
