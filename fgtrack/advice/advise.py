@@ -123,7 +123,7 @@ class _Adviser:
         """Return the advice after all steps."""
         work = 0.35 if tune else 1.0  # share of the work without the tuning
         if self._assumed.assumptions:
-            text = f"assumed, as not configured: {'; '.join(map(str, self._assumed.assumptions))}."
+            text = f"not configured: {'. '.join(self._assumed.lines())}."
             self._findings.append(Finding("assumed", "sensors", 35.0, text))
         self._take(self._strangers())
         before = self._config

@@ -26,7 +26,7 @@ from fgtrack.io.output import Kind, check_apart, check_output, claimed, new_file
 from fgtrack.io.run import RUN, Run, load_run, write_metrics
 from fgtrack.io.source import InputSource, open_input
 from fgtrack.io.span import end_ns
-from fgtrack.pipeline.assumed import Assumed, Assumption, assumed
+from fgtrack.pipeline.assumed import Assumed, assumed
 from fgtrack.pipeline.close_up import close_ups
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.inputs import inputs
@@ -57,7 +57,7 @@ class Study:
     summary
         About five sentences: the recording, the tracks, the best method, the noise, what to do.
     assumptions
-        Settings that neither the configuration nor the advice gives.
+        Settings that neither the configuration nor the advice gives, a line per sensor with the reasons.
     advice
         None where it was not asked for, or nothing could be judged.
     tables
@@ -68,7 +68,7 @@ class Study:
 
     path: Path
     summary: tuple[str, ...]
-    assumptions: tuple[Assumption, ...] = field(repr=False)
+    assumptions: tuple[str, ...] = field(repr=False)
     advice: Advice | None = field(repr=False)
     runs: tuple[Run, ...] = field(repr=False)
     tables: Tables = field(repr=False)
@@ -85,7 +85,7 @@ class Study:
         return self.path / "settings.yaml"
 
     def __str__(self) -> str:
-        lines = [*self.summary, *(f"assumed {one}" for one in self.assumptions)]
+        lines = [*self.summary, *self.assumptions]
         return "\n".join([*lines, f"settings: {self.settings}", f"report: {self.report}"])
 
 
@@ -160,12 +160,12 @@ def study(
         on_step("draw", _DRAW)
         opening = Opening(
             sentences=lines,
-            assumptions=tuple(str(one) for one in known.assumptions),
+            assumptions=known.lines(),
             advice=() if advised is None else advised.sentences,
         )
         _pictured(every, tables, opening, figures, page, overwrite)
         on_step("done", _DONE)
-    return Study(out, lines, known.assumptions, advised, tuple(o.run for o in every), tables, results[0].broken)
+    return Study(out, lines, tuple(known.lines()), advised, tuple(o.run for o in every), tables, results[0].broken)
 
 
 def outputs(out: Path) -> list[Path]:

@@ -48,7 +48,7 @@ def show_study(found: Study, recording: Path) -> None:
     show(replace(found.tables, verdict=()), None)
     say("")
     for assumption in found.assumptions:
-        say(f"assumed {assumption}")
+        say(assumption)
     again = command_line("fgtrack", "study", recording, "-c", found.settings, "-o", "OTHER")
     say(f"settings: {found.settings}; change them and run again by `{again}`")
     say(f"every table and column: {command_line('fgtrack', 'compare', found.path / 'runs', '--all')}")

@@ -454,7 +454,7 @@ def test_noise_that_cannot_be_fitted_leaves_the_other_advice(call: Call) -> None
     code, text = call("advise", "drive.jsonl", "--tune")
     assert code == 0
     assert "- tune: no noise is changed: " in text
-    assert "- sensors: assumed, as not configured: " in text
+    assert "- sensors: not configured: assumed, " in text
     assert "--tune" not in text
 
 
