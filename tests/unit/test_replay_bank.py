@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fgtrack.core.time import nanoseconds
@@ -93,7 +93,6 @@ def drawn(rng: np.random.Generator, motion: MotionModel, offset_ns: int) -> Meas
     return Measurement(START.stamp_ns + offset_ns, model, z, np.diag(std**2), pose, loss, assumed)
 
 
-@settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), motion=st.sampled_from([CTRV(), CTRA(), CV()]), sought=st.booleans())
 def test_any_history_is_that_of_one_estimator_for_each_object(seed: int, motion: MotionModel, sought: bool) -> None:
     rng = np.random.default_rng(seed)
