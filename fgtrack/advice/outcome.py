@@ -11,7 +11,7 @@ from fgtrack.advice.noise import NoiseFit, noise_fits
 from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.cautions import FAR_OFF, USED, misfits
 from fgtrack.evaluation.contest import POSITION_NEES, contests
-from fgtrack.evaluation.matching import confirmed
+from fgtrack.evaluation.lives import MOST_BREAKS_PER_MINUTE, Lives
 from fgtrack.evaluation.metrics import ObjectMetrics, evaluate
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.io.run import Run
@@ -21,7 +21,7 @@ __all__ = ["Outcome", "harm", "objection"]
 _CHANCE = 2.0  # standard deviations of the difference of two counts
 _MORE_USED = 0.05  # share of the detections of a sensor
 _LESS = 0.02  # share of states that fewer are tracked by where it counts
-_FEWEST_TRACKED, _MOST_BREAKS = 0.95, 2.0
+_FEWEST_TRACKED = 0.95
 _POSITION_DOF = 2.0
 
 
@@ -49,15 +49,11 @@ class Outcome:
         """Return the numbers of `run`."""
         counts = dict(run.meta["counts"])
         used = {name: sum(one.get(fate, 0) for fate in USED) / (sum(one.values()) or 1) for name, one in counts.items()}
-        rows = confirmed(run.tracks)
-        ids, inverse = np.unique(run.tracks["track_id"][rows], return_inverse=True)
-        now_ns = run.tracks["now_ns"][rows]
-        life_s = [float(np.ptp(now_ns[inverse == place])) / NS_PER_S for place in range(len(ids))]
-        truth, ticks_ns = evaluate(run).truth, run.timing["now_ns"]
+        lives, truth, ticks_ns = Lives.of(run), evaluate(run).truth, run.timing["now_ns"]
         return cls(
             births=int(np.count_nonzero(run.updates["disposition"] == "birth")),
-            confirmed=len(ids),
-            life_s=float(np.median(life_s)) if life_s else math.nan,
+            confirmed=len(lives.lives_s),
+            life_s=lives.median_s,
             used=used,
             noise=tuple(noise_fits(run)),
             truth=None if truth is None else truth.overall,
@@ -76,7 +72,7 @@ class Outcome:
         if self.truth is None or not self.truth.ticks_in_sight:
             return None
         tracked = self.truth.tracked_share_in_sight
-        if tracked >= _FEWEST_TRACKED and self.breaks_per_minute <= _MOST_BREAKS:
+        if tracked >= _FEWEST_TRACKED and self.breaks_per_minute <= MOST_BREAKS_PER_MINUTE:
             return None
         return (
             f"true objects are tracked {percent(tracked)} of the time in which a sensor could see them, with "

@@ -13,6 +13,7 @@ from fgtrack.core.types import FloatArray
 from fgtrack.estimation.failures import Failure
 from fgtrack.evaluation.innovations import autocorrelations, num_measured
 from fgtrack.evaluation.left_out import because
+from fgtrack.evaluation.lives import MOST_BREAKS_PER_MINUTE, Lives
 from fgtrack.evaluation.statistics import ChiSquareMean
 from fgtrack.io.run import Run, Table, digest
 from fgtrack.models.measurement import ANGULAR
@@ -27,6 +28,10 @@ FEWEST = 30
 """Updates of a sensor whose NIS says something."""
 LASTING = 0.3
 """Autocorrelation of innovations at lag 1 above which their errors are correlated in time."""
+_FEWEST_BREAKS, _BREAKS_SHARE = 3, 0.25
+"""Breaks, and their share of all confirmed tracks, that are not those of occlusions or of chance."""
+_DEAD_SHARE = 0.5
+"""Share of the detections used that begin a track which is never confirmed; of clutter it is below."""
 
 #: Cause and cure of what can happen to most detections of a sensor, by disposition.
 _CURES = {
@@ -46,7 +51,7 @@ _NAME_EGO = "name its topic in the configuration (`fgtrack info` lists the topic
 
 def cautions(run: Run) -> list[Caution]:
     """What is wrong with `run` as far as its files say."""
-    found = (_changed, _clocks, _angles, _ego, _map, _lost, _window, _failures)
+    found = (_changed, _clocks, _angles, _ego, _map, _lost, _window, _failures, _lives)
     return [one for of_kind in found for one in of_kind(run)]
 
 
@@ -64,10 +69,11 @@ def noise_cautions(run: Run) -> list[Caution]:
             f"mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}, as if "
             f"errors were {factor:.2g} times what is configured"
         )
+        fit = _advise(run, " --tune -o advised.yaml")
         lag1 = innovation_lag1(run, sensor)
         if lag1 is not None and lag1 > LASTING:
             text += f", and errors are correlated in time ({lag1:.2f}), which fitted white noise cannot express"
-        found.append(Caution(sensor, f"{text}; `{_advise(run)}` fits it, or says what has to be done first"))
+        found.append(Caution(sensor, f"{text}; `{fit}` fits it, or says what has to be done first"))
     return found
 
 
@@ -91,12 +97,11 @@ def misfits(run: Run) -> Iterator[tuple[str, ChiSquareMean]]:
             yield sensor, nis
 
 
-def _advise(run: Run) -> str:
-    """The command that judges the noise of `run` and fits it where that helps."""
+def _advise(run: Run, options: str = "") -> str:
+    """The command that judges the settings of `run`."""
     source = str((run.meta.get("input") or {}).get("path") or "")
-    if run.path is None or not source:
-        return "fgtrack advise --tune"
-    return f"fgtrack advise {source} -c {run.path / 'config.yaml'} --tune -o advised.yaml"
+    named = f" {source} -c {run.path / 'config.yaml'}" if run.path is not None and source else ""
+    return f"fgtrack advise{named}{options}"
 
 
 def _median_is_off(values: FloatArray, nis: ChiSquareMean) -> bool:
@@ -255,6 +260,29 @@ def _failures(run: Run) -> Iterator[Caution]:
             cure = f"{IN_A_ROW} measurements in a row contradicted a track: look at NIS by sensor, clocks and noise"
         text = f"failures: {', '.join(f'{n} {kind}' for kind, n in counts.items())}"
         yield Caution("estimator", f"{text}{f' (the first one: {first})' if first else ''}: {cure}")
+
+
+def _lives(run: Run) -> Iterator[Caution]:
+    """Tracks that break off and begin again, and births that die unconfirmed: bad tracking that needs no truth."""
+    lives, now_ns = Lives.of(run), run.timing["now_ns"]
+    total, recorded_s = len(lives.lives_s), float(np.ptp(now_ns)) / NS_PER_S if len(now_ns) else 0.0
+    enough = lives.breaks >= max(_FEWEST_BREAKS, _BREAKS_SHARE * total)
+    if enough and lives.breaks_per_minute > MOST_BREAKS_PER_MINUTE:
+        text = (
+            f"{lives.breaks} of {total} confirmed tracks begin where another one has just ended: "
+            f"{lives.breaks_per_minute:.2g} breaks per object and minute, median life {lives.median_s:.2g} of "
+            f"{recorded_s:.3g} s; likely causes: a field of view or range larger than what a sensor covers, "
+            f"detection_probability, lifecycle.lifetime_s, noise; `{_advise(run)}` looks for them"
+        )
+        yield Caution("tracks", text)
+    used = int(np.isin(run.updates["disposition"], USED).sum())
+    dead = int(np.count_nonzero(run.updates["disposition"] == "birth")) - total
+    if used >= FEWEST and dead > _DEAD_SHARE * used:
+        text = (
+            f"{dead} of {used} detections used began a track that was never confirmed; likely causes: clutter, errors "
+            f"or motion larger than configured, a wrong ego or clock; `{_advise(run)}` looks for them"
+        )
+        yield Caution("tracks", text)
 
 
 def _told_window(run: Run) -> tuple[str, float]:

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from unit.evaluation_runs import TICK_NS, update, write_run
+from unit.evaluation_runs import TICK_NS, WEST, Car, update, write_run
 
 from fgtrack.core.types import Disposition, UpdateRecord
 from fgtrack.evaluation.cautions import cautions, noise_cautions, unused
+from fgtrack.evaluation.lives import Lives
 from fgtrack.io.run import Run, Table
 from fgtrack.io.run.reader import column
 
@@ -172,3 +173,48 @@ def test_angles_in_degrees_are_told(tmp_path: Path) -> None:
         ["radar", " bearing_rad goes up to 12"],
     ]
     assert all("`{path: ..., degrees: true}`" in str(one) for one in found[:2])
+
+
+def pieces(folder: Path, *spans: tuple[int, int], ahead_m: float = 0.0) -> Run:
+    """WEST tracked by one track after another, each from and to a tick, the next `ahead_m` further ahead."""
+    tracks = [
+        [WEST.track(tick, k, along_m=k * ahead_m) for k, (begin, end) in enumerate(spans) if begin <= tick < end]
+        for tick in range(max(end for _, end in spans))
+    ]
+    return write_run(folder, tracks, config_text=CONFIG)
+
+
+BROKEN = [(0, 100), (130, 200), (190, 300), (350, 400)]
+"""With gaps of 0.6 s and 1 s, and an overlap of 0.2 s."""
+
+
+def test_tracks_that_begin_where_another_one_has_just_ended_are_told_without_truth(tmp_path: Path) -> None:
+    run = pieces(tmp_path / "run", *BROKEN)
+    lives = Lives.of(run)
+    assert lives.breaks == 3
+    assert lives.lives_s == pytest.approx([1.98, 1.38, 2.18, 0.98])
+    assert lives.breaks_per_minute == pytest.approx(3 * 60 / 6.52)
+    (found,) = cautions(run)
+    assert found.text.startswith("3 of 4 confirmed tracks begin where another one has just ended: 28 breaks per object")
+    assert "`fgtrack advise`" in found.text
+
+
+def test_other_objects_and_other_times_are_no_breaks(tmp_path: Path) -> None:
+    assert Lives.of(pieces(tmp_path / "far", *BROKEN, ahead_m=40.0)).breaks == 0
+    assert Lives.of(pieces(tmp_path / "later", (0, 50), (350, 400))).breaks == 0
+    both = [[WEST.track(k, 1), Car(8, 100.0, 2.0, 3.1, 20.0).track(k, 2)] for k in range(100)]
+    assert Lives.of(write_run(tmp_path / "both", both)).breaks == 0
+    assert Lives.of(write_run(tmp_path / "none", [[]])).lives_s.size == 0
+
+
+def test_a_break_now_and_then_is_no_bad_run(tmp_path: Path) -> None:
+    assert cautions(pieces(tmp_path / "run", *BROKEN[:3])) == []
+
+
+def test_births_that_die_unconfirmed_are_told_where_they_are_most_detections(tmp_path: Path) -> None:
+    (found,) = cautions(run_of(tmp_path / "bad", lists(Disposition.BIRTH, 31) + lists(Disposition.IN_SEQUENCE, 30)))
+    assert (found.about, found.text.split(";")[0]) == (
+        "tracks",
+        "31 of 61 detections used began a track that was never confirmed",
+    )
+    assert cautions(run_of(tmp_path / "good", lists(Disposition.BIRTH, 30) + lists(Disposition.IN_SEQUENCE, 30))) == []
