@@ -121,9 +121,13 @@ def run(arguments: Sequence[str]) -> int:
     """Run one command; gives the exit code. Errors are one line on stderr."""
     debug = "--debug" in arguments
     words = [word for word in arguments if word != "--debug"]
-    with standard_streams(), warnings.catch_warnings():
-        warnings.showwarning = _told  # type: ignore[assignment]  # the rest is of no use here
-        return _run(words, debug)
+    memory = resource.getrlimit(resource.RLIMIT_AS)
+    try:
+        with standard_streams(), warnings.catch_warnings():
+            warnings.showwarning = _told  # type: ignore[assignment]  # the rest is of no use here
+            return _run(words, debug)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, memory)  # of whoever calls this from Python
 
 
 def _told(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: object) -> None:

@@ -4,7 +4,6 @@ import hashlib
 import json
 import math
 import shutil
-import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
@@ -586,17 +585,6 @@ def test_a_run_that_was_killed_is_exported_up_to_there(runs: Path, tmp_path: Pat
     updates.write_text(updates.read_text().splitlines()[0] + "\n")
     export([tmp_path / "run"], tmp_path / "y.mcap")
     assert {"/outcomes", "/arrivals"} & set(read(tmp_path / "y.mcap")) == set()
-
-
-def test_without_the_package_mcap_a_line_says_how_to_install_it(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "mcap.writer", None)
-    assert command(["export", str(runs / "smoother"), "-o", str(tmp_path / "x.mcap")]) == 2
-    [line] = capsys.readouterr().err.strip().splitlines()
-    assert "pip install 'fgtrack[foxglove]'" in line
-    assert "--ros2" in line
-    assert command(["export", str(runs / "ekf-replay"), "-o", str(tmp_path / "x.mcap"), "--ros2"]) == 0
 
 
 # Several runs, and runs of which something is missing
