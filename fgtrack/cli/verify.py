@@ -36,7 +36,7 @@ def verify(
         str | None, typer.Option("-e", "--estimator", help="This one alone.", autocompletion=estimators)
     ] = None,
 ) -> int:
-    """Check that estimators keep their contract: right estimates in any order of arrival.
+    """Check the contract of estimators, in any order of arrival.
 
     All estimators and motion models that are installed, plug-ins included, on simulated streams, against plain
     calculations. Exit code 1 where a promise is broken.

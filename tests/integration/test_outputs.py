@@ -104,7 +104,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             ("replay", "other.jsonl", "-o", "run"),
             ("replay", "kitti/oxts/0001.txt", "-o", "kitti_run"),
             ("demo", "-o", "demo"),
-            *(words for words, _ in WRITERS if words[0] in ("figure", "report", "export", "tune", "advise")),
+            *(words for words, _ in WRITERS if words[0] in ("figure", "report", "export", "tune", "advise", "info")),
         ):
             assert run(list(words)) == 0
     return folder
@@ -162,6 +162,7 @@ WRITERS = [
     (("export", "kitti_run", "-o", "0001.txt", "--kitti", "kitti/oxts/0001.txt"), "0001.txt"),
     (("tune", "noisy.jsonl", "-o", "tuned.yaml"), "tuned.yaml"),
     (("advise", "drive.jsonl", "-o", "advised.yaml"), "advised.yaml"),
+    (("info", "drive.jsonl", "--write", "my.yaml"), "my.yaml"),
 ]
 #: A sweep goes on where it was, and makes its tables anew.
 ONGOING = [
@@ -187,7 +188,8 @@ def test_every_command_with_an_output_is_in_the_table() -> None:
 def test_what_exists_is_refused_at_once_and_replaced_with_overwrite(
     here: Path, call: Call, words: tuple[str, ...], place: str
 ) -> None:
-    out = words[words.index("-o") + 1] if "-o" in words else words[2]
+    flag = {"-o", "--write"}.intersection(words)
+    out = words[words.index(*flag) + 1] if flag else words[2]
     own = here / place
     if own.is_dir():
         own = min(file for file in own.iterdir() if file.is_file())
@@ -498,6 +500,7 @@ TANGLED = [
     (("tune", "noisy.jsonl", "-c", "tuned.yaml", "-o", "tuned.yaml"), "tuned.yaml"),
     (("advise", "bag", "-o", "bag/advised.yaml"), "bag"),
     (("advise", "drive.jsonl", "-c", "advised.yaml", "-o", "advised.yaml"), "advised.yaml"),
+    (("info", "bag", "--write", "bag/my.yaml"), "bag"),
     (("sweep", "sweep.yaml", "--input", "bag", "-o", "bag"), "bag"),
     (("sweep", "sweep.yaml", "--input", "bag", "-o", "bag/swept"), "bag"),
     (("sweep", "swept/parts/sweep.yaml", "-o", "swept"), "swept/parts/sweep.yaml"),

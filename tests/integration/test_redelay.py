@@ -119,7 +119,7 @@ def test_a_stream_that_breaks_off_is_converted_up_to_the_break(fgtrack: Command)
         ),
         ("radar: {loss_probability: 2.0}", "radar.loss_probability: Input should be less than or equal to 1"),
         ("sonar: {delay: {kind: none}}", "bad.yaml: sensor 'sonar' is not in the input, whose sensors are: lidar"),
-        ("radar: [", "bad.yaml:1: no valid YAML"),
+        ("radar: [", "bad.yaml:1: invalid YAML"),
     ],
 )
 def test_a_bad_file_of_delays_is_one_line_that_names_the_key(fgtrack: Command, text: str, message: str) -> None:

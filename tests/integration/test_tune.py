@@ -48,7 +48,7 @@ def written(stream: Path) -> Path:
 def test_the_file_repeats_the_configuration_with_other_noise(written: Path) -> None:
     config, before = load(Config, written), read_config("open_space", ["birth.speed_std_mps=30"])
     assert config.sensors["lidar_cluster"].std == pytest.approx({"x_m": 0.6, "y_m": 0.15}, rel=0.3)
-    assert replace(config, sensors=before.sensors, motion=before.motion) == before
+    assert replace(config, sensors=before.sensors, motion=before.motion, ego=before.ego) == before
     text = written.read_text(encoding="utf-8")
     assert "# where the first detection has no speed" in text
     assert "lidar_cluster: {std: {x_m: 0." in text

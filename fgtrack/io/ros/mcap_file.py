@@ -131,7 +131,7 @@ class McapFile:
                     statistics = record
                 self._note(record)
                 offset = self._file.tell()
-        except (EndOfFile, struct.error):
+        except (EndOfFile, struct.error, MemoryError):  # a damaged length may be larger than the memory
             self.break_off = f"breaks off at byte {offset}"
             self._cut_chunk = self._cut_chunk_at(offset)
             return None
