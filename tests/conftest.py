@@ -15,9 +15,19 @@ settings.register_profile("fast", deadline=None, derandomize=True, max_examples=
 settings.register_profile("thorough", deadline=None, max_examples=200)
 settings.load_profile("fast")
 
+_NIGHTLY = ("_experiment", "_benchmark")
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """How long `tests/fuzz` goes on, how often `tests/faults` kills, and with which random numbers."""
     parser.addoption("--fuzz-seconds", type=float, default=60.0, help="time for each target of the slow fuzzing tests")
     parser.addoption("--fuzz-seed", type=int, default=0, help="seed of the slow fuzzing tests")
     parser.addoption("--kills", type=int, default=100, help="kills of each command in tests/faults")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Whole folders and the experiments are for the night; `make test` is the suite of a change."""
+    for item in items:
+        if item.path.parent.name in ("faults", "fuzz", "statistical") or item.path.stem.endswith(_NIGHTLY):
+            item.add_marker(pytest.mark.slow)

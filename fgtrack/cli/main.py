@@ -58,6 +58,8 @@ def _command(name: str) -> Any:  # Any: Typer does not export the type of its co
     try:
         module = import_module(f"fgtrack.cli.{name}")
     except Exception as error:  # of a library, which may look at files and variables of the system
+        if _is_nowhere():
+            raise
         what = f"{type(error).__name__}: {error}"
         raise CallError(
             f"what {name} needs cannot be loaded ({what}): look at its environment variables and settings, or install "

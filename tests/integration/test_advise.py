@@ -286,6 +286,7 @@ def rmse_m(path: str) -> float:
     return truth.overall.errors["position_m"].rmse
 
 
+@pytest.mark.slow
 def test_without_truth_only_the_difference_of_two_clocks_is_known(call: Call) -> None:
     off = changed(
         lambda item: restamped(item, item.stamp_ns + 80 * MS) if item.sensor == "lidar" else item,
@@ -316,6 +317,7 @@ def test_what_an_advised_clock_leaves_is_nothing(call: Call) -> None:
     assert "Nothing is changed" in Path("b.yaml").read_text()
 
 
+@pytest.mark.slow
 def test_bursts_and_a_limit_that_refuses_them(call: Call) -> None:
     def late_ms(k: int) -> float:
         return 600.0 + 5.0 * (k % 7) if k % 100 in range(40, 60) else 100.0 + 3.0 * (k % 7)
@@ -385,6 +387,7 @@ def told() -> tuple[str, ...]:
     return fgtrack.advise("drive.jsonl", "c.yaml").sentences
 
 
+@pytest.mark.slow
 def test_receipts_for_stamps(call: Call) -> None:
     write("stream", changed(lambda item: replace(item, stamp_ns=item.receipt_ns), drive(truth=False)))
     assert any("every stamp is the receipt" in line for line in told())
@@ -399,6 +402,7 @@ def test_a_sensor_without_a_model_is_left_out(call: Call) -> None:
     assert call("replay", "drive.jsonl", "-c", "a.yaml", "-o", "run")[0] == 0
 
 
+@pytest.mark.slow
 def test_an_estimator_that_forgets_and_noise_that_does_not_fit(call: Call) -> None:
     write("stream", drive(250))
     text = CONFIG.replace("ekf-replay", "ekf-backward-forward").replace(
@@ -419,6 +423,7 @@ def test_an_estimator_that_forgets_and_noise_that_does_not_fit(call: Call) -> No
     assert "Nothing is changed." not in advice.comments()
 
 
+@pytest.mark.slow
 def test_white_noise_is_not_fitted_to_errors_that_last(call: Call) -> None:
     rng, error_m = np.random.default_rng(4), np.zeros(2)
 

@@ -555,6 +555,7 @@ def test_a_path_that_no_file_can_have_is_a_line(fgtrack: Command, stream: Path, 
     assert called.code in (1, 2)
 
 
+@pytest.mark.slow
 def test_names_of_files_need_not_be_text(fgtrack: Command, stream: Path) -> None:
     recording, made = Path(os.fsdecode(b"a\xff\nb.jsonl")), os.fsdecode(b"[bold]\xfe\x1b[31m")
     shutil.copy(stream, recording)

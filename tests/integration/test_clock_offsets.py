@@ -69,6 +69,7 @@ def row(report: OffsetReport, sensor: str) -> SensorOffset:
     return next(item for item in report.sensors if item.sensor == sensor)
 
 
+@pytest.mark.slow
 def test_a_wrong_lidar_clock_is_found_by_the_command(tmp_path: Path, capsys: Capture) -> None:
     stream = tmp_path / "traffic.jsonl"
     write_stream(stream, traffic("lidar_cluster", 0.04, 5.0))

@@ -158,6 +158,7 @@ def test_in_a_column_the_errors_of_all_methods_are_one_readable_plot(folder: Pat
     assert {line.get_color() for line in axes.lines} == {"black", *(look(name).colour for name in NAMES)}
 
 
+@pytest.mark.slow
 def test_all_figures_can_be_the_pages_of_one_pdf(folder: Path, tmp_path: Path) -> None:
     call = ["figure", str(folder / "runs" / NAMES[0]), "-o"]
     assert command([*call, str(tmp_path / "a.pdf")]) == 0

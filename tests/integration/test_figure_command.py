@@ -37,6 +37,7 @@ def test_a_sweep_is_drawn_alone(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "holds no rows of a sweep" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_runs_of_several_seeds_have_bands_and_the_close_up_of_the_first(tmp_path: Path) -> None:
     for seed in (1, 2):
         recording = tmp_path / f"{seed}.jsonl"

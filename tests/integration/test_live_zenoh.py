@@ -162,6 +162,7 @@ def simulated(max_lists: int) -> Counter[str]:
     return found
 
 
+@pytest.mark.slow
 def test_of_ten_thousand_late_messages_none_is_lost_without_a_word() -> None:
     vehicle, tracker = driven("--duration-s", "300", "--max-lists", "10000")
     lists = {topic: count for topic, count in vehicle["sent"].items() if topic.startswith("vehicle/lists/")}

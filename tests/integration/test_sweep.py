@@ -193,6 +193,7 @@ def runs(pid: int) -> bool:
     return bool(asked.stdout.strip()) and not asked.stdout.startswith("Z")
 
 
+@pytest.mark.slow
 def test_a_killed_sweep_goes_on_where_it_was_and_gives_the_same_bytes(
     smoke: Path, done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -97,6 +97,7 @@ def test_a_tuned_file_is_replayed_and_not_replaced_without_being_asked(
     assert written.read_text(encoding="utf-8") == text
 
 
+@pytest.mark.slow
 def test_json_says_the_same_and_every_parameter_has_a_row(stream: Path, capsys: Capture, tmp_path: Path) -> None:
     """Also of sensors that the configuration does not name."""
     out, kept = tmp_path / "tuned.yaml", "motion.std_per_s.speed"
