@@ -46,7 +46,7 @@ class Coverage:
     persistence: Persistence | None = None
     """How its detections persist from list to list; None where too few do."""
     area_m2: float | None = None
-    """Area over which its detections with a range are spread."""
+    """Area over which its detections with a range are spread, at least that of the narrowest sector up to there."""
 
     def __str__(self) -> str:
         rate = "" if self.rate_hz is None else f" at {self.rate_hz:.3g} Hz"
@@ -131,7 +131,8 @@ class _Detections:
         numbers, offsets_m = rows[:, 0].astype(np.int64), self._offsets_m(rows, path, mount)
         if has_range.any():
             extent_m = np.quantile(offsets_m, 1.0 - _OUTSIDE, axis=0) - np.quantile(offsets_m, _OUTSIDE, axis=0)
-            found = replace(found, persistence=self._persistence(rows, path), area_m2=float(np.prod(extent_m)))
+            area_m2 = max(float(np.prod(extent_m)), _narrowest_m2(offsets_m))  # one object may keep its place
+            found = replace(found, persistence=self._persistence(rows, path), area_m2=area_m2)
         period_s = float(np.median(np.diff(receipts_s))) if len(receipts_s) > 1 else 0.0
         span_s = max(_CELL_S, _CELL_PERIODS * period_s)
         reach = _CELL_M + _CELL_MPS * span_s if has_range.any() else _CELL_BEARING
@@ -185,6 +186,11 @@ def _turned(vectors_m: FloatArray, angles_rad: FloatArray) -> FloatArray:
     cosine, sine = np.cos(angles_rad), np.sin(angles_rad)
     x_m, y_m = vectors_m.T
     return np.column_stack([cosine * x_m - sine * y_m, sine * x_m + cosine * y_m])
+
+
+def _narrowest_m2(offsets_m: FloatArray) -> float:
+    """Area of the narrowest sector that reaches as far as detections at `offsets_m` (n, 2)."""
+    return 0.5 * _NARROWEST_RAD * float(np.quantile(np.hypot(*offsets_m.T), 1.0 - _OUTSIDE)) ** 2
 
 
 def _comes_back(points: FloatArray, numbers: IntArray) -> BoolArray:
