@@ -120,3 +120,15 @@ def test_bearings_alone_give_a_sector_and_no_range() -> None:
     found = coverage(messages)
     assert (found.field_of_view_rad, found.range_m) == (pytest.approx(1.57, abs=0.2), None)
     assert math.cos(found.axis_rad) < -0.99
+
+
+def test_an_object_that_keeps_its_place_does_not_make_the_area_small() -> None:
+    rng = np.random.default_rng(1)
+    places_m = np.array([30.0, 0.0]) + 0.3 * rng.standard_normal((200, 2))
+    messages = [
+        DetectionList("radar", k * 10**8, k * 10**8, [Detection(x_m=x_m, y_m=y_m)])
+        for k, (x_m, y_m) in enumerate(places_m.tolist())
+    ]
+    area_m2 = coverages(messages)["radar"].area_m2
+    assert area_m2 is not None
+    assert 0.5 * 0.35 * 30.0**2 < area_m2 < 200.0
