@@ -99,7 +99,8 @@ def page(
     """
     shown = scene(runs, opening.moment)
     warnings = recordings_caution(runs)
-    warnings += [f"{one.label}: {line}" for one in runs for line in (*cautions(one.run), *noise_cautions(one.run))]
+    warnings += [f"{one.label}: {line}" for one in runs for line in cautions(one.run)]
+    warnings += map(str, noise_cautions(runs[0].run))  # of the sensors, as `replay` prints them
     warnings = list(dict.fromkeys((*warnings, *shown.notes, *opening.missing)))
     figures = [(name, _figure(name, picture)) for name, picture in pictures]
     first = _chosen([name for name, _ in figures])
