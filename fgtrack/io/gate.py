@@ -113,13 +113,18 @@ def _checked_list(message: DetectionList) -> DetectionList:
 
 
 def checked_detection(item: Detection) -> Detection:
-    """`item`, where a describing number is not finite with None instead; raises `WrongError` for a wrong type."""
+    """Return `item` with None for describing numbers that are not finite and for class names that are too long.
+
+    Raises `WrongError` for a value of a wrong type.
+    """
     if not isinstance(item, Detection):
         raise WrongError(f"a {type(item).__name__} is no detection")
     _check_numbers(MEASURABLE, _measured(item))
     for name in ("stamp_ns", "object_id"):
         if (value := getattr(item, name)) is not None:
             _check_integer(name, value)
+    if isinstance(item.class_name, str) and len(item.class_name) > _LONGEST_NAME:
+        item = replace(item, class_name=None)
     if item.class_name not in (None, ""):
         _check_name("class_name", item.class_name)
     _check_several("covariance", item)

@@ -150,6 +150,7 @@ def write_stream(
         for message in readable:
             lines.write(_line(_record(message)))
             count += 1
+        readable.raise_before_replacing(path)
     readable.raise_error()
     return count
 

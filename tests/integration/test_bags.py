@@ -22,6 +22,7 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, TruthState
 from fgtrack.io.config import Filter, InputConfig, TopicInput
 from fgtrack.io.errors import TruncatedInput, UntilBreak
+from fgtrack.io.recording import write_recording
 from fgtrack.io.ros.bag import Bag
 from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.source import open_input
@@ -241,6 +242,19 @@ def test_of_a_broken_input_all_before_the_break_is_written(tmp_path):
     with pytest.raises(TruncatedInput):
         write_bag(tmp_path / "b", open_input(tmp_path / "a").messages())
     assert read(tmp_path / "b") == list(UntilBreak(open_input(tmp_path / "a").messages()))
+
+
+@pytest.mark.parametrize("name", ["b", "b.jsonl"])
+def test_what_comes_before_a_break_replaces_no_older_output(tmp_path, name):
+    def broken():
+        yield from drive(20)
+        raise DataError("wrong")
+
+    write_recording(tmp_path / name, drive(50))
+    with pytest.raises(DataError, match=f"wrong; .*{name} is kept"):
+        write_recording(tmp_path / name, broken(), overwrite=True)
+    assert read(tmp_path / name) == drive(50)
+    assert [one.name for one in tmp_path.iterdir()] == [name]
 
 
 # --- foreign recordings

@@ -63,7 +63,6 @@ def of(**fields: object) -> DetectionList:
         (of(score=b"1"), r"radar: objects\[1\]: score: a number"),
         (of(stamp_ns=0.5), r"radar: objects\[1\]: stamp_ns: a 64 bit"),
         (of(object_id=1 << 64), r"radar: objects\[1\]: object_id: a 64 bit"),
-        (of(class_name="x" * 1000), r"radar: objects\[1\]: class_name: a name"),
         (of(covariance="1234"), r"radar: objects\[1\]: covariance: a tuple"),
         ("message", "a str is no message"),
     ],
@@ -78,10 +77,10 @@ def test_what_is_no_message_ends_the_input_in_one_short_line(message: object, co
 
 
 def test_descriptions_that_are_not_finite_are_none_and_measurements_pass_as_they_are() -> None:
-    given = Detection(x_m=float("inf"), score=float("nan"), length_m=float("-inf"), width_m=2.0, class_name="car")
+    given = Detection(x_m=float("inf"), score=float("nan"), length_m=float("-inf"), width_m=2.0, class_name="x" * 201)
     (found,) = checked(Path("drive"), lambda: iter([replace(LIST, objects=(given,))]))
     assert isinstance(found, DetectionList)
-    assert found.objects == (Detection(x_m=float("inf"), width_m=2.0, class_name="car"),)
+    assert found.objects == (Detection(x_m=float("inf"), width_m=2.0),)
     (same,) = checked(Path("drive"), lambda: iter([LIST]))
     assert same is LIST
 

@@ -65,6 +65,7 @@ def write_bag(
             readable = UntilBreak(messages)
             for message in readable:
                 writer.write(message)
+            readable.raise_before_replacing(Path(path))
             writer.flush()
     except FgtrackError:
         raise
