@@ -648,7 +648,7 @@ def test_of_an_input_that_breaks_off_what_came_before_is_written(here: Path) -> 
         raise DataError("broken")
 
     for write, out in ((write_stream, "new.jsonl"), (write_bag, "new")):
-        with pytest.raises(DataError, match="broken$"):
+        with pytest.raises(DataError, match=r"broken$"):
             write(out, failing(), overwrite=True)
         assert list(open_input(here / out).messages()) == drive(5)
 
