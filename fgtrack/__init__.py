@@ -52,13 +52,13 @@ _HOMES = {
     "UpdateResult": "fgtrack.estimation.base",
     "UpdateStatus": "fgtrack.estimation.base",
     "advise": "fgtrack.advice.advise",
-    "close_ups": "fgtrack.pipeline.close_up",
+    "close_ups": "fgtrack.plotting.late_detection",
     "compare": "fgtrack.evaluation.comparison",
     "estimator": "fgtrack.estimation.registry",
     "initial_state": "fgtrack.estimation.birth",
     "load_run": "fgtrack.io.run",
     "measurement_model": "fgtrack.models.measurement",
-    "plot": "fgtrack.evaluation",
+    "plot": "fgtrack.plotting",
     "replay": "fgtrack.pipeline.public",
     "robust_weight": "fgtrack.estimation.ekf",
     "simulate": "fgtrack.pipeline.public",
@@ -101,7 +101,6 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.estimation.birth import initial_state as initial_state
     from fgtrack.estimation.ekf import robust_weight as robust_weight
     from fgtrack.estimation.registry import estimator as estimator
-    from fgtrack.evaluation import plot as plot
     from fgtrack.evaluation.comparison import compare as compare
     from fgtrack.evaluation.tables import Tables as Tables
     from fgtrack.io.adapters.common import ObjectList as ObjectList
@@ -116,7 +115,6 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.models.motion import MotionModel as MotionModel
     from fgtrack.models.sensors import RobustLoss as RobustLoss
     from fgtrack.models.sensors import SensorModel as SensorModel
-    from fgtrack.pipeline.close_up import close_ups as close_ups
     from fgtrack.pipeline.config import Config as Config
     from fgtrack.pipeline.lateness import Lateness as Lateness
     from fgtrack.pipeline.lateness import TickTiming as TickTiming
@@ -127,6 +125,8 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.pipeline.public import simulate as simulate
     from fgtrack.pipeline.tune import tune as tune
     from fgtrack.pipeline.tune_report import TuneReport as TuneReport
+    from fgtrack.plotting import plot as plot
+    from fgtrack.plotting.late_detection import close_ups as close_ups
 
 
 def __getattr__(name: str) -> object:

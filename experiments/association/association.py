@@ -39,10 +39,10 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.factor_graph import SmootherBank, SmootherSettings
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.replay import ReplayEkf
-from fgtrack.evaluation.figures.paper import styled
-from fgtrack.evaluation.figures.style import colour, log_axis, save
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
+from fgtrack.plotting.paper import styled
+from fgtrack.plotting.style import colour, log_axis, save
 from fgtrack.sim.draw import drawn
 from fgtrack.tracking.association import Association, GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.preprocess import Candidate

@@ -31,11 +31,11 @@ from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.registry import ESTIMATORS, OOSM_GROUP, estimator
 from fgtrack.evaluation.bounds import ScheduledMeasurement, bounds, bounds_along
-from fgtrack.evaluation.figures.paper import styled
-from fgtrack.evaluation.figures.style import GREY, WRONG, save
 from fgtrack.evaluation.palette import look
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
+from fgtrack.plotting.paper import styled
+from fgtrack.plotting.style import GREY, WRONG, save
 from fgtrack.sim.draw import drawn
 
 START_NS = 1_790_000_000 * NS_PER_S

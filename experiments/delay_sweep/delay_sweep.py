@@ -18,7 +18,7 @@ from scipy.stats import t
 
 from fgtrack.cli.sweep import swept
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.figures.style import log_axis
+from fgtrack.plotting.style import log_axis
 
 SWEEP = Path(__file__).parents[2] / "configs/sweeps/delay.yaml"
 QUICK_SEEDS = 2

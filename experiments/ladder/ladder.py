@@ -35,11 +35,11 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
 from fgtrack.estimation.registry import ESTIMATORS, EXACT, OOSM_GROUP, Claims, estimator
-from fgtrack.evaluation.figures.paper import styled
-from fgtrack.evaluation.figures.style import WRONG, log_axis, save
 from fgtrack.evaluation.palette import looks
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
+from fgtrack.plotting.paper import styled
+from fgtrack.plotting.style import WRONG, log_axis, save
 from fgtrack.sim.draw import drawn
 
 MOTION = CV(velocity_density_m2ps3=5.0)

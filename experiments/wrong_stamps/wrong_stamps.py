@@ -17,8 +17,8 @@ from matplotlib.axes import Axes
 
 from fgtrack.cli.sweep import swept
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.figures.style import log_axis
 from fgtrack.evaluation.palette import PALETTE
+from fgtrack.plotting.style import log_axis
 
 SWEEP = Path(__file__).parents[2] / "configs/sweeps/wrong_stamps.yaml"
 QUICK_SEEDS = 2

@@ -15,11 +15,7 @@ from fgtrack.advice.summary import summary
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import read_head
 from fgtrack.evaluation.comparison import compare
-from fgtrack.evaluation.figures.style import DRAWN, png
-from fgtrack.evaluation.plot import close_up, drawn, planned
 from fgtrack.evaluation.recordings import by_recording
-from fgtrack.evaluation.report.page import REPORT, Opening, write_report
-from fgtrack.evaluation.report.scene import Moment
 from fgtrack.evaluation.runs import JudgedRun, judged
 from fgtrack.evaluation.tables import Tables
 from fgtrack.io.output import Kind, check_apart, check_output, claimed, new_file, new_files
@@ -27,11 +23,15 @@ from fgtrack.io.run import RUN, Run, load_run, write_metrics
 from fgtrack.io.source import InputSource, open_input
 from fgtrack.io.span import end_ns
 from fgtrack.pipeline.assumed import Assumed, assumed
-from fgtrack.pipeline.close_up import close_ups
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.inputs import inputs
 from fgtrack.pipeline.replay import ReplayResult, replay_each
 from fgtrack.pipeline.shipped import read_config, settings_of
+from fgtrack.plotting.late_detection import close_ups
+from fgtrack.plotting.plot import close_up, drawn, planned
+from fgtrack.plotting.style import DRAWN, png
+from fgtrack.viewers.playback import Moment
+from fgtrack.viewers.report import REPORT, Opening, write_report
 
 __all__ = ["ESTIMATORS", "Study", "study"]
 

@@ -10,9 +10,9 @@ from fgtrack.cli.arguments import Overwrite, Runs
 from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.kitti_result import write_kitti_result
-from fgtrack.evaluation.viewer.export import export as written
 from fgtrack.io.run import load_run
 from fgtrack.pipeline.shipped import shipped_folder
+from fgtrack.viewers.export import export as written
 
 
 def export(

@@ -13,14 +13,14 @@ from fgtrack.cli.show import progress, say
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
-from fgtrack.evaluation.figures.paper import Paper, settings
-from fgtrack.evaluation.figures.style import DRAWN, save_pages
-from fgtrack.evaluation.plot import Planned, close_up, drawn, planned, planned_sweep, save_named
 from fgtrack.evaluation.recordings import by_recording
 from fgtrack.evaluation.runs import JudgedRun, judged, run_folders, start_ns
 from fgtrack.evaluation.sweep_table import is_sweep, read_sweep
 from fgtrack.io.output import check_apart, new_file, new_files
-from fgtrack.pipeline.close_up import close_ups
+from fgtrack.plotting.late_detection import close_ups
+from fgtrack.plotting.paper import Paper, settings
+from fgtrack.plotting.plot import Planned, close_up, drawn, planned, planned_sweep, save_named
+from fgtrack.plotting.style import DRAWN, save_pages
 
 
 def figure(

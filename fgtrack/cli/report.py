@@ -12,11 +12,11 @@ from fgtrack.cli.arguments import Overwrite, Runs
 from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.comparison import compare
-from fgtrack.evaluation.figures.style import png
-from fgtrack.evaluation.plot import named_figures
-from fgtrack.evaluation.report.page import REPORT, write_report
 from fgtrack.evaluation.runs import judged, run_folders
 from fgtrack.io.output import check_apart, check_output
+from fgtrack.plotting.plot import named_figures
+from fgtrack.plotting.style import png
+from fgtrack.viewers.report import REPORT, write_report
 
 _SUFFIXES = (".html", ".htm")
 _MEGABYTE = 1e6

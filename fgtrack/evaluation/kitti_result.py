@@ -20,7 +20,7 @@ from fgtrack.core.files import read_head
 from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.time import seconds
 from fgtrack.evaluation.matching import confirmed
-from fgtrack.evaluation.viewer.placement import update_rows
+from fgtrack.evaluation.placement import update_rows
 from fgtrack.io.adapters.kitti import CLASS_NAMES, is_sequence, view_of_sequence
 from fgtrack.io.adapters.kitti_view import PERIOD_NS, Box, View
 from fgtrack.io.output import Kind, check_apart, new_file

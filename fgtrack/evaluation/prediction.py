@@ -8,9 +8,9 @@ import numpy as np
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.matching import Matching, confirmed
+from fgtrack.evaluation.roads import roads
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.evaluation.truth import TRUE_STATE, true_paths
-from fgtrack.evaluation.viewer.surroundings import roads
 from fgtrack.io.run import Run
 from fgtrack.models.predictor import ArcPredictor, Predictor, RailPredictor
 

@@ -11,9 +11,9 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.evaluation.innovations import residuals, track_states
 from fgtrack.evaluation.matching import confirmed
+from fgtrack.evaluation.roads import roads
 from fgtrack.evaluation.sight import ego_states
 from fgtrack.evaluation.statistics import Moments
-from fgtrack.evaluation.viewer.surroundings import roads
 from fgtrack.io.run import Run
 from fgtrack.models.measurement import ANGULAR
 

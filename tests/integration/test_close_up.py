@@ -12,8 +12,8 @@ from fgtrack.cli.main import run as command
 from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.palette import look
 from fgtrack.models.motion import CTRV
-from fgtrack.pipeline.close_up import chosen, close_up_of
-from fgtrack.tracking.close_up import Arrival, CloseUp
+from fgtrack.plotting.late_detection import chosen, close_up_of
+from fgtrack.plotting.slow_motion import Arrival, CloseUp
 
 NAMES = ("ekf-replay", "ekf-backward-forward")
 

@@ -33,19 +33,19 @@ from fgtrack.core.types import (
     TrackStatus,
     UpdateRecord,
 )
-from fgtrack.evaluation.viewer.export import export, viewer_messages
-from fgtrack.evaluation.viewer.placement import placed
-from fgtrack.evaluation.viewer.surroundings import truth_messages
+from fgtrack.evaluation.placement import placed
 from fgtrack.io.ros.bag import Bag, BagMessage
-from fgtrack.io.ros.viewer_bag import write_viewer_bag
 from fgtrack.io.run import Run, RunWriter, Table, load_run
-from fgtrack.io.viewer.foxglove import write_foxglove
-from fgtrack.io.viewer.scene import Scene
-from fgtrack.io.viewer.schemas import SCHEMAS
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.shipped import read_config, shipped_folder
 from fgtrack.tracking.preprocess import Candidate, Preprocess
+from fgtrack.viewers.export import export, viewer_messages
+from fgtrack.viewers.foxglove import write_foxglove
+from fgtrack.viewers.ros2 import write_viewer_bag
+from fgtrack.viewers.schemas import SCHEMAS
+from fgtrack.viewers.shapes import Scene
+from fgtrack.viewers.surroundings import truth_messages
 
 #: SHA-256 of the schemas that @foxglove/schemas 2.1.0 publishes, without `description` and `$comment`, keys sorted.
 PUBLISHED_SCHEMAS = "d4fcf71a99197351d009edf4917e20a5146f3959c64d715f31f6317dcaff2da5"

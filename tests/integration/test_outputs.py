@@ -24,7 +24,6 @@ from fgtrack.cli import demo
 from fgtrack.cli.main import COMMANDS, _command, run
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TickReport
-from fgtrack.evaluation.figures.style import DRAWN, save
 from fgtrack.io import output
 from fgtrack.io.output import claimed, new_file, write_file
 from fgtrack.io.ros.bag_writer import write_bag
@@ -33,12 +32,13 @@ from fgtrack.io.run.schema import COLUMNS
 from fgtrack.io.source import open_input
 from fgtrack.io.stream import STREAM, read_stream, write_stream
 from fgtrack.models.oval import make_oval
-from fgtrack.pipeline.close_up import close_up_of
 from fgtrack.pipeline.load import dump
 from fgtrack.pipeline.replay import replay_each
 from fgtrack.pipeline.shipped import read_scenario, shipped_folder
 from fgtrack.pipeline.sweep_plan import load_plan
-from fgtrack.tracking.close_up import Arrival
+from fgtrack.plotting.late_detection import close_up_of
+from fgtrack.plotting.slow_motion import Arrival
+from fgtrack.plotting.style import DRAWN, save
 
 MS = 1_000_000
 START_NS = 1_600_000_000_000_000_000

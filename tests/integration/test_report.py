@@ -17,11 +17,11 @@ import pytest
 import fgtrack
 from fgtrack.cli.main import run as command
 from fgtrack.evaluation.palette import look
-from fgtrack.evaluation.report.scene import scene
-from fgtrack.evaluation.report.settings import differing, flattened
+from fgtrack.evaluation.placement import placed
 from fgtrack.evaluation.runs import judged
-from fgtrack.evaluation.viewer.placement import placed
 from fgtrack.io.run import Table
+from fgtrack.viewers.playback import scene
+from fgtrack.viewers.settings import differing, flattened
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = ("ekf-replay", "smoother")
@@ -205,7 +205,7 @@ def test_a_sensor_whose_clock_is_years_off_has_no_stamps(folder: Path) -> None:
 
 
 def test_long_runs_are_thinned_and_it_is_said(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fgtrack.evaluation.report.scene.MOST_ROWS", 200)
+    monkeypatch.setattr("fgtrack.viewers.playback.MOST_ROWS", 200)
     found = scene(judged(folder / "runs" / NAMES[0]))
     run, (shown,) = fgtrack.load_run(folder / "runs" / NAMES[0]), found.values["runs"]
     step = -(-run.tracks.num_rows // 200)
@@ -300,8 +300,6 @@ def test_the_wheel_holds_the_templates(tmp_path: Path) -> None:
     )
     (wheel,) = tmp_path.glob("*.whl")
     names = zipfile.ZipFile(wheel).namelist()
-    templates = [
-        path for path in (ROOT / "fgtrack/evaluation/report").iterdir() if path.suffix in (".js", ".css", ".html")
-    ]
+    templates = [path for path in (ROOT / "fgtrack/viewers/page").iterdir() if path.suffix in (".js", ".css", ".html")]
     assert len(templates) == 4
-    assert {f"fgtrack/evaluation/report/{path.name}" for path in templates} <= set(names)
+    assert {f"fgtrack/viewers/page/{path.name}" for path in templates} <= set(names)

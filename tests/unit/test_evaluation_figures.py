@@ -14,13 +14,13 @@ from matplotlib.figure import Figure
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Disposition
-from fgtrack.evaluation import plot
-from fgtrack.evaluation.figures.style import FORMATS, WRONG, broken_line
 from fgtrack.evaluation.runs import judged
-from fgtrack.evaluation.viewer.export import viewer_messages
 from fgtrack.io.run import Run
-from fgtrack.io.viewer.scene import Scene
 from fgtrack.models.track_map import COLUMNS, TrackMap
+from fgtrack.plotting import plot
+from fgtrack.plotting.style import FORMATS, WRONG, broken_line
+from fgtrack.viewers.export import viewer_messages
+from fgtrack.viewers.shapes import Scene
 
 TICKS = range(60)
 

@@ -13,9 +13,9 @@ from fgtrack.core.types import SmoothedReport
 from fgtrack.evaluation.lagged import WINDOW, LagMetrics, lag_metrics
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.plot import lag
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.io.run import Run
+from fgtrack.plotting.plot import lag
 
 TICKS = range(20)
 STEPS = {0.1: 5, 0.2: 10}  # ticks that a lag is long

@@ -9,9 +9,9 @@ from support.pictures import faults
 from test_figure_texts import a_run
 
 from fgtrack.core.errors import CallError
-from fgtrack.evaluation import plot
-from fgtrack.evaluation.figures.paper import inches
 from fgtrack.evaluation.runs import JudgedRun, judged
+from fgtrack.plotting import plot
+from fgtrack.plotting.paper import inches
 
 
 @pytest.fixture(scope="module")

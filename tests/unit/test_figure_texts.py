@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from support.pictures import faults
 
 from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState
-from fgtrack.evaluation import plot
-from fgtrack.evaluation.figures.paper import styled
-from fgtrack.evaluation.figures.style import StyledFigure, legend_above, title
 from fgtrack.evaluation.runs import judged
 from fgtrack.io.run import Run
+from fgtrack.plotting import plot
+from fgtrack.plotting.paper import styled
+from fgtrack.plotting.style import StyledFigure, legend_above, title
 
 TICKS = range(50)
 LONG = "a-run-with-a-name-that-goes-on-and-on-until-nobody-wants-to-read-it-any-more-and-then-some"

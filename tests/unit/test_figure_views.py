@@ -10,13 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray
-from fgtrack.evaluation import plot
-from fgtrack.evaluation.figures.errors import moving_rms
-from fgtrack.evaluation.figures.ranges import bulk
 from fgtrack.evaluation.palette import look
 from fgtrack.evaluation.runs import judged
 from fgtrack.io.run import Run, Table
 from fgtrack.models.oval import make_oval
+from fgtrack.plotting import plot
+from fgtrack.plotting.errors import moving_rms
+from fgtrack.plotting.ranges import bulk
 
 TICKS = range(60)
 OVAL = "map: {track: oval}"

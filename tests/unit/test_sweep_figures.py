@@ -9,11 +9,11 @@ import pytest
 from support.pictures import faults
 
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.evaluation import plot
-from fgtrack.evaluation.figures.sweep import metric_words
 from fgtrack.evaluation.palette import look
 from fgtrack.evaluation.sweep_table import SWEEP_FILE, is_sweep, read_sweep
 from fgtrack.pipeline.sweep_store import SWEEP_TABLE
+from fgtrack.plotting import plot
+from fgtrack.plotting.sweep import metric_words
 
 POSITION, NEES = "truth.overall.errors.position_m.rmse", "consistency.position_nees.mean"
 DELAYS = ("0.05", "0.1", "0.2")

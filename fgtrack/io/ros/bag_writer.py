@@ -1,6 +1,7 @@
 """Writes rosbag2 recordings: fgtrack's own messages, exact to the bit, and twins in standard types for other tools."""
 
 import json
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal
@@ -18,7 +19,6 @@ from fgtrack.io.output import Kind, new_folder
 from fgtrack.io.ros.bag_files import METADATA, SETTINGS, parts_of
 from fgtrack.io.ros.messages import DETECTED_OBJECTS, DETECTION3D_ARRAY, MessageFactory
 from fgtrack.io.ros.typestore import one_line
-from fgtrack.io.viewer.topics import token
 
 _CHECKPOINT = 1000  # messages; a killed writer loses no more than that
 _PLUGINS = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
@@ -75,6 +75,11 @@ def write_bag(
         ) from error
     readable.raise_error()
     return writer.count
+
+
+def token(name: str) -> str:
+    """Return `name` as a part of a topic name."""
+    return re.sub(r"\W", "_", name, flags=re.ASCII)
 
 
 def _is_recording(path: Path) -> bool:

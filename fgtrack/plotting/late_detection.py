@@ -16,7 +16,7 @@ from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import validate
 from fgtrack.pipeline.replay import delivered
-from fgtrack.tracking.close_up import Arrival, CloseUp, close_up
+from fgtrack.plotting.slow_motion import Arrival, CloseUp, close_up
 
 _STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
 _SETTLED = 20  # measurements of a track before which it moves for want of a good start

@@ -15,23 +15,23 @@ from matplotlib.figure import Figure
 
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation import innovations
-from fgtrack.evaluation.figures.arrivals import arrivals
-from fgtrack.evaluation.figures.close_up import close_up
-from fgtrack.evaluation.figures.consistency import consistency, has_squares
-from fgtrack.evaluation.figures.errors import errors, lag
-from fgtrack.evaluation.figures.frenet import frenet
-from fgtrack.evaluation.figures.map import tracks_on_map as map  # noqa: A004  # the name that users know
-from fgtrack.evaluation.figures.paper import Paper
-from fgtrack.evaluation.figures.residuals import residuals
-from fgtrack.evaluation.figures.seeds import error_bands, has_seeds
-from fgtrack.evaluation.figures.style import save
-from fgtrack.evaluation.figures.sweep import error_against_delay, sweep, sweep_metrics
-from fgtrack.evaluation.figures.times import delays, timing
 from fgtrack.evaluation.matching import track_errors
+from fgtrack.evaluation.roads import roads
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.evaluation.sweep_table import SweepTable
-from fgtrack.evaluation.viewer.surroundings import roads
+from fgtrack.plotting.arrivals import arrivals
+from fgtrack.plotting.close_up import close_up
+from fgtrack.plotting.consistency import consistency, has_squares
+from fgtrack.plotting.errors import errors, lag
+from fgtrack.plotting.frenet import frenet
+from fgtrack.plotting.map import tracks_on_map as map  # noqa: A004  # the name that users know
+from fgtrack.plotting.paper import Paper
+from fgtrack.plotting.residuals import residuals
+from fgtrack.plotting.seeds import error_bands, has_seeds
+from fgtrack.plotting.style import save
+from fgtrack.plotting.sweep import error_against_delay, sweep, sweep_metrics
+from fgtrack.plotting.times import delays, timing
 
 __all__ = [
     "arrivals",

@@ -13,12 +13,12 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import rotation
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import YAW, FloatArray, IntArray
-from fgtrack.evaluation.figures.paper import Paper, Sheet, is_column, styled
-from fgtrack.evaluation.figures.style import GREY, legend_above, run_looks
 from fgtrack.evaluation.palette import Look
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged
 from fgtrack.evaluation.truth import true_paths
-from fgtrack.tracking.close_up import STEP_S, CloseUp, Estimates
+from fgtrack.plotting.paper import Paper, Sheet, is_column, styled
+from fgtrack.plotting.slow_motion import STEP_S, CloseUp, Estimates
+from fgtrack.plotting.style import GREY, legend_above, run_looks
 
 _FORGET = ("ekf-backward-forward", "rewind-forget", "backward-forward")
 _RING_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)

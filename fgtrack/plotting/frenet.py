@@ -10,9 +10,15 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
-from fgtrack.evaluation.figures.ranges import bulk
-from fgtrack.evaluation.figures.style import (
+from fgtrack.evaluation.matching import confirmed
+from fgtrack.evaluation.roads import roads
+from fgtrack.evaluation.runs import JudgedRun, OneRun, one_judged, start_ns
+from fgtrack.evaluation.truth import true_paths
+from fgtrack.io.run import Table
+from fgtrack.models.track_map import TrackMap
+from fgtrack.plotting.paper import Paper, Sheet, styled
+from fgtrack.plotting.ranges import bulk
+from fgtrack.plotting.style import (
     GREY,
     WRONG,
     broken_line,
@@ -21,12 +27,6 @@ from fgtrack.evaluation.figures.style import (
     titled,
     usual_step_ns,
 )
-from fgtrack.evaluation.matching import confirmed
-from fgtrack.evaluation.runs import JudgedRun, OneRun, one_judged, start_ns
-from fgtrack.evaluation.truth import true_paths
-from fgtrack.evaluation.viewer.surroundings import roads
-from fgtrack.io.run import Table
-from fgtrack.models.track_map import TrackMap
 
 _NAMED_OBJECTS = 8  # more objects than these share two entries of the legend
 _TRACK, _FEW_TRUE, _MANY_TRUE, _PALE = 1.2, 5.0, 2.5, 0.3  # widths of lines, and how opaque those of truth are

@@ -9,11 +9,11 @@ import numpy as np
 
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FUSED, LATE, Detection, DetectionList, Disposition
-from fgtrack.evaluation.viewer.look import GREY, Look, faded
-from fgtrack.evaluation.viewer.placement import Placed, placed, update_rows
+from fgtrack.evaluation.placement import Placed, placed, update_rows
+from fgtrack.io.ros.bag_writer import token
 from fgtrack.io.run import NO_TRACK, Run
-from fgtrack.io.viewer.scene import Arrow, Dot, Entity, Facts, Line, Objects, Point, Scene, Shape, ViewerMessage
-from fgtrack.io.viewer.topics import token
+from fgtrack.viewers.look import GREY, Look, faded
+from fgtrack.viewers.shapes import Arrow, Dot, Entity, Facts, Line, Objects, Point, Scene, Shape, ViewerMessage
 
 _SHOWN_S = 0.5  # how long a list is shown that no later one of its sensor replaces
 _DOT_M = 1.0

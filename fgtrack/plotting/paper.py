@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from fgtrack.core.errors import CallError
-from fgtrack.evaluation.figures.style import StyledFigure, title
+from fgtrack.plotting.style import StyledFigure, title
 
 _logger = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import EgoState
 from fgtrack.io.adapters.common import RosMessage
 from fgtrack.io.ros.messages import MARKER_ARRAY, TRANSFORMS, MessageFactory
-from fgtrack.io.viewer.scene import Arrow, Box, Colour, Dot, Ellipse, Entity, Label, Line, Point, Scene, Shape
+from fgtrack.viewers.shapes import Arrow, Box, Colour, Dot, Ellipse, Entity, Label, Line, Point, Scene, Shape
 
 _MARKER = "visualization_msgs/msg/Marker"
 _FRAME_IDS = {"map": "map", "ego": "base_link"}

@@ -9,11 +9,11 @@ import numpy as np
 
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Detection, DetectionList, FloatArray, IntArray
-from fgtrack.evaluation.viewer.ellipse import ellipses
-from fgtrack.evaluation.viewer.look import Look, faded, patch, size
-from fgtrack.evaluation.viewer.surroundings import groups
 from fgtrack.io.run import Run, Table
-from fgtrack.io.viewer.scene import Entity, Line, Objects, Point, Scene, ViewerMessage
+from fgtrack.viewers.ellipse import ellipses
+from fgtrack.viewers.look import Look, faded, patch, size
+from fgtrack.viewers.shapes import Entity, Line, Objects, Point, Scene, ViewerMessage
+from fgtrack.viewers.surroundings import groups
 
 _DEFAULT_LAG_S = 1.0  # of `smoother.lag_s`, where the configuration does not say
 _PART = 20  # states of a line of final states; it is sent anew with each of them

@@ -14,10 +14,10 @@ from scipy.special import stdtrit
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
-from fgtrack.evaluation.figures.style import legend_above, log_axis
 from fgtrack.evaluation.palette import Look, look, looks
 from fgtrack.evaluation.sweep_table import PointMean, SweepTable, number, read_sweep
+from fgtrack.plotting.paper import Paper, Sheet, styled
+from fgtrack.plotting.style import legend_above, log_axis
 
 #: Metrics with a name for people; the others are called by their column.
 _NAMES: Mapping[str, str] = {

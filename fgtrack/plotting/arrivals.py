@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, IntArray
-from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
-from fgtrack.evaluation.figures.style import legend_above, titled, usual_step_ns
 from fgtrack.evaluation.runs import OneRun, one_judged, start_ns
 from fgtrack.io.run import Table
 from fgtrack.io.run.reader import Column
+from fgtrack.plotting.paper import Paper, Sheet, styled
+from fgtrack.plotting.style import legend_above, titled, usual_step_ns
 
 #: None is the colour of an estimator that is compared often.
 _COLOURS = {

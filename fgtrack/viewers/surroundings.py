@@ -1,69 +1,21 @@
 """What the runs of a recording share: the map, the ego, the truth."""
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
 
 from fgtrack.core.types import EGO_ID, STATE_NAMES, Detection, DetectionList, EgoState, FloatArray, IntArray
-from fgtrack.evaluation.viewer.look import GREY, WHITE, car, faded
+from fgtrack.evaluation.roads import road_lines
 from fgtrack.io.run import Run, Table
-from fgtrack.io.viewer.scene import EgoMotion, Entity, Line, Objects, Scene, ViewerMessage
-from fgtrack.models.areas import ExclusionAreas
-from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
-from fgtrack.models.road import OPEN_SPACE
 from fgtrack.models.track_map import TrackMap
-
-_BOUND_STEP_M = 2.0
+from fgtrack.viewers.look import GREY, WHITE, car, faded
+from fgtrack.viewers.shapes import EgoMotion, Entity, Line, Objects, Scene, ViewerMessage
 
 
 def start_ns(run: Run) -> int:
     """The earliest time of the run: of a tick, a receipt or the truth; 0 where it holds nothing."""
     columns = (run.timing["now_ns"], run.ego["receipt_ns"], run.detections["receipt_ns"], run.truth["stamp_ns"])
     return min((int(column.min()) for column in columns if len(column)), default=0)
-
-
-def roads(run: Run) -> tuple[dict[str, TrackMap], list[str]]:
-    """The maps that the configuration names, by `track` and `pit`, and a line for each file that is gone, of any kind.
-
-    Raises
-    ------
-    DataError
-        A file is no map.
-    """
-    found, notes = {}, []
-    config = run.config.get("map") or {}
-    for key, built_in in (("track", make_oval), ("pit", make_pit_lane)):
-        name = config.get(key)
-        if name == OVAL:
-            found[key] = built_in()
-        elif name and Path(str(name)).is_file():
-            found[key] = TrackMap.read(Path(str(name)))
-        elif name and name != OPEN_SPACE:
-            notes.append(f"map.{key}: {name} is not there any more, so it is not shown")
-    lost = [name for name in config.get("excluded") or () if not Path(str(name)).is_file()]
-    notes += [f"map.excluded: {name} is not there any more, so it is not shown" for name in lost]
-    return found, notes
-
-
-def excluded_lines(run: Run) -> list[FloatArray]:
-    """The rings of the exclusion areas that the configuration names, each closed, shape (n, 2); of lost files none.
-
-    Raises
-    ------
-    DataError
-        A file holds no areas.
-    """
-    names = [name for name in (run.config.get("map") or {}).get("excluded") or () if Path(str(name)).is_file()]
-    rings = [ring for polygon in ExclusionAreas.read(names).polygons_m for ring in polygon]
-    return [np.concatenate([ring, ring[:1]]) for ring in rings]
-
-
-def road_lines(road: TrackMap) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The left bound, the right bound and the reference line of `road`, each of shape (n, 2)."""
-    s_m = np.linspace(0.0, road.length_m, max(2, round(road.length_m / _BOUND_STEP_M)) + 1)
-    left_m, right_m = road.bounds(s_m)
-    return road.position(s_m, left_m), road.position(s_m, -right_m), road.position(s_m, np.zeros_like(s_m))
 
 
 def map_scene(maps: dict[str, TrackMap], excluded: Sequence[FloatArray], at_ns: int) -> Iterator[Scene]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from fgtrack.core.types import Detection
 from fgtrack.evaluation.palette import PALETTE, SENSORS
-from fgtrack.io.viewer.scene import Arrow, Box, Colour, Ellipse, Label, Point, Shape
+from fgtrack.viewers.shapes import Arrow, Box, Colour, Ellipse, Label, Point, Shape
 
 #: Length, width and height of the box of an object of which no detection tells them: a racing car's.
 NOMINAL_SIZE_M = (4.8, 2.0, 1.2)

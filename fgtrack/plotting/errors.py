@@ -12,14 +12,14 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
-from fgtrack.evaluation.figures.seeds import group_looks, grouped
-from fgtrack.evaluation.figures.style import broken_line, legend_above, run_looks, usual_step_ns
 from fgtrack.evaluation.lagged import final_errors
 from fgtrack.evaluation.matching import TrackErrors, track_errors
 from fgtrack.evaluation.palette import Look
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged, starts_ns
 from fgtrack.evaluation.statistics import Moments
+from fgtrack.plotting.paper import Paper, Sheet, styled
+from fgtrack.plotting.seeds import group_looks, grouped
+from fgtrack.plotting.style import broken_line, legend_above, run_looks, usual_step_ns
 
 #: What is drawn, with its name, its unit, and that unit over the one of the values.
 _QUANTITIES = {

@@ -8,13 +8,13 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation import innovations
-from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
-from fgtrack.evaluation.figures.ranges import bulk
-from fgtrack.evaluation.figures.style import legend_above, sensor_colour, titled
 from fgtrack.evaluation.innovations import RESIDUAL_NAMES
 from fgtrack.evaluation.runs import OneRun, one_judged, start_ns
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.models.measurement import ANGULAR
+from fgtrack.plotting.paper import Paper, Sheet, styled
+from fgtrack.plotting.ranges import bulk
+from fgtrack.plotting.style import legend_above, sensor_colour, titled
 
 _RESIDUALS = {
     "along_m": "along track [m]",

@@ -8,9 +8,15 @@ from matplotlib.figure import Figure
 
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
-from fgtrack.evaluation.figures.ranges import bulk
-from fgtrack.evaluation.figures.style import (
+from fgtrack.evaluation.matching import confirmed
+from fgtrack.evaluation.placement import placed
+from fgtrack.evaluation.roads import excluded_lines, road_lines, roads
+from fgtrack.evaluation.runs import JudgedRun, OneRun, one_judged, start_ns
+from fgtrack.evaluation.truth import true_paths
+from fgtrack.io.run import Run, Table
+from fgtrack.plotting.paper import Paper, Sheet, styled
+from fgtrack.plotting.ranges import bulk
+from fgtrack.plotting.style import (
     GREY,
     WRONG,
     broken_line,
@@ -19,12 +25,6 @@ from fgtrack.evaluation.figures.style import (
     titled,
     usual_step_ns,
 )
-from fgtrack.evaluation.matching import confirmed
-from fgtrack.evaluation.runs import JudgedRun, OneRun, one_judged, start_ns
-from fgtrack.evaluation.truth import true_paths
-from fgtrack.evaluation.viewer.placement import placed
-from fgtrack.evaluation.viewer.surroundings import excluded_lines, road_lines, roads
-from fgtrack.io.run import Run, Table
 
 _NAMED_OBJECTS = 8  # more objects than these share two entries of the legend
 

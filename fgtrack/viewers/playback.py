@@ -12,15 +12,16 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import EGO_ID, LATE, FloatArray, IntArray
 from fgtrack.evaluation.cautions import USED
 from fgtrack.evaluation.palette import SENSORS, distinct_colours
+from fgtrack.evaluation.placement import placed, update_rows
 from fgtrack.evaluation.recordings import by_recording
+from fgtrack.evaluation.roads import excluded_lines, road_lines, roads
 from fgtrack.evaluation.runs import JudgedRun
-from fgtrack.evaluation.viewer.detection_messages import track_positions
-from fgtrack.evaluation.viewer.ellipse import AROUND_95, ellipses
-from fgtrack.evaluation.viewer.look import NOMINAL_SIZE_M
-from fgtrack.evaluation.viewer.placement import placed, update_rows
-from fgtrack.evaluation.viewer.surroundings import excluded_lines, road_lines, roads, start_ns
-from fgtrack.evaluation.viewer.track_messages import final_ns, position_covariances
 from fgtrack.io.run import Run, Table
+from fgtrack.viewers.detection_messages import track_positions
+from fgtrack.viewers.ellipse import AROUND_95, ellipses
+from fgtrack.viewers.look import NOMINAL_SIZE_M
+from fgtrack.viewers.surroundings import start_ns
+from fgtrack.viewers.track_messages import final_ns, position_covariances
 
 FORMAT = "fgtrack-report/2"
 MOST_ROWS = 60_000

@@ -10,8 +10,11 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.consistency import position_nees
-from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
-from fgtrack.evaluation.figures.style import (
+from fgtrack.evaluation.innovations import num_measured
+from fgtrack.evaluation.runs import JudgedRun, OneRun, one_judged, start_ns
+from fgtrack.evaluation.statistics import chi_square_band
+from fgtrack.plotting.paper import Paper, Sheet, styled
+from fgtrack.plotting.style import (
     GREY,
     broken_line,
     legend_above,
@@ -21,9 +24,6 @@ from fgtrack.evaluation.figures.style import (
     titled,
     usual_step_ns,
 )
-from fgtrack.evaluation.innovations import num_measured
-from fgtrack.evaluation.runs import JudgedRun, OneRun, one_judged, start_ns
-from fgtrack.evaluation.statistics import chi_square_band
 
 _WINDOWS = 40  # of a run, so many values does each mean of NIS hold
 _SHORTEST, _LONGEST = 5, 100

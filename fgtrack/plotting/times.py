@@ -8,13 +8,13 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
-from fgtrack.evaluation.figures.seeds import group_looks, grouped
-from fgtrack.evaluation.figures.style import legend_above, log_axis, sensor_colour, titled
 from fgtrack.evaluation.innovations import message_delays
 from fgtrack.evaluation.runs import OneRun, Runs, judged, one_judged
 from fgtrack.evaluation.statistics import Distribution
 from fgtrack.io.run import Run
+from fgtrack.plotting.paper import Paper, Sheet, styled
+from fgtrack.plotting.seeds import group_looks, grouped
+from fgtrack.plotting.style import legend_above, log_axis, sensor_colour, titled
 
 _MS = 1e3
 

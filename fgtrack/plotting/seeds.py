@@ -12,12 +12,12 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.consistency import nees_over_runs, position_nees
-from fgtrack.evaluation.figures.paper import Paper, Sheet, styled
-from fgtrack.evaluation.figures.style import GREY, broken_line, legend_above, log_axis, usual_step_ns
 from fgtrack.evaluation.matching import Matching, track_errors
 from fgtrack.evaluation.palette import Look, looks
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged, start_ns
 from fgtrack.evaluation.statistics import chi_square_band
+from fgtrack.plotting.paper import Paper, Sheet, styled
+from fgtrack.plotting.style import GREY, broken_line, legend_above, log_axis, usual_step_ns
 
 _QUANTITIES = {"position_m": "position RMSE [m]", "speed_mps": "speed RMSE [m/s]", "yaw_rad": "yaw RMSE [rad]"}
 _EDGES = (0.1, 0.9)  # of the bands: quantiles over the runs

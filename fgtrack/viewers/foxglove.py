@@ -8,9 +8,9 @@ from pathlib import Path
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.io.output import Kind, check_output, new_file
-from fgtrack.io.viewer.foxglove_messages import foxglove_messages
-from fgtrack.io.viewer.scene import ViewerMessage
-from fgtrack.io.viewer.schemas import schema_text
+from fgtrack.viewers.foxglove_messages import foxglove_messages
+from fgtrack.viewers.schemas import schema_text
+from fgtrack.viewers.shapes import ViewerMessage
 
 _LIBRARY = "fgtrack"
 _MAGIC = b"\x89MCAP0\r\n"

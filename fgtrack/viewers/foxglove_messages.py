@@ -5,7 +5,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from fgtrack.core.time import NS_PER_S, nanoseconds
-from fgtrack.io.viewer.scene import (
+from fgtrack.viewers.schemas import FRAME_TRANSFORM, OUTCOME, POSE_IN_FRAME, POSES_IN_FRAME, SCENE_UPDATE
+from fgtrack.viewers.shapes import (
     Arrow,
     Box,
     Colour,
@@ -22,7 +23,6 @@ from fgtrack.io.viewer.scene import (
     Shape,
     ViewerMessage,
 )
-from fgtrack.io.viewer.schemas import FRAME_TRANSFORM, OUTCOME, POSE_IN_FRAME, POSES_IN_FRAME, SCENE_UPDATE
 
 Json = dict[str, Any]  # Any: JSON
 

@@ -19,8 +19,8 @@ from fgtrack.io.ros.bag_files import METADATA
 from fgtrack.io.ros.bag_writer import RECORDING
 from fgtrack.io.ros.mcap_file import MCAP_MAGIC
 from fgtrack.io.ros.typestore import one_line
-from fgtrack.io.ros.viewer_messages import ViewerMessageFactory
-from fgtrack.io.viewer.scene import EgoMotion, Facts, Objects, Scene, ViewerMessage
+from fgtrack.viewers.ros2_messages import ViewerMessageFactory
+from fgtrack.viewers.shapes import EgoMotion, Facts, Objects, Scene, ViewerMessage
 
 _INT64_LIMIT = 1 << 63
 _MARK = ("made_by", "fgtrack export")  # stands in the metadata of the recording, which its file repeats

@@ -9,24 +9,23 @@ from pathlib import Path
 from fgtrack.core.errors import CallError, printable
 from fgtrack.evaluation.palette import distinct_colours
 from fgtrack.evaluation.recordings import same_recording
+from fgtrack.evaluation.roads import excluded_lines, roads
 from fgtrack.evaluation.runs import Runs, judged, run_folders
-from fgtrack.evaluation.viewer.detection_messages import detection_messages, outcome_messages
-from fgtrack.evaluation.viewer.look import Look, rgba
-from fgtrack.evaluation.viewer.surroundings import (
+from fgtrack.io.output import check_apart
+from fgtrack.io.ros.bag_writer import token
+from fgtrack.io.run import Run
+from fgtrack.viewers.detection_messages import detection_messages, outcome_messages
+from fgtrack.viewers.foxglove import check_foxglove, write_foxglove
+from fgtrack.viewers.look import Look, rgba
+from fgtrack.viewers.ros2 import check_viewer_bag, write_viewer_bag
+from fgtrack.viewers.shapes import ViewerMessage
+from fgtrack.viewers.surroundings import (
     ego_messages,
-    excluded_lines,
     map_scene,
-    roads,
     start_ns,
     truth_messages,
 )
-from fgtrack.evaluation.viewer.track_messages import past_messages, smoothed_messages, track_messages
-from fgtrack.io.output import check_apart
-from fgtrack.io.ros.viewer_bag import check_viewer_bag, write_viewer_bag
-from fgtrack.io.run import Run
-from fgtrack.io.viewer.foxglove import check_foxglove, write_foxglove
-from fgtrack.io.viewer.scene import ViewerMessage
-from fgtrack.io.viewer.topics import token
+from fgtrack.viewers.track_messages import past_messages, smoothed_messages, track_messages
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from typing import Any
 from fgtrack.core.files import read_head
 from fgtrack.evaluation.cautions import cautions, noise_cautions
 from fgtrack.evaluation.recordings import recordings_caution
-from fgtrack.evaluation.report.scene import Moment, scene
-from fgtrack.evaluation.report.settings import differing, flattened
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.tables import Table, Tables, cell_rows
 from fgtrack.io.output import Kind, new_file
+from fgtrack.viewers.playback import Moment, scene
+from fgtrack.viewers.settings import differing, flattened
 
 #: Kinds of figures that are open; of some of them there are several, by object or run.
 _FIRST = ("close_up", "errors", "error_against_lag", "map")
@@ -153,7 +153,7 @@ def _folded(title: str, content: str, name: str = "") -> str:
 
 
 def _template(name: str) -> str:
-    return (files(__package__) / name).read_text(encoding="utf-8")
+    return (files(__package__) / "page" / name).read_text(encoding="utf-8")
 
 
 def _filled(template: str, contents: Mapping[str, str]) -> str:

@@ -1,1 +1,0 @@
-"""Runs as viewers show them: what is known when, and what it is about."""

@@ -1,0 +1,1 @@
+"""Figures of runs and sweeps: `fgtrack.plot`. Drawn without pyplot: nothing is global."""

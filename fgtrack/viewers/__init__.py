@@ -1,0 +1,1 @@
+"""Runs to look at: the HTML report, and files for Foxglove and RViz."""
