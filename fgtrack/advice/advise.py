@@ -27,12 +27,11 @@ from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumed import Assumed, assumed, source_of
+from fgtrack.pipeline.clock import corrected
 from fgtrack.pipeline.clock_offsets import OffsetReport
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.effective import effective
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.shipped import read_config, settings_of
-from fgtrack.pipeline.stamping import mended
 from fgtrack.pipeline.trial import TRIAL_S, beginning, suspicions
 from fgtrack.pipeline.tune import tuned
 from fgtrack.pipeline.tune_rules import TuneRules
@@ -137,7 +136,7 @@ class _Adviser:
         self._on_step("clocks", 0.2 * work)
         self._take(self._offsets())
         seen = arrivals_of(
-            mended(message, self._config.sensors)
+            corrected(message, self._config.sensors)
             for message in self._messages
             if isinstance(message, DetectionList) and message.sensor in sensors
         )
@@ -338,8 +337,8 @@ class _Adviser:
         for known, run in self._runs:
             if known == config:
                 return run
-        storage_s = min(effective(config).reach_s, _LONGEST_STORAGE_S)
-        fast = replace(config, clock=replace(config.clock, ticks_file=None))
+        storage_s = min(config.effective.reach_s, _LONGEST_STORAGE_S)
+        fast = config
         if config.estimator.startswith("smoother"):
             fast = replace(fast, estimator="ekf-replay", filter=replace(config.filter, storage_s=storage_s))
         try:
@@ -378,7 +377,7 @@ class _Adviser:
         if not kinds & {"input", "model"}:
             yield "frames, angles and fields"
         if "window" not in kinds and any(one.has_stamps for one in seen.values()):
-            found = effective(self._config)
+            found = self._config.effective
             yield f"{found.lag_key} ({found.lag_s:g} s) and max_delay_s"
         if outcome is None:
             return

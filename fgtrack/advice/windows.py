@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from fgtrack.advice.arrivals import Arrivals
 from fgtrack.advice.finding import Finding, milliseconds, nice_above, percent
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.effective import effective
 from fgtrack.tracking.existence import ExistenceRules
 
 __all__ = ["BeyondLag", "beyond_lags", "window_findings"]
@@ -59,7 +58,7 @@ def window_findings(arrivals: Sequence[Arrivals], config: Config) -> Iterator[Fi
 
 
 def _window(arrivals: Sequence[Arrivals], config: Config, needed_s: float) -> Iterator[Finding]:
-    found = effective(config)
+    found = config.effective
     told = f"{found.lag_key} {found.lag_s:g} s is shorter than"
     slowest = max(arrivals, key=lambda one: one.period_s or 0.0, default=None)
     if slowest is None:

@@ -18,7 +18,6 @@ from fgtrack.io.output import check_apart, check_output
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumed import assumed
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.effective import effective
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.starting import STARTING, write_starting
 from fgtrack.pipeline.trial import Trial, try_out
@@ -55,7 +54,7 @@ def info(
     config = None if config_file is None else read_config(config_file)
     found = describe(recording, None if config is None else config.input)
     topics = _table(found, NO_VALUE if config is None else "ignored")
-    comes_to = effective(config or Config())
+    comes_to = (config or Config()).effective
     show(topics, form, {**_values(found, topics), "effective": comes_to.values()})
     if form is None:
         sentences([f"{config_file or 'without a configuration'}: {comes_to}"])

@@ -18,7 +18,6 @@ from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
 from fgtrack.io.span import end_ns
 from fgtrack.pipeline.assumed import assumed
-from fgtrack.pipeline.effective import effective
 from fgtrack.pipeline.inputs import inputs
 from fgtrack.pipeline.replay import located, replay_each
 from fgtrack.pipeline.shipped import read_config
@@ -68,7 +67,7 @@ def replay(
             overwrite=overwrite,
             realtime=realtime,
         )
-    for line in dict.fromkeys(str(effective(replace(found.config, estimator=name))) for name in names):
+    for line in dict.fromkeys(str(replace(found.config, estimator=name).effective) for name in names):
         say(line)
     runs = [load_run(result.path) for result in results]
     for line in found.lines():

@@ -31,7 +31,6 @@ from fgtrack.models.published_map import CircularHeadingMap, PublishedMap
 from fgtrack.models.road import MappedRoad, OpenSpace, Road
 from fgtrack.models.track_map import TrackMap
 from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
-from fgtrack.pipeline.effective import effective
 from fgtrack.tracking.ego import EgoSource, EgoStd, EgoTrajectory
 from fgtrack.tracking.ego_error import IndependentErrors, SharedErrors
 from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules
@@ -173,7 +172,7 @@ def build_bank(config: Config, failures: Failures | None = None) -> TrackBank:
     build, options = _BANKS.get(config.estimator), config.options.get(config.estimator, {})
     if build is None:
         options = {"initiation": config.initiation.method, **options}
-        lag_s = effective(config).lag_s
+        lag_s = config.effective.lag_s
         return estimator_bank(config.estimator, config.motion_model(), lag_s, options, config.smoother.lagged_s)
     if options:
         raise CallError(f"options.{config.estimator}: set the keys of smoother or filter instead")

@@ -1,24 +1,17 @@
-"""The replay clock: which messages have arrived at which tick."""
+"""Time in a replay: stamps corrected for the clocks of sensors, the ticks of the node, and the wall clock."""
 
-import gzip
-import json
-import zlib
-from collections.abc import Iterable, Iterator
-from itertools import groupby, pairwise
-from pathlib import Path
-from typing import BinaryIO, NamedTuple
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from itertools import groupby
+from typing import NamedTuple
 
-from fgtrack.core.checks import is_stamp
-from fgtrack.core.errors import CallError
-from fgtrack.core.files import open_file
-from fgtrack.core.time import first_multiple, period_ns
+from fgtrack.core.time import first_multiple, nanoseconds, period_ns
 from fgtrack.core.types import DetectionList, EgoState
-from fgtrack.io.stream import GZIP_MAGIC
+from fgtrack.models.sensors import SensorModel
+from fgtrack.sim.redelay import restamped
 
 Delivered = EgoState | DetectionList
-
-_LARGEST_BYTES = 1 << 28  # of ticks, unpacked: two days at 50 Hz
-_LONGEST_LINE = 1 << 20
 
 
 class Tick(NamedTuple):
@@ -29,7 +22,7 @@ class Tick(NamedTuple):
 
 
 def node_ticks(messages: Iterable[Delivered], node_hz: float) -> Iterator[Tick]:
-    """Ticks on multiples of the node period, from the first at or after the first receipt until all is delivered.
+    """Yield ticks on multiples of the node period, from the first at or after the first receipt until all is delivered.
 
     What was received at or before a tick is delivered with it.
     """
@@ -43,64 +36,30 @@ def node_ticks(messages: Iterable[Delivered], node_hz: float) -> Iterator[Tick]:
 
 
 def message_ticks(messages: Iterable[Delivered]) -> Iterator[Tick]:
-    """A tick at every receipt; what was received at the same nanosecond shares one."""
+    """Yield a tick at every receipt; what was received at the same nanosecond shares one."""
     for now_ns, delivered in groupby(messages, lambda message: message.receipt_ns):
         yield Tick(now_ns, list(delivered))
 
 
-def listed_ticks(messages: Iterable[Delivered], ticks_ns: Iterable[int]) -> Iterator[Tick]:
-    """The given ticks, and one more at the last receipt if something is left for it."""
-    source = iter(messages)
-    pending = next(source, None)
-    for now_ns in ticks_ns:
-        waiting = []
-        while pending is not None and pending.receipt_ns <= now_ns:
-            waiting.append(pending)
-            pending = next(source, None)
-        yield Tick(now_ns, waiting)
-    rest = [] if pending is None else [pending, *source]
-    if rest:
-        yield Tick(rest[-1].receipt_ns, rest)
+def corrected(message: DetectionList, sensors: Mapping[str, SensorModel]) -> DetectionList:
+    """Return `message` with its receipt as the stamp, or its clock offset taken off, where `sensors` say so."""
+    sensor = sensors.get(message.sensor)
+    if sensor is None or (sensor.stamp_from != "receipt" and sensor.clock_offset_s == 0.0):
+        return message
+    offset_ns = nanoseconds(sensor.clock_offset_s)
+    if sensor.stamp_from == "receipt":
+        objects = tuple(item if item.stamp_ns is None else replace(item, stamp_ns=None) for item in message.objects)
+        return replace(message, stamp_ns=message.receipt_ns - offset_ns, objects=objects)
+    return restamped(message, message.stamp_ns - offset_ns)
 
 
-def read_ticks(path: Path) -> list[int]:
-    """The `now_ns` of every line of a JSON-lines file, plain or gzip, ascending.
+class WallClock:
+    """The clock of the machine, which only goes forward."""
 
-    Raises `CallError` where the file is missing or too large, or says something else.
-    """
-    try:
-        ticks = [_now_ns(line) for line in _lines(path)]
-    except CallError:
-        raise
-    except OSError as error:
-        raise CallError(f"{path}: ticks cannot be read ({error.strerror or error})") from error
-    except (ValueError, KeyError, TypeError, EOFError, RecursionError, zlib.error) as error:
-        raise CallError(
-            f"{path}: no list of ticks, every line must be an object with now_ns, an integer of 64 bits"
-        ) from error
-    if not all(before < after for before, after in pairwise(ticks)):
-        raise CallError(f"{path}: the ticks are not ascending")
-    return ticks
+    def now_ns(self) -> int:
+        """Return the present time."""
+        return time.perf_counter_ns()
 
-
-def _lines(path: Path) -> Iterator[bytes]:
-    """The lines of `path`, unpacked up to a size that fits into memory."""
-    with open_file(path) as raw:
-        packed = raw.read(len(GZIP_MAGIC)) == GZIP_MAGIC
-        raw.seek(0)
-        file: BinaryIO | gzip.GzipFile = gzip.GzipFile(fileobj=raw) if packed else raw
-        left = _LARGEST_BYTES
-        while line := file.readline(_LONGEST_LINE + 1):
-            left -= len(line)
-            if left < 0:
-                raise CallError(f"{path}: more than {_LARGEST_BYTES >> 20} MB of ticks, replay the recording in parts")
-            if len(line) > _LONGEST_LINE:
-                raise CallError(f"{path}: a line of ticks with more than {_LONGEST_LINE} bytes, only now_ns is needed")
-            yield line
-
-
-def _now_ns(line: bytes) -> int:
-    now_ns = json.loads(line.decode())["now_ns"]
-    if type(now_ns) is not int or not is_stamp(now_ns):
-        raise ValueError(f"{str(now_ns)[:50]} is no time")
-    return now_ns
+    def wait_until(self, time_ns: int) -> None:
+        """Return at `time_ns`, at once where that has passed."""
+        time.sleep(max(time_ns - self.now_ns(), 0) / 1e9)

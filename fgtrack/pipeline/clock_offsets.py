@@ -16,12 +16,11 @@ from fgtrack.estimation.factor_graph.clock_calibration.time_shift import Shiftab
 from fgtrack.io.run import Run
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.assumed import assumed, source_of
-from fgtrack.pipeline.clock import Delivered
+from fgtrack.pipeline.clock import Delivered, corrected
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.ego_path import EgoPath
 from fgtrack.pipeline.offset_measurements import Remeasure, measurements_by_track
 from fgtrack.pipeline.replay import again, replay_in_memory
-from fgtrack.pipeline.stamping import mended
 from fgtrack.sim.redelay import restamped
 
 Track = Sequence[ShiftableMeasurement]
@@ -189,7 +188,7 @@ def least_delays_s(lists: Iterable[DetectionList]) -> dict[str, float]:
 
 
 def unrefused(config: Config) -> Config:
-    """`config` for messages whose stamps it has mended: it takes them as they are, and refuses none for its delay."""
+    """`config` for messages whose stamps it has corrected: it takes them as they are and refuses none for its delay."""
     sensors = {}
     for name, sensor in config.sensors.items():
         stamp_from = "message" if sensor.stamp_from == "receipt" else sensor.stamp_from
@@ -219,7 +218,7 @@ def _recorded(
     """The messages with stamps as `sensors` mend them; those that a tracker hears are kept in `heard` as well."""
     for message in messages:
         if isinstance(message, DetectionList):
-            message = mended(message, sensors)
+            message = corrected(message, sensors)
         if isinstance(message, (EgoState, DetectionList)):
             heard.append(message)
         yield message

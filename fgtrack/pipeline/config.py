@@ -1,13 +1,13 @@
 """The configuration of a run. The defaults are those of open space; a YAML file overrides them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat, PositiveInt, Tag
 
 from fgtrack.estimation.initiation import DEFAULT, Initiation
-from fgtrack.estimation.registry import ESTIMATORS, motion_model
+from fgtrack.estimation.registry import ESTIMATORS, Claims, motion_model
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.io.config import InputConfig
 from fgtrack.io.errors import MOST_SENSORS
@@ -37,8 +37,6 @@ class ClockConfig:
 
     node_hz: Annotated[float, Field(ge=0.1, le=10_000.0)] | None = 50.0
     """Ticks lie on multiples of the node period; null ticks at every message instead."""
-    ticks_file: str | None = None
-    """Tick at the `now_ns` of the lines of this JSON-lines file instead (.jsonl or .jsonl.gz)."""
 
 
 @dataclass(frozen=True)
@@ -219,6 +217,36 @@ class MotionConfig:
         return model.from_std_per_step(self.std_per_s, self.noise_hz)
 
 
+#: Estimators that take all settings of `smoother`.
+_SMOOTHERS = ("smoother", "smoother-batch", "smoother-banded")
+
+
+@dataclass(frozen=True)
+class Effective:
+    """Settings that are easily overlooked, as meta.json has them."""
+
+    detection_origin_m: tuple[float, float]
+    """Origin of the ego frame of detections, ahead of the ego reference point and to its left."""
+    merge_distance_m: float | None
+    """Up to which distance detections become one; None for no merge."""
+    lag_key: str
+    """Key of the configuration that sets the length of the window."""
+    lag_s: float
+    """Length of the window."""
+    reach_s: float
+    """How far back a detection still changes a track."""
+
+    def __str__(self) -> str:
+        x_m, y_m = self.detection_origin_m
+        merge = "none" if self.merge_distance_m is None else f"up to {self.merge_distance_m:g} m"
+        late = "" if self.reach_s == self.lag_s else f", late detections up to {self.reach_s:g} s"
+        return f"detection origin {x_m:g} m ahead, {y_m:g} m left of the ego; merge {merge}; lag {self.lag_s:g} s{late}"
+
+    def values(self) -> dict[str, object]:
+        """JSON values."""
+        return {**asdict(self), "detection_origin_m": list(self.detection_origin_m)}
+
+
 @dataclass(frozen=True)
 class Config:
     """Everything that decides a run besides its input."""
@@ -272,6 +300,17 @@ class Config:
     def used_sensors(self) -> Mapping[str, SensorModel]:
         """The sensors that are not ignored."""
         return {name: sensor for name, sensor in self.sensors.items() if name not in self.ignore_sensors}
+
+    @property
+    def effective(self) -> Effective:
+        """Settings that are easily overlooked, as a run has them."""
+        key, lag_s, behind_s = "filter.storage_s", self.filter.storage_s, 0.0
+        if self.estimator in _SMOOTHERS:
+            key, lag_s, behind_s = "smoother.lag_s", self.smoother.lag_s, self.smoother.behind_s
+        elif Claims.of(ESTIMATORS.load(self.estimator)).reports:
+            key, lag_s = "smoother.lag_s", self.smoother.lag_s
+        distance_m = None if isinstance(self.merge, NoMerge) else self.merge.distance_m
+        return Effective(self.ego.detection_origin_m, distance_m, key, lag_s, lag_s + behind_s)
 
     def motion_model(self) -> MotionModel:
         """The motion model of the tracks, with the errors of sensors that are correlated in time."""

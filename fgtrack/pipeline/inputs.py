@@ -58,8 +58,7 @@ def _files_of(config: Config | None, recording: Path | None, scenario: Scenario 
     """The files, each in a place of its own: of the scenario, of the configuration, and beside the recording."""
     found = [_map(None if scenario is None else scenario.map)]
     if config is not None:
-        ticks = config.clock.ticks_file
-        found += [_map(config.map.track_file), _map(config.map.pit), None if ticks is None else Path(ticks)]
+        found += [_map(config.map.track_file), _map(config.map.pit)]
         found += map(Path, config.map.excluded)
         if recording is not None:
             folder, tables = recording if recording.is_dir() else recording.parent, config.input.csv

@@ -25,11 +25,10 @@ from fgtrack.core.types import (
 )
 from fgtrack.io.gate import WrongError, checked_detection
 from fgtrack.pipeline.build import build_tracker
+from fgtrack.pipeline.clock import WallClock, corrected
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.lateness import Lateness, Receptions, TickTimes, TickTiming
-from fgtrack.pipeline.pace import Clock, WallClock
 from fgtrack.pipeline.shipped import read_config, settings_of
-from fgtrack.pipeline.stamping import mended
 from fgtrack.tracking.inbox import records
 
 __all__ = ["TrackOutput", "Tracker", "TracksAt"]
@@ -56,7 +55,7 @@ class Tracker:
         Times the ticks; nothing else depends on it.
     """
 
-    def __init__(self, config: Config, clock: Clock | None = None) -> None:
+    def __init__(self, config: Config, clock: WallClock | None = None) -> None:
         if not isinstance(config, Config):
             what = f"must be a Config, is a {type(config).__name__}"
             raise CallError(f"config: {what}; Tracker.from_config takes names and paths")
@@ -163,7 +162,7 @@ class Tracker:
             self._receptions[EGO].add(message.stamp_ns, message.receipt_ns, 0)
         elif message.sensor in self.config.sensors:
             objects = tuple(map(self._usable, message.objects))
-            message = mended(replace(message, objects=objects), self.config.sensors)
+            message = corrected(replace(message, objects=objects), self.config.sensors)
             self._receptions[message.sensor].add(message.stamp_ns, message.receipt_ns, len(message.objects))
         else:
             if message.sensor not in self.config.ignore_sensors:

@@ -16,13 +16,10 @@ from fgtrack.io.run import MemoryRun, Node, Run, RunWriter, path_from_run
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.assumed import assumed, is_open, source_of
 from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.clock import Delivered, Tick, listed_ticks, message_ticks, node_ticks, read_ticks
+from fgtrack.pipeline.clock import Delivered, Tick, WallClock, corrected, message_ticks, node_ticks
 from fgtrack.pipeline.config import ClockConfig, Config
-from fgtrack.pipeline.effective import effective
 from fgtrack.pipeline.ego_clock import EgoClock
 from fgtrack.pipeline.load import dump
-from fgtrack.pipeline.pace import Clock, Pace, WallClock
-from fgtrack.pipeline.stamping import mended
 from fgtrack.tracking.tracker import Tracker, TrackerParts, check_sensor
 
 #: Ticks go on while nothing is received: a few messages must not make a recording of days.
@@ -89,7 +86,7 @@ class _Feed:
                 if not isinstance(message, TruthState):
                     self._check_time(message)
                 if isinstance(message, DetectionList):
-                    message = mended(message, self.sensors)
+                    message = corrected(message, self.sensors)
                 yield message
         except DataError as error:
             self.broken = str(error)
@@ -202,7 +199,7 @@ def _drive(
     writer: RunWriter | MemoryRun,
     on_tick: Callable[[int, int], None] | None = None,
     origin: str = "",
-    clock: Clock | None = None,
+    clock: WallClock | None = None,
     realtime: bool = False,
 ) -> tuple[dict[str, object], str | None, int | None]:
     """Run `tracker` over `messages` into `writer`; gives meta, why the input broke off, and missed deadlines.
@@ -210,13 +207,14 @@ def _drive(
     Only here the wall clock is read: the ticks are those of the recording, however long they take.
     """
     clock = clock or WallClock()
-    started_ns, pace = clock.now_ns(), Pace(clock)
+    started_ns, ahead_ns = clock.now_ns(), 0
     node = Node(None if config.clock.node_hz is None else period_ns(config.clock.node_hz))
     ignored = frozenset(config.ignore_sensors)
     feed = _Feed(messages, config.sensors, ignored, writer.write_truth, writer.write_ego, writer.write_detections)
     for tick in _ticks(feed, config.clock):
         if realtime:
-            pace.wait_for(tick.now_ns)
+            ahead_ns = ahead_ns or clock.now_ns() - tick.now_ns
+            clock.wait_until(tick.now_ns + ahead_ns)
         before_ns = clock.now_ns()
         for message in tick.messages:
             tracker.receive(message)
@@ -253,7 +251,7 @@ def _opening(
     if folder is not None and (place := path_from_run(origin, folder)) is not None:
         source["path_from_run"] = place
     meta: dict[str, object] = {"input": source, "estimator": config.estimator, "versions": versions(), "seed": None}
-    meta["effective"] = effective(config).values()
+    meta["effective"] = config.effective.values()
     return dump(config), meta, next(iter(config.smoother.lagged_s), None)
 
 
@@ -300,8 +298,6 @@ def delivered(messages: Iterable[Message], config: Config) -> Iterator[Tick]:
 
 
 def _ticks(messages: Iterable[Delivered], clock: ClockConfig) -> Iterator[Tick]:
-    if clock.ticks_file is not None:
-        return listed_ticks(messages, read_ticks(Path(clock.ticks_file)))
     if clock.node_hz is None:
         return message_ticks(messages)
     return node_ticks(messages, clock.node_hz)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import takewhile
 
 import numpy as np
@@ -50,7 +50,7 @@ def try_out(messages: Iterable[Message], config: Config, duration_s: float = TRI
     problem = None if readable.error is None else str(readable.error)
     run = None
     try:
-        run, broken = replay_in_memory(found, replace(config, clock=replace(config.clock, ticks_file=None)))
+        run, broken = replay_in_memory(found, config)
         problem = problem or broken
     except DataError as error:
         problem = problem or str(error)

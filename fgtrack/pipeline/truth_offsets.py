@@ -29,7 +29,7 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import EGO_ID, DetectionList, EgoState, FloatArray, IntArray, Message, TruthState
 from fgtrack.estimation.factor_graph.clock_calibration.time_shift import ShiftableMeasurement
 from fgtrack.estimation.initiation import fix_of
-from fgtrack.pipeline.clock import Delivered
+from fgtrack.pipeline.clock import Delivered, corrected
 from fgtrack.pipeline.clock_offsets import (
     Bias,
     OffsetReport,
@@ -44,7 +44,6 @@ from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.ego_path import EgoPath
 from fgtrack.pipeline.offset_measurements import Remeasure, measurements_by_track
 from fgtrack.pipeline.replay import replay_in_memory
-from fgtrack.pipeline.stamping import mended
 
 __all__ = ["TRUTH", "truth_offsets"]
 
@@ -113,7 +112,7 @@ def truth_offsets(
         return None
     rules = rules or OffsetRules()
     heard: list[Delivered] = [
-        mended(message, config.sensors) if isinstance(message, DetectionList) else message
+        corrected(message, config.sensors) if isinstance(message, DetectionList) else message
         for message in messages
         if isinstance(message, (EgoState, DetectionList))
         and getattr(message, "sensor", "") not in config.ignore_sensors

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.messages import shared
+from support.ticks import listed_ticks
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import STATE_NAMES
@@ -48,12 +49,16 @@ def golden(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         f"map.{lane}={json.dumps(str(shared(f'data/maps/lvms_{name}.csv')))}"
         for lane, name in (("track", "track"), ("pit", "pitlane"))
     ]
-    ticks = [f"clock.ticks_file={json.dumps(str(expected_file))}"] if request.param == "jitter10" else []
-    config = load(Config, REFERENCE_CONFIG, [*maps, *ticks])
+    with gzip.open(expected_file) as file:
+        expected = [json.loads(line) for line in file]
+    config = load(Config, REFERENCE_CONFIG, maps)
     trackers = []
     lives: list[dict[int, tuple[int, int, int]]] = []
     with pytest.MonkeyPatch.context() as patch:
         build = pipeline.build_tracker
+        if request.param == "jitter10":
+            ticks_ns = [tick["now_ns"] for tick in expected]
+            patch.setattr(pipeline, "node_ticks", lambda messages, node_hz: listed_ticks(messages, ticks_ns))
         patch.setattr(pipeline, "build_tracker", lambda config: trackers.append(build(config)) or trackers[0])
         result = pipeline.replay(
             read_stream(shared(f"reference/{request.param}/stream.jsonl.gz")),
@@ -62,8 +67,6 @@ def golden(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
             on_tick=lambda *_: lives.append(counted(trackers[0]._parts.lifecycle.lives)),
         )
     assert result.broken is None
-    with gzip.open(expected_file) as file:
-        expected = [json.loads(line) for line in file]
     return Golden(expected, load_run(result.path), lives)
 
 

@@ -786,7 +786,6 @@ def at_once() -> Iterator[None]:
         ("replay", "drive.jsonl", "-c", "endless.jsonl", "-o", "new"),
         ("replay", "drive.jsonl", "--map", "endless.jsonl", "-o", "new"),
         ("replay", "drive.jsonl", "--set", "map.excluded=[endless.jsonl]", "-o", "new"),
-        ("replay", "drive.jsonl", "--set", "clock.ticks_file=endless.jsonl", "-o", "new"),
         ("replay", "bag", "-c", "definitions_of_endless.yaml", "-o", "new"),
         ("convert", "drive.jsonl", "new.jsonl", "--delays", "endless.jsonl"),
         ("simulate", "endless.jsonl", "-o", "new.jsonl"),
@@ -826,7 +825,7 @@ def test_what_has_no_end_in_the_configuration_of_a_run_is_a_reason_to_leave_out_
 ) -> None:
     make("endless.jsonl")
     config = Path("run/config.yaml")
-    config.write_text(config.read_text().replace("ticks_file: null", "ticks_file: endless.jsonl"))
+    config.write_text(config.read_text().replace("excluded: []", "excluded: [endless.jsonl]"))
     assert "endless.jsonl" in config.read_text()
     with at_once(), pytest.raises(DataError, match=r"endless\.jsonl: .* so no close-up"):
         close_up_of(load_run("run"), Arrival("lidar", START_NS, START_NS, 0))

@@ -18,12 +18,13 @@ from published_situations import SITUATIONS, Situation, anything
 from published_streams import generate
 from published_tracker import ObjectResult, TickResult, run
 from support.messages import SHARED, shared
+from support.ticks import listed_ticks
 
 from fgtrack.core.types import EgoState
 from fgtrack.io.stream import read_stream
 from fgtrack.models.oval import make_oval, make_pit_lane
 from fgtrack.pipeline.build import build_propagator, build_tracker
-from fgtrack.pipeline.clock import Delivered, listed_ticks
+from fgtrack.pipeline.clock import Delivered
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
 

@@ -14,8 +14,7 @@ from fgtrack.models.road import OpenSpace
 from fgtrack.models.sensors import Mount, SensorModel
 from fgtrack.pipeline.assumed import ASSUMED_STD, assumed, source_of
 from fgtrack.pipeline.build import build_road
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.effective import Effective
+from fgtrack.pipeline.config import Config, Effective
 from fgtrack.pipeline.public import replay, simulate
 from fgtrack.pipeline.recorded import recorded_of
 from fgtrack.pipeline.shipped import read_config, read_scenario

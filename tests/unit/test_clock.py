@@ -1,14 +1,14 @@
-import gzip
-import json
-from pathlib import Path
+"""The ticks of a replay, corrected stamps and the wall clock."""
+
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fgtrack.core.errors import CallError
-from fgtrack.core.types import DetectionList, EgoState
-from fgtrack.pipeline.clock import Delivered, listed_ticks, message_ticks, node_ticks, read_ticks
+from fgtrack.core.types import Detection, DetectionList, EgoState
+from fgtrack.models.sensors import SensorModel
+from fgtrack.pipeline.clock import Delivered, WallClock, corrected, message_ticks, node_ticks
 
 MS = 1_000_000
 receipts = st.lists(st.integers(0, 300 * MS), max_size=20).map(sorted)
@@ -51,71 +51,30 @@ def test_without_a_period_every_receipt_is_a_tick() -> None:
     assert told(message_ticks(messages)) == [(5, [5, 5]), (7, [7, 7]), (9, [9])]
 
 
-@pytest.mark.parametrize("ticks", [lambda m: node_ticks(m, 50.0), message_ticks, lambda m: listed_ticks(m, [])])
+@pytest.mark.parametrize("ticks", [lambda m: node_ticks(m, 50.0), message_ticks])
 def test_without_messages_there_are_no_ticks(ticks) -> None:
     assert list(ticks([])) == []
 
 
-def test_listed_ticks_are_kept_and_one_more_takes_the_rest() -> None:
-    assert told(listed_ticks(received(5, 10, 12, 30, 31), [1, 10, 20])) == [
-        (1, []),
-        (10, [5, 10]),
-        (20, [12]),
-        (31, [30, 31]),
-    ]
-    assert told(listed_ticks(received(5), [10, 20])) == [(10, [5]), (20, [])]
-
-
-@pytest.mark.parametrize("name", ["ticks.jsonl", "ticks.jsonl.gz"])
-def test_ticks_are_read_from_plain_and_gzipped_lines(tmp_path: Path, name: str) -> None:
-    text = "".join(json.dumps({"now_ns": now_ns, "more": []}) + "\n" for now_ns in (3, 5, 8)).encode()
-    (tmp_path / name).write_bytes(gzip.compress(text) if name.endswith("gz") else text)
-    assert read_ticks(tmp_path / name) == [3, 5, 8]
-
-
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("settings", "stamp_ms", "own_ms"),
     [
-        (b'{"now_ns": 5}\n{"now_ns": 5}\n', "not ascending"),
-        (b'{"later": 5}\n', "no list of ticks"),
-        (b"5\n", "no list of ticks"),
-        (b"text\n", "no list of ticks"),
-        (b'{"now_ns": 1e999}\n', "an integer of 64 bits"),
-        (b'{"now_ns": 5.5}\n', "an integer of 64 bits"),
-        (b'{"now_ns": true}\n', "an integer of 64 bits"),
-        (b'{"now_ns": "5"}\n', "an integer of 64 bits"),
-        (b'{"now_ns": %d}\n' % 10**30, "an integer of 64 bits"),
-        (b'{"now_ns": %b}\n' % (b"1" * 5000), "an integer of 64 bits"),
-        (b"[" * 100_000, "no list of ticks"),
-        (b'{"now_ns": 5, "more": "%b"}\n' % (b"x" * (1 << 20)), "a line of ticks with more than"),
-        (b"\xff\xfe", "no list of ticks"),
-        (b"\x1f\x8bbroken", "ticks"),
-        (gzip.compress(b'{"now_ns": 5}\n')[:-9], "no list of ticks"),
-        (b"\x1f\x8b\x08" + 7 * b"\0" + b"\xff", "no list of ticks"),
-        (None, "cannot be read"),
-    ],
-    ids=[
-        *("not ascending", "no time", "no object", "no JSON", "infinite", "broken", "true", "a text", "too large"),
-        *("too long", "too deep", "a long line", "no text", "no gzip", "cut off", "damaged", "missing"),
+        ({}, 400, 390),
+        ({"clock_offset_s": 0.03}, 370, 360),
+        ({"stamp_from": "receipt"}, 500, None),
+        ({"stamp_from": "receipt", "clock_offset_s": 0.03}, 470, None),  # the latency of the sensor
     ],
 )
-def test_a_file_that_is_no_list_of_ticks_is_named(tmp_path: Path, content: bytes | None, message: str) -> None:
-    path = tmp_path / "ticks.jsonl"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(CallError, match=message) as error:
-        read_ticks(path)
-    assert str(path) in str(error.value)
-    assert "\n" not in str(error.value)
+def test_the_offset_of_a_clock_is_taken_off_and_a_receipt_may_stand_for_a_stamp(settings, stamp_ms, own_ms) -> None:
+    given = DetectionList("radar", 400 * MS, 500 * MS, (Detection(1.0, 2.0, stamp_ns=390 * MS), Detection(3.0, 4.0)))
+    first = replace(given.objects[0], stamp_ns=None if own_ms is None else own_ms * MS)
+    expected = replace(given, stamp_ns=stamp_ms * MS, objects=(first, given.objects[1]))
+    assert corrected(given, {"radar": SensorModel(std={"x_m": 1.0, "y_m": 1.0}, **settings)}) == expected
 
 
-def test_ticks_that_unpack_without_end_are_refused_in_little_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    line = b'{"now_ns": %d}' + b" " * 1000 + b"\n"
-    path = tmp_path / "ticks.jsonl.gz"
-    path.write_bytes(gzip.compress(b"".join(line % k for k in range(2000))))
-    assert len(read_ticks(path)) == 2000
-    monkeypatch.setattr("fgtrack.pipeline.clock._LARGEST_BYTES", 1 << 20)
-    with pytest.raises(CallError, match=r"more than 1 MB of ticks, replay the recording in parts"):
-        read_ticks(path)
+def test_the_wall_clock_comes_back_no_earlier_and_at_once_where_the_time_has_passed() -> None:
+    clock = WallClock()
+    until_ns = clock.now_ns() + 3 * MS
+    clock.wait_until(until_ns)
+    assert clock.now_ns() >= until_ns
+    clock.wait_until(0)

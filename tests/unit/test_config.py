@@ -8,8 +8,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.estimation.base import Start
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.pipeline.build import build_bank, build_tracker
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.effective import Effective, effective
+from fgtrack.pipeline.config import Config, Effective
 from fgtrack.pipeline.load import dump, load, read_yaml, validate
 from fgtrack.pipeline.sweep_plan import SweepConfig
 from fgtrack.sim.scenario import Scenario
@@ -58,9 +57,20 @@ def test_there_are_files_of_every_kind() -> None:
 def test_the_defaults_are_those_of_open_space_and_shift_join_and_expect_nothing() -> None:
     config = load(Config, None)
     assert config == Config()
-    assert effective(config) == Effective((0.0, 0.0), None, "filter.storage_s", 3.0, 3.0)
+    assert config.effective == Effective((0.0, 0.0), None, "filter.storage_s", 3.0, 3.0)
     assert (config.map.track, config.birth.ego_speed_factor, config.lifecycle.kind) == (None, 0.0, "existence")
     assert (config.ego.yaw_weight, config.ego.yaw_rate_weight) == (1.0, 1.0)
+
+
+def test_what_is_easily_overlooked_is_a_line() -> None:
+    assert str(paper().effective) == (
+        "detection origin -1.74 m ahead, 0 m left of the ego; merge up to 5.1 m; lag 3.5 s"
+    )
+    smoother = paper("estimator=smoother", "motion.kind=ctrv", "smoother.late=fuse").effective
+    assert (smoother.lag_s, smoother.reach_s) == (1.0, 3.0)
+    assert str(smoother).endswith("lag 1 s, late detections up to 3 s")
+    drops = paper("estimator=smoother-banded", "motion.kind=ctrv", "smoother.late=drop").effective
+    assert (drops.lag_s, drops.reach_s) == (1.0, 1.0)
 
 
 @pytest.mark.parametrize("name", ["karle2023", "karle2023_reference"])

@@ -28,9 +28,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_folder_in_place_of_a_file_is_not_walked(folder: Path) -> None:
     """It may be the root of the file system."""
-    given = config(
-        map={"track": str(folder), "pit": str(folder), "excluded": [str(folder)]}, clock={"ticks_file": str(folder)}
-    )
+    given = config(map={"track": str(folder), "pit": str(folder), "excluded": [str(folder)]})
     assert set(fingerprints(None, None, given)) == {None}
     assert inputs(given) == []
 
