@@ -100,9 +100,7 @@ def rows(detections: int, tracks: int, lists: int) -> Iterator[Row]:
         for side_m in (10_000.0, 100.0):
             what = f"association by {name}: {detections} detections, {tracks} tracks, {side_m:g} m square"
             yield measured(what, lambda name=name, side_m=side_m: association(name, detections, tracks, side_m))
-    for count, side_m in ((detections // 5, 10.0), (detections, 100.0), (detections, 10_000.0)):
-        what = f"merge: {count} detections, {side_m:g} m square"
-        yield measured(what, lambda count=count, side_m=side_m: merge(count, side_m))
+    yield measured(f"merge: {detections} detections, 10000 m square", lambda: merge(detections, 10_000.0))
     for estimator in ("ekf-replay", "ekf-backward-forward"):
         what = f"tick, {estimator}: one list, {tracks} objects, {detections} of clutter, 1000 m square"
         yield measured(what, lambda name=estimator: tick(name, tracks, detections, 1, 1000.0))

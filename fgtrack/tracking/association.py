@@ -1,6 +1,6 @@
 """Which candidate belongs to which track (Karle et al. 2023, section III-D)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal, Protocol
@@ -11,12 +11,10 @@ from scipy.special import gammaincinv
 from fgtrack.core.checks import between_0_and_1, not_negative, positive
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import StatesAt
-from fgtrack.tracking.assignment import Assignment, assigned, cheapest
-from fgtrack.tracking.gating import NO_PAIRS, Pairs, alike, innovations, near, nis_of, reaches_m
+from fgtrack.tracking.assignment import Assignment, assigned
+from fgtrack.tracking.gating import Pairs, grouped, innovations, near, reaches_m
 from fgtrack.tracking.objects import Apart
 from fgtrack.tracking.preprocess import Candidate
-
-_FEW_PAIRS = 2  # so many are judged faster one by one
 
 
 class Association(Protocol):
@@ -49,32 +47,21 @@ class GatedEuclidean:
         return self.within(self.gate_m, candidates, states, apart)
 
     def within(
-        self,
-        gates_m: float | FloatArray,
-        candidates: Sequence[Candidate],
-        states: StatesAt,
-        apart: Apart | None = None,
+        self, gates_m: float | FloatArray, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None
     ) -> Assignment:
-        """The same with other gates; `gates_m` has a shape that goes with (candidates, tracks)."""
-        limits_m, reach_m = None, gates_m
+        """Return the assignment with other gates; `gates_m` broadcasts to (candidates, tracks)."""
+        pairs = _near(candidates, states, float(np.max(gates_m, initial=0.0)), apart)
         if isinstance(gates_m, np.ndarray):
             limits_m = np.broadcast_to(gates_m, (len(candidates), len(states.means)))
-            reach_m = float(gates_m.max(initial=0.0))
-        few = self.max_nis is None or len(candidates) * len(states.means) <= _FEW_PAIRS
-        groups = [] if few else alike(candidates)
-        near_any = set[int]()
-
-        def believed(pairs: Pairs) -> Pairs:
-            if limits_m is not None:
-                pairs = pairs.at(pairs.values <= limits_m[pairs.rows, pairs.columns])
-            if self.max_nis is None:
-                return pairs
-            near_any.update(pairs.rows.tolist())
-            return pairs.at(nis_of(pairs, groups, candidates, states) <= self.max_nis)
-
-        found = _assigned(candidates, states, reach_m, believed, apart)
-        refused = tuple([i for i in found.new if i in near_any])
-        return found._replace(new=[i for i in found.new if i not in near_any], refused=refused) if refused else found
+            pairs = pairs.at(pairs.values <= limits_m[pairs.rows, pairs.columns])
+        suspects = set[int]()
+        if self.max_nis is not None and len(pairs.rows):
+            suspects.update(pairs.rows.tolist())
+            nis = np.empty(len(pairs.rows))
+            for batch in innovations(pairs, grouped(candidates), len(candidates), states):
+                nis[batch.pairs] = batch.nis
+            pairs = pairs.at(nis <= self.max_nis)
+        return _refusing(suspects, assigned(pairs, len(candidates), len(states.means)))
 
 
 @dataclass(frozen=True)
@@ -100,49 +87,39 @@ class GatedMahalanobis:
 
     def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
         """See `Association`; the cost adds log det S, so that a vague track does not win by being vague."""
-        groups = alike(candidates)
+        groups = grouped(candidates)
         quantiles = [chi_square_quantile(self.gate_probability, group.z.shape[-1]) for group in groups]
-
-        def inside(pairs: Pairs) -> Pairs:
-            nis, S_all = innovations(pairs, groups, len(candidates), states)
-            cost, good = nis.copy(), np.zeros(len(nis), dtype=bool)
-            for chosen, S in S_all:
-                cost[chosen] += np.linalg.slogdet(S)[1]
-                good[chosen] = nis[chosen] <= chi_square_quantile(self.gate_probability, S.shape[-1])
-            return pairs._replace(values=cost).at(good)
-
-        found = _assigned(candidates, states, reaches_m(groups, states, quantiles, self.max_distance_m), inside, apart)
-        if not (self.claim_m and found.new and len(states.means)):
-            return found
-        loose, claimed = np.array(found.new), set[int]()
-        for part in near([candidates[i] for i in found.new], states.means, self.claim_m):
-            rows = loose[part.rows]
-            claimed.update((rows if apart is None else rows[~apart(rows, part.columns)]).tolist())
-        return found._replace(
-            new=[i for i in found.new if i not in claimed], refused=tuple([i for i in found.new if i in claimed])
-        )
+        reach_m = reaches_m(groups, states, quantiles, self.max_distance_m)
+        pairs = _near(candidates, states, reach_m, apart)
+        cost, inside = np.empty(len(pairs.rows)), np.empty(len(pairs.rows), dtype=bool)
+        for batch in innovations(pairs, groups, len(candidates), states) if len(cost) else ():
+            cost[batch.pairs] = batch.nis + np.linalg.slogdet(batch.S)[1]
+            inside[batch.pairs] = batch.nis <= chi_square_quantile(self.gate_probability, batch.S.shape[-1])
+        result = assigned(pairs._replace(values=cost).at(inside), len(candidates), len(states.means))
+        if not (self.claim_m and result.new):
+            return result
+        loose = np.array(result.new)
+        claimed = _near(candidates, states, self.claim_m, apart).rows
+        return _refusing(set(loose[np.isin(loose, claimed)].tolist()), result)
 
 
-def _assigned(
-    candidates: Sequence[Candidate],
-    states: StatesAt,
-    reach_m: float | FloatArray,
-    judged: Callable[[Pairs], Pairs],
-    apart: Apart | None,
-) -> Assignment:
-    """The best of the pairs at most `reach_m` apart that `judged` leaves, which gives them their costs."""
-    num_tracks = len(states.means)
-    pairs = NO_PAIRS
-    for part in near(candidates, states.means, reach_m):
-        if apart is not None:
-            part = part.at(~apart(part.rows, part.columns))
-        pairs = Pairs.joined([pairs, judged(part)]) if len(pairs.rows) else judged(part)
-        if len(pairs.rows) > num_tracks:
-            pairs = cheapest(pairs, np.full(num_tracks, num_tracks))
-    return assigned(pairs, len(candidates), num_tracks)
+def _near(
+    candidates: Sequence[Candidate], states: StatesAt, reach_m: float | FloatArray, apart: Apart | None
+) -> Pairs:
+    """Return the pairs at most `reach_m` apart that are not `apart`."""
+    pairs = near(candidates, states.means, reach_m)
+    return pairs if apart is None else pairs.at(~apart(pairs.rows, pairs.columns))
+
+
+def _refusing(suspects: set[int], assignment: Assignment) -> Assignment:
+    """Return `assignment` in which those of `suspects` without a track start none."""
+    refused = tuple([i for i in assignment.new if i in suspects])
+    if not refused:
+        return assignment
+    return assignment._replace(new=[i for i in assignment.new if i not in suspects], refused=refused)
 
 
 @cache
 def chi_square_quantile(probability: float, freedom: int) -> float:
-    """Quantile of the chi-square distribution; `scipy.stats` says the same and takes a second to import."""
+    """Quantile of the chi-square distribution; importing `scipy.stats` for it would take a second."""
     return float(2.0 * gammaincinv(0.5 * freedom, probability))

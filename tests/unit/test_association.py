@@ -12,7 +12,7 @@ from fgtrack.core.types import BoolArray, IntArray
 from fgtrack.models.measurement import SensorPose
 from fgtrack.tracking.assignment import Assignment
 from fgtrack.tracking.association import Association, GatedEuclidean, GatedMahalanobis, chi_square_quantile
-from fgtrack.tracking.gating import Pairs, alike, euclidean_distances, nis_of
+from fgtrack.tracking.gating import euclidean_distances
 from fgtrack.tracking.published import UngatedEuclidean
 
 ALL = [GatedEuclidean(), GatedEuclidean(max_nis=20.0), GatedMahalanobis(), UngatedEuclidean()]
@@ -108,22 +108,6 @@ def test_two_poor_pairs_are_better_than_one_good_one_however_far_the_gate_reache
     """Squared Mahalanobis distances of 6.5, and log det S of 59."""
     tracks = states([(0.0, 0.0), (-4.9e6, 0.0)], variance_m2=4.9e6**2 / 6.5)
     assert association([candidate(0.0, 0.0), candidate(4.9e6, 0.0)], tracks).pairs == [(0, 1), (1, 0)]
-
-
-def test_pairs_judged_one_by_one_have_the_nis_that_they_have_together() -> None:
-    rng = np.random.default_rng(0)
-    found = [
-        candidate(*rng.normal(size=2), 0.3),
-        bearing(0.4, SensorPose()),
-        candidate(*rng.normal(size=2), 2.0),
-        bearing(-0.2, SensorPose()),
-    ]
-    tracks = states([tuple(rng.normal(size=2)) for _ in range(5)], variance_m2=0.7)
-    rows, columns = (each.ravel() for each in np.indices((4, 5)))
-    pairs = Pairs(rows, columns, np.zeros(20))
-    together = nis_of(pairs, alike(found), found, tracks)
-    np.testing.assert_allclose(nis_of(pairs, [], found, tracks), together, rtol=1e-12)
-    assert len(set(together.tolist())) == 20
 
 
 def test_what_is_near_but_not_believed_goes_nowhere_and_leaves_the_track_to_others() -> None:
