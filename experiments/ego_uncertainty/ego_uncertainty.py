@@ -1,4 +1,4 @@
-"""What does it cost to ignore the error of the ego, and what does it gain to estimate it?
+"""What does it cost to ignore the error of the ego?
 
     python experiments/ego_uncertainty/ego_uncertainty.py -o out/ego_uncertainty
 
@@ -8,7 +8,7 @@ as the motion model of the tracker says. A LiDAR (0.3 m along, 0.1 m across the 
 new in every message (time 0), or lasting, a first-order Gauss-Markov process with that correlation time. It says so in
 the covariance of its messages. The low-pass of the ego is off, so that these are the errors that the tracker meets.
 
-`ego.uncertainty` is `none`, `independent` or `shared`, with the same recordings: differences are paired. Errors and
+`ego.uncertainty` is `none` or `independent`, with the same recordings: differences are paired. Errors and
 NEES (expected 2) are those of the present positions, from 2 s on.
 """
 
@@ -39,7 +39,7 @@ from fgtrack.sim.simulate import simulate
 from fgtrack.sim.vehicles import DrawnVehicle
 from fgtrack.tracking.birth import MeasuredBirth
 
-MODES = ("none", "independent", "shared")
+MODES = ("none", "independent")
 EXACT = "no error"
 INTERVAL = ("mean", "low", "high")
 COUNTS, TIMES_S = (3, 8), (0.0, 1.0)

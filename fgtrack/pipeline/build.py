@@ -32,7 +32,6 @@ from fgtrack.models.road import MappedRoad, OpenSpace, Road
 from fgtrack.models.track_map import TrackMap
 from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
 from fgtrack.tracking.ego import EgoSource, EgoStd, EgoTrajectory
-from fgtrack.tracking.ego_error import IndependentErrors, SharedErrors
 from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules
 from fgtrack.tracking.guarded_bank import GuardedBank
 from fgtrack.tracking.inbox import Inbox, QueueInbox
@@ -83,10 +82,9 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
         motion=motion,
         objects=Objects(config.objects),
         lifecycle=build_lifecycle(config),
-        claim_overtaken=config.lifecycle.claim_overtaken,
+        suppress_births_near_newer_tracks=config.lifecycle.suppress_births_near_newer_tracks,
         birth=config.birth,
         road=road,
-        ego_errors=SharedErrors(motion) if config.ego.uncertainty == "shared" else IndependentErrors(),
     )
     return (PublishedTracker if published_order else Tracker)(parts if observed is None else observed(parts))
 

@@ -86,9 +86,9 @@ class EgoConfig:
     """A detection whose stamp is further than this from any ego state cannot be placed, in a gap neither."""
     storage_ticks: PositiveInt = 350
     """Length of the ego storage of the published implementation."""
-    uncertainty: Literal["none", "independent", "shared"] = "independent"
-    """What the ego's covariance does: nothing (as in the paper), widen every detection as if each had an error of its
-    own, or be estimated from all matched detections of a scan, whose common error it is."""
+    uncertainty: Literal["none", "independent"] = "independent"
+    """Effect of the ego's covariance: none (as in the paper), or added to the noise of every detection as if each had an
+    error of its own."""
     position_std_m: NonNegativeFloat = 0.0
     """Standard deviation of the ego's x and y where the recording gives no covariance of them."""
     yaw_std_rad: NonNegativeFloat = 0.0
@@ -122,7 +122,7 @@ class CountingConfig(LifecycleRules):
 
     kind: Literal["counting", "published"] = "counting"
     """`published`: which sensor ages which track, and when, as published (Q9, Q15, Q22)."""
-    claim_overtaken: bool = False
+    suppress_births_near_newer_tracks: bool = False
     """Whether a track claims a detection that the newer one which started it has overtaken. As in the paper it does
     not, and the detection starts a second track: with a fast and a slow sensor nearly every new object gets two."""
 

@@ -60,7 +60,7 @@ class Tracker:
             what = f"must be a Config, is a {type(config).__name__}"
             raise CallError(f"config: {what}; Tracker.from_config takes names and paths")
         self.config = config
-        self._tracker = build_tracker(config, lambda parts: replace(parts, answers=(DataError,)))
+        self._tracker = build_tracker(config, lambda parts: replace(parts, propagated_exceptions=(DataError,)))
         self._refused: Counter[str] = Counter()
         self._records: list[UpdateRecord] = []
         self._counts: dict[str, Counter[Disposition]] = {}

@@ -51,10 +51,7 @@ def for_tuning(config: Config, rules: TuneRules) -> Config:
     if isinstance(association, GatedMahalanobis):
         probability = max(association.gate_probability, rules.gate_probability)
         association = replace(association, gate_probability=probability)
-    ego = config.ego
-    if ego.uncertainty == "shared":  # which replaces what a track would be given
-        ego = replace(ego, uncertainty="independent")
-    return replace(config, estimator="ekf-replay", association=association, ego=ego)
+    return replace(config, estimator="ekf-replay", association=association)
 
 
 def widened(config: Config, rules: TuneRules) -> Config:

@@ -103,9 +103,7 @@ class GatedMahalanobis:
         return _refusing(set(loose[np.isin(loose, claimed)].tolist()), result)
 
 
-def _near(
-    candidates: Sequence[Candidate], states: StatesAt, reach_m: float | FloatArray, apart: Apart | None
-) -> Pairs:
+def _near(candidates: Sequence[Candidate], states: StatesAt, reach_m: float | FloatArray, apart: Apart | None) -> Pairs:
     """Return the pairs at most `reach_m` apart that are not `apart`."""
     pairs = near(candidates, states.means, reach_m)
     return pairs if apart is None else pairs.at(~apart(pairs.rows, pairs.columns))

@@ -26,7 +26,7 @@ from fgtrack.core.linalg import mahalanobis_squared
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray, TrackStatus
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.lifecycle import Look, Sighting
+from fgtrack.tracking.lifecycle import MatchedDetection, Scan
 
 #: Bounds of log-odds: a probability that differs from 0 or 1 by less says nothing more.
 _LARGEST_LOG_ODDS = 30.0
@@ -56,7 +56,7 @@ class ExistenceRules:
     """A track is not confirmed before it was so far from where it began: what never moves is shore, or moored."""
     memory_s: float = 5.0
     """How far back late lists change the probability at their own stamp; older ones count as if they were so old."""
-    claim_overtaken: bool = True
+    suppress_births_near_newer_tracks: bool = True
     """Whether a track claims a detection that the newer one which started it has overtaken."""
 
     def __post_init__(self) -> None:
@@ -149,47 +149,47 @@ class ExistenceLifecycle:
         self.lives: dict[int, Existence] = {}
         """What is known of each track."""
 
-    def born(self, track_id: int, look: Look, sighting: Sighting) -> None:
+    def born(self, track_id: int, scan: Scan, matched: MatchedDetection) -> None:
         """See `Lifecycle.born`."""
         odds = self._rules.birth_probability / (1.0 - self._rules.birth_probability)
-        log_odds = math.log(odds) + self._score(look, sighting)
-        self.lives[track_id] = life = Existence.born(self._rules.lifetime_s, look.stamp_ns, log_odds)
-        life.first_m, life.travelled = sighting.candidate.position_m, self._rules.min_travel_m == 0.0
+        log_odds = math.log(odds) + self._score(scan, matched)
+        self.lives[track_id] = life = Existence.born(self._rules.lifetime_s, scan.stamp_ns, log_odds)
+        life.first_m, life.travelled = matched.candidate.position_m, self._rules.min_travel_m == 0.0
         self._judge(life)
 
-    def matched(self, track_id: int, look: Look, sighting: Sighting) -> None:
+    def matched(self, track_id: int, scan: Scan, matched: MatchedDetection) -> None:
         """See `Lifecycle.matched`."""
         life = self.lives[track_id]
         life.misses = 0
-        if not life.travelled and sighting.mean is not None and life.first_m is not None:
-            travel_m = math.dist(sighting.mean[:2].tolist(), life.first_m.tolist())
+        if not life.travelled and matched.mean is not None and life.first_m is not None:
+            travel_m = math.dist(matched.mean[:2].tolist(), life.first_m.tolist())
             life.travelled = travel_m >= self._rules.min_travel_m
-        found = _position_density(sighting)
+        found = _position_density(matched)
         if found is None:
             return
-        sensor = self._sensors[look.sensor]
-        ratio = found / sensor.clutter_per_m2 * math.exp(self._score(look, sighting))
+        sensor = self._sensors[scan.sensor]
+        ratio = found / sensor.clutter_per_m2 * math.exp(self._score(scan, matched))
         seen = sensor.detection_probability
-        life.learn(look.stamp_ns, math.log(1.0 - seen + seen * ratio))
+        life.learn(scan.stamp_ns, math.log(1.0 - seen + seen * ratio))
         self._judge(life)
 
     def fused(self, track_id: int, placed: bool = True) -> None:
         """See `Lifecycle.fused`."""
         self.lives[track_id].num_measured += 1
 
-    def missed(self, look: Look, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
+    def missed(self, scan: Scan, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
         """See `Lifecycle.missed`."""
-        sensor = self._sensors[look.sensor]
-        self._newest_ns = max(self._newest_ns, look.stamp_ns)
+        sensor = self._sensors[scan.sensor]
+        self._newest_ns = max(self._newest_ns, scan.stamp_ns)
         weight = math.log1p(-sensor.detection_probability)
         in_view = np.ones(len(track_ids), dtype=bool)
-        if look.ego is not None:
-            pose = np.array([look.ego.x_m, look.ego.y_m, look.ego.yaw_rad])
+        if scan.ego is not None:
+            pose = np.array([scan.ego.x_m, scan.ego.y_m, scan.ego.yaw_rad])
             in_view = sensor.sees(positions_m, np.broadcast_to(pose, (len(track_ids), 3)), self._origin_m)
         for track_id in np.asarray(track_ids)[in_view].tolist():
             life = self.lives[track_id]
             life.misses += 1
-            life.learn(look.stamp_ns, weight)
+            life.learn(scan.stamp_ns, weight)
         return [track_id for track_id in track_ids if self._ends(self.lives[track_id])]
 
     def expired(self, present_ns: int) -> list[int]:
@@ -223,19 +223,19 @@ class ExistenceLifecycle:
             return True
         return life.probability(self._present_ns) < self._rules.delete_probability
 
-    def _score(self, look: Look, sighting: Sighting) -> float:
+    def _score(self, scan: Scan, matched: MatchedDetection) -> float:
         """Logarithm of p(score | object) / p(score | clutter) of the best detection; 0 where there is none."""
-        model = self._sensors[look.sensor].score
-        if model is None or not look.objects:
+        model = self._sensors[scan.sensor].score
+        if model is None or not scan.objects:
             return 0.0
-        places = (sighting.candidate.index, *sighting.candidate.merged)
-        scores = [score for place in places if (score := look.objects[place].score) is not None]
+        places = (matched.candidate.index, *matched.candidate.merged)
+        scores = [score for place in places if (score := scan.objects[place].score) is not None]
         return model.log_ratio(max(scores)) if scores else 0.0
 
 
-def _position_density(sighting: Sighting) -> float | None:
+def _position_density(matched: MatchedDetection) -> float | None:
     """N(z - h(x); 0, S) of the position in 1/m^2; None where the detection gives none, or S is singular to rounding."""
-    candidate, mean, P = sighting
+    candidate, mean, P = matched
     if candidate.position_m is None or candidate.position_covariance is None or mean is None or P is None:
         return None
     S = P[:2, :2] + candidate.position_covariance

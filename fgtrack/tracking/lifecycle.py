@@ -12,7 +12,7 @@ from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.preprocess import Candidate
 
 
-class Look(NamedTuple):
+class Scan(NamedTuple):
     """A list as far as it matters to the life of tracks: who looked, when, and from where."""
 
     sensor: str
@@ -24,7 +24,7 @@ class Look(NamedTuple):
     """All detections of the message."""
 
 
-class Sighting(NamedTuple):
+class MatchedDetection(NamedTuple):
     """A detection that belongs to a track, and the track's state at its stamp; None of one that starts with it."""
 
     candidate: Candidate
@@ -39,16 +39,16 @@ class Lifecycle(Protocol):
     neither starts nor confirms nor keeps a track.
     """
 
-    def born(self, track_id: int, look: Look, sighting: Sighting) -> None:
+    def born(self, track_id: int, scan: Scan, matched: MatchedDetection) -> None:
         """A detection started a track."""
 
-    def matched(self, track_id: int, look: Look, sighting: Sighting) -> None:
+    def matched(self, track_id: int, scan: Scan, matched: MatchedDetection) -> None:
         """A detection was associated."""
 
     def fused(self, track_id: int, placed: bool = True) -> None:
         """The associated detection, which is `placed` where it gives a position, changed the state."""
 
-    def missed(self, look: Look, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
+    def missed(self, scan: Scan, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
         """These tracks, at `positions_m` (n, 2) and so far from the ego, were not seen; the ids of those that end."""
 
     def expired(self, present_ns: int) -> list[int]:
@@ -120,15 +120,15 @@ class CountingLifecycle:
         self.lives: dict[int, Life] = {}
         """What is counted, by track."""
 
-    def born(self, track_id: int, look: Look, sighting: Sighting | None = None) -> None:
+    def born(self, track_id: int, scan: Scan, matched: MatchedDetection | None = None) -> None:
         """See `Lifecycle.born`."""
-        self.lives[track_id] = Life(self._sensors[look.sensor].counter_init, look.stamp_ns)
+        self.lives[track_id] = Life(self._sensors[scan.sensor].counter_init, scan.stamp_ns)
 
-    def matched(self, track_id: int, look: Look, sighting: Sighting | None = None) -> None:
+    def matched(self, track_id: int, scan: Scan, matched: MatchedDetection | None = None) -> None:
         """See `Lifecycle.matched`."""
         life = self.lives[track_id]
-        life.counter = min(life.counter + self._sensors[look.sensor].counter_add, self._rules.counter_cap)
-        life.last_seen_ns = max(life.last_seen_ns, look.stamp_ns)
+        life.counter = min(life.counter + self._sensors[scan.sensor].counter_add, self._rules.counter_cap)
+        life.last_seen_ns = max(life.last_seen_ns, scan.stamp_ns)
         life.misses = 0
 
     def fused(self, track_id: int, placed: bool = True) -> None:
@@ -136,15 +136,15 @@ class CountingLifecycle:
         self.lives[track_id].num_measured += 1
         self.lives[track_id].num_placed += placed
 
-    def missed(self, look: Look, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
+    def missed(self, scan: Scan, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
         """See `Lifecycle.missed`."""
         ended = []
         for track_id, range_m in zip(track_ids, ranges_m.tolist(), strict=True):
             life = self.lives[track_id]
-            if self._ages(look.sensor, range_m):
+            if self._ages(scan.sensor, range_m):
                 life.counter -= 1
                 life.misses += 1
-            if self._ends(life, look.present_ns):
+            if self._ends(life, scan.present_ns):
                 ended.append(track_id)
         return ended
 

@@ -16,7 +16,7 @@ from fgtrack.tracking.assignment import Assignment, assigned_densely
 from fgtrack.tracking.ego import EgoPose, EgoSource, EgoStd
 from fgtrack.tracking.gating import euclidean_distances
 from fgtrack.tracking.inbox import Batch, is_bounded, is_covariance, record, records
-from fgtrack.tracking.lifecycle import CountingLifecycle, Life, Look, Sighting
+from fgtrack.tracking.lifecycle import CountingLifecycle, Life, MatchedDetection, Scan
 from fgtrack.tracking.merge import Merge
 from fgtrack.tracking.objects import Apart
 from fgtrack.tracking.preprocess import Candidate, Preprocess
@@ -195,16 +195,16 @@ class PublishedLifecycle(CountingLifecycle):
     The range is that of a state which is one batch old; see `PublishedTracker`.
     """
 
-    def born(self, track_id: int, look: Look, sighting: Sighting | None = None) -> None:
+    def born(self, track_id: int, scan: Scan, matched: MatchedDetection | None = None) -> None:
         """See `Lifecycle.born`."""
-        super().born(track_id, look._replace(stamp_ns=look.present_ns))
+        super().born(track_id, scan._replace(stamp_ns=scan.present_ns))
 
-    def matched(self, track_id: int, look: Look, sighting: Sighting | None = None) -> None:
+    def matched(self, track_id: int, scan: Scan, matched: MatchedDetection | None = None) -> None:
         """See `Lifecycle.matched`."""
         life = self.lives[track_id]
         if life.counter < self._rules.counter_cap:
-            life.counter += self._sensors[look.sensor].counter_add
-        life.last_seen_ns = look.stamp_ns
+            life.counter += self._sensors[scan.sensor].counter_add
+        life.last_seen_ns = scan.stamp_ns
         life.misses = 0
 
     def _ages(self, sensor: str, range_m: float) -> bool:

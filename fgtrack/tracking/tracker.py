@@ -33,9 +33,8 @@ from fgtrack.tracking.assignment import Assignment
 from fgtrack.tracking.association import Association
 from fgtrack.tracking.birth import Birth, in_any_direction
 from fgtrack.tracking.ego import EgoPose, EgoSource
-from fgtrack.tracking.ego_error import EgoErrors, IndependentErrors
 from fgtrack.tracking.inbox import Batch, Inbox, record
-from fgtrack.tracking.lifecycle import Lifecycle, Look, Sighting
+from fgtrack.tracking.lifecycle import Lifecycle, MatchedDetection, Scan
 from fgtrack.tracking.objects import ObjectRules, Objects
 from fgtrack.tracking.preprocess import Candidate, Preprocess
 from fgtrack.tracking.soundness import faults
@@ -53,14 +52,13 @@ class TrackerParts:
     bank: TrackBank
     motion: MotionModel
     lifecycle: Lifecycle
-    claim_overtaken: bool
+    suppress_births_near_newer_tracks: bool
     birth: Birth
     road: Road
-    ego_errors: EgoErrors = field(default_factory=IndependentErrors)
     objects: Objects = field(default_factory=lambda: Objects(ObjectRules()))
     failures: Failures = field(default_factory=Failures)
     """Counts what fails inside, shared with `bank`."""
-    answers: tuple[type[Exception], ...] = (FgtrackError, MemoryError)
+    propagated_exceptions: tuple[type[Exception], ...] = (FgtrackError, MemoryError)
     """Exceptions that the processing of a batch lets out; after any other one, it ends as failed."""
 
 
@@ -163,7 +161,7 @@ class Tracker:
         try:
             self._process(batch)
         except Exception as error:
-            if isinstance(error, self._parts.answers):
+            if isinstance(error, self._parts.propagated_exceptions):
                 raise
             self.failures.add(Failure.LIST_FAILED)
             self.failures.note(error)
@@ -207,7 +205,7 @@ class Tracker:
 
         The detection that started it has overtaken them. They are too old for it, and no other object.
         """
-        if not new or not self._parts.claim_overtaken:
+        if not new or not self._parts.suppress_births_near_newer_tracks:
             return new
         younger = self._younger(batch.stamp_ns, states)
         claims = self._assigned(batch, [candidates[position] for position in new], younger)
@@ -257,12 +255,12 @@ class Tracker:
         """
         lifecycle = self._parts.lifecycle
         seen = self._seen[id(batch.message)]
-        look = self._look(batch, ego)
+        scan = self._scan(batch, ego)
         for place, track in assignment.pairs:
             seen.add(states.track_ids[track])
             if candidates[place].position_m is not None:
-                sighting = Sighting(candidates[place], states.means[track], states.covariances[track])
-                lifecycle.matched(states.track_ids[track], look, sighting)
+                matched = MatchedDetection(candidates[place], states.means[track], states.covariances[track])
+                lifecycle.matched(states.track_ids[track], scan, matched)
             self._describe(batch, candidates[place], states.track_ids[track])
         rows = [track for track in assignment.missed if states.track_ids[track] not in seen]
         sensor = self._parts.sensors[batch.sensor]
@@ -270,19 +268,19 @@ class Tracker:
             return
         missed = [states.track_ids[track] for track in rows]
         positions_m = states.means[rows, :2]
-        self._end(lifecycle.missed(look, missed, positions_m, self._ranges_m(missed, positions_m, ego)))
+        self._end(lifecycle.missed(scan, missed, positions_m, self._ranges_m(missed, positions_m, ego)))
 
-    def _look(self, batch: Batch, ego: EgoPose | None) -> Look:
-        return Look(batch.sensor, batch.stamp_ns, self._parts.bank.present_ns, ego, batch.message.objects)
+    def _scan(self, batch: Batch, ego: EgoPose | None) -> Scan:
+        return Scan(batch.sensor, batch.stamp_ns, self._parts.bank.present_ns, ego, batch.message.objects)
 
     def _estimate(
         self, batch: Batch, candidates: Sequence[Candidate], assignment: Assignment, states: StatesAt
     ) -> None:
         matched = [candidates[position] for position, _ in assignment.pairs]
         rows = [track for _, track in assignment.pairs]
-        fused = self._parts.ego_errors.measurements(batch.stamp_ns, matched, rows, states)
-        if not fused:
+        if not matched:
             return
+        fused = [one.measurement_at(states.means[row]) for one, row in zip(matched, rows, strict=True)]
         track_ids = [states.track_ids[row] for row in rows]
         results = self._parts.bank.update(batch.stamp_ns, track_ids, fused)
         for candidate, track_id, result in zip(matched, track_ids, results, strict=True):
@@ -308,9 +306,8 @@ class Tracker:
             return
         if prior.yaw_rad is None and not parts.motion.cartesian:
             self._undirected[track_id] = prior
-        parts.ego_errors.born(track_id, candidate, prior)
         self._seen[id(batch.message)].add(track_id)
-        parts.lifecycle.born(track_id, self._look(batch, ego), Sighting(candidate))
+        parts.lifecycle.born(track_id, self._scan(batch, ego), MatchedDetection(candidate))
         self._describe(batch, candidate, track_id)
         self._conclude(batch, candidate, Disposition.BIRTH, track_id)
 
@@ -338,7 +335,6 @@ class Tracker:
     def _end(self, track_ids: Sequence[int]) -> None:
         for track_id in track_ids:
             self._parts.bank.remove(track_id)
-            self._parts.ego_errors.ended(track_id)
             self._parts.objects.forget(track_id)
             self._undirected.pop(track_id, None)
             self._parts.lifecycle.forget(track_id)

@@ -35,7 +35,7 @@ EXTRA_SENSORS = {
         std={"x_m": 1.0, "y_m": 0.5, "yaw_rad": 0.2, "range_m": 1.0, "bearing_rad": 0.1}, births=False
     ),
 }
-CLAIM = "lifecycle.claim_overtaken=true"
+CLAIM = "lifecycle.suppress_births_near_newer_tracks=true"
 OVAL = ['map.track="oval"', 'map.pit="oval"']
 
 

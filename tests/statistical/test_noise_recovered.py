@@ -150,7 +150,7 @@ def straight(seed: int) -> tuple[Iterator[Message], Config, Truth]:
             "sensors={lidar: {std: {x_m: 1.0, y_m: 1.0}}, radar: {std: {x_m: 1.0, y_m: 1.0}}}",
             "birth={kind: measured, ego_speed_factor: 0.0, speed_std_mps: 12.0}",
             "ego.detection_origin_x_m=0.0",
-            "lifecycle.claim_overtaken=true",
+            "lifecycle.suppress_births_near_newer_tracks=true",
         ],
     )
     truth = {

@@ -16,7 +16,7 @@ from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
 from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.existence import Existence, ExistenceLifecycle, ExistenceRules
-from fgtrack.tracking.lifecycle import Look, Sighting
+from fgtrack.tracking.lifecycle import MatchedDetection, Scan
 
 SENSORS = {
     "lidar": SensorModel(std={"x_m": 0.3, "y_m": 0.3}, detection_probability=0.8, clutter_per_m2=1e-3),
@@ -32,8 +32,8 @@ def lifecycle(rules: ExistenceRules = STILL) -> ExistenceLifecycle:
     return ExistenceLifecycle(rules, SENSORS, (0.0, 0.0))
 
 
-def look(sensor: str = "lidar", at_ms: float = 0.0, **more) -> Look:
-    return Look(sensor, START_NS + ms(at_ms), START_NS + ms(at_ms), **more)
+def scan(sensor: str = "lidar", at_ms: float = 0.0, **more) -> Scan:
+    return Scan(sensor, START_NS + ms(at_ms), START_NS + ms(at_ms), **more)
 
 
 def ego(x_m: float = 0.0, y_m: float = 0.0, yaw_rad: float = 0.0) -> EgoPose:
@@ -46,12 +46,12 @@ def probability(life: ExistenceLifecycle, at_ms: float = 0.0) -> float:
 
 def test_a_miss_and_a_match_change_the_probability_as_integrated_data_association_says() -> None:
     life = lifecycle()
-    life.born(0, look(), Sighting(HERE))
+    life.born(0, scan(), MatchedDetection(HERE))
     r = 0.2
-    life.missed(look(at_ms=10.0), [0], np.array([[10.0, 0.0]]), np.array([10.0]))
+    life.missed(scan(at_ms=10.0), [0], np.array([[10.0, 0.0]]), np.array([10.0]))
     r = 0.2 * r / (1.0 - 0.8 * r)
     assert probability(life, 10.0) == pytest.approx(r, rel=1e-6)
-    life.matched(0, look(at_ms=20.0), Sighting(candidate(10.3, 0.0), MEAN, P))
+    life.matched(0, scan(at_ms=20.0), MatchedDetection(candidate(10.3, 0.0), MEAN, P))
     S = 0.09 + 0.01
     density = math.exp(-0.5 * 0.3**2 / S) / (2.0 * math.pi * S)
     delta = 0.8 - 0.8 * density / 1e-3
@@ -70,7 +70,7 @@ def test_nothing_survives_a_gap_of_many_lifetimes(gap_s: float) -> None:
     one = Existence.born(10.0, START_NS, math.log(3.0))
     assert one.probability(START_NS + ms(1e3 * gap_s)) < 1e-9
     life = lifecycle(ExistenceRules())
-    life.born(0, look(), Sighting(HERE))
+    life.born(0, scan(), MatchedDetection(HERE))
     assert life.expired(START_NS + ms(1e3 * gap_s)) == [0]
     one.learn(START_NS + ms(1e3 * gap_s), 20.0)
     assert 0.0 < one.probability(START_NS + ms(1e3 * gap_s)) < 1e-4
@@ -108,21 +108,21 @@ def test_what_is_forgotten_changes_nothing_and_what_is_older_counts_as_the_oldes
 )
 def test_a_list_says_nothing_of_what_its_sensor_cannot_see(place: tuple[float, float], counts: bool) -> None:
     life = lifecycle()
-    life.born(0, look("ahead"), Sighting(HERE))
+    life.born(0, scan("ahead"), MatchedDetection(HERE))
     before = probability(life)
-    life.missed(look("ahead", ego=ego()), [0], np.array([place]), np.array([20.0]))
+    life.missed(scan("ahead", ego=ego()), [0], np.array([place]), np.array([20.0]))
     assert (probability(life) < before) is counts
     assert bool(life.lives[0].misses) is counts
 
 
 def test_a_track_that_left_the_view_of_all_sensors_ends_although_it_is_believed() -> None:
     life = lifecycle(replace(STILL, out_of_view_s=0.5))
-    life.born(0, look("ahead"), Sighting(HERE))
+    life.born(0, scan("ahead"), MatchedDetection(HERE))
     for k in range(5):
-        life.matched(0, look("ahead", 10.0 * k, ego=ego()), Sighting(HERE, MEAN, P))
+        life.matched(0, scan("ahead", 10.0 * k, ego=ego()), MatchedDetection(HERE, MEAN, P))
     for at_ms in (100.0, 540.0, 541.0):
         assert life.expired(START_NS + ms(5000)) == []  # nobody looked
-        ended = life.missed(look("ahead", at_ms, ego=ego(x_m=100.0)), [0], np.array([[10.0, 0.0]]), np.array([90.0]))
+        ended = life.missed(scan("ahead", at_ms, ego=ego(x_m=100.0)), [0], np.array([[10.0, 0.0]]), np.array([90.0]))
         assert ended == ([0] if at_ms > 540.0 else [])
 
 
@@ -130,19 +130,19 @@ def test_a_track_that_left_the_view_of_all_sensors_ends_although_it_is_believed(
 def test_a_position_on_an_endless_line_proves_nothing(angle_rad: float) -> None:
     """As of a RADAR whose range is good to 1e9 m."""
     life = lifecycle()
-    life.born(0, look(), Sighting(HERE))
+    life.born(0, scan(), MatchedDetection(HERE))
     along = np.array([math.cos(angle_rad), math.sin(angle_rad)])
     far = replace(candidate(10.0, 0.0), position_covariance=1e18 * np.outer(along, along) + 0.01 * np.eye(2))
-    life.matched(0, look(at_ms=20.0), Sighting(far, MEAN, P))
+    life.matched(0, scan(at_ms=20.0), MatchedDetection(far, MEAN, P))
     assert 0.0 < probability(life, 20.0) < 0.2001
 
 
 def test_a_late_list_takes_nothing_back_of_when_the_track_was_last_in_view() -> None:
     life = lifecycle(replace(STILL, out_of_view_s=0.5))
-    life.born(0, look("ahead"), Sighting(HERE))
+    life.born(0, scan("ahead"), MatchedDetection(HERE))
     for at_ms in (400.0, 100.0):  # the second one late
-        life.matched(0, look("ahead", at_ms, ego=ego()), Sighting(HERE, MEAN, P))
-    elsewhere = look("ahead", 800.0, ego=ego(x_m=100.0))
+        life.matched(0, scan("ahead", at_ms, ego=ego()), MatchedDetection(HERE, MEAN, P))
+    elsewhere = scan("ahead", 800.0, ego=ego(x_m=100.0))
     assert life.missed(elsewhere, [0], np.array([[10.0, 0.0]]), np.array([90.0])) == []
 
 
@@ -150,9 +150,9 @@ def test_the_score_of_a_match_counts_as_much_as_its_place() -> None:
     found = []
     for score in (3.0, 2.5):
         life = lifecycle()
-        life.born(0, look("scored"), Sighting(HERE))
+        life.born(0, scan("scored"), MatchedDetection(HERE))
         seen = (Detection(x_m=12.0, y_m=0.0, score=score),)
-        life.matched(0, look("scored", 10.0, objects=seen), Sighting(candidate(12.0, 0.0), MEAN, P))
+        life.matched(0, scan("scored", 10.0, objects=seen), MatchedDetection(candidate(12.0, 0.0), MEAN, P))
         found.append(probability(life, 10.0))
     odds = [4.0 * p / (1.0 - p) for p in found]  # at birth 1 / 4
     missed = 1.0 - SENSORS["scored"].detection_probability
@@ -163,7 +163,7 @@ def test_a_better_score_makes_an_object_more_probable() -> None:
     found = []
     for score in (2.0, None, 3.0, 5.0):
         life = lifecycle()
-        life.born(0, look("scored", objects=(Detection(x_m=10.0, y_m=0.0, score=score),)), Sighting(HERE))
+        life.born(0, scan("scored", objects=(Detection(x_m=10.0, y_m=0.0, score=score),)), MatchedDetection(HERE))
         found.append(probability(life))
     low, none, even, high = found
     assert low < none < high
@@ -173,30 +173,30 @@ def test_a_better_score_makes_an_object_more_probable() -> None:
 
 def test_a_confirmed_track_is_coasting_when_missed_tentative_when_doubted_and_confirmed_again_when_seen() -> None:
     life = lifecycle(replace(STILL, doubt_probability=0.6))
-    life.born(0, look(), Sighting(HERE))
+    life.born(0, scan(), MatchedDetection(HERE))
     assert life.status(0) is TrackStatus.TENTATIVE
-    life.matched(0, look(at_ms=10.0), Sighting(HERE, MEAN, P))
+    life.matched(0, scan(at_ms=10.0), MatchedDetection(HERE, MEAN, P))
     life.expired(START_NS + ms(10))
     assert life.status(0) is TrackStatus.CONFIRMED
     found = []
     for k in range(2, 6):
-        life.missed(look(at_ms=10.0 * k), [0], np.array([[10.0, 0.0]]), np.array([10.0]))
+        life.missed(scan(at_ms=10.0 * k), [0], np.array([[10.0, 0.0]]), np.array([10.0]))
         life.expired(START_NS + ms(10 * k))
         found.append(life.status(0))
     assert found[0] is TrackStatus.COASTING
     assert found[-1] is TrackStatus.TENTATIVE
-    life.matched(0, look(at_ms=60.0), Sighting(HERE, MEAN, P))
+    life.matched(0, scan(at_ms=60.0), MatchedDetection(HERE, MEAN, P))
     life.expired(START_NS + ms(60))
     assert life.status(0) is TrackStatus.CONFIRMED
 
 
 def test_what_never_moves_is_not_confirmed_and_what_has_moved_stays_so() -> None:
     life = lifecycle(replace(STILL, min_travel_m=5.0))
-    life.born(0, look(), Sighting(HERE))
+    life.born(0, scan(), MatchedDetection(HERE))
     found = []
     for k, x_m in enumerate((10.0, 14.9, 15.1, 10.0)):
         mean = np.array([x_m, 0.0, 0.0, 0.0, 0.0])
-        life.matched(0, look(at_ms=10.0 * k), Sighting(candidate(x_m, 0.0), mean, P))
+        life.matched(0, scan(at_ms=10.0 * k), MatchedDetection(candidate(x_m, 0.0), mean, P))
         life.expired(START_NS + ms(10 * k))
         found.append(life.status(0))
     assert found == [TrackStatus.TENTATIVE, TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.CONFIRMED]

@@ -4,7 +4,7 @@ from support.tracking import START_NS, ms
 
 from fgtrack.core.types import TrackStatus
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.lifecycle import CountingLifecycle, Life, LifecycleRules, Look
+from fgtrack.tracking.lifecycle import CountingLifecycle, Life, LifecycleRules, Scan
 from fgtrack.tracking.published import PublishedLifecycle
 
 STD = {"x_m": 0.3, "y_m": 0.3}
@@ -26,7 +26,7 @@ def lifecycle(kind=CountingLifecycle, **rules) -> CountingLifecycle:
 def test_a_track_starts_with_the_counter_of_the_sensor_that_found_it(kind) -> None:
     life = lifecycle(kind)
     for track_id, sensor in enumerate(SENSORS):
-        life.born(track_id, Look(sensor, START_NS, START_NS))
+        life.born(track_id, Scan(sensor, START_NS, START_NS))
     assert [life.lives[i].counter for i in range(4)] == [3, 5, 2, 4]
     assert all(one.num_measured == 1 for one in life.lives.values())
 
@@ -43,22 +43,22 @@ def test_a_track_starts_with_the_counter_of_the_sensor_that_found_it(kind) -> No
 def test_a_sensor_ages_only_what_it_is_responsible_for(ages, near: bool, at_limit: bool, far: bool) -> None:
     life = CountingLifecycle(LifecycleRules(short_range_m=60.0), {"one": SensorModel(std=STD, ages=ages)})
     for track_id in range(3):
-        life.born(track_id, Look("one", START_NS, START_NS))
-    life.missed(Look("one", START_NS, START_NS), [0, 1, 2], NOWHERE, np.array([10.0, 60.0, 60.1]))
+        life.born(track_id, Scan("one", START_NS, START_NS))
+    life.missed(Scan("one", START_NS, START_NS), [0, 1, 2], NOWHERE, np.array([10.0, 60.0, 60.1]))
     assert [life.lives[i].misses == 1 for i in range(3)] == [near, at_limit, far]
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_missed_track_counts_down_and_ends_at_zero(kind) -> None:
     life = lifecycle(kind)
-    life.born(0, Look("near", START_NS, START_NS))
-    life.born(1, Look("near", START_NS, START_NS))
+    life.born(0, Scan("near", START_NS, START_NS))
+    life.born(1, Scan("near", START_NS, START_NS))
     ranges_m = np.array([10.0, 61.0])
-    assert life.missed(Look("near", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == []
-    assert life.missed(Look("far", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == []
+    assert life.missed(Scan("near", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == []
+    assert life.missed(Scan("far", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == []
     assert [life.lives[i].counter for i in (0, 1)] == [2, 2]
-    assert life.missed(Look("near", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == []
-    assert life.missed(Look("near", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == [0]
+    assert life.missed(Scan("near", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == []
+    assert life.missed(Scan("near", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == [0]
     life.forget(0)
     assert list(life.lives) == [1]
 
@@ -66,29 +66,29 @@ def test_a_missed_track_counts_down_and_ends_at_zero(kind) -> None:
 def test_only_the_clean_life_cycle_knows_sensors_that_age_always() -> None:
     clean, published = lifecycle(), lifecycle(PublishedLifecycle)
     for life in (clean, published):
-        life.born(0, Look("both", START_NS, START_NS))
-        life.missed(Look("both", START_NS, START_NS), [0], NOWHERE, np.array([10.0]))
+        life.born(0, Scan("both", START_NS, START_NS))
+        life.missed(Scan("both", START_NS, START_NS), [0], NOWHERE, np.array([10.0]))
     assert (clean.lives[0].counter, published.lives[0].counter) == (1, 2)
 
 
 def test_the_counter_stops_at_its_cap_but_the_published_one_may_pass_it() -> None:
     clean, published = lifecycle(counter_cap=6), lifecycle(PublishedLifecycle, counter_cap=6)
     for life in (clean, published):
-        life.born(0, Look("far", START_NS, START_NS))
+        life.born(0, Scan("far", START_NS, START_NS))
         for _ in range(3):
-            life.matched(0, Look("far", START_NS, START_NS))
+            life.matched(0, Scan("far", START_NS, START_NS))
     assert (clean.lives[0].counter, published.lives[0].counter) == (6, 7)
 
 
 def test_the_last_sight_is_the_newest_stamp_and_in_the_published_one_the_last() -> None:
     clean, published = lifecycle(), lifecycle(PublishedLifecycle)
     for life in (clean, published):
-        life.born(0, Look("near", START_NS, START_NS + ms(100)))
+        life.born(0, Scan("near", START_NS, START_NS + ms(100)))
     assert clean.lives[0].last_seen_ns == START_NS
     assert published.lives[0].last_seen_ns == START_NS + ms(100)
     for life in (clean, published):
-        life.matched(0, Look("near", START_NS + ms(50), START_NS + ms(50)))
-        life.matched(0, Look("near", START_NS + ms(20), START_NS + ms(20)))
+        life.matched(0, Scan("near", START_NS + ms(50), START_NS + ms(50)))
+        life.matched(0, Scan("near", START_NS + ms(20), START_NS + ms(20)))
     assert clean.lives[0].last_seen_ns == START_NS + ms(50)
     assert published.lives[0].last_seen_ns == START_NS + ms(20)
 
@@ -97,25 +97,25 @@ def test_time_alone_ends_a_track_but_the_published_one_needs_a_list() -> None:
     clean, published = lifecycle(forget_s=2.0), lifecycle(PublishedLifecycle, forget_s=2.0)
     late_ns = START_NS + ms(2000) + 1
     for life in (clean, published):
-        life.born(0, Look("blind", START_NS, START_NS))
+        life.born(0, Scan("blind", START_NS, START_NS))
         assert life.expired(late_ns - 1) == []
     assert clean.expired(late_ns) == [0]
     assert published.expired(late_ns) == []
-    assert published.missed(Look("blind", late_ns - 1, late_ns - 1), [0], NOWHERE, np.array([10.0])) == []
-    assert published.missed(Look("blind", late_ns, late_ns), [0], NOWHERE, np.array([10.0])) == [0]
+    assert published.missed(Scan("blind", late_ns - 1, late_ns - 1), [0], NOWHERE, np.array([10.0])) == []
+    assert published.missed(Scan("blind", late_ns, late_ns), [0], NOWHERE, np.array([10.0])) == [0]
 
 
 def test_the_status_tells_unconfirmed_from_seen_from_missed() -> None:
     life = lifecycle(confirm_count=3)
-    life.born(0, Look("both", START_NS, START_NS))
+    life.born(0, Scan("both", START_NS, START_NS))
     status = []
     for _ in range(2):
-        life.matched(0, Look("both", START_NS, START_NS))
+        life.matched(0, Scan("both", START_NS, START_NS))
         life.fused(0)
         status.append(life.lives[0].status(3))
-    life.missed(Look("both", START_NS, START_NS), [0], NOWHERE, np.array([1.0]))
+    life.missed(Scan("both", START_NS, START_NS), [0], NOWHERE, np.array([1.0]))
     status.append(life.lives[0].status(3))
-    life.matched(0, Look("both", START_NS, START_NS))
+    life.matched(0, Scan("both", START_NS, START_NS))
     status.append(life.lives[0].status(3))
     assert status == [
         TrackStatus.TENTATIVE,
@@ -129,11 +129,11 @@ def test_the_status_tells_unconfirmed_from_seen_from_missed() -> None:
 def test_an_unconfirmed_track_ends_at_its_first_misses_where_that_is_asked_for() -> None:
     life = lifecycle(tentative_misses=2, confirm_count=2)
     for track_id in (0, 1):
-        life.born(track_id, Look("far", START_NS, START_NS))
+        life.born(track_id, Scan("far", START_NS, START_NS))
     life.fused(1)
     ranges_m = np.array([80.0, 80.0])
-    assert life.missed(Look("far", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == []
-    assert life.missed(Look("far", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == [0]
+    assert life.missed(Scan("far", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == []
+    assert life.missed(Scan("far", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == [0]
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from fgtrack.pipeline.config import CountingConfig
 from fgtrack.tracking.association import GatedEuclidean
 from fgtrack.tracking.tracker import Tracker
 
-CLAIMING = CountingConfig(claim_overtaken=True)
+CLAIMING = CountingConfig(suppress_births_near_newer_tracks=True)
 POINTS = SensorModel(std={"x_m": 0.3, "y_m": 0.3})
 
 
