@@ -87,8 +87,8 @@ class EgoConfig:
     storage_ticks: PositiveInt = 350
     """Length of the ego storage of the published implementation."""
     uncertainty: Literal["none", "independent"] = "independent"
-    """Effect of the ego's covariance: none (as in the paper), or added to the noise of every detection as if each had an
-    error of its own."""
+    """Effect of the ego's covariance: none (as in the paper), or added to the noise of every detection as if each had
+    an error of its own."""
     position_std_m: NonNegativeFloat = 0.0
     """Standard deviation of the ego's x and y where the recording gives no covariance of them."""
     yaw_std_rad: NonNegativeFloat = 0.0
