@@ -1,4 +1,4 @@
-"""Which candidate belongs to which track (Karle et al. 2023, section III-D)."""
+"""Association of candidates with tracks (Karle et al. 2023, section III-D)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What is assumed of a new object (Karle et al. 2023, section III-E)."""
+"""Prior of a new track (Karle et al. 2023, section III-E)."""
 
 import math
 from abc import ABC, abstractmethod
@@ -20,7 +20,7 @@ from fgtrack.tracking.preprocess import Candidate
 
 @dataclass(frozen=True)
 class Birth(ABC):
-    """The first state of a track: what is assumed of what a detection does not measure, with standard deviations."""
+    """First state of a track: values and standard deviations of all that its first detection does not measure."""
 
     ego_speed_factor: float = 0.0
     """An object is assumed as fast as the ego times this; 0 for traffic that has nothing to do with the ego."""
@@ -76,7 +76,7 @@ class Birth(ABC):
         """Covariance of the position, standard deviations of yaw and speed, of an object that heads for `yaw_rad`."""
 
     def position_cross(self, candidate: Candidate) -> dict[str, tuple[float, float]]:
-        """Covariance of the position with errors of the sensor that last."""
+        """Covariance of the position with time-correlated errors of the sensor."""
         return {}
 
 

@@ -1,4 +1,4 @@
-"""Where the ego vehicle was at a detection's stamp."""
+"""Pose of the ego vehicle at the stamp of a detection."""
 
 import bisect
 import math
@@ -37,11 +37,11 @@ class EgoPose(NamedTuple):
     speed_mps: float
     yaw_rate_radps: float = 0.0
     covariance: FloatArray | None = None
-    """Of the five above, shape (5, 5), read-only; None where it is not known or not asked for."""
+    """Covariance of the five above, shape (5, 5), read-only; None where it is unknown or not requested."""
 
 
 def is_finite(ego: EgoState) -> bool:
-    """Whether every number of `ego` is one (see `is_bounded`)."""
+    """True if every number of `ego` is finite and bounded (see `is_bounded`)."""
     return all(map(is_bounded, (ego.x_m, ego.y_m, ego.yaw_rad, ego.speed_mps, ego.yaw_rate_radps, ego.accel_mps2)))
 
 
@@ -98,7 +98,7 @@ def _covariance(given: tuple[float, ...] | None, std: tuple[float, ...]) -> Floa
 
 @lru_cache(maxsize=1024)
 def is_ego_covariance(given: tuple[float, ...]) -> bool:
-    """Whether these are the 25 entries of a symmetric positive semidefinite matrix."""
+    """True if these are the 25 entries of a symmetric positive semidefinite matrix."""
     if len(given) != 25 or not all(abs(entry) <= LARGEST**2 for entry in given):
         return False
     P = np.array(given).reshape(5, 5)
@@ -131,7 +131,7 @@ class EgoSource(ABC):
         self.current: EgoState | None = None
         """Newest known state."""
         self.in_pit = False
-        """Whether the ego was last said to drive in the pit lane."""
+        """True if the ego was last reported in the pit lane."""
         self._yaw_weight = yaw_weight
         self._yaw_rate_weight = yaw_rate_weight
 

@@ -1,4 +1,4 @@
-"""Whether the ego can have driven from one of its states to the next."""
+"""Consistency of successive ego states with their own speeds."""
 
 import math
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ class Continuity:
         self._fits = False  # whether the last two did
 
     def judged(self, ego: EgoState) -> tuple[Sequence[EgoState], str | None]:
-        """Which states to take now, in their order, and why the one held back is left out, where it is."""
+        """Return the states to take now, in their order, and the reason if the one held back is left out."""
         last, held = self._last, self._held
         self._held = None
         if last is None or _fit(last, ego):
@@ -66,5 +66,5 @@ def _fit(before: EgoState, after: EgoState) -> bool:
 
 
 def _variance(ego: EgoState) -> float:
-    """Of x and y together, as far as it is said: covariances are those of the five of `EgoPose`."""
+    """Variance of x and y together, 0 where the state has none; covariances are in the order of `EgoPose`."""
     return 0.0 if ego.covariance is None else max(ego.covariance[0] + ego.covariance[6], 0.0)

@@ -1,4 +1,4 @@
-"""How probable it is that the object of a track exists: integrated probabilistic data association.
+"""Existence probability of tracks: integrated probabilistic data association.
 
 Musicki, Evans, Stankovic: Integrated probabilistic data association, IEEE Trans. Automatic Control 39, 1994; the same
 recursion is that of a Bernoulli filter (Ristic, Vo, Vo, Farina: A tutorial on Bernoulli filters, IEEE Trans. Signal
@@ -39,7 +39,7 @@ class ExistenceRules:
 
     kind: Literal["existence"] = "existence"
     birth_probability: float = 0.2
-    """That the object of a detection which belongs to no track exists, before its score is considered."""
+    """Probability that an unassociated detection stems from an object, before its score is considered."""
     confirm_probability: float = 0.9
     """A track is confirmed from here on."""
     doubt_probability: float = 0.5
@@ -55,9 +55,9 @@ class ExistenceRules:
     min_travel_m: float = 0.0
     """A track is not confirmed before it was so far from where it began: what never moves is shore, or moored."""
     memory_s: float = 5.0
-    """How far back late lists change the probability at their own stamp; older ones count as if they were so old."""
+    """Time for which late lists change the probability at their own stamp; older ones count as if they were so old."""
     suppress_births_near_newer_tracks: bool = True
-    """Whether a track claims a detection that the newer one which started it has overtaken."""
+    """True if a late detection near a track that a newer detection has started begins no track of its own."""
 
     def __post_init__(self) -> None:
         for name in ("birth_probability", "confirm_probability", "doubt_probability", "delete_probability"):
@@ -88,13 +88,13 @@ class Existence:
     """Lists since the last match that could have shown it."""
     confirmed: bool = False
     first_m: FloatArray | None = None
-    """Where it began, shape (2,)."""
+    """First position, shape (2,)."""
     travelled: bool = False
-    """Whether it was ever as far from there as a track must be to be confirmed."""
+    """True if it was ever as far from there as a track must be to be confirmed."""
 
     @classmethod
     def born(cls, lifetime_s: float, stamp_ns: int, log_odds: float) -> "Existence":
-        """Of a new object."""
+        """Return the existence of a new object."""
         log_odds = _bounded(log_odds)
         return cls(lifetime_s, [stamp_ns], [log_odds], [log_odds], in_view_ns=stamp_ns)
 
@@ -109,7 +109,7 @@ class Existence:
             self.log_odds.append(_bounded(self._survived(k - 1, self.stamps_ns[k]) + self.weights[k]))
 
     def probability(self, stamp_ns: int) -> float:
-        """That the object exists at `stamp_ns`, at or after the newest evidence."""
+        """Existence probability at `stamp_ns`, at or after the newest evidence."""
         return 1.0 / (1.0 + math.exp(-self._survived(-1, stamp_ns)))
 
     def forget(self, oldest_ns: int) -> None:
@@ -147,7 +147,7 @@ class ExistenceLifecycle:
         self._present_ns = 0
         self._newest_ns = 0  # stamp of the newest list that could have shown something
         self.lives: dict[int, Existence] = {}
-        """What is known of each track."""
+        """Existence by track id."""
 
     def born(self, track_id: int, scan: Scan, matched: MatchedDetection) -> None:
         """See `Lifecycle.born`."""

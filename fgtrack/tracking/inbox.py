@@ -29,7 +29,7 @@ class Batch:
     indices: tuple[int, ...]
     """Positions, in the message, of the detections to process."""
     last: bool = True
-    """Whether this is the newest batch of its message; only detections with stamps of their own make several."""
+    """True for the newest batch of its message; only detections with stamps of their own make several."""
 
     @property
     def sensor(self) -> str:
@@ -50,7 +50,7 @@ def record(
     nis: float | None = None,
     innovation: Mapping[str, float] | None = None,
 ) -> UpdateRecord:
-    """What became of detection `index` of `message`."""
+    """Return the record of detection `index` of `message`."""
     stamp_ns = message.objects[index].stamp_ns
     return UpdateRecord(
         message.sensor,
@@ -80,7 +80,7 @@ class Inbox(Protocol):
 
 
 def is_usable(detection: Detection, sensor: SensorModel) -> bool:
-    """Whether `detection` has sound values, says where it is, and is no empty slot (x = y = 0) of a fixed list."""
+    """True if `detection` has valid values and a position or bearing, and is not an empty slot (x = y = 0)."""
     measured = {name: value for name in sensor.std if (value := getattr(detection, name)) is not None}
     if not all(map(is_bounded, measured.values())) or not is_covariance(detection, sensor):
         return False
@@ -92,7 +92,7 @@ def is_usable(detection: Detection, sensor: SensorModel) -> bool:
 
 
 def is_bounded(value: float) -> bool:
-    """Whether `value` is finite and at most `LARGEST`."""
+    """True if `value` is finite and at most `LARGEST`."""
     return abs(value) <= LARGEST
 
 
@@ -104,7 +104,7 @@ def own_covariance(detection: Detection, names: Sequence[str]) -> FloatArray:
 
 
 def is_covariance(detection: Detection, sensor: SensorModel) -> bool:
-    """Whether the covariance that `detection` carries, if it is used at all, is one: symmetric positive definite."""
+    """True if the covariance of `detection` is not used, or is symmetric positive definite."""
     if detection.covariance is None or not sensor.message_covariance:
         return True
     measured = detection.measured
@@ -155,7 +155,7 @@ class _Seen:
         self._receipts_ns: dict[tuple[str, int, Frame, int], int] = {}  # in order of receipt
 
     def is_copy(self, message: DetectionList, usable: Sequence[bool]) -> bool:
-        """Whether `message` repeats one that is remembered; it is remembered from now on.
+        """True if `message` repeats one that is remembered; it is remembered from now on.
 
         Those that are not `usable` are not compared, nor is their order.
         """

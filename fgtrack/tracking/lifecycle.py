@@ -1,4 +1,4 @@
-"""How long a track lives: the protocol, and the status counter of Karle et al. 2023, section III-D."""
+"""Life of a track: the protocol, and the status counter of Karle et al. 2023, section III-D."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from fgtrack.tracking.preprocess import Candidate
 
 
 class Scan(NamedTuple):
-    """A list as far as it matters to the life of tracks: who looked, when, and from where."""
+    """Sensor, time and pose of a list: all of it that matters to the life of tracks."""
 
     sensor: str
     stamp_ns: int
@@ -33,9 +33,9 @@ class MatchedDetection(NamedTuple):
 
 
 class Lifecycle(Protocol):
-    """Says how far tracks can be trusted, and which of them end.
+    """Status of tracks, and which of them end.
 
-    It hears of sensors that give positions alone: a bearing fits whatever is behind or before its object as well, so it
+    Only sensors that give positions count: a bearing fits whatever is behind or before its object as well, so it
     neither starts nor confirms nor keeps a track.
     """
 
@@ -49,7 +49,7 @@ class Lifecycle(Protocol):
         """The associated detection, which is `placed` where it gives a position, changed the state."""
 
     def missed(self, scan: Scan, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
-        """These tracks, at `positions_m` (n, 2) and so far from the ego, were not seen; the ids of those that end."""
+        """Return the ids that end of tracks, at `positions_m` (n, 2) and so far from the ego, that a list misses."""
 
     def expired(self, present_ns: int) -> list[int]:
         """The ids of tracks that end because time has passed."""
@@ -58,26 +58,26 @@ class Lifecycle(Protocol):
         """The track has ended."""
 
     def status(self, track_id: int) -> TrackStatus:
-        """How far the track can be trusted."""
+        """Status of the track."""
 
     def num_measured(self, track_id: int) -> int:
-        """How many detections have changed its state, the first one included."""
+        """Number of detections that have changed its state, the first one included."""
 
 
 @dataclass(slots=True)
 class Life:
-    """What is counted of one track."""
+    """Counters of one track."""
 
     counter: int
     last_seen_ns: int
     num_measured: int = 1
     num_placed: int = 1
-    """Those of the measurements that give a position."""
+    """Measurements that give a position."""
     misses: int = 0
     """Misses since the last match."""
 
     def status(self, confirm_count: int) -> TrackStatus:
-        """How far the track can be trusted."""
+        """Status of the track."""
         if self.num_placed < confirm_count:
             return TrackStatus.TENTATIVE
         return TrackStatus.COASTING if self.misses else TrackStatus.CONFIRMED
@@ -118,7 +118,7 @@ class CountingLifecycle:
         self._sensors = sensors
         self._forget_ns = nanoseconds(rules.forget_s)
         self.lives: dict[int, Life] = {}
-        """What is counted, by track."""
+        """Counters by track id."""
 
     def born(self, track_id: int, scan: Scan, matched: MatchedDetection | None = None) -> None:
         """See `Lifecycle.born`."""
@@ -149,7 +149,7 @@ class CountingLifecycle:
         return ended
 
     def _ages(self, sensor: str, range_m: float) -> bool:
-        """Whether `sensor` counts down a track at `range_m` that it did not see."""
+        """True if `sensor` counts down a track at `range_m` that it has missed."""
         ages = self._sensors[sensor].ages
         near = range_m <= self._rules.short_range_m
         return ages == "always" or ages == ("short_range" if near else "long_range")

@@ -33,16 +33,16 @@ class Located(NamedTuple):
     points_m: FloatArray
     """Positions in the map, shape (m, 2); NaN where only a bearing was measured."""
     map_yaw: BoolArray
-    """Whether the yaw is that of the map, shape (m,)."""
+    """True where the yaw is that of the map, shape (m,)."""
 
     @property
     def placed(self) -> IntArray:
-        """Which of them have a position."""
+        """Indices of those with a position."""
         x_m = self.points_m[:, 0]
         return np.asarray((x_m == x_m).nonzero()[0])  # NaN is not equal to itself
 
     def at(self, rows: IntArray | BoolArray) -> "Located":
-        """Those of `rows`."""
+        """Return the detections at `rows`."""
         chosen = np.arange(len(self.indices))[rows].tolist()
         detections = [self.detections[row] for row in chosen]
         return Located(self.indices[rows], detections, self.values[rows], self.points_m[rows], self.map_yaw[rows])

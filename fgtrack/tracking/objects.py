@@ -1,4 +1,4 @@
-"""What the objects of tracks are, as their detections say: class by vote, size by average."""
+"""Class and size of the objects of tracks: class by vote of the detections, size by their average."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -25,10 +25,10 @@ _sizes_m = attrgetter(*_SIZES)
 
 @dataclass(frozen=True)
 class ObjectRules:
-    """What the class of a detection decides."""
+    """Rules for the class of a detection."""
 
     separate_classes: bool = True
-    """Whether a detection may only belong to a track of its class or of one like it; what has no class may belong to
+    """True if a detection may only belong to a track of its class or of one like it; one without a class may belong to
     any. The class of a track is that of most of its detections."""
     alike: tuple[tuple[str, ...], ...] = (_VEHICLES, _PERSONS, _RIDERS)
     """Groups of classes that a detector may confuse, in lower case; any other class is like none."""
@@ -43,17 +43,17 @@ class ObjectRules:
 
 @dataclass(slots=True)
 class _Seen:
-    """What the detections of one track have said."""
+    """Classes and sizes that the detections of one track have reported."""
 
     classes: Counter[str] = field(default_factory=Counter)
     num_sizes: Counter[str] = field(default_factory=Counter)
-    """How many have given each of `_SIZES`."""
+    """Number of detections with each of `_SIZES`."""
     sizes_m: dict[str, float] = field(default_factory=dict)
     """Their means."""
 
 
 class Objects:
-    """Remembers what the detections of each track have said, and says which detections cannot be of it."""
+    """Class and size of each track, and the pairs that they exclude."""
 
     def __init__(self, rules: ObjectRules) -> None:
         self._separate = rules.separate_classes
@@ -61,7 +61,7 @@ class Objects:
         self._seen: dict[int, _Seen] = {}
 
     def learn(self, track_id: int, detections: Iterable[Detection]) -> None:
-        """These are detections of the track."""
+        """Add detections of the track."""
         for one in detections:
             sizes_m = _sizes_m(one)
             if one.class_name is None and sizes_m == _NO_SIZES:
@@ -76,7 +76,7 @@ class Objects:
                     seen.sizes_m[name] = mean + 1.0 / seen.num_sizes[name] * (value - mean)
 
     def apart(self, named: Sequence[str | None], track_ids: Sequence[int]) -> Apart | None:
-        """Which candidates of these classes are not these tracks; None where nothing speaks against any pair."""
+        """Return a test of pairs for different classes; None if no pair is excluded."""
         if not self._separate or not self._seen or not any(named):
             return None
         classes = [self._class(track_id) for track_id in track_ids]
@@ -92,7 +92,7 @@ class Objects:
         return differ
 
     def report(self, track_id: int) -> ObjectReport | None:
-        """What is known of the track's object; None where no detection has said anything."""
+        """Class and size of the object of a track; None if no detection has reported any."""
         seen = self._seen.get(track_id)
         if seen is None:
             return None
@@ -101,7 +101,7 @@ class Objects:
         return ObjectReport(name, share, **seen.sizes_m)
 
     def forget(self, track_id: int) -> None:
-        """The track has ended."""
+        """Forget a track that has ended."""
         self._seen.pop(track_id, None)
 
     def _class(self, track_id: int) -> str | None:

@@ -1,4 +1,4 @@
-"""How an error of the ego's pose and motion enters the innovations of one detection."""
+"""Propagation of the error of the ego's pose and motion into the innovation of a detection."""
 
 from typing import NamedTuple
 
@@ -12,12 +12,12 @@ from fgtrack.models.measurement import MeasurementModel, SensorPose
 class PoseError(NamedTuple):
     """The error e of a sensor pose in the innovation z - h(x, pose) = ... + G e of a detection.
 
-    e is the believed pose minus the true one, of x, y, yaw, vx and vy of the sensor, the same for all detections of a
+    e is the estimated pose minus the true one, of x, y, yaw, vx and vy of the sensor, the same for all detections of a
     batch. It enters z where the detection was placed in the map by the pose, and h where it is relative to the sensor.
     """
 
     covariance: FloatArray
-    """Of e, shape (5, 5)."""
+    """Covariance of e, shape (5, 5)."""
     placement: FloatArray
     """Derivative of z by the pose, shape (k, 5), or (m, k, 5) of many detections."""
     R: FloatArray

@@ -1,4 +1,4 @@
-"""From the detections of one batch to what can be associated: map frame, on the road, merged."""
+"""From the detections of one batch to candidates for association: map frame, on the road, merged."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -63,7 +63,7 @@ class Candidate:
     values: Mapping[str, float]
     """Measured components by name, in the map frame."""
     pose_error: PoseError | None = None
-    """What the ego's uncertainty does to the measurement; None where it is not considered. `measurement.R` includes it
+    """Error of the ego in the measurement; None where it is not considered. `measurement.R` includes it
     as far as the detection alone tells."""
 
     def noise_at(self, x: FloatArray) -> FloatArray:
@@ -86,7 +86,7 @@ class _View(NamedTuple):
     sensor: SensorModel
     pose: SensorPose
     pose_covariance: FloatArray | None
-    """Of the entries of `pose`, shape (5, 5); None where it is not considered, or matters to no detection."""
+    """Covariance of the entries of `pose`, shape (5, 5); None where not considered, or of no effect."""
 
 
 class _Group(NamedTuple):
@@ -94,11 +94,11 @@ class _Group(NamedTuple):
 
     leader: int
     merged: tuple[int, ...]
-    """Those that have no outcome of their own."""
+    """Detections without an outcome of their own."""
     parts: tuple[int, ...]
-    """Those that are averaged."""
+    """Detections that are averaged."""
     columns: tuple[int, ...]
-    """What is averaged."""
+    """Components that are averaged."""
 
 
 class Preprocess:
@@ -162,7 +162,7 @@ class Preprocess:
         return SensorPose(float(x_m), float(y_m), yaw_rad, float(vx_mps), float(vy_mps))
 
     def _on_road(self, items: Located, sensor: SensorModel, lost: dict[int, str]) -> Located:
-        """What lies inside the bounds, with what the map says in place of a measurement; `lost` gets the rest."""
+        """Return the detections inside the bounds, with yaw and curvature of the map; `lost` gets the rest."""
         placed = items.placed
         if not self._road.known or not len(placed):
             return items
@@ -264,7 +264,7 @@ class Preprocess:
     def _measured(
         self, items: Located, groups: Sequence[_Group], columns: tuple[int, ...], view: _View
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """What `groups` measure, (m, k) and (m, k, k), and their positions, (m, 2): averages of what is merged."""
+        """Means z (m, k), covariances R (m, k, k) and positions (m, 2) of `groups`, averaged over each."""
         names, frame, sensor, pose = _names(columns), view.batch.frame, view.sensor, view.pose
         leaders = np.array([group.leader for group in groups])
         z, points_m = items.values[leaders].take(columns, axis=1), items.points_m[leaders]
@@ -300,7 +300,7 @@ class Preprocess:
         assumed: tuple[str, ...],
         view: _View,
     ) -> PoseError | None:
-        """How the error of the sensor pose enters measurements at `points_m` in the map, all stacked."""
+        """Error of the sensor pose in measurements at `points_m` in the map, all stacked."""
         if view.pose_covariance is None:
             return None
         pose = view.pose

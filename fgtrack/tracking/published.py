@@ -1,4 +1,4 @@
-"""What the published implementation of Karle et al. 2023 does in another way, each defect a component of its own."""
+"""Deviations of the published implementation of Karle et al. 2023, each defect a component of its own."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

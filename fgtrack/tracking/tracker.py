@@ -1,4 +1,4 @@
-"""The tracker: what happens at a tick, in the order of the paper's algorithm (Karle et al. 2023, figure 2)."""
+"""The tracker: the steps of a tick, in the order of the paper's algorithm (Karle et al. 2023, figure 2)."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -87,13 +87,13 @@ class Tracker:
         self._undirected: dict[int, Start] = {}  # of tracks with one position and an unknown heading, by id
         self._seen: dict[int, set[int]] = {}  # in this tick, by message: tracks that it has matched or started
         self.failures = parts.failures
-        """What has failed inside, and what was done about it."""
+        """Counts of internal failures and of the tracks that they have ended."""
         self.refused_ego: Counter[str] = Counter()
         """Ego messages that were not used, by reason."""
 
     @property
     def ego_jumps(self) -> int:
-        """How often the ego's states went on at a place to which it cannot have driven."""
+        """Number of jumps in the ego's states, see `Continuity`."""
         return self._parts.ego.jumps
 
     def receive(self, message: EgoState | DetectionList) -> None:
@@ -193,7 +193,7 @@ class Tracker:
             self._give_birth(batch, candidates[position], sensor, ego)
 
     def _assigned(self, batch: Batch, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
-        """Which candidate belongs to which track; of another class none does."""
+        """Return the assignment of candidates to tracks of the same class."""
         objects = batch.message.objects
         named = [objects[candidate.index].class_name for candidate in candidates]
         return self._parts.association(candidates, states, self._parts.objects.apart(named, states.track_ids))
@@ -201,7 +201,7 @@ class Tracker:
     def _unclaimed(
         self, batch: Batch, candidates: Sequence[Candidate], new: Sequence[int], states: StatesAt
     ) -> Sequence[int]:
-        """Those of `new` that no track claims which began after the batch's stamp.
+        """Return those of `new` that belong to no track which began after the batch's stamp.
 
         The detection that started it has overtaken them. They are too old for it, and no other object.
         """
@@ -228,7 +228,7 @@ class Tracker:
         return in_any_direction(states, stamp_ns, self._undirected)
 
     def _is_too_old(self, batch: Batch) -> bool:
-        """Whether no track could fuse anything of `batch`."""
+        """True if no track could fuse anything of `batch`."""
         return batch.stamp_ns < self._parts.bank.window_start_ns
 
     def _offered(self, batch: Batch) -> StatesAt:
