@@ -17,8 +17,7 @@ from fgtrack.models.correlated_errors import whole_error
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_in_memory
-from fgtrack.tracking.assignment import Assignment
-from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
+from fgtrack.tracking.association import Assignment, GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.inbox import Batch
 from fgtrack.tracking.objects import Apart

@@ -3,6 +3,7 @@
 import bisect
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from operator import attrgetter
@@ -15,13 +16,14 @@ from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.linalg import congruence, symmetrise
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import EgoState, FloatArray
-from fgtrack.tracking.ego_continuity import Continuity
 from fgtrack.tracking.inbox import ASYMMETRY, is_bounded
 
 LARGEST_STEP_BACK_S = 1.0
 """A state that is older than the newest one by more than this has a wrong stamp."""
 
-_BENT_RAD = 1e-6  # half of a turn below which chord and arc are the same
+CONTRADICTS = "contradicts its neighbours"
+_LONGEST_S, _SLACK_M, _SHARE, _SIGMAS = 1.0, 2.0, 0.5, 3.0  # see `Continuity`
+_STRAIGHT_RAD = 1e-6  # half of a turn below which chord and arc are the same
 
 _FIELDS = [field.name for field in fields(EgoState)]
 _VALUES = attrgetter(*_FIELDS)
@@ -53,7 +55,7 @@ def extrapolated(ego: EgoState, stamp_ns: int, covariance: FloatArray | None = N
     """
     dt_s = seconds(stamp_ns - ego.stamp_ns)
     half_rad = 0.0 if straight else 0.5 * ego.yaw_rate_radps * dt_s
-    bent = abs(half_rad) > _BENT_RAD
+    bent = abs(half_rad) > _STRAIGHT_RAD
     chord_s = dt_s * math.sin(half_rad) / half_rad if bent else dt_s
     travelled_m, c, s = ego.speed_mps * chord_s, math.cos(ego.yaw_rad + half_rad), math.sin(ego.yaw_rad + half_rad)
     if covariance is not None and dt_s:
@@ -111,6 +113,61 @@ def is_ego_covariance(given: tuple[float, ...]) -> bool:
     return bool(symmetric and np.linalg.eigvalsh(symmetrise(correlation))[0] >= -ASYMMETRY)
 
 
+class Continuity:
+    """Holds back a state that contradicts the one before it, until the next one tells which of the two is wrong.
+
+    A stamp that is half a second off puts the ego tens of metres from where it was, and with it all that is seen from
+    it. Two states contradict each other where the way between them differs from that at their speeds by more than half
+    of it, by 2 m, and by three standard deviations of their positions as far as they say them. What is more than 1 s
+    apart says nothing. A single state that contradicts both neighbours is left out; where the states go on from it,
+    the ego has jumped, and is followed. States that never fit, of an ego that does not know its speed, are all taken.
+    """
+
+    def __init__(self) -> None:
+        self.jumps = 0
+        """Places at which states went on elsewhere."""
+        self._last: EgoState | None = None
+        self._pending: EgoState | None = None
+        self._consistent = False  # the last two states
+
+    def accepted(self, ego: EgoState) -> tuple[Sequence[EgoState], str | None]:
+        """Return the states to take now, in their order, and the reason if the one held back is left out."""
+        last, held = self._last, self._pending
+        self._pending = None
+        if last is None or _consistent(last, ego):
+            self._consistent = last is not None
+            self._last = ego
+            return (ego,), None if held is None else CONTRADICTS
+        if held is None and self._consistent:
+            self._pending = ego
+            return (), None
+        self._last = ego
+        if held is None:
+            return (ego,), None
+        self._consistent = _consistent(held, ego)
+        self.jumps += self._consistent
+        return (held, ego), None
+
+
+def _consistent(before: EgoState, after: EgoState) -> bool:
+    dt_s = seconds(after.stamp_ns - before.stamp_ns)
+    if abs(dt_s) > _LONGEST_S:
+        return True
+    travelled_m = 0.5 * (before.speed_mps + after.speed_mps) * dt_s
+    off_m = math.hypot(
+        after.x_m - before.x_m - travelled_m * math.cos(before.yaw_rad),
+        after.y_m - before.y_m - travelled_m * math.sin(before.yaw_rad),
+    )
+    if off_m <= _SLACK_M:  # as nearly always
+        return True
+    return off_m <= _SLACK_M + _SHARE * abs(travelled_m) + _SIGMAS * math.sqrt(_variance(before) + _variance(after))
+
+
+def _variance(ego: EgoState) -> float:
+    """Variance of x and y together, 0 where the state has none; covariances are in the order of `EgoPose`."""
+    return 0.0 if ego.covariance is None else max(ego.covariance[0] + ego.covariance[6], 0.0)
+
+
 class EgoSource(ABC):
     """Holds the ego's past; the weights of its low-pass are those of new values.
 
@@ -151,7 +208,7 @@ class EgoSource(ABC):
         self._newest_ns = max(newest_ns, ego.stamp_ns)
         if self._continuity is None:
             return self._store(ego)
-        taken, reason = self._continuity.judged(ego)
+        taken, reason = self._continuity.accepted(ego)
         for state in taken:
             reason = self._store(state) or reason
         return reason

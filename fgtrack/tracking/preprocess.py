@@ -25,21 +25,21 @@ from fgtrack.models.measurement import (
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.ego import EgoPose
-from fgtrack.tracking.inbox import Batch, record
-from fgtrack.tracking.located import (
+from fgtrack.tracking.detections import (
     BEARING,
     CURVATURE,
     RANGE,
     YAW,
-    Located,
+    MapDetections,
     X,
     common,
     covariances,
-    located,
+    in_map_frame,
     move_back,
     take_map_yaw,
 )
+from fgtrack.tracking.ego import EgoPose
+from fgtrack.tracking.inbox import Batch, record
 from fgtrack.tracking.merge import Merge
 from fgtrack.tracking.pose_error import PoseError, placement
 
@@ -90,7 +90,7 @@ class _View(NamedTuple):
 
 
 class _Group(NamedTuple):
-    """Detections that are one object, as rows of `Located`."""
+    """Detections that are one object, as rows of `MapDetections`."""
 
     leader: int
     merged: tuple[int, ...]
@@ -128,7 +128,7 @@ class Preprocess:
         """
         pose = self._sensor_pose(batch, sensor, ego)
         view = _View(batch, sensor, pose, _pose_covariance(pose, batch, sensor, ego))
-        items = located(batch, sensor, pose)
+        items = in_map_frame(batch, sensor, pose)
         lost = dict[int, str]()
         if sensor.filters:
             names = [sensor.refusing(detection) for detection in items.detections]
@@ -161,7 +161,7 @@ class Preprocess:
         x_m, y_m, vx_mps, vy_mps = body_point(*ego[:5], x_m, y_m)
         return SensorPose(float(x_m), float(y_m), yaw_rad, float(vx_mps), float(vy_mps))
 
-    def _on_road(self, items: Located, sensor: SensorModel, lost: dict[int, str]) -> Located:
+    def _on_road(self, items: MapDetections, sensor: SensorModel, lost: dict[int, str]) -> MapDetections:
         """Return the detections inside the bounds, with yaw and curvature of the map; `lost` gets the rest."""
         placed = items.placed
         if not self._road.known or not len(placed):
@@ -178,7 +178,7 @@ class Preprocess:
         outside[placed[view.outside]] = True
         return _without(items, outside, "map.track", lost)
 
-    def _candidates(self, items: Located, view: _View) -> list[Candidate]:
+    def _candidates(self, items: MapDetections, view: _View) -> list[Candidate]:
         placed = items.placed
         groups = self._merge.groups(items.points_m if len(placed) == len(items.indices) else items.points_m[placed])
         kinds = items.kinds()
@@ -204,7 +204,7 @@ class Preprocess:
             ]
         return self._finished(items, found, view)
 
-    def _finished(self, items: Located, groups: Sequence[_Group], view: _View) -> list[Candidate]:
+    def _finished(self, items: MapDetections, groups: Sequence[_Group], view: _View) -> list[Candidate]:
         """The candidates of `groups`; those that measure the same are made together."""
         map_yaw = items.map_yaw.tolist()
         alike: dict[tuple[tuple[int, ...], bool], list[int]] = {}
@@ -221,7 +221,7 @@ class Preprocess:
         return [candidates[place] for place in range(len(groups))]
 
     def _alike(
-        self, items: Located, groups: Sequence[_Group], columns: tuple[int, ...], assumed: bool, view: _View
+        self, items: MapDetections, groups: Sequence[_Group], columns: tuple[int, ...], assumed: bool, view: _View
     ) -> list[Candidate]:
         """Candidates that measure the same: one detection each, or the average of several."""
         names, pose = _names(columns), view.pose
@@ -262,7 +262,7 @@ class Preprocess:
         ]
 
     def _measured(
-        self, items: Located, groups: Sequence[_Group], columns: tuple[int, ...], view: _View
+        self, items: MapDetections, groups: Sequence[_Group], columns: tuple[int, ...], view: _View
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Means z (m, k), covariances R (m, k, k) and positions (m, 2) of `groups`, averaged over each."""
         names, frame, sensor, pose = _names(columns), view.batch.frame, view.sensor, view.pose
@@ -315,7 +315,7 @@ class Preprocess:
         return ("yaw_rad",) if map_yaw else ()
 
 
-def _without(items: Located, outside: BoolArray, reason: str, lost: dict[int, str]) -> Located:
+def _without(items: MapDetections, outside: BoolArray, reason: str, lost: dict[int, str]) -> MapDetections:
     """`items` without those `outside`, shape (m,), whose indices `lost` gets with the `reason`."""
     if True not in outside.tolist():
         return items

@@ -12,7 +12,7 @@ from fgtrack.core.types import DetectionList, Disposition, EgoState, FloatArray,
 from fgtrack.estimation.base import StatesAt
 from fgtrack.estimation.published import published_yaw
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.assignment import Assignment, assigned_densely
+from fgtrack.tracking.association import Assignment, assigned_densely
 from fgtrack.tracking.ego import EgoPose, EgoSource, EgoStd
 from fgtrack.tracking.gating import euclidean_distances
 from fgtrack.tracking.inbox import Batch, is_bounded, is_covariance, record, records

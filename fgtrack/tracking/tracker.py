@@ -29,8 +29,7 @@ from fgtrack.estimation.present import PresentStates
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.assignment import Assignment
-from fgtrack.tracking.association import Association
+from fgtrack.tracking.association import Assignment, Association
 from fgtrack.tracking.birth import Birth, in_any_direction
 from fgtrack.tracking.ego import EgoPose, EgoSource
 from fgtrack.tracking.inbox import Batch, Inbox, record

@@ -10,8 +10,7 @@ from support.tracking import bearing, candidate, states
 
 from fgtrack.core.types import BoolArray, IntArray
 from fgtrack.models.measurement import SensorPose
-from fgtrack.tracking.assignment import Assignment
-from fgtrack.tracking.association import Association, GatedEuclidean, GatedMahalanobis, chi_square_quantile
+from fgtrack.tracking.association import Assignment, Association, GatedEuclidean, GatedMahalanobis, chi_square_quantile
 from fgtrack.tracking.gating import euclidean_distances
 from fgtrack.tracking.published import UngatedEuclidean
 

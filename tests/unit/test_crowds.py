@@ -11,9 +11,9 @@ from support.tracking import bearing, candidate, states
 
 from fgtrack.core.types import FloatArray
 from fgtrack.models.measurement import SensorPose
-from fgtrack.tracking import assignment, gating
-from fgtrack.tracking.assignment import assigned, assigned_densely
-from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
+from fgtrack.tracking import association as associations
+from fgtrack.tracking import gating
+from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis, assigned, assigned_densely
 from fgtrack.tracking.gating import Pairs, euclidean_distances, grouped, innovations, near
 from fgtrack.tracking.merge import ConnectedMerge
 from fgtrack.tracking.preprocess import Candidate
@@ -37,7 +37,7 @@ def sparse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small problems are solved as large ones are."""
     monkeypatch.setattr(gating, "_DENSE", -1)
     monkeypatch.setattr(gating, "_PORTION", 7)
-    monkeypatch.setattr(assignment, "_DENSE", -1)
+    monkeypatch.setattr(associations, "_DENSE", -1)
 
 
 # --- assignment
@@ -134,7 +134,7 @@ def test_detections_and_tracks_all_in_one_place_are_not_all_compared(
     rng = np.random.default_rng(0)
     candidates = [candidate(x, y) for x, y in rng.normal(0.0, 0.3, size=(6_000, 2)).tolist()]
     tracks = states([(x, y) for x, y in rng.normal(0.0, 0.3, size=(6_000, 2)).tolist()])
-    found: list[assignment.Assignment] = []
+    found: list[associations.Assignment] = []
     peak = peak_bytes(lambda: found.append(association(candidates, tracks)))
     assert peak < 250 * MB, f"{peak / MB:.0f} MB"
     assert len(found[0].pairs) > 5_000

@@ -5,8 +5,7 @@ from dataclasses import replace
 import pytest
 
 from fgtrack.core.types import EgoState
-from fgtrack.tracking.ego import EgoTrajectory
-from fgtrack.tracking.ego_continuity import CONTRADICTS, Continuity
+from fgtrack.tracking.ego import CONTRADICTS, Continuity, EgoTrajectory
 
 MS = 1_000_000
 SPEED_MPS = 60.0
@@ -28,7 +27,7 @@ def judged(states: list[EgoState]) -> tuple[list[EgoState], int, int]:
     """What is taken, how many are left out, how many jumps there are."""
     continuity, taken, left_out = Continuity(), list[EgoState](), 0
     for ego in states:
-        found, reason = continuity.judged(ego)
+        found, reason = continuity.accepted(ego)
         taken += found
         left_out += reason == CONTRADICTS
     return taken, left_out, continuity.jumps

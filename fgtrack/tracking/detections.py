@@ -22,7 +22,7 @@ _VALUES = attrgetter(*MEASURABLE)
 _FEW = 6  # so many points are moved faster one by one
 
 
-class Located(NamedTuple):
+class MapDetections(NamedTuple):
     """Detections with their components in the map frame."""
 
     indices: IntArray
@@ -41,11 +41,11 @@ class Located(NamedTuple):
         x_m = self.points_m[:, 0]
         return np.asarray((x_m == x_m).nonzero()[0])  # NaN is not equal to itself
 
-    def at(self, rows: IntArray | BoolArray) -> "Located":
+    def at(self, rows: IntArray | BoolArray) -> "MapDetections":
         """Return the detections at `rows`."""
         chosen = np.arange(len(self.indices))[rows].tolist()
         detections = [self.detections[row] for row in chosen]
-        return Located(self.indices[rows], detections, self.values[rows], self.points_m[rows], self.map_yaw[rows])
+        return MapDetections(self.indices[rows], detections, self.values[rows], self.points_m[rows], self.map_yaw[rows])
 
     def kinds(self) -> list[tuple[int, ...]]:
         """Columns of the components that each has."""
@@ -59,7 +59,7 @@ class Located(NamedTuple):
         return list(map(tuple, found))
 
 
-def located(batch: Batch, sensor: SensorModel, pose: SensorPose) -> Located:
+def in_map_frame(batch: Batch, sensor: SensorModel, pose: SensorPose) -> MapDetections:
     """The detections of `batch`, what `sensor` measures of them, seen from `pose`."""
     detections = [batch.message.objects[index] for index in batch.indices]
     values = np.full((len(detections), len(COMPONENTS)), np.nan)
@@ -80,10 +80,10 @@ def located(batch: Batch, sensor: SensorModel, pose: SensorPose) -> Located:
             range_m * np.cos(bearing_rad), range_m * np.sin(bearing_rad), pose
         )
     none = np.zeros(len(detections), dtype=bool)
-    return Located(np.array(batch.indices, dtype=np.int64), detections, values, points_m, none)
+    return MapDetections(np.array(batch.indices, dtype=np.int64), detections, values, points_m, none)
 
 
-def move_back(items: Located, pose: SensorPose, by_m: float) -> None:
+def move_back(items: MapDetections, pose: SensorPose, by_m: float) -> None:
     """Move all positions away from the sensor at `pose` by `by_m`, along the line of sight."""
     offsets_m = items.points_m - np.array([pose.x_m, pose.y_m])
     ranges_m = np.hypot(offsets_m[:, 0], offsets_m[:, 1])
@@ -93,7 +93,7 @@ def move_back(items: Located, pose: SensorPose, by_m: float) -> None:
     items.values[:, RANGE] += by_m
 
 
-def take_map_yaw(items: Located, rows: IntArray | slice, yaw_rad: FloatArray) -> None:
+def take_map_yaw(items: MapDetections, rows: IntArray | slice, yaw_rad: FloatArray) -> None:
     """Give those of `rows` that have no yaw that of the map, shape (m,)."""
     given = items.values[rows, YAW]
     lack = given != given  # NaN is not equal to itself
@@ -104,7 +104,7 @@ def take_map_yaw(items: Located, rows: IntArray | slice, yaw_rad: FloatArray) ->
 
 
 def covariances(
-    items: Located, names: tuple[str, ...], frame: Frame, sensor: SensorModel, pose: SensorPose
+    items: MapDetections, names: tuple[str, ...], frame: Frame, sensor: SensorModel, pose: SensorPose
 ) -> FloatArray:
     """Covariances of `names` in the map, shape (m, k, k): a detection's own where it has one, else the sensor's R.
 
