@@ -126,7 +126,7 @@ def predict(
 
     Shapes (..., n) and (..., n, n); `dt_s` a number or of shape (...).
     """
-    return predict_all(mean, covariance, motion, dt_s)[:2]
+    return predict_across(mean, covariance, motion, dt_s)[:2]
 
 
 def correct(
@@ -187,28 +187,13 @@ class OneCorrection(NamedTuple):
     """Covariance of the innovation, shape (k, k), before any loss."""
 
 
-def predict_one(
-    mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: float
-) -> tuple[FloatArray, FloatArray]:
-    """`predict` of one state, shapes (n,) and (n, n), without the price of a stack."""
-    return predict_across(mean, covariance, motion, dt_s)[:2]
-
-
-def predict_across(mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: float) -> Prediction:
-    """`predict_one`, and the cross-covariance of both states, which is half way to the covariance."""
-    after, F, Q = motion.step(mean.tolist(), dt_s)
-    return _predicted(np.array(after), F, Q, covariance)
-
-
-def predict_all(mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: FloatArray | float) -> Prediction:
-    """`predict_across` of a stack of states, shapes (..., n) and (..., n, n); `dt_s` a number or of shape (...)."""
-    after, F, Q = motion.steps(mean, np.broadcast_to(np.float64(dt_s), mean.shape[:-1]))
-    return _predicted(after, F, Q, covariance)
-
-
-def _predicted(mean: FloatArray, F: FloatArray, Q: FloatArray, P: FloatArray) -> Prediction:
-    FP = product(F, P)
-    return Prediction(mean, symmetrise(times_transposed(FP, F) + Q), FP)
+def predict_across(
+    mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: FloatArray | float
+) -> Prediction:
+    """`predict`, and the cross-covariance of both states, which is half way to the covariance."""
+    after, F, Q = motion.transition(mean, dt_s)
+    FP = product(F, covariance)
+    return Prediction(after, symmetrise(times_transposed(FP, F) + Q), FP)
 
 
 class Update(NamedTuple):

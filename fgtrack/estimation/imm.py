@@ -13,7 +13,7 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Order, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.ekf import OneCorrection, Prediction, correct_one, predict_one
+from fgtrack.estimation.ekf import OneCorrection, Prediction, correct_one, predict
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.propagation import wrapped
 from fgtrack.estimation.recursion import EkfRecursion
@@ -176,7 +176,7 @@ class ImmReplay(ReplayingFilter):
         probabilities = joint.sum(axis=0)
         means, covariances = [], []
         for model, shares, total in zip(self._models, joint.T, probabilities, strict=True):
-            mean, covariance = predict_one(*self._moments(old, shares / total, model), model, dt_s)
+            mean, covariance = predict(*self._moments(old, shares / total, model), model, dt_s)
             means.append(mean)
             covariances.append(covariance)
         return Mixture(tuple(means), tuple(covariances), probabilities)

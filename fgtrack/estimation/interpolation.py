@@ -1,6 +1,5 @@
 """The state between two stamps of a Markov chain, under the motion model."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,46 +17,26 @@ class Between(NamedTuple):
     """
 
     mean: FloatArray
-    """Shape (n,)."""
+    """Shape (..., n)."""
     Lambda: FloatArray
-    """Shape (n, n)."""
+    """Shape (..., n, n)."""
     Psi: FloatArray
-    """Shape (n, n)."""
+    """Shape (..., n, n)."""
     Sigma: FloatArray
-    """Shape (n, n)."""
+    """Shape (..., n, n)."""
 
 
-def between(motion: MotionModel, left: Sequence[float], right: FloatArray, until_s: float, after_s: float) -> Between:
-    """State `until_s` after a node with mean `left` (n,) and `after_s` before one with mean `right` (n,).
+def between(
+    motion: MotionModel, left: FloatArray, right: FloatArray, until_s: float | FloatArray, after_s: float | FloatArray
+) -> Between:
+    """State `until_s` after a node with mean `left` (..., n) and `after_s` before one with mean `right` (..., n).
 
     With F1, Q1 until the stamp and F2, Q2 after it, the node on the right is a measurement F2 x + N(0, Q2) of a state
     with covariance Q1, and Psi its gain; Lambda = F1 - Psi F2 F1, Sigma = Q1 - Psi F2 Q1. The motion is linearised at
     `left`.
     """
-    first = motion.step(left, until_s)
-    second = motion.step(first.mean, after_s)
-    return _given(np.asarray(first.mean), first.F, first.Q, np.asarray(second.mean), second.F, second.Q, right)
-
-
-def between_all(
-    motion: MotionModel, left: FloatArray, right: FloatArray, until_s: FloatArray, after_s: FloatArray
-) -> Between:
-    """`between` of m pairs of neighbours, shapes (m, n) and (m,): stacks of its arrays."""
-    first = motion.steps(left, until_s)
-    second = motion.steps(first.mean, after_s)
-    return _given(*first, *second, right)
-
-
-def _given(
-    first: FloatArray,
-    F1: FloatArray,
-    Q1: FloatArray,
-    second: FloatArray,
-    F2: FloatArray,
-    Q2: FloatArray,
-    right: FloatArray,
-) -> Between:
-    """See `between`."""
+    first, F1, Q1 = motion.transition(left, until_s)
+    second, F2, Q2 = motion.transition(first, after_s)
     try:
         Psi, _ = kalman_gain(Q1, F2, Q2)
     except np.linalg.LinAlgError:  # of noise that leaves out a direction

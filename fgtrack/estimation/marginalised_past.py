@@ -99,7 +99,7 @@ class MarginalisedPast:
         a term that cannot be fused.
         """
         dt_s = seconds(next_ns - self._stamp_ns)
-        step = self._motion.step(mean.tolist(), dt_s)
+        step = self._motion.transition(mean, dt_s)
         filtered, P = self.prior.mean, self.prior.covariance
         for y, H, R in [_weighed(term, mean) for term in terms]:
             K, _ = kalman_gain(P, H, R)
@@ -169,7 +169,7 @@ class MarginalisedPast:
             (self._stamp_ns, self._origin) if last else (self._ring[place + 1].stamp_ns, self._ring[place + 1].mean)
         )
         until_s, after_s = seconds(stamp_ns - left.stamp_ns), seconds(right_ns - stamp_ns)
-        inner = between(self._motion, left.mean.tolist(), right, until_s, after_s)
+        inner = between(self._motion, left.mean, right, until_s, after_s)
         A = inner.Lambda @ left.A + inner.Psi
         C = propagated(inner.Lambda, left.C, inner.Sigma)
         b = inner.Lambda @ left.b

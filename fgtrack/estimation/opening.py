@@ -144,8 +144,8 @@ class Opening:
         for stamp_ns, measurement in wanted:
             predicted = Prediction(x, P, P)
             if stamp_ns > at_ns:
-                step = self.motion.step(nominal.tolist(), seconds(stamp_ns - at_ns))
-                moved = np.array(step.mean)
+                step = self.motion.transition(nominal, seconds(stamp_ns - at_ns))
+                moved = step.mean
                 predicted = Prediction(
                     moved + step.F @ (x - nominal), propagated(step.F, P, step.Q), product(step.F, P)
                 )

@@ -9,7 +9,7 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.ekf import Prediction, predict_all
+from fgtrack.estimation.ekf import Prediction, predict_across
 from fgtrack.estimation.initiation import DEFAULT, checked_initiation, sought
 from fgtrack.estimation.present import PresentStates
 from fgtrack.estimation.propagation import wrapped
@@ -226,7 +226,7 @@ class ReplayBank:
         order = self._steps.order
         before = order.at(tracks, places)
         dt_s = (stamps_ns - order.stamps_ns[tracks, places]) / NS_PER_S
-        return predict_all(self._steps.mean[before], self._steps.covariance[before], self._motion, dt_s)
+        return predict_across(self._steps.mean[before], self._steps.covariance[before], self._motion, dt_s)
 
     # --- updates
 
@@ -289,7 +289,7 @@ class ReplayBank:
             blank = predicted.at(slice(late))
             means = np.concatenate([blank.mean, mean[:late]])
             covariances = np.concatenate([blank.covariance, covariance[:late]])
-            both = predict_all(means, covariances, self._motion, np.tile(later.after_s[0], 2))
+            both = predict_across(means, covariances, self._motion, np.tile(later.after_s[0], 2))
             unaware, ahead = both.at(slice(late)), both.at(slice(late, None))
             found = self._retrodicted(blank, unaware, later)
             said += self._steps.innovations(numbers[:late], *found)
@@ -324,7 +324,7 @@ class ReplayBank:
             m = len(numbers)
             if done:
                 _, mean, covariance, _ = done[-1]
-                ahead = predict_all(mean[:m], covariance[:m], self._motion, after_s)
+                ahead = predict_across(mean[:m], covariance[:m], self._motion, after_s)
             mean, covariance, _ = self._corrected(numbers, ahead)
             done.append((numbers, mean, covariance, ahead))
         return done

@@ -5,8 +5,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from typing import NamedTuple, Self
 
-import numpy as np
-
 from fgtrack.core.linalg import mahalanobis_squared
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
@@ -69,8 +67,8 @@ def linearised(term: MeasurementTerm, x: FloatArray) -> Linearised:
     if isinstance(term, EquivalentMeasurement):
         return Linearised(term.y - term.H @ (x - term.origin), term.H, term.R)
     if isinstance(term, NearMeasurement):
-        there, F = term.motion.flow(x.tolist(), term.ahead_s)
-        y, H = ekf.linearised(term.z, np.array(there), term.model, term.pose)
+        there, F = term.motion.predict(x, term.ahead_s), term.motion.jacobian(x, term.ahead_s)
+        y, H = ekf.linearised(term.z, there, term.model, term.pose)
         return Linearised(y, H @ F, term.R)
     return Linearised(*ekf.linearised(term.z, x, term.model, term.pose), term.R)
 

@@ -107,7 +107,7 @@ class UkfRecursion(EkfRecursion):
             return super().predict(mean, covariance, dt_s)
         after, A, noise = motion_regression(self._motion, mean, covariance, dt_s)
         AP = product(A, covariance)
-        Q = self._motion.step(mean.tolist(), dt_s).Q
+        Q = self._motion.process_noise(mean, dt_s)
         return Prediction(after, symmetrise(product(AP, A.T) + noise + Q), AP)
 
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:

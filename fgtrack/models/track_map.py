@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from fgtrack.core.checks import LARGEST
@@ -15,7 +16,6 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.models.arc import ComplexArray
 
 #: Columns of a map file, in order. The normal points to the right of the driving direction.
 COLUMNS = (
@@ -267,7 +267,7 @@ class TrackMap:
         return centre, np.ascontiguousarray(points.T), 0.5 * np.vecdot(points, points)
 
 
-def _complex(vectors: FloatArray) -> ComplexArray:
+def _complex(vectors: FloatArray) -> npt.NDArray[np.complex128]:
     """x + i y of `vectors`, shape (n, 2)."""
     return np.ascontiguousarray(vectors).view(np.complex128)[:, 0]
 

@@ -105,28 +105,16 @@ def _refuses_noise_of_a_negative_duration(model: MotionModel, x: FloatArray, dt_
     return "process_noise accepts it; let self.forward(dt_s) check it"
 
 
-def _steps_one_state_as_it_predicts_arrays(model: MotionModel, x: FloatArray, dt_s: float) -> str | None:
-    step, (mean, F) = model.step(x.tolist(), dt_s), model.flow(x.tolist(), dt_s)
-    return (
-        apart(np.array(step.mean), model.predict(x, dt_s), 1e-9, "the mean of step")
-        or apart(step.F, model.jacobian(x, dt_s), 1e-9, "F of step")
-        or apart(step.Q, model.process_noise(x, dt_s), 1e-9, "Q of step")
-        or apart(np.array(mean), np.array(step.mean), 1e-15, "the mean of flow")
-        or apart(F, step.F, 1e-15, "F of flow")
-    )
-
-
-def _steps_many_states_as_it_predicts_arrays(model: MotionModel, x: FloatArray, dt_s: float) -> str | None:
-    """Of several numbers of states, of which models may take different ways; each state and duration is another one."""
-    for count in (1, 2, 3, 24):
-        states = x + 0.05 * np.linspace(0.0, 1.0, count)[:, None] * np.cos(np.arange(model.dim))
-        for durations_s in (np.full(count, dt_s), np.linspace(0.1, 1.0, count) * dt_s):
-            mean, F, Q = model.steps(states, durations_s)
-            wrong = (
-                apart(mean, model.predict(states, durations_s), 1e-9, f"the mean of steps of {count} states")
-                or apart(F, model.jacobian(states, durations_s), 1e-9, f"F of steps of {count} states")
-                or apart(Q, model.process_noise(states, durations_s), 1e-9, f"Q of steps of {count} states")
-            )
+def _has_the_transition_of_its_functions(model: MotionModel, x: FloatArray, dt_s: float) -> str | None:
+    """Of one state and of several numbers of states, each with another duration."""
+    counts = 1, 2, 3, 24
+    cases: list[tuple[FloatArray, float | FloatArray]] = [(x, dt_s)]
+    cases += [(x + 0.05 * np.linspace(0.0, 1.0, m)[:, None], np.linspace(0.1, 1.0, m) * dt_s) for m in counts]
+    for states, durations_s in cases:
+        found = model.transition(states, durations_s)
+        functions = model.predict, model.jacobian, model.process_noise
+        for name, part, function in zip(found._fields, found, functions, strict=True):
+            wrong = apart(part, function(states, durations_s), 1e-9, f"{name} of the transition of {states.shape}")
             if wrong:
                 return wrong
     return None
@@ -160,8 +148,7 @@ _CHECKS: tuple[ModelCheck, ...] = (
     _has_noise_that_composes,
     _has_noise_that_is_symmetric_and_positive_definite,
     _refuses_noise_of_a_negative_duration,
-    _steps_one_state_as_it_predicts_arrays,
-    _steps_many_states_as_it_predicts_arrays,
+    _has_the_transition_of_its_functions,
     _takes_arrays_of_states_and_durations,
     _keeps_its_inputs,
 )

@@ -1,6 +1,5 @@
 """What is wrong in a nonlinear model alone, with several objects, or in what is handed out, is found out as well."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,12 +10,12 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.banded.smoother import BandedSmoother
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult
-from fgtrack.estimation.ekf import innovation_one, predict_one
+from fgtrack.estimation.ekf import innovation_one, predict
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.propagation import track_state
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import MeasurementModel
-from fgtrack.models.motion import CTRV, MotionModel, Step
+from fgtrack.models.motion import CTRV, MotionModel, Transition
 from fgtrack.testing import BrokenPromiseError, check_estimator, estimator_checks
 
 NEAR = "comes near the posterior of a nonlinear model"
@@ -73,15 +72,15 @@ class NineFold(CTRV):
     def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         return 9.0 * super().process_noise(x, dt_s)
 
-    def step(self, x: Sequence[float], dt_s: float) -> Step:
-        found = super().step(x, dt_s)
+    def transition(self, x: FloatArray, dt_s: float | FloatArray) -> Transition:
+        found = super().transition(x, dt_s)
         return found._replace(Q=9.0 * found.Q)
 
 
 class WrongWay(CTRV):
-    def step(self, x: Sequence[float], dt_s: float) -> Step:
-        found = super().step(x, dt_s)
-        found.F[:2, [2, 4]] *= -1.0
+    def transition(self, x: FloatArray, dt_s: float | FloatArray) -> Transition:
+        found = super().transition(x, dt_s)
+        found.F[..., :2, [2, 4]] *= -1.0
         return found
 
 
@@ -99,7 +98,7 @@ class Believes(Sees):
         state = super().state_at(min(stamp_ns, newest_ns))
         if stamp_ns <= newest_ns:
             return state
-        ahead = predict_one(state.mean, state.covariance, self._right, seconds(stamp_ns - newest_ns))
+        ahead = predict(state.mean, state.covariance, self._right, seconds(stamp_ns - newest_ns))
         return track_state(self._right, stamp_ns, *ahead)
 
 

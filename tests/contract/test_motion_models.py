@@ -5,7 +5,7 @@ import pytest
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.registry import MOTION_MODELS
-from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel, Steps
+from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel, Transition
 from fgtrack.testing import BrokenPromiseError, check_motion_model, motion_model_checks
 
 
@@ -42,12 +42,6 @@ class _SaysLinear(CTRV):
 class _Forwards(CV):
     def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         return super().process_noise(x, np.abs(dt_s))
-
-
-class _OtherStep(CTRV):
-    def flow(self, x, dt_s):
-        mean, F = super().flow(x, dt_s)
-        return [mean[0] + 0.1, *mean[1:]], F
 
 
 class _Lopsided(CV):
@@ -102,16 +96,10 @@ class _NegativeStart(CTRA):
         return -3.0
 
 
-class _OtherSteps(CV):
-    def steps(self, x: FloatArray, dt_s: FloatArray) -> Steps:
-        mean, F, Q = super().steps(x, dt_s)
-        return Steps(mean + 1.0, 2.0 * F, -Q)
-
-
-class _OtherNoiseOfMany(CTRV):
-    def steps(self, x: FloatArray, dt_s: FloatArray) -> Steps:
-        mean, F, Q = super().steps(x, dt_s)
-        return Steps(mean, F, Q * (2.0 if len(x) > 3 else 1.0))
+class _OtherTransitionOfMany(CTRV):
+    def transition(self, x: FloatArray, dt_s: float | FloatArray) -> Transition:
+        found = super().transition(x, dt_s)
+        return found._replace(Q=found.Q * (2.0 if len(x) > 3 else 1.0))
 
 
 class _NegativeBeyondHalfASecond(CTRV):
@@ -129,7 +117,6 @@ class _NegativeBeyondHalfASecond(CTRV):
         (_InPlace(), "keeps its inputs"),
         (_SaysLinear(), "has the same jacobian everywhere if linear"),
         (_Forwards(), "refuses noise of a negative duration"),
-        (_OtherStep(), "steps one state as it predicts arrays"),
         (_Lopsided(), "has noise that is symmetric and positive definite"),
         (_Jumps(), "flows on where it stopped"),
         (_Polar(), "has a state that measurements know"),
@@ -140,8 +127,7 @@ class _NegativeBeyondHalfASecond(CTRV):
         (_NegativeBirth(), "is as it was after a kinematic state"),
         (_NegativeBirth(), "begins with a sound covariance"),
         (_NegativeStart(), "begins with a sound covariance"),
-        (_OtherSteps(), "steps many states as it predicts arrays"),
-        (_OtherNoiseOfMany(), "steps many states as it predicts arrays"),
+        (_OtherTransitionOfMany(), "has the transition of its functions"),
         (_NegativeBeyondHalfASecond(), "has noise that is symmetric and positive definite"),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, MotionModel) else "",
@@ -155,4 +141,4 @@ def test_a_broken_model_is_found_out_by_the_promise_that_it_breaks(model: Motion
 def test_all_that_is_broken_is_said_at_once() -> None:
     with pytest.raises(BrokenPromiseError) as error:
         check_motion_model(_WrongJacobian())
-    assert set(error.value.promises) >= {"has the jacobian of its prediction", "steps one state as it predicts arrays"}
+    assert set(error.value.promises) >= {"has the jacobian of its prediction", "has the transition of its functions"}

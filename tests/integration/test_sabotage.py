@@ -1,7 +1,7 @@
 """Whatever an estimator or a motion model does, what is published is sound, the run goes on, and says what failed."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -260,14 +260,8 @@ class Rotten(CTRV):
         Q = self._spoilt("has negative noise", x, dt_s, Q, -1e3)
         return self._spoilt("has endless noise", x, dt_s, self._spoilt("has no noise", x, dt_s, Q, np.nan), 1e308)
 
-    def flow(self, x: Sequence[float], dt_s: float) -> tuple[list[float], FloatArray]:
-        return MotionModel.flow(self, x, dt_s)
-
-    def step(self, x: Sequence[float], dt_s: float) -> Any:
-        return MotionModel.step(self, x, dt_s)
-
-    def steps(self, x: FloatArray, dt_s: FloatArray) -> Any:
-        return MotionModel.steps(self, x, dt_s)
+    def transition(self, x: FloatArray, dt_s: float | FloatArray) -> Any:
+        return MotionModel.transition(self, x, dt_s)
 
 
 ROTTEN = (

@@ -9,8 +9,8 @@ from support import oracle_measurements
 from support.oracle_models import MODEL_TOLERANCE, model_differences
 
 from fgtrack.core.types import FloatArray
-from fgtrack.models import arc, measurement
-from fgtrack.models.motion import CTRV, MotionModel, Steps
+from fgtrack.models import measurement
+from fgtrack.models.motion import CTRV, MotionModel, WhiteNoise
 from fgtrack.testing.references import Difference
 
 Break = Callable[[pytest.MonkeyPatch], None]
@@ -38,22 +38,13 @@ def method(kind: type, name: str, change: Callable[..., Any]) -> Break:
     return lambda patch: patch.setattr(kind, name, lambda self, *given: change(right(self, *given), self, *given))
 
 
-def reversed_beyond_4_rad(patch: pytest.MonkeyPatch) -> None:
-    def moments(x: FloatArray, t: FloatArray) -> tuple[Any, ...]:
-        far = np.abs(x[..., 4] * t) > 4.0
-        return tuple(np.where(far, -each, each) for each in arc.heading_moments(x, t))
-
-    patch.setattr("fgtrack.models.motion.heading_moments", moments)
-
-
 def densities_of_yaw_as_they_ever_were(patch: pytest.MonkeyPatch) -> None:
-    usual, right = CTRV(), CTRV._densities.func
+    usual, right = CTRV()._density, WhiteNoise._density.func
 
-    def wrong(self: CTRV) -> tuple[float, ...]:
-        position, _, speed, _, accel = right(self)
-        return position, usual.yaw_density_rad2ps, speed, usual.yaw_rate_density_rad2ps3, accel
+    def wrong(self: CTRV) -> FloatArray:
+        return np.where(np.isin(np.arange(self.dim), [2, 4]), np.resize(usual, self.dim), right(self))
 
-    patch.setattr(CTRV, "_densities", property(wrong))
+    patch.setattr(CTRV, "_density", property(wrong))
 
 
 def bearings_off(patch: pytest.MonkeyPatch) -> None:
@@ -77,16 +68,11 @@ BROKEN: dict[str, Break] = {
     "Jacobian of a curvature is no number": component("curvature_radpm", False, by_yaw_rate=no_number),
     "Cartesian yaw is no number": component("yaw_rad", True, value=no_number),
     "densities of yaw that are set are not used": densities_of_yaw_as_they_ever_were,
-    "displacement reversed beyond 4 rad": reversed_beyond_4_rad,
     "published covariance of a Cartesian state": method(MotionModel, "kinematic", shown_too_sure),
     "covariance of a birth": method(MotionModel, "from_kinematic", lambda found, *_: (found[0], 2.0 * found[1])),
     "derivative by the pose": method(measurement.MeasurementModel, "pose_jacobian", lambda found, *_: -3.0 * found),
     "derivative of a position": bearings_off,
-    "noise of many states": method(
-        CTRV, "steps", lambda found, _, x, *t: Steps(found.mean, found.F, found.Q * (2.0 if len(x) > 2 else 1.0))
-    ),
     "Jacobian back in time": method(CTRV, "jacobian", lambda F, _, x, t: F * np.where(np.min(t) < 0.0, 2.0, 1.0)),
-    "flow back in time": method(CTRV, "flow", lambda found, _, x, t: (found[0], found[1] * (2.0 if t < 0.0 else 1.0))),
 }
 
 

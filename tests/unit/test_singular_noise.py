@@ -42,7 +42,7 @@ def test_smoothers_agree_without_noise_of_some_component(without: tuple[str, ...
 
 
 def test_noise_that_is_regular_is_taken_as_it_is() -> None:
-    Q = np.stack([CTRV().step([0.0, 0.0, 0.3, speed, 0.1], 0.1).Q for speed in (0.0, 5.0)])
+    Q = CTRV().process_noise(np.array([[0.0, 0.0, 0.3, speed, 0.1] for speed in (0.0, 5.0)]), 0.1)
     np.testing.assert_array_equal(noise_roots(Q), inverse_roots(Q))
     with pytest.raises(np.linalg.LinAlgError):
         noise_roots(np.array([[1.0, 2.0], [2.0, 1.0]]))

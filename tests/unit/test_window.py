@@ -227,7 +227,7 @@ def test_the_state_between_two_nodes_is_the_conditional_of_the_joint(
     gain = np.linalg.solve(outer, cross.T).T
     right = kind.predict(middle, after_s) + 0.1 * rng.standard_normal(n)
 
-    found = between(kind, left.tolist(), right, until_s, after_s)
+    found = between(kind, left, right, until_s, after_s)
     scale = np.abs(gain).max()
     np.testing.assert_allclose(np.hstack([found.Lambda, found.Psi]), gain, atol=1e-6 * scale)
     np.testing.assert_allclose(found.Sigma, M - gain @ cross.T, atol=1e-7 * np.abs(M).max())
@@ -239,7 +239,7 @@ def test_the_state_between_two_nodes_is_the_conditional_of_the_joint(
 def test_at_its_ends_the_state_between_two_nodes_is_theirs(kind: MotionModel) -> None:
     left = np.array([12.0, 7.0, 0.4, 20.0, 0.3, 1.5])[: kind.dim]
     right = kind.predict(left, 0.3) + 0.1
-    at_left, at_right = (between(kind, left.tolist(), right, *times) for times in ((0.0, 0.3), (0.3, 0.0)))
+    at_left, at_right = (between(kind, left, right, *times) for times in ((0.0, 0.3), (0.3, 0.0)))
     np.testing.assert_allclose(at_left.mean, left, atol=1e-9)
     np.testing.assert_allclose(at_left.Lambda, np.eye(kind.dim), atol=1e-9)
     np.testing.assert_allclose(at_right.mean, right, atol=1e-9)

@@ -5,12 +5,9 @@ the gain and the covariance of the Rauch-Tung-Striebel smoother. No process nois
 stamps 1 us apart. Arguments are those arrays of `Nodes` that have their names.
 """
 
-from collections.abc import Callable
-from typing import Any
-
-import numba
 import numpy as np
 
+from fgtrack.core.compiled import inlined, njit
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
 #: Where a measurement leaves less than this of a variance, the short form of its update keeps too few digits.
@@ -19,23 +16,7 @@ TRACKS, ORDER, VECTORS, MATRICES = "int64[::1]", "int64[:, ::1]", "float64[:, ::
 _WINDOWS = f"{TRACKS}, {TRACKS}, {ORDER}"  # first, count, numbers
 
 
-# Any: numba has no types.
-def njit(signature: str) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that compiles a function once: it is stored in a cache folder, if one can be written."""
-
-    def compiled(function: Callable[..., Any]) -> Any:
-        try:
-            return numba.njit(signature, cache=True, error_model="numpy")(function)
-        except RuntimeError:  # no folder to store it in
-            return numba.njit(signature, error_model="numpy")(function)
-
-    return compiled
-
-
-_inlined = numba.njit(error_model="numpy")
-
-
-@_inlined
+@inlined
 def _congruence(A: FloatArray, B: FloatArray, product: FloatArray, found: FloatArray) -> None:
     """Add A B A' to the lower triangle of `found`."""
     n = A.shape[0]
@@ -52,7 +33,7 @@ def _congruence(A: FloatArray, B: FloatArray, product: FloatArray, found: FloatA
             found[i, j] = value
 
 
-@_inlined
+@inlined
 def _mirror(lower: FloatArray) -> None:
     """Write the lower triangle above the diagonal."""
     for i in range(lower.shape[0]):
@@ -60,7 +41,7 @@ def _mirror(lower: FloatArray) -> None:
             lower[j, i] = lower[i, j]
 
 
-@_inlined
+@inlined
 def _solve(matrix: FloatArray, rhs: FloatArray) -> bool:
     """Gaussian elimination with pivots, as LAPACK's gesv; the solution replaces `rhs`. False if there is none."""
     n = matrix.shape[0]
@@ -90,7 +71,7 @@ def _solve(matrix: FloatArray, rhs: FloatArray) -> bool:
     return True
 
 
-@_inlined
+@inlined
 def _predict(left: FloatArray, segment: FloatArray, origin: FloatArray, moved: FloatArray, ahead: FloatArray) -> None:
     """[F P F' + Q | F x + f - x0] to `ahead`, and F P to `moved`."""
     n = len(origin)
@@ -105,7 +86,7 @@ def _predict(left: FloatArray, segment: FloatArray, origin: FloatArray, moved: F
     _mirror(ahead[:, :n])
 
 
-@_inlined
+@inlined
 def _condition(
     left: FloatArray,
     segment: FloatArray,
@@ -138,7 +119,7 @@ def _condition(
     return True
 
 
-@_inlined
+@inlined
 def _correct(
     state: FloatArray, row: FloatArray, gain: FloatArray, E: FloatArray, P: FloatArray, product: FloatArray
 ) -> None:

@@ -27,7 +27,7 @@ def linearise_segments(nodes: Nodes, motion: MotionModel, tracks: IntArray, plac
             return
     dt_s = (nodes.stamps_ns[tracks, places + 1] - nodes.stamps_ns[tracks, places]) / NS_PER_S
     numbers = nodes.at(tracks, places)
-    ahead, F, Q = motion.steps(nodes.origin[numbers], dt_s)
+    ahead, F, Q = motion.transition(nodes.origin[numbers], dt_s)
     nodes.segment[numbers] = np.concatenate([F, Q, ahead[..., None]], axis=-1)
 
 

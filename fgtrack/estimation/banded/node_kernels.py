@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from fgtrack.core.compiled import njit
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.banded.kernels import MATRICES, ORDER, TRACKS, VECTORS, njit
+from fgtrack.estimation.banded.kernels import MATRICES, ORDER, TRACKS, VECTORS
 
 
 @njit(f"void(int64[:], int64[:], {ORDER}, {TRACKS}, {TRACKS})")

@@ -18,7 +18,7 @@ from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.ekf import propagated
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.initiation import Fix, Line, along, fixes_of
-from fgtrack.estimation.interpolation import between_all
+from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.smoother_settings import SmootherSettings
 from fgtrack.estimation.terms import EquivalentMeasurement, curved, overshot
 from fgtrack.estimation.whitening import Innovations
@@ -109,7 +109,7 @@ class Windows:
 
     def _ahead(self, means: FloatArray, covariances: FloatArray, until_ns: IntArray) -> States:
         """States so long after those of the newest nodes."""
-        means, F, Q = self._motion.steps(means, until_ns / NS_PER_S)
+        means, F, Q = self._motion.transition(means, until_ns / NS_PER_S)
         return States(means, propagated(F, covariances, Q))
 
     def _between(
@@ -128,7 +128,7 @@ class Windows:
         until_s = (stamps_ns - nodes.stamps_ns[tracks, places - 1]) / NS_PER_S
         after_s = (nodes.stamps_ns[tracks, places] - stamps_ns) / NS_PER_S
         left = nodes.origin[at] + np.matvec(A, steps) + b
-        inner = between_all(self._motion, left, right, until_s, after_s)
+        inner = between(self._motion, left, right, until_s, after_s)
         by_right = inner.Lambda @ A + inner.Psi
         given = congruence(inner.Lambda, nodes.C[at]) + inner.Sigma
         return States(inner.mean, symmetrise(congruence(by_right, P_right) + given))

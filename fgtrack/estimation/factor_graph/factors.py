@@ -35,20 +35,15 @@ def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float, at: F
     `at`, shape (n,), is the linearisation point of `left`. No derivative of Q is taken: where the factor is replaced
     when that point moves, this is Gauss-Newton with reweighting.
     """
-    place = at.tolist()
-    step = motion.step(place, dt_s)
-    mean_there, gradient_there, still = step.mean, -step.F, identity(motion.dim)
+    at = at.copy()
+    step, still = motion.transition(at, dt_s), identity(motion.dim)
 
     def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
-        x = values.atVector(left).tolist()
-        if x == place:  # as in nearly every call
-            mean, gradient = mean_there, gradient_there
-        else:
-            mean, F = motion.flow(x, dt_s)
-            gradient = -F
+        x = values.atVector(left)
+        moved = step if np.array_equal(x, at) else motion.transition(x, dt_s)  # the former in nearly every call
         if jacobians is not None:
-            jacobians[0], jacobians[1] = gradient, still
-        return np.subtract(values.atVector(right), mean)
+            jacobians[0], jacobians[1] = -moved.F, still
+        return np.subtract(values.atVector(right), moved.mean)
 
     return gtsam.CustomFactor(_gaussian(noise_roots(step.Q)), [left, right], error)
 

@@ -56,7 +56,7 @@ class Segment:
         """See `Factor.rows`."""
         if self._rows is None:
             left, right = self._at
-            step = self._motion.step(left.tolist(), self._dt_s)
+            step = self._motion.transition(left, self._dt_s)
             W = noise_roots(step.Q)
             self._rows = Rows(self._keys, (-W.dot(step.F), W), W.dot(np.subtract(step.mean, right)), self._at)
         return self._rows
@@ -71,7 +71,7 @@ class Segment:
         if len(segments) <= _FEW:
             return
         left, right = (np.array([segment._at[side] for segment in segments]) for side in (0, 1))
-        step = segments[0]._motion.steps(left, np.array([segment._dt_s for segment in segments]))
+        step = segments[0]._motion.transition(left, np.array([segment._dt_s for segment in segments]))
         W = noise_roots(step.Q)
         b = np.vecdot(W, (step.mean - right)[:, None])
         for segment, by_left, by_right, ahead in zip(segments, -(W @ step.F), W, b, strict=True):

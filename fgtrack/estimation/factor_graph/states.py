@@ -7,8 +7,8 @@ import numpy as np
 
 from fgtrack.core.linalg import symmetrise
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.ekf import predict_one, propagated
-from fgtrack.estimation.interpolation import between, between_all
+from fgtrack.estimation.ekf import predict, propagated
+from fgtrack.estimation.interpolation import between
 from fgtrack.models.motion import MotionModel
 
 State = tuple[FloatArray, FloatArray]
@@ -36,8 +36,8 @@ def state(motion: MotionModel, around: Around) -> State:
     if until_s == 0.0:
         return mean, symmetrise(covariance)
     if right is None:
-        return predict_one(mean, covariance, motion, until_s)
-    inner = between(motion, mean.tolist(), right, until_s, after_s)
+        return predict(mean, covariance, motion, until_s)
+    inner = between(motion, mean, right, until_s, after_s)
     return inner.mean, propagated(np.concatenate([inner.Lambda, inner.Psi], axis=1), covariance, inner.Sigma)
 
 
@@ -57,7 +57,7 @@ def states(motion: MotionModel, arounds: Sequence[Around]) -> list[State]:
 
 def _ahead(motion: MotionModel, arounds: Sequence[Around]) -> State:
     """Of m windows, shapes (m, n) and (m, n, n)."""
-    step = motion.steps(np.array([each.mean for each in arounds]), np.array([each.until_s for each in arounds]))
+    step = motion.transition(np.array([each.mean for each in arounds]), np.array([each.until_s for each in arounds]))
     return step.mean, propagated(step.F, np.array([each.covariance for each in arounds]), step.Q)
 
 
@@ -65,6 +65,6 @@ def _inner(motion: MotionModel, arounds: Sequence[Around]) -> State:
     """Of m windows, shapes (m, n) and (m, n, n)."""
     mean, right = np.array([each.mean for each in arounds]), np.array([each.right for each in arounds])
     until_s, after_s = np.array([each.until_s for each in arounds]), np.array([each.after_s for each in arounds])
-    inner = between_all(motion, mean, right, until_s, after_s)
+    inner = between(motion, mean, right, until_s, after_s)
     weights = np.concatenate([inner.Lambda, inner.Psi], axis=-1)
     return inner.mean, propagated(weights, np.array([each.covariance for each in arounds]), inner.Sigma)

@@ -7,8 +7,7 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray
 from fgtrack.models.correlated_errors import CorrelatedErrors
-from fgtrack.models.motion import MotionModel
-from fgtrack.models.white_noise import WhiteNoise
+from fgtrack.models.motion import MotionModel, WhiteNoise
 
 
 @dataclass(frozen=True)

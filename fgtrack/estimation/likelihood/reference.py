@@ -85,8 +85,8 @@ def filtered(series: Series, space: NoiseSpace, values: Sequence[float] | FloatA
         since_s = seconds(measurement.stamp_ns - stamp_ns)
         opening = place < series.num_opening
         about = series.nominal[place] if opening else x
-        moved, F, Q = motion.step(about.tolist(), since_s)
-        predicted = np.array(moved) + F @ (x - about)
+        moved, F, Q = motion.transition(about, since_s)
+        predicted = moved + F @ (x - about)
         P = propagated(F, P, Q)
         here, there = list(observation.measured), list(observation.assumed)
         sensor = observation.sensor

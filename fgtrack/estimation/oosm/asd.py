@@ -99,8 +99,7 @@ class AccumulatedStateDensity(WindowedFilter):
         n, (stamps_ns, mean, _) = self._motion.dim, self._stack
         left, until_s = mean[place * n : place * n + n], seconds(stamp_ns - stamps_ns[place])
         if place + 1 == len(stamps_ns):
-            step = self._motion.step(left.tolist(), until_s)
-            return np.array(step.mean), step.F, step.Q
+            return self._motion.transition(left, until_s)
         right, after_s = mean[place * n + n : place * n + 2 * n], seconds(stamps_ns[place + 1] - stamp_ns)
-        inner = between(self._motion, left.tolist(), right, until_s, after_s)
+        inner = between(self._motion, left, right, until_s, after_s)
         return inner.mean, np.hstack((inner.Lambda, inner.Psi)), inner.Sigma

@@ -6,7 +6,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
-from fgtrack.estimation.ekf import predict_one
+from fgtrack.estimation.ekf import predict
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.propagation import track_state
 from fgtrack.estimation.replay import ReplayEkf
@@ -62,7 +62,7 @@ class HeldEkf(ABC):
             return self._ordered.state_at(stamp_ns)
         front = self._ordered.state_at(front_ns)
         dt_s = seconds(stamp_ns - front_ns)
-        return track_state(self._motion, stamp_ns, *predict_one(front.mean, front.covariance, self._motion, dt_s))
+        return track_state(self._motion, stamp_ns, *predict(front.mean, front.covariance, self._motion, dt_s))
 
 
 class DelayedHorizon(HeldEkf):

@@ -9,7 +9,7 @@ from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.ekf import OneCorrection, correct_one, linearised, predict_one, propagated
+from fgtrack.estimation.ekf import OneCorrection, correct_one, linearised, predict, propagated
 from fgtrack.models.motion import MotionModel
 
 
@@ -78,11 +78,11 @@ class History:
         """Mean (n,) and covariance (n, n) at `to_ns` from those at `from_ns`."""
         if from_ns == to_ns:
             return mean, covariance
-        return predict_one(mean, covariance, self._motion, seconds(to_ns - from_ns))
+        return predict(mean, covariance, self._motion, seconds(to_ns - from_ns))
 
     def transition(self, mean: FloatArray, from_ns: int, to_ns: int) -> FloatArray:
         """F(to, from), shape (n, n), at the state `mean` (n,)."""
-        return self._motion.flow(mean.tolist(), seconds(to_ns - from_ns))[1]
+        return self._motion.jacobian(mean, seconds(to_ns - from_ns))
 
     def transition_to(self, place: int) -> FloatArray:
         """F_j, shape (n, n), from the step before `place` to the one there."""

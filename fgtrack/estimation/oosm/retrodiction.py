@@ -2,8 +2,6 @@
 
 from typing import ClassVar
 
-import numpy as np
-
 from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
@@ -29,17 +27,16 @@ def retrodicted(
     Bar-Shalom 2002 for one step, Bar-Shalom, Chen and Mallick 2004 for several taken as one.
     """
     mean, covariance = before
-    origin, _ = motion.flow(now.mean.tolist(), -back_s)
-    Q = motion.step(origin, back_s).Q
+    Q = motion.process_noise(motion.predict(now.mean, -back_s), back_s)
     weighted = psd_solve(covariance, Q)  # P^-1 Q
     gained = covariance - now.covariance
     seen = gained @ weighted  # P H' S^-1 H Q
     P_vv, P_xv, end = Q, Q - seen, now.mean
     if noise_in_state:
         P_vv, end = Q - weighted.T @ seen, now.mean - weighted.T @ (now.mean - mean)
-    start, back = motion.flow(end.tolist(), -back_s)
+    start, back = motion.predict(end, -back_s), motion.jacobian(end, -back_s)
     spread = back @ (now.covariance + P_vv - P_xv - P_xv.T) @ back.T
-    return Past(np.array(start), symmetrise(spread), (now.covariance - P_xv) @ back.T)
+    return Past(start, symmetrise(spread), (now.covariance - P_xv) @ back.T)
 
 
 class _OneLag(CrossingEkf):
@@ -97,6 +94,7 @@ class C(CrossingEkf):
 
     def _past(self, stamp_ns: int) -> Past:
         now = self._history.newest
-        mean, back = self._motion.flow(now.mean.tolist(), seconds(stamp_ns - now.stamp_ns))
+        dt_s = seconds(stamp_ns - now.stamp_ns)
+        mean, back = self._motion.predict(now.mean, dt_s), self._motion.jacobian(now.mean, dt_s)
         cross = now.covariance @ back.T
-        return Past(np.array(mean), symmetrise(back @ cross), cross)
+        return Past(mean, symmetrise(back @ cross), cross)

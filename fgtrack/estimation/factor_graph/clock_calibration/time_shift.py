@@ -54,7 +54,7 @@ class Nodes:
         """The state at `time_ns`, which lies after node `place` and before the next one; else at the nearer one."""
         start_ns, end_ns = self.stamps_ns[place], self.stamps_ns[place + 1]
         inside_ns = min(max(time_ns, start_ns), end_ns)
-        left, right = self.means[place].tolist(), self.means[place + 1]
+        left, right = self.means[place], self.means[place + 1]
         return between(motion, left, right, seconds(inside_ns - start_ns), seconds(end_ns - inside_ns))
 
 
