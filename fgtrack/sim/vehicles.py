@@ -145,9 +145,9 @@ class DrawnVehicle:
         noise = np.empty_like(normals)
         states[0] = [getattr(self, name) for name in STATE_NAMES[: self.motion.dim]]
         for k in range(num_steps):
-            # The covariance is singular where a density is zero: eigenvectors, not Cholesky.
+            # The covariance is singular where a density is zero, so no Cholesky factor; the symmetric root is unique.
             variances, axes = np.linalg.eigh(self.motion.process_noise(states[k], self.step_s))
-            noise[k] = (axes * np.sqrt(np.maximum(variances, 0.0))) @ normals[k]
+            noise[k] = (axes * np.sqrt(np.maximum(variances, 0.0))) @ axes.T @ normals[k]
             states[k + 1] = self.motion.predict(states[k], self.step_s) + noise[k, :, 0]
         return DrawnTrajectory(self, states, noise[:, :, 0], noise[:, :, 1])
 
