@@ -66,7 +66,7 @@ def tuned_text(base: str | Path | None, config: Config, comments: Sequence[str])
 def _text(base: str | Path | None, wanted: Config, comments: Sequence[str], title: str, mark: str) -> str:
     yaml = YAML()
     yaml.preserve_quotes = True
-    yaml.width = 80  # a line ends after the entry that passes it
+    yaml.width = 120
     document, name = CommentedMap(), "the defaults"
     if base is not None:
         source = find_file("configuration", base)
