@@ -1,55 +1,50 @@
 """Writes MCAP files for Foxglove and Lichtblick: log time is when something was known, publish time its stamp."""
 
 import json
-import struct
+import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
+
+from foxglove import messages as sdk
+from mcap.writer import Writer
 
 from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.time import NS_PER_S, nanoseconds
+from fgtrack.core.types import EgoState
 from fgtrack.io.output import Kind, check_output, new_file
-from fgtrack.viewers.foxglove_messages import foxglove_messages
-from fgtrack.viewers.schemas import schema_text
-from fgtrack.viewers.shapes import ViewerMessage
+from fgtrack.viewers.shapes import Entity, Point, Scene, Shape, ViewerMessage
 
-_LIBRARY = "fgtrack"
-_MAGIC = b"\x89MCAP0\r\n"
-_HEADER_START = len(_MAGIC) + 9  # behind opcode and length of the header
-
-
-def _is_export(path: Path) -> bool:
-    """Whether `path` is an MCAP file that fgtrack exported: its header says so."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        start = file.read(64)
-    try:
-        (profile_length,) = struct.unpack_from("<I", start, _HEADER_START)
-        place = _HEADER_START + 4 + profile_length
-        (length,) = struct.unpack_from("<I", start, place)
-    except struct.error:
-        return False
-    return start.startswith(_MAGIC) and start[place + 4 : place + 4 + length] == _LIBRARY.encode()
-
-
-EXPORT = Kind("an MCAP file of `fgtrack export`", _is_export)
+_FILE = Kind("a file", Path.is_file)
+_LONGEST_HEAD_M = 1.5
+#: The rows of `updates.csv` have no message of Foxglove's own.
+_OUTCOME = {
+    "title": "fgtrack.Outcome",
+    "type": "object",
+    "properties": {
+        "header": {"type": "object", "properties": {"stamp": {"type": "object", "title": "time"}}},
+        **{name: {"type": "string"} for name in ("sensor", "disposition")},
+        **{name: {"type": "integer"} for name in ("index", "track_id")},
+        **{name: {"type": "number"} for name in ("delay_s", "nis")},
+    },
+}
 
 
 def check_foxglove(path: Path, overwrite: bool) -> None:
     """Raise `CallError` where `write_foxglove` would before the first message."""
     if path.suffix != ".mcap":
-        raise CallError(f"{path}: viewers know such a file by its name, let it end in .mcap")
-    check_output(path, EXPORT, overwrite)
+        raise CallError(f"{path}: viewers recognise such a file by its name, let it end in .mcap")
+    check_output(path, _FILE, overwrite)
 
 
 def write_foxglove(
     path: Path,
     messages: Iterable[ViewerMessage],
     metadata: Mapping[str, Mapping[str, str]],
-    *,
     overwrite: bool = False,
 ) -> dict[str, int]:
-    """Write `messages`, in the order of their log times, to the MCAP file `path`; gives their number by topic.
+    """Write `messages`, in the order of their log times, to the MCAP file `path`; return their number by topic.
 
     The file appears when it is complete. The same messages give the same bytes. `metadata` are records of the file by
     name.
@@ -57,33 +52,118 @@ def write_foxglove(
     Raises
     ------
     CallError
-        The package `mcap` is missing, the name does not end in `.mcap`, something is at `path`, or it cannot be
-        written.
+        The name does not end in `.mcap`, something is at `path`, or it cannot be written.
     DataError
         The disk is full, or a time lies before 1970.
     """
     check_foxglove(path, overwrite)
-    from mcap.writer import Writer
-
     channels: dict[str, int] = {}
-    schemas: dict[str, int] = {}
     counts: Counter[str] = Counter()
-    with new_file(path, EXPORT, overwrite) as file:
+    with new_file(path, _FILE, overwrite) as file:
         writer = Writer(file)
-        writer.start(library=_LIBRARY)
+        writer.start(library="fgtrack")
         for name, entries in metadata.items():
             writer.add_metadata(name, dict(entries))
         for message in messages:
-            log_ns, stamp_ns = message.log_ns, message.stamp_ns
-            if min(log_ns, stamp_ns) < 0:
-                raise DataError(f"the time {min(log_ns, stamp_ns)} ns lies before 1970, which no MCAP file holds")
-            for topic, schema, value in foxglove_messages(message):
+            if min(message.log_ns, message.stamp_ns) < 0:
+                early_ns = min(message.log_ns, message.stamp_ns)
+                raise DataError(f"the time {early_ns} ns lies before 1970, which no MCAP file holds")
+            for topic, value in values(message):
+                is_own = isinstance(value, dict)
                 if topic not in channels:
-                    if schema not in schemas:
-                        schemas[schema] = writer.register_schema(schema, "jsonschema", schema_text(schema))
-                    channels[topic] = writer.register_channel(topic, "json", schemas[schema])
-                data = json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
-                writer.add_message(channels[topic], log_ns, data, stamp_ns, counts[topic])
+                    name, encoding, schema = (
+                        ("fgtrack.Outcome", "jsonschema", json.dumps(_OUTCOME).encode())
+                        if is_own
+                        else ((found := value.get_schema()).name, found.encoding, found.data)
+                    )
+                    schema_id = writer.register_schema(name, encoding, schema)
+                    channels[topic] = writer.register_channel(topic, "json" if is_own else "protobuf", schema_id)
+                data = json.dumps(value, allow_nan=False).encode() if is_own else value.encode()
+                writer.add_message(channels[topic], message.log_ns, data, message.stamp_ns, counts[topic])
                 counts[topic] += 1
         writer.finish()  # type: ignore[no-untyped-call]  # as mcap has it
     return dict(counts)
+
+
+def values(message: ViewerMessage) -> Iterator[tuple[str, Any]]:  # Any: messages of Foxglove, which share no type
+    """Topics, and what is written to them of `message`."""
+    content, topic = message.content, message.topic
+    sec, nsec = divmod(message.stamp_ns, NS_PER_S)
+    time = sdk.Timestamp(sec, nsec)
+    if isinstance(content, Scene):
+        entities = [_entity(one, time, message.log_ns - message.stamp_ns) for one in content.entities]
+        removed = [sdk.SceneEntityDeletion(timestamp=time, id=name) for name in content.removed]
+        yield topic, sdk.SceneUpdate(deletions=removed, entities=entities)
+    elif isinstance(content, EgoState):
+        pose = (content.x_m, content.y_m), 0.0, content.yaw_rad
+        position, turn = _vector(*pose[0]), _turn(pose[2])
+        yield (
+            "/tf",
+            sdk.FrameTransform(
+                timestamp=time, parent_frame_id="map", child_frame_id="ego", translation=position, rotation=turn
+            ),
+        )
+        yield f"{topic}/pose", sdk.PoseInFrame(timestamp=time, frame_id="map", pose=_pose(*pose))
+    elif isinstance(content, tuple):
+        poses = [_pose((one.x_m or 0.0, one.y_m or 0.0), 0.0, one.yaw_rad or 0.0) for one in content]
+        yield f"{topic}/poses", sdk.PosesInFrame(timestamp=time, frame_id="map", poses=poses)
+    else:
+        known = {name: value for name, value in content.items() if value is not None}
+        yield topic, {"header": {"stamp": {"sec": sec, "nsec": nsec}}, **known}
+
+
+def _entity(entity: Entity, time: sdk.Timestamp, late_ns: int) -> sdk.SceneEntity:
+    """By the schema a lifetime counts from the stamp, in viewers from the log time: it is long enough for both."""
+    lists: dict[str, list[Any]] = {}  # Any: primitives share no type
+    lifetime_ns = 0 if entity.lifetime_s is None else max(late_ns + nanoseconds(entity.lifetime_s), 1)
+    for shape in entity.shapes:
+        lists.setdefault(f"{shape.kind}s", []).append(_primitive(shape))
+    return sdk.SceneEntity(
+        timestamp=time,
+        frame_id=entity.frame,
+        id=entity.name,
+        lifetime=sdk.Duration(*divmod(lifetime_ns, NS_PER_S)),
+        frame_locked=entity.frame == "ego",
+        metadata=[sdk.KeyValuePair(key=key, value=value) for key, value in entity.facts.items()],
+        **lists,
+    )
+
+
+def _primitive(shape: Shape) -> Any:  # Any: primitives share no type
+    common: dict[str, Any] = {  # Any: keywords of different types
+        "pose": _pose(shape.at_m, shape.height_m, shape.yaw_rad),
+        "color": sdk.Color(**dict(zip("rgba", shape.colour, strict=True))),
+    }
+    length_m, width_m, letter_m = shape.size_m
+    match shape.kind:
+        case "arrow":
+            head_m = min(_LONGEST_HEAD_M, 0.4 * length_m)
+            return sdk.ArrowPrimitive(
+                shaft_length=length_m - head_m,
+                shaft_diameter=width_m,
+                head_length=head_m,
+                head_diameter=2.5 * width_m,
+                **common,
+            )
+        case "line":
+            return sdk.LinePrimitive(
+                thickness=length_m, points=[sdk.Point3(x=x, y=y) for x, y in shape.points_m], **common
+            )
+        case "text":
+            return sdk.TextPrimitive(text=shape.text, font_size=letter_m, billboard=True, **common)
+        case "cylinder":
+            return sdk.CylinderPrimitive(size=_vector(*shape.size_m), bottom_scale=1.0, top_scale=1.0, **common)
+    kind = sdk.CubePrimitive if shape.kind == "cube" else sdk.SpherePrimitive
+    return kind(size=_vector(*shape.size_m), **common)
+
+
+def _pose(at_m: Point, z_m: float, yaw_rad: float) -> sdk.Pose:
+    return sdk.Pose(position=_vector(*at_m, z_m), orientation=_turn(yaw_rad))
+
+
+def _turn(yaw_rad: float) -> sdk.Quaternion:
+    return sdk.Quaternion(z=math.sin(0.5 * yaw_rad), w=math.cos(0.5 * yaw_rad))
+
+
+def _vector(x: float, y: float, z: float = 0.0) -> sdk.Vector3:
+    return sdk.Vector3(x=x, y=y, z=z)

@@ -17,11 +17,7 @@ from fgtrack.evaluation.recordings import by_recording
 from fgtrack.evaluation.roads import excluded_lines, road_lines, roads
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.io.run import Run, Table
-from fgtrack.viewers.detection_messages import track_positions
-from fgtrack.viewers.ellipse import AROUND_95, ellipses
-from fgtrack.viewers.look import NOMINAL_SIZE_M
-from fgtrack.viewers.surroundings import start_ns
-from fgtrack.viewers.track_messages import final_ns, position_covariances
+from fgtrack.viewers.states import AROUND_95, NOMINAL_SIZE_M, ellipses, final_ns, located, start_ns, track_positions
 
 FORMAT = "fgtrack-report/2"
 MOST_ROWS = 60_000
@@ -121,10 +117,10 @@ class _Packing:
 
     def ellipse(self, states: Table) -> Json:
         """Half axes and direction of the ellipses that hold 95 %."""
-        found = ellipses(position_covariances(states), AROUND_95)
+        found = ellipses(states, AROUND_95)
         return {
-            "long": _column(0.5 * found[:, 0], _POSITION_M),
-            "short": _column(0.5 * found[:, 1], _POSITION_M),
+            "long": _column(found[:, 0], _POSITION_M),
+            "short": _column(found[:, 1], _POSITION_M),
             "direction": self.angle(found[:, 2]),
         }
 
@@ -173,10 +169,10 @@ def _recording(one: _Recording, packing: _Packing) -> Json:
         for kind, points_m in zip(("bound", "bound", "centre"), road_lines(road), strict=True)
     ]
     lines += [{"kind": "bound", **packing.place(*points_m.T)} for points_m in excluded_lines(run)]
-    ego = packing.thinned(_placed(run.ego), "the ego")
+    ego = packing.thinned(located(run.ego), "the ego")
     ego = _sorted(ego, ego["stamp_ns"])
     truth = run.truth.where(run.truth["object_id"] != EGO_ID)
-    truth = packing.thinned(_placed(truth), "the truth")
+    truth = packing.thinned(located(truth), "the truth")
     truth = _sorted(truth, truth["stamp_ns"], truth["object_id"])
     return {
         "start_ns": str(one.start_ns),  # of more digits than a number of JavaScript holds
@@ -193,7 +189,7 @@ def _recording(one: _Recording, packing: _Packing) -> Json:
 
 def _run(run: Run, packing: _Packing) -> Json:
     statuses = np.unique(run.tracks["status"]).tolist()
-    tracks, lagged = _placed(run.tracks), _placed(run.lagged.where(run.lagged["lag_s"] > 0.0))
+    tracks, lagged = located(run.tracks), located(run.lagged.where(run.lagged["lag_s"] > 0.0))
     ticks_ns = packing.thinned_times(
         np.unique(run.timing["now_ns"]), max(tracks.num_rows, lagged.num_rows), "the ticks"
     )
@@ -201,7 +197,7 @@ def _run(run: Run, packing: _Packing) -> Json:
     past = lagged.where(np.isin(lagged["now_ns"], ticks_ns))
     tracks = _sorted(tracks, tracks["now_ns"], tracks["track_id"])
     past = _sorted(past, past["now_ns"], past["track_id"], past["stamp_ns"])
-    final = packing.thinned(_placed(run.smoothed.where(run.smoothed["kind"] == "final")), "final states")
+    final = packing.thinned(located(run.smoothed.where(run.smoothed["kind"] == "final")), "final states")
     final = _sorted(final, final["track_id"], final["stamp_ns"])
     return {
         "estimator": str(run.meta.get("estimator", "")),
@@ -274,10 +270,6 @@ def _pose(states: Table, packing: _Packing) -> Json:
 def _codes(names: Any, among: Sequence[str]) -> IntArray:
     """The place of each of `names`, shape (n,), in the sorted `among`."""
     return np.asarray(np.searchsorted(np.array(among, dtype=np.str_), names), dtype=np.int64)
-
-
-def _placed(table: Table) -> Table:
-    return table.where(np.isfinite(table["x_m"]) & np.isfinite(table["y_m"]))
 
 
 def _sorted(table: Table, *keys: IntArray) -> Table:

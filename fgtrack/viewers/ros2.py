@@ -1,89 +1,62 @@
 """Writes what shows a run as a rosbag2 recording of standard messages, for RViz and whatever reads ROS."""
 
-import mmap
-import re
+import json
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from fgtrack.core.errors import DataError, FgtrackError
-from fgtrack.core.files import read_head
+from fgtrack.core.time import NS_PER_S, nanoseconds
+from fgtrack.core.types import DetectionList, EgoState
 from fgtrack.io.adapters.common import RosMessage
 from fgtrack.io.output import Kind, check_output, new_file, new_folder, write_error
-from fgtrack.io.ros.bag_files import METADATA
 from fgtrack.io.ros.bag_writer import RECORDING
-from fgtrack.io.ros.mcap_file import MCAP_MAGIC
+from fgtrack.io.ros.messages import MARKER_ARRAY, TRANSFORMS, MessageFactory
 from fgtrack.io.ros.typestore import one_line
-from fgtrack.viewers.ros2_messages import ViewerMessageFactory
-from fgtrack.viewers.shapes import EgoMotion, Facts, Objects, Scene, ViewerMessage
+from fgtrack.viewers.shapes import Entity, Scene, Shape, ViewerMessage
 
-_INT64_LIMIT = 1 << 63
-_MARK = ("made_by", "fgtrack export")  # stands in the metadata of the recording, which its file repeats
-_MARKED = rb"^ *custom_data:\n +%b: %b$" % (_MARK[0].encode(), _MARK[1].encode())
-_MARKED_FOLDER = re.compile(_MARKED, re.MULTILINE)
-_MARKED_FILE = re.compile(
-    rb"\x07\0\0\0rosbag2.{4}\x13\0\0\0serialized_metadata.{4}[^\0]{0,500}?" + _MARKED, re.DOTALL | re.MULTILINE
-)
+_FILE = Kind("a file", Path.is_file)
+_LATEST_NS = 1 << 63
+_FRAME_IDS = {"map": "map", "ego": "base_link"}
+_KINDS = {"arrow": 0, "cube": 1, "sphere": 2, "cylinder": 3, "line": 4, "text": 9}  # of Marker.msg
+_ADD, _DELETE = 0, 2
 _FOREVER = QosTime(0, 0)
 
 
-def _reliable(durability: QosDurability) -> Qos:
-    return Qos(
-        QosHistory.KEEP_LAST,
-        10,
-        QosReliability.RELIABLE,
-        durability,
-        _FOREVER,
-        _FOREVER,
-        QosLiveliness.SYSTEM_DEFAULT,
-        _FOREVER,
-        False,
-    )
+def check_ros2(path: Path, overwrite: bool) -> None:
+    """Raise `CallError` where `write_ros2` would for what is at `path`."""
+    check_output(path, _FILE if path.suffix == ".mcap" else RECORDING, overwrite)
 
 
-def _is_export_folder(path: Path) -> bool:
-    return RECORDING.recognises(path) and bool(_MARKED_FOLDER.search((path / METADATA).read_bytes()))
-
-
-def _is_export_file(path: Path) -> bool:
-    if read_head(path, len(MCAP_MAGIC)) != MCAP_MAGIC:
-        return False
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        return _MARKED_FILE.search(content) is not None
-
-
-_FOLDER = Kind("a rosbag2 folder of `fgtrack export`", _is_export_folder)
-_FILE = Kind("an MCAP file of `fgtrack export --ros2`", _is_export_file)
-
-
-def check_viewer_bag(path: Path, overwrite: bool) -> None:
-    """Raise `CallError` where `write_viewer_bag` would for what is at `path`."""
-    check_output(path, _FILE if path.suffix == ".mcap" else _FOLDER, overwrite)
-
-
-def write_viewer_bag(path: Path, messages: Iterable[ViewerMessage], *, overwrite: bool = False) -> dict[str, int]:
-    """Write `messages`, in the order of their log times, as a rosbag2 recording; gives their number by topic.
+def write_ros2(
+    path: Path,
+    messages: Iterable[ViewerMessage],
+    metadata: Mapping[str, Mapping[str, str]],
+    overwrite: bool = False,
+) -> dict[str, int]:
+    """Write `messages`, in the order of their log times, as a rosbag2 recording; return their number by topic.
 
     `path` becomes a rosbag2 folder, or its MCAP file alone where the name ends in `.mcap`. It appears when it is
-    complete. Facts have no standard message and are left out. Raises as `write_bag`.
+    complete. `metadata` is its custom data. Outcomes have no standard message and are left out. Raises as `write_bag`.
     """
-    check_viewer_bag(path, overwrite)
+    check_ros2(path, overwrite)
     try:
         if path.suffix != ".mcap":
-            with new_folder(path, _FOLDER, overwrite) as folder:
-                return _write(folder, messages)
+            with new_folder(path, RECORDING, overwrite) as folder:
+                return _write(folder, messages, metadata)
         with (
             new_file(path, _FILE, overwrite) as file,
-            tempfile.TemporaryDirectory(".part", f"{path.name}.", path.parent) as place,
+            tempfile.TemporaryDirectory(".part", f"{path.name}.", path.parent) as part,
         ):
-            folder = Path(place) / path.stem
-            counts = _write(folder, messages)
-            with (folder / f"{folder.name}.mcap").open("rb") as written:
+            counts = _write(Path(part) / path.stem, messages, metadata)
+            with (Path(part) / path.stem / f"{path.stem}.mcap").open("rb") as written:
                 shutil.copyfileobj(written, file)
             return counts
     except FgtrackError:
@@ -94,45 +67,109 @@ def write_viewer_bag(path: Path, messages: Iterable[ViewerMessage], *, overwrite
         raise DataError(f"{path}: cannot be written ({one_line(error)})") from error
 
 
-def _write(folder: Path, messages: Iterable[ViewerMessage]) -> dict[str, int]:
-    factory = ViewerMessageFactory()
+def _write(
+    folder: Path, messages: Iterable[ViewerMessage], metadata: Mapping[str, Mapping[str, str]]
+) -> dict[str, int]:
+    factory = _MarkerFactory()
     connections: dict[str, Connection] = {}
     counts: Counter[str] = Counter()
     bag = Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
     bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-    bag.set_custom_data(*_MARK)
+    for name, entries in metadata.items():
+        bag.set_custom_data(name, json.dumps(entries))
     with bag:
         for message in messages:
-            if not 0 <= message.log_ns < _INT64_LIMIT:
+            if not 0 <= message.log_ns < _LATEST_NS:
                 raise DataError(f"the time {message.log_ns} ns lies outside what a recording holds")
-            for topic, made in _ros_messages(factory, message):
+            for topic, made in factory.messages(message):
                 if topic not in connections:
-                    durability = _durability(message)
+                    lasting = isinstance(message.content, Scene) and message.content.lasting
                     connections[topic] = bag.add_connection(
-                        topic,
-                        made.__msgtype__,
-                        typestore=factory.typestore,
-                        offered_qos_profiles=[_reliable(durability)],
+                        topic, made.__msgtype__, typestore=factory.typestore, offered_qos_profiles=[_quality(lasting)]
                     )
                 bag.write(connections[topic], message.log_ns, factory.serialize(made))
                 counts[topic] += 1
     return dict(counts)
 
 
-def _durability(message: ViewerMessage) -> QosDurability:
-    lasting = isinstance(message, Scene) and message.lasting
-    return QosDurability.TRANSIENT_LOCAL if lasting else QosDurability.VOLATILE
+def _quality(lasting: bool) -> Qos:
+    durability = QosDurability.TRANSIENT_LOCAL if lasting else QosDurability.VOLATILE
+    reliable, liveliness = QosReliability.RELIABLE, QosLiveliness.SYSTEM_DEFAULT
+    return Qos(QosHistory.KEEP_LAST, 10, reliable, durability, _FOREVER, _FOREVER, liveliness, _FOREVER, False)
 
 
-def _ros_messages(factory: ViewerMessageFactory, message: ViewerMessage) -> Iterator[tuple[str, RosMessage]]:
-    """Topics, and the messages on them that show `message`."""
-    match message:
-        case Scene():
-            yield f"{message.topic}/markers", factory.marker_array(message)
-        case Objects():
-            yield message.topic, factory.detection3d_array(message.objects)
-        case EgoMotion():
-            yield "/tf", factory.transforms(message.ego)
-            yield "/ego/odometry", factory.odometry(message.ego)
-        case Facts():
-            return
+class _MarkerFactory(MessageFactory):
+    """Makes markers and transforms as well; keeps the number of markers of each entity, to remove those left over."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._shown: dict[tuple[str, str], int] = {}
+        image = self._make(
+            "sensor_msgs/msg/CompressedImage", header=self._header(0, ""), format="", data=np.zeros(0, dtype=np.uint8)
+        )
+        mesh = self._make("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, dtype=np.uint8))
+        self._unused: dict[str, Any] = {  # Any: fields of a marker
+            **dict.fromkeys(("texture_resource", "mesh_resource"), ""),
+            **{name: [] for name in ("colors", "uv_coordinates")},
+            "texture": image,
+            "mesh_file": mesh,
+            "mesh_use_embedded_materials": False,
+        }
+
+    def messages(self, message: ViewerMessage) -> Iterator[tuple[str, RosMessage]]:
+        """Topics, and the messages on them that show `message`."""
+        content, topic, stamp_ns = message.content, message.topic, message.stamp_ns
+        if isinstance(content, Scene):
+            markers = [one for entity in content.entities for one in self._markers(topic, stamp_ns, entity)]
+            markers += [one for name in content.removed for one in self._markers(topic, stamp_ns, Entity(name, ()))]
+            yield f"{topic}/markers", self._make(MARKER_ARRAY, markers=markers)
+        elif isinstance(content, EgoState):
+            yield "/tf", self._transforms(content)
+            yield f"{topic}/odometry", self.odometry(content)
+        elif isinstance(content, tuple):
+            yield topic, self.detection3d_array(DetectionList("", stamp_ns, message.log_ns, content, "map"))
+
+    def _transforms(self, ego: EgoState) -> RosMessage:
+        """`tf2_msgs/TFMessage` with the pose of the ego in the map."""
+        pose = self._pose(ego.x_m, ego.y_m, ego.yaw_rad)
+        transform = self._make(
+            "geometry_msgs/msg/Transform", translation=self._vector(ego.x_m, ego.y_m), rotation=pose.orientation
+        )
+        stamped = self._make(
+            "geometry_msgs/msg/TransformStamped",
+            header=self._header(ego.stamp_ns, "map"),
+            child_frame_id=_FRAME_IDS["ego"],
+            transform=transform,
+        )
+        return self._make(TRANSFORMS, transforms=[stamped])
+
+    def _markers(self, topic: str, stamp_ns: int, entity: Entity) -> list[RosMessage]:
+        """A namespace with a marker for each shape; markers that it had before beyond these are removed."""
+        before = self._shown.get((topic, entity.name), 0)
+        self._shown[topic, entity.name] = len(entity.shapes)
+        header, lifetime_ns = self._header(stamp_ns, _FRAME_IDS[entity.frame]), nanoseconds(entity.lifetime_s or 0.0)
+        sec, nanosec = divmod(lifetime_ns, NS_PER_S)
+        lifetime = self._make("builtin_interfaces/msg/Duration", sec=sec, nanosec=nanosec)
+        empty = Shape("sphere", (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        markers = []
+        for number, shape in enumerate([*entity.shapes, *[empty] * (before - len(entity.shapes))]):
+            pose = self._pose(*shape.at_m, shape.yaw_rad)
+            pose.position.z = shape.height_m
+            marker = self._make(
+                "visualization_msgs/msg/Marker",
+                header=header,
+                ns=entity.name,
+                id=number,
+                type=_KINDS[shape.kind],
+                action=_ADD if number < len(entity.shapes) else _DELETE,
+                pose=pose,
+                scale=self._vector(*shape.size_m),
+                color=self._make("std_msgs/msg/ColorRGBA", **dict(zip("rgba", shape.colour, strict=True))),
+                lifetime=lifetime,
+                frame_locked=entity.frame == "ego",
+                points=[self._make("geometry_msgs/msg/Point", x=x, y=y, z=0.0) for x, y in shape.points_m],
+                text=shape.text,
+                **self._unused,
+            )
+            markers.append(marker)
+        return markers

@@ -20,7 +20,6 @@ from fgtrack.models.track_map import COLUMNS, TrackMap
 from fgtrack.plotting import plot
 from fgtrack.plotting.style import FORMATS, WRONG, broken_line
 from fgtrack.viewers.export import viewer_messages
-from fgtrack.viewers.shapes import Scene
 
 TICKS = range(60)
 
@@ -251,7 +250,7 @@ def test_exclusion_areas_are_shown_on_the_map_and_in_the_viewer(tmp_path: Path, 
     axes = plot.map(shown).axes[0]
     assert [len(line.get_xdata()) for line in axes.lines if line.get_linestyle() == ":"] == [4, 5]
     messages, notes = viewer_messages({"run": shown})
-    scene = next(message for message in messages if isinstance(message, Scene) and message.topic == "/map")
+    scene = next(message.content for message in messages if message.topic == "/map")
     assert [len(line.points_m) for line in scene.entities[0].shapes] == [4, 5]
     assert notes[0] == "map.excluded: lost.csv is not there any more, so it is not shown"
 
