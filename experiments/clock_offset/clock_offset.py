@@ -78,7 +78,7 @@ def rows(name: str, true_s: float, seed: int, lengths_s: tuple[float, ...]) -> I
         report = estimate_offsets([one for one in messages if one.receipt_ns <= end_ns], configuration(), REFERENCE)
         found = next(one for one in report.sensors if one.sensor == WRONG)
         offset_s, std_s = (np.nan if value is None else value for value in (found.offset_s, found.std_s))
-        yield Row(name, true_s, seed, length_s, offset_s, std_s, found.identifiable)
+        yield Row(name, true_s, seed, length_s, offset_s, std_s, found.is_known)
 
 
 def draw(found: list[Row], file: Path) -> None:

@@ -9,7 +9,6 @@ from fgtrack.advice.clocks import (
     bias_findings,
     clock_findings,
     clock_verdicts,
-    estimated_clocks,
     receipt_findings,
     stamp_findings,
 )
@@ -28,7 +27,7 @@ from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumed import Assumed, assumed, source_of
 from fgtrack.pipeline.clock import corrected
-from fgtrack.pipeline.clock_offsets import OffsetReport
+from fgtrack.pipeline.clock_offsets import OffsetReport, estimate_offsets
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.shipped import read_config, settings_of
@@ -235,7 +234,7 @@ class _Adviser:
             return
         doubtful = {one.about for one in self._findings if one.kind == "clock"}
         try:
-            self._clocks = estimated_clocks(self._tracked, self._config, self._reference, doubtful, self._replayed)
+            self._clocks = estimate_offsets(self._tracked, self._config, self._reference, doubtful, self._replayed)
         except (DataError, CallError) as error:
             if self._reference is not None and isinstance(error, CallError):
                 raise

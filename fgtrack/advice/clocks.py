@@ -1,46 +1,32 @@
 """What stamps are worth: zeros, other clocks, the future, jumps, drifts, offsets of clocks and of positions."""
 
 import math
-from collections import Counter
-from collections.abc import Container, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
 
 from fgtrack.advice.arrivals import FEWEST, Arrivals
 from fgtrack.advice.finding import Finding, milliseconds, percent
 from fgtrack.core.caution import EGO
-from fgtrack.core.types import DetectionList, Message
-from fgtrack.pipeline.clock_offsets import Bias, OffsetReport, OffsetRules, Replayed, SensorOffset, estimate_offsets
-from fgtrack.pipeline.config import Config, EgoConfig
-from fgtrack.pipeline.replay import replay_in_memory
-from fgtrack.pipeline.truth_offsets import TRUTH, truth_offsets
+from fgtrack.pipeline.clock_offsets import RECEIPT_S, TRUTH, Bias, OffsetReport, SensorOffset
+from fgtrack.pipeline.config import EgoConfig
 
 __all__ = [
     "ClockVerdict",
     "bias_findings",
     "clock_findings",
     "clock_verdicts",
-    "estimated_clocks",
     "receipt_findings",
     "stamp_findings",
 ]
-
-RULES = OffsetRules(fit_noise=True, max_detections=1200)
-"""How clocks are compared, in `advise` as in `offsets`."""
 
 _AHEAD_S = 1e-3  # rounding of stamps
 _AHEAD_SHARE = 0.005
 _JUMP_S, _JUMP_STDS, _JUMP_WINDOW_S = 0.1, 8.0, 3.0
 _JUMP_LASTS_S = 5.0  # a change within the first or last seconds of a recording may pass
-_RECEIPT_S = 1e-5  # stamps that are nearer to the receipt are the receipt
 _SAME_BIAS_M = 0.5  # of sensors of one frame: what two calibrations, or two parts of a car, may differ by
 _DRIFT_BINS, _DRIFT_S, _DRIFT_STDS, _DRIFT_FIT = 10, 0.01, 5.0, 0.8
-_SURE = 0.995  # an offset is believed where 0 is outside of the 99 % interval of Student's t ...
-_OFFSET_STDS = 4.0  # ... or farther off than so many standard deviations, where these are of a model ...
-_SMALLEST_OFFSET_S = 0.01  # ... if it matters
-_LARGEST_STD_S = 0.05
 
 
 def stamp_findings(one: Arrivals) -> Iterator[Finding]:
@@ -157,63 +143,22 @@ class ClockVerdict:
         return " ".join(filter(None, (self.known, self.bound, self.missing)))
 
 
-def estimated_clocks(
-    messages: Sequence[Message],
-    config: Config,
-    reference: str | None = None,
-    doubtful: Container[str] = (),
-    replayed: Replayed = replay_in_memory,
-) -> OffsetReport:
-    """Return the clock offsets of all sensors: against the truth of the recording, else between the sensors.
-
-    Without truth, or where `reference` is named, offsets are differences of two clocks. The reference is then the
-    sensor with most detections, but for those that are `doubtful` and those whose clock must be wrong: nothing is
-    received before it was sensed.
-
-    Raises
-    ------
-    CallError
-        The reference is not in the input.
-    DataError
-        There is nothing to compare.
-    """
-    config = replace(config, estimator="ekf-replay")
-    if reference is None:
-        report = truth_offsets(messages, config, RULES, replayed)
-        if report is not None:
-            return report
-        counts = Counter(one.sensor for one in messages if isinstance(one, DetectionList) for _ in one.objects)
-        trusted = {name for name, sensor in config.used_sensors.items() if sensor.gives_position and counts[name]}
-        if any(name in doubtful for name in trusted):
-            reference = max(
-                sorted(name for name in trusted if name not in doubtful), key=counts.__getitem__, default=None
-            )
-        report = estimate_offsets(messages, config, reference, RULES, replayed)
-        late = [one for one in report.sensors if (most := _surely_late_s(one, report)) is not None and most < 0.0]
-        if not late or reference is not None:
-            return report
-        reference = max(late, key=lambda one: one.num_detections).sensor
-    return estimate_offsets(messages, config, reference, RULES, replayed)
-
-
 def clock_verdicts(report: OffsetReport) -> list[ClockVerdict]:
     """Return what `report` says of the clock of each sensor but the reference."""
     return [_verdict(one, report) for one in report.sensors if one.sensor != report.reference]
 
 
 def _verdict(one: SensorOffset, report: OffsetReport) -> ClockVerdict:
-    half_s = _half_s(one)
     what = "the truth of the recording" if report.reference == TRUTH else f"the clock of {report.reference}"
-    if one.offset_s is None or half_s is None:
+    if one.offset_s is None or one.half_s is None:
         return ClockVerdict(one.sensor, None, False, f"its clock offset is not known: {one.why}.")
-    if abs(one.offset_s) < max(_least_s(one), _SMALLEST_OFFSET_S):
-        is_known = half_s < _LARGEST_STD_S
-        text = f"its stamps agree with {what} (offset {_with_sign(one.offset_s)} ± {milliseconds(half_s)})."
-        if not is_known:
-            text = f"its clock offset from {what} is not known: {_with_sign(one.offset_s)} ± {milliseconds(half_s)}."
-        return ClockVerdict(one.sensor, None, is_known, text)
+    half, offset = milliseconds(one.half_s), f"{1e3 * one.offset_s:+.0f} ms"
+    if not one.is_known:
+        return ClockVerdict(one.sensor, None, False, f"its clock offset from {what} is not known: {offset} ± {half}.")
+    if not one.is_off:
+        return ClockVerdict(one.sensor, None, True, f"its stamps agree with {what} (offset {offset} ± {half}).")
     side = "later" if one.offset_s > 0.0 else "earlier"
-    off = f"its stamps are {milliseconds(abs(one.offset_s))} (± {milliseconds(half_s)}) {side} than"
+    off = f"its stamps are {milliseconds(abs(one.offset_s))} (± {half}) {side} than"
     if report.reference == TRUTH:
         return ClockVerdict(one.sensor, one.offset_s, True, f"{off} the truth of the recording says.")
     return ClockVerdict(
@@ -221,62 +166,23 @@ def _verdict(one: SensorOffset, report: OffsetReport) -> ClockVerdict:
         one.offset_s,
         True,
         f"{off} those of {report.reference}.",
-        _bound(one, report),
+        _bound(one, one.offset_s, report),
         f"To tell which of the two clocks is wrong takes truth, or a sensor whose clock is known (--reference NAME): "
         f"{report.reference} is taken to be right.",
     )
 
 
-def _bound(one: SensorOffset, report: OffsetReport) -> str:
-    """Which of two clocks cannot be the only one that is wrong: nothing is received before it was sensed."""
-    assert one.offset_s is not None  # of a sensor whose offset is known
-    early = report.reference if one.offset_s > 0.0 else one.sensor
-    late = one.sensor if one.offset_s > 0.0 else report.reference
-    least_s = report.least_delays_s.get(early)
-    if least_s is None or least_s <= _RECEIPT_S:
+def _bound(one: SensorOffset, offset_s: float, report: OffsetReport) -> str:
+    """Return which of two clocks cannot be the only wrong one: nothing is received before it was sensed."""
+    early, late = (report.reference, one.sensor) if offset_s > 0.0 else (one.sensor, report.reference)
+    least_s = report.least_delays_s.get(early, 0.0)
+    if least_s <= RECEIPT_S:
         return f"Nothing bounds either clock: {early} has no delays that say something."
     text = f"{early} is received {milliseconds(least_s)} after its stamps at least, so these are not earlier by more"
-    surely_s = _surely_late_s(one, report)
+    surely_s = report.surely_late_s(one)
     if surely_s is None:
         return f"{text}: either clock may be wrong."
     return f"{text}: at least {milliseconds(abs(surely_s))} of it is the clock of {late}."
-
-
-def _surely_late_s(one: SensorOffset, report: OffsetReport) -> float | None:
-    """By how much the later one of two clocks is late at least; negative where it is that of the reference.
-
-    None where either clock may be wrong.
-    """
-    half_s = _half_s(one)
-    if one.offset_s is None or half_s is None or abs(one.offset_s) < max(_least_s(one), _SMALLEST_OFFSET_S):
-        return None
-    least_s = report.least_delays_s.get(report.reference if one.offset_s > 0.0 else one.sensor, 0.0)
-    surely_s = abs(one.offset_s) - half_s - least_s
-    if least_s <= _RECEIPT_S or surely_s <= 0.0:
-        return None
-    return math.copysign(abs(one.offset_s) - least_s, one.offset_s)
-
-
-def _std_s(one: SensorOffset) -> float:
-    """Standard deviation of a difference of two clocks, with what the residuals and stretches of time say of it."""
-    assert one.std_s is not None  # of an offset that was estimated
-    return max(one.std_s * max(1.0, one.residual or 1.0), (one.spread_s or 0.0) * 2.0 / 3.0)
-
-
-def _half_s(one: SensorOffset) -> float | None:
-    """Half of the 95 % interval of an offset; None where it is too wide to say something."""
-    if one.offset_s is None or not one.std_s or one.std_s > _LARGEST_STD_S:
-        return None
-    return 2.0 * _std_s(one) if one.dof is None else one.std_s * float(stdtrit(one.dof, 0.975))
-
-
-def _least_s(one: SensorOffset) -> float:
-    """An offset below this may be chance."""
-    return _OFFSET_STDS * _std_s(one) if one.dof is None else (one.std_s or 0.0) * float(stdtrit(one.dof, _SURE))
-
-
-def _with_sign(offset_s: float) -> str:
-    return f"{1e3 * offset_s:+.0f} ms"
 
 
 def clock_findings(report: OffsetReport, configured_s: Mapping[str, float]) -> Iterator[Finding]:

@@ -1,9 +1,8 @@
 """`fgtrack offsets`: how wrong the clocks of a recording are."""
 
-from collections.abc import Container
 from dataclasses import asdict, replace
 
-from fgtrack.advice.clocks import clock_verdicts, estimated_clocks
+from fgtrack.advice.clocks import clock_verdicts
 from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, PitMap, Reference, Settings, TrackMap
 from fgtrack.cli.show import chosen_form, progress, say, sentences, show
 from fgtrack.core.errors import DataError
@@ -11,7 +10,7 @@ from fgtrack.evaluation.tables import Column, Table, Value
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumed import assumed
-from fgtrack.pipeline.clock_offsets import OffsetReport, SensorOffset
+from fgtrack.pipeline.clock_offsets import OffsetReport, SensorOffset, estimate_offsets
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
 
@@ -36,35 +35,33 @@ def offsets(
     with progress("offsets"):
         found = assumed(config, source)
         readable = UntilBreak(source.messages())
-        report = estimated_clocks(list(readable), found.config, reference)
+        report = estimate_offsets(list(readable), found.config, reference)
         report = report if readable.error is None else replace(report, broken=str(readable.error))
     for line in found.lines() if form is None else ():
         say(line)
     verdicts = clock_verdicts(report)
-    known = {one.sensor for one in verdicts if one.is_known}
-    show(_table(report, known), form, report.as_dict() | {"verdicts": [asdict(one) for one in verdicts]})
+    show(_table(report), form, report.as_dict() | {"verdicts": [asdict(one) for one in verdicts]})
     if form is None:
         sentences(f"{one.sensor}: {one}" for one in verdicts)
     if report.broken is not None:
         raise DataError(f"{located(report.broken, str(recording))}; used up to there")
 
 
-def _table(report: OffsetReport, known: Container[str]) -> Table:
+def _table(report: OffsetReport) -> Table:
     columns: list[Column[SensorOffset]] = [
         Column("sensor", ("sensor",), lambda one: (one.sensor,), left=True),
         Column("offset\n[ms]", ("offset_s",), lambda one: _known(one.offset_s), scale=1e3, text=_one_decimal),
         Column("std\n[ms]", ("std_s",), lambda one: _known(one.std_s), scale=1e3, text=_one_decimal),
         Column("detections", ("num_detections",), lambda one: (one.num_detections,)),
-        Column("residual\n[sigma]", ("residual",), lambda one: _known(one.residual)),
-        Column("known", ("known",), lambda one: (_verdict(one, report.reference, known),), left=True),
+        Column("known", ("known",), lambda one: (_verdict(one, report.reference),), left=True),
     ]
     notes = [f"{one.sensor}: {one.why}" for one in report.sensors]
     title = f"Offsets of {report.num_detections} detections of {report.num_tracks} tracks (reported stamp - true time)"
     return Table(title, columns, report.sensors, row_keys=("sensor",), notes=notes)
 
 
-def _verdict(one: SensorOffset, reference: str, known: Container[str]) -> str:
-    return "reference" if one.sensor == reference else "yes" if one.sensor in known else "no"
+def _verdict(one: SensorOffset, reference: str) -> str:
+    return "reference" if one.sensor == reference else "yes" if one.is_known else "no"
 
 
 def _known(value: float | None) -> tuple[Value, ...] | None:

@@ -1,140 +1,207 @@
-"""What is wrong with the clocks of a recording: a constant offset per sensor, and whether it can be known at all."""
+"""Clock offsets of sensors: against the truth of a recording, else against one of them.
+
+With the path p(t) of an object in the map and T(t) = map_from_ego, a detection z of the object, stamped s, leaves at
+the offset d
+
+    r(d) = p(s - d) - T(s - d) z = r(0) + d r'(0) + ...
+
+r' is minus the velocity of the object against the turning ego. d is found by Gauss-Newton, with Huber weights. The path
+is that of the truth, or a smoothing spline through the detections of a reference sensor, so that only the agreement of
+two sensors counts. With truth a constant bias is found as well: along and across the motion of the object, where the
+sensor sees another part of it than the truth means, or of the ego, where the origin of its detections is not the
+configured one, the one that leaves the smaller residuals. Where the velocity hardly changes, bias and offset cannot be
+told apart, and the offset is not known.
+
+The standard deviation of d is that of the jackknife over stretches of time, so it includes time-correlated errors
+(Bell, McCaffrey, Survey Methodology 28, 2002). Few stretches determine the two apart, those with a bend or an
+overtaking: it is uncertain, and d over it follows Student's t with one degree of freedom less than stretches count, the
+larger ones more (Carter, Schnepel, Steigerwald, Review of Economics and Statistics 99, 2017).
+"""
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
 
 from fgtrack.core.errors import CallError, DataError, did_you_mean
+from fgtrack.core.geometry import rotations
+from fgtrack.core.linalg import psd_solve
 from fgtrack.core.time import nanoseconds, seconds
-from fgtrack.core.types import DetectionList, EgoState, Message
-from fgtrack.estimation.factor_graph.clock_calibration.offsets import OffsetSettings, OffsetSolution, solve_offsets
-from fgtrack.estimation.factor_graph.clock_calibration.time_shift import ShiftableMeasurement
+from fgtrack.core.types import DetectionList, EgoState, FloatArray, IntArray, Message
 from fgtrack.io.run import Run
-from fgtrack.models.sensors import SensorModel
-from fgtrack.pipeline.assumed import assumed, source_of
-from fgtrack.pipeline.clock import Delivered, corrected
+from fgtrack.pipeline.clock import corrected
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.ego_path import EgoPath
-from fgtrack.pipeline.offset_measurements import Remeasure, measurements_by_track
-from fgtrack.pipeline.replay import again, replay_in_memory
-from fgtrack.sim.redelay import restamped
+from fgtrack.pipeline.paths import EgoPath, ObjectPath, Sightings, sightings_of, true_paths
+from fgtrack.pipeline.replay import replay_in_memory
 
-Track = Sequence[ShiftableMeasurement]
+__all__ = ["RECEIPT_S", "TRUTH", "Bias", "OffsetReport", "SensorOffset", "estimate_offsets"]
+
+TRUTH = "truth"
+"""Name of the reference where offsets are those against the truth."""
+_FEWEST = 30  # detections of a sensor
+_MOST = 2000
+_NEAR_M = 20.0  # a track is of the object whose path it is nearer to than this, in the median
+_STEP_S = 0.01  # of differences
+_STRETCH_S, _STRETCHES, _FEWEST_STRETCHES = 5.0, 12, 4
+_SHORTEST_STRETCH_S = 1.0
+_ROUNDS = 10
+_HUBER = 1.5
+_LARGEST_STEP_S, _REACH_S = 0.2, 1.0
+_BIAS_STDS, _SMALLEST_BIAS_M = 4.0, 0.2  # a bias that is no chance, and that a calibration would find
+_SURE = 0.995  # an offset is believed where 0 is outside of the 99 % interval of Student's t ...
+_SMALLEST_OFFSET_S = 0.01  # ... if it matters
+_LARGEST_HALF_S = 0.05  # an interval that is wider leaves an offset unknown
+RECEIPT_S = 1e-5
+"""Stamps that are nearer to the receipt are the receipt."""
+
+_Pair = tuple[Sightings, ObjectPath]
 Replayed = Callable[[Iterable[Message], Config], tuple[Run, str | None]]
 """A function that replays messages, and says why they broke off: `replay_in_memory`, or one that remembers."""
 
 
 @dataclass(frozen=True)
-class OffsetRules:
-    """Which tracks count, and when an offset is known."""
-
-    solver: OffsetSettings = field(default_factory=OffsetSettings)
-    max_std_s: float = 0.01
-    """An offset is identifiable where its standard deviation is below this ..."""
-    max_prior_share: float = 0.1
-    """... and below this share of the prior's."""
-    min_track_s: float = 2.0
-    """Shorter tracks are left out."""
-    min_detections: int = 10
-    """Of a sensor on a track, for the track to be used for the sensor."""
-    max_detections: int = 10_000
-    """Tracks with the most detections come first; what exceeds this is left out, of the first one its end."""
-    ego_cutoff_hz: float = 2.0
-    """See `EgoPath`."""
-    repeat_above_s: float = 0.005
-    """Where an offset is larger, tracks are made a second time, with corrected stamps."""
-    fit_noise: bool = False
-    """Whether the standard deviations of each sensor are first scaled to the residuals of a part of the tracks."""
-    probe_detections: int = 300
-    """Of so many detections of a track are these residuals."""
-
-    @property
-    def needed_std_s(self) -> float:
-        """Largest standard deviation of an identifiable offset."""
-        return min(self.max_std_s, self.max_prior_share * self.solver.prior_std_s)
-
-    @property
-    def needed_information(self) -> float:
-        """Information that the detections must give for that, in 1 / s^2, besides the prior."""
-        return self.needed_std_s**-2 - self.solver.prior_std_s**-2
-
-
-@dataclass(frozen=True)
 class Bias:
-    """A constant error of the positions of a sensor, detections minus truth; 0 in a direction without one."""
+    """Constant error of the positions of a sensor, detections minus truth; 0 in a direction without one.
+
+    Attributes
+    ----------
+    of
+        Whose directions are meant: those of the `ego`, or of the `vehicle` that is seen.
+    """
 
     EGO: ClassVar[str] = "ego"
     VEHICLE: ClassVar[str] = "vehicle"
     of: str
-    """Whose directions are meant: those of the `ego`, or of the `vehicle` that is seen."""
     ahead_m: float
     left_m: float
 
 
 @dataclass(frozen=True)
 class SensorOffset:
-    """One sensor: reported stamp = time at which it sensed + offset."""
+    """Clock of one sensor: reported stamp = time at which it sensed + offset.
+
+    Attributes
+    ----------
+    offset_s
+        None where nothing could be estimated.
+    std_s, dof
+        Standard deviation, and its degrees of freedom.
+    num_detections
+        Used in the estimate.
+    why
+        A line on what the estimate rests on, or why there is none.
+    bias
+        Of its positions against the truth; None where there is none, or no truth.
+    """
 
     sensor: str
     offset_s: float | None
-    """None where nothing could be estimated."""
     std_s: float | None
     num_detections: int
-    """Used in the estimate."""
-    identifiable: bool
     why: str
-    """A line."""
-    residual: float | None = None
-    """RMS residual over the standard deviation used: `std_s` is as right as this is near 1."""
-    spread_s: float | None = None
-    """Standard deviation by how much stretches of 5 s disagree; errors that last make it larger than `std_s`."""
     dof: float | None = None
-    """Degrees of freedom of `std_s`, where few stretches tell it."""
     bias: Bias | None = None
-    """Of its positions against the truth; None where there is none, or no truth."""
+
+    @property
+    def half_s(self) -> float | None:
+        """Half of the 95 % interval of the offset; None where there is none, or it is wider than the offset matters."""
+        half_s = self._times_std_s(0.975)
+        return half_s if half_s is not None and half_s < 2.0 * _LARGEST_HALF_S else None
+
+    @property
+    def is_known(self) -> bool:
+        """True if the offset, which may be 0, is known."""
+        return self.is_off or (self.half_s is not None and self.half_s < _LARGEST_HALF_S)
+
+    @property
+    def is_off(self) -> bool:
+        """True if the offset is no chance, and matters."""
+        least_s = self._times_std_s(_SURE)
+        if self.offset_s is None or self.half_s is None or least_s is None:
+            return False
+        return abs(self.offset_s) >= max(least_s, _SMALLEST_OFFSET_S)
+
+    def _times_std_s(self, share: float) -> float | None:
+        if self.offset_s is None or not self.std_s or self.dof is None:
+            return None
+        return self.std_s * float(stdtrit(self.dof, share))
 
 
 @dataclass(frozen=True)
 class OffsetReport:
-    """The offsets of all sensors against the clock of one of them, which is taken for that of the ego."""
+    """Offsets of all sensors against the truth, or against the clock of one of them.
+
+    Attributes
+    ----------
+    reference
+        Name of that sensor, or `truth`.
+    num_tracks, num_detections
+        Used.
+    broken
+        Why the input broke off, where it did; what came before was used.
+    least_delays_s
+        Shortest delay of each sensor: its stamps are not earlier than the truth by more than that, for nothing is
+        received before it was sensed.
+    """
 
     reference: str
     sensors: tuple[SensorOffset, ...]
     num_tracks: int
-    """Tracks used."""
     num_detections: int
     broken: str | None
-    """Why the input broke off, where it did; what came before was used."""
     least_delays_s: Mapping[str, float] = field(default_factory=dict)
-    """The shortest delay of each sensor: its stamps are not earlier than the truth by more than that, for nothing is
-    received before it was sensed."""
 
     def as_dict(self) -> dict[str, object]:
-        """Plain values for JSON."""
+        """Return plain values for JSON."""
         return asdict(self)
+
+    def surely_late_s(self, one: SensorOffset) -> float | None:
+        """Return by how much the later one of two clocks is late at least; negative where it is that of the reference.
+
+        None where either clock may be wrong.
+        """
+        if not one.is_off or one.offset_s is None or one.half_s is None:
+            return None
+        least_s = self.least_delays_s.get(self.reference if one.offset_s > 0.0 else one.sensor, 0.0)
+        surely_s = abs(one.offset_s) - least_s
+        return math.copysign(surely_s, one.offset_s) if least_s > RECEIPT_S and surely_s > one.half_s else None
+
+
+class _Fit(NamedTuple):
+    """Solution of r + A x = 0, x = (offset, bias ahead and to the left).
+
+    Attributes
+    ----------
+    std
+        Standard deviations of x.
+    dof
+        Degrees of freedom of that of the offset.
+    cost
+        Robust sum of squared residuals that is left.
+    """
+
+    x: tuple[float, ...]
+    std: tuple[float, ...]
+    dof: float
+    cost: float
 
 
 def estimate_offsets(
-    messages: Iterable[Message],
+    messages: Sequence[Message],
     config: Config,
     reference: str | None = None,
-    rules: OffsetRules | None = None,
+    doubtful: Container[str] = (),
     replayed: Replayed = replay_in_memory,
 ) -> OffsetReport:
-    """Estimate the clock offsets of the sensors in `messages`, from tracks that the tracker of `config` makes.
+    """Return the clock offsets of the sensors, from tracks that the tracker of `config` makes.
 
-    Sensors are not refused for their delays here: a wrong stamp looks like one.
-
-    Parameters
-    ----------
-    messages
-        In receipt order. Where they end in a `DataError`, what came before is used.
-    reference
-        The sensor whose offset is 0; None takes the one with most detections on tracks.
+    Without truth, or where `reference` is named, offsets are differences of two clocks. The reference is then the
+    sensor with most detections, but for those that are `doubtful` and those whose clock must be wrong: nothing is
+    received before it was sensed. Sensors are not refused for their delays here: a wrong stamp looks like one.
 
     Raises
     ------
@@ -143,168 +210,166 @@ def estimate_offsets(
     DataError
         There are no detections, fewer than five ego states, or a sensor has no model.
     """
-    rules = rules or OffsetRules()
-    heard: list[Delivered] = []
-    repeated = again(messages, config)
-    config = assumed(config, source_of(repeated)).config
-    recorded = _recorded(repeated(), heard, config.sensors)
-    config = unrefused(config)
-    run, broken = replayed(recorded, config)
-    raw = _lists(heard, config)
-    sensors = [name for name in config.sensors if any(one.sensor == name for one in raw)]
-    if not sensors:
+    heard = [corrected(one, config.sensors) if isinstance(one, DetectionList) else one for one in messages]
+    config = _unrefused(replace(config, estimator="ekf-replay"))
+    lists = [one for one in heard if isinstance(one, DetectionList) and one.sensor in config.used_sensors]
+    counts = Counter({one.sensor: 0 for one in lists})
+    counts.update(one.sensor for one in lists for _ in one.objects)
+    if not counts:
         raise DataError("there are no detections of a sensor that the configuration names (sensors)")
-    if reference is not None and reference not in sensors:
-        hint = did_you_mean(reference, sensors)
-        raise CallError(f"reference {reference!r} is no sensor of the input, which has {', '.join(sensors)}{hint}")
-    path = ego_path_of(heard, raw, rules)
-    remeasure = Remeasure(config, path)
-    tracks = measurements_by_track(run, raw, raw, config.sensors, remeasure)
-    reference = reference or max(sensors, key=_counts(tracks).__getitem__)
-    used = _chosen(tracks, reference, rules)
-    if rules.fit_noise and used:
-        remeasure = Remeasure(_with_noise(config, used, reference, rules), path)
-        used = _chosen(measurements_by_track(run, raw, raw, config.sensors, remeasure), reference, rules)
-    solution = _solution(used, reference, config, rules, {})
-    known_s = {} if solution is None else _known(solution, rules)
-    if any(abs(offset_s) > rules.repeat_above_s for offset_s in known_s.values()):
-        corrected = [_restamped(message, known_s) for message in heard]
-        run, _ = replay_in_memory(corrected, config)
-        used = _chosen(
-            measurements_by_track(run, _lists(corrected, config), raw, config.sensors, remeasure), reference, rules
+    if reference is not None and reference not in counts:
+        hint = did_you_mean(reference, sorted(counts))
+        raise CallError(
+            f"reference {reference!r} is no sensor of the input, which has {', '.join(sorted(counts))}{hint}"
         )
-        solution = _solution(used, reference, config, rules, known_s)
-    counts = _counts(used)
-    rows = tuple(_row(name, reference, counts[name], solution, len(sensors), rules) for name in sensors)
-    return OffsetReport(reference, rows, len(used), counts.total(), broken, least_delays_s(raw))
-
-
-def least_delays_s(lists: Iterable[DetectionList]) -> dict[str, float]:
-    """Return the shortest delay of each sensor."""
-    found: dict[str, float] = {}
+    run, broken = replayed(heard, config)
+    needs_ego = any(one.frame != "map" for one in lists)
+    ego = EgoPath(one for one in heard if isinstance(one, EgoState)) if needs_ego else None
+    seen = sightings_of(run, lists, config, ego)
+    least_s: dict[str, float] = {}
     for one in lists:
-        found[one.sensor] = min(found.get(one.sensor, math.inf), seconds(one.receipt_ns - one.stamp_ns))
-    return found
+        delay_s = seconds(one.receipt_ns - one.stamp_ns)
+        least_s[one.sensor] = min(least_s.get(one.sensor, math.inf), delay_s)
+    sensors = [name for name in config.sensors if name in counts]
+
+    def against(name: str, paths: Sequence[ObjectPath]) -> OffsetReport:
+        rows, tracks = [], set[int]()
+        for sensor in sensors:
+            found = {} if sensor == name else dict(_paired(seen.get(sensor, {}), paths))
+            tracks |= found.keys()
+            rows.append(_row(sensor, list(found.values()), name, len(sensors)))
+        return OffsetReport(name, tuple(rows), len(tracks), sum(one.num_detections for one in rows), broken, least_s)
+
+    paths = true_paths(messages) if reference is None else []
+    if paths:
+        return against(TRUTH, paths)
+    if reference is not None:
+        return against(reference, _paths(seen, reference))
+    placing = [name for name in sensors if config.sensors[name].gives_position and counts[name]]
+    trusted = [name for name in placing if name not in doubtful] or placing or sensors
+    reference = max(sorted(trusted), key=counts.__getitem__)
+    report = against(reference, _paths(seen, reference))
+    late = [one for one in report.sensors if (report.surely_late_s(one) or 0.0) < 0.0]
+    if not late or len(trusted) < len(placing):
+        return report
+    reference = max(late, key=lambda one: one.num_detections).sensor
+    return against(reference, _paths(seen, reference))
 
 
-def unrefused(config: Config) -> Config:
-    """`config` for messages whose stamps it has corrected: it takes them as they are and refuses none for its delay."""
-    sensors = {}
-    for name, sensor in config.sensors.items():
-        stamp_from = "message" if sensor.stamp_from == "receipt" else sensor.stamp_from
-        sensors[name] = replace(sensor, max_delay_s=None, clock_offset_s=0.0, stamp_from=stamp_from)
-    return replace(config, sensors=sensors)
-
-
-def _with_noise(config: Config, used: Sequence[Track], reference: str, rules: OffsetRules) -> Config:
-    """`config` with standard deviations that fit the residuals of the beginning of each track."""
-    solver = replace(rules.solver, max_rounds=1)
-    beginnings = [track[: rules.probe_detections] for track in used]
-    probe = _chosen(beginnings, reference, replace(rules, max_detections=5 * rules.probe_detections))
-    found = _solution(probe, reference, config, replace(rules, solver=solver), {})
-    if found is None:
-        return config
-    sensors = dict(config.sensors)
-    for name, residual in found.residuals.items():
-        if residual > 0.0:
-            std = {component: value * residual for component, value in sensors[name].std.items()}
-            sensors[name] = replace(sensors[name], std=std)
-    return replace(config, sensors=sensors)
-
-
-def _recorded(
-    messages: Iterable[Message], heard: list[Delivered], sensors: Mapping[str, SensorModel]
-) -> Iterator[Message]:
-    """The messages with stamps as `sensors` mend them; those that a tracker hears are kept in `heard` as well."""
-    for message in messages:
-        if isinstance(message, DetectionList):
-            message = corrected(message, sensors)
-        if isinstance(message, (EgoState, DetectionList)):
-            heard.append(message)
-        yield message
-
-
-def _lists(heard: Iterable[Delivered], config: Config) -> list[DetectionList]:
-    return [one for one in heard if isinstance(one, DetectionList) and one.sensor in config.sensors]
-
-
-def ego_path_of(heard: Iterable[Delivered], raw: Iterable[DetectionList], rules: OffsetRules) -> EgoPath | None:
-    """The path of the ego; None where it is not needed."""
-    if all(one.frame == "map" for one in raw):
-        return None
-    return EgoPath((one for one in heard if isinstance(one, EgoState)), rules.ego_cutoff_hz)
-
-
-def _counts(tracks: Iterable[Track]) -> Counter[str]:
-    """Number of measurements by sensor."""
-    return Counter(item.sensor for track in tracks for item in track)
-
-
-def _chosen(tracks: Sequence[Track], reference: str, rules: OffsetRules) -> list[Track]:
-    """Tracks that live long enough and were seen by the reference and another sensor, the longest ones first."""
-    chosen: list[Track] = []
-    total = 0
-    for whole in sorted(tracks, key=len, reverse=True):
-        track = whole[: rules.max_detections]
-        seen = {name for name, count in _counts([track]).items() if count >= rules.min_detections}
-        if reference not in seen or len(seen) == 1:
-            continue
-        if seconds(track[-1].stamp_ns - track[0].stamp_ns) < rules.min_track_s:
-            continue
-        total += len(track)
-        if chosen and total > rules.max_detections:
-            break
-        chosen.append([item for item in track if item.sensor in seen])
-    return chosen
-
-
-def _solution(
-    used: Sequence[Track], reference: str, config: Config, rules: OffsetRules, start_s: Mapping[str, float]
-) -> OffsetSolution | None:
-    """The offsets of all sensors of `used` but the reference; None where there are none."""
-    if not used:
-        return None
-    free_s = {name: start_s.get(name, 0.0) for name in _counts(used) if name != reference}
-    return solve_offsets(config.motion.model(), used, free_s, rules.solver)
-
-
-def _known(solution: OffsetSolution, rules: OffsetRules) -> dict[str, float]:
-    """Offsets that are good enough to correct stamps by."""
-    limit_s = rules.max_prior_share * rules.solver.prior_std_s
-    columns = solution.offsets_s.tolist(), np.sqrt(np.diag(solution.covariance)).tolist(), solution.converged.tolist()
-    rows = zip(solution.sensors, *columns, strict=True)
-    return {name: offset_s for name, offset_s, std_s, converged in rows if converged and std_s < limit_s}
-
-
-def _restamped(message: Delivered, offsets_s: Mapping[str, float]) -> Delivered:
-    """`message` with the stamps that a right clock would have given it."""
-    if isinstance(message, EgoState) or message.sensor not in offsets_s:
-        return message
-    return restamped(message, message.stamp_ns - nanoseconds(offsets_s[message.sensor]))
-
-
-def _row(
-    name: str, reference: str, count: int, solution: OffsetSolution | None, num_sensors: int, rules: OffsetRules
-) -> SensorOffset:
-    residual = None if solution is None else solution.residuals.get(name)
-    if num_sensors == 1:
-        return SensorOffset(name, None, None, count, False, "the only modality: nothing to compare it with")
-    if name == reference:
-        why = "the reference: its clock is taken for that of the ego"
-        return SensorOffset(name, 0.0, 0.0, count, False, why, residual)
-    if solution is None or name not in solution.sensors:
-        why = (
-            f"no track of {rules.min_track_s:g} s has {rules.min_detections} detections of it and of {reference}: "
-            "nothing to compare"
+def _unrefused(config: Config) -> Config:
+    """Return `config` for messages with corrected stamps: it takes these as they are, and none is too late."""
+    sensors = {
+        name: replace(
+            one,
+            max_delay_s=None,
+            clock_offset_s=0.0,
+            stamp_from="message" if one.stamp_from == "receipt" else one.stamp_from,
         )
-        return SensorOffset(name, None, None, count, False, why)
-    place = solution.sensors.index(name)
-    speed = f"objects move {solution.speeds_mps[name]:.2g} m/s (rms) in its frame"
-    if not solution.converged[place]:
-        return SensorOffset(name, None, None, count, False, f"nothing holds the estimate: {speed}", residual)
-    offset_s, std_s = float(solution.offsets_s[place]), float(np.sqrt(solution.covariance[place, place]))
-    information = max(std_s**-2 - rules.solver.prior_std_s**-2, 0.0)
-    why = f"information {information:.3g} /s2, {rules.needed_information:.3g} /s2 needed: {speed}"
-    spread_s = float(solution.spread_s[place])
-    known = std_s < rules.needed_std_s
-    return SensorOffset(name, offset_s, std_s, count, known, why, residual, None if math.isnan(spread_s) else spread_s)
+        for name, one in config.sensors.items()
+    }
+    return replace(config, sensors=sensors)
+
+
+def _paths(seen: Mapping[str, Mapping[int, Sightings]], reference: str) -> list[ObjectPath]:
+    found = [ObjectPath.through(one.stamps_ns, one.at(one.stamps_ns)) for one in seen.get(reference, {}).values()]
+    return [one for one in found if one is not None]
+
+
+def _paired(tracks: Mapping[int, Sightings], paths: Sequence[ObjectPath]) -> Iterator[tuple[int, _Pair]]:
+    """Yield each track with the path that it is nearest to, by its identity."""
+    for track_id, one in tracks.items():
+        positions_m = one.at(one.stamps_ns)
+        best, best_m = None, _NEAR_M
+        for path in paths:
+            gaps_m = np.hypot(*(path(one.stamps_ns) - positions_m).T)
+            if np.isfinite(gaps_m).sum() > len(gaps_m) / 2 and float(np.nanmedian(gaps_m)) < best_m:
+                best, best_m = path, float(np.nanmedian(gaps_m))
+        if best is not None:
+            yield track_id, (one, best)
+
+
+def _row(name: str, pairs: Sequence[_Pair], reference: str, num_sensors: int) -> SensorOffset:
+    if num_sensors == 1 and reference != TRUTH:
+        return SensorOffset(name, None, None, 0, "the only modality: nothing to compare it with")
+    if name == reference:
+        return SensorOffset(name, 0.0, 0.0, 0, "the reference: its clock is taken for that of the ego")
+    pairs = [(one.chosen(np.isfinite(path(one.stamps_ns)[:, 0])), path) for one, path in pairs]
+    count = sum(len(one.stamps_ns) for one, _ in pairs)
+    if count < _FEWEST:
+        why = f"fewer than {_FEWEST} detections of objects whose path is known from {reference}"
+        return SensorOffset(name, None, None, count, why)
+    step = math.ceil(count / _MOST)
+    pairs = [(one.chosen(slice(None, None, step)), path) for one, path in pairs]
+    stamps_ns = np.concatenate([one.stamps_ns for one, _ in pairs])
+    offset_s, move_s = 0.0, math.inf
+    for _ in range(_ROUNDS):
+        r, g, frames = _residuals(pairs, offset_s)
+        if reference != TRUTH:
+            frames = {"": np.empty((len(r), 2, 0))}
+        fits = {of: _solved(r, np.concatenate([g[:, :, None], axes], axis=2), stamps_ns) for of, axes in frames.items()}
+        of, fit = min(fits.items(), key=lambda one: round(one[1].cost, 6))
+        move_s = float(np.clip(fit.x[0], -_LARGEST_STEP_S, _LARGEST_STEP_S))
+        offset_s += move_s
+        if abs(move_s) < 1e-4:
+            break
+    speed_mps = math.sqrt(float(np.nanmean(np.square(g).sum(axis=1))))
+    why = f"objects move {speed_mps:.2g} m/s (rms) in its frame, against {reference}"
+    if not abs(move_s) <= max(0.2 * fit.std[0], 1e-3) or abs(offset_s) > _REACH_S or math.isinf(fit.std[0]):
+        return SensorOffset(name, None, None, len(stamps_ns), why)
+    biases = [_sure(*one) for one in zip(fit.x[1:], fit.std[1:], strict=True)]
+    bias = Bias(of, *biases) if any(biases) else None
+    return SensorOffset(name, offset_s, fit.std[0], len(stamps_ns), why, fit.dof, bias)
+
+
+def _sure(bias_m: float, std_m: float) -> float:
+    """Return `bias_m`, or 0 where it may be chance or does not matter."""
+    return bias_m if abs(bias_m) > max(_BIAS_STDS * std_m, _SMALLEST_BIAS_M) else 0.0
+
+
+def _residuals(pairs: Sequence[_Pair], offset_s: float) -> tuple[FloatArray, FloatArray, dict[str, FloatArray]]:
+    """Return residuals at `offset_s`, their derivatives by it, (n, 2), and (n, 2, 2) axes in which a bias may stay."""
+    step_ns, rows = nanoseconds(_STEP_S), []
+    for one, path in pairs:
+        times_ns = one.stamps_ns - nanoseconds(offset_s)
+        true_m = [path(times_ns + shift_ns) for shift_ns in (-step_ns, 0, step_ns)]
+        sides_m = [true - one.at(times_ns + k * step_ns) for k, true in zip((-1, 0, 1), true_m, strict=True)]
+        moves_m = true_m[2] - true_m[0]
+        yaws_rad = np.arctan2(moves_m[:, 1], moves_m[:, 0])
+        ego_rad = np.full(len(yaws_rad), np.nan) if one.ego is None else one.ego(one.stamps_ns)[:, 2]
+        rows.append((sides_m[1], (sides_m[0] - sides_m[2]) / (2.0 * _STEP_S), yaws_rad, ego_rad))
+    r, g, vehicle_rad, ego_rad = (np.concatenate(column) for column in zip(*rows, strict=True))
+    frames = {Bias.EGO: rotations(ego_rad)} if np.isfinite(ego_rad).any() else {}  # which is taken where both agree
+    return r, g, frames | {Bias.VEHICLE: rotations(vehicle_rad)}
+
+
+def _solved(r: FloatArray, A: FloatArray, stamps_ns: IntArray) -> _Fit:
+    """Return the robust solution of r + A x = 0, of residuals (n, 2) with derivatives (n, 2, k)."""
+    known = np.isfinite(r).all(axis=1) & np.isfinite(A).all(axis=(1, 2))
+    r, A, stamps_ns = r[known], A[known], stamps_ns[known]
+    size = A.shape[2]
+    if len(r) < _FEWEST:
+        return _Fit((0.0,) * size, (math.inf,) * size, 0.0, math.inf)
+    x, weights, scale_m = np.zeros(size), np.ones(len(r)), 1.0
+    H = np.eye(size)
+    for _ in range(5):
+        H = np.einsum("n,nij,nik->jk", weights, A, A) + 1e-9 * np.eye(size)
+        x = -psd_solve(H, np.einsum("n,nij,ni->j", weights, A, r))
+        left_m = np.hypot(*(r + A @ x).T)
+        scale_m = max(float(np.median(left_m)), 1e-6)
+        weights = np.minimum(1.0, _HUBER * scale_m / np.maximum(left_m, 1e-9))
+    left_m = np.hypot(*(r + A @ x).T)
+    inner_m = np.minimum(left_m, _HUBER * scale_m)
+    cost = float(inner_m @ (2.0 * left_m - inner_m))
+    length_s = seconds(int(np.ptp(stamps_ns)))
+    stretch_s = min(_STRETCH_S, max(length_s / _STRETCHES, _SHORTEST_STRETCH_S))
+    names, stretches = np.unique(stamps_ns // nanoseconds(stretch_s), return_inverse=True)
+    if len(names) < _FEWEST_STRETCHES:
+        return _Fit(tuple(x.tolist()), (math.inf,) * size, 0.0, cost)
+    parts, scores = np.zeros((len(names), size, size)), np.zeros((len(names), size))
+    np.add.at(parts, stretches, np.einsum("n,nij,nik->njk", weights, A, A))
+    np.add.at(scores, stretches, np.einsum("n,nij,ni->nj", weights, A, r + A @ x))
+    without = psd_solve(H - parts, scores[:, :, None])[:, :, 0]  # how far the solution moves without each
+    std = np.sqrt((1.0 - 1.0 / len(names)) * np.square(without).sum(axis=0)).tolist()
+    column = psd_solve(H, np.eye(size)[0])
+    shares = np.einsum("j,njk,k->n", column, parts, column) / column[0]  # of what is known of the offset
+    return _Fit(tuple(x.tolist()), tuple(std), 1.0 / float(shares @ shares) - 1.0, cost)

@@ -52,8 +52,8 @@ def test_a_change_in_the_last_seconds_is_no_jump_of_the_clock(at_s: float, is_ju
 
 
 def report(offset_s: float, least_s: float, std_s: float = 0.005) -> OffsetReport:
-    radar = SensorOffset("radar", offset_s, std_s, 500, True, "")
-    lidar = SensorOffset("lidar", 0.0, 0.0, 500, False, "the reference")
+    radar = SensorOffset("radar", offset_s, std_s, 500, "", dof=5.0)
+    lidar = SensorOffset("lidar", 0.0, 0.0, 500, "the reference")
     return OffsetReport("lidar", (lidar, radar), 3, 1000, None, {"lidar": least_s, "radar": least_s})
 
 
@@ -73,9 +73,9 @@ def test_an_offset_is_set_where_it_is_known_and_not_0_and_said_where_it_is_not_k
     (set_,) = clock_findings(report(0.08, 0.1), {"radar": 0.01})
     assert set_.settings == {"sensors.radar.clock_offset_s": 0.09}
     assert not list(clock_findings(report(0.004, 0.1), {"radar": 0.0}))
-    (unknown,) = clock_findings(report(0.133, 0.1, std_s=0.045), {"radar": 0.0})
+    (unknown,) = clock_findings(report(0.1, 0.1, std_s=0.03), {"radar": 0.0})
     assert (unknown.kind, dict(unknown.settings)) == ("offset", {})
-    assert "is not known: +133 ms ± 90 ms" in unknown.text
+    assert "is not known: +100 ms ± 77 ms" in unknown.text
 
 
 @pytest.mark.parametrize(

@@ -1,1 +1,0 @@
-"""Clock offsets of sensors, estimated from tracks."""

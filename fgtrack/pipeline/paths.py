@@ -1,0 +1,209 @@
+"""Where things were at any time: the ego, the objects of a recording, and what a track saw of them."""
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import BSpline, make_interp_spline, make_smoothing_spline
+
+from fgtrack.core.checks import LARGEST
+from fgtrack.core.errors import DataError
+from fgtrack.core.geometry import rotations
+from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
+from fgtrack.core.types import (
+    EGO_ID,
+    FUSED,
+    BoolArray,
+    DetectionList,
+    EgoState,
+    FloatArray,
+    IntArray,
+    Message,
+    TruthState,
+)
+from fgtrack.io.run import NO_TRACK, Run
+from fgtrack.models.road import OpenSpace
+from fgtrack.models.sensors import SensorModel
+from fgtrack.pipeline.config import Config
+from fgtrack.tracking.ego import EgoPose, is_finite
+from fgtrack.tracking.inbox import Batch, stamps
+from fgtrack.tracking.preprocess import Preprocess
+
+__all__ = ["EgoPath", "ObjectPath", "Sightings", "sightings_of", "true_paths"]
+
+_FEWEST = 5  # values that a smoothing spline needs
+_GAP_S = 3.0  # a path is not known in longer gaps
+_EGO_CUTOFF_HZ = 2.0
+#: Components that a wrong stamp moves by metres. Speed and yaw would add little, and as much error as their standard
+#: deviations are wrong by.
+_POSITION = ("x_m", "y_m", "range_m", "bearing_rad")
+
+
+class EgoPath:
+    """Smoothing splines through positions and unwrapped yaw of the ego.
+
+    A spline and not the line from state to state: that line moves as fast as its noise, 2 cm at 100 Hz are 3 m/s, and
+    an estimator that asks how a pose changes with time would take this for motion. The spline minimises
+    sum (y - f)^2 + lam integral f''^2, a low-pass that lets half of a sine of 2 Hz through.
+
+    Parameters
+    ----------
+    states
+        In any order; those that are not finite or repeat a stamp are left out.
+
+    Raises
+    ------
+    DataError
+        There are fewer than five states.
+    """
+
+    def __init__(self, states: Iterable[EgoState]) -> None:
+        by_stamp = {state.stamp_ns: state for state in states if is_finite(state)}
+        if len(by_stamp) < _FEWEST:
+            raise DataError(f"the ego has {len(by_stamp)} states with different stamps, its path needs {_FEWEST}")
+        stamps_ns = sorted(by_stamp)
+        self._start_ns, self._end_ns = stamps_ns[0], stamps_ns[-1]
+        times_s = np.array([seconds(stamp_ns - self._start_ns) for stamp_ns in stamps_ns])
+        values = np.array([[one.x_m, one.y_m, one.yaw_rad] for one in map(by_stamp.__getitem__, stamps_ns)])
+        values[:, 2] = np.unwrap(values[:, 2])
+        density_s = float(times_s[-1]) / (len(times_s) - 1)
+        lam = 1.0 / (density_s * (2.0 * np.pi * _EGO_CUTOFF_HZ) ** 4)
+        self._spline = make_smoothing_spline(times_s, values, lam=lam)
+
+    def __call__(self, times_ns: IntArray) -> FloatArray:
+        """Return x, y and unwrapped yaw at times of shape (m,), shape (m, 3); NaN beyond the first and last state."""
+        poses = np.asarray(self._spline((times_ns - self._start_ns) / NS_PER_S))
+        poses[(times_ns < self._start_ns) | (times_ns > self._end_ns)] = np.nan
+        return poses
+
+
+@dataclass(frozen=True)
+class ObjectPath:
+    """Positions of one object in the map.
+
+    Attributes
+    ----------
+    stamps_ns
+        Times at which it was seen, rising, shape (n,).
+    curve
+        Positions in m over seconds from the first of them.
+    """
+
+    stamps_ns: IntArray
+    curve: BSpline
+
+    @classmethod
+    def through(cls, stamps_ns: IntArray, positions_m: FloatArray) -> "ObjectPath | None":
+        """Return the path through noisy positions (n, 2); None through too few.
+
+        A smoothing spline, its stiffness by generalised cross-validation (Woltring, Advances in Engineering Software
+        8, 1986).
+        """
+        known_ns, rows = np.unique(stamps_ns, return_index=True)
+        if len(known_ns) < 2 * _FEWEST:
+            return None
+        return cls(known_ns, make_smoothing_spline((known_ns - known_ns[0]) / NS_PER_S, positions_m[rows]))
+
+    def __call__(self, times_ns: IntArray) -> FloatArray:
+        """Return positions at times of shape (m,), shape (m, 2); NaN where they are not known."""
+        index = np.clip(np.searchsorted(self.stamps_ns, times_ns), 1, len(self.stamps_ns) - 1)
+        unknown = (times_ns < self.stamps_ns[0]) | (times_ns > self.stamps_ns[-1])
+        unknown |= self.stamps_ns[index] - self.stamps_ns[index - 1] > nanoseconds(_GAP_S)
+        found = np.asarray(self.curve((times_ns - self.stamps_ns[0]) / NS_PER_S))
+        found[unknown] = np.nan
+        return found
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Positions that one sensor measured of one track.
+
+    Attributes
+    ----------
+    stamps_ns
+        Shape (n,).
+    positions_m
+        In the frame of the ego, or of the map where `in_map`, shape (n, 2).
+    """
+
+    stamps_ns: IntArray
+    positions_m: FloatArray
+    in_map: BoolArray
+    ego: EgoPath | None
+
+    def at(self, times_ns: IntArray) -> FloatArray:
+        """Return the positions in the map, had they been measured at these times (n,); shape (n, 2)."""
+        if self.ego is None:
+            return self.positions_m
+        pose = self.ego(times_ns)
+        moved_m = pose[:, :2] + np.einsum("nij,nj->ni", rotations(pose[:, 2]), self.positions_m)
+        return np.where(self.in_map[:, None], self.positions_m, moved_m)
+
+    def chosen(self, rows: BoolArray | slice) -> "Sightings":
+        """Return some of them."""
+        return Sightings(self.stamps_ns[rows], self.positions_m[rows], self.in_map[rows], self.ego)
+
+
+def true_paths(messages: Iterable[Message]) -> list[ObjectPath]:
+    """Return the paths of all true objects of which more than one state is known."""
+    states: dict[int, dict[int, tuple[float, float]]] = defaultdict(dict)
+    for one in messages:
+        if not isinstance(one, TruthState) or one.ignored or one.object_id == EGO_ID:
+            continue
+        if max(abs(one.x_m), abs(one.y_m)) <= LARGEST:  # what is compared with: detections
+            states[one.object_id][one.stamp_ns] = (one.x_m, one.y_m)
+    paths = []
+    for each in states.values():
+        if len(each) > 1:
+            stamps_ns = np.array(sorted(each))
+            positions_m = np.array([each[stamp_ns] for stamp_ns in stamps_ns.tolist()])
+            paths.append(
+                ObjectPath(stamps_ns, make_interp_spline((stamps_ns - stamps_ns[0]) / NS_PER_S, positions_m, k=1))
+            )
+    return paths
+
+
+def sightings_of(
+    run: Run, lists: Sequence[DetectionList], config: Config, ego: EgoPath | None
+) -> dict[str, dict[int, Sightings]]:
+    """Return what `run` of `lists` fused, transformed and merged as the tracker does, by sensor and track.
+
+    `ego` is None where all detections are in the map frame.
+    """
+    columns = (run.updates[name].tolist() for name in ("sensor", "stamp_ns", "receipt_ns", "index", "track_id"))
+    fused = np.isin(run.updates["disposition"], list(FUSED)).tolist()
+    tracks = {
+        (sensor, stamp_ns, receipt_ns, index): track_id
+        for sensor, stamp_ns, receipt_ns, index, track_id, is_fused in zip(*columns, fused, strict=True)
+        if is_fused and track_id != NO_TRACK
+    }
+    preprocess = Preprocess(OpenSpace(), config.merge, config.motion.model(), config.ego.detection_origin_m)
+    sensors = {name: _position_only(sensor) for name, sensor in config.sensors.items()}
+    found: dict[str, dict[int, list[tuple[int, FloatArray, bool]]]] = defaultdict(lambda: defaultdict(list))
+    for message in lists:
+        own_ns = [message.stamp_ns if one.stamp_ns is None else one.stamp_ns for one in message.objects]
+        at_ns = stamps(message, sensors[message.sensor])
+        for stamp_ns in dict.fromkeys(at_ns):
+            batch = Batch(message, stamp_ns, tuple(k for k, each in enumerate(at_ns) if each == stamp_ns))
+            pose = np.zeros(3) if ego is None else ego(np.array([stamp_ns]))[0]
+            if np.isnan(pose[0]):
+                continue
+            placed = None if ego is None else EgoPose(pose[0], pose[1], pose[2], 0.0)
+            for one in preprocess(batch, sensors[message.sensor], placed)[0]:
+                key = message.sensor, own_ns[one.index], message.receipt_ns, one.index
+                if key in tracks and one.position_m is not None:
+                    in_map = ego is None or message.frame == "map"
+                    z_m = one.position_m if in_map else (one.position_m - pose[:2]) @ rotations(pose[2])
+                    found[message.sensor][tracks[key]].append((stamp_ns, z_m, in_map))
+    return {sensor: {name: _gathered(rows, ego) for name, rows in each.items()} for sensor, each in found.items()}
+
+
+def _gathered(rows: Sequence[tuple[int, FloatArray, bool]], ego: EgoPath | None) -> Sightings:
+    stamps_ns, positions_m, in_map = zip(*rows, strict=True)
+    return Sightings(np.array(stamps_ns), np.array(positions_m), np.array(in_map), ego)
+
+
+def _position_only(sensor: SensorModel) -> SensorModel:
+    std = {name: value for name, value in sensor.std.items() if name in _POSITION}
+    return replace(sensor, std=std, yaw_from_map_std_rad=None, max_range_m=None, correlation=None)
