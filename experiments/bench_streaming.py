@@ -10,7 +10,6 @@ docs/metrics.md, section "Streaming accuracy".
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -53,8 +52,8 @@ def compared(messages: Sequence[Message], config: str, methods: Sequence[str], r
 
 def typical(runs: Sequence[fgtrack.Run]) -> fgtrack.Run:
     """The first of equal `runs`, with the median time of every tick, as the machine has other work, too."""
-    process_ns = np.median([run.timing["process_ns"] for run in runs], axis=0).astype(np.int64)
-    return replace(runs[0], timing=Table({**runs[0].timing, "process_ns": process_ns}))
+    process_ns = np.median([run.tables["timing"]["process_ns"] for run in runs], axis=0).astype(np.int64)
+    return runs[0].with_tables(timing=Table({**runs[0].tables["timing"], "process_ns": process_ns}))
 
 
 def table(title: str, tables: Tables) -> str:

@@ -76,11 +76,11 @@ def with_cameras(config: Config, errors: str) -> Config:
 
 def errors_of(run: Run, camera: str) -> list[Series]:
     """Of every vessel the bearings next to it, while no other vessel is near the line of sight."""
-    seen = run.detections.where(run.detections["sensor"] == camera)
+    seen = run.tables["detections"].where(run.tables["detections"]["sensor"] == camera)
     stamps_ns = seen["stamp_ns"]
-    poses = ego_poses(run.ego, stamps_ns)
+    poses = ego_poses(run.tables["ego"], stamps_ns)
     assert poses is not None
-    places_m = np.stack([path.at(stamps_ns)[:, :2] for path in true_paths(run.truth)]) - poses[:, :2]
+    places_m = np.stack([path.at(stamps_ns)[:, :2] for path in true_paths(run.tables["truth"])]) - poses[:, :2]
     true_rad = np.arctan2(places_m[..., 1], places_m[..., 0]) - poses[:, 2]
     found = []
     for place, own_rad in enumerate(true_rad):

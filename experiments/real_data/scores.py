@@ -3,7 +3,6 @@
 import csv
 import statistics
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -85,7 +84,7 @@ def raw(run: Run, seen: Sequence[Scan]) -> Run:
     tracks = {"tick": tick, "stamp_ns": stamps_ns[tick], "track_id": np.arange(len(tick)), "x_m": x_m, "y_m": y_m}
     tracks |= {"num_measured": np.full(len(tick), 99), "status": status}
     timing = Table({"tick": np.arange(len(seen)), "now_ns": stamps_ns})
-    return replace(run, tracks=Table(tracks), timing=timing)
+    return run.with_tables(tracks=Table(tracks), timing=timing)
 
 
 def raw_mota(source: Path, config: Config, run: Run) -> float:

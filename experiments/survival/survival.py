@@ -58,7 +58,9 @@ def expected_share(lidar_delay_s: FloatArray | float, lidar_rate_hz: float) -> F
 
 def wiped_share(run: Run) -> float:
     """Share of the RADAR updates that a later update of the same track, with an older stamp, has wiped."""
-    fused = run.updates.where(np.isin(run.updates["disposition"], ["in_sequence", "out_of_sequence"]))
+    fused = run.tables["updates"].where(
+        np.isin(run.tables["updates"]["disposition"], ["in_sequence", "out_of_sequence"])
+    )
     wiped: list[bool] = []
     for track_id in np.unique(fused["track_id"]):
         own = fused.where(fused["track_id"] == track_id)

@@ -46,7 +46,7 @@ class NoiseFit:
 
 def noise_fits(run: Run) -> list[NoiseFit]:
     """Of every sensor with innovations."""
-    updates, dof = run.updates, num_measured(run.updates)
+    updates, dof = run.tables["updates"], num_measured(run.tables["updates"])
     fits = []
     for sensor in np.unique(updates["sensor"]).tolist():
         mine = (updates["sensor"] == sensor) & np.isfinite(updates["nis"]) & (dof > 0)

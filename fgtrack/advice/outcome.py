@@ -49,9 +49,9 @@ class Outcome:
         """Return the numbers of `run`."""
         counts = dict(run.meta["counts"])
         used = {name: sum(one.get(fate, 0) for fate in USED) / (sum(one.values()) or 1) for name, one in counts.items()}
-        lives, truth, ticks_ns = Lives.of(run), evaluate(run).truth, run.timing["now_ns"]
+        lives, truth, ticks_ns = Lives.of(run), evaluate(run).truth, run.tables["timing"]["now_ns"]
         return cls(
-            births=int(np.count_nonzero(run.updates["disposition"] == "birth")),
+            births=int(np.count_nonzero(run.tables["updates"]["disposition"] == "birth")),
             confirmed=len(lives.lives_s),
             life_s=lives.median_s,
             used=used,

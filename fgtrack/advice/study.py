@@ -13,32 +13,29 @@ from fgtrack.advice.advise import advise
 from fgtrack.advice.page import Advice
 from fgtrack.advice.summary import summary
 from fgtrack.core.errors import DataError
-from fgtrack.core.files import read_head
 from fgtrack.evaluation.comparison import compare
 from fgtrack.evaluation.recordings import by_recording
 from fgtrack.evaluation.runs import JudgedRun, judged
 from fgtrack.evaluation.tables import Tables
-from fgtrack.io.output import Kind, check_apart, check_output, claimed, new_file, new_files
-from fgtrack.io.run import RUN, Run, load_run, write_metrics
+from fgtrack.io.output import check_apart, check_output, claimed, new_file, new_files
+from fgtrack.io.run import Run, check_run, load_run, write_metrics
 from fgtrack.io.source import InputSource, open_input
 from fgtrack.io.span import end_ns
 from fgtrack.pipeline.assumed import Assumed, assumed
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.inputs import inputs
 from fgtrack.pipeline.replay import ReplayResult, replay_each
 from fgtrack.pipeline.shipped import read_config, settings_of
 from fgtrack.plotting.late_detection import close_ups
 from fgtrack.plotting.plot import close_up, drawn, planned
-from fgtrack.plotting.style import DRAWN, png
+from fgtrack.plotting.style import png
 from fgtrack.viewers.playback import Moment
-from fgtrack.viewers.report import REPORT, Opening, write_report
+from fgtrack.viewers.report import Opening, write_report
 
 __all__ = ["ESTIMATORS", "Study", "study"]
 
 ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
 """Estimators of a study."""
 _MARK = "(fgtrack study)"
-_SETTINGS = Kind("settings of a study", lambda path: _MARK.encode() in read_head(path, 500))
 #: Share of the work that is done when a step begins.
 _ADVICE, _REPLAY, _COMPARE, _DRAW, _DONE = 0.02, 0.3, 0.85, 0.9, 1.0
 _TICKS = 50  # between two signs of progress
@@ -135,19 +132,19 @@ def study(
     folders = dict(zip(ESTIMATORS, runs, strict=True))
     config_file = str(config) if isinstance(config, (str, Path)) else None
     for path in outputs(out):
-        check_apart(path, inputs(resolved, [source_path], config_file=config_file))
+        check_apart(path, [source_path, config_file])
     with claimed(out):
         for folder in folders.values():
-            check_output(folder, RUN, overwrite)
-        check_output(figures, Kind("a folder", Path.is_dir), overwrite)
-        check_output(settings, _SETTINGS, overwrite)
-        check_output(page, REPORT, overwrite)
+            check_run(folder, overwrite)
+        check_output(figures, overwrite, Path.is_dir, "a folder")
+        check_output(settings, overwrite)
+        check_output(page, overwrite)
         on_step("reading", 0.0)
         source = open_input(source_path, resolved.input)
         known = assumed(resolved, source)
         advised = _advised(source_path, known.config, on_step) if advice else None
         known = known if advised is None else _following(known, advised)
-        with new_file(settings, _SETTINGS, overwrite) as file:
+        with new_file(settings, overwrite) as file:
             file.write(_settings_text(source_path, known, advised).encode())
         results = _replayed(source_path, source, known.config, folders, overwrite, on_step)
         on_step("compare", _COMPARE)
@@ -242,7 +239,7 @@ def _pictured(
     others = tuple(f"_{one.label}" for one in runs[1:])  # figures of single runs are drawn of the first
     plans = (one for one in planned(runs) if not one.name.endswith(others))
     pictures = [(name, png(figure)) for name, figure in chain(late, drawn(plans))]
-    with new_files(figures, DRAWN, overwrite) as folder:
+    with new_files(figures, overwrite) as folder:
         for name, picture in pictures:
             (folder / f"{name}.png").write_bytes(picture)
     opening = replace(opening, moment=moment.moment, missing=moment.missing)

@@ -21,7 +21,7 @@ def summary(runs: Sequence[JudgedRun], tables: Tables, advice: Advice | None) ->
 
 
 def _recording(one: JudgedRun) -> str:
-    updates, now_ns = one.run.updates, one.run.timing["now_ns"]
+    updates, now_ns = one.run.tables["updates"], one.run.tables["timing"]["now_ns"]
     length_s = (int(now_ns[-1]) - int(now_ns[0])) / NS_PER_S if len(now_ns) else 0.0
     sensors = []
     for sensor in np.unique(updates["sensor"]).tolist():
@@ -44,7 +44,7 @@ def _tracks(one: JudgedRun) -> str:
             f"{_several(of.breaks, 'break')}, {_several(of.id_switches, 'identity switch', 'es')}, "
             f"{_several(truth.false_tracks, 'false track')}."
         )
-    tracks = one.run.tracks
+    tracks = one.run.tables["tracks"]
     confirmed = tracks["status"] != "tentative"
     ids, first = np.unique(tracks["track_id"][confirmed], return_index=True)
     if not len(ids):

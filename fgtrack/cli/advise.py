@@ -10,10 +10,9 @@ from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, Overwrite
 from fgtrack.cli.show import chosen_form, command_line, progress, say, show
 from fgtrack.core.errors import DataError
 from fgtrack.io.output import check_apart, check_output
-from fgtrack.pipeline.inputs import inputs
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
-from fgtrack.pipeline.tune_file import ADVISED, write_advised
+from fgtrack.pipeline.tune_file import write_advised
 
 
 def advise(
@@ -37,10 +36,10 @@ def advise(
     """
     form = chosen_form(as_json, form)
     if out is not None:
-        check_output(out, ADVISED, overwrite)
+        check_output(out, overwrite)
     config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
     if out is not None:
-        check_apart(out, inputs(config, [recording], config_file=config_file))
+        check_apart(out, [recording, config_file])
     with progress("advise") as tell:
         advice = advised(recording, config, reference=reference, tune=tune, on_step=tell)
     if out is not None:

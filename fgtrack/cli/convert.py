@@ -16,7 +16,6 @@ from fgtrack.evaluation.left_out import left_out
 from fgtrack.io.output import check_apart
 from fgtrack.io.recording import check_recording, write_recording
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.inputs import inputs
 from fgtrack.pipeline.load import load
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.sim.redelay import Redelayed, SensorDelays, redelay
@@ -40,7 +39,7 @@ def convert(
     if seed is not None and delays_file is None:
         raise CallError("--seed: only --delays draws random numbers, name its file")
     config = read_config(config_file)
-    check_apart(out, inputs(config, [recording], config_file=config_file, others=[delays_file]))
+    check_apart(out, [recording, config_file, delays_file])
     check_recording(out, overwrite)
     source = open_input(recording, config.input)
     unread: dict[str, Counter[str]] = {}

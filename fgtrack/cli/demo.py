@@ -11,8 +11,8 @@ from fgtrack.advice.study import study
 from fgtrack.cli.arguments import Overwrite
 from fgtrack.cli.show import progress, say, told
 from fgtrack.cli.study import show_study
-from fgtrack.io.output import check_output, claimed
-from fgtrack.io.ros.bag_writer import RECORDING, write_bag
+from fgtrack.io.output import claimed
+from fgtrack.io.recording import check_recording, write_recording
 from fgtrack.models.oval import OVAL
 from fgtrack.pipeline.recorded import recorded_of
 from fgtrack.pipeline.shipped import read_config, read_scenario
@@ -43,10 +43,10 @@ def demo(
     scenario, settings = _changed(read_scenario("default"), delay_s, num_objects)
     with claimed(out):
         bag = out / "recording"
-        check_output(bag, RECORDING, overwrite)
+        check_recording(bag, overwrite)
         with progress("simulate") as tell:
             messages = told(simulate(scenario, np.random.default_rng(seed)), tell)
-            write_bag(bag, messages, overwrite=overwrite, settings=recorded_of(scenario))
+            write_recording(bag, messages, overwrite=overwrite, settings=recorded_of(scenario))
         config = read_config(_CONFIG, settings, track_map=OVAL, pit_map=OVAL)
     with progress("study") as tell:
         found = study(bag, out, config, advice=False, overwrite=overwrite, on_step=tell)

@@ -20,7 +20,7 @@ from fgtrack.io.output import check_apart, new_file, new_files
 from fgtrack.plotting.late_detection import close_ups
 from fgtrack.plotting.paper import Paper, settings
 from fgtrack.plotting.plot import Planned, close_up, drawn, planned, planned_sweep, save_named
-from fgtrack.plotting.style import DRAWN, save_pages
+from fgtrack.plotting.style import save_pages
 
 
 def figure(
@@ -56,11 +56,11 @@ def figure(
         first, plans, missing = _of_sweep(runs, track, stamp) or _of_runs(runs, picture, track, stamp, paper)
         named = chain(first, drawn(plans, every, **paper))
         if one_file:
-            with new_file(out, DRAWN, overwrite) as file:
+            with new_file(out, overwrite) as file:
                 save_pages((each for _, each in named), file)
             files = [out]
         else:
-            with new_files(out, DRAWN, overwrite) as folder:
+            with new_files(out, overwrite) as folder:
                 files = [out / file.name for file in save_named(named, folder, form)]
     if missing is not None:
         say(f"no close-up: {missing}")

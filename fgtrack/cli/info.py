@@ -19,7 +19,7 @@ from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumed import assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
-from fgtrack.pipeline.starting import STARTING, write_starting
+from fgtrack.pipeline.starting import write_starting
 from fgtrack.pipeline.trial import Trial, try_out
 
 _DELAYS = ("delay_mean_s", "delay_p50_s", "delay_p90_s", "delay_max_s")
@@ -45,7 +45,7 @@ def info(
     if write is not None:
         if config_file is not None:
             raise CallError("--write, -c: a starting configuration is made from the recording alone, give one of them")
-        check_output(write, STARTING, overwrite)
+        check_output(write, overwrite)
         check_apart(write, [recording])
         write_starting(write, recording, overwrite)
         if form is None:
@@ -85,7 +85,7 @@ def _try_out(recording: Path, config: Config, warned: Set[tuple[str, str]]) -> T
             say(f"first {trial.duration_s:g} s of {sensor}: {became or 'no detection'}")
         for line in left_out(trial.run.meta):
             say(f"first {trial.duration_s:g} s of {line}")
-        say(f"first {trial.duration_s:g} s: {len(set(trial.run.tracks['track_id'].tolist()))} tracks")
+        say(f"first {trial.duration_s:g} s: {len(set(trial.run.tables['tracks']['track_id'].tolist()))} tracks")
     for found in trial.suspicions:
         if (found.about, found.text.split()[0]) not in warned:
             warn(str(found))

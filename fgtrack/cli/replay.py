@@ -18,7 +18,6 @@ from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
 from fgtrack.io.span import end_ns
 from fgtrack.pipeline.assumed import assumed
-from fgtrack.pipeline.inputs import inputs
 from fgtrack.pipeline.replay import located, replay_each
 from fgtrack.pipeline.shipped import read_config
 
@@ -53,7 +52,7 @@ def replay(
             raise CallError(f"estimator {name!r} is named twice")
     folders = {name: out / name for name in names} if len(names) > 1 else {names[0]: out}
     for folder in folders.values():
-        check_apart(folder, inputs(config, [recording], config_file=config_file))
+        check_apart(folder, [recording, config_file])
     source = open_input(recording, config.input)
     with progress("replay") as tell:
         found = assumed(config, source)

@@ -16,7 +16,7 @@ from fgtrack.evaluation.runs import judged, run_folders
 from fgtrack.io.output import check_apart, check_output
 from fgtrack.plotting.plot import named_figures
 from fgtrack.plotting.style import png
-from fgtrack.viewers.report import REPORT, write_report
+from fgtrack.viewers.report import write_report
 
 _SUFFIXES = (".html", ".htm")
 _MEGABYTE = 1e6
@@ -35,7 +35,7 @@ def report(
     """
     if out.suffix.lower() not in _SUFFIXES:
         raise CallError(f"{out}: a report is one HTML file, end the name with .html")
-    check_output(out, REPORT, overwrite)
+    check_output(out, overwrite)
     every = judged(runs)
     check_apart(out, run_folders(every))
     with progress("report"):

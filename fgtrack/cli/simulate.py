@@ -11,9 +11,8 @@ from fgtrack.cli.completion import scenarios
 from fgtrack.cli.show import progress, say, told
 from fgtrack.io.output import check_apart
 from fgtrack.io.recording import check_recording, write_recording
-from fgtrack.pipeline.inputs import inputs
 from fgtrack.pipeline.recorded import recorded_of
-from fgtrack.pipeline.shipped import find_file, read_scenario
+from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.sim.simulate import simulate as simulated
 
 
@@ -36,7 +35,7 @@ def simulate(
 ) -> None:
     """Simulate a scenario into a stream or a rosbag2 folder."""
     scenario = read_scenario(scenario_file, duration_s=duration_s)
-    check_apart(out, inputs(scenario=scenario, others=[find_file("scenario", scenario_file)]))
+    check_apart(out, [scenario_file, scenario.map])
     check_recording(out, overwrite)
     with progress("simulate") as tell:
         messages = simulated(scenario, np.random.default_rng(seed))

@@ -13,7 +13,6 @@ from fgtrack.cli.show import command_line, progress, say, sentences, show, warn
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.cautions import cautions
 from fgtrack.io.output import check_apart
-from fgtrack.pipeline.inputs import inputs
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
 
@@ -34,7 +33,7 @@ def study(
     """
     config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
     for path in outputs(out):
-        check_apart(path, inputs(config, [recording], config_file=config_file))
+        check_apart(path, [recording, config_file])
     with progress("study") as tell:
         found = studied(recording, out, config, overwrite=overwrite, on_step=tell)
     for line in dict.fromkeys(str(one) for run in found.runs for one in cautions(run)):

@@ -23,10 +23,9 @@ from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
 from fgtrack.io.output import check_apart, check_output
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.inputs import inputs
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.tune import tuned
-from fgtrack.pipeline.tune_file import TUNED, write_tuned
+from fgtrack.pipeline.tune_file import write_tuned
 from fgtrack.pipeline.tune_report import HeldOut, TunedParameter, TuneReport
 from fgtrack.pipeline.tune_rules import TuneRules
 
@@ -53,9 +52,9 @@ def tune(
     Maximum likelihood of the innovations; truth is not needed. Says which parameters are not identifiable.
     """
     form = chosen_form(as_json, form)
-    check_output(out, TUNED, overwrite)
+    check_output(out, overwrite)
     config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
-    check_apart(out, inputs(config, recordings, config_file=config_file))
+    check_apart(out, [*recordings, config_file])
     sources = {str(path): open_input(path, config.input) for path in recordings}
     with progress("tune") as tell:
         report = tuned(sources, config, TuneRules(keep=tuple(keep or ())), tell)

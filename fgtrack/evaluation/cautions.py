@@ -83,17 +83,17 @@ def innovation_lag1(run: Run, sensor: str) -> float | None:
     It is near 0 where its errors are white and the noise is consistent. Of a sensor without positions it is that of the
     first component.
     """
-    found = autocorrelations(run.updates.where(run.updates["sensor"] == sensor))
+    found = autocorrelations(run.tables["updates"].where(run.tables["updates"]["sensor"] == sensor))
     first = next(iter(found.values()), None)
     return None if first is None else first.lag1
 
 
 def misfits(run: Run) -> Iterator[tuple[str, ChiSquareMean]]:
     """The sensors of `noise_cautions`, and their NIS."""
-    measured = num_measured(run.updates)
-    for sensor, mine in _by_sensor(run.updates):
-        nis = ChiSquareMean.of(run.updates["nis"][mine], measured[mine])
-        if nis.count >= FEWEST and is_far_off(nis) and _median_is_off(run.updates["nis"][mine], nis):
+    measured = num_measured(run.tables["updates"])
+    for sensor, mine in _by_sensor(run.tables["updates"]):
+        nis = ChiSquareMean.of(run.tables["updates"]["nis"][mine], measured[mine])
+        if nis.count >= FEWEST and is_far_off(nis) and _median_is_off(run.tables["updates"]["nis"][mine], nis):
             yield sensor, nis
 
 
@@ -117,7 +117,7 @@ def is_far_off(square: ChiSquareMean) -> bool:
 
 def unused(run: Run) -> str | None:
     """What became of the detections of `run` where not one was used; None where one was, or there are none."""
-    updates = run.updates
+    updates = run.tables["updates"]
     if not updates.num_rows or np.isin(updates["disposition"], USED).any():
         return None
     fates = zip(*np.unique(updates["disposition"], return_counts=True), strict=True)
@@ -131,22 +131,22 @@ def _changed(run: Run) -> Iterator[Caution]:
 
 
 def _clocks(run: Run) -> Iterator[Caution]:
-    for sensor, mine in _by_sensor(run.updates):
-        if (run.updates["stamp_ns"][mine] == 0).all():
+    for sensor, mine in _by_sensor(run.tables["updates"]):
+        if (run.tables["updates"]["stamp_ns"][mine] == 0).all():
             text = (
                 "all stamps are 0: its driver does not set them, so nothing is known of its delay; "
                 f"`stamp_from: receipt` on its topic, or sensors.{sensor}.stamp_from, takes the receipt for the stamp"
             )
             yield Caution(sensor, text, {f"sensors.{sensor}.stamp_from": "receipt"})
-        receipts_ns = np.unique(run.updates["receipt_ns"][mine])
+        receipts_ns = np.unique(run.tables["updates"]["receipt_ns"][mine])
         if unit := wrong_unit(len(receipts_ns), int(receipts_ns[0]), int(receipts_ns[-1])):
             yield Caution(sensor, unit)
 
 
 def _angles(run: Run) -> Iterator[Caution]:
     """Angles that were recorded in degrees and read as radians."""
-    by_sensor = ((sensor, run.detections, mine) for sensor, mine in _by_sensor(run.detections))
-    for about, table, mine in [(EGO, run.ego, slice(None)), *by_sensor]:
+    by_sensor = ((sensor, run.tables["detections"], mine) for sensor, mine in _by_sensor(run.tables["detections"]))
+    for about, table, mine in [(EGO, run.tables["ego"], slice(None)), *by_sensor]:
         for name in ANGULAR:
             values = table[name][mine] if name in table else np.empty(0)
             finite = values[np.isfinite(values)]
@@ -157,7 +157,7 @@ def _angles(run: Run) -> Iterator[Caution]:
 def _ego(run: Run) -> Iterator[Caution]:
     """No ego where it is needed, or reasons for which more than half of its states were refused."""
     failed = [f"{count} of {total} of {sensor}" for sensor, fate, count, total in _mostly(run) if fate == "failed"]
-    if run.ego.num_rows:
+    if run.tables["ego"].num_rows:
         if jumps := run.meta.get("ego_jumps"):
             text = (
                 f"its place jumps {jumps} times, as where a clock is set or a localisation starts anew: what is seen "
@@ -165,8 +165,9 @@ def _ego(run: Run) -> Iterator[Caution]:
             )
             yield Caution(EGO, text.replace("1 times", "once") if jumps == 1 else text)
         for reason, count in dict(run.meta.get("ego_refused") or {}).items():
-            if 2 * count > run.ego.num_rows:
-                text = f"{count} of {run.ego.num_rows} states not used, {reason}: look at the clock of its driver"
+            if 2 * count > run.tables["ego"].num_rows:
+                states = f"{count} of {run.tables['ego'].num_rows} states"
+                text = f"{states} not used, {reason}: look at the clock of its driver"
                 yield Caution(EGO, text)
     elif failed:
         text = f"no state was received, so nothing in its frame can be placed ({', '.join(failed)} failed)"
@@ -183,7 +184,7 @@ def _map(run: Run) -> Iterator[Caution]:
     """No map where new objects are as fast as the ego, in its direction."""
     if not _ego_speeds_births(run) or _section(run, "map").get("track") not in (None, OPEN_SPACE):
         return
-    measured = run.detections
+    measured = run.tables["detections"]
     blind = [sensor for sensor, mine in _by_sensor(measured) if not np.isfinite(measured["yaw_rad"][mine]).any()]
     if blind:
         text = (
@@ -195,13 +196,13 @@ def _map(run: Run) -> Iterator[Caution]:
 
 def _ego_speeds_births(run: Run) -> bool:
     """Whether new objects are assumed to be as fast as the ego, or nearly."""
-    return bool(run.updates.num_rows and _section(run, "birth").get("ego_speed_factor"))
+    return bool(run.tables["updates"].num_rows and _section(run, "birth").get("ego_speed_factor"))
 
 
 def _mostly(run: Run) -> Iterator[tuple[str, str, int, int]]:
     """Sensors of which more than half of the detections were not used for one reason: it, how many, and of how many."""
-    for sensor, mine in _by_sensor(run.updates):
-        for fate, count in zip(*np.unique(run.updates["disposition"][mine], return_counts=True), strict=True):
+    for sensor, mine in _by_sensor(run.tables["updates"]):
+        for fate, count in zip(*np.unique(run.tables["updates"]["disposition"][mine], return_counts=True), strict=True):
             if fate not in USED and 2 * count > mine.sum():
                 yield sensor, str(fate), int(count), int(mine.sum())
 
@@ -209,8 +210,10 @@ def _mostly(run: Run) -> Iterator[tuple[str, str, int, int]]:
 def _lost(run: Run) -> Iterator[Caution]:
     """Dispositions that hit more than half of the detections of a sensor, where nothing else tells it already."""
     for sensor, fate, count, total in _mostly(run):
-        unset = fate == "too_old" and not run.updates["stamp_ns"][run.updates["sensor"] == sensor].any()
-        if unset or (fate == "failed" and not run.ego.num_rows):
+        unset = (
+            fate == "too_old" and not run.tables["updates"]["stamp_ns"][run.tables["updates"]["sensor"] == sensor].any()
+        )
+        if unset or (fate == "failed" and not run.tables["ego"].num_rows):
             continue
         told = {"sensor": sensor, "because": because((run.meta.get("out_of_bounds") or {}).get(sensor, {}))}
         cure = _too_old(run, sensor) if fate == "too_old" else _CURES[fate].format_map(told)
@@ -218,8 +221,10 @@ def _lost(run: Run) -> Iterator[Caution]:
 
 
 def _too_old(run: Run, sensor: str) -> str:
-    mine = run.updates["sensor"] == sensor
-    delay_s = float(np.median(run.updates["receipt_ns"][mine] - run.updates["stamp_ns"][mine])) / NS_PER_S
+    mine = run.tables["updates"]["sensor"] == sensor
+    delay_s = (
+        float(np.median(run.tables["updates"]["receipt_ns"][mine] - run.tables["updates"]["stamp_ns"][mine])) / NS_PER_S
+    )
     limit_s = (_section(run, "sensors").get(sensor) or {}).get("max_delay_s")
     if limit_s is not None and delay_s > limit_s:
         cure = f"raise sensors.{sensor}.max_delay_s or correct its clock"
@@ -241,8 +246,8 @@ def _too_old(run: Run, sensor: str) -> str:
 def _window(run: Run) -> Iterator[Caution]:
     """A window that holds less than two lists of a sensor."""
     window, lag_s = _told_window(run)
-    for sensor, mine in _by_sensor(run.updates):
-        stamps_ns = np.unique(run.updates["stamp_ns"][mine])
+    for sensor, mine in _by_sensor(run.tables["updates"]):
+        stamps_ns = np.unique(run.tables["updates"]["stamp_ns"][mine])
         if len(stamps_ns) < FEWEST:
             continue
         period_s = float(np.median(np.diff(stamps_ns))) / NS_PER_S
@@ -264,7 +269,7 @@ def _failures(run: Run) -> Iterator[Caution]:
 
 def _lives(run: Run) -> Iterator[Caution]:
     """Tracks that break off and begin again, and births that die unconfirmed: bad tracking that needs no truth."""
-    lives, now_ns = Lives.of(run), run.timing["now_ns"]
+    lives, now_ns = Lives.of(run), run.tables["timing"]["now_ns"]
     total, recorded_s = len(lives.lives_s), float(np.ptp(now_ns)) / NS_PER_S if len(now_ns) else 0.0
     enough = lives.breaks >= max(_FEWEST_BREAKS, _BREAKS_SHARE * total)
     if enough and lives.breaks_per_minute > MOST_BREAKS_PER_MINUTE:
@@ -275,8 +280,8 @@ def _lives(run: Run) -> Iterator[Caution]:
             f"detection_probability, lifecycle.lifetime_s, noise; `{_advise(run)}` looks for them"
         )
         yield Caution("tracks", text)
-    used = int(np.isin(run.updates["disposition"], USED).sum())
-    dead = int(np.count_nonzero(run.updates["disposition"] == "birth")) - total
+    used = int(np.isin(run.tables["updates"]["disposition"], USED).sum())
+    dead = int(np.count_nonzero(run.tables["updates"]["disposition"] == "birth")) - total
     if used >= FEWEST and dead > _DEAD_SHARE * used:
         text = (
             f"{dead} of {used} detections used began a track that was never confirmed; likely causes: clutter, errors "

@@ -84,7 +84,7 @@ class NeesOverRuns:
 
 def consistency(run: Run, matching: Matching | None) -> Consistency:
     """NEES of the judged rows of `run`, NIS and whiteness of its innovations."""
-    updates = run.updates
+    updates = run.tables["updates"]
     measured = num_measured(updates)
     sensors = {name: updates["sensor"] == name for name in np.unique(updates["sensor"]).tolist()}
     of_position = None if matching is None else position_nees(matching)

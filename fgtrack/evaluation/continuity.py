@@ -18,9 +18,11 @@ def late_switches(run: Run, matching: Matching, within_s: float) -> IntArray:
     A switch counts where the track before it or the one after it had such an update in the ticks from `within_s`
     before the switch up to it.
     """
-    updates = run.updates.where(with_disposition(run.updates, LATE))
-    updates = updates.where(np.isin(updates["tick"], run.timing["tick"]))  # not of a tick that was never finished
-    updated_ns = matching.now_ns[np.searchsorted(run.timing["tick"], updates["tick"])]
+    updates = run.tables["updates"].where(with_disposition(run.tables["updates"], LATE))
+    updates = updates.where(
+        np.isin(updates["tick"], run.tables["timing"]["tick"])
+    )  # not of a tick that was never finished
+    updated_ns = matching.now_ns[np.searchsorted(run.tables["timing"]["tick"], updates["tick"])]
     counts = np.zeros(len(matching.object_ids), dtype=np.int64)
     for index in range(len(counts)):
         ticks = np.flatnonzero(matching.present[:, index] & (matching.track_ids[:, index] != NO_TRACK))
@@ -40,11 +42,15 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
     NaN where there is no such row.
     """
     count = len(matching.object_ids)
-    updates = run.updates.where(with_disposition(run.updates, FUSED) & (run.updates["track_id"] != NO_TRACK))
-    rows = _published(run.tracks, updates)
+    updates = run.tables["updates"].where(
+        with_disposition(run.tables["updates"], FUSED) & (run.tables["updates"]["track_id"] != NO_TRACK)
+    )
+    rows = _published(run.tables["tracks"], updates)
     stamps_ns, rows = updates["stamp_ns"][rows >= 0], rows[rows >= 0]
-    xy = np.stack([run.tracks["x_m"][rows], run.tracks["y_m"][rows]], axis=-1)
-    truth = np.stack([path.at(run.tracks["stamp_ns"][rows])[:, :2] for path in true_paths(run.truth)], axis=1)
+    xy = np.stack([run.tables["tracks"]["x_m"][rows], run.tables["tracks"]["y_m"][rows]], axis=-1)
+    truth = np.stack(
+        [path.at(run.tables["tracks"]["stamp_ns"][rows])[:, :2] for path in true_paths(run.tables["truth"])], axis=1
+    )
     distances_m = np.linalg.norm(truth - xy[:, None], axis=-1)
     distances_m[~(distances_m <= gate_m)] = np.inf
     near = np.isfinite(distances_m).any(axis=1)

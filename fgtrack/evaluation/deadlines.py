@@ -31,13 +31,13 @@ class Deadlines:
     def of(cls, run: Run) -> "Deadlines":
         """Those of `run`."""
         ready_ns, node = ready(run)
-        now_ns = run.timing["now_ns"]
+        now_ns = run.tables["timing"]["now_ns"]
         span_ns = int(now_ns[-1] - now_ns[0]) if len(now_ns) else 0
         return cls(
             period_s=math.nan if node.period_ns is None else seconds(node.period_ns),
             ticks=len(now_ns),
             misses=node.misses,
-            load=float(run.timing["process_ns"].sum() / span_ns) if span_ns else math.nan,
+            load=float(run.tables["timing"]["process_ns"].sum() / span_ns) if span_ns else math.nan,
             latest_s=float((ready_ns - now_ns).max() / NS_PER_S) if len(now_ns) else math.nan,
         )
 
@@ -46,4 +46,4 @@ def ready(run: Run) -> tuple[IntArray, Node]:
     """When the output of every tick was ready, shape (ticks,), and the node that did them."""
     node_hz = (run.config.get("clock") or {}).get("node_hz")
     node = Node(None if node_hz is None else period_ns(float(node_hz)))
-    return ready_times(run.timing, node), node
+    return ready_times(run.tables["timing"], node), node

@@ -26,11 +26,11 @@ def in_regions(run: Run, stamps_ns: IntArray, points_m: FloatArray) -> BoolArray
 
     Between two stamps of the truth the regions of the nearer one count.
     """
-    regions = run.ignored.where(run.ignored["outline_m"] != "")
+    regions = run.tables["ignored"].where(run.tables["ignored"]["outline_m"] != "")
     found = np.zeros(len(stamps_ns), dtype=np.bool_)
     if not regions.num_rows:
         return found
-    known_ns = np.union1d(run.truth["stamp_ns"], run.ignored["stamp_ns"])
+    known_ns = np.union1d(run.tables["truth"]["stamp_ns"], run.tables["ignored"]["stamp_ns"])
     nearest_ns = known_ns[np.searchsorted(known_ns[:-1] + np.diff(known_ns) // 2, stamps_ns)]
     for stamp_ns, text in zip(regions["stamp_ns"], regions["outline_m"], strict=True):
         rows = np.flatnonzero((nearest_ns == stamp_ns) & ~found)

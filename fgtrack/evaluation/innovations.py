@@ -50,7 +50,7 @@ def residuals(run: Run) -> Mapping[str, FloatArray]:
     `along_m` and `across_m` (left positive) turn the position residual into the direction of the track, the
     published yaw at the detection's stamp: they are x_loc and y_loc of Karle et al. 2023.
     """
-    values: dict[str, FloatArray] = {name: run.updates[f"res_{name}"] for name in MEASURABLE}
+    values: dict[str, FloatArray] = {name: run.tables["updates"][f"res_{name}"] for name in MEASURABLE}
     yaw_rad = track_states(run, np.isfinite(values["x_m"]))[:, 2]
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     along_m = c * values["x_m"] + s * values["y_m"]
@@ -123,19 +123,21 @@ def track_states(run: Run, wanted: BoolArray) -> FloatArray:
     Linear between the published rows of the track, constant before the first and after the last one; NaN elsewhere, and
     for a track that was never published.
     """
-    states = np.full((run.updates.num_rows, len(_TRACK_STATE)), np.nan)
-    order = np.lexsort((run.tracks["stamp_ns"], run.tracks["track_id"]))
-    ids = run.tracks["track_id"][order]
-    for track_id in np.unique(run.updates["track_id"][wanted]).tolist():
+    states = np.full((run.tables["updates"].num_rows, len(_TRACK_STATE)), np.nan)
+    order = np.lexsort((run.tables["tracks"]["stamp_ns"], run.tables["tracks"]["track_id"]))
+    ids = run.tables["tracks"]["track_id"][order]
+    for track_id in np.unique(run.tables["updates"]["track_id"][wanted]).tolist():
         start, end = np.searchsorted(ids, (track_id, track_id + 1)).tolist()
         if start == end:
             continue
         rows = order[start:end]
-        mine = np.flatnonzero(wanted & (run.updates["track_id"] == track_id))
-        stamps_ns = run.tracks["stamp_ns"][rows]
+        mine = np.flatnonzero(wanted & (run.tables["updates"]["track_id"] == track_id))
+        stamps_ns = run.tables["tracks"]["stamp_ns"][rows]
         first_ns = stamps_ns[0]  # differences are exact as floats, epoch stamps are not
-        asked, known = ((ns - first_ns).astype(np.float64) for ns in (run.updates["stamp_ns"][mine], stamps_ns))
+        asked, known = (
+            (ns - first_ns).astype(np.float64) for ns in (run.tables["updates"]["stamp_ns"][mine], stamps_ns)
+        )
         for column, name in enumerate(_TRACK_STATE):
-            values = run.tracks[name][rows]
+            values = run.tables["tracks"][name][rows]
             states[mine, column] = np.interp(asked, known, np.unwrap(values) if name in ANGULAR else values)
     return states

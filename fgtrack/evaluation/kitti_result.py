@@ -16,17 +16,16 @@ from pathlib import Path
 import numpy as np
 
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.files import read_head
 from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.time import seconds
 from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.placement import update_rows
 from fgtrack.io.adapters.kitti import CLASS_NAMES, is_sequence, view_of_sequence
 from fgtrack.io.adapters.kitti_view import PERIOD_NS, Box, View
-from fgtrack.io.output import Kind, check_apart, new_file
-from fgtrack.io.run import NO_TRACK, Run, evaluation_config
+from fgtrack.io.output import check_apart, new_file
+from fgtrack.io.run import NO_TRACK, Run
 
-__all__ = ["RESULT", "KittiResult", "write_kitti_result"]
+__all__ = ["KittiResult", "write_kitti_result"]
 
 #: As `_line` writes it: frame, track, type, not told how truncated and occluded, thirteen numbers.
 _LINE = re.compile(rb"\d+ \d+ .+ -1 -1( -?\d+\.\d{6}){13}")
@@ -92,23 +91,18 @@ def write_kitti_result(run: Run, sequence: Path, out: Path, *, overwrite: bool =
             f"{run.path}: no detection of its tracks has a size (detections.csv), which a box needs: replay detections "
             "with length_m, width_m, height_m and z_m"
         )
-    with new_file(out, RESULT, overwrite) as file:
+    with new_file(out, overwrite) as file:
         file.write("".join(lines).encode())
     return KittiResult(len(lines), len(tracks), len(without - tracks))
 
 
-def _is_result(path: Path) -> bool:
-    first, end, _ = read_head(path, _LONGEST_LINE).partition(b"\n")
-    is_empty = path.is_file() and path.stat().st_size == 0  # of a run that saw nothing
-    return is_empty or (bool(end) and _LINE.fullmatch(first) is not None)
-
-
-RESULT = Kind("a result file of the KITTI data set", _is_result)
-
-
 def _lines(run: Run, views: list[View]) -> tuple[list[str], set[int], set[int]]:
     """Lines, the tracks that are in them, and those that are not for want of a box at some frame."""
-    tracks = run.tracks.where(confirmed(run.tracks)) if evaluation_config(run).confirmed_only else run.tracks
+    tracks = (
+        run.tables["tracks"].where(confirmed(run.tables["tracks"]))
+        if run.evaluation.confirmed_only
+        else run.tables["tracks"]
+    )
     of_tick = defaultdict(list)
     for row, tick in enumerate(tracks["tick"].tolist()):
         of_tick[tick].append(row)
@@ -137,7 +131,7 @@ class _Told:
 
     def __init__(self, run: Run) -> None:
         self.of: dict[int, _Seen] = defaultdict(_Seen)
-        detections, updates, rows = run.detections, run.updates, update_rows(run)
+        detections, updates, rows = run.tables["detections"], run.tables["updates"], update_rows(run)
         fused = np.flatnonzero(rows >= 0)
         fused = fused[updates["track_id"][rows[fused]] != NO_TRACK]
         ticks = updates["tick"][rows[fused]]
@@ -158,7 +152,9 @@ class _Told:
 def _ticks(run: Run, num_frames: int) -> dict[int, tuple[int, int]]:
     """Time and number of the newest tick at each frame; not of a frame within whose period there was none before."""
     found: dict[int, tuple[int, int]] = {}
-    for now_ns, tick in zip(run.timing["now_ns"].tolist(), run.timing["tick"].tolist(), strict=True):
+    for now_ns, tick in zip(
+        run.tables["timing"]["now_ns"].tolist(), run.tables["timing"]["tick"].tolist(), strict=True
+    ):
         frame = -(-now_ns // PERIOD_NS)  # the first one that is not before the tick
         if 0 <= frame < num_frames:
             found[frame] = (now_ns, tick)

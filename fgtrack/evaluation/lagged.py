@@ -60,14 +60,14 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
     if matching is None:
         return ()
     parts: list[tuple[float | Literal["window"], Table]] = [
-        (lag_s, run.lagged.where(run.lagged["lag_s"] == lag_s))
-        for lag_s in np.unique(run.lagged["lag_s"]).tolist()
+        (lag_s, run.tables["lagged"].where(run.tables["lagged"]["lag_s"] == lag_s))
+        for lag_s in np.unique(run.tables["lagged"]["lag_s"]).tolist()
         if lag_s > 0.0
     ]
-    final = run.smoothed.where(run.smoothed["kind"] == "final")
+    final = run.tables["smoothed"].where(run.tables["smoothed"]["kind"] == "final")
     if final.num_rows:
         parts.append((WINDOW, final))
-    paths = true_paths(run.truth)
+    paths = true_paths(run.tables["truth"])
     return (_present(matching), *(_judged(matching, paths, lag_s, states) for lag_s, states in parts))
 
 
@@ -94,8 +94,8 @@ def _judged(
 
 def final_errors(run: Run, matching: Matching) -> TrackErrors:
     """Errors of the final states, each against the object that its track was paired with at that stamp."""
-    final = run.smoothed.where(run.smoothed["kind"] == "final")
-    states, truth, rows = _with_truth(matching, true_paths(run.truth), final)
+    final = run.tables["smoothed"].where(run.tables["smoothed"]["kind"] == "final")
+    states, truth, rows = _with_truth(matching, true_paths(run.tables["truth"]), final)
     index = matching.object_index[rows]
     return TrackErrors(states["stamp_ns"], index, states["track_id"], state_errors(states, truth))
 

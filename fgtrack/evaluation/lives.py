@@ -32,7 +32,7 @@ class Lives:
     @classmethod
     def of(cls, run: Run) -> "Lives":
         """Return the lives of `run`."""
-        tracks = run.tracks
+        tracks = run.tables["tracks"]
         ids = np.unique(tracks["track_id"][confirmed(tracks)])
         rows = np.flatnonzero(np.isin(tracks["track_id"], ids))
         rows = rows[np.argsort(tracks["track_id"][rows], kind="stable")]

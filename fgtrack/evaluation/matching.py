@@ -11,7 +11,7 @@ from fgtrack.core.types import BoolArray, FloatArray, IntArray, TrackStatus
 from fgtrack.evaluation.ignoring import ignored_objects, in_regions
 from fgtrack.evaluation.sight import in_sight
 from fgtrack.evaluation.truth import TRUE_STATE, TruePath, true_paths
-from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, Table, evaluation_config
+from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, Table
 
 NO_OBJECT = -1
 """Object index of a track row that is paired with no true object."""
@@ -105,13 +105,13 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     gate, the rest is assigned by the Hungarian method, first as many pairs as possible, then the least sum of
     distances. Ticks are those of timing.csv, so ticks without any track count as well.
     """
-    options = options or evaluation_config(run)
-    paths = true_paths(run.truth)
+    options = options or run.evaluation
+    paths = true_paths(run.tables["truth"])
     if not paths:
         return None
-    ticks, now_ns = run.timing["tick"], run.timing["now_ns"]
-    tracks = run.tracks.where(_judged(run, options))
-    if run.ignored.num_rows:
+    ticks, now_ns = run.tables["timing"]["tick"], run.tables["timing"]["now_ns"]
+    tracks = run.tables["tracks"].where(_judged(run, options))
+    if run.tables["ignored"].num_rows:
         tracks = tracks.where(~_ignored(run, tracks, paths, options.gate_m))
     candidates = np.stack([path.at(tracks["stamp_ns"]) for path in paths], axis=1)
     xy = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
@@ -199,7 +199,7 @@ def scenes(run: Run, matching: Matching) -> Scenes:
 
 def recorded(run: Run, matching: Matching) -> BoolArray:
     """Whether each tick of `matching` lies between the first and the last stamp of the truth, shape (ticks,)."""
-    truth_ns = run.truth["stamp_ns"]
+    truth_ns = run.tables["truth"]["stamp_ns"]
     return np.asarray((matching.now_ns >= truth_ns.min()) & (matching.now_ns <= truth_ns.max()))
 
 
@@ -213,9 +213,9 @@ def _judged(run: Run, options: EvaluationConfig) -> BoolArray:
 
     Only a run that was killed has rows of a tick that timing.csv does not know.
     """
-    tracks, truth_ns = run.tracks, run.truth["stamp_ns"]
+    tracks, truth_ns = run.tables["tracks"], run.tables["truth"]["stamp_ns"]
     judged = (tracks["stamp_ns"] >= truth_ns.min()) & (tracks["stamp_ns"] <= truth_ns.max())
-    judged &= np.isin(tracks["tick"], run.timing["tick"])
+    judged &= np.isin(tracks["tick"], run.tables["timing"]["tick"])
     if options.confirmed_only:
         judged &= confirmed(tracks)
     return np.asarray(judged)
@@ -223,13 +223,13 @@ def _judged(run: Run, options: EvaluationConfig) -> BoolArray:
 
 def _ignored(run: Run, tracks: Table, paths: list[TruePath], gate_m: float) -> BoolArray:
     """Whether each row of `tracks` is neither right nor false, shape (rows,): it is no true object's, and ignored."""
-    ignored = true_paths(ignored_objects(run.ignored))
+    ignored = true_paths(ignored_objects(run.tables["ignored"]))
     both = np.stack([path.at(tracks["stamp_ns"])[:, :2] for path in [*paths, *ignored]], axis=1)
     xy = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
     distances_m = np.linalg.norm(both - xy[:, None], axis=-1)
-    tick_index = np.searchsorted(run.timing["tick"], tracks["tick"])
+    tick_index = np.searchsorted(run.tables["timing"]["tick"], tracks["tick"])
     inside = np.where(distances_m <= gate_m, distances_m, np.inf)
-    found = _pair(inside, tracks["track_id"], tick_index, run.timing.num_rows)
+    found = _pair(inside, tracks["track_id"], tick_index, run.tables["timing"].num_rows)
     return np.asarray((found >= len(paths)) | ((found == NO_OBJECT) & in_regions(run, tracks["stamp_ns"], xy)))
 
 

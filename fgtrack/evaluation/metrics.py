@@ -20,7 +20,7 @@ from fgtrack.evaluation.multi_object import MultiObjectMetrics, multi_object_met
 from fgtrack.evaluation.prediction import PredictionErrors, prediction_errors
 from fgtrack.evaluation.residual_samples import ResidualSamples, residual_samples
 from fgtrack.evaluation.statistics import ChiSquareMean, Distribution, Moments
-from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, evaluation_config
+from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run
 from fgtrack.models.measurement import ANGULAR
 
 FALSE_TRACK_SHARE = 0.5
@@ -176,7 +176,7 @@ def evaluate(run: Run, options: EvaluationConfig | None = None) -> Metrics:
 
     Without `options` it is judged as its configuration says.
     """
-    options = options or evaluation_config(run)
+    options = options or run.evaluation
     return evaluate_matched(run, match(run, options), options, residual_samples(run))
 
 
@@ -184,10 +184,13 @@ def evaluate_matched(
     run: Run, matching: Matching | None, options: EvaluationConfig, samples: ResidualSamples
 ) -> Metrics:
     """Metrics of `run`, whose `match` by these `options` and `residual_samples` are known."""
-    ids = run.tracks["track_id"]
-    is_confirmed = confirmed(run.tracks)
-    busy = run.timing["num_detections"] > 0
-    time_s, detections = run.timing["process_ns"][busy] / NS_PER_S, run.timing["num_detections"][busy]
+    ids = run.tables["tracks"]["track_id"]
+    is_confirmed = confirmed(run.tables["tracks"])
+    busy = run.tables["timing"]["num_detections"] > 0
+    time_s, detections = (
+        run.tables["timing"]["process_ns"][busy] / NS_PER_S,
+        run.tables["timing"]["num_detections"][busy],
+    )
     return Metrics(
         name="" if run.path is None else run.path.resolve().name,
         estimator=str(run.meta.get("estimator", "")),
@@ -266,7 +269,7 @@ def _object_metrics(
 
 
 def _sensor_metrics(run: Run) -> dict[str, SensorMetrics]:
-    updates, values = run.updates, residuals(run)
+    updates, values = run.tables["updates"], residuals(run)
     measured = num_measured(updates)
     sensors = {}
     for sensor in np.unique(updates["sensor"]).tolist():

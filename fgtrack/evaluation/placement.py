@@ -9,7 +9,7 @@ from fgtrack.core.geometry import cartesian, rotations, wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.evaluation.sight import ego_poses
 from fgtrack.io.run import Run
-from fgtrack.io.run.reader import Column
+from fgtrack.io.run.schema import Column
 
 _KEY = ("sensor", "stamp_ns", "receipt_ns", "index")
 
@@ -34,9 +34,9 @@ def placed(run: Run) -> Placed:
     The tracker itself places them by what it knew of the ego when they came, so its own places may differ by what the
     ego moved unexpectedly.
     """
-    table = run.detections
+    table = run.tables["detections"]
     frame, stamps_ns = table["frame"], table["stamp_ns"]
-    poses = ego_poses(run.ego, stamps_ns)
+    poses = ego_poses(run.tables["ego"], stamps_ns)
     if poses is None:
         poses = np.full((len(stamps_ns), 3), np.nan)
     mounts = _mounts(run, table["sensor"], frame == "sensor")
@@ -55,9 +55,9 @@ def placed(run: Run) -> Placed:
 def update_rows(run: Run) -> IntArray:
     """The row of `Run.updates` that says what became of each of `Run.detections`, shape (n,); -1 where none does."""
     waiting: defaultdict[tuple[object, ...], deque[int]] = defaultdict(deque)
-    for row, key in enumerate(zip(*(run.updates[name].tolist() for name in _KEY), strict=True)):
+    for row, key in enumerate(zip(*(run.tables["updates"][name].tolist() for name in _KEY), strict=True)):
         waiting[key].append(row)
-    keys = zip(*(run.detections[name].tolist() for name in _KEY), strict=True)
+    keys = zip(*(run.tables["detections"][name].tolist() for name in _KEY), strict=True)
     return np.array([waiting[key].popleft() if waiting[key] else -1 for key in keys], dtype=np.int64)
 
 

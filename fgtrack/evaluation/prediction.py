@@ -97,7 +97,7 @@ def _truth(run: Run, matching: Matching, stamps_ns: IntArray, objects: IntArray,
     """True positions, shape (n, m, 2), `ahead_s`, shape (m,), of the stamps, shape (n,); NaN where not known."""
     asked_ns = stamps_ns[:, None] + np.round(ahead_s * NS_PER_S).astype(np.int64)
     positions = np.full((*asked_ns.shape, 2), np.nan)
-    paths = {path.object_id: path for path in true_paths(run.truth)}
+    paths = {path.object_id: path for path in true_paths(run.tables["truth"])}
     for index, object_id in enumerate(matching.object_ids):
         mine = objects == index
         states = paths[object_id].at(asked_ns[mine].reshape(-1))

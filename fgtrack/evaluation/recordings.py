@@ -6,7 +6,7 @@ import numpy as np
 
 from fgtrack.core.types import MEASURABLE, BoolArray
 from fgtrack.evaluation.runs import JudgedRun
-from fgtrack.io.run import Run, Table, recording_of
+from fgtrack.io.run import Run, Table
 
 _TIMES = ("stamp_ns", "receipt_ns")
 
@@ -18,17 +18,17 @@ def same_recording(one: Run, other: Run) -> bool:
     stamps (a recording with other delays) or the same receipts (a configuration with other stamps). Without a common
     sensor and without truth the ego decides, without that the place of the recording.
     """
-    if one.truth != other.truth:
+    if not one.tables["truth"].equals(other.tables["truth"]):
         return False
-    common = np.intersect1d(one.updates["sensor"], other.updates["sensor"]).tolist()
+    common = np.intersect1d(one.tables["updates"]["sensor"], other.tables["updates"]["sensor"]).tolist()
     if common:
         return all(_same_detections(one, other, sensor) for sensor in common)
-    if one.truth.num_rows:
+    if one.tables["truth"].num_rows:
         return True
-    if one.ego.num_rows or other.ego.num_rows:
-        return one.ego == other.ego
-    place = recording_of(one)
-    return place is not None and place == recording_of(other)
+    if one.tables["ego"].num_rows or other.tables["ego"].num_rows:
+        return one.tables["ego"].equals(other.tables["ego"])
+    place = one.recording
+    return place is not None and place == other.recording
 
 
 def by_recording(runs: Sequence[JudgedRun]) -> list[list[JudgedRun]]:
@@ -55,9 +55,9 @@ def recordings_caution(runs: Sequence[JudgedRun]) -> list[str]:
 
 
 def _same_detections(one: Run, other: Run, sensor: str) -> bool:
-    mine, its = (run.updates.where(run.updates["sensor"] == sensor) for run in (one, other))
+    mine, its = (run.tables["updates"].where(run.tables["updates"]["sensor"] == sensor) for run in (one, other))
     same = [name for name in _TIMES if np.array_equal(np.sort(mine[name]), np.sort(its[name]))]
-    return any(_same_values(one.detections, other.detections, sensor, time) for time in same)
+    return any(_same_values(one.tables["detections"], other.tables["detections"], sensor, time) for time in same)
 
 
 def _same_values(mine: Table, its: Table, sensor: str, time: str) -> bool:
@@ -80,4 +80,4 @@ def _told(run: Run) -> str:
     words = [str(source["path"])] if source.get("path") else []
     if run.meta.get("messages_received"):
         words.append(f"{run.meta['messages_received']} messages")
-    return ", ".join(words) or f"{run.updates.num_rows} detections"
+    return ", ".join(words) or f"{run.tables['updates'].num_rows} detections"

@@ -59,12 +59,14 @@ class ResidualSamples:
 
 def residual_samples(run: Run) -> ResidualSamples:
     """The samples of `run`. Raises `DataError` where the map that it names is no map."""
-    ids = np.unique(run.tracks["track_id"][confirmed(run.tracks)])
+    ids = np.unique(run.tables["tracks"]["track_id"][confirmed(run.tables["tracks"])])
     local = residuals(run)
-    known = np.isin(run.updates["track_id"], ids) & np.isfinite([local[name] for name in LOCAL_NAMES]).any(axis=0)
+    known = np.isin(run.tables["updates"]["track_id"], ids) & np.isfinite([local[name] for name in LOCAL_NAMES]).any(
+        axis=0
+    )
     rows = np.flatnonzero(known)
-    rows = rows[np.argsort(run.updates["stamp_ns"][rows], kind="stable")]
-    sensors, track_ids, stamps_ns = (run.updates[name][rows] for name in ("sensor", "track_id", "stamp_ns"))
+    rows = rows[np.argsort(run.tables["updates"]["stamp_ns"][rows], kind="stable")]
+    sensors, track_ids, stamps_ns = (run.tables["updates"][name][rows] for name in ("sensor", "track_id", "stamp_ns"))
     states = track_states(run, known)[rows]
     values = {name: local[name][rows] for name in LOCAL_NAMES}
     values["yaw_rad"] = _with_map(run, values["yaw_rad"], states)
@@ -94,7 +96,7 @@ def _with_map(run: Run, yaw_rad: FloatArray, states: FloatArray) -> FloatArray:
 
 def _around_ego(run: Run, states: FloatArray, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Positions ahead and left of the ego, and its speed, shape (n,) each; NaN where it is not known."""
-    ego = ego_states(run.ego, stamps_ns)
+    ego = ego_states(run.tables["ego"], stamps_ns)
     if ego is None:
         unknown = np.full(len(states), np.nan)
         return unknown, unknown, unknown
@@ -105,9 +107,9 @@ def _around_ego(run: Run, states: FloatArray, stamps_ns: IntArray) -> tuple[Floa
 
 def _observed_s(run: Run, track_ids: IntArray, stamps_ns: IntArray) -> FloatArray:
     """Time since the first detection of each track, shape (n,); a detection older than it counts as the first."""
-    ids, numbers = np.unique(run.updates["track_id"], return_inverse=True)
+    ids, numbers = np.unique(run.tables["updates"]["track_id"], return_inverse=True)
     born_ns = np.full(len(ids), np.iinfo(np.int64).max)
-    births = run.updates["disposition"] == "birth"
-    np.minimum.at(born_ns, numbers[births], run.updates["stamp_ns"][births])
+    births = run.tables["updates"]["disposition"] == "birth"
+    np.minimum.at(born_ns, numbers[births], run.tables["updates"]["stamp_ns"][births])
     since_ns = stamps_ns - born_ns[np.searchsorted(ids, track_ids)]
     return np.asarray(np.maximum(since_ns, 0) / NS_PER_S)

@@ -15,7 +15,7 @@ from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
 from fgtrack.evaluation.matching import Matching, match, recorded
 from fgtrack.evaluation.metrics import Metrics, evaluate_matched
 from fgtrack.evaluation.residual_samples import ResidualSamples, residual_samples
-from fgtrack.io.run import EvaluationConfig, Run, evaluation_config, is_run_folder, load_run
+from fgtrack.io.run import EvaluationConfig, Run, is_run_folder, load_run
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class JudgedRun:
     @cached_property
     def options(self) -> EvaluationConfig:
         """How the run is judged."""
-        return evaluation_config(self.run)
+        return self.run.evaluation
 
     @cached_property
     def scored_ticks_ns(self) -> IntArray:
@@ -113,12 +113,14 @@ def one_judged(run: OneRun) -> JudgedRun:
 
 def start_ns(runs: Sequence[JudgedRun]) -> int:
     """Time of the first tick of `runs`; 0 where there is none."""
-    return min((int(one.run.timing["now_ns"][0]) for one in runs if one.run.timing.num_rows), default=0)
+    return min(
+        (int(one.run.tables["timing"]["now_ns"][0]) for one in runs if one.run.tables["timing"].num_rows), default=0
+    )
 
 
 def starts_ns(runs: Sequence[JudgedRun]) -> dict[str, int]:
     """By label when the recording of each run begins: the first tick of it and of those that ran at the same time."""
-    ticks = {one.label: one.run.timing["now_ns"] for one in runs}
+    ticks = {one.label: one.run.tables["timing"]["now_ns"] for one in runs}
     spans = {label: (int(now_ns[0]), int(now_ns[-1])) if len(now_ns) else (0, 0) for label, now_ns in ticks.items()}
     return {
         label: min(first for first, last in spans.values() if first <= end and last >= begin)

@@ -35,9 +35,9 @@ def sensed(one: JudgedRun) -> dict[str, Sensed]:
     """By sensor. Raises `DataError` where the map that the run names is no map."""
     run, samples = one.run, one.samples
     found = {}
-    for sensor in np.unique(run.updates["sensor"]).tolist():
-        receipts_ns, delay_s = message_delays(run.updates.where(run.updates["sensor"] == sensor))
-        ego = ego_states(run.ego, receipts_ns - np.round(delay_s * NS_PER_S).astype(np.int64))
+    for sensor in np.unique(run.tables["updates"]["sensor"]).tolist():
+        receipts_ns, delay_s = message_delays(run.tables["updates"].where(run.tables["updates"]["sensor"] == sensor))
+        ego = ego_states(run.tables["ego"], receipts_ns - np.round(delay_s * NS_PER_S).astype(np.int64))
         mine = samples.sensors == sensor
         counts = np.unique(samples.track_ids[mine], return_counts=True)[1]
         found[sensor] = Sensed(

@@ -35,7 +35,7 @@ def in_sight(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> tuple[Boo
     """
     positions_m = np.stack([path.at(now_ns)[:, :2] for path in paths], axis=1)
     present = np.asarray(np.isfinite(positions_m).all(axis=-1))
-    sensors, poses = _sensors(run), ego_poses(run.ego, now_ns)
+    sensors, poses = _sensors(run), ego_poses(run.tables["ego"], now_ns)
     if poses is None or not sensors:
         return present, False
     ego = run.config.get("ego") or {}
@@ -73,7 +73,7 @@ def _is_limited(sensor: SensorModel) -> bool:
 def _sensors(run: Run) -> list[SensorModel]:
     """Models of the sensors that occur in the run."""
     found: Mapping[str, Any] = run.config.get("sensors") or {}
-    heard = np.unique(run.updates["sensor"]).tolist()
+    heard = np.unique(run.tables["updates"]["sensor"]).tolist()
     try:
         models = _models().validate_python({name: found[name] for name in heard if name in found})
     except ValidationError as error:

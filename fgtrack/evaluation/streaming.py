@@ -65,7 +65,7 @@ def streamed(one: JudgedRun) -> Streamed:
     tracks, ticks = matching.tracks.where(matching.paired), matching.tick_index[rows]
     object_index, ready_ns = matching.object_index[rows], ready(one.run)[0][ticks]
     truth = np.full((len(rows), 2), np.nan)
-    for index, path in enumerate(true_paths(one.run.truth)):
+    for index, path in enumerate(true_paths(one.run.tables["truth"])):
         mine = object_index == index
         truth[mine] = path.at(ready_ns[mine])[:, :2]
     published = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
@@ -164,7 +164,7 @@ def _load(runs: Sequence[JudgedRun]) -> Table:
     """A row for each run: how long after its tick an output was ready, late ticks, load."""
     ages = {}
     for one in runs:
-        delay_ns = ready(one.run)[0] - one.run.timing["now_ns"]
+        delay_ns = ready(one.run)[0] - one.run.tables["timing"]["now_ns"]
         ages[one.label] = Distribution.of(delay_ns / NS_PER_S)
 
     def deadlines(one: JudgedRun) -> Deadlines:

@@ -8,8 +8,8 @@ from typing import Literal
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Message
 from fgtrack.io.output import check_output
-from fgtrack.io.ros.bag_writer import RECORDING, write_bag
-from fgtrack.io.stream import SETTINGS, STREAM, write_stream
+from fgtrack.io.ros.bag_writer import check_bag, write_bag
+from fgtrack.io.stream import SETTINGS, write_stream
 
 Storage = Literal["mcap", "sqlite3"]
 """Storage of a rosbag2 folder."""
@@ -39,7 +39,10 @@ def check_recording(out: Path, overwrite: bool) -> None:
     """Raise `CallError` where `write_recording` would for what is there, before the messages are made."""
     if not _is_stream(out) and _FILE_ENDING.search(out.name) and not out.is_dir():
         raise CallError(f"{out}: is written as .jsonl, as .jsonl.gz, or as a rosbag2 folder without such an ending")
-    check_output(out, STREAM if _is_stream(out) else RECORDING, overwrite)
+    if _is_stream(out):
+        check_output(out, overwrite)
+    else:
+        check_bag(out, overwrite)
 
 
 def _is_stream(out: Path) -> bool:

@@ -25,7 +25,7 @@ from fgtrack.core.types import (
 )
 from fgtrack.io.config import InputConfig
 from fgtrack.io.errors import LARGEST_BYTES, MOST_OBJECTS, TruncatedInput, UntilBreak, refuse_larger
-from fgtrack.io.output import Kind, new_file
+from fgtrack.io.output import new_file
 from fgtrack.io.source import FileFormat
 
 STREAM_FORMAT = "fgtrack-stream/1"
@@ -144,7 +144,7 @@ def write_stream(
     """
     path = Path(path)
     count = 0
-    with new_file(path, STREAM, overwrite) as file, _packed(file, path.name.endswith(".gz")) as lines:
+    with new_file(path, overwrite) as file, _packed(file, path.name.endswith(".gz")) as lines:
         lines.write(_line({"type": "header", "format": STREAM_FORMAT, **(header or {})}))
         readable = UntilBreak(messages)
         for message in readable:
@@ -153,16 +153,6 @@ def write_stream(
         readable.raise_before_replacing(path)
     readable.raise_error()
     return count
-
-
-def _is_stream(path: Path) -> bool:
-    try:
-        return path.is_file() and bool(read_header(path))
-    except DataError:
-        return False
-
-
-STREAM = Kind("an fgtrack stream", _is_stream)
 
 
 @contextmanager

@@ -171,8 +171,10 @@ def sightings_of(
 
     `ego` is None where all detections are in the map frame.
     """
-    columns = (run.updates[name].tolist() for name in ("sensor", "stamp_ns", "receipt_ns", "index", "track_id"))
-    fused = np.isin(run.updates["disposition"], list(FUSED)).tolist()
+    columns = (
+        run.tables["updates"][name].tolist() for name in ("sensor", "stamp_ns", "receipt_ns", "index", "track_id")
+    )
+    fused = np.isin(run.tables["updates"]["disposition"], list(FUSED)).tolist()
     tracks = {
         (sensor, stamp_ns, receipt_ns, index): track_id
         for sensor, stamp_ns, receipt_ns, index, track_id, is_fused in zip(*columns, fused, strict=True)

@@ -13,7 +13,7 @@ from fgtrack.core.errors import CallError, FgtrackError, printable
 from fgtrack.io.adapters.native import NATIVE_ADAPTERS
 from fgtrack.io.config import CsvInput, CsvTable, Field, InputConfig, TopicInput
 from fgtrack.io.info import InputInfo, describe
-from fgtrack.io.output import Kind, new_file
+from fgtrack.io.output import new_file
 from fgtrack.io.ros.bag import Bag
 from fgtrack.io.source import input_kind, open_input
 from fgtrack.pipeline.assumed import Assumed, assumed
@@ -22,27 +22,16 @@ from fgtrack.pipeline.load import plain, validate
 from fgtrack.pipeline.parts import Part, table_parts, topic_parts
 from fgtrack.pipeline.trial import beginning, suspicions
 
-__all__ = ["STARTING", "starting_config", "write_starting"]
+__all__ = ["starting_config", "write_starting"]
 
 _MARK = "(fgtrack info --write)"
 _TRIAL_NS = 5_000_000_000
 
 
-def _recognises(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return _MARK.encode() in file.readline(1000)
-
-
-#: A file that `fgtrack info --write` has written.
-STARTING = Kind("a starting configuration", _recognises)
-
-
 def write_starting(out: Path, recording: Path, overwrite: bool) -> None:
     """Write the starting configuration for `recording`; raises as `starting_config` and `new_file`."""
     text = starting_config(recording)
-    with new_file(out, STARTING, overwrite) as file:
+    with new_file(out, overwrite) as file:
         file.write(text.encode())
 
 

@@ -15,7 +15,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.estimation.registry import ESTIMATORS, MOTION_MODELS
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.inputs import fingerprints, inputs
+from fgtrack.pipeline.inputs import fingerprints
 from fgtrack.pipeline.load import key_and_value, load, names_of, plain, read_yaml, validate
 from fgtrack.pipeline.replay import versions
 from fgtrack.pipeline.shipped import find_file, read_config, read_scenario
@@ -333,8 +333,8 @@ def _inputs(sweep: SweepConfig, base: Mapping[str, Value], path: Path) -> list[P
     others = [] if sweep.delays is None else [folder / sweep.delays]
     others += [] if sweep.scenario is None else [find_file("scenario", sweep.scenario, folder)]
     others += [] if sweep.config is None else [find_file("configuration", sweep.config, folder)]
-    config = validate(Config, base[CONFIG], "configuration")
-    return inputs(config, [] if sweep.input is None else [folder / sweep.input], others=others)
+    others += [] if sweep.input is None else [folder / sweep.input]
+    return others
 
 
 class _Reads:

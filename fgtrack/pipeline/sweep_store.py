@@ -8,14 +8,13 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
-from itertools import pairwise
 from pathlib import Path
 
 from pydantic import ConfigDict, TypeAdapter
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.files import read_head, read_whole
-from fgtrack.io.output import Kind, check_output, write_file
+from fgtrack.io.output import check_output, write_file
 from fgtrack.pipeline.sweep_plan import KEY_COLUMNS, Plan, Value, compact
 
 PART_FORMAT = "fgtrack-sweep-part/1"
@@ -79,7 +78,7 @@ class PartStore:
         has_parts = any(map(_is_part, self._folder.glob("*.json")))
         goes_on = has_parts or (_is_empty(self._folder) and not _has_rows(folder / SWEEP_TABLE))
         for name in _TABLES:
-            check_output(folder / name, _SWEPT, overwrite or goes_on)
+            check_output(folder / name, overwrite or goes_on)
         try:
             if self._folder.is_symlink():
                 raise CallError(f"{self._folder}: is a link, choose another folder")
@@ -143,17 +142,6 @@ def _is_empty(folder: Path) -> bool:
 
 def _has_rows(table: Path) -> bool:
     return bool(read_head(table, _LONGEST_HEAD).partition(b"\n")[2])
-
-
-def _is_swept(path: Path) -> bool:
-    """Whether the header has the columns that every table of a sweep has; the summaries have no seed."""
-    columns = read_head(path, _LONGEST_HEAD).partition(b"\n")[0].decode(errors="replace").strip().split(",")
-    if path.name in (PAIRED_TABLE, SUMMARY_TABLE):
-        return KEY_COLUMNS[1] in columns
-    return KEY_COLUMNS in pairwise(columns)
-
-
-_SWEPT = Kind("a table of a sweep", _is_swept)
 
 
 def _is_part(path: Path) -> bool:

@@ -12,29 +12,12 @@ from ruamel.yaml.error import CommentMark
 from ruamel.yaml.tokens import CommentToken
 
 from fgtrack.core.errors import printable
-from fgtrack.io.output import Kind, new_file
+from fgtrack.io.output import new_file
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import plain, validate
 from fgtrack.pipeline.shipped import find_file, read_config
 
 _TUNED_MARK, _ADVISED_MARK = "(fgtrack tune)", "(fgtrack advise)"
-_LONGEST_HEAD = 1000
-
-
-def _kind(name: str, mark: str) -> Kind:
-    def recognises(path: Path) -> bool:
-        if not path.is_file():
-            return False
-        with path.open("rb") as file:
-            return mark.encode() in file.readline(_LONGEST_HEAD)
-
-    return Kind(name, recognises)
-
-
-#: A file that `fgtrack tune` has written.
-TUNED = _kind("a tuned configuration", _TUNED_MARK)
-#: A file that `fgtrack advise` has written.
-ADVISED = _kind("an advised configuration", _ADVISED_MARK)
 
 
 def write_tuned(path: Path, base: str | Path | None, config: Config, comments: Sequence[str], overwrite: bool) -> None:
@@ -44,7 +27,7 @@ def write_tuned(path: Path, base: str | Path | None, config: Config, comments: S
     `CallError` where `path` exists and must not be replaced, or cannot be written.
     """
     text = tuned_text(base, config, comments)
-    with new_file(path, TUNED, overwrite) as file:
+    with new_file(path, overwrite) as file:
         file.write(text.encode())
 
 
@@ -53,7 +36,7 @@ def write_advised(
 ) -> None:
     """The same for settings that belong to a recording: with its maps."""
     text = _text(base, config, comments, "Settings for a recording, from {}", _ADVISED_MARK)
-    with new_file(path, ADVISED, overwrite) as file:
+    with new_file(path, overwrite) as file:
         file.write(text.encode())
 
 

@@ -13,7 +13,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, IntArray
 from fgtrack.evaluation.runs import OneRun, one_judged, start_ns
 from fgtrack.io.run import Table
-from fgtrack.io.run.reader import Column
+from fgtrack.io.run.schema import Column
 from fgtrack.plotting.paper import Paper, Sheet, styled
 from fgtrack.plotting.style import legend_above, titled, usual_step_ns
 
@@ -52,7 +52,7 @@ def arrivals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         The run has no detections.
     """
     one = one_judged(run)
-    updates = one.run.updates
+    updates = one.run.tables["updates"]
     if not updates.num_rows:
         raise DataError(f"{one.label}: has no detections, so there are no arrivals to draw")
     sensors = np.unique(updates["sensor"]).tolist()

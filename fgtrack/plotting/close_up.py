@@ -98,7 +98,7 @@ class _View:
         one = close_ups[0]
         self._turn = rotation(-float(one.after.means[-1, YAW]))
         now_ns = np.array([one.now_ns])
-        paths = [path for path in true_paths(runs[0].run.truth) if np.isfinite(path.at(now_ns)[0, 0])]
+        paths = [path for path in true_paths(runs[0].run.tables["truth"]) if np.isfinite(path.at(now_ns)[0, 0])]
         self._path = min(
             paths, key=lambda path: float(np.hypot(*(path.at(now_ns)[0, :2] - one.after.means[-1, :2]))), default=None
         )

@@ -49,7 +49,7 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         raise DataError(f"{one.label}: has no errors and no innovations, so there is no consistency to draw")
     sheet = Sheet(10.0, 1.0 + 2.1 * len(panels), paper)
     rows = sheet.plots(len(panels), sharex=True)[:, 0]
-    sensors = np.unique(one.run.updates["sensor"]).tolist()
+    sensors = np.unique(one.run.tables["updates"]["sensor"]).tolist()
     first_ns = start_ns([one])
     for place, (axes, (name, (stamps_ns, values, dof))) in enumerate(zip(rows, panels.items(), strict=True)):
         time_s = (stamps_ns - first_ns) / NS_PER_S
@@ -80,7 +80,7 @@ def _panels(one: JudgedRun) -> dict[str, _Squares]:
         known = np.isfinite(nees.values)
         if known.any():
             found[_NEES] = nees.stamps_ns[known], nees.values[known], nees.dof[known]
-    updates = one.run.updates
+    updates = one.run.tables["updates"]
     measured = num_measured(updates)
     for sensor in np.unique(updates["sensor"]).tolist():
         mine = (updates["sensor"] == sensor) & np.isfinite(updates["nis"]) & (measured > 0)

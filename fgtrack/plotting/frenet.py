@@ -51,7 +51,7 @@ def frenet(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     lines = list(_lines(one, road))
     if not lines:
         raise DataError(f"{one.label}: has no tracks and no truth, so there is nothing along a track to draw")
-    ego = _ego(one.run.ego, road)
+    ego = _ego(one.run.tables["ego"], road)
     sheet = Sheet(10.0, 6.2 if ego is None else 8.0, paper)
     along, *middle, lateral = sheet.plots(2 if ego is None else 3, sharex=True)[:, 0]
     first_ns = start_ns([one])
@@ -121,7 +121,7 @@ class _Line:
 
 def _lines(one: JudgedRun, road: TrackMap) -> Iterator[_Line]:
     """Truth and tracks, in their colours."""
-    matching, paths = one.matching, true_paths(one.run.truth)
+    matching, paths = one.matching, true_paths(one.run.tables["truth"])
     few = len(paths) <= _NAMED_OBJECTS
     for index, path in enumerate(paths):
         name = f"object {path.object_id}" if few else "objects"
@@ -129,7 +129,7 @@ def _lines(one: JudgedRun, road: TrackMap) -> Iterator[_Line]:
         yield _Line(
             road, path.stamps_ns, path.states[:, :2], colour(index), label, "-", _FEW_TRUE if few else _MANY_TRUE
         )
-    tracks = one.run.tracks if matching is None else matching.tracks
+    tracks = one.run.tables["tracks"] if matching is None else matching.tracks
     tracks = tracks.where(confirmed(tracks)) if matching is None else tracks
     named: set[str] = set()
     for place, track_id in enumerate(np.unique(tracks["track_id"]).tolist()):

@@ -9,7 +9,7 @@ import numpy as np
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
-from fgtrack.io.run import Run, Table, load_run, recording_of
+from fgtrack.io.run import Run, Table, load_run
 from fgtrack.io.source import open_input
 from fgtrack.models.motion import CTRV
 from fgtrack.pipeline.build import build_tracker
@@ -59,7 +59,7 @@ def close_up_of(run: Run, arrival: Arrival) -> CloseUp:
         The recording, or a file that the configuration names, is not there any more; or it does not hold the
         detection; or no track fused it.
     """
-    recording = recording_of(run)
+    recording = run.recording
     if recording is None:
         given = (run.meta.get("input") or {}).get("path") or "messages in memory"
         raise DataError(f"{given}: the recording of the run is not there, so no close-up")
@@ -110,7 +110,7 @@ def chosen(runs: Sequence[Run], track_id: int | None = None, stamp_ns: int | Non
     common = [one for one in common if track_id is None or first[one].track_id == track_id]
     if not common:
         where, of = runs[0].path or "the run", "" if track_id is None else f" of track {track_id}"
-        if track_id is not None and track_id not in runs[0].tracks["track_id"]:
+        if track_id is not None and track_id not in runs[0].tables["tracks"]["track_id"]:
             raise DataError(f"{where}: has no track {track_id}")
         raise DataError(
             f"{where}: no late detection{of} was fused by itself after {_SETTLED} others, so there is no close-up"
@@ -136,7 +136,7 @@ def chosen(runs: Sequence[Run], track_id: int | None = None, stamp_ns: int | Non
 
 
 def _late_detections(run: Run) -> dict[Arrival, _Late]:
-    updates, tracks = run.updates, run.tracks
+    updates, tracks = run.tables["updates"], run.tables["tracks"]
     used = np.isin(updates["disposition"], ("in_sequence", "out_of_sequence", "beyond_window"))
     pairs = np.stack([updates["tick"], updates["track_id"]], axis=-1)
     _, group, sizes = np.unique(pairs[used], axis=0, return_inverse=True, return_counts=True)
@@ -152,7 +152,7 @@ def _late_detections(run: Run) -> dict[Arrival, _Late]:
             continue
         now_ns = int(tracks["now_ns"][row])
         expected_m = motion.predict(states[before], seconds(now_ns - int(tracks["now_ns"][before])))[:2]
-        true_m = _true_m(run.truth, now_ns, states[row, :2])
+        true_m = _true_m(run.tables["truth"], now_ns, states[row, :2])
         errors_m = tuple(float(np.hypot(*(at_m - true_m))) for at_m in (expected_m, states[row, :2]))
         stamp_ns, receipt_ns, place = (int(updates[name][update]) for name in ("stamp_ns", "receipt_ns", "index"))
         arrival = Arrival(str(updates["sensor"][update]), stamp_ns, receipt_ns, place)

@@ -53,9 +53,13 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     maps, notes = roads(one.run)
     bounds_m = [line for road in maps.values() for line in road_lines(road)[:2]]
     rings = excluded_lines(one.run)
-    tracks = one.run.tracks.where(confirmed(one.run.tracks)) if one.matching is None else one.matching.tracks
-    detections_m, ego_m = placed(one.run).position_m, _positions(one.run.ego)
-    held = [*bounds_m, ego_m, *(path.states[:, :2] for path in true_paths(one.run.truth))]
+    tracks = (
+        one.run.tables["tracks"].where(confirmed(one.run.tables["tracks"]))
+        if one.matching is None
+        else one.matching.tracks
+    )
+    detections_m, ego_m = placed(one.run).position_m, _positions(one.run.tables["ego"])
+    held = [*bounds_m, ego_m, *(path.states[:, :2] for path in true_paths(one.run.tables["truth"]))]
     lows_m, highs_m = _limits([_positions(tracks), detections_m], held)
     window = _window(one.run)
     has_window = window is not None and (highs_m - lows_m).max() > _WORTHWHILE * 2.0 * window.half_m
@@ -67,7 +71,7 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         for k, ring in enumerate(rings):
             axes.plot(*ring.T, color=GREY, lw=1.2, ls=":", zorder=3, label="" if k else "excluded")
         near = window if is_close else None
-        ego, seen = _near(one.run.ego, near), _near(one.run.detections, near)
+        ego, seen = _near(one.run.tables["ego"], near), _near(one.run.tables["detections"], near)
         if np.isfinite(ego_m).any():
             axes.plot(*ego_m[ego].T, color="black", lw=0.8, ls="--", label="ego", zorder=3.5)
         if np.isfinite(detections_m).any():
@@ -108,7 +112,7 @@ class _Window(NamedTuple):
 
 def _window(run: Run) -> _Window | None:
     """Around the track with the most updates in `_AROUND_S` before and after, at the first such stamp of them."""
-    used, around_ns = run.updates.where(run.updates["track_id"] >= 0), nanoseconds(_AROUND_S)
+    used, around_ns = run.tables["updates"].where(run.tables["updates"]["track_id"] >= 0), nanoseconds(_AROUND_S)
     best: tuple[int, int, int] = (0, 0, 0)
     for track_id in np.unique(used["track_id"]).tolist():
         stamps_ns = np.sort(used["stamp_ns"][used["track_id"] == track_id])
@@ -118,8 +122,9 @@ def _window(run: Run) -> _Window | None:
         row = int(counts.argmax())
         best = max(best, (int(counts[row]), -int(stamps_ns[row]), track_id))
     middle_ns = -best[1]
-    rows = run.tracks.where(
-        (run.tracks["track_id"] == best[2]) & (np.abs(run.tracks["stamp_ns"] - middle_ns) <= around_ns)
+    rows = run.tables["tracks"].where(
+        (run.tables["tracks"]["track_id"] == best[2])
+        & (np.abs(run.tables["tracks"]["stamp_ns"] - middle_ns) <= around_ns)
     )
     positions_m = _positions(rows)
     if not best[0] or not len(positions_m):
@@ -154,13 +159,13 @@ def _limits(samples_m: list[FloatArray], held_m: list[FloatArray]) -> tuple[Floa
 
 def _draw_objects(axes: Axes, one: JudgedRun, tracks: Table, window: _Window | None) -> None:
     """Truth and tracks, in their colours."""
-    step_ns = usual_step_ns(one.run.tracks["now_ns"])
+    step_ns = usual_step_ns(one.run.tables["tracks"]["now_ns"])
     matching = one.matching
     if matching is None:
-        for k, track_id in enumerate(np.unique(one.run.tracks["track_id"]).tolist()):
+        for k, track_id in enumerate(np.unique(one.run.tables["tracks"]["track_id"]).tolist()):
             _draw_tracks(axes, tracks.where(tracks["track_id"] == track_id), step_ns, colour(k), "")
         return
-    paths = true_paths(one.run.truth)
+    paths = true_paths(one.run.tables["truth"])
     few, index_of = len(paths) <= _NAMED_OBJECTS, matching.object_index[_near(matching.tracks, window)]
     for index, path in enumerate(paths):
         name = f"object {path.object_id}" if few else "objects"

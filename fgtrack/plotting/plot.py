@@ -85,12 +85,12 @@ def _of_each(
 
 
 def _maps(runs: Sequence[JudgedRun]) -> _Plans:
-    return _of_each(runs, "map", lambda one: bool(one.run.tracks.num_rows), map)
+    return _of_each(runs, "map", lambda one: bool(one.run.tables["tracks"].num_rows), map)
 
 
 def _along(runs: Sequence[JudgedRun]) -> _Plans:
     def has_data(one: JudgedRun) -> bool:
-        return bool(one.run.tracks.num_rows) and "track" in roads(one.run)[0]
+        return bool(one.run.tables["tracks"].num_rows) and "track" in roads(one.run)[0]
 
     return _of_each(runs, "frenet", has_data, frenet)
 
@@ -110,8 +110,8 @@ def _alike(runs: Sequence[JudgedRun], *names: str) -> list[list[JudgedRun]]:
     """Runs with detections, together those whose columns `names` of updates.csv are the same."""
     groups: dict[bytes, list[JudgedRun]] = {}
     for one in runs:
-        if one.run.updates.num_rows:
-            updates = one.run.updates
+        if one.run.tables["updates"].num_rows:
+            updates = one.run.tables["updates"]
             order = np.lexsort([updates[name] for name in _DETECTION])  # estimators may take them in another order
             content = b"".join(updates[name][order].tobytes() for name in (*_DETECTION, *names))
             groups.setdefault(content, []).append(one)
@@ -134,7 +134,9 @@ def _arrivals(runs: Sequence[JudgedRun]) -> _Plans:
 
 def _delays(runs: Sequence[JudgedRun]) -> _Plans:
     """One for each recording, but for those without any delay."""
-    late = [one for one in runs if (one.run.updates["receipt_ns"] != one.run.updates["stamp_ns"]).any()]
+    late = [
+        one for one in runs if (one.run.tables["updates"]["receipt_ns"] != one.run.tables["updates"]["stamp_ns"]).any()
+    ]
     return _of_groups(_alike(late), "delays", delays)
 
 
@@ -162,7 +164,7 @@ def _lag(runs: Sequence[JudgedRun]) -> _Plans:
 
 
 def _timing(runs: Sequence[JudgedRun]) -> _Plans:
-    if any((one.run.timing["num_detections"] > 0).any() for one in runs):
+    if any((one.run.tables["timing"]["num_detections"] > 0).any() for one in runs):
         yield Planned("timing", partial(timing, runs))
 
 

@@ -42,7 +42,7 @@ def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         The run has no innovations.
     """
     one = one_judged(run)
-    values, updates = innovations.residuals(one.run), one.run.updates
+    values, updates = innovations.residuals(one.run), one.run.tables["updates"]
     time_s = (updates["stamp_ns"] - start_ns([one])) / NS_PER_S
     sensors = np.unique(updates["sensor"]).tolist()
     names = [name for name in RESIDUAL_NAMES if np.isfinite(values[name]).any()]

@@ -123,7 +123,7 @@ def _by_time(group: Group, name: str) -> tuple[FloatArray, FloatArray]:
 
     The error of a run is the root mean square over its objects.
     """
-    step_ns = max(usual_step_ns(one.run.timing["now_ns"]) for one in group.runs)
+    step_ns = max(usual_step_ns(one.run.tables["timing"]["now_ns"]) for one in group.runs)
     step_ns = step_ns if np.isfinite(step_ns) else NS_PER_S
     columns: list[FloatArray] = []
     for one in group.runs:
@@ -172,13 +172,14 @@ def _matching(one: JudgedRun) -> Matching:
 def _is_other_seed(one: JudgedRun, other: JudgedRun) -> bool:
     """Whether two runs are of the same estimator, configuration, objects and length, on different recordings."""
     a, b = one.run, other.run
-    ticks = a.timing.num_rows, b.timing.num_rows
+    mine, its = a.tables["updates"], b.tables["updates"]
+    ticks = a.tables["timing"].num_rows, b.tables["timing"].num_rows
     return (
         a.meta.get("estimator") == b.meta.get("estimator")
         and a.config_text == b.config_text
         and abs(ticks[0] - ticks[1]) <= _SAME_LENGTH * max(ticks)
-        and np.array_equal(np.unique(a.truth["object_id"]), np.unique(b.truth["object_id"]))
-        and not all(np.array_equal(a.updates[name], b.updates[name]) for name in ("stamp_ns", "receipt_ns"))
+        and np.array_equal(np.unique(a.tables["truth"]["object_id"]), np.unique(b.tables["truth"]["object_id"]))
+        and not all(np.array_equal(mine[name], its[name]) for name in ("stamp_ns", "receipt_ns"))
     )
 
 

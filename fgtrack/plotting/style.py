@@ -3,7 +3,6 @@
 import base64
 import io
 import math
-import os
 import re
 import textwrap
 import warnings
@@ -24,11 +23,9 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from fgtrack.core.errors import CallError, printable_lines
-from fgtrack.core.files import open_file, read_head
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.palette import PALETTE, SENSORS, Look, looks
 from fgtrack.evaluation.runs import JudgedRun
-from fgtrack.io.output import Kind
 
 _RC: Any = mpl.rcParams  # Any: its keys are a Literal of all names
 WRONG = "#000000"
@@ -60,29 +57,6 @@ _BEGINNINGS = (
 _HEAD = 3000
 _PDF_END = re.compile(rb"startxref\s+(\d+)\s+%%EOF\s*$")
 _PDF_INFO = b"<< /Creator (%b) >>\nendobj\n" % _MARK.encode()  # before the table that the end points to
-
-
-def _is_drawn(path: Path) -> bool:
-    head = read_head(path, _HEAD)
-    if head.startswith(b"%PDF-"):
-        return _is_drawn_pdf(path)
-    return any(re.match(beginning, head, re.DOTALL) for beginning in _BEGINNINGS)
-
-
-def _is_drawn_pdf(path: Path) -> bool:
-    with open_file(path) as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(max(0, size - _HEAD))
-        end = _PDF_END.search(file.read())
-        place = -1 if end is None else int(end[1]) - len(_PDF_INFO)
-        if not 0 <= place < size:
-            return False
-        file.seek(place)
-        return file.read(len(_PDF_INFO)) == _PDF_INFO
-
-
-#: A picture, or a PDF of several.
-DRAWN = Kind("a figure of fgtrack", _is_drawn)
 
 
 class StyledFigure(Figure):

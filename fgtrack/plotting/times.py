@@ -29,7 +29,7 @@ def delays(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         The run has no detections.
     """
     one = one_judged(run)
-    if not one.run.updates.num_rows:
+    if not one.run.tables["updates"].num_rows:
         raise DataError(f"{one.label}: has no detections, so there are no delays to draw")
     sheet = Sheet(7.0, 3.8, paper)
     axes = sheet.plots()[0, 0]
@@ -47,8 +47,8 @@ def delays(run: OneRun, **paper: Unpack[Paper]) -> Figure:
 
 def sensor_delays(run: Run) -> dict[str, tuple[IntArray, FloatArray]]:
     """Receipt in ns and delay in s of the messages of every sensor, see `message_delays`."""
-    sensors = run.updates["sensor"]
-    return {name: message_delays(run.updates.where(sensors == name)) for name in np.unique(sensors).tolist()}
+    sensors = run.tables["updates"]["sensor"]
+    return {name: message_delays(run.tables["updates"].where(sensors == name)) for name in np.unique(sensors).tolist()}
 
 
 @styled
@@ -63,13 +63,13 @@ def timing(runs: Runs, **paper: Unpack[Paper]) -> Figure:
         No run has a tick with detections.
     """
     every = judged(runs)
-    if not any((one.run.timing["num_detections"] > 0).any() for one in every):
+    if not any((one.run.tables["timing"]["num_detections"] > 0).any() for one in every):
         raise DataError("no run has detections, so there are no processing times to draw")
     sheet = Sheet(7.0, 3.8, paper)
     axes = sheet.plots()[0, 0]
     groups = grouped(every)
     for group, its in zip(groups, group_looks(groups), strict=True):
-        busy = [one.run.timing.where(one.run.timing["num_detections"] > 0) for one in group.runs]
+        busy = [one.run.tables["timing"].where(one.run.tables["timing"]["num_detections"] > 0) for one in group.runs]
         time_ms = np.concatenate([ticks["process_ns"] / NS_PER_S * _MS for ticks in busy])
         if len(time_ms):
             spread = Distribution.of(time_ms)

@@ -64,18 +64,18 @@ def viewer_messages(runs: Mapping[str, Run]) -> tuple[Iterator[ViewerMessage], l
     """Messages that show `runs`, by name, in the order of log times, and a line for whatever cannot be shown."""
     (label, first), *others = runs.items()
     for name, run in others:
-        if not same_recording(first, run) or run.ego != first.ego:  # the file has one ego
+        if not same_recording(first, run) or not run.tables["ego"].equals(first.tables["ego"]):  # the file has one ego
             raise CallError(f"{label} and {name} are of different recordings, export each to a file of its own")
     at_ns = start_ns(first)
     maps, notes = roads(first)
     parts = [
         map_messages(maps, excluded_lines(first), at_ns),
-        ego_messages(first.ego, at_ns),
-        *truth_messages(first.truth),
+        ego_messages(first.tables["ego"], at_ns),
+        *truth_messages(first.tables["truth"]),
     ]
     for look, (name, run) in zip(_looks(runs), runs.items(), strict=True):
         parts += run_messages(run, look)
-        if run.updates.num_rows and not run.detections.num_rows:
+        if run.tables["updates"].num_rows and not run.tables["detections"].num_rows:
             notes.append(f"{name}: has no detections.csv, so no detections are shown; repeat the run")
     return merge(*parts, key=lambda message: message.log_ns), notes
 

@@ -13,10 +13,9 @@ from mcap.writer import Writer
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import EgoState
-from fgtrack.io.output import Kind, check_output, new_file
+from fgtrack.io.output import check_output, new_file
 from fgtrack.viewers.shapes import Entity, Point, Scene, Shape, ViewerMessage
 
-_FILE = Kind("a file", Path.is_file)
 _LONGEST_HEAD_M = 1.5
 #: The rows of `updates.csv` have no message of Foxglove's own.
 _OUTCOME = {
@@ -35,7 +34,7 @@ def check_foxglove(path: Path, overwrite: bool) -> None:
     """Raise `CallError` where `write_foxglove` would before the first message."""
     if path.suffix != ".mcap":
         raise CallError(f"{path}: viewers recognise such a file by its name, let it end in .mcap")
-    check_output(path, _FILE, overwrite)
+    check_output(path, overwrite)
 
 
 def write_foxglove(
@@ -59,7 +58,7 @@ def write_foxglove(
     check_foxglove(path, overwrite)
     channels: dict[str, int] = {}
     counts: Counter[str] = Counter()
-    with new_file(path, _FILE, overwrite) as file:
+    with new_file(path, overwrite) as file:
         writer = Writer(file)
         writer.start(library="fgtrack")
         for name, entries in metadata.items():

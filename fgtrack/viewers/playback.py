@@ -151,7 +151,7 @@ def _recordings(runs: Sequence[JudgedRun]) -> list[_Recording]:
 
 def _origin_m(runs: Sequence[Run]) -> FloatArray:
     """A place near the middle of all that is drawn, in whole metres."""
-    for table in (runs[0].ego, runs[0].truth, *(run.tracks for run in runs)):
+    for table in (runs[0].tables["ego"], runs[0].tables["truth"], *(run.tables["tracks"] for run in runs)):
         places_m = np.stack([table["x_m"], table["y_m"]], axis=-1)
         places_m = places_m[np.isfinite(places_m).all(axis=1)]
         if len(places_m):
@@ -169,9 +169,9 @@ def _recording(one: _Recording, packing: _Packing) -> Json:
         for kind, points_m in zip(("bound", "bound", "centre"), road_lines(road), strict=True)
     ]
     lines += [{"kind": "bound", **packing.place(*points_m.T)} for points_m in excluded_lines(run)]
-    ego = packing.thinned(located(run.ego), "the ego")
+    ego = packing.thinned(located(run.tables["ego"]), "the ego")
     ego = _sorted(ego, ego["stamp_ns"])
-    truth = run.truth.where(run.truth["object_id"] != EGO_ID)
+    truth = run.tables["truth"].where(run.tables["truth"]["object_id"] != EGO_ID)
     truth = packing.thinned(located(truth), "the truth")
     truth = _sorted(truth, truth["stamp_ns"], truth["object_id"])
     return {
@@ -188,16 +188,21 @@ def _recording(one: _Recording, packing: _Packing) -> Json:
 
 
 def _run(run: Run, packing: _Packing) -> Json:
-    statuses = np.unique(run.tracks["status"]).tolist()
-    tracks, lagged = located(run.tracks), located(run.lagged.where(run.lagged["lag_s"] > 0.0))
+    statuses = np.unique(run.tables["tracks"]["status"]).tolist()
+    tracks, lagged = (
+        located(run.tables["tracks"]),
+        located(run.tables["lagged"].where(run.tables["lagged"]["lag_s"] > 0.0)),
+    )
     ticks_ns = packing.thinned_times(
-        np.unique(run.timing["now_ns"]), max(tracks.num_rows, lagged.num_rows), "the ticks"
+        np.unique(run.tables["timing"]["now_ns"]), max(tracks.num_rows, lagged.num_rows), "the ticks"
     )
     tracks = tracks.where(np.isin(tracks["now_ns"], ticks_ns))
     past = lagged.where(np.isin(lagged["now_ns"], ticks_ns))
     tracks = _sorted(tracks, tracks["now_ns"], tracks["track_id"])
     past = _sorted(past, past["now_ns"], past["track_id"], past["stamp_ns"])
-    final = packing.thinned(located(run.smoothed.where(run.smoothed["kind"] == "final")), "final states")
+    final = packing.thinned(
+        located(run.tables["smoothed"].where(run.tables["smoothed"]["kind"] == "final")), "final states"
+    )
     final = _sorted(final, final["track_id"], final["stamp_ns"])
     return {
         "estimator": str(run.meta.get("estimator", "")),
@@ -229,7 +234,7 @@ def _run(run: Run, packing: _Packing) -> Json:
 
 def _detections(run: Run, packing: _Packing) -> Json:
     """Detections in order of receipt: where they were, when, what became of them, where their track was then."""
-    table, updates = run.detections, run.updates
+    table, updates = run.tables["detections"], run.tables["updates"]
     if updates.num_rows and not table.num_rows:
         packing.notes[f"{packing.label}: has no detections.csv, so no detections are shown; repeat the run"] = None
     where, became = placed(run), update_rows(run)

@@ -11,12 +11,11 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from fgtrack.core.files import read_head
 from fgtrack.evaluation.cautions import cautions, noise_cautions
 from fgtrack.evaluation.recordings import recordings_caution
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.tables import Table, Tables, cell_rows
-from fgtrack.io.output import Kind, new_file
+from fgtrack.io.output import new_file
 from fgtrack.viewers.playback import Moment, scene
 from fgtrack.viewers.settings import differing, flattened
 
@@ -27,14 +26,6 @@ _START, _MARK, _HEAD = b"<!DOCTYPE html>", b'<meta name="generator" content="fgt
 _NONE = "–"
 _LONG = 40  # characters of a cell that may be broken
 _PNG_SIZE = slice(16, 24)  # of its header
-
-
-def _is_report(path: Path) -> bool:
-    head = read_head(path, _HEAD)
-    return head.startswith(_START) and _MARK in head
-
-
-REPORT = Kind("a report of fgtrack", _is_report)
 
 
 @dataclass(frozen=True)
@@ -63,7 +54,7 @@ def write_report(
 ) -> int:
     """Write the report of `runs` into the file `out`; returns its size in bytes. Raises as `page` and `new_file`."""
     text = page(runs, tables, pictures, version, opening).encode("utf-8", "backslashreplace")  # names need not be UTF-8
-    with new_file(out, REPORT, overwrite) as file:
+    with new_file(out, overwrite) as file:
         file.write(text)
     return len(text)
 

@@ -16,13 +16,12 @@ from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import DetectionList, EgoState
 from fgtrack.io.adapters.common import RosMessage
-from fgtrack.io.output import Kind, check_output, new_file, new_folder, write_error
-from fgtrack.io.ros.bag_writer import RECORDING
+from fgtrack.io.output import check_output, new_file, new_folder, write_error
+from fgtrack.io.ros.bag_writer import RECORDING, check_bag, is_recording
 from fgtrack.io.ros.messages import MARKER_ARRAY, TRANSFORMS, MessageFactory
 from fgtrack.io.ros.typestore import one_line
 from fgtrack.viewers.shapes import Entity, Scene, Shape, ViewerMessage
 
-_FILE = Kind("a file", Path.is_file)
 _LATEST_NS = 1 << 63
 _FRAME_IDS = {"map": "map", "ego": "base_link"}
 _KINDS = {"arrow": 0, "cube": 1, "sphere": 2, "cylinder": 3, "line": 4, "text": 9}  # of Marker.msg
@@ -32,7 +31,10 @@ _FOREVER = QosTime(0, 0)
 
 def check_ros2(path: Path, overwrite: bool) -> None:
     """Raise `CallError` where `write_ros2` would for what is at `path`."""
-    check_output(path, _FILE if path.suffix == ".mcap" else RECORDING, overwrite)
+    if path.suffix == ".mcap":
+        check_output(path, overwrite)
+    else:
+        check_bag(path, overwrite)
 
 
 def write_ros2(
@@ -49,10 +51,10 @@ def write_ros2(
     check_ros2(path, overwrite)
     try:
         if path.suffix != ".mcap":
-            with new_folder(path, RECORDING, overwrite) as folder:
+            with new_folder(path, overwrite, is_recording, RECORDING) as folder:
                 return _write(folder, messages, metadata)
         with (
-            new_file(path, _FILE, overwrite) as file,
+            new_file(path, overwrite) as file,
             tempfile.TemporaryDirectory(".part", f"{path.name}.", path.parent) as part,
         ):
             counts = _write(Path(part) / path.stem, messages, metadata)

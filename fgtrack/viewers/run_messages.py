@@ -109,11 +109,11 @@ def run_messages(run: Run, look: Look) -> Iterator[Messages]:
 
 def _track_messages(run: Run, look: Look) -> Iterator[Messages]:
     """At every tick boxes, numbers and speeds, the 2-sigma ellipses of the positions, and the poses."""
-    tracks = located(run.tracks)
-    states, axes = _states(tracks, run.objects), ellipses(tracks, _DEVIATIONS).tolist()
+    tracks = located(run.tables["tracks"])
+    states, axes = _states(tracks, run.tables["objects"]), ellipses(tracks, _DEVIATIONS).tolist()
     facts = list(_rows(tracks, "track_id", "status", "speed_mps", "num_measured"))
     rows_at = dict(groups(tracks["now_ns"]))
-    ticks_ns = sorted({*run.timing["now_ns"].tolist(), *rows_at})
+    ticks_ns = sorted({*run.tables["timing"]["now_ns"].tolist(), *rows_at})
 
     def steps(entity: Callable[[int], Entity | None]) -> Iterator[tuple[int, int, list[Entity]]]:
         for now_ns in ticks_ns:
@@ -150,7 +150,10 @@ def _track_messages(run: Run, look: Look) -> Iterator[Messages]:
 
 def _past_messages(run: Run, look: Look) -> Messages:
     """At every tick the past of each track as known then: a line through its lagged states to the present one."""
-    lagged, tracks = located(run.lagged.where(run.lagged["lag_s"] > 0.0)), located(run.tracks)
+    lagged, tracks = (
+        located(run.tables["lagged"].where(run.tables["lagged"]["lag_s"] > 0.0)),
+        located(run.tables["tracks"]),
+    )
     present = {(now_ns, track_id): (x_m, y_m) for now_ns, track_id, x_m, y_m in _rows(tracks, *_NOW)}
     past = list(_rows(lagged, *_NOW))
 
@@ -176,8 +179,8 @@ _NOW = ("now_ns", "track_id", "x_m", "y_m")
 
 def _final_messages(run: Run, look: Look) -> Iterator[Messages]:
     """Final states as soon as nothing can change them any more, and lines through those of the last seconds."""
-    final = located(run.smoothed.where(run.smoothed["kind"] == "final"))
-    states, known_ns, topic = _states(final, run.objects), final_ns(run, final), f"{look.prefix}/smoothed"
+    final = located(run.tables["smoothed"].where(run.tables["smoothed"]["kind"] == "final"))
+    states, known_ns, topic = _states(final, run.tables["objects"]), final_ns(run, final), f"{look.prefix}/smoothed"
 
     def trails() -> Messages:
         lines: defaultdict[int, list[Point]] = defaultdict(list)
@@ -205,7 +208,7 @@ def _detection_messages(run: Run, look: Look) -> Iterator[Messages]:
     An arrow leads from where a detection was sensed to where its track is at the tick that fused it. It is strong where
     the detection came out of sequence, and faint where it did not.
     """
-    table, updates, where = run.detections, run.updates, placed(run)
+    table, updates, where = run.tables["detections"], run.tables["updates"], placed(run)
     fates = [updates["disposition"][row] if row >= 0 else "" for row in update_rows(run).tolist()]
     keys = list(_rows(table, "receipt_ns", "sensor", "stamp_ns"))
     order = sorted(range(len(keys)), key=keys.__getitem__)
@@ -263,7 +266,7 @@ def _outcome_messages(run: Run, look: Look) -> Messages:
     """Rows of `updates.csv` at their receipts."""
     names = ("receipt_ns", "stamp_ns", "sensor", "index", "disposition", "track_id", "nis")
     for receipt_ns, stamp_ns, sensor, index, disposition, track_id, nis in sorted(
-        _rows(run.updates, *names), key=lambda row: row[0]
+        _rows(run.tables["updates"], *names), key=lambda row: row[0]
     ):
         values = {
             "sensor": sensor,

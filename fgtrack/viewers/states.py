@@ -36,14 +36,19 @@ def located(table: Table) -> Table:
 
 def track_positions(run: Run) -> dict[tuple[int, int], tuple[float, float]]:
     """Positions of the tracks by tick and track id."""
-    rows = zip(*(located(run.tracks)[name].tolist() for name in ("tick", "track_id", "x_m", "y_m")), strict=True)
+    rows = zip(
+        *(located(run.tables["tracks"])[name].tolist() for name in ("tick", "track_id", "x_m", "y_m")), strict=True
+    )
     return {(tick, track_id): (x_m, y_m) for tick, track_id, x_m, y_m in rows}
 
 
 def final_ns(run: Run, final: Table) -> IntArray:
     """Time at which each row of `final` left the window of the smoother, or its track ended, shape (n,)."""
     lag_s = (run.config.get("smoother") or {}).get("lag_s", _DEFAULT_LAG_S)
-    ends = {track_id: int(run.tracks["now_ns"][rows].max()) for track_id, rows in groups(run.tracks["track_id"])}
+    ends = {
+        track_id: int(run.tables["tracks"]["now_ns"][rows].max())
+        for track_id, rows in groups(run.tables["tracks"]["track_id"])
+    }
     known_ns = final["stamp_ns"] + nanoseconds(float(lag_s))
     for track_id, rows in groups(final["track_id"]):
         known_ns[rows] = np.minimum(known_ns[rows], ends.get(track_id, known_ns[rows].max()))
@@ -52,7 +57,12 @@ def final_ns(run: Run, final: Table) -> IntArray:
 
 def start_ns(run: Run) -> int:
     """Earliest tick, receipt or truth of the run; 0 if it is empty."""
-    columns = (run.timing["now_ns"], run.ego["receipt_ns"], run.detections["receipt_ns"], run.truth["stamp_ns"])
+    columns = (
+        run.tables["timing"]["now_ns"],
+        run.tables["ego"]["receipt_ns"],
+        run.tables["detections"]["receipt_ns"],
+        run.tables["truth"]["stamp_ns"],
+    )
     return min((int(column.min()) for column in columns if len(column)), default=0)
 
 

@@ -71,13 +71,13 @@ def golden(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 
 def test_the_ticks_are_those_of_the_published_node(golden: Golden) -> None:
-    ticks = golden.run.timing["now_ns"].tolist()
+    ticks = golden.run.tables["timing"]["now_ns"].tolist()
     assert ticks[: len(golden.expected)] == [tick["now_ns"] for tick in golden.expected]
     assert len(ticks) == len(golden.expected) + 1  # one more for what is left
 
 
 def test_every_state_is_the_published_one_at_every_tick(golden: Golden) -> None:
-    tracks = golden.run.tracks
+    tracks = golden.run.tables["tracks"]
     last_ns = golden.expected[-1]["now_ns"]
     tracks = tracks.where(tracks["now_ns"] <= last_ns)
     rows = [
@@ -109,7 +109,7 @@ def test_counters_and_last_sights_are_the_published_ones(golden: Golden) -> None
 
 
 def test_births_and_deaths_are_the_published_ones(golden: Golden) -> None:
-    updates = golden.run.updates
+    updates = golden.run.tables["updates"]
     born: dict[int, list[tuple[int, str]]] = {}
     for row in np.flatnonzero(updates["disposition"] == "birth"):
         birth = (int(updates["track_id"][row]), str(updates["sensor"][row]))
@@ -124,7 +124,7 @@ def test_births_and_deaths_are_the_published_ones(golden: Golden) -> None:
 
 
 def test_every_innovation_is_the_published_one(golden: Golden) -> None:
-    updates = golden.run.updates
+    updates = golden.run.tables["updates"]
     found = {
         (int(updates["tick"][row]), str(updates["sensor"][row]), int(updates["track_id"][row])): row
         for row in np.flatnonzero(np.isin(updates["disposition"], ["in_sequence", "out_of_sequence"]))
@@ -142,4 +142,4 @@ def test_every_innovation_is_the_published_one(golden: Golden) -> None:
 def test_every_detection_has_one_row_and_the_sums_add_up(golden: Golden) -> None:
     meta = golden.run.meta
     counts = sum(sum(of_sensor.values()) for of_sensor in meta["counts"].values())
-    assert counts == golden.run.updates.num_rows == meta["detections_received"] > 0
+    assert counts == golden.run.tables["updates"].num_rows == meta["detections_received"] > 0

@@ -117,7 +117,7 @@ def test_every_storage_gives_the_same_run_to_the_byte(runs: dict[str, Path]) -> 
     contents = [rows(path) for path in runs.values()]
     assert all(content == contents[0] for content in contents)
     assert len({load_run(path).meta["digest"] for path in runs.values()}) == 1
-    assert load_run(runs["mcap"]).tracks.num_rows > 50
+    assert load_run(runs["mcap"]).tables["tracks"].num_rows > 50
 
 
 def test_off_a_terminal_progress_is_lines_with_a_percentage(
@@ -242,7 +242,7 @@ def test_a_replay_in_real_time_takes_as_long_and_gives_the_same(
 ) -> None:
     began_s = time.monotonic()
     assert fgtrack("replay", recordings["mcap"], "-c", "smoother", "--realtime", "-o", "paced").code == 0
-    timing = load_run("paced").timing["now_ns"]
+    timing = load_run("paced").tables["timing"]["now_ns"]
     assert time.monotonic() - began_s >= (timing[-1] - timing[0]) / 1e9
     assert fgtrack("replay", recordings["mcap"], "-c", "smoother", "-o", "fast").code == 0
     assert load_run("paced").meta["digest"] == load_run("fast").meta["digest"]

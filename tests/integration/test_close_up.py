@@ -41,7 +41,7 @@ def test_it_is_typical_of_the_late_detections_that_lower_the_error(folder: Path,
     names = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
     for name in NAMES:
         run = fgtrack.load_run(folder / "runs" / name)
-        tracks, updates, truth = run.tracks, run.updates, run.truth
+        tracks, updates, truth = run.tables["tracks"], run.tables["updates"], run.tables["truth"]
         used = [each in ("in_sequence", "out_of_sequence", "beyond_window") for each in updates["disposition"]]
         keys = list(zip(updates["tick"].tolist(), updates["track_id"].tolist(), strict=True))
         for row, (tick, track) in enumerate(keys):
@@ -78,7 +78,7 @@ def test_it_is_typical_of_the_late_detections_that_lower_the_error(folder: Path,
 
 def test_without_truth_it_moves_the_present_by_the_median(folder: Path) -> None:
     run = fgtrack.load_run(folder / "runs" / NAMES[0])
-    blind = replace(run, truth=run.truth.where(np.zeros(run.truth.num_rows, dtype=bool)))
+    blind = run.with_tables(truth=run.tables["truth"].where(np.zeros(run.tables["truth"].num_rows, dtype=bool)))
     arrival, rule = chosen([blind])
     assert rule.endswith("the one that moves the present by the median.")
     figure = fgtrack.plot.close_up([blind], [replace(close_up_of(blind, arrival), rule=rule)])
@@ -88,7 +88,7 @@ def test_without_truth_it_moves_the_present_by_the_median(folder: Path) -> None:
 
 def test_after_it_the_present_is_that_of_the_run(folder: Path, found: list[CloseUp]) -> None:
     for name, one in zip(NAMES, found, strict=True):
-        tracks = fgtrack.load_run(folder / "runs" / name).tracks
+        tracks = fgtrack.load_run(folder / "runs" / name).tables["tracks"]
         row = tracks.where((tracks["now_ns"] == one.now_ns) & (tracks["track_id"] == one.track_id))
         np.testing.assert_allclose(one.after.means[-1, :2], [row["x_m"][0], row["y_m"][0]], atol=1e-6)
         assert one.after.stamps_ns[-1] == one.now_ns
@@ -108,8 +108,10 @@ def test_it_draws_the_past_towards_the_detection_and_is_fused_once(found: list[C
 
 def test_a_track_and_a_stamp_can_be_asked_for(folder: Path) -> None:
     run = fgtrack.load_run(folder / "runs" / NAMES[0])
-    stamp_ns = int(run.timing["now_ns"][0]) + 4 * NS_PER_S
-    tracks = sorted(set(run.updates["track_id"][run.updates["disposition"] == "out_of_sequence"].tolist()))
+    stamp_ns = int(run.tables["timing"]["now_ns"][0]) + 4 * NS_PER_S
+    tracks = sorted(
+        set(run.tables["updates"]["track_id"][run.tables["updates"]["disposition"] == "out_of_sequence"].tolist())
+    )
     for track in tracks:
         arrival, _ = chosen([run], track, stamp_ns)
         assert abs(arrival.stamp_ns - stamp_ns) < 0.2 * NS_PER_S
@@ -122,10 +124,10 @@ def test_what_is_not_there_is_said(folder: Path) -> None:
     run = fgtrack.load_run(folder / "runs" / NAMES[0])
     with pytest.raises(fgtrack.DataError, match="there is no such list"):
         close_up_of(run, Arrival("lidar_cluster", 1, 2, 0))
-    gated = np.flatnonzero(run.updates["disposition"] == "birth")[0]
-    values = (int(run.updates[name][gated]) for name in ("stamp_ns", "receipt_ns", "index"))
+    gated = np.flatnonzero(run.tables["updates"]["disposition"] == "birth")[0]
+    values = (int(run.tables["updates"][name][gated]) for name in ("stamp_ns", "receipt_ns", "index"))
     with pytest.raises(fgtrack.DataError, match="no track has fused it"):
-        close_up_of(run, Arrival(str(run.updates["sensor"][gated]), *values))
+        close_up_of(run, Arrival(str(run.tables["updates"]["sensor"][gated]), *values))
     in_memory = fgtrack.replay(fgtrack.simulate("default", seed=3, duration_s=3.0), "tuned", estimator="ekf-replay")
     with pytest.raises(fgtrack.DataError, match="recording of the run is not there"):
         fgtrack.close_ups([in_memory])

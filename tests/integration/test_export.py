@@ -134,27 +134,29 @@ def test_every_topic_has_the_messages_and_both_times_of_the_run(
     def poses(topic: str) -> int:
         return sum(len(one.content) for one in shown[topic])
 
-    assert times["/outcomes"] == pairs(run.updates, "receipt_ns", "stamp_ns")
+    assert times["/outcomes"] == pairs(run.tables["updates"], "receipt_ns", "stamp_ns")
     assert any(log_ns > publish_ns for log_ns, publish_ns in times["/outcomes"])
-    assert times["/tf"] == times["/ego/pose"] == pairs(run.ego, "receipt_ns", "stamp_ns")
-    assert set(times["/tracks/poses"]) == set(pairs(run.tracks, "now_ns", "stamp_ns"))
-    assert poses("/tracks/poses") == run.tracks.num_rows
-    assert poses("/truth/poses") == (run.truth["object_id"] >= 0).sum()
-    final = run.smoothed.where(run.smoothed["kind"] == "final")
+    assert times["/tf"] == times["/ego/pose"] == pairs(run.tables["ego"], "receipt_ns", "stamp_ns")
+    assert set(times["/tracks/poses"]) == set(pairs(run.tables["tracks"], "now_ns", "stamp_ns"))
+    assert poses("/tracks/poses") == run.tables["tracks"].num_rows
+    assert poses("/truth/poses") == (run.tables["truth"]["object_id"] >= 0).sum()
+    final = run.tables["smoothed"].where(run.tables["smoothed"]["kind"] == "final")
     assert poses("/smoothed/poses") == final.num_rows > 0
     for log_ns, publish_ns in times["/smoothed/poses"]:
         assert publish_ns <= log_ns <= publish_ns + 1_000_000_000  # the window of the smoother
     every: Times = Counter()
-    for sensor in np.unique(run.detections["sensor"]).tolist():
-        mine = run.detections.where(run.detections["sensor"] == sensor)
+    for sensor in np.unique(run.tables["detections"]["sensor"]).tolist():
+        mine = run.tables["detections"].where(run.tables["detections"]["sensor"] == sensor)
         lists = Counter(set(pairs(mine, "receipt_ns", "stamp_ns")))
         assert times[f"/detections/{sensor}/poses"] == lists
         assert poses(f"/detections/{sensor}/poses") == mine.num_rows
         every += lists
     assert times["/detections"] == every
-    assert times["/past"].total() == len(np.unique(run.lagged["now_ns"]))
+    assert times["/past"].total() == len(np.unique(run.tables["lagged"]["now_ns"]))
     assert times["/map"].total() == times["/ego"].total() == 1
-    places = {(log_ns, x_m, y_m) for log_ns, x_m, y_m in zip(*(run.tracks[n].tolist() for n in ROW), strict=True)}
+    places = {
+        (log_ns, x_m, y_m) for log_ns, x_m, y_m in zip(*(run.tables["tracks"][n].tolist() for n in ROW), strict=True)
+    }
     assert places == {(one.log_ns, each.x_m, each.y_m) for one in shown["/tracks/poses"] for each in one.content}
 
 
@@ -319,12 +321,12 @@ def test_a_bag_has_the_messages_and_times_of_the_run(bag: dict[str, list[BagMess
     def times(topic: str) -> Counter[tuple[int, int]]:
         return Counter((one.log_ns, stamp_ns(one)) for one in bag[topic])
 
-    assert times("/ego/odometry") == pairs(smoothed.ego, "receipt_ns", "stamp_ns")
-    assert len(bag["/tf"]) == smoothed.ego.num_rows
-    assert set(times("/tracks")) == set(pairs(smoothed.tracks, "now_ns", "stamp_ns"))
-    assert sum(len(one.data.detections) for one in bag["/tracks"]) == smoothed.tracks.num_rows
-    for sensor in np.unique(smoothed.detections["sensor"]).tolist():
-        mine = smoothed.detections.where(smoothed.detections["sensor"] == sensor)
+    assert times("/ego/odometry") == pairs(smoothed.tables["ego"], "receipt_ns", "stamp_ns")
+    assert len(bag["/tf"]) == smoothed.tables["ego"].num_rows
+    assert set(times("/tracks")) == set(pairs(smoothed.tables["tracks"], "now_ns", "stamp_ns"))
+    assert sum(len(one.data.detections) for one in bag["/tracks"]) == smoothed.tables["tracks"].num_rows
+    for sensor in np.unique(smoothed.tables["detections"]["sensor"]).tolist():
+        mine = smoothed.tables["detections"].where(smoothed.tables["detections"]["sensor"] == sensor)
         assert set(times(f"/detections/{sensor}")) == set(pairs(mine, "receipt_ns", "stamp_ns"))
         assert sum(len(one.data.detections) for one in bag[f"/detections/{sensor}"]) == mine.num_rows
     kinds = {
@@ -372,7 +374,7 @@ def test_detections_are_where_the_tracker_places_them(runs: Path) -> None:
     run, _ = replay_in_memory(
         messages, config, observed=lambda parts: replace(parts, preprocess=Watched(parts.preprocess))
     )
-    table, found = run.detections, placed(run)
+    table, found = run.tables["detections"], placed(run)
     keys = zip(table["sensor"].tolist(), table["stamp_ns"].tolist(), table["index"].tolist(), strict=True)
     off_m = [
         math.dist(places[key], position_m)

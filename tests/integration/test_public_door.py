@@ -119,7 +119,7 @@ def test_an_input_that_breaks_off_is_a_warning(drive: Path, tmp_path: Path) -> N
     with pytest.warns(UserWarning, match="broke off"):
         run = fgtrack.replay(path, "smoother")
     assert run.meta["broken_off"]
-    assert run.tracks.num_rows
+    assert run.tables["tracks"].num_rows
 
 
 @pytest.mark.skipif(not DESIGN.exists(), reason="the design, which has the snippet, is not beside the repository")

@@ -54,7 +54,7 @@ def drawn(page: Browser) -> str:
 
 def test_the_page_decodes_what_the_run_folders_hold(page: Browser, folder: Path) -> None:
     for index, name in enumerate(NAMES):
-        tracks = fgtrack.load_run(folder / "runs" / name).tracks
+        tracks = fgtrack.load_run(folder / "runs" / name).tables["tracks"]
         order = np.lexsort((tracks["track_id"], tracks["now_ns"]))
         found = page.value(f"[...viewer.scene.runs[{index}].tracks.yaw]")
         np.testing.assert_allclose(found, tracks["yaw_rad"][order], atol=1e-4)
@@ -117,10 +117,16 @@ def test_the_strip_shows_the_errors_and_goes_to_a_time(page: Browser, folder: Pa
         page.value(f"[...errorsOf(viewer.scene.runs[{index}], 0)].map((error) => error || null)"), dtype=float
     )
     assert np.isfinite(found).sum() > 100
-    tick = int(np.flatnonzero(np.isfinite(found) & np.isin(run.timing["now_ns"], run.truth["stamp_ns"]))[-1])
-    now_ns = run.timing["now_ns"][tick]
-    truth = run.truth.where((run.truth["stamp_ns"] == now_ns) & (run.truth["object_id"] == 0))
-    tracks = run.tracks.where(run.tracks["now_ns"] == now_ns)
+    tick = int(
+        np.flatnonzero(np.isfinite(found) & np.isin(run.tables["timing"]["now_ns"], run.tables["truth"]["stamp_ns"]))[
+            -1
+        ]
+    )
+    now_ns = run.tables["timing"]["now_ns"][tick]
+    truth = run.tables["truth"].where(
+        (run.tables["truth"]["stamp_ns"] == now_ns) & (run.tables["truth"]["object_id"] == 0)
+    )
+    tracks = run.tables["tracks"].where(run.tables["tracks"]["now_ns"] == now_ns)
     off_m = np.hypot(tracks["x_m"] - truth["x_m"], tracks["y_m"] - truth["y_m"]).min()
     assert found[tick] == pytest.approx(off_m, abs=3e-3)
     box = page.box("[data-part=strip]")

@@ -154,11 +154,11 @@ def covariances(table: Table) -> FloatArray:
 
 def check_published(run: Run) -> None:
     """Every state is finite, within bounds, and has a positive definite covariance; every detection has one outcome."""
-    for table in (run.tracks, run.smoothed, run.lagged):
+    for table in (run.tables["tracks"], run.tables["smoothed"], run.tables["lagged"]):
         for name in ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps"):
             assert (np.abs(table[name]) < 1e5).all(), name
         np.linalg.cholesky(covariances(table))
-    assert run.updates.num_rows == run.meta["detections_received"] == 2 * LISTS
+    assert run.tables["updates"].num_rows == run.meta["detections_received"] == 2 * LISTS
     assert sum(run.meta["counts"]["lidar_cluster"].values()) == 2 * LISTS
 
 
@@ -176,8 +176,8 @@ def check_told(run: Run) -> Counter[str]:
     ended = run.meta["ended_by_failure"]
     assert len(ended) == min(failed[Failure.TRACK_ENDED], 100)
     for one in ended:
-        mine = run.tracks["track_id"] == one["track_id"]
-        assert (run.tracks["now_ns"][mine] <= one["now_ns"]).all()
+        mine = run.tables["tracks"]["track_id"] == one["track_id"]
+        assert (run.tables["tracks"]["now_ns"][mine] <= one["now_ns"]).all()
     return failed
 
 
@@ -188,9 +188,9 @@ def test_what_a_plug_in_estimator_does_wrong_is_not_published_and_counted(
     run = run_of(sabotaged(wrong), tmp_path)
     check_published(run)
     assert check_told(run)[KINDS[wrong]] > 0
-    near = np.abs(run.tracks["x_m"] - NEAR_M) < 3.0
-    assert run.tracks["now_ns"][near][-1] == run.timing["now_ns"][-1]
-    assert len(np.unique(run.tracks["track_id"][near])) <= 4, "the other car is hardly disturbed"
+    near = np.abs(run.tables["tracks"]["x_m"] - NEAR_M) < 3.0
+    assert run.tables["tracks"]["now_ns"][near][-1] == run.tables["timing"]["now_ns"][-1]
+    assert len(np.unique(run.tables["tracks"]["track_id"][near])) <= 4, "the other car is hardly disturbed"
 
 
 @pytest.mark.parametrize("wrong", [*STATES, "state raises"])
@@ -202,7 +202,7 @@ def test_a_track_that_fails_at_once_ends_and_the_run_says_when_and_why(
     check_published(run)
     assert check_told(run)[Failure.TRACK_ENDED] > 0
     assert {one["failure"] for one in run.meta["ended_by_failure"]} == {KINDS[wrong]}
-    assert (run.tracks["x_m"] < BETWEEN_M).all()
+    assert (run.tables["tracks"]["x_m"] < BETWEEN_M).all()
 
 
 def test_a_healthy_estimator_fails_nowhere_and_compare_says_so_in_full(

@@ -11,7 +11,7 @@ from fgtrack.core.types import Disposition, UpdateRecord
 from fgtrack.evaluation.cautions import cautions, noise_cautions, unused
 from fgtrack.evaluation.lives import Lives
 from fgtrack.io.run import Run, Table
-from fgtrack.io.run.reader import column
+from fgtrack.io.run.schema import column
 
 CONFIG = """
 sensors: {lidar: {max_delay_s: 0.4}, radar: {}}
@@ -141,9 +141,9 @@ def test_states_of_the_ego_that_were_refused_are_told_where_they_are_most(
     refused: int, told: bool, tmp_path: Path
 ) -> None:
     run = run_of(tmp_path / "run", lists(Disposition.IN_SEQUENCE))
-    ego = Table({name: column(name, [0, 1, 2, 3]) for name in run.ego})
+    ego = Table({name: column(name, [0, 1, 2, 3]) for name in run.tables["ego"]})
     meta = {**run.meta, "ego_refused": {"stamp ahead of its receipt": refused}}
-    found = cautions(replace(run, ego=ego, meta=meta))
+    found = cautions(replace(run.with_tables(ego=ego), meta=meta))
     assert len(found) == told
     assert not told or str(found[0]).startswith(f"ego: {refused} of 4 states not used, stamp ahead of its receipt")
 
@@ -151,8 +151,8 @@ def test_states_of_the_ego_that_were_refused_are_told_where_they_are_most(
 @pytest.mark.parametrize(("jumps", "told"), [(0, None), (1, "jumps once"), (3, "jumps 3 times")])
 def test_jumps_of_the_ego_are_told(jumps: int, told: str | None, tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", lists(Disposition.IN_SEQUENCE))
-    ego = Table({name: column(name, [0, 1]) for name in run.ego})
-    found = list(map(str, cautions(replace(run, ego=ego, meta={**run.meta, "ego_jumps": jumps}))))
+    ego = Table({name: column(name, [0, 1]) for name in run.tables["ego"]})
+    found = list(map(str, cautions(replace(run.with_tables(ego=ego), meta={**run.meta, "ego_jumps": jumps}))))
     assert [f"ego: its place {told}" in each for each in found] == ([] if told is None else [True])
 
 
@@ -167,7 +167,7 @@ def test_angles_in_degrees_are_told(tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", [update(tick=k) for k in range(40)])
     ego = {"yaw_rad": np.array([0.1, 67.0, np.nan])}
     of_radar = {"sensor": np.array(["radar", "radar"]), "bearing_rad": np.array([-12.0, 6.0])}
-    found = cautions(replace(run, ego=Table(ego), detections=Table(of_radar)))
+    found = cautions(run.with_tables(ego=Table(ego), detections=Table(of_radar)))
     assert [str(one).split(":")[:2] for one in found[:2]] == [
         ["ego", " yaw_rad goes up to 67"],
         ["radar", " bearing_rad goes up to 12"],

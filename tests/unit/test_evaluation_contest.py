@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -110,7 +109,7 @@ def test_only_samples_that_all_runs_have_are_compared(tmp_path: Path) -> None:
     early = np.where(np.arange(TICKS) < 50, 4.0, NOISE_M)
     runs = [a_run(tmp_path / "a", early), a_run(tmp_path / "b", NOISE_M, first=50)]
     # the detections of the first 50 ticks are in one run alone
-    runs[1] = replace(runs[1], updates=runs[0].updates)
+    runs[1] = runs[1].with_tables(updates=runs[0].tables["updates"])
     found = contest_of(runs)
     assert (found.samples, found.most_samples) == (150, 200)
     entries = quantities_of(found)["position_rmse_m"].entries
@@ -136,7 +135,9 @@ def test_runs_of_other_recordings_or_judged_otherwise_are_not_paired(tmp_path: P
     one = JudgedRun("one", trio[0])
     other_truth = write_run(tmp_path / "truth", [[WEST.track(0, 1)]], truth=WEST.truth(range(9)))
     other_gate = a_run(tmp_path / "gate", NOISE_M, config_text="evaluation: {gate_m: 3.0}")
-    more_detections = replace(trio[1], updates=write_run(tmp_path / "more", updates={0: [update(), update()]}).updates)
+    more_detections = trio[1].with_tables(
+        updates=write_run(tmp_path / "more", updates={0: [update(), update()]}).tables["updates"]
+    )
     for other in (other_truth, other_gate, more_detections):
         assert contests([one, JudgedRun("other", other)]) == []
 
@@ -145,7 +146,7 @@ def test_the_same_detections_with_other_delays_or_other_stamps_are_paired(tmp_pa
     one = JudgedRun("one", trio[0])
     later = write_run(tmp_path / "later", updates={k: [update(tick=k, delay_ns=7)] for k in range(0, TICKS, 5)})
     restamped = a_run(tmp_path / "restamped", NOISE_M, stamps_late=1)
-    for other in (replace(trio[1], updates=later.updates), restamped):
+    for other in (trio[1].with_tables(updates=later.tables["updates"]), restamped):
         assert same_recording(one.run, other)
         assert len(contests([one, JudgedRun("other", other)])) == 1
 

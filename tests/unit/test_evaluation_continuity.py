@@ -74,8 +74,8 @@ def test_the_setting_says_how_soon(tmp_path: Path) -> None:
 
 def test_an_update_of_a_tick_that_was_never_finished_does_not_count(tmp_path: Path) -> None:
     run = switching_run(tmp_path / "run", {12: [update(disposition=LATE, track_id=2)], 19: [update(disposition=LATE)]})
-    finished = run.timing["tick"] < 15
-    assert late_of(replace(run, timing=run.timing.where(finished)), 0.1) == [1, 0]
+    finished = run.tables["timing"]["tick"] < 15
+    assert late_of(run.with_tables(timing=run.tables["timing"].where(finished)), 0.1) == [1, 0]
 
 
 # --- time to confirm

@@ -151,7 +151,9 @@ def test_there_is_a_figure_of_what_runs_have_data_for(
         *("errors_object_7", "errors_object_8", "error_against_lag", "timing"),
     ]
     assert names(runs[1:]) == [name for name in names(runs) if "smoother" not in name and "lag" not in name]
-    plain = replace(runs[0], truth=runs[0].truth.where(np.zeros(len(runs[0].truth["stamp_ns"]), dtype=bool)))
+    plain = runs[0].with_tables(
+        truth=runs[0].tables["truth"].where(np.zeros(len(runs[0].tables["truth"]["stamp_ns"]), dtype=bool))
+    )
     assert names([plain]) == [
         *("map_smoother", "residuals_smoother", "consistency_smoother", "arrivals", "delays", "timing"),
     ]
@@ -270,7 +272,9 @@ def test_the_built_in_oval_is_drawn_and_open_space_has_no_bounds(runs: list[Run]
 
 
 def test_without_truth_the_map_shows_the_tracks_with_enough_measurements(runs: list[Run]) -> None:
-    plain = replace(runs[0], truth=runs[0].truth.where(np.zeros(len(runs[0].truth["stamp_ns"]), dtype=bool)))
+    plain = runs[0].with_tables(
+        truth=runs[0].tables["truth"].where(np.zeros(len(runs[0].tables["truth"]["stamp_ns"]), dtype=bool))
+    )
     assert "3 confirmed tracks, no truth" in plot.map(plain).get_suptitle()
 
 

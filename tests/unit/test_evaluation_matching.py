@@ -14,7 +14,7 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.types import TruthState
 from fgtrack.evaluation.matching import NO_OBJECT, _assign, _pair, contested, match, track_errors
 from fgtrack.evaluation.truth import TruePath, true_paths
-from fgtrack.io.run import NO_TRACK, EvaluationConfig, evaluation_config
+from fgtrack.io.run import NO_TRACK, EvaluationConfig
 
 S_NS = 1_000_000_000
 
@@ -75,7 +75,7 @@ def test_the_ego_and_rows_without_position_are_no_true_objects(tmp_path: Path) -
     ego = dataclasses.replace(WEST, object_id=-1)
     lost = TruthState(START_NS, START_NS, 5, math.nan, 0.0)
     run = write_run(tmp_path / "run", truth=[*ego.truth(range(3)), *WEST.truth(range(3)), lost])
-    assert [path.object_id for path in true_paths(run.truth)] == [7]
+    assert [path.object_id for path in true_paths(run.tables["truth"])] == [7]
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -84,7 +84,7 @@ def test_truth_beyond_all_distances_is_none(tmp_path: Path) -> None:
     far = [TruthState(START_NS + each * S_NS, START_NS, 5, 1e308 * (-1.0) ** each, 0.0) for each in range(4)]
     fast = dataclasses.replace(WEST.truth(range(1))[0], object_id=6, speed_mps=-1e300)
     run = write_run(tmp_path / "run", truth=[*far, fast, *WEST.truth(range(3))])
-    odd, usual = true_paths(run.truth)
+    odd, usual = true_paths(run.tables["truth"])
     assert (odd.object_id, usual.object_id) == (6, 7)
     assert np.isnan(odd.at(np.array([fast.stamp_ns]))[0, 3])
 
@@ -93,7 +93,7 @@ def test_truth_in_any_order_is_one_path_and_its_last_word_counts(tmp_path: Path)
     rows = WEST.truth(range(4))
     wrong = dataclasses.replace(rows[2], x_m=99.0)
     run = write_run(tmp_path / "run", truth=[wrong, rows[0], rows[3], rows[1], rows[2]])
-    (path,) = true_paths(run.truth)
+    (path,) = true_paths(run.tables["truth"])
     assert path.stamps_ns.tolist() == [row.stamp_ns for row in rows]
     assert path.states[:, 0].tolist() == [row.x_m for row in rows]
 
@@ -249,10 +249,10 @@ def test_a_tick_is_contested_where_a_row_or_an_object_has_a_choice() -> None:
 def test_a_configuration_that_cannot_be_used_is_one_clear_error(tmp_path: Path, text: str, message: str) -> None:
     run = write_run(tmp_path / "run", config_text=text)
     with pytest.raises(DataError, match=message):
-        evaluation_config(run)
+        _ = run.evaluation
 
 
 def test_what_the_configuration_does_not_say_has_its_default(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", config_text="evaluation: {confirmed_only: false, of_a_later_version: 1}")
-    assert evaluation_config(run) == EvaluationConfig(confirmed_only=False)
-    assert evaluation_config(dataclasses.replace(run, config_text="")) == EvaluationConfig()
+    assert run.evaluation == EvaluationConfig(confirmed_only=False)
+    assert dataclasses.replace(run, config_text="").evaluation == EvaluationConfig()

@@ -200,7 +200,7 @@ def test_ticks_without_recorded_truth_are_not_judged(story: Run) -> None:
     matching = match(story)
     assert matching is not None
     there = scenes(story, matching)
-    assert (story.timing.num_rows, there.num_ticks) == (12, 10)
+    assert (story.tables["timing"].num_rows, there.num_ticks) == (12, 10)
     assert there.present.sum(axis=0).tolist() == [10, 8]
     assert np.isinf(there.distances_m[there.tick_index >= 8, 1]).all()
 
@@ -222,8 +222,8 @@ def test_an_object_that_has_left_has_no_pair_though_a_row_has_an_earlier_stamp(t
 
 
 def test_the_order_of_the_rows_does_not_matter(story: Run) -> None:
-    tracks = Table({name: column[::-1] for name, column in story.tracks.items()})
-    assert multi_object(replace(story, tracks=tracks)) == multi_object(story)
+    tracks = Table({name: column[::-1] for name, column in story.tables["tracks"].items()})
+    assert multi_object(story.with_tables(tracks=tracks)) == multi_object(story)
 
 
 def test_a_late_stamped_row_is_as_far_as_it_is_at_its_own_stamp(tmp_path: Path) -> None:

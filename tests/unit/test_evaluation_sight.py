@@ -57,8 +57,8 @@ def a_run(
 
 def seen(run: Run) -> list[int]:
     """Objects in sight, which are the same at every tick."""
-    paths = true_paths(run.truth)
-    found, _ = in_sight(run, paths, run.timing["now_ns"])
+    paths = true_paths(run.tables["truth"])
+    found, _ = in_sight(run, paths, run.tables["timing"]["now_ns"])
     assert (found == found[0]).all()
     return [path.object_id for path, is_seen in zip(paths, found[0], strict=True) if is_seen]
 
@@ -85,7 +85,7 @@ def test_sight_is_known_where_every_sensor_has_a_limit(tmp_path: Path, limit: st
     run = a_run(
         tmp_path / "run", ["camera"], config_text=CONFIG.replace("bearing_rad: 0.1}", f"bearing_rad: 0.1}}{limit}")
     )
-    assert in_sight(run, true_paths(run.truth), run.timing["now_ns"])[1] == is_known
+    assert in_sight(run, true_paths(run.tables["truth"]), run.tables["timing"]["now_ns"])[1] == is_known
 
 
 def test_a_damaged_configuration_is_told(tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_a_track_of_an_object_out_of_sight_is_no_false_one(tmp_path: Path) -> No
 def test_runs_of_one_recording_are_measured_by_one_sight(tmp_path: Path) -> None:
     """Where a run does not know what its sensors see, that of the other counts; else what any of them sees."""
     knows, plain = a_run(tmp_path / "knows"), a_run(tmp_path / "plain", config_text="")
-    radar = replace(knows, updates=knows.updates.where(knows.updates["sensor"] == "radar"))
+    radar = knows.with_tables(updates=knows.tables["updates"].where(knows.tables["updates"]["sensor"] == "radar"))
     for other in (plain, radar):
         table = compare([knows, replace(other, path=None)])["differences"]
         mine = table.where(table["quantity"] == "gospa_in_sight_rms_m")
@@ -141,11 +141,11 @@ def test_the_path_of_the_ego_is_linear_between_its_stamps_in_any_order_and_turns
         for stamp_ns, x_m, yaw_rad in [(20, 2.0, -3.1), (0, 0.0, 3.1), (10, math.nan, 0.0), (20, 9.0, 0.0)]:
             writer.write_ego(EgoState(stamp_ns, 30, x_m, 5.0, yaw_rad, 0.0))
         writer.finish({})
-    poses = ego_poses(load_run(tmp_path / "run").ego, np.array([-5, 0, 10, 20, 99]))
+    poses = ego_poses(load_run(tmp_path / "run").tables["ego"], np.array([-5, 0, 10, 20, 99]))
     assert poses is not None
     assert poses[:, 0].tolist() == pytest.approx([0.0, 0.0, 1.0, 2.0, 2.0])
     assert poses[2, 2] == pytest.approx(math.pi)
-    assert ego_poses(load_run(tmp_path / "run").ego.where(np.zeros(4, bool)), np.array([0])) is None
+    assert ego_poses(load_run(tmp_path / "run").tables["ego"].where(np.zeros(4, bool)), np.array([0])) is None
 
 
 def test_the_shipped_configuration_sees_what_the_sensors_of_the_default_scenario_see() -> None:
@@ -164,14 +164,14 @@ def test_the_shipped_configuration_sees_what_the_sensors_of_the_default_scenario
     ]
     messages = simulate(replace(scenario, sensors=tuple(perfect)), np.random.default_rng(1))
     run, _ = replay_in_memory(messages, read_config("smoother", track_map="oval", estimator="ekf-replay"))
-    paths = true_paths(run.truth)
+    paths = true_paths(run.tables["truth"])
     matching = match(run)
     assert matching is not None
     for sensor in perfect:
         scans = [message for message in messages if getattr(message, "sensor", "") == sensor.name]
         stamps_ns = np.array([scan.stamp_ns for scan in scans])
         counts = [len(scan.objects) for scan in scans]
-        only = replace(run, updates=run.updates.where(run.updates["sensor"] == sensor.name))
+        only = run.with_tables(updates=run.tables["updates"].where(run.tables["updates"]["sensor"] == sensor.name))
         found, is_known = in_sight(only, paths, stamps_ns)
         assert is_known
         assert (found.sum(axis=1) == counts).mean() > 0.97, sensor.name  # they may differ at the edges of the view

@@ -122,7 +122,9 @@ def test_it_gives_what_the_replay_of_the_same_messages_gives() -> None:
                 tracker.receive(message)
         rows += [(track.x_m, track.y_m, track.speed_mps) for track in tracker.tick(receipt_ns).tracks]
     assert len(rows) > 50
-    np.testing.assert_array_equal(rows, np.stack([run.tracks[n] for n in ("x_m", "y_m", "speed_mps")], axis=1))
+    np.testing.assert_array_equal(
+        rows, np.stack([run.tables["tracks"][n] for n in ("x_m", "y_m", "speed_mps")], axis=1)
+    )
     received = Counter(m.sensor for m in messages if isinstance(m, DetectionList) for _ in m.objects)
     assert {sensor: sum(counts.values()) for sensor, counts in tracker.counts.items()} == received
 

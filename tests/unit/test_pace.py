@@ -52,7 +52,7 @@ def driven(messages: list[Message], tmp_path: Path) -> Driven:
             _, _, misses = pipeline._drive(
                 build_tracker(config), messages, config, writer, clock=clock, realtime=realtime
             )
-        return load_run(writer.path).timing["process_ns"].tolist(), misses
+        return load_run(writer.path).tables["timing"]["process_ns"].tolist(), misses
 
     return drive
 
@@ -112,6 +112,6 @@ def test_in_real_time_all_files_but_the_times_are_the_same_to_the_bit(messages: 
         k: v for k, v in paced.meta.items() if k != "wall_s"
     }
     for table in COLUMNS:
-        for name, values in getattr(fast, table).items():
+        for name, values in fast.tables[table].items():
             if name != "process_ns":
-                assert values.tobytes() == getattr(paced, table)[name].tobytes(), (table, name)
+                assert values.tobytes() == paced.tables[table][name].tobytes(), (table, name)

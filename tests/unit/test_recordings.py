@@ -11,7 +11,7 @@ from unit.evaluation_runs import ROUND, WEST, update, write_run
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
 from fgtrack.evaluation.recordings import by_recording, recordings_caution, same_recording
 from fgtrack.evaluation.runs import judged
-from fgtrack.io.run import Run, load_run, recording_of
+from fgtrack.io.run import Run, load_run
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay, replay_in_memory
@@ -80,16 +80,16 @@ def test_the_recording_of_a_run_is_found_from_elsewhere_and_after_a_move(
     write_stream(Path("drive.jsonl"), drive())
     replay(drive(), Config(), Path("out/run"), origin="drive.jsonl", kind="stream")
     monkeypatch.chdir(tmp_path)
-    place = recording_of(load_run("work/out/run"))
+    place = load_run("work/out/run").recording
     assert place is not None
     assert place.samefile("work/drive.jsonl")
     os.rename("work", "moved")
-    moved = recording_of(load_run("moved/out/run"))
+    moved = load_run("moved/out/run").recording
     assert moved is not None
     assert moved.samefile("moved/drive.jsonl")
     shutil.copytree("moved/out/run", "copy")
-    assert recording_of(load_run("copy")) is None
-    assert recording_of(run_of(drive())) is None
+    assert load_run("copy").recording is None
+    assert run_of(drive()).recording is None
     meta = load_run("copy").meta
     assert (meta["messages_received"], meta["first_receipt_ns"]) == (40, START_NS)
     assert meta["last_receipt_ns"] == START_NS + 380 * MS

@@ -36,7 +36,7 @@ def assert_same(memory: Run, written: Run) -> None:
     assert memory.config_text == written.config_text
     assert without(memory.meta) == without(written.meta)
     for table in COLUMNS:
-        kept, read = getattr(memory, table), getattr(written, table)
+        kept, read = memory.tables[table], written.tables[table]
         assert list(kept) == list(read) == list(COLUMNS[table])
         for name in read:
             assert kept[name].dtype == read[name].dtype, (table, name)
@@ -63,14 +63,18 @@ def test_replays_are_the_same_in_memory_and_written(estimator: str, messages: li
     written = load_run(tmp_path / "run")
     memory, broken = replay_in_memory(messages, config)
     assert broken is None
-    assert memory.tracks.num_rows > 100
-    assert memory.ego.num_rows == sum(isinstance(message, EgoState) for message in messages)
+    assert memory.tables["tracks"].num_rows > 100
+    assert memory.tables["ego"].num_rows == sum(isinstance(message, EgoState) for message in messages)
     said, ended = (
         sorted(zip(*(table[name].tolist() for name in ("sensor", "stamp_ns", "receipt_ns", "index")), strict=True))
-        for table in (memory.detections, memory.updates)
+        for table in (memory.tables["detections"], memory.tables["updates"])
     )
     assert said == ended
-    assert (memory.lagged.num_rows > 100) == (memory.smoothed.num_rows > 100) == (estimator == "smoother")
+    assert (
+        (memory.tables["lagged"].num_rows > 100)
+        == (memory.tables["smoothed"].num_rows > 100)
+        == (estimator == "smoother")
+    )
     assert_same(memory, written)
     kept, read = (evaluate(run).as_dict() for run in (memory, written))
     assert {name: kept[name] for name in kept if not name.startswith(NAMES_AND_TIMES)} == {
@@ -112,8 +116,8 @@ def test_every_kind_of_row_is_the_same(size: int, tmp_path: Path) -> None:
             sink.write_smoothed([SmoothedReport(7, reports[1].tracks[0].state)])
             sink.finish({"broken_off": None})
     assert_same(memory.run, load_run(tmp_path / "run"))
-    assert memory.run.smoothed.num_rows == 4
-    assert memory.run.ego.num_rows == 3
+    assert memory.run.tables["smoothed"].num_rows == 4
+    assert memory.run.tables["ego"].num_rows == 3
 
 
 def test_states_are_kept_as_they_were_when_they_came() -> None:
@@ -123,5 +127,5 @@ def test_states_are_kept_as_they_were_when_they_came() -> None:
     memory.write_tick(TickReport(0, START_NS, (track,), ()), 0, 0)
     mean += 1.0
     covariance += 1.0
-    assert memory.run.tracks["x_m"].tolist() == [0.0]
-    assert memory.run.tracks["p_x_y"].tolist() == [0.0]
+    assert memory.run.tables["tracks"]["x_m"].tolist() == [0.0]
+    assert memory.run.tables["tracks"]["p_x_y"].tolist() == [0.0]

@@ -132,19 +132,6 @@ def test_a_part_may_hold_all_that_a_sweep_writes(tmp_path: Path) -> None:
     assert list(Sweep.open(PLAN, tmp_path).done) == ["k0"]
 
 
-@pytest.mark.parametrize("beside", [(), ("notes.txt",)], ids=["empty", "notes"])
-def test_a_table_of_somebody_beside_a_folder_of_parts_stays(tmp_path: Path, beside: tuple[str, ...]) -> None:
-    """Also one that has a column `estimator`."""
-    (tmp_path / "parts").mkdir()
-    for name in beside:
-        (tmp_path / "parts" / name).write_text("mine")
-    for text in ("yield,estimator\n1,2\n", "seed,yield,estimator\n1,2,3\n", ""):
-        (tmp_path / "sweep.csv").write_text(text)
-        for overwrite in (False, True):
-            with pytest.raises(CallError, match=r"sweep\.csv: exists and is not a table of a sweep"):
-                PartStore(tmp_path, overwrite)
-
-
 def test_results_whose_parts_are_gone_are_replaced_with_overwrite_only(tmp_path: Path) -> None:
     PartStore(tmp_path).write("k0", DONE["k0"])
     write_tables(tmp_path, PLAN, DONE)
@@ -161,10 +148,8 @@ def test_links_in_the_folder_of_a_sweep_are_neither_followed_nor_replaced(tmp_pa
     write_tables(tmp_path, PLAN, DONE)
     (tmp_path / "timing.csv").rename(tmp_path / "mine.csv")
     (tmp_path / "timing.csv").symlink_to("mine.csv")
-    with pytest.raises(CallError, match=r"timing\.csv: exists and is not a table of a sweep"):
+    with pytest.raises(CallError, match=r"timing\.csv: exists and is not a file"):
         PartStore(tmp_path)
-    with pytest.raises(CallError, match=r"timing\.csv: cannot be written \(is a link\)"):
-        write_tables(tmp_path, PLAN, DONE)
     assert (tmp_path / "timing.csv").is_symlink()
     (tmp_path / "timing.csv").unlink()
     (tmp_path / "parts").rename(tmp_path / "real")
@@ -177,17 +162,6 @@ def test_a_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(CallError, match=r"file.*: cannot be written .*, choose another"):
         PartStore(tmp_path / "file")
-
-
-def test_tables_without_parts_are_replaced_with_overwrite_where_a_sweep_wrote_them(tmp_path: Path) -> None:
-    (tmp_path / "sweep.csv").write_text("lag_s,seed,estimator,rmse\n")
-    with pytest.raises(CallError, match=r"sweep\.csv: already exists"):
-        PartStore(tmp_path)
-    (tmp_path / "paired.csv").write_text("yield\n")
-    with pytest.raises(CallError, match=r"paired\.csv: exists and is not a table of a sweep"):
-        PartStore(tmp_path, overwrite=True)
-    (tmp_path / "paired.csv").unlink()
-    assert not PartStore(tmp_path, overwrite=True).keys()
 
 
 def test_a_part_without_all_its_cells_is_not_done(tmp_path: Path) -> None:

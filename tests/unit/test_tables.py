@@ -171,7 +171,7 @@ def test_a_damaged_file_is_one_line_and_what_is_before_it_is_replayed(tmp_path, 
     if text.startswith(RADAR_TEXT):
         run, broken = replay_in_memory(open_input(tmp_path, config).messages(), Config())
         assert broken == str(caught.value)
-        assert run.detections.num_rows == 3
+        assert run.tables["detections"].num_rows == 3
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.io.adapters.common import RosMessage
 from fgtrack.io.errors import UntilBreak
-from fgtrack.io.output import Kind, new_folder
+from fgtrack.io.output import check_output, new_folder
 from fgtrack.io.ros.bag_files import METADATA, SETTINGS, parts_of
 from fgtrack.io.ros.messages import DETECTED_OBJECTS, DETECTION3D_ARRAY, MessageFactory
 from fgtrack.io.ros.typestore import one_line
@@ -23,6 +23,7 @@ from fgtrack.io.ros.typestore import one_line
 _CHECKPOINT = 1000  # messages; a killed writer loses no more than that
 _PLUGINS = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _INT64_LIMIT = 1 << 63
+RECORDING = "a rosbag2 folder with nothing else in it"
 _JOURNALS = ("-wal", "-shm", "-journal")  # that SQLite may leave beside a file
 
 
@@ -56,7 +57,7 @@ def write_bag(
     path = Path(path)
     try:
         with (
-            new_folder(path, RECORDING, overwrite) as folder,
+            new_folder(path, overwrite, is_recording, RECORDING) as folder,
             Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=_PLUGINS[storage]) as bag,
         ):
             if settings:
@@ -82,7 +83,12 @@ def token(name: str) -> str:
     return re.sub(r"\W", "_", name, flags=re.ASCII)
 
 
-def _is_recording(path: Path) -> bool:
+def check_bag(path: Path, overwrite: bool) -> None:
+    """Raise `CallError` where `write_bag` would for what is at `path`."""
+    check_output(path, overwrite, is_recording, RECORDING)
+
+
+def is_recording(path: Path) -> bool:
     """Whether `path` is a folder of what its metadata.yaml lists, and of nothing else."""
     if not (path / METADATA).is_file():
         return False
@@ -92,9 +98,6 @@ def _is_recording(path: Path) -> bool:
         return False
     known = {METADATA, *listed, *(f"{name}{journal}" for name in listed for journal in _JOURNALS)}
     return bool(listed) and all(file.name in known and file.is_file() for file in path.iterdir())
-
-
-RECORDING = Kind("a rosbag2 folder with nothing else in it", _is_recording)
 
 
 class _MessageWriter:

@@ -1,12 +1,11 @@
 """The run folder `fgtrack-run/1`, the interface of tracking and evaluation: writer, reader, layout; runs in memory."""
 
-from fgtrack.io.run.judging import EvaluationConfig, evaluation_config
 from fgtrack.io.run.memory import MemoryRun
-from fgtrack.io.run.origin import path_from_run, recording_of
-from fgtrack.io.run.reader import NO_TRACK, Run, Table, load_run
-from fgtrack.io.run.schema import COLUMNS, COVARIANCE_COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
+from fgtrack.io.run.reader import Run, Table, load_run
+from fgtrack.io.run.schema import COLUMNS, COVARIANCE_COLUMNS, NO_TRACK, OPTIONAL_TABLES, RUN_FORMAT
+from fgtrack.io.run.settings import EvaluationConfig
 from fgtrack.io.run.timing import Node, ready_times
-from fgtrack.io.run.writer import RUN, RunWriter, digest, is_run_folder, write_metrics
+from fgtrack.io.run.writer import RunWriter, check_run, digest, is_run_folder, path_from_run, write_metrics
 
 __all__ = [
     "COLUMNS",
@@ -16,17 +15,15 @@ __all__ = [
     "NO_TRACK",
     "Node",
     "OPTIONAL_TABLES",
-    "RUN",
     "RUN_FORMAT",
     "Run",
     "RunWriter",
     "Table",
+    "check_run",
     "digest",
-    "evaluation_config",
     "is_run_folder",
     "load_run",
     "path_from_run",
     "ready_times",
-    "recording_of",
     "write_metrics",
 ]

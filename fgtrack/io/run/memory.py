@@ -6,10 +6,12 @@ from operator import itemgetter
 
 import numpy as np
 
-from fgtrack.io.run.reader import CHUNK, Column, Run, Table, column
+from fgtrack.io.run.reader import Run, Table
 from fgtrack.io.run.rows import Row, text, text_header
-from fgtrack.io.run.schema import COLUMNS
+from fgtrack.io.run.schema import COLUMNS, Column, column
 from fgtrack.io.run.sink import RunSink
+
+_CHUNK = 4096  # rows that wait for becoming columns, which take a tenth of the memory
 
 
 class MemoryRun(RunSink):
@@ -37,7 +39,7 @@ class MemoryRun(RunSink):
         for table in COLUMNS:
             self._pack(table)
             tables[table] = Table({name: np.concatenate(parts) for name, parts in self._columns[table].items()})
-        return Run(None, dict(self._meta), self._config_text, **tables)
+        return Run(None, dict(self._meta), self._config_text, tables)
 
     def _append(self, table: str, found: Sequence[Row]) -> None:
         if table == "tracks":
@@ -45,7 +47,7 @@ class MemoryRun(RunSink):
         elif table == "updates":
             self._updates += text(table, found).encode()
         self._waiting[table] += found
-        if len(self._waiting[table]) >= CHUNK:
+        if len(self._waiting[table]) >= _CHUNK:
             self._pack(table)
 
     def _pack(self, table: str) -> None:

@@ -1,12 +1,14 @@
 """The layout of a run folder `fgtrack-run/1`: its tables and their columns."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES
 
 RUN_FORMAT = "fgtrack-run/1"
-LARGEST_META_MB = 16.0
-"""Of meta.json and config.yaml, which have some kB."""
 
 #: States whose covariance is written.
 COVARIANCE_STATES = ("x", "y", "yaw", "speed", "yaw_rate")
@@ -38,3 +40,35 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
 
 #: Tables that are written only when there is something to write.
 OPTIONAL_TABLES = ("smoothed", "lagged", "truth", "ignored", "ego", "objects", "detections")
+
+NO_TRACK = -1
+"""Track id of an update that belongs to no track."""
+
+# A column holds floats, integers or text, as its name says; the reader of it knows which.
+Column = npt.NDArray[Any]
+
+_TEXT = frozenset({"status", "sensor", "disposition", "kind", "frame", "class_name", "outline_m"})
+_INTEGERS = frozenset(
+    {
+        *("tick", "now_ns", "stamp_ns", "receipt_ns", "process_ns", "track_id", "object_id"),
+        *("index", "num_measured", "num_tracks", "num_detections"),
+    }
+)
+_LARGEST = 1e60  # its square is a number; more is no measurement, and no state
+
+
+def column_type(name: str) -> type:
+    """Type of the values of the column `name`: `str`, `int` or `float`."""
+    return str if name in _TEXT else int if name in _INTEGERS else float
+
+
+def column(name: str, cells: Sequence[Any] | Column) -> Column:
+    """The column `name` of `cells`, shape (rows,); None is an empty cell, and a number beyond 1e60 is NaN."""
+    kind = column_type(name)
+    if kind is str:
+        return np.array(["" if cell is None else cell for cell in cells], dtype=np.str_)
+    if kind is int:
+        return np.array([NO_TRACK if cell is None else cell for cell in cells], dtype=np.int64)
+    numbers = np.array(cells, dtype=np.float64)
+    numbers[np.abs(numbers) > _LARGEST] = np.nan
+    return numbers

@@ -88,7 +88,7 @@ class RunSink(ABC):
             for sensor, counter in sorted(self._counts.items())
         }
         bounds = {"out_of_bounds": _by_reason(self._out_of_bounds), "left_out": _by_reason(self._left_out)}
-        self._meta |= {**meta, "counts": counts, **bounds, "digest": self._digest(), "complete": True}
+        self._meta |= {"counts": counts, **bounds, "complete": True, **meta, "digest": self._digest()}
         return dict(self._meta)
 
     def _append_objects(self, alive: Set[int]) -> None:

@@ -3,32 +3,33 @@
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from io import FileIO
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.files import open_file, read_head, read_whole
-from fgtrack.io.exchange import EXCHANGED, exchanged
-from fgtrack.io.output import Kind, check_output, claimed, part_of, write_error, write_file
+from fgtrack.core.errors import DataError
+from fgtrack.core.files import open_file, read_whole
+from fgtrack.io.output import check_output, claimed, write_error, write_file
 from fgtrack.io.run.rows import Row, text, text_header
-from fgtrack.io.run.schema import COLUMNS, LARGEST_META_MB, OPTIONAL_TABLES, RUN_FORMAT
+from fgtrack.io.run.schema import COLUMNS, NO_TRACK, OPTIONAL_TABLES, RUN_FORMAT, Column
 from fgtrack.io.run.sink import RunSink
 
-_FILES = (*(f"{table}.csv" for table in COLUMNS), "metrics.json", "config.yaml", "meta.json")
-#: Tables that every run has and no recording, whose files may have the names of other tables.
-_TELLING = ("tracks", "updates", "timing")
+LARGEST_META_MB = 16.0
+"""Of meta.json and config.yaml, which have some kB."""
+_META, _OLD_META, _STAGE = "meta.json", "meta.json.part", "new.part"
+_FILES = (*(f"{table}.csv" for table in COLUMNS), "metrics.json", "config.yaml", _META)
 
 
 class RunWriter(RunSink):
     """Writes a run folder as the run goes; a context manager.
 
-    The folder is locked until the writer is closed. Its files appear with the first tick, so a run that fails before
-    leaves what was there. From then on every tick reaches the files before `write_tick` returns: a killed run leaves
-    readable files and a `meta.json` with `"complete": false`.
+    The folder is locked until the writer is closed. Every tick reaches the files before `write_tick` returns: a killed
+    run leaves readable files and a `meta.json` with `"complete": false`. An older run stays until `finish`: the new one
+    grows in `new.part` beside it. Other files in the folder stay.
 
     Parameters
     ----------
@@ -37,7 +38,7 @@ class RunWriter(RunSink):
     config_text, meta, smoothed_lag_s
         As of `RunSink`.
     overwrite
-        Replace a run at `path`; other files beside it stay.
+        Replace a run at `path`.
 
     Raises
     ------
@@ -55,25 +56,23 @@ class RunWriter(RunSink):
     ) -> None:
         super().__init__(config_text, meta, smoothed_lag_s)
         self.path = Path(path)
-        self._overwrite = overwrite
-        self._begun = False
-        self._truth: dict[str, list[Row]] = {"truth": [], "ignored": []}  # what came before the first tick
+        self._folder: Path | None = None  # where the files are, once there are any
+        self._truth: dict[str, list[Row]] = {"truth": [], "ignored": []}  # of the time before the first tick
         self._files: dict[str, FileIO] = {}
         with ExitStack() as claim:
             claim.enter_context(claimed(self.path))
-            check_output(self.path, RUN, overwrite)
+            check_run(self.path, overwrite)
             self._claim = claim.pop_all()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+        if isinstance(error, Exception):  # an interrupt leaves the beginning, as a kill does
+            shutil.rmtree(self.path / _STAGE, ignore_errors=True)
 
     def close(self) -> None:
         """Close the tables and unlock the folder; without `finish` before, the run stays marked as incomplete."""
@@ -82,49 +81,99 @@ class RunWriter(RunSink):
         self._claim.close()
 
     def finish(self, meta: Mapping[str, object]) -> dict[str, object]:
-        """See `RunSink`; rewrites `meta.json`."""
-        self._begin()
+        """Complete the run, see `RunSink`, and replace an older one."""
+        folder = self._begin()
         finished = super().finish(meta)
-        self._write_meta(self.path)
+        self._write_meta(folder)
+        if folder != self.path:
+            try:
+                self._replace(folder)
+            except OSError as error:
+                raise write_error(self.path, error) from error
         return finished
 
-    def _append(self, table: str, found: Sequence[Row]) -> None:
-        if table in self._truth and not self._begun:
-            self._truth[table] += found
-            return
-        self._begin()
-        self._write(table, text(table, found))
+    def _replace(self, folder: Path) -> None:
+        with suppress(FileNotFoundError):  # a killed command had begun with this
+            os.replace(self.path / _META, self.path / _OLD_META)  # until the end of the exchange there is no run
+        for name in _FILES:
+            if (folder / name).exists():
+                os.replace(folder / name, self.path / name)
+            else:
+                (self.path / name).unlink(missing_ok=True)
+        folder.rmdir()
+        (self.path / _OLD_META).unlink(missing_ok=True)
 
-    def _begin(self) -> None:
-        """Make the files; an older run stays until all of them are there."""
-        if self._begun:
-            return
-        self._begun = True
-        with exchanged(self.path, _FILES, self._overwrite) as folder:
-            write_file(folder / "config.yaml", self._config_text)
+    def _append(self, table: str, rows: Sequence[Row]) -> None:
+        if table in self._truth and self._folder is None:
+            self._truth[table] += rows
+        else:
+            self._begin()
+            self._write(table, text(table, rows))
+
+    def _begin(self) -> Path:
+        """Make the files, with the first tick: a run that fails before leaves nothing."""
+        if self._folder is None:
+            self._folder = self.path / _STAGE if any(self.path.iterdir()) else self.path
+            if self._folder != self.path:
+                shutil.rmtree(self._folder, ignore_errors=True)  # of a killed command
+                self._folder.mkdir()
+            self._write_meta(self._folder)  # the first, so that a folder with a table is known as a run
+            write_file(self._folder / "config.yaml", self._config_text)
             for table in COLUMNS:
-                if table not in OPTIONAL_TABLES:
-                    self._write(table, "", folder)
-            for table, found in self._truth.items():
-                if found:
-                    self._write(table, text(table, found), folder)
-            self._write_meta(folder)
+                rows = self._truth.get(table)
+                if rows or table not in OPTIONAL_TABLES:
+                    self._write(table, text(table, rows or ()))
+        return self._folder
 
-    def _write(self, table: str, lines: str, folder: Path | None = None) -> None:
-        file, name = self._files.get(table), f"{table}.csv"
+    def _write(self, table: str, lines: str) -> None:
+        file, path = self._files.get(table), (self._folder or self.path) / f"{table}.csv"
         try:
             if file is None:
-                file = self._files[table] = FileIO((folder or self.path) / name, "x")
+                file = self._files[table] = FileIO(path, "w")
                 _write_all(file, text_header(table))
             _write_all(file, lines.encode())
         except OSError as error:
-            raise write_error(self.path / name, error) from error
+            raise write_error(path, error) from error
 
     def _write_meta(self, folder: Path) -> None:
-        write_file(folder / "meta.json", json.dumps(self._meta, indent=2) + "\n")
+        write_file(folder / _META, json.dumps(self._meta, indent=2) + "\n")
 
     def _digest(self) -> str:
-        return digest(self.path)
+        return digest(self._folder or self.path)
+
+
+def check_run(path: Path, overwrite: bool) -> None:
+    """Raise `CallError` where `RunWriter` would for what is at `path`."""
+    check_output(path, overwrite, is_run_folder, "a run folder")
+
+
+def save_run(
+    path: Path,
+    tables: Mapping[str, Mapping[str, Column]],
+    config_text: str,
+    meta: Mapping[str, object],
+    overwrite: bool,
+) -> None:
+    """Write a run that is complete; raises as `RunWriter`."""
+    with RunWriter(path, config_text, meta, overwrite=overwrite) as writer:
+        for table, columns in tables.items():
+            empty = {NO_TRACK: None} if table == "updates" else {}
+            cells = [
+                [None if cell != cell or cell == "" else cell for cell in values.tolist()]
+                if name != "track_id"
+                else [empty.get(cell, cell) for cell in values.tolist()]
+                for name, values in columns.items()
+            ]
+            if rows := list(zip(*cells, strict=True)):
+                writer._append(table, rows)
+        writer.finish(meta)
+
+
+def path_from_run(origin: str, folder: Path) -> str | None:
+    """The path `origin` relative to the run folder `folder`; None if nothing is there."""
+    if not origin or not Path(origin).exists():
+        return None
+    return os.path.relpath(os.path.realpath(origin), os.path.realpath(folder))
 
 
 def write_metrics(path: Path, metrics: Mapping[str, object]) -> None:
@@ -143,9 +192,13 @@ def digest(path: Path) -> str:
 
 
 def is_run_folder(path: Path) -> bool:
-    """Whether `path` holds a run: its `meta.json` names the format."""
+    """True if `path` holds a run: its `meta.json` names the format."""
+    return any(_is_meta(path / name) for name in (_META, _OLD_META))
+
+
+def _is_meta(file: Path) -> bool:
     try:
-        meta = json.loads(read_whole(path / "meta.json", LARGEST_META_MB))
+        meta = json.loads(read_whole(file, LARGEST_META_MB))
     except (DataError, ValueError, RecursionError):
         return False
     return isinstance(meta, dict) and meta.get("format") == RUN_FORMAT
@@ -155,36 +208,3 @@ def _write_all(file: FileIO, data: bytes) -> None:
     """Write `data`; a disk that is about to be full takes only the first part of it at a time."""
     while data:
         data = data[file.write(data) :]
-
-
-def _is_run(path: Path) -> bool:
-    """Whether `path` holds a run, or what is left of one whose writer was killed at its beginning.
-
-    Raises `CallError` where a run has another file in place of one of its own.
-    """
-    if not path.is_dir():
-        return False
-    there = [path / name for name in _FILES if os.path.lexists(path / name)]
-    foreign = next((file for file in there if not _is_of_run(file)), None)
-    if is_run_folder(path):
-        if foreign is not None:
-            raise CallError(f"{foreign}: is not what a run has there, move it away or choose another folder")
-        return True
-    if foreign is not None or not all(part_of(name) in (*_FILES, EXCHANGED) for name in os.listdir(path)):
-        return False
-    return not there or any(_begins(path / f"{table}.csv", text_header(table)) for table in _TELLING)
-
-
-def _is_of_run(file: Path) -> bool:
-    """Whether `file`, which has the name of one of a run, may be it; what a link leads to is not touched."""
-    if file.is_symlink() or file.suffix != ".csv":
-        return file.is_symlink() or file.is_file()
-    header = text_header(file.stem)
-    return file.is_file() and (_begins(file, header) or header.startswith(read_head(file, len(header))))
-
-
-def _begins(file: Path, start: bytes) -> bool:
-    return read_head(file, len(start)) == start
-
-
-RUN = Kind("a run folder", _is_run)

@@ -1,4 +1,4 @@
-"""What is relied on in the meta.json and config.yaml of a run; other keys may hold anything."""
+"""What is used of the meta.json and config.yaml of a run, and its type; other keys may hold anything."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -10,11 +10,42 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import DataError
-from fgtrack.io.run.judging import EvaluationConfig
 
-__all__ = ["check_config", "check_meta"]
+__all__ = ["EvaluationConfig", "check_config", "check_meta"]
 
 _Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+_Counts = Mapping[str, Mapping[str, int]]
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """How tracks are paired with true objects, and which metrics are computed."""
+
+    gate_m: float = 5.0
+    """Largest distance of a track from its true object. The default is the tracker's own association distance, a
+    car's length (more for ships): a track farther off is not updated by its object any more. It bounds the errors,
+    so compare at one gate."""
+    confirmed_only: bool = True
+    """Whether tentative tracks are left out: by counting, those measured less than `lifecycle.confirm_count` times."""
+    multi_object: bool = True
+    """Whether GOSPA, CLEAR, IDF1 and HOTA are computed."""
+    gospa_c_m: float | None = None
+    """Cut-off distance c of GOSPA; null for `gate_m`."""
+    late_switch_s: float = 0.5
+    """An identity switch within this time after an out-of-sequence update counts as late."""
+
+    @property
+    def gospa_cut_off_m(self) -> float:
+        """Cut-off distance c of GOSPA, the gate where none is given."""
+        return self.gate_m if self.gospa_c_m is None else self.gospa_c_m
+
+    def __post_init__(self) -> None:
+        for name in ("gate_m", "gospa_c_m"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value <= LARGEST:
+                raise ValueError(f"{name}: must be positive and at most {LARGEST:g}, is {value}")
+        if not 0.0 <= self.late_switch_s <= LARGEST:
+            raise ValueError(f"late_switch_s: must not be negative, nor above {LARGEST:g}, is {self.late_switch_s}")
 
 
 @dataclass(frozen=True)
@@ -39,9 +70,9 @@ class _Meta:
     digest: str = ""
     detections_received: int = 0
     messages_received: int = 0
-    counts: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
-    out_of_bounds: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
-    left_out: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    counts: _Counts = field(default_factory=dict)
+    out_of_bounds: _Counts = field(default_factory=dict)
+    left_out: _Counts = field(default_factory=dict)
     ego_refused: Mapping[str, int] = field(default_factory=dict)
     ego_jumps: int = 0
     failures: Mapping[str, int] = field(default_factory=dict)
@@ -69,11 +100,6 @@ class _Map:
 
 
 @dataclass(frozen=True)
-class _Birth:
-    ego_speed_factor: _Number | None = None
-
-
-@dataclass(frozen=True)
 class _Clock:
     node_hz: Annotated[float, Field(gt=0.0, le=LARGEST)] | None = None
 
@@ -88,7 +114,7 @@ class _Config:
     sensors: Mapping[str, _Sensor | None] | None = None
     ego: _Ego | None = None
     map: _Map | None = None
-    birth: _Birth | None = None
+    birth: Mapping[str, Any] | None = None
     clock: _Clock | None = None
     smoother: _Smoother | None = None
     input: Mapping[str, Any] | None = None
@@ -99,12 +125,12 @@ _META, _CONFIG = TypeAdapter(_Meta), TypeAdapter(_Config)
 
 
 def check_meta(meta: Any, path: Path) -> None:
-    """Raise `DataError` where a value of meta.json at `path` is of another kind than what a run writes."""
+    """Raise `DataError` where a value of meta.json at `path` has not the type that a run writes."""
     _check(_META, meta, path)
 
 
 def check_config(config: Any, path: Path) -> None:
-    """Raise `DataError` where a value of config.yaml at `path` is of another kind than what a run writes."""
+    """Raise `DataError` where a value of config.yaml at `path` has not the type that a run writes."""
     _check(_CONFIG, config, path)
 
 
@@ -115,7 +141,7 @@ def _check(kind: TypeAdapter[Any], value: Any, path: Path) -> None:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        if first["type"] == "value_error":  # of a rule that says what is wrong
+        if first["type"] == "value_error":  # of `EvaluationConfig`, whose message says what is wrong
             raise DataError(f"{path}: {where}: {first['ctx']['error']}") from error
         raise DataError(f"{path}: {where} is not what a run writes there, repeat the run") from error
     except (ValueError, RecursionError) as error:
