@@ -7,6 +7,7 @@ instead: created, and locked until the command ends.
 
 import errno
 import fcntl
+import filecmp
 import os
 import secrets
 import shutil
@@ -78,7 +79,8 @@ def write_file(path: Path, text: str) -> None:
 @contextmanager
 def new_file(path: Path, overwrite: bool) -> Iterator[BinaryIO]:
     """A file that is renamed to `path` when the block ends; raises as `check_output` and `write_error`."""
-    with _part_of(path, overwrite) as part:
+    check_output(path, overwrite)
+    with _part_of(path) as part:
         part.parent.mkdir(parents=True, exist_ok=True)
         with part.open("xb") as file:
             yield file
@@ -88,13 +90,16 @@ def new_file(path: Path, overwrite: bool) -> Iterator[BinaryIO]:
 
 @contextmanager
 def new_files(folder: Path, overwrite: bool) -> Iterator[Path]:
-    """A folder whose files are moved into `folder` when the block ends; raises as `new_file`."""
-    with _part_of(folder, overwrite, os.path.isdir, "a folder") as part:
+    """A folder whose files are moved into `folder` when the block ends; raises as `new_file` where one would change."""
+    check_output(folder, True, os.path.isdir, "a folder")
+    with _part_of(folder) as part:
         part.mkdir(parents=True)
         yield part
         files = sorted(part.iterdir())
         for file in files:
-            check_output(folder / file.name, overwrite)
+            other = folder / file.name
+            if not other.is_file() or not filecmp.cmp(file, other, shallow=False):
+                check_output(other, overwrite)
         folder.mkdir(exist_ok=True)
         for file in files:
             os.replace(file, folder / file.name)
@@ -104,7 +109,8 @@ def new_files(folder: Path, overwrite: bool) -> Iterator[Path]:
 @contextmanager
 def new_folder(path: Path, overwrite: bool, replaceable: Callable[[Path], bool], what: str) -> Iterator[Path]:
     """Path at which to make a folder that is renamed to `path` when the block ends; raises as `new_file`."""
-    with _part_of(path, overwrite, replaceable, what) as part:
+    check_output(path, overwrite, replaceable, what)
+    with _part_of(path) as part:
         part.mkdir(parents=True)
         new, old = part / Path(os.path.abspath(path)).name, part / _REPLACED
         yield new
@@ -121,11 +127,8 @@ def new_folder(path: Path, overwrite: bool, replaceable: Callable[[Path], bool],
 
 
 @contextmanager
-def _part_of(
-    path: Path, overwrite: bool, replaceable: Callable[[Path], bool] = os.path.isfile, what: str = "a file"
-) -> Iterator[Path]:
+def _part_of(path: Path) -> Iterator[Path]:
     """The path `<path>.*.part`, removed after an error; an interrupt keeps it, as a kill does."""
-    check_output(path, overwrite, replaceable, what)
     absolute = Path(os.path.abspath(path))
     part = absolute.with_name(f"{absolute.name}.{secrets.token_hex(6)}.part")
     try:
