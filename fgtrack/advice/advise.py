@@ -35,7 +35,7 @@ from fgtrack.pipeline.trial import TRIAL_S, beginning, suspicions
 from fgtrack.pipeline.tune import tuned
 from fgtrack.pipeline.tune_rules import TuneRules
 
-__all__ = ["advise"]
+__all__ = ["advice_on", "advise"]
 
 TRACKED_S = 300.0
 """So much of a recording is tracked, to judge clocks and noise; delays are those of all of it."""
@@ -95,7 +95,20 @@ def advise(
     messages = list(readable)
     broken = None if readable.error is None else str(readable.error)
     found = assumed(resolved, replace(source, messages=lambda: iter(messages)))
-    return _Adviser(str(recording), messages, found, reference, on_step).advice(broken, tune)
+    return advice_on(str(recording), messages, found, reference, tune, broken, on_step)
+
+
+def advice_on(
+    recording: str,
+    messages: Sequence[Message],
+    found: Assumed,
+    reference: str | None = None,
+    tune: bool = False,
+    broken: str | None = None,
+    on_step: Callable[[str, float], None] = lambda text, share: None,
+) -> Advice:
+    """Return `advise` of messages that have been read; `broken` is why the recording breaks off, where it does."""
+    return _Adviser(recording, messages, found, reference, on_step).advice(broken, tune)
 
 
 class _Adviser:

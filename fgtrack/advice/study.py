@@ -1,32 +1,31 @@
 """A recording in one call: advice, three methods on the same stream, their comparison, figures, and a page."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import chain
+from itertools import chain, count
 from pathlib import Path
 
-from matplotlib.figure import Figure
-
 import fgtrack
-from fgtrack.advice.advise import advise
+from fgtrack.advice.advise import advice_on
 from fgtrack.advice.page import Advice
 from fgtrack.advice.summary import summary
 from fgtrack.core.errors import DataError
+from fgtrack.core.types import Message
 from fgtrack.evaluation.comparison import compare
-from fgtrack.evaluation.recordings import by_recording
 from fgtrack.evaluation.runs import JudgedRun, judged
 from fgtrack.evaluation.tables import Tables
+from fgtrack.io.errors import UntilBreak
 from fgtrack.io.output import check_apart, check_output, claimed, new_file, new_files
 from fgtrack.io.run import Run, check_run, load_run, write_metrics
 from fgtrack.io.source import InputSource, open_input
-from fgtrack.io.span import end_ns
 from fgtrack.pipeline.assumed import Assumed, assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import ReplayResult, replay_each
 from fgtrack.pipeline.shipped import read_config, settings_of
-from fgtrack.plotting.late_detection import close_ups
-from fgtrack.plotting.plot import close_up, drawn, planned
+from fgtrack.plotting.late_detection import drawn_close_up
+from fgtrack.plotting.plot import drawn, planned
+from fgtrack.plotting.slow_motion import CloseUp
 from fgtrack.plotting.style import png
 from fgtrack.viewers.playback import Moment
 from fgtrack.viewers.report import Opening, write_report
@@ -141,12 +140,21 @@ def study(
         check_output(page, overwrite)
         on_step("reading", 0.0)
         source = open_input(source_path, resolved.input)
-        known = assumed(resolved, source)
-        advised = _advised(source_path, known.config, on_step) if advice else None
+        readable = UntilBreak(source.messages())
+        messages = list(readable)
+        known = assumed(resolved, replace(source, messages=lambda: iter(messages)))
+        advised = _advised(source_path, messages, known, on_step) if advice else None
         known = known if advised is None else _following(known, advised)
         with new_file(settings, overwrite) as file:
             file.write(_settings_text(source_path, known, advised).encode())
-        results = _replayed(source_path, source, known.config, folders, overwrite, on_step)
+
+        def repeated() -> Iterator[Message]:
+            yield from messages
+            readable.raise_error()
+
+        times_ns = (messages[0].receipt_ns, messages[-1].receipt_ns) if messages else (0, 0)
+        source = replace(source, messages=repeated)
+        results = _replayed(source, times_ns, known.config, folders, overwrite, on_step)
         on_step("compare", _COMPARE)
         every = judged([load_run(result.path) for result in results])
         tables = compare(*every)
@@ -173,16 +181,15 @@ def outputs(out: Path) -> list[Path]:
     ]
 
 
-def _advised(recording: Path, config: Config, on_step: OnStep) -> Advice | None:
+def _advised(recording: Path, messages: Sequence[Message], known: Assumed, on_step: OnStep) -> Advice | None:
     """Return the advice on `recording`; None where nothing can be judged, which the runs report as well."""
-    steps: list[str] = []
-
-    def on_part(text: str = "", *_: object) -> None:
-        steps.append(text)
-        on_step(f"advice, {text}", _REPLAY - (_REPLAY - _ADVICE) * 0.8 ** len(steps))
-
     with suppress(DataError):
-        return advise(recording, config, on_step=on_part)
+        return advice_on(
+            str(recording),
+            messages,
+            Assumed(known.config, ()),
+            on_step=lambda text, share: on_step(f"advice, {text}", _ADVICE + (_REPLAY - _ADVICE) * share),
+        )
     return None
 
 
@@ -199,63 +206,52 @@ def _settings_text(recording: Path, known: Assumed, advice: Advice | None) -> st
 
 
 def _replayed(
-    recording: Path,
     source: InputSource,
+    times_ns: tuple[int, int],
     config: Config,
     folders: Mapping[str, Path],
     overwrite: bool,
     on_step: OnStep,
 ) -> list[ReplayResult]:
-    end, each = end_ns(source), (_COMPARE - _REPLAY) / len(folders)
+    share, (start_ns, end_ns) = (_COMPARE - _REPLAY) / len(folders), times_ns
+    results: list[ReplayResult] = []
+    ticks = count()
 
-    def replayed(name: str, folder: Path, before: float) -> ReplayResult:
-        ticks_ns: list[int] = []
+    def on_tick(now_ns: int, num_tracks: int) -> None:
+        if next(ticks) % _TICKS == 0:
+            done = len(results) + min(max(now_ns - start_ns, 0) / max(end_ns - start_ns, 1), 1.0)
+            on_step(f"replay, {list(folders)[len(results)]}, {num_tracks} tracks", _REPLAY + share * done)
 
-        def on_tick(now_ns: int, num_tracks: int) -> None:
-            ticks_ns.append(now_ns)
-            if len(ticks_ns) % _TICKS == 1:
-                length_ns = max((end or 0) - ticks_ns[0], 1)
-                done = min((now_ns - ticks_ns[0]) / length_ns, 1.0) if end is not None else 0.0
-                on_step(f"replay, {name}, {num_tracks} tracks", before + each * done)
-
-        (result,) = replay_each(
+    for name, folder in folders.items():
+        results += replay_each(
             source.messages,
             config,
             {name: folder},
-            origin=str(recording),
+            origin=str(source.path),
             kind=source.kind,
             on_tick=on_tick,
             overwrite=overwrite,
         )
-        return result
-
-    return [replayed(name, folder, _REPLAY + each * k) for k, (name, folder) in enumerate(folders.items())]
+    return results
 
 
 def _pictured(
     runs: list[JudgedRun], tables: Tables, opening: Opening, figures: Path, page: Path, overwrite: bool
 ) -> None:
-    late, moment = late_case(runs)
+    close_up, late = drawn_close_up(runs)
     others = tuple(f"_{one.label}" for one in runs[1:])  # figures of single runs are drawn of the first
     plans = (one for one in planned(runs) if not one.name.endswith(others))
-    pictures = [(name, png(figure)) for name, figure in chain(late, drawn(plans))]
+    pictures = [(name, png(figure)) for name, figure in chain(close_up, drawn(plans))]
     with new_files(figures, overwrite) as folder:
         for name, picture in pictures:
             (folder / f"{name}.png").write_bytes(picture)
-    opening = replace(opening, moment=moment.moment, missing=moment.missing)
+    at = opening_at(late)
+    opening = replace(opening, moment=at.moment, missing=at.missing)
     write_report(runs, tables, pictures, page, fgtrack.__version__, opening, overwrite)
 
 
-def late_case(runs: Sequence[JudgedRun]) -> tuple[list[tuple[str, Figure]], Opening]:
-    """Return the close-up of a late detection by its name, and how a report opens at that moment.
-
-    Without such a detection, or without the recording, there is no figure and the opening says why.
-    """
-    same = by_recording(runs)[0]
-    try:
-        late = close_ups([one.run for one in same])
-    except DataError as error:
-        return [], Opening(missing=(f"no close-up: {error}",))
-    first = late[0]
-    moment = Moment(first.now_ns, *first.position_m.tolist())
-    return [("close_up", close_up(same, late))], Opening(moment=moment)
+def opening_at(late: CloseUp | DataError) -> Opening:
+    """Return how a report opens at a late detection; without one it says why."""
+    if isinstance(late, DataError):
+        return Opening(missing=(f"no close-up: {late}",))
+    return Opening(moment=Moment(late.now_ns, *late.position_m.tolist()))

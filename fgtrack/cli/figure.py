@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Literal, Unpack
+from typing import Annotated, Literal
 
 import typer
 from matplotlib.figure import Figure
@@ -13,13 +13,12 @@ from fgtrack.cli.show import progress, say
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
-from fgtrack.evaluation.recordings import by_recording
-from fgtrack.evaluation.runs import JudgedRun, judged, run_folders, start_ns
+from fgtrack.evaluation.runs import judged, run_folders, start_ns
 from fgtrack.evaluation.sweep_table import is_sweep, read_sweep
 from fgtrack.io.output import check_apart, new_file, new_files
-from fgtrack.plotting.late_detection import close_ups
+from fgtrack.plotting.late_detection import drawn_close_up
 from fgtrack.plotting.paper import Paper, settings
-from fgtrack.plotting.plot import Planned, close_up, drawn, planned, planned_sweep, save_named
+from fgtrack.plotting.plot import Planned, drawn, planned, planned_sweep, save_named
 from fgtrack.plotting.style import save_pages
 
 
@@ -105,18 +104,8 @@ def _of_runs(folders: Sequence[Path], out: Path, track: int | None, stamp: float
     if stamp is not None and not abs(stamp) <= LARGEST:
         raise CallError(f"--stamp {stamp}: is no time after the first tick, up to {LARGEST:g} s")
     stamp_ns = None if stamp is None else start_ns(found) + nanoseconds(stamp)
-    first, missing = drawn_close_up(found, track, stamp_ns, **paper)
+    first, late = drawn_close_up(found, track, stamp_ns, **paper)
+    missing = late if isinstance(late, DataError) else None
     if missing is not None and (track is not None or stamp is not None):
         raise missing
     return first, planned(found), missing
-
-
-def drawn_close_up(
-    runs: Sequence[JudgedRun], track_id: int | None = None, stamp_ns: int | None = None, **paper: Unpack[Paper]
-) -> tuple[list[tuple[str, Figure]], DataError | None]:
-    """The close-up of those of `runs` that are of the first one's recording, by its name; where it is none, why."""
-    same = by_recording(runs)[0]
-    try:
-        return [("close_up", close_up(same, close_ups([one.run for one in same], track_id, stamp_ns), **paper))], None
-    except DataError as error:
-        return [], error

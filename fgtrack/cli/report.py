@@ -7,13 +7,14 @@ from typing import Annotated
 import typer
 
 import fgtrack
-from fgtrack.advice.study import late_case
+from fgtrack.advice.study import opening_at
 from fgtrack.cli.arguments import Overwrite, Runs
 from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.comparison import compare
 from fgtrack.evaluation.runs import judged, run_folders
 from fgtrack.io.output import check_apart, check_output
+from fgtrack.plotting.late_detection import drawn_close_up
 from fgtrack.plotting.plot import named_figures
 from fgtrack.plotting.style import png
 from fgtrack.viewers.report import write_report
@@ -39,7 +40,7 @@ def report(
     every = judged(runs)
     check_apart(out, run_folders(every))
     with progress("report"):
-        close_up, opening = late_case(every)
+        close_up, late = drawn_close_up(every)
         pictures = ((name, png(figure)) for name, figure in chain(close_up, named_figures(every)))
-        size = write_report(every, compare(*every), pictures, out, fgtrack.__version__, opening, overwrite)
+        size = write_report(every, compare(*every), pictures, out, fgtrack.__version__, opening_at(late), overwrite)
     say(f"{out}: {size / _MEGABYTE:.1f} MB, open it in a browser")

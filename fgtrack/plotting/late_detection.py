@@ -1,14 +1,19 @@
 """Close-ups of runs: which late detection to look at, and their recordings replayed up to it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import tee
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import seconds
-from fgtrack.core.types import FloatArray
+from fgtrack.core.types import FloatArray, Message
+from fgtrack.evaluation.recordings import by_recording
+from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.io.run import Run, Table, load_run
 from fgtrack.io.source import open_input
 from fgtrack.models.motion import CTRV
@@ -16,6 +21,8 @@ from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import validate
 from fgtrack.pipeline.replay import delivered
+from fgtrack.plotting.close_up import close_up as figure_of
+from fgtrack.plotting.paper import Paper
 from fgtrack.plotting.slow_motion import Arrival, CloseUp, close_up
 
 _STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
@@ -47,11 +54,46 @@ def close_ups(
     """
     read = [run if isinstance(run, Run) else load_run(Path(run)) for run in runs]
     arrival, rule = chosen(read, track_id, stamp_ns)
-    return [replace(close_up_of(run, arrival), rule=rule) for run in read]
+    recordings = [(run.recording, run.config.get("input")) for run in read]
+    same = recordings.count(recordings[0]) == len(read)
+    recorded = tee(_recorded(read[0]), len(read)) if same else map(_recorded, read)  # a recording is read once
+    return [replace(close_up_of(run, arrival, one), rule=rule) for run, one in zip(read, recorded, strict=True)]
 
 
-def close_up_of(run: Run, arrival: Arrival) -> CloseUp:
-    """The track of `run` that fused `arrival`, before and after: its recording is replayed up to there.
+def drawn_close_up(
+    runs: Sequence[JudgedRun], track_id: int | None = None, stamp_ns: int | None = None, **paper: Unpack[Paper]
+) -> tuple[list[tuple[str, Figure]], CloseUp | DataError]:
+    """Return the named figure of `close_ups` and the first of these; no figure and the error where there is none.
+
+    It is that of the runs of the first one's recording.
+    """
+    same = by_recording(runs)[0]
+    try:
+        found = close_ups([one.run for one in same], track_id, stamp_ns)
+    except DataError as error:
+        return [], error
+    return [("close_up", figure_of(same, found, **paper))], found[0]
+
+
+def _recorded(run: Run) -> Iterator[Message]:
+    """Return the messages of its recording. Raises `DataError` where that is not there any more."""
+    recording = run.recording
+    if recording is None:
+        given = (run.meta.get("input") or {}).get("path") or "messages in memory"
+        raise DataError(f"{given}: the recording of the run is not there, so no close-up")
+    try:
+        return open_input(recording, validate(Config, run.config, str(run.config_path)).input).messages()
+    except CallError as error:  # nobody has called with it: it is what the run says
+        raise DataError(f"{error}, so no close-up") from error
+
+
+def close_up_of(run: Run, arrival: Arrival, messages: Iterable[Message] | None = None) -> CloseUp:
+    """Return the track of `run` that fused `arrival`, before and after: its recording is replayed up to there.
+
+    Parameters
+    ----------
+    messages
+        Those of the recording, where they have been read; None to read them.
 
     Raises
     ------
@@ -59,15 +101,11 @@ def close_up_of(run: Run, arrival: Arrival) -> CloseUp:
         The recording, or a file that the configuration names, is not there any more; or it does not hold the
         detection; or no track fused it.
     """
-    recording = run.recording
-    if recording is None:
-        given = (run.meta.get("input") or {}).get("path") or "messages in memory"
-        raise DataError(f"{given}: the recording of the run is not there, so no close-up")
     try:
         config = validate(Config, run.config, str(run.config_path))
-        ticks = delivered(open_input(recording, config.input).messages(), config)
+        ticks = delivered(_recorded(run) if messages is None else messages, config)
         return close_up(lambda observed: build_tracker(config, observed), ticks, arrival)
-    except CallError as error:  # nobody has called with it: it is what the run says
+    except CallError as error:  # as above
         raise DataError(f"{error}, so no close-up") from error
 
 
