@@ -198,22 +198,13 @@ class BackwardForwardBank:
         R = np.array([measurement.R for measurement in measurements])
         model, pose, measured = measurements[0].model, measurements[0].pose, measurements[0].measured
         residual = partial(self._propagator.residual, model)
-        try:
-            losses = [measurement.loss for measurement in measurements]
-            corrected = correct(means, covariances, z, R, model, pose, residual, measured, losses)
-        except np.linalg.LinAlgError:
-            if len(track_ids) == 1:
-                return [UpdateResult(UpdateStatus.FAILED)]
-            return [  # one by one, to find that which cannot be fused
-                self._update_alike([track_id], means[row, None], covariances[row, None], [measurement], back)[0]
-                for row, (track_id, measurement) in enumerate(zip(track_ids, measurements, strict=True))
-            ]
+        losses = [measurement.loss for measurement in measurements]
+        corrected = correct(means, covariances, z, R, model, pose, residual, measured, losses)
         wrapped = self._propagator.wrap(corrected.mean)
-        flat = corrected.covariance.reshape(len(wrapped), -1)
-        finite = np.isfinite(np.vecdot(wrapped, wrapped) + np.vecdot(flat, flat)).tolist()
+        fused = corrected.fused.tolist()
         results = []
         for row, (track_id, measurement) in enumerate(zip(track_ids, measurements, strict=True)):
-            if not finite[row]:
+            if not fused[row]:
                 results.append(UpdateResult(UpdateStatus.FAILED))
                 continue
             storage = self._objects[track_id]

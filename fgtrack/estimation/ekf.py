@@ -1,22 +1,23 @@
-"""The extended Kalman filter's two steps, on stacks of independent states and on one state."""
+"""The extended Kalman filter's two steps, on stacks of independent states."""
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cache
+from importlib import import_module
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
 
 from fgtrack.core.linalg import (
-    applied,
     congruence,
     identity,
-    mahalanobis_squared,
     product,
     psd_solve,
     symmetrise,
     times_transposed,
 )
-from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.measurement import MeasurementModel, SensorPose
 from fgtrack.models.motion import MotionModel
@@ -37,15 +38,9 @@ def kalman_gain(P: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray
 
     Raises `numpy.linalg.LinAlgError` for a singular S.
     """
-    S, solved = _solved(P, H, R)
-    return solved.mT, S
-
-
-def _solved(P: FloatArray, H: FloatArray, R: FloatArray, *columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """S, and S^-1 times H P and further columns."""
     HP = product(H, P)
     S = times_transposed(HP, H) + R
-    return S, psd_solve(S, np.concatenate([HP, *columns], axis=-1) if columns else HP)
+    return psd_solve(S, HP).mT, S
 
 
 def joseph(P: FloatArray, K: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
@@ -100,74 +95,21 @@ class Correction(NamedTuple):
     """Shape (m, k)."""
     nis: FloatArray
     """Normalised innovation squared, shape (m,)."""
+    weight: FloatArray
+    """What each measurement counted under its loss, shape (m,); 1 for all of it."""
     S: FloatArray
     """Covariances of the innovations, shape (m, k, k), before any loss."""
+    fused: BoolArray
+    """True where S was positive definite and the posterior is finite, shape (m,)."""
 
-
-class Prediction(NamedTuple):
-    """A state after some time, or a stack of them, and how it depends on that before."""
-
-    mean: FloatArray
-    """Shape (..., n); angles are not wrapped."""
-    covariance: FloatArray
-    """Shape (..., n, n)."""
-    cross: FloatArray
-    """Covariance of the state after (rows) and before (columns), of first order F P; shape (..., n, n)."""
-
-    def at(self, rows: IntArray | slice) -> "Prediction":
-        """Those at `rows` of a stack."""
-        return Prediction(self.mean[rows], self.covariance[rows], self.cross[rows])
-
-
-def predict(
-    mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: FloatArray | float
-) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance after `dt_s`: x' = f(x), P' = F P F' + Q (Karle et al. 2023, eqs. 3 and 4).
-
-    Shapes (..., n) and (..., n, n); `dt_s` a number or of shape (...).
-    """
-    return predict_across(mean, covariance, motion, dt_s)[:2]
-
-
-def correct(
-    mean: FloatArray,
-    covariance: FloatArray,
-    z: FloatArray,
-    R: FloatArray,
-    model: MeasurementModel,
-    pose: SensorPose,
-    residual: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
-    measured: Sequence[int] | None = None,
-    losses: Sequence[RobustLoss | None] = (),
-) -> Correction:
-    """Fuse z (m, k) with covariance R (m, k, k) into m states (Karle et al. 2023, eqs. 5 to 9).
-
-    `residual` may take the place of the model's own; `measured` is `Measurement.measured`, for the NIS; `losses`, none
-    or m of them, are those of the measurements (see `robust_weight`). The posterior covariance is in Joseph form.
-    Raises `numpy.linalg.LinAlgError` for a singular S.
-    """
-    y, H = linearised(z, mean, model, pose, residual)
-    found = correct_with_innovation(mean, covariance, y, R, H, measured)
-    if not any(losses):
-        return found
-    parts = zip(losses, y, congruence(H, covariance), R, strict=True)
-    w = np.array([robust_weight(*part) for part in parts])
-    return correct_with_innovation(mean, covariance, y, R / w[:, None, None], H)._replace(nis=found.nis, S=found.S)
-
-
-def correct_with_innovation(
-    mean: FloatArray,
-    covariance: FloatArray,
-    y: FloatArray,
-    R: FloatArray,
-    H: FloatArray,
-    measured: Sequence[int] | None = None,
-) -> Correction:
-    """Fuse the innovations y (m, k) of measurements with Jacobians H (m, k, n) or (k, n)."""
-    S, solved = _solved(covariance, H, R, y[..., None])
-    K = solved[..., :-1].mT
-    nis = np.vecdot(y, solved[..., -1]) if measured is None else mahalanobis_squared(y, S, measured)
-    return Correction(mean + applied(K, y), joseph(covariance, K, H, R), y, np.asarray(nis), S)
+    def rows(self) -> "list[OneCorrection | None]":
+        """Results one by one; None where a measurement could not be fused."""
+        numbers = zip(self.nis.tolist(), self.weight.tolist(), self.fused.tolist(), strict=True)
+        arrays = zip(self.mean, self.covariance, self.innovation, self.S, strict=True)
+        return [
+            OneCorrection(x, P, y, nis, weight, S) if fused else None
+            for (x, P, y, S), (nis, weight, fused) in zip(arrays, numbers, strict=True)
+        ]
 
 
 class OneCorrection(NamedTuple):
@@ -187,26 +129,80 @@ class OneCorrection(NamedTuple):
     """Covariance of the innovation, shape (k, k), before any loss."""
 
 
+class Prediction(NamedTuple):
+    """A state after some time, or a stack of them, and how it depends on that before."""
+
+    mean: FloatArray
+    """Shape (..., n); angles are not wrapped."""
+    covariance: FloatArray
+    """Shape (..., n, n)."""
+    cross: FloatArray
+    """Covariance of the state after (rows) and before (columns), of first order F P; shape (..., n, n)."""
+
+
+def predict(
+    mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: FloatArray | float
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance after `dt_s`: x' = f(x), P' = F P F' + Q (Karle et al. 2023, eqs. 3 and 4).
+
+    Shapes (..., n) and (..., n, n); `dt_s` a number or of shape (...).
+    """
+    return predict_across(mean, covariance, motion, dt_s)[:2]
+
+
 def predict_across(
     mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: FloatArray | float
 ) -> Prediction:
     """`predict`, and the cross-covariance of both states, which is half way to the covariance."""
     after, F, Q = motion.transition(mean, dt_s)
-    FP = product(F, covariance)
-    return Prediction(after, symmetrise(times_transposed(FP, F) + Q), FP)
+    shape, n = after.shape[:-1], after.shape[-1]
+    P = np.broadcast_to(covariance, (*shape, n, n))
+    found, cross = _kernels().predict(*(np.array(each, dtype=np.float64, order="C").reshape(-1, n, n) for each in (F, P, Q)))
+    return Prediction(after, found.reshape(*shape, n, n), cross.reshape(*shape, n, n))
 
 
-class Update(NamedTuple):
-    """Result of `updated_one`."""
+def correct(
+    mean: FloatArray,
+    covariance: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    model: MeasurementModel,
+    pose: SensorPose,
+    residual: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
+    measured: Sequence[int] | None = None,
+    losses: Sequence[RobustLoss | None] = (),
+) -> Correction:
+    """Fuse z (m, k) with covariance R (m, k, k) into m states (Karle et al. 2023, eqs. 5 to 9).
 
-    mean: FloatArray
-    """Posterior mean, shape (n,); angles are not wrapped."""
-    covariance: FloatArray
-    """Posterior covariance, shape (n, n)."""
-    S: FloatArray
-    """Covariance of the innovation without a loss, shape (k, k)."""
-    weight: float
-    """See `robust_weight`."""
+    `residual` may take the place of the model's own; `measured` is `Measurement.measured`, for the NIS; `losses`, none
+    or m of them, are those of the measurements (see `robust_weight`). The posterior covariance is in Joseph form.
+    """
+    return correct_with_innovation(
+        mean, covariance, *linearised(z, mean, model, pose, residual), R=R, measured=measured, losses=losses
+    )
+
+
+def correct_with_innovation(
+    mean: FloatArray,
+    covariance: FloatArray,
+    y: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+    measured: Sequence[int] | None = None,
+    losses: Sequence[RobustLoss | None] = (),
+) -> Correction:
+    """Fuse the innovations y (m, k) of measurements with Jacobians H (m, k, n) or (k, n)."""
+    rows = np.arange(y.shape[-1]) if measured is None else np.array(measured, dtype=np.int64)
+    x, P, y, R = (np.array(each, dtype=np.float64, order="C") for each in (mean, covariance, y, R))
+    H = np.array(H, dtype=np.float64, order="C", ndmin=3)
+    after, covariance, nis, S, fused = _kernels().correct(x, P, y, H, R, rows)
+    w = np.ones(len(x))
+    if any(losses):
+        spread = congruence(H, P)
+        for row, loss in enumerate(losses):
+            w[row] = robust_weight(loss, y[row], spread[row], R[row]) if fused[row] else 1.0
+        after, covariance, _, _, fused = _kernels().correct(x, P, y, H, R / w[:, None, None], rows)
+    return Correction(after, covariance, y, nis, w, S, fused)
 
 
 def updated_one(
@@ -216,54 +212,25 @@ def updated_one(
     H: FloatArray,
     R: FloatArray,
     loss: RobustLoss | None = None,
-) -> Update:
+    measured: Sequence[int] | None = None,
+) -> OneCorrection:
     """One state, (n,) and (n, n), after the innovation y (k,) of a measurement with Jacobian H (k, n), noise R (k, k).
 
-    Raises `numpy.linalg.LinAlgError` for a singular S.
+    Raises `numpy.linalg.LinAlgError` for one that cannot be fused.
     """
-    K, S = kalman_gain(covariance, H, R)
-    w = 1.0
-    if loss is not None:
-        w = robust_weight(loss, y, congruence(H, covariance), R)
-        R = R / w
-        K, _ = kalman_gain(covariance, H, R)
-    return Update(mean + K.dot(y), joseph(covariance, K, H, R), S, w)
+    [found] = correct_with_innovation(mean[None], covariance[None], y[None], H, R[None], measured, [loss]).rows()
+    if found is None:
+        raise np.linalg.LinAlgError("innovation covariance not positive definite, or posterior not finite")
+    return found
 
 
 def correct_one(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
-    """`correct` of one state, shapes (n,) and (n, n), without the price of a stack."""
+    """`correct` of one state, shapes (n,) and (n, n). Raises as `updated_one`."""
     y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
-    after, P, S, w = updated_one(mean, covariance, y, H, measurement.R, measurement.loss)
-    return OneCorrection(after, P, y, measurement.nis(y, S), w, S)
+    return updated_one(mean, covariance, y, H, measurement.R, measurement.loss, measurement.measured)
 
 
-class Innovation(NamedTuple):
-    """What a measurement says that was not expected."""
-
-    innovation: FloatArray
-    """Shape (k,)."""
-    nis: float
-    S: FloatArray
-    """Covariance of the innovation, shape (k, k)."""
-
-
-def innovations(
-    mean: FloatArray,
-    covariance: FloatArray,
-    z: FloatArray,
-    R: FloatArray,
-    model: MeasurementModel,
-    pose: SensorPose,
-    measured: Sequence[int] | None = None,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Innovation (..., k), NIS (...) and S (..., k, k) of `correct` alone; of one state or a stack of them."""
-    y, H = linearised(z, mean, model, pose)
-    S = congruence(H, covariance) + R
-    return y, mahalanobis_squared(y, S, measured), S
-
-
-def innovation_one(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> Innovation:
-    """The innovation of `measurement` at one state, shapes (n,) and (n, n), which stays as it is."""
-    own = measurement
-    y, nis, S = innovations(mean, covariance, own.z, own.R, own.model, own.pose, own.measured)
-    return Innovation(y, float(nis), S)
+@cache
+def _kernels() -> ModuleType:
+    """Return the compiled loops, which are not imported before they are needed: numba is large."""
+    return import_module("fgtrack.estimation.kernels.kalman")

@@ -9,7 +9,7 @@ from fgtrack.core.checks import not_negative
 from fgtrack.core.linalg import psd_solve
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.ekf import OneCorrection, Update, linearised, updated_one
+from fgtrack.estimation.ekf import OneCorrection, linearised, updated_one
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.recursion import EkfRecursion
 from fgtrack.estimation.replay import ReplayingFilter
@@ -40,10 +40,10 @@ class IekfRecursion(EkfRecursion):
         check_iteration(max_iterations, tolerance)
         self._max_iterations, self._tolerance = max_iterations, tolerance
 
-    def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
-        """See `EkfRecursion.correct`."""
-        if measurement.model.linear:
-            return super().correct(mean, covariance, measurement)
+    linearises_at_prediction = False
+
+    def correct_one(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
+        """See `EkfRecursion.correct_one`."""
 
         def cost(x: FloatArray) -> float:
             y = measurement.model.residual(measurement.z, measurement.model.predict(x, measurement.pose))
@@ -58,8 +58,8 @@ class IekfRecursion(EkfRecursion):
             x = update.mean if self._max_iterations == 1 else descended(cost, limit, last, update.mean)
             if largest_move(x - last, covariance) < self._tolerance:
                 break
-        found = self.innovation(mean, covariance, measurement)
-        return OneCorrection(x, update.covariance, found.innovation, found.nis, update.weight, found.S)
+        first = super().correct_one(mean, covariance, measurement)
+        return first._replace(mean=x, covariance=update.covariance, weight=update.weight)
 
 
 class IekfReplay(ReplayingFilter):
@@ -137,7 +137,7 @@ def reweighted(
     R: FloatArray,
     loss: RobustLoss | None,
     off: FloatArray,
-) -> Update:
+) -> OneCorrection:
     """`updated_one` with a measurement that is linearised `off` (n,) from the prior, where it leaves `residual` (k,).
 
     Its innovation for the prior is residual + H off. The weight under a robust loss is that of the residual, which

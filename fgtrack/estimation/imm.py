@@ -11,14 +11,14 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.linalg import mahalanobis_squared, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Measurement, Order, Start
+from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.ekf import OneCorrection, Prediction, correct_one, predict
-from fgtrack.estimation.initiation import DEFAULT
+from fgtrack.estimation.initiation import DEFAULT, Initiation
 from fgtrack.estimation.propagation import wrapped
-from fgtrack.estimation.recursion import EkfRecursion
+from fgtrack.estimation.recursion import EkfRecursion, Step
 from fgtrack.estimation.registry import motion_model
-from fgtrack.estimation.replay import ReplayingFilter, Step
+from fgtrack.estimation.replay import ReplayingFilter
 from fgtrack.models.correlated_errors import CorrelatedErrors
 from fgtrack.models.motion import CTRA, CTRV, MotionModel
 from fgtrack.models.robust import penalty
@@ -77,6 +77,114 @@ class ImmStep(Step):
     mixture: Mixture | None = None
 
 
+class ImmRecursion(EkfRecursion):
+    """Extended Kalman filters of several models, mixed before each step and weighted after it; see `ImmReplay`.
+
+    Parameters
+    ----------
+    models
+        Motion models, the first of which is that of the states.
+    sojourns
+        How an object goes from one to another.
+    """
+
+    def __init__(self, models: Sequence[MotionModel], sojourns: Sojourns) -> None:
+        super().__init__(models[0])
+        self._models, self._sojourns = models, sojourns
+
+    def first(self, prior: Start, initiation: Initiation) -> ImmStep:
+        """See `EkfRecursion.first`."""
+        states = [initial_state(model, prior) for model in self._models]
+        means, covariances = zip(*states, strict=True)
+        return _with(super().first(prior, initiation), Mixture(means, covariances, self._sojourns.share))
+
+    def ahead(self, before: Sequence[Step], stamps_ns: Sequence[int]) -> Prediction:
+        """See `EkfRecursion.ahead`; the cross-covariance, of which nothing is asked, is the covariance."""
+        mixtures = [self._mixed(*each) for each in zip(before, stamps_ns, strict=True)]
+        states = [self._moments(mixture, mixture.probabilities, self.motion) for mixture in mixtures]
+        mean, covariance = (np.array(part) for part in zip(*states, strict=True))
+        return Prediction(mean, covariance, covariance)
+
+    def fused(
+        self, before: Sequence[Step], measurements: Sequence[Measurement]
+    ) -> list[tuple[Step, OneCorrection] | None]:
+        """See `EkfRecursion.fused`."""
+        found: list[tuple[Step, OneCorrection] | None] = []
+        for step, measurement in zip(before, measurements, strict=True):
+            try:
+                found.append(self._fused(step, measurement))
+            except np.linalg.LinAlgError:
+                found.append(None)
+        return found
+
+    def _fused(self, before: Step, measurement: Measurement) -> tuple[Step, OneCorrection] | None:
+        prior = self._mixed(before, measurement.stamp_ns)
+        predicted = self._moments(prior, prior.probabilities, self.motion)
+        corrected = [
+            correct_one(mean, covariance, measurement.seen_by(model))
+            for model, mean, covariance in zip(self._models, prior.means, prior.covariances, strict=True)
+        ]
+        posterior = Mixture(
+            tuple(wrapped(model, each.mean) for model, each in zip(self._models, corrected, strict=True)),
+            tuple(each.covariance for each in corrected),
+            _weighed(prior.probabilities, [_log_likelihood(each, measurement) for each in corrected]),
+        )
+        found = correct_one(*predicted, measurement)
+        weight = float(posterior.probabilities @ [each.weight for each in corrected])
+        whole = self._moments(posterior, posterior.probabilities, self.motion)
+        corrected_whole = OneCorrection(*whole, found.innovation, found.nis, weight, found.S)
+        concluded = self._concluded(before, measurement, Prediction(*predicted, predicted[1]), corrected_whole)
+        if concluded is None:
+            return None
+        step, correction = concluded
+        if step.along:  # the state comes from all that was measured, along a line, by `motion`
+            alike = [self._own(self.motion, model, step.mean, step.covariance) for model in self._models]
+            means, covariances = zip(*alike, strict=True)
+            posterior = posterior._replace(means=means, covariances=covariances)
+        return _with(step, posterior), correction
+
+    def _mixed(self, before: Step, stamp_ns: int) -> Mixture:
+        """The mixture at `stamp_ns`, from the step before it.
+
+        Each model starts from the mixture of what the object may have followed before, given that it follows that model
+        now; all of these together have the moments of the mixture before.
+        """
+        old = _mixture(before)
+        if stamp_ns == before.stamp_ns:
+            return old
+        dt_s = seconds(stamp_ns - before.stamp_ns)
+        joint = old.probabilities[:, None] * self._sojourns.transition(dt_s)
+        probabilities = joint.sum(axis=0)
+        means, covariances = [], []
+        for model, shares, total in zip(self._models, joint.T, probabilities, strict=True):
+            mean, covariance = predict(*self._moments(old, shares / total, model), model, dt_s)
+            means.append(mean)
+            covariances.append(covariance)
+        return Mixture(tuple(means), tuple(covariances), probabilities)
+
+    def _moments(self, mixture: Mixture, weights: FloatArray, model: MotionModel) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance of the Gaussians of `mixture` with other `weights`, in the state of `model`."""
+        states = [
+            self._own(each, model, mean, covariance)
+            for each, mean, covariance in zip(self._models, mixture.means, mixture.covariances, strict=True)
+        ]
+        if len(states) == 1:
+            return states[0]
+        reference = states[int(weights.argmax())][0]
+        apart = [wrapped(model, mean - reference) for mean, _ in states]
+        offset = weights @ np.array(apart)
+        spread = [P + np.outer(d - offset, d - offset) for d, (_, P) in zip(apart, states, strict=True)]
+        return reference + offset, symmetrise(np.tensordot(weights, np.array(spread), axes=1))
+
+    def _own(
+        self, model: MotionModel, wanted: MotionModel, mean: FloatArray, covariance: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """A state of `model` in the form of another one that is `wanted`."""
+        if model.state_names == wanted.state_names:
+            return mean, covariance
+        return wanted.from_kinematic(*model.kinematic(mean, covariance))
+
+
 class ImmReplay(ReplayingFilter):
     """Interacting multiple model filter that rewinds and replays: `motion` and another model, weighed by what they say.
 
@@ -116,92 +224,14 @@ class ImmReplay(ReplayingFilter):
         initiation: str = DEFAULT,
     ) -> None:
         beside = _beside(motion, other, accel_density_m2ps5)
-        self._models = (motion,) if beside is None else (motion, beside)
-        self._sojourns = Sojourns((stay_s, other_stay_s)[: len(self._models)])
-        super().__init__(motion, prior, lag_s, EkfRecursion(motion), initiation)
+        models = (motion,) if beside is None else (motion, beside)
+        recursion = ImmRecursion(models, Sojourns((stay_s, other_stay_s)[: len(models)]))
+        super().__init__(motion, prior, lag_s, recursion, initiation)
 
     @property
     def probabilities(self) -> FloatArray:
         """How probable `motion` and the other model are after the newest measurement, shape (m,)."""
-        return _mixture(self._steps[-1]).probabilities.copy()
-
-    def _first(self, prior: Start) -> ImmStep:
-        """See `ReplayingFilter`."""
-        states = [initial_state(model, prior) for model in self._models]
-        means, covariances = zip(*states, strict=True)
-        return _with(super()._first(prior), Mixture(means, covariances, self._sojourns.share))
-
-    def _fused(self, before: Step, order: Order, measurement: Measurement) -> tuple[Step, OneCorrection]:
-        """See `ReplayingFilter`."""
-        prior = self._mixed(before, measurement.stamp_ns)
-        predicted = self._moments(prior, prior.probabilities, self._motion)
-        corrected = [
-            correct_one(mean, covariance, measurement.seen_by(model))
-            for model, mean, covariance in zip(self._models, prior.means, prior.covariances, strict=True)
-        ]
-        posterior = Mixture(
-            tuple(wrapped(model, each.mean) for model, each in zip(self._models, corrected, strict=True)),
-            tuple(each.covariance for each in corrected),
-            _weighed(prior.probabilities, [_log_likelihood(each, measurement) for each in corrected]),
-        )
-        found = self._recursion.innovation(*predicted, measurement)
-        weight = float(posterior.probabilities @ [each.weight for each in corrected])
-        whole = self._moments(posterior, posterior.probabilities, self._motion)
-        step, correction = self._concluded(
-            before, order, measurement, Prediction(*predicted, predicted[1]), OneCorrection(*whole, *found[:2], weight)
-        )
-        if step.along:  # the state comes from all that was measured, along a line, by `motion`
-            alike = [self._own(self._motion, model, step.mean, step.covariance) for model in self._models]
-            means, covariances = zip(*alike, strict=True)
-            posterior = posterior._replace(means=means, covariances=covariances)
-        return _with(step, posterior), correction._replace(S=found.S)
-
-    def _predicted(self, before: Step, stamp_ns: int) -> Prediction:
-        """See `ReplayingFilter`; the cross-covariance, of which nothing is asked, is the covariance."""
-        mixture = self._mixed(before, stamp_ns)
-        mean, covariance = self._moments(mixture, mixture.probabilities, self._motion)
-        return Prediction(mean, covariance, covariance)
-
-    def _mixed(self, before: Step, stamp_ns: int) -> Mixture:
-        """The mixture at `stamp_ns`, from the step before it.
-
-        Each model starts from the mixture of what the object may have followed before, given that it follows that model
-        now; all of these together have the moments of the mixture before.
-        """
-        old = _mixture(before)
-        if stamp_ns == before.order[0]:
-            return old
-        dt_s = seconds(stamp_ns - before.order[0])
-        joint = old.probabilities[:, None] * self._sojourns.transition(dt_s)
-        probabilities = joint.sum(axis=0)
-        means, covariances = [], []
-        for model, shares, total in zip(self._models, joint.T, probabilities, strict=True):
-            mean, covariance = predict(*self._moments(old, shares / total, model), model, dt_s)
-            means.append(mean)
-            covariances.append(covariance)
-        return Mixture(tuple(means), tuple(covariances), probabilities)
-
-    def _moments(self, mixture: Mixture, weights: FloatArray, model: MotionModel) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance of the Gaussians of `mixture` with other `weights`, in the state of `model`."""
-        states = [
-            self._own(each, model, mean, covariance)
-            for each, mean, covariance in zip(self._models, mixture.means, mixture.covariances, strict=True)
-        ]
-        if len(states) == 1:
-            return states[0]
-        reference = states[int(weights.argmax())][0]
-        apart = [wrapped(model, mean - reference) for mean, _ in states]
-        offset = weights @ np.array(apart)
-        spread = [P + np.outer(d - offset, d - offset) for d, (_, P) in zip(apart, states, strict=True)]
-        return reference + offset, symmetrise(np.tensordot(weights, np.array(spread), axes=1))
-
-    def _own(
-        self, model: MotionModel, wanted: MotionModel, mean: FloatArray, covariance: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """A state of `model` in the form of another one that is `wanted`."""
-        if model.state_names == wanted.state_names:
-            return mean, covariance
-        return wanted.from_kinematic(*model.kinematic(mean, covariance))
+        return _mixture(self.steps[-1]).probabilities.copy()
 
 
 def _beside(motion: MotionModel, other: str | MotionModel, accel_density_m2ps5: float) -> MotionModel | None:
@@ -236,7 +266,7 @@ def _log_likelihood(found: OneCorrection, measurement: Measurement) -> float:
 
 
 def _with(step: Step, mixture: Mixture) -> ImmStep:
-    plain = step.order, step.measurement, step.mean, step.covariance, step.predicted, step.opening
+    plain = step.stamp_ns, step.measurement, step.mean, step.covariance, step.predicted, step.opening
     return ImmStep(*plain, mixture)
 
 

@@ -36,10 +36,8 @@ class IplfRecursion(UkfRecursion):
         check_iteration(max_iterations, tolerance)
         self._max_iterations, self._tolerance = max_iterations, tolerance
 
-    def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
-        """See `EkfRecursion.correct`."""
-        if measurement.model.linear:
-            return super().correct(mean, covariance, measurement)
+    def correct_one(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
+        """See `EkfRecursion.correct_one`."""
         x, P = mean, covariance
         for _ in range(self._max_iterations):
             last, spread = x, P
@@ -54,8 +52,8 @@ class IplfRecursion(UkfRecursion):
             narrowed = np.abs(1.0 - spread.diagonal() / P.diagonal()).max()
             if max(largest_move(x - last, P), narrowed) < self._tolerance:
                 break
-        found = self.innovation(mean, covariance, measurement)
-        return OneCorrection(x, P, found.innovation, found.nis, update.weight, found.S)
+        first = super().correct_one(mean, covariance, measurement)
+        return first._replace(mean=x, covariance=P, weight=update.weight)
 
     def _cost(
         self,

@@ -19,8 +19,7 @@ from fgtrack.estimation.hypotheses import hypotheses
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.opening import initiated
-from fgtrack.estimation.replay import ReplayEkf
-from fgtrack.estimation.replay_bank import ReplayBank
+from fgtrack.estimation.replay import ReplayBank, ReplayingFilter
 from fgtrack.estimation.smoothing_bank import SmoothingBank
 from fgtrack.models.motion import MotionModel
 
@@ -67,9 +66,6 @@ MOTION_MODELS = Registry(
     "motion model",
     {"fgtrack.motion_models": {name: f"fgtrack.models.motion:{name.upper()}" for name in ("ctrv", "ctra", "cv")}},
 )
-
-#: Banks that do for all objects at once what an estimator does for one.
-_TOGETHER: Mapping[object, Callable[..., TrackBank]] = {ReplayEkf: ReplayBank}
 
 Factory = Callable[..., Any]  # Any: an estimator or a bank, see the module
 
@@ -199,8 +195,6 @@ def start_bank(
     if claims.bank:
         return _made_bank(name, factory, motion, lag_s, own)
     _check_options(name, factory, 3, own)
-    if factory in _TOGETHER:
-        return _TOGETHER[factory](motion, lag_s, **own)
     if claims.reports:
 
         def one(start: Start) -> Smoother:
@@ -208,6 +202,8 @@ def start_bank(
             return smoother
 
         return SmoothingBank(motion, one, lag_s, lagged_s)
+    if _replays(factory):
+        return ReplayBank(motion, lambda start: _made(ESTIMATORS, name, factory, motion, start, lag_s, **own), lag_s)
     return ObjectBank(motion, lambda start: start_estimator(name, factory, motion, start, lag_s, options), lag_s)
 
 
@@ -221,7 +217,11 @@ def motion_model(name: str, parameters: Mapping[str, Any]) -> MotionModel:
 
 def works_together(factory: Factory) -> bool:
     """Whether the estimators of several objects are made as one, by other code than those of a single object."""
-    return Claims.of(factory).bank or factory in _TOGETHER
+    return Claims.of(factory).bank or _replays(factory)
+
+
+def _replays(factory: Factory) -> bool:
+    return isinstance(factory, type) and issubclass(factory, ReplayingFilter)
 
 
 def _made_bank(name: str, factory: Factory, motion: MotionModel, lag_s: float, options: Mapping[str, Any]) -> TrackBank:

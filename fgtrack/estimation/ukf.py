@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.linalg import congruence, identity, product, symmetrise
+from fgtrack.core.linalg import identity, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.ekf import Innovation, OneCorrection, Prediction, updated_one
+from fgtrack.estimation.ekf import OneCorrection, Prediction, updated_one
 from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.recursion import EkfRecursion
 from fgtrack.estimation.replay import ReplayingFilter
@@ -69,11 +69,6 @@ def _root(covariance: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.cholesky(covariance + _JITTER * scale[..., None, None] * identity(n)))
 
 
-def motion_regression(motion: MotionModel, mean: FloatArray, covariance: FloatArray, dt_s: float) -> Regression:
-    """Regression of the flow over `dt_s`, without process noise; yaws are not wrapped."""
-    return regression(lambda x: motion.predict(x, dt_s), mean, covariance)
-
-
 def measurement_regression(measurement: Measurement, mean: FloatArray, covariance: FloatArray) -> Regression:
     """Regression of what `measurement` measures. Angles are averaged on the circle, but for entries of the state."""
     model, pose = measurement.model, measurement.pose
@@ -101,32 +96,21 @@ class UkfRecursion(EkfRecursion):
     is linear it does as the extended Kalman filter.
     """
 
-    def predict(self, mean: FloatArray, covariance: FloatArray, dt_s: float) -> Prediction:
+    linearises_at_prediction = False
+
+    def predict(self, mean: FloatArray, covariance: FloatArray, dt_s: FloatArray) -> Prediction:
         """See `EkfRecursion.predict`."""
-        if self._motion.linear:
+        if self.motion.linear:
             return super().predict(mean, covariance, dt_s)
-        after, A, noise = motion_regression(self._motion, mean, covariance, dt_s)
-        AP = product(A, covariance)
-        Q = self._motion.process_noise(mean, dt_s)
-        return Prediction(after, symmetrise(product(AP, A.T) + noise + Q), AP)
+        after, A, noise = regression(lambda x: self.motion.predict(x, dt_s[:, None]), mean, covariance)
+        AP, Q = A @ covariance, self.motion.process_noise(mean, dt_s)
+        return Prediction(after, symmetrise(AP @ A.mT + noise + Q), AP)
 
-    def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
-        """See `EkfRecursion.correct`."""
-        if measurement.model.linear:
-            return super().correct(mean, covariance, measurement)
+    def correct_one(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
+        """See `EkfRecursion.correct_one`."""
         z, A, noise = measurement_regression(measurement, mean, covariance)
-        y = measurement.model.residual(measurement.z, z)
-        after, P, S, w = updated_one(mean, covariance, y, A, measurement.R + noise, measurement.loss)
-        return OneCorrection(after, P, y, measurement.nis(y, S), w, S)
-
-    def innovation(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> Innovation:
-        """See `EkfRecursion.innovation`."""
-        if measurement.model.linear:
-            return super().innovation(mean, covariance, measurement)
-        z, A, noise = measurement_regression(measurement, mean, covariance)
-        y = measurement.model.residual(measurement.z, z)
-        S = congruence(A, covariance) + noise + measurement.R
-        return Innovation(y, measurement.nis(y, S), S)
+        y, R = measurement.model.residual(measurement.z, z), measurement.R + noise
+        return updated_one(mean, covariance, y, A, R, measurement.loss, measurement.measured)
 
 
 class UkfReplay(ReplayingFilter):

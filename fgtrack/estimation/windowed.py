@@ -45,17 +45,20 @@ class WindowedFilter(ABC):
         """See `Estimator.update`."""
         if measurement.stamp_ns < self._start_ns:
             return UpdateResult(UpdateStatus.TOO_OLD)
-        late = measurement.stamp_ns < self._newest_ns
         try:
             result = self._fuse(measurement.seen_by(self._motion))
         except np.linalg.LinAlgError:
             return UpdateResult(UpdateStatus.FAILED)
-        if result is None:
-            return UpdateResult(UpdateStatus.TOO_OLD)
-        self._newest_ns = max(self._newest_ns, measurement.stamp_ns)
+        return UpdateResult(UpdateStatus.TOO_OLD) if result is None else self.outcome(measurement.stamp_ns, result)
+
+    def outcome(self, stamp_ns: int, found: OneCorrection | None) -> UpdateResult:
+        """Outcome of a measurement that was fused; None of one that could not be. The window moves on."""
+        if found is None:
+            return UpdateResult(UpdateStatus.FAILED)
+        status = UpdateStatus.OUT_OF_SEQUENCE if stamp_ns < self._newest_ns else UpdateStatus.IN_SEQUENCE
+        self._newest_ns = max(self._newest_ns, stamp_ns)
         self.advance(self._newest_ns)
-        status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
-        return UpdateResult(status, result.innovation, result.nis, result.S)
+        return UpdateResult(status, found.innovation, found.nis, found.S)
 
     @abstractmethod
     def _fuse(self, measurement: Measurement) -> OneCorrection | None:

@@ -61,14 +61,14 @@ def test_the_iterated_update_is_the_mode(loss: RobustLoss | None) -> None:
         y = measurement.model.residual(measurement.z, measurement.model.predict(x))
         return negative_log_posterior(x - MEAN, P, y, measurement.R, loss)
 
-    found = recursions()["iekf"].correct(MEAN, P, measurement)
+    found = recursions()["iekf"].correct_one(MEAN, P, measurement)
     best = minimize(cost, found.mean, method="Nelder-Mead", options={"xatol": 1e-10, "fatol": 1e-14, "maxiter": 20000})
     np.testing.assert_allclose(found.mean, best.x, atol=1e-4)
-    assert cost(found.mean) < cost(recursions()["ekf"].correct(MEAN, P, measurement).mean)
+    assert cost(found.mean) < cost(recursions()["ekf"].correct_one(MEAN, P, measurement).mean)
 
 
 def test_the_iterated_update_says_what_the_extended_one_says_of_the_innovation() -> None:
-    found, plain = (recursions()[name].correct(MEAN, P, seen()) for name in ("iekf", "ekf"))
+    found, plain = (recursions()[name].correct_one(MEAN, P, seen()) for name in ("iekf", "ekf"))
     np.testing.assert_array_equal(found.innovation, plain.innovation)
     assert found.nis == plain.nis
 
@@ -95,7 +95,7 @@ def divergence(mean: FloatArray, covariance: FloatArray) -> float:
 def test_iterating_comes_nearer_to_the_posterior_of_a_precise_range() -> None:
     found = {}
     for name, each in recursions().items():
-        correction = each.correct(MEAN, P, seen())
+        correction = each.correct_one(MEAN, P, seen())
         found[name] = divergence(correction.mean, correction.covariance)
     assert found["iekf"] < 0.2 * found["ekf"]
     assert found["iplf"] < 0.2 * found["ukf"]
@@ -110,8 +110,8 @@ def test_a_step_that_makes_it_worse_is_halved() -> None:
         y = measurement.model.residual(measurement.z, measurement.model.predict(x))
         return negative_log_posterior(x - mean, wide, y, measurement.R, None)
 
-    plain = recursions()["ekf"].correct(mean, wide, measurement)
-    found = recursions()["iekf"].correct(mean, wide, measurement)
+    plain = recursions()["ekf"].correct_one(mean, wide, measurement)
+    found = recursions()["iekf"].correct_one(mean, wide, measurement)
     assert cost(plain.mean) > cost(mean)  # the full step overshoots
     assert cost(found.mean) < 0.01 * cost(mean)
 
@@ -120,8 +120,8 @@ def test_the_unscented_prediction_is_the_mean_over_the_spread() -> None:
     wide = np.diag([0.1, 0.1, 0.09, 1.0, 0.01])
     x = np.random.default_rng(0).multivariate_normal(MEAN, wide, size=400_000)
     moved = MOTION.predict(x, 1.0)
-    found, plain = (recursions()[name].predict(MEAN, wide, 1.0) for name in ("ukf", "ekf"))
-    np.testing.assert_allclose(found.mean, moved.mean(axis=0), atol=0.02)
+    found, plain = (recursions()[name].predict(MEAN[None], wide[None], np.ones(1)) for name in ("ukf", "ekf"))
+    np.testing.assert_allclose(found.mean[0], moved.mean(axis=0), atol=0.02)
     assert np.linalg.norm(plain.mean - moved.mean(axis=0)) > 0.2
     spread = np.cov(moved.T) + MOTION.process_noise(MEAN, 1.0)
     assert np.linalg.norm(found.covariance - spread) < 0.1 * np.linalg.norm(spread)
@@ -133,7 +133,7 @@ def test_one_iteration_is_the_filter_without_any() -> None:
     once = IekfRecursion(MOTION, 1, 0.0), IplfRecursion(MOTION, 1, 0.0)
     for one, name in zip(once, ("ekf", "ukf"), strict=True):
         np.testing.assert_array_equal(
-            one.correct(MEAN, P, seen()).mean, recursions()[name].correct(MEAN, P, seen()).mean
+            one.correct_one(MEAN, P, seen()).mean, recursions()[name].correct_one(MEAN, P, seen()).mean
         )
 
 

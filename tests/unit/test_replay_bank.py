@@ -8,13 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fgtrack.core.time import nanoseconds
-from fgtrack.estimation import replay_bank
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
-from fgtrack.estimation.histories import NEVER_NS, Histories
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.registry import estimator_bank
-from fgtrack.estimation.replay import ReplayEkf
-from fgtrack.estimation.replay_bank import ReplayBank
+from fgtrack.estimation.replay import ReplayBank, ReplayEkf
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
@@ -22,11 +19,6 @@ from fgtrack.testing import check_estimator
 from fgtrack.testing.streams import MS, START
 
 LAG_S = 0.6
-
-
-@pytest.fixture(autouse=True)
-def arrays_from_the_first_track(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(replay_bank, "_FEW", 0)
 
 
 KINDS = (("x_m", "y_m"), ("x_m", "y_m", "speed_mps"), ("x_m", "y_m", "yaw_rad"), ("range_m", "bearing_rad"))
@@ -39,7 +31,7 @@ class Banks:
     def __init__(self, motion: MotionModel, initiation: str = "regression") -> None:
         self.motion = motion
         self.expected = ObjectBank(motion, lambda start: ReplayEkf(motion, start, LAG_S, initiation), LAG_S)
-        self.found = ReplayBank(motion, LAG_S, initiation)
+        self.found = ReplayBank(motion, lambda start: ReplayEkf(motion, start, LAG_S, initiation), LAG_S)
 
     def advance(self, now_ns: int) -> None:
         self.expected.advance(now_ns)
@@ -96,7 +88,6 @@ def drawn(rng: np.random.Generator, motion: MotionModel, offset_ns: int) -> Meas
 @given(seed=st.integers(0, 2**32 - 1), motion=st.sampled_from([CTRV(), CTRA(), CV()]), sought=st.booleans())
 def test_any_history_is_that_of_one_estimator_for_each_object(seed: int, motion: MotionModel, sought: bool) -> None:
     rng = np.random.default_rng(seed)
-    replay_bank._FEW = int(rng.choice([0, 2]))
     banks, now_ms, born = Banks(motion), 0, 0
     start = replace(START, yaw_rad=None, yaw_std_rad=None, speed_mps=15.0) if sought else START
     banks.advance(START.stamp_ns)
@@ -132,7 +123,7 @@ def test_a_stream_of_a_window_many_times_as_long_stays_the_same_and_small() -> N
             offset_ns = (50 * k - late_ms) * MS
             chosen = [i for i in range(5) if rng.random() < 0.9]
             banks.update(START.stamp_ns + offset_ns, chosen, [drawn(rng, motion, offset_ns) for _ in chosen])
-    assert banks.found._steps.order.size <= 8 * 128
+    assert max(len(each.steps) for each in banks.found._estimators.values()) < 60
 
 
 def test_what_cannot_be_fused_fails_alone_and_changes_nothing() -> None:
@@ -151,73 +142,14 @@ def test_what_cannot_be_fused_fails_alone_and_changes_nothing() -> None:
         assert UpdateStatus.FAILED not in (statuses[0], statuses[2])
 
 
-def test_few_tracks_are_by_themselves_and_more_of_them_in_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(replay_bank, "_FEW", 2)
-    rng, motion = np.random.default_rng(0), CTRV()
-    banks = Banks(motion)
-    for track_id in range(4):
-        banks.birth(track_id, START)
-        ids = list(range(track_id + 1))
-        offset_ns = 100 * (track_id + 1) * MS
-        banks.update(START.stamp_ns + offset_ns, ids, [drawn(rng, motion, offset_ns) for _ in ids])
-        assert len(banks.found._single) == (track_id + 1 if track_id < 2 else 0)
-
-
-def test_a_track_is_taken_over_once_its_direction_has_long_been_found() -> None:
-    rng, motion = np.random.default_rng(1), CTRV()
-    banks = Banks(motion)
-    banks.birth(0, replace(START, yaw_rad=None, yaw_std_rad=None, speed_mps=0.0))
-    assert banks.found._single
-    for k in range(1, 60):
-        for late_ms in (0, 70):
-            offset_ns = (50 * k - late_ms) * MS
-            banks.update(START.stamp_ns + offset_ns, [0], [drawn(rng, motion, offset_ns)])
-    assert not banks.found._single
-
-
 @pytest.mark.parametrize("motion", [CTRV(), CV()])
 def test_the_bank_keeps_the_contract_of_an_estimator(motion: MotionModel) -> None:
     def one(motion: MotionModel, start: Start, lag_s: float) -> OneObject:
-        return OneObject(motion, ReplayBank(motion, lag_s), start)
+        return OneObject(motion, ReplayBank(motion, lambda start: ReplayEkf(motion, start, lag_s), lag_s), start)
 
     check_estimator(one, num_streams=5)
 
 
 def test_the_tracker_gets_the_bank_and_other_filters_are_one_for_each_object() -> None:
     assert isinstance(estimator_bank("ekf-replay", CTRV(), 1.0, {"initiation": "two-point"}), ReplayBank)
-    assert isinstance(estimator_bank("iekf-replay", CTRV(), 1.0, {}), ObjectBank)
-
-
-# --- places
-
-
-@given(seed=st.integers(0, 2**32 - 1))
-def test_histories_are_lists_in_order(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    histories, lists = Histories(), dict[int, list[tuple[int, int]]]()
-    for track in range(6):
-        lists[track] = [(0, histories.begin(track, 0))]
-    for _ in range(60):
-        tracks = np.flatnonzero(rng.random(6) < 0.6)
-        if not tracks.size:
-            continue
-        if rng.random() < 0.2:
-            many = np.array([rng.integers(0, len(lists[track])) for track in tracks.tolist()])
-            histories.drop(tracks, many)
-            for track, number in zip(tracks.tolist(), many.tolist(), strict=True):
-                del lists[track][:number]
-            continue
-        stamp_ns = int(rng.integers(1, 50))
-        numbers = histories.reserve(tracks)
-        places = histories.place_before(tracks, np.full(len(tracks), stamp_ns)) + 1
-        histories.insert(tracks, places, stamp_ns)
-        for track, number, place in zip(tracks.tolist(), numbers.tolist(), places.tolist(), strict=True):
-            assert place == sum(stamp <= stamp_ns for stamp, _ in lists[track])
-            lists[track].insert(place, (stamp_ns, number))
-    for track, entries in lists.items():
-        count = len(entries)
-        assert histories.count[track] == count
-        kept = zip(histories.stamps_ns[track, :count].tolist(), histories.numbers[track, :count].tolist(), strict=True)
-        assert list(kept) == entries
-        assert (histories.stamps_ns[track, count:] == NEVER_NS).all()
-    assert sorted(histories.numbers.ravel().tolist()) == list(range(histories.size))
+    assert not isinstance(estimator_bank("rts", CTRV(), 1.0, {}), ReplayBank)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.ukf import measurement_regression, motion_regression, regression
+from fgtrack.estimation.ukf import measurement_regression, regression
 from fgtrack.models.motion import CTRV
 
 MEAN = np.array([1.0, -2.0, 0.5])
@@ -53,7 +53,7 @@ def test_the_regression_is_that_of_many_samples() -> None:
 
 def test_a_narrow_spread_gives_the_derivative() -> None:
     motion, x = CTRV(), np.array([3.0, 1.0, 0.4, 20.0, 0.3])
-    found = motion_regression(motion, x, 1e-8 * np.eye(5), 0.2)
+    found = regression(lambda each: motion.predict(each, 0.2), x, 1e-8 * np.eye(5))
     np.testing.assert_allclose(found.A, motion.jacobian(x, 0.2), atol=1e-6)
     np.testing.assert_allclose(found.mean, motion.predict(x, 0.2), atol=1e-6)
 
@@ -77,7 +77,7 @@ def test_a_yaw_is_an_entry_of_the_state_however_wide_it_is() -> None:
 
 def test_a_semidefinite_covariance_is_taken() -> None:
     motion = CTRV()
-    found = motion_regression(motion, np.zeros(5), np.diag([1.0, 1.0, 0.0, 1.0, 0.0]), 0.1)
+    found = regression(lambda x: motion.predict(x, 0.1), np.zeros(5), np.diag([1.0, 1.0, 0.0, 1.0, 0.0]))
     assert np.isfinite(found.A).all()
     with pytest.raises(np.linalg.LinAlgError):
-        motion_regression(motion, np.zeros(5), np.diag([1.0, 1.0, -1.0, 1.0, 1.0]), 0.1)
+        regression(lambda x: motion.predict(x, 0.1), np.zeros(5), np.diag([1.0, 1.0, -1.0, 1.0, 1.0]))
