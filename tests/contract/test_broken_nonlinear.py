@@ -10,7 +10,7 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.banded.smoother import BandedSmoother
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult
-from fgtrack.estimation.ekf import innovation_one, predict
+from fgtrack.estimation.ekf import correct_one, predict
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.propagation import track_state
 from fgtrack.estimation.replay import ReplayEkf
@@ -34,7 +34,7 @@ class Sees(ReplayEkf):
         result = super().update(measurement if self._motion.linear else self.seen(measurement))
         if result.nis is None or before is None or late:
             return result
-        said = innovation_one(before.mean, before.covariance, measurement.seen_by(self._motion))
+        said = correct_one(before.mean, before.covariance, measurement.seen_by(self._motion))
         return replace(result, innovation=said.innovation, nis=said.nis, innovation_covariance=said.S)
 
     def seen(self, measurement: Measurement) -> Measurement:

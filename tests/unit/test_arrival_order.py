@@ -12,7 +12,7 @@ from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.initiation import Fix, Search
 from fgtrack.estimation.registry import ESTIMATORS, estimator
-from fgtrack.estimation.replay_bank import ReplayBank
+from fgtrack.estimation.replay import ReplayBank, ReplayEkf
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRV, CV
 from fgtrack.models.sensors import RobustLoss
@@ -60,7 +60,7 @@ def test_a_smoother_that_has_converged_counts_them_the_same_too(name: str, what:
 def test_they_do_in_the_bank_of_many_objects_as_well(what: str) -> None:
     states = set()
     for order in permutations((*ALIKE[what], POSITION)):
-        bank = ReplayBank(CTRV(), 1.0)
+        bank = ReplayBank(CTRV(), lambda start: ReplayEkf(CTRV(), start, 1.0), 1.0)
         for track_id in range(5):
             bank.birth(track_id, START)
         for measurement in order:
