@@ -157,7 +157,9 @@ def predict_across(
     after, F, Q = motion.transition(mean, dt_s)
     shape, n = after.shape[:-1], after.shape[-1]
     P = np.broadcast_to(covariance, (*shape, n, n))
-    found, cross = _kernels().predict(*(np.array(each, dtype=np.float64, order="C").reshape(-1, n, n) for each in (F, P, Q)))
+    found, cross = _kernels().predict(
+        *(np.array(each, dtype=np.float64, order="C").reshape(-1, n, n) for each in (F, P, Q))
+    )
     return Prediction(after, found.reshape(*shape, n, n), cross.reshape(*shape, n, n))
 
 
