@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, replace
 from itertools import chain, count
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
 import fgtrack
 from fgtrack.advice.advise import advice_on
 from fgtrack.advice.page import Advice
@@ -94,6 +96,7 @@ def study(
     pit_map: str | Path | None = None,
     set: Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
     advice: bool = True,
+    figures: Mapping[str, Figure] | None = None,
     overwrite: bool = False,
     on_step: OnStep = lambda text, share: None,
 ) -> Study:
@@ -113,6 +116,8 @@ def study(
         Values of single settings: `{"smoother.lag_s": 3.0}`.
     advice
         True to follow the settings of `fgtrack.advise`.
+    figures
+        Further figures for folder and report, by name.
     overwrite
         True to replace a study in `out`.
     on_step
@@ -127,7 +132,7 @@ def study(
     """
     out, source_path = Path(out), Path(recording)
     resolved = read_config(config, settings_of(set), track_map=map, pit_map=pit_map)
-    *runs, figures, settings, page = outputs(out)
+    *runs, pictures, settings, page = outputs(out)
     folders = dict(zip(ESTIMATORS, runs, strict=True))
     config_file = str(config) if isinstance(config, (str, Path)) else None
     for path in outputs(out):
@@ -135,7 +140,7 @@ def study(
     with claimed(out):
         for folder in folders.values():
             check_run(folder, overwrite)
-        check_output(figures, overwrite, Path.is_dir, "a folder")
+        check_output(pictures, overwrite, Path.is_dir, "a folder")
         check_output(settings, overwrite)
         check_output(page, overwrite)
         on_step("reading", 0.0)
@@ -168,7 +173,7 @@ def study(
             assumptions=known.lines(),
             advice=() if advised is None else advised.sentences,
         )
-        _pictured(every, tables, opening, figures, page, overwrite)
+        _pictured(every, tables, opening, figures or {}, pictures, page, overwrite)
         on_step("done", _DONE)
     return Study(out, lines, tuple(known.lines()), advised, tuple(o.run for o in every), tables, results[0].broken)
 
@@ -236,12 +241,18 @@ def _replayed(
 
 
 def _pictured(
-    runs: list[JudgedRun], tables: Tables, opening: Opening, figures: Path, page: Path, overwrite: bool
+    runs: list[JudgedRun],
+    tables: Tables,
+    opening: Opening,
+    more: Mapping[str, Figure],
+    figures: Path,
+    page: Path,
+    overwrite: bool,
 ) -> None:
     close_up, late = drawn_close_up(runs)
     others = tuple(f"_{one.label}" for one in runs[1:])  # figures of single runs are drawn of the first
     plans = (one for one in planned(runs) if not one.name.endswith(others))
-    pictures = [(name, png(figure)) for name, figure in chain(close_up, drawn(plans))]
+    pictures = [(name, png(figure)) for name, figure in chain(close_up, drawn(plans), more.items())]
     with new_files(figures, overwrite) as folder:
         for name, picture in pictures:
             (folder / f"{name}.png").write_bytes(picture)

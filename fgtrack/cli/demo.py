@@ -16,6 +16,7 @@ from fgtrack.io.recording import check_recording, write_recording
 from fgtrack.models.oval import OVAL
 from fgtrack.pipeline.recorded import recorded_of
 from fgtrack.pipeline.shipped import read_config, read_scenario
+from fgtrack.plotting.plot import error_against_delay
 from fgtrack.sim.delays import AnyDelay, ConstantDelay, GammaDelay
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate
@@ -49,9 +50,11 @@ def demo(
             write_recording(bag, messages, overwrite=overwrite, settings=recorded_of(scenario))
         config = read_config(_CONFIG, settings, track_map=OVAL, pit_map=OVAL)
     with progress("study") as tell:
-        found = study(bag, out, config, advice=False, overwrite=overwrite, on_step=tell)
+        sweep = {"error_against_delay": error_against_delay()}
+        found = study(bag, out, config, advice=False, figures=sweep, overwrite=overwrite, on_step=tell)
     say(f"{scenario.duration_s:g} s of a simulated race ({bag}), noise fitted to other races (-c {_CONFIG}):")
     show_study(found, bag)
+    say(f"error against delay, of a sweep over ten races: {out / 'figures/error_against_delay.png'}")
 
 
 def _changed(scenario: Scenario, delay_s: float | None, num_objects: int) -> tuple[Scenario, list[str]]:

@@ -20,7 +20,8 @@ from fgtrack.viewers.playback import Moment, scene
 from fgtrack.viewers.settings import differing, flattened
 
 #: Kinds of figures that are open; of some of them there are several, by object or run.
-_FIRST = ("close_up", "errors", "error_against_lag", "map")
+_FIRST = ("close_up", "errors", "error_against_delay", "error_against_lag", "map")
+_CAPTIONS = {"error_against_delay": "error against delay: a sweep over ten races that comes with fgtrack"}
 _MOST_OPEN, _MOST_WARNINGS = 3, 3
 _START, _MARK, _HEAD = b"<!DOCTYPE html>", b'<meta name="generator" content="fgtrack ', 1000
 _NONE = "–"
@@ -200,10 +201,11 @@ def _figures(texts: Iterable[str]) -> str:
 
 def _figure(name: str, picture: bytes) -> str:
     text, data = escape(name), base64.b64encode(picture).decode()
+    caption = _CAPTIONS.get(name, text.replace("_", " "))
     width, height = struct.unpack(">II", picture[_PNG_SIZE])
     return (
         f'<figure class="figure" id="figure-{text}" tabindex="0"><img alt="{text}" width="{width}" height="{height}" '
-        f'src="data:image/png;base64,{data}"><figcaption>{text.replace("_", " ")}</figcaption></figure>\n'
+        f'src="data:image/png;base64,{data}"><figcaption>{caption}</figcaption></figure>\n'
     )
 
 
