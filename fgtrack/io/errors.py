@@ -15,6 +15,11 @@ MOST_SENSORS = 100
 """Of a recording or a configuration. Each is a row of figures and tables, and 30 lines of a run folder."""
 
 
+def one_line(error: BaseException) -> str:
+    """Text of `error` in one line of at most 200 characters."""
+    return " ".join(str(error)[:2000].split())[:200] or type(error).__name__
+
+
 class TruncatedInput(DataError):  # noqa: N818 - it names what the input is; the readers have given all before it
     """An input broke off; everything before the break has been yielded.
 

@@ -16,10 +16,10 @@ from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import DetectionList, EgoState
 from fgtrack.io.adapters.common import RosMessage
+from fgtrack.io.errors import one_line
 from fgtrack.io.output import check_output, new_file, new_folder, write_error
 from fgtrack.io.ros.bag_writer import RECORDING, check_bag, is_recording
 from fgtrack.io.ros.messages import MARKER_ARRAY, TRANSFORMS, MessageFactory
-from fgtrack.io.ros.typestore import one_line
 from fgtrack.viewers.shapes import Entity, Scene, Shape, ViewerMessage
 
 _LATEST_NS = 1 << 63

@@ -310,13 +310,12 @@ def test_a_ros1_bag_is_read(tmp_path):
     assert read(tmp_path / "a.bag", InputConfig(ego=TopicInput("/odom"))) == [ODOMETRY_STATE]
 
 
-@pytest.mark.parametrize("rest", ["itself", "garbage"])
-def test_what_follows_the_end_of_a_recording_is_a_break(tmp_path, rest):
+def test_what_follows_the_end_of_a_recording_is_a_break(tmp_path):
     write_bag(tmp_path / "bag", drive(), "mcap")
     whole, path = storage_file(tmp_path / "bag").read_bytes(), tmp_path / "x.mcap"
     path.write_bytes(whole)
     expected = [message.log_ns for message in Bag(path).messages(["/fgtrack/ego"])]
-    path.write_bytes(whole + (whole if rest == "itself" else b"x" * 1000))
+    path.write_bytes(whole + b"x" * 1000)
     found = []
     with pytest.raises(TruncatedInput, match=f"is followed by something else from byte {len(whole)} on"):
         found.extend(message.log_ns for message in Bag(path).messages(["/fgtrack/ego"]))

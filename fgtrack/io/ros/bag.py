@@ -1,10 +1,12 @@
 """Reads recordings without ROS: rosbag2 folders, single MCAP and SQLite files, ROS 1 bags."""
 
+import heapq
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +15,10 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2
 
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S
-from fgtrack.io.errors import LARGEST_BYTES, MOST_OBJECTS, TruncatedInput, refuse_larger
-from fgtrack.io.ros.bag_files import (
-    BagFile,
-    EmptyFile,
-    Parts,
-    bags_in,
-    check_serialization,
-    merged,
-    parts_of,
-    storage_of,
-)
-from fgtrack.io.ros.mcap_file import McapFile
+from fgtrack.io.errors import LARGEST_BYTES, MOST_OBJECTS, TruncatedInput, one_line, refuse_larger
+from fgtrack.io.ros.bag_files import BagFile, bags_in, check_serialization, parts_of, storage_of
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
-from fgtrack.io.ros.typestore import Key, MessageTypes, one_line, type_name
+from fgtrack.io.ros.typestore import Key, MessageTypes, type_name
 
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
@@ -94,7 +86,7 @@ class Bag:
             self._ros1 = any(isinstance(file, Rosbag1File) for file in files)
             self._types = MessageTypes(map(_key, connections), self._ros1, message_definitions, most_objects)
             self._stamped = {key for key in set(map(_key, connections)) if self._starts_with_header(key)}
-            self.break_off = _break_off(files)
+            self.break_off = self._break_off(files)
         self.topics = _topics(connections, self._types.problems)
         """Topics by name; a topic with two types is listed twice."""
 
@@ -126,21 +118,6 @@ class Bag:
             topic = by_key[connection.topic, connection.msgtype]
             yield topic, log_ns, self._stamp_ns(data) if _key(connection) in self._stamped else None
 
-    def sendings(self) -> Iterator[tuple[BagTopic, int, int, int]]:
-        """Topic, header stamp, time of sending and log time of every message that has a header, file by file.
-
-        Only MCAP keeps when a message was sent (its publish time); a recorder that did not know it writes the log
-        time. Compression of single messages is not undone, such recordings give nothing.
-        """
-        by_key = {(topic.name, topic.type): topic for topic in self.topics}
-        with self._files() as files:
-            for file in files:
-                for connection, sent_ns, log_ns, data in file.sendings() if isinstance(file, McapFile) else ():
-                    if _key(connection) not in self._stamped or data[:4] == _ZSTD_MAGIC:
-                        continue
-                    if (stamp_ns := self._stamp_ns(data)) is not None:
-                        yield by_key[connection.topic, connection.msgtype], stamp_ns, sent_ns, log_ns
-
     def end_ns(self) -> int | None:
         """The end of the log times as the indexes of the files say it, without reading messages; None without any."""
         with self._files() as files:
@@ -167,14 +144,32 @@ class Bag:
 
     @contextmanager
     def _files(self) -> Iterator[list[BagFile]]:
-        with _as_data_error(self.path), _opened(self._parts, self._largest_bytes) as files:
+        with _as_data_error(self.path), ExitStack() as stack:
+            paths = stack.enter_context(self._parts.decompressed())
+            files: list[BagFile] = []
+            for path in paths:
+                empty = path.stat().st_size == 0
+                kind = storage_of(path)
+                if kind is None and not (empty and len(paths) > 1):
+                    raise DataError(f"{path}: {'is empty' if empty else 'is not a bag file'}")
+                if kind is not None:
+                    file = kind(path) if issubclass(kind, Rosbag1File) else kind(path, self._largest_bytes)
+                    stack.callback(file.close)
+                    file.open()
+                    files.append(file)
             yield files
+
+    def _break_off(self, files: list[BagFile]) -> str | None:
+        """How the first file that is not whole breaks off."""
+        broken = [f"{file.path} {file.break_off}" for file in files if file.break_off]
+        empty = [f"{path} is empty" for path in self._parts.files if path.stat().st_size == 0]
+        return next(iter(broken + empty), None)
 
     def _records(self, topics: Collection[str]) -> Iterator[tuple[Connection, int, bytes]]:
         count = 0
         with self._files() as files:
             try:
-                for connection, log_ns, data in merged(files, topics):
+                for connection, log_ns, data in _merged(files, topics):
                     if data[:4] == _ZSTD_MAGIC and not self._ros1:
                         what = f"{self.path}: the message on {connection.topic} at {log_ns} ns"
                         data = self._decompressed(data, what)
@@ -184,7 +179,7 @@ class Bag:
                 raise
             except Exception as error:  # whatever damaged bytes make rosbags or its decompressors raise
                 raise TruncatedInput(f"{self.path}: breaks off after {count} messages ({one_line(error)})") from error
-            if broken := _break_off(files):
+            if broken := self._break_off(files):
                 raise TruncatedInput(f"{broken}, after {count} messages")
 
 
@@ -209,31 +204,14 @@ def _topics(connections: list[Connection], problems: Mapping[Key, str]) -> tuple
     return tuple(BagTopic(*topic, count, found.get(topic)) for topic, count in sorted(counts.items()))
 
 
-def _break_off(files: list[BagFile]) -> str | None:
-    return next((f"{file.path} {file.break_off}" for file in files if file.break_off), None)
+def _merged(files: list[BagFile], wanted: Collection[str]) -> Iterator[tuple[Connection, int, bytes]]:
+    """Records on the `wanted` topics of all files in log-time order; equal times keep the files' order."""
 
+    def records(file: BagFile) -> Iterator[tuple[Connection, int, bytes]]:
+        connections = [item for item in file.connections if item.topic in wanted]
+        return iter(file.messages(connections)) if connections else iter(())
 
-def _bag_file(path: Path, alone: bool, largest_bytes: int) -> BagFile:
-    empty = path.stat().st_size == 0
-    if empty and not alone:
-        return EmptyFile(path)
-    kind = storage_of(path)
-    if kind is None:
-        raise DataError(f"{path}: {'is empty' if empty else 'is not a bag file'}")
-    return kind(path) if issubclass(kind, Rosbag1File) else kind(path, largest_bytes)
-
-
-@contextmanager
-def _opened(parts: Parts, largest_bytes: int) -> Iterator[list[BagFile]]:
-    with ExitStack() as stack:
-        paths = stack.enter_context(parts.decompressed())
-        files: list[BagFile] = []
-        for path in paths:
-            file = _bag_file(path, len(paths) == 1, largest_bytes)
-            stack.callback(file.close)
-            file.open()
-            files.append(file)
-        yield files
+    return heapq.merge(*map(records, files), key=itemgetter(1))
 
 
 @contextmanager

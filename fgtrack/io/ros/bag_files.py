@@ -1,31 +1,29 @@
-"""Files of a recording, each read in log-time order and up to the place where it is truncated."""
+"""The files of a recording: which they are, and what its metadata.yaml says."""
 
 import filecmp
-import heapq
 import json
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
-from typing import Protocol
+from typing import Any
 
 import zstandard
-from rosbags.interfaces import Connection
 from ruamel.yaml.error import YAMLError
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file, read_whole
-from fgtrack.io.errors import LARGEST_BYTES
+from fgtrack.io.errors import LARGEST_BYTES, one_line
 from fgtrack.io.ros.mcap_file import MCAP_MAGIC, McapFile
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
 from fgtrack.io.ros.sqlite3_file import Sqlite3File
 from fgtrack.io.yaml_text import safe_yaml
 
-Record = tuple[Connection, int, bytes]
-"""Connection, log time in ns, serialized message."""
+BagFile = McapFile | Sqlite3File | Rosbag1File
+"""One file of a recording, read in log-time order up to where it breaks off (`break_off`)."""
 
 METADATA = "metadata.yaml"
 SETTINGS = "fgtrack"
@@ -33,30 +31,11 @@ SETTINGS = "fgtrack"
 _BAG_SUFFIXES = (".mcap", ".db3")
 _NEWEST_VERSION = 9
 _LARGEST_RATIO = 100
-SQLITE_MAGIC = b"SQLite format 3\x00"
-ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
-
-
-class BagFile(Protocol):
-    """One file of a recording."""
-
-    path: Path
-    connections: list[Connection]
-    break_off: str | None
-    """How the file breaks off in the middle; None when it is whole."""
-
-    @property
-    def end_time(self) -> int:
-        """Last log time in ns, or a little later, according to the index; 0 without one."""
-
-    def open(self) -> None:
-        """Open the file and read which connections it holds."""
-
-    def close(self) -> None:
-        """Close the file."""
-
-    def messages(self, connections: Collection[Connection]) -> Iterator[Record]:
-        """Records of `connections` in log-time order; equal times keep the order of writing."""
+_READERS: Mapping[bytes, type[BagFile]] = {
+    MCAP_MAGIC: McapFile,
+    b"SQLite format 3\x00": Sqlite3File,
+    b"#ROSBAG V2.0\n": Rosbag1File,
+}
 
 
 @dataclass(frozen=True)
@@ -110,9 +89,8 @@ def settings_of(path: Path) -> Mapping[str, object]:
     if not (path / METADATA).is_file():
         return {}
     try:
-        metadata = safe_yaml(read_whole(path / METADATA, 1.0).decode())
-        found = json.loads(metadata["rosbag2_bagfile_information"]["custom_data"][SETTINGS])
-    except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError, YAMLError):
+        found = json.loads(_metadata(path)["custom_data"][SETTINGS])
+    except (KeyError, TypeError, ValueError, RecursionError, YAMLError):
         return {}
     return found if isinstance(found, dict) else {}
 
@@ -126,10 +104,14 @@ def bags_in(path: Path) -> list[Path]:
     return sorted((file for file in path.iterdir() if file.suffix in _BAG_SUFFIXES), key=natural)
 
 
+def _metadata(path: Path) -> Any:  # Any: YAML values, checked by who reads them
+    return safe_yaml(read_whole(path / METADATA, 1.0).decode())["rosbag2_bagfile_information"]
+
+
 def _named_parts(path: Path) -> Parts:
     file = path / METADATA
     try:
-        metadata = safe_yaml(read_whole(file, 1.0).decode())["rosbag2_bagfile_information"]
+        metadata = _metadata(path)
         files = [path / PurePath(name).name for name in metadata["relative_file_paths"]]
         version = int(metadata["version"])
         mode = (metadata.get("compression_mode") or "none").lower()
@@ -137,8 +119,9 @@ def _named_parts(path: Path) -> Parts:
         topics = [item["topic_metadata"] for item in metadata.get("topics_with_message_count") or ()]
         serializations = {str(topic["name"]): str(topic["serialization_format"]) for topic in topics}
     except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError, YAMLError) as error:
-        what = " ".join(f"{type(error).__name__}: {error}".split())[:120]
-        raise DataError(f"{file}: is not the metadata of a recording ({what})") from error
+        raise DataError(
+            f"{file}: is not the metadata of a recording ({type(error).__name__}: {one_line(error)})"
+        ) from error
     if missing := [file for file in files if not file.is_file()]:
         raise DataError(f"{missing[0]}: is missing, {file} names it")
     if len(set(files)) < len(files):
@@ -157,41 +140,8 @@ def check_serialization(path: Path, topic: str, serialization: str) -> None:
         raise DataError(f"{path}: topic {topic} is serialized as {serialization!r}, only 'cdr' can be read")
 
 
-class EmptyFile:
-    """A file into which a killed recorder has not written anything yet."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.connections: list[Connection] = []
-        self.break_off: str | None = "is empty"
-        self.end_time = 0
-
-    def open(self) -> None:
-        """Open the file, of which nothing can be read."""
-
-    def close(self) -> None:
-        """Close the file."""
-
-    def messages(self, connections: Collection[Connection]) -> Iterator[Record]:
-        """No records."""
-        return iter(())
-
-
-def storage_of(path: Path) -> type[McapFile | Sqlite3File | Rosbag1File] | None:
+def storage_of(path: Path) -> type[BagFile] | None:
     """Reader of the file `path`, by its first bytes; None for other files."""
     with open_file(path) as file:
-        magic = file.read(len(SQLITE_MAGIC))
-    for start, kind in ((MCAP_MAGIC, McapFile), (SQLITE_MAGIC, Sqlite3File), (ROSBAG1_MAGIC, Rosbag1File)):
-        if magic.startswith(start):
-            return kind
-    return None
-
-
-def merged(files: list[BagFile], wanted: Collection[str]) -> Iterator[Record]:
-    """Records on the `wanted` topics of all files in log-time order; equal times keep the files' order."""
-
-    def records(file: BagFile) -> Iterator[Record]:
-        connections = [item for item in file.connections if item.topic in wanted]
-        return file.messages(connections) if connections else iter(())
-
-    return heapq.merge(*map(records, files), key=lambda record: record[1])
+        start = file.read(max(map(len, _READERS)))
+    return next((kind for magic, kind in _READERS.items() if start.startswith(magic)), None)

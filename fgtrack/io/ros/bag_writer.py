@@ -14,11 +14,10 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.io.adapters.common import RosMessage
-from fgtrack.io.errors import UntilBreak
+from fgtrack.io.errors import UntilBreak, one_line
 from fgtrack.io.output import check_output, new_folder
 from fgtrack.io.ros.bag_files import METADATA, SETTINGS, parts_of
 from fgtrack.io.ros.messages import DETECTED_OBJECTS, DETECTION3D_ARRAY, MessageFactory
-from fgtrack.io.ros.typestore import one_line
 
 _CHECKPOINT = 1000  # messages; a killed writer loses no more than that
 _PLUGINS = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}

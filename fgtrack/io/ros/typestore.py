@@ -1,31 +1,51 @@
-"""The message types of a recording: rosbags', fgtrack's, the user's and those embedded in the recording."""
+"""The message types of a recording: rosbags', fgtrack's, the user's and those embedded in the recording.
 
-import os
-from collections.abc import Collection, Iterable, Mapping
+rosbags generates Python code from a definition and runs it: what a recording brings must not become anything but names
+and numbers there.
+"""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from rosbags.interfaces import MessageDefinition
-from rosbags.interfaces.typing import Fielddefs, Typesdict
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
+from rosbags.interfaces.typing import Constdefs, Fielddefs, FieldDesc, Typesdict
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.files import read_whole
-from fgtrack.io.errors import MOST_OBJECTS, refuse_larger
-from fgtrack.io.ros.definition_text import DefinitionReader, one_line
+from fgtrack.io.errors import MOST_OBJECTS, one_line, refuse_larger
 from fgtrack.io.ros.definitions import DEFINITIONS
-from fgtrack.io.ros.type_checks import check_definition, check_size, named_types
 
-__all__ = ["Key", "MessageTypes", "build_typestore", "one_line", "type_name"]
+__all__ = ["Key", "MessageTypes", "build_typestore", "check_definition", "type_name"]
 
-_LARGEST_FILE_MB = 1.0
-_LARGEST_MESSAGE = 32_000_000
-"""Of a message that is decoded: an object list or a state, never an image; each byte takes up to a hundred."""
-_MOST_FOLDERS = 10_000  # below a folder of definitions
 Key = tuple[str, MessageDefinition | None]
-"""A message type, and what the recording says of it: two topics may know different types by one name."""
+"""A message type and its definition in the recording: two topics may define one name differently."""
+
+_LARGEST_MESSAGE = 32_000_000
+"""Bytes of a message that is decoded: an object list or a state, never an image; each byte takes up to a hundred."""
+_LONGEST_TEXT = 200_000
+_LONGEST_NAME = 255
+_MOST_MEMBERS = 2_000
+_MOST_VALUES = 4_000
+"""Of a type with all its parts: arrays of texts and messages become code for each element."""
+_LONGEST_ARRAY = 1_000_000
+_INTEGERS = range(-(1 << 63), 1 << 64)
+_TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*)+", re.ASCII)
+_MEMBER_NAME = re.compile(r"(?!__)[A-Za-z_]\w*", re.ASCII)
+_BASE_NAME = re.compile(r"[a-z]+[0-9]*", re.ASCII)
+_SEPARATOR = "=" * 80 + "\n"
+_MSG_HEADER = re.compile(r"MSG: ([A-Za-z0-9/_]+)[ \t]*\n")
+_EMPTY_LINE = re.compile(r"^[ \t]*(?:#[^\n]*)?\n", re.MULTILINE)
+_IDL_TEXT = re.compile(r'"(?:\\.|[^"\\])*"')
+_IDL_REMARK = re.compile(r"/\*.*?\*/|//[^\n]*|^#[^\n]*|@\s*[\w:]*(?:\s*\([^()]*\))?", re.DOTALL | re.MULTILINE)
+_IDL_COSTLY = re.compile(r"=[^;]*[()*/%|^&~<]|(?:sequence\s*<\s*){4}")
 
 
 def type_name(name: str) -> str:
@@ -42,9 +62,9 @@ class MessageTypes:
     Parameters
     ----------
     keys
-        The types, with what the recording carries of them.
+        The types, with their definitions in the recording.
     ros1
-        Whether the messages are serialized as ROS 1 does.
+        True if the messages are serialized as ROS 1 does.
     message_definitions
         The user's `.msg` files, or folders of them.
     most_objects
@@ -69,35 +89,31 @@ class MessageTypes:
         self._stores: dict[Key, Typestore] = {}
         self.problems: dict[Key, str] = {}
         """Why messages of a type cannot be decoded."""
-        keys = sorted(set(keys), key=str)
-        embedded = self._embedded(keys)
-        known = _known_types(ros1, message_definitions)
-        shared, ambiguous = _shared(embedded.values())
-        for key in keys:
-            if key not in self.problems:
-                try:
-                    types = _closure(key[0], [embedded[key], shared, known], ambiguous)
-                    check_size(key[0], types)
-                    self._types[key] = types
-                except (ValueError, RecursionError) as error:
-                    self.problems[key] = str(error)
-
-    def _embedded(self, keys: list[Key]) -> dict[Key, Typesdict]:
-        reader = DefinitionReader()
-        found: dict[Key, Typesdict] = {}
-        for key in keys:
+        known = dict(_shipped_types(ros1))
+        for path in message_definitions:
+            known |= _user_types(Path(path))
+        embedded: dict[Key, Typesdict] = {}
+        for key in sorted(set(keys), key=str):
             try:
-                found[key] = reader.read(*key)
-            except ValueError as error:
+                embedded[key] = _embedded(*key)
+            except Exception as error:  # whatever an invalid definition makes the parser raise
                 self.problems[key] = f"its embedded definition cannot be read ({one_line(error)})"
-        return found
+        shared: Typesdict = {}
+        for types in embedded.values():
+            shared = types | shared
+        for key, types in embedded.items():
+            try:
+                self._types[key] = _closure(key[0], (types, shared, known))
+                _check_size(key[0], self._types[key])
+            except (ValueError, RecursionError) as error:
+                self.problems[key] = str(error)
 
     def fields(self, key: Key) -> Fielddefs:
         """The members of a type that has no problem."""
         return self._types[key][key[0]][1]
 
     def types(self, key: Key) -> Typesdict:
-        """A type that has no problem, with all that it is made of."""
+        """A type that has no problem, with all its parts."""
         return self._types[key]
 
     def decode(self, key: Key, data: bytes, what: str) -> Any:  # a message has the attributes of its type
@@ -110,35 +126,24 @@ class MessageTypes:
         """
         refuse_larger(len(data), what, _LARGEST_MESSAGE)
         try:
-            store = self._store(key)
+            if key not in self._stores:
+                self._stores[key] = _registered(self._types[key])
+            store = self._stores[key]
             message = (store.deserialize_ros1 if self._ros1 else store.deserialize_cdr)(data, key[0])
+        except MemoryError:
+            raise
         except Exception as error:  # whatever bytes of another type make the decoder raise
             raise DataError(f"{what} is not a {key[0]} ({one_line(error)})") from error
-        if len(data) > self._most_objects and (length := _longest_list(message)) > self._most_objects:
-            raise DataError(f"{what}: a list of {length} objects, more than input.most_objects allows")
+        longest = max((len(value) for value in vars(message).values() if isinstance(value, list)), default=0)
+        if longest > self._most_objects:
+            raise DataError(f"{what}: a list of {longest} objects, more than input.most_objects allows")
         return message
-
-    def _store(self, key: Key) -> Typestore:
-        if key not in self._stores:
-            self._stores[key] = _registered(self._types[key])
-        return self._stores[key]
-
-
-def _longest_list(message: Any) -> int:  # a message has the attributes of its type
-    """Length of the longest list in `message`, not looking into lists."""
-    lengths = [0]
-    for value in vars(message).values():
-        if isinstance(value, list):
-            lengths.append(len(value))
-        elif hasattr(value, "__msgtype__"):
-            lengths.append(_longest_list(value))
-    return max(lengths)
 
 
 def build_typestore(
     definitions: Mapping[str, MessageDefinition | None], ros1: bool, message_definitions: Iterable[str] = ()
 ) -> tuple[Typestore, Mapping[str, str]]:
-    """One store of the types that are the keys of `definitions`, and of those which cannot be read why.
+    """One store of the types that are the keys of `definitions`, and why the others cannot be read.
 
     Arguments and errors as of `MessageTypes`, by type name.
     """
@@ -155,22 +160,8 @@ def _registered(types: Typesdict) -> Typestore:
     return store
 
 
-def _shared(embedded: Collection[Typesdict]) -> tuple[Typesdict, frozenset[str]]:
-    """What the definitions of any type say, and the names of which they say different things."""
-    shared: Typesdict = {}
-    ambiguous = set()
-    for types in embedded:
-        for name, definition in types.items():
-            if shared.setdefault(name, definition)[1] != definition[1]:
-                ambiguous.add(name)
-    return shared, frozenset(ambiguous)
-
-
-def _closure(name: str, sources: list[Typesdict], ambiguous: frozenset[str]) -> Typesdict:
-    """The type `name` with all that it is made of, each from the first of `sources` that has it.
-
-    Raises `ValueError` where none has, or where it is to be taken from other topics which contradict each other.
-    """
+def _closure(name: str, sources: Iterable[Typesdict]) -> Typesdict:
+    """The type `name` with all its parts, each from the first of `sources` that has it; else `ValueError`."""
     needed: Typesdict = {}
     pending = [name]
     while pending:
@@ -183,18 +174,12 @@ def _closure(name: str, sources: list[Typesdict], ambiguous: frozenset[str]) -> 
                 f"the definition of {current or 'a type without a name'} is neither in the recording nor known, "
                 "name its .msg file in message_definitions"
             )
-        if current in ambiguous and current not in sources[0]:
-            raise ValueError(f"the recording defines {current} in several ways, and for this type in none of its own")
         needed[current] = found
-        pending += [part for _, field in found[1] for part in named_types(field)]
+        for _, description in found[1]:
+            kind, value = _innermost(description)
+            if kind == Nodetype.NAME:
+                pending.append(cast("str", value))
     return needed
-
-
-def _known_types(ros1: bool, message_definitions: Iterable[str]) -> Typesdict:
-    types = dict(_shipped_types(ros1))
-    for path in message_definitions:
-        types |= _user_types(Path(path))
-    return types
 
 
 @cache
@@ -206,29 +191,133 @@ def _shipped_types(ros1: bool) -> Typesdict:
     return types
 
 
-def definition_files(path: Path) -> list[Path]:
-    """The `.msg` files at or below `path`. Raises `CallError` where there are none, or folders without end."""
-    if not path.is_dir():
-        return [path]
-    files: list[Path] = []
-    for count, (folder, _, names) in enumerate(os.walk(path), start=1):
-        if count > _MOST_FOLDERS:
-            raise CallError(f"{path}: has more than {_MOST_FOLDERS} folders, name that of the message definitions")
-        files += (Path(folder, name) for name in names if name.endswith(".msg"))
-    if not files:
-        raise CallError(f"{path}: holds no .msg file")
-    return sorted(files)
-
-
 def _user_types(path: Path) -> Typesdict:
     types: Typesdict = {}
-    for file in definition_files(path):
+    files = sorted(path.rglob("*.msg")) if path.is_dir() else [path]
+    if not files:
+        raise CallError(f"{path}: holds no .msg file")
+    for file in files:
         package = file.parent.parent.name if file.parent.name == "msg" else file.parent.name
         try:
-            found = get_types_from_msg(read_whole(file, _LARGEST_FILE_MB).decode(), f"{package}/msg/{file.stem}")
-            for name, definition in found.items():
-                check_definition(name, definition)
-        except Exception as error:  # whatever a foreign definition makes the parser raise
+            text = read_whole(file, 1.0).decode()
+            types |= _checked(get_types_from_msg(text, f"{package}/msg/{file.stem}"))
+        except Exception as error:  # whatever an invalid definition makes the parser raise
             raise CallError(f"{file}: is not a message definition ({one_line(error)})") from error
-        types |= found
     return types
+
+
+def _embedded(name: str, definition: MessageDefinition | None) -> Typesdict:
+    """Types that the text of `definition`, of the type `name`, defines; empty without a text.
+
+    Raises whatever rosbags makes of an invalid one.
+    """
+    form, text = (None, "") if definition is None else (definition.format, definition.data)
+    if form not in (MessageDefinitionFormat.MSG, MessageDefinitionFormat.IDL) or not text.strip():
+        return {}
+    if len(text) > _LONGEST_TEXT:
+        raise ValueError(f"it has more than {_LONGEST_TEXT} characters")
+    _check_type_name(name)
+    first, *others = text.split(_SEPARATOR)
+    types: Typesdict = {}
+    if form == MessageDefinitionFormat.IDL:
+        for part in [part.partition("\n")[2] for part in others] if others and not first.strip() else [text]:
+            types |= _checked(get_types_from_idl(_plain_idl(part)))
+        return types
+    parts = [(name, first)]
+    for part in others:
+        header = _MSG_HEADER.match(part)
+        if header is None:
+            raise ValueError("a type in it has no name, a line 'MSG: package/Type'")
+        parts.append((header[1], part[header.end() :]))
+    for each, part in parts:
+        types |= _checked(get_types_from_msg(_EMPTY_LINE.sub("", part if part.endswith("\n") else f"{part}\n"), each))
+    return types
+
+
+def _plain_idl(text: str) -> str:
+    """Text without string contents, annotations, comments and preprocessor lines, which define no member.
+
+    Raises `ValueError` for what rosbags would parse or evaluate for minutes: computed constants, nested sequences.
+    """
+    plain = _IDL_REMARK.sub(" ", _IDL_TEXT.sub('""', text))
+    if _IDL_COSTLY.search(plain):
+        raise ValueError("it computes a constant or nests sequences, which no definition of ROS does")
+    return plain.replace(">", "> ")  # rosbags takes the end of `sequence<string<9>>` for a shift
+
+
+def _checked(types: Typesdict) -> Typesdict:
+    for name, definition in types.items():
+        check_definition(name, definition)
+    return types
+
+
+def check_definition(name: str, definition: tuple[Constdefs, Fielddefs]) -> None:
+    """Raise `ValueError` unless all names of a definition are names, and its constants plain values."""
+    constants, members = definition
+    _check_type_name(name)
+    if len(constants) + len(members) > _MOST_MEMBERS:
+        raise ValueError(f"{name} has more than {_MOST_MEMBERS} members")
+    names = [*(constant[0] for constant in constants), *(one[0] for one in members)]
+    for member in names:
+        if len(member) > _LONGEST_NAME or not _MEMBER_NAME.fullmatch(member):
+            raise ValueError(f"{member[:_LONGEST_NAME]!a} is not a name of a member")
+    for member, count in Counter(map(normalize_fieldname, names)).items():
+        if count > 1:
+            raise ValueError(f"{name} has the member {member} twice")
+    for member, kind, value in constants:
+        if not _is_plain(value) or not _BASE_NAME.fullmatch(kind):
+            raise ValueError(f"the constant {member} is not a plain value")
+    for member, description in members:
+        node, inner = _innermost(description)
+        if node == Nodetype.NAME:
+            _check_type_name(cast("str", inner))
+        elif not _BASE_NAME.fullmatch(cast("tuple[str, int]", inner)[0]):
+            raise ValueError(f"{member} is of an unknown type")
+
+
+def _check_type_name(name: str) -> None:
+    if len(name) > _LONGEST_NAME or not _TYPE_NAME.fullmatch(name):
+        raise ValueError(f"{name[:_LONGEST_NAME]!a} is not a name of a message type")
+
+
+def _is_plain(value: object) -> bool:
+    if type(value) is int:
+        return value in _INTEGERS
+    return math.isfinite(value) if type(value) is float else type(value) in (bool, str)
+
+
+def _innermost(description: FieldDesc) -> FieldDesc:
+    """The type of the elements of arrays and sequences, of whatever depth."""
+    while description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        description, size = cast("tuple[FieldDesc, int]", description[1])
+        if not 0 <= int(size) <= _LONGEST_ARRAY:
+            raise ValueError(f"an array is longer than {_LONGEST_ARRAY}")
+    return description
+
+
+def _check_size(name: str, types: Typesdict) -> None:
+    """Raise `ValueError` for a type that contains itself, or has more values than any message needs."""
+    sizes: dict[str, int] = {}
+
+    def size_of(description: FieldDesc) -> int:
+        kind, value = description
+        if kind == Nodetype.BASE:
+            return 1
+        if kind == Nodetype.NAME:
+            return size_of_type(cast("str", value))
+        inner, count = cast("tuple[FieldDesc, int]", value)
+        size, fixed = size_of(inner), int(count) if kind == Nodetype.ARRAY else 1
+        if kind == Nodetype.SEQUENCE and size == 0:
+            raise ValueError(f"{name} has a list of elements without content")
+        is_number = inner[0] == Nodetype.BASE and cast("tuple[str, int]", inner[1])[0] not in ("string", "wstring")
+        return size * (min(fixed, 1) if is_number else fixed)  # numbers become one NumPy array
+
+    def size_of_type(current: str) -> int:
+        if current not in sizes:
+            sizes[current] = _MOST_VALUES + 1  # until it is known: a type that contains itself is too large
+            sizes[current] = sum(size_of(description) for _, description in types[current][1])
+        if sizes[current] > _MOST_VALUES:
+            raise ValueError(f"{name} has more than {_MOST_VALUES} values, or contains itself")
+        return sizes[current]
+
+    size_of_type(name)
