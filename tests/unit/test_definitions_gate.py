@@ -50,6 +50,7 @@ def test_what_is_no_name_and_no_number_is_refused(name: str, definition, problem
 
 def test_a_definition_that_is_refused_is_a_problem_of_its_type_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the parser makes of a text."""
+    build_typestore({}, ros1=False)  # reads the shipped definitions once
     evil = {NAME: ([], [("x);import os;(", NUMBER)])}
     monkeypatch.setattr("fgtrack.io.ros.typestore.get_types_from_msg", lambda *of: evil)
     given = {NAME: MessageDefinition(MessageDefinitionFormat.MSG, "float64 x"), "nav_msgs/msg/Odometry": None}
