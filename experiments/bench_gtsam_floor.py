@@ -23,7 +23,7 @@ from bench_tracker import traffic
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.factor_graph import IncrementalBackend
 from fgtrack.estimation.factor_graph.backends.base import Change
-from fgtrack.estimation.smoother_settings import SmootherSettings
+from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.pipeline import build
 from fgtrack.pipeline.clock import Tick
 from fgtrack.pipeline.config import Config

@@ -36,9 +36,9 @@ ESTIMATORS = Registry(
             "iekf-replay": "fgtrack.estimation.iekf:IekfReplay",
             "imm-replay": "fgtrack.estimation.imm:ImmReplay",
             "iplf-replay": "fgtrack.estimation.iplf:IplfReplay",
-            "smoother": "fgtrack.estimation.factor_graph.factories:smoother",
-            "smoother-batch": "fgtrack.estimation.factor_graph.factories:smoother_batch",
-            "smoother-banded": "fgtrack.estimation.banded.smoother:BandedSmoother",
+            "smoother": "fgtrack.estimation.smoothing.gtsam.smoothers:smoother",
+            "smoother-batch": "fgtrack.estimation.smoothing.gtsam.smoothers:smoother_batch",
+            "smoother-banded": "fgtrack.estimation.smoothing.banded:smoother_banded",
             "ukf-replay": "fgtrack.estimation.ukf:UkfReplay",
         },
         OOSM_GROUP: {

@@ -8,10 +8,7 @@ import numpy as np
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import period_ns, seconds
 from fgtrack.estimation.backward_forward import BackwardForwardBank
-from fgtrack.estimation.banded.bank import BandedBank
 from fgtrack.estimation.base import Estimator, Start, TrackBank
-from fgtrack.estimation.factor_graph import BatchBackend, IncrementalBackend, SmootherBank
-from fgtrack.estimation.factor_graph.backends.base import Backend
 from fgtrack.estimation.failures import Failures
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.opening import initiated
@@ -25,6 +22,10 @@ from fgtrack.estimation.published import (
     StalePresent,
 )
 from fgtrack.estimation.registry import estimator_bank
+from fgtrack.estimation.smoothing.bank import MakeSolver, SmootherBank
+from fgtrack.estimation.smoothing.gtsam.batch import BatchSolver
+from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
+from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.models.areas import ExclusionAreas
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.published_map import CircularHeadingMap, PublishedMap
@@ -143,22 +144,18 @@ def _build_backward_forward(config: Config, failures: Failures) -> TrackBank:
     return ObjectBank(motion, one, config.filter.storage_s)
 
 
-def _smoother(make_backend: Callable[[], Backend]) -> Callable[[Config, Failures], TrackBank]:
+def _smoother(make_solver: MakeSolver) -> Callable[[Config, Failures], TrackBank]:
     return lambda config, failures: SmootherBank(
-        config.motion_model(), config.smoother, make_backend, config.initiation.method, failures
+        config.motion_model(), config.smoother, make_solver, config.initiation.method, failures
     )
-
-
-def _build_banded(config: Config, failures: Failures) -> TrackBank:
-    return BandedBank(config.motion_model(), config.smoother, config.initiation.method, failures)
 
 
 #: Banks that are built from settings of their own.
 _BANKS: Mapping[str, Callable[[Config, Failures], TrackBank]] = {
     "ekf-backward-forward": _build_backward_forward,
-    "smoother": _smoother(IncrementalBackend),
-    "smoother-batch": _smoother(BatchBackend),
-    "smoother-banded": _build_banded,
+    "smoother": _smoother(IncrementalSolver),
+    "smoother-batch": _smoother(BatchSolver),
+    "smoother-banded": _smoother(Solver),
 }
 
 

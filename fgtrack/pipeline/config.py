@@ -8,7 +8,7 @@ from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat, Posi
 
 from fgtrack.estimation.initiation import DEFAULT, Initiation
 from fgtrack.estimation.registry import ESTIMATORS, Claims, motion_model
-from fgtrack.estimation.smoother_settings import SmootherSettings
+from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.io.config import InputConfig
 from fgtrack.io.errors import MOST_SENSORS
 from fgtrack.io.run import EvaluationConfig

@@ -11,7 +11,7 @@ import numpy as np
 
 from fgtrack.core.time import seconds
 from fgtrack.core.types import DetectionList, FloatArray
-from fgtrack.estimation.smoother_settings import SmootherSettings
+from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.pipeline.config import ClockConfig, Config, FilterConfig, MotionConfig
 
 __all__ = ["Revisits", "for_slow_revisits"]

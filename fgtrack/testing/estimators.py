@@ -13,7 +13,7 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, UpdateResult, UpdateStatus
 from fgtrack.estimation.registry import ESTIMATORS, EXACT, Claims, Factory
-from fgtrack.estimation.terms import NEAR_NS
+from fgtrack.estimation.smoothing.terms import NEAR_NS
 from fgtrack.models.motion import MotionModel
 from fgtrack.testing.banks import (
     gives_each_of_several_objects_what_it_gives_one_alone,

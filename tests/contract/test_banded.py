@@ -15,7 +15,7 @@ from fgtrack.estimation.banded.smoother import BandedSmoother
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
 from fgtrack.estimation.factor_graph import SmootherBank
 from fgtrack.estimation.registry import estimator
-from fgtrack.estimation.smoother_settings import SmootherSettings
+from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss

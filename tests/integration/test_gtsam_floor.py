@@ -11,7 +11,7 @@ import bench_gtsam_floor as floor
 from bench_tracker import traffic
 
 from fgtrack.estimation.factor_graph.backends.base import Change
-from fgtrack.estimation.smoother_settings import SmootherSettings
+from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.motion import CTRV
 
 

@@ -13,7 +13,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother
 from fgtrack.estimation.factor_graph.window import Window
 from fgtrack.estimation.failures import Failure
-from fgtrack.estimation.smoother_settings import SmootherSettings
+from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CV
 

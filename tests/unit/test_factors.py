@@ -15,7 +15,7 @@ from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother, IncrementalBackend, SmootherSettings
 from fgtrack.estimation.factor_graph.factors import measurement_factor, motion_factor, prior_factor
-from fgtrack.estimation.terms import EquivalentMeasurement, MeasurementTerm, curved
+from fgtrack.estimation.smoothing.terms import EquivalentMeasurement, MeasurementTerm, curved
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
 from fgtrack.models.robust import penalty, weight

@@ -14,7 +14,7 @@ from fgtrack.estimation.factor_graph.backends.base import Change
 from fgtrack.estimation.factor_graph.backends.incremental import IncrementalBackend
 from fgtrack.estimation.factor_graph.rows import Factor, PriorOf, Segment, Term
 from fgtrack.estimation.marginalised_past import Prior
-from fgtrack.estimation.terms import EquivalentMeasurement
+from fgtrack.estimation.smoothing.terms import EquivalentMeasurement
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.sensors import RobustLoss

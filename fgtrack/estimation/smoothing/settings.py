@@ -15,7 +15,7 @@ from fgtrack.models.motion import MotionModel
 _NEVER = 1e9
 
 _RELINEARISE = {"yaw_rad": 0.02, "speed_mps": 1.0, "yaw_rate_radps": 0.05, "accel_mps2": 1.0}
-_CURVED = {"x_m": 0.05, "y_m": 0.05, "vx_mps": 0.2, "vy_mps": 0.2}
+_NONLINEAR = {"x_m": 0.05, "y_m": 0.05, "vx_mps": 0.2, "vy_mps": 0.2}
 
 
 @dataclass(frozen=True)
@@ -74,11 +74,11 @@ class SmootherSettings:
                 "lengthen smoother.lag_s, or set smoother.late to fuse or drop"
             )
 
-    def thresholds(self, motion: MotionModel, curved: bool) -> FloatArray:
+    def thresholds(self, motion: MotionModel, nonlinear: bool) -> FloatArray:
         """Relinearisation thresholds of the state of `motion`, shape (n,).
 
-        Motion models are linear in the position. `curved` says that some measurement is not, or has a robust loss:
-        then the position has a threshold as well. Where all is linear, nothing has one.
+        Motion models are linear in the position. If some measurement is `nonlinear`, or has a robust loss, the position
+        has a threshold as well. Where all is linear, nothing has one.
         """
-        named = {**(_CURVED if curved else {}), **self.relinearise} if curved or not motion.linear else {}
+        named = {**_NONLINEAR, **self.relinearise} if nonlinear else {} if motion.linear else self.relinearise
         return np.array([named.get(name, _NEVER) for name in motion.state_names])

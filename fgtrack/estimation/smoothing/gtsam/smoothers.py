@@ -1,13 +1,13 @@
-"""The smoother of one object, by name."""
+"""The smoothers of one object that gtsam solves, by name."""
 
-from collections.abc import Callable
 from typing import Any
 
 from fgtrack.estimation.base import Start
-from fgtrack.estimation.factor_graph.backends.batch import BatchBackend
-from fgtrack.estimation.factor_graph.smoother import FixedLagSmoother
 from fgtrack.estimation.initiation import DEFAULT
-from fgtrack.estimation.smoother_settings import SmootherSettings
+from fgtrack.estimation.smoothing.bank import FixedLagSmoother
+from fgtrack.estimation.smoothing.gtsam.batch import BatchSolver
+from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
+from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
 
 
@@ -17,7 +17,7 @@ def smoother(
 ) -> FixedLagSmoother:
     """Fixed-lag smoother, a factor graph that iSAM2 solves incrementally."""
     settings = SmootherSettings.of_options(lag_s, options)
-    return FixedLagSmoother(motion, start, settings, initiation=initiation)
+    return FixedLagSmoother(motion, start, settings, IncrementalSolver, initiation)
 
 
 def smoother_batch(
@@ -25,21 +25,10 @@ def smoother_batch(
 ) -> FixedLagSmoother:
     """Fixed-lag smoother, a factor graph that Levenberg-Marquardt solves anew at every update: slow, for checks."""
     settings = SmootherSettings.of_options(lag_s, options)
-    return FixedLagSmoother(motion, start, settings, BatchBackend, initiation)
+    return FixedLagSmoother(motion, start, settings, BatchSolver, initiation)
 
 
-def _claim(factory: Callable[..., FixedLagSmoother], rounding: float, tolerance: float = 1e-9) -> None:
-    """See `registry.Claims`."""
-    vars(factory).update(
-        exact="any lag, any number",
-        nonlinear="at convergence",
-        smooths=True,
-        initiates=True,
-        tolerance=tolerance,
-        rounding=rounding,
-    )
-
-
-_claim(smoother, rounding=1.0)
+_EXACT = {"exact": "any lag, any number", "nonlinear": "at convergence", "smooths": True, "initiates": True}
+vars(smoother).update(_EXACT, rounding=1.0)
 # Levenberg-Marquardt compares errors at absolute positions: eps W of 50 m instead of the standard deviation, 0.5 m.
-_claim(smoother_batch, rounding=100.0, tolerance=1e-6)
+vars(smoother_batch).update(_EXACT, rounding=100.0, tolerance=1e-6)

@@ -42,6 +42,23 @@ def _mirror(lower: FloatArray) -> None:
 
 
 @inlined
+def cholesky(matrix: FloatArray, n: int, L: FloatArray) -> bool:
+    """Write the lower Cholesky factor of the leading n rows and columns to `L`; False if there is none."""
+    for i in range(n):
+        for j in range(i + 1):
+            value = matrix[i, j]
+            for m in range(j):
+                value -= L[i, m] * L[j, m]
+            if i > j:
+                L[i, j] = value / L[j, j]
+            elif value > 0.0:
+                L[i, i] = np.sqrt(value)
+            else:
+                return False
+    return True
+
+
+@inlined
 def _solve(matrix: FloatArray, rhs: FloatArray) -> bool:
     """Gaussian elimination with pivots, as LAPACK's gesv; the solution replaces `rhs`. False if there is none."""
     n = matrix.shape[0]
@@ -149,10 +166,14 @@ def _correct(
     _mirror(state[:, :n])
 
 
-@njit(f"b1(int64[:], int64[:], {_WINDOWS}, {VECTORS}, {MATRICES}, {MATRICES}, {TRACKS}, {', '.join([MATRICES] * 4)})")
+@njit(
+    f"b1(int64[:], int64[:], int64[:], {_WINDOWS}, {VECTORS}, {MATRICES}, {MATRICES}, {TRACKS},"
+    f" {', '.join([MATRICES] * 4)})"
+)
 def eliminate(
     tracks: IntArray,
-    places: IntArray,
+    starts: IntArray,
+    ends: IntArray,
     first: IntArray,
     count: IntArray,
     numbers: IntArray,
@@ -165,15 +186,15 @@ def eliminate(
     back: FloatArray,
     C: FloatArray,
 ) -> bool:
-    """Eliminate the nodes of `tracks` from `places` on, one each; True if all is finite."""
+    """Eliminate the nodes of `tracks` from `starts` up to before `ends`; True if all is finite."""
     n = origin.shape[1]
     A, E, P, product, gain = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(n)
     for t in range(len(tracks)):
         track = tracks[t]
-        for place in range(places[t], count[track]):
-            at = numbers[track, place]
-            if place > first[track]:  # else the prior of the oldest node in the window, which follows from nothing
-                before = numbers[track, place - 1]
+        for index in range(starts[t], min(ends[t], count[track])):
+            at = numbers[track, index]
+            if index > first[track]:  # else the prior of the oldest node in the window, which follows from nothing
+                before = numbers[track, index - 1]
                 _predict(filtered[before], segment[before], origin[at], A, predicted[at])
                 if not _condition(
                     filtered[before], segment[before], predicted[at], A, E, product, back[before], C[before]
@@ -188,41 +209,56 @@ def eliminate(
     return True
 
 
-@njit(f"void(int64[:], {_WINDOWS}, {VECTORS}, {TRACKS}, {MATRICES}, {MATRICES}, {VECTORS}, b1[::1], b1[::1])")
-def solve_means(
+@njit(f"void(int64[:], {_WINDOWS}, {MATRICES}, {MATRICES}, {VECTORS})")
+def back_substitute(
     tracks: IntArray,
     first: IntArray,
     count: IntArray,
     numbers: IntArray,
-    thresholds: FloatArray,
-    anchored: IntArray,
     filtered: FloatArray,
     back: FloatArray,
     step: FloatArray,
-    far: BoolArray,
-    any_far: BoolArray,
 ) -> None:
-    """Find `step` of the nodes in the windows, and mark with `far` those longer than `thresholds` (tracks, n).
-
-    The first `anchored` nodes of each window are never marked.
-    """
+    """Write `step` of the nodes in the windows: A (step of the next node) + b."""
     n = step.shape[1]
     for track in tracks:
-        any_far[track] = False
         later = -1
-        for place in range(count[track] - 1, first[track] - 1, -1):
-            at = numbers[track, place]
-            too_long = False
+        for index in range(count[track] - 1, first[track] - 1, -1):
+            at = numbers[track, index]
             for i in range(n):
                 value = filtered[at, i, n] if later < 0 else back[at, i, n]
                 if later >= 0:
                     for j in range(n):
                         value += back[at, i, j] * step[later, j]
                 step[at, i] = value
-                too_long |= abs(value) > thresholds[track, i]
-            far[at] = too_long and place >= first[track] + anchored[track]
-            any_far[track] |= far[at]
             later = at
+
+
+@njit(f"void(int64[:], {_WINDOWS}, {VECTORS}, {TRACKS}, {VECTORS}, b1[::1], b1[::1])")
+def mark_far(
+    tracks: IntArray,
+    first: IntArray,
+    count: IntArray,
+    numbers: IntArray,
+    thresholds: FloatArray,
+    anchored: IntArray,
+    step: FloatArray,
+    far: BoolArray,
+    any_far: BoolArray,
+) -> None:
+    """Mark with `far` the nodes in the windows with a `step` longer than `thresholds` (tracks, n).
+
+    The first `anchored` nodes of each window are never marked.
+    """
+    for track in tracks:
+        any_far[track] = False
+        for index in range(first[track], count[track]):
+            at = numbers[track, index]
+            too_long = False
+            for i in range(step.shape[1]):
+                too_long |= abs(step[at, i]) > thresholds[track, i]
+            far[at] = too_long and index >= first[track] + anchored[track]
+            any_far[track] |= far[at]
 
 
 @njit(f"int64(int64[:], {_WINDOWS}, {TRACKS}, b1[::1], b1[::1], {TRACKS}, {TRACKS})")
@@ -235,16 +271,16 @@ def find_far(
     far: BoolArray,
     any_far: BoolArray,
     rows: IntArray,
-    places: IntArray,
+    indices: IntArray,
 ) -> int:
-    """Write the marked nodes as rows of `tracks` and places; return their number."""
+    """Write the marked nodes as rows of `tracks` and `indices`; return their number."""
     num = 0
     for t in range(len(tracks)):
         track = tracks[t]
         if any_far[track]:
-            for place in range(first[track] + anchored[track], count[track]):
-                if far[numbers[track, place]]:
-                    rows[num], places[num] = t, place
+            for index in range(first[track] + anchored[track], count[track]):
+                if far[numbers[track, index]]:
+                    rows[num], indices[num] = t, index
                     num += 1
     return num
 
@@ -255,7 +291,7 @@ def find_far(
 )
 def smoothed(
     tracks: IntArray,
-    places: IntArray,
+    indices: IntArray,
     known: IntArray,
     first: IntArray,
     count: IntArray,
@@ -268,29 +304,29 @@ def smoothed(
     steps: FloatArray,
     covariances: FloatArray,
 ) -> None:
-    """Write `steps` and `covariances` of the nodes at `places`; those computed on the way stay in `step` and `P`.
+    """Write `steps` and `covariances` of the nodes at `indices`; those computed on the way stay in `step` and `P`.
 
-    From the places `known` on covariances are known.
+    From index `known` on covariances are known.
     """
     n = step.shape[1]
     product = np.empty((n, n))
     for t in range(len(tracks)):
         track = tracks[t]
-        for place in range(known[track] - 1, places[t] - 1, -1):
-            at = numbers[track, place]
-            if place == count[track] - 1:
+        for index in range(known[track] - 1, indices[t] - 1, -1):
+            at = numbers[track, index]
+            if index == count[track] - 1:
                 P[at] = filtered[at, :, :n]
                 continue
-            later = numbers[track, place + 1]
+            later = numbers[track, index + 1]
             P[at] = C[at]
             _congruence(back[at, :, :n], P[later], product, P[at])
             _mirror(P[at])
-            if place < first[track]:  # behind the window
+            if index < first[track]:  # behind the window
                 for i in range(n):
                     value = back[at, i, n]
                     for j in range(n):
                         value += back[at, i, j] * step[later, j]
                     step[at, i] = value
-        known[track] = min(known[track], places[t])
-        at = numbers[track, places[t]]
+        known[track] = min(known[track], indices[t])
+        at = numbers[track, indices[t]]
         steps[t], covariances[t] = step[at], P[at]

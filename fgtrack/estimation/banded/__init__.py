@@ -1,1 +1,0 @@
-"""Sliding windows of all tracks, solved together by NumPy and LAPACK: no import of gtsam."""

@@ -1,1 +1,0 @@
-"""What solves the window: a protocol and its implementations on gtsam."""

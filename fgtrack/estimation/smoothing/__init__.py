@@ -1,0 +1,1 @@
+"""Sliding windows of states at the stamps of the measurements, smoothed together."""

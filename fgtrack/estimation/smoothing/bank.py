@@ -1,0 +1,385 @@
+"""The fixed-lag smoothers of all objects, and that of one."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import compress
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.time import nanoseconds
+from fgtrack.core.types import BoolArray, FloatArray, IntArray, SmoothedReport, TrackState
+from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
+from fgtrack.estimation.birth import initial_state
+from fgtrack.estimation.failures import Failure, Failures
+from fgtrack.estimation.histories import grown
+from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
+from fgtrack.estimation.present import PresentStates, smoothed_reports
+from fgtrack.estimation.propagation import track_state
+from fgtrack.estimation.smoothing.settings import SmootherSettings
+from fgtrack.estimation.smoothing.solver import Solver
+from fgtrack.estimation.smoothing.terms import Innovations
+from fgtrack.estimation.smoothing.windows import States, Windows
+from fgtrack.models.motion import MotionModel
+
+MakeSolver = Callable[[MotionModel, SmootherSettings], Solver]
+
+_TOO_OLD, _FAILED = UpdateResult(UpdateStatus.TOO_OLD), UpdateResult(UpdateStatus.FAILED)
+
+
+class _Times(NamedTuple):
+    """Stamps of m tracks, each of shape (m,)."""
+
+    newest: IntArray
+    """Of the newest nodes."""
+    start: IntArray
+    """Where the windows start, by the clock and the newest stamps."""
+    reach: IntArray
+    """The oldest that may be fused."""
+    oldest: IntArray
+    """The oldest that can be fused or asked for."""
+
+    def at(self, tracks: IntArray) -> "_Times":
+        """Return those of some tracks."""
+        return _Times(*(values[tracks] for values in self))
+
+
+class _Known(NamedTuple):
+    """Tracks that are known at a stamp."""
+
+    track_ids: tuple[int, ...]
+    tracks: IntArray
+    """Rows of the arrays."""
+    states: States
+
+
+class SmootherBank:
+    """The fixed-lag smoothers of all objects, whose windows are in arrays; see `TrackBank`.
+
+    Parameters
+    ----------
+    motion
+        The motion model of all objects.
+    settings
+        Window, late policy, relinearisation and outputs.
+    make_solver
+        Makes what solves the windows: `Solver`, or one of `smoothing.gtsam`.
+    initiation
+        How the direction of travel of a new object is found where nothing else gives one, see `Initiation`.
+    failures
+        Counts how often windows are built anew and steps are damped.
+    """
+
+    def __init__(
+        self,
+        motion: MotionModel,
+        settings: SmootherSettings,
+        make_solver: MakeSolver = Solver,
+        initiation: str = DEFAULT,
+        failures: Failures | None = None,
+    ) -> None:
+        self._motion = motion
+        self._settings = settings
+        self._lag_ns, self._behind_ns = nanoseconds(settings.lag_s), nanoseconds(settings.behind_s)
+        self.windows = Windows(make_solver(motion, settings), settings.final, failures or Failures())
+        self._tracks: dict[int, int] = {}
+        """Row of the arrays that holds each track, by track id in order of birth."""
+        self._free: list[int] = []
+        self._now_ns = 0
+        self._clock_ns: IntArray = np.zeros(0, dtype=np.int64)
+        self._first_ns: IntArray = np.zeros(0, dtype=np.int64)
+        self._initiation = checked_initiation(initiation)
+        self._searches: dict[int, Search] = {}
+        """Of the tracks whose direction is sought, by row."""
+        self._known: dict[int, _Known] = {}
+        """By stamp, until something changes."""
+        self._known_times: _Times | None = None
+        """Of all rows, until something changes."""
+        self._final: dict[int, list[TrackState]] = {}
+        """States of nodes that have left, by row."""
+        self._ended: list[SmoothedReport] = []
+
+    # --- a `TrackBank`
+
+    @property
+    def present_ns(self) -> int:
+        """See `TrackBank.present_ns`."""
+        return self._now_ns
+
+    @property
+    def window_start_ns(self) -> int:
+        """See `TrackBank.window_start_ns`; where late measurements are an error, they must come as far as here."""
+        return 0 if self._settings.late == "raise" else self._oldest_ns
+
+    @property
+    def _oldest_ns(self) -> int:
+        return self._now_ns - self._lag_ns - self._behind_ns
+
+    @property
+    def track_ids(self) -> tuple[int, ...]:
+        """See `TrackBank.track_ids`."""
+        return tuple(self._tracks)
+
+    def advance(self, now_ns: int) -> None:
+        """See `TrackBank.advance`; the nodes that leave are marginalised at the next update."""
+        self._now_ns = now_ns
+        self._clock_ns = np.maximum(self._clock_ns, now_ns)
+        self._changed()  # which tracks are known at a stamp depends on the clock
+
+    def states_at(self, stamp_ns: int) -> StatesAt:
+        """See `TrackBank.states_at`. Raises `DataError` for a stamp before the window where the policy is `raise`."""
+        self._settings.refuse_older(stamp_ns, self._oldest_ns)
+        known = self._known_at(stamp_ns)
+        return StatesAt(known.track_ids, *known.states) if known.track_ids else no_states(self._motion.dim)
+
+    def update(
+        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+    ) -> list[UpdateResult]:
+        """See `TrackBank.update`."""
+        tracks = np.array([self._tracks[track_id] for track_id in track_ids], dtype=np.int64)
+        times = self._times().at(tracks)
+        self._settings.refuse_older(stamp_ns, int(times.start.max(initial=stamp_ns)))
+        results = [_TOO_OLD] * len(tracks)
+        rows = (times.oldest <= stamp_ns).nonzero()[0]
+        if not rows.size:
+            return results
+        chosen = [measurements[row].seen_by(self._motion) for row in rows.tolist()]
+        known = self._known_at(stamp_ns)
+        position = np.zeros(len(self._clock_ns), dtype=np.int64)
+        position[known.tracks] = np.arange(len(known.tracks))
+        means, covariances = (values[position[tracks[rows]]] for values in known.states)
+        innovations = Innovations.of(chosen, means, covariances)
+        is_fused = np.isfinite(innovations.nis)
+        self._fuse(stamp_ns, tracks[rows], chosen, innovations, means, times.at(rows), is_fused)
+        given = zip(
+            *(values.tolist() for values in (rows, is_fused, times.start[rows], times.newest[rows])), strict=True
+        )
+        for k, (row, fused, start_ns, newest_ns) in enumerate(given):
+            results[row] = innovations.result(k, _status(stamp_ns, start_ns, newest_ns)) if fused else _FAILED
+        return results
+
+    def birth(self, track_id: int, prior: Start) -> None:
+        """See `TrackBank.birth`."""
+        track = self._free.pop() if self._free else len(self._tracks)
+        self.windows.solver.begin(track, prior.stamp_ns, *initial_state(self._motion, prior))
+        if track >= len(self._clock_ns):
+            size = len(self.windows.nodes.first)
+            self._clock_ns, self._first_ns = grown(self._clock_ns, size), grown(self._first_ns, size)
+        self._clock_ns[track] = self._first_ns[track] = prior.stamp_ns
+        self._searches.pop(track, None)
+        search = Search.of(self._motion, prior, self._initiation)
+        if search is not None:
+            self._searches[track] = search
+        self._tracks[track_id] = track
+        self._changed()
+
+    def remove(self, track_id: int) -> None:
+        """See `TrackBank.remove`; what was still inside the window becomes final."""
+        self._ended += self._reports([(track_id, state) for state in self.take_rest(track_id)])
+        self._free.append(self._tracks.pop(track_id))
+        self._changed()
+
+    def present(self) -> list[TrackState]:
+        """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
+        if not self._tracks:
+            return []
+        tracks = self._all_tracks()
+        states = self.windows.states_at(tracks, np.maximum(self._now_ns, self._times().oldest[tracks]))
+        return PresentStates(self._motion, self._now_ns, *states)
+
+    def smoothed(self) -> list[SmoothedReport]:
+        """See `TrackBank.smoothed`."""
+        reports, self._ended = self._ended, []
+        reports += self._reports(
+            [(track_id, state) for track_id, track in self._tracks.items() for state in self._final.get(track, ())]
+        )
+        self._final.clear()
+        for lag_s in self._settings.lagged_s:
+            stamp_ns = self._now_ns - nanoseconds(lag_s)
+            states = self.states_at(stamp_ns)
+            stamps_ns = [stamp_ns] * len(states.track_ids)
+            reports += smoothed_reports(
+                self._motion, states.track_ids, stamps_ns, states.means, states.covariances, lag_s
+            )
+        return reports
+
+    def _reports(self, states: Sequence[tuple[int, TrackState]]) -> list[SmoothedReport]:
+        if not states:
+            return []
+        track_ids, final = zip(*states, strict=True)
+        means, covariances = np.array([each.mean for each in final]), np.array([each.covariance for each in final])
+        return smoothed_reports(self._motion, track_ids, [each.stamp_ns for each in final], means, covariances)
+
+    # --- one track
+
+    def window_ns(self, track_id: int) -> tuple[int, int]:
+        """See `Estimator.window_ns`."""
+        times, track = self._times(), self._tracks[track_id]
+        return int(times.oldest[track]), int(times.newest[track])
+
+    def state_at(self, track_id: int, stamp_ns: int) -> TrackState:
+        """See `Estimator.state_at`."""
+        states = self.windows.states_at(np.array([self._tracks[track_id]]), np.array([stamp_ns]))
+        return track_state(self._motion, stamp_ns, states.means[0], states.covariances[0])
+
+    def take_final(self, track_id: int) -> list[TrackState]:
+        """Smoothed states of the nodes that have left the window since the last call, in order."""
+        return self._final.pop(self._tracks[track_id], [])
+
+    def take_rest(self, track_id: int) -> list[TrackState]:
+        """Like `take_final`, and of the nodes that are still inside."""
+        if not self._settings.final:
+            return []
+        stamps_ns = self.windows.nodes.window_stamps_ns(self._tracks[track_id]).tolist()
+        return self.take_final(track_id) + [self.state_at(track_id, stamp_ns) for stamp_ns in stamps_ns]
+
+    def converge(self, track_id: int, max_iterations: int) -> None:
+        """Relinearise a track until nothing moves; for comparisons."""
+        self.windows.solver.converge(self._tracks[track_id], max_iterations)
+        self._changed()
+
+    # --- inside
+
+    def _fuse(
+        self,
+        stamp_ns: int,
+        tracks: IntArray,
+        measurements: Sequence[Measurement],
+        innovations: Innovations,
+        guesses: FloatArray,
+        times: _Times,
+        is_fused: BoolArray,
+    ) -> None:
+        """Fuse those of `measurements` that `is_fused` marks; unmark those that cannot be."""
+        rows = is_fused.nonzero()[0]
+        if not rows.size:
+            return
+        self._changed()
+        chosen = [measurements[row] for row in rows.tolist()]
+        of, reach = tracks[rows], (times.start[rows], times.reach[rows])
+        try:
+            left = self.windows.fuse(of, stamp_ns, chosen, innovations.at(is_fused), guesses[rows], *reach)
+        except np.linalg.LinAlgError:
+            if len(rows) == 1:
+                self.windows.failures.add(Failure.GRAPH_REBUILT)
+                is_fused[rows] = False
+                return
+            for row in rows.tolist():
+                alone = np.arange(len(tracks)) == row
+                self._fuse(stamp_ns, tracks, measurements, innovations, guesses, times, alone)
+                is_fused[row] = alone[row]
+            return
+        for track, left_ns, mean, covariance in zip(
+            left.tracks.tolist(), left.stamps_ns.tolist(), *left.states, strict=True
+        ):
+            self._final.setdefault(track, []).append(track_state(self._motion, left_ns, mean, covariance))
+        for track in self._searches.keys() & set(of.tolist()):
+            self._initiate(track, stamp_ns)
+        self.windows.damp(of)
+        self.windows.solver.iterate(of, self._settings.max_iterations - 1)
+
+    def _initiate(self, track: int, oldest_ns: int) -> None:
+        """Begin again from a straight line, where the oldest new stamp asks for it, as long as nothing has left."""
+        if not self.windows.nothing_marginalised(track):
+            del self._searches[track]
+            return
+        following = self._searches[track].next_line(partial(self.windows.fixes, track), oldest_ns)
+        if following is not None:
+            line, self._searches[track] = following
+            self.windows.restart(track, line)
+            self.windows.solver.iterate(np.array([track]), SMOOTHER_ITERATIONS)
+
+    def _changed(self) -> None:
+        """Forget what was computed of the states."""
+        self._known.clear()
+        self._known_times = None
+
+    def _all_tracks(self) -> IntArray:
+        return np.fromiter(self._tracks.values(), dtype=np.int64, count=len(self._tracks))
+
+    def _times(self) -> _Times:
+        """Return the times of all rows."""
+        if self._known_times is None:
+            rows = np.arange(len(self._clock_ns))
+            newest, first = self.windows.newest_ns(rows), self._first_ns
+            start = np.maximum(np.maximum(self._clock_ns, newest) - self._lag_ns, first)
+            reach = np.maximum(start - self._behind_ns, first)
+            self._known_times = _Times(newest, start, reach, np.maximum(reach, self.windows.oldest_ns(rows)))
+        return self._known_times
+
+    def _known_at(self, stamp_ns: int) -> _Known:
+        """Return the tracks that are known at `stamp_ns`, in order of birth."""
+        known = self._known.get(stamp_ns)
+        if known is None:
+            tracks = self._all_tracks()
+            is_known = self._times().oldest[tracks] <= stamp_ns
+            track_ids = tuple(compress(self._tracks, is_known.tolist()))
+            tracks = tracks[is_known]
+            states = self.windows.states_at(tracks, np.full(len(tracks), stamp_ns))
+            known = self._known[stamp_ns] = _Known(track_ids, tracks, states)
+        return known
+
+
+def _status(stamp_ns: int, start_ns: int, newest_ns: int) -> UpdateStatus:
+    """Status of a measurement that is fused in a window that begins and ends there."""
+    if stamp_ns < start_ns:
+        return UpdateStatus.BEYOND_WINDOW
+    return UpdateStatus.OUT_OF_SEQUENCE if stamp_ns < newest_ns else UpdateStatus.IN_SEQUENCE
+
+
+class FixedLagSmoother:
+    """The fixed-lag smoother of one object; see `Smoother`.
+
+    Measurements may arrive in any order: each is fused at a node at its own stamp. The oldest node is the newest one
+    at or before the window's start, so every stamp inside the window has a left neighbour.
+
+    Parameters
+    ----------
+    motion
+        Motion model; its process noise composes, so a late measurement may split a segment.
+    start
+        First state; nothing older than it can be fused.
+    settings, make_solver, initiation, failures
+        See `SmootherBank`.
+    """
+
+    def __init__(
+        self,
+        motion: MotionModel,
+        start: Start,
+        settings: SmootherSettings,
+        make_solver: MakeSolver = Solver,
+        initiation: str = DEFAULT,
+        failures: Failures | None = None,
+    ) -> None:
+        self.bank = SmootherBank(motion, settings, make_solver, initiation, failures)
+        self.bank.birth(0, start)
+
+    @property
+    def window_ns(self) -> tuple[int, int]:
+        """See `Estimator.window_ns`."""
+        return self.bank.window_ns(0)
+
+    def advance(self, now_ns: int) -> None:
+        """See `Estimator.advance`; the nodes that leave are marginalised at the next update."""
+        self.bank.advance(now_ns)
+
+    def update(self, measurement: Measurement) -> UpdateResult:
+        """See `Estimator.update`."""
+        return self.bank.update(measurement.stamp_ns, [0], [measurement])[0]
+
+    def state_at(self, stamp_ns: int) -> TrackState:
+        """See `Estimator.state_at`: smoothed in the past, interpolated under the motion model, predicted ahead."""
+        return self.bank.state_at(0, stamp_ns)
+
+    def take_final(self) -> list[TrackState]:
+        """Smoothed states of the nodes that have left the window since the last call, in order."""
+        return self.bank.take_final(0)
+
+    def take_rest(self) -> list[TrackState]:
+        """Like `take_final`, and of the nodes that are still inside: for when the track ends."""
+        return self.bank.take_rest(0)
+
+    def converge(self, max_iterations: int = 50) -> None:
+        """Relinearise until nothing moves; for comparisons."""
+        self.bank.converge(0, max_iterations)

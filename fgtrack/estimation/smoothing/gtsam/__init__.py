@@ -1,0 +1,1 @@
+"""Windows that gtsam solves as factor graphs: the only importer of gtsam."""

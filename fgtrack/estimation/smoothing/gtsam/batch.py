@@ -1,0 +1,136 @@
+"""The slow check: Levenberg-Marquardt on the whole window at every update, with factors that call the models."""
+
+from collections.abc import Callable, Mapping
+from typing import ClassVar
+
+import gtsam
+import numpy as np
+from gtsam.noiseModel import mEstimator
+from scipy.linalg.lapack import dtrtri
+
+from fgtrack.core.linalg import identity, inverse_roots, noise_roots
+from fgtrack.core.time import seconds
+from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.estimation.smoothing.gtsam.graph_solver import GraphSolver
+from fgtrack.estimation.smoothing.settings import SmootherSettings
+from fgtrack.estimation.smoothing.terms import (
+    EquivalentMeasurement,
+    MeasurementTerm,
+    is_nonlinear,
+    linearised,
+    whitened,
+)
+from fgtrack.models.motion import MotionModel
+
+_Loss = mEstimator.Huber | mEstimator.Cauchy | mEstimator.Tukey | mEstimator.GemanMcClure | mEstimator.DCS
+
+_LOSSES: Mapping[str, Callable[[float], _Loss]] = {
+    "huber": mEstimator.Huber.Create,
+    "cauchy": mEstimator.Cauchy.Create,
+    "tukey": mEstimator.Tukey.Create,
+    "geman_mcclure": mEstimator.GemanMcClure.Create,
+    "dcs": lambda width: mEstimator.DCS.Create(width * width),  # gtsam's is in squared standard deviations
+}
+
+
+class BatchSolver(GraphSolver):
+    """Windows that are solved from their last estimates. What leaves them is replaced by the prior that it gives.
+
+    Process noise stays that of the linearisation point; all else is linearised anew at every step.
+    """
+
+    is_damped: ClassVar[bool] = True
+
+    def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
+        super().__init__(motion, settings)
+        self._solved: dict[int, tuple[gtsam.NonlinearFactorGraph, gtsam.Values]] = {}
+
+    def optimise(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+        """Return the values near `values` with the least error."""
+        params = gtsam.LevenbergMarquardtParams()
+        params.setLinearSolverType("MULTIFRONTAL_QR")
+        params.setRelativeErrorTol(1e-12)
+        params.setAbsoluteErrorTol(1e-12)
+        return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+
+    def _update(self, tracks: IntArray, starts: IntArray) -> None:
+        nodes = self.nodes
+        for track in tracks.tolist():
+            graph, values = self._graph(track), gtsam.Values()
+            _, last = self._solved.get(track, (None, values))
+            numbers = nodes.window(track).tolist()
+            for number in numbers:
+                values.insert(number, last.atVector(number) if last.exists(number) else nodes.origin[number])
+            values = self.optimise(graph, values)
+            self._solved[track] = graph, values
+            for number in numbers:
+                nodes.step[number] = values.atVector(number) - nodes.origin[number]
+
+    def _covariance(self, track: int, *numbers: int) -> FloatArray:
+        """See `GraphSolver._covariance`; from one dense QR of the whole linearised window."""
+        graph, values = self._solved[track]
+        ordering, n = gtsam.Ordering(), self.motion.dim
+        for number in (*sorted(set(values.keys()).difference(numbers)), *numbers):
+            ordering.push_back(number)
+        A, _ = graph.linearize(values).jacobian(ordering)
+        R, size = np.asarray(np.linalg.qr(A, mode="r")), n * len(numbers)
+        root = dtrtri(R[-size:, -size:])[0]
+        return np.asarray(root @ root.T)
+
+    def _forget(self, track: int) -> None:
+        self._solved.pop(track, None)
+
+    def _graph(self, track: int) -> gtsam.NonlinearFactorGraph:
+        """Return the factors of a window as functions of the states."""
+        nodes, n = self.nodes, self.motion.dim
+        graph, numbers = gtsam.NonlinearFactorGraph(), nodes.window(track).tolist()
+        prior = nodes.predicted[numbers[0]]
+        noise = gtsam.noiseModel.Gaussian.Covariance(prior[:, :n])
+        graph.add(gtsam.PriorFactorVector(numbers[0], nodes.origin[numbers[0]] + prior[:, n], noise))
+        for left, right, dt_ns in zip(
+            numbers, numbers[1:], np.diff(nodes.window_stamps_ns(track)).tolist(), strict=False
+        ):
+            graph.add(motion_factor(self.motion, left, right, seconds(dt_ns), nodes.segment[left, :, n : 2 * n]))
+        for number in numbers:
+            for term in nodes.terms[number]:
+                graph.add(measurement_factor(number, term, nodes.origin[number]))
+        return graph
+
+
+def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float, Q: FloatArray) -> gtsam.NonlinearFactor:
+    """Return the factor of the motion from the state at key `left` to that at `right`, with noise Q (n, n)."""
+
+    def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
+        mean, F, _ = motion.transition(values.atVector(left), dt_s)
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = -F, identity(motion.dim)
+        return np.subtract(values.atVector(right), mean)
+
+    return gtsam.CustomFactor(_gaussian(noise_roots(Q)), [left, right], error)
+
+
+def measurement_factor(key: int, term: MeasurementTerm, origin: FloatArray) -> gtsam.NonlinearFactor:
+    """Return the factor of `term` on the state at `key`; a linear one takes angles on the branch next to `origin`.
+
+    Raises `numpy.linalg.LinAlgError` for a covariance that is not positive definite.
+    """
+    if isinstance(term, EquivalentMeasurement) or not is_nonlinear(term):
+        rows, at = whitened(term, origin), gtsam.Values()
+        at.insert(key, origin)
+        linear = gtsam.JacobianFactor(key, rows[:, :-1], rows[:, -1], gtsam.noiseModel.Unit.Create(len(rows)))
+        return gtsam.LinearContainerFactor(linear, at)
+
+    def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
+        y, H, _ = linearised(term, values.atVector(key))
+        if jacobians is not None:
+            jacobians[0] = H
+        return -y
+
+    noise, loss = _gaussian(inverse_roots(term.R)), term.loss
+    if loss is not None:
+        noise = gtsam.noiseModel.Robust.Create(_LOSSES[loss.kind](loss.width), noise)
+    return gtsam.CustomFactor(noise, [key], error)
+
+
+def _gaussian(root: FloatArray) -> gtsam.noiseModel.Base:
+    return gtsam.noiseModel.Gaussian.SqrtInformation(root, smart=False)

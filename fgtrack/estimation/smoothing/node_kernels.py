@@ -1,0 +1,161 @@
+"""Compiled loops that look up, insert, move and linearise nodes; arguments are arrays of `Nodes` by name."""
+
+import numpy as np
+
+from fgtrack.core.compiled import njit
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.estimation.smoothing.kernels import MATRICES, ORDER, TRACKS, VECTORS, cholesky
+
+
+@njit(f"void(int64[:], int64[:], {ORDER}, {TRACKS}, {TRACKS})")
+def place_before(tracks: IntArray, stamps_ns: IntArray, all_ns: IntArray, count: IntArray, indices: IntArray) -> None:
+    """Write the indices of the newest nodes at or before `stamps_ns`; -1 if there is none."""
+    for t in range(len(tracks)):
+        track = tracks[t]
+        indices[t] = np.searchsorted(all_ns[track, : count[track]], stamps_ns[t], side="right") - 1
+
+
+@njit(f"void(int64[:], int64[:], int64[:], {ORDER}, {TRACKS}, {TRACKS})")
+def last_before(
+    tracks: IntArray, indices: IntArray, stamps_ns: IntArray, all_ns: IntArray, count: IntArray, last: IntArray
+) -> None:
+    """Write the same, or `indices` where these are later; searches step by step from there."""
+    for t in range(len(tracks)):
+        track, index = tracks[t], indices[t]
+        while index + 1 < count[track] and all_ns[track, index + 1] <= stamps_ns[t]:
+            index += 1
+        last[t] = index
+
+
+@njit(f"void(int64[:], int64[:], int64, {ORDER}, {ORDER}, {TRACKS}, {TRACKS})")
+def insert(
+    tracks: IntArray,
+    indices: IntArray,
+    stamp_ns: int,
+    all_ns: IntArray,
+    numbers: IntArray,
+    count: IntArray,
+    given: IntArray,
+) -> None:
+    """Insert nodes at `indices`, whose numbers are written to `given`; later nodes move up."""
+    for t in range(len(tracks)):
+        track = tracks[t]
+        given[t] = numbers[track, count[track]]
+        for index in range(count[track], indices[t], -1):
+            all_ns[track, index], numbers[track, index] = all_ns[track, index - 1], numbers[track, index - 1]
+        all_ns[track, indices[t]], numbers[track, indices[t]] = stamp_ns, given[t]
+        count[track] += 1
+
+
+@njit(f"void(int64[:], int64[:], float64[:, :], {TRACKS}, {ORDER}, {VECTORS}, {VECTORS}, {', '.join([MATRICES] * 3)})")
+def shift(
+    tracks: IntArray,
+    shifted: IntArray,
+    steps: FloatArray,
+    first: IntArray,
+    numbers: IntArray,
+    origin: FloatArray,
+    step: FloatArray,
+    predicted: FloatArray,
+    back: FloatArray,
+    rows: FloatArray,
+) -> None:
+    """Move the linearisation points of the nodes `shifted` by `steps`, and all that is relative to them."""
+    n = origin.shape[1]
+    for t in range(len(tracks)):
+        at, oldest = shifted[t], first[tracks[t]]
+        for i in range(n):
+            origin[at, i] += steps[t, i]
+            step[at, i] -= steps[t, i]
+            predicted[at, i, n] -= steps[t, i]
+        for k in range(rows.shape[1]):
+            for j in range(n):
+                rows[at, k, n] -= rows[at, k, j] * steps[t, j]
+        if oldest > 0 and numbers[tracks[t], oldest] == at:
+            behind = numbers[tracks[t], oldest - 1]
+            for i in range(n):
+                for j in range(n):
+                    back[behind, i, n] += back[behind, i, j] * steps[t, j]
+
+
+@njit(f"b1(int64[:], int64[:], float64[:, :], {MATRICES}, float64[:, :, :], float64[:, :], {MATRICES}, {TRACKS})")
+def observe(
+    numbers: IntArray,
+    size: IntArray,
+    y: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+    offsets: FloatArray,
+    rows: FloatArray,
+    num_rows: IntArray,
+) -> bool:
+    """Append L^-1 [H | y + H offset], R = L L', to the rows of the nodes; False if an R is not positive definite."""
+    n = H.shape[2]
+    L = np.empty(R.shape[1:])
+    for t in range(len(numbers)):
+        at, k = numbers[t], size[t]
+        if not cholesky(R[t], k, L):
+            return False
+        used = num_rows[at]
+        for i in range(k):
+            measured = y[t, i]
+            for j in range(n):
+                measured += H[t, i, j] * offsets[t, j]
+            for j in range(n + 1):
+                value = measured if j == n else H[t, i, j]
+                for m in range(i):
+                    value -= L[i, m] * rows[at, used + m, j]
+                rows[at, used + i, j] = value / L[i, i]
+        num_rows[at] += k
+    return True
+
+
+@njit(
+    f"int64(int64[:], int64[:], {TRACKS}, {ORDER}, {VECTORS}, {VECTORS}, {MATRICES}, b1[:, ::1], {ORDER}, {MATRICES})"
+)
+def motion_factors(
+    tracks: IntArray,
+    starts: IntArray,
+    count: IntArray,
+    numbers: IntArray,
+    origin: FloatArray,
+    reference: FloatArray,
+    segment: FloatArray,
+    changed: BoolArray,
+    pairs: IntArray,
+    factors: FloatArray,
+) -> int:
+    """Write the motion factors from `starts` on that have `changed`; return their number, or -1 if a Q is not definite.
+
+    They are W (F d_left - d_right) = W e + N(0, I), d relative to `reference`, W' W = Q^-1 and e = r_right - f(x0) -
+    F (r_left - x0): row of `tracks`, left and right number in `pairs`; [(W F)'; -W'; (W e)'] in `factors`.
+    """
+    n = origin.shape[1]
+    L, Q, rhs = np.empty((n, n)), np.empty((n, n)), np.empty((n, 2 * n + 1))
+    num = 0
+    for t in range(len(tracks)):
+        for index in range(starts[t], count[tracks[t]] - 1):
+            left, right = numbers[tracks[t], index], numbers[tracks[t], index + 1]
+            if not changed[left, 0]:
+                continue
+            changed[left, 0] = False
+            Q[:] = segment[left, :, n : 2 * n]
+            if not cholesky(Q, n, L):
+                for i in range(n):  # noise without some direction: see `linalg.regular`
+                    Q[i, i] += 1e-12 * max(Q[i, i], 1e-6)
+                if not cholesky(Q, n, L):
+                    return -1
+            for i in range(n):
+                rhs[i, 2 * n] = reference[right, i] - segment[left, i, 2 * n]
+                for j in range(n):
+                    rhs[i, j], rhs[i, n + j] = segment[left, i, j], -1.0 if i == j else 0.0
+                    rhs[i, 2 * n] -= segment[left, i, j] * (reference[left, j] - origin[left, j])
+            for j in range(2 * n + 1):
+                for i in range(n):
+                    value = rhs[i, j]
+                    for m in range(i):
+                        value -= L[i, m] * factors[num, j, m]
+                    factors[num, j, i] = value / L[i, i]
+            pairs[num, 0], pairs[num, 1], pairs[num, 2] = t, left, right
+            num += 1
+    return num

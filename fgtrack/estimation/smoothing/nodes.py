@@ -1,0 +1,209 @@
+"""The nodes of all windows in arrays.
+
+Each track has a row of nodes in the order of their stamps; the values of a node are kept under its number, which stays
+the same as long as the node exists, so that an insertion moves no values. The first `first` nodes of a row have left
+the window and are kept for detections that are older (see `ring`); those from there up to `count` are the window.
+"""
+
+import numpy as np
+
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.estimation.histories import Histories, grown
+from fgtrack.estimation.smoothing import node_kernels
+from fgtrack.estimation.smoothing.terms import Innovations, MeasurementTerm, is_nonlinear, whitened
+
+_FEW_NODES, _FEW_COMPONENTS = 16, 4
+
+
+class Nodes(Histories):
+    """Arrays of shape (tracks, nodes) with the order of the nodes, and (numbers, ...) with the values of each.
+
+    Vectors stand as a last column beside the matrix that moves with them: [F | Q | f(x0)], [P | x], [A | b].
+
+    Parameters
+    ----------
+    n
+        Length of a state.
+    """
+
+    _ORDER = ("stamps_ns", "numbers", "first", "count", "anchored")
+    _VALUES = (
+        *("origin", "segment", "rows", "num_rows", "predicted", "filtered", "back", "C"),
+        *("step", "P", "far", "changed"),
+    )
+
+    def __init__(self, n: int) -> None:
+        super().__init__(_FEW_NODES)
+        self.dim, size = n, self.size
+        self.first: IntArray = np.zeros_like(self.count)
+        """Index of the oldest node of the window."""
+        self.anchored: IntArray = np.zeros_like(self.count)
+        """1 if the oldest node of the window keeps its linearisation, because it has a marginalised past."""
+        self.known: IntArray = np.zeros_like(self.count)
+        """From this index on `P` is known."""
+        self.any_far: BoolArray = np.zeros(len(self.count), dtype=bool)
+        """True if a node of the track is marked as `far`."""
+        self.origin = np.zeros((size, n))
+        """Linearisation points x0."""
+        self.segment = np.zeros((size, n, 2 * n + 1))
+        """Motion to the next node: F, the derivative of f at x0, the noise Q, and f(x0)."""
+        self.rows = np.zeros((size, _FEW_COMPONENTS, n + 1))
+        """Measurements: G and y of y = G (x - x0) + N(0, I); unused rows are 0."""
+        self.num_rows: IntArray = np.zeros(size, dtype=np.int64)
+        """How many of `rows` are used."""
+        self.predicted, self.filtered = (np.zeros((size, n, n + 1)) for _ in range(2))
+        """Covariances and means relative to x0, before and after the node's own measurements."""
+        self.back, self.C = np.zeros((size, n, n + 1)), np.zeros((size, n, n))
+        """The node given the next one: x - x0 = A (next - its x0) + b + N(0, C); A and b."""
+        self.step, self.P = np.zeros((size, n)), np.zeros((size, n, n))
+        """Mean relative to x0, and covariance, given everything."""
+        self.far = np.zeros(size, dtype=bool)
+        """True if `step` is longer than it may be."""
+        self.changed: BoolArray = np.zeros((size, 2), dtype=bool)
+        """True if the motion to the next node, and the measurements, were linearised since a factor graph read them."""
+        self.terms: dict[int, list[MeasurementTerm]] = {}
+        """Measurements of each node."""
+
+    def place_before(self, tracks: IntArray, stamps_ns: IntArray) -> IntArray:
+        """See `Histories.place_before`."""
+        indices = np.empty(len(tracks), dtype=np.int64)
+        node_kernels.place_before(tracks, stamps_ns, self.stamps_ns, self.count, indices)
+        return indices
+
+    def last_before(self, tracks: IntArray, indices: IntArray, stamps_ns: IntArray) -> IntArray:
+        """Return `place_before`, or `indices` if these are later."""
+        last = np.empty(len(tracks), dtype=np.int64)
+        node_kernels.last_before(tracks, indices, stamps_ns, self.stamps_ns, self.count, last)
+        return last
+
+    def window(self, track: int) -> IntArray:
+        """Return the numbers of all nodes of a window."""
+        return self.numbers[track, self.first[track] : self.count[track]].copy()
+
+    def window_stamps_ns(self, track: int) -> IntArray:
+        """Return the stamps of all nodes of a window."""
+        return self.stamps_ns[track, self.first[track] : self.count[track]].copy()
+
+    def begin_window(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
+        """Make the first node of a new track."""
+        number = self.begin(track, stamp_ns)
+        self.first[track] = self.known[track] = self.anchored[track] = 0
+        self.any_far[track] = False
+        self._empty(np.array([number]))
+        self.origin[number] = mean
+        for values in (self.predicted, self.filtered):
+            values[number, :, :-1], values[number, :, -1] = covariance, 0.0
+        self.P[number], self.step[number] = covariance, 0.0
+
+    def insert_at(self, tracks: IntArray, indices: IntArray, stamp_ns: int, origins: FloatArray) -> None:
+        """Insert nodes at `indices`, one for each of `tracks`, linearised at `origins` (m, n)."""
+        self.make_room(tracks)
+        numbers = np.empty(len(tracks), dtype=np.int64)
+        node_kernels.insert(tracks, indices, stamp_ns, self.stamps_ns, self.numbers, self.count, numbers)
+        self._empty(numbers)
+        self.origin[numbers] = origins
+
+    def move(self, tracks: IntArray, numbers: IntArray, steps: FloatArray) -> None:
+        """Move the linearisation points of nodes of `tracks`, one each, by `steps` (m, n), and linearise their
+        measurements there.
+        """
+        order = self.first, self.numbers
+        node_kernels.shift(tracks, numbers, steps, *order, self.origin, self.step, self.predicted, self.back, self.rows)
+        self.far[numbers] = False
+        for number in numbers.tolist():
+            if any(map(is_nonlinear, self.terms[number])):
+                self.linearise_terms(number)
+
+    def drop(self, tracks: IntArray, many: IntArray) -> None:
+        """See `Histories.drop`: nodes behind the windows."""
+        super().drop(tracks, many)
+        self.first[tracks] -= many
+        self.known[tracks] -= many
+
+    def linearise_terms(self, number: int) -> None:
+        """Linearise all measurements of a node at its linearisation point."""
+        rows = [whitened(term, self.origin[number]) for term in self.terms[number]]
+        stacked = np.concatenate([np.zeros((0, self.dim + 1)), *rows])
+        self.rows[number], self.num_rows[number] = 0.0, 0
+        self.append_rows(np.array([number]), stacked[None])
+
+    def append_rows(self, numbers: IntArray, rows: FloatArray) -> None:
+        """Add measurements [G | y] (m, k, n + 1) of m nodes to those that they have."""
+        used, k = self.num_rows[numbers], rows.shape[-2]
+        self._fit_rows(int(used.max(initial=0)) + k)
+        self.rows[numbers[:, None], used[:, None] + np.arange(k)] = rows
+        self.num_rows[numbers] = used + k
+        self.changed[numbers, 1] = True
+
+    def observe(self, numbers: IntArray, measured: Innovations, offsets: FloatArray) -> None:
+        """Add measurements y = H (x - guess) + N(0, R); guess - x0 is `offsets`, (m, n).
+
+        Raises `numpy.linalg.LinAlgError` for an R that is not positive definite.
+        """
+        self._fit_rows(int(self.num_rows[numbers].max(initial=0)) + measured.y.shape[1])
+        given = measured.size, measured.y, measured.H, measured.R
+        if not node_kernels.observe(numbers, *given, offsets, self.rows, self.num_rows):
+            raise np.linalg.LinAlgError("a covariance is not positive definite")
+        self.changed[numbers, 1] = True
+
+    def _empty(self, numbers: IntArray) -> None:
+        self.num_rows[numbers] = 0
+        self.rows[numbers] = 0.0
+        self.predicted[numbers, :, -1] = 0.0
+        self.far[numbers] = False
+        for number in numbers.tolist():
+            self.terms[number] = []
+
+    def _grow_tracks(self) -> None:
+        super()._grow_tracks()
+        for name in ("first", "anchored", "known", "any_far"):
+            setattr(self, name, grown(getattr(self, name), len(self.count)))
+        self._fit()
+
+    def _grow_places(self) -> None:
+        super()._grow_places()
+        self._fit()
+
+    def _fit(self) -> None:
+        """Make room for the values of all numbers."""
+        for name in self._VALUES:
+            setattr(self, name, self.fitted(getattr(self, name)))
+
+    def _fit_rows(self, most: int) -> None:
+        while most > self.rows.shape[1]:
+            self.rows = np.concatenate([self.rows, np.zeros_like(self.rows)], axis=1)
+
+
+class Undo:
+    """Values of the nodes of some tracks before an update that may fail; what is linearised anew is not among them."""
+
+    def __init__(self, nodes: Nodes, tracks: IntArray) -> None:
+        nodes.make_room(tracks)  # what is saved is not laid out anew then
+        self._nodes, self._tracks = nodes, tracks
+        self._order = [getattr(nodes, name).take(tracks, axis=0) for name in nodes._ORDER]
+        self.first = nodes.first[tracks]
+        self._saved: list[tuple[str, IntArray, FloatArray]] = []
+        self._keep("predicted", nodes.at(tracks, self.first))
+        self._keep("back", nodes.at(tracks, np.maximum(self.first - 1, 0)))
+        self._keep("origin", nodes.numbers[tracks])
+        self.added: list[int] = []
+        """Nodes to which a measurement was added."""
+
+    def keep_ring(self, track: int) -> None:
+        """Save what is behind the window of `track`."""
+        numbers = self._nodes.numbers[track, : self._nodes.first[track]].copy()
+        self._keep("back", numbers)
+        self._keep("C", numbers)
+
+    def _keep(self, name: str, numbers: IntArray) -> None:
+        self._saved.append((name, numbers, getattr(self._nodes, name)[numbers]))
+
+    def __call__(self) -> None:
+        """Restore what was saved."""
+        nodes = self._nodes
+        for name, values in zip(nodes._ORDER, self._order, strict=True):
+            getattr(nodes, name)[self._tracks] = values
+        for name, numbers, values in reversed(self._saved):
+            getattr(nodes, name)[numbers] = values
+        for number in self.added:
+            nodes.terms[number].pop()

@@ -1,0 +1,78 @@
+"""Detections older than the window, fused through the conditionals of the nodes that have left it.
+
+A node that leaves keeps its distribution given the next one: x - x0 = A (next - its x0) + b + N(0, C). A detection of
+it conditions that on itself, and what it says of the next node is passed on, up to the oldest node of the window. All
+is exact in a linear model; else the nodes stay linearised where they were when they left.
+"""
+
+import numpy as np
+
+from fgtrack.core.linalg import symmetrise
+from fgtrack.core.time import seconds
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import Measurement
+from fgtrack.estimation.ekf import joseph, kalman_gain, propagated
+from fgtrack.estimation.interpolation import between
+from fgtrack.estimation.smoothing.nodes import Nodes
+from fgtrack.estimation.smoothing.terms import NEAR_NS, EquivalentMeasurement, NearMeasurement, whitened
+from fgtrack.models.motion import MotionModel
+
+_Conditional = tuple[FloatArray, FloatArray, FloatArray]
+"""A (n, n), b (n,), C (n, n)."""
+
+
+def fuse_behind(nodes: Nodes, motion: MotionModel, track: int, measurement: Measurement) -> EquivalentMeasurement:
+    """Fuse a detection older than the window of `track` behind it; return what it says of the oldest node inside.
+
+    A node is inserted at its stamp, unless there is one at most `NEAR_NS` away. Raises `numpy.linalg.LinAlgError` if it
+    cannot be fused; all is as it was then.
+    """
+    first, n = int(nodes.first[track]), nodes.dim
+    stamps_ns = nodes.stamps_ns[track, : first + 1]
+    index = int(np.abs(stamps_ns - measurement.stamp_ns).argmin())
+    is_new = abs(int(stamps_ns[index]) - measurement.stamp_ns) > NEAR_NS
+    if is_new:
+        index = int(stamps_ns.searchsorted(measurement.stamp_ns))
+        origin, *split = _split(nodes, motion, track, index, measurement.stamp_ns)
+    else:
+        origin, split = nodes.origin[nodes.numbers[track, index]], []
+        if stamps_ns[index] != measurement.stamp_ns:
+            measurement = NearMeasurement.at(measurement, int(stamps_ns[index]), motion)
+    rows = whitened(measurement, origin)
+    H, y, R = rows[:, :n], rows[:, n], np.eye(len(rows))
+    path: list[_Conditional] = [*split[1:]]
+    for number in nodes.numbers[track, index:first].tolist():
+        path.append((nodes.back[number, :, :n], nodes.back[number, :, n], nodes.C[number]))
+    updated = [*split[:1]]
+    for A, b, C in path:
+        K, S = kalman_gain(C, H, R)
+        rest, through = y - H @ b, H @ A
+        updated.append((A - K @ through, b + K @ rest, joseph(C, K, H, R)))
+        y, H, R = rest, through, symmetrise(S)
+    if is_new:
+        nodes.insert_at(np.array([track]), np.array([index]), measurement.stamp_ns, origin[None])
+        nodes.first[track] += 1
+    changed = nodes.numbers[track, index - len(split[:1]) : nodes.first[track]]
+    for number, (A, b, C) in zip(changed.tolist(), updated, strict=True):
+        nodes.back[number, :, :n], nodes.back[number, :, n], nodes.C[number] = A, b, C
+    return EquivalentMeasurement(nodes.origin[nodes.numbers[track, nodes.first[track]]].copy(), H, y, R)
+
+
+def _split(
+    nodes: Nodes, motion: MotionModel, track: int, index: int, stamp_ns: int
+) -> tuple[FloatArray, _Conditional, _Conditional]:
+    """Origin of a node at `stamp_ns`, before that at `index`; the node before given it, and it given the next one."""
+    before, after = nodes.numbers[track, index - 1 : index + 1]
+    before_ns, after_ns = nodes.stamps_ns[track, index - 1 : index + 1].tolist()
+    n = nodes.dim
+    left_A, left_b, left_C = nodes.back[before, :, :n], nodes.back[before, :, n], nodes.C[before]
+    times_s = seconds(stamp_ns - before_ns), seconds(after_ns - stamp_ns)
+    inner = between(motion, nodes.origin[before], nodes.origin[after], *times_s)
+    A = inner.Lambda @ left_A + inner.Psi
+    C = propagated(inner.Lambda, left_C, inner.Sigma)
+    b = inner.Lambda @ left_b
+    # Given the state between them the left one no longer depends on the right one: left_A = gain A. Stamps close
+    # together leave hardly a digit of the same gain as C_left Lambda' C^-1.
+    gain = np.asarray(np.linalg.solve(A.T, left_A.T)).T
+    spread = joseph(left_C, gain, inner.Lambda, inner.Sigma)
+    return inner.mean, (gain, left_b - gain @ b, spread), (A, b, C)

@@ -1,0 +1,330 @@
+"""The windows of all tracks: insertion, relinearisation, marginalisation and states at any stamp."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.linalg import congruence, symmetrise
+from fgtrack.core.time import NS_PER_S, seconds
+from fgtrack.core.types import YAW, BoolArray, FloatArray, IntArray
+from fgtrack.estimation.base import Measurement
+from fgtrack.estimation.ekf import propagated
+from fgtrack.estimation.failures import Failure, Failures
+from fgtrack.estimation.initiation import Fix, Line, along, fixes_of
+from fgtrack.estimation.interpolation import between
+from fgtrack.estimation.smoothing.damping import DampedWindow
+from fgtrack.estimation.smoothing.nodes import Undo
+from fgtrack.estimation.smoothing.ring import fuse_behind
+from fgtrack.estimation.smoothing.solver import Moved, Solver
+from fgtrack.estimation.smoothing.terms import Innovations, NearMeasurement, is_nonlinear, overshot
+
+#: Nodes behind the window are forgotten when there are so many that nobody needs.
+_MANY = 16
+#: Later than any index.
+_NEVER = np.iinfo(np.int64).max
+
+
+class States(NamedTuple):
+    """States of m tracks."""
+
+    means: FloatArray
+    """Shape (m, n)."""
+    covariances: FloatArray
+    """Shape (m, n, n)."""
+
+
+class Leaving(NamedTuple):
+    """Smoothed states of the nodes that leave their windows, oldest first for each track."""
+
+    tracks: IntArray
+    """Shape (m,)."""
+    stamps_ns: IntArray
+    """Shape (m,)."""
+    states: States
+
+
+class Windows:
+    """Windows of many tracks, each by its number.
+
+    Parameters
+    ----------
+    solver
+        Solves them.
+    final
+        True if the states of nodes that leave are wanted.
+    failures
+        Counts how often steps are damped.
+    """
+
+    def __init__(self, solver: Solver, final: bool, failures: Failures) -> None:
+        self._motion = solver.motion
+        self._final = final
+        self.solver = solver
+        self.nodes = solver.nodes
+        self.failures = failures
+
+    # --- states
+
+    def oldest_ns(self, tracks: IntArray) -> IntArray:
+        """Oldest stamps at which a state is known, behind the windows too."""
+        return np.asarray(self.nodes.stamps_ns[tracks, 0])
+
+    def newest_ns(self, tracks: IntArray) -> IntArray:
+        """Stamps of the newest nodes."""
+        return np.asarray(self.nodes.stamps_ns[tracks, self.nodes.count[tracks] - 1])
+
+    def states_at(self, tracks: IntArray, stamps_ns: IntArray) -> States:
+        """States of `tracks` at `stamps_ns`, not older than `oldest_ns`: interpolated, or predicted ahead."""
+        nodes = self.nodes
+        indices = nodes.place_before(tracks, stamps_ns)
+        until_ns = stamps_ns - nodes.stamps_ns[tracks, indices]
+        is_between = (until_ns > 0) & (indices < nodes.count[tracks] - 1)
+        indices = indices + is_between
+        self.solver.look_up(tracks, indices, is_between)
+        steps, covariances = self.solver.smoothed(tracks, indices)
+        means = nodes.origin[nodes.at(tracks, indices)] + steps
+        inner = is_between.nonzero()[0]
+        if inner.size == len(tracks):
+            return self._between(tracks, indices, stamps_ns, steps, means, covariances)
+        if inner.size:
+            means[inner], covariances[inner] = self._between(
+                tracks[inner], indices[inner], stamps_ns[inner], steps[inner], means[inner], covariances[inner]
+            )
+        ahead = ((until_ns > 0) & ~is_between).nonzero()[0]
+        if ahead.size:
+            moved, F, Q = self._motion.transition(means[ahead], until_ns[ahead] / NS_PER_S)
+            means[ahead], covariances[ahead] = moved, propagated(F, covariances[ahead], Q)
+        return States(means, covariances)
+
+    def _between(
+        self,
+        tracks: IntArray,
+        indices: IntArray,
+        stamps_ns: IntArray,
+        steps: FloatArray,
+        right: FloatArray,
+        P_right: FloatArray,
+    ) -> States:
+        """States between the nodes at `indices`, with these steps, means and covariances, and those before them."""
+        nodes, n = self.nodes, self._motion.dim
+        at = nodes.at(tracks, indices - 1)
+        A, b = nodes.back[at, :, :n], nodes.back[at, :, n]
+        until_s = (stamps_ns - nodes.stamps_ns[tracks, indices - 1]) / NS_PER_S
+        after_s = (nodes.stamps_ns[tracks, indices] - stamps_ns) / NS_PER_S
+        left = nodes.origin[at] + np.matvec(A, steps) + b
+        inner = between(self._motion, left, right, until_s, after_s)
+        by_right = inner.Lambda @ A + inner.Psi
+        given = congruence(inner.Lambda, nodes.C[at]) + inner.Sigma
+        return States(inner.mean, symmetrise(congruence(by_right, P_right) + given))
+
+    # --- updates
+
+    def fuse(
+        self,
+        tracks: IntArray,
+        stamp_ns: int,
+        measurements: Sequence[Measurement],
+        innovations: Innovations,
+        guesses: FloatArray,
+        start_ns: IntArray,
+        reach_ns: IntArray,
+    ) -> Leaving:
+        """Fuse one measurement of each of `tracks`, all at `stamp_ns`, and move the windows up to `start_ns`.
+
+        `innovations` are those at `guesses`, shape (m, n), the states at `stamp_ns`. One node at or before `start_ns`
+        stays in each window; behind it, what `reach_ns` needs is kept. Returns the states of the nodes that left.
+        Raises `numpy.linalg.LinAlgError` if it fails; all is as before then.
+        """
+        nodes, solver = self.nodes, self.solver
+        guesses = self._relinearised(tracks, stamp_ns, measurements, guesses)
+        anchors = nodes.last_before(tracks, nodes.first[tracks], start_ns)
+        left = self._leaving(tracks, anchors)
+        stamps_ns, measurements = self._at_nodes(tracks, stamp_ns, measurements)
+        indices = nodes.place_before(tracks, stamps_ns)
+        is_old = indices < anchors
+        undo = Undo(nodes, tracks)
+        try:
+            moved = solver.move_far(tracks)
+            starts = moved.starts
+            if is_old.any():
+                solver.linearise_motion(moved.tracks, moved.indices)
+                moved = Moved(starts, tracks[:0], tracks[:0])
+                nodes.anchored[tracks] |= anchors > undo.first
+                solver.solve(tracks[is_old], starts[is_old], anchors[is_old])
+                for row in is_old.nonzero()[0].tolist():
+                    track = int(tracks[row])
+                    undo.keep_ring(track)
+                    term = fuse_behind(nodes, self._motion, track, measurements[row])
+                    starts[row] = anchors[row] = nodes.first[track]
+                    number = int(nodes.numbers[track, starts[row]])
+                    nodes.terms[number].append(term)
+                    undo.added.append(number)
+                    nodes.linearise_terms(number)
+            numbers = self._insert(tracks, stamp_ns, stamps_ns, indices, ~is_old, guesses, moved)
+            self._measure(numbers, measurements, innovations, guesses, ~is_old, undo)
+            nodes.anchored[tracks] |= anchors > undo.first
+            solver.solve(tracks, starts, anchors)
+        except np.linalg.LinAlgError:
+            undo()
+            solver.rebuild(tracks)
+            raise
+        self._forget_before(tracks, reach_ns)
+        return left
+
+    def damp(self, tracks: IntArray) -> None:
+        """Solve again by Levenberg-Marquardt where the last step went beyond what its linearisation is good for."""
+        solver, nodes = self.solver, self.nodes
+        tracks = tracks[solver.is_nonlinear[tracks]]
+        if not tracks.size or solver.is_damped:
+            return
+        rows, indices = solver.far(tracks)
+        moved = nodes.at(tracks[rows], indices)
+        far = zip(rows.tolist(), moved.tolist(), nodes.origin[moved], nodes.step[moved], strict=True)
+        for row in sorted({row for row, number, x, step in far if overshot(nodes.terms[number], x, x + step)}):
+            track = int(tracks[row])
+            means = nodes.origin[nodes.window(track)]
+            with suppress(np.linalg.LinAlgError):  # then the linearisation points remain
+                means = DampedWindow(solver, track).solved()
+            solver.solve_anew(track, means)
+            self.failures.add(Failure.STEP_DAMPED)
+
+    def _relinearised(
+        self, tracks: IntArray, stamp_ns: int, measurements: Sequence[Measurement], guesses: FloatArray
+    ) -> FloatArray:
+        """States at `stamp_ns` after the relinearisation of tracks whose first nonlinear measurement comes now."""
+        first = [k for k, each in enumerate(measurements) if is_nonlinear(each) > self.solver.is_nonlinear[tracks[k]]]
+        if first:
+            for track in tracks[first].tolist():
+                self.solver.mark_nonlinear(track)
+            guesses = guesses.copy()
+            guesses[first] = self.states_at(tracks[first], np.full(len(first), stamp_ns)).means
+        return guesses
+
+    def _leaving(self, tracks: IntArray, anchors: IntArray) -> Leaving:
+        nodes, n = self.nodes, self._motion.dim
+        num = anchors - nodes.first[tracks]
+        if not self._final or not num.any():
+            return Leaving(np.empty(0, np.int64), np.empty(0, np.int64), States(np.empty((0, n)), np.empty((0, n, n))))
+        self.solver.prepare_leaving(tracks[num > 0], anchors[num > 0])
+        rows, columns = np.nonzero(np.arange(int(num.max())) < num[:, None])
+        tracks, indices = tracks[rows], nodes.first[tracks[rows]] + columns
+        steps, covariances = self.solver.smoothed(tracks, indices)
+        means = nodes.origin[nodes.at(tracks, indices)] + steps
+        return Leaving(tracks, nodes.stamps_ns[tracks, indices], States(means, covariances))
+
+    def _at_nodes(
+        self, tracks: IntArray, stamp_ns: int, measurements: Sequence[Measurement]
+    ) -> tuple[IntArray, Sequence[Measurement]]:
+        """Stamps (m,) and measurements, moved to the nearest node where it is closer than the solver can tell apart."""
+        nodes, stamps_ns = self.nodes, np.full(len(tracks), stamp_ns)
+        if not self.solver.near_ns:
+            return stamps_ns, measurements
+        indices = nodes.place_before(tracks, stamps_ns)
+        around = np.stack([indices, np.minimum(indices + 1, nodes.count[tracks] - 1)])
+        around_ns = nodes.stamps_ns[tracks, around]
+        apart_ns = np.abs(around_ns - stamp_ns)
+        nearest_ns = np.where(apart_ns[0] <= apart_ns[1], *around_ns)
+        is_near = (apart_ns.min(axis=0) <= self.solver.near_ns) & (nearest_ns != stamp_ns)
+        if not is_near.any():
+            return stamps_ns, measurements
+        measurements = list(measurements)
+        for row in is_near.nonzero()[0].tolist():
+            stamps_ns[row] = nearest_ns[row]
+            measurements[row] = NearMeasurement.at(measurements[row], int(nearest_ns[row]), self._motion)
+        return stamps_ns, measurements
+
+    def _insert(
+        self,
+        tracks: IntArray,
+        stamp_ns: int,
+        stamps_ns: IntArray,
+        indices: IntArray,
+        is_live: BoolArray,
+        guesses: FloatArray,
+        moved: Moved,
+    ) -> IntArray:
+        """Insert nodes at `stamps_ns` where there are none, after those at `indices`; return the numbers of the nodes.
+
+        Linearises the motion from and to them, and from the nodes that have `moved`. The windows have changed from
+        there on: `moved.starts` becomes smaller.
+        """
+        nodes = self.nodes
+        is_new = is_live & (nodes.stamps_ns[tracks, indices] != stamps_ns)
+        indices = indices + is_new
+        of, at = moved.tracks, moved.indices
+        if is_new.any():
+            to, inner = tracks[is_new], indices[is_new]
+            nodes.insert_at(to, inner, stamp_ns, guesses[is_new])
+            if of.size:
+                inserted = np.full(len(nodes.first), _NEVER)
+                inserted[to] = inner
+                at = at + (at >= inserted[of])
+            of, at = np.concatenate([of, to, to]), np.concatenate([at, inner - 1, inner])
+        if of.size:
+            self.solver.linearise_motion(of, at)
+        np.minimum(moved.starts, indices, out=moved.starts, where=is_live)
+        return nodes.at(tracks, indices)
+
+    def _measure(
+        self,
+        numbers: IntArray,
+        measurements: Sequence[Measurement],
+        innovations: Innovations,
+        guesses: FloatArray,
+        is_live: BoolArray,
+        undo: Undo,
+    ) -> None:
+        """Add the measurements of the nodes `numbers`, where `is_live`."""
+        nodes = self.nodes
+        is_linear = is_live.copy()
+        for row in is_live.nonzero()[0].tolist():
+            number, term = int(numbers[row]), measurements[row]
+            nodes.terms[number].append(term)
+            undo.added.append(number)
+            if is_nonlinear(term) or isinstance(term, NearMeasurement):
+                is_linear[row] = False
+                nodes.linearise_terms(number)
+        if is_linear.any():
+            at = numbers[is_linear]
+            nodes.observe(at, innovations.at(is_linear), guesses[is_linear] - nodes.origin[at])
+
+    def _forget_before(self, tracks: IntArray, stamps_ns: IntArray) -> None:
+        nodes = self.nodes
+        most = nodes.first[tracks] - 1
+        if not ((most >= _MANY) & (nodes.stamps_ns[tracks, _MANY - 1] <= stamps_ns)).any():
+            return
+        num = np.minimum(nodes.place_before(tracks, stamps_ns), most)
+        many = num >= _MANY
+        if many.any():
+            nodes.drop(tracks[many], num[many])
+
+    # --- one track
+
+    def nothing_marginalised(self, track: int) -> bool:
+        """True if no node has left the window."""
+        return bool(self.nodes.first[track] == 0)  # a node that left stays behind the window
+
+    def fixes(self, track: int) -> list[Fix]:
+        """Positions measured at the nodes, after that of the prior, of a window that nothing has left yet."""
+        nodes, numbers = self.nodes, self.nodes.window(track)
+        stamps_ns = nodes.window_stamps_ns(track).tolist()
+        prior = nodes.predicted[numbers[0]]
+        later = (
+            (seconds(stamp_ns - stamps_ns[0]), term)
+            for number, stamp_ns in zip(numbers.tolist(), stamps_ns, strict=True)
+            for term in nodes.terms[number]
+            if isinstance(term, Measurement)
+        )
+        return fixes_of(nodes.origin[numbers[0]] + prior[:, -1], prior[:, :-1].copy(), later)
+
+    def restart(self, track: int, line: Line) -> None:
+        """Solve again from states along `line`, with the prior's heading, which must be vague, turned there."""
+        nodes, oldest = self.nodes, self.nodes.window(track)[0]
+        stamps_ns = nodes.window_stamps_ns(track)
+        times_s = (stamps_ns - stamps_ns[0]) / NS_PER_S
+        means = np.array([along(line, time_s, self._motion.state_names) for time_s in times_s.tolist()])
+        if not self._motion.cartesian:
+            nodes.predicted[oldest, YAW, -1] = means[0, YAW] - nodes.origin[oldest, YAW]
+        self.solver.solve_at(track, means)
