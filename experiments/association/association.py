@@ -36,9 +36,11 @@ from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.factor_graph import SmootherBank, SmootherSettings
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.smoothing.bank import SmootherBank
+from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
+from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.plotting.paper import styled
@@ -163,7 +165,7 @@ def replaying() -> TrackBank:
 def smoothing() -> TrackBank:
     """The bank of `smoother`."""
     settings = SmootherSettings(lag_s=LAG_S, lagged_s=(), final=False)
-    return SmootherBank(MOTION, settings)
+    return SmootherBank(MOTION, settings, IncrementalSolver)
 
 
 def at_stamp(bank: TrackBank, stamp_ns: int) -> StatesAt:

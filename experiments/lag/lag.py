@@ -18,7 +18,9 @@ from scipy.stats import chi2
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
+from fgtrack.estimation.smoothing.bank import FixedLagSmoother
+from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
+from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.sim.draw import drawn
@@ -68,7 +70,7 @@ def smoother(start: FloatArray, lag_s: float) -> FixedLagSmoother:
         yaw_rate_std_radps=PRIOR_STD[4],
     )
     settings = SmootherSettings(lag_s=lag_s, lagged_s=(), final=False)
-    return FixedLagSmoother(MOTION, prior, settings)
+    return FixedLagSmoother(MOTION, prior, settings, IncrementalSolver)
 
 
 def judged(run: Run, lag_s: float) -> tuple[FloatArray, FloatArray, float]:

@@ -8,12 +8,15 @@ import pytest
 
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
-from fgtrack.estimation.banded.smoother import BandedSmoother
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult
 from fgtrack.estimation.ekf import correct_one, predict
+from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.propagation import track_state
+from fgtrack.estimation.registry import EXACT
 from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.smoothing.bank import FixedLagSmoother
+from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.measurement import MeasurementModel
 from fgtrack.models.motion import CTRV, MotionModel, Transition
 from fgtrack.testing import BrokenPromiseError, check_estimator, estimator_checks
@@ -183,10 +186,16 @@ class GivesOneForAll(FilterBank):
         return replace(states, means=np.repeat(states.means[:1], len(states.means), axis=0))
 
 
-class Reports(BandedSmoother):
+class Reports(FixedLagSmoother):
     """What the broken smoothers are made of."""
 
-    reports = True
+    exact = EXACT
+    nonlinear = "at convergence"
+    smooths = initiates = reports = True
+
+    def __init__(self, motion: MotionModel, start: Start, lag_s: float, initiation: str = DEFAULT) -> None:
+        settings = SmootherSettings(lag_s=lag_s, lagged_s=())
+        super().__init__(motion, start, settings, initiation=initiation)
 
 
 class ReportsNoNumber(Reports):

@@ -11,7 +11,10 @@ import pytest
 from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
-from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherBank, SmootherSettings
+from fgtrack.estimation.failures import Failure
+from fgtrack.estimation.smoothing.bank import SmootherBank
+from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
+from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
 
@@ -32,7 +35,7 @@ class Drive:
     """What a drive left behind."""
 
     statuses: Counter[UpdateStatus] = field(default_factory=Counter)
-    smoothers: list[FixedLagSmoother] = field(default_factory=list)
+    failures: Counter[Failure] = field(default_factory=Counter)
     errors_m: list[float] = field(default_factory=list)
     num_final: int = 0
     resident: list[int] = field(default_factory=list)
@@ -70,7 +73,7 @@ def schedule(num_detections: int, rng: np.random.Generator) -> list[tuple[int, i
 
 def drive(num_detections: int, seed: int) -> Drive:
     rng, done = np.random.default_rng(seed), Drive()
-    bank = SmootherBank(MOTION, SETTINGS)
+    bank = SmootherBank(MOTION, SETTINGS, IncrementalSolver)
     events = schedule(num_detections, rng)
     last_ns = max(stamp_ns for _, stamp_ns, _ in events)
     quarters = {len(events) * k // 4 for k in (1, 2, 3, 4)}
@@ -105,15 +108,14 @@ def drive(num_detections: int, seed: int) -> Drive:
         if number in quarters:
             gc.collect()
             done.resident.append(int(STATM.read_text().split()[1]) if STATM.exists() else 0)
-    done.smoothers += bank._estimators.values()
+    done.failures = bank.windows.failures.counts
     return done
 
 
 def check(done: Drive, num_detections: int) -> None:
-    assert len(done.smoothers) == VEHICLES
     assert sum(done.statuses.values()) == num_detections - VEHICLES
     assert done.statuses[UpdateStatus.FAILED] == 0
-    assert [smoother.failures.counts for smoother in done.smoothers] == [{}] * VEHICLES
+    assert not done.failures
     late = done.statuses[UpdateStatus.OUT_OF_SEQUENCE] + done.statuses[UpdateStatus.BEYOND_WINDOW]
     assert late > 0.35 * num_detections
     assert done.statuses[UpdateStatus.BEYOND_WINDOW] > 0.005 * num_detections

@@ -10,8 +10,10 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.smoothing.bank import FixedLagSmoother
+from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
+from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.evaluation.bounds import Bounds, ScheduledMeasurement, bounds, bounds_along
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.sim.draw import drawn
@@ -39,7 +41,7 @@ def make(name: str, motion: MotionModel) -> Estimator:
     if name == "ekf-replay":
         return ReplayEkf(motion, PRIOR, 1.0)
     settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)
-    return FixedLagSmoother(motion, PRIOR, settings)
+    return FixedLagSmoother(motion, PRIOR, settings, IncrementalSolver)
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,10 @@ from scipy.stats import chi2
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
 from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.smoothing.bank import FixedLagSmoother
+from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
+from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.sensors import RobustLoss
@@ -43,7 +45,7 @@ def prior(mean: FloatArray) -> Start:
 
 def smoother(motion: MotionModel, start: Start) -> FixedLagSmoother:
     settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)
-    return FixedLagSmoother(motion, start, settings)
+    return FixedLagSmoother(motion, start, settings, IncrementalSolver)
 
 
 def replay(motion: MotionModel, start: Start) -> ReplayEkf:

@@ -1,19 +1,18 @@
 """Steps of the smoother that go further than their linearisation holds are taken again with damping."""
 
-from collections import Counter
-
 import numpy as np
 import pytest
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.banded.bank import BandedBank
-from fgtrack.estimation.banded.windows import Windows
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.factor_graph import BatchBackend, FixedLagSmoother
-from fgtrack.estimation.factor_graph.window import Window
 from fgtrack.estimation.failures import Failure
+from fgtrack.estimation.smoothing.bank import SmootherBank
+from fgtrack.estimation.smoothing.gtsam.batch import BatchSolver
+from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
 from fgtrack.estimation.smoothing.settings import SmootherSettings
+from fgtrack.estimation.smoothing.solver import Solver
+from fgtrack.estimation.smoothing.windows import Windows
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CV
 
@@ -41,28 +40,9 @@ SPREAD = np.diag([RANGE_STD_M**2, (100.0 * STD_RAD) ** 2])
 BIRTH = Start(position_m=(100.0, 0.0), position_covariance=SPREAD, speed_std_mps=10.0)
 
 
-def tracked(measurements: list[Measurement], **backend: object) -> FixedLagSmoother:
-    one = FixedLagSmoother(MOTION, BIRTH, SETTINGS, **backend)  # type: ignore[arg-type]  # nothing or a factory
-    for measurement in measurements[1:]:
-        one.update(measurement)
-    return one
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_bearings_alone_lead_where_levenberg_marquardt_does(seed: int) -> None:
-    measurements, truth = heard(np.random.default_rng(seed))
-    one, other = tracked(measurements), tracked(measurements, make_backend=BatchBackend)
-    state, slow = (it.state_at(measurements[-1].stamp_ns) for it in (one, other))
-    std = np.sqrt(np.diag(slow.covariance))
-    assert np.abs((state.mean - slow.mean) / std).max() < 0.1
-    d = state.mean - truth
-    assert d @ np.linalg.solve(state.covariance, d) < 23.5  # one in ten thousand
-    assert not other.failures.counts
-
-
-def tracked_together(streams: list[list[Measurement]]) -> BandedBank:
-    """All objects in one bank of smoother-banded."""
-    bank = BandedBank(MOTION, SETTINGS)
+def tracked(streams: list[list[Measurement]], make: type[Solver]) -> SmootherBank:
+    """All objects in one bank."""
+    bank = SmootherBank(MOTION, SETTINGS, make)
     for track_id in range(len(streams)):
         bank.birth(track_id, BIRTH)
     for measurements in zip(*(stream[1:] for stream in streams), strict=True):
@@ -70,43 +50,34 @@ def tracked_together(streams: list[list[Measurement]]) -> BandedBank:
     return bank
 
 
-def test_smoother_banded_takes_the_same_steps_again() -> None:
-    streams = [heard(np.random.default_rng(seed))[0] for seed in range(4)]
-    bank, expected = tracked_together(streams), [tracked(stream) for stream in streams]
-    assert bank.windows.failures.counts == sum((one.failures.counts for one in expected), Counter())
-    for track_id, one in enumerate(expected):
-        state, other = bank.state_at(track_id, streams[0][-1].stamp_ns), one.state_at(streams[0][-1].stamp_ns)
-        assert np.abs((state.mean - other.mean) / np.sqrt(np.diag(other.covariance))).max() < 1e-6
+def worst_m(bank: SmootherBank, found: list[tuple[list[Measurement], FloatArray]]) -> float:
+    states = [bank.state_at(track_id, found[0][0][-1].stamp_ns) for track_id in range(len(found))]
+    return max(float(np.hypot(*(s.mean - truth)[:2])) for s, (_, truth) in zip(states, found, strict=True))
 
 
-def test_without_damping_smoother_banded_loses_some(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("make", [Solver, IncrementalSolver])
+def test_bearings_alone_lead_where_levenberg_marquardt_does(make: type[Solver]) -> None:
     found = [heard(np.random.default_rng(seed)) for seed in range(4)]
-    streams = [measurements for measurements, _ in found]
-
-    def worst_m(bank: BandedBank) -> float:
-        states = [bank.state_at(track_id, streams[0][-1].stamp_ns) for track_id in range(4)]
-        return max(float(np.hypot(*(s.mean - truth)[:2])) for s, (_, truth) in zip(states, found, strict=True))
-
-    assert worst_m(tracked_together(streams)) < 20.0
-    monkeypatch.setattr(Windows, "damp", lambda self, tracks: None)
-    assert worst_m(tracked_together(streams)) > 1000.0
+    bank, slow = (tracked([stream for stream, _ in found], each) for each in (make, BatchSolver))
+    for track_id, (measurements, truth) in enumerate(found):
+        state, expected = (each.state_at(track_id, measurements[-1].stamp_ns) for each in (bank, slow))
+        std = np.sqrt(np.diag(expected.covariance))
+        assert np.abs((state.mean - expected.mean) / std).max() < 0.1
+        d = state.mean - truth
+        assert d @ np.linalg.solve(state.covariance, d) < 23.5  # one in ten thousand
+    assert bank.windows.failures.counts[Failure.STEP_DAMPED] > 0
+    assert not slow.windows.failures.counts
 
 
 def test_without_damping_some_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    def worst_m() -> float:
-        return max(
-            float(np.hypot(*(tracked(measurements).state_at(measurements[-1].stamp_ns).mean - truth)[:2]))
-            for measurements, truth in (heard(np.random.default_rng(seed)) for seed in range(4))
-        )
-
-    damped_m = worst_m()
-    monkeypatch.setattr(Window, "damp", lambda self: None)
-    assert worst_m() > 1000.0 > 20.0 > damped_m
+    found = [heard(np.random.default_rng(seed)) for seed in range(4)]
+    streams = [measurements for measurements, _ in found]
+    assert worst_m(tracked(streams, Solver), found) < 20.0
+    monkeypatch.setattr(Windows, "damp", lambda self, tracks: None)
+    assert worst_m(tracked(streams, Solver), found) > 1000.0
 
 
 def test_positions_need_none() -> None:
     model = measurement_model(("x_m", "y_m"), MOTION)
     fixes = [Measurement(k * NS_PER_S, model, np.array([5.0 * k, 1.0]), np.eye(2)) for k in range(5)]
-    assert not tracked(fixes).failures.counts
-    found = [tracked(heard(np.random.default_rng(seed))[0]).failures.counts for seed in range(4)]
-    assert sum(found, Counter())[Failure.STEP_DAMPED] > 0
+    assert not tracked([fixes], Solver).windows.failures.counts

@@ -5,9 +5,10 @@ import pytest
 
 from fgtrack.core.geometry import rotation
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
-from fgtrack.estimation.factor_graph.window import Window
 from fgtrack.estimation.initiation import Fix, Line, Search, along, fixes_of, over, straight_line
+from fgtrack.estimation.smoothing.bank import FixedLagSmoother
+from fgtrack.estimation.smoothing.settings import SmootherSettings
+from fgtrack.estimation.smoothing.windows import Windows
 from fgtrack.models.motion import CTRV, CV
 from fgtrack.models.sensors import RobustLoss
 
@@ -61,8 +62,10 @@ def test_while_the_direction_is_uncertain_every_measurement_is_solved_to_converg
 def test_a_certain_direction_is_not_sought_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """A line is a poor guess of a bend, so it serves as long as it must and no longer."""
     restarts: list[Line] = []
-    restart = Window.restart
-    monkeypatch.setattr(Window, "restart", lambda self, line: (restarts.append(line), restart(self, line)))
+    restart = Windows.restart
+    monkeypatch.setattr(
+        Windows, "restart", lambda self, track, line: (restarts.append(line), restart(self, track, line))
+    )
     fused(1.0, 20)
     assert restarts[-1].certainty > 3.0
     assert not any(line.certainty > 3.0 for line in restarts[:-1])
@@ -73,7 +76,7 @@ def test_a_certain_direction_is_not_sought_again(monkeypatch: pytest.MonkeyPatch
         standing.update(Measurement.of(k * PERIOD_NS, x_m=0.0, y_m=0.0, std=STD))
     assert len(restarts) == 6  # until the first node left the window
     restarts.clear()
-    smoother = FixedLagSmoother(CTRV(), Start(yaw_rad=0.0))
+    smoother = FixedLagSmoother(CTRV(), Start(yaw_rad=0.0), EXACT)
     smoother.update(Measurement.of(PERIOD_NS, x_m=1.0, y_m=0.0, std=STD))
     assert not restarts
 

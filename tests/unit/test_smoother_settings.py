@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.factor_graph import FixedLagSmoother, SmootherSettings
+from fgtrack.estimation.smoothing.bank import FixedLagSmoother
+from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.motion import CTRV, CV
 
 
@@ -26,7 +27,7 @@ def test_settings_that_make_no_sense_are_refused(wrong: dict, said: str) -> None
 
 def test_thresholds_stand_in_the_order_of_the_state() -> None:
     settings = SmootherSettings(relinearise={"speed_mps": 2.0, "x_m": 0.3})
-    straight, curved = (settings.thresholds(CTRV(), curved) for curved in (False, True))
+    straight, curved = (settings.thresholds(CTRV(), nonlinear) for nonlinear in (False, True))
     np.testing.assert_array_equal(straight[[0, 3]], [0.3, 2.0])
     assert (straight[[1, 2, 4]] > 1e6).all()
     np.testing.assert_array_equal(curved[:4], [0.3, 0.05, straight[2], 2.0])
@@ -34,8 +35,8 @@ def test_thresholds_stand_in_the_order_of_the_state() -> None:
 
 def test_where_all_is_linear_nothing_is_relinearised() -> None:
     settings = SmootherSettings(relinearise={"x_m": 0.3})
-    assert (settings.thresholds(CV(), curved=False) > 1e6).all()
-    np.testing.assert_array_equal(settings.thresholds(CV(), curved=True), [0.3, 0.05, 0.2, 0.2])
+    assert (settings.thresholds(CV(), nonlinear=False) > 1e6).all()
+    np.testing.assert_array_equal(settings.thresholds(CV(), nonlinear=True), [0.3, 0.05, 0.2, 0.2])
 
 
 def test_more_iterations_bring_a_state_nearer_to_that_at_which_nothing_moves() -> None:

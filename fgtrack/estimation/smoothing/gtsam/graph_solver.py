@@ -25,14 +25,17 @@ class GraphSolver(Solver):
     def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
         super().__init__(motion, settings)
         self._is_known: BoolArray = np.zeros((0, 2), dtype=bool)
-        """True if the covariance of a node, and its distribution given the next node, have been read."""
+        """True if `_covariances` of a node have been read."""
+        self._covariances = np.zeros((0, 2, motion.dim, motion.dim))
+        """By number: the covariance of the node, and that of the next one, from the joint covariance with it."""
 
     def begin(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
         """See `Solver.begin`."""
         super().begin(track, stamp_ns, mean, covariance)
         self._forget(track)
         self._fit()
-        self._is_known[self.nodes.numbers[track, 0], 0] = True
+        number = self.nodes.numbers[track, 0]
+        self._covariances[number, 0], self._is_known[number, 0] = covariance, True
 
     def prepare_leaving(self, tracks: IntArray, anchors: IntArray) -> None:
         """See `Solver.prepare_leaving`: eliminated by themselves."""
@@ -41,27 +44,29 @@ class GraphSolver(Solver):
         self.nodes.known[tracks] = anchors
 
     def look_up(self, tracks: IntArray, indices: IntArray, with_previous: BoolArray) -> None:
-        """See `Solver.look_up`."""
-        nodes, n = self.nodes, self.motion.dim
-        first = nodes.first[tracks]
-        indices = np.maximum(indices, first)
-        previous = nodes.at(tracks, np.maximum(indices - 1, 0))
-        with_previous = with_previous & (indices > first)
-        numbers = nodes.at(tracks, indices)
-        missing = ~np.where(with_previous, self._is_known[previous, 1], self._is_known[numbers, 0])
-        for row in missing.nonzero()[0].tolist():
-            number = int(numbers[row])
-            if not with_previous[row]:
-                nodes.P[number] = self._covariance(int(tracks[row]), number)
+        """See `Solver.look_up`. What is read for a stamp never depends on what was read for others."""
+        nodes, first = self.nodes, self.nodes.first[tracks]
+        kinds = (with_previous & (indices > first)).astype(np.int64)
+        numbers = nodes.at(tracks, np.maximum(indices, first))
+        owners = np.where(kinds, nodes.at(tracks, np.maximum(indices - 1, 0)), numbers)
+        for row in (~self._is_known[owners, kinds]).nonzero()[0].tolist():
+            track, number, owner = int(tracks[row]), int(numbers[row]), int(owners[row])
+            if kinds[row]:
+                self._read_pair(track, owner, number)
             else:
-                left = int(previous[row])
-                joint = self._covariance(int(tracks[row]), left, number)
-                cross, nodes.P[number], nodes.P[left] = joint[:n, n:], joint[n:, n:], joint[:n, :n]
-                A = psd_solve(nodes.P[number], cross.T).T
-                nodes.back[left, :, :n], nodes.back[left, :, n] = A, nodes.step[left] - A @ nodes.step[number]
-                nodes.C[left] = symmetrise(nodes.P[left] - A @ cross.T)
-                self._is_known[left] = True
-            self._is_known[number, 0] = True
+                self._covariances[number, 0] = self._covariance(track, number)
+            self._is_known[owner, kinds[row]] = True
+        nodes.P[numbers] = self._covariances[owners, kinds]
+
+    def _read_pair(self, track: int, left: int, right: int) -> None:
+        """Read the covariance of a node, and the distribution of the one before it given that."""
+        nodes, n = self.nodes, self.motion.dim
+        joint = self._covariance(track, left, right)
+        cross, P = joint[:n, n:], joint[n:, n:]
+        A = psd_solve(P, cross.T).T
+        nodes.back[left, :, :n], nodes.back[left, :, n] = A, nodes.step[left] - A @ nodes.step[right]
+        nodes.C[left] = symmetrise(joint[:n, :n] - A @ cross.T)
+        self._covariances[left, 1] = P
 
     def solve(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
         """See `Solver.solve`."""
@@ -111,3 +116,4 @@ class GraphSolver(Solver):
         """Make room for the values of all numbers."""
         if self.nodes.size > len(self._is_known):
             self._is_known = grown(self._is_known, self.nodes.size)
+            self._covariances = grown(self._covariances, self.nodes.size)

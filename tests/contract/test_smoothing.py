@@ -1,0 +1,486 @@
+"""What the fixed-lag smoothers promise beyond the contract of all estimators, with each solver."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.time import nanoseconds
+from fgtrack.core.types import SmoothedReport, TrackState
+from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
+from fgtrack.estimation.failures import Failure
+from fgtrack.estimation.registry import estimator
+from fgtrack.estimation.smoothing.bank import FixedLagSmoother, SmootherBank
+from fgtrack.estimation.smoothing.gtsam.batch import BatchSolver
+from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
+from fgtrack.estimation.smoothing.settings import SmootherSettings
+from fgtrack.estimation.smoothing.solver import Solver
+from fgtrack.models.measurement import SensorPose
+from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
+from fgtrack.models.sensors import RobustLoss
+from fgtrack.testing.references import Difference, dense_joint, difference
+from fgtrack.testing.streams import COMPONENTS, MS, START, US, measured, shuffled
+
+START_NS = START.stamp_ns
+LINEAR = (("x_m", "y_m"), ("x_m", "y_m", "speed_mps"), ("x_m", "y_m", "yaw_rad"))
+KINDS = ("huber", "cauchy", "tukey", "geman_mcclure", "dcs")
+SOLVERS: dict[str, type[Solver]] = {"banded": Solver, "incremental": IncrementalSolver, "batch": BatchSolver}
+TOLERANCES = {"banded": 1e-9, "incremental": 1e-9, "batch": 1e-6}
+every_solver = pytest.mark.parametrize("name", SOLVERS)
+
+
+def smoother(motion: MotionModel, name: str, lag_s: float = 0.3, **settings: Any) -> FixedLagSmoother:
+    own = SmootherSettings(lag_s=lag_s, **{"ring_s": 10.0, "lagged_s": (), **settings})
+    return FixedLagSmoother(motion, START, own, SOLVERS[name])
+
+
+def fill(motion: MotionModel, rng: np.random.Generator, *estimators: Estimator, num: int = 9) -> None:
+    for k in range(1, num + 1):
+        measurement = measured(rng, motion, k * 50 * MS)
+        for each in estimators:
+            each.update(measurement)
+
+
+def apart(first: Estimator, second: Estimator) -> float:
+    stamps_ns = [START_NS + ms * MS for ms in (0, 120, 345, 450, 475, 500, 600)]
+    return max(max(difference(first.state_at(at), second.state_at(at))) for at in stamps_ns)
+
+
+def arriving(
+    motion: MotionModel, seed: int, names: Sequence[tuple[str, ...]] = LINEAR, delay_s: float = 0.2, num: int = 50
+) -> list[Measurement]:
+    """Measurements of 2 s in the order of their arrival."""
+    rng = np.random.default_rng(seed)
+    offsets_ns = np.sort(rng.integers(1, 2000, num)) * MS
+    order = np.argsort(offsets_ns + rng.uniform(0.0, delay_s, num) * 1e9)
+    drawn = [measured(rng, motion, int(ns), names[rng.integers(len(names))]) for ns in offsets_ns]
+    return [drawn[index] for index in order.tolist()]
+
+
+# --- gtsam's factor graph and the compiled loops solve the same windows
+
+
+def largest_difference(
+    motion: MotionModel,
+    measurements: Sequence[Measurement],
+    start: Start = START,
+    lag_s: float = 0.7,
+    past_s: float = 0.13,
+    **options: Any,
+) -> float:
+    """Between `smoother` and `smoother-banded`, after each measurement: present, a state of the past, and NIS."""
+    expected, found = (
+        estimator(name, motion, start, lag_s=lag_s, **options) for name in ("smoother", "smoother-banded")
+    )
+    largest = 0.0
+    for measurement in measurements:
+        before, after = expected.update(measurement), found.update(measurement)
+        assert after.status is before.status
+        assert found.window_ns == expected.window_ns
+        if before.nis is not None and after.nis is not None:
+            largest = max(largest, abs(after.nis - before.nis) / (1.0 + before.nis))
+        oldest_ns, newest_ns = expected.window_ns
+        for at_ns in (newest_ns + 50 * MS, max(oldest_ns, newest_ns - nanoseconds(past_s))):
+            largest = max(largest, *difference(found.state_at(at_ns), expected.state_at(at_ns)))
+    return largest
+
+
+@pytest.mark.parametrize("motion", [CTRV(), CTRA()], ids=["ctrv", "ctra"])
+@pytest.mark.parametrize("names", [LINEAR, COMPONENTS], ids=["linear", "nonlinear"])
+def test_at_any_thresholds_both_solve_the_same_windows(motion: MotionModel, names: tuple[tuple[str, ...], ...]) -> None:
+    assert largest_difference(motion, arriving(motion, 0, names)) < 1e-9
+    assert largest_difference(motion, arriving(motion, 7, names), max_iterations=4) < 1e-9
+
+
+def test_so_they_do_with_robust_losses_and_an_unknown_heading() -> None:
+    unknown = replace(START, yaw_rad=None, yaw_std_rad=None)
+    rng = np.random.default_rng(5)
+    lossy = [
+        replace(m, loss=RobustLoss(KINDS[k % 5], 2.0), z=m.z + (4.0 if rng.random() < 0.1 else 0.0))
+        for k, m in enumerate(arriving(CTRV(), 1, LINEAR[:1]))
+    ]
+    assert largest_difference(CTRV(), lossy) < 1e-9
+    assert largest_difference(CTRV(), arriving(CTRV(), 2, LINEAR[:1]), unknown) < 1e-9
+    assert largest_difference(CTRV(), lossy, unknown, initiation="two-point") < 1e-9
+
+
+@pytest.mark.parametrize("late", ["fuse", "drop"])
+def test_so_they_do_with_what_is_older_than_the_window(late: str) -> None:
+    for motion in (CV(), CTRV()):
+        measurements = arriving(motion, 3, LINEAR[:1], delay_s=0.9)
+        assert largest_difference(motion, measurements, lag_s=0.3, late=late, ring_s=0.4) < 1e-9
+
+
+def test_a_whole_window_converges_to_the_minimum_that_levenberg_marquardt_finds() -> None:
+    motion = CTRV()
+    for seed in range(2):
+        stream = shuffled(motion, np.random.default_rng([seed, 4]))
+        three = [smoother(motion, name, 9.0, relinearise=dict.fromkeys(motion.state_names, 1e-7)) for name in SOLVERS]
+        for each in three:
+            for measurement in stream.measurements:
+                each.update(measurement)
+            each.converge()
+        for at_ns in (START_NS, *stream.stamps_ns, stream.newest_ns + 100 * MS):
+            states = [each.state_at(at_ns) for each in three]
+            assert max(*difference(states[0], states[1]), *difference(states[0], states[2])) < 1e-6
+
+
+# --- failures
+
+
+class Fuse:
+    """Lets the next solution of track 0 raise, once, before it is applied or after it."""
+
+    def __init__(self, one: SmootherBank, when: Literal["before", "after"]) -> None:
+        self.blown = False
+        solver = one.windows.solver
+        solve = solver.solve
+
+        def gives_up(tracks: Any, *arguments: Any) -> None:
+            hit = 0 in tracks and not self.blown
+            if hit and when == "before":
+                self.blow()
+            solve(tracks, *arguments)
+            if hit:
+                self.blow()
+
+        solver.solve = gives_up  # type: ignore[method-assign]
+
+    def blow(self) -> None:
+        self.blown = True
+        raise np.linalg.LinAlgError("the solver gave up")
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+@every_solver
+def test_a_solver_that_gives_up_once_fails_one_measurement_and_the_rest_is_as_if_nothing_had_happened(
+    name: str, when: Literal["before", "after"]
+) -> None:
+    """The measurement comes ahead, on the newest node, into a segment, beyond the window, or moves the window on."""
+    motion, tolerance = CV(), TOLERANCES[name]
+    for ms in (500, 475, 450, 345, 120, 1000):
+        rng = np.random.default_rng(8)
+        hit, spared = smoother(motion, name), smoother(motion, name)
+        fill(motion, rng, hit, spared)
+        left = [state.stamp_ns for state in spared.take_final()]
+        assert [state.stamp_ns for state in hit.take_final()] == left
+
+        fuse = Fuse(hit.bank, when)
+        assert hit.update(measured(rng, motion, ms * MS)).status is UpdateStatus.FAILED
+        assert fuse.blown
+        assert hit.bank.windows.failures.counts == {Failure.GRAPH_REBUILT: 1}
+        assert hit.window_ns == spared.window_ns
+        assert apart(hit, spared) < tolerance
+
+        for late_ms in (500, 320, 130, 900, 650):
+            measurement = measured(rng, motion, late_ms * MS)
+            assert hit.update(measurement).status is spared.update(measurement).status
+            assert apart(hit, spared) < tolerance
+        assert hit.bank.windows.failures.counts == {Failure.GRAPH_REBUILT: 1}
+        for found, expected in zip(hit.take_rest(), spared.take_rest(), strict=True):
+            assert found.stamp_ns == expected.stamp_ns
+            assert max(difference(found, expected)) < tolerance
+
+
+@pytest.mark.parametrize("make", [Solver, IncrementalSolver])
+@pytest.mark.parametrize("what", ["R", "z", "solver"])
+def test_of_several_tracks_the_one_that_cannot_be_updated_fails_alone(make: type[Solver], what: str) -> None:
+    """By a covariance that is none, by what is no number, and by a solver that gives up once more on it alone."""
+    motion, rng = CTRV(), np.random.default_rng(3)
+    settings = SmootherSettings(lag_s=0.3, ring_s=5.0, relinearise=dict.fromkeys(motion.state_names, 1e9))
+    hit, spared = (SmootherBank(motion, settings, make) for _ in range(2))
+    for bank in (hit, spared):
+        for track_id in range(3):
+            bank.birth(track_id, START)
+    for ms in (*range(50, 600, 50), 430, 275, 100, 600):
+        stamp_ns = START_NS + ms * MS
+        measurements = [measured(rng, motion, ms * MS) for _ in range(3)]
+        if ms % 50 == 0 and ms not in (100, 600):
+            for bank in (hit, spared):
+                bank.advance(stamp_ns)
+                bank.update(stamp_ns, [0, 1, 2], measurements)
+            continue
+        expected = [result.status for result in spared.update(stamp_ns, [1, 2], measurements[1:])]
+        broken = {"R": {"R": -9.0 * np.eye(2)}, "z": {"z": np.full(2, np.nan)}, "solver": {}}[what]
+        given = [replace(measurements[0], **broken), *measurements[1:]]
+        solve, solver = hit.windows.solver.solve, hit.windows.solver
+        calls: list[int] = []
+
+        def gives_up(tracks: Any, *arguments: Any, solve: Any = solve, calls: list[int] = calls) -> None:
+            """At the update of all, and at that of track 0 alone; not where windows are built again after that."""
+            solve(tracks, *arguments)
+            if what == "solver" and 0 in tracks:
+                calls.append(len(tracks))
+                if len(calls) in (1, 3):
+                    raise np.linalg.LinAlgError("gave up")
+
+        solver.solve = gives_up  # type: ignore[method-assign]
+        found = [result.status for result in hit.update(stamp_ns, [0, 1, 2], given)]
+        solver.solve = solve  # type: ignore[method-assign]
+        assert found == [UpdateStatus.FAILED, *expected]
+        for before, after in zip(spared.present(), hit.present(), strict=True):
+            assert max(known_apart(after, before)) < 1e-6
+        for at_ms in (250, 320):
+            before, after = (bank.state_at(0, START_NS + at_ms * MS) for bank in (spared, hit))
+            assert max(difference(after, before)) < 1e-6
+
+
+def test_after_a_rebuild_a_nonlinear_model_stands_where_it_stood() -> None:
+    motion, rng = CTRV(), np.random.default_rng(9)
+    hit, spared = smoother(motion, "incremental"), smoother(motion, "incremental")
+    fill(motion, rng, hit, spared)
+    Fuse(hit.bank, "after")
+    assert hit.update(measured(rng, motion, 345 * MS)).status is UpdateStatus.FAILED
+    hit.converge()
+    spared.converge()
+    assert apart(hit, spared) < 1e-2
+
+
+# --- outputs
+
+
+@every_solver
+def test_final_states_are_the_dense_joint_of_what_had_arrived_when_the_node_left(name: str) -> None:
+    """Without the measurements that come 1 us after another, which cost digits."""
+    motion = CV()
+    for seed in range(3):
+        stream = shuffled(motion, np.random.default_rng([11, seed]), span_s=2.0)
+        one, arrived, stamps_ns = smoother(motion, name), list[Measurement](), list[int]()
+        for measurement in (*(m for m in stream.measurements if (m.stamp_ns - START_NS) % (2 * MS) == 0), None):
+            if measurement is not None:
+                one.update(measurement)
+            states = one.take_rest() if measurement is None else one.take_final()
+            joint = dense_joint(motion, START, arrived, [state.stamp_ns for state in states])
+            for state in states:
+                assert max(difference(state, joint[state.stamp_ns])) < TOLERANCES[name]
+            stamps_ns += [state.stamp_ns for state in states]
+            arrived += [] if measurement is None else [measurement]
+        assert stamps_ns == sorted(set(stamps_ns))
+        assert set(stamps_ns) <= set(stream.stamps_ns)
+
+
+def test_a_prior_that_says_nothing_costs_no_digits() -> None:
+    motion = CV()
+    start = replace(START, position_std_m=1e5, speed_std_mps=1e5)
+    one = estimator("smoother-banded", motion, start, lag_s=9.0)
+    measurements = arriving(motion, 6, LINEAR[:1], num=20)
+    for measurement in measurements:
+        one.update(measurement)
+    for state in one.take_rest():  # type: ignore[attr-defined]  # smoothers have it
+        joint = dense_joint(motion, start, measurements, [state.stamp_ns])
+        assert max(difference(state, joint[state.stamp_ns])) < 1e-6
+
+
+def test_an_option_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(CallError, match="unknown option 'lagg_s'; its options are"):
+        estimator("smoother", CV(), START, lagg_s=1)
+
+
+@every_solver
+def test_states_between_which_gauss_newton_oscillates_converge(name: str) -> None:
+    """Two clusters of positions: the noise of the motion between them follows the state before it, and so on."""
+    motion, rng = CTRV(), np.random.default_rng(295)
+    offsets_ns = (1422 * MS, 1422 * MS + US, 2 * MS, 2 * MS + US)
+    measurements = [measured(rng, motion, ns, COMPONENTS[rng.integers(4)]) for ns in offsets_ns]
+    shuffled_one, in_order = (smoother(motion, name, 2.0) for _ in range(2))
+    for index in range(4):
+        shuffled_one.update(measurements[index])
+        in_order.update(measurements[3 - index])
+    for each in (shuffled_one, in_order):
+        each.converge(20)
+    for ns in (0, 2 * MS, 700 * MS, 1422 * MS):
+        assert max(difference(shuffled_one.state_at(START_NS + ns), in_order.state_at(START_NS + ns))) < 1e-5
+
+
+# --- late measurements
+
+
+def test_fusing_late_data_reaches_as_far_as_the_ring_and_says_so() -> None:
+    motion, rng = CV(), np.random.default_rng(0)
+    one = smoother(motion, "incremental", ring_s=0.2)
+    fill(motion, rng, one, num=20)
+    assert one.window_ns == (START_NS + 500 * MS, START_NS + 1000 * MS)
+    found = [one.update(measured(rng, motion, ms * MS)).status for ms in (499, 500, 699, 700)]
+    too_old, beyond = UpdateStatus.TOO_OLD, UpdateStatus.BEYOND_WINDOW
+    assert found == [too_old, beyond, beyond, UpdateStatus.OUT_OF_SEQUENCE]
+
+
+@every_solver
+def test_late_data_may_be_an_error_and_the_estimator_stays_as_it_was(name: str) -> None:
+    motion, rng = CTRV(), np.random.default_rng(0)
+    one = smoother(motion, name, late="raise")
+    fill(motion, rng, one, num=11)
+    start_ns, newest_ns = one.window_ns
+    before = [repr(one.state_at(stamp_ns)) for stamp_ns in (start_ns, newest_ns)]
+    with pytest.raises(DataError, match=r"0\.01 s older than the window: lengthen smoother\.lag_s"):
+        one.update(measured(rng, motion, start_ns - START_NS - 10 * MS))
+    assert [repr(one.state_at(stamp_ns)) for stamp_ns in (start_ns, newest_ns)] == before
+    assert one.update(measured(rng, motion, start_ns - START_NS)).status is UpdateStatus.OUT_OF_SEQUENCE
+
+
+@every_solver
+def test_in_a_nonlinear_model_late_data_beyond_the_window_costs_little(name: str) -> None:
+    """Marginalised nodes keep their linearisation: most of what the detection says arrives, not all."""
+    motion, rng = CTRV(), np.random.default_rng(7)
+    measurements = [measured(rng, motion, k * 50 * MS) for k in range(1, 30)]
+    late = measurements[10]
+    in_order, beyond = smoother(motion, name), smoother(motion, name)
+    for measurement in measurements:
+        in_order.update(measurement)
+        if measurement is not late:
+            beyond.update(measurement)
+    newest_ns = START_NS + 1450 * MS
+    without, expected = beyond.state_at(newest_ns), in_order.state_at(newest_ns)
+    assert beyond.update(late).status is UpdateStatus.BEYOND_WINDOW
+    remaining = difference(beyond.state_at(newest_ns), expected).mean_sigma
+    assert remaining < 0.2 * difference(without, expected).mean_sigma
+
+
+# --- many tracks
+
+
+def known_apart(found: TrackState, expected: TrackState) -> Difference:
+    """`difference` of what is known of a kinematic state."""
+    known = np.diag(expected.covariance) > 0.0
+    parts = (TrackState(s.stamp_ns, s.mean[known], s.covariance[known][:, known]) for s in (found, expected))
+    return difference(*parts)
+
+
+class Alone:
+    """As a bank, smoothers of one object each."""
+
+    def __init__(self, motion: MotionModel, settings: SmootherSettings, make: Callable[..., Solver]) -> None:
+        self.make = lambda start: FixedLagSmoother(motion, start, settings, make).bank
+        self.banks: dict[int, SmootherBank] = {}
+        self.ended: list[SmoothedReport] = []
+        self.now_ns = 0
+
+    def advance(self, now_ns: int) -> None:
+        self.now_ns = now_ns
+        for bank in self.banks.values():
+            bank.advance(now_ns)
+
+    def birth(self, track_id: int, start: Start) -> None:
+        self.banks[track_id] = self.make(start)
+        self.banks[track_id].advance(self.now_ns)
+
+    def remove(self, track_id: int) -> None:
+        bank = self.banks.pop(track_id)
+        bank.remove(0)
+        self.ended += [replace(report, track_id=track_id) for report in bank.smoothed() if report.lag_s is None]
+
+    def update(self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]) -> list[Any]:
+        return [
+            self.banks[track_id].update(stamp_ns, [0], [each])[0]
+            for track_id, each in zip(track_ids, measurements, strict=True)
+        ]
+
+    def present(self) -> list[TrackState]:
+        return [bank.present()[0] for bank in self.banks.values()]
+
+    def smoothed(self) -> list[SmoothedReport]:
+        reports, self.ended = self.ended, []
+        each = [replace(r, track_id=track_id) for track_id, bank in self.banks.items() for r in bank.smoothed()]
+        return reports + sorted(each, key=lambda report: report.lag_s or 0.0)
+
+
+class Traffic:
+    """Object lists of tracks that begin, end and are missed, delivered to a bank and to single smoothers."""
+
+    def __init__(self, seed: int, settings: SmootherSettings, motion: MotionModel, make: type[Solver]) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.motion = motion
+        self.bank, self.alone = SmootherBank(motion, settings, make), Alone(motion, settings, Solver)
+        self.statuses: set[UpdateStatus] = set()
+        self.smoothed: list[tuple[SmoothedReport, SmoothedReport]] = []
+        self.largest = 0.0
+        self._next_id = 0
+
+    def run(self, latest_ms: int, num: int = 60) -> None:
+        now_ns = START_NS
+        for k in range(num):
+            now_ns += 25 * MS
+            self.bank.advance(now_ns)
+            self.alone.advance(now_ns)
+            if k % 9 == 0 or self.rng.random() < 0.05:
+                self._birth(now_ns - int(self.rng.integers(0, 80)) * MS)
+            if len(self.bank.track_ids) > 2 and self.rng.random() < 0.05:
+                gone = int(self.rng.choice(self.bank.track_ids))
+                self.bank.remove(gone)
+                self.alone.remove(gone)
+            self._list(now_ns - int(self.rng.choice([0, 40, 150, 150, 150, latest_ms])) * MS)
+            for found, expected in zip(self.bank.present(), self.alone.present(), strict=True):
+                self.largest = max(self.largest, *known_apart(found, expected))
+            self.smoothed += zip(self.bank.smoothed(), self.alone.smoothed(), strict=True)
+
+    def _birth(self, stamp_ns: int) -> None:
+        unknown = self.rng.random() < 0.3
+        start = replace(START, stamp_ns=stamp_ns, position_m=self.rng.normal(size=2), yaw_rad=None if unknown else 0.4)
+        self.bank.birth(self._next_id, start)
+        self.alone.birth(self._next_id, start)
+        self._next_id += 1
+
+    def _list(self, stamp_ns: int) -> None:
+        seen = [track_id for track_id in self.bank.states_at(stamp_ns).track_ids if self.rng.random() < 0.8]
+        names = [LINEAR[0] if self.motion.linear else LINEAR[self.rng.integers(3)] for _ in seen]
+        pose = SensorPose(*self.rng.normal(size=2))
+        measurements = [measured(self.rng, self.motion, stamp_ns - START_NS, each) for each in names]
+        measurements = [
+            replace(m, pose=pose, loss=RobustLoss("huber", 2.0) if k == 3 else None) for k, m in enumerate(measurements)
+        ]
+        if self.motion.linear and len(seen) > 2 and self.rng.random() < 0.2:
+            measurements[1] = replace(measurements[1], R=-np.eye(len(measurements[1].z)))
+        given = stamp_ns, seen, measurements
+        for found, expected in zip(self.bank.update(*given), self.alone.update(*given), strict=True):
+            assert found.status is expected.status
+            self.statuses.add(found.status)
+            if expected.nis is not None:
+                self.largest = max(self.largest, abs(found.nis - expected.nis) / (1.0 + expected.nis))
+                np.testing.assert_allclose(found.innovation, expected.innovation, atol=1e-8)
+                np.testing.assert_allclose(
+                    found.innovation_covariance, expected.innovation_covariance, rtol=1e-7, atol=1e-9
+                )
+
+
+@pytest.mark.parametrize("make", [Solver, IncrementalSolver])
+@pytest.mark.parametrize("motion", [CTRV(), CV()], ids=["ctrv", "cv"])
+def test_a_bank_of_tracks_of_all_ages_is_a_bank_of_single_smoothers(make: type[Solver], motion: MotionModel) -> None:
+    """Also of both solvers: the single ones are solved by the compiled loops."""
+    traffic = Traffic(9, SmootherSettings(lag_s=0.4, ring_s=0.5, lagged_s=(0.2, 0.4)), motion, make)
+    traffic.run(latest_ms=600 if motion.linear else 450)
+    assert traffic.largest < 1e-8
+    assert UpdateStatus.OUT_OF_SEQUENCE in traffic.statuses
+    assert {UpdateStatus.BEYOND_WINDOW, UpdateStatus.FAILED} <= traffic.statuses or not motion.linear
+    assert len(traffic.smoothed) > 100
+    for found, expected in traffic.smoothed:
+        assert (found.track_id, found.lag_s, found.state.stamp_ns) == (
+            expected.track_id,
+            expected.lag_s,
+            expected.state.stamp_ns,
+        )
+        assert max(known_apart(found.state, expected.state)) < 1e-8
+
+
+def test_the_arrays_stay_as_small_as_window_and_ring_need() -> None:
+    motion, rng = CTRV(), np.random.default_rng(4)
+    bank = SmootherBank(motion, SmootherSettings(lag_s=0.3, ring_s=0.3), IncrementalSolver)
+    for k in range(1, 301):
+        stamp_ns = START_NS + 25 * k * MS
+        bank.advance(stamp_ns)
+        if k % 30 == 1:  # one after the other, and one that stays
+            for track_id in bank.track_ids[1:]:
+                bank.remove(track_id)
+            bank.birth(k, replace(START, stamp_ns=stamp_ns))
+        seen = [track_id for track_id in bank.track_ids if rng.random() < 0.9]
+        bank.states_at(stamp_ns)
+        bank.update(stamp_ns, seen, [measured(rng, motion, 25 * k * MS) for _ in seen])
+        bank.smoothed()
+    nodes = bank.windows.nodes
+    assert nodes.stamps_ns.shape == (4, 64)
+    assert nodes.rows.shape[:2] == (4 * 64, 4)
+    assert len(nodes.terms) <= 4 * 64
+    assert max(map(len, nodes.terms.values())) <= 1
+    assert len(bank._known) <= 2
