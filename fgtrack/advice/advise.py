@@ -30,7 +30,7 @@ from fgtrack.pipeline.clock import corrected
 from fgtrack.pipeline.clock_offsets import OffsetReport, estimate_offsets
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_in_memory
-from fgtrack.pipeline.shipped import read_config, settings_of
+from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.trial import TRIAL_S, beginning, suspicions
 from fgtrack.pipeline.tune import tuned
 from fgtrack.pipeline.tune_rules import TuneRules
@@ -88,7 +88,7 @@ def advise(
     DataError
         The recording cannot be read, or holds nothing to track.
     """
-    resolved = read_config(config, settings_of(set), track_map=map, pit_map=pit_map)
+    resolved = read_config(config, set, track_map=map, pit_map=pit_map)
     on_step("reading", 0.0)
     source = open_input(recording, resolved.input)
     readable = UntilBreak(source.messages())
@@ -403,4 +403,4 @@ class _Adviser:
 
 def _with(config: Config, finding: Finding) -> Config:
     """`config` with the settings of a finding."""
-    return read_config(config, settings_of(finding.settings)) if finding.settings else config
+    return read_config(config, finding.settings) if finding.settings else config

@@ -24,7 +24,7 @@ from fgtrack.io.source import InputSource, open_input
 from fgtrack.pipeline.assumed import Assumed, assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import ReplayResult, replay_each
-from fgtrack.pipeline.shipped import read_config, settings_of
+from fgtrack.pipeline.shipped import read_config
 from fgtrack.plotting.late_detection import drawn_close_up
 from fgtrack.plotting.plot import drawn, planned
 from fgtrack.plotting.slow_motion import CloseUp
@@ -131,7 +131,7 @@ def study(
         The recording cannot be read, or holds nothing to track.
     """
     out, source_path = Path(out), Path(recording)
-    resolved = read_config(config, settings_of(set), track_map=map, pit_map=pit_map)
+    resolved = read_config(config, set, track_map=map, pit_map=pit_map)
     *runs, pictures, settings, page = outputs(out)
     folders = dict(zip(ESTIMATORS, runs, strict=True))
     config_file = str(config) if isinstance(config, (str, Path)) else None

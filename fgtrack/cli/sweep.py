@@ -19,9 +19,7 @@ from fgtrack.evaluation.sweep_table import SweepTable, read_sweep
 from fgtrack.io.output import check_apart, write_file
 from fgtrack.io.run import Run
 from fgtrack.pipeline.shipped import find_file
-from fgtrack.pipeline.sweep import Scores, Sweep
-from fgtrack.pipeline.sweep_plan import load_plan
-from fgtrack.pipeline.sweep_store import (
+from fgtrack.pipeline.sweep import (
     ERROR_TABLE,
     PAIRED_TABLE,
     PRODUCTS,
@@ -29,8 +27,11 @@ from fgtrack.pipeline.sweep_store import (
     SWEEP_TABLE,
     Cell,
     Scalar,
+    Scores,
+    Sweep,
     SweepResult,
 )
+from fgtrack.pipeline.sweep_plan import load_plan
 
 #: Wall times among the metrics, and what follows from them; they have a table of their own.
 _TIMES = ("time_per_", "deadlines.")

@@ -1,15 +1,14 @@
 """The table of a sweep: mean and standard error over the seeds at every point of its grid."""
 
-import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import numpy as np
+import pandas as pd  # type: ignore[import-untyped]  # has no stubs
 
 from fgtrack.core.errors import CallError, DataError, did_you_mean
-from fgtrack.core.files import open_text
 
 SWEEP_FILE = "sweep.csv"
 _SEED, _ESTIMATOR = "seed", "estimator"
@@ -47,74 +46,58 @@ class SweepTable:
         return tuple(varying[k] for k in telling(points, len(varying)))
 
     def means(self, metric: str, axes: Sequence[str] | None = None) -> list[PointMean]:
-        """Mean and standard error of `metric` at every point and of every estimator, in the order of the table.
+        """Return mean and standard error of `metric` at every point, by estimator, in the order of the table.
 
-        `axes` are those that make a point, by default `shown_axes`. Cells that are empty or no finite number count for
-        nothing; a point without any is left out.
-
-        Raises
-        ------
-        CallError
-            There is no such metric.
+        `axes` are those that make a point, by default `shown_axes`. Cells without a finite number are left out, and a
+        point without any. Raises `CallError` where there is no such metric.
         """
         if metric not in self.metrics:
             hint = did_you_mean(metric, self.metrics) or f", there are {', '.join(self.metrics[:5])} ..."
             raise CallError(f"{metric}: the sweep has no such metric{hint}")
-        axes = self.shown_axes if axes is None else axes
-        values: dict[tuple[tuple[str, ...], str], list[float]] = {}
-        for row in self.rows:
-            value = number(row[metric])
-            if math.isfinite(value):
-                values.setdefault((tuple(row[axis] for axis in axes), row[_ESTIMATOR]), []).append(value)
-        return [PointMean(*key, *_mean(found), len(found)) for key, found in values.items()]
+        keys = [*(self.shown_axes if axes is None else axes), _ESTIMATOR]
+        frame: Any = pd.DataFrame(list(self.rows))
+        frame[metric] = [value if math.isfinite(value) else None for value in map(number, frame[metric])]
+        found = frame.dropna(subset=[metric]).astype({metric: float}).groupby(keys, sort=False)[metric]
+        rows = found.agg(["mean", "sem", "count"]).reset_index().itertuples(index=False)
+        return [PointMean(tuple(row[:-4]), *row[-4:]) for row in rows]
 
 
 def read_sweep(folder: Path | str) -> SweepTable:
-    """The table of the sweep in `folder`.
+    """Return the table of the sweep in `folder`.
 
-    Raises
-    ------
-    CallError
-        There is none.
-    DataError
-        It is no table of a sweep, or has no rows.
+    Raises `CallError` where there is none, and `DataError` where it is another table.
     """
     path = Path(folder) / SWEEP_FILE
     try:
-        with open_text(path, newline="") as file:
-            rows = list(csv.DictReader(file))
+        frame = pd.read_csv(path, dtype=str, keep_default_na=False)
     except OSError as error:
         raise CallError(f"{path}: cannot be read ({error.strerror}), make one with `fgtrack sweep`") from error
-    except (csv.Error, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise DataError(f"{path}: is no table ({error}), repeat the sweep") from error
-    columns = list(rows[0]) if rows else []
-    if _SEED not in columns or _ESTIMATOR not in columns or any(None in row.values() for row in rows):
+    columns = list(frame.columns)
+    if _SEED not in columns or _ESTIMATOR not in columns or frame.empty:
         raise DataError(f"{path}: holds no rows of a sweep, repeat it")
-    place = columns.index(_SEED)
-    return SweepTable(tuple(columns[:place]), tuple(columns[place + 2 :]), rows)
+    index = columns.index(_SEED)
+    return SweepTable(tuple(columns[:index]), tuple(columns[index + 2 :]), frame.to_dict("records"))
 
 
 def is_sweep(folder: Path) -> bool:
-    """Whether `folder` holds the table of a sweep."""
+    """True if `folder` holds the table of a sweep."""
     return (folder / SWEEP_FILE).is_file()
 
 
 def telling(points: Iterable[tuple[str, ...]], num_axes: int) -> list[int]:
-    """Which axes tell `points` apart, without those of whole mappings where labels do it."""
+    """Indices of the axes that tell `points` apart, without those of whole mappings where labels do it."""
     distinct = set(points)
     plain = [k for k in range(num_axes) if not any(point[k].startswith(("{", "[")) for point in distinct)]
-    told = {tuple(point[k] for k in plain) for point in distinct}
-    return plain if len(told) == len(distinct) else list(range(num_axes))
+    return (
+        plain if len({tuple(point[k] for k in plain) for point in distinct}) == len(distinct) else list(range(num_axes))
+    )
 
 
 def number(cell: str) -> float:
-    """The number in a cell; NaN where there is none."""
+    """Number in a cell; NaN where there is none."""
     try:
         return float(cell)
     except ValueError:
         return math.nan
-
-
-def _mean(values: Sequence[float]) -> tuple[float, float]:
-    error = float(np.std(values, ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
-    return float(np.mean(values)), error

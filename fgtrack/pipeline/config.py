@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Literal, Self
 
 from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat, PositiveInt, Tag
 
@@ -16,6 +17,7 @@ from fgtrack.models.correlated_errors import with_correlated_errors
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.road import OPEN_SPACE
 from fgtrack.models.sensors import SensorModel
+from fgtrack.pipeline.load import dump, load, plain, with_settings
 from fgtrack.sim.settings import settings
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
@@ -295,6 +297,23 @@ class Config:
             raise ValueError(
                 f"{key}: needs a motion model with a yaw rate, as ctrv or ctra, and not {self.motion.kind}"
             )
+
+    @classmethod
+    def from_yaml(cls, path: str | Path) -> Self:
+        """Return the configuration of a YAML file. Raises `CallError` with the file and the key."""
+        return load(cls, Path(path))
+
+    def to_yaml(self, path: str | Path) -> None:
+        """Write every key to a YAML file, which is replaced."""
+        Path(path).write_text(dump(self), encoding="utf-8")
+
+    def replace(self, settings: Mapping[str, object] | None = None, /, **sections: object) -> Self:
+        """Return a copy with other values of dotted keys or of whole sections, validated as a file is.
+
+        `config.replace({"smoother.lag_s": 3.0}, estimator="smoother")`. Raises `CallError` with the key.
+        """
+        changes = {key: plain(value) for key, value in {**(settings or {}), **sections}.items()}
+        return with_settings(type(self), plain(self), changes, "the configuration")
 
     @property
     def used_sensors(self) -> Mapping[str, SensorModel]:

@@ -28,7 +28,7 @@ from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import WallClock, corrected
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.lateness import Lateness, Receptions, TickTimes, TickTiming
-from fgtrack.pipeline.shipped import read_config, settings_of
+from fgtrack.pipeline.shipped import read_config
 from fgtrack.tracking.inbox import records
 
 __all__ = ["TrackOutput", "Tracker", "TracksAt"]
@@ -50,15 +50,25 @@ class Tracker:
     Parameters
     ----------
     config
-        Settings of the tracker. Raises `CallError` where they cannot be built.
+        Name of a shipped configuration, path of a YAML file, or a `Config`; None for the defaults. Raises `CallError`
+        where it cannot be built.
+    map, pit_map, estimator, set
+        As of `fgtrack.replay`.
     clock
         Times the ticks; nothing else depends on it.
     """
 
-    def __init__(self, config: Config, clock: WallClock | None = None) -> None:
-        if not isinstance(config, Config):
-            what = f"must be a Config, is a {type(config).__name__}"
-            raise CallError(f"config: {what}; Tracker.from_config takes names and paths")
+    def __init__(
+        self,
+        config: str | Path | Config | None = None,
+        *,
+        map: str | Path | None = None,  # noqa: A002 - the name of the option
+        pit_map: str | Path | None = None,
+        estimator: str | None = None,
+        set: Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
+        clock: WallClock | None = None,
+    ) -> None:
+        config = read_config(config, set, track_map=map, pit_map=pit_map, estimator=estimator)
         self.config = config
         self._tracker = build_tracker(config, lambda parts: replace(parts, propagated_exceptions=(DataError,)))
         self._refused: Counter[str] = Counter()
@@ -82,8 +92,8 @@ class Tracker:
         estimator: str | None = None,
         set: Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
     ) -> Self:
-        """A tracker with a shipped configuration by name, one from a YAML file, or a `Config`; see `fgtrack.replay`."""
-        return cls(read_config(config, settings_of(set), track_map=map, pit_map=pit_map, estimator=estimator))
+        """Return `Tracker(config, ...)`."""
+        return cls(config, map=map, pit_map=pit_map, estimator=estimator, set=set)
 
     @property
     def refused(self) -> Mapping[str, int]:

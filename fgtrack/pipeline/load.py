@@ -9,6 +9,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
@@ -21,33 +22,39 @@ from fgtrack.io.yaml_text import safe_yaml
 T = TypeVar("T")
 
 SMALLEST = 1e-12
-"""No configured number but 0 is nearer to it, in any unit: squares and products stay finite."""
-_LONGEST_VALUE = 4096  # of a path
+"""No configured number but 0 has a smaller magnitude, in any unit: squares and products stay finite."""
+_LONGEST_TEXT = 4096  # of a path
+_UNKNOWN = "unexpected_keyword_argument"
 
 
 def load(kind: type[T], path: Path | None, settings: Sequence[str] = ()) -> T:
-    """An instance of the dataclass `kind` from the YAML file `path`, with `settings` of the form a.b=value on top.
+    """Return an instance of the dataclass `kind` from the YAML file `path`, with `settings` of the form a.b=value.
 
-    A setting below a key that the file leaves out changes that key's default: one sensor of all, the same `kind`.
-    Without a file, from the defaults, which a `kind` that takes settings must have. Raises `CallError` for a missing
-    file, wrong YAML, an unknown or repeated key, and a value of the wrong type or range.
+    Without a file, from the defaults. Raises `CallError` for a missing file, wrong YAML, an unknown or repeated key,
+    and a value of the wrong type or range.
     """
-    raw = {} if path is None else read_yaml(path)
-    return with_settings(kind, raw, settings, "defaults" if path is None else str(path))
+    raw, origin = ({}, "defaults") if path is None else (read_yaml(path), str(path))
+    return with_settings(kind, raw, dict(map(key_and_value, settings)), origin)
 
 
-def with_settings(kind: type[T], raw: dict[str, Any], settings: Sequence[str], origin: str) -> T:
-    """`raw` as an instance of `kind`, as `load` reads it from a file."""
+def with_settings(kind: type[T], raw: dict[str, Any], settings: Mapping[str, Any], origin: str) -> T:
+    """Return `raw` as an instance of `kind`, with values of the dotted keys of `settings`.
+
+    A setting below a key that `raw` leaves out changes that key's default: one sensor of all, the same `kind`.
+    """
     if not settings:
         return validate(kind, raw, origin)
     defaults = validate(kind, {}, "defaults")
-    for setting in settings:
-        raw = _with_setting(raw, setting, defaults)
+    for key, value in settings.items():
+        try:
+            raw = with_value(raw, names_of(key), value, defaults)
+        except LookupError as error:
+            raise CallError(f"--set {key}: {error.args[0]}") from error
     return validate(kind, raw, f"{origin} with --set")
 
 
-def read_yaml(path: Path) -> dict[str, Any]:  # Any: what YAML says is only known after validation
-    """The mapping that the YAML 1.2 file `path` holds; empty for an empty file."""
+def read_yaml(path: Path) -> dict[str, Any]:  # Any: what YAML holds is only known after validation
+    """Return the mapping in the YAML 1.2 file `path`, empty for an empty file."""
     try:
         with open_text(path) as file:
             value = _parse(file.read(), str(path))
@@ -55,23 +62,23 @@ def read_yaml(path: Path) -> dict[str, Any]:  # Any: what YAML says is only know
         reason = getattr(error, "strerror", None) or "is no text file"
         raise CallError(f"{path}: configuration cannot be read ({reason})") from error
     if not isinstance(value, dict | None):
-        raise CallError(f"{path}: a mapping of keys to values is needed, this is {_name(value)}")
+        raise CallError(f"{path}: a mapping of keys to values is needed, this is {_short(value)}")
     return value or {}
 
 
 def _parse(text: str, origin: str) -> Any:
     try:
         return safe_yaml(text)
-    except MarkedYAMLError as error:
-        line = "" if error.problem_mark is None else f":{error.problem_mark.line + 1}"
-        problem = " ".join(str(error.problem or error.context).split())
-        raise CallError(f"{origin}{line}: invalid YAML, {problem.split(' To suppress')[0]}") from error
     except YAMLError as error:
-        raise CallError(f"{origin}: invalid YAML, {' '.join(str(error).split())}") from error
+        mark, problem = None, str(error)
+        if isinstance(error, MarkedYAMLError):
+            mark, problem = error.problem_mark, str(error.problem or error.context).split("To suppress")[0]
+        line = "" if mark is None else f":{mark.line + 1}"
+        raise CallError(f"{origin}{line}: invalid YAML, {' '.join(problem.split())}") from error
 
 
 def names_of(key: str) -> list[str]:
-    """Names of the path `key`; one that contains a dot stands in double quotes: `sensors."cam.top".std.x_m`.
+    """Return the names of the path `key`; one that contains a dot is in double quotes: `sensors."cam.top".std.x_m`.
 
     Empty where `key` is not a path.
     """
@@ -81,8 +88,8 @@ def names_of(key: str) -> list[str]:
     return [name.strip('"') for name in re.findall(quoted, key)]
 
 
-def key_and_value(setting: str) -> tuple[str, Any]:  # Any: what YAML says
-    """The key and the value of a setting of the form a.b=value. Raises `CallError` for another form."""
+def key_and_value(setting: str) -> tuple[str, Any]:
+    """Return key and value of a setting of the form a.b=value. Raises `CallError` for another form."""
     key, equals, text = setting.partition("=")
     if not equals or not names_of(key.strip()):
         raise CallError(
@@ -92,71 +99,67 @@ def key_and_value(setting: str) -> tuple[str, Any]:  # Any: what YAML says
     return key.strip(), _parse(text, f"--set {setting}")
 
 
-def _with_setting(raw: dict[str, Any], setting: str, defaults: object) -> dict[str, Any]:
-    key, value = key_and_value(setting)
-    names = names_of(key)
-    changed = dict(raw)
-    inner = changed
-    for name in names[:-1]:
-        defaults = getattr(defaults, name, None)
-        below = inner.get(name, _kept(defaults))
-        if below is not None and not isinstance(below, dict):
-            raise CallError(f"--set {setting}: {name} is a single value and has no keys below it")
-        inner[name] = dict(below or {})
-        inner = inner[name]
-    inner[names[-1]] = value
-    return changed
+def with_value(inside: Any, names: Sequence[str], value: Any, default: object = None) -> Any:
+    """Return a copy of `inside` with `value` at the path `names`.
 
-
-def _kept(default: object) -> dict[str, Any] | None:
-    """What of a default stays where one key below it is set: the other names of a mapping, the form of a choice."""
-    if isinstance(default, Mapping):
-        kept: dict[str, Any] = plain(default)
-        return kept
-    return {"kind": default.kind} if hasattr(default, "kind") else None
+    An entry of a list is addressed by its index or by its `name`. Of a mapping that is left out, the other names of
+    `default` stay, or its `kind`. Raises `LookupError` for a path that leads into a number or text.
+    """
+    if not names:
+        return value
+    first, rest = names[0], names[1:]
+    if inside is None:
+        inside = plain(default) if isinstance(default, Mapping) else {}
+        inside |= {"kind": default.kind} if hasattr(default, "kind") else {}
+    if isinstance(inside, list):
+        known = [str(one.get("name", k)) if isinstance(one, Mapping) else str(k) for k, one in enumerate(inside)]
+        known = known if first in known else [str(k) for k in range(len(inside))]
+        if first not in known:
+            raise LookupError(f"there is no {first!r} among {len(inside)} entries")
+        index = known.index(first)
+        return [*inside[:index], with_value(inside[index], rest, value), *inside[index + 1 :]]
+    if not isinstance(inside, Mapping):
+        raise LookupError(f"there is no {first!r} in {_short(inside)}, a single value")
+    return {**inside, first: with_value(inside.get(first), rest, value, getattr(default, first, None))}
 
 
 def validate(kind: type[T], raw: Mapping[str, Any], origin: str) -> T:
-    """`raw` as an instance of the dataclass `kind`; `origin` is named in errors."""
+    """Return `raw` as an instance of the dataclass `kind`; `origin` is named in errors."""
     try:
-        text = json.dumps(raw)
+        text = json.dumps(raw, default=_number)
     except (TypeError, ValueError) as error:
         raise CallError(f"{origin}: only plain YAML values and text keys are allowed ({error})") from error
     try:
-        # What is unknown is found below, which says what is known.
-        value: T = _adapter(kind).validate_json(text, strict=True, extra="ignore")  # type: ignore[arg-type]  # a class is hashable
+        value: T = _adapter(kind).validate_json(text, strict=True, extra="forbid")  # type: ignore[arg-type]  # a class is hashable
     except ValidationError as error:
-        raise CallError(f"{origin}: {_first(error)}{_meant(error, raw)}") from error
-    for where, name, known in _unknown(raw, value, ""):
-        hint = did_you_mean(name, known).removesuffix("?")
-        raise CallError(f"{origin}: {where}{name}: unknown key{hint}, known here: {', '.join(known)}")
+        raise CallError(f"{origin}: {_first_problem(error, kind, text)}") from error
     for where, scalar in _scalars(plain(value), ""):
         if isinstance(scalar, str):
-            if not scalar.isprintable():
-                raise CallError(f"{origin}: {where}: {scalar!a} holds what is no letter or sign")
-            if len(scalar) > _LONGEST_VALUE:
-                raise CallError(
-                    f"{origin}: {where}: {scalar[:50]} ... has {len(scalar)} letters, at most {_LONGEST_VALUE} are "
-                    "allowed"
-                )
-        elif isinstance(scalar, int):
-            if abs(scalar) >= 2**63:
-                raise CallError(f"{origin}: {where}: {_name(scalar)} has more than 64 bits")
-        elif scalar and not SMALLEST <= abs(scalar) <= LARGEST:
-            raise CallError(
-                f"{origin}: {where}: {_name(scalar)} is out of range, a magnitude of {SMALLEST:g} to {LARGEST:g} or 0 "
-                "is needed"
+            usable, needed = (
+                scalar.isprintable() and len(scalar) <= _LONGEST_TEXT,
+                f"printable text of at most {_LONGEST_TEXT} letters",
             )
+        elif isinstance(scalar, int):
+            usable, needed = abs(scalar) < 2**63, "an integer of 64 bits"
+        else:
+            usable = not scalar or SMALLEST <= abs(scalar) <= LARGEST
+            needed = f"a magnitude of {SMALLEST:g} to {LARGEST:g}, or 0"
+        if not usable:
+            raise CallError(f"{origin}: {where}: {needed} is needed, not {_short(scalar)}")
     return value
 
 
+def texts_of(value: object) -> Iterator[str]:
+    """Yield every text in plain `value`, keys too."""
+    return (scalar for _, scalar in _scalars(value, "") if isinstance(scalar, str))
+
+
 def _scalars(value: object, where: str) -> Iterator[tuple[str, float | str]]:
-    """Every number and text in plain `value`, keys too, with its path."""
+    """Yield every number and text in plain `value`, keys too, with its path."""
     if isinstance(value, float | int | str):
         yield where, value
     elif isinstance(value, (dict, list)):
-        items = value.items() if isinstance(value, dict) else enumerate(value)
-        for name, item in items:
+        for name, item in value.items() if isinstance(value, dict) else enumerate(value):
             yield where, name
             yield from _scalars(item, f"{where}.{name}" if where else str(name))
 
@@ -166,56 +169,59 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:  # Any: one for each dataclass, whi
     return TypeAdapter(kind | None, config=ConfigDict(allow_inf_nan=False))  # a class by itself takes no `config`
 
 
-def _first(error: ValidationError) -> str:
-    """The first of pydantic's complaints in a line."""
+def _number(value: object) -> object:
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"a {type(value).__name__} is not a plain value")
+
+
+def _first_problem(error: ValidationError, kind: type[Any], text: str) -> str:
+    """Return a line on the first complaint of pydantic, on an unknown key where there is one."""
     details = error.errors(include_url=False)
-    first = details[0]
-    where = ".".join(str(part) for part in first["loc"])
-    message = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "union_tag_not_found":
+    first = next((one for one in details if one["type"] == _UNKNOWN), details[0])
+    raw = json.loads(text)
+    names, inside, siblings = list[str](), raw, raw
+    part: Any
+    for part in first["loc"]:  # tags of unions are not written in the file
+        if isinstance(inside, list) or (isinstance(inside, Mapping) and part in inside):
+            names, inside, siblings = [*names, str(part)], inside[part], inside
+    if first["type"] == "missing":
+        names, siblings = [*names, str(first["loc"][-1])], siblings if len(first["loc"]) > 1 else {}
+    message, given = first["msg"].removeprefix("Value error, "), f", not {_short(first.get('input'))}"
+    if first["type"] == _UNKNOWN:
+        known = _known_keys(kind, text, names[:-1])
+        hint = did_you_mean(names[-1], known).removesuffix("?")
+        message, given = f"unknown key{hint}, known here: {', '.join(known)}", ""
+    elif first["type"] == "union_tag_not_found":
         message = "needs the key `kind`, which says which of its forms is meant"
+    elif first["type"] == "union_tag_invalid":
+        given += did_you_mean(first["ctx"]["tag"], first["ctx"]["expected_tags"].replace("'", "").split(", "))
+    elif first["type"] == "missing":  # of `sensors.radr` the misspelt part may not be meant to be a new one
+        others = [key for key in siblings if key != names[-2]] if isinstance(siblings, Mapping) and names[1:] else []
+        given = did_you_mean(names[-2], others) if others else ""
+    elif first["type"] == "value_error":
+        given = ""
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
-    given = "" if first["type"] in ("value_error", "missing") else f", not {_name(first.get('input'))}"
-    return f"{where + ': ' if where else ''}{message}{given}{more}"
+    return f"{'.'.join(names) + ': ' if names else ''}{message}{given}{more}"
 
 
-def _name(value: object) -> str:
+def _known_keys(kind: type[Any], text: str, names: Sequence[str]) -> list[str]:
+    """Return the keys of the dataclass at the path `names`; none where the rest is wrong as well."""
+    try:
+        value = _adapter(kind).validate_json(text, strict=True, extra="ignore")  # type: ignore[arg-type]  # as above
+    except ValidationError:
+        return []
+    for name in names:
+        if is_dataclass(value):
+            value = getattr(value, name)
+        else:
+            value = value[name] if isinstance(value, Mapping) else value[int(name)]
+    return [field.name for field in fields(value)]
+
+
+def _short(value: object) -> str:
     text = json.dumps(value, default=str)
     return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _meant(error: ValidationError, raw: object) -> str:
-    """What may have been meant: of a form that does not exist one that does; of a part that lacks something one beside.
-
-    `sensors.radr.std` is missing where `sensors.radr` was not meant to be a new sensor.
-    """
-    first = error.errors(include_url=False)[0]
-    if first["type"] == "union_tag_invalid":
-        return did_you_mean(first["ctx"]["tag"], first["ctx"]["expected_tags"].replace("'", "").split(", "))
-    if first["type"] != "missing" or len(first["loc"]) < 2:
-        return ""
-    for key in first["loc"][:-2]:
-        raw = raw.get(key) if isinstance(raw, Mapping) else None
-    name = first["loc"][-2]
-    return did_you_mean(name, [key for key in raw if key != name]) if isinstance(raw, Mapping) else ""
-
-
-def _unknown(raw: object, value: object, where: str) -> list[tuple[str, str, list[str]]]:
-    """Keys of `raw` that the dataclasses in `value` do not have."""
-    found = []
-    if is_dataclass(value) and isinstance(raw, Mapping):
-        known = [field.name for field in fields(value)]
-        found = [(where, name, known) for name in raw if name not in known]
-        for name in known:
-            if name in raw:
-                found += _unknown(raw[name], getattr(value, name), f"{where}{name}.")
-    elif isinstance(value, Mapping) and isinstance(raw, Mapping):
-        for name in raw:
-            found += _unknown(raw[name], value.get(name), f"{where}{name}.")
-    elif isinstance(raw, list) and isinstance(value, Sequence):
-        for index, (item, inner) in enumerate(zip(raw, value, strict=False)):
-            found += _unknown(item, inner, f"{where}{index}.")
-    return found
 
 
 def plain(value: object) -> Any:  # Any: JSON values, as `validate` takes them

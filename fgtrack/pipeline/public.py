@@ -17,7 +17,7 @@ from fgtrack.pipeline import replay as pipeline
 from fgtrack.pipeline.assumed import assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.recorded import recorded_of
-from fgtrack.pipeline.shipped import read_config, read_scenario, settings_of
+from fgtrack.pipeline.shipped import read_config, read_scenario
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate as simulated
 
@@ -62,7 +62,7 @@ def replay(
     DataError
         The recording cannot be read, or a sensor of it has no model.
     """
-    resolved = read_config(config, settings_of(set), track_map=map, pit_map=pit_map, estimator=estimator)
+    resolved = read_config(config, set, track_map=map, pit_map=pit_map, estimator=estimator)
     check_paths(out=out)
     origin, kind = "", "messages"
     if isinstance(recording, (str, Path)):

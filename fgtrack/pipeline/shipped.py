@@ -1,23 +1,21 @@
 """Configurations, scenarios and sweeps that come with the package, by name."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from fgtrack.core.checks import check_paths
 from fgtrack.core.errors import CallError, did_you_mean
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import load, plain, read_yaml, validate, with_settings
+from fgtrack.pipeline.load import key_and_value, plain, read_yaml, validate, with_settings
 from fgtrack.sim.scenario import Scenario
 
 Kind = Literal["configuration", "scenario", "sweep"]
 
 _FOLDERS = {"configuration": ".", "scenario": "scenarios", "sweep": "sweeps"}
 _PACKAGE = Path(__file__).parents[1]
+_WANTED = {"estimator": "a name", "set": "a mapping of keys to values"}
 
 
 def shipped_folder() -> Path:
@@ -58,48 +56,33 @@ def summary(path: Path) -> str:
 
 def read_config(
     name: str | Path | Config | None,
-    settings: Sequence[str] = (),
+    settings: Sequence[str] | Mapping[str, object] | None = None,
     *,
     track_map: str | Path | None = None,
     pit_map: str | Path | None = None,
     estimator: str | None = None,
     folder: Path | None = None,
 ) -> Config:
-    """The configuration of a file (in `folder`) or of that shipped name, else the defaults.
+    """Return the configuration of a file (in `folder`) or of that shipped name, else the defaults.
 
-    `settings` are of the form a.b=value; maps and estimator replace those that the file names. Raises `CallError` for
-    what does not fit.
+    `settings` are values by dotted key, or texts of the form a.b=value; maps and estimator replace those of the file.
+    Raises `CallError` for what does not fit.
     """
     check_paths(map=track_map, pit_map=pit_map)
-    if not isinstance(estimator, str | None):
-        raise CallError(f"estimator: must be a name, is a {type(estimator).__name__}")
+    if not isinstance(estimator, str | None) or not isinstance(settings, Mapping | list | tuple | None):
+        what, given = ("set", settings) if isinstance(estimator, str | None) else ("estimator", estimator)
+        raise CallError(f"{what}: must be {_WANTED[what]}, is a {type(given).__name__}")
+    changes = settings if isinstance(settings, Mapping) else dict(map(key_and_value, settings or ()))
     if isinstance(name, Config):
-        config = with_settings(Config, plain(name), settings, "the given configuration") if settings else name
+        config = with_settings(Config, plain(name), changes, "the given configuration") if changes else name
     else:
         check_paths(config=name)
-        config = load(Config, None if name is None else find_file("configuration", name, folder), settings)
-    track = str(track_map) if track_map else config.map.track
-    pit = str(pit_map) if pit_map else config.map.pit
-    return replace(config, map=replace(config.map, track=track, pit=pit), estimator=estimator or config.estimator)
-
-
-def settings_of(values: Mapping[str, object] | None) -> list[str]:
-    """Settings of the form a.b=value from a mapping of keys to plain values, numbers of NumPy among them.
-
-    Raises `CallError` for what is no mapping, and no plain value.
-    """
-    if not isinstance(values, Mapping | None):
-        raise CallError(f"set: must be a mapping of keys to values, is a {type(values).__name__}")
-    try:
-        return [f"{key}={json.dumps(value, default=_number)}" for key, value in (values or {}).items()]
-    except (TypeError, ValueError) as error:
-        raise CallError(f"set: only plain values can be set ({error})") from error
-
-
-def _number(value: object) -> object:
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    raise TypeError(f"a {type(value).__name__} is none")
+        path = None if name is None else find_file("configuration", name, folder)
+        raw, origin = ({}, "defaults") if path is None else (read_yaml(path), str(path))
+        config = with_settings(Config, raw, changes, origin)
+    track, pit = track_map or config.map.track, pit_map or config.map.pit
+    road = replace(config.map, track=track and str(track), pit=pit and str(pit))
+    return replace(config, map=road, estimator=estimator or config.estimator)
 
 
 def read_scenario(name: str | Path | Scenario, folder: Path | None = None, duration_s: float | None = None) -> Scenario:

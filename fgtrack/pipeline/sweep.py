@@ -1,6 +1,7 @@
-"""Sweeps: the jobs of a plan on all cores or a cluster, every finished one kept at once."""
+"""Sweeps: the jobs of a plan on all cores or a cluster, every finished one kept at once, and tables of the results."""
 
 import importlib
+import json
 import logging
 import os
 import signal
@@ -9,46 +10,87 @@ import time
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from fnmatch import fnmatchcase
 from multiprocessing import resource_tracker
 from pathlib import Path
 
 import joblib  # type: ignore[import-untyped]  # has no stubs
 import numpy as np
+import pandas as pd  # type: ignore[import-untyped]  # has no stubs
 from joblib.externals.loky.process_executor import TerminatedWorkerError  # type: ignore[import-untyped]
+from pydantic import ConfigDict, TypeAdapter
 
 from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.core.types import Message
-from fgtrack.io.output import claimed
+from fgtrack.io.output import check_output, claimed, write_file
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumed import assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import validate
 from fgtrack.pipeline.replay import replay_in_memory
-from fgtrack.pipeline.sweep_plan import Job, Plan, Recipe
-from fgtrack.pipeline.sweep_store import Cell, PartStore, Scalar, SweepResult, write_tables
+from fgtrack.pipeline.sweep_plan import KEY_COLUMNS, Job, Plan, Recipe, Value, compact
 from fgtrack.sim.redelay import SensorDelays, redelay
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate
 
+PART_FORMAT = "fgtrack-sweep-part/1"
+SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE = "sweep.csv", "timing.csv", "errors.csv"
+PAIRED_TABLE, SUMMARY_TABLE = "paired.csv", "summary.csv"
+_PARTS = "parts"
+_TABLES = (SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE, PAIRED_TABLE, SUMMARY_TABLE)
+#: All that a sweep writes into its folder.
+PRODUCTS = (*_TABLES, _PARTS)
 _SCHEDULER_TIMEOUT_S = 10
 _WATCH_S = 1.0  # how often a process checks that its sweep still runs
 _HANDED_OUT = 2  # jobs per process that are handed out at a time
 
+_logger = logging.getLogger(__name__)
+
+Scalar = str | bool | int | float | None
+
 
 @dataclass(frozen=True)
 class Scores:
-    """A run in numbers, by column."""
+    """Numbers of a run, by column."""
 
     values: Mapping[str, Scalar]
-    """What is the same wherever and whenever the run is made."""
+    """Metrics: the same wherever and whenever the run is made."""
     times: Mapping[str, Scalar]
     """Wall times."""
 
 
 #: Judges a run. A function of a module, so that other processes find it.
 Score = Callable[[Run], Scores]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One estimator on the stream of one job."""
+
+    estimator: str
+    values: Mapping[str, Scalar]
+    """See `Scores`."""
+    times: Mapping[str, Scalar]
+    error: str | None = None
+    """Why there is no result, in a line."""
+
+
+_CELLS = TypeAdapter(tuple[Cell, ...], config=ConfigDict(strict=True, extra="forbid"))
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """Counts of the tables of a sweep."""
+
+    num_cells: int
+    """Cells of the plan: finished, bad and left ones."""
+    num_good: int
+    num_bad: int
+    first_error: str | None
+    unknown_metrics: tuple[str, ...]
+    """The plan's metrics that match no column."""
 
 
 @dataclass(frozen=True)
@@ -59,38 +101,40 @@ class Sweep:
     folder: Path
     done: dict[str, Sequence[Cell]]
     """Cells of the finished jobs by key."""
-    store: PartStore
 
     @classmethod
     def open(cls, plan: Plan, folder: Path, overwrite: bool = False) -> "Sweep":
-        """The sweep `plan` in `folder`; what was finished there before is taken over, if all its cells are there.
+        """Return the sweep `plan` in `folder` with the jobs that were finished there before.
 
-        Raises as `PartStore`, and `DataError` for a damaged part.
+        Raises `CallError` where `folder` has a link, or, without `overwrite`, tables but no parts of a sweep.
         """
-        store = PartStore(folder, overwrite)
-        kept = store.keys()
-        parts = {key: store.read(key) for key in dict.fromkeys(job.key for job in plan.jobs) if key in kept}
-        names = sorted(plan.estimators)
-        whole: dict[str, Sequence[Cell]] = {
-            key: cells for key, cells in parts.items() if cells and _names(cells) == names
-        }
-        return cls(plan, folder, whole, store)
+        parts = {path.stem: path for path in (folder / _PARTS).glob("*.json")}
+        known = parts.keys() & {job.key for job in plan.jobs}
+        resumes = bool(known) or any(map(_read_part, parts.values()))
+        for name in _TABLES:
+            check_output(folder / name, overwrite or resumes)
+        names, done = sorted(plan.estimators), dict[str, Sequence[Cell]]()
+        for key in known:
+            cells = _read_part(parts[key])
+            if sorted(cell.estimator for cell in cells) == names:
+                done[key] = cells
+        return cls(plan, folder, done)
 
     @property
     def todo(self) -> list[Job]:
-        """What is left: jobs without a result, and those with a bad cell, which are tried again.
+        """Jobs without a result, and those with a bad cell, which are tried again.
 
-        All points of the grid with the first seed come first: what is there at an interruption covers the grid,
-        and the time that the rest takes is well known early.
+        All points of the grid with the first seed come first: an interrupted sweep covers the grid.
         """
+        good = {key for key, cells in self.done.items() if all(cell.error is None for cell in cells)}
+        left = {job.key: job for job in self.plan.jobs if job.recipe is not None and job.key not in good}
         seeds = {seed: rank for rank, seed in enumerate(dict.fromkeys(job.seed for job in self.plan.jobs))}
-        left = {job.key: job for job in self.plan.jobs if job.recipe is not None and not self._is_good(job.key)}
         return sorted(left.values(), key=lambda job: seeds[job.seed])
 
     @property
     def num_unused(self) -> int:
-        """Parts in the folder that belong to other settings, files or versions."""
-        return len(self.store.keys() - {job.key for job in self.plan.jobs})
+        """Number of parts in the folder that belong to other settings, files or versions."""
+        return len({path.stem for path in (self.folder / _PARTS).glob("*.json")} - {job.key for job in self.plan.jobs})
 
     def run(
         self,
@@ -100,7 +144,7 @@ class Sweep:
         dask: str | None = None,
         on_job: Callable[[Sequence[Cell]], None] = lambda cells: None,
     ) -> SweepResult:
-        """Do what is left, keep each finished job at once, and write the tables; also when interrupted.
+        """Do the jobs that are left, keep each at once, and write the tables; also when interrupted.
 
         Parameters
         ----------
@@ -120,28 +164,66 @@ class Sweep:
         DataError
             The cluster failed, or the folder cannot be written to.
         """
-        tasks = [(job.key, job.recipe) for job in self.todo if job.recipe is not None]
+        tasks = {job.key: job.recipe for job in self.todo if job.recipe is not None}
         with claimed(self.folder):
-            results = _local(tasks, score, jobs) if dask is None else _on_cluster(tasks, score, dask)
+            (self.folder / _PARTS).mkdir(exist_ok=True)
             try:
-                for key, cells in results:
-                    self.store.write(key, cells)
+                for key, cells in _local(tasks, score, jobs) if dask is None else _on_cluster(tasks, score, dask):
+                    content = {"format": PART_FORMAT, "cells": [asdict(cell) for cell in cells]}
+                    write_file(self.folder / _PARTS / f"{key}.json", json.dumps(content))
                     self.done[key] = cells
                     on_job(cells)
             finally:
-                tables = write_tables(self.folder, self.plan, self.done)
-        return tables
-
-    def _is_good(self, key: str) -> bool:
-        return key in self.done and all(cell.error is None for cell in self.done[key])
+                result = write_tables(self.folder, self.plan, self.done)
+        return result
 
 
-def _names(cells: Sequence[Cell]) -> list[str]:
-    return sorted(cell.estimator for cell in cells)
+def _read_part(path: Path) -> tuple[Cell, ...]:
+    """Return the cells of a job; none of a file that no sweep wrote, with a warning."""
+    try:
+        content = json.loads(path.read_bytes())
+        if content["format"] == PART_FORMAT:
+            return _CELLS.validate_json(json.dumps(content["cells"]))
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        pass
+    _logger.warning("%s: no sweep wrote it, its job is done again", path)
+    return ()
+
+
+def write_tables(folder: Path, plan: Plan, done: Mapping[str, Sequence[Cell]]) -> SweepResult:
+    """Write sweep.csv, timing.csv and errors.csv from the cells of the finished jobs, by key, in grid order."""
+    rows: list[tuple[tuple[Value, ...], Cell]] = []
+    for job in plan.jobs:
+        cells = done.get(job.key, ()) if job.recipe else [Cell(name, {}, {}, job.problem) for name in plan.estimators]
+        rows += [((*job.cells, job.seed, cell.estimator), cell) for cell in cells]
+    good = [(keys, cell) for keys, cell in rows if cell.error is None]
+    bad = [(keys, {"error": cell.error}) for keys, cell in rows if cell.error is not None]
+    columns = list(dict.fromkeys(name for _, cell in good for name in cell.values))
+    matching = {pattern: [c for c in columns if fnmatchcase(c, pattern)] for pattern in plan.metrics or ("*",)}
+    chosen = list(dict.fromkeys(column for found in matching.values() for column in found))
+    times = list(dict.fromkeys(name for _, cell in good for name in cell.times))
+    for name, wanted, values in (
+        (SWEEP_TABLE, chosen, [(keys, cell.values) for keys, cell in good]),
+        (TIMING_TABLE, times, [(keys, cell.times) for keys, cell in good]),
+        (ERROR_TABLE, ["error"], bad),
+    ):
+        texts = [[_text(value) for value in (*keys, *map(row.get, wanted))] for keys, row in values]
+        table = pd.DataFrame(texts, columns=[*plan.columns, *KEY_COLUMNS, *wanted], dtype=str)
+        write_file(folder / name, table.to_csv(index=False, lineterminator="\n"))
+    unknown = tuple(pattern for pattern, found in matching.items() if good and not found)
+    first_error = bad[0][1]["error"] if bad else None
+    return SweepResult(len(plan.jobs) * len(plan.estimators), len(good), len(bad), first_error, unknown)
+
+
+def _text(value: Value) -> str:
+    """Text of a cell: floats with all digits, lists and mappings as JSON."""
+    if value is None or isinstance(value, str):
+        return value or ""
+    return repr(value) if isinstance(value, float) else compact(value)
 
 
 def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
-    """The cells of a job, with its key. Whatever goes wrong becomes the error of a cell."""
+    """Return the cells of a job, with its key. Whatever goes wrong becomes the error of a cell."""
     started = time.perf_counter()
     try:
         config = validate(Config, recipe.config, "configuration")
@@ -149,17 +231,14 @@ def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
         if recipe.recording is not None:
             source = open_input(recipe.recording, config.input)
             config = assumed(config, replace(source, messages=lambda: iter(messages))).config
-    except (
-        Exception,
-        SystemExit,
-    ) as error:  # whatever is wrong with one job out of hundreds
+    except (Exception, SystemExit) as error:  # whatever is wrong with one job out of hundreds
         return key, [Cell(name, {}, {}, _reason(error)) for name in recipe.estimators]
     source_s = time.perf_counter() - started
     return key, [_cell(messages, replace(config, estimator=name), score, source_s) for name in recipe.estimators]
 
 
 def read_messages(recipe: Recipe, config: Config) -> list[Message]:
-    """The stream of a job: simulated, or recorded and perhaps delayed anew. All estimators get the same one."""
+    """Return the stream of a job, simulated or recorded, perhaps under other delays. All estimators get the same."""
     rng = np.random.default_rng(recipe.seed)
     if recipe.recording is None:
         return simulate(validate(Scenario, recipe.scenario or {}, "scenario"), rng)
@@ -184,27 +263,24 @@ def _cell(messages: Sequence[Message], config: Config, score: Score, source_s: f
 
 
 def _reason(error: BaseException) -> str:
-    """What went wrong, in a line; of a bug also what it is."""
+    """Return the message of an error in a line; of a bug with its type."""
     text = " ".join(str(error).split())
     return text if isinstance(error, FgtrackError) else f"{type(error).__name__}: {text}"
 
 
-_Task = tuple[str, Recipe]
 _Result = tuple[str, Sequence[Cell]]
 
 
-def _local(tasks: Sequence[_Task], score: Score, jobs: int) -> Iterator[_Result]:
-    """Results of processes of this machine, as they come.
+def _local(tasks: Mapping[str, Recipe], score: Score, jobs: int) -> Iterator[_Result]:
+    """Yield results of processes of this machine, as they come.
 
     Where a process dies (out of memory, a crash in a library) joblib gives up all that were handed out. These are
-    tried again alone; what kills its process again is bad.
+    repeated alone; what kills its process again is bad.
     """
-    with _told():
-        count = joblib.effective_n_jobs(jobs)
-    left = dict(tasks)
+    count, left = joblib.effective_n_jobs(jobs), dict(tasks)
     while left:
         try:
-            for key, cells in _in_processes(list(left.items()), score, count):
+            for key, cells in _in_processes(dict(left), score, count):
                 del left[key]
                 yield key, cells
         except TerminatedWorkerError:
@@ -214,37 +290,23 @@ def _local(tasks: Sequence[_Task], score: Score, jobs: int) -> Iterator[_Result]
 
 
 def _alone(key: str, recipe: Recipe, score: Score) -> Cell:
-    """The cell of a recipe with one estimator, from a process of its own."""
+    """Return the cell of a recipe with one estimator, from a process of its own."""
     try:
-        ((_, (cell,)),) = _in_processes([(key, recipe)], score, 2)  # one process would be this one
+        ((_, (cell,)),) = _in_processes({key: recipe}, score, 2)  # one process would be this one
     except TerminatedWorkerError:
         error = "the process that ran it died: out of memory, or a crash in a library"
         return Cell(recipe.estimators[0], {}, {}, error)
     return cell
 
 
-def _in_processes(tasks: Sequence[_Task], score: Score, count: int) -> Iterator[_Result]:
+def _in_processes(tasks: Mapping[str, Recipe], score: Score, count: int) -> Iterator[_Result]:
     # With several jobs at once, threads of BLAS would only wait for each other.
-    settings = {"inner_max_num_threads": 1, "initializer": _leave_with, "initargs": (os.getpid(),)}
-    with joblib.parallel_config("loky", n_jobs=count, **settings), _told():
+    settings = {"inner_max_num_threads": 1, "initializer": _end_with_parent, "initargs": (os.getpid(),)}
+    with joblib.parallel_config("loky", n_jobs=count, **settings):
         yield from _results(tasks, score)
 
 
-@contextmanager
-def _told() -> Iterator[None]:
-    """What keeps processes from starting is said in a line; what goes wrong in a job is told by its cells."""
-    try:
-        yield
-    except FileNotFoundError:  # names the folder, or there is no working directory
-        raise
-    except (OSError, ValueError) as error:
-        raise CallError(
-            f"processes cannot be started ({_reason(error)}): look at the environment variables of joblib "
-            "(JOBLIB_..., LOKY_...) and at the limits of the system"
-        ) from error
-
-
-def _leave_with(parent: int) -> None:
+def _end_with_parent(parent: int) -> None:
     """End this process soon after its parent; when that was killed, joblib would let it wait for work for ever."""
 
     def watch() -> None:
@@ -255,14 +317,14 @@ def _leave_with(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _on_cluster(tasks: Sequence[_Task], score: Score, address: str) -> Iterator[_Result]:
-    """Results of the workers of a dask cluster, as they come."""
+def _on_cluster(tasks: Mapping[str, Recipe], score: Score, address: str) -> Iterator[_Result]:
+    """Yield results of the workers of a dask cluster, as they come."""
     try:
         distributed = importlib.import_module("distributed")
     except ImportError as error:
         raise CallError("--dask needs the extra `dask`: pip install 'fgtrack[dask]'") from error
     for name in ("distributed", "distributed.client"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong comes as an error, in a line
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # failures are raised below, in a line
     try:
         client = distributed.Client(address, timeout=_SCHEDULER_TIMEOUT_S)
     except (OSError, ValueError) as error:
@@ -275,22 +337,22 @@ def _on_cluster(tasks: Sequence[_Task], score: Score, address: str) -> Iterator[
             raise DataError(f"{address}: the cluster failed ({reason}), start the sweep again to go on") from error
 
 
-def _results(tasks: Sequence[_Task], score: Score) -> Iterator[_Result]:
-    """Results of the tasks in the backend of joblib that is set, as they come."""
+def _results(tasks: Mapping[str, Recipe], score: Score) -> Iterator[_Result]:
+    """Yield results of the tasks in the backend of joblib that is set, as they come."""
     parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch=f"{_HANDED_OUT}*n_jobs")
-    with _interrupts_held():
-        results: Generator[_Result] = parallel(joblib.delayed(run_job)(*task, score) for task in tasks)
+    with _interrupts_blocked():
+        results: Generator[_Result] = parallel(joblib.delayed(run_job)(*task, score) for task in tasks.items())
     try:
         yield from results
     finally:
-        with warnings.catch_warnings():  # an interrupt is said once, in one line
+        with warnings.catch_warnings():  # an interrupt is reported once, in one line
             warnings.filterwarnings("ignore", "[0-9]+ tasks (have|which)", UserWarning)
             results.close()
 
 
 @contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """What is started in the block never sees Ctrl-C, which is for this process; here it has to wait for the end."""
+def _interrupts_blocked() -> Iterator[None]:
+    """Keep Ctrl-C, which is for this process, from those that are started in the block; here it waits for its end."""
     resource_tracker.ensure_running()  # started in the block, it would let interrupts through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

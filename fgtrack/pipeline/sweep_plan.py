@@ -11,18 +11,17 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator
 
-from fgtrack.core.errors import CallError
+from fgtrack.core.errors import CallError, FgtrackError
 from fgtrack.estimation.registry import ESTIMATORS, MOTION_MODELS
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.inputs import fingerprints
-from fgtrack.pipeline.load import key_and_value, load, names_of, plain, read_yaml, validate
+from fgtrack.pipeline.load import key_and_value, load, names_of, plain, read_yaml, texts_of, validate, with_value
 from fgtrack.pipeline.replay import versions
 from fgtrack.pipeline.shipped import find_file, read_config, read_scenario
 from fgtrack.sim.redelay import SensorDelays
 from fgtrack.sim.scenario import Scenario
 
-#: What a key may be set to: JSON, of which only the dataclass that has the key knows more.
+#: What a key may be set to: JSON, which is checked by the dataclass that has the key.
 Value = Any
 
 #: Columns that every table of a sweep has behind those of its axes.
@@ -42,12 +41,24 @@ CONFIG, SCENARIO, DELAYS = "config", "scenario", "delays"
 
 
 def _seeds(given: Value) -> Value:
-    """A number of seeds as 0, 1, 2, ...; anything else is left to the validation."""
-    if isinstance(given, int) and not isinstance(given, bool):
-        if given > MOST_JOBS:
-            raise ValueError(f"no sweep has more than {MOST_JOBS}, not {given}")
-        return tuple(range(given))
+    """Return a number of seeds as 0, 1, 2, ...; anything else is left to the validation."""
+    if type(given) is int:
+        return tuple(range(min(given, MOST_JOBS + 1)))
     return tuple(given) if isinstance(given, list) else given
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point of the grid, or of one of its axes."""
+
+    cells: Mapping[str, Value]
+    """Content of the columns by name."""
+    changes: Mapping[str, Value]
+    """Values of the changed keys."""
+
+    def __str__(self) -> str:
+        texts = (f"{name}={cell if isinstance(cell, str) else compact(cell)}" for name, cell in self.cells.items())
+        return ", ".join(text if len(text) <= 80 else text[:77] + "..." for text in texts)
 
 
 @dataclass(frozen=True)
@@ -79,159 +90,71 @@ class SweepConfig:
     """Columns of metrics, `*` matches anything; all of them where none is named."""
 
     def __post_init__(self) -> None:
-        if (self.scenario is None) == (self.input is None):
-            raise ValueError("scenario, input: name one of them")
-        if not self.estimators:
-            raise ValueError("estimators: name at least one")
-        for name, values in (("estimators", self.estimators), ("seeds", self.seeds)):
-            if len(set(values)) < len(values):
-                raise ValueError(f"{name}: one is named twice")
-        if not self.seeds or min(self.seeds) < 0:
-            raise ValueError("seeds: a positive number of them, or a list of numbers that are not negative")
-        if self.input is not None and self.duration_s is not None:
-            raise ValueError("duration_s: a recording is as long as it is")
-        if self.scenario is not None and self.delays is not None:
-            raise ValueError("delays: a scenario has delays of its own, vary scenario.sensors.NAME.delay")
-        if self.input is not None and len(self.seeds) > 1 and not self._redelays:
-            raise ValueError("seeds: nothing is drawn where a recording keeps its delays, leave them out")
-        num_points = math.prod(len(axis.points) for axis in self.axes())
-        if num_points * len(self.seeds) > MOST_JOBS:
-            raise ValueError(f"vary, seeds: {num_points} points by {len(self.seeds)} seeds, more than {MOST_JOBS} jobs")
+        object.__setattr__(self, "estimators", tuple(map(ESTIMATORS.resolve, self.estimators)))
+        recorded, axes = self.input is not None, self.axes()
+        keys = [("set", key) for key in self.set]
+        keys += [("vary", key) for axis in axes for point in axis for key in point.changes]
+        absent = SCENARIO if recorded else DELAYS
+        for where, key in keys:
+            root = (names_of(key) or [""])[0]
+            if root in ("", "estimator", absent):
+                why = {"": "is not a key, write names with dots between them", "estimator": "belongs to `estimators`"}
+                raise ValueError(f"{where}: {key} {why.get(root, f'changes the {root}, which this sweep lacks')}")
+        redelays = self.delays is not None or any(key.startswith(f"{DELAYS}.") for _, key in keys)
+        columns = [*KEY_COLUMNS, *(column for axis in axes for column in axis[0].cells)]
+        num_jobs = math.prod(map(len, axes)) * len(self.seeds)
+        for wrong, text in (
+            (recorded == (self.scenario is not None), "scenario, input: name one of them"),
+            (not self.estimators, "estimators: name at least one"),
+            (len(set(self.estimators)) < len(self.estimators), "estimators: one is named twice"),
+            (not self.seeds or min(self.seeds) < 0, "seeds: a number of seeds, or a list of numbers of 0 or more"),
+            (len(set(self.seeds)) < len(self.seeds), "seeds: one is named twice"),
+            (recorded and self.duration_s is not None, "duration_s: a recording has its own length"),
+            (not recorded and self.delays is not None, "delays: a scenario has its own, vary scenario.sensors"),
+            (recorded and len(self.seeds) > 1 and not redelays, "seeds: a recording with its own delays has one"),
+            (len(set(columns)) < len(columns), f"vary: a column is named twice in {', '.join(columns)}"),
+            (num_jobs > MOST_JOBS, f"vary, seeds: {num_jobs} jobs, at most {MOST_JOBS} are possible"),
+        ):
+            if wrong:
+                raise ValueError(text)
 
-    @property
-    def _redelays(self) -> bool:
-        varied = (key for axis in self.axes() for point in axis.points for key in point.changes)
-        return self.delays is not None or any(key.startswith(f"{DELAYS}.") for key in (*self.set, *varied))
+    def axes(self) -> list[list[Point]]:
+        """Points of each axis of the grid; raises `ValueError` with the key's path."""
+        axes = [_axis(f"vary.{name}", name, values) for name, values in self.vary.items()]
+        return [_one_at_a_time(self.one_at_a_time), *axes] if self.one_at_a_time else axes
 
-    def axes(self) -> "tuple[Axis, ...]":
-        """The axes of the grid; raises `ValueError` with the key's path."""
-        axes = tuple(_axis("vary", name, values) for name, values in self.vary.items())
-        if self.one_at_a_time:
-            axes = (_one_at_a_time(self.one_at_a_time), *axes)
-        columns = [*KEY_COLUMNS, *(column for axis in axes for column in axis.columns)]
-        for column in columns:
-            if columns.count(column) > 1:
-                raise ValueError(f"vary: {column!r} is named twice, or is a column that every table has")
-        changes = [(axis.name, point.changes) for axis in axes for point in axis.points]
-        for where, keys in (("set", self.set), *changes):
-            for key in keys:
-                self._check_key(where, key)
-        return axes
-
-    def grid(self) -> "Iterator[Point]":
-        """The points of the grid; the last axis changes fastest."""
-        for points in itertools.product(*(axis.points for axis in self.axes())):
-            yield Point(
-                cells=tuple(cell for point in points for cell in point.cells),
-                changes={key: value for point in points for key, value in point.changes.items()},
-                description=", ".join(point.description for point in points if point.description),
-            )
-
-    def _check_key(self, where: str, key: str) -> None:
-        names = names_of(key)
-        if not names:
-            raise ValueError(f"{where}: {key!r} is not a key, write names with dots between them")
-        root = names[0]
-        if root == "estimator":
-            raise ValueError(f"{where}: name estimators under `estimators`")
-        if (root == SCENARIO and self.scenario is None) or (root == DELAYS and self.input is None):
-            raise ValueError(f"{where}: {key} changes the {root}, of which this sweep has none")
+    def grid(self) -> Iterator[Point]:
+        """Yield the points of the grid; the last axis changes fastest."""
+        for points in itertools.product(*self.axes()):
+            cells = {column: cell for point in points for column, cell in point.cells.items()}
+            yield Point(cells, {key: value for point in points for key, value in point.changes.items()})
 
 
-@dataclass(frozen=True)
-class Point:
-    """A point of the grid, or of one of its axes."""
-
-    cells: tuple[Value, ...]
-    """Content of the columns."""
-    changes: Mapping[str, Value]
-    """Changed keys."""
-    description: str
-    """The point in a few words."""
-
-
-@dataclass(frozen=True)
-class Axis:
-    """One direction of the grid."""
-
-    name: str
-    """Its path in the file."""
-    columns: tuple[str, ...]
-    """Columns of the tables that identify a point."""
-    points: tuple[Point, ...]
-
-
-def _axis(section: str, name: str, given: Value) -> Axis:
-    """The axis under `section.name`; raises `ValueError` with the key's path."""
-    where = f"{section}.{name}"
-    if isinstance(given, (list, tuple)):
-        lists = {name: _values(where, given)}
-    elif isinstance(given, Mapping) and set(given) - {LABEL}:
-        lists = {key: _values(f"{where}.{key}", values) for key, values in given.items()}
-    else:
-        raise ValueError(f"{where}: a list of values is needed, or a mapping of keys to lists of values")
-    lengths = {key: len(values) for key, values in lists.items()}
+def _axis(where: str, name: str, given: Value) -> list[Point]:
+    """Points of the axis at the path `where`; raises `ValueError` with that path."""
+    lists = given if isinstance(given, Mapping) else {name: given}
+    lengths = {key: len(values) if isinstance(values, (list, tuple)) else 0 for key, values in lists.items()}
+    if not set(lists) - {LABEL} or not all(lengths.values()):
+        raise ValueError(f"{where}: a list of values is needed, or a mapping of keys to such lists")
     if len(set(lengths.values())) > 1:
-        lengths_text = ", ".join(f"{key} has {length}" for key, length in lengths.items())
-        raise ValueError(f"{where}: its keys change together and need equally many values, {lengths_text}")
-    labels = {name: lists.pop(LABEL)} if LABEL in lists else {}
+        raise ValueError(f"{where}: its keys change together and need equally many values, not {compact(lengths)}")
     points = []
-    for cells in zip(*labels.values(), *lists.values(), strict=True):
-        changes = dict(zip(lists, cells[len(labels) :], strict=True))
-        shown = dict(zip(labels or lists, cells, strict=False))
-        description = ", ".join(f"{column}={_short(cell)}" for column, cell in shown.items())
-        points.append(Point(cells, changes, description))
-    return Axis(where, (*labels, *lists), tuple(points))
+    for values in zip(*lists.values(), strict=True):
+        changes = dict(zip(lists, values, strict=True))
+        label = {name: changes.pop(LABEL)} if LABEL in changes else {}
+        points.append(Point({**label, **changes}, changes))
+    return points
 
 
-def _one_at_a_time(given: Mapping[str, Value]) -> Axis:
-    """The axis whose points are the base and every value alone; raises `ValueError` with the key's path."""
-    section = "one_at_a_time"
-    points = [Point((BASE, None), {}, "")]
+def _one_at_a_time(given: Mapping[str, Value]) -> list[Point]:
+    """Points of the base and of every value alone; raises `ValueError` with the key's path."""
+    points = [Point({CHANGED: BASE, TO: None}, {})]
     for name, values in given.items():
-        axis = _axis(section, name, values)
-        alike = len(axis.columns) == 1 or axis.columns[0] == name  # one key, or a label: the first cell says it all
-        points += [replace(one, cells=(name, one.cells[0] if alike else list(one.cells))) for one in axis.points]
-    return Axis(section, (CHANGED, TO), tuple(points))
-
-
-def _values(where: str, given: Value) -> tuple[Value, ...]:
-    if not isinstance(given, (list, tuple)) or not given:
-        raise ValueError(f"{where}: a list of at least one value is needed")
-    return tuple(given)
-
-
-def with_value(inside: Value, names: Sequence[str], value: Value) -> Value:
-    """A copy of `inside` in which the entry at the path `names` is `value`.
-
-    An entry of a list is addressed by its index or by its `name`. Raises `LookupError` where there is no such path;
-    what is left out of a mapping may be set, its reader knows the keys.
-    """
-    if not names:
-        return value
-    first, rest = names[0], names[1:]
-    if isinstance(inside, list):
-        place = _place(inside, first)
-        return [with_value(item, rest, value) if index == place else item for index, item in enumerate(inside)]
-    if not isinstance(inside, Mapping):
-        raise LookupError(f"there is no {first!r} in {compact(inside)}")
-    return {**inside, first: with_value(inside.get(first, {}) if rest else None, rest, value)}
-
-
-def _place(items: list[Value], name: str) -> int:
-    """Index of the item of this name, or index."""
-    named = [item.get("name") if isinstance(item, Mapping) else None for item in items]
-    if name in named:
-        return named.index(name)
-    if name.isdecimal() and int(name) < len(items):
-        return int(name)
-    known = ", ".join(str(one) for one in named if one is not None)
-    raise LookupError(f"there is no {name!r} among {len(items)} entries{f' ({known})' if known else ''}")
-
-
-def _short(value: Value) -> str:
-    text = value if isinstance(value, str) else compact(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+        for point in _axis(f"one_at_a_time.{name}", name, values):
+            cells = list(point.cells.values())
+            alone = len(cells) == 1 or name in point.cells  # one key, or a label
+            points.append(Point({CHANGED: name, TO: cells[0] if alone else cells}, point.changes))
+    return points
 
 
 def compact(value: Value) -> str:
@@ -278,20 +201,21 @@ class Plan:
     estimators: tuple[str, ...]
     metrics: tuple[str, ...]
     inputs: tuple[Path, ...] = ()
-    """Files and folders that it was made of, and that its jobs read."""
+    """Files and folders that the sweep file names, and itself."""
 
 
 def load_plan(path: Path, recording: Path | None = None, settings: Sequence[str] = ()) -> Plan:
-    """The plan of the sweep file `path`, on `recording` instead of what it names, with `settings` a.b=value for all.
+    """Return the plan of the sweep file `path`, with `settings` a.b=value for all its runs.
 
-    A grid point with settings that do not fit is a job with a problem. A recording has one seed, the first.
+    `recording` replaces what the file names, with the first seed alone. A grid point with settings that do not fit is a
+    job with a problem.
 
     Raises
     ------
     CallError
         The file is wrong, something that it names is missing, or no grid point can be run.
     """
-    sweep = load(SweepConfig, path)
+    sweep, folder = load(SweepConfig, path), path.parent
     changes: dict[str, Value] = {"set": {**sweep.set, **dict(map(key_and_value, settings))}}
     if recording is not None:
         of_scenario = {"scenario": None, "duration_s": None, "delays": None}
@@ -300,92 +224,82 @@ def load_plan(path: Path, recording: Path | None = None, settings: Sequence[str]
         sweep = replace(sweep, **changes)
     except ValueError as error:
         raise CallError(f"{path}: {error}") from error
-    try:
-        sweep = replace(sweep, estimators=tuple(ESTIMATORS.resolve(name) for name in sweep.estimators))
-    except CallError as error:
-        raise CallError(f"{path}: estimators: {error}") from error
-    base = _with_keys(_base(sweep, path), sweep.set, f"{path}: set")
-    source = None if sweep.input is None else (path.parent / sweep.input).resolve()
-    reads = _Reads(source)
-    jobs = tuple(job for point in sweep.grid() for job in _jobs(sweep, base, point, reads))
-    if all(job.recipe is None for job in jobs):
-        raise CallError(f"{path}: {jobs[0].problem}")
-    columns = tuple(column for axis in sweep.axes() for column in axis.columns)
-    return Plan(columns, jobs, sweep.estimators, sweep.metrics, (path, *_inputs(sweep, base, path)))
-
-
-def _base(sweep: SweepConfig, path: Path) -> dict[str, Value]:
-    """Scenario, delays and configuration before anything is varied, with every key written out."""
-    folder = path.parent
     config = read_config(sweep.config, folder=folder)
+    named = [folder / one for one in (sweep.input, sweep.delays) if one is not None]
+    base = {CONFIG: plain(config), DELAYS: {} if sweep.delays is None else read_yaml(folder / sweep.delays)}
+    if sweep.config is not None:
+        named.append(find_file("configuration", sweep.config, folder))
+    if sweep.scenario is not None:
+        named.append(find_file("scenario", sweep.scenario, folder))
+        base[SCENARIO] = plain(read_scenario(sweep.scenario, folder, sweep.duration_s))
     if sweep.input is not None:
         open_input(folder / sweep.input, config.input)  # raises where it is none
-    delays = {} if sweep.delays is None else read_yaml(folder / sweep.delays)
-    base = {CONFIG: plain(config), DELAYS: delays}
-    if sweep.scenario is not None:
-        base[SCENARIO] = plain(read_scenario(sweep.scenario, folder, sweep.duration_s))
-    return base
+    base = _with_keys(base, sweep.set, f"{path}: set")
+    known: dict[str, str] = {}
+    jobs = tuple(job for point in sweep.grid() for job in _jobs(sweep, folder, base, point, known))
+    if all(job.recipe is None for job in jobs):
+        raise CallError(f"{path}: {jobs[0].problem}")
+    columns = tuple(column for axis in sweep.axes() for column in axis[0].cells)
+    return Plan(columns, jobs, sweep.estimators, sweep.metrics, (path, *named))
 
 
-def _inputs(sweep: SweepConfig, base: Mapping[str, Value], path: Path) -> list[Path]:
-    """What the sweep file names, and what is named there; a value of an axis may name more."""
-    folder = path.parent
-    others = [] if sweep.delays is None else [folder / sweep.delays]
-    others += [] if sweep.scenario is None else [find_file("scenario", sweep.scenario, folder)]
-    others += [] if sweep.config is None else [find_file("configuration", sweep.config, folder)]
-    others += [] if sweep.input is None else [folder / sweep.input]
-    return others
-
-
-class _Reads:
-    """What decides the results of jobs besides their settings; `recording` is read once for each way to read it."""
-
-    def __init__(self, recording: Path | None) -> None:
-        self.recording = recording
-        self._plugins: list[Value] = [ESTIMATORS.sources(), MOTION_MODELS.sources()]
-        self._known: dict[str, list[Value]] = {}
-
-    def __call__(self, scenario: Scenario | None, config: Config) -> list[Value]:
-        """Fingerprints of what such a job reads and runs."""
-        key = compact(plain([config.input, config.map, config.clock, scenario and scenario.map]))
-        if key not in self._known:
-            self._known[key] = [*fingerprints(self.recording, scenario, config), *self._plugins]
-        return self._known[key]
-
-
-def _jobs(sweep: SweepConfig, base: Mapping[str, Value], point: Point, reads: _Reads) -> Iterator[Job]:
-    """The jobs of one grid point, one for each seed."""
+def _jobs(
+    sweep: SweepConfig, folder: Path, base: Mapping[str, Value], point: Point, known: dict[str, str]
+) -> Iterator[Job]:
+    """Yield the jobs of one grid point, one for each seed; `known` are fingerprints by what they depend on."""
+    cells = tuple(point.cells.values())
     try:
         values = _with_keys(base, point.changes, "vary")
         config = validate(Config, values[CONFIG], "configuration")
         delays = validate(dict[str, SensorDelays], values[DELAYS], DELAYS)
         scenario = validate(Scenario, values[SCENARIO], SCENARIO) if SCENARIO in values else None
     except CallError as error:
-        problem = f"{point.description}: {error}" if point.description else str(error)
-        yield from (Job(point.cells, seed, "", None, problem) for seed in sweep.seeds)
+        yield from (Job(cells, seed, "", None, f"{point}: {error}" if cells else str(error)) for seed in sweep.seeds)
         return
-    files = reads(scenario, config)
+    source = None if sweep.input is None else (folder / sweep.input).resolve()
+    recipe = Recipe(
+        plain(scenario), None if source is None else str(source), plain(delays), plain(config), 0, sweep.estimators
+    )
+    files = sorted(text for text in texts_of([recipe.config, recipe.scenario]) if _is_file(text))
+    read = compact([files, recipe.config["input"]])
+    if read not in known:
+        known[read] = fingerprint(source, config, files)
     for seed in sweep.seeds:
-        name = None if reads.recording is None else str(reads.recording)
-        recipe = Recipe(plain(scenario), name, plain(delays), plain(config), seed, sweep.estimators)
-        yield Job(point.cells, seed, job_key(recipe, files), recipe)
+        seeded = replace(recipe, seed=seed)
+        content = {**plain(seeded), "recording": None, "files": known[read], "versions": versions()}
+        yield Job(cells, seed, hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32], seeded)
 
 
-def job_key(recipe: Recipe, files: Sequence[Value]) -> str:
-    """Hash of what decides the cells of a job, in hex; `files` are the fingerprints of what it reads and runs."""
-    content = {**plain(recipe), "recording": None, "files": files, "versions": versions()}
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
+def fingerprint(recording: Path | None, config: Config, files: Sequence[str]) -> str:
+    """Hash of all messages and settings of `recording`, of the content of `files`, and of the code of all plug-ins."""
+    found = hashlib.sha256(repr([ESTIMATORS.sources(), MOTION_MODELS.sources()]).encode())
+    for file in files:
+        found.update(file.encode() + hashlib.sha256(Path(file).read_bytes()).digest())
+    try:
+        if recording is not None:
+            source = open_input(recording, config.input)
+            found.update(repr(source.settings()).encode())
+            for message in source.messages():
+                found.update(repr(message).encode())
+    except FgtrackError as error:
+        found.update(str(error).encode())
+    return found.hexdigest()
+
+
+def _is_file(text: str) -> bool:
+    try:
+        return Path(text).is_file()
+    except (OSError, ValueError):  # longer than a path
+        return False
 
 
 def _with_keys(base: Mapping[str, Value], changes: Mapping[str, Value], where: str) -> dict[str, Value]:
-    """`base` with `changes`: dotted keys, those of the configuration without its name in front."""
+    """Return `base` with `changes`: dotted keys, those of the configuration without its name in front."""
     changed = dict(base)
     for key, value in changes.items():
         names = names_of(key)
-        if names[0] not in (SCENARIO, DELAYS):
-            names = [CONFIG, *names]
         try:
-            changed = with_value(changed, names, value)
+            changed = with_value(changed, names if names[0] in (SCENARIO, DELAYS) else [CONFIG, *names], value)
         except LookupError as error:
             raise CallError(f"{where}.{key}: {error.args[0]}") from error
     return changed

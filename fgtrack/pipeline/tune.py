@@ -21,7 +21,7 @@ from fgtrack.io.source import InputSource, open_input
 from fgtrack.pipeline.assumed import assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import located
-from fgtrack.pipeline.shipped import read_config, settings_of
+from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.tune_measurements import recorded
 from fgtrack.pipeline.tune_report import HeldOut, InnovationFit, Known, SensorNoise, TunedParameter, TuneReport
 from fgtrack.pipeline.tune_rules import TuneRules, for_tuning, widened
@@ -79,7 +79,7 @@ def tune(
     DataError
         A recording cannot be read, a sensor of it has no model, or nothing can be fitted to it.
     """
-    resolved = read_config(config, settings_of(set), track_map=map, pit_map=pit_map)
+    resolved = read_config(config, set, track_map=map, pit_map=pit_map)
     if not isinstance(recordings, (str, Path, Sequence)):
         raise CallError(f"recordings: must be a path or several, is a {type(recordings).__name__}")
     paths = [recordings] if isinstance(recordings, (str, Path)) else list(recordings)

@@ -254,7 +254,7 @@ def test_a_wrong_setting_names_its_key(setting: str, message: str) -> None:
 
 def test_a_path_through_a_single_value_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path, "filter: {storage_s: 2.0}\n")
-    with pytest.raises(CallError, match="storage_s is a single value"):
+    with pytest.raises(CallError, match="a single value"):
         load(Config, path, ["filter.storage_s.x=1"])
 
 
@@ -271,11 +271,11 @@ def test_an_empty_file_is_the_default_and_a_missing_one_an_error(tmp_path: Path)
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("smoother.lag_s=1e308", "smoother.lag_s: 1e+308 is out of range"),
-        ("sensors.radar.std.speed_mps=1e-300", "sensors.radar.std.speed_mps: 1e-300 is out of range"),
-        ("motion.std_per_s.yaw=1e100", "1e+100 is out of range"),
+        ("smoother.lag_s=1e308", "smoother.lag_s: a magnitude of 1e-12 to 1e+09, or 0 is needed, not 1e+308"),
+        ("sensors.radar.std.speed_mps=1e-300", "sensors.radar.std.speed_mps: a magnitude of"),
+        ("motion.std_per_s.yaw=1e100", "is needed, not 1e+100"),
         ("motion.std_per_s.yaw=-0.3", "std_per_s.yaw: must not be negative"),
-        ("ego.storage_ticks=99999999999999999999", "has more than 64 bits"),
+        ("ego.storage_ticks=99999999999999999999", "an integer of 64 bits is needed"),
         ("inbox.max_future_s=-1", "inbox.max_future_s"),
         ("sensors=" + "[" * 1_000, "nested too deeply"),
     ],
@@ -287,38 +287,9 @@ def test_no_setting_is_beyond_reason(setting: str, message: str) -> None:
     assert len(str(caught.value)) < 720
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (
-            "a: &a [x, x, x, x, x, x, x, x, x]\n"
-            + "".join(f"{chr(98 + i)}: &{chr(98 + i)} [{', '.join(9 * ['*' + chr(97 + i)])}]\n" for i in range(8)),
-            "more than 25 aliases",
-        ),
-        (
-            "m0: &m0 {a: 1, b: 1}\n"
-            + "".join(f"m{k}: &m{k}\n  <<: [{', '.join([f'*m{k - 1}'] * 10)}]\n" for k in range(1, 9)),
-            "more than 25 aliases",
-        ),
-        (f"a: &a {'x' * 100_000}\nb: [{'*a, ' * 10_000}]\n", "more than 25 aliases"),
-        ("a: &a [*a]\n", "Circular reference"),
-        ("a: " + "[" * 1_000, "nested too deeply"),
-        ("a: [" + "1, " * 700_000 + "1]", "is longer than 2000000 characters"),
-    ],
-    ids=["aliases", "merges", "texts", "itself", "brackets", "length"],
-)
-def test_a_file_that_would_fill_the_memory_is_refused(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "bomb.yaml"
-    path.write_text(text)
-    with pytest.raises(CallError) as caught:
-        load(Config, path)
-    assert message in str(caught.value)
-    assert str(path) in str(caught.value)
-
-
 def test_a_text_of_the_configuration_is_no_longer_than_a_path() -> None:
     assert load(Config, None, [f"map.track={'x' * 4096}"]).map.track == "x" * 4096
-    with pytest.raises(CallError, match=r"map\.track: x+ \.\.\. has 4097 letters, at most 4096 are allowed"):
+    with pytest.raises(CallError, match=r"map\.track: printable text of at most 4096 letters is needed"):
         load(Config, None, [f"map.track={'x' * 4097}"])
 
 
@@ -326,6 +297,16 @@ def test_a_text_of_the_configuration_is_no_longer_than_a_path() -> None:
     "setting", ['map.track="a\\0b"', 'ignore_sensors=["\\x1b[31m"]', 'input.ego={topic: "\\u202ex"}']
 )
 def test_a_text_of_the_configuration_can_be_printed(setting: str) -> None:
-    with pytest.raises(CallError, match="holds what is no letter or sign") as caught:
+    with pytest.raises(CallError, match="printable text") as caught:
         load(Config, None, [setting])
     assert str(caught.value).isprintable()
+
+
+def test_a_config_goes_through_a_file_and_takes_other_values(tmp_path: Path) -> None:
+    config = paper().replace({"smoother.lag_s": 2.0, 'sensors."radar".max_delay_s': 0.5}, estimator="smoother")
+    assert (config.smoother.lag_s, config.sensors["radar"].max_delay_s, config.estimator) == (2.0, 0.5, "smoother")
+    assert config.replace(smoother=paper().smoother).smoother == paper().smoother
+    config.to_yaml(tmp_path / "my.yaml")
+    assert Config.from_yaml(tmp_path / "my.yaml") == config
+    with pytest.raises(CallError, match=r"the configuration.*: smoother\.lags: unknown key, did you mean 'lag_s'"):
+        config.replace({"smoother.lags": 2.0})

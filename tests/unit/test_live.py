@@ -216,7 +216,10 @@ def test_reports_and_configurations_pickle_copy_and_turn_into_dicts() -> None:
     assert asdict(report)["tracks"][0]["track_id"] == report.tracks[0].track_id
 
 
-@pytest.mark.parametrize("config", [None, "smoother", 5])
-def test_a_tracker_is_made_of_a_config(config: object) -> None:
-    with pytest.raises(CallError, match=r"^config: must be a Config, .*Tracker\.from_config"):
-        Tracker(config)  # type: ignore[arg-type]  # the same
+def test_a_tracker_is_made_of_a_name_a_path_or_a_config() -> None:
+    made = Tracker("smoother", set={"smoother.lag_s": np.float64(2.0)}, estimator="ekf-replay")
+    assert made.config == Tracker.from_config(made.config).config
+    assert (made.config.smoother.lag_s, made.config.estimator) == (2.0, "ekf-replay")
+    assert Tracker().config == read_config(None)
+    with pytest.raises(CallError, match=r"^config: must be a name or a path, is a int"):
+        Tracker(5)  # type: ignore[arg-type]  # the same

@@ -1,17 +1,21 @@
-"""Sweep files: what the grid is, which jobs follow, and what is said about a wrong one."""
+"""Sweep files: the grid, its jobs and their keys, errors; parts and tables of the results."""
 
+import json
+import math
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from support import kitti
 
 from fgtrack.core.errors import CallError
-from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.io.stream import write_stream
-from fgtrack.pipeline.load import dump, plain
+from fgtrack.pipeline.load import dump, plain, with_value
 from fgtrack.pipeline.shipped import read_scenario
-from fgtrack.pipeline.sweep_plan import Plan, load_plan, with_value
+from fgtrack.pipeline.sweep import PART_FORMAT, Cell, Sweep, write_tables
+from fgtrack.pipeline.sweep_plan import Job, Plan, Recipe, load_plan
 from fgtrack.sim.simulate import simulate
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -35,12 +39,6 @@ def plan(tmp_path: Path) -> Any:
 
 
 # --- the grid
-
-
-def test_a_sweep_that_varies_nothing_is_one_job(plan: Any) -> None:
-    (job,) = plan("").jobs
-    assert (job.cells, job.seed, job.recipe.estimators) == ((), 0, ("ekf-replay",))
-    assert job.recipe.scenario["duration_s"] == read_scenario("default").duration_s
 
 
 def test_the_grid_is_the_product_with_the_last_axis_fastest_and_then_the_seed(plan: Any) -> None:
@@ -135,50 +133,34 @@ def test_every_point_of_a_grid_has_one_setting_at_a_time(plan: Any) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("seed: 3", "seed: unknown key, did you mean 'seeds', known here: format, estimators"),
-        ("seeds: 0", "seeds: a positive number"),
+        ("seed: 3", "seed: unknown key, did you mean 'seeds'"),
+        ("seeds: 0", "seeds: a number of seeds, or a list"),
         ("seeds: [1, 1]", "seeds: one is named twice"),
         ("seeds: [1, x]", 'seeds.1: Input should be a valid integer, not "x"'),
-        ("seeds: [-1]", "seeds: a positive number"),
-        ("seeds: 99999999999999999999", "seeds: no sweep has more than 100000"),
-        ("seeds: [99999999999999999999]", "seeds.0: 99999999999999999999 has more than 64 bits"),
-        ("seeds: 90000\nvary: {clock.node_hz: [5.0, 9.0]}", "vary, seeds: 2 points by 90000 seeds, more than 100000"),
-        ("duration_s: long", "duration_s: Input should be a valid number"),
+        ("seeds: [-1]", "seeds: a number of seeds, or a list"),
+        ("seeds: 99999999999999999999", "vary, seeds: 100001 jobs"),
+        ("seeds: 90000\nvary: {clock.node_hz: [5.0, 9.0]}", "vary, seeds: 180000 jobs, at most 100000 are possible"),
         ("vary: {association.gate_m: 5.0}", "vary.association.gate_m: a list of values is needed"),
-        ("vary: {association.gate_m: []}", "vary.association.gate_m: a list of at least one value"),
-        ("vary: {a: {clock.node_hz: 5.0}}", "vary.a.clock.node_hz: a list of at least one value"),
+        ("vary: {a: {clock.node_hz: 5.0}}", "vary.a: a list of values is needed, or a mapping"),
         ("vary: {a: {label: [1]}}", "vary.a: a list of values is needed, or a mapping"),
         (
             "vary: {a: {clock.node_hz: [5.0, 9.0], association.gate_m: [3.0]}}",
-            "vary.a: its keys change together and need equally many values, clock.node_hz has 2, association.gate_m",
+            "vary.a: its keys change together and need equally many values",
         ),
-        ("vary: {a: {label: [1], map.track: [oval]}, map.track: [oval]}", "vary: 'map.track' is named twice"),
-        ("vary: {seed: [1]}", "vary: 'seed' is named twice, or is a column"),
-        ("vary: {estimator: [smoother]}", "vary: 'estimator' is named twice, or is"),
-        ("set: {estimator: smoother}", "set: name estimators under `estimators`"),
-        ("vary: {clock..node_hz: [5.0]}", "vary.clock..node_hz: 'clock..node_hz' is not a key"),
-        ("vary: {delays.radar.delay: [null]}", "delays.radar.delay changes the delays, of which this sweep has none"),
+        ("vary: {a: {label: [1], map.track: [oval]}, map.track: [oval]}", "vary: a column is named twice in seed"),
+        ("set: {estimator: smoother}", "set: estimator belongs to `estimators`"),
+        ("vary: {clock..node_hz: [5.0]}", "vary: clock..node_hz is not a key"),
+        ("vary: {delays.radar.delay: [null]}", "delays.radar.delay changes the delays, which this sweep lacks"),
         ("one_at_a_time: {association.gate_m: 5.0}", "one_at_a_time.association.gate_m: a list of values is needed"),
-        ("one_at_a_time: {clock.node_hz: [5.0], seed: [1], estimator: [x]}", "one_at_a_time: name estimators under"),
-        ("vary: {to: {label: [1], clock.node_hz: [5.0]}}\none_at_a_time: {clock.node_hz: [5.0]}", "'to' is named"),
-        ("one_at_a_time: {clok.node_hz: [5.0], a.b: [1]}\nset: {clok.x: 1}", "configuration: clok: unknown key"),
-        ("delays: d.yaml", "delays: a scenario has delays of its own"),
+        ("delays: d.yaml", "delays: a scenario has its own"),
         ("input: x", "scenario, input: name one of them"),
         ("vary: {clok.node_hz: [5.0, 7.0]}", "clok.node_hz=5.0: configuration: clok: unknown key"),
-        (
-            "vary: {clock.node_hz: [-5.0]}",
-            "clock.node_hz=-5.0: configuration: clock.node_hz: Input should be greater than or equal to 0.1",
-        ),
-        (
-            "vary: {scenario.sensors.lidr.rate_hz: [5.0]}",
-            "vary.scenario.sensors.lidr.rate_hz: there is no 'lidr' among 2 entries (lidar_cluster, radar)",
-        ),
-        ("vary: {scenario.sensors.7.rate_hz: [5.0]}", "there is no '7' among 2 entries"),
+        ("vary: {scenario.sensors.lidr.rate_hz: [5.0]}", "lidr.rate_hz: there is no 'lidr' among 2 entries"),
         ("duration_s: 7.0\nvary: {scenario.duration_s.x: [5.0]}", "there is no 'x' in 7.0"),
         ("set: {scenario.sensors.lidr.rate_hz: 5.0}", "set.scenario.sensors.lidr.rate_hz: there is no 'lidr'"),
     ],
 )
-def test_a_wrong_file_is_told_by_the_path_of_the_key(plan: Any, text: str, said: str) -> None:
+def test_an_error_names_the_path_of_the_key(plan: Any, text: str, said: str) -> None:
     with pytest.raises(CallError) as caught:
         plan(text)
     assert said in str(caught.value)
@@ -191,11 +173,7 @@ def test_a_wrong_file_is_told_by_the_path_of_the_key(plan: Any, text: str, said:
         ("scenario: default\nestimators: [ekf-replay]", "format: Field required"),
         ("format: fgtrack-sweep/2\nscenario: default\nestimators: [ekf-replay]", "format: Input should be"),
         ("format: fgtrack-sweep/1\nscenario: default\nestimators: []", "estimators: name at least one"),
-        (
-            "format: fgtrack-sweep/1\nscenario: default\nestimators: [ukf]",
-            "estimators: estimator 'ukf' is unknown: there are",
-        ),
-        ("format: fgtrack-sweep/1\nestimators: [ekf-replay]", "scenario, input: name one"),
+        ("format: fgtrack-sweep/1\nscenario: default\nestimators: [ukf]", "estimator 'ukf' is unknown"),
         ("format: fgtrack-sweep/1\ninput: nothing.mcap\nestimators: [ekf-replay]", "nothing.mcap: there is no such"),
     ],
 )
@@ -227,7 +205,7 @@ def recording(tmp_path: Path) -> str:
 def test_a_recording_with_its_own_delays_has_one_seed(plan: Any, recording: str) -> None:
     (job,) = plan("", recording).jobs
     assert (job.recipe.scenario, job.recipe.delays) == (None, {})
-    with pytest.raises(CallError, match="seeds: nothing is drawn where a recording keeps its delays"):
+    with pytest.raises(CallError, match="seeds: a recording with its own delays has one"):
         plan("seeds: 2", recording)
 
 
@@ -240,7 +218,7 @@ def test_the_delays_of_a_recording_may_be_varied(plan: Any, recording: str) -> N
 
 
 def test_a_recording_is_as_long_as_it_is(plan: Any, recording: str) -> None:
-    with pytest.raises(CallError, match="duration_s: a recording is as long as it is"):
+    with pytest.raises(CallError, match="duration_s: a recording has its own length"):
         plan("duration_s: 3.0", recording)
 
 
@@ -262,41 +240,51 @@ def test_the_key_of_a_job_is_that_of_its_content_however_it_is_written(plan: Any
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "seeds: [1]",
-        "estimators: [ekf-replay, smoother]",
-        "set: {association.gate_m: 4.9}",
-        "duration_s: 59.9",
-        "set: {scenario.sensors.radar.delay.mean_s: 0.0621}",
-    ],
+    ["seeds: [1]", "set: {association.gate_m: 4.9}", "duration_s: 59.9", "set: {ego.memory_s: 4.0}"],
 )
 def test_whatever_decides_the_result_changes_the_key(plan: Any, text: str) -> None:
-    head = HEAD.replace("estimators: [ekf-replay]\n", "") if text.startswith("estimators") else HEAD
-    assert keys(plan(text, head)) != keys(plan(""))
+    assert keys(plan(text)) != keys(plan(""))
 
 
-def test_a_changed_map_or_recording_changes_the_key(plan: Any, recording: str, tmp_path: Path) -> None:
-    track = tmp_path / "track.csv"
-    track.write_text("a")
-    for head, file in ((HEAD, track), (recording, tmp_path / "drive.jsonl")):
-        text = f"set: {{map.track: {track}}}" if file == track else ""
-        before = keys(plan(text, head))
+def test_versions_and_the_code_of_plug_ins_change_the_key(plan: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plug-in may change without a new version."""
+    found = [keys(plan(""))]
+    for target, value in (
+        ("fgtrack.pipeline.sweep_plan.versions", {"fgtrack": "another"}),
+        ("fgtrack.estimation.registry.ESTIMATORS.sources", {"mine": "package 1.0 of other code"}),
+        ("fgtrack.estimation.registry.MOTION_MODELS.sources", {"mine": "package 1.0 of other code"}),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(target, lambda value=value: value)
+            found.append(keys(plan("")))
+    assert found.count(keys(plan(""))) == 1
+
+
+def test_the_content_of_every_file_changes_the_key_whatever_its_size_and_time(
+    plan: Any, recording: str, tmp_path: Path
+) -> None:
+    track, shore, drive = tmp_path / "track.csv", tmp_path / "shore.csv", tmp_path / "drive.jsonl"
+    for file in (track, shore):
+        file.write_text("abc")
+    for text, head, file in (
+        (f"set: {{map.track: {track}}}", HEAD, track),
+        (f"set: {{map.excluded: [{shore}]}}", recording, shore),
+        ("", recording, drive),
+    ):
+        before, time_ns = keys(plan(text, head)), file.stat().st_mtime_ns
         assert keys(plan(text, head)) == before
-        file.write_text(file.read_text() + "\n")
+        file.write_text(file.read_text().replace("c", "d", 1) if file != drive else file.read_text()[:-300] + "\n")
+        os.utime(file, ns=(time_ns, time_ns))
         assert keys(plan(text, head)) != before
 
 
-def test_changed_areas_change_the_key(plan: Any, recording: str, tmp_path: Path) -> None:
-    shore = tmp_path / "shore.csv"
-    before = keys(plan(text := f"set: {{map.excluded: [{shore}]}}", recording))
-    shore.write_text("a")
-    assert keys(plan(text, recording)) != before
-
-
-def test_the_key_knows_the_versions(plan: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = keys(plan(""))
-    monkeypatch.setattr("fgtrack.pipeline.sweep_plan.versions", lambda: {"fgtrack": "another"})
-    assert keys(plan("")) != before
+def test_the_files_beside_the_one_that_is_named_change_the_key(plan: Any, tmp_path: Path) -> None:
+    """A sequence of KITTI is named by its file of `oxts/`, and its detections lie elsewhere."""
+    kitti.folder(tmp_path, rrc=[kitti.pose(0, 20.0, 1.0, 0.0)])
+    head = "format: fgtrack-sweep/1\ninput: oxts/0001.txt\nestimators: [ekf-replay]\n"
+    before = keys(plan("", head))
+    (tmp_path / "rrc/0001.txt").write_text(kitti.pose(0, 21.0, 1.0, 0.0))
+    assert keys(plan("", head)) != before
 
 
 # --- the committed ones
@@ -332,12 +320,101 @@ def test_a_recording_takes_the_place_of_the_scenario(tmp_path: Path) -> None:
 
 def test_a_sweep_of_the_scenario_cannot_take_a_recording(tmp_path: Path) -> None:
     (tmp_path / "sweep.yaml").write_text(f"{HEAD}\nvary: {{scenario.sensors.radar.rate_hz: [20.0]}}")
-    with pytest.raises(CallError, match="changes the scenario, of which this sweep has none"):
+    with pytest.raises(CallError, match="changes the scenario, which this sweep lacks"):
         load_plan(tmp_path / "sweep.yaml", tmp_path / "drive.jsonl")
 
 
-def test_the_key_of_a_job_follows_the_code_of_plug_ins(plan: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    (before,) = plan("").jobs
-    assert plan("").jobs == (before,)
-    monkeypatch.setattr(ESTIMATORS, "sources", lambda: {"mine": "package 1.0 of other code"})
-    assert plan("").jobs[0].key != before.key
+# --- parts and tables
+
+
+RECIPE = Recipe(None, None, {}, {}, 0, ("a", "b"))
+TABLES = Plan(
+    columns=("rate_hz", "delay"),
+    jobs=(
+        Job((5.0, {"kind": "none"}), 0, "k0", RECIPE),
+        Job((5.0, None), 1, "k1", RECIPE),
+        Job((-1, "x,y"), 0, "", None, "rate_hz=-1: must be positive"),
+    ),
+    estimators=("a", "b"),
+    metrics=(),
+)
+
+
+def cell(name: str, error: str | None = None, **values: float | None) -> Cell:
+    return Cell(name, {} if error else values, {} if error else {"replay_s": 0.25}, error)
+
+
+DONE = {
+    "k1": [cell("a", x=1 / 3, n=2), cell("b", error="it, broke")],
+    "k0": [cell("a", x=0.1), cell("b", y=1e-300, x=None)],
+}
+
+
+def lines(path: Path) -> list[str]:
+    return path.read_text().splitlines()
+
+
+def test_tables_are_in_the_order_of_the_grid_with_all_digits(tmp_path: Path) -> None:
+    result = write_tables(tmp_path, TABLES, DONE)
+    assert lines(tmp_path / "sweep.csv") == [
+        "rate_hz,delay,seed,estimator,x,y,n",
+        '5.0,"{""kind"":""none""}",0,a,0.1,,',
+        '5.0,"{""kind"":""none""}",0,b,,1e-300,',
+        "5.0,,1,a,0.3333333333333333,,2",
+    ]
+    assert lines(tmp_path / "timing.csv")[1] == '5.0,"{""kind"":""none""}",0,a,0.25'
+    assert lines(tmp_path / "errors.csv") == [
+        "rate_hz,delay,seed,estimator,error",
+        '5.0,,1,b,"it, broke"',
+        '-1,"x,y",0,a,rate_hz=-1: must be positive',
+        '-1,"x,y",0,b,rate_hz=-1: must be positive',
+    ]
+    assert (result.num_cells, result.num_good, result.num_bad) == (6, 3, 3)
+    assert result.first_error == "it, broke"
+
+
+def test_jobs_that_are_not_finished_have_no_row(tmp_path: Path) -> None:
+    result = write_tables(tmp_path, TABLES, {"k0": DONE["k0"]})
+    assert len(lines(tmp_path / "sweep.csv")) == 3
+    assert (result.num_good, result.num_bad) == (2, 2)
+
+
+def test_metrics_are_chosen_by_name_or_pattern_and_unknown_ones_reported(tmp_path: Path) -> None:
+    plan = Plan(TABLES.columns, TABLES.jobs, TABLES.estimators, ("n", "[xz]", "n*", "missing", "m.*"))
+    result = write_tables(tmp_path, plan, DONE)
+    assert lines(tmp_path / "sweep.csv")[0] == "rate_hz,delay,seed,estimator,n,x"
+    assert result.unknown_metrics == ("missing", "m.*")
+
+
+def part(folder: Path, key: str, cells: list[dict[str, Any]], head: str = PART_FORMAT) -> None:
+    (folder / "parts").mkdir(exist_ok=True)
+    (folder / f"parts/{key}.json").write_text(json.dumps({"format": head, "cells": cells}))
+
+
+def test_a_part_gives_back_its_cells_to_the_last_bit(tmp_path: Path) -> None:
+    values = {"window": "window", "on": True, "none": None, "nan": math.nan, "n": 2**62, "x": 0.1 + 0.2}
+    part(tmp_path, "k0", [{"estimator": name, "values": values, "times": {"s": 0.5}} for name in "ab"])
+    part(tmp_path, "k1", [{"estimator": "a", "values": values, "times": {}}])  # without all its cells it is not done
+    part(tmp_path, "k2", [])  # of another sweep
+    sweep = Sweep.open(TABLES, tmp_path)
+    assert list(sweep.done) == ["k0"]
+    assert repr(sweep.done["k0"][0].values) == repr(values)
+    assert [job.key for job in sweep.todo] == ["k1"]
+    assert sweep.num_unused == 1
+
+
+@pytest.mark.parametrize("text", ['{"format": "fgtrack-sw', "[]", '{"format": "x"}', "[" * 100_000, "\0"])
+def test_the_job_of_a_damaged_part_is_done_again(tmp_path: Path, caplog: pytest.LogCaptureFixture, text: str) -> None:
+    part(tmp_path, "k1", [{"estimator": name, "values": {"x": 1}, "times": {}} for name in "ab"])
+    (tmp_path / "parts/k0.json").write_text(text)
+    assert [job.key for job in Sweep.open(TABLES, tmp_path).todo] == ["k0"]
+    assert "k0.json: no sweep wrote it, its job is done again" in caplog.text
+
+
+@pytest.mark.parametrize("name", ["sweep.csv", "paired.csv"])
+def test_tables_without_parts_are_replaced_with_overwrite_only(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("yield\n1\n")
+    part(tmp_path, "wheel", [], "parts of a car")
+    with pytest.raises(CallError, match=rf"{name}: already exists"):
+        Sweep.open(TABLES, tmp_path)
+    assert Sweep.open(TABLES, tmp_path, overwrite=True).done == {}
