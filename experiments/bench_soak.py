@@ -35,7 +35,7 @@ from fgtrack.io.run.rows import Row, text
 from fgtrack.io.run.sink import RunSink
 from fgtrack.pipeline.clock import node_ticks
 from fgtrack.sim.clocks import ArrivalClock, DriftClock, JitterClock, OffsetClock
-from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY, BurstDelay, ConstantDelay, LossyDelay, MarkovTimeDelay
+from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY, ConstantDelay, LossyDelay, MarkovTimeDelay
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.sensor import Clutter, SimulatedSensor
 from fgtrack.sim.simulate import simulate
@@ -62,7 +62,7 @@ def race(rng: np.random.Generator, lap_s: float, speed_mps: float) -> Scenario:
         lateral_m = rng.uniform(-5.0, 0.0)
         cars.append(TrackVehicle(arc_m=start_m, lateral_m=lateral_m, speed=((0.0, speed_mps + faster_mps),)))
     silent_s = rng.uniform(0.0, lap_s - 3.0)
-    slow = BurstDelay(0.002, 1.5, 0.12, LIDAR_DELAY)
+    slow = MarkovTimeDelay(LIDAR_DELAY, ConstantDelay(0.27), 0.04, 0.67)
     lidar = SimulatedSensor(
         "lidar_cluster",
         {"x_m": 0.3, "y_m": 0.1},

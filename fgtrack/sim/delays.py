@@ -122,33 +122,6 @@ class GammaDelay:
 
 
 @settings
-class BurstDelay:
-    """Another model, and bursts in which everything takes longer.
-
-    Outside a burst, each message starts one with `probability`; all messages stamped less than `duration_s`
-    after it are `extra_s` later, itself included.
-    """
-
-    probability: Probability
-    duration_s: PositiveFloat
-    extra_s: NonNegativeFloat
-    base: "AnyDelay" = field(default_factory=NoDelay)
-    kind: Literal["burst"] = "burst"
-
-    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """See `DelayModel`."""
-        delays = self.base.draw(rng, stamps_s)
-        starts = rng.random(len(stamps_s)) < self.probability
-        burst_end_s = -math.inf
-        for index, stamp_s in enumerate(stamps_s):
-            if stamp_s >= burst_end_s and starts[index]:
-                burst_end_s = stamp_s + self.duration_s
-            if stamp_s < burst_end_s:
-                delays[index] += self.extra_s
-        return delays
-
-
-@settings
 class LossyDelay:
     """Another model, and messages that never arrive, each with `probability`."""
 
@@ -221,15 +194,7 @@ class MarkovTimeDelay:
 
 #: Every delay model, chosen by `kind`.
 AnyDelay = Annotated[
-    NoDelay
-    | ConstantDelay
-    | UniformDelay
-    | NormalDelay
-    | GammaDelay
-    | BurstDelay
-    | LossyDelay
-    | MarkovDelay
-    | MarkovTimeDelay,
+    NoDelay | ConstantDelay | UniformDelay | NormalDelay | GammaDelay | LossyDelay | MarkovDelay | MarkovTimeDelay,
     Discriminator("kind"),
 ]
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from fgtrack.core.errors import CallError, DataError, did_you_mean
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import BoolArray, DetectionList, IntArray, Message
+from fgtrack.core.types import DetectionList, IntArray, Message
 from fgtrack.sim.clocks import AnyClock, reported_stamps
 from fgtrack.sim.delays import AnyDelay
 from fgtrack.sim.settings import Probability, settings
@@ -37,40 +37,35 @@ class Redelayed:
 
     At the same receipt, what keeps its receipt comes first, in its old order; then sensor by sensor, by stamp.
     Holds no more messages at a time than wait for an earlier one. Raises what the input raises, after everything
-    before it; `DataError` where it is not what it was when the delays were drawn.
+    before it; `DataError` where it is shorter than it was when the delays were drawn.
     """
 
     num_lost: Mapping[str, int]
     """Lists lost, by sensor."""
     _read: Callable[[], Iterable[Message]]
-    _place: IntArray
-    """Place of each message of the input in the order of receipt, -1 of a lost one."""
+    _ranks: IntArray
+    """Rank of each message of the input in the order of receipt, -1 of a lost one."""
     _receipts_ns: IntArray
     _stamps_ns: IntArray
 
     def __iter__(self) -> Iterator[Message]:
         waiting: dict[int, Message] = {}
-        next_place = count = 0
-        for index, message in enumerate(self._read()):
-            count = index + 1
-            if index >= len(self._place):
-                break
-            place = int(self._place[index])
-            if place < 0:
-                continue
-            receipt_ns, stamp_ns = int(self._receipts_ns[index]), int(self._stamps_ns[index])
-            waiting[place] = _moved(message, stamp_ns, receipt_ns)
-            while next_place in waiting:
-                yield waiting.pop(next_place)
-                next_place += 1
-        if count != len(self._place):
+        next_rank = 0
+        rows = zip(self._ranks.tolist(), self._stamps_ns.tolist(), self._receipts_ns.tolist(), strict=True)
+        for message, (rank, stamp_ns, receipt_ns) in zip(self._read(), rows, strict=False):
+            if rank >= 0:
+                waiting[rank] = _moved(message, stamp_ns, receipt_ns)
+            while next_rank in waiting:
+                yield waiting.pop(next_rank)
+                next_rank += 1
+        if next_rank <= self._ranks.max(initial=-1):
             raise DataError("the input has changed while it was given other delays: record to the end, then convert")
 
 
 def redelay(
     read: Callable[[], Iterable[Message]], delays: Mapping[str, SensorDelays], rng: np.random.Generator
 ) -> Redelayed:
-    """Messages of `read()` with the detections of the sensors in `delays` under other delays.
+    """Return the messages of `read()` with the detections of the sensors in `delays` under other delays.
 
     The receipt becomes the stamp plus a delay, drawn for all lists of a sensor in the order of their stamps. The
     ego, the truth and sensors that are not named keep theirs. Every sensor, and in it delays, losses and clock
@@ -88,85 +83,45 @@ def redelay(
     CallError
         A sensor of `delays` is not in the input.
     """
-    plan = _Plan.of(read)
-    chosen = _chosen(delays, plan.places)
-    num_lost = {}
-    for rank, (sensor, child) in enumerate(zip(chosen, rng.spawn(len(chosen)), strict=True), 1):
-        num_lost[sensor] = plan.draw(chosen[sensor], plan.places[sensor], rank, child)
-    return Redelayed(num_lost, read, plan.order(), plan.receipts_ns, plan.reported_ns)
+    times, sensors = list[tuple[int, int]](), list[str]()
+    try:
+        for message in read():
+            times.append((message.receipt_ns, message.stamp_ns))
+            sensors.append(message.sensor if isinstance(message, DetectionList) else "")
+    except DataError:
+        pass  # comes again when the messages are read, after everything before it
+    receipts_ns, stamps_ns = np.array(times, dtype=np.int64).reshape(-1, 2).T.copy()
+    reported_ns, priority, lost = stamps_ns.copy(), np.zeros_like(stamps_ns), np.zeros(len(times), dtype=bool)
+    chosen, num_lost, names = _chosen(delays, set(sensors) - {""}), dict[str, int](), np.array(sensors)
+    for number, (sensor, child) in enumerate(zip(chosen, rng.spawn(len(chosen)), strict=True), 1):
+        settings, (delay_rng, loss_rng, clock_rng) = chosen[sensor], child.spawn(3)
+        own = np.flatnonzero(names == sensor)
+        own = own[np.argsort(stamps_ns[own], kind="stable")]
+        lost[own] = loss_rng.random(len(own)) < settings.loss_probability
+        if settings.delay is not None:
+            delays_s = settings.delay.draw(delay_rng, (stamps_ns[own] - stamps_ns[own[:1]]) / NS_PER_S)
+            lost[own] |= np.isnan(delays_s)
+            receipts_ns[own] = stamps_ns[own] + np.rint(np.nan_to_num(delays_s) * NS_PER_S).astype(np.int64)
+            priority[own] = number
+        reported_ns[own] = reported_stamps(settings.clock, clock_rng, stamps_ns[own], receipts_ns[own])
+        num_lost[sensor] = int(lost[own].sum())
+    # What keeps its receipt also keeps its order among equals: no stamp in its key.
+    order = np.lexsort((np.where(priority > 0, stamps_ns, 0), priority, receipts_ns))
+    kept, ranks = order[~lost[order]], np.full(len(order), -1, dtype=np.int64)
+    ranks[kept] = np.arange(len(kept))
+    return Redelayed(num_lost, read, ranks, receipts_ns, reported_ns)
 
 
 def _chosen(delays: Mapping[str, SensorDelays], known: Iterable[str]) -> dict[str, SensorDelays]:
     """Settings of every sensor that has some: the named ones in their order, then the others by name."""
     names = sorted(known)
-    missing = [sensor for sensor in delays if sensor not in names and sensor != OTHERS]
+    missing = [sensor for sensor in delays if sensor not in (*names, OTHERS)]
     if missing:
-        there = ", ".join(names) or "none"
-        hint = did_you_mean(missing[0], names)
+        there, hint = ", ".join(names) or "none", did_you_mean(missing[0], names)
         raise CallError(f"sensor {missing[0]!r} is not in the input, whose sensors are: {there}{hint}")
-    chosen = {sensor: settings for sensor, settings in delays.items() if sensor != OTHERS}
-    if OTHERS in delays:
-        chosen |= {sensor: delays[OTHERS] for sensor in names if sensor not in chosen}
-    return chosen
-
-
-@dataclass(eq=False)
-class _Plan:
-    """What becomes of each message of the input; all arrays of shape (n,)."""
-
-    places: dict[str, IntArray]
-    """Where the lists of each sensor are in the input."""
-    receipts_ns: IntArray
-    stamps_ns: IntArray
-    reported_ns: IntArray
-    """Stamps that will be reported."""
-    rank: IntArray
-    """Order at the same receipt: 0 of what keeps its receipt, then the sensors."""
-    lost: BoolArray
-
-    @classmethod
-    def of(cls, read: Callable[[], Iterable[Message]]) -> "_Plan":
-        """The plan that changes nothing, up to where the input breaks off."""
-        places: dict[str, list[int]] = {}
-        times: list[tuple[int, int]] = []
-        try:
-            for index, message in enumerate(read()):
-                if isinstance(message, DetectionList):
-                    places.setdefault(message.sensor, []).append(index)
-                times.append((message.receipt_ns, message.stamp_ns))
-        except DataError:
-            pass  # comes again when the messages are read, after everything before it
-        table = np.array(times, dtype=np.int64).reshape(-1, 2)
-        receipts_ns, stamps_ns = table[:, 0].copy(), table[:, 1].copy()
-        rank = np.zeros(len(times), dtype=np.int64)
-        lost = np.zeros(len(times), dtype=bool)
-        arrays = {sensor: np.array(where, dtype=np.int64) for sensor, where in places.items()}
-        return cls(arrays, receipts_ns, stamps_ns, stamps_ns.copy(), rank, lost)
-
-    def draw(self, settings: SensorDelays, where: IntArray, rank: int, rng: np.random.Generator) -> int:
-        """Draw delays, losses and clock errors of the lists at `where`; gives the number of lists lost."""
-        delay_rng, loss_rng, clock_rng = rng.spawn(3)
-        where = where[np.argsort(self.stamps_ns[where], kind="stable")]
-        stamps_ns = self.stamps_ns[where]
-        lost = loss_rng.random(len(where)) < settings.loss_probability
-        if settings.delay is not None:
-            delays_s = settings.delay.draw(delay_rng, (stamps_ns - stamps_ns[:1]) / NS_PER_S)
-            lost |= np.isnan(delays_s)
-            self.receipts_ns[where] = stamps_ns + np.rint(np.nan_to_num(delays_s) * NS_PER_S).astype(np.int64)
-            self.rank[where] = rank
-        self.lost[where] = lost
-        self.reported_ns[where] = reported_stamps(settings.clock, clock_rng, stamps_ns, self.receipts_ns[where])
-        return int(np.count_nonzero(lost))
-
-    def order(self) -> IntArray:
-        """Place of each message in the order of receipt, -1 of a lost one."""
-        # What keeps its receipt also keeps its place among equals: no stamp in its key.
-        stamps_ns = np.where(self.rank > 0, self.stamps_ns, 0)
-        order = np.lexsort((stamps_ns, self.rank, self.receipts_ns))
-        place = np.full(len(order), -1, dtype=np.int64)
-        kept = order[~self.lost[order]]
-        place[kept] = np.arange(len(kept))
-        return place
+    named = {sensor: settings for sensor, settings in delays.items() if sensor != OTHERS}
+    others = {sensor: delays[OTHERS] for sensor in names if sensor not in delays} if OTHERS in delays else {}
+    return named | others
 
 
 def _moved(message: Message, stamp_ns: int, receipt_ns: int) -> Message:

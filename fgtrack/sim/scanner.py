@@ -51,8 +51,8 @@ class Scanner:
         seen = [self._see(child, states) for child, states in zip(children, objects, strict=True)]
         detected = _joined([self._clutter(clutter_rng, track), *seen])
         order = np.lexsort((detected.key, detected.scan))
-        components = self.sensor.components
-        detections = [Detection(**dict(zip(components, row, strict=True))) for row in detected.z[order].tolist()]
+        rows = detected.z[order].tolist()
+        detections = [Detection(**dict(zip(self.sensor.components, row, strict=True))) for row in rows]
         bounds = np.searchsorted(detected.scan[order], np.arange(len(self.ego) + 1)).tolist()
         return [tuple(detections[a:b]) for a, b in pairwise(bounds)]
 
@@ -107,9 +107,8 @@ class Scanner:
             line_of_sight = self._relative(scan, states)[:, 1] + sensor.mount.yaw_rad
             noise[:, :2] = _rotated(noise[:, :2], line_of_sight)
         z = self._measure(scan, states) + noise
-        for column, name in enumerate(components):
-            if name in ANGULAR:
-                z[:, column] = wrap_angles(z[:, column])
+        angles = [name in ANGULAR for name in components]
+        z[:, angles] = wrap_angles(z[:, angles])
         return z
 
     def _measure(self, scan: IntArray, states: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt
 from fgtrack.models.oval import OVAL
 from fgtrack.sim.delays import AnyDelay, ConstantDelay
 from fgtrack.sim.sensor import SimulatedSensor
-from fgtrack.sim.settings import Rate, settings
+from fgtrack.sim.settings import Rate, require, settings
 from fgtrack.sim.vehicles import AnyVehicle, TrackVehicle
 
 
@@ -45,10 +45,7 @@ class Scenario:
 
     def __post_init__(self) -> None:
         names = [sensor.name for sensor in self.sensors]
-        if len(set(names)) < len(names):
-            raise ValueError(f"sensors: names must differ, are {', '.join(names)}")
-        if self.map is None:
-            if any(isinstance(vehicle, TrackVehicle) for vehicle in (self.ego, *self.opponents)):
-                raise ValueError("map: a vehicle of kind track needs one")
-            if any(sensor.clutter.region == "track" for sensor in self.sensors):
-                raise ValueError("map: clutter on the track needs one")
+        require(len(set(names)) == len(names), "sensors", "names must differ", names)
+        on_track = any(isinstance(vehicle, TrackVehicle) for vehicle in (self.ego, *self.opponents))
+        on_track |= any(sensor.clutter.region == "track" for sensor in self.sensors)
+        require(self.map is not None or not on_track, "map", "a vehicle or clutter on the track needs one", self.map)

@@ -71,23 +71,18 @@ class SimulatedSensor:
     """Intervals [start, end) in seconds in which the sensor is silent."""
 
     def __post_init__(self) -> None:
-        unknown = set(self.std) - set(MEASURABLE)
-        if unknown or not self.std:
-            raise ValueError(f"std: name components out of {', '.join(MEASURABLE)}, not {sorted(unknown)}")
-        if ("x_m" in self.std) != ("y_m" in self.std):
-            raise ValueError("std: x_m and y_m are measured together")
-        if "x_m" in self.std and not set(POLAR).isdisjoint(self.std):
-            raise ValueError("std: measure x_m and y_m or range and bearing, not both")
+        std, behind_m = set(self.std), self.max_range_behind_m
+        seen = behind_m is None or self.min_range_m < behind_m <= self.max_range_m
+        known = bool(std) and std <= set(MEASURABLE)
+        require(known, "std", f"name components out of {', '.join(MEASURABLE)}", sorted(std))
+        require(("x_m" in std) == ("y_m" in std), "std", "x_m and y_m are measured together", sorted(std))
+        require("x_m" not in std or std.isdisjoint(POLAR), "std", "positions or range and bearing", sorted(std))
         require(self.jitter_s < 1.0 / self.rate_hz, "jitter_s", "must be below a period", self.jitter_s)
         require(self.max_range_m > self.min_range_m, "max_range_m", "must exceed min_range_m", self.max_range_m)
-        if self.max_range_behind_m is not None:
-            behind_m = self.max_range_behind_m
-            inside = self.min_range_m < behind_m <= self.max_range_m
-            require(inside, "max_range_behind_m", "must lie in (min_range_m, max_range_m]", behind_m)
-        low, high = self.split_distance_m
-        require(low <= high, "split_distance_m", "must be a range (low, high), high", high)
-        for start_s, end_s in self.drop_outs:
-            require(start_s < end_s, "drop_outs", "must be intervals (start, end), end", end_s)
+        require(seen, "max_range_behind_m", "must lie in (min_range_m, max_range_m]", behind_m)
+        for name, ranges in (("split_distance_m", (self.split_distance_m,)), ("drop_outs", self.drop_outs)):
+            for low, high in ranges:
+                require(low <= high, name, "must be (low, high), high", high)
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -108,7 +103,5 @@ class SimulatedSensor:
 
     def silent(self, times_s: FloatArray) -> BoolArray:
         """Which of `times_s` lie in a drop-out."""
-        result = np.zeros(len(times_s), dtype=bool)
-        for start_s, end_s in self.drop_outs:
-            result |= (times_s >= start_s) & (times_s < end_s)
-        return result
+        starts_s, ends_s = np.reshape(self.drop_outs, (-1, 2)).T[:, :, None]
+        return np.asarray(((times_s >= starts_s) & (times_s < ends_s)).any(axis=0))

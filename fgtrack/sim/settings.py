@@ -19,7 +19,7 @@ def settings(cls: type[T]) -> type[T]:
     return dataclass(cls, frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))  # type: ignore[return-value]  # it is `cls` itself
 
 
-def require(condition: bool, key: str, rule: str, value: float) -> None:
+def require(condition: bool, key: str, rule: str, value: object) -> None:
     """Raise a `ValueError` that names `key` unless `condition` holds: for rules between several settings."""
     if not condition:
         raise ValueError(f"{key}: {rule}, is {value}")

@@ -7,11 +7,12 @@ import numpy as np
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import wrap_angles
-from fgtrack.core.time import nanoseconds, seconds
+from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import (
     EGO_COVARIANCE_STATES,
     EGO_ID,
     YAW,
+    BoolArray,
     DetectionList,
     EgoState,
     FloatArray,
@@ -22,7 +23,7 @@ from fgtrack.core.types import (
 from fgtrack.models.oval import OVAL, make_oval
 from fgtrack.models.path import Path
 from fgtrack.models.track_map import TrackMap
-from fgtrack.sim.clocks import ClockModel, reported_stamps
+from fgtrack.sim.clocks import reported_stamps
 from fgtrack.sim.delays import DelayModel
 from fgtrack.sim.scanner import Scanner
 from fgtrack.sim.scenario import Scenario
@@ -47,104 +48,34 @@ def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
     CallError
         If it does not fit into memory.
     """
-    return _Simulation(scenario, rng).messages()
-
-
-class _Simulation:
-    """One run: the generators of everything and the true trajectories."""
-
-    def __init__(self, scenario: Scenario, rng: np.random.Generator) -> None:
-        self.scenario = scenario
-        count = _num_states(scenario)
-        if count > _MOST_STATES:
-            raise CallError(
-                f"the scenario has some {count:.3g} sightings and states, more than {_MOST_STATES:g} do not fit into "
-                "memory: shorten duration_s, or lower rates, vehicles or clutter"
-            )
-        vehicles_rng, self.ego_rng, self.sensors_rng = rng.spawn(3)
-        self.track = _track(scenario)
-        path = None if self.track is None else Path.through(self.track.table[:, :2])
-        vehicles = (scenario.ego, *scenario.opponents)
-        self.ego, *self.opponents = (
-            self._trajectory(vehicle, path, child)
-            for vehicle, child in zip(vehicles, vehicles_rng.spawn(len(vehicles)), strict=True)
+    count = _num_states(scenario)
+    if count > _MOST_STATES:
+        raise CallError(
+            f"the scenario has some {count:.3g} measurements and states, more than {_MOST_STATES:g} do not fit into "
+            "memory: shorten duration_s, or lower rates, vehicles or clutter"
         )
-
-    def messages(self) -> list[Message]:
-        """All messages in order of receipt."""
-        sensors = self.scenario.sensors
-        messages: list[Message] = [*self._truth(), *self._ego_messages()]
-        for sensor, rng in zip(sensors, self.sensors_rng.spawn(len(sensors)), strict=True):
-            messages += self._scans(sensor, rng)
-        messages.sort(key=lambda message: message.receipt_ns)
-        return messages
-
-    def _trajectory(self, vehicle: AnyVehicle, path: Path | None, rng: np.random.Generator) -> Trajectory:
-        if isinstance(vehicle, DrawnVehicle):
-            return vehicle.trajectory(rng, self.scenario.duration_s)
-        assert path is not None, "a scenario without a map has no vehicle on a track"
-        return vehicle.trajectory(path)
-
-    def _truth(self) -> list[Message]:
-        stamps, times = self._whole(self._times(self.scenario.truth_rate_hz))
-        rows = [trajectory.states(times).tolist() for trajectory in (self.ego, *self.opponents)]
-        return [
-            TruthState(stamp, stamp, object_id, *states[index])
-            for index, stamp in enumerate(stamps)
-            for object_id, states in enumerate(rows, start=EGO_ID)
-        ]
-
-    def _ego_messages(self) -> list[Message]:
-        settings = self.scenario.ego_messages
-        noise_rng, delay_rng = self.ego_rng.spawn(2)
-        stamps, times = self._whole(self._times(settings.rate_hz))
-        std = [*[settings.position_std_m] * 2, settings.yaw_std_rad, settings.speed_std_mps]
-        std += [settings.yaw_rate_std_radps, settings.accel_std_mps2]
-        states = self.ego.states(times)
-        states += np.array(std) * noise_rng.standard_normal(states.shape)
-        states[:, YAW] = wrap_angles(states[:, YAW])
-        receipts = _receipts(settings.delay, delay_rng, stamps, times)
-        variances = np.square(std[: len(EGO_COVARIANCE_STATES)])
-        covariance = tuple(np.diag(variances).ravel().tolist()) if variances.any() else None
-        columns = zip(stamps, receipts, *states.T.tolist(), strict=True)
-        return [
-            EgoState(stamp, receipt, x, y, yaw, speed, yaw_rate, accel, covariance=covariance)
-            for stamp, receipt, x, y, yaw, speed, yaw_rate, accel in columns
-            if receipt is not None
-        ]
-
-    def _scans(self, sensor: SimulatedSensor, rng: np.random.Generator) -> list[Message]:
-        times_rng, delay_rng, scanner_rng, clock_rng = rng.spawn(4)
-        stamps, times = self._whole(sensor.scan_times(times_rng, self.scenario.duration_s))
-        scanner = Scanner(sensor, self.ego.states(times), self.scenario.detection_origin_x_m)
-        objects = [trajectory.states(times) for trajectory in self.opponents]
-        scans = scanner.scans(scanner_rng, objects, self.track)
-        receipts = _receipts(sensor.delay, delay_rng, stamps, times)
-        reported = _reported(sensor.clock, clock_rng, stamps, receipts)
-        silent = sensor.silent(times)
-        return [
-            DetectionList(sensor.name, stamp, receipt, detections, sensor.frame)
-            for stamp, receipt, detections, quiet in zip(reported, receipts, scans, silent, strict=True)
-            if receipt is not None and not quiet
-        ]
-
-    def _times(self, rate_hz: float) -> FloatArray:
-        return np.arange(math.floor(self.scenario.duration_s * rate_hz + 1e-9) + 1) / rate_hz
-
-    def _whole(self, times_s: FloatArray) -> tuple[list[int], FloatArray]:
-        """The stamps of times since the start, and the times again, now of whole nanoseconds."""
-        since_start_ns = [nanoseconds(time_s) for time_s in times_s.tolist()]
-        stamps = [self.scenario.start_ns + time_ns for time_ns in since_start_ns]
-        return stamps, np.array([seconds(time_ns) for time_ns in since_start_ns])
+    vehicles_rng, ego_rng, sensors_rng = rng.spawn(3)
+    track = _track(scenario)
+    path = None if track is None else Path.through(track.table[:, :2])
+    vehicles = (scenario.ego, *scenario.opponents)
+    ego, *opponents = (
+        _trajectory(vehicle, path, child, scenario.duration_s)
+        for vehicle, child in zip(vehicles, vehicles_rng.spawn(len(vehicles)), strict=True)
+    )
+    messages: list[Message] = [*_truth(scenario, [ego, *opponents]), *_ego_messages(scenario, ego, ego_rng)]
+    for sensor, child in zip(scenario.sensors, sensors_rng.spawn(len(scenario.sensors)), strict=True):
+        messages += _scans(scenario, sensor, ego, opponents, track, child)
+    messages.sort(key=lambda message: message.receipt_ns)
+    return messages
 
 
 def _num_states(scenario: Scenario) -> float:
-    """About how many states of vehicles, sightings and ghosts are drawn."""
-    vehicles = 1 + len(scenario.opponents)
-    per_s = scenario.ego_messages.rate_hz + scenario.truth_rate_hz * vehicles
-    per_s += sum(sensor.rate_hz * (vehicles + sensor.clutter.mean_per_scan) for sensor in scenario.sensors)
-    drawn = [one for one in (scenario.ego, *scenario.opponents) if isinstance(one, DrawnVehicle)]
-    return scenario.duration_s * (per_s + sum(1.0 / one.step_s for one in drawn))
+    """About how many states of vehicles, measurements and clutter are drawn."""
+    vehicles = (scenario.ego, *scenario.opponents)
+    per_s = scenario.ego_messages.rate_hz + scenario.truth_rate_hz * len(vehicles)
+    per_s += sum(sensor.rate_hz * (len(vehicles) + sensor.clutter.mean_per_scan) for sensor in scenario.sensors)
+    per_s += sum(1.0 / vehicle.step_s for vehicle in vehicles if isinstance(vehicle, DrawnVehicle))
+    return scenario.duration_s * per_s
 
 
 def _track(scenario: Scenario) -> TrackMap | None:
@@ -153,20 +84,74 @@ def _track(scenario: Scenario) -> TrackMap | None:
     return make_oval() if scenario.map == OVAL else TrackMap.read(scenario.map)
 
 
-def _receipts(delay: DelayModel, rng: np.random.Generator, stamps: list[int], times_s: FloatArray) -> list[int | None]:
-    """Receipt of each stamp, None where the message is lost."""
-    delays = delay.draw(rng, times_s).tolist()
+def _trajectory(vehicle: AnyVehicle, path: Path | None, rng: np.random.Generator, duration_s: float) -> Trajectory:
+    if isinstance(vehicle, DrawnVehicle):
+        return vehicle.trajectory(rng, duration_s)
+    assert path is not None, "a scenario without a map has no vehicle on a track"
+    return vehicle.trajectory(path)
+
+
+def _truth(scenario: Scenario, vehicles: Sequence[Trajectory]) -> list[Message]:
+    stamps_ns, times_s = _stamps(scenario, _times(scenario, scenario.truth_rate_hz))
+    rows = [vehicle.states(times_s).tolist() for vehicle in vehicles]
     return [
-        None if math.isnan(delay_s) else stamp + nanoseconds(delay_s)
-        for stamp, delay_s in zip(stamps, delays, strict=True)
+        TruthState(stamp_ns, stamp_ns, object_id, *states[index])
+        for index, stamp_ns in enumerate(stamps_ns.tolist())
+        for object_id, states in enumerate(rows, start=EGO_ID)
     ]
 
 
-def _reported(
-    clocks: Sequence[ClockModel], rng: np.random.Generator, stamps: list[int], receipts: list[int | None]
-) -> list[int]:
-    """Stamp that the sensor reports in place of each of `stamps`; of a lost message it does not matter."""
-    sensed_ns: IntArray = np.array(stamps, dtype=np.int64)
-    receipts_ns = [stamp if receipt is None else receipt for stamp, receipt in zip(stamps, receipts, strict=True)]
-    reported = reported_stamps(clocks, rng, sensed_ns, np.array(receipts_ns, dtype=np.int64))
-    return [int(stamp) for stamp in reported]
+def _ego_messages(scenario: Scenario, ego: Trajectory, rng: np.random.Generator) -> list[Message]:
+    settings = scenario.ego_messages
+    noise_rng, delay_rng = rng.spawn(2)
+    stamps_ns, times_s = _stamps(scenario, _times(scenario, settings.rate_hz))
+    std = [*[settings.position_std_m] * 2, settings.yaw_std_rad, settings.speed_std_mps]
+    std += [settings.yaw_rate_std_radps, settings.accel_std_mps2]
+    states = ego.states(times_s)
+    states += np.array(std) * noise_rng.standard_normal(states.shape)
+    states[:, YAW] = wrap_angles(states[:, YAW])
+    receipts_ns, lost = _receipts(settings.delay, delay_rng, stamps_ns, times_s)
+    variances = np.square(std[: len(EGO_COVARIANCE_STATES)])
+    covariance = tuple(np.diag(variances).ravel().tolist()) if variances.any() else None
+    columns = zip(stamps_ns[~lost].tolist(), receipts_ns[~lost].tolist(), states[~lost].tolist(), strict=True)
+    return [EgoState(stamp_ns, receipt_ns, *row, covariance=covariance) for stamp_ns, receipt_ns, row in columns]
+
+
+def _scans(
+    scenario: Scenario,
+    sensor: SimulatedSensor,
+    ego: Trajectory,
+    opponents: Sequence[Trajectory],
+    track: TrackMap | None,
+    rng: np.random.Generator,
+) -> list[Message]:
+    times_rng, delay_rng, scanner_rng, clock_rng = rng.spawn(4)
+    stamps_ns, times_s = _stamps(scenario, sensor.scan_times(times_rng, scenario.duration_s))
+    scanner = Scanner(sensor, ego.states(times_s), scenario.detection_origin_x_m)
+    scans = scanner.scans(scanner_rng, [opponent.states(times_s) for opponent in opponents], track)
+    receipts_ns, lost = _receipts(sensor.delay, delay_rng, stamps_ns, times_s)
+    reported_ns = reported_stamps(sensor.clock, clock_rng, stamps_ns, receipts_ns)
+    columns = zip(reported_ns.tolist(), receipts_ns.tolist(), scans, lost | sensor.silent(times_s), strict=True)
+    return [
+        DetectionList(sensor.name, stamp_ns, receipt_ns, detections, sensor.frame)
+        for stamp_ns, receipt_ns, detections, is_missing in columns
+        if not is_missing
+    ]
+
+
+def _times(scenario: Scenario, rate_hz: float) -> FloatArray:
+    return np.arange(math.floor(scenario.duration_s * rate_hz + 1e-9) + 1) / rate_hz
+
+
+def _stamps(scenario: Scenario, times_s: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Stamps of times since the start, and the times again, now of whole nanoseconds."""
+    since_start_ns = np.rint(times_s * NS_PER_S).astype(np.int64)
+    return scenario.start_ns + since_start_ns, since_start_ns / NS_PER_S
+
+
+def _receipts(
+    delay: DelayModel, rng: np.random.Generator, stamps_ns: IntArray, times_s: FloatArray
+) -> tuple[IntArray, BoolArray]:
+    """Receipt of each stamp, and True where the message is lost."""
+    delays_s = delay.draw(rng, times_s)
+    return stamps_ns + np.rint(np.nan_to_num(delays_s) * NS_PER_S).astype(np.int64), np.isnan(delays_s)

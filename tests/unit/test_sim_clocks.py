@@ -4,11 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import stats
-from support.tracking import message, ms
 
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import Detection, DetectionList, IntArray, Message
-from fgtrack.models.sensors import SensorModel
+from fgtrack.core.types import DetectionList, IntArray, Message
 from fgtrack.pipeline.load import load
 from fgtrack.sim.clocks import (
     AnyClock,
@@ -19,10 +17,8 @@ from fgtrack.sim.clocks import (
     QuantisedClock,
     reported_stamps,
 )
-from fgtrack.sim.delays import ConstantDelay, LossyDelay
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate
-from fgtrack.tracking.inbox import QueueInbox
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "configs/scenarios"
 START_NS = 1_700_000_000_123_456_789
@@ -38,10 +34,6 @@ def errors_ns(*clocks: AnyClock, seed: int = 0) -> IntArray:
 # Each clock
 
 
-def test_no_clock_is_a_right_clock() -> None:
-    np.testing.assert_array_equal(errors_ns(), 0)
-
-
 @pytest.mark.parametrize("clock", ALL, ids=lambda clock: clock.kind)
 def test_stamps_are_one_per_message_whole_and_the_same_for_the_same_seed(clock: AnyClock) -> None:
     before = STAMPS_NS.copy()
@@ -53,10 +45,6 @@ def test_stamps_are_one_per_message_whole_and_the_same_for_the_same_seed(clock: 
     np.testing.assert_array_equal(before, STAMPS_NS)
     nothing = np.empty(0, dtype=np.int64)
     assert reported_stamps([clock], np.random.default_rng(0), nothing, nothing).shape == (0,)
-
-
-def test_an_offset_is_the_same_everywhere() -> None:
-    assert set(errors_ns(OffsetClock(-0.25)).tolist()) == {-250_000_000}
 
 
 def test_a_drift_grows_by_microseconds_per_second_from_the_first_message() -> None:
@@ -71,7 +59,7 @@ def test_jitter_is_normal_and_without_memory() -> None:
     assert abs(np.mean(errors[1:] * errors[:-1])) < 4.0 / np.sqrt(len(errors))
 
 
-@pytest.mark.parametrize("step_s", [0.01, 0.1, 1.0, 0.033])
+@pytest.mark.parametrize("step_s", [0.01, 0.033])
 def test_a_quantised_stamp_is_the_last_tick_of_its_clock(step_s: float) -> None:
     errors = errors_ns(QuantisedClock(step_s))
     step_ns = round(step_s * NS_PER_S)
@@ -142,44 +130,3 @@ def test_a_clock_changes_the_stamps_of_its_sensor_and_nothing_else() -> None:
     assert [replace(m, stamp_ns=0) for m in lists(right)] == [replace(m, stamp_ns=0) for m in lists(wrong)]
     others = [[m for m in messages if m not in lists(messages)] for messages in (right, wrong)]
     assert others[0] == others[1]
-
-
-def test_arrival_stamps_of_a_scenario_are_its_receipts() -> None:
-    wrong = lists(simulate(with_clocks(ArrivalClock()), np.random.default_rng(0)))
-    assert wrong
-    assert all(m.stamp_ns == m.receipt_ns for m in wrong)
-
-
-def test_lost_messages_leave_the_stamps_of_the_others() -> None:
-    def stamps(loss: float) -> list[int]:
-        lidar = replace(SHORT.sensors[0], delay=LossyDelay(loss, ConstantDelay(0.1)), clock=(JitterClock(0.01),))
-        return [m.stamp_ns for m in lists(simulate(replace(SHORT, sensors=(lidar,)), np.random.default_rng(0)))]
-
-    some, everything = stamps(0.5), stamps(0.0)
-    assert 10 < len(some) < 50
-    assert set(some) < set(everything)
-
-
-def test_the_scenario_with_wrong_clocks_has_them() -> None:
-    scenario = replace(load(Scenario, SCENARIOS / "wrong_clock.yaml"), duration_s=3.0)
-    lidar, radar = scenario.sensors
-    assert [clock.kind for clock in lidar.clock] == ["offset", "drift", "jitter", "quantised"]
-    right = replace(scenario, sensors=(replace(lidar, clock=()), replace(radar, clock=())))
-    wrong, sensed = (simulate(one, np.random.default_rng(0)) for one in (scenario, right))
-    errors_s = [(a.stamp_ns - b.stamp_ns) / NS_PER_S for a, b in zip(lists(wrong), lists(sensed), strict=True)]
-    assert np.mean(errors_s) == pytest.approx(0.0195, abs=4.0 * 0.002 / np.sqrt(len(errors_s)) + 1e-4)
-    assert {m.receipt_ns - m.stamp_ns for m in lists(wrong, "radar")} == {60_000_000}
-
-
-# What the tracker does with it
-
-
-@pytest.mark.parametrize(
-    ("offset_s", "refused"), [(1.05, []), (1.051, ["invalid"]), (-0.25, []), (-0.251, ["too_old"])]
-)
-def test_the_inbox_takes_a_stamp_after_its_receipt_up_to_a_limit(offset_s: float, refused: list[str]) -> None:
-    inbox = QueueInbox({"lidar": SensorModel(std={"x_m": 0.3, "y_m": 0.3}, max_delay_s=0.3)}, max_future_s=1.0)
-    sensed = message(Detection(x_m=10.0, y_m=1.0), delay_ms=50.0)
-    stamp_ns = int(OffsetClock(offset_s).read(np.random.default_rng(0), np.array([sensed.stamp_ns]), RECEIPTS_NS)[0])
-    assert stamp_ns == sensed.stamp_ns + ms(1000.0 * offset_s)
-    assert [record.disposition.value for record in inbox.put(replace(sensed, stamp_ns=stamp_ns))] == refused

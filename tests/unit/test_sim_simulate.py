@@ -3,37 +3,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydantic import BaseModel, ConfigDict, ValidationError
-from ruamel.yaml import YAML
 from scipy import stats
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
-from fgtrack.sim.delays import ConstantDelay, GammaDelay, LossyDelay, NoDelay
+from fgtrack.pipeline.shipped import read_scenario
+from fgtrack.sim.delays import ConstantDelay, GammaDelay, NoDelay
 from fgtrack.sim.scenario import EgoMessages, Scenario
 from fgtrack.sim.sensor import Clutter, SimulatedSensor
 from fgtrack.sim.simulate import simulate
 from fgtrack.sim.vehicles import DrawnVehicle, TrackVehicle
 
 ROOT = Path(__file__).resolve().parents[2]
-SCENARIOS = sorted((ROOT / "configs/scenarios").glob("*.yaml"))
 
 
-class Document(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-    scenario: Scenario
-
-
-def load(text: str) -> Scenario:
-    return Document(scenario=YAML(typ="safe").load(text)).scenario
-
-
-def named(name: str) -> Scenario:
-    return load((ROOT / f"configs/scenarios/{name}.yaml").read_text(encoding="utf-8"))
-
-
-DEFAULT = named("default")
+DEFAULT = read_scenario("default")
 SHORT = replace(DEFAULT, duration_s=5.0)
 
 
@@ -49,51 +34,15 @@ def scans_of(messages: list[Message], sensor: str) -> list[DetectionList]:
 # Scenarios
 
 
-@pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)
-def test_every_scenario_of_the_project_loads_and_runs(path: Path) -> None:
-    scenario = load(path.read_text(encoding="utf-8"))
-    messages = run(replace(scenario, duration_s=1.0))
-    assert {type(message) for message in messages} == {EgoState, DetectionList, TruthState}
-    for sensor in scenario.sensors:
-        assert any(scan.objects for scan in scans_of(messages, sensor.name))
-
-
-def test_the_scenarios_are_the_ones_the_documents_name() -> None:
-    names = {path.stem for path in SCENARIOS}
-    assert names >= {"default", "single_opponent", "drawn_ctrv", "dense", "no_delay"}
-    assert len(named("dense").opponents) == 10
-
-
-@pytest.mark.parametrize(
-    ("text", "key"),
-    [
-        ("duration: 3", "duration"),
-        ("sensors: [{name: a, std: {x_m: 1.0, y_m: 1.0}, colour: 3}]", "colour"),
-        ("ego_messages: {delay: {kind: gamma, min_s: 0.0}}", "mean_s"),
-        ("opponents: [{kind: boat}]", "boat"),
-        ("duration_s: -1.0", "duration_s"),
-    ],
-)
-def test_a_scenario_with_a_wrong_key_is_refused_with_its_name(text: str, key: str) -> None:
-    ego = "ego: {kind: track, arc_m: 0.0, speed: [[0.0, 60.0]]}\n"
-    assert load(ego).ego == TrackVehicle(0.0, speed=((0.0, 60.0),))
-    with pytest.raises(ValidationError, match=key):
-        load(ego + text)
-
-
 def test_settings_of_a_scenario_that_make_no_sense_are_named() -> None:
     drawn, driven = DrawnVehicle(0.0, 0.0, 0.0, 9.0), TrackVehicle(0.0, speed=((0.0, 9.0),))
     lidar = SimulatedSensor("lidar", {"x_m": 1.0, "y_m": 1.0})
     on_track = replace(lidar, clutter=Clutter(1.0, region="track"))
     for make, message in (
-        (lambda: Scenario(drawn, truth_rate_hz=0.0), "truth_rate_hz"),
-        (lambda: Scenario(drawn, start_ns=-1), "start_ns"),
-        (lambda: Scenario(drawn, detection_origin_x_m=float("nan")), "detection_origin_x_m"),
         (lambda: Scenario(drawn, sensors=(lidar, lidar)), "sensors: names must differ"),
         (lambda: Scenario(driven, map=None), "map: a vehicle"),
         (lambda: Scenario(drawn, opponents=(driven,), map=None), "map: a vehicle"),
-        (lambda: Scenario(drawn, sensors=(on_track,), map=None), "map: clutter"),
-        (lambda: EgoMessages(rate_hz=0.0), "rate_hz"),
+        (lambda: Scenario(drawn, sensors=(on_track,), map=None), "map: a vehicle or clutter"),
         (lambda: EgoMessages(speed_std_mps=-1.0), "speed_std_mps"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -166,17 +115,6 @@ def test_a_scan_that_saw_nothing_is_sent_and_a_silent_sensor_sends_nothing() -> 
     assert times == [k / 10 for k in range(51) if not 10 <= k < 20]
 
 
-def test_a_lost_message_is_not_in_the_list_and_the_others_stay() -> None:
-    def scans(delay: NoDelay | LossyDelay) -> list[DetectionList]:
-        sensors = tuple(replace(sensor, delay=delay) for sensor in SHORT.sensors)
-        return scans_of(run(replace(SHORT, sensors=sensors)), "radar")
-
-    all_scans, some_scans = scans(NoDelay()), scans(LossyDelay(0.5))
-    assert 20 < len(some_scans) < 80
-    assert all(scan in all_scans for scan in some_scans)
-    assert scans(LossyDelay(1.0)) == []
-
-
 def test_another_sensor_leaves_everything_else_as_it_was() -> None:
     extra = SimulatedSensor("extra", {"x_m": 1.0, "y_m": 1.0}, clutter=Clutter(2.0))
     messages = run(replace(SHORT, sensors=(*SHORT.sensors, extra)))
@@ -193,7 +131,7 @@ def test_another_delay_leaves_stamps_and_detections_as_they_were() -> None:
     late = tuple(replace(sensor, delay=ConstantDelay(0.5)) for sensor in SHORT.sensors)
     gone = {"duration_s": 5.0}
     assert without_receipts(replace(SHORT, sensors=late)) == without_receipts(SHORT)
-    assert without_receipts(replace(named("no_delay"), **gone)) == without_receipts(SHORT)  # type: ignore[arg-type]
+    assert without_receipts(replace(read_scenario("no_delay"), **gone)) == without_receipts(SHORT)  # type: ignore[arg-type]
     assert all(isinstance(sensor.delay, GammaDelay) for sensor in SHORT.sensors)
 
 
