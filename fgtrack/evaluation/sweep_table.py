@@ -4,9 +4,10 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pandas as pd  # type: ignore[import-untyped]  # has no stubs
+from scipy.stats import sem
 
 from fgtrack.core.errors import CallError, DataError, did_you_mean
 
@@ -54,12 +55,15 @@ class SweepTable:
         if metric not in self.metrics:
             hint = did_you_mean(metric, self.metrics) or f", there are {', '.join(self.metrics[:5])} ..."
             raise CallError(f"{metric}: the sweep has no such metric{hint}")
-        keys = [*(self.shown_axes if axes is None else axes), _ESTIMATOR]
-        frame: Any = pd.DataFrame(list(self.rows))
-        frame[metric] = [value if math.isfinite(value) else None for value in map(number, frame[metric])]
-        found = frame.dropna(subset=[metric]).astype({metric: float}).groupby(keys, sort=False)[metric]
-        rows = found.agg(["mean", "sem", "count"]).reset_index().itertuples(index=False)
-        return [PointMean(tuple(row[:-4]), *row[-4:]) for row in rows]
+        axes = self.shown_axes if axes is None else axes
+        values: dict[tuple[tuple[str, ...], str], list[float]] = {}
+        for row in self.rows:
+            if math.isfinite(value := number(row[metric])):
+                values.setdefault((tuple(row[axis] for axis in axes), row[_ESTIMATOR]), []).append(value)
+        return [
+            PointMean(*key, float(np.mean(found)), float(sem(found)) if len(found) > 1 else math.nan, len(found))
+            for key, found in values.items()
+        ]
 
 
 def read_sweep(folder: Path | str) -> SweepTable:

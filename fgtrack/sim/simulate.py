@@ -114,7 +114,10 @@ def _ego_messages(scenario: Scenario, ego: Trajectory, rng: np.random.Generator)
     variances = np.square(std[: len(EGO_COVARIANCE_STATES)])
     covariance = tuple(np.diag(variances).ravel().tolist()) if variances.any() else None
     columns = zip(stamps_ns[~lost].tolist(), receipts_ns[~lost].tolist(), states[~lost].tolist(), strict=True)
-    return [EgoState(stamp_ns, receipt_ns, *row, covariance=covariance) for stamp_ns, receipt_ns, row in columns]
+    return [
+        EgoState(stamp_ns, receipt_ns, *row, in_pit=None, covariance=covariance)  # type: ignore[misc]  # six in a row
+        for stamp_ns, receipt_ns, row in columns
+    ]
 
 
 def _scans(

@@ -29,51 +29,46 @@ def dense_joint(
     """States at `stamps_ns` (from the prior's stamp on) given all `measurements`, by stamp.
 
     Every distinct stamp is a node, measured or not, so interpolating and predicting need no equation of their own.
-    With x_0 = m_0 + L_0 u_0 and x_k = F x_(k-1) + L_k u_k (L L' = P_0 or Q) all states are x = m + M u, u ~ N(0, I).
-    The rows u = 0 and W H M u = W (z - H m), W the inverse root of R, are solved by one QR, whose triangle also gives
-    the covariances, S S' with S = M R^-1. This is the least-squares problem of x itself, but its condition stays small
-    where two stamps nearly coincide and Q almost vanishes.
+    About means m all states are x = m + d + M u with u ~ N(0, I): d_k = F d_(k-1) + f(m_(k-1)) - m_k, and M holds the
+    roots L of L L' = P_0 or Q. The rows u = 0 and W H M u = W (y - H d), W the inverse root of R, are solved by one QR,
+    whose triangle also gives the covariances, S S' with S = M R^-1. This is the least-squares problem of x itself, but
+    its condition stays small where two stamps nearly coincide and Q almost vanishes.
 
-    Raises `CallError` for a model that is not linear, or a stamp before the prior's.
+    A linear model takes one step. Of another one the steps begin at the states of `kalman_filter` and go on until they
+    are small; noise and robust weights are those at the last states. Raises `CallError` for a stamp before the prior's.
     """
     wanted = sorted(set(stamps_ns))
-    stamps = sorted({prior.stamp_ns, *wanted, *(m.stamp_ns for m in measurements)})
-    if not motion.linear or not all(m.model.linear for m in measurements):
-        raise CallError("dense_joint: motion and measurements must be linear")
+    stamps = sorted({prior.stamp_ns, *wanted, *(one.stamp_ns for one in measurements)})
     if stamps[0] < prior.stamp_ns:
         raise CallError(f"dense_joint: stamp {stamps[0]} ns lies before the prior's, {prior.stamp_ns} ns")
-    m, M = _moments(motion, prior, stamps)
-    place = {stamp_ns: k for k, stamp_ns in enumerate(stamps)}
-    size = M.shape[-1]
-    rows = [np.eye(size, size + 1)]
-    for item in measurements:
-        k = place[item.stamp_ns]
-        H = item.model.selection(motion.dim)
-        y = item.model.residual(item.z, item.model.predict(m[k], item.pose))
-        rows.append(np.linalg.solve(np.linalg.cholesky(item.R), np.column_stack([H @ M[k], y])))
-    R = np.asarray(np.linalg.qr(np.vstack(rows), mode="r"))
-    root, u = R[:size, :size], np.linalg.solve(R[:size, :size], R[:size, size])
-    places = [place[stamp_ns] for stamp_ns in wanted]
-    roots = np.linalg.solve(root.T, M[places].reshape(len(wanted) * motion.dim, size).T).T
-    roots = roots.reshape(len(wanted), motion.dim, size)
-    return {
-        stamp_ns: TrackState(stamp_ns, m[k] + M[k] @ u, S @ S.T)
-        for stamp_ns, k, S in zip(wanted, places, roots, strict=True)
-    }
-
-
-def _moments(motion: MotionModel, prior: Start, stamps_ns: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-    """Prior mean m (N, n) of the states at `stamps_ns`, and how they depend on u: M (N, n, N n)."""
-    mean, covariance = initial_state(motion, prior)
-    n, count = motion.dim, len(stamps_ns)
-    m, M = np.zeros((count, n)), np.zeros((count, n, count * n))
-    m[0], M[0, :, :n] = mean, np.linalg.cholesky(covariance)
-    for k in range(1, count):
-        dt_s = seconds(stamps_ns[k] - stamps_ns[k - 1])
-        m[k] = motion.predict(m[k - 1], dt_s)
-        M[k] = motion.jacobian(m[k - 1], dt_s) @ M[k - 1]
-        M[k, :, k * n : (k + 1) * n] = np.linalg.cholesky(motion.process_noise(m[k - 1], dt_s))
-    return m, M
+    linear = motion.linear and all(one.model.linear and one.loss is None for one in measurements)
+    n, size, nodes = motion.dim, motion.dim * len(stamps), {stamp_ns: k for k, stamp_ns in enumerate(stamps)}
+    start, P0 = initial_state(motion, prior)
+    known = [] if linear else measurements
+    means = np.array([kalman_filter(motion, prior, known, at_ns).mean for at_ns in stamps])
+    for _ in range(1 if linear else _NEWTON_STEPS):
+        d, M = np.zeros(means.shape), np.zeros((*means.shape, size))
+        d[0], M[0, :, :n] = start - means[0], np.linalg.cholesky(P0)
+        for k in range(1, len(stamps)):
+            dt_s, x = seconds(stamps[k] - stamps[k - 1]), means[k - 1]
+            F = motion.jacobian(x, dt_s)
+            d[k], M[k] = F @ d[k - 1] + motion.predict(x, dt_s) - means[k], F @ M[k - 1]
+            M[k, :, k * n : (k + 1) * n] = np.linalg.cholesky(motion.process_noise(x, dt_s))
+        rows = [np.eye(size, size + 1)]
+        for one in measurements:
+            k = nodes[one.stamp_ns]
+            y = _residual(one, means[k])
+            H = one.model.selection(n) if one.model.linear else _slope(one, means[k])
+            root = np.linalg.cholesky(one.R / _weight(one, y))
+            rows.append(np.linalg.solve(root, np.column_stack([H @ M[k], y - H @ d[k]])))
+        R = np.asarray(np.linalg.qr(np.vstack(rows), mode="r"))[:size]
+        step = d + M @ np.linalg.solve(R[:, :size], R[:, size])
+        means = means + step
+        if np.abs(step).max() < _STEP_TOLERANCE:
+            break
+    chosen = [nodes[stamp_ns] for stamp_ns in wanted]
+    roots = np.linalg.solve(R[:, :size].T, M[chosen].reshape(-1, size).T).T.reshape(len(wanted), n, size)
+    return {at: TrackState(at, means[k], S @ S.T) for at, k, S in zip(wanted, chosen, roots, strict=True)}
 
 
 def kalman_filter(motion: MotionModel, prior: Start, measurements: Sequence[Measurement], stamp_ns: int) -> TrackState:
@@ -96,57 +91,6 @@ def kalman_filter(motion: MotionModel, prior: Start, measurements: Sequence[Meas
         x, P, now_ns = x + step, P - P @ H.T @ np.linalg.solve(S, H @ P), one.stamp_ns
     x, P = _moved(motion, x, P, stamp_ns - now_ns)
     return TrackState(stamp_ns, x, P)
-
-
-def least_squares(
-    motion: MotionModel, prior: Start, measurements: Sequence[Measurement], stamps_ns: Iterable[int]
-) -> dict[int, TrackState]:
-    """States at `stamps_ns` that minimise the weighted squares of all residuals of a nonlinear model, by stamp.
-
-    Gauss-Newton over the states of all stamps, from those of `kalman_filter`; noise and robust weights are those at the
-    last states. Stamps that nearly coincide are for `dense_joint`.
-    """
-    wanted = set(stamps_ns)
-    stamps = sorted({prior.stamp_ns, *wanted, *(m.stamp_ns for m in measurements)})
-    means = np.array([kalman_filter(motion, prior, measurements, at_ns).mean for at_ns in stamps])
-    for _ in range(_NEWTON_STEPS):
-        R = np.asarray(np.linalg.qr(_equations(motion, prior, measurements, stamps, means), mode="r"))
-        root = np.linalg.inv(R[: means.size, : means.size])
-        step = (root @ R[: means.size, -1]).reshape(means.shape)
-        means = means + step
-        if np.abs(step).max() < _STEP_TOLERANCE:
-            break
-    covariance, n = root @ root.T, motion.dim
-    blocks = {at_ns: slice(k * n, (k + 1) * n) for k, at_ns in enumerate(stamps)}
-    return {
-        at: TrackState(at, means[k], covariance[blocks[at], blocks[at]]) for k, at in enumerate(stamps) if at in wanted
-    }
-
-
-def _equations(
-    motion: MotionModel, prior: Start, measurements: Sequence[Measurement], stamps_ns: list[int], means: FloatArray
-) -> FloatArray:
-    """Whitened equations A step = b at `means` (N, n), as rows (A, b): prior, motion, measurements."""
-    n, rows = motion.dim, list[FloatArray]()
-
-    def add(R: FloatArray, y: FloatArray, blocks: Sequence[tuple[int, FloatArray]]) -> None:
-        row = np.zeros((len(y), means.size + 1))
-        row[:, -1] = y
-        for k, block in blocks:
-            row[:, k * n : (k + 1) * n] = block
-        rows.append(np.linalg.solve(np.linalg.cholesky(R), row))
-
-    start, covariance = initial_state(motion, prior)
-    add(covariance, start - means[0], [(0, np.eye(n))])
-    for k in range(1, len(stamps_ns)):
-        x, dt_s = means[k - 1], seconds(stamps_ns[k] - stamps_ns[k - 1])
-        y = motion.predict(x, dt_s) - means[k]
-        add(motion.process_noise(x, dt_s), y, [(k - 1, -motion.jacobian(x, dt_s)), (k, np.eye(n))])
-    for one in measurements:
-        k = stamps_ns.index(one.stamp_ns)
-        y = _residual(one, means[k])
-        add(one.R / _weight(one, y), y, [(k, _slope(one, means[k]))])
-    return np.vstack(rows)
 
 
 def _moved(motion: MotionModel, x: FloatArray, P: FloatArray, ahead_ns: int) -> tuple[FloatArray, FloatArray]:

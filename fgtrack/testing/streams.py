@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S, seconds
-from fgtrack.core.types import YAW, FloatArray
+from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.models.measurement import SensorPose, measurement_model
@@ -26,7 +25,6 @@ START = Start(
     speed_std_mps=3.0,
     yaw_rate_radps=0.1,
 )
-TURN_RADPS = 0.2
 LINEAR, NONLINEAR = CV(velocity_density_m2ps3=5.0), CTRV()
 _POSITION = ("x_m", "y_m")
 COMPONENTS = (_POSITION, (*_POSITION, "speed_mps"), (*_POSITION, "yaw_rad"), (*_POSITION, "range_m"))
@@ -100,19 +98,6 @@ def one_late(steps: int, rng: np.random.Generator) -> Stream:
     stamps_ns = [k * 100 * MS for k in range(1, 10)]
     late_ns = stamps_ns[-1] - steps * 100 * MS + int(rng.integers(20, 80)) * MS
     return Stream(LINEAR, tuple(measured(rng, LINEAR, ns) for ns in (*stamps_ns, late_ns)))
-
-
-def across_pi(rng: np.random.Generator) -> Stream:
-    """Positions and yaws of an object that turns through a yaw of pi."""
-    truth = np.array([3.0, -2.0, np.pi - 0.05, 20.0, TURN_RADPS])
-    start = replace(START, yaw_rad=truth[YAW], yaw_std_rad=0.1, yaw_rate_radps=TURN_RADPS)
-    model = measurement_model((*_POSITION, "yaw_rad"), NONLINEAR)
-    measurements = []
-    for ms in (50, 100, 150, 200, 250, 300, 350, 400, 450, 500, 420, 280):
-        z = model.predict(NONLINEAR.predict(truth, ms / 1e3)) + 0.05 * rng.standard_normal(3)
-        z[YAW] = wrap_angle(z[YAW])
-        measurements.append(Measurement(start.stamp_ns + ms * MS, model, z, 0.05**2 * np.eye(3)))
-    return Stream(NONLINEAR, tuple(measurements), start)
 
 
 def mild(rng: np.random.Generator) -> Stream:

@@ -17,7 +17,7 @@ from fgtrack.io.config import InputConfig
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.sweep_store import SWEEP_TABLE, PartStore
+from fgtrack.pipeline.sweep import SWEEP_TABLE
 
 OUT = "product"
 KILLED = -9
@@ -263,11 +263,9 @@ def _sweep_problems(folder: Path, out: str, undisturbed: Path, older: Path | Non
     path = folder / out
     if not path.exists():
         return
-    if (path / "parts").is_dir():
-        right, found = PartStore(undisturbed), PartStore(path)
-        for key in sorted(found.keys()):
-            if _values(found, key) != _values(right, key):
-                yield f"part {key} is not what it should be"
+    for part in sorted((path / "parts").glob("*.json")):
+        if _values(part) != _values(undisturbed / "parts" / part.name):
+            yield f"part {part.stem} is not what it should be"
     if (path / SWEEP_TABLE).exists():
         with (path / SWEEP_TABLE).open(newline="") as mine, (undisturbed / SWEEP_TABLE).open(newline="") as its:
             rows = list(csv.reader(its))
@@ -275,9 +273,10 @@ def _sweep_problems(folder: Path, out: str, undisturbed: Path, older: Path | Non
                 yield "sweep.csv has rows that are not right"
 
 
-def _values(store: PartStore, key: str) -> list[tuple[str, Mapping[str, object]]] | None:
-    cells = store.read(key)
-    return None if cells is None else [(cell.estimator, cell.values) for cell in cells]
+def _values(part: Path) -> list[tuple[str, Mapping[str, object]]] | None:
+    if not part.exists():
+        return None
+    return [(cell["estimator"], cell["values"]) for cell in json.loads(part.read_text())["cells"]]
 
 
 _JUDGES = {"run": _run_problems, "recording": _recording_problems, "sweep": _sweep_problems}

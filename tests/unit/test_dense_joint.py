@@ -6,7 +6,7 @@ import pytest
 from fgtrack.core.errors import CallError
 from fgtrack.estimation.base import Measurement, Start, no_states
 from fgtrack.estimation.birth import initial_state
-from fgtrack.models.motion import CTRV, CV
+from fgtrack.models.motion import CV
 from fgtrack.testing.references import dense_joint
 
 NS = 10**9
@@ -36,12 +36,7 @@ def test_two_nodes_are_a_prediction_a_correction_and_a_smoothing_step() -> None:
         np.testing.assert_allclose(found[stamp_ns].covariance, covariance, rtol=1e-9, atol=1e-12)
 
 
-def test_what_is_not_linear_or_before_the_start_is_refused() -> None:
-    with pytest.raises(CallError, match="motion and measurements must be linear"):
-        dense_joint(CTRV(), START, [], [NS])
-    ranged = Measurement.of(NS, range_m=3.0, std={"range_m": 1.0}).seen_by(CV())
-    with pytest.raises(CallError, match="motion and measurements must be linear"):
-        dense_joint(CV(), START, [ranged], [NS])
+def test_what_is_before_the_start_is_refused() -> None:
     with pytest.raises(CallError, match="stamp -1 ns lies before the prior's, 0 ns"):
         dense_joint(CV(), START, [], [-1])
 

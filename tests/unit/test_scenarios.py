@@ -53,8 +53,6 @@ def test_the_sensors_of_the_default_see_where_those_of_the_paper_did(detections:
     assert np.hypot(*radar.T).max() < 105.0 + 3.0 + 3.0  # its range counts from the nose
 
 
-
-
 def test_cars_of_the_default_follow_each_other_and_overtake_at_the_speeds_of_the_paper(
     cars: dict[int, FloatArray],
 ) -> None:
@@ -81,5 +79,3 @@ def test_only_one_car_of_the_default_is_in_sight_at_a_time(cars: dict[int, Float
 def test_no_rate_is_beyond_reason(rate_hz: float) -> None:
     with pytest.raises(ValueError, match="rate_hz"):
         SimulatedSensor(name="lidar", std={"x_m": 0.1, "y_m": 0.1}, rate_hz=rate_hz)
-
-
