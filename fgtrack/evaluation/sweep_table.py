@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pandas as pd  # type: ignore[import-untyped]  # has no stubs
+import pandas as pd
 from scipy.stats import sem
 
 from fgtrack.core.errors import CallError, DataError, did_you_mean

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import joblib  # type: ignore[import-untyped]  # has no stubs
 import numpy as np
-import pandas as pd  # type: ignore[import-untyped]  # has no stubs
+import pandas as pd
 from joblib.externals.loky.process_executor import TerminatedWorkerError  # type: ignore[import-untyped]
 from pydantic import ConfigDict, TypeAdapter
 
