@@ -8,7 +8,6 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-import fgtrack
 from fgtrack.advice.advise import advice_on
 from fgtrack.advice.page import Advice
 from fgtrack.advice.summary import summary
@@ -29,7 +28,6 @@ from fgtrack.plotting.late_detection import drawn_close_up
 from fgtrack.plotting.plot import drawn, planned
 from fgtrack.plotting.slow_motion import CloseUp
 from fgtrack.plotting.style import png
-from fgtrack.viewers.playback import Moment
 from fgtrack.viewers.report import Opening, write_report
 
 __all__ = ["ESTIMATORS", "Study", "study"]
@@ -258,11 +256,12 @@ def _pictured(
             (folder / f"{name}.png").write_bytes(picture)
     at = opening_at(late)
     opening = replace(opening, moment=at.moment, missing=at.missing)
-    write_report(runs, tables, pictures, page, fgtrack.__version__, opening, overwrite)
+    write_report(runs, tables, pictures, page, opening, overwrite)
 
 
 def opening_at(late: CloseUp | DataError) -> Opening:
     """Return how a report opens at a late detection; without one it says why."""
     if isinstance(late, DataError):
         return Opening(missing=(f"no close-up: {late}",))
-    return Opening(moment=Moment(late.now_ns, *late.position_m.tolist()))
+    x_m, y_m = late.position_m.tolist()
+    return Opening(moment=(late.now_ns, x_m, y_m))

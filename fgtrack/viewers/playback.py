@@ -1,8 +1,8 @@
-"""What the viewer of a report shows, as JSON values: recordings (map, ego, truth) and the runs of them."""
+"""JSON values that the viewer of a report plays: recordings (map, ego, truth) and the runs of them."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,265 +19,187 @@ from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.io.run import Run, Table
 from fgtrack.viewers.states import AROUND_95, NOMINAL_SIZE_M, ellipses, final_ns, located, start_ns, track_positions
 
-FORMAT = "fgtrack-report/2"
 MOST_ROWS = 60_000
-"""Rows of a table that the viewer shows of all runs together; of more every second tick or stamp, every third ..."""
+"""Rows of a table that the viewer shows of all runs together; of more every second time, every third ..."""
 
 Json = dict[str, Any]  # Any: JSON values
-_TIME_S, _POSITION_M, _ANGLE_RAD = 1e-4, 1e-3, 1e-4  # steps that numbers are rounded to
-_LONGEST_S = 1e7  # times farther from the start are of another clock, and missing
+Moment = tuple[int, float, float]
+"""Time in ns and position in the map that the viewer shows first."""
+
+_TIME_DIGITS, _DIGITS = 4, 3  # of seconds; of metres and radians
+_LONGEST_S = 1e7  # times farther from the start are of another clock, and left out
 
 
-@dataclass
-class _Recording:
-    """Runs of the same recording, their common start, and the place that their positions are relative to."""
+def playback(runs: Sequence[JudgedRun], moment: Moment | None = None) -> tuple[Json, list[str]]:
+    """Return what the viewer shows of `runs`, first `moment`, and a line for whatever it does not show.
 
-    runs: list[Run]
-    start_ns: int = 0
-    origin_m: FloatArray = field(default_factory=lambda: np.zeros(2))
-
-
-@dataclass(frozen=True)
-class Moment:
-    """A time and a position in the map that are worth a look."""
-
-    now_ns: int
-    x_m: float
-    y_m: float
-
-
-@dataclass(frozen=True)
-class Scene:
-    """What the viewer shows."""
-
-    values: Json
-    notes: tuple[str, ...]
-    """What it does not show, a line each."""
-
-
-def scene(runs: Sequence[JudgedRun], moment: Moment | None = None) -> Scene:
-    """Return everything that the viewer shows of `runs`, first `moment`; times are seconds from the start.
+    Times are seconds from the start of a recording, positions relative to its origin, and missing values null.
 
     Raises
     ------
     DataError
         A run or its map is damaged.
     """
-    recordings, notes = _recordings(runs), dict[str, None]()
-    shown = []
-    for one in runs:
-        index = next(k for k, recording in enumerate(recordings) if any(one.run is its for its in recording.runs))
-        packing = _Packing(recordings[index], notes, one.label, len(runs))
-        shown.append({"label": one.label, "recording": index, **_run(one.run, packing)})
-    values = {
-        "format": FORMAT,
+    recordings, notes = [_Recording.of(group) for group in by_recording(runs)], dict[str, None]()
+    first = recordings[0]
+    return {
         "colours": distinct_colours([str(one.run.meta.get("estimator", "")) for one in runs]),
         "sensor_colours": SENSORS,
-        "moment": None if moment is None else _first(moment, recordings[0]),
+        "moment": None if moment is None else first.moment(moment),
         "size_m": NOMINAL_SIZE_M[:2],
-        "used": USED,
-        "late": sorted(LATE),
-        "recordings": [_recording(one, _Packing(one, notes, "", len(recordings))) for one in recordings],
-        "runs": shown,
-    }
-    return Scene(values, tuple(notes))
-
-
-def _first(moment: Moment, of: _Recording) -> Json:
-    x0_m, y0_m = of.origin_m.tolist()
-    return {"t": (moment.now_ns - of.start_ns) / NS_PER_S, "x": moment.x_m - x0_m, "y": moment.y_m - y0_m}
-
-
-def _column(values: npt.ArrayLike, step: float = 1.0) -> Json:
-    """Return a column as whole steps, with null for what is not finite."""
-    steps = np.rint(np.asarray(values, dtype=np.float64) / step)
-    finite = np.isfinite(steps)
-    whole = np.where(finite, steps, 0.0).astype(np.int64).tolist()
-    if not finite.all():
-        whole = [value if known else None for value, known in zip(whole, finite.tolist(), strict=True)]
-    return {"step": step, "values": whole}
+        "recordings": [one.values(notes, MOST_ROWS // len(recordings)) for one in recordings],
+        "runs": [
+            {"label": one.label, "recording": index, **recording.run(one, notes, MOST_ROWS // len(runs))}
+            for one in runs
+            for index, recording in enumerate(recordings)
+            if any(one is other for other in recording.runs)
+        ],
+    }, list(notes)
 
 
 @dataclass(frozen=True)
-class _Packing:
-    """Packs columns of a recording."""
+class _Recording:
+    """Runs of one recording, and the time and place that theirs are relative to."""
 
-    recording: _Recording
-    notes: dict[str, None]
-    label: str
-    num_runs: int
+    runs: Sequence[JudgedRun]
+    start_ns: int
+    origin_m: FloatArray
 
-    def time(self, ns: IntArray) -> Json:
-        times_s = (ns - self.recording.start_ns) / NS_PER_S
-        return _column(np.where(np.abs(times_s) < _LONGEST_S, times_s, math.nan), _TIME_S)
+    @classmethod
+    def of(cls, runs: Sequence[JudgedRun]) -> "_Recording":
+        """Return the recording of `runs`; its origin is near the middle of all that is drawn, in whole metres."""
+        origin_m = np.zeros(2)
+        for table in (
+            runs[0].run.tables["ego"],
+            runs[0].run.tables["truth"],
+            *(one.run.tables["tracks"] for one in runs),
+        ):
+            if (drawn := located(table)).num_rows:
+                origin_m = np.rint([0.5 * (drawn[name].min() + drawn[name].max()) for name in ("x_m", "y_m")])
+                break
+        return cls(runs, min(start_ns(one.run) for one in runs), origin_m)
 
-    def place(self, x_m: FloatArray, y_m: FloatArray) -> Json:
-        x0_m, y0_m = self.recording.origin_m
-        return {"x": _column(x_m - x0_m, _POSITION_M), "y": _column(y_m - y0_m, _POSITION_M)}
+    def seconds(self, times_ns: IntArray) -> FloatArray:
+        times_s = (times_ns - self.start_ns) / NS_PER_S
+        return np.where(np.abs(times_s) < _LONGEST_S, times_s, math.nan)
 
-    def ellipse(self, states: Table) -> Json:
-        """Half axes and direction of the ellipses that hold 95 %."""
-        found = ellipses(states, AROUND_95)
+    def moment(self, moment: Moment) -> Json:
+        x0_m, y0_m = self.origin_m.tolist()
+        return {"t": (moment[0] - self.start_ns) / NS_PER_S, "x": moment[1] - x0_m, "y": moment[2] - y0_m}
+
+    def place(self, position_m: FloatArray, prefix: str = "") -> Json:
+        """Columns of positions, shape (n, 2)."""
+        return {f"{prefix}{name}": _column(position_m[:, k] - self.origin_m[k]) for k, name in enumerate("xy")}
+
+    def rows(self, states: Table, time: str, *order: str) -> Table:
+        """Rows of `states` with a position and a time, in the order of `time` and `order`."""
+        states = located(states)
+        states = states.where(np.isfinite(self.seconds(states[time])))
+        keys = np.lexsort([states[name] for name in (*reversed(order), time)])
+        return Table({name: values[keys] for name, values in states.items()})
+
+    def columns(self, states: Table, time: str) -> Json:
+        """Times and poses of rows, and where they have covariances the half axes of their 95 % ellipses."""
+        position_m = np.stack([states["x_m"], states["y_m"]], axis=-1)
+        columns = {"t": _column(self.seconds(states[time]), _TIME_DIGITS), **self.place(position_m)}
+        if "yaw_rad" in states:
+            columns["yaw"] = _column(states["yaw_rad"])
+        if "p_x_x" in states:
+            axes = ellipses(states, AROUND_95)
+            columns |= {name: _column(axes[:, k]) for k, name in enumerate(("long", "short", "direction"))}
+        return columns
+
+    def values(self, notes: dict[str, None], most: int) -> Json:
+        """Map, ego and truth."""
+        run = self.runs[0].run
+        maps, gone = roads(run)
+        notes.update(dict.fromkeys(gone))
+        lines = [(kind, line) for road in maps.values() for kind, line in zip(_LINES, road_lines(road), strict=True)]
+        lines += [("bound", line) for line in excluded_lines(run)]
+        ego, truth = run.tables["ego"], run.tables["truth"].where(run.tables["truth"]["object_id"] != EGO_ID)
+        (ego,) = _thinned([self.rows(ego, "stamp_ns")], "stamp_ns", most, "ego", notes)
+        (truth,) = _thinned([self.rows(truth, "stamp_ns", "object_id")], "stamp_ns", most, "truth", notes)
         return {
-            "long": _column(found[:, 0], _POSITION_M),
-            "short": _column(found[:, 1], _POSITION_M),
-            "direction": self.angle(found[:, 2]),
+            "start_ns": str(self.start_ns),  # of more digits than a number of JavaScript holds
+            "origin_m": self.origin_m.tolist(),
+            "map": [{"kind": kind, **self.place(line)} for kind, line in lines],
+            "ego": self.columns(ego, "stamp_ns"),
+            "truth": {"object": _column(truth["object_id"]), **self.columns(truth, "stamp_ns")},
         }
 
-    def angle(self, angles_rad: FloatArray) -> Json:
-        return _column(angles_rad, _ANGLE_RAD)
+    def run(self, one: JudgedRun, notes: dict[str, None], most: int) -> Json:
+        """Ticks, tracks, their past at every tick, final states and detections."""
+        tables, lagged, smoothed = one.run.tables, one.run.tables["lagged"], one.run.tables["smoothed"]
+        past = self.rows(lagged.where(lagged["lag_s"] > 0.0), "now_ns", "track_id", "stamp_ns")
+        final = self.rows(smoothed.where(smoothed["kind"] == "final"), "stamp_ns")
+        ticks = Table({"now_ns": np.unique(tables["timing"]["now_ns"])})
+        of_ticks = [ticks, self.rows(tables["tracks"], "now_ns", "track_id"), past]
+        ticks, tracks, past = _thinned(of_ticks, "now_ns", most, one.label, notes)
+        (final,) = _thinned([final], "stamp_ns", most, f"{one.label}, final states", notes)
+        if tables["updates"].num_rows and not tables["detections"].num_rows:
+            notes[f"{one.label}: has no detections.csv, so no detections are shown; repeat the run"] = None
+        return {
+            "ticks": _column(self.seconds(ticks["now_ns"]), _TIME_DIGITS),
+            "tracks": {
+                "track": _column(tracks["track_id"]),
+                "confirmed": _column(tracks["status"] == "confirmed"),
+                **self.columns(tracks, "now_ns"),
+            },
+            "past": {"track": _column(past["track_id"]), **self.columns(past, "now_ns")},
+            "final": {
+                "track": _column(final["track_id"]),
+                "known": _column(self.seconds(final_ns(one.run, final)), _TIME_DIGITS),
+                **self.columns(final, "stamp_ns"),
+            },
+            **self.detections(one.run),
+        }
 
-    def thinned(self, table: Table, what: str) -> Table:
-        """`table`, or the rows of every k-th of its stamps where it has too many."""
-        stamps_ns = self.thinned_times(np.unique(table["stamp_ns"]), table.num_rows, what)
-        return table.where(np.isin(table["stamp_ns"], stamps_ns))
-
-    def thinned_times(self, times_ns: IntArray, num_rows: int, what: str) -> IntArray:
-        """Every k-th of `times_ns`, which have `num_rows` rows."""
-        step = max(1, math.ceil(num_rows * self.num_runs / MOST_ROWS))
-        if step > 1:
-            name = f"{self.label}: " if self.label else ""
-            self.notes[f"{name}the viewer shows one of {step} times of {what}, as there are {num_rows} rows"] = None
-        return times_ns[::step]
-
-
-def _recordings(runs: Sequence[JudgedRun]) -> list[_Recording]:
-    found = [_Recording([one.run for one in group]) for group in by_recording(runs)]
-    for one in found:
-        one.start_ns = min(map(start_ns, one.runs))
-        one.origin_m = _origin_m(one.runs)
-    return found
-
-
-def _origin_m(runs: Sequence[Run]) -> FloatArray:
-    """A place near the middle of all that is drawn, in whole metres."""
-    for table in (runs[0].tables["ego"], runs[0].tables["truth"], *(run.tables["tracks"] for run in runs)):
-        places_m = np.stack([table["x_m"], table["y_m"]], axis=-1)
-        places_m = places_m[np.isfinite(places_m).all(axis=1)]
-        if len(places_m):
-            return np.asarray(np.rint(0.5 * (places_m.min(axis=0) + places_m.max(axis=0))))
-    return np.zeros(2)
-
-
-def _recording(one: _Recording, packing: _Packing) -> Json:
-    run = one.runs[0]
-    maps, notes = roads(run)
-    packing.notes.update(dict.fromkeys(notes))
-    lines = [
-        {"kind": kind, **packing.place(*points_m.T)}
-        for road in maps.values()
-        for kind, points_m in zip(("bound", "bound", "centre"), road_lines(road), strict=True)
-    ]
-    lines += [{"kind": "bound", **packing.place(*points_m.T)} for points_m in excluded_lines(run)]
-    ego = packing.thinned(located(run.tables["ego"]), "the ego")
-    ego = _sorted(ego, ego["stamp_ns"])
-    truth = run.tables["truth"].where(run.tables["truth"]["object_id"] != EGO_ID)
-    truth = packing.thinned(located(truth), "the truth")
-    truth = _sorted(truth, truth["stamp_ns"], truth["object_id"])
-    return {
-        "start_ns": str(one.start_ns),  # of more digits than a number of JavaScript holds
-        "origin_m": one.origin_m.tolist(),
-        "map": lines,
-        "ego": {"t": packing.time(ego["stamp_ns"]), **_pose(ego, packing)},
-        "truth": {
-            "object": _column(truth["object_id"]),
-            "t": packing.time(truth["stamp_ns"]),
-            **_pose(truth, packing),
-        },
-    }
+    def detections(self, run: Run) -> Json:
+        """Detections in order of receipt: stamp, sensor, fate (0 unused, 1 used, 2 late), place, their track then."""
+        table, updates, where, rows = run.tables["detections"], run.tables["updates"], placed(run), update_rows(run)
+        sensors, sensor = np.unique(table["sensor"], return_inverse=True)
+        ends_m: dict[Any, Any] = dict(track_positions(run))  # Any: NaN for the others
+        track_m = np.full((len(rows), 2), math.nan)
+        fate = np.zeros(len(rows), dtype=np.int64)
+        for k, row in enumerate(rows.tolist()):
+            if row >= 0:
+                name = updates["disposition"][row]
+                fate[k] = 2 if name in LATE else int(name in USED)
+                track_m[k] = ends_m.get(
+                    (int(updates["tick"][row]), int(updates["track_id"][row])), (math.nan, math.nan)
+                )
+        order = np.argsort(table["receipt_ns"], kind="stable")
+        order = order[np.isfinite(self.seconds(table["receipt_ns"][order]))]
+        return {
+            "sensors": sensors.tolist(),
+            "detections": {
+                "stamp": _column(self.seconds(table["stamp_ns"][order]), _TIME_DIGITS),
+                "receipt": _column(self.seconds(table["receipt_ns"][order]), _TIME_DIGITS),
+                "sensor": _column(sensor[order]),
+                "fate": _column(fate[order]),
+                **self.place(where.position_m[order]),
+                **self.place(track_m[order], "track_"),
+                **self.place(where.sensor_m[order], "from_"),
+                "bearing": _column(where.bearing_rad[order]),
+            },
+        }
 
 
-def _run(run: Run, packing: _Packing) -> Json:
-    statuses = np.unique(run.tables["tracks"]["status"]).tolist()
-    tracks, lagged = (
-        located(run.tables["tracks"]),
-        located(run.tables["lagged"].where(run.tables["lagged"]["lag_s"] > 0.0)),
-    )
-    ticks_ns = packing.thinned_times(
-        np.unique(run.tables["timing"]["now_ns"]), max(tracks.num_rows, lagged.num_rows), "the ticks"
-    )
-    tracks = tracks.where(np.isin(tracks["now_ns"], ticks_ns))
-    past = lagged.where(np.isin(lagged["now_ns"], ticks_ns))
-    tracks = _sorted(tracks, tracks["now_ns"], tracks["track_id"])
-    past = _sorted(past, past["now_ns"], past["track_id"], past["stamp_ns"])
-    final = packing.thinned(
-        located(run.tables["smoothed"].where(run.tables["smoothed"]["kind"] == "final")), "final states"
-    )
-    final = _sorted(final, final["track_id"], final["stamp_ns"])
-    return {
-        "estimator": str(run.meta.get("estimator", "")),
-        "statuses": statuses,
-        "ticks": packing.time(ticks_ns),
-        "tracks": {
-            "t": packing.time(tracks["now_ns"]),
-            "track": _column(tracks["track_id"]),
-            "status": _column(_codes(tracks["status"], statuses)),
-            **_pose(tracks, packing),
-            **packing.ellipse(tracks),
-        },
-        "past": {
-            "t": packing.time(past["now_ns"]),
-            "track": _column(past["track_id"]),
-            **packing.place(past["x_m"], past["y_m"]),
-            **packing.ellipse(past),
-        },
-        "final": {
-            "track": _column(final["track_id"]),
-            "t": packing.time(final["stamp_ns"]),
-            "known": packing.time(final_ns(run, final)),
-            **packing.place(final["x_m"], final["y_m"]),
-            **packing.ellipse(final),
-        },
-        **_detections(run, packing),
-    }
+_LINES = ("bound", "bound", "centre")  # of a road
 
 
-def _detections(run: Run, packing: _Packing) -> Json:
-    """Detections in order of receipt: where they were, when, what became of them, where their track was then."""
-    table, updates = run.tables["detections"], run.tables["updates"]
-    if updates.num_rows and not table.num_rows:
-        packing.notes[f"{packing.label}: has no detections.csv, so no detections are shown; repeat the run"] = None
-    where, became = placed(run), update_rows(run)
-    sensors = np.unique(table["sensor"]).tolist()
-    known = became >= 0
-    rows = np.where(known, became, 0)
-    fates = np.where(known, updates["disposition"][rows], "") if updates.num_rows else np.full(len(became), "")
-    ids = np.where(known, updates["track_id"][rows], -1) if updates.num_rows else np.full(len(became), -1)
-    ticks = updates["tick"][rows].tolist() if updates.num_rows else [0] * len(became)
-    positions = track_positions(run)
-    nowhere = (math.nan, math.nan)
-    track_m = np.array(
-        [positions.get((tick, track), nowhere) for tick, track in zip(ticks, ids.tolist(), strict=True)]
-    ).reshape(-1, 2)
-    order = np.argsort(table["receipt_ns"], kind="stable")
-    dispositions = np.unique(fates).tolist()
-    track = packing.place(*track_m[order].T)
-    found = {
-        "stamp": packing.time(table["stamp_ns"][order]),
-        "receipt": packing.time(table["receipt_ns"][order]),
-        "sensor": _column(_codes(table["sensor"][order], sensors)),
-        "disposition": _column(_codes(fates[order], dispositions)),
-        "track": _column(ids[order]),
-        **packing.place(*where.position_m[order].T),
-        "track_x": track["x"],
-        "track_y": track["y"],
-    }
-    if (np.isnan(where.position_m).any(axis=1) & np.isfinite(where.bearing_rad)).any():
-        origin = packing.place(*where.sensor_m[order].T)
-        found |= {"from_x": origin["x"], "from_y": origin["y"], "bearing": packing.angle(where.bearing_rad[order])}
-    return {"sensors": sensors, "dispositions": dispositions, "detections": found}
+def _thinned(tables: Sequence[Table], time: str, most: int, label: str, notes: dict[str, None]) -> list[Table]:
+    """Return `tables` where they have more than `most` rows at every second time of the first one, every third ..."""
+    num_rows = max(one.num_rows for one in tables)
+    step = max(1, math.ceil(num_rows / most))
+    if step > 1:
+        notes[f"{label}: the viewer shows one of {step} times, as there are {num_rows} rows"] = None
+    kept_ns = np.unique(tables[0][time])[::step]
+    return [one.where(np.isin(one[time], kept_ns)) if step > 1 else one for one in tables]
 
 
-def _pose(states: Table, packing: _Packing) -> Json:
-    return {**packing.place(states["x_m"], states["y_m"]), "yaw": packing.angle(states["yaw_rad"])}
-
-
-def _codes(names: Any, among: Sequence[str]) -> IntArray:
-    """The place of each of `names`, shape (n,), in the sorted `among`."""
-    return np.asarray(np.searchsorted(np.array(among, dtype=np.str_), names), dtype=np.int64)
-
-
-def _sorted(table: Table, *keys: IntArray) -> Table:
-    """The rows in the order of `keys`, the first one counts most."""
-    order = np.lexsort(keys[::-1])
-    return Table({name: values[order] for name, values in table.items()})
+def _column(values: npt.ArrayLike, digits: int = _DIGITS) -> list[float | int | None]:
+    """Numbers rounded to `digits`; None for what is not finite."""
+    given = np.asarray(values)
+    rounded = given + 0 if given.dtype.kind != "f" else np.round(given, digits) + 0.0
+    return [value if math.isfinite(value) else None for value in rounded.tolist()]

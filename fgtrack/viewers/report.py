@@ -1,4 +1,4 @@
-"""The page of a report: its parts as HTML, put into one file that loads nothing."""
+"""A report of runs: one HTML file with verdict, viewer, figures, tables and configuration, which loads nothing."""
 
 import base64
 import json
@@ -11,19 +11,18 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import fgtrack
 from fgtrack.evaluation.cautions import cautions, noise_cautions
 from fgtrack.evaluation.recordings import recordings_caution
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.tables import Table, Tables, cell_rows
 from fgtrack.io.output import new_file
-from fgtrack.viewers.playback import Moment, scene
-from fgtrack.viewers.settings import differing, flattened
+from fgtrack.viewers.playback import Moment, playback
 
 #: Kinds of figures that are open; of some of them there are several, by object or run.
 _FIRST = ("close_up", "errors", "error_against_delay", "error_against_lag", "map")
 _CAPTIONS = {"error_against_delay": "error against delay: a sweep over ten races that comes with fgtrack"}
 _MOST_OPEN, _MOST_WARNINGS = 3, 3
-_START, _MARK, _HEAD = b"<!DOCTYPE html>", b'<meta name="generator" content="fgtrack ', 1000
 _NONE = "–"
 _LONG = 40  # characters of a cell that may be broken
 _PNG_SIZE = slice(16, 24)  # of its header
@@ -34,7 +33,7 @@ class Opening:
     """How a report begins."""
 
     sentences: Sequence[str] = ()
-    """Its verdict; none for that of the comparison."""
+    """Its verdict; empty for that of the comparison."""
     assumptions: Sequence[str] = ()
     """Settings that the user has not given."""
     advice: Sequence[str] = ()
@@ -49,27 +48,13 @@ def write_report(
     tables: Tables,
     pictures: Iterable[tuple[str, bytes]],
     out: Path,
-    version: str,
     opening: Opening,
     overwrite: bool,
 ) -> int:
-    """Write the report of `runs` into the file `out`; returns its size in bytes. Raises as `page` and `new_file`."""
-    text = page(runs, tables, pictures, version, opening).encode("utf-8", "backslashreplace")  # names need not be UTF-8
-    with new_file(out, overwrite) as file:
-        file.write(text)
-    return len(text)
+    """Write the report of `runs` into the file `out`, and return its size in bytes.
 
-
-def page(
-    runs: Sequence[JudgedRun],
-    tables: Tables,
-    pictures: Iterable[tuple[str, bytes]],
-    version: str,
-    opening: Opening = Opening(),
-) -> str:
-    """Return the report of `runs` as one HTML file: the same runs and figures give the same text.
-
-    Verdict, warnings, viewer and three figures are open, the rest is folded.
+    Verdict, warnings, viewer and three figures are open, the rest is folded. The same runs and figures give the same
+    bytes.
 
     Parameters
     ----------
@@ -79,63 +64,69 @@ def page(
         Their comparison.
     pictures
         Figures as PNG by name, in the order in which they are shown.
-    version
-        Version of fgtrack.
+    out
+        HTML file.
     opening
         How the page begins.
+    overwrite
+        True to replace a file.
 
     Raises
     ------
+    CallError
+        The file exists, or cannot be written.
     DataError
-        A run or its map is damaged.
+        A run or its map is damaged, or the disk is full.
     """
-    shown = scene(runs, opening.moment)
+    text = _page(runs, tables, pictures, opening).encode("utf-8", "backslashreplace")  # names need not be UTF-8
+    with new_file(out, overwrite) as file:
+        file.write(text)
+    return len(text)
+
+
+def _page(runs: Sequence[JudgedRun], tables: Tables, pictures: Iterable[tuple[str, bytes]], opening: Opening) -> str:
+    scene, notes = playback(runs, opening.moment)
     warnings = recordings_caution(runs)
     warnings += [f"{one.label}: {line}" for one in runs for line in cautions(one.run)]
     warnings += map(str, noise_cautions(runs[0].run))  # of the sensors, as `replay` prints them
-    warnings = list(dict.fromkeys((*warnings, *shown.notes, *opening.missing)))
-    figures = [(name, _figure(name, picture)) for name, picture in pictures]
-    first = _chosen([name for name, _ in figures])
-    verdict = _list(opening.sentences or tables.verdict)
+    warnings = list(dict.fromkeys((*warnings, *notes, *opening.missing)))
+    figures = {name: _figure(name, picture) for name, picture in pictures}
+    first = [next((name for name in figures if name.startswith(kind)), "") for kind in _FIRST]
+    first = list(dict.fromkeys(name for name in (*first, *figures) if name))[:_MOST_OPEN]
     open_parts = {
-        "Verdict": verdict or "<p>Nothing to judge: no errors and no innovations.</p>",
+        "Verdict": _list(opening.sentences or tables.verdict)
+        or "<p>Nothing to judge: no errors and no innovations.</p>",
         "Warnings": _list(warnings[:_MOST_WARNINGS], "warnings")
         + _folded("More warnings", _list(warnings[_MOST_WARNINGS:])),
         "Viewer": _template("viewer.html"),
-        "Figures": _figures(text for name, text in figures if name in first),
+        "Figures": _figures(text for name, text in figures.items() if name in first),
     }
     folded_parts = {
         "Assumptions": _list(opening.assumptions),
         "Advice": _list(opening.advice),
         "Tables": "".join(_table(table) for table in tables.values() if table.num_rows),
-        "More figures": _figures(text for name, text in figures if name not in first),
+        "More figures": _figures(text for name, text in figures.items() if name not in first),
         "Configuration": _configuration(runs),
-        "Runs": _runs(runs),
+        "Runs": _grid("What they were made of", _FACTS, [_facts(one) for one in runs]),
     }
+    sections = [
+        f'<section id="{_anchor(name)}">\n<h2>{name}</h2>\n{content}</section>\n'
+        for name, content in open_parts.items()
+        if content
+    ]
+    sections += [_folded(name, content, _anchor(name)) for name, content in folded_parts.items()]
     labels = ", ".join(one.label for one in runs)
-    return _filled(
-        _template("page.html"),
-        {
-            "version": escape(version),
-            "title": escape(f"fgtrack report: {labels}" if len(runs) == 1 else f"fgtrack report of {len(runs)} runs"),
-            "subtitle": escape(labels),
-            "style": _template("page.css"),
-            "parts": "".join(
-                f'<section id="{_anchor(name)}">\n<h2>{name}</h2>\n{content}</section>\n'
-                for name, content in open_parts.items()
-                if content
-            )
-            + "".join(_folded(name, content, _anchor(name)) for name, content in folded_parts.items()),
-            "scene": _json(shown.values),
-            "script": _template("viewer.js"),
-        },
-    )
-
-
-def _chosen(names: Sequence[str]) -> list[str]:
-    """The figures that are open: of each kind of `_FIRST` the first one, or else whatever is there."""
-    found = [next((name for name in names if name.startswith(kind)), None) for kind in _FIRST]
-    return list(dict.fromkeys([*(name for name in found if name), *names]))[:_MOST_OPEN]
+    contents = {
+        "version": escape(fgtrack.__version__),
+        "title": escape(f"fgtrack report: {labels}" if len(runs) == 1 else f"fgtrack report of {len(runs)} runs"),
+        "subtitle": escape(labels),
+        "style": _template("page.css"),
+        "parts": "".join(sections),
+        "scene": json.dumps(scene, allow_nan=False, separators=(",", ":")).replace("<", r"\u003c"),
+        "script": _template("viewer.js"),
+    }
+    # Each {{name}} is replaced once: what is put in is not searched again.
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: contents[found[1]], _template("page.html"))
 
 
 def _folded(title: str, content: str, name: str = "") -> str:
@@ -146,16 +137,6 @@ def _folded(title: str, content: str, name: str = "") -> str:
 
 def _template(name: str) -> str:
     return (files(__package__) / "page" / name).read_text(encoding="utf-8")
-
-
-def _filled(template: str, contents: Mapping[str, str]) -> str:
-    """`template` with each {{name}} replaced once; what is put in is not searched again."""
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: contents[found[1]], template)
-
-
-def _json(values: Any) -> str:  # Any: JSON values
-    """`values` as JSON that may stand in a script element."""
-    return json.dumps(values, allow_nan=False, separators=(",", ":")).replace("<", r"\u003c")
 
 
 def _anchor(name: str) -> str:
@@ -176,6 +157,12 @@ def _table(table: Table) -> str:
         cells = (_cell("td", text, column.left, bold) for column, (text, bold) in zip(table.shown, row, strict=True))
         rows.append(f"<tr>{''.join(cells)}</tr>\n")
     return _wide(table.title, head, "".join(rows)) + _list(table.notes, "soft")
+
+
+def _grid(title: str, names: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table of texts."""
+    lines = (f"<tr>{''.join(_cell('td', text, True) for text in row)}</tr>\n" for row in rows)
+    return _wide(title, "".join(_cell("th", name, True) for name in names), "".join(lines))
 
 
 def _wide(title: str, head: str, rows: str) -> str:
@@ -212,30 +199,34 @@ def _figure(name: str, picture: bytes) -> str:
 def _configuration(runs: Sequence[JudgedRun]) -> str:
     """The keys whose values differ between runs, then everything of each run."""
     settings = {one.label: flattened(one.run.config) for one in runs}
-    keys = differing(settings.values())
-    parts = []
-    if len(runs) > 1 and keys:
-        head = "".join(_cell("th", text, True) for text in ("key", *settings))
-        rows = (_row([key, *(known.get(key, _NONE) for known in settings.values())]) for key in keys)
-        parts.append(_wide("Where the runs differ", head, "".join(rows)))
-    elif len(runs) > 1:
-        parts.append("<p>All runs have the same configuration.</p>\n")
+    keys = dict.fromkeys(key for one in settings.values() for key in one)
+    rows = [[key, *(one.get(key, _NONE) for one in settings.values())] for key in keys]
+    rows = [row for row in rows if len(set(row[1:])) > 1]
+    text = _grid("Where the runs differ", ("key", *settings), rows) if rows else ""
+    if len(runs) > 1 and not rows:
+        text = "<p>All runs have the same configuration.</p>\n"
     for one in runs:
-        parts.append(
-            f"<details><summary>{escape(one.label)}: config.yaml</summary>"
-            f"<pre>{escape(one.run.config_text)}</pre></details>\n"
-        )
-    return "".join(parts)
+        config = f"<pre>{escape(one.run.config_text)}</pre>"
+        text += f"<details><summary>{escape(one.label)}: config.yaml</summary>{config}</details>\n"
+    return text
 
 
-def _runs(runs: Sequence[JudgedRun]) -> str:
-    """What each run was made of, by whom and how long it took."""
-    names = ("run", "estimator", "recording", "detections", "time [s]", "versions", "digest")
-    head = "".join(_cell("th", name, True) for name in names)
-    return _wide("What they were made of", head, "".join(_row(_facts(one)) for one in runs))
+def flattened(config: Mapping[str, Any], above: str = "") -> dict[str, str]:
+    """Values of `config` as text, by the path of their key (`smoother.lag_s`)."""
+    flat: dict[str, str] = {}
+    for key, value in config.items():
+        if isinstance(value, Mapping) and value:
+            flat |= flattened(value, f"{above}{key}.")
+        else:
+            flat[f"{above}{key}"] = value if isinstance(value, str) else json.dumps(value, default=str)
+    return flat
+
+
+_FACTS = ("run", "estimator", "recording", "detections", "time [s]", "versions", "digest")
 
 
 def _facts(one: JudgedRun) -> list[str]:
+    """What a run was made of, by whom and how long it took, in the order of `_FACTS`."""
     meta = one.run.meta
     versions: Mapping[str, Any] = meta.get("versions") or {}
     wall_s = meta.get("wall_s")
@@ -249,7 +240,3 @@ def _facts(one: JudgedRun) -> list[str]:
         ", ".join(f"{name} {version}" for name, version in versions.items()),
         str(meta.get("digest", _NONE)),
     ]
-
-
-def _row(texts: Sequence[str]) -> str:
-    return f"<tr>{''.join(_cell('td', text, True) for text in texts)}</tr>\n"

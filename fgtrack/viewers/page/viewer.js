@@ -1,959 +1,447 @@
 "use strict";
-// The viewer of a report: reads its data, draws it on a canvas, and answers the controls.
+// Plays the runs of a report on a canvas. What the controls say is the state of the form; besides there is the view.
 
-/** The numbers of a column; NaN where a value is missing. */
-function numbers({ step, values }) {
-  return Float64Array.from(values, (value) => (value === null ? NaN : value * step));
+const BEARING_M = 150; // length of a line of sight
+const SHOWN_S = 0.3; // how long a received detection stays
+const TRAIL_S = 2;
+const WIDTHS_M = [4, 20000];
+const FIRST_WIDTH_M = { ego: 160, other: 40 }; // around the ego more: its opponents are farther away
+const BEHIND = 0.2; // of the width: more of the picture is behind what is followed than ahead of it
+const FARTHEST_M = 10; // a track that is farther from an object is of another one
+const STRIP_PX = 64;
+const PANES = { leastPx: 300, most: 3 }; // beside one another
+const LINK_MS = 300; // after which the address follows
+const MARKS = {
+  "\u25CF": null,
+  "\u25A0": [[-1, -1], [1, -1], [1, 1], [-1, 1]],
+  "\u25B2": [[0, -1.2], [-1.1, 1], [1.1, 1]],
+  "\u25C6": [[0, -1.3], [-1.3, 0], [0, 1.3], [1.3, 0]],
+}; // corners to the right and down
+
+// --- Data ------------------------------------------------------------------------------------------------------------
+
+/** The columns of a table; NaN where a value is missing. */
+function tableOf(columns) {
+  const column = ([name, values]) => [name, Float64Array.from(values, (value) => value ?? NaN)];
+  return Object.fromEntries(Object.entries(columns).map(column));
 }
 
-/** All columns of a table by name. */
-function tableOf(packed) {
-  return Object.fromEntries(Object.entries(packed).map(([name, column]) => [name, numbers(column)]));
-}
-
-/** Number of values of the rising `values`[from..to) that are at most `limit`, counted from 0. */
-function countUpTo(values, limit, from = 0, to = values.length) {
+/** Number of the first `length` rising values at(0), at(1) ... that are at most `limit`. */
+function countUpTo(length, limit, at) {
+  let [from, to] = [0, length];
   while (from < to) {
     const middle = (from + to) >> 1;
-    if (values[middle] <= limit) from = middle + 1;
+    if (at(middle) <= limit) from = middle + 1;
     else to = middle;
   }
   return from;
 }
 
-/** Where the rows of each tick begin: rows of tick k are starts[k] to starts[k + 1]; both rise in time. */
-function startsOfTicks(ticks, times) {
-  const starts = new Int32Array(ticks.length + 1);
-  let row = 0;
-  for (let k = 0; k < ticks.length; k += 1) {
-    while (row < times.length && times[row] < ticks[k] - 1e-9) row += 1;
-    starts[k] = row;
-  }
-  starts[ticks.length] = times.length;
-  return starts;
+/** Those of `rows`, which rise in time, after `since` and up to `until`. */
+function between(rows, times, since, until) {
+  const count = (limit) => countUpTo(rows.length, limit, (k) => times[rows[k]]);
+  return rows.slice(count(since), count(until + 1e-9));
 }
 
-/** For every row the row before it with the same identity; -1 for the first one. */
-function rowsBefore(identities) {
-  const before = new Int32Array(identities.length);
-  const last = new Map();
-  for (let row = 0; row < identities.length; row += 1) {
-    before[row] = last.get(identities[row]) ?? -1;
-    last.set(identities[row], row);
-  }
-  return before;
+/** Rows of each value of a column, in their order, by rising value. */
+function rowsOf(values) {
+  const rows = new Map([...new Set(values)].sort((a, b) => a - b).map((value) => [value, []]));
+  values.forEach((value, row) => rows.get(value).push(row));
+  return rows;
 }
 
-/** Rows of each identity, in their order. */
-function rowsOf(identities) {
-  const rows = new Map();
-  for (let row = 0; row < identities.length; row += 1) {
-    if (!rows.has(identities[row])) rows.set(identities[row], []);
-    rows.get(identities[row]).push(row);
-  }
-  return new Map([...rows].sort((a, b) => a[0] - b[0]).map(([identity, found]) => [identity, Int32Array.from(found)]));
+/** Median of the positive steps between times. */
+function usualStep(times) {
+  const steps = times.slice(1).map((time, k) => time - times[k]).filter((step) => step > 0).sort();
+  return steps.length ? steps[steps.length >> 1] : 0.1;
 }
 
-/** A path through times: where something was at any time between its first and its last one. */
+/** A path through rows of a table: where something was at any time between its first and its last one. */
 class Path {
-  constructor(table, rows) {
-    this.t = Float64Array.from(rows, (row) => table.t[row]);
-    this.x = Float64Array.from(rows, (row) => table.x[row]);
-    this.y = Float64Array.from(rows, (row) => table.y[row]);
-    this.yaw = Float64Array.from(rows, (row) => table.yaw[row]);
-    this.pause = 5 * medianStep(this.t);
+  constructor(table, rows = [...table.t.keys()]) {
+    Object.assign(this, { table, rows, t: Float64Array.from(rows, (row) => table.t[row]) });
+    this.pause = 5 * usualStep(this.t);
   }
 
   /** x, y and yaw at `time`, linear between stamps; null before the first, after the last one and in a pause. */
   at(time) {
-    const next = countUpTo(this.t, time);
-    const row = next - 1;
-    if (row < 0) return null;
-    if (next === this.t.length) return time - this.t[row] <= this.pause ? this.#row(row) : null;
-    const step = this.t[next] - this.t[row];
-    if (step > this.pause) return time - this.t[row] <= this.pause ? this.#row(row) : null;
-    const share = step > 0 ? (time - this.t[row]) / step : 0;
-    const turn = Math.atan2(Math.sin(this.yaw[next] - this.yaw[row]), Math.cos(this.yaw[next] - this.yaw[row]));
-    return {
-      x: this.x[row] + share * (this.x[next] - this.x[row]),
-      y: this.y[row] + share * (this.y[next] - this.y[row]),
-      yaw: this.yaw[row] + share * turn,
-    };
+    const { x, y, yaw } = this.table;
+    const next = countUpTo(this.t.length, time, (k) => this.t[k]);
+    if (!next) return null;
+    const [since, step] = [time - this.t[next - 1], (this.t[next] ?? Infinity) - this.t[next - 1]];
+    const [a, b] = [this.rows[next - 1], this.rows[next]];
+    if (step > this.pause) return since <= this.pause ? { x: x[a], y: y[a], yaw: yaw[a] } : null;
+    const share = step > 0 ? since / step : 0;
+    const turn = Math.atan2(Math.sin(yaw[b] - yaw[a]), Math.cos(yaw[b] - yaw[a]));
+    return { x: x[a] + share * (x[b] - x[a]), y: y[a] + share * (y[b] - y[a]), yaw: yaw[a] + share * turn };
   }
 
-  /** As `at`; before the first and after the last stamp, and in a pause, what is nearest before, or the first. */
+  /** As `at`, and where there is none the last row before, or the first one; null of an empty path. */
   near(time) {
     if (!this.t.length) return null;
-    return this.at(time) ?? this.#row(Math.max(0, countUpTo(this.t, time) - 1));
-  }
-
-  #row(row) {
-    return { x: this.x[row], y: this.y[row], yaw: this.yaw[row] };
-  }
-}
-
-function medianStep(times) {
-  const steps = [];
-  for (let k = 1; k < times.length; k += 1) if (times[k] > times[k - 1]) steps.push(times[k] - times[k - 1]);
-  steps.sort((a, b) => a - b);
-  return steps.length ? steps[steps.length >> 1] : 0.1;
-}
-
-/** What the runs of a recording share. */
-class Recording {
-  constructor(packed) {
-    this.map = packed.map.map((line) => ({ kind: line.kind, x: numbers(line.x), y: numbers(line.y) }));
-    const ego = tableOf(packed.ego);
-    this.ego = new Path(ego, Int32Array.from(ego.t.keys()));
-    const truth = tableOf(packed.truth);
-    this.objects = new Map();
-    for (const [object, rows] of rowsOf(truth.object)) this.objects.set(object, new Path(truth, rows));
-    this.end = Math.max(this.ego.t.at(-1) ?? 0, ...truth.t.slice(-1), 0);
+    return this.at(time) ?? this.at(this.t[Math.max(0, countUpTo(this.t.length, time, (k) => this.t[k]) - 1)]);
   }
 }
 
 /** A run, indexed by time. */
 class Run {
-  constructor(packed, recordings) {
-    this.label = packed.label;
-    this.recording = recordings[packed.recording];
-    this.statuses = packed.statuses;
-    this.sensors = packed.sensors;
-    this.dispositions = packed.dispositions;
-    this.ticks = numbers(packed.ticks);
-    this.step = medianStep(this.ticks);
-    this.tracks = tableOf(packed.tracks);
-    this.tracksOfTick = startsOfTicks(this.ticks, this.tracks.t);
-    this.trackBefore = rowsBefore(this.tracks.track);
-    this.past = tableOf(packed.past);
-    this.pastOfTick = startsOfTicks(this.ticks, this.past.t);
-    this.final = tableOf(packed.final);
+  constructor(packed, colour, recordings) {
+    Object.assign(this, packed, { colour, recording: recordings[packed.recording], errors: new Map() });
+    this.ticks = Float64Array.from(packed.ticks);
+    for (const name of ["tracks", "past", "final", "detections"]) this[name] = tableOf(packed[name]);
+    this.step = usualStep(this.ticks);
+    this.trackPaths = new Map([...rowsOf(this.tracks.track)].map(([id, rows]) => [id, new Path(this.tracks, rows)]));
+    this.tracksOfTick = rowsOf(this.tracks.t);
+    this.pastOfTick = rowsOf(this.past.t);
     this.finalOfTrack = rowsOf(this.final.track);
-    this.detections = tableOf(packed.detections);
-    const stamped = [...this.detections.stamp.keys()].filter((row) => Number.isFinite(this.detections.stamp[row]));
-    this.byStamp = Int32Array.from(stamped).sort(
-      (a, b) => this.detections.stamp[a] - this.detections.stamp[b] || a - b,
-    );
-    this.stamps = Float64Array.from(this.byStamp, (row) => this.detections.stamp[row]);
-    this.end = Math.max(this.recording.end, this.ticks.at(-1) ?? 0, this.detections.receipt.at(-1) ?? 0);
+    const { stamp, receipt } = this.detections;
+    this.byReceipt = [...receipt.keys()];
+    this.byStamp = this.byReceipt.filter((row) => Number.isFinite(stamp[row])).sort((a, b) => stamp[a] - stamp[b]);
+    this.longestDelay = this.byStamp.reduce((most, row) => Math.max(most, receipt[row] - stamp[row]), 0);
+    this.end = Math.max(this.recording.end, this.ticks.at(-1) ?? 0, receipt.at(-1) ?? 0);
   }
 
-  /** Number of the newest tick at `time`; -1 before the first one. */
-  tickAt(time) {
-    return countUpTo(this.ticks, time + 1e-9) - 1;
+  /** Time of the newest tick, and the rows of the tracks and of their past there. */
+  at(time) {
+    const tick = this.ticks[countUpTo(this.ticks.length, time + 1e-9, (k) => this.ticks[k]) - 1];
+    return { tick, rows: this.tracksOfTick.get(tick) ?? [], past: this.pastOfTick.get(tick) ?? [] };
   }
 
-  /** First and behind-last row of the tracks at tick `tick`. */
-  trackRows(tick) {
-    return tick < 0 ? [0, 0] : [this.tracksOfTick[tick], this.tracksOfTick[tick + 1]];
+  /** Row of the track that is nearest to a place at `time`, with its distance; undefined where there is none. */
+  nearest(time, place) {
+    const { x, y } = this.tracks;
+    const found = this.at(time).rows.map((row) => ({ row, distance: Math.hypot(x[row] - place.x, y[row] - place.y) }));
+    return found.sort((a, b) => a.distance - b.distance)[0];
   }
 
-  /** Row of the track that is nearest to a place at `tick`, with its distance; null where there is none. */
-  nearest(tick, place) {
-    const [from, to] = this.trackRows(tick);
-    let found = null;
-    for (let row = from; row < to; row += 1) {
-      const distance = Math.hypot(this.tracks.x[row] - place.x, this.tracks.y[row] - place.y);
-      if (found === null || distance < found.distance) found = { row, distance };
+  /** Distance of the nearest track to a true object at each tick; NaN where there is none. */
+  errorsAt(object) {
+    if (!this.errors.has(object)) {
+      const path = this.recording.objects.get(object);
+      this.errors.set(object, Float32Array.from(this.ticks, (tick) => {
+        const place = path?.at(tick);
+        const distance = place ? this.nearest(tick, place)?.distance : NaN;
+        return distance < FARTHEST_M ? distance : NaN;
+      }));
     }
-    return found;
-  }
-
-  /** Row of the track with that number at `tick`; -1 where there is none. */
-  rowOfTrack(tick, track) {
-    const [from, to] = this.trackRows(tick);
-    for (let row = from; row < to; row += 1) if (this.tracks.track[row] === track) return row;
-    return -1;
+    return this.errors.get(object);
   }
 }
 
-/** Everything that the viewer shows. */
 function readScene(text) {
-  const packed = JSON.parse(text);
-  const recordings = packed.recordings.map((one) => new Recording(one));
-  const runs = packed.runs.map((one) => new Run(one, recordings));
-  return {
-    runs,
-    colours: packed.colours,
-    sensorColours: packed.sensor_colours,
-    moment: packed.moment,
-    size: packed.size_m,
-    used: new Set(packed.used),
-    late: new Set(packed.late),
-    sensors: [...new Set(runs.flatMap((run) => run.sensors))].sort(),
-    end: Math.max(0, ...runs.map((run) => run.end)),
-  };
+  const scene = JSON.parse(text);
+  for (const recording of scene.recordings) {
+    recording.ego = new Path(tableOf(recording.ego));
+    const truth = tableOf(recording.truth);
+    recording.objects = new Map([...rowsOf(truth.object)].map(([object, rows]) => [object, new Path(truth, rows)]));
+    recording.end = Math.max(0, recording.ego.t.at(-1) ?? 0, truth.t.at(-1) ?? 0);
+  }
+  scene.runs = scene.runs.map((run, k) => new Run(run, scene.colours[k], scene.recordings));
+  scene.sensors = [...new Set(scene.runs.flatMap((run) => run.sensors))].sort();
+  scene.end = Math.max(0, ...scene.runs.map((run) => run.end));
+  const late = ({ receipt, fate }) => receipt.filter((time, row) => fate[row] === 2);
+  scene.lateTimes = [...new Set(scene.runs.flatMap((run) => [...late(run.detections)]))].sort((a, b) => a - b);
+  return scene;
 }
 
-// Draws one run, or several over one another, into a pane of the canvas. World: metres, y up; a pane clips it.
+// --- Drawing ---------------------------------------------------------------------------------------------------------
 
-const MARKS = { // corners to the right and up
-  circle: null,
-  square: [[-1, -1], [1, -1], [1, 1], [-1, 1]],
-  triangle: [[0, 1.2], [-1.1, -1], [1.1, -1]],
-  diamond: [[0, 1.3], [-1.3, 0], [0, -1.3], [1.3, 0]],
-};
-const SENSOR_MARKS = Object.keys(MARKS);
-const BEARING_M = 150;
-const SHOWN_S = 0.3; // how long a detection stays
-const MOST_IN_FLIGHT = 2000;
-const WIDEST = 100; // pixels of a line
-const CHUNK = 64; // points of a piece of the map, which is drawn only if it can be seen
-
-/** Where a pane is on the canvas, what of the world is in its middle, and which direction points to the right. */
-class Camera {
-  constructor(pane, x, y, turn, scale) {
-    Object.assign(this, { pane, x, y, scale });
-    this.right = [scale * Math.cos(turn), scale * Math.sin(turn)];
-    this.middle = [pane.left + pane.width / 2, pane.top + pane.height / 2];
+/** A part of the canvas with runs of one recording over one another; detections are those of the first one. */
+class Pane {
+  constructor(viewer, runs, box) {
+    Object.assign(this, { viewer, runs, ...box, context: viewer.context, theme: viewer.theme, scene: viewer.scene });
+    const { x, y, turn } = viewer.middle(runs[0]);
+    this.scale = this.width / viewer.view.width;
+    Object.assign(this, { x, y, turn, c: this.scale * Math.cos(turn), s: this.scale * Math.sin(turn) });
   }
 
-  /** Lets the context draw in metres from here on. */
-  toWorld(context, ratio) {
-    const [c, s] = this.right;
-    const [left, top] = this.onCanvas(0, 0);
-    context.setTransform(c * ratio, s * ratio, s * ratio, -c * ratio, left * ratio, top * ratio);
-  }
-
-  /** Place on the canvas in CSS pixels. */
-  onCanvas(x, y) {
-    const [c, s] = this.right;
+  /** Place on the canvas, in CSS pixels, of a place in metres. */
+  at(x, y) {
     const [dx, dy] = [x - this.x, y - this.y];
-    return [this.middle[0] + c * dx + s * dy, this.middle[1] + s * dx - c * dy];
+    const [left, top] = [this.left + this.width / 2, this.top + this.height / 2];
+    return [left + this.c * dx + this.s * dy, top + this.s * dx - this.c * dy];
   }
 
-  /** Whether a place is in the pane, or not more than `margin` metres beside it. */
-  sees(x, y, margin) {
-    const [left, top] = this.onCanvas(x, y);
-    const { pane } = this;
-    const reach = margin * this.scale;
-    return (
-      left >= pane.left - reach && left <= pane.left + pane.width + reach &&
-      top >= pane.top - reach && top <= pane.top + pane.height + reach
-    );
-  }
-
-  /** Beyond which sides of the pane a place is, a bit for each: a line between two with a common one is not seen. */
-  sides(x, y) {
-    const [left, top] = this.onCanvas(x, y);
-    const { pane } = this;
-    const [right, bottom] = [pane.left + pane.width + WIDEST, pane.top + pane.height + WIDEST];
-    return (left < pane.left - WIDEST) | ((left > right) << 1) | ((top < pane.top - WIDEST) << 2) | ((top > bottom) << 3);
-  }
-}
-
-/** Lines of the map in pieces with their bounds. */
-function piecesOfMap(map) {
-  const pieces = [];
-  for (const line of map) {
-    for (let from = 0; from + 1 < line.x.length; from += CHUNK) {
-      const to = Math.min(from + CHUNK + 1, line.x.length);
-      const path = new Path2D();
-      const piece = { kind: line.kind, path, x: 0, y: 0, reach: 0 };
-      piece.x = line.x[from];
-      piece.y = line.y[from];
-      for (let k = from; k < to; k += 1) {
-        path.lineTo(line.x[k], line.y[k]);
-        piece.reach = Math.max(piece.reach, Math.hypot(line.x[k] - piece.x, line.y[k] - piece.y));
-      }
-      pieces.push(piece);
-    }
-  }
-  return pieces;
-}
-
-/** Draws at a time; settings say what. */
-class Painter {
-  constructor(context, scene) {
-    this.context = context;
-    this.scene = scene;
-    this.pieces = new Map();
-    for (const run of scene.runs) {
-      if (!this.pieces.has(run.recording)) this.pieces.set(run.recording, piecesOfMap(run.recording.map));
-    }
-  }
-
-  colourOfRun(index) {
-    return this.scene.colours[index];
-  }
-
-  colourOfSensor(name) {
-    const { sensorColours, sensors } = this.scene;
-    return sensorColours[sensors.indexOf(name) % sensorColours.length];
-  }
-
-  /** One pane: `runs` are numbers of runs of the same recording, over one another; detections are as of the first one. */
-  pane(camera, ratio, time, runs, settings, theme) {
-    const { context } = this;
-    this.camera = camera;
-    this.theme = theme;
-    this.px = 1 / camera.scale; // metres
+  draw(time, shows, detections) {
+    const { context, runs } = this;
+    const { recording } = runs[0];
     context.save();
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.beginPath();
-    context.rect(camera.pane.left, camera.pane.top, camera.pane.width, camera.pane.height);
+    context.rect(this.left, this.top, this.width, this.height);
     context.clip();
-    camera.toWorld(context, ratio);
     context.lineJoin = "round";
-    const { recording } = this.scene.runs[runs[0]];
-    if (settings.map) this.#map(recording);
-    if (settings.truth) this.#truth(recording, time, settings.trail);
-    for (const index of runs) this.#run(index, time, settings);
-    if (settings.detections !== "none") this.#detections(this.scene.runs[runs[0]], time, settings.detections);
-    this.#ego(recording, time);
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    if (settings.names) for (const index of runs) this.#names(this.scene.runs[index], time);
+    if (shows.has("map")) for (const line of recording.map) this.mapLine(line);
+    if (shows.has("truth")) for (const path of recording.objects.values()) this.truth(path, time);
+    for (const run of runs) this.run(run, time, shows);
+    if (detections !== "none") this.detections(runs[0], time, detections);
+    const ego = recording.ego.at(time);
+    if (ego) this.box(ego, this.theme.ego, this.theme.text);
+    if (shows.has("names")) for (const run of runs) this.names(run, time);
+    this.title(time);
     context.restore();
   }
 
-  #map(recording) {
-    const { context, theme, px } = this;
-    for (const piece of this.pieces.get(recording)) {
-      if (!this.camera.sees(piece.x, piece.y, piece.reach)) continue;
-      context.strokeStyle = piece.kind === "bound" ? theme.bound : theme.grid;
-      context.lineWidth = (piece.kind === "bound" ? 1.5 : 1) * px;
-      context.stroke(piece.path);
-    }
-  }
-
-  /** Continues the line to a place; a piece that cannot be seen is left out. */
-  #lineTo(x, y, isFirst = false) {
-    const sides = this.camera.sides(x, y);
-    if (isFirst || (sides & this.sides) !== 0) this.context.moveTo(x, y);
-    else this.context.lineTo(x, y);
-    this.sides = sides;
-  }
-
-  #truth(recording, time, trail) {
-    const { context, theme } = this;
-    for (const path of recording.objects.values()) {
-      const here = path.at(time);
-      if (here === null) continue;
-      context.strokeStyle = theme.truth;
-      context.lineWidth = Math.max(this.scene.size[1], 4 * this.px);
-      context.beginPath();
-      const first = countUpTo(path.t, time - trail);
-      for (let row = first; row < path.t.length && path.t[row] <= time; row += 1) {
-        this.#lineTo(path.x[row], path.y[row], row === first);
-      }
-      this.#lineTo(here.x, here.y);
-      context.stroke();
-      if (this.camera.sees(here.x, here.y, 50)) this.#box(here.x, here.y, here.yaw, theme.truth, null);
-    }
-  }
-
-  #run(index, time, settings) {
-    const run = this.scene.runs[index];
-    const tick = run.tickAt(time);
-    const [from, to] = run.trackRows(tick);
-    const isNew = tick >= 0 && time - run.ticks[tick] <= Math.max(1, 20 * run.step);
-    const colour = this.colourOfRun(index);
-    if (isNew) {
-      for (let row = from; row < to; row += 1) {
-        if (settings.published) this.#published(run, row, time - settings.trail, colour);
-        if (settings.past) this.#past(run, tick, row, time, settings, colour);
-      }
-      for (let row = from; row < to; row += 1) this.#track(run, row, settings, colour);
-    }
-  }
-
-  /** The positions of a track as they were published, dotted. */
-  #published(run, row, since, colour) {
-    const { context, px } = this;
-    const { x, y, t } = run.tracks;
+  /** Strokes a line through places. */
+  line(places, colour, width, dash = [], alpha = 1) {
+    const { context } = this;
+    context.globalAlpha = alpha;
     context.strokeStyle = colour;
-    context.globalAlpha = 0.75;
-    context.lineWidth = 1.2 * px;
-    context.setLineDash([2 * px, 3 * px]);
+    context.lineWidth = width;
+    context.setLineDash(dash);
     context.beginPath();
-    for (let at = row; at >= 0 && t[at] >= since; at = run.trackBefore[at]) this.#lineTo(x[at], y[at], at === row);
+    for (const [x, y] of places) context.lineTo(...this.at(x, y));
     context.stroke();
     context.setLineDash([]);
     context.globalAlpha = 1;
   }
 
+  mapLine({ kind, x, y }) {
+    const [colour, width] = kind === "bound" ? [this.theme.bound, 1.5] : [this.theme.grid, 1];
+    this.line(x.map((value, k) => [value, y[k]]), colour, width);
+  }
+
+  truth(path, time) {
+    const here = path.at(time);
+    if (here === null) return;
+    const rows = between(path.rows, path.table.t, time - TRAIL_S, time);
+    const places = [...rows.map((row) => [path.table.x[row], path.table.y[row]]), [here.x, here.y]];
+    this.line(places, this.theme.truth, Math.max(this.scene.size_m[1] * this.scale, 4));
+    this.box(here, this.theme.truth, null);
+  }
+
+  run(run, time, shows) {
+    const { tick, rows, past } = run.at(time);
+    if (!(time - tick <= Math.max(1, 20 * run.step))) return; // long over
+    const { x, y, yaw, t, track, confirmed } = run.tracks;
+    for (const row of rows) {
+      const trail = between(run.trackPaths.get(track[row]).rows, t, time - TRAIL_S, time);
+      const published = trail.map((each) => [x[each], y[each]]);
+      if (shows.has("published")) this.line(published, run.colour, 1.2, [2, 3], 0.75);
+      if (shows.has("past")) this.past(run, row, past, time, shows);
+    }
+    for (const row of rows) {
+      if (shows.has("ellipses")) this.ellipse(run.tracks, row, run.colour, 1.5, 0.15, 1);
+      this.box({ x: x[row], y: y[row], yaw: yaw[row] }, null, run.colour, confirmed[row] ? [] : [3, 2]);
+    }
+  }
+
   /** The past of a track as it is known now: final states, the states of every lag, the present one. */
-  #past(run, tick, row, time, settings, colour) {
-    const { context, px } = this;
+  past(run, row, pastRows, time, shows) {
     const { tracks, past, final } = run;
-    const track = tracks.track[row];
-    const ellipses = [];
-    context.strokeStyle = colour;
-    context.lineWidth = 2 * px;
+    const ended = between(run.finalOfTrack.get(tracks.track[row]) ?? [], final.t, time - TRAIL_S, time);
+    const known = ended.filter((each) => final.known[each] <= time + 1e-9).map((each) => [final, each]);
+    const lagged = pastRows.filter((each) => past.track[each] === tracks.track[row]).map((each) => [past, each]);
+    if (!known.length && !lagged.length) return;
+    const places = [...known, ...lagged, [tracks, row]].map(([table, each]) => [table.x[each], table.y[each]]);
+    this.line(places, run.colour, 2);
+    if (!shows.has("ellipses")) return;
+    for (const [table, each] of [...lagged, ...known.slice(-1)]) this.ellipse(table, each, run.colour, 1, 0, 0.6);
+  }
+
+  ellipse(table, row, colour, width, fill, alpha) {
+    const { context, scale } = this;
+    const [long, short] = [table.long[row] * scale, table.short[row] * scale];
+    if (!(long >= 0)) return;
     context.beginPath();
-    const rows = run.finalOfTrack.get(track) ?? [];
-    let last = -Infinity;
-    for (let k = firstOfStamp(rows, final.t, time - settings.trail); k < rows.length; k += 1) {
-      const at = rows[k];
-      if (final.t[at] > time) break;
-      if (final.known[at] > time + 1e-9) continue;
-      this.#lineTo(final.x[at], final.y[at], last === -Infinity);
-      last = at;
-    }
-    const [from, to] = [run.pastOfTick[tick], run.pastOfTick[tick + 1]];
-    let known = last > -Infinity;
-    for (let at = from; at < to; at += 1) {
-      if (past.track[at] !== track) continue;
-      this.#lineTo(past.x[at], past.y[at], !known);
-      known = true;
-      ellipses.push([past, at]);
-    }
-    if (!known) return;
-    if (to > from || time - final.t[last] < 3) this.#lineTo(tracks.x[row], tracks.y[row]);
+    context.ellipse(...this.at(table.x[row], table.y[row]), long, short, this.turn - table.direction[row], 0, 2 * Math.PI);
+    Object.assign(context, { fillStyle: colour, strokeStyle: colour, lineWidth: width, globalAlpha: fill });
+    context.fill();
+    context.globalAlpha = alpha;
     context.stroke();
-    if (!settings.ellipses) return;
-    if (last > -Infinity) ellipses.push([final, last]);
-    context.globalAlpha = 0.6;
-    context.lineWidth = px;
-    for (const [table, at] of ellipses) this.#ellipse(table, at);
     context.globalAlpha = 1;
-  }
-
-  #track(run, row, settings, colour) {
-    const { context, px } = this;
-    const { x, y, yaw, status } = run.tracks;
-    if (!this.camera.sees(x[row], y[row], 50)) return;
-    const isSure = run.statuses[status[row]] === "confirmed";
-    if (settings.ellipses) {
-      context.strokeStyle = colour;
-      context.fillStyle = colour;
-      context.lineWidth = 1.5 * px;
-      this.#ellipse(run.tracks, row, 0.15);
-    }
-    this.#box(x[row], y[row], yaw[row], null, colour, isSure);
-  }
-
-  #ellipse(table, row, fill = 0) {
-    const { context } = this;
-    const [long, short] = [table.long[row], table.short[row]];
-    if (!(long >= 0) || !this.camera.sees(table.x[row], table.y[row], long)) return;
-    context.beginPath();
-    context.ellipse(table.x[row], table.y[row], long, short, table.direction[row], 0, 2 * Math.PI);
-    if (fill) {
-      const alpha = context.globalAlpha;
-      context.globalAlpha = fill;
-      context.fill();
-      context.globalAlpha = alpha;
-    }
-    context.stroke();
   }
 
   /** An object of the size of a car, at least some pixels long; its front is marked. */
-  #box(x, y, yaw, fill, stroke, isSure = true) {
-    const { context, px } = this;
-    const grown = Math.max(1, (10 * px) / this.scene.size[0]);
-    const [half, side] = [(grown * this.scene.size[0]) / 2, (grown * this.scene.size[1]) / 2];
-    const [c, s] = Number.isFinite(yaw) ? [Math.cos(yaw), Math.sin(yaw)] : [1, 0];
-    const corner = (ahead, left) => context.lineTo(x + c * ahead - s * left, y + s * ahead + c * left);
+  box(place, fill, stroke, dash = []) {
+    const { context, scene, turn } = this;
+    const scale = Math.max(this.scale, 10 / scene.size_m[0]);
+    const [half, side] = scene.size_m.map((size) => (scale * size) / 2);
+    const angle = (Number.isFinite(place.yaw) ? place.yaw : 0) - turn;
+    const [c, s] = [Math.cos(angle), Math.sin(angle)];
+    const [left, top] = this.at(place.x, place.y);
     context.beginPath();
-    corner(-half, -side);
-    corner(0.55 * half, -side);
-    corner(half, 0);
-    corner(0.55 * half, side);
-    corner(-half, side);
+    for (const [ahead, aside] of [[-half, -side], [0.55 * half, -side], [half, 0], [0.55 * half, side], [-half, side]]) {
+      context.lineTo(left + c * ahead - s * aside, top - s * ahead - c * aside);
+    }
     context.closePath();
-    if (fill !== null) {
-      context.fillStyle = fill;
-      context.fill();
-    }
-    if (stroke !== null) {
-      context.strokeStyle = stroke;
-      context.lineWidth = 2 * px;
-      context.setLineDash(isSure ? [] : [3 * px, 2 * px]);
-      context.stroke();
-      context.setLineDash([]);
-    }
-  }
-
-  #ego(recording, time) {
-    const here = recording.ego.at(time);
-    if (here !== null && this.camera.sees(here.x, here.y, 20)) {
-      this.#box(here.x, here.y, here.yaw, this.theme.ego, this.theme.text);
-    }
+    Object.assign(context, { fillStyle: fill, strokeStyle: stroke, lineWidth: 2 });
+    context.setLineDash(dash);
+    if (fill !== null) context.fill();
+    if (stroke !== null) context.stroke();
+    context.setLineDash([]);
   }
 
   /** Hollow from the stamp on (sensed, on its way), full from the receipt on, with a line to where its track is then. */
-  #detections(run, time, mode) {
-    const { detections } = run;
-    if (mode !== "received") {
-      const reach = mode === "stamped" ? SHOWN_S : Infinity;
-      const to = countUpTo(run.stamps, time + 1e-9);
-      for (let k = to - 1; k >= 0 && k > to - MOST_IN_FLIGHT && run.stamps[k] > time - reach; k -= 1) {
-        const row = run.byStamp[k];
-        const isOnItsWay = detections.receipt[row] > time + 1e-9;
-        if (mode === "stamped") this.#detection(run, row, false, 1 - (time - run.stamps[k]) / SHOWN_S);
-        else if (isOnItsWay) this.#detection(run, row, false, 1);
-        else if (time - run.stamps[k] > 5) break;
+  detections(run, time, mode) {
+    const { stamp, receipt } = run.detections;
+    if (mode === "stamped") {
+      for (const row of between(run.byStamp, stamp, time - SHOWN_S, time)) {
+        this.detection(run, row, false, 1 - (time - stamp[row]) / SHOWN_S);
       }
+      return;
     }
-    if (mode !== "stamped") {
-      const from = countUpTo(detections.receipt, time - SHOWN_S);
-      const to = countUpTo(detections.receipt, time + 1e-9);
-      for (let row = from; row < to; row += 1) {
-        this.#detection(run, row, true, 1 - (time - detections.receipt[row]) / (1.3 * SHOWN_S));
-      }
+    const sensed = mode === "both" ? between(run.byStamp, stamp, time - run.longestDelay - 1e-6, time) : [];
+    for (const row of sensed) if (receipt[row] > time + 1e-9) this.detection(run, row, false, 1);
+    for (const row of between(run.byReceipt, receipt, time - SHOWN_S, time)) {
+      this.detection(run, row, true, 1 - (time - receipt[row]) / (1.3 * SHOWN_S));
     }
   }
 
-  #detection(run, row, isFull, strength) {
-    const { context, px, theme } = this;
-    const { x, y, sensor, disposition, track_x, track_y, from_x, from_y, bearing } = run.detections;
-    const name = run.dispositions[disposition[row]];
-    const colour = this.scene.used.has(name) ? this.colourOfSensor(run.sensors[sensor[row]]) : theme.unused;
-    context.globalAlpha = Math.max(0.15, Math.min(1, strength));
-    context.strokeStyle = colour;
-    context.fillStyle = colour;
-    context.lineWidth = 1.5 * px;
+  detection(run, row, isFull, strength) {
+    const { x, y, sensor, fate, track_x, track_y, from_x, from_y, bearing } = run.detections;
+    const index = this.scene.sensors.indexOf(run.sensors[sensor[row]]);
+    const colour = fate[row] ? this.viewer.colourOfSensor(index) : this.theme.unused;
+    const alpha = Math.max(0.15, Math.min(1, strength));
     if (Number.isFinite(x[row])) {
-      if (this.camera.sees(x[row], y[row], 100)) {
-        if (isFull && Number.isFinite(track_x[row])) {
-          context.lineWidth = (this.scene.late.has(name) ? 1.5 : 0.7) * px;
-          context.beginPath();
-          context.moveTo(x[row], y[row]);
-          context.lineTo(track_x[row], track_y[row]);
-          context.stroke();
-          context.lineWidth = 1.5 * px;
-        }
-        this.#mark(x[row], y[row], this.scene.sensors.indexOf(run.sensors[sensor[row]]), isFull);
-      }
-    } else if (bearing !== undefined && Number.isFinite(bearing[row])) {
-      context.lineWidth = px;
-      context.beginPath();
-      context.moveTo(from_x[row], from_y[row]);
-      context.lineTo(from_x[row] + BEARING_M * Math.cos(bearing[row]), from_y[row] + BEARING_M * Math.sin(bearing[row]));
-      context.stroke();
+      const places = [[x[row], y[row]], [track_x[row], track_y[row]]];
+      if (isFull && Number.isFinite(track_x[row])) this.line(places, colour, fate[row] === 2 ? 1.5 : 0.7, [], alpha);
+      this.mark(x[row], y[row], index, colour, isFull, alpha);
+    } else if (Number.isFinite(bearing[row])) {
+      const end = [from_x[row] + BEARING_M * Math.cos(bearing[row]), from_y[row] + BEARING_M * Math.sin(bearing[row])];
+      this.line([[from_x[row], from_y[row]], end], colour, 1, [], alpha);
     }
-    context.globalAlpha = 1;
   }
 
-  /** A mark that stands upright however the picture is turned. */
-  #mark(x, y, sensor, isFull) {
-    const { context, px } = this;
-    const r = 4.5 * px;
-    const [c, s] = this.camera.right.map((value) => value / this.camera.scale);
-    const corner = ([right, up]) => context.lineTo(x + r * (c * right - s * up), y + r * (s * right + c * up));
-    const corners = MARKS[SENSOR_MARKS[sensor % SENSOR_MARKS.length]];
+  mark(x, y, sensor, colour, isFull, alpha) {
+    const { context } = this;
+    const [left, top] = this.at(x, y);
+    const corners = Object.values(MARKS)[sensor % 4];
+    Object.assign(context, { fillStyle: colour, strokeStyle: colour, lineWidth: 1.5, globalAlpha: alpha });
     context.beginPath();
-    if (corners === null) context.arc(x, y, r, 0, 2 * Math.PI);
-    else corners.forEach(corner);
+    if (corners === null) context.arc(left, top, 4.5, 0, 2 * Math.PI);
+    else for (const [right, down] of corners) context.lineTo(left + 4.5 * right, top + 4.5 * down);
     context.closePath();
     if (isFull) context.fill();
     context.stroke();
+    context.globalAlpha = 1;
   }
 
-  #names(run, time) {
-    const { context, theme } = this;
-    const [from, to] = run.trackRows(run.tickAt(time));
-    context.font = "12px system-ui, sans-serif";
-    context.fillStyle = theme.text;
-    for (let row = from; row < to; row += 1) {
-      const [x, y] = [run.tracks.x[row], run.tracks.y[row]];
-      if (!this.camera.sees(x, y, 0)) continue;
-      const [left, top] = this.camera.onCanvas(x, y);
+  names(run, time) {
+    const { context } = this;
+    Object.assign(context, { font: "12px system-ui, sans-serif", fillStyle: this.theme.text });
+    for (const row of run.at(time).rows) {
+      const [left, top] = this.at(run.tracks.x[row], run.tracks.y[row]);
       context.fillText(String(run.tracks.track[row]), left + 8, top - 8);
     }
   }
-}
 
-/** Place in `rows`, which are in order of their time, of the first one at `since` or later. */
-function firstOfStamp(rows, times, since) {
-  let [from, to] = [0, rows.length];
-  while (from < to) {
-    const middle = (from + to) >> 1;
-    if (times[rows[middle]] < since) from = middle + 1;
-    else to = middle;
-  }
-  return from;
-}
-
-// The strip below the picture: how far each run is off the followed object over time, and when late detections came.
-
-const STRIP_PIXELS = 64;
-const FARTHEST_M = 10; // a track that is farther away is of another object
-const SHOWN_SHARE = 0.99; // of the errors; those beyond are cut off
-
-/** Distance of the nearest track to a true object at each tick of a run; NaN where there is none. */
-function errorsOf(run, object) {
-  const path = run.recording.objects.get(object);
-  return Float32Array.from(run.ticks, (time, tick) => {
-    const place = path?.at(time) ?? null;
-    const nearest = place === null ? null : run.nearest(tick, place);
-    return nearest !== null && nearest.distance < FARTHEST_M ? nearest.distance : NaN;
-  });
-}
-
-class Strip {
-  constructor(canvas, caption, viewer) {
-    this.canvas = canvas;
-    this.caption = caption;
-    this.viewer = viewer;
-    this.context = canvas.getContext("2d");
-    this.errors = new Map();
-    this.curves = document.createElement("canvas"); // what does not change with time
-  }
-
-  /** Draws the time, and the curves where something else has changed. */
-  draw() {
-    const { canvas, context, viewer } = this;
-    const [kind, id] = viewer.follow.split(" ");
-    canvas.hidden = this.caption.hidden = kind !== "object";
-    if (canvas.hidden) return;
-    const { ratio, theme } = viewer;
-    const { width } = viewer.size;
-    const shows = [width, ratio, id, viewer.runsShown(), theme.background].join(" ");
-    if (shows !== this.shows) {
-      this.shows = shows;
-      canvas.width = this.curves.width = Math.round(width * ratio);
-      canvas.height = this.curves.height = Math.round(STRIP_PIXELS * ratio);
-      this.#drawCurves(Number(id), width, ratio, theme);
-    }
-    context.drawImage(this.curves, 0, 0);
-    context.fillStyle = theme.text;
-    context.fillRect(Math.round(this.#at(viewer.time) * canvas.width) - ratio, 0, 2 * ratio, canvas.height);
-  }
-
-  /** Share of the width at which a time is. */
-  #at(time) {
-    return this.viewer.scene.end > 0 ? time / this.viewer.scene.end : 0;
-  }
-
-  #drawCurves(object, width, ratio, theme) {
-    const { viewer } = this;
-    const context = this.curves.getContext("2d");
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    context.fillStyle = theme.background;
-    context.fillRect(0, 0, width, STRIP_PIXELS);
-    context.fillStyle = theme.bound;
-    for (const time of viewer.lateTimes) context.fillRect(this.#at(time) * width, STRIP_PIXELS - 5, 1, 5);
-    const runs = viewer.runsShown();
-    const every = runs.map((run) => this.#errors(run, object));
-    const known = Float32Array.from(every.flatMap((errors) => [...errors]).filter(Number.isFinite)).sort();
-    const top = known[Math.floor(SHOWN_SHARE * (known.length - 1))] || 1;
-    for (const [k, errors] of every.entries()) {
-      const { ticks } = viewer.scene.runs[runs[k]];
-      context.lineWidth = Math.min(1 + 1.4 * (every.length - 1 - k), 4); // equal curves are seen below one another
-      context.strokeStyle = viewer.painter.colourOfRun(runs[k]);
-      context.beginPath();
-      let isBroken = true;
-      for (let tick = 0; tick < ticks.length; tick += 1) {
-        if (Number.isFinite(errors[tick])) {
-          const [x, y] = [this.#at(ticks[tick]) * width, (STRIP_PIXELS - 8) * (1 - Math.min(errors[tick] / top, 1)) + 2];
-          if (isBroken) context.moveTo(x, y);
-          else context.lineTo(x, y);
-        }
-        isBroken = !Number.isFinite(errors[tick]);
-      }
-      context.stroke();
-    }
-    this.caption.textContent =
-      `Position error at object ${object}, 0 to ${top.toPrecision(2)} m; the strokes are late detections.`;
-  }
-
-  #errors(index, object) {
-    const key = `${index} ${object}`;
-    if (!this.errors.has(key)) this.errors.set(key, errorsOf(this.viewer.scene.runs[index], object));
-    return this.errors.get(key);
-  }
-}
-
-// Links to a moment: what the address says behind #, in the form t=12.34&view=-8,0,40&follow=...
-
-/** The link to what `viewer` shows. */
-function linkTo(viewer) {
-  const { view, settings } = viewer;
-  const said = new URLSearchParams({
-    t: viewer.time.toFixed(4).replace(/\.?0+$/, ""),
-    view: [view.x, view.y, view.width].map((value) => Number(value.toFixed(2))).join(","),
-    follow: viewer.follow,
-    turn: viewer.isTurned ? "travel" : "north",
-    layout: viewer.isSideBySide ? "side" : "over",
-    runs: viewer.runsShown().join(","),
-    detections: settings.detections,
-    layers: LAYERS.filter((layer) => settings[layer]).join(","),
-  });
-  return `#${said.toString().replaceAll("%2C", ",")}`;
-}
-
-/** Lets `viewer` show what `link` says; gives whether it names a moment. What it does not say stays as it is. */
-function showLink(viewer, link) {
-  const said = new URLSearchParams(link.slice(1));
-  if (!said.has("t")) return false;
-  const oneOf = (name, ...choices) => (choices.includes(said.get(name)) ? said.get(name) : undefined);
-  const { settings, scene } = viewer;
-  viewer.isSideBySide = (oneOf("layout", "side", "over") ?? (viewer.isSideBySide ? "side" : "over")) === "side";
-  viewer.isTurned = (oneOf("turn", "travel", "north") ?? (viewer.isTurned ? "travel" : "north")) === "travel";
-  viewer.follow = oneOf("follow", ...viewer.controls.followed()) ?? viewer.follow;
-  settings.detections = oneOf("detections", "both", "received", "stamped", "none") ?? settings.detections;
-  const runs = (said.get("runs") ?? "").split(",").filter((run) => run !== "" && scene.runs[run] !== undefined);
-  if (runs.length) viewer.shown = new Set(runs.map(Number));
-  const [x, y, width] = (said.get("view") ?? "").split(",").map(Number);
-  if ([x, y, width].every(Number.isFinite) && width > 0) viewer.view = { x, y, width: widthWithin(width) };
-  if (said.has("layers")) {
-    const layers = said.get("layers").split(",");
-    for (const layer of LAYERS) settings[layer] = layers.includes(layer);
-  }
-  viewer.isPlaying = false;
-  viewer.seek(Number(said.get("t")));
-  return true;
-}
-
-// The controls of the viewer: buttons, keys, pointers, and what they show.
-
-const SPEEDS = [0.05, 0.1, 0.25, 0.5, 1, 2, 4];
-const LINK_MS = 300; // after which the address follows
-
-class Controls {
-  constructor(viewer) {
-    this.viewer = viewer;
-    this.parts = Object.fromEntries(
-      [...viewer.root.querySelectorAll("[data-part]")].map((part) => [part.dataset.part, part]),
-    );
-    this.isUsed = false; // until then the address stays as it is
-    this.#fill();
-  }
-
-  /** What can be followed. */
-  followed() {
-    return [...this.parts.follow.options].map((option) => option.value);
-  }
-
-  /** Shows the state of the viewer. */
-  show() {
-    const { parts, viewer } = this;
-    const text = `${viewer.time.toFixed(2)} s`;
-    parts.scrubber.value = String(viewer.time);
-    parts.scrubber.setAttribute("aria-valuetext", text);
-    parts.time.textContent = `${text} of ${viewer.scene.end.toFixed(1)} s`;
-    parts.play.textContent = viewer.isPlaying ? "Pause" : "Play";
-    parts.speed.value = String(viewer.speed);
-    parts.turn.value = viewer.isTurned ? "travel" : "north";
-    parts.layout.value = viewer.isSideBySide ? "side" : "over";
-    parts.follow.value = viewer.follow;
-    parts.detections.value = viewer.settings.detections;
-    for (const layer of LAYERS) parts[layer].checked = viewer.settings[layer];
-    for (const box of parts.runs.querySelectorAll("input")) box.checked = viewer.shown.has(Number(box.value));
-    if (!viewer.isPlaying) {
-      clearTimeout(this.linking);
-      if (this.isUsed) this.linking = setTimeout(() => this.#writeLink(), LINK_MS);
+  /** Frame, and the runs with how far their track is from the followed object. */
+  title(time) {
+    const { context, theme } = this;
+    Object.assign(context, { strokeStyle: theme.grid, lineWidth: 1, font: "600 13px system-ui, sans-serif" });
+    context.strokeRect(this.left + 0.5, this.top + 0.5, this.width - 1, this.height - 1);
+    for (const [k, run] of this.runs.entries()) {
+      const place = run.recording.objects.get(this.viewer.object)?.at(time);
+      const distance = place ? run.nearest(time, place)?.distance : NaN;
+      const error = place ? (distance < FARTHEST_M ? `: ${distance.toFixed(2)} m off` : ": no track") : "";
+      const where = [`${run.label}${error}`, this.left + 24, this.top + 20 + 18 * k, this.width - 32];
+      Object.assign(context, { lineWidth: 4, strokeStyle: theme.background, fillStyle: theme.text });
+      context.strokeText(...where);
+      context.fillText(...where);
+      context.fillStyle = run.colour;
+      context.fillRect(this.left + 8, this.top + 10 + 18 * k, 11, 11);
     }
   }
 
-  async #copyLink() {
-    this.#writeLink();
-    const { copy } = this.parts;
-    try {
-      await navigator.clipboard.writeText(location.href);
-      copy.textContent = "Copied";
-    } catch {
-      copy.textContent = "It is in the address bar";
-    }
-    setTimeout(() => { copy.textContent = "Link to this moment"; }, 2000);
-  }
-
-  #writeLink() {
-    const link = linkTo(this.viewer);
-    if (link !== location.hash) history.replaceState(null, "", link);
-  }
-
-  #fill() {
-    const { parts } = this;
-    const { scene, painter } = this.viewer;
-    parts.scrubber.max = String(scene.end);
-    for (const speed of SPEEDS) parts.speed.add(new Option(`${speed} x`, String(speed)));
-    const objects = [...new Set(scene.runs.flatMap((run) => [...run.recording.objects.keys()]))].sort((a, b) => a - b);
-    for (const object of objects) parts.follow.add(new Option(`object ${object}`, `object ${object}`));
-    if (scene.runs.some((run) => run.recording.ego.t.length)) parts.follow.add(new Option("the ego", "ego"));
-    for (const track of this.#longestTracks()) parts.follow.add(new Option(`track ${track}`, `track ${track}`));
-    parts.follow.add(new Option("nothing", "nothing"));
-    for (const [index, run] of scene.runs.entries()) {
-      const label = document.createElement("label");
-      const box = Object.assign(document.createElement("input"), { type: "checkbox", value: String(index) });
-      const patch = document.createElement("span");
-      patch.className = "patch";
-      patch.style.background = painter.colourOfRun(index);
-      label.append(box, patch, run.label);
-      parts.runs.append(label);
-    }
-    for (const sensor of scene.sensors) parts.legend.append(this.#legendOf(sensor));
-    if (!scene.runs.some((run) => run.past.t.length || run.final.t.length)) parts.past.disabled = true;
-  }
-
-  #legendOf(sensor) {
-    const { scene, painter } = this.viewer;
-    const entry = document.createElement("span");
-    const marks = { circle: "\u25CF", square: "\u25A0", triangle: "\u25B2", diamond: "\u25C6" };
-    const mark = document.createElement("b");
-    mark.textContent = marks[SENSOR_MARKS[scene.sensors.indexOf(sensor) % SENSOR_MARKS.length]];
-    mark.style.color = painter.colourOfSensor(sensor);
-    entry.append(mark, ` ${sensor}`);
-    return entry;
-  }
-
-  /** Up to eight tracks of the first run that were there longest. */
-  #longestTracks() {
-    const counts = new Map();
-    for (const track of this.viewer.scene.runs[0].tracks.track) counts.set(track, (counts.get(track) ?? 0) + 1);
-    return [...counts].sort((a, b) => b[1] - a[1] || a[0] - b[0]).slice(0, 8).map(([track]) => track);
-  }
-
-  /** Lets the controls act from here on. */
-  listen() {
-    const { parts, viewer } = this;
-    const { canvas } = viewer;
-    const on = (part, event, does) => part.addEventListener(event, (...given) => {
-      this.isUsed = true;
-      does(...given);
-      viewer.changed();
-    });
-    on(parts.play, "click", () => viewer.play(!viewer.isPlaying));
-    on(parts.scrubber, "input", () => { viewer.isPlaying = false; viewer.seek(Number(parts.scrubber.value)); });
-    on(parts.speed, "change", () => viewer.setSpeed(Number(parts.speed.value)));
-    on(parts.layout, "change", () => { viewer.isSideBySide = parts.layout.value === "side"; viewer.resize(); });
-    on(parts.turn, "change", () => viewer.setTurned(parts.turn.value === "travel"));
-    on(parts.follow, "change", () => viewer.setFollow(parts.follow.value));
-    on(parts.detections, "change", () => { viewer.settings.detections = parts.detections.value; });
-    on(parts.late_before, "click", () => viewer.toLate(-1));
-    on(parts.late_next, "click", () => viewer.toLate(1));
-    on(parts.closer, "click", () => viewer.zoom(1 / 1.5));
-    on(parts.farther, "click", () => viewer.zoom(1.5));
-    on(parts.copy, "click", () => this.#copyLink());
-    for (const layer of LAYERS) on(parts[layer], "change", () => { viewer.settings[layer] = parts[layer].checked; });
-    on(parts.runs, "change", () => {
-      const wanted = [...parts.runs.querySelectorAll("input:checked")].map((box) => Number(box.value));
-      if (wanted.length) viewer.shown = new Set(wanted);
-      viewer.resize();
-    });
-    on(viewer.root, "keydown", (event) => this.#onKey(event));
-    on(canvas, "wheel", (event) => {
-      if (!event.ctrlKey && !event.metaKey && document.activeElement !== canvas) return;
-      event.preventDefault();
-      viewer.zoom(Math.exp(event.deltaY / 500));
-    });
-    addPointers(canvas, (dx, dy) => { this.isUsed = true; viewer.pan(dx, dy); }, (factor) => viewer.zoom(factor));
-    const seekOnStrip = (event) => {
-      if (event.type === "pointermove" && !event.buttons) return;
-      viewer.isPlaying = false;
-      viewer.seek((event.offsetX / parts.strip.clientWidth) * viewer.scene.end);
-    };
-    on(parts.strip, "pointerdown", (event) => { parts.strip.setPointerCapture(event.pointerId); seekOnStrip(event); });
-    on(parts.strip, "pointermove", seekOnStrip);
-    addEventListener("hashchange", () => showLink(viewer, location.hash) && viewer.resize());
-    new ResizeObserver(() => viewer.resize()).observe(parts.stage);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { viewer.readTheme(); viewer.changed(); });
-  }
-
-  #onKey(event) {
-    const { viewer } = this;
-    const { target } = event;
-    if (event.ctrlKey || event.metaKey || event.altKey || target.tagName === "SELECT") return;
-    if (event.key === " " && (target.tagName === "BUTTON" || target.type === "checkbox")) return;
-    const does = {
-      " ": () => viewer.play(!viewer.isPlaying),
-      ArrowLeft: () => viewer.step(event.shiftKey ? -1 : -viewer.scene.runs[0].step),
-      ArrowRight: () => viewer.step(event.shiftKey ? 1 : viewer.scene.runs[0].step),
-      ArrowUp: () => this.#shiftSpeed(1),
-      ArrowDown: () => this.#shiftSpeed(-1),
-      Home: () => viewer.step(-Infinity),
-      End: () => viewer.step(Infinity),
-      ",": () => viewer.toLate(-1),
-      ".": () => viewer.toLate(1),
-      "+": () => viewer.zoom(1 / 1.5),
-      "-": () => viewer.zoom(1.5),
-      0: () => viewer.resetView(),
-    }[event.key];
-    if (does === undefined) return;
-    event.preventDefault();
-    does();
-  }
-
-  #shiftSpeed(by) {
-    const place = SPEEDS.indexOf(this.viewer.speed) + by;
-    this.viewer.setSpeed(SPEEDS[Math.min(Math.max(place, 0), SPEEDS.length - 1)]);
+  scaleBar() {
+    const { context, theme } = this;
+    const most = this.viewer.view.width / 2.5;
+    const unit = 10 ** Math.floor(Math.log10(most));
+    const length = [5, 2, 1].map((k) => k * unit).find((each) => each <= most);
+    const [left, top, right] = [this.left + 10, this.top + this.height - 12, this.left + 10 + length * this.scale];
+    Object.assign(context, { strokeStyle: theme.text, fillStyle: theme.text, lineWidth: 2 });
+    context.beginPath();
+    for (const [x, y] of [[left, top - 5], [left, top], [right, top], [right, top - 5]]) context.lineTo(x, y);
+    context.stroke();
+    context.font = "12px system-ui, sans-serif";
+    context.fillText(`${length} m`, left + 5, top - 6);
   }
 }
 
-/** Tells how far the picture is dragged, by one pointer or two, and how far two spread. */
-function addPointers(canvas, onPan, onZoom) {
-  const held = new Map();
-  canvas.addEventListener("pointerdown", (event) => {
-    canvas.focus({ preventScroll: true });
-    canvas.setPointerCapture(event.pointerId);
-    held.set(event.pointerId, [event.clientX, event.clientY]);
-  });
-  canvas.addEventListener("pointermove", (event) => {
-    const from = held.get(event.pointerId);
-    if (from === undefined) return;
-    const others = [...held].filter(([id]) => id !== event.pointerId).map(([, place]) => place);
-    const to = [event.clientX, event.clientY];
-    const share = 1 / (1 + others.length);
-    onPan((to[0] - from[0]) * share, (to[1] - from[1]) * share);
-    if (others.length) {
-      const span = (place) => Math.max(1, Math.hypot(place[0] - others[0][0], place[1] - others[0][1]));
-      onZoom(span(from) / span(to));
+/** The errors of runs at a true object over time, and strokes at late detections, below the picture. */
+function drawStrip(viewer) {
+  const { strip, scene, ratio, theme, size, object } = viewer;
+  const caption = viewer.form.querySelector(".caption");
+  strip.hidden = caption.hidden = object === null;
+  if (strip.hidden) return;
+  const context = strip.getContext("2d");
+  strip.width = Math.round(size.width * ratio);
+  strip.height = Math.round(STRIP_PX * ratio);
+  context.scale(ratio, ratio);
+  context.fillStyle = theme.background;
+  context.fillRect(0, 0, size.width, STRIP_PX);
+  const at = (time) => (scene.end > 0 ? (time / scene.end) * size.width : 0);
+  context.fillStyle = theme.bound;
+  for (const time of scene.lateTimes) context.fillRect(at(time), STRIP_PX - 5, 1, 5);
+  const runs = viewer.shown();
+  const known = Float32Array.from(runs.flatMap((run) => [...run.errorsAt(object)].filter(Number.isFinite))).sort();
+  const highest = known[Math.floor(0.99 * (known.length - 1))] || 1; // few are higher, and cut off
+  for (const [k, run] of runs.entries()) {
+    const errors = run.errorsAt(object);
+    const every = Math.max(1, Math.floor(errors.length / (2 * size.width)));
+    context.strokeStyle = run.colour;
+    context.lineWidth = Math.min(1 + 1.4 * (runs.length - 1 - k), 4); // equal curves are seen below one another
+    context.beginPath();
+    for (let tick = 0, isBroken = true; tick < errors.length; tick += every) {
+      const place = [at(run.ticks[tick]), (STRIP_PX - 8) * (1 - Math.min(errors[tick] / highest, 1)) + 2];
+      if (!Number.isNaN(errors[tick])) isBroken ? context.moveTo(...place) : context.lineTo(...place);
+      isBroken = Number.isNaN(errors[tick]);
     }
-    held.set(event.pointerId, to);
-  });
-  for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => held.delete(event.pointerId));
+    context.stroke();
+  }
+  context.fillStyle = theme.text;
+  context.fillRect(at(viewer.time) - 1, 0, 2, STRIP_PX);
+  caption.textContent = `Position error at object ${object}, 0 to ${highest.toPrecision(2)} m; the strokes are late detections.`;
 }
 
-// The viewer: its state, playing, panes. What it shows is in data.js, how it looks in drawing.js.
-
-const LAYERS = ["map", "truth", "published", "past", "ellipses", "names"];
-const FIRST_WIDTH_M = 40;
-const WIDTH_OF_EGO_M = 160; // when the ego is followed: its opponents are farther away
-const BEHIND = 0.2; // of the width: more of the picture is behind what is followed than ahead of it
-const WIDTHS_M = [4, 20000];
-const PANE_PIXELS = [300, 3]; // the least width of panes beside one another, and the largest number of them
-
-function widthWithin(metres) {
-  return Math.min(Math.max(metres, WIDTHS_M[0]), WIDTHS_M[1]);
-}
+// --- The viewer ------------------------------------------------------------------------------------------------------
 
 class Viewer {
-  constructor(root, scene) {
-    this.root = root;
-    this.scene = scene;
-    this.canvas = root.querySelector("canvas");
-    this.painter = new Painter(this.canvas.getContext("2d"), scene);
-    this.time = 0;
-    this.speed = 0.25;
-    this.isPlaying = false;
-    this.isSideBySide = true;
-    this.shown = new Set([...scene.runs.keys()].slice(0, Math.max(2, this.#columns())));
-    this.settings = { detections: "both", trail: 2 };
-    for (const layer of LAYERS) this.settings[layer] = true;
-    this.isTurned = true;
-    this.frames = 0;
-    this.drawnMs = 0;
-    this.lateTimes = this.#lateTimes();
-    this.controls = new Controls(this);
-    this.follow = this.#firstFollowed();
-    this.view = this.#firstView();
-    this.time = this.#firstTime();
-    this.strip = new Strip(this.controls.parts.strip, this.controls.parts.strip_caption, this);
+  constructor(form, scene) {
+    Object.assign(this, { form, scene, isPlaying: false, isUsed: false, controls: form.elements });
+    this.canvas = form.querySelector("#stage canvas");
+    this.context = this.canvas.getContext("2d");
+    this.strip = form.querySelector(".strip");
+    this.fillControls();
+    this.begin();
     this.readTheme();
-    this.controls.listen();
-    if (showLink(this, location.hash)) root.scrollIntoView();
+    this.listen();
+    if (this.showLink(location.hash)) form.scrollIntoView();
     this.resize();
   }
 
-  // --- state -----------------------------------------------------------------------------------------------------
+  // --- state
 
-  /** Goes to a time in seconds. */
+  get time() {
+    return Number(this.controls.t.value);
+  }
+
+  get follow() {
+    return this.controls.follow.value;
+  }
+
+  /** The true object that is followed; null where something else is. */
+  get object() {
+    return this.follow.startsWith("object ") ? Number(this.follow.slice(7)) : null;
+  }
+
+  /** Values of the checked boxes of a name. */
+  checked(name) {
+    return [...this.form.querySelectorAll(`[name=${name}]:checked`)].map((box) => box.value);
+  }
+
+  shown() {
+    return this.checked("run").map((index) => this.scene.runs[index]);
+  }
+
   seek(time) {
-    this.time = Math.min(Math.max(0, Number.isNaN(time) ? 0 : time), this.scene.end);
+    this.controls.t.value = String(Math.min(Math.max(0, time || 0), this.scene.end));
     this.changed();
   }
 
   play(isPlaying) {
-    if (isPlaying && this.time >= this.scene.end) this.time = 0;
-    this.isPlaying = isPlaying;
-    this.before = null;
-    this.changed();
-  }
-
-  setSpeed(speed) {
-    this.speed = speed;
+    if (isPlaying && this.time >= this.scene.end) this.seek(0);
+    Object.assign(this, { isPlaying, before: null });
     this.changed();
   }
 
@@ -964,16 +452,15 @@ class Viewer {
 
   /** Goes to the next receipt of a detection out of sequence, or with -1 to the one before. */
   toLate(direction) {
+    const { lateTimes } = this.scene;
+    const count = countUpTo(lateTimes.length, this.time + direction * 1e-6, (k) => lateTimes[k]);
     this.play(false);
-    const next = countUpTo(this.lateTimes, this.time + 1e-6);
-    const before = countUpTo(this.lateTimes, this.time - 1e-6) - 1;
-    const found = this.lateTimes[direction > 0 ? next : before];
-    if (found !== undefined) this.seek(found);
+    this.seek(lateTimes[direction > 0 ? count : count - 1] ?? this.time);
   }
 
   /** What is followed stays where it is in the picture; when nothing is, the middle does. */
   zoom(factor) {
-    const width = widthWithin(this.view.width * factor);
+    const width = Math.min(Math.max(this.view.width * factor, WIDTHS_M[0]), WIDTHS_M[1]);
     const share = this.follow === "nothing" ? 1 : width / this.view.width;
     this.view = { x: this.view.x * share, y: this.view.y * share, width };
     this.changed();
@@ -986,218 +473,117 @@ class Viewer {
     this.changed();
   }
 
-  /** Follows an object, the ego, a track, or nothing; the picture stays where it is when nothing is followed. */
-  setFollow(follow) {
-    const middle = this.#middle();
-    this.follow = follow;
-    this.view = follow === "nothing" ? { x: middle.x, y: middle.y, width: this.view.width } : this.#firstView();
-    this.changed();
-  }
-
-  setTurned(isTurned) {
-    this.isTurned = isTurned;
-    this.view = this.follow === "nothing" ? this.view : this.#firstView(this.view.width);
-    this.changed();
-  }
-
-  resetView() {
-    this.view = this.#firstView();
-    this.changed();
-  }
-
-  /** Numbers of the runs that are shown, rising. */
-  runsShown() {
-    return [...this.shown].sort((a, b) => a - b);
-  }
-
   /** Metres to the right of and above what is followed at which the middle is, and the width of a picture. */
-  #firstView(width = this.follow === "ego" ? WIDTH_OF_EGO_M : FIRST_WIDTH_M) {
-    return { x: this.isTurned && this.follow !== "ego" ? -BEHIND * width : 0, y: 0, width };
+  resetView(width = FIRST_WIDTH_M[this.follow] ?? FIRST_WIDTH_M.other) {
+    const isBehind = this.controls.turn.value === "travel" && this.follow !== "ego" && this.follow !== "nothing";
+    this.view = { x: isBehind ? -BEHIND * width : 0, y: 0, width };
+    this.changed();
   }
 
-  /** What is in the middle of a pane of `runs`, and the direction that points to the right. */
-  #middle(runs = undefined) {
-    const target = this.#target(runs);
-    const turn = this.isTurned && Number.isFinite(target.yaw) ? target.yaw : 0;
+  /** What is in the middle of a pane of `run`, and the direction that points to the right. */
+  middle(run = this.shown()[0]) {
+    const target = this.target(run);
+    const turn = this.controls.turn.value === "travel" && Number.isFinite(target.yaw) ? target.yaw : 0;
     const [c, s] = [Math.cos(turn), Math.sin(turn)];
     return { x: target.x + c * this.view.x - s * this.view.y, y: target.y + s * this.view.x + c * this.view.y, turn };
   }
 
+  /** Where what is followed is at this time, in the recording of `run`. */
+  target({ recording, trackPaths }) {
+    const id = Number(this.follow.split(" ")[1]);
+    const path = { ego: recording.ego, object: recording.objects.get(id), track: trackPaths.get(id) };
+    return path[this.follow.split(" ")[0]]?.near(this.time) ?? { x: 0, y: 0 };
+  }
+
+  /** The moment of the report and the object or track that it is about; without one a late detection near the start. */
+  begin() {
+    const { moment, runs, lateTimes } = this.scene;
+    const first = Math.min(...runs.map((run) => run.tracks.t[0] ?? Infinity));
+    const later = lateTimes.find((time) => time > first + 2) ?? first + 2;
+    this.controls.t.value = String(moment?.t ?? (Number.isFinite(later) ? later : 0));
+    if (moment !== null) {
+      const places = [...runs[0].recording.objects].map(([id, path]) => [`object ${id}`, path.at(moment.t)]);
+      const nearest = runs[0].nearest(moment.t, moment);
+      if (!places.length && nearest) places.push([`track ${runs[0].tracks.track[nearest.row]}`, moment]);
+      const away = ([, place]) => (place ? Math.hypot(place.x - moment.x, place.y - moment.y) : Infinity);
+      places.sort((a, b) => away(a) - away(b));
+      this.choose("follow", places[0]?.[0]);
+    }
+    this.resetView();
+  }
+
+  /** Chooses an option; one that is not there changes nothing. */
+  choose(name, value) {
+    const options = [...this.controls[name].options].map((option) => option.value);
+    if (options.includes(value)) this.controls[name].value = value;
+  }
+
+  // --- the picture
+
   /** How many panes have room beside one another. */
-  #columns() {
-    const [least, most] = PANE_PIXELS;
-    return Math.min(Math.max(1, Math.floor(this.root.clientWidth / least)), most);
+  columns() {
+    return Math.min(Math.max(1, Math.floor(this.form.clientWidth / PANES.leastPx)), PANES.most);
   }
 
-  // --- drawing ---------------------------------------------------------------------------------------------------
+  /** The runs of each pane: of one, or of all of a recording. */
+  groups() {
+    const runs = this.shown();
+    if (this.controls.layout.value === "side") return runs.map((run) => [run]);
+    const recordings = [...new Set(runs.map((run) => run.recording))];
+    return recordings.map((recording) => runs.filter((run) => run.recording === recording));
+  }
 
-  /** Draws anew with the next frame. */
+  panes() {
+    const groups = this.groups();
+    const columns = Math.min(groups.length, this.columns());
+    const [width, height] = [this.size.width / columns, this.size.height / Math.ceil(groups.length / columns)];
+    const box = (k) => ({ left: (k % columns) * width, top: Math.floor(k / columns) * height, width, height });
+    return groups.map((runs, k) => new Pane(this, runs, box(k)));
+  }
+
+  colourOfSensor(index) {
+    return this.scene.sensor_colours[index % this.scene.sensor_colours.length];
+  }
+
+  /** Draws with the next frame. */
   changed() {
-    if (this.frame === undefined) this.frame = requestAnimationFrame((now) => this.#onFrame(now));
+    this.frame ??= requestAnimationFrame((now) => this.onFrame(now));
   }
 
-  #onFrame(now) {
+  onFrame(now) {
     this.frame = undefined;
     if (this.isPlaying) {
-      if (this.before !== null) this.time = Math.min(this.time + ((now - this.before) / 1000) * this.speed, this.scene.end);
+      if (this.before !== null) this.seek(this.time + ((now - this.before) / 1000) * this.controls.speed.value);
       this.before = now;
-      if (this.time >= this.scene.end) this.isPlaying = false;
+      this.isPlaying = this.time < this.scene.end;
+      this.changed();
     }
-    const start = performance.now();
     this.draw();
-    this.drawnMs += performance.now() - start;
-    this.frames += 1;
-    if (this.isPlaying) this.changed();
-  }
-
-  /** Panes in CSS pixels, each with the runs that it shows. */
-  panes() {
-    const shown = this.runsShown();
-    const groups = this.isSideBySide ? shown.map((run) => [run]) : this.#byRecording(shown);
-    const { width, height } = this.size;
-    const columns = Math.min(groups.length, this.#columns());
-    const rows = Math.ceil(groups.length / columns);
-    return groups.map((runs, k) => ({
-      runs,
-      left: ((k % columns) * width) / columns,
-      top: (Math.floor(k / columns) * height) / rows,
-      width: width / columns,
-      height: height / rows,
-    }));
-  }
-
-  #byRecording(runs) {
-    const groups = new Map();
-    for (const run of runs) {
-      const { recording } = this.scene.runs[run];
-      groups.set(recording, [...(groups.get(recording) ?? []), run]);
-    }
-    return [...groups.values()];
   }
 
   draw() {
-    const { ratio, size, theme } = this;
-    const { context } = this.painter;
+    const { context, ratio, size, controls, time } = this;
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    context.fillStyle = theme.background;
+    context.fillStyle = this.theme.background;
     context.fillRect(0, 0, size.width, size.height);
-    const panes = this.panes();
-    for (const pane of panes) {
-      const { x, y, turn } = this.#middle(pane.runs);
-      const camera = new Camera(pane, x, y, turn, pane.width / this.view.width);
-      this.painter.pane(camera, ratio, this.time, pane.runs, this.settings, theme);
-      this.#frameOf(pane);
-    }
-    if (panes.length) this.#scaleBar(panes[0]);
-    this.strip.draw();
-    this.controls.show();
-  }
-
-  #frameOf(pane) {
-    const { context } = this.painter;
-    context.strokeStyle = this.theme.grid;
-    context.lineWidth = 1;
-    context.strokeRect(pane.left + 0.5, pane.top + 0.5, pane.width - 1, pane.height - 1);
-    context.font = "600 13px system-ui, sans-serif";
-    for (const [k, run] of pane.runs.entries()) {
-      const text = `${this.scene.runs[run].label}${this.#errorOf(run)}`;
-      const top = pane.top + 20 + 18 * k;
-      context.lineWidth = 4;
-      context.strokeStyle = this.theme.background;
-      context.strokeText(text, pane.left + 24, top, pane.width - 32);
-      context.fillStyle = this.theme.text;
-      context.fillText(text, pane.left + 24, top, pane.width - 32);
-      context.fillStyle = this.painter.colourOfRun(run);
-      context.fillRect(pane.left + 8, top - 10, 11, 11);
-    }
-  }
-
-  /** How far the track that is nearest to the followed object is from it. */
-  #errorOf(index) {
-    const run = this.scene.runs[index];
-    const [kind, id] = this.follow.split(" ");
-    const place = kind === "object" ? run.recording.objects.get(Number(id))?.at(this.time) : null;
-    if (!place) return "";
-    const nearest = run.nearest(run.tickAt(this.time), place);
-    return nearest && nearest.distance < 10 ? `: ${nearest.distance.toFixed(2)} m off` : ": no track";
-  }
-
-  #scaleBar(pane) {
-    const { context } = this.painter;
-    const metres = 10 ** Math.floor(Math.log10(this.view.width / 2.5));
-    const length = [5, 2, 1].map((k) => k * metres).find((one) => one <= this.view.width / 2.5) ?? metres;
-    const pixels = (length * pane.width) / this.view.width;
-    const [left, top] = [pane.left + 10, pane.top + pane.height - 12];
-    context.strokeStyle = this.theme.text;
-    context.fillStyle = this.theme.text;
-    context.lineWidth = 2;
-    context.beginPath();
-    context.moveTo(left, top - 5);
-    context.lineTo(left, top);
-    context.lineTo(left + pixels, top);
-    context.lineTo(left + pixels, top - 5);
-    context.stroke();
-    context.font = "12px system-ui, sans-serif";
-    context.fillText(`${length} m`, left + 5, top - 6);
-  }
-
-  /** Where what is followed is at this time, in the recording of the first of `runs`. */
-  #target(runs = this.runsShown()) {
-    const run = this.scene.runs[runs[0] ?? 0];
-    const [kind, id] = this.follow.split(" ");
-    let place = null;
-    if (kind === "ego") place = run.recording.ego.near(this.time);
-    if (kind === "object") place = run.recording.objects.get(Number(id))?.near(this.time) ?? null;
-    if (kind === "track") {
-      const row = run.rowOfTrack(run.tickAt(this.time), Number(id));
-      if (row >= 0) place = { x: run.tracks.x[row], y: run.tracks.y[row], yaw: run.tracks.yaw[row] };
-    }
-    this.lastTargets ??= new Map();
-    if (place !== null) this.lastTargets.set(`${kind} ${id} ${runs[0]}`, place);
-    return kind === "nothing" ? { x: 0, y: 0 } : place ?? this.lastTargets.get(`${kind} ${id} ${runs[0]}`) ?? { x: 0, y: 0 };
-  }
-
-  // --- setting up ------------------------------------------------------------------------------------------------
-
-  /** Receipts of detections out of sequence, rising. */
-  #lateTimes() {
-    const times = new Set();
-    for (const run of this.scene.runs) {
-      const { receipt, disposition } = run.detections;
-      for (let row = 0; row < receipt.length; row += 1) {
-        if (this.scene.late.has(run.dispositions[disposition[row]])) times.add(receipt[row]);
-      }
-    }
-    return Float64Array.from(times).sort();
-  }
-
-  /** The object, or else the track, that the moment of the report is about; without one the first that there is. */
-  #firstFollowed() {
-    const { moment, runs } = this.scene;
-    const followed = this.controls.followed();
-    if (moment === null) return followed[0];
-    const places = [...runs[0].recording.objects].map(([object, path]) => [`object ${object}`, path.at(moment.t)]);
-    const nearest = runs[0].nearest(runs[0].tickAt(moment.t), moment);
-    if (!places.length && nearest) places.push([`track ${runs[0].tracks.track[nearest.row]}`, moment]);
-    const away = (place) => (place ? Math.hypot(place.x - moment.x, place.y - moment.y) : Infinity);
-    places.sort((a, b) => away(a[1]) - away(b[1]));
-    return places.length && followed.includes(places[0][0]) ? places[0][0] : followed[0];
-  }
-
-  /** The moment that the report is about; without one a late detection a little after the first track. */
-  #firstTime() {
-    if (this.scene.moment !== null) return this.scene.moment.t;
-    const first = Math.min(...this.scene.runs.map((run) => run.tracks.t[0] ?? Infinity));
-    if (!Number.isFinite(first)) return 0;
-    return this.lateTimes[countUpTo(this.lateTimes, first + 2)] ?? Math.min(first + 2, this.scene.end);
+    const [panes, shows] = [this.panes(), new Set(this.checked("show"))];
+    for (const pane of panes) pane.draw(time, shows, controls.detections.value);
+    if (panes.length) this.centre = { x: panes[0].x, y: panes[0].y };
+    panes[0]?.scaleBar();
+    drawStrip(this);
+    controls.t.setAttribute("aria-valuetext", `${time.toFixed(2)} s`);
+    this.form.querySelector("output").textContent = `${time.toFixed(2)} s of ${this.scene.end.toFixed(1)} s`;
+    this.form.querySelector("#play").textContent = this.isPlaying ? "Pause" : "Play";
+    clearTimeout(this.linking);
+    if (this.isUsed && !this.isPlaying) this.linking = setTimeout(() => this.writeLink(), LINK_MS);
   }
 
   /** Fits the canvas to the page. */
   resize() {
-    const width = this.controls.parts.stage.clientWidth;
-    const groups = this.isSideBySide ? this.shown.size : this.#byRecording([...this.shown]).length;
-    const columns = Math.min(groups, this.#columns());
-    const rows = Math.ceil(groups / columns);
+    const width = this.form.querySelector("#stage").clientWidth;
+    const count = this.groups().length;
+    const columns = Math.min(count, this.columns());
+    const rows = Math.ceil(count / columns);
     const each = rows > 1 ? Math.max(200, 460 / rows) : Math.min(460, Math.max(280, (0.8 * width) / columns));
     this.ratio = Math.min(devicePixelRatio || 1, 2);
     this.size = { width, height: Math.round(each * rows) };
@@ -1209,9 +595,167 @@ class Viewer {
 
   /** Takes the colours of the page. */
   readTheme() {
-    const style = getComputedStyle(this.root);
+    const style = getComputedStyle(this.form);
     const names = ["background", "text", "grid", "bound", "truth", "ego", "unused"];
     this.theme = Object.fromEntries(names.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
+  }
+
+  // --- links: #t=12.34&view=-8,0,40&follow=..., what the controls say and the view
+
+  link() {
+    const said = new URLSearchParams(new FormData(this.form));
+    said.set("t", String(Number(this.time.toFixed(4))));
+    said.set("view", [this.view.x, this.view.y, this.view.width].map((value) => Number(value.toFixed(2))).join(","));
+    return `#${said.toString().replaceAll("%2C", ",")}`;
+  }
+
+  /** Shows what `link` says, and returns whether it names a moment. What it does not say stays as it is. */
+  showLink(link) {
+    const said = new URLSearchParams(link.slice(1));
+    if (!said.has("t")) return false;
+    for (const name of ["speed", "follow", "turn", "layout", "detections"]) this.choose(name, said.get(name));
+    for (const name of ["show", "run"]) {
+      const values = new Set(said.getAll(name));
+      const boxes = [...this.form.querySelectorAll(`[name=${name}]`)];
+      if (boxes.some((box) => values.has(box.value))) for (const box of boxes) box.checked = values.has(box.value);
+    }
+    this.resetView();
+    const [x, y, width] = (said.get("view") ?? "").split(",").map(Number);
+    if ([x, y, width].every(Number.isFinite) && width > 0) this.view = { x, y, width };
+    this.zoom(1); // within its limits
+    this.play(false);
+    this.seek(Number(said.get("t")));
+    return true;
+  }
+
+  writeLink() {
+    if (this.link() !== location.hash) history.replaceState(null, "", this.link());
+  }
+
+  async copyLink({ target }) {
+    this.writeLink();
+    const isCopied = await navigator.clipboard?.writeText(location.href).then(() => true, () => false);
+    target.textContent = isCopied ? "Link copied" : "Link is in the address bar";
+  }
+
+  // --- controls
+
+  fillControls() {
+    const { scene, controls, form } = this;
+    const add = (value, text = value) => controls.follow.add(new Option(text, value));
+    controls.t.max = String(scene.end);
+    const objects = new Set(scene.runs.flatMap((run) => [...run.recording.objects.keys()]));
+    for (const object of [...objects].sort((a, b) => a - b)) add(`object ${object}`);
+    if (scene.recordings.some((recording) => recording.ego.t.length)) add("ego", "the ego");
+    const longest = [...scene.runs[0].trackPaths].sort((a, b) => b[1].t.length - a[1].t.length).slice(0, 8);
+    for (const [track] of longest) add(`track ${track}`);
+    add("nothing");
+    const isFirst = (index) => index < Math.max(2, this.columns());
+    for (const [index, run] of scene.runs.entries()) {
+      const label = document.createElement("label");
+      const box = { type: "checkbox", name: "run", value: String(index), checked: isFirst(index) };
+      const patch = Object.assign(document.createElement("span"), { className: "patch" });
+      patch.style.background = run.colour;
+      label.append(Object.assign(document.createElement("input"), box), patch, run.label);
+      form.querySelector("#runs").append(label);
+    }
+    for (const [index, sensor] of scene.sensors.entries()) {
+      const [entry, mark] = [document.createElement("span"), document.createElement("b")];
+      mark.textContent = Object.keys(MARKS)[index % 4];
+      mark.style.color = this.colourOfSensor(index);
+      entry.append(mark, ` ${sensor}`);
+      form.querySelector("#legend").append(entry);
+    }
+  }
+
+  /** What keys and buttons do. */
+  action(name, isLong = false) {
+    const tick = isLong ? 1 : this.scene.runs[0].step;
+    const speed = (by) => {
+      const { options, selectedIndex } = this.controls.speed;
+      this.controls.speed.selectedIndex = Math.min(Math.max(selectedIndex + by, 0), options.length - 1);
+    };
+    return {
+      " ": () => this.play(!this.isPlaying),
+      ArrowLeft: () => this.step(-tick),
+      ArrowRight: () => this.step(tick),
+      ArrowUp: () => speed(1),
+      ArrowDown: () => speed(-1),
+      Home: () => this.step(-Infinity),
+      End: () => this.step(Infinity),
+      ",": () => this.toLate(-1),
+      ".": () => this.toLate(1),
+      "+": () => this.zoom(1 / 1.5),
+      "-": () => this.zoom(1.5),
+      0: () => this.resetView(),
+    }[name];
+  }
+
+  /** Lets the controls act from here on. */
+  listen() {
+    const { form, canvas, strip, controls } = this;
+    const on = (part, event, does) => part.addEventListener(event, (given) => {
+      does(given);
+      this.isUsed = true;
+      this.changed();
+    });
+    form.addEventListener("submit", (event) => event.preventDefault());
+    on(form, "click", (event) => this.action(event.target.dataset.do)?.());
+    on(form.querySelector("#copy"), "click", (event) => this.copyLink(event));
+    on(controls.t, "input", () => this.play(false));
+    on(form, "change", ({ target }) => {
+      if (target.name === "run" && !this.shown().length) target.checked = true;
+      if (target.name === "follow" && this.follow === "nothing") this.view = { ...this.centre, width: this.view.width };
+      else if (target.name === "follow") this.resetView();
+      if (target.name === "turn" && this.follow !== "nothing") this.resetView(this.view.width);
+      this.resize();
+    });
+    on(form, "keydown", (event) => {
+      const { key, target } = event;
+      if (event.ctrlKey || event.metaKey || event.altKey || target.tagName === "SELECT") return;
+      if (key === " " && (target.tagName === "BUTTON" || target.type === "checkbox")) return;
+      const does = key.length === 1 || /^(Arrow|Home$|End$)/.test(key) ? this.action(key, event.shiftKey) : undefined;
+      if (does) event.preventDefault();
+      does?.();
+    });
+    on(canvas, "wheel", (event) => {
+      if (!event.ctrlKey && !event.metaKey && document.activeElement !== canvas) return;
+      event.preventDefault();
+      this.zoom(Math.exp(event.deltaY / 500));
+    });
+    this.listenToPointers();
+    const seek = (event) => {
+      if (!event.buttons) return;
+      this.play(false);
+      this.seek((event.offsetX / strip.clientWidth) * this.scene.end);
+    };
+    on(strip, "pointerdown", (event) => { strip.setPointerCapture(event.pointerId); seek(event); });
+    on(strip, "pointermove", seek);
+    addEventListener("hashchange", () => this.showLink(location.hash) && this.resize());
+    new ResizeObserver(() => this.resize()).observe(form.querySelector("#stage"));
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { this.readTheme(); this.changed(); });
+  }
+
+  /** Moves the picture by one pointer or two, and zooms as far as two spread. */
+  listenToPointers() {
+    const [{ canvas }, held] = [this, new Map()];
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.focus({ preventScroll: true });
+      canvas.setPointerCapture(event.pointerId);
+      held.set(event.pointerId, [event.clientX, event.clientY]);
+    });
+    canvas.addEventListener("pointermove", (event) => {
+      const from = held.get(event.pointerId);
+      if (from === undefined) return;
+      const to = [event.clientX, event.clientY];
+      const other = [...held].find(([id]) => id !== event.pointerId)?.[1];
+      this.isUsed = true;
+      this.pan((to[0] - from[0]) / held.size, (to[1] - from[1]) / held.size);
+      const apart = (place) => Math.max(1, Math.hypot(place[0] - other[0], place[1] - other[1]));
+      if (other) this.zoom(apart(from) / apart(to));
+      held.set(event.pointerId, to);
+    });
+    for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, ({ pointerId }) => held.delete(pointerId));
   }
 }
 
