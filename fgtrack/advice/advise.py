@@ -258,18 +258,9 @@ class _Adviser:
         yield from bias_findings(self._clocks, self._config.ego)
 
     def _late(self, arrivals: Sequence[Arrivals], shares: Mapping[str, float]) -> Iterator[Finding]:
-        """Bursts, losses, and an estimator that cannot deal with what is overtaken."""
+        """Losses, and an estimator that cannot deal with what is overtaken."""
         for one in arrivals:
-            if one.bursts is not None:
-                bad = one.bursts
-                text = (
-                    f"{percent(bad.share)} of its lists are late (above {milliseconds(one.late_s)}) or lost, and these "
-                    f"come together: {bad.count} times, for {bad.mean_length_s:.2g} s on average and "
-                    f"{bad.longest_s:.2g} s at most. Its computer or its bus is overloaded now and then: limits and "
-                    "windows must hold its worst times, not the usual ones."
-                )
-                yield Finding("late", one.name, 40.0, text)
-            elif one.lost is not None and one.lost > _LOST:
+            if one.lost is not None and one.lost > _LOST:
                 text = (
                     f"{percent(one.lost)} of its lists never came, one by one (period "
                     f"{milliseconds(one.period_s or 0.0)}). No setting brings them back."

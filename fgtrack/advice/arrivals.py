@@ -1,4 +1,4 @@
-"""When the lists of each sensor were sensed and received: lateness, losses, bursts."""
+"""Stamps and receipts of the lists of each sensor: lateness and losses."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,29 +8,14 @@ import numpy as np
 
 from fgtrack.core.caution import EGO
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import BoolArray, DetectionList, EgoState, FloatArray, IntArray, Message
+from fgtrack.core.types import DetectionList, EgoState, FloatArray, IntArray, Message
 
-__all__ = ["FEWEST", "Arrivals", "Bursts", "arrivals_of", "overtaken"]
+__all__ = ["FEWEST", "Arrivals", "arrivals_of", "overtaken"]
 
 FEWEST = 20
 """Messages of which something can be said."""
-_ONE_STD = 0.1587  # quantile of a normal variable one standard deviation below its median
-_LATE = 4.0  # such standard deviations above the median
 _REGULAR = 0.2  # of the period: stamps that scatter more have none
 _LONGEST_LOSS = 40  # periods; what is silent for longer was switched off, or had nothing to say
-_RARE = 0.03  # share of late or lost lists that is not worth a word
-_MORE_OFTEN = 0.15  # a list is late after a late one by so much more often than any list
-
-
-@dataclass(frozen=True)
-class Bursts:
-    """Lists that are late or lost, where they come together."""
-
-    share: float
-    """Of the lists."""
-    count: int
-    mean_length_s: float
-    longest_s: float
 
 
 @dataclass(frozen=True)
@@ -118,41 +103,6 @@ class Arrivals:
         """Longest time between two stamps."""
         gaps = np.diff(self.sensed_ns)
         return float(gaps.max()) / NS_PER_S if len(gaps) else 0.0
-
-    @cached_property
-    def late_s(self) -> float:
-        """A delay above this is unusual: by how much usual ones scatter is read off those below the median."""
-        low_s, middle_s = np.quantile(self.delays_s, (_ONE_STD, 0.5)).tolist()
-        return float(middle_s + max(_LATE * (middle_s - low_s), 1e-3))
-
-    @cached_property
-    def bursts(self) -> Bursts | None:
-        """Late or lost lists that come together; None where they come one by one, or hardly ever."""
-        if len(self.sensed_ns) < 5 * FEWEST or self.period_s is None:
-            return None
-        bad = self._bad()
-        share = float(bad.mean())
-        if bad.sum() < 10 or not _RARE < share < 0.8:
-            return None
-        again = float(bad[1:][bad[:-1]].mean())
-        error = np.sqrt(share * (1.0 - share) / max(int(bad[:-1].sum()), 1))
-        if again - share < max(_MORE_OFTEN, 3.0 * error):
-            return None
-        joined = bad.copy()
-        joined[1:-1] |= bad[:-2] & bad[2:]  # one list that came through
-        edges = np.diff(np.concatenate([[0], joined.astype(np.int64), [0]]))
-        lengths = (np.flatnonzero(edges == -1) - np.flatnonzero(edges == 1)) * self.period_s
-        return Bursts(share, len(lengths), float(lengths.mean()), float(lengths.max()))
-
-    def _bad(self) -> BoolArray:
-        """Whether each list, in the order of stamps and with the lost ones among them, was late or lost."""
-        order = np.argsort(self.stamps_ns, kind="stable")
-        late = np.asarray(self.delays_s[order] > self.late_s)
-        if not len(self.steps) or len(self.sensed_ns) < len(order):
-            return late
-        steps = np.concatenate([self.steps, [1]])
-        lost = np.where(steps <= _LONGEST_LOSS, steps - 1, 0)
-        return np.concatenate([[each, *[True] * count] for each, count in zip(late, lost, strict=True)]).astype(bool)
 
 
 def arrivals_of(messages: Iterable[Message]) -> dict[str, Arrivals]:

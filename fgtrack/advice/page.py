@@ -88,9 +88,6 @@ class Advice:
         def quantiles(one: Arrivals) -> tuple[Value, ...]:
             return (one.quantile_s(0.5), one.quantile_s(0.95), float(one.delays_s.max()))
 
-        def bursts(one: Arrivals) -> tuple[Value, ...] | None:
-            return None if one.bursts is None else (one.bursts.count, one.bursts.mean_length_s)
-
         names = ("delay_p50_s", "delay_p95_s", "delay_max_s")
         columns: list[Column[Arrivals]] = [
             Column("sensor", ("sensor",), lambda one: (one.name,), left=True),
@@ -99,7 +96,6 @@ class Advice:
             Column("delay [ms]\np50/p95/max", names, quantiles, "{}/{}/{}", 1e3, text=_whole),
             Column("overtaken\n[%]", ("overtaken",), lambda one: (self.overtaken[one.name],), scale=100.0),
             Column("lost\n[%]", ("lost",), lambda one: _known(one.lost), scale=100.0),
-            Column("bursts\n[s]", ("bursts", "burst_s"), bursts, "{} of {}"),
         ]
         return Table("Lists by sensor, with the stamps advised", columns, self.arrivals, row_keys=("sensor",))
 

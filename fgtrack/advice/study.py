@@ -149,7 +149,8 @@ def study(
         advised = _advised(source_path, messages, known, on_step) if advice else None
         known = known if advised is None else _following(known, advised)
         with new_file(settings, overwrite) as file:
-            file.write(_settings_text(source_path, known, advised).encode())
+            head = [f"Settings of {source_path.name} {_MARK}: change them and run again with -c."]
+            file.write(known.to_yaml([*head, *([] if advised is None else advised.comments())]).encode())
 
         def repeated() -> Iterator[Message]:
             yield from messages
@@ -200,12 +201,6 @@ def _following(known: Assumed, advice: Advice) -> Assumed:
     """Return `known` with the advice followed; what the advice changes is not assumed any more."""
     changed = {one.key for one in advice.changes}
     return Assumed(advice.config, tuple(one for one in known.assumptions if one.key not in changed))
-
-
-def _settings_text(recording: Path, known: Assumed, advice: Advice | None) -> str:
-    comments = [f"Settings of {recording.name} {_MARK}: change them and run again with -c."]
-    comments += [] if advice is None else advice.comments()
-    return "".join(f"# {line}".rstrip() + "\n" for text in comments for line in text.splitlines()) + known.to_yaml()
 
 
 def _replayed(

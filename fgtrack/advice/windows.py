@@ -94,7 +94,7 @@ def _life(arrivals: Sequence[Arrivals], config: Config) -> Iterator[Finding]:
         period_s = one.period_s or 0.0
         alone = len(placing) == 1 or period_s > 2.0 * fastest_s
         if alone or fastest_s > limit_s:
-            silent_s[one.name] = period_s + (one.bursts.longest_s if alone and one.bursts else 0.0)
+            silent_s[one.name] = period_s
     name = max(silent_s, key=silent_s.__getitem__, default=None)
     if name is not None and silent_s[name] > limit_s:
         text = (

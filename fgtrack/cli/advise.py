@@ -9,10 +9,10 @@ from fgtrack.advice.advise import advise as advised
 from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, Overwrite, PitMap, Reference, Settings, TrackMap
 from fgtrack.cli.show import chosen_form, command_line, progress, say, show
 from fgtrack.core.errors import DataError
-from fgtrack.io.output import check_apart, check_output
+from fgtrack.io.output import check_apart, check_output, new_file
+from fgtrack.pipeline.assumed import Assumed
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
-from fgtrack.pipeline.tune_file import write_advised
 
 
 def advise(
@@ -43,7 +43,9 @@ def advise(
     with progress("advise") as tell:
         advice = advised(recording, config, reference=reference, tune=tune, on_step=tell)
     if out is not None:
-        write_advised(out, config_file, advice.config, advice.comments(), overwrite)
+        head = [f"Settings for {recording} (fgtrack advise).", "", *advice.comments(), ""]
+        with new_file(out, overwrite) as file:
+            file.write(Assumed(advice.config, ()).to_yaml(head).encode())
     show(advice.tables, form, advice.as_dict())
     if out is not None and form is None:
         say(f"{out}: written; follow it by `{command_line('fgtrack', 'replay', recording, '-c', out, '-o', 'RUN')}`")

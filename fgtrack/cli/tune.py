@@ -2,13 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import StringIO
 from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 from rich.console import Console
 
@@ -16,16 +15,12 @@ from fgtrack.advice.noise import noise_fits
 from fgtrack.cli.arguments import ConfigFile, FormOption, Json, Overwrite, PitMap, Settings, TrackMap
 from fgtrack.cli.show import chosen_form, command_line, progress, say, show
 from fgtrack.core.errors import DataError
-from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.consistency import position_nees
-from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
-from fgtrack.io.output import check_apart, check_output
-from fgtrack.io.run import Run
+from fgtrack.io.output import check_apart, check_output, new_file
 from fgtrack.io.source import open_input
+from fgtrack.pipeline.assumed import Assumed
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.tune import tuned
-from fgtrack.pipeline.tune_file import write_tuned
 from fgtrack.pipeline.tune_report import HeldOut, TunedParameter, TuneReport
 from fgtrack.pipeline.tune_rules import TuneRules
 
@@ -62,8 +57,11 @@ def tune(
     options = [*(("--set", setting) for setting in settings or []), *(("--keep", key) for key in keep or [])]
     lines = [_command(recordings, out, config_file, track_map, pit_map, options), ""]
     lines += [*_text(tables), "", *found]
-    write_tuned(out, config_file, report.config, lines, overwrite)
-    show(tables, form, report.as_dict() | {"nees": _nees_values(report.held_out)})
+    of_recordings = replace(report.config, map=read_config(config_file).map)  # the maps belong to these
+    head = [f"The noise of {config_file or 'the defaults'}, fitted to recordings (fgtrack tune).", "", *lines, ""]
+    with new_file(out, overwrite) as file:
+        file.write(Assumed(of_recordings, ()).to_yaml(head).encode())
+    show(tables, form, report.as_dict())
     if form is None:
         say("\n".join(["", *found, f"{out}: written"]))
     if report.broken:
@@ -156,9 +154,6 @@ def _judged(held_out: HeldOut) -> Table:
         _Judged(f"NIS {one.sensor} {one.component}", one.count, one.before, one.after, 1.0, one.band)
         for one in held_out.innovations
     ]
-    found = _nees_values(held_out)
-    if found is not None:
-        rows.append(_Judged("NEES of the position", None, found["before"], found["after"], 2.0))
     rows.append(_Judged("log-likelihood per innovation", held_out.count, held_out.before, held_out.after))
     columns: list[Column[_Judged]] = [
         Column("of", ("of",), lambda row: (row.name,), left=True),
@@ -171,28 +166,6 @@ def _judged(held_out: HeldOut) -> Table:
     share = f"the last {100.0 * held_out.share:.0f} % of the time"
     title = f"Held out: {share}, {held_out.count} innovations, by the noise fitted to the rest"
     return Table(title, columns, rows, row_keys=("of",))
-
-
-def _nees_values(held_out: HeldOut | None) -> dict[str, float] | None:
-    """Mean NEES of the position on the time held out, before and after; None without truth there."""
-    if held_out is None:
-        return None
-    found = {"before": held_out.runs_before, "after": held_out.runs_after}
-    values = {
-        name: np.concatenate([_nees(*one) for one in zip(runs, held_out.from_ns, strict=True)])
-        for name, runs in found.items()
-    }
-    if not all(len(part) for part in values.values()):
-        return None
-    return {name: float(part.mean()) for name, part in values.items()}
-
-
-def _nees(run: Run, from_ns: int) -> FloatArray:
-    matching = match(run)
-    if matching is None:
-        return np.empty(0)
-    nees = position_nees(matching)
-    return nees.values[(nees.stamps_ns >= from_ns) & np.isfinite(nees.values)]
 
 
 def _text(tables: Tables) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 
-from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.errors import CallError, DataError, printable
 from fgtrack.core.types import MEASURABLE, DetectionList, Message
 from fgtrack.io.errors import MOST_SENSORS
 from fgtrack.io.source import InputSource
@@ -99,10 +99,10 @@ class Assumed:
     config: Config
     assumptions: tuple[Assumption, ...]
 
-    def to_yaml(self) -> str:
-        """YAML text of all settings that differ from the defaults; those that were assumed say why in a comment.
+    def to_yaml(self, head: Iterable[str] = ()) -> str:
+        """Return YAML of all settings that differ from the defaults; a comment says why one was assumed.
 
-        As `-c` it gives the run of this configuration without assuming anything.
+        As `-c` it gives the run of this configuration without assuming anything. The lines of `head` are comments.
         """
         sensors = {name: _of_sensor(sensor) for name, sensor in self.config.sensors.items()}
         tree = _commented({**_departures(self.config, Config()), "sensors": sensors})
@@ -116,7 +116,8 @@ class Assumed:
         yaml = YAML()
         yaml.width = 4096
         yaml.dump(tree, text)
-        return text.getvalue()
+        lines = [f"# {printable(line)}".rstrip() for line in head]
+        return "\n".join([*lines, text.getvalue()])
 
     def lines(self) -> list[str]:
         """What was assumed in words: a line for each sensor, and one for the rest."""
