@@ -6,7 +6,7 @@ Its yaw is 0 along +y and jumps at +-pi there, which in REP-103 is at 3 pi / 2 (
 import numpy as np
 
 from fgtrack.core.geometry import TWO_PI
-from fgtrack.core.types import ACCEL, SPEED, YAW, YAW_RATE, FloatArray
+from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.backward_forward import BackwardForwardBank
 from fgtrack.estimation.propagation import EulerCtrv
 from fgtrack.models.measurement import MeasurementModel
@@ -28,20 +28,13 @@ def published_yaw(yaw_rad: FloatArray) -> FloatArray:
 class AcceleratedEulerCtrv(EulerCtrv):
     """The acceleration is a state that drives the speed but is absent from the transition matrix (defect Q5)."""
 
-    def speeds(self, mean: FloatArray, elapsed_s: FloatArray) -> FloatArray:
-        """See `EulerCtrv.speeds`."""
-        return np.asarray(mean[:, SPEED, None] + elapsed_s * mean[:, ACCEL, None])
+    accelerates = True
 
 
 class SaturatedYaw:
     """Mix-in: the predicted yaw sticks at the upper end of its range, and runs on below the lower one (defect Q2)."""
 
-    def yaws(self, mean: FloatArray, elapsed_s: FloatArray) -> FloatArray:
-        """See `EulerCtrv.yaws`; a yaw that an update left beyond the limit steers the first step as it is."""
-        yaw, rate, first_s = mean[:, YAW, None], mean[:, YAW_RATE, None], elapsed_s[..., 1:2]
-        after_first = np.minimum(yaw + rate * first_s, YAW_LIMIT_RAD)
-        stuck = np.minimum(after_first + rate * (elapsed_s - first_s), YAW_LIMIT_RAD)
-        return np.where(elapsed_s > 0.0, stuck, yaw)
+    yaw_limit_rad = YAW_LIMIT_RAD
 
     def wrap(self, mean: FloatArray) -> FloatArray:
         """Means with the yaw in the published range."""

@@ -1,0 +1,50 @@
+"""Constant turn rate and velocity in Euler steps (Karle et al. 2023, eq. 10)."""
+
+import math
+
+import numpy as np
+
+from fgtrack.core.compiled import njit
+from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.estimation.kernels.kalman import add_product_transposed, product
+
+
+@njit("(float64[:, ::1], float64[:, :, ::1], int64[::1], float64, float64[::1], b1, float64)")
+def propagate(
+    mean: FloatArray,
+    P: FloatArray,
+    steps: IntArray,
+    dt_s: float,
+    density: FloatArray,
+    accelerates: bool,
+    yaw_limit_rad: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Means (m, n) and covariances (m, n, n), each after its own number of `steps` (m,): P' = F P F' + Q dt.
+
+    `density`, shape (n,): diagonal of Q, along and across the heading first. What follows the yaw rate stays, but that
+    an acceleration may drive the speed, without a part in F; the yaw goes up to `yaw_limit_rad`.
+    """
+    m, n = mean.shape
+    after, covariance = mean.copy(), P.copy()
+    F, FP, more = np.eye(n), np.empty((n, n)), np.empty((n, n))
+    F[2, 4] = dt_s
+    along, across = density[0] * dt_s, density[1] * dt_s
+    for i in range(m):
+        x = after[i]
+        for _ in range(steps[i]):
+            c, s, way = math.cos(x[2]), math.sin(x[2]), x[3] * dt_s
+            F[0, 2], F[0, 3], F[1, 2], F[1, 3] = -way * s, c * dt_s, way * c, s * dt_s
+            product(F, covariance[i], FP)
+            more[:] = 0.0
+            for j in range(2, n):
+                more[j, j] = density[j] * dt_s
+            more[0, 0], more[1, 1] = along * c * c + across * s * s, along * s * s + across * c * c
+            more[0, 1] = more[1, 0] = (along - across) * c * s
+            add_product_transposed(FP, F, more)
+            covariance[i] = more
+            x[0] += way * c
+            x[1] += way * s
+            x[2] = min(x[2] + x[4] * dt_s, yaw_limit_rad)
+            if accelerates:
+                x[3] += x[5] * dt_s
+    return after, covariance
