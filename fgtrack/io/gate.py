@@ -1,4 +1,4 @@
-"""The gate behind every reader: all that comes out of an input has the types and ranges that the rest relies on.
+"""Validation behind every reader: all that comes out of an input has the types and ranges that the rest relies on.
 
 A reader may meet anything. What is wrong with its input is a `DataError` that names the place, whatever the reader
 raised itself; everything before has been given, so a run is complete up to there. Measured numbers that are not
@@ -18,6 +18,7 @@ from fgtrack.core.checks import LARGEST_NS, is_stamp
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.types import (
     DESCRIBING,
+    EGO_COVARIANCE_STATES,
     FRAMES,
     MEASURABLE,
     STATE_NAMES,
@@ -27,19 +28,22 @@ from fgtrack.core.types import (
     Message,
     TruthState,
 )
-from fgtrack.io.errors import MOST_OBJECTS, MOST_SENSORS
+from fgtrack.io.errors import MOST_OBJECTS, MOST_SENSORS, one_line
 
-__all__ = ["WrongError", "checked", "checked_detection"]
+__all__ = ["WrongError", "checked", "checked_detection", "checked_message"]
 
 _LONGEST_NAME = 200
 _FAR_M = 1e9
 _INT64 = range(-(1 << 63), 1 << 63)
 _PLAIN = {float, type(None)}
 _DESCRIBING = tuple(name for name in DESCRIBING if name != "class_name")
-_NOTHING = (None,) * len(_DESCRIBING)
 _state_numbers = attrgetter(*STATE_NAMES)
 _measured = attrgetter(*MEASURABLE)
 _described = attrgetter(*_DESCRIBING)
+
+
+class WrongError(Exception):
+    """What is wrong with a message."""
 
 
 def checked(
@@ -57,16 +61,14 @@ def checked(
     count, sensors = 0, set[str]()
     try:
         for message in messages():
-            message = _checked(message)
+            message = checked_message(message)
             if isinstance(message, DetectionList):
                 sensors.add(message.sensor)
                 if len(sensors) > MOST_SENSORS:
                     raise WrongError(f"{message.sensor}: the lists before it are of {MOST_SENSORS} other sensors")
                 if len(message.objects) > most_objects:
-                    raise WrongError(
-                        f"{message.sensor}: a list of {len(message.objects)} objects, more than input.most_objects "
-                        "allows"
-                    )
+                    many = f"a list of {len(message.objects)} objects"
+                    raise WrongError(f"{message.sensor}: {many}, more than input.most_objects allows")
             yield message
             count += 1
     except WrongError as error:
@@ -74,31 +76,39 @@ def checked(
     except (FgtrackError, MemoryError):
         raise
     except Exception as error:  # whatever a foreign input makes a reader raise
-        what = " ".join(f"{type(error).__name__}: {error}".split())[:_LONGEST_NAME]
+        what = f"{type(error).__name__}: {one_line(error)}"
         raise DataError(f"{path}: cannot be read beyond message {count} ({what}): repair or convert it") from error
 
 
-class WrongError(Exception):
-    """What is wrong with a message."""
-
-
-def _checked(message: Message) -> Message:
-    match message:
-        case DetectionList():
-            return _checked_list(message)
-        case EgoState() | TruthState():
-            _check_times(message)
-            _check_numbers(STATE_NAMES, _state_numbers(message))
-            _check_integer("object_id", message.object_id if isinstance(message, TruthState) else 0)
-            _check_several("covariance" if isinstance(message, EgoState) else "outline_m", message)
-        case _:
-            raise WrongError(f"a {type(message).__name__} is no message")
+def checked_message(message: Message) -> Message:
+    """Return `message`, its detections as of `checked_detection`. Raises `WrongError`."""
+    if not isinstance(message, DetectionList | EgoState | TruthState):
+        raise WrongError(f"a {type(message).__name__} is no message")
+    _check_integer("stamp_ns", message.stamp_ns)
+    _check_integer("receipt_ns", message.receipt_ns)
+    if not is_stamp(message.receipt_ns):  # all windows are counted from it
+        raise WrongError(f"receipt_ns: at most {LARGEST_NS:.0g} ns from 0 expected, not {_shown(message.receipt_ns)}")
+    if isinstance(message, DetectionList):
+        return _checked_list(message)
+    _check_numbers(STATE_NAMES, _state_numbers(message))
+    if isinstance(message, EgoState):
+        size = len(EGO_COVARIANCE_STATES)
+        if message.covariance is not None and len(_several("covariance", message.covariance)) != size**2:
+            raise WrongError(f"covariance: a list of {size} x {size} numbers expected")
+        if message.in_pit is not None:
+            _check_flag("in_pit", message.in_pit)
+        return message
+    _check_integer("object_id", message.object_id)
+    _check_flag("ignored", message.ignored)
+    corners = _several("outline_m", () if message.outline_m is None else message.outline_m)
+    is_ring = len(corners) >= 6 and len(corners) % 2 == 0 and all(abs(each) <= _FAR_M for each in corners)
+    if message.outline_m is not None and not is_ring:
+        raise WrongError(f"outline_m: x and y of at least three corners expected, not {_shown(corners)}")
     return message
 
 
 def _checked_list(message: DetectionList) -> DetectionList:
     _check_name("sensor", message.sensor)
-    _check_times(message)
     if message.frame not in FRAMES:
         raise WrongError(f"frame: one of {', '.join(sorted(FRAMES))} expected, not {_shown(message.frame)}")
     objects = []
@@ -107,9 +117,7 @@ def _checked_list(message: DetectionList) -> DetectionList:
             objects.append(checked_detection(item))
         except WrongError as error:
             raise WrongError(f"{message.sensor}: objects[{index}]: {error}") from error
-    if all(map(is_, objects, message.objects)):
-        return message
-    return replace(message, objects=tuple(objects))
+    return message if all(map(is_, objects, message.objects)) else replace(message, objects=tuple(objects))
 
 
 def checked_detection(item: Detection) -> Detection:
@@ -119,39 +127,32 @@ def checked_detection(item: Detection) -> Detection:
     """
     if not isinstance(item, Detection):
         raise WrongError(f"a {type(item).__name__} is no detection")
+    described = _described(item)
     _check_numbers(MEASURABLE, _measured(item))
+    _check_numbers(_DESCRIBING, described)
     for name in ("stamp_ns", "object_id"):
         if (value := getattr(item, name)) is not None:
             _check_integer(name, value)
-    if isinstance(item.class_name, str) and len(item.class_name) > _LONGEST_NAME:
-        item = replace(item, class_name=None)
-    if item.class_name not in (None, ""):
-        _check_name("class_name", item.class_name)
-    _check_several("covariance", item)
-    described = _described(item)
-    if described == _NOTHING:
-        return item
-    _check_numbers(_DESCRIBING, described)
+    if item.covariance is not None:  # one of another size makes the detection invalid
+        _several("covariance", item.covariance)
     lost = [
         name for name, value in zip(_DESCRIBING, described, strict=True) if value is not None and not isfinite(value)
     ]
+    if isinstance(item.class_name, str) and len(item.class_name) > _LONGEST_NAME:
+        lost.append("class_name")
+    elif item.class_name not in (None, ""):
+        _check_name("class_name", item.class_name)
     return replace(item, **dict.fromkeys(lost)) if lost else item
 
 
-def _check_times(message: Message) -> None:
-    _check_integer("stamp_ns", message.stamp_ns)
-    _check_integer("receipt_ns", message.receipt_ns)
-    if not is_stamp(message.receipt_ns):  # all windows are counted from it
-        raise WrongError(f"receipt_ns: at most {LARGEST_NS:.0g} ns from 0 expected, not {_shown(message.receipt_ns)}")
-
-
 def _check_integer(name: str, value: object) -> None:
-    if type(value) is int:
-        if value in _INT64:
-            return
-    elif isinstance(value, np.integer):
-        return
-    raise WrongError(f"{name}: a 64 bit integer expected, not {_shown(value)}")
+    if not (value in _INT64 if type(value) is int else isinstance(value, np.integer)):
+        raise WrongError(f"{name}: a 64 bit integer expected, not {_shown(value)}")
+
+
+def _check_flag(name: str, value: object) -> None:
+    if not isinstance(value, bool | np.bool_):
+        raise WrongError(f"{name}: true or false expected, not {_shown(value)}")
 
 
 def _check_numbers(names: tuple[str, ...], values: tuple[object, ...]) -> None:
@@ -166,22 +167,16 @@ def _check_number(name: str, value: object) -> None:
         return
     if type(value) is not int:
         raise WrongError(f"{name}: a number expected, not {_shown(value)}")
-    try:
-        float(value)
-    except OverflowError as error:
-        raise WrongError(f"{name}: {_shown(value)} is too large for a number") from error
+    if value.bit_length() > 1000:
+        raise WrongError(f"{name}: {_shown(value)} is too large for a number")
 
 
-def _check_several(name: str, message: EgoState | TruthState | Detection) -> None:
-    values = getattr(message, name)
-    if values is None:
-        return
+def _several(name: str, values: object) -> tuple[float, ...]:
     if not isinstance(values, tuple):
-        raise WrongError(f"{name}: a tuple of numbers expected, not {_shown(values)}")
+        raise WrongError(f"{name}: a list of numbers expected, not {_shown(values)}")
     for value in values:
         _check_number(name, value)
-    if name == "outline_m" and (len(values) < 6 or len(values) % 2 or not all(abs(each) <= _FAR_M for each in values)):
-        raise WrongError(f"outline_m: x and y of at least three corners expected, not {_shown(values)}")
+    return values
 
 
 def _check_name(name: str, value: object) -> None:

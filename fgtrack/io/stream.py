@@ -10,21 +10,20 @@ from contextlib import closing, contextmanager
 from dataclasses import MISSING, fields
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, get_args
+from typing import Any, BinaryIO
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file
 from fgtrack.core.types import (
-    EGO_COVARIANCE_STATES,
     Detection,
     DetectionList,
     EgoState,
-    Frame,
     Message,
     TruthState,
 )
 from fgtrack.io.config import InputConfig
 from fgtrack.io.errors import LARGEST_BYTES, MOST_OBJECTS, TruncatedInput, UntilBreak, refuse_larger
+from fgtrack.io.gate import WrongError, checked_message
 from fgtrack.io.output import new_file
 from fgtrack.io.source import FileFormat
 
@@ -72,7 +71,7 @@ def read_stream(
         for line, record in records:
             try:
                 message = _message(record, unknown)
-            except _BadRecordError as error:
+            except WrongError as error:
                 raise DataError(f"{path}:{line}: {error}") from error
             if not isinstance(message, TruthState):
                 if newest_ns is not None and message.receipt_ns < newest_ns:
@@ -242,111 +241,53 @@ def _check_header(path: Path, first: tuple[int, Record] | None) -> Record:
     return record
 
 
-class _BadRecordError(Exception):
-    """What is wrong with a record; the caller adds where."""
-
-
 def _message(record: Record, unknown: Counter[str]) -> Message:
     name = record.get("type")
     kind = _KINDS.get(name) if isinstance(name, str) else None
     if kind is None:
-        raise _BadRecordError(f"unknown record type {name!r}, known are {', '.join(_KINDS)}")
-    values = _values(kind, record)
-    if len(record) > len(values) + 1:
-        _count_unknown(name, kind, record, unknown)
+        raise WrongError(f"unknown record type {name!r}, known are {', '.join(_KINDS)}")
+    values = _values(str(name), kind, record, unknown)
     if kind is DetectionList:
         values["objects"] = [_detection(index, item, unknown) for index, item in enumerate(values["objects"])]
-    message = kind(**values)
-    if isinstance(message, EgoState) and message.covariance is not None:
-        _check_size(message.covariance, len(EGO_COVARIANCE_STATES))
-    return message
-
-
-def _check_size(covariance: tuple[float, ...], size: int) -> None:
-    if len(covariance) != size * size:
-        raise _BadRecordError(f"covariance: a list of {size} x {size} numbers expected")
+    return checked_message(kind(**values))
 
 
 def _detection(index: int, item: object, unknown: Counter[str]) -> Detection:
-    try:
-        if not isinstance(item, dict):
-            raise _BadRecordError(f"a JSON object expected, not {item!r}")
-        values = _values(Detection, item)
-        if len(item) > len(values):
-            _count_unknown("objects", Detection, item, unknown)
-        detection = Detection(**values)
-        if detection.covariance is not None:
-            _check_size(detection.covariance, len(detection.measured))
-    except _BadRecordError as error:
-        raise _BadRecordError(f"objects[{index}]: {error}") from error
-    return detection
+    if not isinstance(item, dict):
+        raise WrongError(f"objects[{index}]: a JSON object expected, not {item!r}")
+    return Detection(**_values("objects", Detection, item, unknown))
 
 
-def _count_unknown(name: object, kind: type, record: Record, unknown: Counter[str]) -> None:
-    unknown.update(f"{name}.{key}" for key in record.keys() - _FIELDS[kind].keys() - {"type"})
-
-
-def _values(kind: type, record: Record) -> Record:
-    """What `record` gives of the fields of `kind`; null is not given."""
+def _values(name: str, kind: type, record: Record, unknown: Counter[str]) -> Record:
+    """Values of the fields of `kind` in `record`; null is not given. Unknown keys are counted."""
+    given = {key: value for key, value in record.items() if value is not None and key != "type"}
+    known = _FIELDS[kind]
+    if given.keys() - known.keys():
+        unknown.update(f"{name}.{key}" for key in given.keys() - known.keys())
     values = {}
-    for name, (read, required) in _FIELDS[kind].items():
-        value = record.get(name)
-        if value is not None:
-            values[name] = read(name, value)
-        elif required:
-            raise _BadRecordError(f"{name}: is missing")
+    for key, is_needed in known.items():
+        if key in given:
+            value = given[key]
+            is_list = isinstance(value, list)
+            if is_list != (key in _LISTS):
+                raise WrongError(f"{key}: {'no list' if is_list else 'a list'} expected, not {str(value)[:60]}")
+            values[key] = tuple(map(_plain_number, value)) if is_list else value
+            if key not in _INTEGERS:
+                values[key] = _plain_number(values[key])
+        elif is_needed:
+            raise WrongError(f"{key}: is missing")
     return values
 
 
-def _number(name: str, value: object) -> float:
-    if type(value) is float:
-        return value
-    if type(value) is not int:
-        raise _BadRecordError(f"{name}: a number expected, not {value!r}")
-    try:
-        return float(value)
-    except OverflowError as error:
-        raise _BadRecordError(f"{name}: {str(value)[:20]}... is too large for a number") from error
+def _plain_number(value: Any) -> Any:
+    """A float where `value` is an integer that can be one."""
+    return float(value) if type(value) is int and value.bit_length() < 1000 else value
 
 
-def _integer(name: str, value: object) -> int:
-    if type(value) is not int or not -_INT64_LIMIT <= value < _INT64_LIMIT:
-        raise _BadRecordError(f"{name}: a 64 bit integer expected, not {value!r}")
-    return value
-
-
-def _checked(is_right: Callable[[Any], bool], what: str) -> Callable[[str, Any], Any]:
-    def read(name: str, value: Any) -> Any:
-        if not is_right(value):
-            raise _BadRecordError(f"{name}: {what} expected, not {value!r}")
-        return value
-
-    return read
-
-
-def _numbers(name: str, value: object) -> tuple[float, ...]:
-    if not isinstance(value, list):
-        raise _BadRecordError(f"{name}: a list of numbers expected, not {value!r}")
-    return tuple(_number(name, item) for item in value)
-
-
-# Any: JSON values. What is not here is a number.
-_READERS: dict[str, Callable[[str, Any], Any]] = {
-    "stamp_ns": _integer,
-    "receipt_ns": _integer,
-    "object_id": _integer,
-    "in_pit": _checked(lambda value: isinstance(value, bool), "true or false"),
-    "sensor": _checked(lambda value: isinstance(value, str) and value != "", "a name"),
-    "frame": _checked(lambda value: value in get_args(Frame), f"one of {', '.join(get_args(Frame))}"),
-    "objects": _checked(lambda value: isinstance(value, list), "a list"),
-    "covariance": _numbers,
-    "class_name": _checked(lambda value: isinstance(value, str), "a name"),
-    "ignored": _checked(lambda value: isinstance(value, bool), "true or false"),
-    "outline_m": _numbers,
-}
-
-#: Names of what a message or a detection holds; of each how to read it from JSON, and whether it has to be given.
-_FIELDS: dict[type, dict[str, tuple[Callable[[str, Any], Any], bool]]] = {
-    kind: {field.name: (_READERS.get(field.name, _number), field.default is MISSING) for field in fields(kind)}
+_INTEGERS = frozenset({"stamp_ns", "receipt_ns", "object_id"})
+_LISTS = frozenset({"objects", "covariance", "outline_m"})
+#: Names of the fields of messages and detections, and if they have to be given.
+_FIELDS: dict[type, dict[str, bool]] = {
+    kind: {field.name: field.default is MISSING for field in fields(kind) if field.name != "left_out"}
     for kind in (EgoState, DetectionList, TruthState, Detection)
 }
