@@ -1,7 +1,7 @@
 """What a replay assumes where the configuration leaves it open: what a recording carries, and what it shows."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from io import StringIO
@@ -16,7 +16,7 @@ from fgtrack.core.types import MEASURABLE, DetectionList, Message
 from fgtrack.io.errors import MOST_SENSORS
 from fgtrack.io.source import InputSource
 from fgtrack.models.sensors import Mount, Score, SensorModel
-from fgtrack.pipeline.config import Config, LifecycleConfig
+from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.coverage import Coverage, coverages
 from fgtrack.pipeline.list_statistics import ListStatistics
 from fgtrack.pipeline.load import plain
@@ -37,12 +37,15 @@ ASSUMED_STD = {
     "range_rate_mps": 0.5,
 }
 
+_BOX_STD_M = 0.3
+"""Standard deviation of the middle of a box: the translation error of LiDAR detectors is 0.25 to 0.5 m (nuScenes)."""
 _LISTS_OUT_OF_VIEW = 2.5
 """Periods of the slowest sensor for which a track that is out of view lives on."""
 _LEAST_CLUTTER = 0.05
 """False detections of a list that can never be excluded."""
 
 RECORDED, USUAL = "recorded", "usual of a detector of cars by LiDAR or RADAR"
+USUAL_BOX = "usual of boxes that a detector fits to cars"
 """Reasons."""
 
 
@@ -175,15 +178,19 @@ def assumed(config: Config, source: InputSource) -> Assumed:
             config, more = _for_revisits(config, lists)
             found += more
             for name, one in covered.items():
-                std = _std(one.measured)
-                found.append(Assumption(f"sensors.{name}.std", std, USUAL))
+                std = _std(one)
+                found.append(Assumption(f"sensors.{name}.std", std, USUAL_BOX if one.boxes else USUAL))
                 sensor, more = _with_lists(name, SensorModel(std=std), one, lists.get(name, ListStatistics()))
                 found += more
                 sensors[name] = _with_recorded(name, sensor, carried.sensors.get(name, RecordedSensor()), found)
         for name, sensor in sensors.items():
             if sensor.scan and not sensor.is_view_given and name in covered:
                 sensors[name] = _with_coverage(name, sensor, covered[name], found)
-        lifecycle = _with_slow_lists(config.lifecycle, covered.values(), found)
+        gap_s, reason = _out_of_view_s(replace(config, sensors=sensors), covered)
+        default_s = ExistenceRules.out_of_view_s
+        if isinstance(lifecycle, ExistenceRules) and lifecycle.out_of_view_s == default_s != gap_s:
+            lifecycle = replace(lifecycle, out_of_view_s=float(f"{gap_s:.2g}"))
+            found.append(Assumption("lifecycle.out_of_view_s", lifecycle.out_of_view_s, reason))
     sensors = {
         name: replace(sensor, field_of_view_rad=sensor.field_of_view_rad or math.tau)
         for name, sensor in sensors.items()
@@ -207,14 +214,18 @@ def _with_recorded(name: str, sensor: SensorModel, carried: RecordedSensor, foun
     return replace(sensor, **given)
 
 
-def _with_slow_lists(rules: LifecycleConfig, seen: Iterable[Coverage], found: list[Assumption]) -> LifecycleConfig:
-    """`rules` in which a track outlives two lists of the slowest sensor that do not see it, unless that is set."""
-    slowest_s = max((1.0 / one.rate_hz for one in seen if one.rate_hz), default=0.0)
-    key, at_least_s = "out_of_view_s", float(f"{_LISTS_OUT_OF_VIEW * slowest_s:.2g}")
-    if not isinstance(rules, ExistenceRules) or not rules.out_of_view_s == ExistenceRules.out_of_view_s < at_least_s:
-        return rules
-    found.append(Assumption(f"lifecycle.{key}", at_least_s, "two lists of the slowest sensor"))
-    return replace(rules, out_of_view_s=at_least_s)
+def _out_of_view_s(config: Config, seen: Mapping[str, Coverage]) -> tuple[float, str]:
+    """How long a track lives that no sensor can see, and why.
+
+    Where one sensor alone gives positions nothing else sees what has left its view: the first list that could not show
+    it ends it. Else it may come into the view of another one, and outlives two lists of the slowest sensor.
+    """
+    periods_s = {name: 1.0 / one.rate_hz for name, one in seen.items() if one.rate_hz}
+    placing = [name for name, one in config.used_sensors.items() if one.gives_position]
+    if len(placing) == 1 and placing[0] in periods_s:
+        return 0.5 * periods_s[placing[0]], "no other sensor gives positions, half its period"
+    slow_s = _LISTS_OUT_OF_VIEW * max(periods_s.values(), default=0.0)
+    return max(ExistenceRules.out_of_view_s, slow_s), "two lists of the slowest sensor"
 
 
 def _with_coverage(name: str, sensor: SensorModel, seen: Coverage, found: list[Assumption]) -> SensorModel:
@@ -273,6 +284,7 @@ def _with_lists(
     if lists.scans and seen.persistence is not None and seen.area_m2:
         reason = f"how its detections persist, of {seen.persistence.num_triples} in three lists running"
         clutter_per_m2 = max(seen.persistence.clutter_per_list, _LEAST_CLUTTER) / seen.area_m2
+        clutter_per_m2 = max(clutter_per_m2, seen.persistence.near_clutter_per_m2 or 0.0)
         found["detection_probability"] = round(seen.persistence.detection_probability, 2), reason
         found["clutter_per_m2"] = float(f"{clutter_per_m2:.2g}"), reason
         if seen.persistence.score is not None:
@@ -293,10 +305,11 @@ def _for_revisits(config: Config, lists: Mapping[str, ListStatistics]) -> tuple[
     return replace(config, **sections), found
 
 
-def _std(measured: Set[str]) -> dict[str, float]:
-    cartesian = {"x_m", "y_m"}
+def _std(seen: Coverage) -> dict[str, float]:
+    measured, cartesian = seen.measured, {"x_m", "y_m"}
     left = measured - ({"range_m", "bearing_rad"} if cartesian <= measured else cartesian) or cartesian
-    return {name: ASSUMED_STD[name] for name in MEASURABLE if name in left}
+    usual = ASSUMED_STD | (dict.fromkeys(cartesian, _BOX_STD_M) if seen.boxes else {})
+    return {name: usual[name] for name in MEASURABLE if name in left}
 
 
 def _departures(value: object, default: object) -> Any:  # Any: plain values

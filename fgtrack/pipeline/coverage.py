@@ -45,6 +45,8 @@ class Coverage:
     """Up to where it detects; None where it measures no range, or too seldom."""
     persistence: Persistence | None = None
     """How its detections persist from list to list; None where too few do."""
+    boxes: bool = False
+    """Whether its detections have a length and a width."""
     area_m2: float | None = None
     """Area over which its detections with a range are spread, at least that of the narrowest sector up to there."""
 
@@ -93,6 +95,7 @@ class _Detections:
 
     measured: set[str] = field(default_factory=set)
     num_detections: int = 0
+    boxes: bool = False
     receipts_s: "array[float]" = field(default_factory=lambda: array("d"))
     """Of every list."""
     stamps_s: "array[float]" = field(default_factory=lambda: array("d"))
@@ -112,6 +115,7 @@ class _Detections:
             self.frames.add(message.frame)
         for detection in message.objects:
             self.measured.update(detection.measured)
+            self.boxes |= detection.length_m is not None and detection.width_m is not None
             x_m, y_m, has_range = _position(detection)
             if math.isfinite(x_m) and math.isfinite(y_m):
                 score = math.nan if detection.score is None else detection.score
@@ -122,7 +126,7 @@ class _Detections:
         receipts_s = np.array(self.receipts_s)
         span_s = float(np.ptp(receipts_s))
         rate_hz = (len(receipts_s) - 1) / span_s if span_s > 0.0 else None
-        found = Coverage(frozenset(self.measured), len(receipts_s), self.num_detections, rate_hz)
+        found = Coverage(frozenset(self.measured), len(receipts_s), self.num_detections, rate_hz, boxes=self.boxes)
         rows = np.array(self.rows).reshape(-1, 6)
         has_range = rows[:, 4] > 0.0
         rows = rows[has_range] if has_range.any() else rows

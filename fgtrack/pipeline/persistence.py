@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import minimize
@@ -34,10 +35,16 @@ class Persistence:
 
     Three detections on a line at constant speed are of one object. How often the fourth list continues the line is the
     detection probability; detections in no triple, beyond those that misses explain, are clutter.
+
+    What a detector takes for a car now it takes for one in the next list, too. So where scores tell clutter, its
+    density is also that around clutter, where it competes with a track that began there (Song, Musicki: Adaptive
+    clutter measurement density estimation for improved target tracking, IEEE T-AES 2011).
     """
 
     detection_probability: float
     clutter_per_list: float
+    near_clutter_per_m2: float | None
+    """Clutter of the next list around clutter; None without `score`."""
     score: Score | None
     """Model of the scores; None if they are absent, or higher ones are not more often of an object."""
     num_triples: int
@@ -86,7 +93,30 @@ def persistence(
     probability = float(np.clip(share, *_PROBABILITY))
     of_objects = min(num_triples / probability**2, float(len(misfit)))  # the others' neighbours were missed
     clutter = (len(misfit) - of_objects) / len(range(1, len(stamps_s) - 3, every))
-    return Persistence(probability, clutter, _score(np.array(found_scores), of_object, ~in_triple), num_triples)
+    score_model = _score(np.array(found_scores), of_object, ~in_triple)
+    near = None
+    if score_model is not None:
+        odds = len(misfit) / max(of_objects, 1.0) - 1.0
+        near = _near_clutter_per_m2(trees, [_of_clutter(one, score_model, odds) for one in scores])
+    return Persistence(probability, clutter, near, score_model, num_triples)
+
+
+def _of_clutter(scores: FloatArray, model: Score, odds: float) -> FloatArray:
+    """Probability that detections of these scores are clutter, before which the odds for it are `odds`."""
+    ratio = np.exp((np.nan_to_num(scores, nan=model.even) - model.even) / model.scale)
+    return odds / (odds + ratio)
+
+
+def _near_clutter_per_m2(trees: Sequence[cKDTree | None], of_clutter: Sequence[FloatArray]) -> float:
+    """Density of clutter of the next list around that of each, which are so with the probabilities `of_clutter`."""
+    together, total = 0.0, 0.0
+    for k, (tree, after) in enumerate(pairwise(trees)):
+        if tree is not None:
+            total += float(of_clutter[k].sum())
+        if tree is not None and after is not None:
+            for i, near in enumerate(tree.query_ball_tree(after, _LARGEST_ERROR_M)):
+                together += float(of_clutter[k][i] * of_clutter[k + 1][near].sum())
+    return together / (total * math.pi * _LARGEST_ERROR_M**2) if total else 0.0
 
 
 def _continued(line: _Line, ahead_s: FloatArray, trees: Sequence[cKDTree | None], reach_m: float) -> list[bool]:

@@ -18,6 +18,7 @@ from fgtrack.pipeline.config import Config, Effective
 from fgtrack.pipeline.public import replay, simulate
 from fgtrack.pipeline.recorded import recorded_of
 from fgtrack.pipeline.shipped import read_config, read_scenario
+from fgtrack.tracking.existence import ExistenceRules
 from fgtrack.tracking.tracker import check_sensor
 
 POINT = Detection(x_m=20.0, y_m=1.0)
@@ -195,6 +196,28 @@ def test_a_sensor_is_taken_to_see_where_it_detects_unless_any_of_it_is_given() -
     for given in ({"field_of_view_rad": 3.0}, {"view_range_m": 90.0}, {"max_range_m": 90.0}):
         config = replace(Config(), sensors={"radar": SensorModel(std={"x_m": 2.0, "y_m": 2.0}, **given)})
         assert assumed(config, source_of(forward)).assumptions == ()
+
+
+def test_what_leaves_the_view_of_the_only_sensor_that_gives_positions_ends_at_once() -> None:
+    alone = assumed(Config(), source_of(forward)).config
+    assert alone.lifecycle.out_of_view_s == pytest.approx(0.025, rel=0.01)
+
+    def with_slow_sensor():
+        for k, one in enumerate(forward()):
+            yield one
+            if k % 50 == 0:
+                yield message(POINT, sensor="lidar", stamp_ms=25.0 * k)
+
+    assert assumed(Config(), source_of(with_slow_sensor)).config.lifecycle.out_of_view_s == pytest.approx(3.1, rel=0.1)
+    own = replace(Config(), lifecycle=ExistenceRules(out_of_view_s=2.0))
+    assert assumed(own, source_of(forward)).config.lifecycle == own.lifecycle
+
+
+def test_boxes_are_taken_to_be_more_exact_than_points() -> None:
+    box = replace(POINT, length_m=4.0, width_m=1.8)
+    found = assumed(Config(), source_of(lambda: [message(box, sensor="lidar")]))
+    assert found.config.sensors["lidar"].std == {"x_m": 0.3, "y_m": 0.3}
+    assert "usual of boxes" in found.lines()[0]
 
 
 def test_a_rear_sensor_gets_a_mount_that_looks_back() -> None:
