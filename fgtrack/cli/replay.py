@@ -16,7 +16,6 @@ from fgtrack.evaluation.left_out import left_out
 from fgtrack.io.output import check_apart
 from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
-from fgtrack.io.span import end_ns
 from fgtrack.pipeline.assumed import assumed
 from fgtrack.pipeline.replay import located, replay_each
 from fgtrack.pipeline.shipped import read_config
@@ -62,7 +61,7 @@ def replay(
             folders,
             origin=str(recording),
             kind=source.kind,
-            on_tick=TickProgress(tell, lambda: end_ns(source), len(names)),
+            on_tick=TickProgress(tell, source.end_ns, len(names)),
             overwrite=overwrite,
             realtime=realtime,
         )

@@ -31,6 +31,7 @@ STREAM_FORMAT = "fgtrack-stream/1"
 SETTINGS = "settings"
 """Entry of the header record with what the recording carries of a configuration."""
 GZIP_MAGIC = b"\x1f\x8b"
+_TAIL = 1 << 16
 
 _logger = logging.getLogger(__name__)
 _INT64_LIMIT = 1 << 63
@@ -104,7 +105,15 @@ def _settings(path: Path) -> Mapping[str, object]:
     return found if isinstance(found, dict) else {}
 
 
-FORMAT = FileFormat("an fgtrack stream (.jsonl, .jsonl.gz)", _recognises, _open, _settings)
+def _end_ns(path: Path) -> int | None:
+    """Receipt of the last record of a stream; None of a gzipped one."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _TAIL))
+        lines = file.read().splitlines()
+    return max((json.loads(line)["receipt_ns"] for line in lines[1:] if b"receipt_ns" in line), default=None)
+
+
+FORMAT = FileFormat("an fgtrack stream (.jsonl, .jsonl.gz)", _recognises, _open, _settings, _end_ns)
 
 
 def read_header(path: Path | str) -> Mapping[str, Any]:

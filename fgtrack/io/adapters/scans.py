@@ -1,6 +1,5 @@
 """Detections that come one per message, put together to the scans that they are of."""
 
-from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -14,25 +13,12 @@ __all__ = ["grouped"]
 _LONGEST_NS = NS_PER_S  # after the last detection of a scan, in receipts: it is complete then
 
 
-@dataclass
-class _Slot:
-    """A place in the order of receipt: a message, or the newest detection of a scan that is not complete."""
-
-    message: Message | None
-    """None of a scan that has moved on to a later place."""
-    is_open: bool = False
-
-
-@dataclass
+@dataclass(eq=False)
 class _Scan:
-    slot: _Slot
-    first_ns: int
-    lists: list[DetectionList]
+    """Lists of one scan, whose place in the order of receipt is that of the last one."""
 
-    @property
-    def newest_ns(self) -> int:
-        """Receipt of the last list."""
-        return self.lists[-1].receipt_ns
+    lists: list[DetectionList]
+    is_open: bool = True
 
     def joined(self) -> DetectionList:
         """The scan: the mean stamp of its lists, the last receipt, and of every detection its own stamp."""
@@ -58,42 +44,34 @@ def grouped(messages: Iterable[Message], windows_ns: Mapping[str, int]) -> Itera
     Whatever ends `messages` in a `DataError`, the scans that are open then come before it.
     """
     scans: dict[str, _Scan] = {}
-    waiting: deque[_Slot] = deque()
+    waiting: list[Message | _Scan] = []
     error: DataError | None = None
 
-    def close(scan: _Scan) -> None:
-        scan.slot.message, scan.slot.is_open = scan.joined(), False
-        del scans[scan.lists[-1].sensor]
-
     def ready() -> Iterator[Message]:
-        while waiting and not waiting[0].is_open:
-            message = waiting.popleft().message
-            if message is not None:
-                yield message
+        while waiting and not (isinstance(waiting[0], _Scan) and waiting[0].is_open):
+            first = waiting.pop(0)
+            yield first.joined() if isinstance(first, _Scan) else first
 
     try:
         for message in messages:
-            for old in [each for each in scans.values() if message.receipt_ns - each.newest_ns > _LONGEST_NS]:
-                close(old)
-            if isinstance(message, DetectionList) and message.sensor in windows_ns:
-                scan = scans.get(message.sensor)
-                slot = _Slot(None, is_open=True)
-                if scan is not None and abs(message.stamp_ns - scan.first_ns) <= windows_ns[message.sensor]:
-                    scan.slot.is_open = False
-                    scan.slot = slot
-                    scan.lists.append(message)
+            for scan in scans.values():
+                scan.is_open &= message.receipt_ns - scan.lists[-1].receipt_ns <= _LONGEST_NS
+            if isinstance(message, DetectionList) and (window_ns := windows_ns.get(message.sensor)) is not None:
+                scan = scans.get(message.sensor, _Scan([], is_open=False))
+                if scan.is_open and abs(message.stamp_ns - scan.lists[0].stamp_ns) <= window_ns:
+                    waiting.remove(scan)
                 else:
-                    if scan is not None:
-                        close(scan)
-                    scans[message.sensor] = _Scan(slot, message.stamp_ns, [message])
-                waiting.append(slot)
+                    scan.is_open = False
+                    scan = scans[message.sensor] = _Scan([])
+                scan.lists.append(message)
+                waiting.append(scan)
             else:
-                waiting.append(_Slot(message))
+                waiting.append(message)
             yield from ready()
     except DataError as found:
         error = found
-    for scan in list(scans.values()):
-        close(scan)
+    for scan in scans.values():
+        scan.is_open = False
     yield from ready()
     if error is not None:
         raise error

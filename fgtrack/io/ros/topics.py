@@ -105,7 +105,9 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
     return lambda: grouped(bag_messages(bag, uses), windows_ns) if windows_ns else bag_messages(bag, uses)
 
 
-FORMAT = FileFormat("a rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file", is_bag, _open, settings_of)
+FORMAT = FileFormat(
+    "a rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file", is_bag, _open, settings_of, lambda path: Bag(path).end_ns()
+)
 
 
 def bag_messages(bag: Bag, uses: tuple[TopicUse, ...]) -> Iterator[Message]:
