@@ -83,8 +83,8 @@ def test_messages_without_any_configuration_are_tracked() -> None:
     assert set(run.config["sensors"]) == {"odd"}
     assert set(run.tracks["track_id"].tolist()) == {0}
     newest = run.tracks["now_ns"] == run.tracks["now_ns"].max()
-    assert run.tracks["x_m"][newest] == pytest.approx([39.0], abs=0.5)
-    assert run.tracks["speed_mps"][newest] == pytest.approx([10.0], abs=1.0)
+    assert run.tracks["x_m"][newest].to_numpy() == pytest.approx([39.0], abs=0.5)
+    assert run.tracks["speed_mps"][newest].to_numpy() == pytest.approx([10.0], abs=1.0)
     assert run.tracks["status"][newest].tolist() == ["confirmed"]
 
 

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray
 from fgtrack.evaluation.palette import look
 from fgtrack.evaluation.runs import judged
-from fgtrack.io.run import Run, Table
+from fgtrack.io.run import Run
 from fgtrack.models.oval import make_oval
 from fgtrack.plotting import plot
 from fgtrack.plotting.errors import moving_rms
@@ -167,8 +167,9 @@ def test_runs_of_another_day_begin_at_zero_as_well(tmp_path: Path) -> None:
     runs = [write_run(tmp_path / name, [[WEST.track(k, 1)] for k in TICKS], truth=WEST.truth(TICKS)) for name in "ab"]
     day_ns = 86_400 * 1_000_000_000
     for table, names in (("tracks", ("now_ns", "stamp_ns")), ("timing", ("now_ns",)), ("truth", ("stamp_ns",))):
-        moved = Table({name: of + day_ns if name in names else of for name, of in getattr(runs[1], table).items()})
-        runs[1] = replace(runs[1], **{table: moved})
+        columns = runs[1].tables[table]
+        later = Table({name: of + day_ns if name in names else of for name, of in columns.items()})
+        runs[1] = replace(runs[1], tables={**runs[1].tables, table: later})
     first, second = plot.errors(runs).axes[0].lines
     np.testing.assert_allclose(x_of(first), x_of(second))
 

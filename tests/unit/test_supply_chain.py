@@ -31,6 +31,8 @@ BOUND_ABOVE = {
     "joblib",
     "motrics",
     "matplotlib",
+    "pandas",
+    "ijson",
 }
 
 
@@ -63,7 +65,7 @@ def locked() -> dict[str, dict[str, tuple[set[Version], int]]]:
 def test_what_is_imported_is_asked_for() -> None:
     """Not only by another package, whose next or last version may do without it."""
     asked = {_name(one.name) for one in REQUIRED}
-    asked |= {_name(Requirement(line).name) for extra in ("dask", "bench") for line in EXTRAS[extra]}
+    asked |= {_name(Requirement(line).name) for extra in ("dask", "bench", "foxglove") for line in EXTRAS[extra]}
     installed = packages_distributions()
     imported = {
         name.split(".")[0]
@@ -133,5 +135,5 @@ def test_the_makefile_installs_what_is_locked() -> None:
 
 
 def test_packages_of_the_extras_are_locked(locked: dict[str, Any]) -> None:
-    asked = {_name(Requirement(line).name) for extra in ("dask", "bench") for line in EXTRAS[extra]}
+    asked = {_name(Requirement(line).name) for extra in ("dask", "bench", "foxglove") for line in EXTRAS[extra]}
     assert asked <= set(locked["test"])
