@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray
 from fgtrack.evaluation.palette import look
 from fgtrack.evaluation.runs import judged
-from fgtrack.io.run import Run
+from fgtrack.io.run import Run, Table
 from fgtrack.models.oval import make_oval
 from fgtrack.plotting import plot
 from fgtrack.plotting.errors import moving_rms
