@@ -40,6 +40,6 @@ fgtrack.plot.errors(runs)
 print(tables["dispositions"])
 
 # %%
-# Every table of a run maps column names to arrays, so that `pandas.DataFrame(run.tracks)` is a data frame.
+# Every table of a run is a pandas DataFrame.
 smoother = runs[0]
-print({name: column.dtype.name for name, column in smoother.smoothed.items()})
+print(smoother.smoothed.dtypes)
