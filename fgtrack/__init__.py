@@ -52,10 +52,12 @@ _HOMES = {
     "UpdateResult": "fgtrack.estimation.base",
     "UpdateStatus": "fgtrack.estimation.base",
     "advise": "fgtrack.advice.advise",
+    "config": "fgtrack.pipeline",
     "close_ups": "fgtrack.plotting.late_detection",
     "compare": "fgtrack.evaluation.comparison",
     "estimator": "fgtrack.estimation.registry",
     "initial_state": "fgtrack.estimation.birth",
+    "list_estimators": "fgtrack.estimation.registry",
     "load_run": "fgtrack.io.run",
     "measurement_model": "fgtrack.models.measurement",
     "plot": "fgtrack.plotting",
@@ -101,6 +103,7 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.estimation.birth import initial_state as initial_state
     from fgtrack.estimation.ekf import robust_weight as robust_weight
     from fgtrack.estimation.registry import estimator as estimator
+    from fgtrack.estimation.registry import list_estimators as list_estimators
     from fgtrack.evaluation.comparison import compare as compare
     from fgtrack.evaluation.tables import Tables as Tables
     from fgtrack.io.adapters.common import ObjectList as ObjectList
@@ -115,6 +118,7 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.models.motion import MotionModel as MotionModel
     from fgtrack.models.sensors import RobustLoss as RobustLoss
     from fgtrack.models.sensors import SensorModel as SensorModel
+    from fgtrack.pipeline import config as config
     from fgtrack.pipeline.config import Config as Config
     from fgtrack.pipeline.lateness import Lateness as Lateness
     from fgtrack.pipeline.lateness import TickTiming as TickTiming

@@ -21,20 +21,20 @@ from fgtrack.pipeline.replay import replay
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
-#: Defect -> the sections of the configuration that hold it, with the keys there; without keys the whole section.
-DEFECTS = {
-    "Q2 yaw sticks at its limit": {"motion": ["yaw"]},
-    "Q3 heading interpolated through its jump": {"map": ["lookup"]},
-    "Q3, Q4 whole map look-up": {"map": ["lookup"]},
-    "Q5 acceleration drives the speed": {"motion": ["acceleration", "std_per_s"]},
-    "Q6 noise per step": {"motion": ["noise"]},
-    "Q8 present state not stored": {"filter": ["present"]},
+#: Defect -> its name under `defects`, or the sections of the configuration that hold it, with the keys there.
+DEFECTS: dict[str, str | dict[str, list[str]]] = {
+    "Q2 yaw sticks at its limit": "saturated_yaw",
+    "Q3 heading interpolated through its jump": "heading_jump",
+    "Q3, Q4 whole map look-up": "heading_jump",
+    "Q5 acceleration drives the speed": {"motion": ["std_per_s"]},
+    "Q6 noise per step": "noise_per_step",
+    "Q8 present state not stored": "stale_present",
     "Q9, Q15, Q22 ageing": {"lifecycle": [], "sensors": []},
     "Q10 gate after the assignment": {"association": []},
     "Q11 merge not transitive": {"merge": []},
-    "Q12 one slot per sensor": {"inbox": []},
-    "Q13 ego filtered again and again": {"ego": []},
-    "Q14 tracking time leads the clock": {"filter": ["clock"]},
+    "Q12 one slot per sensor": "one_slot",
+    "Q13 ego filtered again and again": "refiltered_ego",
+    "Q14 tracking time leads the clock": "leading_clock",
 }
 #: Q3 alone is the step between the published look-up and the same with the heading on the circle.
 HEADING = "Q3 heading interpolated through its jump"
@@ -42,7 +42,11 @@ HEADING = "Q3 heading interpolated through its jump"
 
 def switched(config: Config, other: Config, defect: str) -> Config:
     """`config` with the parts that hold `defect` taken from `other`."""
-    for section, keys in DEFECTS[defect].items():
+    parts = DEFECTS[defect]
+    if isinstance(parts, str):
+        mine = set(config.defects) - {parts} | ({parts} & set(other.defects))
+        return replace(config, defects=tuple(sorted(mine)))
+    for section, keys in parts.items():
         part = getattr(other, section)
         if keys:
             part = replace(getattr(config, section), **{key: getattr(part, key) for key in keys})
@@ -53,10 +57,10 @@ def switched(config: Config, other: Config, defect: str) -> Config:
 def variants(published: Config, clean: Config) -> dict[str, Config]:
     """All configurations by name."""
     found = {"published": published, "clean": clean}
-    circular = replace(published.map, lookup="published_circular_heading")
     for defect in DEFECTS:
         if defect == HEADING:
-            found[f"published without {defect}"] = replace(published, map=circular)
+            circular = tuple(sorted({*published.defects, "circular_heading"} - {"heading_jump"}))
+            found[f"published without {defect}"] = replace(published, defects=circular)
             continue
         found[f"published without {defect}"] = switched(published, clean, defect)
         found[f"clean with {defect}"] = switched(clean, published, defect)

@@ -14,7 +14,7 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TruthState
 from fgtrack.io.source import open_input
 from fgtrack.models.sensors import Correlation
-from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.config import NOISE_HZ, Config
 from fgtrack.tracking.existence import ExistenceRules
 
 #: A jump between successive errors counts as one of so many standard deviations at most: larger ones are another end of
@@ -128,7 +128,7 @@ def ruled(config: Config, recordings: Sequence[Recorded]) -> Config:
     return replace(
         config,
         sensors=sensors,
-        motion=replace(config.motion, std_per_s={"velocity": _digits(per_root_s * math.sqrt(config.motion.noise_hz))}),
+        motion=replace(config.motion, std_per_s={"velocity": _digits(per_root_s * math.sqrt(NOISE_HZ))}),
         birth=replace(config.birth, speed_std_mps=_digits(speed_mps)),
         lifecycle=replace(config.lifecycle, min_travel_m=_digits(3.0 * worst_m)),
     )

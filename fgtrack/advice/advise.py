@@ -34,6 +34,7 @@ from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.trial import TRIAL_S, beginning, suspicions
 from fgtrack.pipeline.tune import tuned
 from fgtrack.pipeline.tune_rules import TuneRules
+from fgtrack.tracking.ego import MAX_EXTRAPOLATION_S
 
 __all__ = ["advice_on", "advise"]
 
@@ -280,11 +281,11 @@ class _Adviser:
         one = self._arrivals.get(EGO)
         if one is None or len(one.stamps_ns) < FEWEST or not one.has_stamps:
             return
-        limit_s = self._config.ego.max_extrapolation_s
+        limit_s = MAX_EXTRAPOLATION_S
         gaps = [gap_s for gap_s in (one.sensed_ns[1:] - one.sensed_ns[:-1]) / 1e9 if gap_s > 2.0 * limit_s]
         if gaps:
             text = (
-                f"{len(gaps)} gaps in its states are longer than twice max_extrapolation_s {limit_s:g} s, the longest "
+                f"{len(gaps)} gaps in its states are longer than twice {limit_s:g} s, the longest "
                 f"{max(gaps):.3g} s: what is sensed in the middle cannot be placed, and fails."
             )
             yield Finding("ego", EGO, 65.0, text)

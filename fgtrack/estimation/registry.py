@@ -116,6 +116,11 @@ class Claims:
         return cls(**{f.name: getattr(factory, f.name) for f in fields(cls) if hasattr(factory, f.name)})
 
 
+def list_estimators() -> list[str]:
+    """Names of all estimators, those of installed plug-ins included."""
+    return list(ESTIMATORS)
+
+
 def summary(factory: Factory) -> str:
     """The first paragraph of a docstring, in one line."""
     return " ".join((inspect.getdoc(factory) or "").split("\n\n")[0].split())

@@ -190,7 +190,7 @@ def _gospa_sums(group: Sequence[JudgedRun]) -> FloatArray | None:
     for one, scene, mine in zip(group, there, rows, strict=True):
         in_sight = scene.in_sight.copy()
         in_sight[mine] = seen
-        parts = gospa(replace(scene, in_sight=in_sight), one.options.gospa_cut_off_m)
+        parts = gospa(replace(scene, in_sight=in_sight), one.options.gate_m)
         columns.append(np.square(parts.in_sight_m[mine]))
     return np.stack([*columns, np.ones(len(common_ns))], axis=-1)
 

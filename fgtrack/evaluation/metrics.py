@@ -25,6 +25,8 @@ from fgtrack.models.measurement import ANGULAR
 
 FALSE_TRACK_SHARE = 0.5
 """A track that is paired with a true object in less than this share of its rows is false."""
+LATE_SWITCH_S = 0.5
+"""An identity switch within this time after an out-of-sequence update counts as late."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +216,7 @@ def evaluate_matched(
 
 def _truth_metrics(run: Run, matching: Matching, options: EvaluationConfig) -> TruthMetrics:
     errors = track_errors(matching)
-    late = late_switches(run, matching, options.late_switch_s)
+    late = late_switches(run, matching, LATE_SWITCH_S)
     confirm_s = times_to_confirm(run, matching, options.gate_m)
     objects = {}
     for index, object_id in enumerate(matching.object_ids):

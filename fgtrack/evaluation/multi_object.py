@@ -209,7 +209,7 @@ def multi_object_metrics(run: Run, matching: Matching | None, options: Evaluatio
     if matching is None or not options.multi_object:
         return None
     there = scenes(run, matching)
-    c_m = options.gospa_cut_off_m
+    c_m = options.gate_m
     frames = Frames.of(there, options.gate_m)
     return MultiObjectMetrics(
         Gospa.of(gospa(there, c_m), c_m), Clear.of(there, options.gate_m), Identity.of(frames), Hota.of(frames)

@@ -44,7 +44,7 @@ class PublishedMap:
             row = int(np.argmax(np.diff(self._arc) <= 0.0)) + 1
             raise DataError(
                 f"no map for a published look-up: row {row}: s_racetraj_m does not grow to the next row; "
-                "write a raceline, or take map.lookup frenet"
+                "write a raceline, or drop circular_heading and heading_jump from defects"
             )
         self._length_m = float(self._arc.max())
         self._segment = np.roll(self._line, -1, axis=0) - self._line

@@ -1,6 +1,6 @@
 """From a configuration to a tracker."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -31,11 +31,11 @@ from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.published_map import CircularHeadingMap, PublishedMap
 from fgtrack.models.road import MappedRoad, OpenSpace, Road
 from fgtrack.models.track_map import TrackMap
-from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
+from fgtrack.pipeline.config import NOISE_HZ, Config, Defect, MapConfig
 from fgtrack.tracking.ego import EgoSource, EgoStd, EgoTrajectory
 from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules
 from fgtrack.tracking.guarded_bank import GuardedBank
-from fgtrack.tracking.inbox import Inbox, QueueInbox
+from fgtrack.tracking.inbox import QueueInbox
 from fgtrack.tracking.lifecycle import CountingLifecycle, Lifecycle
 from fgtrack.tracking.objects import Objects
 from fgtrack.tracking.preprocess import Preprocess
@@ -49,16 +49,17 @@ from fgtrack.tracking.published import (
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
 _EULER = {
-    ("free", "none"): EulerCtrv,
-    ("free", "driving"): AcceleratedEulerCtrv,
-    ("saturated", "none"): SaturatedEulerCtrv,
-    ("saturated", "driving"): SaturatedAcceleratedEulerCtrv,
+    (False, False): EulerCtrv,
+    (False, True): AcceleratedEulerCtrv,
+    (True, False): SaturatedEulerCtrv,
+    (True, True): SaturatedAcceleratedEulerCtrv,
 }
+_EGO_STORAGE_TICKS = 350  # of the published implementation
 _STORAGE = {
-    ("grid", "stored"): BackwardForwardBank,
-    ("grid", "stale"): StalePresent,
-    ("leading", "stored"): LeadingClock,
-    ("leading", "stale"): LeadingClockStalePresent,
+    (False, False): BackwardForwardBank,
+    (False, True): StalePresent,
+    (True, False): LeadingClock,
+    (True, True): LeadingClockStalePresent,
 }
 
 
@@ -67,13 +68,13 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
 
     `observed` may put its own parts, which watch the others, in their place.
     """
-    road = build_road(config.map)
+    road = build_road(config.map, config.defects)
     motion, failures = config.motion_model(), Failures()
     published_order = config.lifecycle.kind == "published"
     parts = TrackerParts(
         sensors=config.sensors,
         ego=_build_ego(config),
-        inbox=_build_inbox(config),
+        inbox=(SlotInbox if "one_slot" in config.defects else QueueInbox)(config.sensors),
         preprocess=(PublishedPreprocess if published_order else Preprocess)(
             road, config.merge, motion, config.ego.detection_origin_m, ExclusionAreas.read(config.map.excluded)
         ),
@@ -98,7 +99,7 @@ def build_lifecycle(config: Config) -> Lifecycle:
     return (PublishedLifecycle if rules.kind == "published" else CountingLifecycle)(rules, config.sensors)
 
 
-def build_road(config: MapConfig) -> Road:
+def build_road(config: MapConfig, defects: Collection[Defect] = ()) -> Road:
     """The map that `config` names. Raises `CallError` for a pit lane without a track, which it belongs to."""
     if config.track_file is None:
         if config.pit is not None:
@@ -109,9 +110,9 @@ def build_road(config: MapConfig) -> Road:
     track = _read_map(config.track_file, make_oval)
     pit = None if config.pit is None else _read_map(config.pit, make_pit_lane)
     buffers = (config.inner_buffer_m, config.outer_buffer_m, config.pit_buffer_m)
-    if config.lookup == "frenet":
+    if not {"heading_jump", "circular_heading"} & set(defects):
         return MappedRoad(track, pit, *buffers)
-    lookup = PublishedMap if config.lookup == "published" else CircularHeadingMap
+    lookup = PublishedMap if "heading_jump" in defects else CircularHeadingMap
     try:
         return MappedRoad(lookup(track), None if pit is None else lookup(pit), *buffers)
     except DataError as error:
@@ -128,7 +129,7 @@ def _read_map(name: str, built_in: Callable[[], TrackMap]) -> TrackMap:
 
 def _build_backward_forward(config: Config, failures: Failures) -> TrackBank:
     step_ns = period_ns(config.filter.frequency_hz)
-    storage = _STORAGE[config.filter.clock, config.filter.present]
+    storage = _STORAGE["leading_clock" in config.defects, "stale_present" in config.defects]
     steps = round(config.filter.storage_s * config.filter.frequency_hz)
 
     def bank() -> TrackBank:
@@ -179,30 +180,18 @@ def build_propagator(config: Config, step_s: float) -> Propagator:
     motion, noise = config.motion_model(), config.motion
     if noise.kind != "ctrv_euler":
         return ExactPropagator(motion)
-    density = np.array([noise.std_per_s[name] ** 2 / noise.noise_hz for name in _noise_names(noise)])
-    if noise.noise == "per_step":
-        density *= noise.noise_hz * step_s
-    return _EULER[noise.yaw, noise.acceleration](motion, density)
-
-
-def _noise_names(config: MotionConfig) -> list[str]:
-    names = ["position", "position", "yaw", "speed", "yaw_rate"]
-    return [*names, "accel"] if config.acceleration == "driving" else names
+    names = ["position", "position", "yaw", "speed", "yaw_rate", *(["accel"] if noise.is_driven else [])]
+    density = np.array([noise.std_per_s[name] ** 2 / NOISE_HZ for name in names])
+    if "noise_per_step" in config.defects:
+        density *= NOISE_HZ * step_s
+    return _EULER["saturated_yaw" in config.defects, noise.is_driven](motion, density)
 
 
 def _build_ego(config: Config) -> EgoSource:
     ego = config.ego
     std = EgoStd(ego.position_std_m, ego.yaw_std_rad, ego.speed_std_mps, ego.yaw_rate_std_radps)
-    known, max_future_s = None if ego.uncertainty == "none" else std, config.inbox.max_future_s
-    if ego.kind == "published":
+    known = None if ego.uncertainty == "none" else std
+    if "refiltered_ego" in config.defects:
         step_ns = period_ns(config.filter.frequency_hz)
-        return PublishedEgo(ego.yaw_weight, ego.yaw_rate_weight, step_ns, ego.storage_ticks, known, max_future_s)
-    return EgoTrajectory(
-        ego.yaw_weight, ego.yaw_rate_weight, ego.memory_s, ego.max_extrapolation_s, known, max_future_s
-    )
-
-
-def _build_inbox(config: Config) -> Inbox:
-    if config.inbox.kind == "slot":
-        return SlotInbox(config.sensors)
-    return QueueInbox(config.sensors, config.inbox.max_future_s, config.inbox.memory_s)
+        return PublishedEgo(ego.yaw_weight, ego.yaw_rate_weight, step_ns, _EGO_STORAGE_TICKS, known)
+    return EgoTrajectory(ego.yaw_weight, ego.yaw_rate_weight, std=known)

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat, PositiveInt, Tag
+from pydantic import Discriminator, Field, NonNegativeFloat, Tag
 
 from fgtrack.estimation.initiation import DEFAULT, Initiation
 from fgtrack.estimation.registry import ESTIMATORS, Claims, motion_model
@@ -50,8 +50,6 @@ class MapConfig:
     recording, else open space."""
     pit: str | None = None
     """CSV file of the pit lane, `oval` for the built-in one, or null."""
-    lookup: Literal["frenet", "published", "published_circular_heading"] = "frenet"
-    """`frenet` projects on the reference line; the others are look-ups of the published implementation (Q3, Q4)."""
     inner_buffer_m: float = 0.0
     """How far beyond the inner bound an object may be."""
     outer_buffer_m: float = 0.0
@@ -71,8 +69,6 @@ class MapConfig:
 class EgoConfig:
     """What is done to the ego state, and where detections in the ego frame have their origin."""
 
-    kind: Literal["low_pass", "published"] = "low_pass"
-    """`published` filters its own output again at every tick (Q13)."""
     yaw_weight: _Weight = 1.0
     """Weight of the new yaw in the low-pass; 1 leaves it as it is."""
     yaw_rate_weight: _Weight = 1.0
@@ -82,12 +78,6 @@ class EgoConfig:
     else 0."""
     detection_origin_y_m: float = 0.0
     """The same to the left."""
-    memory_s: PositiveFloat = 5.0
-    """How far back the ego pose is known."""
-    max_extrapolation_s: PositiveFloat = 1.0
-    """A detection whose stamp is further than this from any ego state cannot be placed, in a gap neither."""
-    storage_ticks: PositiveInt = 350
-    """Length of the ego storage of the published implementation."""
     uncertainty: Literal["none", "independent"] = "independent"
     """Effect of the ego's covariance: none (as in the paper), or added to the noise of every detection as if each had
     an error of its own."""
@@ -106,16 +96,21 @@ class EgoConfig:
         return self.detection_origin_x_m or 0.0, self.detection_origin_y_m
 
 
-@dataclass(frozen=True)
-class InboxConfig:
-    """How detections wait for the tick."""
-
-    kind: Literal["queue", "slot"] = "queue"
-    """`slot` keeps only the newest list of each sensor (Q12)."""
-    max_future_s: NonNegativeFloat = 1.0
-    """A detection or ego state stamped further than this ahead of its receipt is not used."""
-    memory_s: PositiveFloat = 10.0
-    """How long a list is remembered at least, so that a copy of it is not fused again."""
+Defect = Literal[
+    "circular_heading",
+    "heading_jump",
+    "noise_per_step",
+    "saturated_yaw",
+    "stale_present",
+    "one_slot",
+    "refiltered_ego",
+    "leading_clock",
+]
+"""The map look-up of the published implementation with the heading on the circle (Q4) or through its jump (Q3, Q4);
+(std_per_s dt)^2 in every step dt of the filter, whatever its frequency (Q6); a yaw that sticks at its upper limit (Q2);
+an update without delay that does not reach the stored present state (Q8); the newest list of each sensor alone (Q12);
+an ego low-pass that filters its own output again at every tick (Q13); a tracking time up to a step ahead of the clock
+(Q14)."""
 
 
 @dataclass(frozen=True)
@@ -149,10 +144,6 @@ class FilterConfig:
     """Frequency of the grid."""
     storage_s: float = 3.0
     """How far back states are kept."""
-    clock: Literal["grid", "leading"] = "grid"
-    """`leading`: the tracking time leads the clock by up to a step (Q14)."""
-    present: Literal["stored", "stale"] = "stored"
-    """Whether an update without delay reaches the stored present state."""
 
     def __post_init__(self) -> None:
         if not 1.0 / self.frequency_hz <= self.storage_s <= 60.0:
@@ -168,6 +159,8 @@ class InitiationConfig:
     through the first ones, until its direction is certain."""
 
 
+#: Frequency of the steps to which `motion.std_per_s` belongs, as in the paper.
+NOISE_HZ = 100.0
 #: Of traffic: 1.5 m/s and 0.2 rad/s of change within a second.
 _STD_PER_S = {"position": 0.3, "yaw": 0.1, "speed": 15.0, "yaw_rate": 2.0}
 _BUILT_IN_MOTION: Mapping[str, type[CTRV | CV]] = {"ctrv_euler": CTRV, "ctrv": CTRV, "ctra": CTRA, "cv": CV}
@@ -180,31 +173,26 @@ class MotionConfig:
     kind: str = "ctrv"
     """`ctrv`, `ctra`, `cv`, `ctrv_euler` (the paper's steps), or the name of a plug-in."""
     std_per_s: Mapping[str, float] = field(default_factory=_STD_PER_S.copy)
-    """Process noise as the paper gives it: each step of 1 / noise_hz adds (std_per_s / noise_hz)^2, hence the density
-    std_per_s^2 / noise_hz. `ctra` takes `accel` as well, `cv` takes `velocity` alone."""
-    noise_hz: float = 100.0
-    """Frequency of the steps to which `std_per_s` belongs."""
+    """Process noise as the paper gives it: each step of 1 / `NOISE_HZ` adds (std_per_s / NOISE_HZ)^2, hence the density
+    std_per_s^2 / NOISE_HZ. `ctra` takes `accel` as well, `cv` takes `velocity` alone; of `ctrv_euler` `accel` is an
+    acceleration that drives the speed but is never estimated (Q5)."""
     parameters: Mapping[str, float] = field(default_factory=dict)
     """Keyword parameters of a plug-in, which has no `std_per_s`."""
-    noise: Literal["density", "per_step"] = "density"
-    """`per_step`: (std_per_s dt)^2 in every step dt of the filter, whatever its frequency (`ctrv_euler`)."""
-    yaw: Literal["free", "saturated"] = "free"
-    """`saturated`: the yaw sticks at its upper limit (Q2)."""
-    acceleration: Literal["none", "driving"] = "none"
-    """`driving`: an acceleration that drives the speed but is never estimated (`ctrv_euler`, takes `accel`)."""
 
     def __post_init__(self) -> None:
         for name, std_per_s in self.std_per_s.items():
             if std_per_s < 0.0:
                 raise ValueError(f"std_per_s.{name}: must not be negative, is {std_per_s}")
-        departures = (self.noise, self.yaw, self.acceleration) != ("density", "free", "none")
-        if departures and self.kind != "ctrv_euler":
-            raise ValueError("noise, yaw and acceleration may be changed for kind ctrv_euler only")
         if self.kind in _BUILT_IN_MOTION and self.parameters:
             raise ValueError(f"parameters: are a plug-in's, kind {self.kind} takes std_per_s")
         if self.kind not in _BUILT_IN_MOTION and dict(self.std_per_s) != _STD_PER_S:
             raise ValueError(f"std_per_s: is that of the built-in models, give parameters for kind {self.kind}")
         self.model()
+
+    @property
+    def is_driven(self) -> bool:
+        """True if an acceleration drives the speed that is never estimated."""
+        return self.kind == "ctrv_euler" and "accel" in self.std_per_s
 
     @property
     def is_plug_in(self) -> bool:
@@ -215,8 +203,8 @@ class MotionConfig:
         """The motion model, with the densities; raises `ValueError` where `std_per_s` does not fit it."""
         if self.is_plug_in:
             return motion_model(self.kind, self.parameters)
-        model = CTRA if self.acceleration == "driving" else _BUILT_IN_MOTION[self.kind]
-        return model.from_std_per_step(self.std_per_s, self.noise_hz)
+        model = CTRA if self.is_driven else _BUILT_IN_MOTION[self.kind]
+        return model.from_std_per_step(self.std_per_s, NOISE_HZ)
 
 
 #: Estimators that take all settings of `smoother`.
@@ -263,7 +251,6 @@ class Config:
     clock: ClockConfig = field(default_factory=ClockConfig)
     map: MapConfig = field(default_factory=MapConfig)
     ego: EgoConfig = field(default_factory=EgoConfig)
-    inbox: InboxConfig = field(default_factory=InboxConfig)
     merge: MergeConfig = field(default_factory=NoMerge)
     association: AssociationConfig = field(default_factory=GatedMahalanobis)
     objects: ObjectRules = field(default_factory=ObjectRules)
@@ -274,6 +261,8 @@ class Config:
     filter: FilterConfig = field(default_factory=FilterConfig)
     smoother: SmootherSettings = field(default_factory=SmootherSettings)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    defects: tuple[Defect, ...] = ()
+    """Defects of the published implementation that change its numbers, see `Defect`."""
     options: Mapping[str, Mapping[str, bool | int | float | str]] = field(default_factory=dict)
     """Options of estimators that have no section of their own, by name: `{reorder-buffer: {hold_s: 0.2}}`."""
 
@@ -288,6 +277,8 @@ class Config:
             strangers = set(named) - set(self.sensors) - set(self.ignore_sensors)
             if strangers and self.sensors:
                 raise ValueError(f"input.{key}: {sorted(strangers)[0]!r} has no model under sensors")
+        if self.motion.kind != "ctrv_euler" and {"noise_per_step", "saturated_yaw"} & set(self.defects):
+            raise ValueError("defects: noise_per_step and saturated_yaw are of motion.kind ctrv_euler")
         erring = [name for name, sensor in self.sensors.items() if sensor.correlation is not None]
         if erring and self.motion.kind == "ctrv_euler":
             raise ValueError(f"sensors.{erring[0]}.correlation: needs motion.kind ctrv, ctra or cv")

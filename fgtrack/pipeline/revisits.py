@@ -12,7 +12,7 @@ import numpy as np
 from fgtrack.core.time import seconds
 from fgtrack.core.types import DetectionList, FloatArray
 from fgtrack.estimation.smoothing.settings import SmootherSettings
-from fgtrack.pipeline.config import ClockConfig, Config, FilterConfig, MotionConfig
+from fgtrack.pipeline.config import NOISE_HZ, ClockConfig, Config, FilterConfig, MotionConfig
 
 __all__ = ["Revisits", "for_slow_revisits"]
 
@@ -71,7 +71,7 @@ def for_slow_revisits(config: Config, revisits: Iterable[Revisits]) -> tuple[dic
     typical_s = [found.typical_s for found in revisits]
     known_s = [each for each in typical_s if each is not None]
     default = MotionConfig()
-    density = default.std_per_s["yaw_rate"] ** 2 / default.noise_hz
+    density = default.std_per_s["yaw_rate"] ** 2 / NOISE_HZ
     limit_s = math.cbrt(3.0 / density)
     if len(known_s) < len(typical_s) or not known_s or min(known_s) <= limit_s:
         return {}, ""

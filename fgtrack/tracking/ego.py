@@ -18,6 +18,8 @@ from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import EgoState, FloatArray
 from fgtrack.tracking.inbox import ASYMMETRY, is_bounded
 
+#: A detection whose stamp is further than this from any ego state cannot be placed, in a gap neither.
+MAX_EXTRAPOLATION_S = 1.0
 LARGEST_STEP_BACK_S = 1.0
 """A state that is older than the newest one by more than this has a wrong stamp."""
 
@@ -255,8 +257,8 @@ class EgoTrajectory(EgoSource):
         self,
         yaw_weight: float,
         yaw_rate_weight: float,
-        memory_s: float,
-        max_extrapolation_s: float,
+        memory_s: float = 5.0,
+        max_extrapolation_s: float = MAX_EXTRAPOLATION_S,
         std: EgoStd | None = None,
         max_future_s: float = 1.0,
     ) -> None:

@@ -175,7 +175,7 @@ class _Seen:
 class QueueInbox:
     """Keeps every message. Refuses repeated, too late and future ones, and single detections that are no detections."""
 
-    def __init__(self, sensors: Mapping[str, SensorModel], max_future_s: float, memory_s: float = 10.0) -> None:
+    def __init__(self, sensors: Mapping[str, SensorModel], max_future_s: float = 1.0, memory_s: float = 10.0) -> None:
         """`memory_s`: how long a list is remembered; at least as long as a sensor's list may take."""
         self._sensors = sensors
         self._max_future_ns = nanoseconds(max_future_s)

@@ -95,14 +95,10 @@ class LifecycleRules:
     """Up to here short-range sensors age a track, beyond it long-range sensors do."""
     confirm_count: int = 3
     """Measurements of its position after which a track is confirmed."""
-    tentative_misses: int | None = None
-    """A track that is not yet confirmed ends after so many misses; null leaves it to its counter."""
 
     def __post_init__(self) -> None:
         if self.counter_cap < 1 or self.confirm_count < 1:
             raise ValueError("counter_cap and confirm_count must be at least 1")
-        if self.tentative_misses is not None and self.tentative_misses < 1:
-            raise ValueError(f"tentative_misses: must be at least 1, is {self.tentative_misses}")
         positive(forget_s=self.forget_s)
         not_negative(short_range_m=self.short_range_m)
 
@@ -155,9 +151,7 @@ class CountingLifecycle:
         return ages == "always" or ages == ("short_range" if near else "long_range")
 
     def _ends(self, life: Life, present_ns: int) -> bool:
-        limit = self._rules.tentative_misses
-        unconfirmed = life.num_placed < self._rules.confirm_count
-        return life.counter <= 0 or (limit is not None and life.misses >= limit and unconfirmed)
+        return life.counter <= 0
 
     def expired(self, present_ns: int) -> list[int]:
         """See `Lifecycle.expired`."""

@@ -25,11 +25,11 @@ _sizes_m = attrgetter(*_SIZES)
 
 @dataclass(frozen=True)
 class ObjectRules:
-    """Rules for the class of a detection."""
+    """Rules for the class of a detection, which may only belong to a track of its class or of one like it.
 
-    separate_classes: bool = True
-    """True if a detection may only belong to a track of its class or of one like it; one without a class may belong to
-    any. The class of a track is that of most of its detections."""
+    One without a class may belong to any. The class of a track is that of most of its detections.
+    """
+
     alike: tuple[tuple[str, ...], ...] = (_VEHICLES, _PERSONS, _RIDERS)
     """Groups of classes that a detector may confuse, in lower case; any other class is like none."""
 
@@ -56,7 +56,6 @@ class Objects:
     """Class and size of each track, and the pairs that they exclude."""
 
     def __init__(self, rules: ObjectRules) -> None:
-        self._separate = rules.separate_classes
         self._groups = {name: -1 - number for number, group in enumerate(rules.alike) for name in group}
         self._seen: dict[int, _Seen] = {}
 
@@ -77,7 +76,7 @@ class Objects:
 
     def apart(self, named: Sequence[str | None], track_ids: Sequence[int]) -> Apart | None:
         """Return a test of pairs for different classes; None if no pair is excluded."""
-        if not self._separate or not self._seen or not any(named):
+        if not self._seen or not any(named):
             return None
         classes = [self._class(track_id) for track_id in track_ids]
         if not any(classes):

@@ -314,4 +314,3 @@ def test_consistency_is_strict_json(tmp_path: Path) -> None:
     assert again["multi_object"]["clear"]["pairs"] == 3
     assert set(again["multi_object"]["identity"]) == {"idf1", "idp", "idr"}
     assert set(again["multi_object"]["hota"]) == {"hota", "deta", "assa"}
-    assert again["options"]["gospa_c_m"] is None

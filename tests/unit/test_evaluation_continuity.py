@@ -64,14 +64,6 @@ def test_several_late_updates_make_one_late_switch(tmp_path: Path) -> None:
     assert late_of(run, 0.0) == [0, 0]
 
 
-def test_the_setting_says_how_soon(tmp_path: Path) -> None:
-    run = switching_run(tmp_path / "run", {6: [update(disposition=LATE, track_id=1)]})
-    for late_switch_s, late in ((0.1, 0), (0.12, 1)):
-        truth = evaluate(run, EvaluationConfig(late_switch_s=late_switch_s)).truth
-        assert truth is not None
-        assert truth.objects[7].late_id_switches == late
-
-
 def test_an_update_of_a_tick_that_was_never_finished_does_not_count(tmp_path: Path) -> None:
     run = switching_run(tmp_path / "run", {12: [update(disposition=LATE, track_id=2)], 19: [update(disposition=LATE)]})
     finished = run.tables["timing"]["tick"] < 15

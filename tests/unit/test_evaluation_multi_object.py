@@ -87,7 +87,7 @@ def test_gospa_of_a_run_is_what_can_be_counted(story: Run) -> None:
 
 def test_the_cut_off_is_the_gate_unless_it_is_set(story: Run) -> None:
     assert multi_object(story, EvaluationConfig(gate_m=2.0)).gospa.c_m == 2.0
-    own = multi_object(story, EvaluationConfig(gospa_c_m=0.5)).gospa
+    own = multi_object(story, EvaluationConfig(gate_m=0.5)).gospa
     assert own.localisation_m2 == 0.0
     assert own.false_m2 == pytest.approx(11 * 0.125 / 10)  # a pair at 0.8 m is a miss and a false track
 
@@ -244,11 +244,11 @@ def test_the_configuration_of_the_run_says_how_it_is_judged(story: Run) -> None:
     without = replace(story, config_text="evaluation: {multi_object: false}")
     assert evaluate(without).multi_object is None
     assert str(evaluate(without).truth) == str(evaluate(story).truth)  # NaN equals no NaN
-    options = "evaluation: {gate_m: 3, gospa_c_m: 7, late_switch_s: 2, multi_object: true}"
+    options = "evaluation: {gate_m: 3, multi_object: true}"
     one = evaluate(replace(story, config_text=options))
-    assert one.options == EvaluationConfig(3.0, True, True, 7.0, 2.0)
+    assert one.options == EvaluationConfig(3.0)
     assert one.multi_object is not None
-    assert one.multi_object.gospa.c_m == 7.0
+    assert one.multi_object.gospa.c_m == 3.0
     assert evaluate(story).options == EvaluationConfig()
 
 

@@ -17,7 +17,7 @@ from fgtrack.io.adapters.scans import grouped
 from fgtrack.io.stream import write_stream
 from fgtrack.models.sensors import Filter, SensorModel
 from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.config import Config, InboxConfig
+from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_in_memory
 
 SEEN = (
@@ -41,9 +41,9 @@ def radar_list(at_ms: float = 0.0) -> DetectionList:
     return DetectionList("radar", now_ns, now_ns, SEEN, "map")
 
 
-@pytest.mark.parametrize("inbox", ["queue", "slot"])
-def test_score_class_and_speed_decide_what_is_used_and_the_rest_is_out_of_bounds(inbox: str) -> None:
-    one = build_tracker(replace(Config(), sensors={"radar": RADAR}, inbox=InboxConfig(kind=inbox)))
+@pytest.mark.parametrize("defects", [(), ("one_slot",)])
+def test_score_class_and_speed_decide_what_is_used_and_the_rest_is_out_of_bounds(defects) -> None:
+    one = build_tracker(replace(Config(), sensors={"radar": RADAR}, defects=defects))
     one.receive(radar_list())
     report = one.tick(START_NS)
     found = {each.index: (each.disposition.value, each.reason) for each in report.updates}

@@ -126,19 +126,9 @@ def test_the_status_tells_unconfirmed_from_seen_from_missed() -> None:
     assert Life(1, START_NS, num_measured=2, misses=1).status(3) is TrackStatus.TENTATIVE
 
 
-def test_an_unconfirmed_track_ends_at_its_first_misses_where_that_is_asked_for() -> None:
-    life = lifecycle(tentative_misses=2, confirm_count=2)
-    for track_id in (0, 1):
-        life.born(track_id, Scan("far", START_NS, START_NS))
-    life.fused(1)
-    ranges_m = np.array([80.0, 80.0])
-    assert life.missed(Scan("far", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == []
-    assert life.missed(Scan("far", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == [0]
-
-
 @pytest.mark.parametrize(
     "rules",
-    [{"counter_cap": 0}, {"confirm_count": 0}, {"forget_s": 0.0}, {"short_range_m": -1.0}, {"tentative_misses": 0}],
+    [{"counter_cap": 0}, {"confirm_count": 0}, {"forget_s": 0.0}, {"short_range_m": -1.0}],
 )
 def test_rules_that_make_no_sense_are_named(rules: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(rules))):

@@ -51,7 +51,6 @@ def test_a_car_never_joins_the_track_of_a_pedestrian(association: str) -> None:
         ("animal", "debris", {}, False),
         ("animal", "Animal", {}, True),
         ("car", "truck", {"alike": ()}, False),
-        ("car", "pedestrian", {"separate_classes": False}, True),
         (None, "pedestrian", {}, True),
         ("car", None, {}, True),
     ],

@@ -240,7 +240,7 @@ def test_the_key_of_a_job_is_that_of_its_content_however_it_is_written(plan: Any
 
 @pytest.mark.parametrize(
     "text",
-    ["seeds: [1]", "set: {association.gate_m: 4.9}", "duration_s: 59.9", "set: {ego.memory_s: 4.0}"],
+    ["seeds: [1]", "set: {association.gate_m: 4.9}", "duration_s: 59.9", "set: {ego.yaw_weight: 0.5}"],
 )
 def test_whatever_decides_the_result_changes_the_key(plan: Any, text: str) -> None:
     assert keys(plan(text)) != keys(plan(""))

@@ -29,23 +29,10 @@ class EvaluationConfig:
     """Whether tentative tracks are left out: by counting, those measured less than `lifecycle.confirm_count` times."""
     multi_object: bool = True
     """Whether GOSPA, CLEAR, IDF1 and HOTA are computed."""
-    gospa_c_m: float | None = None
-    """Cut-off distance c of GOSPA; null for `gate_m`."""
-    late_switch_s: float = 0.5
-    """An identity switch within this time after an out-of-sequence update counts as late."""
-
-    @property
-    def gospa_cut_off_m(self) -> float:
-        """Cut-off distance c of GOSPA, the gate where none is given."""
-        return self.gate_m if self.gospa_c_m is None else self.gospa_c_m
 
     def __post_init__(self) -> None:
-        for name in ("gate_m", "gospa_c_m"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 < value <= LARGEST:
-                raise ValueError(f"{name}: must be positive and at most {LARGEST:g}, is {value}")
-        if not 0.0 <= self.late_switch_s <= LARGEST:
-            raise ValueError(f"late_switch_s: must not be negative, nor above {LARGEST:g}, is {self.late_switch_s}")
+        if not 0.0 < self.gate_m <= LARGEST:
+            raise ValueError(f"gate_m: must be positive and at most {LARGEST:g}, is {self.gate_m}")
 
 
 @dataclass(frozen=True)
