@@ -25,10 +25,7 @@ from fgtrack.pipeline.load import load
 
 CONFIG = Path(__file__).parent.parent / "configs" / "smoother.yaml"
 PARTS = {
-    "making the factors": [
-        (incremental.IncrementalSolver, "_add_motion"),
-        (incremental.IncrementalSolver, "_add_measurements"),
-    ],
+    "making the factors": [(incremental.IncrementalSolver, "_add_factors")],
     "iSAM2's update and the means": [(incremental._Graph, "solve")],
     "covariances": [(incremental.IncrementalSolver, "_covariance")],
 }

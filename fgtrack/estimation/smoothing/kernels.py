@@ -9,36 +9,12 @@ import numpy as np
 
 from fgtrack.core.compiled import inlined, njit
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.estimation.kernels.kalman import add_product_transposed, product, solve
 
 #: Where a measurement leaves less than this of a variance, the short form of its update keeps too few digits.
 _LEAST_SHARE = 1e-6
 TRACKS, ORDER, VECTORS, MATRICES = "int64[::1]", "int64[:, ::1]", "float64[:, ::1]", "float64[:, :, ::1]"
 _WINDOWS = f"{TRACKS}, {TRACKS}, {ORDER}"  # first, count, numbers
-
-
-@inlined
-def _congruence(A: FloatArray, B: FloatArray, product: FloatArray, found: FloatArray) -> None:
-    """Add A B A' to the lower triangle of `found`."""
-    n = A.shape[0]
-    for i in range(n):
-        for j in range(n):
-            value = 0.0
-            for k in range(n):
-                value += A[i, k] * B[k, j]
-            product[i, j] = value
-        for j in range(i + 1):
-            value = found[i, j]
-            for k in range(n):
-                value += product[i, k] * A[j, k]
-            found[i, j] = value
-
-
-@inlined
-def _mirror(lower: FloatArray) -> None:
-    """Write the lower triangle above the diagonal."""
-    for i in range(lower.shape[0]):
-        for j in range(i):
-            lower[j, i] = lower[i, j]
 
 
 @inlined
@@ -59,33 +35,10 @@ def cholesky(matrix: FloatArray, n: int, L: FloatArray) -> bool:
 
 
 @inlined
-def _solve(matrix: FloatArray, rhs: FloatArray) -> bool:
-    """Gaussian elimination with pivots, as LAPACK's gesv; the solution replaces `rhs`. False if there is none."""
-    n = matrix.shape[0]
-    for k in range(n):
-        pivot = k
-        for i in range(k + 1, n):
-            if abs(matrix[i, k]) > abs(matrix[pivot, k]):
-                pivot = i
-        if not abs(matrix[pivot, k]) > 0.0:
-            return False
-        if pivot != k:
-            for j in range(n):
-                matrix[k, j], matrix[pivot, j] = matrix[pivot, j], matrix[k, j]
-                rhs[k, j], rhs[pivot, j] = rhs[pivot, j], rhs[k, j]
-        for i in range(k + 1, n):
-            factor = matrix[i, k] / matrix[k, k]
-            for j in range(k + 1, n):
-                matrix[i, j] -= factor * matrix[k, j]
-            for j in range(n):
-                rhs[i, j] -= factor * rhs[k, j]
-    for k in range(n - 1, -1, -1):
-        for j in range(n):
-            value = rhs[k, j]
-            for i in range(k + 1, n):
-                value -= matrix[k, i] * rhs[i, j]
-            rhs[k, j] = value / matrix[k, k]
-    return True
+def regularise(Q: FloatArray) -> None:
+    """Add to process noise that leaves out a direction, see `linalg.regular`."""
+    for i in range(Q.shape[0]):
+        Q[i, i] += 1e-12 * max(Q[i, i], 1e-6)
 
 
 @inlined
@@ -99,8 +52,8 @@ def _predict(left: FloatArray, segment: FloatArray, origin: FloatArray, moved: F
         ahead[i, n] = mean
         for j in range(i + 1):
             ahead[i, j] = 0.5 * (segment[i, n + j] + segment[j, n + i])
-    _congruence(segment[:, :n], left, moved, ahead[:, :n])
-    _mirror(ahead[:, :n])
+    product(segment[:, :n], left[:, :n], moved)
+    add_product_transposed(moved, segment[:, :n], ahead[:, :n])
 
 
 @inlined
@@ -110,14 +63,14 @@ def _condition(
     ahead: FloatArray,
     gain: FloatArray,
     E: FloatArray,
-    product: FloatArray,
+    work: FloatArray,
     back: FloatArray,
     C: FloatArray,
 ) -> bool:
     """A = P F' (F P F' + Q)^-1, b, C = E P E' + A Q A', E = I - A F; `gain` holds F P. False if there is no A."""
     n = gain.shape[0]
     E[:] = ahead[:, :n]
-    if not _solve(E, gain):
+    if not solve(E, gain):
         return False
     for i in range(n):
         mean = left[i, n]
@@ -130,15 +83,16 @@ def _condition(
             E[i, j] = value
         back[i, n] = mean
     C[:] = 0.0
-    _congruence(E, left, product, C)
-    _congruence(back[:, :n], segment[:, n : 2 * n], product, C)
-    _mirror(C)
+    product(E, left[:, :n], work)
+    add_product_transposed(work, E, C)
+    product(back[:, :n], segment[:, n : 2 * n], work)
+    add_product_transposed(work, back[:, :n], C)
     return True
 
 
 @inlined
 def _correct(
-    state: FloatArray, row: FloatArray, gain: FloatArray, E: FloatArray, P: FloatArray, product: FloatArray
+    state: FloatArray, row: FloatArray, gain: FloatArray, E: FloatArray, P: FloatArray, work: FloatArray
 ) -> None:
     """Fuse y = G x + N(0, 1), `row` being [G | y], into `state` [P | x]; precise ones in Joseph's form."""
     n = len(gain)
@@ -156,14 +110,14 @@ def _correct(
         gain[i] /= S
         state[i, n] += gain[i] * y
         for j in range(i + 1):
-            state[i, j] -= gain[i] * S * gain[j]
+            state[i, j] = state[j, i] = state[i, j] - gain[i] * S * gain[j]
     if precise:
         for i in range(n):
             for j in range(n):
                 E[i, j] = (1.0 if i == j else 0.0) - gain[i] * row[j]
                 state[i, j] = gain[i] * gain[j]
-        _congruence(E, P, product, state[:, :n])
-    _mirror(state[:, :n])
+        product(E, P, work)
+        add_product_transposed(work, E, state[:, :n])
 
 
 @njit(
@@ -188,7 +142,7 @@ def eliminate(
 ) -> bool:
     """Eliminate the nodes of `tracks` from `starts` up to before `ends`; True if all is finite."""
     n = origin.shape[1]
-    A, E, P, product, gain = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(n)
+    A, E, P, work, gain = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(n)
     for t in range(len(tracks)):
         track = tracks[t]
         for index in range(starts[t], min(ends[t], count[track])):
@@ -197,13 +151,13 @@ def eliminate(
                 before = numbers[track, index - 1]
                 _predict(filtered[before], segment[before], origin[at], A, predicted[at])
                 if not _condition(
-                    filtered[before], segment[before], predicted[at], A, E, product, back[before], C[before]
+                    filtered[before], segment[before], predicted[at], A, E, work, back[before], C[before]
                 ):
                     return False
             state = filtered[at]
             state[:] = predicted[at]
             for k in range(num_rows[at]):
-                _correct(state, rows[at, k], gain, E, P, product)
+                _correct(state, rows[at, k], gain, E, P, work)
             if not np.isfinite(state).all():
                 return False
     return True
@@ -309,7 +263,7 @@ def smoothed(
     From index `known` on covariances are known.
     """
     n = step.shape[1]
-    product = np.empty((n, n))
+    work = np.empty((n, n))
     for t in range(len(tracks)):
         track = tracks[t]
         for index in range(known[track] - 1, indices[t] - 1, -1):
@@ -319,8 +273,8 @@ def smoothed(
                 continue
             later = numbers[track, index + 1]
             P[at] = C[at]
-            _congruence(back[at, :, :n], P[later], product, P[at])
-            _mirror(P[at])
+            product(back[at, :, :n], P[later], work)
+            add_product_transposed(work, back[at, :, :n], P[at])
             if index < first[track]:  # behind the window
                 for i in range(n):
                     value = back[at, i, n]
@@ -330,3 +284,52 @@ def smoothed(
         known[track] = min(known[track], indices[t])
         at = numbers[track, indices[t]]
         steps[t], covariances[t] = step[at], P[at]
+
+
+@njit(f"b1({', '.join([VECTORS, MATRICES, MATRICES] * 2)}, {VECTORS}, {MATRICES}, {MATRICES}, {MATRICES})")
+def interpolate(
+    mean: FloatArray,
+    F1: FloatArray,
+    Q1: FloatArray,
+    ahead: FloatArray,
+    F2: FloatArray,
+    Q2: FloatArray,
+    right: FloatArray,
+    A: FloatArray,
+    C: FloatArray,
+    P: FloatArray,
+) -> bool:
+    """Write means and covariances of states between two nodes over `mean` and `P`; False if noise is not definite.
+
+    `mean` is predicted from the left node, `ahead` from there; the right one has mean `right` and covariance P, that
+    on the left A and C given it. See `interpolation.between` for Psi, Lambda and Sigma, which is E Q1 E' + Psi Q2 Psi'.
+    """
+    n = mean.shape[1]
+    S, gain, Psi, E, Lambda, by_right, work = np.empty((7, n, n))
+    for t in range(len(mean)):
+        for attempt in range(2):
+            product(F2[t], Q1[t], gain)
+            S[:] = Q2[t]
+            add_product_transposed(gain, F2[t], S)
+            if solve(S, gain):
+                break
+            if attempt == 1:
+                return False
+            regularise(Q1[t])
+            regularise(Q2[t])
+        Psi[:] = gain.T
+        product(Psi, F2[t], E)
+        for i in range(n):
+            for j in range(n):
+                E[i, j] = (1.0 if i == j else 0.0) - E[i, j]
+                mean[t, i] += Psi[i, j] * (right[t, j] - ahead[t, j])
+        product(E, F1[t], Lambda)
+        product(Lambda, A[t], by_right)
+        by_right += Psi
+        product(by_right, P[t], work)
+        P[t] = 0.0
+        add_product_transposed(work, by_right, P[t])
+        for weights, noise in ((Lambda, C[t]), (E, Q1[t]), (Psi, Q2[t])):
+            product(weights, noise, work)
+            add_product_transposed(work, weights, P[t])
+    return True

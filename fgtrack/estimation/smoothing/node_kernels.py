@@ -4,7 +4,7 @@ import numpy as np
 
 from fgtrack.core.compiled import njit
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation.smoothing.kernels import MATRICES, ORDER, TRACKS, VECTORS, cholesky
+from fgtrack.estimation.smoothing.kernels import MATRICES, ORDER, TRACKS, VECTORS, cholesky, regularise
 
 
 @njit(f"void(int64[:], int64[:], {ORDER}, {TRACKS}, {TRACKS})")
@@ -111,9 +111,10 @@ def observe(
 
 
 @njit(
-    f"int64(int64[:], int64[:], {TRACKS}, {ORDER}, {VECTORS}, {VECTORS}, {MATRICES}, b1[:, ::1], {ORDER}, {MATRICES})"
+    f"int64(int64[:], int64[:], {TRACKS}, {ORDER}, {VECTORS}, {VECTORS}, {MATRICES},"
+    f" {TRACKS}, b1[:, ::1], {ORDER}, {MATRICES})"
 )
-def motion_factors(
+def changed_factors(
     tracks: IntArray,
     starts: IntArray,
     count: IntArray,
@@ -121,28 +122,34 @@ def motion_factors(
     origin: FloatArray,
     reference: FloatArray,
     segment: FloatArray,
+    num_rows: IntArray,
     changed: BoolArray,
-    pairs: IntArray,
+    owners: IntArray,
     factors: FloatArray,
 ) -> int:
-    """Write the motion factors from `starts` on that have `changed`; return their number, or -1 if a Q is not definite.
+    """Write the factors from `starts` on that have `changed`; return their number, or -1 if a Q is not definite.
 
-    They are W (F d_left - d_right) = W e + N(0, I), d relative to `reference`, W' W = Q^-1 and e = r_right - f(x0) -
-    F (r_left - x0): row of `tracks`, left and right number in `pairs`; [(W F)'; -W'; (W e)'] in `factors`.
+    Row of `tracks`, number and next number in `owners`; the latter is -1 for measurements. Motion is W (F d_left -
+    d_right) = W e + N(0, I), d relative to `reference`, W' W = Q^-1 and e = r_right - f(x0) - F (r_left - x0):
+    [(W F)'; -W'; (W e)'] in `factors`.
     """
     n = origin.shape[1]
     L, Q, rhs = np.empty((n, n)), np.empty((n, n)), np.empty((n, 2 * n + 1))
     num = 0
     for t in range(len(tracks)):
-        for index in range(starts[t], count[tracks[t]] - 1):
-            left, right = numbers[tracks[t], index], numbers[tracks[t], index + 1]
-            if not changed[left, 0]:
+        for index in range(starts[t], count[tracks[t]]):
+            left = numbers[tracks[t], index]
+            if changed[left, 1] and num_rows[left] > 0:
+                owners[num, 0], owners[num, 1], owners[num, 2] = t, left, -1
+                num += 1
+            is_moved = changed[left, 0] and index < count[tracks[t]] - 1
+            changed[left] = False
+            if not is_moved:
                 continue
-            changed[left, 0] = False
+            right = numbers[tracks[t], index + 1]
             Q[:] = segment[left, :, n : 2 * n]
             if not cholesky(Q, n, L):
-                for i in range(n):  # noise without some direction: see `linalg.regular`
-                    Q[i, i] += 1e-12 * max(Q[i, i], 1e-6)
+                regularise(Q)
                 if not cholesky(Q, n, L):
                     return -1
             for i in range(n):
@@ -156,6 +163,6 @@ def motion_factors(
                     for m in range(i):
                         value -= L[i, m] * factors[num, j, m]
                     factors[num, j, i] = value / L[i, i]
-            pairs[num, 0], pairs[num, 1], pairs[num, 2] = t, left, right
+            owners[num, 0], owners[num, 1], owners[num, 2] = t, left, right
             num += 1
     return num

@@ -5,17 +5,32 @@ the same as long as the node exists, so that an insertion moves no values. The f
 the window and are kept for detections that are older (see `ring`); those from there up to `count` are the window.
 """
 
+from typing import TypeVar
+
 import numpy as np
+import numpy.typing as npt
 
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation.histories import Histories, grown
 from fgtrack.estimation.smoothing import node_kernels
 from fgtrack.estimation.smoothing.terms import Innovations, MeasurementTerm, is_nonlinear, whitened
 
-_FEW_NODES, _FEW_COMPONENTS = 16, 4
+_FEW_TRACKS, _FEW_NODES, _FEW_COMPONENTS = 4, 16, 4
+_NEVER_NS = int(np.iinfo(np.int64).max)
+
+_Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
-class Nodes(Histories):
+def grown(values: npt.NDArray[_Scalar], size: int) -> npt.NDArray[_Scalar]:
+    """Return `values` with zeros behind them, `size` rows in all."""
+    return np.concatenate([values, np.zeros((size - len(values), *values.shape[1:]), values.dtype)])
+
+
+def _numbered(first: int, tracks: int, nodes: int) -> IntArray:
+    """Return numbers from `first` on, shape (tracks, nodes); the first nodes of all tracks are neighbours in memory."""
+    return np.ascontiguousarray(first + np.arange(tracks * nodes).reshape(nodes, tracks).T)
+
+
+class Nodes:
     """Arrays of shape (tracks, nodes) with the order of the nodes, and (numbers, ...) with the values of each.
 
     Vectors stand as a last column beside the matrix that moves with them: [F | Q | f(x0)], [P | x], [A | b].
@@ -33,8 +48,14 @@ class Nodes(Histories):
     )
 
     def __init__(self, n: int) -> None:
-        super().__init__(_FEW_NODES)
-        self.dim, size = n, self.size
+        shape = _FEW_TRACKS, _FEW_NODES
+        self.dim, size = n, _FEW_TRACKS * _FEW_NODES
+        self.stamps_ns: IntArray = np.full(shape, _NEVER_NS)
+        """Shape (tracks, nodes); `_NEVER_NS` from `count` on."""
+        self.numbers: IntArray = _numbered(0, *shape)
+        """Shape (tracks, nodes); those from `count` on are free."""
+        self.count: IntArray = np.zeros(_FEW_TRACKS, dtype=np.int64)
+        """Number of nodes of each track."""
         self.first: IntArray = np.zeros_like(self.count)
         """Index of the oldest node of the window."""
         self.anchored: IntArray = np.zeros_like(self.count)
@@ -64,8 +85,12 @@ class Nodes(Histories):
         self.terms: dict[int, list[MeasurementTerm]] = {}
         """Measurements of each node."""
 
+    def at(self, tracks: IntArray, indices: IntArray) -> IntArray:
+        """Return the numbers of the nodes at `indices`; both of one shape."""
+        return self.numbers[tracks, indices]
+
     def place_before(self, tracks: IntArray, stamps_ns: IntArray) -> IntArray:
-        """See `Histories.place_before`."""
+        """Return the index of the newest node at or before `stamps_ns`, of each track; -1 where all are after it."""
         indices = np.empty(len(tracks), dtype=np.int64)
         node_kernels.place_before(tracks, stamps_ns, self.stamps_ns, self.count, indices)
         return indices
@@ -86,7 +111,12 @@ class Nodes(Histories):
 
     def begin_window(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
         """Make the first node of a new track."""
-        number = self.begin(track, stamp_ns)
+        while track >= len(self.count):
+            self._grow_tracks()
+        self.stamps_ns[track] = _NEVER_NS
+        self.stamps_ns[track, 0] = stamp_ns
+        self.count[track] = 1
+        number = int(self.numbers[track, 0])
         self.first[track] = self.known[track] = self.anchored[track] = 0
         self.any_far[track] = False
         self._empty(np.array([number]))
@@ -115,8 +145,14 @@ class Nodes(Histories):
                 self.linearise_terms(number)
 
     def drop(self, tracks: IntArray, many: IntArray) -> None:
-        """See `Histories.drop`: nodes behind the windows."""
-        super().drop(tracks, many)
+        """Forget so `many` of the oldest nodes of each of `tracks`, which lie behind the windows."""
+        columns = np.arange(self.stamps_ns.shape[1])
+        source = (columns + many[:, None]) % len(columns)
+        is_left = columns < (self.count[tracks] - many)[:, None]
+        stamps_ns = np.take_along_axis(self.stamps_ns[tracks], source, axis=1)
+        self.stamps_ns[tracks] = np.where(is_left, stamps_ns, _NEVER_NS)
+        self.numbers[tracks] = np.take_along_axis(self.numbers[tracks], source, axis=1)
+        self.count[tracks] -= many
         self.first[tracks] -= many
         self.known[tracks] -= many
 
@@ -154,20 +190,27 @@ class Nodes(Histories):
         for number in numbers.tolist():
             self.terms[number] = []
 
+    def make_room(self, tracks: IntArray) -> None:
+        """Make room for one more node of each of `tracks`."""
+        if self.count[tracks].max(initial=0) >= self.stamps_ns.shape[1]:
+            self._grow(axis=1)
+
     def _grow_tracks(self) -> None:
-        super()._grow_tracks()
-        for name in ("first", "anchored", "known", "any_far"):
-            setattr(self, name, grown(getattr(self, name), len(self.count)))
-        self._fit()
+        self._grow(axis=0)
+        for name in ("count", "first", "anchored", "known", "any_far"):
+            setattr(self, name, grown(getattr(self, name), len(self.numbers)))
 
-    def _grow_places(self) -> None:
-        super()._grow_places()
-        self._fit()
-
-    def _fit(self) -> None:
-        """Make room for the values of all numbers."""
+    def _grow(self, axis: int) -> None:
+        """Double the tracks, or the nodes of each; a node keeps its number and, if it is of a track, its values."""
+        shape, first = self.numbers.shape, self.numbers.size
+        used = self.numbers[np.arange(shape[1]) < self.count[:, None]]
+        self.stamps_ns = np.concatenate([self.stamps_ns, np.full(shape, _NEVER_NS)], axis=axis)
+        self.numbers = np.concatenate([self.numbers, _numbered(first, *shape)], axis=axis)
         for name in self._VALUES:
-            setattr(self, name, self.fitted(getattr(self, name)))
+            values = getattr(self, name)
+            larger = np.zeros((self.numbers.size, *values.shape[1:]), values.dtype)  # only pages of used ones are made
+            larger[used] = values[used]
+            setattr(self, name, larger)
 
     def _fit_rows(self, most: int) -> None:
         while most > self.rows.shape[1]:

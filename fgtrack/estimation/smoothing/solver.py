@@ -6,9 +6,8 @@ import numpy as np
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation.histories import grown
 from fgtrack.estimation.smoothing import kernels
-from fgtrack.estimation.smoothing.nodes import Nodes
+from fgtrack.estimation.smoothing.nodes import Nodes, grown
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
 

@@ -6,14 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.linalg import congruence, symmetrise
 from fgtrack.core.time import NS_PER_S, seconds
 from fgtrack.core.types import YAW, BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.ekf import propagated
+from fgtrack.estimation.ekf import predict
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.initiation import Fix, Line, along, fixes_of
-from fgtrack.estimation.interpolation import between
+from fgtrack.estimation.smoothing import kernels
 from fgtrack.estimation.smoothing.damping import DampedWindow
 from fgtrack.estimation.smoothing.nodes import Undo
 from fgtrack.estimation.smoothing.ring import fuse_behind
@@ -85,17 +84,17 @@ class Windows:
         self.solver.look_up(tracks, indices, is_between)
         steps, covariances = self.solver.smoothed(tracks, indices)
         means = nodes.origin[nodes.at(tracks, indices)] + steps
-        inner = is_between.nonzero()[0]
-        if inner.size == len(tracks):
-            return self._between(tracks, indices, stamps_ns, steps, means, covariances)
-        if inner.size:
-            means[inner], covariances[inner] = self._between(
-                tracks[inner], indices[inner], stamps_ns[inner], steps[inner], means[inner], covariances[inner]
+        is_ahead = (until_ns > 0) & ~is_between
+        if is_ahead.any():
+            until_s = until_ns[is_ahead] / NS_PER_S
+            means[is_ahead], covariances[is_ahead] = predict(
+                means[is_ahead], covariances[is_ahead], self._motion, until_s
             )
-        ahead = ((until_ns > 0) & ~is_between).nonzero()[0]
-        if ahead.size:
-            moved, F, Q = self._motion.transition(means[ahead], until_ns[ahead] / NS_PER_S)
-            means[ahead], covariances[ahead] = moved, propagated(F, covariances[ahead], Q)
+        if is_between.any():
+            chosen = slice(None) if is_between.all() else is_between
+            means[chosen], covariances[chosen] = self._between(
+                tracks[chosen], indices[chosen], stamps_ns[chosen], steps[chosen], means[chosen], covariances[chosen]
+            )
         return States(means, covariances)
 
     def _between(
@@ -105,19 +104,20 @@ class Windows:
         stamps_ns: IntArray,
         steps: FloatArray,
         right: FloatArray,
-        P_right: FloatArray,
+        P: FloatArray,
     ) -> States:
         """States between the nodes at `indices`, with these steps, means and covariances, and those before them."""
         nodes, n = self.nodes, self._motion.dim
         at = nodes.at(tracks, indices - 1)
-        A, b = nodes.back[at, :, :n], nodes.back[at, :, n]
+        A, b = nodes.back[at, :, :n].copy(), nodes.back[at, :, n]
+        left = nodes.origin[at] + np.matvec(A, steps) + b
         until_s = (stamps_ns - nodes.stamps_ns[tracks, indices - 1]) / NS_PER_S
         after_s = (nodes.stamps_ns[tracks, indices] - stamps_ns) / NS_PER_S
-        left = nodes.origin[at] + np.matvec(A, steps) + b
-        inner = between(self._motion, left, right, until_s, after_s)
-        by_right = inner.Lambda @ A + inner.Psi
-        given = congruence(inner.Lambda, nodes.C[at]) + inner.Sigma
-        return States(inner.mean, symmetrise(congruence(by_right, P_right) + given))
+        first = self._motion.transition(left, until_s)
+        second = self._motion.transition(first.mean, after_s)
+        if not kernels.interpolate(*first, *second, right, A, nodes.C[at], P):
+            raise np.linalg.LinAlgError("process noise is not positive definite")
+        return States(first.mean, P)
 
     # --- updates
 

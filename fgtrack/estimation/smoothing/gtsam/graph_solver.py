@@ -7,7 +7,6 @@ import numpy as np
 
 from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation.histories import grown
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.estimation.smoothing.terms import NEAR_NS
@@ -24,18 +23,17 @@ class GraphSolver(Solver):
 
     def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
         super().__init__(motion, settings)
-        self._is_known: BoolArray = np.zeros((0, 2), dtype=bool)
-        """True if `_covariances` of a node have been read."""
-        self._covariances = np.zeros((0, 2, motion.dim, motion.dim))
-        """By number: the covariance of the node, and that of the next one, from the joint covariance with it."""
+        self._known: dict[int, dict[tuple[int | None, int], FloatArray]] = {}
+        """Covariances by track and node, with the node before that it was read with, if any, since the last solution.
+
+        So what is read for a stamp does not depend on what was read for others.
+        """
 
     def begin(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
         """See `Solver.begin`."""
         super().begin(track, stamp_ns, mean, covariance)
         self._forget(track)
-        self._fit()
-        number = self.nodes.numbers[track, 0]
-        self._covariances[number, 0], self._is_known[number, 0] = covariance, True
+        self._known[track] = {(None, int(self.nodes.numbers[track, 0])): covariance}
 
     def prepare_leaving(self, tracks: IntArray, anchors: IntArray) -> None:
         """See `Solver.prepare_leaving`: eliminated by themselves."""
@@ -44,34 +42,31 @@ class GraphSolver(Solver):
         self.nodes.known[tracks] = anchors
 
     def look_up(self, tracks: IntArray, indices: IntArray, with_previous: BoolArray) -> None:
-        """See `Solver.look_up`. What is read for a stamp never depends on what was read for others."""
-        nodes, first = self.nodes, self.nodes.first[tracks]
-        kinds = (with_previous & (indices > first)).astype(np.int64)
-        numbers = nodes.at(tracks, np.maximum(indices, first))
-        owners = np.where(kinds, nodes.at(tracks, np.maximum(indices - 1, 0)), numbers)
-        for row in (~self._is_known[owners, kinds]).nonzero()[0].tolist():
-            track, number, owner = int(tracks[row]), int(numbers[row]), int(owners[row])
-            if kinds[row]:
-                self._read_pair(track, owner, number)
-            else:
-                self._covariances[number, 0] = self._covariance(track, number)
-            self._is_known[owner, kinds[row]] = True
-        nodes.P[numbers] = self._covariances[owners, kinds]
+        """See `Solver.look_up`."""
+        nodes = self.nodes
+        rows = zip(tracks.tolist(), indices.tolist(), nodes.first[tracks].tolist(), with_previous.tolist(), strict=True)
+        for track, index, first, has_previous in rows:
+            number, known = int(nodes.numbers[track, max(index, first)]), self._known[track]
+            left = int(nodes.numbers[track, index - 1]) if has_previous and index > first else None
+            if (left, number) not in known:
+                known[left, number] = self._read(track, left, number)
+            nodes.P[number] = known[left, number]
 
-    def _read_pair(self, track: int, left: int, right: int) -> None:
-        """Read the covariance of a node, and the distribution of the one before it given that."""
+    def _read(self, track: int, left: int | None, number: int) -> FloatArray:
+        """Read the covariance of a node, and the distribution of that on its left given it."""
+        if left is None:
+            return self._covariance(track, number)
         nodes, n = self.nodes, self.motion.dim
-        joint = self._covariance(track, left, right)
+        joint = self._covariance(track, left, number)
         cross, P = joint[:n, n:], joint[n:, n:]
         A = psd_solve(P, cross.T).T
-        nodes.back[left, :, :n], nodes.back[left, :, n] = A, nodes.step[left] - A @ nodes.step[right]
-        nodes.C[left] = symmetrise(joint[:n, :n] - A @ cross.T)
-        self._covariances[left, 1] = P
+        nodes.back[left, :, :n], nodes.back[left, :, n] = A, nodes.step[left] - A.dot(nodes.step[number])
+        nodes.C[left] = symmetrise(joint[:n, :n] - A.dot(cross.T))
+        return P
 
     def solve(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
         """See `Solver.solve`."""
         nodes = self.nodes
-        self._fit()
         first = nodes.first[tracks]
         is_leaving = first < anchors
         if is_leaving.any():
@@ -81,11 +76,7 @@ class GraphSolver(Solver):
             self._update(tracks, first)
         except (RuntimeError, ValueError, IndexError) as error:
             raise np.linalg.LinAlgError(f"the graph cannot be solved ({error})") from error
-        for track in tracks.tolist():
-            window = nodes.window(track)
-            if not np.isfinite(nodes.step[window]).all():
-                raise np.linalg.LinAlgError("a state is not finite")
-            self._is_known[window] = False
+        self._known.update((track, {}) for track in tracks.tolist())
         self._mark_far(tracks)
         nodes.known[tracks] = anchors
 
@@ -111,9 +102,3 @@ class GraphSolver(Solver):
     @abstractmethod
     def _forget(self, track: int) -> None:
         """Forget the graph of a track."""
-
-    def _fit(self) -> None:
-        """Make room for the values of all numbers."""
-        if self.nodes.size > len(self._is_known):
-            self._is_known = grown(self._is_known, self.nodes.size)
-            self._covariances = grown(self._covariances, self.nodes.size)

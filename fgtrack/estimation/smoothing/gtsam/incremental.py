@@ -9,16 +9,15 @@ import numpy as np
 
 from fgtrack.core.linalg import inverse_roots
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.histories import grown
 from fgtrack.estimation.smoothing import node_kernels
 from fgtrack.estimation.smoothing.gtsam.graph_solver import GraphSolver
+from fgtrack.estimation.smoothing.nodes import grown
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
 
 _Key = SupportsInt | SupportsIndex
 _Stamp = SupportsFloat | SupportsIndex
 
-_MOTION, _MEASURED = 0, 1
 #: gtsam marginalises what is older than its lag: only nodes that leave are given such a stamp.
 _INSIDE, _LEFT, _LAG = 1.0, 0.0, 0.5
 
@@ -47,7 +46,7 @@ class _Graph:
         self._prior: gtsam.JacobianFactor | None = prior
 
     def replace(self, number: int, kind: int, factor: gtsam.JacobianFactor) -> None:
-        """Add a factor instead of that of this `kind` of a node."""
+        """Add a factor instead of that of this `kind` of a node, 0 for motion and 1 for measurements."""
         self._factors.push_back(factor)
         self._owners.append((number, kind))
         slot = self.slots[number][kind]
@@ -87,11 +86,6 @@ class IncrementalSolver(GraphSolver):
     def _forget(self, track: int) -> None:
         self._graphs.pop(track, None)
 
-    def _fit(self) -> None:
-        super()._fit()
-        if self.nodes.size > len(self._reference):
-            self._reference = grown(self._reference, self.nodes.size)
-
     def _covariance(self, track: int, *numbers: int) -> FloatArray:
         smoother = self._graphs[track].smoother
         if len(numbers) == 1:
@@ -100,21 +94,26 @@ class IncrementalSolver(GraphSolver):
 
     def _update(self, tracks: IntArray, starts: IntArray) -> None:
         nodes, n = self.nodes, self.motion.dim
-        windows = [nodes.numbers[t, k : nodes.count[t]] for t, k in zip(tracks.tolist(), starts.tolist(), strict=True)]
-        graphs = [self._graph(track, window) for track, window in zip(tracks.tolist(), windows, strict=True)]
+        if nodes.numbers.size > len(self._reference):
+            self._reference = grown(self._reference, nodes.numbers.size)
+        rows = list(zip(tracks.tolist(), starts.tolist(), strict=True))
+        windows = [nodes.numbers[track, start : nodes.count[track]] for track, start in rows]
+        graphs = [self._graph(track, window) for (track, _), window in zip(rows, windows, strict=True)]
         added = [
             [number for number in w.tolist() if number not in g.slots] for w, g in zip(windows, graphs, strict=True)
         ]
         for new, graph in zip(added, graphs, strict=True):
             self._reference[new] = nodes.origin[new]
-            graph.slots |= {number: [None, None] for number in new}
-        self._add_motion(tracks, starts, graphs, sum(map(len, windows)))
-        for track, window, graph, new in zip(tracks.tolist(), windows, graphs, added, strict=True):
-            self._add_measurements(window, graph)
-            inside = nodes.window(track)
-            graph.solve(new, window[: len(window) - len(inside)].tolist(), n)
+            graph.slots.update((number, [None, None]) for number in new)
+        self._add_factors(tracks, starts, graphs, 2 * sum(map(len, windows)))
+        for (track, start), window, graph, new in zip(rows, windows, graphs, added, strict=True):
+            num_leaving = int(nodes.first[track]) - start
+            inside = window[num_leaving:]
+            graph.solve(new, window[:num_leaving].tolist(), n)
             delta = graph.smoother.getDelta().vector(inside.tolist()).reshape(len(inside), n)
             nodes.step[inside] = self._reference[inside] - nodes.origin[inside] + delta
+            if not np.isfinite(delta).all():
+                raise ValueError("a state is not finite")
 
     def _graph(self, track: int, window: IntArray) -> _Graph:
         """Return the graph of a track; a new one has the prior of the oldest node only."""
@@ -127,26 +126,22 @@ class IncrementalSolver(GraphSolver):
             nodes.changed[window] = True
         return graph
 
-    def _add_motion(self, tracks: IntArray, starts: IntArray, graphs: Sequence[_Graph], most: int) -> None:
-        """Add the motion factors that have changed, at most so many, of all tracks."""
+    def _add_factors(self, tracks: IntArray, starts: IntArray, graphs: Sequence[_Graph], most: int) -> None:
+        """Add the factors that have changed, at most so many, of all tracks."""
         nodes, n = self.nodes, self.motion.dim
-        pairs, factors = np.empty((most, 3), dtype=np.int64), np.empty((most, 2 * n + 1, n))
-        given = nodes.origin, self._reference, nodes.segment, nodes.changed
-        num = node_kernels.motion_factors(tracks, starts, nodes.count, nodes.numbers, *given, pairs, factors)
+        owners, factors = np.empty((most, 3), dtype=np.int64), np.empty((most, 2 * n + 1, n))
+        given = nodes.origin, self._reference, nodes.segment, nodes.num_rows, nodes.changed
+        num = node_kernels.changed_factors(tracks, starts, nodes.count, nodes.numbers, *given, owners, factors)
         if num < 0:
             raise ValueError("process noise is not positive definite")
-        for (row, left, right), each in zip(pairs[:num].tolist(), factors, strict=False):
-            factor = gtsam.JacobianFactor(left, each[:n].T, right, each[n:-1].T, each[-1], _unit(n))
-            graphs[row].replace(left, _MOTION, factor)
-
-    def _add_measurements(self, window: IntArray, graph: _Graph) -> None:
-        """Add the measurements of the nodes of `window` that have changed."""
-        nodes = self.nodes
-        for number in window[nodes.changed[window, 1] & (nodes.num_rows[window] > 0)].tolist():
-            rows = nodes.rows[number, : nodes.num_rows[number]]
-            b = rows[:, -1] + rows[:, :-1] @ (nodes.origin[number] - self._reference[number])
-            graph.replace(number, _MEASURED, gtsam.JacobianFactor(number, rows[:, :-1], b, _unit(len(rows))))
-        nodes.changed[window, 1] = False
+        for (row, number, right), motion in zip(owners[:num].tolist(), factors, strict=False):
+            if right >= 0:
+                factor = gtsam.JacobianFactor(number, motion[:n].T, right, motion[n:-1].T, motion[-1], _unit(n))
+            else:
+                rows = nodes.rows[number, : nodes.num_rows[number]]
+                b = rows[:, -1] + rows[:, :-1].dot(nodes.origin[number] - self._reference[number])
+                factor = gtsam.JacobianFactor(number, rows[:, :-1], b, _unit(len(rows)))
+            graphs[row].replace(number, right < 0, factor)
 
 
 @cache
