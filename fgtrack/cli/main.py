@@ -42,7 +42,7 @@ class _LazyCommands(TyperGroup):
         try:
             return super().invoke(ctx)
         except BrokenPipeError as error:
-            raise DataError(f"{error.filename or 'an output'}: who was to read it has left") from error
+            raise DataError(f"{error.filename or 'an output'}: output pipe closed") from error
         except SystemExit as error:
             what = f"SystemExit: {error.code}"
             raise CallError(
@@ -55,16 +55,7 @@ class _LazyCommands(TyperGroup):
 
 
 def _command(name: str) -> Any:  # Any: Typer does not export the type of its commands
-    try:
-        module = import_module(f"fgtrack.cli.{name}")
-    except Exception as error:  # of a library, which may look at files and variables of the system
-        if _is_nowhere():
-            raise
-        what = f"{type(error).__name__}: {error}"
-        raise CallError(
-            f"what {name} needs cannot be loaded ({what}): look at its environment variables and settings, or install "
-            "it anew"
-        ) from error
+    module = import_module(f"fgtrack.cli.{name}")
     single = typer.Typer(**_STYLE)
     single.command(name)(getattr(module, name))
     return typer.main.get_command(single)
@@ -162,8 +153,6 @@ def _run(words: Sequence[str], debug: bool) -> int:
             return _failed(what, BAD_DATA, debug)
         if error.filename is not None:  # of a path that was given, there or in a file
             return _failed(f"{error.filename}: cannot be used, the system says: {error.strerror}", BAD_CALL, debug)
-        if _is_nowhere():
-            return _failed("the working directory has been removed, change to another one", BAD_CALL, debug)
         return _bug(error, debug)
     except Exception as error:  # the last line of defence: a bug must not look like bad data
         return _bug(error, debug)
@@ -178,14 +167,6 @@ def _wrong_call(error: typer.TyperException) -> str:
     arguments = [each for each in context.command.params if each.param_type_name == "argument"]
     takes = " and ".join(f"one {each.metavar or each.name.upper()}" for each in arguments) or "no argument"
     return f"{context.info_name}: takes {takes}, {extra.strip('()')} is too many"
-
-
-def _is_nowhere() -> bool:
-    try:
-        os.getcwd()
-    except FileNotFoundError:
-        return True
-    return False
 
 
 def _bug(error: Exception, debug: bool) -> int:

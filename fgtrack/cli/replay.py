@@ -8,7 +8,7 @@ import typer
 
 from fgtrack.cli import completion
 from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Settings, TrackMap
-from fgtrack.cli.show import TickProgress, progress, say, warn
+from fgtrack.cli.show import progress, say, tick_progress, warn
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.evaluation.cautions import cautions, noise_cautions, unused
@@ -61,7 +61,7 @@ def replay(
             folders,
             origin=str(recording),
             kind=source.kind,
-            on_tick=TickProgress(tell, source.end_ns, len(names)),
+            on_tick=tick_progress(tell, source.end_ns(), len(names)),
             overwrite=overwrite,
             realtime=realtime,
         )

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import count
 from typing import Any, Protocol
 
 from rich.console import Console
@@ -30,8 +31,6 @@ from fgtrack.evaluation.terminal import bulleted, hanging
 _WIDTH_WITHOUT_TERMINAL = 120
 LINE_PERIOD_S = 10.0
 """Between two lines of progress off a terminal."""
-SOON_S = 1.0
-"""What takes less needs no percentage."""
 _TICKS, _MESSAGES = 50, 1000  # between two signs of progress
 _SPEED_PERIOD_S = 600.0  # over which the time of the rest is estimated: jobs differ
 
@@ -144,47 +143,26 @@ class _Lines:
         print(f"fgtrack: {', '.join(parts)}", file=sys.stderr, flush=True)
 
 
-class TickProgress:
-    """Tells how far replays have come, now and then.
+def tick_progress(tell: Progress, end_ns: int | None, passes: int) -> Callable[[int, int], None]:
+    """Return what to call after each tick of `passes` replays: it reports now and then how far they have come.
 
-    Parameters
-    ----------
-    tell
-        Is told.
-    end_ns
-        When the recording ends; asked once the replay has taken a while.
-    passes
-        How often it is replayed.
+    `end_ns` is when the recording ends, where that is known.
     """
+    ticks = count()
+    first_ns, last_ns, passed = 0, 0, -1
 
-    def __init__(self, tell: Progress, end_ns: Callable[[], int | None] = lambda: None, passes: int = 1) -> None:
-        self._tell, self._find_end, self._passes = tell, end_ns, passes
-        self._first_ns: int | None = None
-        self._last_ns = self._pass = self._count = 0
-        self._started_s = time.monotonic()
-        self._end_ns: int | None = None
-        self._asked = False
+    def moved(now_ns: int, num_tracks: int) -> None:
+        nonlocal first_ns, last_ns, passed
+        if passed < 0 or now_ns < last_ns:  # the next estimator begins
+            first_ns, passed = now_ns, passed + 1
+        last_ns = now_ns
+        if next(ticks) % _TICKS == 0:
+            done_ns = now_ns - first_ns
+            done = None if end_ns is None else min(done_ns / max(end_ns - first_ns, 1), 1.0)
+            share = None if done is None else (passed + done) / passes
+            tell(f"{done_ns / NS_PER_S:.1f} s of data, {num_tracks} tracks", share)
 
-    def __call__(self, now_ns: int, num_tracks: int) -> None:
-        """After a tick."""
-        if self._first_ns is None:
-            self._first_ns = now_ns
-        elif now_ns < self._last_ns:  # the next estimator begins
-            self._pass += 1
-            self._end_ns, self._asked = self._last_ns, True
-        self._last_ns = now_ns
-        self._count += 1
-        if self._count % _TICKS:
-            return
-        if not self._asked and time.monotonic() - self._started_s >= SOON_S:
-            self._end_ns, self._asked = self._find_end(), True
-        done_ns = now_ns - self._first_ns
-        self._tell(f"{done_ns / NS_PER_S:.1f} s of data, {num_tracks} tracks", self._share(done_ns))
-
-    def _share(self, done_ns: int) -> float | None:
-        if self._end_ns is None or self._first_ns is None or self._end_ns <= self._first_ns:
-            return None
-        return (self._pass + min(done_ns / (self._end_ns - self._first_ns), 1.0)) / self._passes
+    return moved
 
 
 def told(messages: Sequence[Message], tell: Progress) -> Iterator[Message]:

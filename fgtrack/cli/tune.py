@@ -2,9 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from io import StringIO
-from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +12,7 @@ from rich.console import Console
 
 from fgtrack.advice.noise import noise_fits
 from fgtrack.cli.arguments import ConfigFile, FormOption, Json, Overwrite, PitMap, Settings, TrackMap
-from fgtrack.cli.show import chosen_form, command_line, progress, say, show
+from fgtrack.cli.show import chosen_form, progress, say, show
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
 from fgtrack.io.output import check_apart, check_output, new_file
@@ -21,7 +20,7 @@ from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumed import Assumed
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.tune import tuned
-from fgtrack.pipeline.tune_report import HeldOut, TunedParameter, TuneReport
+from fgtrack.pipeline.tune_report import HeldOut, InnovationFit, TunedParameter, TuneReport
 from fgtrack.pipeline.tune_rules import TuneRules
 
 _KNOWN = {"yes": "yes", "roughly": "roughly", "limit": "a limit", "no": "not identifiable"}
@@ -54,11 +53,10 @@ def tune(
     with progress("tune") as tell:
         report = tuned(sources, config, TuneRules(keep=tuple(keep or ())), tell)
     tables, found = Tables(_tables(report)), _sensors(report)
-    options = [*(("--set", setting) for setting in settings or []), *(("--keep", key) for key in keep or [])]
-    lines = [_command(recordings, out, config_file, track_map, pit_map, options), ""]
-    lines += [*_text(tables), "", *found]
+    lines = [*_text(tables), "", *found]
     of_recordings = replace(report.config, map=read_config(config_file).map)  # the maps belong to these
-    head = [f"The noise of {config_file or 'the defaults'}, fitted to recordings (fgtrack tune).", "", *lines, ""]
+    title = f"The noise of {config_file or 'the defaults'}, fitted to {', '.join(sources)} (fgtrack tune)."
+    head = [title, "", *lines, ""]
     with new_file(out, overwrite) as file:
         file.write(Assumed(of_recordings, ()).to_yaml(head).encode())
     show(tables, form, report.as_dict())
@@ -66,19 +64,6 @@ def tune(
         say("\n".join(["", *found, f"{out}: written"]))
     if report.broken:
         raise DataError(f"{next(iter(report.broken.values()))}; used up to there")
-
-
-def _command(
-    recordings: Sequence[Path],
-    out: Path,
-    config_file: str | None,
-    track_map: str | None,
-    pit_map: str | None,
-    options: Sequence[tuple[str, str]],
-) -> str:
-    files = (("-c", config_file), ("-o", out), ("--map", track_map), ("--pit-map", pit_map))
-    given = [(flag, value) for flag, value in files if value is not None]
-    return f"  {command_line('fgtrack', 'tune', *recordings, *chain.from_iterable([*given, *options]))}"
 
 
 def _tables(report: TuneReport) -> dict[str, Table]:
@@ -137,35 +122,19 @@ def _sensors(report: TuneReport) -> list[str]:
     return lines
 
 
-@dataclass(frozen=True)
-class _Judged:
-    """A number on the time held out, with the configured and with the fitted noise."""
-
-    name: str
-    count: int | None
-    before: float
-    after: float
-    expected: float = math.nan
-    band: float = math.nan
-
-
 def _judged(held_out: HeldOut) -> Table:
-    rows = [
-        _Judged(f"NIS {one.sensor} {one.component}", one.count, one.before, one.after, 1.0, one.band)
-        for one in held_out.innovations
-    ]
-    rows.append(_Judged("log-likelihood per innovation", held_out.count, held_out.before, held_out.after))
-    columns: list[Column[_Judged]] = [
-        Column("of", ("of",), lambda row: (row.name,), left=True),
-        Column("count", ("count",), lambda row: None if row.count is None else (row.count,)),
-        Column("before", ("before",), lambda row: (row.before,)),
-        Column("after", ("after",), lambda row: (row.after,)),
-        Column("expected", ("expected",), lambda row: (row.expected,), text=_four_digits),
-        Column("95 %", ("band",), lambda row: (row.band,), "± {}"),
+    columns: list[Column[InnovationFit]] = [
+        Column("NIS of", ("of",), lambda one: (f"{one.sensor} {one.component}",), left=True),
+        Column("count", ("count",), lambda one: (one.count,)),
+        Column("before", ("before",), lambda one: (one.before,)),
+        Column("after", ("after",), lambda one: (one.after,)),
+        Column("expected", ("expected",), lambda one: (1.0,), text=_four_digits),
+        Column("95 %", ("band",), lambda one: (one.band,), "± {}"),
     ]
     share = f"the last {100.0 * held_out.share:.0f} % of the time"
     title = f"Held out: {share}, {held_out.count} innovations, by the noise fitted to the rest"
-    return Table(title, columns, rows, row_keys=("of",))
+    notes = [f"log-likelihood per innovation: {held_out.before:.4g} before, {held_out.after:.4g} after"]
+    return Table(title, columns, held_out.innovations, row_keys=("of",), notes=notes)
 
 
 def _text(tables: Tables) -> list[str]:

@@ -124,7 +124,6 @@ def test_off_a_terminal_progress_is_lines_with_a_percentage(
     fgtrack: Command, recordings: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(show, "LINE_PERIOD_S", 0.0)
-    monkeypatch.setattr(show, "SOON_S", 0.0)
     for name in ("s.jsonl", "s.jsonl.gz", "mcap", "sqlite3"):
         lines = fgtrack(
             "replay", recordings[name], "-c", "karle2023", "-e", "drop,ekf-replay", "--map", "oval", "-o", name
