@@ -1,6 +1,5 @@
 """`advise`: what it says of a recording is right, and the configuration that it writes follows it."""
 
-import csv
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -8,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.messages import drive as support_drive
 
 import fgtrack
 from fgtrack.advice import advise as advise_module
@@ -17,7 +15,6 @@ from fgtrack.advice.windows import window_findings
 from fgtrack.cli.main import run as run_command
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.run import Run, load_run
 from fgtrack.io.source import open_input
 from fgtrack.io.stream import write_stream
@@ -41,19 +38,6 @@ ego: {detection_origin_x_m: 0.0}
 merge: {kind: none}
 """
 
-CSV_CONFIG = """\
-input:
-  csv:
-    ego: {file: ego.csv, columns: {stamp: stamp, receipt: receipt, x_m: x, y_m: y, yaw_rad: yaw, speed_mps: speed},
-          time_unit: ns}
-    detections:
-      lidar: {file: lidar.csv, columns: {stamp: stamp, receipt: receipt, x_m: x, y_m: y, yaw_rad: yaw}, time_unit: ns,
-              frame: FRAME}
-      radar: {file: radar.csv, columns: {stamp: stamp, receipt: receipt, x_m: x, y_m: y, yaw_rad: yaw}, time_unit: ns,
-              frame: FRAME}
-"""
-
-KINDS = ("stream", "bag", "csv")
 Call = Callable[..., tuple[int, str]]
 
 
@@ -98,35 +82,11 @@ def changed(change: Callable[[DetectionList], DetectionList], messages: Iterable
     return [change(item) if isinstance(item, DetectionList) else item for item in messages]
 
 
-def write(kind: str, messages: Sequence[Message], *, ego: bool = True, frame: str = "ego") -> str:
-    """Write the recording of a kind and `c.yaml` that reads it; gives its name."""
-    if kind == "stream":
-        write_stream("drive.jsonl", messages, overwrite=True)
-        Path("c.yaml").write_text(CONFIG)
-        return "drive.jsonl"
-    if kind == "bag":
-        write_bag(Path("drive"), messages)
-        Path("c.yaml").write_text(CONFIG)
-        return "drive"
-    Path("table").mkdir()
-    tables: dict[str, list[list[object]]] = {"ego": [], "lidar": [], "radar": []}
-    for one in messages:
-        if isinstance(one, EgoState):
-            tables["ego"].append([one.stamp_ns, one.receipt_ns, one.x_m, one.y_m, one.yaw_rad, one.speed_mps])
-        elif isinstance(one, DetectionList):
-            tables[one.sensor] += [[one.stamp_ns, one.receipt_ns, of.x_m, of.y_m, of.yaw_rad] for of in one.objects]
-    for name, rows in tables.items():
-        with Path(f"table/{name}.csv").open("w", newline="") as file:
-            csv.writer(file).writerows(
-                [["stamp", "receipt", "x", "y", "yaw", "speed"][: 6 if name == "ego" else 5], *rows]
-            )
-    text = CSV_CONFIG.replace("FRAME", frame)
-    if not ego:
-        text = "\n".join(
-            line for line in text.splitlines() if "ego.csv" not in line and line.strip() != "time_unit: ns}"
-        )
-    Path("c.yaml").write_text(f"{text}\n{CONFIG}")
-    return "table"
+def write(messages: Sequence[Message]) -> str:
+    """Write the recording and `c.yaml` that reads it; gives its name."""
+    write_stream("drive.jsonl", messages, overwrite=True)
+    Path("c.yaml").write_text(CONFIG)
+    return "drive.jsonl"
 
 
 def advised(call: Call, recording: str, *options: str) -> tuple[int, str]:
@@ -134,7 +94,7 @@ def advised(call: Call, recording: str, *options: str) -> tuple[int, str]:
 
 
 def test_a_healthy_recording_is_fine_and_nothing_is_changed(call: Call) -> None:
-    write("stream", drive())
+    write(drive())
     code, text = advised(call, "drive.jsonl", "-o", "a.yaml")
     assert code == 0
     assert "Fine: the ego (20 Hz" in text
@@ -157,7 +117,7 @@ def test_what_nothing_is_changed_of_is_tracked_once(call: Call, monkeypatch: pyt
         return real(messages, config)
 
     monkeypatch.setattr(advise_module, "replay_in_memory", counted)
-    write("stream", drive(60))
+    write(drive(60))
     assert not fgtrack.advise("drive.jsonl", "c.yaml").changes
     assert len(tracked) == 1
     Path("c.yaml").write_text(CONFIG.replace("lidar: {", "lidar: {max_delay_s: 0.05, "))
@@ -168,7 +128,7 @@ def test_what_nothing_is_changed_of_is_tracked_once(call: Call, monkeypatch: pyt
 @pytest.mark.parametrize("command", ["advise", "tune", "offsets"])
 def test_without_a_configuration_the_sensors_are_those_of_the_recording(call: Call, command: str) -> None:
     bare = changed(lambda item: replace(item, objects=[replace(one, yaw_rad=None) for one in item.objects]), drive(100))
-    write("stream", bare)
+    write(bare)
     out = () if command == "offsets" else ("-o", "a.yaml")
     code, text = call(command, "drive.jsonl", *out)
     assert code == 0, text
@@ -196,10 +156,9 @@ def test_a_track_outlives_the_silence_of_the_slowest_sensor() -> None:
     assert [one.settings for one in window_findings(arrivals[1:2], counted)] == [{"lifecycle.forget_s": 10.0}]
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_stamps_of_zero(call: Call, kind: str) -> None:
+def test_stamps_of_zero(call: Call) -> None:
     zero = changed(lambda item: replace(item, stamp_ns=0) if item.sensor == "radar" else item, drive(45))
-    recording = write(kind, zero)
+    recording = write(zero)
     _, shown = call("info", recording, "-c", "c.yaml")
     assert "radar: all stamps are 0: set `stamp_from: receipt`" in shown
     code, text = advised(call, recording, "-o", "a.yaml")
@@ -210,61 +169,10 @@ def test_stamps_of_zero(call: Call, kind: str) -> None:
     assert sum(fates.get(fate, 0) for fate in ("birth", "in_sequence", "out_of_sequence")) > 40
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_missing_ego(call: Call, kind: str) -> None:
-    recording = write(kind, [item for item in drive(45) if not isinstance(item, EgoState)], ego=False)
-    wanted = "ego: no state is read, but lidar is relative to it: name its topic (input.ego)"
-    assert wanted in call("info", recording, "-c", "c.yaml")[1]
-    code, text = advised(call, recording)
-    assert code == 0
-    assert wanted in text
-    assert "Fine: " not in text or "the ego" not in text.partition("Fine: ")[2]
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_wrong_frame(call: Call, kind: str) -> None:
-    recording = write(kind, changed(lambda item: replace(item, frame="map"), drive(45)), frame="map")
-    for command in ("info", "advise"):
-        code, text = call(command, recording, "-c", "c.yaml")
-        assert code == 0
-        assert "lidar: is read as in the map, " in text
-        assert "set `frame: ego` (or sensor)" in text
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_degrees_for_radians(call: Call, kind: str) -> None:
-    turned = [replace(item, yaw_rad=90.0) if isinstance(item, EgoState) else item for item in drive(45)]
-    recording = write(kind, turned)
-    for command in ("info", "advise"):
-        assert "ego: yaw_rad goes up to 90: degrees?" in call(command, recording, "-c", "c.yaml")[1]
-
-
-def test_a_typo_in_a_field_path(call: Call) -> None:
-    write_bag(Path("bag"), support_drive())
-    Path("c.yaml").write_text(
-        "input:\n  ego: {topic: /ego/odometry}\n  detections:\n"
-        "    radar: {topic: /detections/radar, fields: {objects: objects, x_m: kinematics.pose.x}}\n"
-        "sensors:\n  radar: {std: {x_m: 1.0, y_m: 1.0}}\n"
-    )
-    for command in ("info", "advise"):
-        code, text = call(command, "bag", "-c", "c.yaml")
-        assert code == 1
-        assert "kinematics.pose.x: leads nowhere, there is no 'pose', but pose_with_covariance" in text
-
-
-def test_a_typo_in_a_column(call: Call) -> None:
-    recording = write("csv", drive())
-    Path("c.yaml").write_text(Path("c.yaml").read_text().replace("x_m: x,", "x_m: xx,"))
-    for command in ("info", "advise"):
-        code, text = call(command, recording, "-c", "c.yaml")
-        assert code == 1
-        assert "'xx'" in text
-
-
 @pytest.mark.parametrize("sensor", ["lidar", "radar"])
 def test_a_wrong_clock_is_found_by_the_truth_and_mended(call: Call, sensor: str) -> None:
     off = changed(lambda item: restamped(item, item.stamp_ns + 80 * MS) if item.sensor == sensor else item, drive(600))
-    write("stream", off)
+    write(off)
     code, text = advised(call, "drive.jsonl", "-o", "a.yaml")
     assert code == 0
     assert f"later than the truth of the recording says. Set sensors.{sensor}.clock_offset_s" in text
@@ -292,7 +200,7 @@ def test_without_truth_only_the_difference_of_two_clocks_is_known(call: Call) ->
         lambda item: restamped(item, item.stamp_ns + 80 * MS) if item.sensor == "lidar" else item,
         drive(250, truth=False, wave_mps=12.0),
     )
-    write("stream", off)
+    write(off)
     advice = fgtrack.advise("drive.jsonl", "c.yaml", reference="radar")
     (clock,) = [one for one in advice.findings if one.kind == "clock"]
     assert "later than those of radar. radar is received 40 ms after its stamps at least" in clock.text
@@ -309,7 +217,7 @@ def test_without_truth_only_the_difference_of_two_clocks_is_known(call: Call) ->
 @pytest.mark.slow
 def test_what_an_advised_clock_leaves_is_nothing(call: Call) -> None:
     off = changed(lambda item: restamped(item, item.stamp_ns + 80 * MS) if item.sensor == "lidar" else item, drive(600))
-    write("stream", off)
+    write(off)
     advised(call, "drive.jsonl", "-o", "a.yaml")
     code, text = call("advise", "drive.jsonl", "-c", "a.yaml", "-o", "b.yaml")
     assert code == 0
@@ -321,7 +229,7 @@ def test_a_limit_that_refuses_bursts(call: Call) -> None:
     def late_ms(k: int) -> float:
         return 600.0 + 5.0 * (k % 7) if k % 100 in range(40, 60) else 100.0 + 3.0 * (k % 7)
 
-    write("stream", drive(200, late_ms=late_ms))
+    write(drive(200, late_ms=late_ms))
     Path("c.yaml").write_text(CONFIG.replace("lidar: {", "lidar: {max_delay_s: 0.3, "))
     advice = fgtrack.advise("drive.jsonl", "c.yaml")
     assert advice.config.sensors["lidar"].max_delay_s == pytest.approx(0.8)
@@ -338,7 +246,7 @@ def test_a_limit_that_refuses_bursts(call: Call) -> None:
 
 
 def test_a_window_shorter_than_the_delays_and_than_a_period(call: Call) -> None:
-    write("stream", drive(300))
+    write(drive(300))
     Path("c.yaml").write_text(CONFIG + "filter: {storage_s: 0.05}\n")
     assert fgtrack.advise("drive.jsonl", "c.yaml").config.filter.storage_s == pytest.approx(0.2)
     slow = [
@@ -346,7 +254,7 @@ def test_a_window_shorter_than_the_delays_and_than_a_period(call: Call) -> None:
         for item in drive(1200)
         if not isinstance(item, DetectionList) or (item.stamp_ns - START_NS) % (1500 * MS) == 0
     ]
-    write("stream", slow)
+    write(slow)
     text = CONFIG.replace("estimator: ekf-replay", "estimator: smoother-banded") + "lifecycle: {out_of_view_s: 1.0}\n"
     Path("c.yaml").write_text(text)
     advice = fgtrack.advise("drive.jsonl", "c.yaml")
@@ -358,21 +266,21 @@ def test_negative_delays_a_jump_and_a_drift(call: Call) -> None:
     def ahead(item: DetectionList) -> DetectionList:
         return restamped(item, item.stamp_ns + 70 * MS) if item.sensor == "radar" else item
 
-    write("stream", changed(ahead, drive(300)))
+    write(changed(ahead, drive(300)))
     assert "radar: 100 % of its stamps lie after their receipt, by up to 30 ms" in " ".join(told())
 
     def jump(item: DetectionList) -> DetectionList:
         later = item.sensor == "radar" and item.stamp_ns > START_NS + 10_000 * MS
         return restamped(item, item.stamp_ns - 500 * MS) if later else item
 
-    write("stream", changed(jump, drive(400)))
+    write(changed(jump, drive(400)))
     assert "radar: its delay changes by 500 ms at 10.1 s and stays so" in " ".join(told())
 
     def drift(item: DetectionList) -> DetectionList:
         slow_ns = (item.stamp_ns - START_NS) * 2 // 1000
         return restamped(item, item.stamp_ns - slow_ns) if item.sensor == "radar" else item
 
-    write("stream", changed(drift, drive(400)))
+    write(changed(drift, drive(400)))
     assert "radar: its delay grows by 2e+03 us per second" in " ".join(told())
 
 
@@ -383,12 +291,12 @@ def told() -> tuple[str, ...]:
 
 @pytest.mark.slow
 def test_receipts_for_stamps(call: Call) -> None:
-    write("stream", changed(lambda item: replace(item, stamp_ns=item.receipt_ns), drive(truth=False)))
+    write(changed(lambda item: replace(item, stamp_ns=item.receipt_ns), drive(truth=False)))
     assert any("every stamp is the receipt" in line for line in told())
 
 
 def test_a_sensor_without_a_model_is_left_out(call: Call) -> None:
-    write("stream", drive())
+    write(drive())
     Path("c.yaml").write_text("\n".join(line for line in CONFIG.splitlines() if "radar" not in line))
     code, text = advised(call, "drive.jsonl", "-o", "a.yaml")
     assert code == 0
@@ -398,7 +306,7 @@ def test_a_sensor_without_a_model_is_left_out(call: Call) -> None:
 
 @pytest.mark.slow
 def test_an_estimator_that_forgets_and_noise_that_does_not_fit(call: Call) -> None:
-    write("stream", drive(250))
+    write(drive(250))
     text = CONFIG.replace("ekf-replay", "ekf-backward-forward").replace(
         "radar: {std: {x_m: 1.0", "radar: {std: {x_m: 9.0"
     )
@@ -449,7 +357,7 @@ def test_white_noise_is_not_fitted_to_errors_that_last(call: Call) -> None:
 
 
 def test_noise_that_cannot_be_fitted_leaves_the_other_advice(call: Call) -> None:
-    write("stream", drive(10))
+    write(drive(10))
     code, text = call("advise", "drive.jsonl", "--tune")
     assert code == 0
     assert "- tune: no noise is changed: " in text
@@ -458,7 +366,7 @@ def test_noise_that_cannot_be_fitted_leaves_the_other_advice(call: Call) -> None
 
 
 def test_the_forms_of_the_page(call: Call, capsys: pytest.CaptureFixture[str]) -> None:
-    write("stream", drive())
+    write(drive())
     assert run_command(["advise", "drive.jsonl", "-c", "c.yaml", "--json"]) == 0
     values = json.loads(capsys.readouterr().out)
     assert values["recording"] == "drive.jsonl"
@@ -472,7 +380,7 @@ def test_an_origin_that_is_wrong_is_found_by_the_truth(call: Call) -> None:
     def moved(item: DetectionList) -> DetectionList:
         return replace(item, objects=[replace(of, x_m=of.x_m + 1.5) for of in item.objects if of.x_m is not None])
 
-    write("stream", changed(moved, drive(600)))
+    write(changed(moved, drive(600)))
     advice = fgtrack.advise("drive.jsonl", "c.yaml")
     (bias,) = [one for one in advice.findings if one.kind == "bias"]
     assert bias.text.startswith("detections of all sensors lie 1.")
@@ -485,7 +393,7 @@ def test_an_origin_that_is_wrong_is_found_by_the_truth(call: Call) -> None:
 
 
 def test_bad_calls(call: Call) -> None:
-    write("stream", drive())
+    write(drive())
     assert advised(call, "drive.jsonl", "--reference", "sonar")[0] == 2
     Path("mine.yaml").write_text("estimator: smoother\n")
     assert advised(call, "drive.jsonl", "-o", "mine.yaml")[0] == 2

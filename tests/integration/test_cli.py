@@ -2,8 +2,6 @@
 
 import json
 import math
-import os
-import shutil
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -124,7 +122,7 @@ def test_off_a_terminal_progress_is_lines_with_a_percentage(
     fgtrack: Command, recordings: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(show, "LINE_PERIOD_S", 0.0)
-    for name in ("s.jsonl", "s.jsonl.gz", "mcap", "sqlite3"):
+    for name in ("s.jsonl.gz", "mcap"):
         lines = fgtrack(
             "replay", recordings[name], "-c", "karle2023", "-e", "drop,ekf-replay", "--map", "oval", "-o", name
         ).err.splitlines()
@@ -245,13 +243,6 @@ def test_a_replay_in_real_time_takes_as_long_and_gives_the_same(
     assert time.monotonic() - began_s >= (timing[-1] - timing[0]) / 1e9
     assert fgtrack("replay", recordings["mcap"], "-c", "smoother", "-o", "fast").code == 0
     assert load_run("paced").meta["digest"] == load_run("fast").meta["digest"]
-
-
-def test_info_tells_topics_and_delays(fgtrack: Command, recordings: dict[str, Path]) -> None:
-    for path in recordings.values():
-        told = fgtrack("info", path)
-        assert (told.code, told.err) == (0, "")
-        assert "radar" in told.out
 
 
 def test_the_printed_configuration_is_one(fgtrack: Command, stream: Path) -> None:
@@ -448,12 +439,11 @@ def test_a_recording_with_broken_time_is_replayed_up_to_there(
     assert found.updates.num_rows == found.meta["detections_received"] >= 30
 
 
-@pytest.mark.parametrize("name", ["drive.jsonl", "drive"])
 def test_a_stray_stamp_of_the_ego_costs_one_state_and_a_clock_that_was_set_ends_the_run(
-    fgtrack: Command, tmp_path: Path, name: str
+    fgtrack: Command, tmp_path: Path
 ) -> None:
-    recording, write = tmp_path / name, write_stream if name.endswith("jsonl") else write_bag
-    write(recording, edited(drive(), 60, stamp_ns=START_NS + 60_000 * MS))
+    recording, name = tmp_path / "drive.jsonl", "drive.jsonl"
+    write_stream(recording, edited(drive(), 60, stamp_ns=START_NS + 60_000 * MS))
     assert fgtrack("replay", recording, "-o", "stray").code == 0
     found = load_run("stray")
     assert found.meta["ego_refused"] == {"stamp ahead of its receipt": 1}
@@ -462,7 +452,7 @@ def test_a_stray_stamp_of_the_ego_costs_one_state_and_a_clock_that_was_set_ends_
         replace(message, stamp_ns=message.stamp_ns - 5000 * MS) if isinstance(message, EgoState) and i > 80 else message
         for i, message in enumerate(drive(120))
     ]
-    write(tmp_path / f"loop-{name}", jumped)
+    write_stream(tmp_path / f"loop-{name}", jumped)
     called = fgtrack("replay", tmp_path / f"loop-{name}", "-o", "loop")
     assert f"loop-{name}" in called.error
     assert "ego stamps jump back by" in called.error
@@ -552,21 +542,6 @@ def test_a_path_that_no_file_can_have_is_a_line(fgtrack: Command, stream: Path, 
     assert called.code in (1, 2)
 
 
-@pytest.mark.slow
-def test_names_of_files_need_not_be_text(fgtrack: Command, stream: Path) -> None:
-    recording, made = Path(os.fsdecode(b"a\xff\nb.jsonl")), os.fsdecode(b"[bold]\xfe\x1b[31m")
-    shutil.copy(stream, recording)
-    called = [fgtrack("info", recording), fgtrack("replay", recording, "-o", made), fgtrack("compare", made)]
-    called += [fgtrack("compare", made, "--json"), fgtrack("compare", made, "--format", "md")]
-    called += [fgtrack("advise", recording, "-o", f"{made}.yaml"), fgtrack("offsets", recording)]
-    called += [fgtrack("report", made, "-o", f"{made}.html"), fgtrack("export", made, "-o", f"{made}.mcap")]
-    called += [fgtrack("convert", recording, f"{made}.jsonl"), fgtrack("figure", made, "-o", f"{made} figures")]
-    for one in called:
-        assert one.code == 0, one.err
-        odd = [line for line in (one.out + one.err).splitlines() if not line.isprintable()]
-        assert odd == []
-
-
 def test_a_bug_is_one_line_and_shows_its_traceback_on_demand(
     fgtrack: Command, stream: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -646,15 +621,13 @@ def test_whatever_a_recording_says_every_command_prints_lines_for_a_terminal(
             assert len(line) < 2000
 
 
-@pytest.mark.parametrize("same_tick", [True, False])
 def test_an_unknown_sensor_in_mid_stream_is_a_break_up_to_which_the_run_is_complete(
-    fgtrack: Command, tmp_path: Path, same_tick: bool
+    fgtrack: Command, tmp_path: Path
 ) -> None:
     messages = drive()
     place = messages[61]
-    late_ns = 0 if same_tick else 10 * MS
     messages.insert(
-        62, DetectionList("sonar", place.stamp_ns, place.receipt_ns + late_ns, (Detection(x_m=1.0, y_m=2.0),))
+        62, DetectionList("sonar", place.stamp_ns, place.receipt_ns + 10 * MS, (Detection(x_m=1.0, y_m=2.0),))
     )
     write_stream(tmp_path / "odd.jsonl", messages)
     called = fgtrack("replay", "odd.jsonl", "-c", "karle2023", "-o", "run")
