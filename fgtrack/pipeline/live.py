@@ -27,7 +27,7 @@ from fgtrack.io.gate import WrongError, checked_detection
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import WallClock, corrected
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.lateness import Lateness, Receptions, TickTimes, TickTiming
+from fgtrack.pipeline.latencies import Lateness, Receptions, TickTimes, TickTiming
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.tracking.inbox import records
 
@@ -205,10 +205,9 @@ class Tracker:
             if self._last.tick >= 0 and now_ns < self._last.now_ns:
                 self._refused["tick before the last one"] += 1
                 return replace(self._last, updates=(), smoothed=())
-            self._times.begin()
-            self._take_arrivals()
-            report = self._tracker.tick(now_ns)
-            if self._records:
+            with self._times.tick(now_ns):
+                self._take_arrivals()
+                report = self._tracker.tick(now_ns)
                 report = replace(report, updates=(*self._records, *report.updates))
                 self._records = []
             for update in report.updates:
@@ -216,7 +215,6 @@ class Tracker:
             if self._last.tick < 0:
                 self._first_tick_ns = now_ns
             self._last = report
-            self._times.end(now_ns)
             return report
 
     def state_at(self, track_id: int, stamp_ns: int) -> TrackReport:

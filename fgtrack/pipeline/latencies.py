@@ -1,8 +1,9 @@
-"""How late each sensor's messages come, and how long a tick takes: what a running tracker says of itself."""
+"""Latencies of sensors and durations of ticks of a running tracker."""
 
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -54,85 +55,64 @@ class TickTiming:
     """Periods of the node in which the host called no tick."""
 
 
-@dataclass
-class _Spread:
-    """Median and 99th percentile of the newest values in ns, largest of all."""
+class _Durations:
+    """Median and 99th percentile of the newest durations in ns, longest of all."""
 
-    _newest: deque[int] = field(default_factory=lambda: deque(maxlen=NEWEST), init=False)
-    _worst: int | None = field(default=None, init=False)
+    def __init__(self) -> None:
+        self._newest: deque[int] = deque(maxlen=NEWEST)
+        self._worst_ns = 0
 
-    def add(self, value_ns: int) -> None:
-        self._newest.append(value_ns)
-        self._worst = value_ns if self._worst is None else max(self._worst, value_ns)
+    def add(self, duration_ns: int) -> None:
+        self._worst_ns = max(duration_ns, self._worst_ns) if self._newest else duration_ns
+        self._newest.append(duration_ns)
 
     def summary_s(self) -> tuple[float | None, float | None, float | None]:
-        """Median, 99th percentile, largest."""
-        if self._worst is None:
+        """Median, 99th percentile, longest; None before the first."""
+        if not self._newest:
             return None, None, None
-        median, p99 = (np.quantile(self._newest, (0.5, 0.99)) / 1e9).tolist()
-        return median, p99, seconds(self._worst)
+        median_s, p99_s = (np.quantile(self._newest, (0.5, 0.99)) / 1e9).tolist()
+        return median_s, p99_s, seconds(self._worst_ns)
 
 
-@dataclass
 class Receptions:
-    """What has been received from one sensor."""
+    """Counts and delays of the messages of one sensor."""
 
-    messages: int = field(default=0, init=False)
-    detections: int = field(default=0, init=False)
-    _last_receipt_ns: int | None = field(default=None, init=False)
-    _delays: _Spread = field(default_factory=_Spread, init=False)
+    def __init__(self) -> None:
+        self.messages = self.detections = 0
+        self._last_receipt_ns: int | None = None
+        self._delays = _Durations()
 
     def add(self, stamp_ns: int, receipt_ns: int, num_detections: int) -> None:
-        """A message has come."""
+        """Count a message."""
         self.messages += 1
         self.detections += num_detections
         self._delays.add(receipt_ns - stamp_ns)
         self._last_receipt_ns = max(receipt_ns, self._last_receipt_ns or receipt_ns)
 
     def lateness(self, too_late: int, first_tick_ns: int, now_ns: int) -> Lateness:
-        """What a running tracker says of this sensor at `now_ns`."""
+        """Return the report at `now_ns`."""
         since_ns = first_tick_ns if self._last_receipt_ns is None else self._last_receipt_ns
-        median_s, p99_s, worst_s = self._delays.summary_s()
-        return Lateness(
-            self.messages,
-            self.detections,
-            too_late,
-            median_s,
-            p99_s,
-            worst_s,
-            self._last_receipt_ns,
-            max(seconds(now_ns - since_ns), 0.0),
-        )
+        silent_s, delays_s = max(seconds(now_ns - since_ns), 0.0), self._delays.summary_s()
+        return Lateness(self.messages, self.detections, too_late, *delays_s, self._last_receipt_ns, silent_s)
 
 
 class TickTimes:
-    """Times the ticks of a node.
-
-    Parameters
-    ----------
-    clock_ns
-        Tells the time of the machine.
-    period_ns
-        Between ticks; without one there are no deadlines.
-    """
+    """Durations of the ticks of a node by `clock_ns`; without `period_ns` there are no deadlines."""
 
     def __init__(self, clock_ns: Callable[[], int], period_ns: int | None) -> None:
         self._clock_ns = clock_ns
         self._node = Node(period_ns)
-        self._spread = _Spread()
-        self._ticks = 0
-        self._skipped = 0
+        self._durations = _Durations()
+        self._ticks = self._skipped = 0
         self._last_ns: int | None = None
-        self._begun_ns = 0
 
-    def begin(self) -> None:
-        """A tick begins."""
-        self._begun_ns = self._clock_ns()
-
-    def end(self, now_ns: int) -> None:
-        """The tick at `now_ns` is done."""
-        process_ns = self._clock_ns() - self._begun_ns
-        self._spread.add(process_ns)
+    @contextmanager
+    def tick(self, now_ns: int) -> Iterator[None]:
+        """Time the block as the tick at `now_ns`."""
+        begun_ns = self._clock_ns()
+        yield
+        process_ns = self._clock_ns() - begun_ns
+        self._durations.add(process_ns)
         self._node.done_ns(now_ns, process_ns)
         self._ticks += 1
         if self._node.period_ns is not None and self._last_ns is not None:
@@ -141,5 +121,5 @@ class TickTimes:
 
     @property
     def timing(self) -> TickTiming:
-        """So far."""
-        return TickTiming(self._ticks, *self._spread.summary_s(), self._node.misses, self._skipped)
+        """Report so far."""
+        return TickTiming(self._ticks, *self._durations.summary_s(), self._node.misses, self._skipped)
