@@ -1,8 +1,9 @@
 """The measurements that a tracker gives to each of its tracks, taken from a replay in memory."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -10,15 +11,17 @@ from fgtrack.core.geometry import rotation
 from fgtrack.core.linalg import congruence
 from fgtrack.core.types import FloatArray, Message, UpdateRecord
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult
-from fgtrack.estimation.forwarding import ForwardingBank
+from fgtrack.estimation.failures import Failures
 from fgtrack.estimation.likelihood.series import Observation, Series, positive_part
 from fgtrack.io.run import Run
 from fgtrack.models.correlated_errors import whole_error
 from fgtrack.models.sensors import SensorModel
+from fgtrack.pipeline.build import build_bank
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.tracking.association import Assignment, GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.ego import EgoPose
+from fgtrack.tracking.guarded_bank import GuardedBank
 from fgtrack.tracking.inbox import Batch
 from fgtrack.tracking.objects import Apart
 from fgtrack.tracking.preprocess import Candidate, Preprocess
@@ -36,7 +39,8 @@ def recorded(
 
     def observed(parts: TrackerParts) -> TrackerParts:
         preprocess = _WatchedPreprocess(parts.preprocess)
-        banks.append(_RecordingBank(parts.bank, preprocess))
+        make = partial(build_bank, config, parts.failures)
+        banks.append(_RecordingBank(make, parts.failures, preprocess))
         association = parts.association
         if isinstance(association, GatedEuclidean | GatedMahalanobis):
             association = _OpenedGate(association, gate_stds)
@@ -119,11 +123,11 @@ def observation(name: str, sensor: SensorModel, measurement: Measurement, own: b
     return Observation(name, measurement, measured, assumed, T, np.zeros_like(R), positive_part(R - known))
 
 
-class _RecordingBank(ForwardingBank):
-    """Keeps the first state and the fused measurements of every track of another `TrackBank`."""
+class _RecordingBank(GuardedBank):
+    """Keeps the first state and the fused measurements of every track."""
 
-    def __init__(self, bank: TrackBank, preprocess: _WatchedPreprocess) -> None:
-        super().__init__(bank)
+    def __init__(self, make: Callable[[], TrackBank], failures: Failures, preprocess: _WatchedPreprocess) -> None:
+        super().__init__(make, failures)
         self._preprocess = preprocess
         self._starts: dict[int, Start] = {}
         self._fused: dict[int, list[Observation]] = {}

@@ -7,7 +7,6 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import EstimatorError, Failure, Failures
-from fgtrack.estimation.forwarding import ForwardingBank
 from fgtrack.tracking.soundness import Divergence, are_finite, check_real, faults
 
 __all__ = ["GuardedBank"]
@@ -15,7 +14,7 @@ __all__ = ["GuardedBank"]
 _T = TypeVar("_T")
 
 
-class GuardedBank(ForwardingBank):
+class GuardedBank:
     """Guards a bank: what it raises, and states that cannot be published (see `faults`), end the track concerned.
 
     Where it cannot be told which track failed, all tracks of that call end. A `DataError` is an answer, not a failure,
@@ -31,8 +30,7 @@ class GuardedBank(ForwardingBank):
     """
 
     def __init__(self, make: Callable[[], TrackBank], failures: Failures | None = None) -> None:
-        super().__init__(make())
-        self._make = make
+        self._make, self._bank = make, make()
         self._now_ns = 0
         self._alive: dict[int, None] = {}  # track ids in order of birth
         self._can_start = False
@@ -41,13 +39,19 @@ class GuardedBank(ForwardingBank):
         """Counts of failures and of the tracks that they have ended."""
 
     @property
+    def present_ns(self) -> int:
+        """See `TrackBank.present_ns`."""
+        return self._bank.present_ns
+
+    @property
+    def window_start_ns(self) -> int:
+        """See `TrackBank.window_start_ns`."""
+        return self._bank.window_start_ns
+
+    @property
     def track_ids(self) -> tuple[int, ...]:
         """See `TrackBank.track_ids`."""
         return tuple(self._alive)
-
-    def has(self, track_id: int) -> bool:
-        """See `ForwardingBank.has`: True if its birth has succeeded, and nothing has ended it."""
-        return track_id in self._alive
 
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
@@ -57,10 +61,11 @@ class GuardedBank(ForwardingBank):
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`; states that are not finite are left out."""
         states = self._ask(lambda bank: _states_at(bank, stamp_ns))
-        if are_finite(states.means, states.covariances):
+        finite = are_finite(states.means, states.covariances)
+        if finite.all():
             return states
-        rows = [row for row in range(len(states.means)) if are_finite(states.means[row], states.covariances[row])]
-        return StatesAt(tuple(states.track_ids[row] for row in rows), states.means[rows], states.covariances[rows])
+        track_ids = tuple(track_id for track_id, kept in zip(states.track_ids, finite, strict=True) if kept)
+        return StatesAt(track_ids, states.means[finite], states.covariances[finite])
 
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]

@@ -1,14 +1,12 @@
 """Faults of states that no object can have, and of tracks that their measurements contradict."""
 
-import math
 from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf
 from scipy.special import chdtri
 
-from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.core.types import BoolArray, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, UpdateResult
 from fgtrack.estimation.failures import Failure
 from fgtrack.estimation.present import PresentStates
@@ -17,10 +15,6 @@ __all__ = ["IN_A_ROW", "RARE", "Divergence", "are_finite", "check_real", "faults
 
 _MOST = np.array([1e9, 1e9, 1e3, 1e5, 1e4, 1e6])
 """Largest x, y, yaw, speed, yaw rate and acceleration, in SI units: far beyond any vehicle on Earth."""
-_SMALL = float(_MOST.min()) ** 2
-"""Where the sum of all squares is below it, no entry is too large."""
-_FEW = 4
-"""So many matrices are factorised faster one by one."""
 _ROUNDING = 1e-9
 """So much less than 0 an eigenvalue of a correlation matrix may be: rounding, where an entry is known for certain."""
 _TINY = 1e-300
@@ -36,11 +30,9 @@ def check_real(*arrays: FloatArray) -> None:
             raise TypeError(f"states must be real numbers, are of type {array.dtype}")
 
 
-def are_finite(means: FloatArray, covariances: FloatArray) -> bool:
-    """True if all states are, means (m, n) and covariances (m, n, n)."""
-    if math.isfinite(np.vdot(means, means) + np.vdot(covariances, covariances)):  # one number instead of two masks
-        return True
-    return bool(np.isfinite(means).all() and np.isfinite(covariances).all())
+def are_finite(means: FloatArray, covariances: FloatArray) -> BoolArray:
+    """True where a state is, of means (m, n) and covariances (m, n, n); shape (m,)."""
+    return np.asarray(np.isfinite(means).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2)))
 
 
 def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
@@ -62,46 +54,32 @@ def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
     n = means.shape[1]
     if not 5 <= n <= len(_MOST) or covariances.shape[1:] != (n, n):
         raise ValueError(f"states have the shapes {means.shape} and {covariances.shape}")
-    small = np.vdot(means, means) <= _SMALL or (np.abs(means) <= _MOST[:n]).all()
-    if small and _are_covariances(covariances):
+    finite, small = are_finite(means, covariances), np.asarray((np.abs(means) <= _MOST[:n]).all(axis=1))
+    if finite.all() and small.all() and _are_covariances(covariances):
         return {}
-    each = ((row, _fault(mean, P)) for row, (mean, P) in enumerate(zip(means, covariances, strict=True)))
-    return {row: fault for row, fault in each if fault is not None}
-
-
-def _fault(mean: FloatArray, covariance: FloatArray) -> Failure | None:
-    if not are_finite(mean, covariance):
-        return Failure.NOT_FINITE
-    if (np.abs(mean) > _MOST[: len(mean)]).any():
-        return Failure.OUT_OF_BOUNDS
-    return None if _are_covariances(covariance[None]) else Failure.NOT_DEFINITE
+    found = {}
+    for row in range(len(means)):
+        if not finite[row]:
+            found[row] = Failure.NOT_FINITE
+        elif not small[row]:
+            found[row] = Failure.OUT_OF_BOUNDS
+        elif not _are_covariances(covariances[row : row + 1]):
+            found[row] = Failure.NOT_DEFINITE
+    return found
 
 
 def _are_covariances(covariances: FloatArray) -> bool:
-    """True if all, shape (m, n, n), are finite, symmetric and positive semidefinite up to rounding."""
-    if covariances.tobytes() == covariances.mT.tobytes() and _are_definite(covariances):  # nearly always
-        return True
+    """True if all, shape (m, n, n), are symmetric and positive semidefinite up to rounding."""
     variances = np.diagonal(covariances, axis1=-2, axis2=-1)
-    if not (np.isfinite(covariances).all() and (variances >= 0.0).all()):
-        return False
     std = np.sqrt(np.maximum(variances, _TINY))
     with np.errstate(over="ignore"):
         correlations = np.asarray(covariances / std[:, :, None] / std[:, None, :])
-    if not (np.abs(correlations - correlations.mT) <= _ROUNDING).all():
+    if not ((variances >= 0.0).all() and (np.abs(correlations - correlations.mT) <= _ROUNDING).all()):
         return False
     n = covariances.shape[-1]
     correlations[:, range(n), range(n)] = 1.0 + _ROUNDING
-    return _are_definite(correlations)
-
-
-def _are_definite(covariances: FloatArray) -> bool:
-    """True if all, shape (m, n, n), are finite and positive definite; their lower halves count."""
-    if not math.isfinite(np.vdot(covariances, covariances)):
-        return False
-    if len(covariances) <= _FEW:
-        return not any(dpotrf(P, lower=1)[1] for P in covariances)
     try:
-        np.linalg.cholesky(covariances)
+        np.linalg.cholesky(correlations)
     except np.linalg.LinAlgError:
         return False
     return True

@@ -23,7 +23,6 @@ from fgtrack.core.types import (
 from fgtrack.estimation.base import Start, StatesAt, TrackBank, UpdateResult, no_states
 from fgtrack.estimation.ekf import propagated
 from fgtrack.estimation.failures import Failure, Failures
-from fgtrack.estimation.forwarding import has
 from fgtrack.estimation.object_bank import state_of, states_of
 from fgtrack.estimation.present import PresentStates
 from fgtrack.models.motion import MotionModel
@@ -300,7 +299,7 @@ class Tracker:
         track_id = self._next_id
         self._next_id += 1
         parts.bank.birth(track_id, prior)
-        if not has(parts.bank, track_id):
+        if track_id not in parts.bank.track_ids:
             self._conclude(batch, candidate, Disposition.FAILED)
             return
         if prior.yaw_rad is None and not parts.motion.cartesian:

@@ -9,7 +9,6 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start, StatesAt, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import EndedTrack, Failure
-from fgtrack.estimation.forwarding import has
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.motion import CTRV, MotionModel
@@ -137,13 +136,6 @@ def test_a_birth_that_raises_leaves_no_track() -> None:
     assert counted(bank) == {"birth failed": 1}
 
 
-def test_bad_data_is_an_answer_and_is_let_through() -> None:
-    bank = bank_of(0.0)
-    with pytest.raises(DataError, match="not this one"):
-        step(bank, 600 * MS, [3000.0])
-    assert counted(bank) == {}
-
-
 def test_a_bank_that_cannot_remove_a_track_is_replaced() -> None:
     class Sticky(ObjectBank[Moody]):
         def remove(self, track_id: int) -> None:
@@ -156,28 +148,6 @@ def test_a_bank_that_cannot_remove_a_track_is_replaced() -> None:
     bank.remove(0)
     assert (bank.track_ids, bank.present()) == ((), [])
     assert counted(bank) == {"estimator raised": 1, "track ended": 1}
-
-
-def test_births_do_not_list_all_tracks() -> None:
-    """Else a list of many new objects takes the square of their number."""
-    listed = 0
-
-    class Listing(ObjectBank):
-        @property
-        def track_ids(self) -> tuple[int, ...]:
-            nonlocal listed
-            listed += 1
-            return super().track_ids
-
-    bank = GuardedBank(lambda: Listing(MOTION, lambda start: Moody(start, MOTION), 1.0))
-    for track_id in range(20):
-        bank.birth(track_id, Start(yaw_rad=0.0))
-        assert has(bank, track_id)
-    for track_id in range(10):
-        bank.remove(track_id)
-    assert not has(bank, 0)
-    assert listed == 0
-    assert bank.track_ids == tuple(range(10, 20))
 
 
 class Wrong(ObjectBank[Moody]):

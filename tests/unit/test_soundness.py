@@ -105,16 +105,6 @@ def test_chance_makes_no_track_diverge_and_errors_three_times_too_large_some_onc
     assert sum(outcomes(Divergence(), nis.tolist(), x_m=0.0, y_m=0.0)) in times
 
 
-@pytest.mark.parametrize("where", [(0, 1), (1, 0), (3, 0), (0, 4)])
-@pytest.mark.parametrize("motion", MOTIONS[:2], ids=lambda motion: type(motion).__name__)
-def test_both_halves_of_a_covariance_count(motion: MotionModel, where: tuple[int, int]) -> None:
-    states = present(motion)
-    for more, fault in ((1e6, {1: Failure.NOT_DEFINITE}), (1e-3, {1: Failure.NOT_DEFINITE}), (1e-13, {})):
-        P = states[1].covariance.copy()
-        P[where] += more
-        assert faults(spoilt(states, 1, states[1].mean, P)) == fault
-
-
 @pytest.mark.parametrize("kind", [complex, object, str, bool])
 def test_states_are_real_numbers(kind: type) -> None:
     states = present(CTRV())
