@@ -1,11 +1,9 @@
 """The closed line of a race track or pit lane with its bounds, and the road coordinates along it."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -51,8 +49,8 @@ _MAX_HEADING_ERROR_RAD = 1.0  # coarse maps turn much in a row; a wrong conventi
 # x + i y; times `_BACK`, exp(-i heading), a vector is along + i left. `_ALONG` is the segment's own part along.
 _POINT, _BACK, (_HEADING, _CURVATURE, _LEFT, _RIGHT, _ARC, _ALONG) = slice(0, 2), slice(2, 4), range(4, 10)
 _QUANTITIES = 10
-_FEW_DISTANCES = 3000  # so many are calculated sooner than the tree is asked
-_FEW = 3  # so many points are looked up faster one by one
+
+ComplexArray = npt.NDArray[np.complex128]
 
 
 class RoadView(NamedTuple):
@@ -226,78 +224,35 @@ class TrackMap:
 
     def _locate(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Quantities at the feet of `points_m` on the line, shape (n, 10), and lateral offsets, shape (n,)."""
-        nearest = self._nearest(points_m)
-        if len(nearest) <= _FEW:
-            found = [self._located(*each) for each in zip(nearest.tolist(), points_m.tolist(), strict=True)]
-            return np.array([foot for foot, _ in found]).reshape(-1, _QUANTITIES), np.array([at for _, at in found])
+        nearest = np.asarray(self._tree.query(points_m)[1])
         points = _complex(points_m)
         plane = self._segments.take(nearest, axis=0).view(np.complex128)
         behind = ((points - plane[:, 0]) * plane[:, 1]).real < 0.0
         at = self._segments.take(nearest - behind, axis=0, mode="wrap")
-        part, lateral_m = _projected(points, at.view(np.complex128).T, at[:, _ALONG::_QUANTITIES].T, _OF_ARRAYS)
+        part, lateral_m = _projected(points, at.view(np.complex128).T, at[:, _ALONG::_QUANTITIES].T)
         return _interpolated(at, part), lateral_m
 
-    def _located(self, nearest: int, point_m: list[float]) -> tuple[list[float], float]:
-        """`_locate` of one point, with the row nearest to it."""
-        point = complex(*point_m)
-        row, plane = self._rows[nearest]
-        if ((point - plane[0]) * plane[1]).real < 0.0:
-            row, plane = self._rows[nearest - 1]
-        part, lateral_m = _projected(point, plane, row[_ALONG::_QUANTITIES], _OF_NUMBERS)
-        changes = row[_QUANTITIES:]
-        return [start + part * change for start, change in zip(row, changes, strict=False)], lateral_m
 
-    @cached_property
-    def _rows(self) -> list[tuple[list[float], list[complex]]]:
-        """The segment rows as numbers, real and complex."""
-        return list(zip(self._segments.tolist(), self._segments.view(np.complex128).tolist(), strict=True))
-
-    def _nearest(self, points_m: FloatArray) -> IntArray:
-        """Index of the row nearest to each of `points_m`."""
-        if len(points_m) * len(self._points) > _FEW_DISTANCES:
-            return np.asarray(self._tree.query(points_m)[1])
-        centre, points, halves = self._from_centre
-        return np.asarray((halves - (points_m - centre).dot(points)).argmin(axis=1))  # half of |p|^2 - 2 p q + |q|^2
-
-    @cached_property
-    def _from_centre(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Centre of the points, the points from there, shape (2, n), and half of their squared distances."""
-        centre = self._points.mean(axis=0)
-        points = self._points - centre
-        return centre, np.ascontiguousarray(points.T), 0.5 * np.vecdot(points, points)
-
-
-def _complex(vectors: FloatArray) -> npt.NDArray[np.complex128]:
+def _complex(vectors: FloatArray) -> ComplexArray:
     """x + i y of `vectors`, shape (n, 2)."""
     return np.ascontiguousarray(vectors).view(np.complex128)[:, 0]
 
 
-class _Of(NamedTuple):
-    """What `_projected` needs of numbers or of arrays."""
-
-    larger: Callable[[Any, Any], Any]
-    smaller: Callable[[Any, Any], Any]
-    root: Callable[[Any], Any]
-
-
-_OF_NUMBERS, _OF_ARRAYS = _Of(max, min, math.sqrt), _Of(np.maximum, np.minimum, np.sqrt)
-
-
-def _projected(point: Any, plane: Any, along: Any, of: _Of) -> tuple[Any, Any]:
-    """Part t of a segment at which the foot of `point` is, and its lateral offset; numbers, or arrays (n,) of them.
+def _projected(points: ComplexArray, plane: ComplexArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Parts t of segments at which the feet of `points` are, and their lateral offsets, shapes (n,).
 
     The foot has the point on its normal: Re((q - t e) (B + t dB)) = 0 with q from the start of the segment to the
-    point, e the segment, B and dB `_BACK` and its change. `plane` is the segment row in complex numbers, `along` are
-    `_ALONG` and its change. Any: numbers, or arrays of them.
+    point, e the segment, B and dB `_BACK` and its change. `plane` (10, n) are the segment rows in complex numbers,
+    `along` (2, n) are `_ALONG` and its change.
     """
-    offset, back, segment, turn = point - plane[0], plane[1], plane[5], plane[6]  # values, then changes
+    offset, back, segment, turn = points - plane[0], plane[1], plane[5], plane[6]  # values, then changes
     c = (offset * back).real
     # Positive as far as the centre of curvature; beyond it the nearer end of the segment is the foot.
-    b = of.larger(0.5 * (along[0] - (offset * turn).real), 1e-12)
-    root = of.root(of.larger(b * b + along[1] * c, 0.0))
-    part = of.smaller(of.larger(c / (root + b), 0.0), 1.0)
+    b = np.maximum(0.5 * (along[0] - (offset * turn).real), 1e-12)
+    root = np.sqrt(np.maximum(b * b + along[1] * c, 0.0))
+    part = np.clip(c / (root + b), 0.0, 1.0)
     back = back + part * turn
-    return part, ((offset - part * segment) * back).imag / abs(back)
+    return part, ((offset - part * segment) * back).imag / np.abs(back)
 
 
 def _interpolated(at: FloatArray, part: FloatArray) -> FloatArray:
