@@ -62,7 +62,7 @@ _HOMES = {
     "measurement_model": "fgtrack.models.measurement",
     "plot": "fgtrack.plotting",
     "replay": "fgtrack.pipeline.public",
-    "robust_weight": "fgtrack.estimation.ekf",
+    "robust_weight": "fgtrack.estimation.filters.ekf",
     "simulate": "fgtrack.pipeline.public",
     "starts": "fgtrack.estimation",
     "study": "fgtrack.advice.study",
@@ -101,7 +101,7 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.estimation.base import UpdateResult as UpdateResult
     from fgtrack.estimation.base import UpdateStatus as UpdateStatus
     from fgtrack.estimation.birth import initial_state as initial_state
-    from fgtrack.estimation.ekf import robust_weight as robust_weight
+    from fgtrack.estimation.filters.ekf import robust_weight as robust_weight
     from fgtrack.estimation.registry import estimator as estimator
     from fgtrack.estimation.registry import list_estimators as list_estimators
     from fgtrack.evaluation.comparison import compare as compare

@@ -36,8 +36,8 @@ from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank
 from fgtrack.estimation.birth import initial_state
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank
-from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
 from fgtrack.estimation.smoothing.settings import SmootherSettings

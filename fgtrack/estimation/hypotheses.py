@@ -11,8 +11,8 @@ from fgtrack.core.linalg import congruence, mahalanobis_squared, symmetrise
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation import starts
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateResult
-from fgtrack.estimation.ekf import linearised
-from fgtrack.estimation.propagation import track_state, wrapped
+from fgtrack.estimation.filters.ekf import linearised
+from fgtrack.estimation.filters.propagation import track_state, wrapped
 from fgtrack.models.motion import MotionModel
 
 #: A hypothesis is dropped once it is so much less likely than the best.

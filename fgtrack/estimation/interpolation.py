@@ -6,7 +6,7 @@ import numpy as np
 
 from fgtrack.core.linalg import applied, product, regular
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.ekf import joseph, kalman_gain
+from fgtrack.estimation.filters.ekf import joseph, kalman_gain
 from fgtrack.models.motion import MotionModel
 
 

@@ -18,10 +18,10 @@ from fgtrack.estimation.base import (
     UpdateStatus,
     no_states,
 )
-from fgtrack.estimation.ekf import predict
 from fgtrack.estimation.failures import EstimatorError
+from fgtrack.estimation.filters.ekf import predict
+from fgtrack.estimation.filters.propagation import track_state
 from fgtrack.estimation.present import PresentStates
-from fgtrack.estimation.propagation import track_state
 from fgtrack.models.motion import MotionModel
 
 _E = TypeVar("_E", bound=Estimator)

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
-from fgtrack.estimation.propagation import wrapped_yaw
+from fgtrack.estimation.filters.propagation import wrapped_yaw
 from fgtrack.models.motion import MotionModel
 
 __all__ = ["PresentStates", "smoothed_reports"]

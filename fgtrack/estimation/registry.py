@@ -15,11 +15,11 @@ from fgtrack.core.checks import is_number
 from fgtrack.core.errors import CallError
 from fgtrack.core.plugins import Registry
 from fgtrack.estimation.base import Estimator, Smoother, Start, TrackBank
+from fgtrack.estimation.filters.initiation import DEFAULT
+from fgtrack.estimation.filters.replay import ReplayBank, ReplayingFilter
+from fgtrack.estimation.filters.track_initiation import initiated
 from fgtrack.estimation.hypotheses import hypotheses
-from fgtrack.estimation.initiation import DEFAULT
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
-from fgtrack.estimation.opening import initiated
-from fgtrack.estimation.replay import ReplayBank, ReplayingFilter
 from fgtrack.estimation.smoothing_bank import SmoothingBank
 from fgtrack.models.motion import MotionModel
 
@@ -31,15 +31,15 @@ ESTIMATORS = Registry(
     "estimator",
     {
         "fgtrack.estimators": {
-            "ekf-backward-forward": "fgtrack.estimation.backward_forward:backward_forward",
-            "ekf-replay": "fgtrack.estimation.replay:ReplayEkf",
-            "iekf-replay": "fgtrack.estimation.iekf:IekfReplay",
-            "imm-replay": "fgtrack.estimation.imm:ImmReplay",
-            "iplf-replay": "fgtrack.estimation.iplf:IplfReplay",
+            "ekf-backward-forward": "fgtrack.estimation.filters.backward_forward:backward_forward",
+            "ekf-replay": "fgtrack.estimation.filters.replay:ReplayEkf",
+            "iekf-replay": "fgtrack.estimation.filters.iekf:IekfReplay",
+            "imm-replay": "fgtrack.estimation.filters.imm:ImmReplay",
+            "iplf-replay": "fgtrack.estimation.filters.iplf:IplfReplay",
             "smoother": "fgtrack.estimation.smoothing.gtsam.smoothers:smoother",
             "smoother-batch": "fgtrack.estimation.smoothing.gtsam.smoothers:smoother_batch",
             "smoother-banded": "fgtrack.estimation.smoothing.banded:smoother_banded",
-            "ukf-replay": "fgtrack.estimation.ukf:UkfReplay",
+            "ukf-replay": "fgtrack.estimation.filters.ukf:UkfReplay",
         },
         OOSM_GROUP: {
             "drop": f"{_OOSM}:Drop",

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from fgtrack.core.linalg import applied, congruence, psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.ekf import Prediction
+from fgtrack.estimation.filters.ekf import Prediction
 
 
 class Smoothed(NamedTuple):

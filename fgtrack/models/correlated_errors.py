@@ -84,7 +84,7 @@ class CorrelatedErrors(MotionModel):
 
 
 @dataclass(frozen=True)
-class ErringMeasurement(MeasurementModel):
+class ColouredNoiseMeasurement(MeasurementModel):
     """A measurement of which a part of the error is in the state: z = h(x, pose) + gain e + noise."""
 
     columns: tuple[int, ...]
@@ -142,12 +142,12 @@ def split_error(
     gain = np.zeros((len(R), len(own)))
     gain[own] = _root(lasting)
     columns = tuple(state_names.index(_name(sensor, measurement.components[row])) for row in own)
-    return ErringMeasurement(measurement.components, measurement.state_names, columns, gain), symmetrise(white)
+    return ColouredNoiseMeasurement(measurement.components, measurement.state_names, columns, gain), symmetrise(white)
 
 
 def whole_error(measurement: MeasurementModel, white: FloatArray) -> FloatArray:
     """Covariance R, shape (k, k), of the lasting error and the rest `white`: the inverse of `split_error`."""
-    if not isinstance(measurement, ErringMeasurement):
+    if not isinstance(measurement, ColouredNoiseMeasurement):
         return white
     return white + measurement.gain @ measurement.gain.T
 
@@ -157,7 +157,7 @@ def position_cross(measurement: MeasurementModel, z: FloatArray, pose: SensorPos
 
     An object that is placed at its first detection, x = G (z - gain e - noise), is off by what the error is: -G gain.
     """
-    if not isinstance(measurement, ErringMeasurement):
+    if not isinstance(measurement, ColouredNoiseMeasurement):
         return {}
     G = position_gradient(measurement.components, z, pose)
     if G is None:

@@ -7,13 +7,11 @@ import numpy as np
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import period_ns, seconds
-from fgtrack.estimation.backward_forward import BackwardForwardBank
 from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.failures import Failures
-from fgtrack.estimation.object_bank import ObjectBank, OneObject
-from fgtrack.estimation.opening import initiated
-from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator, Propagator
-from fgtrack.estimation.published import (
+from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
+from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator, Propagator
+from fgtrack.estimation.filters.published import (
     AcceleratedEulerCtrv,
     LeadingClock,
     LeadingClockStalePresent,
@@ -21,6 +19,8 @@ from fgtrack.estimation.published import (
     SaturatedEulerCtrv,
     StalePresent,
 )
+from fgtrack.estimation.filters.track_initiation import initiated
+from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.registry import estimator_bank
 from fgtrack.estimation.smoothing.bank import MakeSolver, SmootherBank
 from fgtrack.estimation.smoothing.gtsam.batch import BatchSolver

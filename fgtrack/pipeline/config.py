@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Discriminator, Field, NonNegativeFloat, Tag
 
-from fgtrack.estimation.initiation import DEFAULT, Initiation
+from fgtrack.estimation.filters.initiation import DEFAULT, Initiation
 from fgtrack.estimation.registry import ESTIMATORS, Claims, motion_model
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.io.config import InputConfig

@@ -48,7 +48,7 @@ def recorded(
 
     run, _ = replay_in_memory(messages, config, origin=origin, observed=observed)
     motion, method = config.motion_model(), config.initiation.method
-    return [series.opened(motion, method) for series in banks[0].series()], run
+    return [series.initiated(motion, method) for series in banks[0].series()], run
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ import numpy as np
 
 from fgtrack.core.types import STATE_NAMES, YAW, YAW_RATE, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start, TrackBank, UpdateResult
+from fgtrack.estimation.filters.propagation import wrapped_yaw
 from fgtrack.estimation.object_bank import state_of
-from fgtrack.estimation.propagation import wrapped_yaw
 from fgtrack.models.motion import MotionModel
 from fgtrack.testing.promise import Subject, require, sound
 from fgtrack.testing.references import dense_joint, difference

@@ -15,7 +15,7 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.propagation import wrapped
+from fgtrack.estimation.filters.propagation import wrapped
 from fgtrack.models.motion import MotionModel
 
 _WEIGHT_STEPS, _NEWTON_STEPS = 50, 50

@@ -10,7 +10,7 @@ from fgtrack.core.grouping import equal_ones
 from fgtrack.core.linalg import congruence, mahalanobis_squared, symmetrise
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, StatesAt
-from fgtrack.estimation.ekf import linearised
+from fgtrack.estimation.filters.ekf import linearised
 from fgtrack.tracking.pose_error import PoseError
 from fgtrack.tracking.preprocess import Candidate
 

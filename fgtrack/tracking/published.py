@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Disposition, EgoState, FloatArray, TickReport, UpdateRecord
 from fgtrack.estimation.base import StatesAt
-from fgtrack.estimation.published import published_yaw
+from fgtrack.estimation.filters.published import published_yaw
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, assigned_densely
 from fgtrack.tracking.ego import EgoPose, EgoSource, EgoStd

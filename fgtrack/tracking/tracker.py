@@ -21,8 +21,8 @@ from fgtrack.core.types import (
     UpdateRecord,
 )
 from fgtrack.estimation.base import Start, StatesAt, TrackBank, UpdateResult, no_states
-from fgtrack.estimation.ekf import propagated
 from fgtrack.estimation.failures import Failure, Failures
+from fgtrack.estimation.filters.ekf import propagated
 from fgtrack.estimation.object_bank import state_of, states_of
 from fgtrack.estimation.present import PresentStates
 from fgtrack.models.motion import MotionModel

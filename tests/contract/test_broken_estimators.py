@@ -7,7 +7,7 @@ import pytest
 
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
-from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.models.motion import MotionModel
 from fgtrack.testing import BrokenPromiseError, check_estimator, estimator_checks
 

@@ -9,12 +9,12 @@ import pytest
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult
-from fgtrack.estimation.ekf import correct_one, predict
-from fgtrack.estimation.initiation import DEFAULT
+from fgtrack.estimation.filters.ekf import correct_one, predict
+from fgtrack.estimation.filters.initiation import DEFAULT
+from fgtrack.estimation.filters.propagation import track_state
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank
-from fgtrack.estimation.propagation import track_state
 from fgtrack.estimation.registry import EXACT
-from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.estimation.smoothing.bank import FixedLagSmoother
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.measurement import MeasurementModel

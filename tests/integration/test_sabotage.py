@@ -14,10 +14,10 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import Failure
-from fgtrack.estimation.initiation import DEFAULT
+from fgtrack.estimation.filters.initiation import DEFAULT
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.registry import ESTIMATORS
-from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.evaluation.cautions import cautions
 from fgtrack.evaluation.comparison import compare
 from fgtrack.io.run import Run, Table, load_run

@@ -8,8 +8,8 @@ import pytest
 from fgtrack.cli.main import run
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Measurement, UpdateResult, UpdateStatus
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.registry import ESTIMATORS
-from fgtrack.estimation.replay import ReplayEkf
 
 Capture = pytest.CaptureFixture[str]
 

@@ -10,7 +10,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.smoothing.bank import FixedLagSmoother
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
 from fgtrack.estimation.smoothing.settings import SmootherSettings

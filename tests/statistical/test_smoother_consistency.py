@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.smoothing.bank import FixedLagSmoother
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
 from fgtrack.estimation.smoothing.settings import SmootherSettings

@@ -6,7 +6,7 @@ from scipy.stats import binom
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import MEASURABLE, FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.evaluation.innovations import Autocorrelation, autocorrelations
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV

@@ -7,8 +7,8 @@ import numpy as np
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.registry import ESTIMATORS, OOSM_GROUP, estimator
-from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 

@@ -10,9 +10,9 @@ import pytest
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.initiation import Fix, Search
+from fgtrack.estimation.filters.initiation import Fix, Search
+from fgtrack.estimation.filters.replay import ReplayBank, ReplayEkf
 from fgtrack.estimation.registry import ESTIMATORS, estimator
-from fgtrack.estimation.replay import ReplayBank, ReplayEkf
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRV, CV
 from fgtrack.models.sensors import RobustLoss

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.backward_forward import BackwardForwardBank
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
-from fgtrack.estimation.ekf import correct
-from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator, Propagator
-from fgtrack.estimation.published import LeadingClock, StalePresent
+from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
+from fgtrack.estimation.filters.ekf import correct
+from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator, Propagator
+from fgtrack.estimation.filters.published import LeadingClock, StalePresent
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, CV
 

@@ -7,7 +7,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.evaluation.bounds import Bounds, ScheduledMeasurement, bounds, bounds_along
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel

@@ -9,7 +9,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.ekf import correct_one
+from fgtrack.estimation.filters.ekf import correct_one
 from fgtrack.estimation.registry import estimator
 from fgtrack.models.correlated_errors import (
     CorrelatedErrors,

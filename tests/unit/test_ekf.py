@@ -6,8 +6,8 @@ from support.models import MODELS
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.ekf import correct, correct_one, correct_with_innovation, predict
-from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.filters.ekf import correct, correct_one, correct_with_innovation, predict
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
 

@@ -12,7 +12,7 @@ from fgtrack.core.geometry import polar, polar_gradient, rotation, wrap_angle
 from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.opening import LONGEST_S, MOST_MEASUREMENTS, Opening
+from fgtrack.estimation.filters.track_initiation import LONGEST_S, MOST_MEASUREMENTS, TrackInitiation
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRA, CTRV, CV
 from fgtrack.sim.draw import drawn
@@ -135,13 +135,13 @@ def test_a_known_direction_is_not_sought() -> None:
     expected = states(fed("one-point", positions(2.0, 5), start), 5)
     for method in METHODS:
         np.testing.assert_array_equal(states(fed(method, positions(2.0, 5), start), 5), expected)
-        assert Opening.of(CV(), START, method) is None  # a linear model needs none
+        assert TrackInitiation.of(CV(), START, method) is None  # a linear model needs none
 
 
 def test_two_points_end_it_and_a_regression_ends_where_the_direction_is_certain() -> None:
     slow = positions(1.0, 3, speed_mps=1.0)
     for method, num in (("two-point", 1), ("regression", 3)):
-        opening = Opening.of(CTRV(), START, method)
+        opening = TrackInitiation.of(CTRV(), START, method)
         for measurement in slow[:num]:
             assert opening is not None
             assert not opening.over
@@ -150,13 +150,13 @@ def test_two_points_end_it_and_a_regression_ends_where_the_direction_is_certain(
         assert opening.over == (method == "two-point")
     assert opening is not None
     assert opening.with_measurement(position(round(LONGEST_S * 1e9) // PERIOD_NS + 1, 0.0, 0.0)) is None
-    fast = Opening.of(CTRV(), START, "regression")
+    fast = TrackInitiation.of(CTRV(), START, "regression")
     assert fast is not None
     last = fast.with_measurement(position(2, 100.0, 0.0))
     assert last is not None
     assert last.over
     at_rest = [position(4, 0.0, 0.0)] * (MOST_MEASUREMENTS + 1)
-    openings = [Opening.of(CTRV(), START, "regression")]
+    openings = [TrackInitiation.of(CTRV(), START, "regression")]
     for measurement in at_rest:
         assert openings[-1] is not None
         openings.append(openings[-1].with_measurement(measurement))

@@ -9,8 +9,8 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start, StatesAt, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import EndedTrack, Failure
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank
-from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.tracking.guarded_bank import GuardedBank
 

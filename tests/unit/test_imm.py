@@ -11,8 +11,8 @@ import fgtrack
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import ACCEL, FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.imm import ImmReplay, Sojourns
-from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.filters.imm import ImmReplay, Sojourns
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.models.correlated_errors import CorrelatedErrors
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss

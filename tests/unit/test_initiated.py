@@ -10,7 +10,7 @@ import fgtrack
 from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.types import YAW
 from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.opening import MOST_MEASUREMENTS, Initiated
+from fgtrack.estimation.filters.track_initiation import MOST_MEASUREMENTS, Initiated
 from fgtrack.estimation.registry import ESTIMATORS, Claims, start_estimator
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.pipeline.build import build_bank

@@ -5,7 +5,7 @@ import pytest
 
 from fgtrack.core.geometry import rotation
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.initiation import Fix, Line, Search, along, fixes_of, over, straight_line
+from fgtrack.estimation.filters.initiation import Fix, Line, Search, along, fixes_of, over, straight_line
 from fgtrack.estimation.smoothing.bank import FixedLagSmoother
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.windows import Windows

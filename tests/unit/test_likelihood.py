@@ -197,18 +197,18 @@ def turning(seed: int, num: int) -> tuple[FloatArray, Series]:
 
 def test_a_track_of_unknown_direction_is_linearised_along_its_first_positions() -> None:
     values, track = turning(5, 200)
-    opened = track.opened(TURNING.motion_model(values), "regression")
-    assert 3 < opened.num_opening < 30
+    opened = track.initiated(TURNING.motion_model(values), "regression")
+    assert 3 < opened.num_initial < 30
     steps = filtered(opened, TURNING, values)
     for step, about in zip(steps, opened.nominal[:-1], strict=False):
         assert np.array_equal(step.about, about)
-    assert abs(wrap_angle(steps[opened.num_opening].after[2] - 2.5)) < 0.3
+    assert abs(wrap_angle(steps[opened.num_initial].after[2] - 2.5)) < 0.3
     counted = [step for place, step in enumerate(steps) if FitSettings().counts(opened, place)]
     assert len(counted) > 150
     assert np.mean([step.nis for step in counted]) == pytest.approx(2.0, abs=0.4)
-    assert track.opened(TURNING.motion_model(values), "one-point") is track
+    assert track.initiated(TURNING.motion_model(values), "one-point") is track
     likelihood = Problem([opened], TURNING, values, EVERYTHING).likelihood(values, np.ones(10, dtype=bool))
-    place = opened.num_opening
+    place = opened.num_initial
     assert likelihood.totals(values[None])[0] == pytest.approx(
         sum(step.log_likelihood for step in steps[place:]), abs=1e-8
     )
@@ -216,12 +216,12 @@ def test_a_track_of_unknown_direction_is_linearised_along_its_first_positions() 
 
 def test_innovations_count_from_where_the_direction_is_known() -> None:
     values, track = turning(6, 100)
-    opened = track.opened(TURNING.motion_model(values), "regression")
+    opened = track.initiated(TURNING.motion_model(values), "regression")
     settings = FitSettings(settle_s=1.0, settle_steps=5)
     first = next(place for place in range(100) if settings.counts(opened, place))
-    since_s = (opened.observations[first].measurement.stamp_ns - opened.opened_ns) / NS_PER_S
-    assert opened.opened_ns == opened.observations[opened.num_opening - 1].measurement.stamp_ns
-    assert first >= opened.num_opening + 5
+    since_s = (opened.observations[first].measurement.stamp_ns - opened.initiated_ns) / NS_PER_S
+    assert opened.initiated_ns == opened.observations[opened.num_initial - 1].measurement.stamp_ns
+    assert first >= opened.num_initial + 5
     assert 1.0 <= since_s < 1.05
 
 

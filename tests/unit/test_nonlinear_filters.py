@@ -9,11 +9,11 @@ from scipy.optimize import minimize
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.iekf import IekfRecursion, negative_log_posterior
-from fgtrack.estimation.iplf import IplfRecursion
-from fgtrack.estimation.recursion import EkfRecursion
+from fgtrack.estimation.filters.iekf import IekfRecursion, negative_log_posterior
+from fgtrack.estimation.filters.iplf import IplfRecursion
+from fgtrack.estimation.filters.recursion import EkfRecursion
+from fgtrack.estimation.filters.ukf import UkfRecursion
 from fgtrack.estimation.registry import estimator
-from fgtrack.estimation.ukf import UkfRecursion
 from fgtrack.models.motion import CTRV, CV
 from fgtrack.models.sensors import RobustLoss
 from fgtrack.testing.streams import LINEAR, START, shuffled

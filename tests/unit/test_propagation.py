@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from support.models import MODELS
 
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.propagation import EulerCtrv, ExactPropagator
-from fgtrack.estimation.published import (
+from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator
+from fgtrack.estimation.filters.published import (
     YAW_LIMIT_RAD,
     AcceleratedEulerCtrv,
     SaturatedAcceleratedEulerCtrv,

@@ -7,9 +7,9 @@ import pytest
 
 from fgtrack.core.time import nanoseconds
 from fgtrack.estimation.base import Estimator, Measurement, Start
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.oosm import ReorderBuffer
 from fgtrack.estimation.registry import estimator, estimator_bank
-from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRV, CV
 from fgtrack.testing.references import dense_joint

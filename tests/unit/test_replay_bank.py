@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from fgtrack.core.time import nanoseconds
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
+from fgtrack.estimation.filters.replay import ReplayBank, ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.registry import estimator_bank
-from fgtrack.estimation.replay import ReplayBank, ReplayEkf
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss

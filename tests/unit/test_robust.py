@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.ekf import correct, correct_one, robust_weight
+from fgtrack.estimation.filters.ekf import correct, correct_one, robust_weight
 from fgtrack.estimation.registry import ESTIMATORS, Claims, estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV

@@ -13,8 +13,8 @@ import pytest
 from fgtrack.core.types import Detection, DetectionList, EgoState, TrackReport, TrackState, TruthState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult
 from fgtrack.estimation.failures import Failures
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank
-from fgtrack.estimation.replay import ReplayEkf
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.latencies import TickTiming
 from fgtrack.pipeline.live import EGO, Tracker

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.ukf import measurement_regression, regression
+from fgtrack.estimation.filters.ukf import measurement_regression, regression
 from fgtrack.models.motion import CTRV
 
 MEAN = np.array([1.0, -2.0, 0.5])

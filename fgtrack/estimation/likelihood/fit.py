@@ -52,8 +52,8 @@ class FitSettings:
         It does where it is late enough in its track, within the limits of its series, and of one object.
         """
         stamp_ns = series.observations[place].measurement.stamp_ns
-        settled = place >= series.num_opening + self.settle_steps and place not in series.mixed
-        settled &= stamp_ns - series.opened_ns >= NS_PER_S * self.settle_s
+        settled = place >= series.num_initial + self.settle_steps and place not in series.mixed
+        settled &= stamp_ns - series.initiated_ns >= NS_PER_S * self.settle_s
         after, before = series.from_ns, series.until_ns
         return settled and (after is None or stamp_ns >= after) and (before is None or stamp_ns < before)
 

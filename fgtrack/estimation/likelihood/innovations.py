@@ -15,12 +15,12 @@ import numpy as np
 from fgtrack.core.time import seconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.ekf import joseph, kalman_gain, propagated
+from fgtrack.estimation.filters.ekf import joseph, kalman_gain, propagated
 from fgtrack.estimation.likelihood.contaminated import update
 from fgtrack.estimation.likelihood.noise import NoiseSpace
 from fgtrack.estimation.likelihood.reference import Step
 from fgtrack.estimation.likelihood.series import Series
-from fgtrack.models.correlated_errors import ErringMeasurement
+from fgtrack.models.correlated_errors import ColouredNoiseMeasurement
 
 
 class Evaluation(NamedTuple):
@@ -101,7 +101,7 @@ class Innovations:
         self._foreign[k, t, :size, :size] = observation.foreign
         if observation.tuned:
             self._axes[k, t, :size, :size] = observation.axes
-            if isinstance(model, ErringMeasurement):
+            if isinstance(model, ColouredNoiseMeasurement):
                 self._lasting[k, t] = names[sensor, "share"]
                 self._errors[k, t, range(size), model.columns] = 1.0
             self._std[k, t, :size] = [names[sensor, model.components[place]] for place in observation.measured]

@@ -11,11 +11,11 @@ from fgtrack.core.linalg import congruence, mahalanobis_squared
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.ekf import joseph, kalman_gain, linearised, propagated
+from fgtrack.estimation.filters.ekf import joseph, kalman_gain, linearised, propagated
 from fgtrack.estimation.likelihood.contaminated import update
 from fgtrack.estimation.likelihood.noise import NoiseSpace
 from fgtrack.estimation.likelihood.series import Observation, Series
-from fgtrack.models.correlated_errors import ErringMeasurement
+from fgtrack.models.correlated_errors import ColouredNoiseMeasurement
 from fgtrack.models.measurement import MeasurementModel
 
 
@@ -65,7 +65,7 @@ def errors(observation: Observation, stds: FloatArray, odds: float) -> tuple[Mea
     if not observation.tuned:
         return model, observation.own
     R, share = congruence(observation.axes, np.diag(np.square(stds))), odds / (1.0 + odds)
-    if not isinstance(model, ErringMeasurement):
+    if not isinstance(model, ColouredNoiseMeasurement):
         return model, R
     gain = np.zeros_like(model.gain)
     gain[list(observation.measured)] = congruence(observation.axes, np.diag(math.sqrt(share) * stds))
@@ -83,8 +83,8 @@ def filtered(series: Series, space: NoiseSpace, values: Sequence[float] | FloatA
     for place, observation in enumerate(series.observations):
         measurement = observation.measurement
         since_s = seconds(measurement.stamp_ns - stamp_ns)
-        opening = place < series.num_opening
-        about = series.nominal[place] if opening else x
+        initial = place < series.num_initial
+        about = series.nominal[place] if initial else x
         moved, F, Q = motion.transition(about, since_s)
         predicted = moved + F @ (x - about)
         P = propagated(F, P, Q)
@@ -92,7 +92,7 @@ def filtered(series: Series, space: NoiseSpace, values: Sequence[float] | FloatA
         sensor = observation.sensor
         stds = np.array([by_name[sensor, measurement.model.components[place]] for place in here])
         model, R = errors(observation, stds, by_name.get((sensor, "share"), 0.0))
-        seen_from = series.nominal[place + 1] if opening else predicted
+        seen_from = series.nominal[place + 1] if initial else predicted
         y, H = linearised(measurement.z, seen_from, model, measurement.pose)
         y = y - H @ (predicted - seen_from)
         found = update(P, H[here], y[here], R, observation.foreign, np.array(by_name[sensor, ""]))
@@ -121,6 +121,6 @@ def filtered(series: Series, space: NoiseSpace, values: Sequence[float] | FloatA
             )
         )
         x, stamp_ns = after.copy(), measurement.stamp_ns
-        if yawed and place + 1 >= series.num_opening:  # until then it belongs to the nominal trajectory
+        if yawed and place + 1 >= series.num_initial:  # until then it belongs to the nominal trajectory
             x[YAW] = wrap_angle(x[YAW])
     return steps

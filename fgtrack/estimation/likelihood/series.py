@@ -10,8 +10,8 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.base import UNKNOWN_YAW_STD_RAD, Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.initiation import Initiation
-from fgtrack.estimation.opening import Opening
+from fgtrack.estimation.filters.initiation import Initiation
+from fgtrack.estimation.filters.track_initiation import TrackInitiation
 from fgtrack.models.motion import MotionModel
 
 
@@ -59,31 +59,31 @@ class Series:
     """Places of observations whose innovations have no part in the likelihood either; see `without_mixed`."""
 
     @property
-    def num_opening(self) -> int:
+    def num_initial(self) -> int:
         """Number of the first observations that are linearised about `nominal`."""
         return max(len(self.nominal) - 1, 0)
 
     @property
-    def opened_ns(self) -> int:
+    def initiated_ns(self) -> int:
         """Stamp of the last of these, or of the start where there are none."""
-        return self.observations[self.num_opening - 1].measurement.stamp_ns if self.nominal else self.start.stamp_ns
+        return self.observations[self.num_initial - 1].measurement.stamp_ns if self.nominal else self.start.stamp_ns
 
-    def opened(self, motion: MotionModel, method: Initiation) -> "Series":
+    def initiated(self, motion: MotionModel, method: Initiation) -> "Series":
         """With a nominal trajectory along the first positions, where `start` does not know the direction of travel.
 
-        As in the tracker (see `Opening`): an EKF that starts in a wrong direction takes many seconds to turn, in which
-        its innovations say nothing of the noise. Unchanged where no line leads through the positions.
+        As in the tracker (see `TrackInitiation`): an EKF that starts in a wrong direction takes many seconds to turn, in
+        which its innovations say nothing of the noise. Unchanged where no line leads through the positions.
         """
-        opening, count = Opening.of(motion, self.start, method), 0
-        if opening is None:
+        search, count = TrackInitiation.of(motion, self.start, method), 0
+        if search is None:
             return self
         for observation in self.observations:
-            longer = opening.with_measurement(observation.measurement)
+            longer = search.with_measurement(observation.measurement)
             if longer is None:
                 break
-            opening, count = longer, count + 1
+            search, count = longer, count + 1
         try:
-            states = [opening.nominal(initial_state(motion, self.start)[0])]
+            states = [search.nominal(initial_state(motion, self.start)[0])]
         except np.linalg.LinAlgError:
             return self
         stamp_ns, start = self.start.stamp_ns, self.start

@@ -5,8 +5,8 @@ counted in steps. The methods differ in their estimate of the state at tau; most
 """
 
 from fgtrack.estimation.oosm.asd import AccumulatedStateDensity
+from fgtrack.estimation.oosm.buffers import DelayedHorizon, ReorderBuffer
 from fgtrack.estimation.oosm.forward import CovarianceIntersection, Fpfd, determinant, trace
-from fgtrack.estimation.oosm.held import DelayedHorizon, ReorderBuffer
 from fgtrack.estimation.oosm.larsen import Larsen
 from fgtrack.estimation.oosm.one_step import Al1, Bl1
 from fgtrack.estimation.oosm.policies import AsCurrent, Drop

@@ -9,10 +9,10 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.ekf import OneCorrection, propagated
+from fgtrack.estimation.filters.ekf import OneCorrection, propagated
+from fgtrack.estimation.filters.windowed import WindowedFilter
 from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.oosm.crossing import Past, fuse_across
-from fgtrack.estimation.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
 
 

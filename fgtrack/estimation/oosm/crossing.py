@@ -7,7 +7,7 @@ import numpy as np
 from fgtrack.core.linalg import congruence, psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.ekf import OneCorrection, linearised, propagated, robust_weight
+from fgtrack.estimation.filters.ekf import OneCorrection, linearised, propagated, robust_weight
 from fgtrack.estimation.oosm.history import require_finite
 
 

@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 from fgtrack.core.linalg import identity, psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.ekf import OneCorrection
+from fgtrack.estimation.filters.ekf import OneCorrection
 from fgtrack.estimation.oosm.history import corrected
 from fgtrack.estimation.oosm.late import LateEkf
 from fgtrack.models.motion import MotionModel

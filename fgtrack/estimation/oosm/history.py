@@ -9,7 +9,7 @@ from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.ekf import OneCorrection, correct_one, linearised, predict, propagated
+from fgtrack.estimation.filters.ekf import OneCorrection, correct_one, linearised, predict, propagated
 from fgtrack.models.motion import MotionModel
 
 

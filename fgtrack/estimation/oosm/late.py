@@ -7,11 +7,11 @@ import numpy as np
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.ekf import OneCorrection
+from fgtrack.estimation.filters.ekf import OneCorrection
+from fgtrack.estimation.filters.propagation import track_state
+from fgtrack.estimation.filters.windowed import WindowedFilter
 from fgtrack.estimation.oosm.crossing import Past, fuse_across
 from fgtrack.estimation.oosm.history import History
-from fgtrack.estimation.propagation import track_state
-from fgtrack.estimation.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
 
 

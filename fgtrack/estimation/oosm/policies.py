@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.ekf import OneCorrection
+from fgtrack.estimation.filters.ekf import OneCorrection
 from fgtrack.estimation.oosm.late import LateEkf
 
 

@@ -1,7 +1,7 @@
 """Rewind to the late stamp, correct there, predict to now, and forget the rest."""
 
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.ekf import OneCorrection
+from fgtrack.estimation.filters.ekf import OneCorrection
 from fgtrack.estimation.oosm.late import LateEkf
 
 
@@ -10,7 +10,7 @@ class RewindForget(LateEkf):
 
     Karle, Fent, Huch, Sauerbeck and Lienkamp, Multi-modal sensor fusion and object tracking for autonomous racing, IEEE
     Transactions on Intelligent Vehicles, 2023, section III-G: x_1 = f(x_{tau|tau}), P_1 = F P_{tau|tau} F' + Q from tau
-    to now. Here at the stamp itself; `fgtrack.estimation.backward_forward` has the paper's time grid.
+    to now. Here at the stamp itself; `fgtrack.estimation.filters.backward_forward` has the paper's time grid.
 
     Exact for: nothing. For what it keeps it is the filter in order of stamps, so it stays consistent, but all
     measurements between the late stamp and the present are lost.

@@ -1,6 +1,6 @@
 """Smoother gains from the present back to the late stamp."""
 
-from fgtrack.estimation.ekf import Prediction
+from fgtrack.estimation.filters.ekf import Prediction
 from fgtrack.estimation.oosm.crossing import Past
 from fgtrack.estimation.oosm.late import CrossingEkf
 from fgtrack.estimation.rts import rts_step

@@ -12,9 +12,9 @@ from fgtrack.core.types import BoolArray, FloatArray, IntArray, SmoothedReport, 
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.failures import Failure, Failures
-from fgtrack.estimation.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
+from fgtrack.estimation.filters.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
+from fgtrack.estimation.filters.propagation import track_state
 from fgtrack.estimation.present import PresentStates, smoothed_reports
-from fgtrack.estimation.propagation import track_state
 from fgtrack.estimation.smoothing.nodes import grown
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver

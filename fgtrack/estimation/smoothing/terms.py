@@ -11,8 +11,8 @@ from fgtrack.core.grouping import equal_ones
 from fgtrack.core.linalg import congruence, inverse_roots, mahalanobis_squared
 from fgtrack.core.time import seconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation import ekf
 from fgtrack.estimation.base import Measurement, UpdateResult, UpdateStatus
+from fgtrack.estimation.filters import ekf
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import penalty, weight
 

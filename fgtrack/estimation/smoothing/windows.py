@@ -9,9 +9,9 @@ import numpy as np
 from fgtrack.core.time import NS_PER_S, seconds
 from fgtrack.core.types import YAW, BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.ekf import predict
 from fgtrack.estimation.failures import Failure, Failures
-from fgtrack.estimation.initiation import Fix, Line, along, fixes_of
+from fgtrack.estimation.filters.ekf import predict
+from fgtrack.estimation.filters.initiation import Fix, Line, along, fixes_of
 from fgtrack.estimation.smoothing import kernels
 from fgtrack.estimation.smoothing.damping import DampedWindow
 from fgtrack.estimation.smoothing.nodes import Undo

@@ -3,7 +3,7 @@
 from typing import Any
 
 from fgtrack.estimation.base import Start
-from fgtrack.estimation.initiation import DEFAULT
+from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.smoothing.bank import FixedLagSmoother
 from fgtrack.estimation.smoothing.gtsam.batch import BatchSolver
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver

@@ -8,7 +8,7 @@ import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import YAW, FloatArray, IntArray, TrackState
-from fgtrack.estimation.ekf import predict
+from fgtrack.estimation.filters.ekf import predict
 from fgtrack.models.measurement import MeasurementModel
 from fgtrack.models.motion import MotionModel
 

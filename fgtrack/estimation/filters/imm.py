@@ -13,12 +13,12 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.ekf import OneCorrection, Prediction, correct_one, predict
-from fgtrack.estimation.initiation import DEFAULT, Initiation
-from fgtrack.estimation.propagation import wrapped
-from fgtrack.estimation.recursion import EkfRecursion, Step
+from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, correct_one, predict
+from fgtrack.estimation.filters.initiation import DEFAULT, Initiation
+from fgtrack.estimation.filters.propagation import wrapped
+from fgtrack.estimation.filters.recursion import EkfRecursion, Step
+from fgtrack.estimation.filters.replay import ReplayingFilter
 from fgtrack.estimation.registry import motion_model
-from fgtrack.estimation.replay import ReplayingFilter
 from fgtrack.models.correlated_errors import CorrelatedErrors
 from fgtrack.models.motion import CTRA, CTRV, MotionModel
 from fgtrack.models.robust import penalty
@@ -266,7 +266,7 @@ def _log_likelihood(found: OneCorrection, measurement: Measurement) -> float:
 
 
 def _with(step: Step, mixture: Mixture) -> ImmStep:
-    plain = step.stamp_ns, step.measurement, step.mean, step.covariance, step.predicted, step.opening
+    plain = step.stamp_ns, step.measurement, step.mean, step.covariance, step.predicted, step.search
     return ImmStep(*plain, mixture)
 
 

@@ -6,11 +6,11 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.ekf import OneCorrection
-from fgtrack.estimation.iekf import check_iteration, descended, largest_move, negative_log_posterior, reweighted
-from fgtrack.estimation.initiation import DEFAULT
-from fgtrack.estimation.replay import ReplayingFilter
-from fgtrack.estimation.ukf import UkfRecursion, measurement_regression
+from fgtrack.estimation.filters.ekf import OneCorrection
+from fgtrack.estimation.filters.iekf import check_iteration, descended, largest_move, negative_log_posterior, reweighted
+from fgtrack.estimation.filters.initiation import DEFAULT
+from fgtrack.estimation.filters.replay import ReplayingFilter
+from fgtrack.estimation.filters.ukf import UkfRecursion, measurement_regression
 from fgtrack.models.motion import MotionModel
 
 

@@ -12,9 +12,9 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.ekf import OneCorrection, Prediction, correct, correct_one, predict_across
-from fgtrack.estimation.initiation import Initiation
-from fgtrack.estimation.opening import Opening
+from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, correct, correct_one, predict_across
+from fgtrack.estimation.filters.initiation import Initiation
+from fgtrack.estimation.filters.track_initiation import TrackInitiation
 from fgtrack.models.motion import MotionModel
 
 
@@ -29,13 +29,13 @@ class Step:
     covariance: FloatArray
     predicted: Prediction
     """The state before it, predicted from the step before."""
-    opening: Opening | None = None
+    search: TrackInitiation | None = None
     """What had been measured up to here, where the direction of travel was sought."""
 
     @property
     def along(self) -> bool:
         """Whether the state comes from all that had been measured, along a line, and not from the step before."""
-        return self.opening is not None and self.opening.line is not None
+        return self.search is not None and self.search.line is not None
 
 
 class EkfRecursion:
@@ -93,8 +93,8 @@ class EkfRecursion:
     def first(self, prior: Start, initiation: Initiation) -> Step:
         """The step that everything is replayed from."""
         mean, covariance = initial_state(self.motion, prior)
-        opening, predicted = Opening.of(self.motion, prior, initiation), Prediction(mean, covariance, covariance)
-        return Step(prior.stamp_ns, None, mean, covariance, predicted, opening)
+        search, predicted = TrackInitiation.of(self.motion, prior, initiation), Prediction(mean, covariance, covariance)
+        return Step(prior.stamp_ns, None, mean, covariance, predicted, search)
 
     def ahead(self, before: Sequence[Step], stamps_ns: Sequence[int]) -> Prediction:
         """States at `stamps_ns`, each predicted from its step."""
@@ -120,12 +120,12 @@ class EkfRecursion:
     ) -> tuple[Step, OneCorrection] | None:
         """The step of a corrected state; while the direction of travel is sought, that along the line instead."""
         mean, covariance = corrected.mean, corrected.covariance
-        opening = None if before.opening is None else before.opening.with_measurement(measurement)
-        if opening is not None and opening.line is not None:
+        search = None if before.search is None else before.search.with_measurement(measurement)
+        if search is not None and search.line is not None:
             try:
-                mean, covariance = opening.state()
+                mean, covariance = search.state()
             except np.linalg.LinAlgError:
                 return None
         if not self.motion.cartesian:
             mean[YAW] = wrap_angle(mean[YAW])
-        return Step(measurement.stamp_ns, measurement, mean, covariance, predicted, opening), corrected
+        return Step(measurement.stamp_ns, measurement, mean, covariance, predicted, search), corrected

@@ -7,8 +7,8 @@ import numpy as np
 
 from fgtrack.core.geometry import TWO_PI
 from fgtrack.core.types import YAW, FloatArray
-from fgtrack.estimation.backward_forward import BackwardForwardBank
-from fgtrack.estimation.propagation import EulerCtrv
+from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
+from fgtrack.estimation.filters.propagation import EulerCtrv
 from fgtrack.models.measurement import MeasurementModel
 
 #: The published yaw range in REP-103 is (YAW_LIMIT - 2 pi, YAW_LIMIT].

@@ -8,7 +8,7 @@ from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
-from fgtrack.estimation.ekf import OneCorrection
+from fgtrack.estimation.filters.ekf import OneCorrection
 from fgtrack.models.motion import MotionModel
 
 

@@ -14,8 +14,17 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import KNOWN_YAW_STD_RAD, UNKNOWN_YAW_STD_RAD, Estimator, Measurement, Start, UpdateResult
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.ekf import Prediction, correct_one, propagated
-from fgtrack.estimation.initiation import Fix, Initiation, Line, checked_initiation, fix_of, over, sought, straight_line
+from fgtrack.estimation.filters.ekf import Prediction, correct_one, propagated
+from fgtrack.estimation.filters.initiation import (
+    Fix,
+    Initiation,
+    Line,
+    checked_initiation,
+    fix_of,
+    over,
+    sought,
+    straight_line,
+)
 from fgtrack.estimation.rts import rts_step
 from fgtrack.models.motion import MotionModel
 
@@ -38,7 +47,7 @@ class _Link(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Opening:
+class TrackInitiation:
     """What has been measured of a new object while its direction of travel is sought, in order of the stamps.
 
     A value: `with_measurement` gives another one, so a filter may keep one at each step and go back to it.
@@ -54,14 +63,14 @@ class Opening:
     """Through the fixes; None where they are of one time."""
 
     @classmethod
-    def of(cls, motion: MotionModel, start: Start, method: Initiation) -> "Opening | None":
+    def of(cls, motion: MotionModel, start: Start, method: Initiation) -> "TrackInitiation | None":
         """Before the first measurement; None where no direction is sought."""
         if not sought(motion, start, method):
             return None
         x, P = initial_state(motion, start)
         return cls(motion, start, method, fixes=(Fix(0.0, x[:2], P[:2, :2]),))
 
-    def with_measurement(self, measurement: Measurement) -> "Opening | None":
+    def with_measurement(self, measurement: Measurement) -> "TrackInitiation | None":
         """With one more measurement, the newest; None where the direction is known, or sought no more."""
         time_s = seconds(measurement.stamp_ns - self.start.stamp_ns)
         if self.over or time_s > LONGEST_S or len(self.measurements) == MOST_MEASUREMENTS:
@@ -184,30 +193,30 @@ class Opening:
 
 def initiated(motion: MotionModel, start: Start, method: str, make: Callable[[Start], Estimator]) -> Estimator:
     """What `make` gives for `start`, by itself or as `Initiated`. Raises `CallError` for an unknown `method`."""
-    opening = Opening.of(motion, start, checked_initiation(method))
-    return make(start) if opening is None else Initiated(opening, make)
+    search = TrackInitiation.of(motion, start, checked_initiation(method))
+    return make(start) if search is None else Initiated(search, make)
 
 
 class Initiated:
     """An `Estimator` that begins again, in the direction of the first positions, until that is certain.
 
     What it has fused so far is given in order of the stamps to a new one, which starts along the line (see
-    `Opening.turned`). From then on it is the last of these.
+    `TrackInitiation.turned`). From then on it is the last of these.
 
     Parameters
     ----------
-    opening
+    search
         Before the first measurement.
     make
         Makes the estimator of an object.
     """
 
-    def __init__(self, opening: Opening, make: Callable[[Start], Estimator]) -> None:
+    def __init__(self, search: TrackInitiation, make: Callable[[Start], Estimator]) -> None:
         self._make = make
-        self._nothing: Opening | None = opening
+        self._search: TrackInitiation | None = search
         self._fused: list[Measurement] = []
-        self._clock_ns = opening.start.stamp_ns
-        self._inner = make(opening.start)
+        self._clock_ns = search.start.stamp_ns
+        self._inner = make(search.start)
 
     @property
     def window_ns(self) -> tuple[int, int]:
@@ -217,9 +226,9 @@ class Initiated:
     def update(self, measurement: Measurement) -> UpdateResult:
         """See `Estimator.update`; the innovation is that before it begins again."""
         result = self._inner.update(measurement)
-        if self._nothing is not None and result.innovation is not None:
-            bisect.insort(self._fused, measurement.seen_by(self._nothing.motion), key=lambda each: each.order)
-            self._begin_again(self._nothing)
+        if self._search is not None and result.innovation is not None:
+            bisect.insort(self._fused, measurement.seen_by(self._search.motion), key=lambda each: each.order)
+            self._begin_again(self._search)
         return result
 
     def state_at(self, stamp_ns: int) -> TrackState:
@@ -231,22 +240,22 @@ class Initiated:
         self._clock_ns = max(self._clock_ns, now_ns)
         self._inner.advance(now_ns)
 
-    def _begin_again(self, opening: Opening) -> None:
+    def _begin_again(self, search: TrackInitiation) -> None:
         """Let a new estimator that starts along the first positions take the place of the present one, if it can."""
         count = 0
         for measurement in self._fused:
-            longer = opening.with_measurement(measurement)
+            longer = search.with_measurement(measurement)
             if longer is None:
                 break
-            opening, count = longer, count + 1
-        ended = opening.over or count < len(self._fused)
-        if opening.line is not None:
-            inner = self._make(opening.turned())
+            search, count = longer, count + 1
+        ended = search.over or count < len(self._fused)
+        if search.line is not None:
+            inner = self._make(search.turned())
             fused = all(inner.update(measurement).innovation is not None for measurement in self._fused)
             if fused:
                 inner.advance(self._clock_ns)
                 self._inner = inner
             ended |= not fused  # the window has moved on
         if ended:
-            self._nothing = None
+            self._search = None
             self._fused.clear()

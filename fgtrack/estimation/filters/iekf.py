@@ -9,10 +9,10 @@ from fgtrack.core.checks import not_negative
 from fgtrack.core.linalg import psd_solve
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.ekf import OneCorrection, linearised, updated_one
-from fgtrack.estimation.initiation import DEFAULT
-from fgtrack.estimation.recursion import EkfRecursion
-from fgtrack.estimation.replay import ReplayingFilter
+from fgtrack.estimation.filters.ekf import OneCorrection, linearised, updated_one
+from fgtrack.estimation.filters.initiation import DEFAULT
+from fgtrack.estimation.filters.recursion import EkfRecursion
+from fgtrack.estimation.filters.replay import ReplayingFilter
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import penalty, weight
 from fgtrack.models.sensors import RobustLoss

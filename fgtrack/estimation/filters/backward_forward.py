@@ -17,9 +17,9 @@ from fgtrack.core.time import nanoseconds, period_ns, seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.ekf import correct
+from fgtrack.estimation.filters.ekf import correct
+from fgtrack.estimation.filters.propagation import ExactPropagator, Propagator
 from fgtrack.estimation.present import PresentStates
-from fgtrack.estimation.propagation import ExactPropagator, Propagator
 from fgtrack.models.motion import MotionModel
 
 _LONGEST_STRETCH = 64  # steps of pure prediction after which a state is stored, so that predictions stay short

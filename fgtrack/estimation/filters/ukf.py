@@ -14,10 +14,10 @@ import numpy as np
 from fgtrack.core.linalg import identity, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.ekf import OneCorrection, Prediction, updated_one
-from fgtrack.estimation.initiation import DEFAULT
-from fgtrack.estimation.recursion import EkfRecursion
-from fgtrack.estimation.replay import ReplayingFilter
+from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, updated_one
+from fgtrack.estimation.filters.initiation import DEFAULT
+from fgtrack.estimation.filters.recursion import EkfRecursion
+from fgtrack.estimation.filters.replay import ReplayingFilter
 from fgtrack.models.measurement import MeasurementModel
 from fgtrack.models.motion import MotionModel
 

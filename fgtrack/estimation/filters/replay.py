@@ -16,14 +16,14 @@ from fgtrack.estimation.base import (
     UpdateStatus,
     no_states,
 )
-from fgtrack.estimation.ekf import OneCorrection, Prediction
-from fgtrack.estimation.initiation import DEFAULT, checked_initiation
+from fgtrack.estimation.filters.ekf import OneCorrection, Prediction
+from fgtrack.estimation.filters.initiation import DEFAULT, checked_initiation
+from fgtrack.estimation.filters.propagation import track_state, wrapped
+from fgtrack.estimation.filters.recursion import EkfRecursion, Step
+from fgtrack.estimation.filters.windowed import WindowedFilter
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.present import PresentStates
-from fgtrack.estimation.propagation import track_state, wrapped
-from fgtrack.estimation.recursion import EkfRecursion, Step
 from fgtrack.estimation.rts import rts_step
-from fgtrack.estimation.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
 
 
@@ -127,22 +127,22 @@ def _retrodicted(
 
     From the newest step back (see `rts_step`), each as it was when the new measurement was unknown.
     """
-    blank = [Step(step.stamp_ns, None, *step.predicted[:2], step.predicted) for step in new]
-    first = recursion.ahead(blank, [steps[0].stamp_ns for steps in later])
+    without = [Step(step.stamp_ns, None, *step.predicted[:2], step.predicted) for step in new]
+    first = recursion.ahead(without, [steps[0].stamp_ns for steps in later])
     mean, covariance = (np.array([getattr(steps[-1], name) for steps in later]) for name in ("mean", "covariance"))
     sought = list(range(len(new)))  # those whose state does not come from a line through all that was measured
     for place in range(max(map(len, later)) - 1, -1, -1):
         chosen = list[int]()
         for row in [row for row in sought if len(later[row]) > place]:
-            after, before = later[row][place], later[row][place - 1] if place else blank[row]
-            if after.along and after.opening is not None:
-                mean[row], covariance[row] = after.opening.retrodicted(new[row].stamp_ns, mean[row], covariance[row])
+            after, before = later[row][place], later[row][place - 1] if place else without[row]
+            if after.along and after.search is not None:
+                mean[row], covariance[row] = after.search.retrodicted(new[row].stamp_ns, mean[row], covariance[row])
                 sought.remove(row)
             elif before.stamp_ns != after.stamp_ns:  # else it is the same state
                 chosen.append(row)
         if not chosen:
             continue
-        befores = [later[row][place - 1] if place else blank[row] for row in chosen]
+        befores = [later[row][place - 1] if place else without[row] for row in chosen]
         predicted = (
             Prediction(*(part[chosen] for part in first))
             if not place

@@ -6,14 +6,14 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
-from fgtrack.estimation.ekf import predict
-from fgtrack.estimation.initiation import DEFAULT
-from fgtrack.estimation.propagation import track_state
-from fgtrack.estimation.replay import ReplayEkf
+from fgtrack.estimation.filters.ekf import predict
+from fgtrack.estimation.filters.initiation import DEFAULT
+from fgtrack.estimation.filters.propagation import track_state
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.models.motion import MotionModel
 
 
-class HeldEkf(ABC):
+class BufferedEkf(ABC):
     """An EKF whose state ends at a front; measurements after the front are held and do not count yet.
 
     Until the front has passed them they are kept in order of their stamps, so a measurement that comes before the
@@ -65,7 +65,7 @@ class HeldEkf(ABC):
         return track_state(self._motion, stamp_ns, *predict(front.mean, front.covariance, self._motion, dt_s))
 
 
-class DelayedHorizon(HeldEkf):
+class DelayedHorizon(BufferedEkf):
     """Run the filter at now - D, and predict from there to now.
 
     Now is the clock, or the newest stamp where that is ahead, so D has to cover the longest delay. As in flight
@@ -97,7 +97,7 @@ class DelayedHorizon(HeldEkf):
         return self._now_ns - self._hold_ns
 
 
-class ReorderBuffer(HeldEkf):
+class ReorderBuffer(BufferedEkf):
     """Hold every measurement until one has come whose stamp is D later, and fuse in order of stamps.
 
     The stamps push the front and the clock does not, so D has to cover only how much later than its successors a
