@@ -71,8 +71,8 @@ class Series:
     def initiated(self, motion: MotionModel, method: Initiation) -> "Series":
         """With a nominal trajectory along the first positions, where `start` does not know the direction of travel.
 
-        As in the tracker (see `TrackInitiation`): an EKF that starts in a wrong direction takes many seconds to turn, in
-        which its innovations say nothing of the noise. Unchanged where no line leads through the positions.
+        As in the tracker (see `TrackInitiation`): an EKF that starts in a wrong direction takes many seconds to turn,
+        in which its innovations say nothing of the noise. Unchanged where no line leads through the positions.
         """
         search, count = TrackInitiation.of(motion, self.start, method), 0
         if search is None:
