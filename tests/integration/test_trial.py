@@ -128,12 +128,12 @@ def test_a_typo_in_a_field_path_is_one_line_with_the_names_there(tmp_path):
     config = tmp_path / "c.yaml"
     config.write_text(
         "input:\n  ego: {topic: /ego/odometry}\n  detections:\n"
-        "    radar: {topic: /detections/radar, fields: {objects: objects, x_m: kinematics.pose.x}}\n"
+        "    radar: {topic: /detections/radar, fields: {objects: detections, x_m: bbox.pose.x}}\n"
         "sensors:\n  radar: {std: {x_m: 1.0, y_m: 1.0}}\n"
     )
     code, text = info(tmp_path / "bag", config)
     assert code == 1
-    assert "kinematics.pose.x: leads nowhere, there is no 'pose', but pose_with_covariance" in text
+    assert "bbox.pose.x: leads nowhere, there is no 'pose', but center" in text
     assert "/detections/lidar" in text
     assert "ignored" in text
 

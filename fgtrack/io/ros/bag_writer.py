@@ -17,7 +17,7 @@ from fgtrack.io.adapters.common import RosMessage
 from fgtrack.io.errors import UntilBreak, one_line
 from fgtrack.io.output import check_output, new_folder
 from fgtrack.io.ros.bag_files import METADATA, SETTINGS, parts_of
-from fgtrack.io.ros.messages import DETECTED_OBJECTS, DETECTION3D_ARRAY, MessageFactory
+from fgtrack.io.ros.messages import MessageFactory
 
 _CHECKPOINT = 1000  # messages; a killed writer loses no more than that
 _PLUGINS = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
@@ -38,11 +38,10 @@ def write_bag(
 
     `/fgtrack/ego`, `/fgtrack/detections/SENSOR` and `/fgtrack/truth` hold every field to the bit and carry
     their definitions; the log time is the receipt, the header stamp the stamp. The twins for other tools are
-    `/ego/odometry` (nav_msgs/Odometry), `/detections/SENSOR` (vision_msgs/Detection3DArray, or with speeds
-    autoware_perception_msgs/DetectedObjects) and `/truth/poses` (geometry_msgs/PoseArray); an object
-    without a position is not in them. What is written reaches the disk every thousand messages: a killed
-    writer leaves a recording (`<path>.*.part`) that `Bag` reads up to there. `settings`, what the recording carries of
-    a configuration, are in the custom data of metadata.yaml.
+    `/ego/odometry` (nav_msgs/Odometry), `/detections/SENSOR` (vision_msgs/Detection3DArray, without speeds) and
+    `/truth/poses` (geometry_msgs/PoseArray); an object without a position is not in them. What is written reaches the
+    disk every thousand messages: a killed writer leaves a recording (`<path>.*.part`) that `Bag` reads up to there.
+    `settings`, what the recording carries of a configuration, are in the custom data of metadata.yaml.
 
     Raises
     ------
@@ -66,7 +65,7 @@ def write_bag(
             for message in readable:
                 writer.write(message)
             readable.raise_before_replacing(Path(path))
-            writer.flush()
+            writer.write_truth_twin()
     except FgtrackError:
         raise
     except Exception as error:  # rosbags lets SQLite and struct errors through
@@ -107,8 +106,6 @@ class _MessageWriter:
         self._standard_topics = standard_topics
         self._factory = MessageFactory()
         self._connections: dict[str, Connection] = {}
-        self._twin_types: dict[str, str] = {}
-        self._undecided: dict[str, list[DetectionList]] = {}
         self._truth: list[TruthState] = []
         self.count = 0
 
@@ -127,14 +124,6 @@ class _MessageWriter:
         if self.count % _CHECKPOINT == 0:
             self._checkpoint()
 
-    def flush(self) -> None:
-        """Write the twins that wait for later messages."""
-        self._write_truth_twin()
-        for messages in list(self._undecided.values()):
-            for message in messages:
-                self._write_list_twin(message, DETECTION3D_ARRAY)
-        self._undecided.clear()
-
     def _write_twin(self, message: Message) -> None:
         match message:
             case EgoState():
@@ -142,30 +131,14 @@ class _MessageWriter:
             case TruthState():
                 times = (message.stamp_ns, message.receipt_ns)
                 if self._truth and (self._truth[0].stamp_ns, self._truth[0].receipt_ns) != times:
-                    self._write_truth_twin()
+                    self.write_truth_twin()
                 self._truth.append(message)
             case DetectionList():
-                self._decide_list_twin(message)
+                twin = self._factory.detection3d_array(message)
+                self._put(f"/detections/{token(message.sensor)}", twin, message.receipt_ns)
 
-    def _decide_list_twin(self, message: DetectionList) -> None:
-        """A sensor's first object says whether it measures speed; empty lists before it wait."""
-        sensor = message.sensor
-        if sensor not in self._twin_types:
-            waiting = self._undecided.setdefault(sensor, [])
-            if not message.objects:
-                waiting.append(message)
-                return
-            fast = any(item.speed_mps is not None for item in message.objects)
-            self._twin_types[sensor] = DETECTED_OBJECTS if fast else DETECTION3D_ARRAY
-            for earlier in self._undecided.pop(sensor):
-                self._write_list_twin(earlier, self._twin_types[sensor])
-        self._write_list_twin(message, self._twin_types[sensor])
-
-    def _write_list_twin(self, message: DetectionList, msgtype: str) -> None:
-        make = self._factory.detected_objects if msgtype == DETECTED_OBJECTS else self._factory.detection3d_array
-        self._put(f"/detections/{token(message.sensor)}", make(message), message.receipt_ns)
-
-    def _write_truth_twin(self) -> None:
+    def write_truth_twin(self) -> None:
+        """Write the true states that wait for others of their stamp."""
         if self._truth:
             self._put("/truth/poses", self._factory.pose_array(self._truth), self._truth[0].receipt_ns)
             self._truth = []

@@ -24,7 +24,6 @@ from fgtrack.io.ros.typestore import build_typestore
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 DETECTION3D_ARRAY = "vision_msgs/msg/Detection3DArray"
-DETECTED_OBJECTS = "autoware_perception_msgs/msg/DetectedObjects"
 POSE_ARRAY = "geometry_msgs/msg/PoseArray"
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -35,7 +34,7 @@ _SECONDS_LIMIT = 1 << 31  # builtin_interfaces/Time holds 32 bits
 
 @cache
 def _typestore() -> Typestore:
-    standard = (ODOMETRY, DETECTION3D_ARRAY, DETECTED_OBJECTS, POSE_ARRAY, MARKER_ARRAY, TRANSFORMS)
+    standard = (ODOMETRY, DETECTION3D_ARRAY, POSE_ARRAY, MARKER_ARRAY, TRANSFORMS)
     types = (EGO, DETECTIONS, TRUTH, *standard)
     return build_typestore(dict.fromkeys(types), ros1=False)[0]
 
@@ -102,14 +101,6 @@ class MessageFactory:
             detections=[self._detection3d(item) for item in message.objects if _has_position(item)],
         )
 
-    def detected_objects(self, message: DetectionList) -> RosMessage:
-        """`autoware_perception_msgs/DetectedObjects` of the objects that have a position."""
-        return self._make(
-            DETECTED_OBJECTS,
-            header=self._list_header(message),
-            objects=[self._detected_object(item) for item in message.objects if _has_position(item)],
-        )
-
     def pose_array(self, states: list[TruthState]) -> RosMessage:
         """`geometry_msgs/PoseArray` in the frame `map`, of states of one stamp."""
         return self._make(
@@ -142,7 +133,7 @@ class MessageFactory:
             hypothesis = self._make("vision_msgs/msg/ObjectHypothesis", class_id=item.class_name or "", score=1.0)
             result = "vision_msgs/msg/ObjectHypothesisWithPose"
             results.append(
-                self._make(result, hypothesis=hypothesis, pose=self._with_covariance("Pose", pose, covariance[0]))
+                self._make(result, hypothesis=hypothesis, pose=self._with_covariance("Pose", pose, covariance))
             )
         return self._make(
             "vision_msgs/msg/Detection3D",
@@ -150,29 +141,6 @@ class MessageFactory:
             results=results,
             bbox=self._make("vision_msgs/msg/BoundingBox3D", center=pose, size=self._size(item)),
             id="" if item.object_id is None else str(item.object_id),
-        )
-
-    def _detected_object(self, item: Detection) -> RosMessage:
-        package = "autoware_perception_msgs/msg"
-        covariance = _full_covariance(item)
-        pose, twist = (None, None) if covariance is None else covariance
-        kinematics = self._make(
-            f"{package}/DetectedObjectKinematics",
-            pose_with_covariance=self._with_covariance("Pose", self._pose(item.x_m, item.y_m, item.yaw_rad), pose),
-            has_position_covariance=pose is not None,
-            orientation_availability=0 if item.yaw_rad is None else 2,
-            twist_with_covariance=self._with_covariance("Twist", self._twist(item.speed_mps, 0.0), twist),
-            has_twist=item.speed_mps is not None,
-            has_twist_covariance=twist is not None and item.speed_mps is not None,
-        )
-        footprint = self._make("geometry_msgs/msg/Polygon", points=[])
-        shape = self._make(f"{package}/Shape", type=0, footprint=footprint, dimensions=self._size(item))
-        return self._make(
-            f"{package}/DetectedObject",
-            existence_probability=1.0,
-            classification=[],
-            kinematics=kinematics,
-            shape=shape,
         )
 
     def _vector(self, x: float, y: float, z: float = 0.0) -> RosMessage:
@@ -225,18 +193,14 @@ def _odometry_covariances(state: EgoState) -> tuple[FloatArray, FloatArray] | tu
     return pose, twist
 
 
-def _full_covariance(item: Detection) -> tuple[FloatArray, FloatArray] | None:
-    """Covariances, shape (6, 6), of pose and twist; None where the detection has none."""
+def _full_covariance(item: Detection) -> FloatArray | None:
+    """Covariance of the pose, shape (6, 6); None where the detection has none."""
     if item.covariance is None:
         return None
-    given = np.asarray(item.covariance).reshape(len(item.measured), -1)
-    pose, twist = np.zeros((6, 6)), np.zeros((6, 6))
+    given, pose = np.asarray(item.covariance).reshape(len(item.measured), -1), np.zeros((6, 6))
     place = {"x_m": 0, "y_m": 1, "yaw_rad": 5}
     kept = [(place[name], index) for index, name in enumerate(item.measured) if name in place]
     for row, i in kept:
         for column, j in kept:
             pose[row, column] = given[i, j]
-    if "speed_mps" in item.measured:
-        index = item.measured.index("speed_mps")
-        twist[0, 0] = given[index, index]
-    return pose, twist
+    return pose
