@@ -24,9 +24,9 @@ from fgtrack.pipeline.assumed import Assumed, assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import ReplayResult, replay_each
 from fgtrack.pipeline.shipped import read_config
+from fgtrack.plotting.close_up import CloseUp
 from fgtrack.plotting.late_detection import drawn_close_up
 from fgtrack.plotting.plot import drawn, planned
-from fgtrack.plotting.slow_motion import CloseUp
 from fgtrack.plotting.style import png
 from fgtrack.viewers.report import Opening, write_report
 
@@ -258,5 +258,5 @@ def opening_at(late: CloseUp | DataError) -> Opening:
     """Return how a report opens at a late detection; without one it says why."""
     if isinstance(late, DataError):
         return Opening(missing=(f"no close-up: {late}",))
-    x_m, y_m = late.position_m.tolist()
+    x_m, y_m = late.after.means[-1, :2].tolist()
     return Opening(moment=(late.now_ns, x_m, y_m))

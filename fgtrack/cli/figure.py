@@ -39,9 +39,9 @@ def figure(
 ) -> None:
     """Draw runs or a sweep: late detections, map, errors, time.
 
-    Of runs: a late detection in close-up, the map, the way along the track, residuals, NEES and NIS, arrivals, delays,
-    errors over time (bands where runs differ by their seed only) and against lag, time per tick. Of many objects or
-    runs the worst few. Of a sweep: its metrics over the grid, mean and 95 % interval over the seeds.
+    Of runs: a late detection in close-up, the map, residuals, NEES and NIS, arrivals, delays, errors over time and
+    against lag, time per tick. Of many objects or runs the worst few. Of a sweep: its metrics over the grid, mean and
+    95 % interval over the seeds.
 
     The close-up replays the recording up to a late detection that is typical of those that lower the error of the first
     run's present; where the recording is not there any more it is left out.

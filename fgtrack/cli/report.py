@@ -14,7 +14,7 @@ from fgtrack.evaluation.comparison import compare
 from fgtrack.evaluation.runs import judged, run_folders
 from fgtrack.io.output import check_apart, check_output
 from fgtrack.plotting.late_detection import drawn_close_up
-from fgtrack.plotting.plot import named_figures
+from fgtrack.plotting.plot import drawn, planned
 from fgtrack.plotting.style import png
 from fgtrack.viewers.report import write_report
 
@@ -40,6 +40,6 @@ def report(
     check_apart(out, run_folders(every))
     with progress("report"):
         close_up, late = drawn_close_up(every)
-        pictures = ((name, png(figure)) for name, figure in chain(close_up, named_figures(every)))
+        pictures = ((name, png(figure)) for name, figure in chain(close_up, drawn(planned(every))))
         size = write_report(every, compare(*every), pictures, out, opening_at(late), overwrite)
     say(f"{out}: {size / _MEGABYTE:.1f} MB, open it in a browser")

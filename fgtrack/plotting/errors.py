@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,7 +18,6 @@ from fgtrack.evaluation.palette import Look
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged, starts_ns
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.plotting.paper import Paper, Sheet, styled
-from fgtrack.plotting.seeds import group_looks, grouped
 from fgtrack.plotting.style import broken_line, legend_above, run_looks, usual_step_ns
 
 #: What is drawn, with its name, its unit, and that unit over the one of the values.
@@ -148,8 +147,7 @@ def lag(runs: Runs, quantity: str = "position_m", **paper: Unpack[Paper]) -> Fig
     """RMSE against the lag, a line for each run; level where a run has no lagged states.
 
     Of a track that ended there are no lagged states of its last moments, so the thin dotted line shows the present
-    states of the same tracks at the same stamps: the distance between the two is what waiting brings. Runs that differ
-    by their seed only look alike.
+    states of the same tracks at the same stamps: the distance between the two is what waiting brings.
 
     Parameters
     ----------
@@ -165,30 +163,24 @@ def lag(runs: Runs, quantity: str = "position_m", **paper: Unpack[Paper]) -> Fig
     DataError
         No run has truth of this quantity.
     """
-    groups = grouped(judged(runs))
-    every = [one for group in groups for one in group.runs]
+    every = judged(runs)
     if quantity not in _QUANTITIES or not any(entry.errors[quantity].count for one in every for entry in one.lagged):
         raise DataError(f"no run has tracks with truth of {quantity}, so there are no errors to draw")
     what, unit, factor = _QUANTITIES[quantity]
     sheet = Sheet(7.0, 4.2, paper)
     axes: Axes = sheet.plots()[0, 0]
-    has_lags = False
-    for group, its in zip(groups, group_looks(groups), strict=True):
-        for place, one in enumerate(group.runs):
-            curve = [one.lagged[0], *(entry for entry in one.lagged if entry.is_lagged)] if one.lagged else []
-            rmse = [factor * entry.errors[quantity].rmse for entry in curve]
-            label, width = "" if place else group.label, 1.6 if len(group.runs) == 1 else 0.8
-            if len(curve) > 1:
-                has_lags = True
-                lags_s = [float(entry.lag_s) for entry in curve]
-                present = [factor * entry.present_errors[quantity].rmse for entry in curve]
-                axes.plot(lags_s, rmse, color=its.colour, ls=its.line, lw=width, marker=its.marker, ms=4, label=label)
-                axes.plot(lags_s, present, color=its.colour, ls=":", lw=0.8)
-            elif curve:
-                axes.axhline(
-                    rmse[0], color=its.colour, ls=its.line, lw=width, label=f"{label} (no lag)" if label else ""
-                )
-    if has_lags:
+    for one, its in zip(every, run_looks(every).values(), strict=True):
+        curve = [one.lagged[0], *(entry for entry in one.lagged if entry.is_lagged)] if one.lagged else []
+        rmse = [factor * entry.errors[quantity].rmse for entry in curve]
+        given: dict[str, Any] = {"color": its.colour, "ls": its.line, "lw": 1.6}
+        if len(curve) > 1:
+            lags_s = [float(entry.lag_s) for entry in curve]
+            present = [factor * entry.present_errors[quantity].rmse for entry in curve]
+            axes.plot(lags_s, rmse, marker=its.marker, ms=4, label=one.label, **given)
+            axes.plot(lags_s, present, color=its.colour, ls=":", lw=0.8)
+        elif curve:
+            axes.axhline(rmse[0], label=f"{one.label} (no lag)", **given)
+    if len(axes.lines) > len(every):
         axes.plot([], [], color="black", ls=":", lw=0.8, label="present, at the same stamps")
     axes.set(xlabel="lag of the output [s]", ylabel=f"{what} RMSE [{unit}]")
     axes.set_ylim(0.0, 1.08 * axes.dataLim.y1 or 1.0)

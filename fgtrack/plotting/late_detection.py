@@ -1,30 +1,34 @@
-"""Close-ups of runs: which late detection to look at, and their recordings replayed up to it."""
+"""Close-ups of runs: which late detection to look at, and its track just before and just after it was fused."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from itertools import tee
 from pathlib import Path
-from typing import Unpack
+from typing import NamedTuple, Unpack
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.time import seconds
-from fgtrack.core.types import FloatArray, Message
+from fgtrack.core.time import nanoseconds, seconds
+from fgtrack.core.types import FUSED, DetectionList, Disposition, FloatArray, Message
 from fgtrack.evaluation.recordings import by_recording
 from fgtrack.evaluation.runs import JudgedRun
-from fgtrack.io.run import Run, Table, load_run
+from fgtrack.evaluation.truth import true_paths
+from fgtrack.io.run import Run, load_run
 from fgtrack.io.source import open_input
 from fgtrack.models.motion import CTRV
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import validate
 from fgtrack.pipeline.replay import delivered
+from fgtrack.plotting.close_up import STEP_S, Arrival, CloseUp, Estimates
 from fgtrack.plotting.close_up import close_up as figure_of
 from fgtrack.plotting.paper import Paper
-from fgtrack.plotting.slow_motion import Arrival, CloseUp, close_up
+from fgtrack.tracking.tracker import Tracker
 
+_BACK_S = 0.15  # before the detection the estimates begin
 _STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
 _SETTLED = 20  # measurements of a track before which it moves for want of a good start
 
@@ -32,11 +36,11 @@ _SETTLED = 20  # measurements of a track before which it moves for want of a goo
 def close_ups(
     runs: Sequence[Run | Path | str], track_id: int | None = None, stamp_ns: int | None = None
 ) -> list[CloseUp]:
-    """One late detection in slow motion, in each of `runs`: its track before and after it was fused.
+    """Return one late detection in slow motion, in each of `runs`: its track before and after it was fused.
 
     The detection is a typical one of those that lower the error of the first run's present, see `chosen`; `rule` of
-    the result says by what rule. The recording is replayed up to there for every run; `fgtrack.plot.close_up` draws
-    the result.
+    the result is the rule of the choice. The recording is replayed up to there for every run; `fgtrack.plot.close_up`
+    draws the result.
 
     Parameters
     ----------
@@ -77,18 +81,19 @@ def drawn_close_up(
 
 def _recorded(run: Run) -> Iterator[Message]:
     """Return the messages of its recording. Raises `DataError` where that is not there any more."""
-    recording = run.recording
-    if recording is None:
+    if run.recording is None:
         given = (run.meta.get("input") or {}).get("path") or "messages in memory"
         raise DataError(f"{given}: the recording of the run is not there, so no close-up")
     try:
-        return open_input(recording, validate(Config, run.config, str(run.config_path)).input).messages()
-    except CallError as error:  # nobody has called with it: it is what the run says
+        return open_input(run.recording, validate(Config, run.config, str(run.config_path)).input).messages()
+    except CallError as error:  # nobody has called with it: the run names it
         raise DataError(f"{error}, so no close-up") from error
 
 
 def close_up_of(run: Run, arrival: Arrival, messages: Iterable[Message] | None = None) -> CloseUp:
     """Return the track of `run` that fused `arrival`, before and after: its recording is replayed up to there.
+
+    What came with the same tick before the list is processed first, by itself; what came after it is left out.
 
     Parameters
     ----------
@@ -103,22 +108,60 @@ def close_up_of(run: Run, arrival: Arrival, messages: Iterable[Message] | None =
     """
     try:
         config = validate(Config, run.config, str(run.config_path))
-        ticks = delivered(_recorded(run) if messages is None else messages, config)
-        return close_up(lambda observed: build_tracker(config, observed), ticks, arrival)
+        tracker = build_tracker(config)
     except CallError as error:  # as above
         raise DataError(f"{error}, so no close-up") from error
+    start_ns, fused_ns = arrival.stamp_ns - nanoseconds(_BACK_S), list[tuple[int | None, int]]()
+    name = f"detection {arrival.index} of {arrival.sensor} received at {arrival.receipt_ns} ns"
+    for now_ns, batch in delivered(_recorded(run) if messages is None else messages, config):
+        place = next((k for k, message in enumerate(batch) if _is_list_of(arrival, message)), None)
+        for message in batch[:place]:
+            tracker.receive(message)
+        report = tracker.tick(now_ns)
+        fused_ns += [(one.track_id, one.stamp_ns) for one in report.updates if one.disposition in FUSED[1:]]
+        if place is None:
+            continue
+        stamps_ns = sorted({*range(now_ns, start_ns - 1, -nanoseconds(STEP_S)), arrival.stamp_ns}, reverse=True)
+        before = {one.track_id: _estimates(tracker, one.track_id, stamps_ns) for one in report.tracks}
+        tracker.receive(batch[place])
+        key = arrival.sensor, arrival.index, arrival.receipt_ns
+        updates = tracker.tick(now_ns).updates
+        taken = next((one for one in updates if (one.sensor, one.index, one.receipt_ns) == key), None)
+        if taken is None or taken.disposition not in FUSED or taken.track_id not in before:
+            raise DataError(f"{name}: no track has fused it ({taken.disposition if taken else 'no such detection'})")
+        track_id, after = taken.track_id, _estimates(tracker, taken.track_id, stamps_ns)
+        since_ns = sorted(stamp for track, stamp in fused_ns if track == track_id and stamp >= start_ns)
+        return CloseUp(arrival, now_ns, track_id, before[track_id], after, np.array(since_ns, dtype=np.int64))
+    raise DataError(f"{name}: there is no such list")
 
 
-@dataclass(frozen=True)
-class _Late:
-    """A late detection that its track fused by itself: what it did to the present of one run."""
+def _is_list_of(arrival: Arrival, message: Message) -> bool:
+    key = arrival.sensor, arrival.receipt_ns
+    return isinstance(message, DetectionList) and (message.sensor, message.receipt_ns) == key
 
-    stamp_ns: int
+
+def _estimates(tracker: Tracker, track_id: int, stamps_ns: Iterable[int]) -> Estimates:
+    """States at the falling `stamps_ns`, as far as the track's window reaches back."""
+    found = []
+    for stamp_ns in stamps_ns:
+        try:
+            found.append(tracker.state_at(track_id, stamp_ns).state)
+        except CallError:  # before its window
+            break
+    found.reverse()
+    columns = ([state.stamp_ns for state in found], [state.mean for state in found], [s.covariance for s in found])
+    return Estimates(*map(np.array, columns))
+
+
+class _Late(NamedTuple):
+    """A late detection that its track fused by itself: its effect on the present of one run."""
+
     track_id: int
     moved_m: float
-    """From where the tick before it expected the present."""
-    errors_m: tuple[float, float]
-    """Of the present before and after it; NaN without truth."""
+    """From where the tick before it predicted the present."""
+    before_m: float
+    """Error of the present before it; NaN without truth."""
+    after_m: float
 
 
 def chosen(runs: Sequence[Run], track_id: int | None = None, stamp_ns: int | None = None) -> tuple[Arrival, str]:
@@ -144,8 +187,11 @@ def chosen(runs: Sequence[Run], track_id: int | None = None, stamp_ns: int | Non
         The runs have no such detection.
     """
     first, *others = (_late_detections(run) for run in runs)
-    common = [one for one in first if all(one in other for other in others)]
-    common = [one for one in common if track_id is None or first[one].track_id == track_id]
+    common = [
+        one
+        for one in first
+        if all(one in other for other in others) and (track_id is None or first[one].track_id == track_id)
+    ]
     if not common:
         where, of = runs[0].path or "the run", "" if track_id is None else f" of track {track_id}"
         if track_id is not None and track_id not in runs[0].tables["tracks"]["track_id"]:
@@ -155,7 +201,9 @@ def chosen(runs: Sequence[Run], track_id: int | None = None, stamp_ns: int | Non
         )
     if stamp_ns is not None:
         return min(common, key=lambda one: abs(one.stamp_ns - stamp_ns)), "Chosen by its stamp."
-    errors_m = np.array([[*first[one].errors_m, *(late[one].errors_m[1] for late in others)] for one in common])
+    errors_m = np.array(
+        [[first[one].before_m, first[one].after_m, *(late[one].after_m for late in others)] for one in common]
+    )
     lowered = errors_m[:, 1] < errors_m[:, 0]
     if not lowered.any():
         moved_m = np.array([first[one].moved_m for one in common])
@@ -165,45 +213,40 @@ def chosen(runs: Sequence[Run], track_id: int | None = None, stamp_ns: int | Non
     with np.errstate(divide="ignore"):
         apart = np.abs(np.log(errors_m / rms_m)).max(axis=1)
     row = int(np.where(lowered & np.isfinite(apart), apart, np.inf).argmin())
-    share = 100.0 * float(lowered.mean())
     rms_all_m = np.sqrt(np.nanmean(errors_m[:, :2] ** 2, axis=0))
     return common[row], (
-        f"{share:.0f} % of {len(common)} late detections lower the error of the present; this one is nearest to their "
-        f"root mean square ({rms_m[0]:.2f} to {rms_m[1]:.2f} m; of all {rms_all_m[0]:.2f} to {rms_all_m[1]:.2f} m)."
+        f"{100.0 * float(lowered.mean()):.0f} % of {len(common)} late detections lower the error of the present; this "
+        f"one is nearest to their root mean square ({rms_m[0]:.2f} to {rms_m[1]:.2f} m; of all {rms_all_m[0]:.2f} to "
+        f"{rms_all_m[1]:.2f} m)."
     )
 
 
 def _late_detections(run: Run) -> dict[Arrival, _Late]:
-    updates, tracks = run.tables["updates"], run.tables["tracks"]
-    used = np.isin(updates["disposition"], ("in_sequence", "out_of_sequence", "beyond_window"))
+    updates, tracks, paths = run.tables["updates"], run.tables["tracks"], true_paths(run.tables["truth"])
+    used = np.isin(updates["disposition"], FUSED[1:])
     pairs = np.stack([updates["tick"], updates["track_id"]], axis=-1)
     _, group, sizes = np.unique(pairs[used], axis=0, return_inverse=True, return_counts=True)
     alone = np.zeros(len(used), dtype=bool)
     alone[used] = sizes[group.reshape(-1)] == 1
-    index = {key: row for row, key in enumerate(zip(tracks["track_id"].tolist(), tracks["tick"].tolist(), strict=True))}
+    rows = {key: row for row, key in enumerate(zip(tracks["tick"].tolist(), tracks["track_id"].tolist(), strict=True))}
     states, motion = np.stack([tracks[name] for name in _STATE], axis=-1), CTRV()
     found: dict[Arrival, _Late] = {}
-    for update in np.flatnonzero(alone & (updates["disposition"] == "out_of_sequence")).tolist():
+    for update in np.flatnonzero(alone & (updates["disposition"] == Disposition.OUT_OF_SEQUENCE)).tolist():
         tick, track_id = pairs[update].tolist()
-        row, before = index.get((track_id, tick)), index.get((track_id, tick - 1))
+        row, before = rows.get((tick, track_id)), rows.get((tick - 1, track_id))
         if row is None or before is None or tracks["num_measured"][row] < _SETTLED:
             continue
-        now_ns = int(tracks["now_ns"][row])
-        expected_m = motion.predict(states[before], seconds(now_ns - int(tracks["now_ns"][before])))[:2]
-        true_m = _true_m(run.tables["truth"], now_ns, states[row, :2])
-        errors_m = tuple(float(np.hypot(*(at_m - true_m))) for at_m in (expected_m, states[row, :2]))
-        stamp_ns, receipt_ns, place = (int(updates[name][update]) for name in ("stamp_ns", "receipt_ns", "index"))
-        arrival = Arrival(str(updates["sensor"][update]), stamp_ns, receipt_ns, place)
-        moved_m = float(np.hypot(*(states[row, :2] - expected_m)))
-        found[arrival] = _Late(stamp_ns, track_id, moved_m, (errors_m[0], errors_m[1]))
+        now_ns, at_m = tracks["now_ns"][[row]], states[row, :2]
+        predicted_m = motion.predict(states[before], seconds(int(now_ns[0] - tracks["now_ns"][before])))[:2]
+        true_m = [path.at(now_ns)[0, :2] for path in paths]
+        true_m = [each for each in true_m if np.isfinite(each).all()]
+        nearest_m = min(true_m, key=partial(_distance_m, at_m), default=None)
+        errors_m = [np.nan] * 2 if nearest_m is None else [_distance_m(each, nearest_m) for each in (predicted_m, at_m)]
+        numbers = (int(updates[name][update]) for name in ("stamp_ns", "receipt_ns", "index"))
+        moved_m = _distance_m(at_m, predicted_m)
+        found[Arrival(str(updates["sensor"][update]), *numbers)] = _Late(track_id, moved_m, *errors_m)
     return found
 
 
-def _true_m(truth: Table, now_ns: int, near_m: FloatArray) -> FloatArray:
-    """Position of the true object nearest to `near_m`, shape (2,); NaN where none is known."""
-    found = [np.full(2, np.nan)]
-    for object_id in np.unique(truth["object_id"]).tolist():
-        own = truth.where(truth["object_id"] == object_id)
-        since_ns = (own["stamp_ns"] - now_ns).astype(np.float64)  # differences are exact as floats
-        found.append(np.array([np.interp(0.0, since_ns, own[name], np.nan, np.nan) for name in ("x_m", "y_m")]))
-    return min(found, key=lambda at_m: float(np.nan_to_num(np.hypot(*(at_m - near_m)), nan=np.inf)))
+def _distance_m(one_m: FloatArray, other_m: FloatArray) -> float:
+    return float(np.hypot(*(one_m - other_m)))

@@ -86,11 +86,8 @@ def inches(width: float | str) -> float:
         Not a width between 1.5 and 40 inches.
     """
     text = str(width).strip()
-    found = re.fullmatch(r"([0-9.]+(?:e[+-]?\d+)?)\s*([a-z]*)", text)
-    try:
-        value = float(found[1]) * _UNITS_IN[found[2] or "in"] if found else math.nan
-    except (KeyError, ValueError):
-        value = math.nan
+    found = re.fullmatch(r"([0-9]+\.?[0-9]*|\.[0-9]+)\s*(in|cm|mm|pt|)", text)
+    value = float(found[1]) * _UNITS_IN[found[2] or "in"] if found else math.nan
     if not _NARROWEST_IN <= value <= _WIDEST_IN:
         raise CallError(
             f"width {text!r}: not between {_NARROWEST_IN:g} and {_WIDEST_IN:g} inches, write 3.4in, 8.6cm or 86mm"
@@ -125,24 +122,19 @@ def settings(paper: Mapping[str, Any]) -> Any:  # Any: keys of rcParams are a Li
     wanted = {**_STYLE, **(_COLUMN if is_column(paper) else {})}
     current: Any = mpl.rcParams
     usual: Any = mpl.rcParamsDefault
-    found = {key: value for key, value in wanted.items() if current[key] == usual[key]}
+    found: Any = {key: value for key, value in wanted.items() if current[key] == usual[key]}
     if "style" in paper:
-        found.update(_style(paper["style"]))
+        try:
+            found.update(
+                style.library.get(str(paper["style"])) or mpl.rc_params_from_file(paper["style"], False, False)
+            )
+        except (OSError, ValueError) as error:
+            raise CallError(
+                f"style {paper['style']}: cannot be used ({error}), name an .mplstyle file or a style of matplotlib"
+            ) from error
     if "font" in paper:
         found["font.family"] = _families(paper["font"])
     return found
-
-
-def _style(name: str | Path) -> Any:
-    if str(name) in style.library:
-        return style.library[str(name)]
-    try:
-        return mpl.rc_params_from_file(name, use_default_template=False)
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise CallError(
-            f"style {name}: cannot be used ({reason}), name an .mplstyle file or a style of matplotlib"
-        ) from error
 
 
 @cache  # so that a substitute is named once

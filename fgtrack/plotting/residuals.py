@@ -9,7 +9,7 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation import innovations
 from fgtrack.evaluation.innovations import RESIDUAL_NAMES
-from fgtrack.evaluation.runs import OneRun, one_judged, start_ns
+from fgtrack.evaluation.runs import JudgedRun, OneRun, one_judged, start_ns
 from fgtrack.evaluation.statistics import Moments
 from fgtrack.models.measurement import ANGULAR
 from fgtrack.plotting.paper import Paper, Sheet, styled
@@ -79,3 +79,8 @@ def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         legend_above(over_time, 2.0 / 3.0, markerscale=3.0)
     sheet.title(titled(one.label, "innovations (measured minus predicted)"))
     return sheet.figure
+
+
+def has_residuals(one: JudgedRun) -> bool:
+    """True if `residuals` has anything to show."""
+    return any(np.isfinite(values).any() for values in innovations.residuals(one.run).values())

@@ -3,7 +3,6 @@
 import base64
 import io
 import math
-import re
 import textwrap
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,7 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_pdf import PdfPages
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.text import Text
 from matplotlib.ticker import LogLocator, NullFormatter
@@ -37,7 +36,6 @@ _LETTER = 0.58  # width of a letter over the size of the font
 _MOST_ENTRIES = 12  # of a legend
 _HANDLE = 8  # characters that the line before an entry and the space around it take
 _BESIDE_IN = 0.6  # what the labels of an axis take of the width
-_COLUMN_IN = 5.0  # a figure as narrow as a column has no title: there is a caption
 _FREE_LINES = 2  # of a legend for which figures have room
 
 _MARK = "fgtrack figure"
@@ -49,37 +47,19 @@ FORMATS: Mapping[str, Mapping[str, str | None]] = {
 }
 
 
-#: How the files begin, with the place where that stands.
-_BEGINNINGS = (
-    rb"\x89PNG\r\n\x1a\n.{0,500}?tEXtCreator\0%b" % _MARK.encode(),
-    rb"<\?xml .{0,1500}?<dc:creator>\s*<cc:Agent>\s*<dc:title>%b</dc:title>" % _MARK.encode(),
-)
-_HEAD = 3000
-_PDF_END = re.compile(rb"startxref\s+(\d+)\s+%%EOF\s*$")
-_PDF_INFO = b"<< /Creator (%b) >>\nendobj\n" % _MARK.encode()  # before the table that the end points to
-
-
 class StyledFigure(Figure):
-    """A figure that keeps the settings with which it was made; title and legends are fitted to its width."""
+    """A figure that keeps the settings with which it was made."""
 
     def __init__(self, figsize: tuple[float, float]) -> None:
         super().__init__(figsize=figsize)
         self._settings: Any = {key: value for key, value in _RC.items() if "backend" not in key}
-        self.long_title = ""
-        self.fitted_legends: list[tuple[Axes, float, float]] = []
-        self._fitted_in = self.get_figwidth()
 
     def draw(self, renderer: Any) -> None:  # Any: matplotlib does not export the type
-        """Draw it, see `matplotlib.figure.Figure.draw`; what is no letter or sign, in a name out of a file, escaped."""
+        """Draw it, see `matplotlib.figure.Figure.draw`; control characters in names out of files are escaped."""
         for text in self.findobj(Text):
             text.set_text(printable_lines(text.get_text()))
         with mpl.rc_context(self._settings), warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Glyph .* missing")  # of a script that the font lacks: an empty box
-            if self.get_figwidth() != self._fitted_in:  # resized since
-                self._fitted_in = self.get_figwidth()
-                _fit_title(self)
-                for axes, share, markerscale in self.fitted_legends:
-                    _fit_legend(axes, share, markerscale)
             super().draw(renderer)
 
     def savefig(self, *args: Any, **kwargs: Any) -> None:  # Any: those of matplotlib
@@ -111,20 +91,10 @@ def run_looks(runs: Sequence[JudgedRun]) -> dict[str, Look]:
 
 def title(figure: Figure, text: str) -> None:
     """Write `text` above `figure`, broken into lines that are no wider than it."""
-    if isinstance(figure, StyledFigure):
-        figure.long_title = text
-        _grow(figure, _line_in("figure.titlesize") * (_fit_title(figure) - 1))
-
-
-def _fit_title(figure: StyledFigure) -> int:
-    """Break the title into lines, and return how many."""
     width = max(10, int(figure.get_figwidth() / (_LETTER * _size_in("figure.titlesize"))))
-    lines = [line for part in figure.long_title.split("\n") for line in textwrap.wrap(part, width)]
-    if figure.get_figwidth() < _COLUMN_IN:
-        lines = []
-    if lines or figure.get_suptitle():
-        figure.suptitle("\n".join(lines))
-    return max(1, len(lines))
+    lines = [line for part in text.split("\n") for line in textwrap.wrap(part, width)]
+    figure.suptitle("\n".join(lines))
+    _grow(figure, _line_in("figure.titlesize") * (len(lines) - 1))
 
 
 def titled(label: str, what: str) -> str:
@@ -137,31 +107,18 @@ def legend_above(axes: Axes, share: float = 1.0, markerscale: float = 1.0) -> No
 
     It takes `share` of the width of the figure; small markers are shown larger by `markerscale`.
     """
-    num_lines = _fit_legend(axes, share, markerscale)
-    if not num_lines:
-        return
-    figure = axes.get_figure(root=True)
-    if isinstance(figure, StyledFigure):
-        figure.fitted_legends.append((axes, share, markerscale))
-        _grow(figure, _line_in("legend.fontsize") * max(0, num_lines - _FREE_LINES))
-
-
-def _fit_legend(axes: Axes, share: float, markerscale: float) -> int:
-    """Write the legend in as many columns as there is room for, and return its lines."""
     handles, labels = axes.get_legend_handles_labels()
     figure = axes.get_figure(root=True)
     if not handles or figure is None:
-        return 0
+        return
     more = len(labels) - _MOST_ENTRIES
     if more > 1:
-        handles, labels = handles[:_MOST_ENTRIES], [*labels[: _MOST_ENTRIES - 1], f"{labels[_MOST_ENTRIES - 1]} ..."]
-        labels[-1] += f" and {more} more"
-    width = max(
-        _HANDLE + 10, int((share * figure.get_figwidth() - _BESIDE_IN) / (_LETTER * _size_in("legend.fontsize")))
-    )
+        handles, labels = handles[:_MOST_ENTRIES], labels[:_MOST_ENTRIES]
+        labels[-1] += f" ... and {more} more"
+    letters = (share * figure.get_figwidth() - _BESIDE_IN) / (_LETTER * _size_in("legend.fontsize"))
+    width = max(_HANDLE + 10, int(letters))
     broken = [textwrap.wrap(label, width - _HANDLE) for label in labels]
-    lengths = [_HANDLE + max(map(len, lines)) for lines in broken]
-    columns = next(k for k in range(len(broken), 0, -1) if k == 1 or sum(_column_widths(lengths, k)) <= width)
+    columns = max(1, width // (_HANDLE + max(len(line) for lines in broken for line in lines)))
     axes.legend(
         handles,
         ["\n".join(lines) for lines in broken],
@@ -174,14 +131,9 @@ def _fit_legend(axes: Axes, share: float, markerscale: float) -> int:
         columnspacing=1.2,
         handlelength=1.8,
     )
-    return math.ceil(sum(map(len, broken)) / columns)
-
-
-def _column_widths(lengths: Sequence[int], columns: int) -> list[int]:
-    """Widths of the columns in which a legend puts entries of these lengths: one after the other, the first longer."""
-    rows, longer = divmod(len(lengths), columns)
-    ends = np.cumsum([rows + (k < longer) for k in range(columns)]).tolist()
-    return [max(lengths[start:end]) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+    num_lines = math.ceil(sum(map(len, broken)) / columns)
+    if isinstance(figure, StyledFigure):
+        _grow(figure, _line_in("legend.fontsize") * max(0, num_lines - _FREE_LINES))
 
 
 def _size_in(name: str) -> float:
@@ -194,10 +146,9 @@ def _line_in(name: str) -> float:
     return 1.5 * _size_in(name)
 
 
-def _grow(figure: Figure | SubFigure, more_in: float) -> None:
+def _grow(figure: Figure, more_in: float) -> None:
     """Make `figure` higher, so that what is written above its plots takes nothing from them."""
-    if more_in > 0.0 and isinstance(figure, Figure):
-        figure.set_figheight(figure.get_figheight() + more_in)
+    figure.set_figheight(figure.get_figheight() + max(0.0, more_in))
 
 
 def log_axis(axis: Axis) -> None:

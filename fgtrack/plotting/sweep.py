@@ -36,16 +36,8 @@ _NAMES: Mapping[str, str] = {
     "multi_object.hota.hota": "HOTA",
 }
 _POSITION, _LAGGED = "truth.overall.errors.position_m.rmse", "lagged.*.errors.position_m.rmse"
-_UNITS = {
-    "s": "s",
-    "ms": "ms",
-    "ns": "ns",
-    "m": "m",
-    "hz": "Hz",
-    "rad": "rad",
-    "mps": "m/s",
-    "radps": "rad/s",
-    "mps2": "m/s²",
+_UNITS = {"hz": "Hz", "mps": "m/s", "radps": "rad/s", "mps2": "m/s²"} | {
+    name: name for name in ("s", "ms", "ns", "m", "rad")
 }
 _EXPECTED: Mapping[str, float] = {"consistency.position_nees.mean": 2.0}
 #: Those that are drawn where nothing else is asked for.
@@ -98,42 +90,41 @@ def sweep(
         The sweep has no value of the metric.
     """
     table = table if isinstance(table, SweepTable) else read_sweep(table)
-    axes = table.shown_axes
-    means = table.means(metric, axes)
+    names = table.shown_axes
+    means = table.means(metric, names)
     if not means:
         raise DataError(f"{metric}: no cell of the sweep has a value, so there is nothing to draw")
-    across = _horizontal(table, axes)
-    panels: dict[tuple[str, ...], list[PointMean]] = {}
-    for one in means:
-        panels.setdefault(_without(one.point, across), []).append(one)
+    across = _horizontal(table, names)
+    rest = [k for k in range(len(names)) if k != across]
+    panels = {tuple(one.point[k] for k in rest): None for one in means}
     columns = min(_WIDE, len(panels))
     rows = math.ceil(len(panels) / columns)
     sheet = Sheet(max(7.0, 1.2 + 3.8 * columns), 1.5 + 3.0 * rows, paper)
     grid = sheet.plots(rows, columns, sharex=True, sharey=True)
     estimators = list(dict.fromkeys(one.estimator for one in means))
-    steps = _Steps([row[axes[across]] for row in table.rows] if axes else [""])
-    for panel, (rest, found) in zip(grid.flat, panels.items(), strict=False):
+    ticks = _ticks([row[names[across]] for row in table.rows] if names else [""])
+    for axes, point in zip(grid.flat, panels, strict=False):
         for k, (estimator, its) in enumerate(zip(estimators, looks(estimators), strict=True)):
-            mine = [one for one in found if one.estimator == estimator]
-            _draw(panel, steps, mine, across if axes else None, k - (len(estimators) - 1) / 2.0, its, estimator)
-        named = zip(_without(axes, across), rest, strict=True)
-        panel.set_title("\n".join(f"{words(axis)}: {cell}" for axis, cell in named), loc="left")
+            mine = [one for one in means if one.estimator == estimator and tuple(one.point[k] for k in rest) == point]
+            at = [ticks[one.point[across] if names else ""] for one in mine]
+            _draw(axes, at, mine, k - (len(estimators) - 1) / 2.0, its, ticks)
+        axes.set_title("\n".join(f"{words(names[k])}: {c}" for k, c in zip(rest, point, strict=True)), loc="left")
         if metric in _EXPECTED:
-            panel.axhline(_EXPECTED[metric], color="black", lw=0.9, ls="--", label="expected")
-    for panel in grid.flat[len(panels) :]:
-        panel.set_visible(False)
-    _scale(grid[0, 0], means, steps)
-    for panel in grid.flat[max(0, len(panels) - columns) : len(panels)]:
-        panel.set_xlabel(words(axes[across]) if axes else "")
-        panel.tick_params(labelbottom=True)
-    for panel in grid[:, 0]:
-        panel.set_ylabel(metric_words(metric))
+            axes.axhline(_EXPECTED[metric], color="black", lw=0.9, ls="--", label="expected")
+    for k, axes in enumerate(grid.flat):
+        axes.set_visible(k < len(panels))
+        if len(panels) - columns <= k < len(panels):
+            axes.set_xlabel(words(names[across]) if names else "")
+            axes.tick_params(labelbottom=True)
+    _scale(grid[0, 0], means, ticks)
+    for axes in grid[:, 0]:
+        axes.set_ylabel(metric_words(metric))
     if len(panels) == 1:
         legend_above(grid[0, 0])
     else:
         sheet.figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-    seeds = {one.seeds for one in means}
-    of = f"{min(seeds)} to {max(seeds)}" if len(seeds) > 1 else str(max(seeds))
+    seeds = [one.seeds for one in means]
+    of = f"{min(seeds)} to {max(seeds)}" if min(seeds) < max(seeds) else str(max(seeds))
     bars = f"mean over {of} seeds, bars: 95 % interval" if max(seeds) > 1 else "one seed"
     sheet.title(f"{metric_words(metric).partition(' [')[0]}: {bars}")
     return sheet.figure
@@ -169,23 +160,23 @@ def error_against_delay(table: SweepTable | Path | str | None = None, **paper: U
         )
     sheet = Sheet(7.0, 4.2, paper)
     axes: Axes = sheet.plots()[0, 0]
-    curves = [(name, look(name), means) for name in dict.fromkeys(one.estimator for one in means)]
     waits = [name for name in table.metrics if fnmatchcase(name, _LAGGED)][:1]
-    for metric in waits:
-        lagged = table.means(metric)
-        wait_s = metric.removeprefix("lagged.").partition(".errors")[0]
-        curves += [
-            (f"{name}, output {wait_s} s later", look(name)._replace(line=":", marker="."), lagged)
-            for name in dict.fromkeys(one.estimator for one in lagged)
-        ]
-    for label, its, found in curves:
-        mine = sorted(
-            (one for one in found if one.estimator == label.partition(",")[0]), key=lambda one: number(one.point[0])
-        )
+    curves = [
+        (metric, name) for metric in (_POSITION, *waits) for name in dict.fromkeys(one.estimator for one in means)
+    ]
+    for metric, name in curves:
+        mine = [one for one in table.means(metric) if one.estimator == name]
+        if not mine:
+            continue
+        mine.sort(key=lambda one: number(one.point[0]))
         delay_ms = np.array([1e3 * number(one.point[0]) for one in mine])
-        mean, half = np.array([one.mean for one in mine]), half_widths(mine)
+        mean, half, its = np.array([one.mean for one in mine]), half_widths(mine), look(name)
+        wait = (
+            "" if metric == _POSITION else f", output {metric.removeprefix('lagged.').partition('.errors')[0]} s later"
+        )
+        line, marker = (":", ".") if wait else (its.line, its.marker)
         axes.fill_between(delay_ms, mean - half, mean + half, color=its.colour, alpha=0.18, lw=0)
-        axes.plot(delay_ms, mean, ls=its.line, marker=its.marker, ms=4, lw=1.6, color=its.colour, label=label)
+        axes.plot(delay_ms, mean, ls=line, marker=marker, ms=4, lw=1.6, color=its.colour, label=f"{name}{wait}")
     axes.set(
         xlabel=f"{words(table.shown_axes[0]).partition(' [')[0]}, mean [ms]",
         ylabel="position RMSE [m]",
@@ -222,71 +213,59 @@ def words(name: str) -> str:
     """Words for the key `name` of a configuration or a table, with its unit: "delay [s]" for "sensors.x.delay_s"."""
     plain = ".".join(name.split(".")[-2:]).replace(".", " ")
     stem, _, unit = plain.rpartition("_")
-    if stem and unit in _UNITS:
-        return f"{_proper(stem)} [{_UNITS[unit]}]"
-    return _proper(plain)
+    text, end = (stem, f" [{_UNITS[unit]}]") if stem and unit in _UNITS else (plain, "")
+    proper = {each.lower(): each for each in ("LiDAR", "RADAR", "NEES", "NIS")}
+    return " ".join(proper.get(word, word) for word in text.replace("_", " ").split(" ")) + end
 
 
-def _proper(text: str) -> str:
-    plain = text.replace("_", " ")
-    for name in ("LiDAR", "RADAR", "NEES", "NIS"):
-        plain = " ".join(name if word == name.lower() else word for word in plain.split(" "))
-    return plain
-
-
-class _Steps:
-    """Where the values of the horizontal axis are: at themselves where they are numbers, else side by side."""
-
-    def __init__(self, cells: Sequence[str]) -> None:
-        self.names = list(dict.fromkeys(cells))
-        self.are_numbers = all(math.isfinite(number(cell)) for cell in self.names)
-        places = map(number, self.names) if self.are_numbers else range(len(self.names))
-        self.at = dict(zip(self.names, places, strict=True))
-        self.width = max(self.at.values()) - min(self.at.values()) or 1.0
+def _ticks(cells: Sequence[str]) -> dict[str, float]:
+    """Position of each value of the horizontal axis: its own where all are numbers, else side by side."""
+    names = list(dict.fromkeys(cells))
+    numbers = [number(name) for name in names]
+    return dict(zip(names, numbers if all(map(math.isfinite, numbers)) else map(float, range(len(names))), strict=True))
 
 
 def _draw(
-    panel: Axes, steps: _Steps, means: Sequence[PointMean], across: int | None, aside: float, its: Look, label: str
+    panel: Axes, at: Sequence[float], means: Sequence[PointMean], aside: float, its: Look, ticks: Mapping[str, float]
 ) -> None:
-    shift = _DODGE * steps.width * aside  # so that bars do not hide each other
-    at = np.array([steps.at["" if across is None else one.point[across]] + shift for one in means])
-    order = np.argsort(at, kind="stable")
+    x = np.array(at) + _DODGE * _width(ticks) * aside  # so that bars do not hide each other
+    order = np.argsort(x, kind="stable")
     panel.errorbar(
-        at[order],
+        x[order],
         np.array([one.mean for one in means])[order],
         half_widths(means)[order],
         color=its.colour,
-        ls=its.line if steps.are_numbers else "none",
+        ls=its.line if all(number(name) == x for name, x in ticks.items()) else "none",
         marker=its.marker,
         ms=4,
         lw=1.2,
         capsize=_CAP,
-        label=label,
+        label=means[0].estimator if means else "",
     )
 
 
-def _scale(panel: Axes, means: Sequence[PointMean], steps: _Steps) -> None:
+def _width(ticks: Mapping[str, float]) -> float:
+    return max(ticks.values()) - min(ticks.values()) or 1.0
+
+
+def _scale(panel: Axes, means: Sequence[PointMean], ticks: Mapping[str, float]) -> None:
     values = np.array([one.mean for one in means])
     if (values > 0.0).all() and values.max() > _LOG_FROM * values.min():
         panel.set_yscale("log")
         log_axis(panel.yaxis)
     elif (values >= 0.0).all():
         panel.set_ylim(0.0, None if values.any() else 1.0)
-    if not steps.are_numbers or len(steps.names) <= _NAMED_STEPS:
-        panel.set_xticks(list(steps.at.values()), steps.names)
-    margin = 0.08 * steps.width
-    panel.set_xlim(min(steps.at.values()) - margin, max(steps.at.values()) + margin)
+    if len(ticks) <= _NAMED_STEPS or any(number(name) != x for name, x in ticks.items()):
+        panel.set_xticks(list(ticks.values()), list(ticks))
+    margin = 0.08 * _width(ticks)
+    panel.set_xlim(min(ticks.values()) - margin, max(ticks.values()) + margin)
 
 
 def _horizontal(table: SweepTable, axes: Sequence[str]) -> int:
-    """Place of the axis with the most different numbers, else with the most different texts."""
+    """Index of the axis with the most different numbers, else with the most different texts."""
 
-    def rank(place: int) -> tuple[bool, int]:
-        cells = {row[axes[place]] for row in table.rows}
+    def rank(k: int) -> tuple[bool, int]:
+        cells = {row[axes[k]] for row in table.rows}
         return all(math.isfinite(number(cell)) for cell in cells), len(cells)
 
     return max(range(len(axes)), key=rank, default=0)
-
-
-def _without(cells: Sequence[str], place: int) -> tuple[str, ...]:
-    return (*cells[:place], *cells[place + 1 :])

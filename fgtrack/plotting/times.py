@@ -13,8 +13,7 @@ from fgtrack.evaluation.runs import OneRun, Runs, judged, one_judged
 from fgtrack.evaluation.statistics import Distribution
 from fgtrack.io.run import Run
 from fgtrack.plotting.paper import Paper, Sheet, styled
-from fgtrack.plotting.seeds import group_looks, grouped
-from fgtrack.plotting.style import legend_above, log_axis, sensor_colour, titled
+from fgtrack.plotting.style import legend_above, log_axis, run_looks, sensor_colour, titled
 
 _MS = 1e3
 
@@ -55,8 +54,6 @@ def sensor_delays(run: Run) -> dict[str, tuple[IntArray, FloatArray]]:
 def timing(runs: Runs, **paper: Unpack[Paper]) -> Figure:
     """Share of the ticks with detections that are done within a wall time, a line for each run.
 
-    Runs that differ by their seed only are taken together.
-
     Raises
     ------
     DataError
@@ -67,14 +64,14 @@ def timing(runs: Runs, **paper: Unpack[Paper]) -> Figure:
         raise DataError("no run has detections, so there are no processing times to draw")
     sheet = Sheet(7.0, 3.8, paper)
     axes = sheet.plots()[0, 0]
-    groups = grouped(every)
-    for group, its in zip(groups, group_looks(groups), strict=True):
-        busy = [one.run.tables["timing"].where(one.run.tables["timing"]["num_detections"] > 0) for one in group.runs]
-        time_ms = np.concatenate([ticks["process_ns"] / NS_PER_S * _MS for ticks in busy])
+    looks = run_looks(every)
+    for one in every:
+        ticks = one.run.tables["timing"]
+        time_ms = ticks["process_ns"][ticks["num_detections"] > 0] / NS_PER_S * _MS
         if len(time_ms):
             spread = Distribution.of(time_ms)
-            text = f"{group.label}: median {spread.p50:.3g} ms, 99 % within {spread.p99:.3g} ms"
-            axes.ecdf(time_ms, color=its.colour, ls=its.line, lw=1.6, label=text)
+            text = f"{one.label}: median {spread.p50:.3g} ms, 99 % within {spread.p99:.3g} ms"
+            axes.ecdf(time_ms, color=looks[one.label].colour, ls=looks[one.label].line, lw=1.6, label=text)
     axes.set(xscale="log", xlabel="time per tick with detections [ms]", ylabel="share of the ticks")
     log_axis(axes.xaxis)
     legend_above(axes)

@@ -11,9 +11,10 @@ import fgtrack
 from fgtrack.cli.main import run as command
 from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.palette import look
+from fgtrack.evaluation.placement import placed
 from fgtrack.models.motion import CTRV
+from fgtrack.plotting.close_up import Arrival, CloseUp
 from fgtrack.plotting.late_detection import chosen, close_up_of
-from fgtrack.plotting.slow_motion import Arrival, CloseUp
 
 NAMES = ("ekf-replay", "ekf-backward-forward")
 
@@ -95,15 +96,21 @@ def test_after_it_the_present_is_that_of_the_run(folder: Path, found: list[Close
         assert one.arrival.stamp_ns in one.after.stamps_ns
 
 
-def test_it_draws_the_past_towards_the_detection_and_is_fused_once(found: list[CloseUp]) -> None:
-    for one in found:
-        place = one.after.at(one.arrival.stamp_ns)
-        off_m = [np.linalg.norm(b.means[place, :2] - one.position_m) for b in (one.before, one.after)]
+def test_it_draws_the_past_towards_the_detection_and_is_fused_once(folder: Path, found: list[CloseUp]) -> None:
+    for name, one in zip(NAMES, found, strict=True):
+        run = fgtrack.load_run(folder / "runs" / name)
+        table, stamp_ns = run.tables["detections"], one.arrival.stamp_ns
+        row = np.logical_and.reduce(
+            [table[key] == getattr(one.arrival, key) for key in ("sensor", "stamp_ns", "receipt_ns", "index")]
+        )
+        (position_m,) = placed(run).position_m[row]
+        k = one.after.stamps_ns.tolist().index(stamp_ns)
+        off_m = [np.linalg.norm(each.means[k, :2] - position_m) for each in (one.before, one.after)]
         assert off_m[1] < off_m[0]
-        spread = [np.linalg.slogdet(b.covariances[place, :2, :2]).logabsdet for b in (one.before, one.after)]
+        spread = [np.linalg.slogdet(each.covariances[k, :2, :2]).logabsdet for each in (one.before, one.after)]
         assert spread[1] < spread[0]
-        assert all(record.stamp_ns != one.arrival.stamp_ns for record in one.fused)
-        assert any(record.stamp_ns > one.arrival.stamp_ns for record in one.fused)
+        assert stamp_ns not in one.fused_ns
+        assert one.fused_ns.max() > stamp_ns
 
 
 def test_a_track_and_a_stamp_can_be_asked_for(folder: Path) -> None:

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-import fgtrack
 from fgtrack.cli.main import run as command
 
 HEADER = "delay_s,seed,estimator,truth.overall.errors.position_m.rmse,truth.overall.errors.yaw_rad.rmse\n"
@@ -35,15 +34,3 @@ def test_a_sweep_is_drawn_alone(tmp_path: Path, capsys: pytest.CaptureFixture[st
     (tmp_path / "sweep" / "sweep.csv").write_text(HEADER)
     assert command(["figure", sweep, *out]) == 1
     assert "holds no rows of a sweep" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_runs_of_several_seeds_have_bands_and_the_close_up_of_the_first(tmp_path: Path) -> None:
-    for seed in (1, 2):
-        recording = tmp_path / f"{seed}.jsonl"
-        fgtrack.simulate("single_opponent", seed=seed, duration_s=4.0, out=recording)
-        fgtrack.replay(recording, "tuned", map="oval", estimator="ekf-replay", out=tmp_path / "runs" / f"seed{seed}")
-    assert command(["figure", str(tmp_path / "runs"), "-o", str(tmp_path / "out")]) == 0
-    names = {file.name for file in (tmp_path / "out").iterdir()}
-    assert {"close_up.png", "error_bands.png", "frenet_seed1_ekf-replay.png"} <= names
-    assert not any(name.startswith("errors_") for name in names)

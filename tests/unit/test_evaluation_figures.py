@@ -111,7 +111,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Run]:
 @pytest.fixture
 def names(monkeypatch: pytest.MonkeyPatch) -> Callable[[Sequence[Run]], list[str]]:
     """Gives the names of the figures that runs have data for; none is drawn."""
-    for name in plot.FIGURES:
+    for name in EXPECTED:
         monkeypatch.setattr(plot, name, lambda *_: Figure())
     return lambda runs: [plan.name for plan in plot.planned(judged(runs))]
 
@@ -196,28 +196,17 @@ def test_arrivals_show_the_part_with_the_most_late_detections(tmp_path: Path) ->
         assert {y for line in axes.lines for y in line.get_ydata()} == {delay_ms}
 
 
-def test_delays_name_their_runs_where_there_are_several_recordings(
-    monkeypatch: pytest.MonkeyPatch, runs: list[Run], tmp_path: Path
-) -> None:
-    labels: list[str] = []
-    monkeypatch.setattr(plot, "delays", lambda one: labels.append(one.label))
-    other = write_run(tmp_path / "other", updates={0: [update(delay_ns=1_000_000)]})
-    for shown in (runs, [*runs, other]):
-        for plan in plot.FIGURES["delays"](judged(shown)):
-            plan.draw()
-    assert labels == ["", "smoother, ekf-replay", "other (smoother)"]
-
-
 @pytest.mark.usefixtures("names")
 def test_a_file_is_named_after_its_figure_and_run(tmp_path: Path) -> None:
     run = write_run(tmp_path / "a run", updates={0: [update(x_m=1.0, y_m=1.0, delay_ns=1)]})
-    files = plot.save_figures(run, tmp_path / "out", "svg")
+    (tmp_path / "out").mkdir()
+    files = plot.save_named(plot.drawn(plot.planned(judged(run))), tmp_path / "out", "svg")
     assert [file.name for file in files] == [
         *("residuals_a_run_smoother.svg", "arrivals.svg", "delays.svg", "timing.svg")
     ]
 
 
-@pytest.mark.parametrize("name", [name for name in plot.FIGURES if name != "map"])
+@pytest.mark.parametrize("name", [name for name in EXPECTED if name != "map"])
 def test_without_data_there_is_one_clear_error(name: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="to draw"):
         getattr(plot, name)(write_run(tmp_path / "run", [[]]))
@@ -346,7 +335,7 @@ def short_run(tmp_path: Path) -> Run:
 def test_files_hold_no_date_and_no_version(
     form: str, start: bytes, varying: bytes, short_run: Run, tmp_path: Path
 ) -> None:
-    (file,) = plot.save_figures(short_run, tmp_path / "out", form)
+    (file,) = plot.save_named(plot.drawn(plot.planned(judged(short_run))), tmp_path, form)
     assert file.name == f"timing.{form}"
     content = file.read_bytes()
     assert content.startswith(start)
@@ -373,9 +362,6 @@ def test_a_figure_has_its_style_whenever_it_is_drawn_and_saved(short_run: Run) -
 def test_what_cannot_be_written_is_one_clear_error_and_a_notebook_shows_the_figure(
     short_run: Run, tmp_path: Path
 ) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(CallError, match="cannot be made"):
-        plot.save_figures(short_run, tmp_path / "file" / "out")
     figure = plot.timing(short_run)
     figure.set_dpi(30)
     with pytest.raises(CallError, match="cannot be written"):

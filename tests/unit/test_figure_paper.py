@@ -30,15 +30,6 @@ def test_a_figure_in_a_column_is_readable(name: str, runs: list[JudgedRun]) -> N
         assert axes.get_window_extent().width > 0.7 * figure.bbox.width
 
 
-def test_a_figure_resized_afterwards_does_not_collapse(runs: list[JudgedRun]) -> None:
-    figure = plot.lag(runs)
-    figure.set_size_inches(3.4, 2.4)
-    assert faults(figure) == []
-    (axes,) = figure.axes
-    assert axes.get_window_extent().width > 0.7 * figure.bbox.width
-    assert axes.get_window_extent().height > 0.35 * figure.bbox.height
-
-
 def test_settings_of_the_user_are_kept_and_a_font_is_that_of_every_text(runs: list[JudgedRun]) -> None:
     with mpl.rc_context({"font.family": "DejaVu Serif", "axes.grid": False}):
         figure = plot.timing(runs)

@@ -1,7 +1,6 @@
 """No text of any figure is cut off or lies on another: of few and many objects, runs, sensors, long names."""
 
 from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -75,30 +74,19 @@ SCENES = {
     "small numbers": lambda folder: [a_run(folder / name, scale=1e-7) for name in ("smoother", "ekf-replay")],
     "many sensors": lambda folder: [a_run(folder / "smoother", sensors=7)],
     "many runs with long names": many_runs,
-    "several seeds": lambda folder: [
-        a_run(folder / f"seed{seed}" / name, seed=seed) for seed in range(4) for name in ("smoother", LONG)
-    ],
 }
 
 
 def figures(runs: list[Run]) -> Iterator[tuple[str, Figure]]:
     """One of each kind."""
-    every = judged(runs)
-    return plot.drawn(plan for plans in plot.FIGURES.values() for plan in islice(plans(every), 1))
+    plans = {plan.draw.func: plan for plan in reversed(plot.planned(judged(runs)))}
+    return plot.drawn(plans.values())
 
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_no_text_is_cut_off_or_lies_on_another(scene: str, tmp_path: Path) -> None:
     found = {name: faults(figure) for name, figure in figures(SCENES[scene](tmp_path))}
     assert {name: lines for name, lines in found.items() if lines} == {}
-
-
-def test_every_figure_of_runs_is_among_the_scenes(tmp_path: Path) -> None:
-    """But for those of recordings and sweeps, which have tests of their own."""
-    runs = [*SCENES["two objects"](tmp_path), *SCENES["several seeds"](tmp_path)]
-    seen = {name for name, plans in plot.FIGURES.items() if list(plans(judged(runs)))}
-    seen |= {name for name, plans in plot.FIGURES.items() if list(plans(judged(runs[:2])))}
-    assert set(plot.FIGURES) == seen
 
 
 @styled

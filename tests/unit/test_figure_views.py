@@ -1,4 +1,4 @@
-"""What single figures draw: the map, the way along the track, NEES and NIS, differences, bands over seeds, the few."""
+"""What single figures draw: the map, NEES and NIS, differences, the few."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,14 +12,12 @@ from matplotlib.lines import Line2D
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray
 from fgtrack.evaluation.palette import look
 from fgtrack.evaluation.runs import judged
-from fgtrack.io.run import Run, Table
-from fgtrack.models.oval import make_oval
+from fgtrack.io.run import Table
 from fgtrack.plotting import plot
 from fgtrack.plotting.errors import moving_rms
 from fgtrack.plotting.ranges import bulk
 
 TICKS = range(60)
-OVAL = "map: {track: oval}"
 
 
 def labelled(axes: Axes, label: str) -> Line2D:
@@ -67,43 +65,6 @@ def test_the_bulk_of_a_sample_leaves_out_what_is_far_away() -> None:
     assert bulk([np.zeros(3)], [np.array([-10.0, 10.0])]) == (-11.0, 11.0)
     for value in (1e9, -1e18, 1e300):
         assert (np.diff(np.linspace(*bulk([np.full(3, value)]), 41)) > 0.0).all()
-
-
-# --- along the track
-
-
-def drive(first_s_m: float, lateral_m: float, object_id: int) -> list[Car]:
-    """A car for each tick, which goes 1 m along the oval in each."""
-    road = make_oval()
-    s_m = np.mod(first_s_m + np.arange(len(TICKS)), road.length_m)
-    return [Car(object_id, *road.position(np.array([s]), np.array([lateral_m]))[0].tolist(), 0.0, 0.0) for s in s_m]
-
-
-def test_the_way_along_the_track_is_in_frenet_coordinates(tmp_path: Path) -> None:
-    length_m = make_oval().length_m
-    cars, own = drive(length_m - 30.0, 2.5, 0), drive(length_m - 40.0, 0.0, -1)
-    tracks = [[car.track(0, 1)] for car in cars]
-    for k, reports in enumerate(tracks):
-        object.__setattr__(reports[0].state, "stamp_ns", stamp_ns(k))
-    ego = [EgoState(stamp_ns(k), stamp_ns(k), one.x_m, one.y_m, 0.0, 0.0) for k, one in enumerate(own)]
-    figure = plot.frenet(write_run(tmp_path / "run", tracks, ego=ego, config_text=OVAL))
-    along, ahead, lateral = figure.axes
-    s_m = y_of(labelled(along, "tracks"))
-    assert np.isnan(s_m).sum() == 1  # the line is broken where the lap ends, and nowhere else
-    assert (s_m[0], s_m[-1]) == pytest.approx((length_m - 30.0, 29.0), abs=0.05)
-    np.testing.assert_allclose(y_of(labelled(ahead, "tracks")), 10.0, atol=0.05)
-    np.testing.assert_allclose(y_of(labelled(lateral, "tracks")), 2.5, atol=0.05)
-    np.testing.assert_allclose(y_of(labelled(lateral, "ego")), 0.0, atol=0.05)
-    assert [axes.get_ylabel() for axes in figure.axes] == [
-        *("along the track [m]", "ahead of the ego [m]", "left of the reference\nline [m] (grey: bounds)")
-    ]
-
-
-def test_without_an_ego_there_is_nothing_ahead_of_it(tmp_path: Path) -> None:
-    run = write_run(tmp_path / "run", [[WEST.track(k, 1)] for k in TICKS], truth=WEST.truth(TICKS), config_text=OVAL)
-    along, _ = plot.frenet(run).axes
-    assert labelled(along, "object 7, truth").get_color() == labelled(along, "object 7, track").get_color()
-    assert [plan.name for plan in plot.planned(judged(run)) if "frenet" in plan.name] == ["frenet_run (smoother)"]
 
 
 # --- NEES and NIS
@@ -167,46 +128,10 @@ def test_runs_of_another_day_begin_at_zero_as_well(tmp_path: Path) -> None:
     runs = [write_run(tmp_path / name, [[WEST.track(k, 1)] for k in TICKS], truth=WEST.truth(TICKS)) for name in "ab"]
     day_ns = 86_400 * 1_000_000_000
     for table, names in (("tracks", ("now_ns", "stamp_ns")), ("timing", ("now_ns",)), ("truth", ("stamp_ns",))):
-        columns = runs[1].tables[table]
-        later = Table({name: of + day_ns if name in names else of for name, of in columns.items()})
-        runs[1] = replace(runs[1], tables={**runs[1].tables, table: later})
+        moved = Table({name: of + day_ns if name in names else of for name, of in runs[1].tables[table].items()})
+        runs[1] = runs[1].with_tables(**{table: moved})
     first, second = plot.errors(runs).axes[0].lines
     np.testing.assert_allclose(x_of(first), x_of(second))
-
-
-# --- over seeds
-
-
-def seed_run(folder: Path, seed: int, along_m: float, estimator: str = "smoother") -> Run:
-    tracks = [[WEST.track(k, 1, along_m=along_m)] for k in TICKS]
-    updates = {k: [update(tick=k, delay_ns=1_000_000 + seed, nis=2.0, x_m=0.1, y_m=0.1)] for k in TICKS}
-    meta = {"estimator": estimator}
-    return write_run(folder / f"seed{seed}" / estimator, tracks, truth=WEST.truth(TICKS), updates=updates, meta=meta)
-
-
-def test_runs_of_several_seeds_are_a_line_and_a_band(tmp_path: Path) -> None:
-    runs = [seed_run(tmp_path, seed, along_m) for seed, along_m in enumerate((1.0, 2.0, 3.0))]
-    runs.append(seed_run(tmp_path, 0, 5.0, "ekf-replay"))  # of one seed only
-    figure = plot.error_bands(runs)
-    position, *_, nees = figure.axes
-    (line,) = position.lines
-    assert line.get_label() == "smoother (3 runs)"
-    np.testing.assert_allclose(y_of(line), np.sqrt(14.0 / 3.0), rtol=1e-4)
-    np.testing.assert_allclose(x_of(line), 0.02 * np.arange(60), atol=1e-9)
-    band = position.collections[0].get_paths()[0].vertices[:, 1]
-    assert (band.min(), band.max()) == pytest.approx((1.2, 2.8), abs=1e-3)  # 10 and 90 % of 1, 2, 3
-    np.testing.assert_allclose(y_of(labelled(nees, "smoother")), 14.0 / 3.0, rtol=1e-4)
-    assert position.get_ylabel() == "position RMSE [m]"
-
-
-def test_bands_take_the_place_of_the_curves_of_many_seeds(tmp_path: Path) -> None:
-    runs = judged([seed_run(tmp_path, seed, 0.1 + 0.1 * seed) for seed in range(8)])
-    plans = plot.planned(runs)
-    names = {plan.name for plan in plans if not plan.is_extra}
-    assert "error_bands" in names
-    assert not any("errors" in name for name in names)
-    assert {name for name in names if "map" in name} == {f"map_seed{k}/smoother" for k in (5, 6, 7)}
-    assert sum("map" in plan.name for plan in plans) == 8
 
 
 # --- few
@@ -223,3 +148,8 @@ def test_of_many_objects_the_worst_are_drawn_and_the_rest_on_request(tmp_path: P
     assert len(plans) == 7
     few, every = ([name for name, _ in plot.drawn(plans, each)] for each in (False, True))
     assert len(every) == len(few) + 3
+    many = judged(
+        [replace(run, path=None)] * 1 + [write_run(tmp_path / f"r{k}", [[cars[0].track(0, 1)]]) for k in range(7)]
+    )
+    maps = [plan for plan in plot.planned(many) if plan.name.startswith("map")]
+    assert (len(maps), sum(not plan.is_extra for plan in maps)) == (8, 3)
