@@ -17,8 +17,8 @@ import typer
 
 import fgtrack
 from fgtrack.evaluation.consistency import Consistency
+from fgtrack.evaluation.intervals import average
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.paired import average
 from fgtrack.pipeline.load import validate
 from fgtrack.sim.scenario import Scenario
 

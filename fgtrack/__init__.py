@@ -54,7 +54,7 @@ _HOMES = {
     "advise": "fgtrack.advice.advise",
     "config": "fgtrack.pipeline",
     "close_ups": "fgtrack.plotting.late_detection",
-    "compare": "fgtrack.evaluation.comparison",
+    "compare": "fgtrack.evaluation.compare",
     "estimator": "fgtrack.estimation.registry",
     "initial_state": "fgtrack.estimation.birth",
     "list_estimators": "fgtrack.estimation.registry",
@@ -104,7 +104,7 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.estimation.filters.ekf import robust_weight as robust_weight
     from fgtrack.estimation.registry import estimator as estimator
     from fgtrack.estimation.registry import list_estimators as list_estimators
-    from fgtrack.evaluation.comparison import compare as compare
+    from fgtrack.evaluation.compare import compare as compare
     from fgtrack.evaluation.tables import Tables as Tables
     from fgtrack.io.adapters.common import ObjectList as ObjectList
     from fgtrack.io.run import Run as Run

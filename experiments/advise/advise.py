@@ -17,8 +17,8 @@ from joblib import Parallel, delayed
 import fgtrack
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Message
+from fgtrack.evaluation.intervals import average, paired
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.paired import average, paired
 from fgtrack.io.recording import write_recording
 from fgtrack.io.run import Run
 from fgtrack.pipeline.shipped import read_config

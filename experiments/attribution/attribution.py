@@ -22,7 +22,7 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.registry import estimator
-from fgtrack.evaluation.paired import Estimate, average, paired
+from fgtrack.evaluation.intervals import Estimate, average, paired
 from fgtrack.models.measurement import SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import RobustLoss

@@ -25,7 +25,7 @@ from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.registry import ESTIMATORS, estimator
 from fgtrack.estimation.starts import distances
-from fgtrack.evaluation.paired import average, paired
+from fgtrack.evaluation.intervals import average, paired
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CV
 from fgtrack.sim.draw import drawn

@@ -21,9 +21,9 @@ import fgtrack
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
+from fgtrack.evaluation.intervals import average, paired
 from fgtrack.evaluation.lagged import lag_metrics
 from fgtrack.evaluation.matching import match
-from fgtrack.evaluation.paired import average, paired
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import Correlation, Mount, SensorModel
 from fgtrack.pipeline.config import Config

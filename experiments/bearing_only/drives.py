@@ -24,9 +24,9 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray, TruthState
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.registry import estimator
+from fgtrack.evaluation.intervals import by_stamp, within_run
 from fgtrack.evaluation.lagged import lag_metrics
 from fgtrack.evaluation.matching import Matching, match
-from fgtrack.evaluation.paired import by_stamp, within_run
 from fgtrack.io.source import open_input
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV

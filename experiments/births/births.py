@@ -19,7 +19,7 @@ import fgtrack
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.evaluation.paired import Estimate
+from fgtrack.evaluation.intervals import Estimate
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
 from fgtrack.sim.draw import drawn

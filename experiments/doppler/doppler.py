@@ -19,7 +19,7 @@ from joblib import Parallel, delayed
 import fgtrack
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.evaluation.paired import Estimate, paired
+from fgtrack.evaluation.intervals import Estimate, paired
 from fgtrack.models.measurement import SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.sim.draw import drawn

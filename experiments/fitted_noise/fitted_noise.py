@@ -16,8 +16,8 @@ import joblib
 import typer
 
 import fgtrack
+from fgtrack.evaluation.intervals import average, paired
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.paired import average, paired
 
 PAPER, FITTED = "smoother", "tuned"
 ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")

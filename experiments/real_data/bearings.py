@@ -24,11 +24,10 @@ from scores import autoferry_sources, nis_ratios, write
 import fgtrack
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import FloatArray, IntArray, Message
-from fgtrack.evaluation.contest import paired_sums
-from fgtrack.evaluation.paired import UNKNOWN, Estimate, within_run
+from fgtrack.evaluation.comparison import paired_sums
+from fgtrack.evaluation.intervals import UNKNOWN, Estimate, within_run
 from fgtrack.evaluation.runs import JudgedRun
-from fgtrack.evaluation.sight import ego_poses
-from fgtrack.evaluation.truth import true_paths
+from fgtrack.evaluation.truth import ego_poses, true_paths
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
 from fgtrack.models.sensors import Correlation, Filter, SensorModel

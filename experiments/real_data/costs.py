@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from fgtrack.core.types import FloatArray, Message
-from fgtrack.evaluation.contest import paired_sums
-from fgtrack.evaluation.paired import Estimate, by_stamp, within_run
+from fgtrack.evaluation.comparison import paired_sums
+from fgtrack.evaluation.intervals import Estimate, by_stamp, within_run
 from fgtrack.evaluation.prediction import displacements
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.sim.delays import ConstantDelay

@@ -21,7 +21,7 @@ from rules import numbers, recorded, ruled
 from scores import HEADER, Found, autoferry_sources, scored, write, write_scores
 
 import fgtrack
-from fgtrack.evaluation.paired import paired
+from fgtrack.evaluation.intervals import paired
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config

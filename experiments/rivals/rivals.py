@@ -20,7 +20,7 @@ import typer
 
 import fgtrack
 from fgtrack.core.types import Detection, DetectionList, Message
-from fgtrack.evaluation.paired import average, paired
+from fgtrack.evaluation.intervals import average, paired
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.models.oval import OVAL, make_oval
 from fgtrack.models.track_map import COLUMNS, TrackMap

@@ -21,7 +21,7 @@ from fgtrack.core.caution import EGO
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Message
-from fgtrack.evaluation.cautions import cautions
+from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
@@ -238,7 +238,7 @@ class _Adviser:
     def _cautions(self, run: Run) -> Iterator[Finding]:
         """What a run with the settings warns of, but of sensors whose trouble is known."""
         known = {one.about for one in self._findings if one.weight >= _USELESS}
-        for one in cautions(run):
+        for one in diagnostics(run):
             if one.about not in known:
                 yield Finding("track", one.about, 70.0, f"{one.text}.", one.settings)
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgtrack.advice.finding import Finding
-from fgtrack.evaluation.cautions import FAR_OFF, FEWEST, LASTING, innovation_lag1, misfits
+from fgtrack.evaluation.diagnostics import CORRELATED, FAR_OFF, FEWEST, innovation_lag1, misfits
 from fgtrack.evaluation.innovations import num_measured
-from fgtrack.evaluation.paired import Estimate, by_stamp, mean_square
+from fgtrack.evaluation.intervals import Estimate, by_stamp, mean_square
 from fgtrack.io.run import Run
 
 __all__ = ["NoiseFit", "noise_findings", "noise_fits"]
@@ -32,7 +32,7 @@ class NoiseFit:
     @property
     def lasts(self) -> bool:
         """Whether its innovations resemble the one before."""
-        return self.lag1 is not None and self.lag1 > LASTING
+        return self.lag1 is not None and self.lag1 > CORRELATED
 
     @property
     def is_consistent(self) -> bool:

@@ -9,9 +9,8 @@ import numpy as np
 from fgtrack.advice.finding import percent
 from fgtrack.advice.noise import NoiseFit, noise_fits
 from fgtrack.core.time import NS_PER_S
-from fgtrack.evaluation.cautions import FAR_OFF, USED, misfits
-from fgtrack.evaluation.contest import POSITION_NEES, contests
-from fgtrack.evaluation.lives import MOST_BREAKS_PER_MINUTE, Lives
+from fgtrack.evaluation.comparison import POSITION_NEES, comparisons
+from fgtrack.evaluation.diagnostics import FAR_OFF, MOST_BREAKS_PER_MINUTE, USED, Fragmentation, misfits
 from fgtrack.evaluation.metrics import ObjectMetrics, evaluate
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.io.run import Run
@@ -49,11 +48,11 @@ class Outcome:
         """Return the numbers of `run`."""
         counts = dict(run.meta["counts"])
         used = {name: sum(one.get(fate, 0) for fate in USED) / (sum(one.values()) or 1) for name, one in counts.items()}
-        lives, truth, ticks_ns = Lives.of(run), evaluate(run).truth, run.tables["timing"]["now_ns"]
+        found, truth, ticks_ns = Fragmentation.of(run), evaluate(run).truth, run.tables["timing"]["now_ns"]
         return cls(
             births=int(np.count_nonzero(run.tables["updates"]["disposition"] == "birth")),
-            confirmed=len(lives.lives_s),
-            life_s=lives.median_s,
+            confirmed=len(found.lifetimes_s),
+            life_s=found.median_s,
             used=used,
             noise=tuple(noise_fits(run)),
             truth=None if truth is None else truth.overall,
@@ -137,7 +136,7 @@ def objection(before: Run, after: Run) -> str | None:
     if (worse := harm(Outcome.of(before), Outcome.of(after))) is not None:
         return f"{worse}: tracks break at errors that the noise does not expect"
     runs = [JudgedRun("before", before), JudgedRun("after", after)]
-    for quantity in (each for contest in contests(runs) for each in contest.quantities):
+    for quantity in (each for contest in comparisons(runs) for each in contest.quantities):
         found = {entry.name: entry for entry in quantity.entries}
         was, now = found["before"].value, found["after"].value
         fits = quantity.name == POSITION_NEES and 1.0 / FAR_OFF <= now / _POSITION_DOF <= FAR_OFF

@@ -1,15 +1,15 @@
 """The page of `fgtrack advise`: sentences, two tables, and the configuration that follows them."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from textwrap import wrap
 
 from fgtrack.advice.arrivals import Arrivals
 from fgtrack.advice.finding import Finding
 from fgtrack.advice.outcome import Outcome
 from fgtrack.advice.windows import BeyondLag
-from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
+from fgtrack.evaluation.tables import NO_VALUE, Column, Record, Table, Tables, Value, short
 from fgtrack.pipeline.config import Config
 
 __all__ = ["Advice", "Change"]
@@ -75,35 +75,41 @@ class Advice:
 
     def _outcome(self) -> Table:
         before, after = (dict(() if one is None else one.rows()) for one in (self.before, self.after))
-        names = tuple({**before, **after})
-        columns: list[Column[str]] = [
-            Column("replayed", ("replayed",), lambda name: (name,), left=True),
-            Column("before", ("before",), lambda name: (before.get(name, math.nan),)),
+        columns = [Column("replayed", left=True), Column("before")]
+        columns += [Column("advised")] if self.changes else []
+        records = [
+            {"replayed": name, "before": before.get(name)} | ({"advised": after.get(name)} if self.changes else {})
+            for name in {**before, **after}
         ]
-        if self.changes:
-            columns.append(Column("advised", ("advised",), lambda name: (after.get(name, math.nan),)))
-        return Table("What the settings make of the recording", columns, names, row_keys=("replayed",))
+        return Table("Replays with the settings before and as advised", records, columns, ("replayed",))
 
     def _lateness(self) -> Table:
-        def quantiles(one: Arrivals) -> tuple[Value, ...]:
-            return (one.quantile_s(0.5), one.quantile_s(0.95), float(one.delays_s.max()))
-
-        names = ("delay_p50_s", "delay_p95_s", "delay_max_s")
-        columns: list[Column[Arrivals]] = [
-            Column("sensor", ("sensor",), lambda one: (one.name,), left=True),
-            Column("lists", ("lists",), lambda one: (len(one.counts),)),
-            Column("period\n[ms]", ("period_s",), lambda one: _known(one.period_s), scale=1e3),
-            Column("delay [ms]\np50/p95/max", names, quantiles, "{}/{}/{}", 1e3, text=_whole),
-            Column("overtaken\n[%]", ("overtaken",), lambda one: (self.overtaken[one.name],), scale=100.0),
-            Column("lost\n[%]", ("lost",), lambda one: _known(one.lost), scale=100.0),
+        records = []
+        for one in self.arrivals:
+            record = {"sensor": one.name, "lists": len(one.counts), "period_s": one.period_s}
+            record |= {"delay_p50_s": one.quantile_s(0.5), "delay_p95_s": one.quantile_s(0.95)}
+            record |= {
+                "delay_max_s": float(one.delays_s.max()),
+                "overtaken": self.overtaken[one.name],
+                "lost": one.lost,
+            }
+            records.append(record)
+        columns = [
+            Column("sensor", left=True),
+            Column("lists"),
+            Column("period\n[ms]", "period_s", scale=1e3),
+            Column("delay [ms]\np50/p95/max", "delay_p50_s delay_p95_s delay_max_s", "{}/{}/{}", 1e3, text=_whole),
+            Column("overtaken\n[%]", "overtaken", scale=100.0),
+            Column("lost\n[%]", "lost", scale=100.0),
         ]
-        return Table("Lists by sensor, with the stamps advised", columns, self.arrivals, row_keys=("sensor",))
+        return Table("Lists by sensor, with the stamps advised", records, columns, ("sensor",))
 
     def _beyond(self) -> Table:
-        columns: list[Column[BeyondLag]] = [Column("lag [s]", ("lag_s",), lambda row: (row.lag_s,), text=str)]
-        for one in self.arrivals:
-            columns.append(_share_column(one.name))
-        return Table("Detections that are later than a window or limit [%]", columns, self.beyond, row_keys=("lag_s",))
+        shares = {f"{one.name}_share": one.name for one in self.arrivals}
+        records = [{"lag_s": row.lag_s} | {key: row.share[name] for key, name in shares.items()} for row in self.beyond]
+        columns = [Column("lag [s]", "lag_s", text=str)]
+        columns += [Column(name, cell_of=partial(_share, key)) for key, name in shares.items()]
+        return Table("Detections that are later than a window or limit [%]", records, columns, ("lag_s",))
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""
@@ -129,13 +135,9 @@ def _wrapped(text: str) -> list[str]:
     return wrap(text, _COMMENT, initial_indent="- ", subsequent_indent="  ", break_long_words=False)
 
 
-def _known(value: float | None) -> tuple[Value, ...] | None:
-    return None if value is None else (value,)
-
-
 def _whole(value: Value) -> str:
     return f"{value:.0f}" if abs(float(value)) < 3.6e6 else NO_VALUE
 
 
-def _share_column(name: str) -> Column[BeyondLag]:
-    return Column(name, (f"{name}_share",), lambda row: (row.share[name],), scale=100.0)
+def _share(key: str, record: Record) -> str:
+    return short(100.0 * record[key])

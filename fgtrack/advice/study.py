@@ -13,7 +13,7 @@ from fgtrack.advice.page import Advice
 from fgtrack.advice.summary import summary
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Message
-from fgtrack.evaluation.comparison import compare
+from fgtrack.evaluation.compare import compare
 from fgtrack.evaluation.runs import JudgedRun, judged
 from fgtrack.evaluation.tables import Tables
 from fgtrack.io.errors import UntilBreak

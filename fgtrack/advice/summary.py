@@ -1,5 +1,6 @@
 """The summary of a study: about five sentences that an engineer can act on."""
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from fgtrack.advice.page import Advice
 from fgtrack.core.time import NS_PER_S
-from fgtrack.evaluation.cautions import USED, cautions
+from fgtrack.evaluation.diagnostics import USED, diagnostics
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.tables import Tables, short
 
@@ -59,7 +60,7 @@ def _to_do(runs: Sequence[JudgedRun], tables: Tables, advice: Advice | None) -> 
     """What comes first: a defect of the recording or its settings, else the choice of a method."""
     open_findings = [] if advice is None else [one for one in advice.findings if not one.settings]
     found = [str(one) for one in open_findings if one.weight >= _IMPORTANT] or [
-        str(one) for one in cautions(runs[0].run)
+        str(one) for one in diagnostics(runs[0].run)
     ]
     if found:
         return f"First: {found[0]}"
@@ -68,16 +69,16 @@ def _to_do(runs: Sequence[JudgedRun], tables: Tables, advice: Advice | None) -> 
 
 def _choices(tables: Tables) -> Iterator[str]:
     """The fastest of the best for the present state, and the best where the output may wait."""
-    rows: list[dict[str, Any]] = tables["differences"].records()  # Any, as below: cells are text or numbers
+    rows = tables.tables["differences"].records
     ranked = [row for row in rows if row["quantity"] == "position_rmse_m"]
     best = {row["run"] for row in ranked if row["standing"] != "worse"}
-    of_runs: list[dict[str, Any]] = tables["tracking"].records()
+    of_runs = tables.tables["tracking"].records
     times = {row["run"]: row["time_per_tick_p50_s"] for row in of_runs}
     fastest = min(best or times, key=lambda run: (times[run], run))
     because = "as accurate as the best" if best else "errors are unknown without truth"
     yield f"{fastest} for the present state ({short(_MS * times[fastest])} ms per tick, {because})"
-    lags: list[dict[str, Any]] = tables["lag"].records()
-    lagged = [row for row in lags if (row["lag_s"] or 0.0) > 0.0 and row["position_reduction"]]
+    lags = tables.tables["lag"].records
+    lagged = [row for row in lags if (row["lag_s"] or 0.0) > 0.0 and math.isfinite(row["position_reduction"])]
     if lagged:
         row = lagged[0]
         share = _PERCENT * row["position_reduction"]

@@ -7,11 +7,10 @@ import typer
 from fgtrack.cli.arguments import All, FormOption, Json, Runs
 from fgtrack.cli.show import chosen_form, say, show, warn
 from fgtrack.core.errors import FgtrackError
-from fgtrack.evaluation.cautions import cautions
-from fgtrack.evaluation.comparison import compare as tables_of
-from fgtrack.evaluation.recordings import recordings_caution
+from fgtrack.evaluation.compare import compare as tables_of
+from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.evaluation.runs import Runs as AnyRuns
-from fgtrack.evaluation.runs import judged
+from fgtrack.evaluation.runs import judged, recordings_warning
 from fgtrack.evaluation.tables import Tables
 from fgtrack.io.run import write_metrics
 
@@ -28,8 +27,8 @@ def compare(
     """Compare runs in tables, and write metrics.json into each."""
     form = chosen_form(as_json, form)
     every = judged(runs)
-    of_each = dict.fromkeys(f"{one.label}: {line}" for one in every for line in cautions(one.run))
-    for line in (*recordings_caution(every), *of_each):
+    of_each = dict.fromkeys(f"{one.label}: {line}" for one in every for line in diagnostics(one.run))
+    for line in (*recordings_warning(every), *of_each):
         warn(line)
     tables = written_tables(every, streaming)
     show(tables.in_full() if everything else tables, form)

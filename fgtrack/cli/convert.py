@@ -12,7 +12,7 @@ from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, StorageOption
 from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import DetectionList, Message
-from fgtrack.evaluation.left_out import left_out
+from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.io.output import check_apart
 from fgtrack.io.recording import check_recording, write_recording
 from fgtrack.io.source import open_input
@@ -51,7 +51,7 @@ def convert(
     lost = messages.num_lost if isinstance(messages, Redelayed) else {}
     losses = ", ".join(f"{number} of {sensor}" for sensor, number in lost.items() if number)
     say(f"{out}: {count} messages{losses and f', lost {losses}'}")
-    for line in left_out({"left_out": unread}):
+    for line in excluded_lines({"left_out": unread}):
         say(line)
 
 

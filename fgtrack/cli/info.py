@@ -11,9 +11,9 @@ import typer
 from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, Overwrite
 from fgtrack.cli.show import chosen_form, progress, say, sentences, show, warn
 from fgtrack.core.errors import CallError, DataError, FgtrackError
-from fgtrack.evaluation.left_out import left_out
+from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value
-from fgtrack.io.info import OTHER_CLOCK_S, InputInfo, TopicInfo, describe
+from fgtrack.io.info import OTHER_CLOCK_S, InputInfo, describe
 from fgtrack.io.output import check_apart, check_output
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumed import assumed
@@ -83,7 +83,7 @@ def _try_out(recording: Path, config: Config, warned: Set[tuple[str, str]]) -> T
         for sensor, counts in trial.run.meta["counts"].items():
             became = ", ".join(f"{count} {fate.replace('_', ' ')}" for fate, count in counts.items() if count)
             say(f"first {trial.duration_s:g} s of {sensor}: {became or 'no detection'}")
-        for line in left_out(trial.run.meta):
+        for line in excluded_lines(trial.run.meta):
             say(f"first {trial.duration_s:g} s of {line}")
         say(f"first {trial.duration_s:g} s: {len(set(trial.run.tables['tracks']['track_id'].tolist()))} tracks")
     for found in trial.suspicions:
@@ -95,7 +95,7 @@ def _try_out(recording: Path, config: Config, warned: Set[tuple[str, str]]) -> T
 def _values(found: InputInfo, topics: Table) -> dict[str, object]:
     """JSON values."""
     about = {"path": str(found.path), "kind": found.kind, "start_ns": found.start_ns, "duration_s": found.duration_s}
-    return {**about, "problem": found.problem, "cautions": list(map(str, found.cautions)), "topics": topics.records()}
+    return {**about, "problem": found.problem, "cautions": list(map(str, found.cautions)), "topics": topics.plain()}
 
 
 def _heading(found: InputInfo) -> str:
@@ -107,23 +107,25 @@ def _heading(found: InputInfo) -> str:
 
 
 def _table(found: InputInfo, unused: str) -> Table:
-    columns: list[Column[TopicInfo]] = [
-        Column("topic", ("topic",), lambda one: (one.name,), left=True),
-        Column("messages", ("messages",), lambda one: (one.count,)),
-        Column("rate\n[Hz]", ("rate_hz",), lambda one: None if one.rate_hz is None else (one.rate_hz,)),
-        Column("delay [ms]\nmean/p50/p90/max", _DELAYS, _delays, "{}/{}/{}/{}", 1e3, text=_whole),
-        Column("taken as", ("taken_as",), lambda one: (one.used_as or unused,), left=True),
-        Column("type", ("type",), lambda one: (one.type,), left=True),
+    records = []
+    for one in found.topics:
+        record: dict[str, object] = {"topic": one.name, "messages": one.count, "rate_hz": one.rate_hz}
+        delay = one.delay
+        delays = (None,) * 4 if delay is None else (delay.mean_s, delay.p50_s, delay.p90_s, delay.max_s)
+        record |= zip(_DELAYS, delays, strict=True)
+        records.append(record | {"taken_as": one.used_as or unused, "type": one.type})
+    columns = [
+        Column("topic", left=True),
+        Column("messages"),
+        Column("rate\n[Hz]", "rate_hz"),
+        Column("delay [ms]\nmean/p50/p90/max", " ".join(_DELAYS), "{}/{}/{}/{}", 1e3, text=_whole),
+        Column("taken as", "taken_as", left=True),
+        Column("type", left=True),
     ]
     notes = [
         f"{topic.name}: {topic.note}" for topic in found.topics if topic.note is not None and topic.used_as is None
     ]
-    return Table(_heading(found), columns, found.topics, row_keys=("topic",), notes=notes)
-
-
-def _delays(one: TopicInfo) -> tuple[Value, ...] | None:
-    found = one.delay
-    return None if found is None else (found.mean_s, found.p50_s, found.p90_s, found.max_s)
+    return Table(_heading(found), records, columns, ("topic",), notes)
 
 
 def _whole(value: Value) -> str:

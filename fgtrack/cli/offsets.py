@@ -48,24 +48,25 @@ def offsets(
 
 
 def _table(report: OffsetReport) -> Table:
-    columns: list[Column[SensorOffset]] = [
-        Column("sensor", ("sensor",), lambda one: (one.sensor,), left=True),
-        Column("offset\n[ms]", ("offset_s",), lambda one: _known(one.offset_s), scale=1e3, text=_one_decimal),
-        Column("std\n[ms]", ("std_s",), lambda one: _known(one.std_s), scale=1e3, text=_one_decimal),
-        Column("detections", ("num_detections",), lambda one: (one.num_detections,)),
-        Column("known", ("known",), lambda one: (_verdict(one, report.reference),), left=True),
+    records = [
+        {"sensor": one.sensor, "offset_s": one.offset_s, "std_s": one.std_s, "num_detections": one.num_detections}
+        | {"known": _verdict(one, report.reference)}
+        for one in report.sensors
+    ]
+    columns = [
+        Column("sensor", left=True),
+        Column("offset\n[ms]", "offset_s", scale=1e3, text=_one_decimal),
+        Column("std\n[ms]", "std_s", scale=1e3, text=_one_decimal),
+        Column("detections", "num_detections"),
+        Column("known", left=True),
     ]
     notes = [f"{one.sensor}: {one.why}" for one in report.sensors]
     title = f"Offsets of {report.num_detections} detections of {report.num_tracks} tracks (reported stamp - true time)"
-    return Table(title, columns, report.sensors, row_keys=("sensor",), notes=notes)
+    return Table(title, records, columns, ("sensor",), notes)
 
 
 def _verdict(one: SensorOffset, reference: str) -> str:
     return "reference" if one.sensor == reference else "yes" if one.is_known else "no"
-
-
-def _known(value: float | None) -> tuple[Value, ...] | None:
-    return None if value is None else (value,)
 
 
 def _one_decimal(value: Value) -> str:

@@ -11,8 +11,7 @@ from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Settings
 from fgtrack.cli.show import progress, say, tick_progress, warn
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.estimation.registry import ESTIMATORS
-from fgtrack.evaluation.cautions import cautions, noise_cautions, unused
-from fgtrack.evaluation.left_out import left_out
+from fgtrack.evaluation.diagnostics import diagnostics, excluded_lines, noise_diagnostics, unused
 from fgtrack.io.output import check_apart
 from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
@@ -74,9 +73,11 @@ def replay(
         what = "{estimator}, {detections_received} detections, {wall_s:.1f} s, digest {digest:.12}"
         missed = f", {result.deadline_misses} ticks slower than real time" if result.deadline_misses else ""
         say(f"{result.path}: {what.format_map(result.meta)}{missed}")
-    for line in left_out(results[0].meta):  # the same of all
+    for line in excluded_lines(results[0].meta):  # the same of all
         say(line)
-    for line in dict.fromkeys(map(str, [*(one for run in runs for one in cautions(run)), *noise_cautions(runs[0])])):
+    for line in dict.fromkeys(
+        map(str, [*(one for run in runs for one in diagnostics(run)), *noise_diagnostics(runs[0])])
+    ):
         warn(line)
     if results[0].broken is not None:  # the others break off at the same place
         raise DataError(f"{located(results[0].broken, str(recording))}; replayed up to there")

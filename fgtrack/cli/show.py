@@ -20,13 +20,14 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.progress import Progress as RichProgress
+from rich.table import Table as Grid
+from rich.text import Text
 
 from fgtrack.cli.arguments import Form
 from fgtrack.core.errors import CallError, one_line, printable_lines
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Message
-from fgtrack.evaluation.tables import Table, Tables
-from fgtrack.evaluation.terminal import bulleted, hanging
+from fgtrack.evaluation.tables import Table, Tables, bulleted
 
 _WIDTH_WITHOUT_TERMINAL = 120
 LINE_PERIOD_S = 10.0
@@ -58,8 +59,10 @@ def warn(line: str) -> None:
 
 def entries(names: Mapping[str, str]) -> None:
     """Print names and what they are, in two columns."""
-    for line in hanging(names, console().width):
-        console().print(line)
+    grid = Grid.grid(padding=(0, 0, 0, 2))
+    for name, what in names.items():
+        grid.add_row(Text(name, no_wrap=True), Text(what))
+    console().print(grid)
 
 
 def sentences(lines: Iterable[str]) -> None:
@@ -80,7 +83,7 @@ def show(tables: Tables | Table, form: Form | None, values: Mapping[str, Any] | 
     if form is None:
         console().print(tables)
     elif form == "json":
-        found = values if values is not None else tables.to_dict() if isinstance(tables, Tables) else tables.records()
+        found = values if values is not None else tables.to_dict() if isinstance(tables, Tables) else tables.plain()
         print(json.dumps(found, indent=2, allow_nan=False))
     else:
         print({"md": tables.to_markdown, "csv": tables.to_csv, "latex": tables.to_latex}[form](), end="")

@@ -11,7 +11,7 @@ from fgtrack.advice.study import study as studied
 from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Settings, TrackMap
 from fgtrack.cli.show import command_line, progress, say, sentences, show, warn
 from fgtrack.core.errors import DataError
-from fgtrack.evaluation.cautions import cautions
+from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.io.output import check_apart
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
@@ -36,7 +36,7 @@ def study(
         check_apart(path, [recording, config_file])
     with progress("study") as tell:
         found = studied(recording, out, config, overwrite=overwrite, on_step=tell)
-    for line in dict.fromkeys(str(one) for run in found.runs for one in cautions(run)):
+    for line in dict.fromkeys(str(one) for run in found.runs for one in diagnostics(run)):
         warn(line)
     show_study(found, recording)
 

@@ -14,8 +14,7 @@ from fgtrack.cli.completion import sweeps
 from fgtrack.cli.show import progress, say, show
 from fgtrack.core.errors import CallError, one_line
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.over_seeds import seed_contests, shown_tables, summary_table, to_csv
-from fgtrack.evaluation.sweep_table import SweepTable, read_sweep
+from fgtrack.evaluation.seeds import SweepTable, read_sweep, seed_comparisons, shown_tables, summary_table, to_csv
 from fgtrack.io.output import check_apart, write_file
 from fgtrack.io.run import Run
 from fgtrack.pipeline.shipped import find_file
@@ -118,7 +117,7 @@ def _read(path: Path) -> list[dict[str, str]]:
 
 def _summarise(table: SweepTable, out: Path, form: Form | None, everything: bool) -> None:
     """Write means and paired differences of the estimators; show the differences of one metric, and the means."""
-    contests = seed_contests(table.rows, table.axes)
+    contests = seed_comparisons(table.rows, table.axes)
     write_file(out / PAIRED_TABLE, to_csv(contests, table.axes))
     summary = summary_table(table, contests)
     write_file(out / SUMMARY_TABLE, summary.to_csv())

@@ -20,7 +20,7 @@ from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumed import Assumed
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.tune import tuned
-from fgtrack.pipeline.tune_report import HeldOut, InnovationFit, TunedParameter, TuneReport
+from fgtrack.pipeline.tune_report import HeldOut, TunedParameter, TuneReport
 from fgtrack.pipeline.tune_rules import TuneRules
 
 _KNOWN = {"yes": "yes", "roughly": "roughly", "limit": "a limit", "no": "not identifiable"}
@@ -74,28 +74,29 @@ def _tables(report: TuneReport) -> dict[str, Table]:
 
 
 def _parameters(parameters: Sequence[TunedParameter]) -> Table:
-    def error(one: TunedParameter) -> tuple[Value, ...] | None:
-        return None if one.std_error is None or one.known in ("no", "limit") else (one.std_error,)
-
-    columns: list[Column[TunedParameter]] = [
-        Column("parameter", (), lambda one: (_short(one.key),), left=True),
-        Column("", ("key",), lambda one: (one.key,)),
-        Column("configured", ("configured",), lambda one: (one.configured,), text=_four_digits),
-        Column("tuned", ("tuned",), lambda one: (one.tuned,), text=_four_digits),
-        Column("error", ("std_error",), error, "{} %", 100.0, text=lambda value: f"{value:.1f}"),
-        Column("known", ("known",), lambda one: (_KNOWN[one.known],), left=True),
+    records = [
+        {"key": one.key, "configured": one.configured, "tuned": one.tuned, "known": _KNOWN[one.known]}
+        | {"std_error": None if one.known in ("no", "limit") else one.std_error}
+        for one in parameters
+    ]
+    columns = [
+        Column("parameter", "key", text=_short, left=True),
+        Column("configured", text=_four_digits),
+        Column("tuned", text=_four_digits),
+        Column("error", "std_error", "{} %", 100.0, text=lambda value: f"{value:.1f}"),
+        Column("known", left=True),
     ]
     notes = [f"{_short(one.key)}: {one.why}" for one in parameters if one.why]
-    return Table("Noise, as standard deviations", columns, parameters, row_keys=("key",), notes=notes)
+    return Table("Noise, as standard deviations", records, columns, ("key",), notes)
 
 
 def _four_digits(value: Value) -> str:
     return f"{value:.4g}" if math.isfinite(float(value)) else NO_VALUE
 
 
-def _short(key: str) -> str:
+def _short(key: Value) -> str:
     """A key of the configuration without what all have in common."""
-    return key.removeprefix("sensors.").replace(".std.", " ").replace("std_per_s.", "").replace("parameters.", "")
+    return str(key).removeprefix("sensors.").replace(".std.", " ").replace("std_per_s.", "").replace("parameters.", "")
 
 
 def _sensors(report: TuneReport) -> list[str]:
@@ -123,18 +124,23 @@ def _sensors(report: TuneReport) -> list[str]:
 
 
 def _judged(held_out: HeldOut) -> Table:
-    columns: list[Column[InnovationFit]] = [
-        Column("NIS of", ("of",), lambda one: (f"{one.sensor} {one.component}",), left=True),
-        Column("count", ("count",), lambda one: (one.count,)),
-        Column("before", ("before",), lambda one: (one.before,)),
-        Column("after", ("after",), lambda one: (one.after,)),
-        Column("expected", ("expected",), lambda one: (1.0,), text=_four_digits),
-        Column("95 %", ("band",), lambda one: (one.band,), "± {}"),
+    records: list[dict[str, object]] = [
+        {"of": f"{one.sensor} {one.component}", "count": one.count, "before": one.before, "after": one.after}
+        | {"expected": 1.0, "band": one.band}
+        for one in held_out.innovations
+    ]
+    columns = [
+        Column("NIS of", "of", left=True),
+        Column("count"),
+        Column("before"),
+        Column("after"),
+        Column("expected", text=_four_digits),
+        Column("95 %", "band", "± {}"),
     ]
     share = f"the last {100.0 * held_out.share:.0f} % of the time"
     title = f"Held out: {share}, {held_out.count} innovations, by the noise fitted to the rest"
     notes = [f"log-likelihood per innovation: {held_out.before:.4g} before, {held_out.after:.4g} after"]
-    return Table(title, columns, held_out.innovations, row_keys=("of",), notes=notes)
+    return Table(title, records, columns, ("of",), notes)
 
 
 def _text(tables: Tables) -> list[str]:

@@ -79,10 +79,14 @@ def _row(name: str, claim: str, checks: Mapping[str, Callable[[], None]]) -> _Ro
 
 
 def _table(rows: list[_Row]) -> Table:
-    columns: list[Column[_Row]] = [
-        Column("name", ("name",), lambda row: (row.name,), left=True),
-        Column("exact for late measurements", ("exact",), lambda row: (row.claim or "-",), left=True),
-        Column("promises", ("promises",), lambda row: (row.num_promises,)),
-        Column("broken", ("broken",), lambda row: (len(row.broken),)),
+    records = [
+        {"name": row.name, "exact": row.claim or "-", "promises": row.num_promises, "broken": len(row.broken)}
+        for row in rows
     ]
-    return Table("Contract of estimators and motion models", columns, rows, row_keys=("name",))
+    columns = [
+        Column("name", left=True),
+        Column("exact for late measurements", "exact", left=True),
+        Column("promises"),
+        Column("broken"),
+    ]
+    return Table("Contract of estimators and motion models", records, columns, ("name",))

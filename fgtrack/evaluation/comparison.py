@@ -1,283 +1,250 @@
-"""Runs compared: what each table of a comparison shows."""
+"""Runs of one recording compared: paired differences of their errors, at the same objects and stamps.
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
-from typing import Literal
+The sums behind a value are kept for every stamp, so that the difference of two runs has the interval of a block
+bootstrap over time (`fgtrack.evaluation.intervals`).
+"""
 
-from fgtrack.core.errors import CallError
-from fgtrack.evaluation.contest import BEST_NOTE, POSITION_NEES, Contest, contests, differences, is_best
-from fgtrack.evaluation.failures_table import failures_table
-from fgtrack.evaluation.lagged import WINDOW, LagMetrics
-from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics, ObjectMetrics, TruthMetrics
-from fgtrack.evaluation.multi_object import MultiObjectMetrics
-from fgtrack.evaluation.paper_tables import with_paper_tables
-from fgtrack.evaluation.runs import OneRun, judged
-from fgtrack.evaluation.sensor_tables import consistency_table, dispositions_table, residuals_table
-from fgtrack.evaluation.streaming import with_streaming
-from fgtrack.evaluation.table_rows import ERRORS, MS, PERCENT, Row, Values, named, run_column
-from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
-from fgtrack.evaluation.verdict import verdict
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
 
-BACKWARD_FORWARD = "ekf-backward-forward"
-BACKWARD_FORWARD_NOTE = "backward-forward forgets what was fused after the stamp of a late detection"
+import numpy as np
 
-_MAIN_ERRORS = ("position_m",)
-_RANKED = ("position_rmse_m", "speed_rmse_mps", "yaw_rmse_rad", POSITION_NEES)
-_LAG_ERRORS = ("position_m", "speed_mps", "yaw_rad")
-_MOST_LAGS = 8
-_FEW_LAGS = 3
+from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.evaluation.consistency import position_nees
+from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, within_run
+from fgtrack.evaluation.matching import scenes, track_errors
+from fgtrack.evaluation.multi_object import gospa
+from fgtrack.evaluation.runs import JudgedRun, by_recording
+from fgtrack.evaluation.tables import Column, Value, short, two_digits
+from fgtrack.io.run import EvaluationConfig
+
+POSITION_NEES = "position_nees"
+"""The quantity that is the better the nearer it is to 2."""
+
+STANDING_NOTE = "+: best; =: ties with the best, as the interval contains 0 (block bootstrap)"
+"""Meaning of the marks of `entry_columns`, for a table within a run."""
+
+_MARKS: Mapping[Value, str] = {"best": "+", "tie": "=", "worse": " "}
+_ERRORS = {"position_rmse_m": "position_m", "speed_rmse_mps": "speed_mps", "yaw_rmse_rad": "yaw_rad"}
+_SEED = 20040101  # of the bootstrap: the same runs give the same intervals
 
 
-def compare(*runs: OneRun | Iterable[OneRun], streaming: bool = False) -> Tables:
-    """Metrics of `runs` in comparison: the `verdict`, and tables `differences`, `tracking`, `multi_object`, `lag`,
-    `consistency`, `dispositions`, `failures`, `residuals_SENSOR` of every sensor, and those of `with_paper_tables`.
+@dataclass(frozen=True)
+class Entry:
+    """A run or an estimator, compared in one quantity.
 
-    Runs of the same recording are compared sample by sample. A path is a run folder, or a folder that holds run
-    folders. With `streaming` a table of that name judges what was published when it was ready, and the verdict says who
-    is best then.
-
-    Raises
-    ------
-    CallError
-        No run is given, one is given twice, or a path is no run folder.
-    DataError
-        A run folder is damaged.
+    Attributes
+    ----------
+    name
+        Of the run, or of the estimator.
+    value
+        Of the quantity.
+    worse_by
+        Difference to the best; None of the best itself.
+    standing
+        `tie` where the interval of the difference to the best contains 0; `best` only without any tie.
     """
-    every = judged(runs)
-    if not every:
-        raise CallError("compare: no run is given, name at least one")
-    tables = comparison({one.label: one.metrics for one in every}, contests(every))
-    tables = with_paper_tables(tables, every)
-    return with_streaming(tables, every) if streaming else tables
+
+    name: str
+    value: float
+    worse_by: Estimate | None
+    standing: Literal["best", "tie", "worse"]
 
 
-def comparison(metrics: Mapping[str, Metrics], found: Sequence[Contest] = ()) -> Tables:
-    """The tables of `metrics`, by label, and what the contests among these runs `found`."""
-    notes = [BACKWARD_FORWARD_NOTE] if any(one.estimator == BACKWARD_FORWARD for one in metrics.values()) else []
-    rows = [Row(label, one) for label, one in metrics.items()]
-    of_sensors = [Row(row.run, sensor, name) for row in rows for name, sensor in row.of.sensors.items()]
-    tables = {
-        "differences": differences(found),
-        "tracking": _tracking(rows, found, notes),
-        "multi_object": _multi_object(rows, found),
-        "lag": _lag(rows),
-        "consistency": consistency_table(rows),
-    }
-    for sensor in dict.fromkeys(row.part for row in of_sensors):
-        tables[f"residuals_{sensor}"] = residuals_table(sensor, [row for row in of_sensors if row.part == sensor])
-    tables["dispositions"] = dispositions_table(
-        of_sensors, dict.fromkeys(line for row in rows for line in row.of.left_out)
-    )
-    tables["failures"] = failures_table(rows)
-    details = {"runs": {label: one.as_dict() for label, one in metrics.items()}, "notes": notes}
-    return Tables(tables, details, verdict(metrics, found))
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity with its unit in the name, and its entries from the best to the worst. Less is better, but for the
+    NEES."""
+
+    name: str
+    entries: tuple[Entry, ...]
 
 
-def _tracking(rows: Sequence[Row[Metrics]], found: Sequence[Contest], notes: Sequence[str]) -> Table:
-    """A row for each run: errors against truth, continuity, number of tracks, time."""
+@dataclass(frozen=True)
+class Comparison:
+    """Runs of one recording.
 
-    def of_truth(get: Callable[[TruthMetrics], Values]) -> Callable[[Row[Metrics]], Values | None]:
-        return lambda row: None if row.of.truth is None else get(row.of.truth)
+    Attributes
+    ----------
+    runs
+        Labels.
+    samples
+        Objects and stamps at which all runs have a paired track.
+    most_samples
+        Those of the run with most of them.
+    quantities
+        Those that all runs have.
+    """
 
-    def rmse(name: str) -> Column[Row[Metrics]]:
-        data = named(name, "rmse")
-        return Column(
-            ERRORS[name],
-            (data,),
-            of_truth(lambda truth: (truth.overall.errors[name].rmse,)),
-            bold=lambda row: is_best(found, data, row.run),
-            when="always" if name in _MAIN_ERRORS else "full",
-        )
+    runs: tuple[str, ...]
+    samples: int
+    most_samples: int
+    quantities: tuple[Quantity, ...]
 
-    with_truth = any(row.of.truth for row in rows)
-    truth: list[Column[Row[Metrics]]] = [
-        *map(rmse, ERRORS),
-        Column(
-            "NEES\npos.",
-            (),
-            lambda row: (row.of.consistency.position_nees.mean,) if row.of.truth else None,
-            bold=lambda row: is_best(found, POSITION_NEES, row.run),
-            when="few",
-            note="NEES: mean of the position's; 2 if the covariances fit",
-        ),
-        Column("", ("tracked_share",), of_truth(lambda of: (of.overall.tracked_share,))),
-        Column(
-            "tracked\n[%]",
-            ("tracked_share_in_sight",),
-            of_truth(lambda of: (of.overall.tracked_share_in_sight,)),
-            scale=PERCENT,
-            note="tracked: share of the ticks at which some sensor could see the object",
-        ),
-        Column(
-            "breaks/\nswitches",
-            ("breaks", "id_switches"),
-            of_truth(lambda of: (of.overall.breaks, of.overall.id_switches)),
-            "{}/{}",
-            note="breaks: resumed after a loss or with another track; switches: the latter",
-        ),
-        Column(
-            "false\ntracks",
-            ("false_tracks",),
-            of_truth(lambda of: (of.false_tracks,)),
-            note=f"false: paired with a true object in less than {FALSE_TRACK_SHARE:.0%} of its life",
-        ),
-        Column(
-            "preci-\nsion",
-            ("precision",),
-            lambda row: (row.of.precision,),
-            text=_two_decimals,
-            when="full",
-            note="precision: true objects tracked / tracks that were confirmed",
-        ),
-    ]
-    columns = [
-        run_column(rows),
-        Column("", ("estimator",), lambda row: (row.of.estimator,)),
-        *(truth if with_truth else [replace(column, heading="") for column in truth]),
-        Column(
-            "tracks all/\nconfirmed",
-            ("num_tracks", "num_confirmed"),
-            lambda row: (row.of.num_tracks, row.of.num_confirmed),
-            "{}/{}",
-            when="full" if with_truth else "always",
-            note="confirmed: published as more than tentative at some tick",
-        ),
-        Column(
-            "ms/tick\np50/p99",
-            ("time_per_tick_p50_s", "time_per_tick_p99_s"),
-            lambda row: (row.of.time_per_tick_s.p50, row.of.time_per_tick_s.p99),
-            "{}/{}",
-            MS,
-        ),
-    ]
-    own = [BEST_NOTE] if any(is_best(found, name, row.run) for row in rows for name in _RANKED) else []
-    known = [row for row in rows if row.of.deadlines.are_known]
-    if known:
-        late = [
-            f"{row.run} {row.of.deadlines.misses}/{row.of.deadlines.ticks}" for row in known if row.of.deadlines.misses
-        ]
-        if late:
-            own.append(f"slower than real time, on a machine that may have been busy (ticks late): {', '.join(late)}")
-    title = "Tracking" + (" (errors: RMSE against truth)" if with_truth else "")
-    return Table(title, columns, rows, notes=[*own, *notes])
+    def __getitem__(self, name: str) -> tuple[Entry, ...]:
+        """Entries of a quantity from the best to the worst; empty where not all runs have it."""
+        return next((one.entries for one in self.quantities if one.name == name), ())
 
 
-def _multi_object(rows: Sequence[Row[Metrics]], found: Sequence[Contest]) -> Table:
-    """A row for each run where any has truth: GOSPA and its parts, CLEAR, IDF1, HOTA, switches, time to confirm."""
-
-    def score(get: Callable[[MultiObjectMetrics], float]) -> Callable[[Row[Metrics]], Values | None]:
-        return lambda row: None if row.of.multi_object is None else (get(row.of.multi_object),)
-
-    def of_objects(get: Callable[[ObjectMetrics], Values]) -> Callable[[Row[Metrics]], Values | None]:
-        return lambda row: get(row.of.truth.overall) if row.of.multi_object and row.of.truth else None
-
-    scores: dict[str, Callable[[MultiObjectMetrics], float]] = {
-        "MOTA": lambda of: of.clear.mota,
-        "IDF1": lambda of: of.identity.idf1,
-        "HOTA": lambda of: of.hota.hota,
-        "DetA": lambda of: of.hota.deta,
-        "AssA": lambda of: of.hota.assa,
-    }
-    gospa = "gospa_in_sight_rms_m"
-    columns: list[Column[Row[Metrics]]] = [
-        run_column(rows),
-        Column(
-            "GOSPA\n[m]",
-            (gospa,),
-            score(lambda of: of.gospa.in_sight_rms_m),
-            bold=lambda row: is_best(found, gospa, row.run),
-        ),
-        Column("local.\n[m]", ("gospa_localisation_m",), score(lambda of: math.sqrt(of.gospa.localisation_m2))),
-        Column("missed\n[m]", ("gospa_missed_in_sight_m",), score(_missed_in_sight_m)),
-        Column("false\n[m]", ("gospa_false_m",), score(lambda of: math.sqrt(of.gospa.false_m2))),
-        Column("unseen\n[m]", ("gospa_out_of_sight_m",), score(lambda of: math.sqrt(of.gospa.out_of_sight_m2))),
-        Column("with\nunseen", ("gospa_rms_m",), score(lambda of: of.gospa.rms_m)),
-        Column("", ("gospa_missed_m",), score(lambda of: math.sqrt(of.gospa.missed_m2))),
-        *(Column(f"{k}\n[%]", (k.lower(),), score(get), scale=PERCENT) for k, get in scores.items()),
-        Column(
-            "switches/\nlate",
-            ("id_switches", "late_id_switches"),
-            of_objects(lambda of: (of.id_switches, of.late_id_switches)),
-            "{}/{}",
-        ),
-        Column("confirm\n[s]", ("time_to_confirm_s",), of_objects(lambda of: (of.time_to_confirm_s.mean,))),
-    ]
-    notes = [
-        "GOSPA: root mean square over ticks; the squares of its parts add up to its own",
-        "unseen: missed where no sensor could see; the scores in % count it too",
-        "scores: 100 is perfect; defined in docs/metrics.md",
-        "late: switches soon after an out-of-sequence update of one of the two tracks",
-        "confirm: from an object's first detection to its first confirmed track",
-        *([BEST_NOTE] if any(is_best(found, gospa, row.run) for row in rows) else []),
-    ]
-    rows = rows if any(row.of.multi_object for row in rows) else []
-    return Table("Multi-object metrics", columns, rows, notes=notes, detail=True)
+def comparisons(runs: Sequence[JudgedRun]) -> list[Comparison]:
+    """A comparison for every recording of which there are several runs with truth."""
+    return [_comparison(group) for group in comparable(runs) if len(group) > 1]
 
 
-def _missed_in_sight_m(of: MultiObjectMetrics) -> float:
-    return math.sqrt(max(of.gospa.missed_m2 - of.gospa.out_of_sight_m2, 0.0))
+def comparable(runs: Sequence[JudgedRun]) -> list[list[JudgedRun]]:
+    """The runs with truth, those of the same recording and evaluated by the same settings together."""
+    groups: dict[tuple[int, EvaluationConfig], list[JudgedRun]] = {}
+    for number, group in enumerate(by_recording([one for one in runs if one.matching is not None])):
+        for one in group:
+            groups.setdefault((number, one.options), []).append(one)
+    return list(groups.values())
 
 
-def _lag(rows: Sequence[Row[Metrics]]) -> Table:
-    """A row for each run and lag, where any run has lagged or final states: errors, and how waiting lowers them."""
+def is_best(compared: Sequence[Comparison], quantity: str, run: str) -> bool:
+    """True if `run` is better than all other runs of its recording, none of which ties with it."""
+    first = (entries[0] for one in compared if (entries := one[quantity]))
+    return any(entry.name == run and entry.standing == "best" for entry in first)
 
-    def rmse(name: str) -> Callable[[Row[LagMetrics]], Values]:
-        return lambda row: (row.of.errors[name].rmse,)
 
-    def reduction(name: str) -> Callable[[Row[LagMetrics]], Values]:
-        return lambda row: (math.nan if row.of.lag_s == 0.0 else row.of.gain(name),)
-
-    def interval(row: Row[LagMetrics]) -> Values:
-        return row.of.position_reduction.low, row.of.position_reduction.high
-
-    errors: list[Column[Row[LagMetrics]]] = []
-    for name in _LAG_ERRORS:
-        when: Literal["always", "full"] = "always" if name in _MAIN_ERRORS else "full"
-        quantity = f"{name.rpartition('_')[0]}_reduction"
-        errors.append(Column(ERRORS[name], (named(name, "rmse"),), rmse(name), when=when))
-        errors.append(Column("below\n[%]", (quantity,), reduction(name), scale=PERCENT, when=when))
-        if name == "position_m":
-            errors.append(
-                Column(
-                    "95 %\ninterval",
-                    ("position_reduction_low", "position_reduction_high"),
-                    interval,
-                    "{} to {}",
-                    PERCENT,
-                )
-            )
-    entries = [Row(row.run, one) for row in rows for one in _shown_lags(row.of.lagged, _MOST_LAGS)]
-    few = [id(one) for row in rows for one in _shown_lags(row.of.lagged, _FEW_LAGS)]
-    columns: list[Column[Row[LagMetrics]]] = [
-        run_column(entries),
-        Column("lag\n[s]", ("lag",), lambda row: (row.of.lag_s if row.of.lag_s == WINDOW else f"{row.of.lag_s:g}",)),
-        Column("", ("lag_s",), lambda row: None if row.of.lag_s == WINDOW else (row.of.lag_s,)),
-        Column("states", ("num_states",), lambda row: (row.of.errors["position_m"].count,), when="full"),
-        *errors,
-        Column("NEES\npos.", ("position_nees",), lambda row: (row.of.position_nees.mean,)),
-    ]
-    own = [
-        "lag 0: states as published; window: final states, as they leave the window",
-        "below: reduction against the present states of the same tracks and stamps",
-        "NEES: of the position; 2 if consistent",
-    ]
-    if any(len(_shown_lags(row.of.lagged, _MOST_LAGS)) < len(row.of.lagged) for row in rows):
-        own.append(f"{_MOST_LAGS} lags of a run are shown at most, metrics.json has all")
-    entries = entries if any(len(row.of.lagged) > 1 for row in rows) else []
-    title = "Error against lag (RMSE against truth)"
-    return Table(
-        title, columns, entries, row_keys=("run", "lag"), notes=own, detail_rows=lambda row: id(row.of) not in few
+def ranked(
+    names: Sequence[str],
+    values: Sequence[float] | FloatArray,
+    costs: Sequence[float] | FloatArray,
+    worse_by: Callable[[int, int], Estimate],
+) -> tuple[Entry, ...]:
+    """Entries from the least of the `costs` to the largest; `worse_by` gives the cost of one index minus another's."""
+    best, *others = np.argsort(costs, kind="stable").tolist()
+    differences = {k: worse_by(k, best) for k in others}
+    tie = any(not difference.is_significant for difference in differences.values())
+    return (
+        Entry(names[best], float(values[best]), None, "tie" if tie else "best"),
+        *(Entry(names[k], float(values[k]), d, "worse" if d.is_significant else "tie") for k, d in differences.items()),
     )
 
 
-def _shown_lags(lagged: Sequence[LagMetrics], most: int) -> list[LagMetrics]:
-    """The present and the final states, and of the lags between them at most so many that are evenly spread."""
-    lags = [entry for entry in lagged if entry.lag_s not in (0.0, WINDOW)]
-    if len(lags) > most:
-        lags = [lags[round(k * (len(lags) - 1) / (most - 1))] for k in range(most)]
-    return [entry for entry in lagged if entry.lag_s in (0.0, WINDOW) or entry in lags]
+def entry_record(entry: Entry, name: str = "value") -> dict[str, Any]:
+    """Numbers of an entry, its value as `name`, which `entry_columns` show."""
+    worse = entry.worse_by or UNKNOWN
+    numbers = {"worse_by": worse.mean, "low": worse.low, "high": worse.high}
+    return {"run": entry.name, name: entry.value, "standing": entry.standing, **numbers}
 
 
-def _two_decimals(value: Value) -> str:
-    return f"{value:.2f}" if math.isfinite(float(value)) else NO_VALUE
+def entry_columns(heading: str, name: str = "value") -> list[Column]:
+    """The value of an entry with its standing, the best one bold, and how much worse it is."""
+    return [
+        Column(
+            f"{heading}  ",
+            f"{name} standing",
+            "{} {}",
+            text=lambda value: _MARKS.get(value, "") or short(value),
+            bold=lambda record: bool(record["standing"] == "best"),
+        ),
+        Column("worse\nby", "worse_by", text=two_digits),
+        Column("95 % interval", "low high", "{} to {}", text=two_digits),
+    ]
+
+
+class Paired(NamedTuple):
+    """What runs of one recording are compared by.
+
+    Attributes
+    ----------
+    samples, most_samples
+        See `Comparison`.
+    sums
+        By quantity: of every stamp the sum of each run, and in the last column the count, shape (n, runs + 1).
+    """
+
+    samples: int
+    most_samples: int
+    sums: Mapping[str, FloatArray]
+
+
+def paired_sums(group: Sequence[JudgedRun]) -> Paired:
+    """The errors of `group`, runs of one recording, at the same objects and stamps, stamp by stamp."""
+    matchings = [one.matching for one in group if one.matching is not None]
+    errors, squares = [track_errors(one) for one in matchings], [position_nees(one).values for one in matchings]
+    codes, at_ns, rows = common_samples([one.object_index for one in errors], [one.stamps_ns for one in errors])
+    sums: dict[str, FloatArray] = {}
+    if len(at_ns):
+        for name, error in _ERRORS.items():
+            values = [np.square(one.values[error][row]) for one, row in zip(errors, rows, strict=True)]
+            sums[name] = by_stamp(at_ns, np.stack(values, axis=-1))
+        values = [one[row] for one, row in zip(squares, rows, strict=True)]
+        sums[POSITION_NEES] = by_stamp(at_ns, np.stack(values, axis=-1))
+    if all(one.options.multi_object for one in group):
+        sums["gospa_in_sight_rms_m"] = _gospa_sums(group)
+    return Paired(len(at_ns), max(codes), sums)
+
+
+def common_samples(
+    objects: Sequence[IntArray], stamps_ns: Sequence[IntArray]
+) -> tuple[list[int], IntArray, list[IntArray]]:
+    """Samples of several runs at the same object and stamp.
+
+    Returns
+    -------
+    counts
+        Distinct samples of each run.
+    stamps
+        Those of the common samples, shape (n,).
+    rows
+        Of each run the rows of the common samples, shape (n,) each.
+    """
+    every_ns = np.unique(np.concatenate(stamps_ns))
+    found = [
+        np.unique(index * len(every_ns) + np.searchsorted(every_ns, ns), return_index=True)
+        for index, ns in zip(objects, stamps_ns, strict=True)
+    ]
+    common = functools.reduce(np.intersect1d, [codes for codes, _ in found])
+    rows = [first[np.searchsorted(codes, common)] for codes, first in found]
+    return [len(codes) for codes, _ in found], every_ns[common % max(len(every_ns), 1)], rows
+
+
+def quantity(name: str, labels: Sequence[str], ticks: FloatArray) -> Quantity:
+    """The runs by rising cost, and how much worse than the best they are.
+
+    `ticks` has a column of sums for each run and one of counts, shape (n, runs + 1). The cost is the root of the mean,
+    of a NEES its distance from 2.
+    """
+    is_nees = name == POSITION_NEES
+
+    def cost(mean: FloatArray) -> FloatArray:
+        return np.abs(mean - 2.0) if is_nees else np.sqrt(mean)
+
+    def worse_by(one: int, best: int) -> Estimate:
+        sums = ticks[:, [one, best, -1]]
+        return within_run(sums, lambda S: cost(S[0] / S[2]) - cost(S[1] / S[2]), np.random.default_rng(_SEED))
+
+    *numerators, count = ticks.sum(axis=0).tolist()
+    means = np.array(numerators) / count
+    return Quantity(name, ranked(labels, means if is_nees else np.sqrt(means), cost(means), worse_by))
+
+
+def _comparison(group: Sequence[JudgedRun]) -> Comparison:
+    paired, labels = paired_sums(group), tuple(one.label for one in group)
+    quantities = [quantity(name, labels, ticks) for name, ticks in paired.sums.items() if ticks[:, -1].any()]
+    return Comparison(labels, paired.samples, paired.most_samples, tuple(quantities))
+
+
+def _gospa_sums(group: Sequence[JudgedRun]) -> FloatArray:
+    """Squared GOSPA of the visible objects of every run, and 1, at the ticks that all have.
+
+    Visible is what a sensor of any run could see, so that all are measured alike; runs without a known field of view
+    are left out of that, unless none has one.
+    """
+    common_ns = functools.reduce(np.intersect1d, [one.scored_ticks_ns for one in group])
+    rows = [np.searchsorted(one.scored_ticks_ns, common_ns) for one in group]
+    matchings = [one.matching for one in group if one.matching is not None]
+    there = [scenes(one.run, matching) for one, matching in zip(group, matchings, strict=True)]
+    asked = [k for k, matching in enumerate(matchings) if matching.is_sight_known] or list(range(len(group)))
+    seen = np.any([there[k].in_sight[rows[k]] for k in asked], axis=0)
+    columns = []
+    for one, scene, mine in zip(group, there, rows, strict=True):
+        in_sight = scene.in_sight.copy()
+        in_sight[mine] = seen
+        parts = gospa(replace(scene, in_sight=in_sight), one.options.gate_m)
+        columns.append(np.square(parts.in_sight_m[mine]))
+    return np.stack([*columns, np.ones(len(common_ns))], axis=-1)

@@ -7,8 +7,8 @@ import numpy as np
 
 from fgtrack.core.types import YAW, FloatArray, IntArray
 from fgtrack.evaluation.innovations import Autocorrelation, autocorrelations, num_measured
+from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, mean_square
 from fgtrack.evaluation.matching import Matching, state_errors
-from fgtrack.evaluation.paired import UNKNOWN, Estimate, by_stamp, mean_square
 from fgtrack.evaluation.statistics import ChiSquareMean, Moments, chi_square_band
 from fgtrack.evaluation.truth import TRUE_STATE
 from fgtrack.io.run import Run, Table
@@ -27,49 +27,69 @@ class Consistency:
 
     The bands are those of independent samples. Innovations of a consistent estimator are independent, errors along a
     run are not: a single run may leave the band of its NEES, see `nees_over_runs`.
+
+    Attributes
+    ----------
+    position_nees
+        Of the present position; empty without truth.
+    state_nees
+        Of the present x, y, yaw, speed and yaw rate; without the yaw rate where truth or the model has none.
+    nis
+        By sensor.
+    autocorrelation
+        By sensor and innovation, see `autocorrelations`.
+    position_nees_interval
+        Mean of `position_nees` with the interval of correlated errors, see `mean_square`.
     """
 
     position_nees: ChiSquareMean
-    """Of the present position, where there is truth."""
     state_nees: ChiSquareMean
-    """Of the present x, y, yaw, speed and yaw rate; without the yaw rate where truth or the model has none."""
     nis: Mapping[str, ChiSquareMean]
-    """By sensor."""
     autocorrelation: Mapping[str, Mapping[str, Autocorrelation]]
-    """By sensor and innovation, see `autocorrelations`."""
     position_nees_interval: Estimate = UNKNOWN
-    """Mean of `position_nees` with the interval of correlated errors, see `within_run`."""
 
 
 @dataclass(frozen=True)
 class Nees:
-    """NEES of n present states."""
+    """NEES of n present states.
+
+    Attributes
+    ----------
+    stamps_ns, object_ids, values
+        Of each state, shape (n,).
+    dof
+        Degrees of freedom of each value: what a consistent estimator has on average.
+    """
 
     stamps_ns: IntArray
     object_ids: IntArray
     values: FloatArray
     dof: IntArray
-    """Degrees of freedom of each value: what a consistent estimator has on average."""
 
 
 @dataclass(frozen=True)
 class NeesOverRuns:
-    """NEES averaged over Monte-Carlo runs: at m objects and stamps, each with at most one value of a run."""
+    """NEES averaged over Monte-Carlo runs: at m objects and stamps, each with at most one value of a run.
+
+    Attributes
+    ----------
+    object_ids, stamps_ns
+        Shape (m,).
+    num_runs
+        Runs with a value there, shape (m,).
+    mean, low, high
+        Mean over them and its 95 % band, shape (m,).
+    run_means
+        Average of every run's own values, shape (runs,); these are independent. NaN for a run without any.
+    """
 
     object_ids: IntArray
-    """Shape (m,)."""
     stamps_ns: IntArray
-    """Shape (m,)."""
     num_runs: IntArray
-    """Runs with a value there, shape (m,)."""
     mean: FloatArray
-    """Shape (m,)."""
     low: FloatArray
-    """Lower end of the 95 % band of `mean`, shape (m,)."""
     high: FloatArray
-    """Its upper end."""
     run_means: FloatArray = field(repr=False)
-    """Average of every run's own values, shape (runs,); these are independent. NaN for a run without any."""
 
     @property
     def share_inside(self) -> float:
@@ -83,17 +103,25 @@ class NeesOverRuns:
 
 
 def consistency(run: Run, matching: Matching | None) -> Consistency:
-    """NEES of the judged rows of `run`, NIS and whiteness of its innovations."""
+    """NEES of the evaluated rows of `run`, NIS and whiteness of its innovations."""
     updates = run.tables["updates"]
     measured = num_measured(updates)
     sensors = {name: updates["sensor"] == name for name in np.unique(updates["sensor"]).tolist()}
-    of_position = None if matching is None else position_nees(matching)
-    return Consistency(
-        position_nees=_mean(of_position),
-        state_nees=_mean(None if matching is None else state_nees(matching)),
-        position_nees_interval=_interval(of_position),
+    found = Consistency(
+        position_nees=ChiSquareMean(),
+        state_nees=ChiSquareMean(),
         nis={name: ChiSquareMean.of(updates["nis"][mine], measured[mine]) for name, mine in sensors.items()},
         autocorrelation={name: autocorrelations(updates.where(mine)) for name, mine in sensors.items()},
+    )
+    if matching is None or not matching.paired.any():
+        return found
+    position, state = position_nees(matching), state_nees(matching)
+    ticks = by_stamp(position.stamps_ns, position.values[:, None])
+    return replace(
+        found,
+        position_nees=ChiSquareMean.of(position.values, position.dof),
+        state_nees=ChiSquareMean.of(state.values, state.dof),
+        position_nees_interval=mean_square(ticks, np.random.default_rng(_SEED)),
     )
 
 
@@ -132,20 +160,12 @@ def nees_over_runs(samples: Sequence[Nees]) -> NeesOverRuns:
         raise ValueError("at least one run is needed")
     kept = [_one_each(sample) for sample in samples]
     keys = np.concatenate([np.stack([one.object_ids, one.stamps_ns], axis=-1) for one in kept])
-    places, inverse = np.unique(keys, axis=0, return_inverse=True)
-    num_runs = np.bincount(inverse, minlength=len(places))
+    distinct, inverse, num_runs = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
     values, dof = (np.concatenate([getattr(one, name) for one in kept]) for name in ("values", "dof"))
-    total, total_dof = (np.bincount(inverse, part, len(places)).astype(np.float64) for part in (values, dof))
-    low, high = chi_square_band(total_dof, num_runs)
-    return NeesOverRuns(
-        object_ids=places[:, 0],
-        stamps_ns=places[:, 1],
-        num_runs=num_runs,
-        mean=total / num_runs,
-        low=low,
-        high=high,
-        run_means=np.array([Moments.of(one.values).mean for one in kept]),
-    )
+    total, total_dof = (np.bincount(inverse, part, len(distinct)).astype(np.float64) for part in (values, dof))
+    run_means = np.array([Moments.of(one.values).mean for one in kept])
+    band = chi_square_band(total_dof, num_runs)
+    return NeesOverRuns(distinct[:, 0], distinct[:, 1], num_runs, total / num_runs, *band, run_means)
 
 
 def normalised_squares(states: Table, errors: FloatArray) -> FloatArray:
@@ -158,8 +178,8 @@ def normalised_squares(states: Table, errors: FloatArray) -> FloatArray:
     e = list(errors.T)
     P = [[states[f"p_{a}_{b}"] for b in names[i:]] for i, a in enumerate(names)]
     total = np.zeros(len(errors))
-    # One component after the other is taken out of all rows at once: what is left of the others is their error and
-    # covariance given this one (Schur complement), so the squares add up.
+    # One component after the other is taken out of all rows at once: the others keep their error and covariance given
+    # this one (Schur complement), so the squares add up.
     with np.errstate(over="ignore", invalid="ignore"):  # of what is not definite
         while P:
             (variance, *covs), *P = P
@@ -183,17 +203,6 @@ def _nees(matching: Matching, size: int) -> Nees:
         values=normalised_squares(tracks, errors[:, :size]),
         dof=np.full(tracks.num_rows, size),
     )
-
-
-def _mean(nees: Nees | None) -> ChiSquareMean:
-    return ChiSquareMean() if nees is None else ChiSquareMean.of(nees.values, nees.dof)
-
-
-def _interval(nees: Nees | None) -> Estimate:
-    if nees is None or not len(nees.values):
-        return UNKNOWN
-    ticks = by_stamp(nees.stamps_ns, nees.values[:, None])
-    return mean_square(ticks, np.random.default_rng(_SEED))
 
 
 def _one_each(nees: Nees) -> Nees:

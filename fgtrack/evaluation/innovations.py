@@ -1,4 +1,4 @@
-"""Innovations and delays by sensor: along and across the direction of the track, and whether they are white."""
+"""Innovations and delays by sensor: along and across the direction of the track, their context and their whiteness."""
 
 import math
 from collections.abc import Mapping
@@ -6,22 +6,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import MEASURABLE, BoolArray, FloatArray, IntArray
-from fgtrack.evaluation.statistics import NORMAL_95
+from fgtrack.evaluation.matching import confirmed
+from fgtrack.evaluation.roads import roads
+from fgtrack.evaluation.statistics import NORMAL_95, Moments
 from fgtrack.io.run import NO_TRACK, Run, Table
 from fgtrack.models.measurement import ANGULAR
 
 #: Every residual, in the order in which it is shown.
 RESIDUAL_NAMES = ("along_m", "across_m", *MEASURABLE)
-
-_TRACK_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps")
-
+#: Residuals of table I of Karle et al. 2023: x_loc, y_loc, psi and v.
+LOCAL_NAMES = ("along_m", "across_m", "yaw_rad", "speed_mps")
 LAGS = 10
 """Highest lag examined."""
 FEWEST = 20
 """A track with fewer innovations of the sensor is left out: the band is that of a large sample."""
 
+_TRACK_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps")
 #: Innovations that are taken together, as a vector; the others are scalars.
 _GROUPS: Mapping[str, tuple[str, ...]] = {
     "position_m": ("x_m", "y_m"),
@@ -31,21 +34,52 @@ _GROUPS: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Autocorrelation:
-    """Autocorrelation of the innovations of one sensor, over all tracks that have at least `FEWEST` of them."""
+    """Autocorrelation of the innovations of one sensor, over all tracks that have at least `FEWEST` of them.
+
+    Attributes
+    ----------
+    tracks, count
+        Number of these tracks and of their innovations.
+    lag1, lag1_band
+        Normalised autocorrelation at lag 1, between -1 and 1 and 0 on average for white innovations, and the half-width
+        of its 95 % interval for white innovations.
+    share_outside
+        Share of the tracks and lags 1 to `LAGS` outside their own bands; 0.05 on average for white innovations.
+    """
 
     tracks: int
     count: int
-    """Innovations of these tracks."""
     lag1: float
-    """Normalised autocorrelation at lag 1, between -1 and 1; 0 on average for white innovations."""
     lag1_band: float
-    """Half-width of its 95 % interval for white innovations."""
     share_outside: float
-    """Share of the tracks and lags 1 to `LAGS` outside their own bands; 0.05 on average for white innovations."""
+
+
+def moments_of(name: str, values: FloatArray) -> Moments:
+    """Moments of the residual `name`; those of angles are circular."""
+    return (Moments.of_angles if name in ANGULAR else Moments.of)(values)
+
+
+def local_innovations(run: Run) -> tuple[IntArray, dict[str, FloatArray], FloatArray]:
+    """Innovations of the tracks that were `confirmed`: rows of updates.csv, values by name, and states of the track.
+
+    Values are of shape (n,), NaN where not measured: along and across the direction of the track, its yaw and speed.
+    Without a measured yaw, on a map, that of the map less the track's, as in the paper. States are x, y, yaw and speed
+    at the stamps of the detections, shape (n, 4). Raises `DataError` where the map that the run names is not a map.
+    """
+    tracks, updates, every = run.tables["tracks"], run.tables["updates"], residuals(run)
+    known = np.isin(updates["track_id"], tracks["track_id"][confirmed(tracks)])
+    known &= np.isfinite([every[name] for name in LOCAL_NAMES]).any(axis=0)
+    rows, states = np.flatnonzero(known), track_states(run, known)[known]
+    values = {name: every[name][rows] for name in LOCAL_NAMES}
+    road = roads(run)[0].get("track")
+    missing = np.flatnonzero(np.isnan(values["yaw_rad"]) & np.isfinite(states).all(axis=1))
+    if road is not None and len(missing):
+        values["yaw_rad"][missing] = wrap_angles(road.heading(states[missing, :2]) - states[missing, 2])
+    return rows, values, states
 
 
 def residuals(run: Run) -> Mapping[str, FloatArray]:
-    """Innovations by name of `RESIDUAL_NAMES`, each of shape (rows of updates.csv,), NaN where there is none.
+    """Innovations by name of `RESIDUAL_NAMES`, each of shape (rows of updates.csv,), NaN where not measured.
 
     `along_m` and `across_m` (left positive) turn the position residual into the direction of the track, the
     published yaw at the detection's stamp: they are x_loc and y_loc of Karle et al. 2023.
@@ -94,27 +128,15 @@ def autocorrelations(updates: Table) -> dict[str, Autocorrelation]:
         enough = counts >= FEWEST
         sums = np.array([_sums(innovations[known][ids == track_id]) for track_id in tracks[enough].tolist()])
         if len(sums) and sums[:, 0, 0].all():
-            found[group] = _summary(sums, int(counts[enough].sum()))
+            energy, numerators, deviations = sums[:, 0, 0], sums[:, 0, 1:], np.sqrt(sums[:, 1, 1:])
+            found[group] = Autocorrelation(
+                tracks=len(sums),
+                count=int(counts[enough].sum()),
+                lag1=float(numerators[:, 0].sum() / energy.sum()),
+                lag1_band=NORMAL_95 * math.sqrt(np.square(deviations[:, 0]).sum()) / float(energy.sum()),
+                share_outside=float((np.abs(numerators) > NORMAL_95 * deviations).mean()),
+            )
     return found
-
-
-def _sums(innovations: FloatArray) -> FloatArray:
-    """Sums over k of nu(k)' nu(k + l) and of its square at the lags l = 0, 1, ..., `LAGS`, shape (2, `LAGS` + 1)."""
-    padded = np.concatenate([innovations, np.zeros((LAGS, innovations.shape[1]))])
-    later = np.lib.stride_tricks.sliding_window_view(padded, LAGS + 1, axis=0)
-    products = np.einsum("ni,nil->nl", innovations, later)
-    return np.stack([products.sum(axis=0), np.square(products).sum(axis=0)])
-
-
-def _summary(sums: FloatArray, count: int) -> Autocorrelation:
-    energy, numerators, variances = sums[:, 0, 0], sums[:, 0, 1:], sums[:, 1, 1:]
-    return Autocorrelation(
-        tracks=len(sums),
-        count=count,
-        lag1=float(numerators[:, 0].sum() / energy.sum()),
-        lag1_band=NORMAL_95 * math.sqrt(variances[:, 0].sum()) / float(energy.sum()),
-        share_outside=float((np.abs(numerators) > NORMAL_95 * np.sqrt(variances)).mean()),
-    )
 
 
 def track_states(run: Run, wanted: BoolArray) -> FloatArray:
@@ -123,21 +145,25 @@ def track_states(run: Run, wanted: BoolArray) -> FloatArray:
     Linear between the published rows of the track, constant before the first and after the last one; NaN elsewhere, and
     for a track that was never published.
     """
-    states = np.full((run.tables["updates"].num_rows, len(_TRACK_STATE)), np.nan)
-    order = np.lexsort((run.tables["tracks"]["stamp_ns"], run.tables["tracks"]["track_id"]))
-    ids = run.tables["tracks"]["track_id"][order]
-    for track_id in np.unique(run.tables["updates"]["track_id"][wanted]).tolist():
-        start, end = np.searchsorted(ids, (track_id, track_id + 1)).tolist()
-        if start == end:
-            continue
-        rows = order[start:end]
-        mine = np.flatnonzero(wanted & (run.tables["updates"]["track_id"] == track_id))
-        stamps_ns = run.tables["tracks"]["stamp_ns"][rows]
-        first_ns = stamps_ns[0]  # differences are exact as floats, epoch stamps are not
-        asked, known = (
-            (ns - first_ns).astype(np.float64) for ns in (run.tables["updates"]["stamp_ns"][mine], stamps_ns)
-        )
+    tracks, updates = run.tables["tracks"], run.tables["updates"]
+    states = np.full((updates.num_rows, len(_TRACK_STATE)), np.nan)
+    order = np.lexsort((tracks["stamp_ns"], tracks["track_id"]))
+    ids = tracks["track_id"][order]
+    for track_id in np.intersect1d(updates["track_id"][wanted], ids).tolist():
+        rows = order[slice(*np.searchsorted(ids, (track_id, track_id + 1)).tolist())]
+        mine = np.flatnonzero(wanted & (updates["track_id"] == track_id))
+        stamps_ns = tracks["stamp_ns"][rows]
+        # differences are exact as floats, epoch stamps are not
+        asked, known = ((ns - stamps_ns[0]).astype(np.float64) for ns in (updates["stamp_ns"][mine], stamps_ns))
         for column, name in enumerate(_TRACK_STATE):
-            values = run.tables["tracks"][name][rows]
+            values = tracks[name][rows]
             states[mine, column] = np.interp(asked, known, np.unwrap(values) if name in ANGULAR else values)
     return states
+
+
+def _sums(innovations: FloatArray) -> FloatArray:
+    """Sums over k of nu(k)' nu(k + l) and of its square at the lags l = 0, 1, ..., `LAGS`, shape (2, `LAGS` + 1)."""
+    padded = np.concatenate([innovations, np.zeros((LAGS, innovations.shape[1]))])
+    later = np.lib.stride_tricks.sliding_window_view(padded, LAGS + 1, axis=0)
+    products = np.einsum("ni,nil->nl", innovations, later)
+    return np.stack([products.sum(axis=0), np.square(products).sum(axis=0)])

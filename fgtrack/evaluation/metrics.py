@@ -1,27 +1,32 @@
 """All metrics of a run."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import BoolArray, Disposition, IntArray
+from fgtrack.core.types import Disposition
 from fgtrack.evaluation.consistency import Consistency, consistency
-from fgtrack.evaluation.continuity import late_switches, times_to_confirm, tracked_visits
+from fgtrack.evaluation.continuity import breaks, late_switches, switches, times_to_confirm, tracked_visits
 from fgtrack.evaluation.deadlines import Deadlines
-from fgtrack.evaluation.innovations import RESIDUAL_NAMES, message_delays, num_measured, residuals
+from fgtrack.evaluation.diagnostics import excluded_lines
+from fgtrack.evaluation.innovations import (
+    RESIDUAL_NAMES,
+    local_innovations,
+    message_delays,
+    moments_of,
+    num_measured,
+    residuals,
+)
 from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
-from fgtrack.evaluation.left_out import left_out
 from fgtrack.evaluation.matching import ERROR_NAMES, Matching, confirmed, match, track_errors
 from fgtrack.evaluation.multi_object import MultiObjectMetrics, multi_object_metrics
 from fgtrack.evaluation.prediction import PredictionErrors, prediction_errors
-from fgtrack.evaluation.residual_samples import ResidualSamples, residual_samples
 from fgtrack.evaluation.statistics import ChiSquareMean, Distribution, Moments
-from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run
-from fgtrack.models.measurement import ANGULAR
+from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, Table
 
 FALSE_TRACK_SHARE = 0.5
 """A track that is paired with a true object in less than this share of its rows is false."""
@@ -31,26 +36,39 @@ LATE_SWITCH_S = 0.5
 
 @dataclass(frozen=True)
 class ObjectMetrics:
-    """How one true object, or all of them together, was tracked."""
+    """Metrics of one true object, or of all of them together.
+
+    Attributes
+    ----------
+    errors
+        Track minus truth, by name of `ERROR_NAMES`; `position_m` is the distance.
+    ticks_present
+        Ticks at which there is truth.
+    ticks_tracked
+        Ticks among them at which a track was paired.
+    breaks
+        Times that tracking went on after a loss, or with another track.
+    id_switches
+        Times that it went on with another track than the last one.
+    late_id_switches
+        Those that follow on an out-of-sequence update, see `late_switches`.
+    time_to_confirm_s
+        From the first detection to the first confirmed track, a sample for each object, see `times_to_confirm`.
+    ticks_in_sight
+        Ticks at which there is truth and some sensor could see it, see `visible`.
+    ticks_tracked_in_sight
+        Ticks among them at which a track was paired.
+    """
 
     errors: Mapping[str, Moments]
-    """Track minus truth, by name of `ERROR_NAMES`; `position_m` is the distance."""
-    ticks_present: int
-    """Ticks at which there is truth."""
-    ticks_tracked: int
-    """Ticks among them at which a track was paired."""
-    breaks: int
-    """How often tracking went on after a loss, or with another track."""
-    id_switches: int
-    """How often it went on with another track than the last one."""
-    late_id_switches: int
-    """Those that follow on an out-of-sequence update, see `late_switches`."""
-    time_to_confirm_s: Moments
-    """From the first detection to the first confirmed track, a sample for each object, see `times_to_confirm`."""
-    ticks_in_sight: int
-    """Ticks at which there is truth and some sensor could see it, see `in_sight`."""
-    ticks_tracked_in_sight: int
-    """Ticks among them at which a track was paired."""
+    ticks_present: int = 0
+    ticks_tracked: int = 0
+    breaks: int = 0
+    id_switches: int = 0
+    late_id_switches: int = 0
+    time_to_confirm_s: Moments = field(default_factory=Moments)
+    ticks_in_sight: int = 0
+    ticks_tracked_in_sight: int = 0
 
     @property
     def tracked_share(self) -> float:
@@ -62,58 +80,71 @@ class ObjectMetrics:
         """Share of the ticks in sight at which the object was tracked."""
         return self.ticks_tracked_in_sight / self.ticks_in_sight if self.ticks_in_sight else math.nan
 
-    def __add__(self, other: "ObjectMetrics") -> "ObjectMetrics":
-        return ObjectMetrics(
-            {name: self.errors[name] + other.errors[name] for name in ERROR_NAMES},
-            self.ticks_present + other.ticks_present,
-            self.ticks_tracked + other.ticks_tracked,
-            self.breaks + other.breaks,
-            self.id_switches + other.id_switches,
-            self.late_id_switches + other.late_id_switches,
-            self.time_to_confirm_s + other.time_to_confirm_s,
-            self.ticks_in_sight + other.ticks_in_sight,
-            self.ticks_tracked_in_sight + other.ticks_tracked_in_sight,
+    @classmethod
+    def total(cls, objects: Iterable["ObjectMetrics"]) -> "ObjectMetrics":
+        """All `objects` together."""
+        every = list(objects)
+        errors = {name: sum((one.errors[name] for one in every), Moments()) for name in ERROR_NAMES}
+        empty = cls(errors)
+        names = [entry.name for entry in fields(cls) if entry.name != "errors"]
+        return replace(
+            empty, **{name: sum((getattr(one, name) for one in every), getattr(empty, name)) for name in names}
         )
-
-
-NOTHING_TRACKED = ObjectMetrics({name: Moments() for name in ERROR_NAMES}, 0, 0, 0, 0, 0, Moments(), 0, 0)
 
 
 @dataclass(frozen=True)
 class TruthMetrics:
-    """Metrics that need truth."""
+    """Metrics that need truth.
+
+    Attributes
+    ----------
+    objects
+        By object id.
+    judged_tracks
+        Tracks with an evaluated row.
+    false_tracks
+        Those of them paired in less than `FALSE_TRACK_SHARE` of their rows.
+    tracked_objects
+        True objects that a confirmed track was ever paired with.
+    tracked_visits
+        Times that one came into sight and was tracked there: TP of the precision, see `tracked_visits`.
+    """
 
     objects: Mapping[int, ObjectMetrics]
-    """By object id."""
     judged_tracks: int
-    """Tracks with a judged row."""
     false_tracks: int
-    """Those of them paired in less than `FALSE_TRACK_SHARE` of their judged rows."""
     tracked_objects: int
-    """True objects that a confirmed track was ever paired with."""
     tracked_visits: int
-    """How often one came into sight and was tracked there: TP of the precision, see `tracked_visits`."""
 
     @property
     def overall(self) -> ObjectMetrics:
         """All objects together."""
-        return sum(self.objects.values(), start=NOTHING_TRACKED)
+        return ObjectMetrics.total(self.objects.values())
 
 
 @dataclass(frozen=True)
 class SensorMetrics:
-    """What became of the detections of one sensor."""
+    """Dispositions and innovations of one sensor.
+
+    Attributes
+    ----------
+    dispositions
+        Detections by disposition; every disposition is there.
+    delay_s
+        Receipt minus stamp of the messages that held a detection.
+    residuals
+        Innovations by name of `RESIDUAL_NAMES`, those that occur.
+    nis
+        Normalised innovation squared.
+    nis_dof
+        Number of measured components of the updates with a NIS: a consistent filter has this mean NIS.
+    """
 
     dispositions: Mapping[str, int]
-    """Detections by disposition; every disposition is there."""
     delay_s: Distribution
-    """Receipt minus stamp of the messages that held a detection."""
     residuals: Mapping[str, Moments]
-    """Innovations by name of `RESIDUAL_NAMES`, those that occur."""
     nis: Moments
-    """Normalised innovation squared."""
     nis_dof: Moments
-    """Number of measured components of the updates with a NIS: a consistent filter has this mean NIS."""
 
     @property
     def detections(self) -> int:
@@ -123,37 +154,57 @@ class SensorMetrics:
 
 @dataclass(frozen=True)
 class Metrics:
-    """All metrics of one run."""
+    """All metrics of one run.
+
+    Attributes
+    ----------
+    name
+        Name of the run folder; empty for a run in memory.
+    estimator
+        Name of the estimator.
+    options
+        Settings of the evaluation.
+    num_tracks, num_confirmed
+        Distinct ids in tracks.csv, and those that were `confirmed`.
+    sensors
+        By sensor.
+    residuals
+        Innovations of all sensors and confirmed tracks, by name of `LOCAL_NAMES`: table I of Karle et al. 2023.
+    time_per_tick_s, time_per_detection_s
+        Wall time of the ticks with a detection, and the same per detection received; NaN without any.
+    consistency, deadlines
+        Normalised squares of errors and innovations; computing time against the clock.
+    truth
+        None for a run without truth.
+    lagged
+        Present, lagged and final states, see `lag_metrics`.
+    multi_object
+        None for a run without truth, and where the options exclude it.
+    predictions
+        Errors of predictions by predictor and horizon, see `prediction_errors`; empty without truth.
+    failures
+        Failures inside the estimator by kind, zeros included; empty of runs that did not count them.
+    left_out
+        Lines on the detections that settings excluded.
+    """
 
     name: str
-    """Name of the run folder; empty for a run in memory."""
     estimator: str
     options: EvaluationConfig
     num_tracks: int
-    """Distinct ids in tracks.csv."""
     num_confirmed: int
-    """Ids that were `confirmed`."""
     sensors: Mapping[str, SensorMetrics]
     residuals: Mapping[str, Moments]
-    """Innovations of all sensors and confirmed tracks, by name of `LOCAL_NAMES`: table I of Karle et al. 2023."""
     time_per_tick_s: Distribution
-    """Wall time of the ticks with a detection."""
     time_per_detection_s: float
-    """Wall time of these ticks per detection received; NaN without any."""
     consistency: Consistency
     deadlines: Deadlines
-    truth: TruthMetrics | None = field(default=None)
-    """None for a run without truth."""
+    truth: TruthMetrics | None = None
     lagged: tuple[LagMetrics, ...] = ()
-    """Present, lagged and final states, see `lag_metrics`."""
     multi_object: MultiObjectMetrics | None = None
-    """None for a run without truth, and where they are not asked for."""
     predictions: Mapping[str, Mapping[str, PredictionErrors]] = field(default_factory=dict)
-    """What states say of the next seconds, by predictor and horizon, see `prediction_errors`; empty without truth."""
     failures: Mapping[str, int] = field(default_factory=dict)
-    """What failed while the run was made, by kind, zeros included; empty of runs that did not count it."""
     left_out: tuple[str, ...] = ()
-    """For sensors of which settings left out detections, how many by which."""
 
     @property
     def precision(self) -> float:
@@ -163,7 +214,7 @@ class Metrics:
         return self.truth.tracked_visits / self.num_confirmed
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON values by name, derived ones included; None for what does not exist."""
+        """JSON values by name, derived ones included; None for NaN."""
         values: dict[str, Any] = _plain(self)
         values["precision"] = _plain(self.precision)
         for name, sensor in self.sensors.items():
@@ -173,34 +224,38 @@ class Metrics:
         return values
 
 
-def evaluate(run: Run, options: EvaluationConfig | None = None) -> Metrics:
+def evaluate(run: Run, truth: Mapping[str, Any] | None = None, options: EvaluationConfig | None = None) -> Metrics:
     """Metrics of `run`; without truth, those that need none.
 
-    Without `options` it is judged as its configuration says.
+    Parameters
+    ----------
+    truth
+        Columns of truth.csv by name, such as a pandas DataFrame: `stamp_ns`, `object_id`, `x_m`, `y_m`, and what else
+        is known. By default that of the recording.
+    options
+        By default those of the run's configuration.
     """
+    if truth is not None:
+        num_rows = len(truth["stamp_ns"])
+        columns = {name: np.asarray(truth.get(name, np.full(num_rows, np.nan))) for name in run.tables["truth"]}
+        run = replace(run, tables={**run.tables, "truth": Table(columns)})
     options = options or run.evaluation
-    return evaluate_matched(run, match(run, options), options, residual_samples(run))
+    return evaluate_matched(run, match(run, options), options)
 
 
-def evaluate_matched(
-    run: Run, matching: Matching | None, options: EvaluationConfig, samples: ResidualSamples
-) -> Metrics:
-    """Metrics of `run`, whose `match` by these `options` and `residual_samples` are known."""
-    ids = run.tables["tracks"]["track_id"]
-    is_confirmed = confirmed(run.tables["tracks"])
-    busy = run.tables["timing"]["num_detections"] > 0
-    time_s, detections = (
-        run.tables["timing"]["process_ns"][busy] / NS_PER_S,
-        run.tables["timing"]["num_detections"][busy],
-    )
+def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationConfig) -> Metrics:
+    """Metrics of `run`, whose `match` by these `options` is known."""
+    tracks, timing = run.tables["tracks"], run.tables["timing"]
+    busy = timing["num_detections"] > 0
+    time_s, detections = timing["process_ns"][busy] / NS_PER_S, timing["num_detections"][busy]
     return Metrics(
         name="" if run.path is None else run.path.resolve().name,
         estimator=str(run.meta.get("estimator", "")),
         options=options,
-        num_tracks=len(np.unique(ids)),
-        num_confirmed=len(np.unique(ids[is_confirmed])),
+        num_tracks=len(np.unique(tracks["track_id"])),
+        num_confirmed=len(np.unique(tracks["track_id"][confirmed(tracks)])),
         sensors=_sensor_metrics(run),
-        residuals=samples.moments(),
+        residuals={name: moments_of(name, values) for name, values in local_innovations(run)[1].items()},
         time_per_tick_s=Distribution.of(time_s),
         time_per_detection_s=float(time_s.sum() / detections.sum()) if len(time_s) else math.nan,
         consistency=consistency(run, matching),
@@ -210,7 +265,7 @@ def evaluate_matched(
         multi_object=multi_object_metrics(run, matching, options),
         predictions=prediction_errors(run, matching),
         failures=dict(run.meta.get("failures") or {}),
-        left_out=tuple(left_out(run.meta)),
+        left_out=tuple(excluded_lines(run.meta)),
     )
 
 
@@ -221,52 +276,27 @@ def _truth_metrics(run: Run, matching: Matching, options: EvaluationConfig) -> T
     objects = {}
     for index, object_id in enumerate(matching.object_ids):
         mine = errors.object_index == index
-        objects[object_id] = _object_metrics(
-            {name: Moments.of(values[mine]) for name, values in errors.values.items()},
-            matching.present[:, index],
-            matching.in_sight[:, index],
-            matching.track_ids[:, index],
-            int(late[index]),
-            Moments.of(confirm_s[index : index + 1]),
+        present, in_sight = matching.present[:, index], matching.in_sight[:, index]
+        tracked = matching.track_ids[:, index] != NO_TRACK
+        objects[object_id] = ObjectMetrics(
+            errors={name: Moments.of(values[mine]) for name, values in errors.values.items()},
+            ticks_present=int(present.sum()),
+            ticks_tracked=int((present & tracked).sum()),
+            breaks=breaks(matching.track_ids[present, index]),
+            id_switches=len(switches(matching.track_ids[present, index])),
+            late_id_switches=int(late[index]),
+            time_to_confirm_s=Moments.of(confirm_s[index : index + 1]),
+            ticks_in_sight=int((present & in_sight).sum()),
+            ticks_tracked_in_sight=int((present & in_sight & tracked).sum()),
         )
-    tracks, paired = matching.tracks, matching.paired
-    ids, inverse = np.unique(tracks["track_id"], return_inverse=True)
-    life = np.bincount(inverse, minlength=len(ids))
-    paired_life = np.bincount(inverse[paired], minlength=len(ids))
-    is_confirmed = confirmed(tracks)
+    ids, inverse = np.unique(matching.tracks["track_id"], return_inverse=True)
+    life, paired_life = (np.bincount(of, minlength=len(ids)) for of in (inverse, inverse[matching.paired]))
     return TruthMetrics(
         objects=objects,
         judged_tracks=len(ids),
         false_tracks=int((paired_life < FALSE_TRACK_SHARE * life).sum()),
-        tracked_objects=len(np.unique(matching.object_index[paired & is_confirmed])),
+        tracked_objects=len(np.unique(matching.object_index[matching.paired & confirmed(matching.tracks)])),
         tracked_visits=tracked_visits(matching),
-    )
-
-
-def _object_metrics(
-    errors: Mapping[str, Moments],
-    present: BoolArray,
-    in_sight: BoolArray,
-    track_ids: IntArray,
-    late_id_switches: int,
-    time_to_confirm_s: Moments,
-) -> ObjectMetrics:
-    """Counts from the track paired with one object at every tick, shape (ticks,)."""
-    track_ids, seen = track_ids[present], in_sight[present]
-    tracked = track_ids != NO_TRACK
-    before = np.concatenate([[NO_TRACK], track_ids])[:-1]
-    stretches = int((tracked & (track_ids != before)).sum())
-    sequence = track_ids[tracked]
-    return ObjectMetrics(
-        errors=errors,
-        ticks_present=len(track_ids),
-        ticks_tracked=len(sequence),
-        breaks=max(stretches - 1, 0),
-        id_switches=int((sequence[1:] != sequence[:-1]).sum()),
-        late_id_switches=late_id_switches,
-        time_to_confirm_s=time_to_confirm_s,
-        ticks_in_sight=int(seen.sum()),
-        ticks_tracked_in_sight=int((seen & tracked).sum()),
     )
 
 
@@ -277,9 +307,7 @@ def _sensor_metrics(run: Run) -> dict[str, SensorMetrics]:
     for sensor in np.unique(updates["sensor"]).tolist():
         mine = updates["sensor"] == sensor
         with_nis = mine & np.isfinite(updates["nis"])
-        moments = {
-            name: (Moments.of_angles if name in ANGULAR else Moments.of)(values[name][mine]) for name in RESIDUAL_NAMES
-        }
+        moments = {name: moments_of(name, values[name][mine]) for name in RESIDUAL_NAMES}
         dispositions = updates["disposition"][mine].tolist()
         sensors[sensor] = SensorMetrics(
             dispositions={name.value: dispositions.count(name.value) for name in Disposition},

@@ -7,7 +7,7 @@ import numpy as np
 
 from fgtrack.core.geometry import cartesian, rotations, wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.evaluation.sight import ego_poses
+from fgtrack.evaluation.truth import ego_poses
 from fgtrack.io.run import Run
 from fgtrack.io.run.schema import Column
 

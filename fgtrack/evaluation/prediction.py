@@ -1,4 +1,4 @@
-"""How good predictions from the published states are: displacement errors some seconds ahead (ADE, FDE)."""
+"""Displacement errors of predictions from the published states some seconds ahead (ADE, FDE)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from fgtrack.evaluation.truth import TRUE_STATE, true_paths
 from fgtrack.io.run import Run
 from fgtrack.models.predictor import ArcPredictor, Predictor, RailPredictor
 
-#: At which times ahead predictions are judged, in s.
+#: Times ahead of the predictions, in s.
 HORIZONS_S = (1.0, 2.0, 3.0, 5.0)
 
 _STEP_S = 0.1
@@ -23,24 +23,35 @@ _PERIOD_NS = NS_PER_S // 10  # of the published node's predictions
 
 @dataclass(frozen=True)
 class PredictionErrors:
-    """Distances of predicted and true positions, of the predictions whose truth is known up to the horizon."""
+    """Distances of predicted and true positions, of the predictions whose truth is known up to the horizon.
+
+    Attributes
+    ----------
+    final_m
+        At the horizon: the mean is the final displacement error, FDE.
+    average_m
+        Of each prediction the mean over every 0.1 s until then: the mean is the average displacement error, ADE.
+    """
 
     final_m: Moments
-    """At the horizon: the mean is the final displacement error, FDE."""
     average_m: Moments
-    """Of each prediction the mean over every 0.1 s until then: the mean is the average displacement error, ADE."""
 
 
 @dataclass(frozen=True)
 class Displacements:
-    """How far predictions are off, ten times a second and for every tenth of a second ahead."""
+    """Distances of predicted from true positions, ten times a second and for every tenth of a second ahead.
+
+    Attributes
+    ----------
+    stamps_ns, object_index
+        Stamp and object of the states that are predicted, shape (n,).
+    distances_m
+        By predictor, up to the last of `HORIZONS_S`, shape (n, m); NaN where the truth is not known.
+    """
 
     stamps_ns: IntArray
-    """What is predicted from, shape (n,)."""
     object_index: IntArray
-    """Object that is predicted, shape (n,)."""
     distances_m: Mapping[str, FloatArray]
-    """By predictor, up to the last of `HORIZONS_S`, shape (n, m); NaN where the truth is not known."""
 
     def at(self, horizon_s: float, predictor: str = "arc") -> FloatArray:
         """Distances `horizon_s` ahead, shape (n,)."""
@@ -48,17 +59,32 @@ class Displacements:
 
 
 def displacements(run: Run, matching: Matching) -> Displacements:
-    """Distances of what the states of `run` predict from the truth.
+    """Distances of predictions from the states of `run` from the truth.
 
-    Predictors are `arc` and, where the run has a map, `rail`. Judged are confirmed tracks that are paired with an
-    object, against that object, wherever it goes. Raises `DataError` where the map that the run names is no map.
+    Predictors are `arc` and, where the run has a map, `rail`. Confirmed tracks that are paired with an object are
+    predicted, and compared with that object, wherever it goes. Raises `DataError` where the map that the run names is
+    not a map.
     """
-    states, stamps_ns, objects = _starts(matching)
+    _, first = np.unique(matching.now_ns // _PERIOD_NS, return_index=True)
+    tracks = matching.tracks
+    states = np.stack([tracks[name] for name in TRUE_STATE], axis=-1)
+    states[:, 4] = np.nan_to_num(states[:, 4])  # models without a yaw rate
+    chosen = matching.paired & np.isin(matching.tick_index, first) & confirmed(tracks) & np.isfinite(states).all(axis=1)
+    stamps_ns, objects = tracks["stamp_ns"][chosen], matching.object_index[chosen]
     ahead_s: FloatArray = _STEP_S * np.arange(1, round(HORIZONS_S[-1] / _STEP_S) + 1, dtype=np.float64)
-    truth = _truth(run, matching, stamps_ns, objects, ahead_s)
+    at_ns = stamps_ns[:, None] + np.round(ahead_s * NS_PER_S).astype(np.int64)
+    truth = np.full((*at_ns.shape, 2), np.nan)
+    for index, path in enumerate(true_paths(run.tables["truth"])):
+        mine = objects == index
+        truth[mine] = path.at(at_ns[mine].reshape(-1))[:, :2].reshape(-1, len(ahead_s), 2)
+    road = roads(run)[0].get("track")
+    predictors: dict[str, Predictor] = {
+        "arc": ArcPredictor(),
+        **({} if road is None else {"rail": RailPredictor(road)}),
+    }
     found = {
-        name: np.asarray(np.linalg.norm(predictor.positions(states, ahead_s) - truth, axis=-1))
-        for name, predictor in _predictors(run).items()
+        name: np.asarray(np.linalg.norm(predictor.positions(states[chosen], ahead_s) - truth, axis=-1))
+        for name, predictor in predictors.items()
     }
     return Displacements(stamps_ns, objects, found)
 
@@ -74,32 +100,3 @@ def prediction_errors(run: Run, matching: Matching | None) -> dict[str, dict[str
             errors = PredictionErrors(Moments.of(until[:, -1]), Moments.of(until.mean(axis=1)))
             found[name][f"{horizon_s:g}s"] = errors
     return found
-
-
-def _predictors(run: Run) -> dict[str, Predictor]:
-    track = roads(run)[0].get("track")
-    return {"arc": ArcPredictor(), **({} if track is None else {"rail": RailPredictor(track)})}
-
-
-def _starts(matching: Matching) -> tuple[FloatArray, IntArray, IntArray]:
-    """States, shape (n, 5), stamps and object indices, shape (n,), of what is predicted from."""
-    _, first = np.unique(matching.now_ns // _PERIOD_NS, return_index=True)
-    tracks = matching.tracks
-    chosen = matching.paired & np.isin(matching.tick_index, first)
-    chosen &= confirmed(tracks)
-    states = np.stack([tracks[name][chosen] for name in TRUE_STATE], axis=-1)
-    states[np.isnan(states[:, 4]), 4] = 0.0  # models without a yaw rate
-    known = np.isfinite(states).all(axis=1)
-    return states[known], tracks["stamp_ns"][chosen][known], matching.object_index[chosen][known]
-
-
-def _truth(run: Run, matching: Matching, stamps_ns: IntArray, objects: IntArray, ahead_s: FloatArray) -> FloatArray:
-    """True positions, shape (n, m, 2), `ahead_s`, shape (m,), of the stamps, shape (n,); NaN where not known."""
-    asked_ns = stamps_ns[:, None] + np.round(ahead_s * NS_PER_S).astype(np.int64)
-    positions = np.full((*asked_ns.shape, 2), np.nan)
-    paths = {path.object_id: path for path in true_paths(run.tables["truth"])}
-    for index, object_id in enumerate(matching.object_ids):
-        mine = objects == index
-        states = paths[object_id].at(asked_ns[mine].reshape(-1))
-        positions[mine] = states[:, :2].reshape(-1, len(ahead_s), 2)
-    return positions

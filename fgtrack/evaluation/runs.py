@@ -1,29 +1,36 @@
-"""Runs that are looked at together: read, labelled, and each matched and evaluated once."""
+"""Runs that are evaluated together: read, labelled, and each matched and evaluated once."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.types import IntArray
-from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
+from fgtrack.core.types import MEASURABLE, IntArray
+from fgtrack.evaluation.lagged import LagMetrics
 from fgtrack.evaluation.matching import Matching, match, recorded
 from fgtrack.evaluation.metrics import Metrics, evaluate_matched
-from fgtrack.evaluation.residual_samples import ResidualSamples, residual_samples
-from fgtrack.io.run import EvaluationConfig, Run, is_run_folder, load_run
+from fgtrack.io.run import EvaluationConfig, Run, Table, is_run_folder, load_run
 
 
 @dataclass(frozen=True, eq=False)
 class JudgedRun:
-    """A run and what evaluation finds, computed when it is first asked for."""
+    """A run and its evaluation, computed when it is first used.
+
+    Attributes
+    ----------
+    label
+        Name among the runs that it is shown with.
+    run
+        The run.
+    """
 
     label: str
-    """Name among the runs that it is shown with."""
     run: Run
 
     @cached_property
@@ -33,38 +40,33 @@ class JudgedRun:
 
     @cached_property
     def options(self) -> EvaluationConfig:
-        """How the run is judged."""
+        """Settings of the evaluation."""
         return self.run.evaluation
 
     @cached_property
     def scored_ticks_ns(self) -> IntArray:
-        """Times of the ticks that scores over all objects are made of, shape (t,); none without truth."""
+        """Times of the ticks that scores over all objects are made of, shape (t,); empty without truth."""
         if self.matching is None:
             return np.zeros(0, dtype=np.int64)
         return self.matching.now_ns[recorded(self.run, self.matching)]
 
-    @cached_property
-    def samples(self) -> ResidualSamples:
-        """Innovations of the confirmed tracks. Raises `DataError` where the map that the run names is no map."""
-        return residual_samples(self.run)
-
-    @cached_property
+    @property
     def lagged(self) -> tuple[LagMetrics, ...]:
         """Errors of present, lagged and final states; empty for a run without truth."""
-        return lag_metrics(self.run, self.matching)
+        return self.metrics.lagged
 
     @cached_property
     def metrics(self) -> Metrics:
-        """All metrics, judged as the run's configuration says."""
-        return evaluate_matched(self.run, self.matching, self.options, self.samples)
+        """All metrics, by the settings of the run's configuration."""
+        return evaluate_matched(self.run, self.matching, self.options)
 
 
 OneRun = Run | JudgedRun | Path | str
-Runs = OneRun | Iterable[OneRun | Iterable[OneRun]]
+Runs = OneRun | Mapping[str, OneRun] | Iterable[OneRun | Iterable[OneRun] | Mapping[str, OneRun]]
 
 
 def judged(runs: Runs) -> list[JudgedRun]:
-    """Runs under labels of their own; a path is a run folder, or a folder that holds some.
+    """Runs under labels of their own; a path is a run folder, or a folder that holds some; a mapping gives labels.
 
     Runs of a folder come by name; they may be one folder deeper, as in that of `fgtrack demo`.
 
@@ -79,20 +81,11 @@ def judged(runs: Runs) -> list[JudgedRun]:
     for one in every:
         if not isinstance(one, OneRun):
             raise CallError(f"runs: must be runs or paths of run folders, there is a {type(one).__name__}")
-    if every and all(isinstance(run, JudgedRun) for run in every):
-        return [run for run in every if isinstance(run, JudgedRun)]
-    plain = [run.run if isinstance(run, JudgedRun) else run for run in every]
-    read = [found for run in plain for found in ([run] if isinstance(run, Run) else _read(Path(run)))]
+    if all(isinstance(one, JudgedRun) for one in every):
+        return every
+    plain = [one.run if isinstance(one, JudgedRun) else one for one in every]
+    read = [found for one in plain for found in ([one] if isinstance(one, Run) else _read(Path(one)))]
     return [JudgedRun(label, run) for label, run in labelled(read).items()]
-
-
-def run_folders(runs: Iterable[JudgedRun]) -> list[Path]:
-    """The folders of `runs`, of those that have one."""
-    return [one.run.path for one in runs if one.run.path is not None]
-
-
-def _several(given: Any) -> list[Any]:  # Any: what a user gives
-    return [given] if isinstance(given, OneRun) or not isinstance(given, Iterable) else list(given)
 
 
 def one_judged(run: OneRun) -> JudgedRun:
@@ -111,20 +104,22 @@ def one_judged(run: OneRun) -> JudgedRun:
     return every[0]
 
 
+def run_folders(runs: Iterable[JudgedRun]) -> list[Path]:
+    """The folders of `runs`, of those that have one."""
+    return [one.run.path for one in runs if one.run.path is not None]
+
+
 def start_ns(runs: Sequence[JudgedRun]) -> int:
-    """Time of the first tick of `runs`; 0 where there is none."""
-    return min(
-        (int(one.run.tables["timing"]["now_ns"][0]) for one in runs if one.run.tables["timing"].num_rows), default=0
-    )
+    """Time of the first tick of `runs`; 0 without one."""
+    return min((int(ns[0]) for ns in map(_ticks_ns, runs) if len(ns)), default=0)
 
 
 def starts_ns(runs: Sequence[JudgedRun]) -> dict[str, int]:
-    """By label when the recording of each run begins: the first tick of it and of those that ran at the same time."""
-    ticks = {one.label: one.run.tables["timing"]["now_ns"] for one in runs}
-    spans = {label: (int(now_ns[0]), int(now_ns[-1])) if len(now_ns) else (0, 0) for label, now_ns in ticks.items()}
+    """Start of the recording of each run, by label: the first tick of it and of those that ran at the same time."""
+    ends = {one.label: (int(ns[0]), int(ns[-1])) if len(ns) else (0, 0) for one in runs for ns in [_ticks_ns(one)]}
     return {
-        label: min(first for first, last in spans.values() if first <= end and last >= begin)
-        for label, (begin, end) in spans.items()
+        label: min(first for first, last in ends.values() if first <= end and last >= begin)
+        for label, (begin, end) in ends.items()
     }
 
 
@@ -138,23 +133,64 @@ def labelled(runs: Sequence[Run]) -> dict[str, Run]:
     CallError
         A run is given twice.
     """
-    for identity, count in Counter(run.path.resolve() if run.path else id(run) for run in runs).items():
-        if count > 1:
+    for identity, times in Counter(run.path.resolve() if run.path else id(run) for run in runs).items():
+        if times > 1:
             raise CallError(f"{identity if isinstance(identity, Path) else 'run'}: is given twice, name every run once")
     paths = [run.path.resolve() for run in runs if run.path]
-    length = 1
-    while len({path.parts[-length:] for path in paths}) < len(paths):
-        length += 1
+    length = next(n for n in count(1) if len({path.parts[-n:] for path in paths}) == len(paths))
     labels: dict[str, Run] = {}
     for run in runs:
         estimator = str(run.meta.get("estimator", "run"))
         label = "/".join(run.path.resolve().parts[-length:]) if run.path else estimator
         label = label if estimator in label else f"{label} ({estimator})"
-        same = 1
-        while (unique := label if same == 1 else f"{label} #{same}") in labels:
-            same += 1
-        labels[unique] = run
+        unique = (label if n == 1 else f"{label} #{n}" for n in count(1))
+        labels[next(name for name in unique if name not in labels)] = run
     return labels
+
+
+def same_recording(one: Run, other: Run) -> bool:
+    """True if two runs are of the same scene, detected by the same sensors.
+
+    The truth is the same, and of every sensor that both have the detections are as many and have the same values, at
+    the same stamps (a recording with other delays) or the same receipts (a configuration with other stamps). Without a
+    common sensor and without truth the ego decides, without that the path of the recording.
+    """
+    if not one.tables["truth"].equals(other.tables["truth"]):
+        return False
+    common = np.intersect1d(one.tables["updates"]["sensor"], other.tables["updates"]["sensor"]).tolist()
+    if common:
+        return all(_same_detections(one, other, sensor) for sensor in common)
+    if one.tables["truth"].num_rows:
+        return True
+    if one.tables["ego"].num_rows or other.tables["ego"].num_rows:
+        return one.tables["ego"].equals(other.tables["ego"])
+    return one.recording is not None and one.recording == other.recording
+
+
+def by_recording(runs: Sequence[JudgedRun]) -> list[list[JudgedRun]]:
+    """`runs` in groups, those of the same recording together."""
+    groups: list[list[JudgedRun]] = []
+    for one in runs:
+        group = next((group for group in groups if same_recording(group[0].run, one.run)), None)
+        if group is None:
+            groups.append([one])
+        else:
+            group.append(one)
+    return groups
+
+
+def recordings_warning(runs: Sequence[JudgedRun]) -> list[str]:
+    """A line where `runs` are of different recordings, with their names; empty otherwise."""
+    groups = by_recording(runs)
+    texts = [f"{', '.join(one.label for one in group)} ({_source(group[0].run)})" for group in groups]
+    what = f"the runs are of {len(groups)} recordings, so their numbers cannot be compared across them"
+    return [f"{what}: {'; '.join(texts)}"] if len(groups) > 1 else []
+
+
+def _several(given: Any) -> list[Any]:  # Any: what a user gives
+    if isinstance(given, Mapping):
+        return [JudgedRun(str(label), one_judged(run).run) for label, run in given.items()]
+    return [given] if isinstance(given, OneRun) or not isinstance(given, Iterable) else list(given)
 
 
 def _read(path: Path) -> list[Run]:
@@ -165,3 +201,39 @@ def _read(path: Path) -> list[Run]:
         if below:
             return below
     raise CallError(f"{path}: no run folder, make one with `fgtrack replay`")
+
+
+def _ticks_ns(one: JudgedRun) -> IntArray:
+    return one.run.tables["timing"]["now_ns"]
+
+
+def _same_detections(one: Run, other: Run, sensor: str) -> bool:
+    """True if the detections of a sensor are the same, in the order of the stamps or of the receipts."""
+    runs = (one, other)
+    updates = [run.tables["updates"].where(run.tables["updates"]["sensor"] == sensor) for run in runs]
+    tables = [run.tables["detections"].where(run.tables["detections"]["sensor"] == sensor) for run in runs]
+    same = [k for k in ("stamp_ns", "receipt_ns") if np.array_equal(np.sort(updates[0][k]), np.sort(updates[1][k]))]
+    if not all(table.num_rows for table in tables):  # of fgtrack 0.1
+        return bool(same)
+    return any(_same_values(tables, time) for time in same)
+
+
+def _same_values(tables: Sequence[Table], time: str) -> bool:
+    """True if two sensors measured the same in the order of `time`, as far as both have values."""
+    if tables[0].num_rows != tables[1].num_rows:
+        return False
+    orders = [np.lexsort((table["index"], table[time])) for table in tables]
+    for name in MEASURABLE:
+        a, b = (table[name][order] for table, order in zip(tables, orders, strict=True))
+        known = np.isfinite(a) & np.isfinite(b)
+        if not np.array_equal(a[known], b[known]):
+            return False
+    return True
+
+
+def _source(run: Run) -> str:
+    source = run.meta.get("input") or {}
+    words = [str(source["path"])] if source.get("path") else []
+    if run.meta.get("messages_received"):
+        words.append(f"{run.meta['messages_received']} messages")
+    return ", ".join(words) or f"{run.tables['updates'].num_rows} detections"

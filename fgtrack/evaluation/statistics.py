@@ -16,12 +16,19 @@ NORMAL_95 = 1.959963984540054
 
 @dataclass(frozen=True)
 class Moments:
-    """Count, mean and spread of a sample; the moments of two samples add up to those of both together."""
+    """Moments of a sample; those of two samples add up to those of both together.
+
+    Attributes
+    ----------
+    count, mean
+        Size and mean of the sample.
+    squares
+        Sum of squared deviations from the mean.
+    """
 
     count: int = 0
     mean: float = math.nan
     squares: float = 0.0
-    """Sum of squared deviations from the mean."""
 
     @classmethod
     def of(cls, values: FloatArray) -> Self:
@@ -90,12 +97,19 @@ class Distribution:
 
 @dataclass(frozen=True)
 class ChiSquareMean:
-    """Mean of independent normalised squares (NEES, NIS) and its expected value; two samples add up."""
+    """Mean of independent normalised squares (NEES, NIS).
+
+    Attributes
+    ----------
+    count, mean
+        Size and mean of the sample.
+    dof
+        Mean of the degrees of freedom: the expected value of `mean`.
+    """
 
     count: int = 0
     mean: float = math.nan
     dof: float = math.nan
-    """Mean of the degrees of freedom: the expected value of `mean`."""
 
     @classmethod
     def of(cls, values: FloatArray, dof: IntArray) -> Self:
@@ -104,15 +118,6 @@ class ChiSquareMean:
         if not known.any():
             return cls()
         return cls(int(known.sum()), float(values[known].mean()), float(dof[known].mean()))
-
-    def __add__(self, other: "ChiSquareMean") -> "ChiSquareMean":
-        if not self.count or not other.count:
-            return self if self.count else other
-        count = self.count + other.count
-        share = other.count / count
-        return ChiSquareMean(
-            count, self.mean + share * (other.mean - self.mean), self.dof + share * (other.dof - self.dof)
-        )
 
     @property
     def band(self) -> tuple[float, float]:

@@ -1,243 +1,303 @@
-"""Tables of numbers by column name, and their forms: terminal, Markdown, LaTeX, CSV, JSON values."""
+"""Tables: records of numbers in SI units, and how people read them on a terminal, in Markdown and in LaTeX."""
 
-import copy
 import csv
 import io
 import math
+import re
+import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
-from typing import Any, Generic, Literal, Self, TypeVar
+from itertools import takewhile
+from typing import Any, Literal, TypeVar, overload
 
-import numpy as np
-import numpy.typing as npt
+from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from fgtrack.core.errors import printable, printable_lines
-from fgtrack.evaluation.terminal import Shown, bulleted, lines, of_rows
-from fgtrack.io.run import Table as RunTable
 
-Row = TypeVar("Row")
-Cell = TypeVar("Cell")
 Value = str | int | float
+Record = Mapping[str, Any]  # Any: text, integers, floats, None
+Cell = TypeVar("Cell")
+DataFrame = Any  # pandas, which is untyped and imported where it is used
 
 NO_VALUE = "-"
+PERCENT = 100.0
+MS = 1e3
 
-_MOST_DECIMALS = 5
 _WIDTH = 120  # of a table as text
 _MOST_SENTENCES = 10  # of the verdict in a repr
 _MARKDOWN = {"\\": r"\\", "|": r"\|", "<": r"\<"}
 _LATEX = {char: f"\\{char}" for char in "&%$#_{}"} | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _LATEX |= {"\\": r"\textbackslash{}", "±": r"$\pm$", "<": r"$<$", ">": r"$>$"}
+_QUANTITY = re.compile(r"(\d) (%|mm?|m/s|rad|s)(?=\W|$)")
 
 
-def short(value: Value) -> str:
-    """`value` with three significant digits, whole numbers and text in full; a dash for NaN."""
-    if isinstance(value, str | int):
+def short(value: Value, digits: int = 3, most_decimals: int = 3) -> str:
+    """`value` with three significant digits, integers and text in full; a dash for NaN."""
+    if not isinstance(value, float):
         return str(value)
     if not math.isfinite(value):
         return NO_VALUE
-    size = abs(float(f"{value:.2e}"))
-    decimals = 0 if size >= 100.0 else 1 if size >= 10.0 else 2 if size >= 1.0 else 3
+    size = abs(float(f"{value:.{digits - 1}e}"))
+    decimals = digits - 1 - math.floor(math.log10(size)) if size else most_decimals
+    decimals = min(max(decimals, 0), most_decimals)
     return f"{round(value, decimals) + 0.0:.{decimals}f}"  # no negative zero
 
 
 def two_digits(value: Value) -> str:
-    """`value` with two significant digits and at most five decimals, whole numbers in full; a dash for NaN."""
-    if isinstance(value, str | int):
-        return str(value)
-    if not math.isfinite(value):
-        return NO_VALUE
-    size = abs(float(f"{value:.1e}"))
-    if round(size, _MOST_DECIMALS) == 0.0:
-        return "0"
-    decimals = min(max(0, 1 - math.floor(math.log10(size))), _MOST_DECIMALS)
-    return f"{value:.{decimals}f}"
+    """`value` with two significant digits and at most five decimals, integers in full; a dash for NaN."""
+    text = short(value, 2, 5)
+    return "0" if text == "0.00000" else text
 
 
 @dataclass(frozen=True)
-class Column(Generic[Row]):
-    """One or several numbers of every row, and the one cell that shows them."""
+class Column:
+    """One or several numbers of every record, in one cell.
+
+    Attributes
+    ----------
+    heading
+        Lines, with the unit.
+    names
+        Keys of the numbers, separated by spaces; by default the heading.
+    form
+        How their texts become the cell.
+    scale
+        What is shown is as many times the number.
+    text
+        The text of a number.
+    left
+        True for text, which is aligned left. The leading columns of text name the rows.
+    when
+        `few`: unless the table is shown in full; `full`: only then.
+    bold
+        True for the records whose cell is bold.
+    note
+        A line below the table where the column is shown.
+    cell_of
+        The cell of a record, instead of all this.
+    """
 
     heading: str
-    """Lines, with the unit; a column without heading is in the data alone."""
-    names: tuple[str, ...]
-    """Names of the numbers, with their units."""
-    of: Callable[[Row], tuple[Value, ...] | None]
-    """The numbers; None where the row has none."""
+    names: str = ""
     form: str = "{}"
-    """How the numbers become one cell."""
     scale: float = 1.0
-    """What is shown is as many times the number."""
     text: Callable[[Value], str] = short
     left: bool = False
-    """Whether cells are aligned left, for text; else right."""
-    bold: Callable[[Row], bool] | None = None
-    """Which rows have the best value; none without it."""
     when: Literal["always", "few", "full"] = "always"
-    """Whether it is shown only among few columns, or only where the table is shown in full."""
+    bold: Callable[[Record], bool] = lambda record: False
     note: str = ""
-    """A line below the table where the column is shown."""
+    cell_of: Callable[[Record], str] | None = None
 
-    def cell(self, values: tuple[Value, ...] | None) -> str:
-        """What is shown; a dash where no number is known."""
-        texts = [self.text(v * self.scale if isinstance(v, float) else v) for v in values or ()]
+    def cell(self, record: Record) -> str:
+        """Text of the numbers of `record`; a dash where none is known."""
+        if self.cell_of is not None:
+            return self.cell_of(record)
+        values = [record.get(name) for name in (self.names or self.heading).split()]
+        texts = [
+            NO_VALUE if value is None else self.text(value * self.scale if isinstance(value, float) else value)
+            for value in values
+        ]
         return self.form.format(*texts) if set(texts) - {NO_VALUE} else NO_VALUE
 
 
-class Table(RunTable):
-    """Columns by name, each of shape (rows,): SI units, NaN where there is no value. `str` shows it as text.
+RUN = Column("run", left=True)
+
+
+def named(name: str, moment: str) -> str:
+    """`name` of a quantity with the `moment` before its unit: position_rmse_m."""
+    quantity, _, unit = name.rpartition("_")
+    return f"{quantity}_{moment}_{unit}"
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A column as text."""
+
+    heading: str
+    cells: Sequence[str]
+    bold: Sequence[bool]
+    left: bool
+
+    @property
+    def width(self) -> int:
+        """Width in a terminal, without the space beside it."""
+        return max(map(cell_len, (*self.heading.split("\n"), *self.cells)), default=0)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Records and the columns that show them; `str` gives the text of a terminal of 120 columns.
 
     Attributes
     ----------
     title
-        What it is.
-    row_keys
-        Names of the columns that identify a row; the first is the run.
+        Caption.
+    records
+        Rows: numbers by name with their units; a name that is missing, None and NaN are no value.
+    columns
+        What is shown.
+    keys
+        Names that identify a row; the first is the run.
     notes
-        Lines below the table, where it is shown in full.
-    shown
-        Columns as people read them: rounded, in handy units, some with several numbers in a cell.
+        Lines below the table.
     is_detail
-        Whether it is shown only where a comparison is shown in full.
+        True for a table that is shown only where a comparison is shown in full.
+    is_main
+        True for the records that are shown unless the table is shown in full.
+    is_full
+        True if all columns and records are shown.
     """
 
-    def __init__(
-        self,
-        title: str,
-        columns: Sequence[Column[Row]],
-        rows: Sequence[Row],
-        row_keys: tuple[str, ...] = ("run",),
-        notes: Sequence[str] = (),
-        *,
-        detail: bool = False,
-        detail_rows: Callable[[Row], bool] = lambda row: False,
-    ) -> None:
-        self.title, self.row_keys, self.is_detail = printable(title), row_keys, detail
-        data: dict[str, npt.NDArray[Any]] = {}  # Any: a column holds floats, integers or text
-        shown = []
-        for column in columns:
-            values = [column.of(row) for row in rows]
-            for k, name in enumerate(column.names):
-                data[name] = np.array([math.nan if one is None else one[k] for one in values])
-            cells = tuple(printable(column.cell(each)) for each in values)
-            if column.heading:
-                bold = tuple(column.bold is not None and column.bold(row) for row in rows)
-                shown.append((column, Shown(printable_lines(column.heading), cells, column.left, bold)))
-        super().__init__(data)
-        self._shown, self._own_notes, self._full = shown, tuple(notes), False
-        self._few_rows = [k for k, row in enumerate(rows) if not detail_rows(row)]
-        self.shown = tuple(each for column, each in shown if column.when != "few")
-        self.notes = self._notes("few")
+    title: str
+    records: Sequence[Record]
+    columns: Sequence[Column]
+    keys: Sequence[str] = ("run",)
+    notes: Sequence[str] = ()
+    is_detail: bool = False
+    is_main: Callable[[Record], bool] = lambda record: True
+    is_full: bool = False
 
-    def in_full(self) -> Self:
-        """The same table, which shows all of its columns and rows; without it `str` and files show the main ones."""
-        full = copy.copy(self)
-        full._full = True
-        return full
+    def in_full(self) -> "Table":
+        """The same table with all columns and records shown."""
+        return replace(self, is_full=True)
 
     @property
     def has_more(self) -> bool:
-        """Whether there is more than what is shown."""
-        hidden = len(self._few_rows) < self.num_rows or any(column.when == "full" for column, _ in self._shown)
-        return hidden and not self._full
+        """True if there is more than what is shown."""
+        hidden = any(column.when == "full" for column in self.columns) or not all(map(self.is_main, self.records))
+        return hidden and not self.is_full
+
+    @property
+    def names(self) -> list[str]:
+        """Names of all numbers."""
+        return list(dict.fromkeys(name for record in self.records for name in record))
+
+    @property
+    def data(self) -> DataFrame:
+        """All numbers as a pandas DataFrame."""
+        import pandas as pd  # slow to load, and no command needs it
+
+        return pd.DataFrame([dict(record) for record in self.records], columns=self.names)
+
+    def plain(self) -> list[dict[str, Value | None]]:
+        """Records as JSON values: None where there is no value."""
+        return [{name: _plain(record.get(name)) for name in self.names} for record in self.records]
+
+    def to_csv(self) -> str:
+        """All numbers with all digits; an empty cell where there is no value."""
+        return csv_text([self.names, *(record.values() for record in self.plain())])
+
+    def to_markdown(self) -> str:
+        """What is shown as a table of GitHub Markdown under a heading, the notes below."""
+        shown = self.shown()
+        head, *rows = grid(shown, lambda cell, bold: f"**{_markdown(cell.strip())}**" if bold else _markdown(cell))
+        rule = [":---" if column.left else "---:" for column in shown]
+        lines = [
+            f"### {_markdown(printable(self.title))}",
+            "",
+            *(f"| {' | '.join(row)} |" for row in (head, rule, *rows)),
+            "",
+        ]
+        return "\n".join(
+            [*lines, *(f"- {_markdown(note)}" for note in self.shown_notes()), *([""] if self.shown_notes() else [])]
+        )
+
+    def to_latex(self) -> str:
+        """What is shown as a table environment with the rules of the package booktabs; notes as comments."""
+        shown = self.shown()
+        head, *rows = grid(shown, lambda cell, bold: f"\\textbf{{{_latex(cell)}}}" if bold else _latex(cell))
+        body = [f"{'{}' if row[0][:1] in ('[', '*') else ''}{' & '.join(row)} \\\\" for row in rows]  # no option of \\
+        spec = "".join("l" if column.left else "r" for column in shown)
+        begin = [r"\begin{table}", r"\centering", f"\\caption{{{_latex(printable(self.title))}}}"]
+        begin += [f"\\begin{{tabular}}{{{spec}}}", r"\toprule", f"{' & '.join(head)} \\\\", r"\midrule"]
+        end = [r"\bottomrule", r"\end{tabular}", *(f"% {note}" for note in self.shown_notes()), r"\end{table}", ""]
+        return "\n".join([*begin, *body, *end])
+
+    def _repr_html_(self) -> str:
+        head, *rows = grid(self.shown(), lambda cell, bold: f"<b>{escape(cell)}</b>" if bold else escape(cell))
+        lines = [f"<tr><th>{'</th><th>'.join(head)}</th></tr>"]
+        lines += [f"<tr><td>{'</td><td>'.join(row)}</td></tr>" for row in rows]
+        notes = "".join(f"<li>{escape(note)}</li>" for note in self.shown_notes())
+        caption = f"<caption>{escape(printable(self.title))}</caption>"
+        return f"<table>{caption}{''.join(lines)}</table>" + f"<ul>{notes}</ul>" * bool(notes)
 
     def __str__(self) -> str:
         return _text(self)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """The table, its columns arranged as the width of the terminal demands."""
-        yield Text(f"\n{self.title}")
-        yield from lines(self._visible(), options.max_width)
-        yield from map(Text, self._visible_notes())
+        yield Text(f"\n{printable(self.title)}")
+        for line in _arranged(self.shown(), options.max_width):
+            yield from line.divide(range(options.max_width, line.cell_len, options.max_width))
+        yield from map(Text, self.shown_notes())
 
-    def _visible(self) -> list[Shown]:
-        if self._full:
-            return list(self.shown)
-        return [of_rows(each, self._few_rows) for column, each in self._shown if column.when != "full"]
+    def _visible(self) -> list[Column]:
+        return [column for column in self.columns if column.when != ("few" if self.is_full else "full")]
 
-    def _visible_notes(self) -> tuple[str, ...]:
-        return self.notes if self._full else self._notes("full")
+    def shown(self) -> list[Shown]:
+        """The columns as text."""
+        records = [record for record in self.records if self.is_full or self.is_main(record)]
+        return [
+            Shown(
+                printable_lines(column.heading),
+                [printable(column.cell(record)) for record in records],
+                [column.bold(record) for record in records],
+                column.left,
+            )
+            for column in self._visible()
+        ]
 
-    def _notes(self, hidden: str) -> tuple[str, ...]:
-        """The notes, without those of the columns that are `hidden`."""
-        of_columns = (column.note for column, _ in self._shown if column.note and column.when != hidden)
-        return tuple(dict.fromkeys(map(printable, (*of_columns, *self._own_notes))))
-
-    def to_markdown(self) -> str:
-        """A table of GitHub Markdown under a heading, the notes below."""
-        shown, notes = self._visible(), self._visible_notes()
-        head = [_markdown(_one_line(column.heading)) for column in shown]
-        rule = [":---" if column.left else "---:" for column in shown]
-        cells = cell_rows(shown, lambda cell, bold: f"**{_markdown(cell.strip())}**" if bold else _markdown(cell))
-        text = [f"### {_markdown(self.title)}", "", *(f"| {' | '.join(row)} |" for row in (head, rule, *cells)), ""]
-        return "\n".join([*text, *(f"- {_markdown(note)}" for note in notes), *([""] if notes else [])])
-
-    def _repr_html_(self) -> str:
-        """The table as a notebook shows it."""
-        shown = self._visible()
-        head = "".join(f"<th>{escape(_one_line(column.heading))}</th>" for column in shown)
-        cells = cell_rows(shown, lambda cell, bold: f"<td>{f'<b>{escape(cell)}</b>' if bold else escape(cell)}</td>")
-        rows = "".join(f"<tr>{''.join(row)}</tr>" for row in cells)
-        notes = "".join(f"<li>{escape(note)}</li>" for note in self._visible_notes())
-        table = f"<table><caption>{escape(self.title)}</caption><tr>{head}</tr>{rows}</table>"
-        return table + f"<ul>{notes}</ul>" * bool(notes)
-
-    def to_latex(self) -> str:
-        """A table environment with the rules of the package booktabs; notes as comments."""
-        shown = self._visible()
-        head = [_latex(_one_line(column.heading)) for column in shown]
-        rows = cell_rows(shown, lambda cell, bold: f"\\textbf{{{_latex(cell)}}}" if bold else _latex(cell))
-        body = [f"{'{}' if row[0][:1] in ('[', '*') else ''}{' & '.join(row)} \\\\" for row in rows]  # no option of \\
-        spec = "".join("l" if column.left else "r" for column in shown)
-        return "\n".join(
-            [
-                *(r"\begin{table}", r"\centering", f"\\caption{{{_latex(self.title)}}}"),
-                *(f"\\begin{{tabular}}{{{spec}}}", r"\toprule", f"{' & '.join(head)} \\\\", r"\midrule", *body),
-                *(
-                    r"\bottomrule",
-                    r"\end{tabular}",
-                    *(f"% {note}" for note in self._visible_notes()),
-                    r"\end{table}",
-                    "",
-                ),
-            ]
-        )
-
-    def to_csv(self) -> str:
-        """All columns with all digits; an empty cell where there is no value."""
-        return _csv([tuple(self), *(tuple(record.values()) for record in self.records())])
-
-    def records(self) -> list[dict[str, Value | None]]:
-        """Rows as values by name; None where there is none."""
-        columns = [[_plain(value) for value in column.tolist()] for column in self.values()]
-        return [dict(zip(self, row, strict=True)) for row in zip(*columns, strict=True)]
+    def shown_notes(self) -> list[str]:
+        """Notes of the columns that are shown, and of the table."""
+        of_columns = (column.note for column in self._visible() if column.note)
+        return list(dict.fromkeys(map(printable, (*of_columns, *self.notes))))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Tables(Mapping[str, Table]):
-    """Tables by name; `str` gives the verdict and the main tables as text, in full all that have rows."""
+class Tables(Mapping[str, DataFrame]):
+    """Tables by name: `tables["tracking"]` is a pandas DataFrame, `tables[["tracking", "lag"]]` are two of the tables.
+
+    `str` gives the verdict and the main tables as text, in full all that have rows.
+
+    Attributes
+    ----------
+    tables
+        By name, each with its `data` and the columns that show it.
+    details
+        JSON values beside the tables.
+    verdict
+        Sentences that summarise the tables.
+    is_full
+        True if all tables are shown, with all columns and records.
+    """
 
     tables: Mapping[str, Table]
     details: Mapping[str, Any] = field(default_factory=dict)  # Any: JSON values
-    """What JSON has besides the tables."""
     verdict: tuple[str, ...] = ()
-    """Sentences that say what the tables amount to."""
     is_full: bool = False
 
     def in_full(self) -> "Tables":
-        """The same tables, which show all of their columns and rows, and those of details."""
+        """The same tables, all of them shown with all columns and records."""
         return replace(self, tables={name: table.in_full() for name, table in self.tables.items()}, is_full=True)
 
     @property
     def has_more(self) -> bool:
-        """Whether there is more than what is shown."""
-        filled = [table for table in self.tables.values() if table.num_rows]
+        """True if there is more than what is shown."""
+        filled = [table for table in self.tables.values() if table.records]
         return not self.is_full and any(table.is_detail or table.has_more for table in filled)
 
-    def __getitem__(self, name: str) -> Table:
-        return self.tables[name]
+    @overload
+    def __getitem__(self, name: str) -> DataFrame: ...
+
+    @overload
+    def __getitem__(self, name: list[str]) -> "Tables": ...
+
+    def __getitem__(self, name: str | list[str]) -> DataFrame:
+        if isinstance(name, list):
+            return Tables({one: self.tables[one].in_full() for one in name}, is_full=True)
+        return self.tables[name].data
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.tables)
@@ -246,14 +306,15 @@ class Tables(Mapping[str, Table]):
         return len(self.tables)
 
     def __str__(self) -> str:
-        parts: list[Table | Text] = [*bulleted(self.verdict, _WIDTH), *self._filled()]
-        return "\n".join(map(_text, parts))
+        return _text(self)
 
     def __repr__(self) -> str:
-        filled = [name for name, table in self.items() if table.num_rows]
-        return "\n".join(
-            ["Tables", *(f"  {line}" for line in self.verdict[:_MOST_SENTENCES]), f"  {', '.join(filled)}"]
-        )
+        lines = [
+            "Tables",
+            *self.verdict[:_MOST_SENTENCES],
+            ", ".join(k for k, table in self.tables.items() if table.records),
+        ]
+        return "\n  ".join(lines)
 
     def _repr_html_(self) -> str:
         verdict = "".join(f"<li>{escape(printable(line))}</li>" for line in self.verdict)
@@ -263,64 +324,111 @@ class Tables(Mapping[str, Table]):
         yield from bulleted(self.verdict, options.max_width)
         yield from self._filled()
 
-    def to_markdown(self, name: str | None = None) -> str:
-        """The table `name`, or those that are shown."""
-        verdict = [] if name else [f"- {_markdown(printable(line))}" for line in self.verdict]
-        lines = "\n".join([*verdict, "", ""]) if verdict else ""
-        return lines + "\n".join(table.to_markdown() for table in self._filled(name))
+    def to_markdown(self) -> str:
+        """Verdict and tables, as far as they are shown."""
+        verdict = "".join(f"- {_markdown(printable(line))}\n" for line in self.verdict)
+        return f"{verdict}\n" * bool(verdict) + "\n".join(table.to_markdown() for table in self._filled())
 
-    def to_latex(self, name: str | None = None) -> str:
-        """The table `name`, or those that are shown."""
-        lines = "" if name else "".join(f"% {printable(line)}\n" for line in self.verdict)
-        return lines + "\n".join(table.to_latex() for table in self._filled(name))
+    def to_latex(self) -> str:
+        """Tables, as far as they are shown, the verdict as comments."""
+        verdict = "".join(f"% {printable(line)}\n" for line in self.verdict)
+        return verdict + "\n".join(table.to_latex() for table in self._filled())
 
-    def to_csv(self, name: str | None = None) -> str:
-        """The table `name`, or all numbers in one of five columns: table, run, part (sensor, lag), quantity, value."""
-        if name is not None:
-            return self[name].to_csv()
-        rows: list[tuple[Value | None, ...]] = [("table", "run", "part", "quantity", "value")]
+    def to_csv(self) -> str:
+        """All numbers, one in a row of five columns: table, run, part (sensor, lag), quantity, value."""
+        rows: list[Sequence[Value | None]] = [("table", "run", "part", "quantity", "value")]
         for name, table in self.tables.items():
-            for record in table.records():
-                run, *part = (record[key] for key in table.row_keys)
-                rows += [(name, run, *(part or [""]), k, v) for k, v in record.items() if k not in table.row_keys]
-        return _csv(rows)
+            for record in table.plain():
+                run, *part = (record[key] for key in table.keys)
+                rows += [(name, run, *(part or [""]), k, v) for k, v in record.items() if k not in table.keys]
+        return csv_text(rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON values: the verdict, the details, and the tables as lists of rows."""
-        return {
-            "verdict": list(self.verdict),
-            **self.details,
-            "tables": {name: table.records() for name, table in self.tables.items()},
-        }
+        """JSON values: the verdict, the details, and the tables as lists of records."""
+        tables = {name: table.plain() for name, table in self.tables.items()}
+        return {"verdict": list(self.verdict), **self.details, "tables": tables}
 
-    def _filled(self, name: str | None = None) -> list[Table]:
-        if name is not None:
-            return [self[name]]
-        return [table for table in self.tables.values() if table.num_rows and (self.is_full or not table.is_detail)]
+    def _filled(self) -> list[Table]:
+        return [table for table in self.tables.values() if table.records and (self.is_full or not table.is_detail)]
 
 
-def _text(shown: Table | Text) -> str:
+def bulleted(sentences: Iterable[str], width: int) -> Iterator[Text]:
+    """Sentences, each behind a dash, wrapped between words; a number and its unit stay together."""
+    for sentence in sentences:
+        kept = _QUANTITY.sub("\\1\u00a0\\2", printable(sentence))
+        for line in textwrap.wrap(kept, width, initial_indent="- ", subsequent_indent="  ", break_on_hyphens=False):
+            yield _line(line.replace("\u00a0", " "))
+
+
+def _text(shown: Table | Tables) -> str:
     console = Console(file=io.StringIO(), width=_WIDTH, color_system=None, force_terminal=False)
     with console.capture() as capture:
         console.print(shown)
     return capture.get().removesuffix("\n")
 
 
-def cell_rows(columns: Sequence[Shown], form: Callable[[str, bool], Cell]) -> Iterator[list[Cell]]:
-    """Rows of cells as `form` makes them of the text and whether it is bold; the first cell only where it changes."""
-    before = ""
-    for marks, (first, *cells) in zip(
-        zip(*(column.bold for column in columns), strict=True),
-        zip(*(column.cells for column in columns), strict=True),
-        strict=True,
-    ):
-        texts = ("" if first == before else first, *cells)
-        yield [form(text, mark) for text, mark in zip(texts, marks, strict=True)]
-        before = first
+def grid(shown: Sequence[Shown], form: Callable[[str, bool], Cell]) -> Iterator[list[Cell]]:
+    """Headings and rows in a `form` of text and whether it is bold; the first cell only where it changes."""
+    headings = (column.heading.replace("-\n", "").replace("/\n", "/").replace("\n", " ") for column in shown)
+    yield [form(heading, False) for heading in headings]
+    for k, first in enumerate(shown[0].cells):
+        repeated = k > 0 and shown[0].cells[k - 1] == first
+        yield [form("" if repeated and column is shown[0] else column.cells[k], column.bold[k]) for column in shown]
 
 
-def _one_line(heading: str) -> str:
-    return heading.replace("-\n", "").replace("/\n", "/").replace("\n", " ")
+def _arranged(shown: Sequence[Shown], width: int) -> list[Text]:
+    """Lines of a terminal, no longer than `width` where possible, and as few as possible.
+
+    What does not fit beside the names of the rows stands in further parts below, each with the names; the first name
+    stands beside its rows, or on a line above them.
+    """
+    layouts = [list(_layout(shown, width, above)) for above in ([False, True] if shown[0].left else [False])]
+    return min(layouts, key=lambda lines: (any(line.cell_len > width for line in lines), len(lines)))
+
+
+def _layout(shown: Sequence[Shown], width: int, above: bool) -> Iterator[Text]:
+    title, indent = (shown[0], "  ") if above else (None, "")
+    names = [*takewhile(lambda column: column.left, shown)]
+    parts = [names[above:]]
+    for column in shown[len(names) :]:
+        if len(parts[-1]) > len(names[above:]) and _width(indent, [*parts[-1], column]) > width:
+            parts.append(names[above:])
+        parts[-1].append(column)
+    for number, part in enumerate(parts):
+        if number:
+            yield _line("continued:")
+        if title is not None and title.heading:
+            yield _line(f" {title.heading}")
+        headings = [column.heading.split("\n") for column in part]
+        for k in range(max(map(len, headings), default=0), 0, -1):
+            yield _row(part, [lines[-k] if k <= len(lines) else "" for lines in headings], None, indent)
+        yield _line("─" * max(_width(indent, part), 1))
+        for k, first in enumerate(shown[0].cells):
+            repeated = k > 0 and shown[0].cells[k - 1] == first
+            if title is not None and not repeated:
+                yield _line(f" {first}")
+            cells = ["" if repeated and column is shown[0] and column.left else column.cells[k] for column in part]
+            yield _row(part, cells, k, indent)
+
+
+def _width(indent: str, columns: Sequence[Shown]) -> int:
+    return len(indent) + sum(column.width + 2 for column in columns) - 1
+
+
+def _row(columns: Sequence[Shown], cells: Sequence[str], k: int | None, indent: str) -> Text:
+    text = _line(indent)
+    for column, cell in zip(columns, cells, strict=True):
+        space = " " * (column.width - cell_len(cell))
+        text.append((" " if len(text) == len(indent) else "  ") + ("" if column.left else space))
+        text.append(cell, "bold" if k is not None and column.bold[k] else "")
+        text.append(space if column.left else "")
+    text.rstrip()
+    return text
+
+
+def _line(text: str) -> Text:
+    """Text that no terminal wraps or cuts before its edge."""
+    return Text(text, no_wrap=True, overflow="ignore")
 
 
 def _markdown(text: str) -> str:
@@ -332,11 +440,12 @@ def _latex(text: str) -> str:
     return "".join(_LATEX.get(char, char) for char in text)
 
 
-def _plain(value: Value) -> Value | None:
+def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _csv(rows: Iterable[Sequence[Value | None]]) -> str:
+def csv_text(rows: Iterable[Iterable[Value | None]]) -> str:
+    """Rows as CSV; None and NaN are empty cells."""
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
+    csv.writer(text, lineterminator="\n").writerows(map(_plain, row) for row in rows)
     return text.getvalue()

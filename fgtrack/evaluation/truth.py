@@ -1,14 +1,21 @@
-"""True objects as functions of time."""
+"""True objects as functions of time, their visibility to the sensors, and what of them is not evaluated."""
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from fgtrack.core.checks import LARGEST
-from fgtrack.core.geometry import wrap_angles
+from fgtrack.core.errors import DataError
+from fgtrack.core.geometry import in_polygon, wrap_angles
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import EGO_ID, FloatArray, IntArray
-from fgtrack.io.run import Table
+from fgtrack.core.types import EGO_ID, BoolArray, FloatArray, IntArray
+from fgtrack.io.run import Run, Table
+from fgtrack.models.sensors import SensorModel
 
 #: What is interpolated, in the order of the columns of `TruePath.at`.
 TRUE_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
@@ -19,13 +26,21 @@ _GAP_PERIODS = 5
 
 @dataclass(frozen=True)
 class TruePath:
-    """Truth of one object: distinct stamps in rising order and the states there."""
+    """Truth of one object.
+
+    Attributes
+    ----------
+    object_id
+        Its id.
+    stamps_ns
+        Distinct, in rising order, shape (n,).
+    states
+        x, y, yaw, speed, yaw rate there, shape (n, 5); NaN where the truth has no value.
+    """
 
     object_id: int
     stamps_ns: IntArray
-    """Shape (n,)."""
     states: FloatArray
-    """x, y, yaw, speed, yaw rate, shape (n, 5); NaN where the truth has no value."""
 
     def at(self, stamps_ns: IntArray) -> FloatArray:
         """States at `stamps_ns`, shape (m,); shape (m, 5), NaN where there is no truth.
@@ -49,41 +64,134 @@ class TruePath:
         curve = _hermite(a, b, u, h_ns / NS_PER_S)
         states[:, :2] = np.where(np.isfinite(curve), curve, states[:, :2])
         away = h_ns > max(_SHORTEST_GAP_NS, _GAP_PERIODS * float(np.median(periods_ns)))
-        outside = (u < 0.0) | (u > 1.0) | (away & (u > 0.0) & (u < 1.0))
-        states[outside] = np.nan
-        # At a truth stamp the state is the recorded one: a neighbour without a value must not blank it.
-        for end, where in ((a, u == 0.0), (b, u == 1.0)):
-            states[where] = end[where]
+        states[(u < 0.0) | (u > 1.0) | (away & (u > 0.0) & (u < 1.0))] = np.nan
+        # At a truth stamp the state is the recorded one, even where a neighbour has no value.
+        for end, mine in ((a, u == 0.0), (b, u == 1.0)):
+            states[mine] = end[mine]
         return states
 
 
 def true_paths(truth: Table) -> list[TruePath]:
     """Every true object but the ego, by rising id.
 
-    Of several rows with one stamp the last counts. A value beyond `LARGEST`, as of a detection, is none; rows without a
-    position are no truth.
+    Of several rows with one stamp the last counts. A value beyond `LARGEST` is unknown, as that of a detection; rows
+    without a position are ignored.
     """
     rows = np.stack([truth[name] for name in TRUE_STATE], axis=-1)
     rows[~(np.abs(rows) <= LARGEST)] = np.nan
-    usable = np.isfinite(rows[:, :2]).all(axis=1)
+    usable = np.isfinite(rows[:, :2]).all(axis=1) & (truth["object_id"] != EGO_ID)
     paths = []
     for object_id in np.unique(truth["object_id"][usable]).tolist():
-        if object_id == EGO_ID:
-            continue
         mine = np.flatnonzero(usable & (truth["object_id"] == object_id))[::-1]
         stamps_ns, newest = np.unique(truth["stamp_ns"][mine], return_index=True)
         paths.append(TruePath(object_id, stamps_ns, rows[mine[newest]]))
     return paths
 
 
+def ignored_paths(ignored: Table) -> list[TruePath]:
+    """Objects of a neighbouring class: a track that follows one of them is neither right nor false.
+
+    As in the evaluation of the KITTI data set (Geiger, Lenz, Urtasun 2012).
+    """
+    rows = ignored.where(ignored["outline_m"] == "")
+    unknown = np.full(rows.num_rows, np.nan)
+    return true_paths(Table({**rows, **dict.fromkeys(("yaw_rad", "speed_mps", "yaw_rate_radps"), unknown)}))
+
+
+def in_ignored_regions(run: Run, stamps_ns: IntArray, points_m: FloatArray) -> BoolArray:
+    """True for `points_m`, shape (n, 2), that lie in an unlabelled region at `stamps_ns`, shape (n,).
+
+    Between two stamps of the truth the regions of the nearer one count.
+    """
+    ignored = run.tables["ignored"]
+    regions = ignored.where(ignored["outline_m"] != "")
+    inside = np.zeros(len(stamps_ns), dtype=np.bool_)
+    if not regions.num_rows:
+        return inside
+    known_ns = np.union1d(run.tables["truth"]["stamp_ns"], ignored["stamp_ns"])
+    nearest_ns = known_ns[np.searchsorted(known_ns[:-1] + np.diff(known_ns) // 2, stamps_ns)]
+    for stamp_ns, text in zip(regions["stamp_ns"], regions["outline_m"], strict=True):
+        rows = np.flatnonzero((nearest_ns == stamp_ns) & ~inside)
+        try:
+            corners = np.array(text.split(), dtype=np.float64).reshape(-1, 2)
+        except ValueError as error:
+            raise DataError(f"{run.path}: ignored.csv holds a bad outline ({error}), repeat the run") from error
+        inside[rows] = in_polygon(points_m[rows], corners)
+    return inside
+
+
+def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> tuple[BoolArray, bool]:
+    """True where an object of `paths` is in range and in the field of view of a sensor at `now_ns`, shape (n, objects).
+
+    The sensors are those that the run had detections of, as its configuration describes them, from the pose of the ego
+    that ego.csv gives (linear between its stamps). Nothing hides an object. Where the ego's path, a sensor or its range
+    and field of view are not known, every object counts as visible, and the second value is false; an object without
+    truth is not visible.
+
+    Raises
+    ------
+    DataError
+        The configuration of the run is damaged.
+    """
+    positions_m = np.stack([path.at(now_ns)[:, :2] for path in paths], axis=1)
+    present = np.asarray(np.isfinite(positions_m).all(axis=-1))
+    sensors, poses = _sensors(run), ego_poses(run.tables["ego"], now_ns)
+    if poses is None or not sensors:
+        return present, False
+    ego = run.config.get("ego") or {}
+    origin_m = (float(ego.get("detection_origin_x_m", 0.0)), float(ego.get("detection_origin_y_m", 0.0)))
+    positions_m[~present] = 0.0
+    poses = np.broadcast_to(poses[:, None], (*present.shape, 3))
+    seen = np.any([sensor.sees(positions_m, poses, origin_m) for sensor in sensors], axis=0)
+    return present & seen, all(map(_is_limited, sensors))
+
+
+def ego_poses(ego: Table, stamps_ns: IntArray) -> FloatArray | None:
+    """x, y and yaw (not wrapped) of the ego at `stamps_ns`, shape (n, 3), constant beyond the ends; None if unknown."""
+    states = ego_states(ego, stamps_ns)
+    return None if states is None else states[:, :3]
+
+
+def ego_states(ego: Table, stamps_ns: IntArray) -> FloatArray | None:
+    """As `ego_poses`, with the speed, shape (n, 4)."""
+    rows = np.stack([ego[name] for name in ("x_m", "y_m", "yaw_rad", "speed_mps")], axis=-1)
+    known = np.flatnonzero(np.isfinite(rows[:, :3]).all(axis=1))
+    if not len(known):
+        return None
+    at_ns, first = np.unique(ego["stamp_ns"][known], return_index=True)
+    rows = rows[known[first]]
+    rows[:, 2] = np.unwrap(rows[:, 2])
+    times, wanted = ((ns - at_ns[0]).astype(np.float64) for ns in (at_ns, stamps_ns))
+    return np.stack([np.interp(wanted, times, column) for column in rows.T], axis=-1)
+
+
 def _hermite(a: FloatArray, b: FloatArray, u: FloatArray, h_s: FloatArray) -> FloatArray:
     """Positions, shape (m, 2), at the share `u` of the way from `a` to `b`, `h_s` seconds apart."""
     u, h_s = u[:, None], h_s[:, None]
-    from_a = (1 + 2 * u) * (1 - u) ** 2 * a[:, :2] + u * (1 - u) ** 2 * h_s * _velocity(a)
-    from_b = u**2 * (3 - 2 * u) * b[:, :2] - u**2 * (1 - u) * h_s * _velocity(b)
+    v_a, v_b = (one[:, 3:4] * np.stack([np.cos(one[:, 2]), np.sin(one[:, 2])], axis=-1) for one in (a, b))
+    from_a = (1 + 2 * u) * (1 - u) ** 2 * a[:, :2] + u * (1 - u) ** 2 * h_s * v_a
+    from_b = u**2 * (3 - 2 * u) * b[:, :2] - u**2 * (1 - u) * h_s * v_b
     return np.asarray(from_a + from_b)
 
 
-def _velocity(states: FloatArray) -> FloatArray:
-    yaw_rad, speed_mps = states[:, 2], states[:, 3]
-    return np.stack([speed_mps * np.cos(yaw_rad), speed_mps * np.sin(yaw_rad)], axis=-1)
+def _is_limited(sensor: SensorModel) -> bool:
+    limits_m = (sensor.max_range_m, sensor.view_range_m, sensor.max_range_behind_m)
+    return any(limit_m is not None for limit_m in limits_m) or (sensor.field_of_view_rad or math.tau) < math.tau
+
+
+@cache
+def _models() -> TypeAdapter[dict[str, SensorModel]]:
+    return TypeAdapter(dict[str, SensorModel])
+
+
+def _sensors(run: Run) -> list[SensorModel]:
+    """Models of the sensors that occur in the run; empty where one has none."""
+    configured: Mapping[str, Any] = run.config.get("sensors") or {}
+    names = np.unique(run.tables["updates"]["sensor"]).tolist()
+    try:
+        models = _models().validate_python({name: configured[name] for name in names if name in configured})
+    except ValidationError as error:
+        (first, *_) = error.errors()
+        key = ".".join(map(str, first["loc"]))
+        raise DataError(f"{run.config_path}: sensors.{key}: {first['msg']}") from error
+    return list(models.values()) if len(models) == len(names) else []

@@ -1,189 +1,135 @@
-"""What a comparison says, in plain sentences with their intervals: the best run, the noise, the worth of waiting."""
+"""Sentences of a comparison with their intervals: the best run, the fit of the noise, the worth of waiting."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
-from fgtrack.evaluation.cautions import FEWEST, is_far_off
-from fgtrack.evaluation.contest import Contest, Quantity
+from fgtrack.evaluation.comparison import Comparison, Entry
+from fgtrack.evaluation.diagnostics import FEWEST, is_far_off
+from fgtrack.evaluation.intervals import UNKNOWN, Estimate
 from fgtrack.evaluation.lagged import WINDOW
 from fgtrack.evaluation.metrics import Metrics
-from fgtrack.evaluation.paired import UNKNOWN, Estimate
-from fgtrack.evaluation.ranking import Entry
-from fgtrack.evaluation.tables import short, two_digits
+from fgtrack.evaluation.statistics import ChiSquareMean
+from fgtrack.evaluation.tables import PERCENT, short, two_digits
 
 _MOST_NAMED = 3
-_MM = 1e3
-_CM_M = 0.01
-_PERCENT = 100.0
+_POSITION = "position_rmse_m"
 
 
-@dataclass(frozen=True)
-class _Square:
-    """A mean NEES or NIS."""
+class _Square(NamedTuple):
+    """A mean NEES or NIS, and its interval where the values are correlated."""
 
     name: str
-    mean: float
-    expected: float
-    is_far_off: bool
+    square: ChiSquareMean
     interval: Estimate = UNKNOWN
-    """Of the mean, where the values are correlated."""
 
     @property
     def may_be_chance(self) -> bool:
-        """Whether what is expected is within the interval."""
-        return self.interval.is_known and self.interval.low <= self.expected <= self.interval.high
+        return self.interval.is_known and self.interval.low <= self.square.dof <= self.interval.high
+
+    def __str__(self) -> str:
+        low, high = two_digits(self.interval.low), two_digits(self.interval.high)
+        known = f", 95 % interval {low} to {high}" if self.interval.is_known else ""
+        return f"{self.name} {short(self.square.mean)} (expected {self.square.dof:.3g}{known})"
 
 
-def verdict(metrics: Mapping[str, Metrics], contests: Sequence[Contest]) -> tuple[str, ...]:
-    """Sentences on the runs of `metrics`, by label; nothing on runs without errors and innovations."""
-    sentences = [found for contest in contests for found in _positions(contest)]
-    alone = [label for label in metrics if not any(label in contest.runs for contest in contests)]
-    if len(metrics) > 1 and (len(contests) > 1 or alone):
-        sentences.append(_unpaired(metrics, alone))
-    for contest in contests:
-        sentences += _noise({label: metrics[label] for label in _ranked(contest)})
-    for label in alone:
-        sentences += _noise({label: metrics[label]})
-    sentences += [found for label, one in metrics.items() for found in _waiting(label, one)]
+def verdict(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]) -> tuple[str, ...]:
+    """Sentences on the runs of `metrics`, by label; none for runs without errors and innovations."""
+    sentences = [
+        who_is_best(one[_POSITION], "at the newest stamp")
+        if one[_POSITION]
+        else f"{_listed(one.runs)} never track the same object at the same stamp: there is nothing to pair."
+        for one in compared
+    ]
+    alone = [label for label in metrics if not any(label in one.runs for one in compared)]
+    if len(metrics) > 1 and (len(compared) > 1 or alone):
+        sentences.append(
+            "Without truth there are no errors to compare."
+            if all(one.truth is None for one in metrics.values())
+            else "Not all runs are of the same recording with truth (or they are evaluated by different settings): "
+            "only those that are can be ranked by their differences."
+        )
+    groups = [[entry.name for entry in one[_POSITION]] or list(one.runs) for one in compared]
+    for labels in (*groups, *([label] for label in alone)):
+        sentences += _noise({label: metrics[label] for label in labels})
+    for label, one in metrics.items():
+        lags = [lag for lag in one.lagged if lag.is_lagged and lag.lag_s != WINDOW and lag.position_reduction.is_known]
+        parts = [f"{lag.lag_s:g} s by {_percent(lag.position_reduction)}" for lag in (*lags[:1], *lags[1:][-1:])]
+        if parts:
+            sentences.append(f"Waiting lowers the position RMSE of {label}: {', '.join(parts)}.")
     return tuple(sentences)
 
 
-def _positions(contest: Contest) -> Iterator[str]:
-    """Who is best at the newest stamp."""
-    quantity = _position(contest)
-    if quantity is None:
-        yield f"{_listed(contest.runs)} never track the same object at the same stamp: there is nothing to pair."
-        return
-    yield who_is_best(quantity.entries, "at the newest stamp")
-
-
 def who_is_best(entries: Sequence[Entry], when: str) -> str:
-    """A sentence on a position RMSE: who is best or ties `when`, and how much worse the others are."""
+    """A sentence on a position RMSE: which is best or ties `when`, and how much worse the others are."""
     best, *others = entries
     ties = [entry for entry in others if entry.standing == "tie"]
     worse = [entry for entry in others if entry.standing == "worse"]
     value = f"position RMSE {short(best.value)} m"
     if ties:
-        last = ties[-1]
-        difference = f"{'difference' if len(ties) == 1 else 'largest difference'} {_metres(last)}"
-        names = _listed([best.name, *(one.name for one in ties)])
-        first = f"{names} tie {when} ({value}, {difference})"
+        difference = f"{'difference' if len(ties) == 1 else 'largest difference'} {_metres(ties[-1])}"
+        first = f"{_listed([best.name, *(one.name for one in ties)])} tie {when} ({value}, {difference})"
     else:
         first = f"{best.name} is best {when} ({value})"
-    return f"{first}{'; ' if worse else ''}{_worse(worse)}."
-
-
-def _worse(entries: Sequence[Entry]) -> str:
-    most = _MOST_NAMED if len(entries) > _MOST_NAMED + 1 else len(entries)
-    named = [f"{entry.name} is {_metres(entry, ' worse')}" for entry in entries[:most]]
-    left = len(entries) - len(named)
-    return ", ".join([*named, *([f"{left} more are worse"] if left else [])])
+    most = _MOST_NAMED if len(worse) > _MOST_NAMED + 1 else len(worse)
+    named = [f"{entry.name} is {_metres(entry, ' worse')}" for entry in worse[:most]]
+    named += [f"{len(worse) - most} more are worse"] if len(worse) > most else []
+    return f"{'; '.join([first, *([', '.join(named)] if named else [])])}."
 
 
 def _metres(entry: Entry, what: str = "") -> str:
     """How much worse `entry` is, with the interval and `what` behind the unit."""
-    found = entry.worse_by
-    assert found is not None
-    scale, unit = (_MM, "mm") if abs(found.mean) < _CM_M else (1.0, "m")
-    amount = f"{two_digits(scale * found.mean)} {unit}{what}"
-    if not found.is_known:
+    worse = entry.worse_by or UNKNOWN
+    scale, unit = (1e3, "mm") if abs(worse.mean) < 0.01 else (1.0, "m")
+    mean, low, high = (two_digits(scale * value) for value in (worse.mean, worse.low, worse.high))
+    amount = f"{mean} {unit}{what}"
+    if not worse.is_known:
         return f"{amount}, too short a run for an interval"
-    interval = f"{two_digits(scale * found.low)} to {two_digits(scale * found.high)}"
-    return f"{amount} ({interval})" if what else f"{amount}, 95 % interval {interval}"
-
-
-def _unpaired(metrics: Mapping[str, Metrics], alone: Sequence[str]) -> str:
-    without = [label for label in alone if metrics[label].truth is None]
-    if len(without) == len(metrics):
-        return "Without truth there are no errors to compare."
-    return (
-        "Not all runs are of the same recording with truth (or they are judged by different settings): "
-        "only those that are can be told apart by their differences."
-    )
+    return f"{amount} ({low} to {high})" if what else f"{amount}, 95 % interval {low} to {high}"
 
 
 def _noise(metrics: Mapping[str, Metrics]) -> Iterator[str]:
-    """Whether the covariances of the first run, the best one, fit what happened; who else's do not."""
-    (label, one), *others = metrics.items()
-    found = list(_squares(one))
-    if not found:
-        return
-    far = [square for square in found if square.is_far_off]
-    off = [square for square in far if not square.may_be_chance]
+    """Fit of the covariances of the first run, the best one, to the errors; the others whose do not fit."""
+    (label, *others), squares = metrics, {label: list(_squares(one)) for label, one in metrics.items()}
+    found, far = squares[label], [one for one in squares[label] if is_far_off(one.square)]
+    off = [one for one in far if not one.may_be_chance]
     if off:
-        small = [square.mean > square.expected for square in off]
+        small = [one.square.mean > one.square.dof for one in off]
         size = "too small" if all(small) else "partly too small, partly too large" if any(small) else "too large"
         yield (
-            f"The configured noise is {size} (judged by {label}): {_named(off)}. "
-            "`fgtrack advise --tune` fits it, or says what comes first; the order of the runs may change then."
+            f"The configured noise is {size} (judged by {label}): {', '.join(map(str, off))}. "
+            "`fgtrack advise --tune` fits it, or reports what has to be corrected first; the order of the runs may "
+            "change then."
         )
-        return
-    if far:
-        yield f"Whether the noise fits (judged by {label}) so short a run does not tell: {_named(far)}."
-        return
-    yield f"The noise fits (judged by {label}): {_named(found)}."
-    wrong = {
-        other: [square for square in _squares(its) if square.is_far_off and not square.may_be_chance]
-        for other, its in others
-    }
-    runs = [other for other, squares in wrong.items() if squares]
-    if runs:
-        yield f"Not so of {_listed(runs)}: {_ranges([square for other in runs for square in wrong[other]])}."
-
-
-def _named(squares: Sequence[_Square]) -> str:
-    return ", ".join(map(_text, squares))
+    elif far:
+        yield f"Too short a run to tell if the noise fits (judged by {label}): {', '.join(map(str, far))}."
+    elif found:
+        yield f"The noise fits (judged by {label}): {', '.join(map(str, found))}."
+        wrong = {k: [one for one in squares[k] if is_far_off(one.square) and not one.may_be_chance] for k in others}
+        runs = [name for name, those in wrong.items() if those]
+        if runs:
+            yield f"Not so of {_listed(runs)}: {_ranges([one for name in runs for one in wrong[name]])}."
 
 
 def _ranges(squares: Sequence[_Square]) -> str:
     """The names of `squares`, each with its lowest and highest mean."""
     texts = []
     for name in dict.fromkeys(one.name for one in squares):
-        mine = [one for one in squares if one.name == name]
-        means = dict.fromkeys(short(of(one.mean for one in mine)) for of in (min, max))
-        texts.append(f"{name} {' to '.join(means)} (expected {mine[0].expected:.3g})")
+        mine = [one.square for one in squares if one.name == name]
+        means = dict.fromkeys(short(end(one.mean for one in mine)) for end in (min, max))
+        texts.append(f"{name} {' to '.join(means)} (expected {mine[0].dof:.3g})")
     return ", ".join(texts)
-
-
-def _text(square: _Square) -> str:
-    interval = square.interval
-    known = f", 95 % interval {two_digits(interval.low)} to {two_digits(interval.high)}" if interval.is_known else ""
-    return f"{square.name} {short(square.mean)} (expected {square.expected:.3g}{known})"
 
 
 def _squares(one: Metrics) -> Iterator[_Square]:
     """NEES of the position, and NIS of every sensor with enough of them."""
-    nees, interval = one.consistency.position_nees, one.consistency.position_nees_interval
-    if nees.count:
-        yield _Square("NEES of the position", nees.mean, nees.dof, is_far_off(nees), interval)
-    for sensor, nis in one.consistency.nis.items():
-        if nis.count >= FEWEST:
-            yield _Square(f"NIS of {sensor}", nis.mean, nis.dof, is_far_off(nis))
-
-
-def _waiting(label: str, one: Metrics) -> Iterator[str]:
-    """What the first and the last lag bring."""
-    lags = [
-        entry for entry in one.lagged if entry.is_lagged and entry.lag_s != WINDOW and entry.position_reduction.is_known
-    ]
-    if lags:
-        ends = lags if len(lags) == 1 else [lags[0], lags[-1]]
-        parts = [f"{entry.lag_s:g} s by {_percent(entry.position_reduction)}" for entry in ends]
-        yield f"Waiting lowers the position RMSE of {label}: {', '.join(parts)}."
+    if one.consistency.position_nees.count:
+        interval = one.consistency.position_nees_interval
+        yield _Square("NEES of the position", one.consistency.position_nees, interval)
+    yield from (_Square(f"NIS of {name}", nis) for name, nis in one.consistency.nis.items() if nis.count >= FEWEST)
 
 
 def _percent(share: Estimate) -> str:
-    return f"{_PERCENT * share.mean:.0f} % ({_PERCENT * share.low:.0f} to {_PERCENT * share.high:.0f})"
-
-
-def _position(contest: Contest) -> Quantity | None:
-    return next((one for one in contest.quantities if one.name == "position_rmse_m"), None)
-
-
-def _ranked(contest: Contest) -> Sequence[str]:
-    """The runs, the best one first."""
-    quantity = _position(contest)
-    return contest.runs if quantity is None else [entry.name for entry in quantity.entries]
+    return f"{PERCENT * share.mean:.0f} % ({PERCENT * share.low:.0f} to {PERCENT * share.high:.0f})"
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FUSED, DetectionList, Disposition, FloatArray, Message
-from fgtrack.evaluation.recordings import by_recording
-from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.runs import JudgedRun, by_recording
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import Run, load_run
 from fgtrack.io.source import open_input

@@ -7,9 +7,8 @@ from pathlib import Path
 
 from fgtrack.core.errors import CallError, printable
 from fgtrack.evaluation.palette import distinct_colours
-from fgtrack.evaluation.recordings import same_recording
 from fgtrack.evaluation.roads import excluded_lines, roads
-from fgtrack.evaluation.runs import Runs, judged, run_folders
+from fgtrack.evaluation.runs import Runs, judged, run_folders, same_recording
 from fgtrack.io.output import check_apart
 from fgtrack.io.ros.bag_writer import token
 from fgtrack.io.run import Run

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import fgtrack
-from fgtrack.evaluation.cautions import cautions, noise_cautions
-from fgtrack.evaluation.recordings import recordings_caution
-from fgtrack.evaluation.runs import JudgedRun
-from fgtrack.evaluation.tables import Table, Tables, cell_rows
+from fgtrack.evaluation.diagnostics import diagnostics, noise_diagnostics
+from fgtrack.evaluation.runs import JudgedRun, recordings_warning
+from fgtrack.evaluation.tables import Table, Tables, grid
 from fgtrack.io.output import new_file
 from fgtrack.viewers.playback import Moment, playback
 
@@ -86,9 +85,9 @@ def write_report(
 
 def _page(runs: Sequence[JudgedRun], tables: Tables, pictures: Iterable[tuple[str, bytes]], opening: Opening) -> str:
     scene, notes = playback(runs, opening.moment)
-    warnings = recordings_caution(runs)
-    warnings += [f"{one.label}: {line}" for one in runs for line in cautions(one.run)]
-    warnings += map(str, noise_cautions(runs[0].run))  # of the sensors, as `replay` prints them
+    warnings = recordings_warning(runs)
+    warnings += [f"{one.label}: {line}" for one in runs for line in diagnostics(one.run)]
+    warnings += map(str, noise_diagnostics(runs[0].run))  # of the sensors, as `replay` prints them
     warnings = list(dict.fromkeys((*warnings, *notes, *opening.missing)))
     figures = {name: _figure(name, picture) for name, picture in pictures}
     first = [next((name for name in figures if name.startswith(kind)), "") for kind in _FIRST]
@@ -104,7 +103,7 @@ def _page(runs: Sequence[JudgedRun], tables: Tables, pictures: Iterable[tuple[st
     folded_parts = {
         "Assumptions": _list(opening.assumptions),
         "Advice": _list(opening.advice),
-        "Tables": "".join(_table(table) for table in tables.values() if table.num_rows),
+        "Tables": "".join(_table(table) for table in tables.in_full().tables.values() if table.records),
         "More figures": _figures(text for name, text in figures.items() if name not in first),
         "Configuration": _configuration(runs),
         "Runs": _grid("What they were made of", _FACTS, [_facts(one) for one in runs]),
@@ -151,12 +150,13 @@ def _list(lines: Iterable[str], kind: str = "") -> str:
 
 def _table(table: Table) -> str:
     """A table as people read it; the name of a run is in its first row only."""
-    head = "".join(_cell("th", column.heading, column.left) for column in table.shown)
+    shown = table.shown()
+    head = "".join(_cell("th", column.heading, column.left) for column in shown)
     rows = []
-    for row in cell_rows(table.shown, lambda text, bold: (text, bold)):
-        cells = (_cell("td", text, column.left, bold) for column, (text, bold) in zip(table.shown, row, strict=True))
+    for row in list(grid(shown, lambda text, bold: (text, bold)))[1:]:
+        cells = (_cell("td", text, column.left, bold) for column, (text, bold) in zip(shown, row, strict=True))
         rows.append(f"<tr>{''.join(cells)}</tr>\n")
-    return _wide(table.title, head, "".join(rows)) + _list(table.notes, "soft")
+    return _wide(table.title, head, "".join(rows)) + _list(table.shown_notes(), "soft")
 
 
 def _grid(title: str, names: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

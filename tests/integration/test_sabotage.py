@@ -18,8 +18,8 @@ from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.registry import ESTIMATORS
-from fgtrack.evaluation.cautions import cautions
-from fgtrack.evaluation.comparison import compare
+from fgtrack.evaluation.compare import compare
+from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.io.run import Run, Table, load_run
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.pipeline.config import Config
@@ -163,10 +163,10 @@ def check_published(run: Run) -> None:
 
 
 def check_told(run: Run) -> Counter[str]:
-    """What failed is counted in meta.json, and said by `cautions` and `compare`."""
+    """What failed is counted in meta.json, and said by `diagnostics` and `compare`."""
     failed = Counter({kind: count for kind, count in run.meta["failures"].items() if count})
     assert list(run.meta["failures"]) == [kind.value for kind in Failure]
-    [line] = [str(one) for one in cautions(run) if one.about == "estimator"]
+    [line] = [str(one) for one in diagnostics(run) if one.about == "estimator"]
     tables = compare(run)
     for kind, count in failed.items():
         assert f"{count} {kind}" in line or kind == Failure.STEP_DAMPED
@@ -211,7 +211,7 @@ def test_a_healthy_estimator_fails_nowhere_and_compare_says_so_in_full(
     run = run_of(sabotaged("nothing"), tmp_path)
     assert set(run.meta["failures"].values()) == {0}
     assert run.meta["ended_by_failure"] == []
-    assert not [one for one in cautions(run) if one.about == "estimator"]
+    assert not [one for one in diagnostics(run) if one.about == "estimator"]
     tables = compare(run)
     assert "Failures inside the estimator" not in str(tables)
     assert "Failures inside the estimator" in str(tables.in_full())

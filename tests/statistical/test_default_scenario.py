@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import fgtrack
+from fgtrack.evaluation.intervals import paired
 from fgtrack.evaluation.metrics import Metrics, evaluate
-from fgtrack.evaluation.paired import paired
 
 NUM_SEEDS = 10
 LAG_S = 0.3

@@ -10,8 +10,8 @@ from fgtrack.advice.arrivals import Arrivals
 from fgtrack.advice.clocks import clock_findings, clock_verdicts, stamp_findings
 from fgtrack.advice.noise import NoiseFit
 from fgtrack.advice.outcome import Outcome, harm
+from fgtrack.evaluation.intervals import Estimate
 from fgtrack.evaluation.metrics import NOTHING_TRACKED
-from fgtrack.evaluation.paired import Estimate
 from fgtrack.pipeline.clock_offsets import OffsetReport, SensorOffset
 
 SECOND_NS = 1_000_000_000

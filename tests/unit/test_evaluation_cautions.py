@@ -8,8 +8,7 @@ import pytest
 from unit.evaluation_runs import TICK_NS, WEST, Car, update, write_run
 
 from fgtrack.core.types import Disposition, UpdateRecord
-from fgtrack.evaluation.cautions import cautions, noise_cautions, unused
-from fgtrack.evaluation.lives import Lives
+from fgtrack.evaluation.diagnostics import Fragmentation, diagnostics, noise_diagnostics, unused
 from fgtrack.io.run import Run, Table
 from fgtrack.io.run.schema import column
 
@@ -38,7 +37,7 @@ def test_a_healthy_run_has_none(tmp_path: Path) -> None:
     fine = [update(tick=k, delay_ns=150_000_000, nis=float(rng.chisquare(2)), x_m=0.1, y_m=0.1) for k in range(100)]
     refused = [update(tick=k, disposition=Disposition.GATED) for k in range(100, 150)]
     run = run_of(tmp_path / "run", fine + refused)
-    assert (cautions(run), noise_cautions(run), unused(run)) == ([], [], None)
+    assert (diagnostics(run), noise_diagnostics(run), unused(run)) == ([], [], None)
 
 
 @pytest.mark.parametrize(
@@ -55,18 +54,18 @@ def test_what_most_detections_of_a_sensor_ended_in_is_told_with_a_cure(
     fate: Disposition, cure: str, tmp_path: Path
 ) -> None:
     run = run_of(tmp_path / "run", [*lists(fate, 30), *lists(Disposition.IN_SEQUENCE, 29)])
-    (found,) = cautions(run)
+    (found,) = diagnostics(run)
     assert (found.about, found.settings) == ("lidar", {})
     assert found.text.startswith(f"30 of 59 {fate.value}: ")
     assert cure in found.text
     assert unused(run) is None
-    (again,) = cautions(run_of(tmp_path / "other", lists(fate, 3)))
+    (again,) = diagnostics(run_of(tmp_path / "other", lists(fate, 3)))
     assert str(again).startswith("lidar: 3 of 3")
 
 
 def test_detections_that_fail_without_an_ego_are_the_trouble_of_the_ego_alone(tmp_path: Path) -> None:
     failed = [update(sensor, tick=k, disposition=Disposition.FAILED) for k in range(5) for sensor in ("lidar", "radar")]
-    (found,) = cautions(run_of(tmp_path / "run", failed))
+    (found,) = diagnostics(run_of(tmp_path / "run", failed))
     assert found.about == "ego"
     assert "nothing in its frame can be placed (5 of 5 of lidar, 5 of 5 of radar" in found.text
     assert found.settings == {}
@@ -74,51 +73,51 @@ def test_detections_that_fail_without_an_ego_are_the_trouble_of_the_ego_alone(tm
 
 def test_half_is_not_most(tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", [*lists(Disposition.GATED, 30), *lists(Disposition.IN_SEQUENCE, 30)])
-    assert cautions(run) == []
+    assert diagnostics(run) == []
 
 
 def test_too_old_names_the_limit_that_was_passed(tmp_path: Path) -> None:
     late = [update(tick=k, disposition=Disposition.TOO_OLD, delay_ns=3_500_000_000) for k in range(5)]
-    (by_sensor,) = cautions(run_of(tmp_path / "a", late))
+    (by_sensor,) = diagnostics(run_of(tmp_path / "a", late))
     assert "median delay 3.5 s, allowed 0.4 s: raise sensors.lidar.max_delay_s" in by_sensor.text
-    (by_window,) = cautions(run_of(tmp_path / "b", late, CONFIG.replace("max_delay_s: 0.4", "max_delay_s: 9.0")))
+    (by_window,) = diagnostics(run_of(tmp_path / "b", late, CONFIG.replace("max_delay_s: 0.4", "max_delay_s: 9.0")))
     assert "older than the window (smoother.lag_s 1 s)" in by_window.text
     unlimited = CONFIG.replace("{max_delay_s: 0.4}", "{}")
-    (by_storage,) = cautions(run_of(tmp_path / "c", late, unlimited, FILTER))
+    (by_storage,) = diagnostics(run_of(tmp_path / "c", late, unlimited, FILTER))
     assert "older than the window (filter.storage_s 3 s)" in by_storage.text
 
 
 def test_what_drop_ignores_is_not_blamed_on_the_window(tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", lists(Disposition.TOO_OLD, 5), effective=FILTER)
-    (dropped,) = cautions(replace(run, meta={**run.meta, "estimator": "drop"}))
+    (dropped,) = diagnostics(replace(run, meta={**run.meta, "estimator": "drop"}))
     assert dropped.text.startswith("5 of 5 too_old: median delay 0.15 s, and `drop` ignores by design")
     assert "raise" not in dropped.text
-    (young,) = cautions(run)
+    (young,) = diagnostics(run)
     assert "within the window (filter.storage_s 3 s): no track is as old" in young.text
 
 
 def test_stamps_that_nobody_set_and_a_window_shorter_than_a_period_are_told(tmp_path: Path) -> None:
     unset = [UpdateRecord("lidar", 0, 10**18 + k, 0, Disposition.IN_SEQUENCE) for k in range(3)]
-    (found,) = cautions(run_of(tmp_path / "a", unset))
+    (found,) = diagnostics(run_of(tmp_path / "a", unset))
     assert str(found).startswith("lidar: all stamps are 0")
     assert found.settings == {"sensors.lidar.stamp_from": "receipt"}
     slow = [update(tick=100 * k) for k in range(40)]
-    (found,) = cautions(run_of(tmp_path / "b", slow))
+    (found,) = diagnostics(run_of(tmp_path / "b", slow))
     period_s = 100 * TICK_NS / 1e9
     assert str(found) == f"lidar: one list every {period_s:g} s, longer than the window (smoother.lag_s 1 s): raise it"
-    assert cautions(run_of(tmp_path / "c", slow, effective=FILTER)) == []
+    assert diagnostics(run_of(tmp_path / "c", slow, effective=FILTER)) == []
 
 
 @pytest.mark.parametrize(("nis", "size"), [(26.0, "small"), (0.2, "large"), (-1e-9, "large")])
 def test_noise_that_does_not_fit_is_told(nis: float, size: str, tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", [update(tick=k, nis=nis, x_m=0.1, y_m=0.1) for k in range(40)])
-    (found,) = noise_cautions(run)
+    (found,) = noise_diagnostics(run)
     assert str(found).startswith(f"lidar: mean NIS {nis:.3g}, expected 2: the configured noise is too {size}")
     burst = [26.0 if k % 10 == 0 else 1.4 for k in range(40)]
     born = run_of(tmp_path / "born", [update(tick=k, nis=each, x_m=0.1, y_m=0.1) for k, each in enumerate(burst)])
-    assert noise_cautions(born) == []
+    assert noise_diagnostics(born) == []
     few = run_of(tmp_path / "few", [update(tick=k, nis=nis, x_m=0.1, y_m=0.1) for k in range(20)])
-    assert noise_cautions(few) == []
+    assert noise_diagnostics(few) == []
 
 
 def test_a_run_that_used_nothing_says_what_became_of_all(tmp_path: Path) -> None:
@@ -131,7 +130,7 @@ def test_a_table_that_was_changed_after_the_run_is_told(tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", lists(Disposition.IN_SEQUENCE))
     table = tmp_path / "run/updates.csv"
     table.write_text(table.read_text().replace("lidar", "radar"))
-    assert list(map(str, cautions(run))) == [
+    assert list(map(str, diagnostics(run))) == [
         "tracks.csv or updates.csv: changed since the run: the digest is another; repeat the run"
     ]
 
@@ -143,7 +142,7 @@ def test_states_of_the_ego_that_were_refused_are_told_where_they_are_most(
     run = run_of(tmp_path / "run", lists(Disposition.IN_SEQUENCE))
     ego = Table({name: column(name, [0, 1, 2, 3]) for name in run.tables["ego"]})
     meta = {**run.meta, "ego_refused": {"stamp ahead of its receipt": refused}}
-    found = cautions(replace(run.with_tables(ego=ego), meta=meta))
+    found = diagnostics(replace(run.with_tables(ego=ego), meta=meta))
     assert len(found) == told
     assert not told or str(found[0]).startswith(f"ego: {refused} of 4 states not used, stamp ahead of its receipt")
 
@@ -152,13 +151,13 @@ def test_states_of_the_ego_that_were_refused_are_told_where_they_are_most(
 def test_jumps_of_the_ego_are_told(jumps: int, told: str | None, tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", lists(Disposition.IN_SEQUENCE))
     ego = Table({name: column(name, [0, 1]) for name in run.tables["ego"]})
-    found = list(map(str, cautions(replace(run.with_tables(ego=ego), meta={**run.meta, "ego_jumps": jumps}))))
+    found = list(map(str, diagnostics(replace(run.with_tables(ego=ego), meta={**run.meta, "ego_jumps": jumps}))))
     assert [f"ego: its place {told}" in each for each in found] == ([] if told is None else [True])
 
 
 def test_seconds_in_place_of_nanoseconds_are_told(tmp_path: Path) -> None:
     times = [UpdateRecord("lidar", 1_700_000_000 + k, 1_700_000_000 + k, 0, Disposition.IN_SEQUENCE) for k in range(20)]
-    (found,) = cautions(run_of(tmp_path / "run", times))
+    (found,) = diagnostics(run_of(tmp_path / "run", times))
     assert "20 times within 1.9e-08 s, which no sensor sends" in found.text
     assert "they look like s since 1970" in found.text
 
@@ -167,7 +166,7 @@ def test_angles_in_degrees_are_told(tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", [update(tick=k) for k in range(40)])
     ego = {"yaw_rad": np.array([0.1, 67.0, np.nan])}
     of_radar = {"sensor": np.array(["radar", "radar"]), "bearing_rad": np.array([-12.0, 6.0])}
-    found = cautions(run.with_tables(ego=Table(ego), detections=Table(of_radar)))
+    found = diagnostics(run.with_tables(ego=Table(ego), detections=Table(of_radar)))
     assert [str(one).split(":")[:2] for one in found[:2]] == [
         ["ego", " yaw_rad goes up to 67"],
         ["radar", " bearing_rad goes up to 12"],
@@ -190,31 +189,33 @@ BROKEN = [(0, 100), (130, 200), (190, 300), (350, 400)]
 
 def test_tracks_that_begin_where_another_one_has_just_ended_are_told_without_truth(tmp_path: Path) -> None:
     run = pieces(tmp_path / "run", *BROKEN)
-    lives = Lives.of(run)
+    lives = Fragmentation.of(run)
     assert lives.breaks == 3
-    assert lives.lives_s == pytest.approx([1.98, 1.38, 2.18, 0.98])
+    assert lives.lifetimes_s == pytest.approx([1.98, 1.38, 2.18, 0.98])
     assert lives.breaks_per_minute == pytest.approx(3 * 60 / 6.52)
-    (found,) = cautions(run)
+    (found,) = diagnostics(run)
     assert found.text.startswith("3 of 4 confirmed tracks begin where another one has just ended: 28 breaks per object")
     assert "`fgtrack advise`" in found.text
 
 
 def test_other_objects_and_other_times_are_no_breaks(tmp_path: Path) -> None:
-    assert Lives.of(pieces(tmp_path / "far", *BROKEN, ahead_m=40.0)).breaks == 0
-    assert Lives.of(pieces(tmp_path / "later", (0, 50), (350, 400))).breaks == 0
+    assert Fragmentation.of(pieces(tmp_path / "far", *BROKEN, ahead_m=40.0)).breaks == 0
+    assert Fragmentation.of(pieces(tmp_path / "later", (0, 50), (350, 400))).breaks == 0
     both = [[WEST.track(k, 1), Car(8, 100.0, 2.0, 3.1, 20.0).track(k, 2)] for k in range(100)]
-    assert Lives.of(write_run(tmp_path / "both", both)).breaks == 0
-    assert Lives.of(write_run(tmp_path / "none", [[]])).lives_s.size == 0
+    assert Fragmentation.of(write_run(tmp_path / "both", both)).breaks == 0
+    assert Fragmentation.of(write_run(tmp_path / "none", [[]])).lifetimes_s.size == 0
 
 
 def test_a_break_now_and_then_is_no_bad_run(tmp_path: Path) -> None:
-    assert cautions(pieces(tmp_path / "run", *BROKEN[:3])) == []
+    assert diagnostics(pieces(tmp_path / "run", *BROKEN[:3])) == []
 
 
 def test_births_that_die_unconfirmed_are_told_where_they_are_most_detections(tmp_path: Path) -> None:
-    (found,) = cautions(run_of(tmp_path / "bad", lists(Disposition.BIRTH, 31) + lists(Disposition.IN_SEQUENCE, 30)))
+    (found,) = diagnostics(run_of(tmp_path / "bad", lists(Disposition.BIRTH, 31) + lists(Disposition.IN_SEQUENCE, 30)))
     assert (found.about, found.text.split(";")[0]) == (
         "tracks",
         "31 of 61 detections used began a track that was never confirmed",
     )
-    assert cautions(run_of(tmp_path / "good", lists(Disposition.BIRTH, 30) + lists(Disposition.IN_SEQUENCE, 30))) == []
+    assert (
+        diagnostics(run_of(tmp_path / "good", lists(Disposition.BIRTH, 30) + lists(Disposition.IN_SEQUENCE, 30))) == []
+    )

@@ -9,10 +9,9 @@ import pytest
 from evaluation_runs import ROUND, WEST, update, write_run
 
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.comparison import compare
-from fgtrack.evaluation.contest import Contest, Quantity, contests
-from fgtrack.evaluation.recordings import same_recording
-from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.compare import compare
+from fgtrack.evaluation.comparison import Comparison, Quantity, comparisons
+from fgtrack.evaluation.runs import JudgedRun, same_recording
 from fgtrack.io.run import Run
 
 TICKS = 200
@@ -31,12 +30,12 @@ def judged(runs: Sequence[Run]) -> list[JudgedRun]:
     return [JudgedRun(str(number), run) for number, run in enumerate(runs)]
 
 
-def contest_of(runs: Sequence[Run]) -> Contest:
-    (found,) = contests(judged(runs))
+def contest_of(runs: Sequence[Run]) -> Comparison:
+    (found,) = comparisons(judged(runs))
     return found
 
 
-def quantities_of(contest: Contest) -> dict[str, Quantity]:
+def quantities_of(contest: Comparison) -> dict[str, Quantity]:
     return {one.name: one for one in contest.quantities}
 
 
@@ -139,7 +138,7 @@ def test_runs_of_other_recordings_or_judged_otherwise_are_not_paired(tmp_path: P
         updates=write_run(tmp_path / "more", updates={0: [update(), update()]}).tables["updates"]
     )
     for other in (other_truth, other_gate, more_detections):
-        assert contests([one, JudgedRun("other", other)]) == []
+        assert comparisons([one, JudgedRun("other", other)]) == []
 
 
 def test_the_same_detections_with_other_delays_or_other_stamps_are_paired(tmp_path: Path, trio: list[Run]) -> None:
@@ -148,14 +147,14 @@ def test_the_same_detections_with_other_delays_or_other_stamps_are_paired(tmp_pa
     restamped = a_run(tmp_path / "restamped", NOISE_M, stamps_late=1)
     for other in (trio[1].with_tables(updates=later.tables["updates"]), restamped):
         assert same_recording(one.run, other)
-        assert len(contests([one, JudgedRun("other", other)])) == 1
+        assert len(comparisons([one, JudgedRun("other", other)])) == 1
 
 
 def test_each_recording_has_a_contest_of_its_own(tmp_path: Path, trio: list[Run]) -> None:
     tracks = [[ROUND.track(k, 1, across_m=0.1 * (k % 3))] for k in range(50)]
     pair = [write_run(tmp_path / name, tracks, truth=ROUND.truth(range(50))) for name in "ab"]
     without = write_run(tmp_path / "without", tracks)
-    found = contests(judged([trio[0], pair[0], without, trio[1], pair[1]]))
+    found = comparisons(judged([trio[0], pair[0], without, trio[1], pair[1]]))
     assert [one.runs for one in found] == [("0", "3"), ("1", "4")]
 
 

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from fgtrack.evaluation.over_seeds import SeedContest, seed_contests, shown_tables, summary_table, to_csv
-from fgtrack.evaluation.paired import paired
-from fgtrack.evaluation.sweep_table import SweepTable
+from fgtrack.evaluation.intervals import paired
+from fgtrack.evaluation.seeds import SeedComparison, SweepTable, seed_comparisons, shown_tables, summary_table, to_csv
 
 RMSE = "truth.overall.errors.position_m.rmse"
 SEEDS = 6
@@ -28,8 +27,8 @@ def noisy(seed: int, mean: float) -> list[float]:
     return list(np.random.default_rng(seed).normal(mean, 0.01, SEEDS))
 
 
-def only(rows: list[dict[str, str]], axes: Sequence[str] = ()) -> SeedContest:
-    (found,) = seed_contests(rows, axes)
+def only(rows: list[dict[str, str]], axes: Sequence[str] = ()) -> SeedComparison:
+    (found,) = seed_comparisons(rows, axes)
     return found
 
 
@@ -72,10 +71,10 @@ def test_only_seeds_that_all_estimators_have_count() -> None:
 
 
 def test_one_estimator_no_common_seed_or_an_unknown_metric_make_no_contest() -> None:
-    assert seed_contests(rows_of({"a": [1.0, 2.0]}), ()) == []
-    assert seed_contests(rows_of({"a": [1.0, None], "b": [None, 1.0]}), ()) == []
-    assert seed_contests(rows_of({"a": [1.0, 2.0], "b": [1.0, 2.0]}, "num_tracks"), ()) == []
-    assert seed_contests([], ()) == []
+    assert seed_comparisons(rows_of({"a": [1.0, 2.0]}), ()) == []
+    assert seed_comparisons(rows_of({"a": [1.0, None], "b": [None, 1.0]}), ()) == []
+    assert seed_comparisons(rows_of({"a": [1.0, 2.0], "b": [1.0, 2.0]}, "num_tracks"), ()) == []
+    assert seed_comparisons([], ()) == []
 
 
 def test_every_point_is_a_contest_and_csv_gives_the_numbers_back() -> None:
@@ -84,7 +83,7 @@ def test_every_point_is_a_contest_and_csv_gives_the_numbers_back() -> None:
         for delay in ("0.1", "0.2")
         for row in rows_of({"a": noisy(1, 0.4), "b": noisy(2, 0.5 + float(delay))}, delay_s=delay)
     ]
-    found = seed_contests(rows, ("delay_s",))
+    found = seed_comparisons(rows, ("delay_s",))
     read = list(csv.DictReader(io.StringIO(to_csv(found, ("delay_s",)))))
     assert [(row["delay_s"], row["estimator"], row["standing"], row["seeds"]) for row in read] == [
         *(("0.1", "a", "best", "6"), ("0.1", "b", "worse", "6")),
@@ -99,7 +98,7 @@ def test_every_point_is_a_contest_and_csv_gives_the_numbers_back() -> None:
 def test_few_points_are_shown_in_full_under_the_labels_of_their_axes() -> None:
     cells = {"late": "much", "sensors.radar.delay": '{"kind": "constant"}', "association.gate_m": "5.0"}
     rows = rows_of({"a": noisy(1, 0.4), "b": noisy(2, 0.5)}, **cells)
-    (table,) = shown_tables(seed_contests(rows, tuple(cells)), tuple(cells))
+    (table,) = shown_tables(seed_comparisons(rows, tuple(cells)), tuple(cells))
     assert table["point"].tolist() == ["much, 5.0"] * 2
     assert table.shown[0].heading == "late,\ngate_m"
     assert table["standing"].tolist() == ["best", "worse"]
@@ -112,13 +111,13 @@ def test_of_many_points_it_is_shown_how_often_who_is_best() -> None:
         for k in range(30)
         for row in rows_of({"a": noisy(k, 0.4), "b": noisy(k, 0.4 if k < 10 else 0.5)}, delay_s=str(k))
     ]
-    (table,) = shown_tables(seed_contests(rows, ("delay_s",)), ("delay_s",))
+    (table,) = shown_tables(seed_comparisons(rows, ("delay_s",)), ("delay_s",))
     assert table["estimator"].tolist() == ["a", "b"]
     assert (table["best"].tolist(), table["tie"].tolist(), table["worse"].tolist()) == ([20, 0], [10, 10], [0, 20])
 
 
 def test_a_single_seed_shows_nothing() -> None:
-    assert shown_tables(seed_contests(rows_of({"a": [1.0], "b": [2.0]}), ()), ()) == []
+    assert shown_tables(seed_comparisons(rows_of({"a": [1.0], "b": [2.0]}), ()), ()) == []
     assert shown_tables([], ()) == []
 
 
@@ -128,7 +127,7 @@ def test_a_summary_has_mean_and_standard_error_of_each_point_and_estimator() -> 
     rows = [row | {"truth.false_tracks": "3"} for row in rows_of({k: values[k] for k in values}, **cells)]
     rows += [row | {"truth.false_tracks": ""} for row in rows_of({"a": [0.7]}, **{**cells, "late": "little"})]
     sweep = SweepTable(tuple(cells), (RMSE, "truth.false_tracks"), rows)
-    table = summary_table(sweep, seed_contests(rows, tuple(cells)))
+    table = summary_table(sweep, seed_comparisons(rows, tuple(cells)))
     assert table[RMSE].tolist() == pytest.approx([0.5, 1.0, 0.7])
     assert table[f"{RMSE}.standard_error"][:2] == pytest.approx(np.std(values["a"], ddof=1) / 2)
     assert np.isnan(table[f"{RMSE}.standard_error"][2]), "of one seed nothing is known"

@@ -9,7 +9,7 @@ from scipy.special import stdtrit
 from scipy.stats import ttest_rel
 
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.paired import Estimate, average, block_length, by_stamp, mean_square, paired, within_run
+from fgtrack.evaluation.intervals import Estimate, average, block_length, by_stamp, mean_square, paired, within_run
 
 
 def mean(sums: FloatArray) -> FloatArray:

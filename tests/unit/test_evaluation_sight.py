@@ -11,11 +11,10 @@ from evaluation_runs import START_NS, TICK_NS, update
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import EgoState, TickReport, TrackReport, TrackState, TrackStatus, TruthState
-from fgtrack.evaluation.comparison import compare
+from fgtrack.evaluation.compare import compare
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.sight import ego_poses, in_sight
-from fgtrack.evaluation.truth import true_paths
+from fgtrack.evaluation.truth import ego_poses, in_sight, true_paths
 from fgtrack.io.run import Run, RunWriter, load_run
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.shipped import read_config, read_scenario

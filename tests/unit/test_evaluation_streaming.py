@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from evaluation_runs import ROUND, WEST, write_run
 
-from fgtrack.evaluation.comparison import compare
+from fgtrack.evaluation.compare import compare
 from fgtrack.evaluation.deadlines import Deadlines
 from fgtrack.evaluation.runs import JudgedRun
 from fgtrack.evaluation.streaming import ASKED, PREDICTED, READY, streamed

@@ -17,7 +17,7 @@ from rich.console import Console
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Disposition
 from fgtrack.estimation.failures import Failures
-from fgtrack.evaluation.comparison import BACKWARD_FORWARD_NOTE, compare, comparison
+from fgtrack.evaluation.compare import BACKWARD_FORWARD_NOTE, compare, comparison
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.runs import JudgedRun, labelled
 from fgtrack.evaluation.statistics import Distribution

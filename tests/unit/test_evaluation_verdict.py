@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from evaluation_runs import WEST, update, write_run
 
+from fgtrack.evaluation.comparison import Comparison, Entry, Quantity
 from fgtrack.evaluation.consistency import Consistency
-from fgtrack.evaluation.contest import Contest, Quantity
+from fgtrack.evaluation.intervals import Estimate
 from fgtrack.evaluation.metrics import Metrics, evaluate
-from fgtrack.evaluation.paired import Estimate
-from fgtrack.evaluation.ranking import Entry
 from fgtrack.evaluation.statistics import ChiSquareMean, Moments
 from fgtrack.evaluation.tables import two_digits
 from fgtrack.evaluation.verdict import verdict
@@ -44,17 +43,17 @@ def metrics_of(plain: Metrics, **consistency: Consistency) -> dict[str, Metrics]
     return {name: replace(plain, consistency=found) for name, found in consistency.items()}
 
 
-def contest(**differences: Estimate | None) -> Contest:
+def contest(**differences: Estimate | None) -> Comparison:
     entries = [
         Entry(name, 0.4, worse, "worse" if worse is not None and worse.is_significant else "tie")
         for name, worse in differences.items()
     ]
     if sum(entry.standing == "tie" for entry in entries) == 1:
         entries[0] = replace(entries[0], standing="best")
-    return Contest(tuple(differences), 10, 10, (Quantity("position_rmse_m", tuple(entries)),))
+    return Comparison(tuple(differences), 10, 10, (Quantity("position_rmse_m", tuple(entries)),))
 
 
-def first(plain: Metrics, found: Contest) -> str:
+def first(plain: Metrics, found: Comparison) -> str:
     return verdict(dict.fromkeys(found.runs, plain), [found])[0]
 
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import fgtrack
 from fgtrack.cli.main import app
 from fgtrack.core.types import Detection, DetectionList, Disposition
-from fgtrack.evaluation.left_out import because, left_out
+from fgtrack.evaluation.diagnostics import excluded_lines, reasons
 from fgtrack.io.adapters.scans import grouped
 from fgtrack.io.stream import write_stream
 from fgtrack.models.sensors import Filter, SensorModel
@@ -94,7 +94,7 @@ def test_what_a_reader_leaves_out_is_counted_and_stays_with_its_scan() -> None:
     config = replace(Config(), sensors={"radar": replace(RADAR, filters={})})
     run, _ = replay_in_memory([scan], config)
     assert run.meta["left_out"] == {"radar": {"filters.rcs": 4}}
-    assert list(left_out(run.meta)) == ["radar: 4 left out when read (4 by filters.rcs)"]
+    assert list(excluded_lines(run.meta)) == ["radar: 4 left out when read (4 by filters.rcs)"]
 
 
 def test_a_recording_that_is_converted_says_what_it_holds_no_more(tmp_path: Path) -> None:
@@ -109,4 +109,4 @@ def test_a_recording_that_is_converted_says_what_it_holds_no_more(tmp_path: Path
 
 
 def test_the_most_frequent_reason_comes_first() -> None:
-    assert because({"b": 1, "a": 3}) == "3 by a, 1 by b"
+    assert reasons({"b": 1, "a": 3}) == "3 by a, 1 by b"

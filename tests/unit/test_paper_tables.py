@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from evaluation_runs import WEST, run_beside, write_run
 
-from fgtrack.evaluation.comparison import compare
+from fgtrack.evaluation.compare import compare
 from fgtrack.io.run import Run
 
 

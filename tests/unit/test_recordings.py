@@ -9,8 +9,7 @@ import pytest
 from unit.evaluation_runs import ROUND, WEST, update, write_run
 
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
-from fgtrack.evaluation.recordings import by_recording, recordings_caution, same_recording
-from fgtrack.evaluation.runs import judged
+from fgtrack.evaluation.runs import by_recording, judged, recordings_warning, same_recording
 from fgtrack.io.run import Run, load_run
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.config import Config
@@ -65,11 +64,11 @@ def test_runs_of_different_recordings_are_told_by_name(tmp_path: Path) -> None:
 
     runs = judged([write("a", WEST), write("b", ROUND), write("c", WEST)])
     assert [[one.label[:1] for one in group] for group in by_recording(runs)] == [["a", "c"], ["b"]]
-    (line,) = recordings_caution(runs)
+    (line,) = recordings_warning(runs)
     assert line.startswith("the runs are of 2 recordings")
     assert "a.mcap, 7 messages" in line
     assert "b (smoother) (b.mcap" in line
-    assert recordings_caution(runs[::2]) == []
+    assert recordings_warning(runs[::2]) == []
 
 
 def test_the_recording_of_a_run_is_found_from_elsewhere_and_after_a_move(

@@ -9,8 +9,8 @@ import pytest
 from evaluation_runs import START_NS, TICK_NS, WEST, Car, update, write_run
 
 from fgtrack.core.types import Disposition, EgoState, TickReport
+from fgtrack.evaluation.innovations import residual_samples
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.residual_samples import residual_samples
 from fgtrack.io.run import Run, RunWriter, load_run
 from fgtrack.models.oval import make_oval
 

@@ -1,4 +1,4 @@
-"""Differences with their uncertainty: paired over seeds (t interval), and within one run (block bootstrap).
+"""Confidence intervals of 95 %: of differences paired over seeds (t interval), and within one run (block bootstrap).
 
 Two estimators on the same recording make nearly the same errors, so their difference is known far better than either
 value. Over seeds the differences are independent. Along one run they are not: neighbouring ticks share their errors,
@@ -28,22 +28,29 @@ Statistic = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number and its 95 % confidence interval; NaN where it is not known."""
+    """A number and its 95 % confidence interval; NaN where it is not known.
+
+    Attributes
+    ----------
+    mean, low, high
+        The number and the ends of its interval.
+    count
+        Independent samples that it rests on: seeds, or blocks of a run.
+    """
 
     mean: float
     low: float
     high: float
     count: int
-    """Independent pieces that it rests on: seeds, or blocks of a run."""
 
     @property
     def is_significant(self) -> bool:
-        """Whether the interval excludes 0; not where it is unknown."""
+        """True if the interval excludes 0; false where it is unknown."""
         return self.low > 0.0 or self.high < 0.0
 
     @property
     def is_known(self) -> bool:
-        """Whether there is an interval."""
+        """True if there is an interval."""
         return math.isfinite(self.low) and math.isfinite(self.high)
 
     def __format__(self, spec: str) -> str:
@@ -52,7 +59,6 @@ class Estimate:
 
 
 UNKNOWN = Estimate(math.nan, math.nan, math.nan, 0)
-"""Of nothing."""
 
 
 def paired(values_a: Sequence[float] | FloatArray, values_b: Sequence[float] | FloatArray) -> Estimate:
@@ -80,11 +86,10 @@ def average(values: Sequence[float] | FloatArray) -> Estimate:
     """
     known = np.asarray(values, dtype=np.float64)
     known = known[~np.isnan(known)]
-    count = len(known)
-    if not count:
+    if not len(known):
         return UNKNOWN
-    error = float(known.std(ddof=1)) / math.sqrt(count) if count > 1 else math.nan
-    return _around(float(known.mean()), error, count)
+    error = float(known.std(ddof=1)) / math.sqrt(len(known)) if len(known) > 1 else math.nan
+    return _t_interval(float(known.mean()), error, len(known))
 
 
 def within_run(ticks: FloatArray, statistic: Statistic, rng: np.random.Generator) -> Estimate:
@@ -123,7 +128,7 @@ def within_run(ticks: FloatArray, statistic: Statistic, rng: np.random.Generator
         drawn = statistic(_drawn_sums(pieces, length, rng).T)
     blocks = n / length
     error = float(np.nanstd(drawn)) * math.sqrt(blocks / (blocks - 1.0))
-    return _around(value, error, blocks)
+    return _t_interval(value, error, blocks)
 
 
 def mean_square(ticks: FloatArray, rng: np.random.Generator) -> Estimate:
@@ -131,10 +136,10 @@ def mean_square(ticks: FloatArray, rng: np.random.Generator) -> Estimate:
 
     The interval is that of the logarithm, so it is positive however few blocks it comes from.
     """
-    found = within_run(ticks, lambda S: np.log(S[0] / S[1]), rng)
+    log = within_run(ticks, lambda S: np.log(S[0] / S[1]), rng)
     with np.errstate(over="ignore"):
-        mean, low, high = np.exp([found.mean, found.low, found.high]).tolist()
-    return Estimate(mean, low, high, found.count)
+        mean, low, high = np.exp([log.mean, log.low, log.high]).tolist()
+    return Estimate(mean, low, high, log.count)
 
 
 def by_stamp(stamps_ns: IntArray, samples: FloatArray) -> FloatArray:
@@ -200,7 +205,7 @@ def _drawn_sums(pieces: FloatArray, length: int, rng: np.random.Generator) -> Fl
     return np.asarray(whole[starts[:, :-1]].sum(axis=1) + rest[starts[:, -1]])
 
 
-def _around(mean: float, error: float, count: float) -> Estimate:
+def _t_interval(mean: float, error: float, count: float) -> Estimate:
     """`mean` with its t interval, `error` being its standard error from `count` independent pieces."""
     half = float(stdtrit(count - 1.0, _UPPER)) * error if count > 1.0 else math.nan
     return Estimate(mean, mean - half, mean + half, int(count))

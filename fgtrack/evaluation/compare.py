@@ -1,0 +1,412 @@
+"""Runs in comparison: their tables and the sentences that summarise them."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from fgtrack.core.errors import CallError
+from fgtrack.core.types import FUSED, LATE, Disposition
+from fgtrack.evaluation.comparison import (
+    POSITION_NEES,
+    STANDING_NOTE,
+    Comparison,
+    comparisons,
+    entry_columns,
+    entry_record,
+    is_best,
+)
+from fgtrack.evaluation.diagnostics import USED
+from fgtrack.evaluation.innovations import FEWEST, LAGS, RESIDUAL_NAMES, Autocorrelation
+from fgtrack.evaluation.intervals import UNKNOWN
+from fgtrack.evaluation.lagged import WINDOW, LagMetrics
+from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics
+from fgtrack.evaluation.prediction import HORIZONS_S
+from fgtrack.evaluation.runs import OneRun, judged
+from fgtrack.evaluation.statistics import ChiSquareMean
+from fgtrack.evaluation.streaming import streaming_tables
+from fgtrack.evaluation.tables import MS, NO_VALUE, PERCENT, RUN, Column, Table, Tables, Value, named
+from fgtrack.evaluation.verdict import verdict
+
+BACKWARD_FORWARD = "ekf-backward-forward"
+BACKWARD_FORWARD_NOTE = "backward-forward forgets what was fused after the stamp of a late detection"
+BEST_NOTE = "bold: the best run of its recording in this, with 95 % confidence"
+
+_ERRORS = {
+    "position_m": "pos.\n[m]",
+    "along_m": "along\n[m]",
+    "across_m": "across\n[m]",
+    "yaw_rad": "yaw\n[rad]",
+    "speed_mps": "speed\n[m/s]",
+}
+_QUANTITIES = {
+    "position_rmse_m": "pos. [m]",
+    "speed_rmse_mps": "speed [m/s]",
+    "yaw_rmse_rad": "yaw [rad]",
+    POSITION_NEES: "NEES pos.",
+    "gospa_in_sight_rms_m": "GOSPA [m]",
+}
+_MAIN_QUANTITIES = ("position_rmse_m", "gospa_in_sight_rms_m")
+_GOSPA = "gospa_in_sight_rms_m"
+_UNITS = {"m": "m", "rad": "rad", "mps": "m/s"}
+_COMMON_SHARE = 0.9  # of the samples that all runs have in common; below it a note says how many
+_MOST_LAGS, _FEW_LAGS = 8, 3
+
+
+def compare(*runs: OneRun | Iterable[OneRun] | Mapping[str, OneRun], streaming: bool = False) -> Tables:
+    """Metrics of `runs` in comparison: the `verdict`, and tables `differences`, `tracking`, `multi_object`, `lag`,
+    `consistency`, `dispositions`, `failures`, `residuals_SENSOR` of every sensor, and `predictions`.
+
+    Runs of the same recording are compared sample by sample. A path is a run folder, or a folder that holds run
+    folders; a mapping gives runs labels. With `streaming` a table of that name evaluates what was published when it was
+    ready, and the verdict names the best run then.
+
+    Raises
+    ------
+    CallError
+        No run is given, one is given twice, or a path is not a run folder.
+    DataError
+        A run folder is damaged.
+    """
+    every = judged(runs)
+    if not every:
+        raise CallError("compare: no run is given, name at least one")
+    metrics, compared = {one.label: one.metrics for one in every}, comparisons(every)
+    notes = [BACKWARD_FORWARD_NOTE] if any(one.estimator == BACKWARD_FORWARD for one in metrics.values()) else []
+    tables = {
+        "differences": _differences(compared),
+        "tracking": _tracking(metrics, compared, notes),
+        "multi_object": _multi_object(metrics, compared),
+        "lag": _lag(metrics),
+        "consistency": _consistency(metrics),
+        **{f"residuals_{name}": _residuals(name, metrics) for one in metrics.values() for name in one.sensors},
+        "dispositions": _dispositions(metrics),
+        "failures": _failures(metrics),
+        "predictions": _predictions(metrics),
+    }
+    sentences = verdict(metrics, compared)
+    if streaming:
+        more, added = streaming_tables(every)
+        tables, sentences = tables | more, (*sentences, *added)
+    details = {"runs": {label: one.as_dict() for label, one in metrics.items()}, "notes": notes}
+    return Tables(tables, details, sentences)
+
+
+def _differences(compared: Sequence[Comparison]) -> Table:
+    """A row for each recording, quantity and run: its value, and how much worse than the best it is."""
+    records = [
+        {"quantity": q.name, **entry_record(entry), "blocks": (entry.worse_by or UNKNOWN).count}
+        for one in compared
+        for q in one.quantities
+        for entry in q.entries
+    ]
+    quantity = Column("quantity", text=lambda name: _QUANTITIES[str(name)], left=True)
+    notes = ["RMSE where all runs track the object; NEES: worse is farther from 2", STANDING_NOTE]
+    notes += [
+        f"{', '.join(one.runs)}: {one.samples} samples in common, of up to {one.most_samples}"
+        for one in compared
+        if one.samples < _COMMON_SHARE * one.most_samples
+    ]
+    return Table(
+        "Differences of runs of the same recording",
+        records,
+        [quantity, RUN, *entry_columns("value")],
+        ("run", "quantity"),
+        notes,
+        is_main=lambda record: record["quantity"] in _MAIN_QUANTITIES,
+    )
+
+
+def _tracking(metrics: Mapping[str, Metrics], compared: Sequence[Comparison], notes: Sequence[str]) -> Table:
+    """A row for each run: errors against truth, continuity, number of tracks, time."""
+    records, with_truth = [], any(one.truth for one in metrics.values())
+    for label, one in metrics.items():
+        record: dict[str, Any] = {"run": label, "estimator": one.estimator}
+        if one.truth is not None:
+            overall = one.truth.overall
+            record |= {named(name, "rmse"): overall.errors[name].rmse for name in _ERRORS}
+            record |= {"position_nees": one.consistency.position_nees.mean, "tracked_share": overall.tracked_share}
+            record |= {"tracked_share_in_sight": overall.tracked_share_in_sight, "breaks": overall.breaks}
+            record |= {"id_switches": overall.id_switches, "false_tracks": one.truth.false_tracks}
+            record["precision"] = one.precision
+        record |= {"num_tracks": one.num_tracks, "num_confirmed": one.num_confirmed}
+        record["time_per_tick_p50_s"], record["time_per_tick_p99_s"] = one.time_per_tick_s.p50, one.time_per_tick_s.p99
+        records.append(record)
+    best = _best_of(compared)
+    nees_note = "NEES: mean of the position's; 2 if the covariances fit"
+    seen_note = "tracked: share of the ticks at which some sensor could see the object"
+    break_note = "breaks: resumed after a loss or with another track; switches: the latter"
+    false_note = f"false: paired with a true object in less than {FALSE_TRACK_SHARE:.0%} of its life"
+    precision_note = "precision: true objects tracked / tracks that were confirmed"
+    truth = [
+        *(
+            Column(heading, rmse, bold=best(rmse), when="always" if name == "position_m" else "full")
+            for name, heading in _ERRORS.items()
+            for rmse in [named(name, "rmse")]
+        ),
+        Column("NEES\npos.", "position_nees", when="few", bold=best(POSITION_NEES), note=nees_note),
+        Column("tracked\n[%]", "tracked_share_in_sight", scale=PERCENT, note=seen_note),
+        Column("breaks/\nswitches", "breaks id_switches", "{}/{}", note=break_note),
+        Column("false\ntracks", "false_tracks", note=false_note),
+        Column("preci-\nsion", "precision", text=_two_decimals, when="full", note=precision_note),
+    ]
+    columns = [
+        RUN,
+        *(truth if with_truth else ()),
+        Column(
+            "tracks all/\nconfirmed",
+            "num_tracks num_confirmed",
+            "{}/{}",
+            when="full" if with_truth else "always",
+            note="confirmed: published as more than tentative at some tick",
+        ),
+        Column("ms/tick\np50/p99", "time_per_tick_p50_s time_per_tick_p99_s", "{}/{}", MS),
+    ]
+    names = [*(column.names for column in truth[: len(_ERRORS)]), POSITION_NEES]
+    own = [BEST_NOTE] if any(is_best(compared, name, run) for run in metrics for name in names) else []
+    late = [
+        f"{label} {one.deadlines.misses}/{one.deadlines.ticks}"
+        for label, one in metrics.items()
+        if one.deadlines.are_known and one.deadlines.misses
+    ]
+    if late:
+        own.append(f"slower than real time, on a machine that may have been busy (ticks late): {', '.join(late)}")
+    title = "Tracking" + (" (errors: RMSE against truth)" if with_truth else "")
+    return Table(title, records, columns, notes=[*own, *notes])
+
+
+def _multi_object(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]) -> Table:
+    """A row for each run with truth: GOSPA and its parts, CLEAR, IDF1, HOTA, switches, time to confirm."""
+    records = []
+    for label, one in metrics.items():
+        record: dict[str, Any] = {"run": label}
+        if one.multi_object is not None and one.truth is not None:
+            gospa, overall, hota = one.multi_object.gospa, one.truth.overall, one.multi_object.hota
+            record |= {
+                _GOSPA: gospa.in_sight_rms_m,
+                "gospa_localisation_m": math.sqrt(gospa.localisation_m2),
+                "gospa_missed_in_sight_m": math.sqrt(max(gospa.missed_m2 - gospa.out_of_sight_m2, 0.0)),
+                "gospa_false_m": math.sqrt(gospa.false_m2),
+                "gospa_out_of_sight_m": math.sqrt(gospa.out_of_sight_m2),
+                "gospa_rms_m": gospa.rms_m,
+                "gospa_missed_m": math.sqrt(gospa.missed_m2),
+            }
+            record |= {"mota": one.multi_object.clear.mota, "idf1": one.multi_object.identity.idf1, "hota": hota.hota}
+            record |= {"deta": hota.deta, "assa": hota.assa, "id_switches": overall.id_switches}
+            record |= {
+                "late_id_switches": overall.late_id_switches,
+                "time_to_confirm_s": overall.time_to_confirm_s.mean,
+            }
+        records.append(record)
+    columns = [
+        RUN,
+        Column("GOSPA\n[m]", _GOSPA, bold=_best_of(compared)(_GOSPA)),
+        Column("local.\n[m]", "gospa_localisation_m"),
+        Column("missed\n[m]", "gospa_missed_in_sight_m"),
+        Column("false\n[m]", "gospa_false_m"),
+        Column("unseen\n[m]", "gospa_out_of_sight_m"),
+        Column("with\nunseen", "gospa_rms_m"),
+        *(Column(f"{name}\n[%]", name.lower(), scale=PERCENT) for name in ("MOTA", "IDF1", "HOTA", "DetA", "AssA")),
+        Column("switches/\nlate", "id_switches late_id_switches", "{}/{}"),
+        Column("confirm\n[s]", "time_to_confirm_s"),
+    ]
+    notes = [
+        "GOSPA: root mean square over ticks; the squares of its parts add up to its own",
+        "unseen: missed where no sensor could see; the scores in % count it too",
+        "scores: 100 is perfect; defined in docs/metrics.md",
+        "late: switches soon after an out-of-sequence update of one of the two tracks",
+        "confirm: from an object's first detection to its first confirmed track",
+        *([BEST_NOTE] if any(is_best(compared, _GOSPA, run) for run in metrics) else []),
+    ]
+    records = records if any(len(record) > 1 for record in records) else []
+    return Table("Multi-object metrics", records, columns, notes=notes, is_detail=True)
+
+
+def _lag(metrics: Mapping[str, Metrics]) -> Table:
+    """A row for each run and lag, where any run has lagged or final states: errors, and how waiting lowers them."""
+    records = []
+    for label, one in metrics.items():
+        few = _some_lags(one.lagged, _FEW_LAGS)
+        for lag in _some_lags(one.lagged, _MOST_LAGS):
+            is_window, is_present = lag.lag_s == WINDOW, lag.lag_s == 0.0
+            record: dict[str, Any] = {"run": label, "lag": lag.lag_s if is_window else f"{lag.lag_s:g}"}
+            record |= {"lag_s": None if is_window else lag.lag_s, "num_states": lag.errors["position_m"].count}
+            for name in ("position_m", "speed_mps", "yaw_rad"):
+                record[named(name, "rmse")] = lag.errors[name].rmse
+                record[f"{name.rpartition('_')[0]}_reduction"] = math.nan if is_present else lag.gain(name)
+            record["position_reduction_low"] = lag.position_reduction.low
+            record["position_reduction_high"] = lag.position_reduction.high
+            record["position_nees"] = lag.position_nees.mean
+            records.append((record, lag in few))
+    main = [record for record, is_main in records if is_main]
+    interval = "position_reduction_low position_reduction_high"
+    columns = [
+        RUN,
+        Column("lag\n[s]", "lag"),
+        Column("states", "num_states", when="full"),
+        Column(_ERRORS["position_m"], "position_rmse_m"),
+        Column("below\n[%]", "position_reduction", scale=PERCENT),
+        Column("95 %\ninterval", interval, "{} to {}", PERCENT),
+        Column(_ERRORS["speed_mps"], "speed_rmse_mps", when="full"),
+        Column("below\n[%]", "speed_reduction", scale=PERCENT, when="full"),
+        Column(_ERRORS["yaw_rad"], "yaw_rmse_rad", when="full"),
+        Column("below\n[%]", "yaw_reduction", scale=PERCENT, when="full"),
+        Column("NEES\npos.", "position_nees"),
+    ]
+    notes = [
+        "lag 0: states as published; window: final states, as they leave the window",
+        "below: reduction against the present states of the same tracks and stamps",
+        "NEES: of the position; 2 if consistent",
+    ]
+    if any(len(_some_lags(one.lagged, _MOST_LAGS)) < len(one.lagged) for one in metrics.values()):
+        notes.append(f"{_MOST_LAGS} lags of a run are shown at most, metrics.json has all")
+    found = [record for record, _ in records] if any(len(one.lagged) > 1 for one in metrics.values()) else []
+    title = "Error against lag (RMSE against truth)"
+    return Table(title, found, columns, ("run", "lag"), notes, is_main=lambda record: record in main)
+
+
+def _some_lags(lagged: Sequence[LagMetrics], most: int) -> list[LagMetrics]:
+    """The present and the final states, and of the lags between them at most so many that are evenly spread."""
+    lags = [entry for entry in lagged if entry.lag_s not in (0.0, WINDOW)]
+    if len(lags) > most:
+        lags = [lags[round(k * (len(lags) - 1) / (most - 1))] for k in range(most)]
+    return [entry for entry in lagged if entry.lag_s in (0.0, WINDOW) or entry in lags]
+
+
+def _consistency(metrics: Mapping[str, Metrics]) -> Table:
+    """A row for each run and normalised square: NEES of the present states, NIS and whiteness of every sensor."""
+    records = []
+    for label, one in metrics.items():
+        found = one.consistency
+        squares: dict[str, tuple[ChiSquareMean, Autocorrelation | None]] = {
+            "NEES position": (found.position_nees, None),
+            "NEES state": (found.state_nees, None),
+        }
+        for sensor, nis in found.nis.items():
+            squares[f"NIS {sensor}"] = nis, next(iter(found.autocorrelation[sensor].values()), None)
+        for name, (square, white) in squares.items():
+            record: dict[str, Any] = {"run": label, "of": name, "num_samples": square.count, "mean": square.mean}
+            record |= {"expected": square.dof, "band_low": square.band[0], "band_high": square.band[1]}
+            if white is not None:
+                record |= {"lag1_correlation": white.lag1, "lag1_band": white.lag1_band}
+                record["share_outside"] = white.share_outside
+            records += [record] if square.count else []
+    columns = [
+        RUN,
+        Column("of", left=True),
+        Column("samples", "num_samples"),
+        Column("mean"),
+        Column("expected"),
+        Column("95 % band", "band_low band_high", "{} to {}"),
+        Column("correlation\nat lag 1", "lag1_correlation lag1_band", "{} ± {}"),
+        Column("outside\n[%]", "share_outside", scale=PERCENT),
+    ]
+    notes = [
+        "band: of the mean of independent samples; errors along one run are correlated,",
+        "so the NEES of a single run may leave it (average over several runs)",
+        f"correlation: of innovations, tracks with {FEWEST}+ of them; ± 95 % band if white",
+        f"outside: share of tracks and lags 1 to {LAGS} outside their bands; 5 if white",
+    ]
+    title = "Consistency (mean NEES and NIS, and their expected values)"
+    return Table(title, records, columns, ("run", "of"), notes, is_detail=True)
+
+
+def _residuals(sensor: str, metrics: Mapping[str, Metrics]) -> Table:
+    """A row for each run with the sensor: mean and standard deviation of the innovations, NIS, delay."""
+    found = {label: one.sensors[sensor] for label, one in metrics.items() if sensor in one.sensors}
+    names = [name for name in RESIDUAL_NAMES if any(name in one.residuals for one in found.values())]
+    records = []
+    for label, one in found.items():
+        record: dict[str, Any] = {"run": label}
+        for name in names:
+            if name in one.residuals:
+                record |= {named(name, "mean"): one.residuals[name].mean, named(name, "std"): one.residuals[name].std}
+        record |= {"nis_mean": one.nis.mean, "nis_expected": one.nis_dof.mean}
+        records.append(record | {"delay_mean_s": one.delay_s.mean, "delay_p90_s": one.delay_s.p90})
+    shown = [name for name in names if "along_m" not in names or name not in ("x_m", "y_m")]
+    columns = [
+        RUN,
+        *(
+            Column(
+                f"{quantity.replace('_', ' ')}\n[{_UNITS[unit]}]",
+                f"{named(name, 'mean')} {named(name, 'std')}",
+                "{} ± {}",
+            )
+            for name in shown
+            for quantity, _, unit in [name.rpartition("_")]
+        ),
+        Column("NIS", "nis_mean"),
+        Column("NIS\nexpected", "nis_expected"),
+        Column("delay [ms]\nmean/p90", "delay_mean_s delay_p90_s", "{}/{}", MS),
+    ]
+    title = f"Residuals of {sensor} (measured minus predicted: mean ± standard deviation)"
+    return Table(title, records, columns, is_detail=True)
+
+
+def _dispositions(metrics: Mapping[str, Metrics]) -> Table:
+    """A row for each run and sensor: dispositions of the detections, and their sum."""
+    records = []
+    for label, one in metrics.items():
+        for name, sensor in one.sensors.items():
+            counts = sensor.dispositions
+            refused = sum(count for kind, count in counts.items() if kind not in USED)
+            groups = {"fused": sum(counts[k] for k in FUSED), "late": sum(counts[k] for k in LATE), "refused": refused}
+            records.append({"run": label, "sensor": name, **counts, "detections": sensor.detections, **groups})
+    absent = [kind for kind in Disposition if not any(record[kind.value] for record in records)]
+    columns = [
+        RUN,
+        Column("sensor", left=True),
+        Column("fused", when="few", note="fused: also those that started a track"),
+        Column("late", when="few", note="late: of the fused ones, those out of sequence"),
+        Column("merged", when="few", note="merged: with another detection of their list"),
+        Column("refused", when="few"),
+        *(Column(k.value.replace("_", "\n"), k.value, when="full") for k in Disposition if k not in absent),
+        Column("sum", "detections"),
+    ]
+    notes = [f"no detection was {' or '.join(kind.value.replace('_', ' ') for kind in absent)}"] if absent else []
+    notes += dict.fromkeys(line for one in metrics.values() for line in one.left_out)
+    title = "Dispositions (the outcome of every detection)"
+    return Table(title, records, columns, ("run", "sensor"), notes)
+
+
+def _failures(metrics: Mapping[str, Metrics]) -> Table:
+    """A row for each run that counted its failures; without any failure it is a detail."""
+    records = [
+        {"run": label, **{kind.replace(" ", "_"): count for kind, count in one.failures.items()}}
+        | {"failures": sum(one.failures.values())}
+        for label, one in metrics.items()
+        if one.failures
+    ]
+    kinds = list(dict.fromkeys(kind for one in metrics.values() for kind in one.failures))
+    absent = [kind for kind in kinds if not any(one.failures.get(kind) for one in metrics.values())]
+    columns = [RUN, *(Column(kind.replace(" ", "\n"), kind.replace(" ", "_")) for kind in kinds if kind not in absent)]
+    columns.append(Column("sum", "failures"))
+    notes = [f"none: {', '.join(absent)}"] if absent else []
+    return Table("Failures inside the estimator", records, columns, notes=notes, is_detail=len(absent) == len(kinds))
+
+
+def _predictions(metrics: Mapping[str, Metrics]) -> Table:
+    """A row for each run and predictor: FDE and ADE at every horizon."""
+    records = []
+    for label, one in metrics.items():
+        for predictor, horizons in one.predictions.items():
+            record: dict[str, Any] = {"run": label, "predictor": predictor}
+            record["count"] = next(iter(horizons.values())).final_m.count
+            for name, errors in horizons.items():
+                record |= {f"fde_{name}_m": errors.final_m.mean, f"ade_{name}_m": errors.average_m.mean}
+            records.append(record)
+    columns = [RUN, Column("along", "predictor", left=True), Column("predic-\ntions", "count")]
+    columns += [Column(f"{s:g} s [m]\nFDE/ADE", f"fde_{s:g}s_m ade_{s:g}s_m", "{}/{}") for s in HORIZONS_S]
+    notes = [
+        "FDE: mean distance from the truth at that time ahead; ADE: the same, averaged up to it",
+        "arc: constant turn rate and speed; rail: the same for 0.2 s, then along the track",
+    ]
+    return Table("Predictions from the published states", records, columns, ("run", "predictor"), notes, is_detail=True)
+
+
+def _best_of(compared: Sequence[Comparison]) -> Any:
+    """Function of a quantity: True for the records whose run is best in it."""
+    return lambda quantity: lambda record: is_best(compared, quantity, str(record["run"]))
+
+
+def _two_decimals(value: Value) -> str:
+    return f"{value:.2f}" if math.isfinite(float(value)) else NO_VALUE

@@ -1,0 +1,382 @@
+"""What must be known before a run is trusted: unused detections and why, inconsistent noise, broken tracks."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.special import chdtri
+
+from fgtrack.core.caution import EGO, Caution, in_degrees
+from fgtrack.core.time import NS_PER_S, wrong_unit
+from fgtrack.core.types import FloatArray
+from fgtrack.evaluation.innovations import autocorrelations, num_measured
+from fgtrack.evaluation.matching import confirmed
+from fgtrack.evaluation.statistics import ChiSquareMean
+from fgtrack.io.run import Run, Table, digest
+from fgtrack.models.measurement import ANGULAR
+from fgtrack.models.road import OPEN_SPACE
+
+USED = ("birth", "in_sequence", "out_of_sequence", "beyond_window", "merged")
+"""Dispositions of detections that took part."""
+FAR_OFF = 1.5
+"""A mean NIS farther from its expected value than by this factor is inconsistent."""
+FEWEST = 30
+"""Fewest updates of a sensor whose NIS is evaluated."""
+CORRELATED = 0.3
+"""Autocorrelation of innovations at lag 1 above which their errors are correlated in time."""
+MOST_BREAKS_PER_MINUTE = 2.0
+"""More breaks per object and minute than these are bad tracking."""
+_FEWEST_BREAKS, _BREAKS_SHARE = 3, 0.25
+"""Breaks, and their share of all confirmed tracks, that are not those of occlusions or of chance."""
+_DEAD_SHARE = 0.5
+"""Share of the detections used that begin a track which is never confirmed; of clutter it is below."""
+#: A track continues another one that ended at most so long before, or after, it began.
+_GAP_S, _OVERLAP_S = 5.0, 2.0
+#: It begins within this distance of the prediction of the other one: noise, and a turn of 0.3 rad or 30 % of its speed.
+_NEAR_M, _DEPARTURE = 3.0, 0.3
+_NO_FAILURE = "step damped"  # a failure that is none: with bearings damped steps are usual
+
+#: Cause and cure of dispositions that most detections of a sensor may have.
+_CURES = {
+    "gated": "no track was near enough and none was started: check the gate of `association`, the clock, and "
+    "ego.detection_origin_x_m",
+    "out_of_bounds": "{reasons}: are these settings meant, and is it the right map (--map), and the frame of the "
+    "detections?",
+    "duplicate": "the same list again and again: look at the recording, a sensor or a bridge repeats itself",
+    "superseded": "another list of the sensor came in the same tick, and the inbox keeps one: raise clock.node_hz",
+    "invalid": "no position, a value that is not finite, an invalid covariance, or a stamp ahead of its receipt: "
+    "compare the keys of sensors.{sensor}.std with what `fgtrack info` shows",
+    "failed": "no ego state near the stamp, or a numerical failure: check the clock of the ego",
+}
+_STANDING = {"birth.ego_speed_factor": 0.0}
+_NAME_EGO = "name its topic in the configuration (`fgtrack info` lists the topics)"
+
+
+@dataclass(frozen=True)
+class Fragmentation:
+    """Lifetimes and breaks of the tracks of a run that were ever confirmed: without truth.
+
+    Attributes
+    ----------
+    lifetimes_s
+        From birth to end, shape (tracks,).
+    breaks
+        Tracks that begin where and when another one ends, within the distance that the object can have travelled.
+    """
+
+    lifetimes_s: FloatArray
+    breaks: int
+
+    @classmethod
+    def of(cls, run: Run) -> "Fragmentation":
+        """Return the fragmentation of `run`."""
+        tracks = run.tables["tracks"]
+        ids = np.unique(tracks["track_id"][confirmed(tracks)])
+        rows = np.flatnonzero(np.isin(tracks["track_id"], ids))
+        rows = rows[np.argsort(tracks["track_id"][rows], kind="stable")]
+        births, ends = (
+            rows[np.searchsorted(tracks["track_id"][rows], ids)],
+            rows[np.searchsorted(tracks["track_id"][rows], ids, "right") - 1],
+        )
+        born_s, ended_s = ((tracks["now_ns"][each] - tracks["now_ns"][:1]) / NS_PER_S for each in (births, ends))
+        positions_m = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
+        yaw_rad, speed_mps = tracks["yaw_rad"][ends], tracks["speed_mps"][ends]
+        velocities_mps = speed_mps[:, None] * np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=-1)
+        free, breaks = np.ones(len(ids), dtype=bool), 0
+        for k in np.argsort(born_s, kind="stable").tolist():
+            gap_s = born_s[k] - ended_s
+            late = (born_s < born_s[k]) & (ended_s < ended_s[k]) & (gap_s >= -_OVERLAP_S) & (gap_s <= _GAP_S)
+            before = np.flatnonzero(free & late)
+            expected_m = positions_m[ends[before]] + velocities_mps[before] * gap_s[before, None]
+            apart_m = np.linalg.norm(positions_m[births[k]] - expected_m, axis=-1)
+            near = apart_m <= _NEAR_M + _DEPARTURE * np.abs(speed_mps[before] * gap_s[before])
+            if near.any():
+                free[before[near][apart_m[near].argmin()]] = False
+                breaks += 1
+        return cls(ended_s - born_s, breaks)
+
+    @property
+    def median_s(self) -> float:
+        """Median lifetime; NaN without tracks."""
+        return float(np.median(self.lifetimes_s)) if len(self.lifetimes_s) else math.nan
+
+    @property
+    def breaks_per_minute(self) -> float:
+        """Breaks per minute of all lifetimes together; NaN without tracks."""
+        minutes = float(self.lifetimes_s.sum()) / 60.0
+        return self.breaks / minutes if minutes else math.nan
+
+
+def diagnostics(run: Run) -> list[Caution]:
+    """Defects of `run`, as far as its files show them."""
+    found = (_changed, _clocks, _angles, _ego, _map, _unused, _window, _failures, _fragmentation)
+    return [one for of_kind in found for one in of_kind(run)]
+
+
+def noise_diagnostics(run: Run) -> list[Caution]:
+    """Sensors whose innovations are inconsistent with the noise; see also the verdict of `compare`."""
+    found = []
+    for sensor, nis in misfits(run):
+        size = "small" if nis.mean > nis.dof else "large"
+        factor = math.sqrt(max(nis.mean, 0.0) / nis.dof)  # below 0 by rounding, where one std is 1e9 of another
+        text = (
+            f"mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}, as if "
+            f"errors were {factor:.2g} times what is configured"
+        )
+        lag1 = innovation_lag1(run, sensor)
+        if lag1 is not None and lag1 > CORRELATED:
+            text += f", and errors are correlated in time ({lag1:.2f}), which fitted white noise cannot express"
+        fit = _advise(run, " --tune -o advised.yaml")
+        found.append(Caution(sensor, f"{text}; `{fit}` fits it, or reports what has to be done first"))
+    return found
+
+
+def innovation_lag1(run: Run, sensor: str) -> float | None:
+    """Autocorrelation of the position innovations of a sensor at lag 1; None where no track has enough of them.
+
+    It is near 0 where its errors are white and the noise is consistent. Of a sensor without positions it is that of the
+    first component.
+    """
+    updates = run.tables["updates"]
+    first = next(iter(autocorrelations(updates.where(updates["sensor"] == sensor)).values()), None)
+    return None if first is None else first.lag1
+
+
+def misfits(run: Run) -> Iterator[tuple[str, ChiSquareMean]]:
+    """The sensors whose mean and median NIS are both far off, on the same side, and their NIS.
+
+    The mean alone may be that of a few outliers, or of the first innovations of new tracks.
+    """
+    updates = run.tables["updates"]
+    measured = num_measured(updates)
+    for sensor, mine in _by_sensor(updates):
+        nis = ChiSquareMean.of(updates["nis"][mine], measured[mine])
+        if nis.count >= FEWEST and is_far_off(nis):
+            ratio = float(np.nanmedian(updates["nis"][mine])) / float(chdtri(nis.dof, 0.5))
+            if ratio > FAR_OFF if nis.mean > nis.dof else ratio < 1.0 / FAR_OFF:
+                yield sensor, nis
+
+
+def is_far_off(square: ChiSquareMean) -> bool:
+    """True if a mean NEES or NIS is out of proportion to its expected value."""
+    return not square.dof / FAR_OFF <= square.mean <= square.dof * FAR_OFF
+
+
+def unused(run: Run) -> str | None:
+    """Line on the dispositions of a run that used no detection; None where one was used, or none was received."""
+    dispositions = run.tables["updates"]["disposition"]
+    if not len(dispositions) or np.isin(dispositions, USED).any():
+        return None
+    counts = zip(*np.unique(dispositions, return_counts=True), strict=True)
+    return f"none of the {len(dispositions)} detections was used ({', '.join(f'{n} {name}' for name, n in counts)})"
+
+
+def reasons(counts: Mapping[str, int]) -> str:
+    """`counts` by setting in words, the most first: `40 by filters.score, 2 by map.excluded`."""
+    return ", ".join(f"{count} by {name}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))
+
+
+def excluded_lines(meta: Mapping[str, Any]) -> Iterator[str]:
+    """A line for each sensor of a run with this meta.json whose detections settings excluded."""
+    bounds, unread = (dict(meta.get(key) or {}) for key in ("out_of_bounds", "left_out"))
+    for sensor in sorted({*bounds, *unread}):
+        found = []
+        if sensor in bounds:
+            count, total = sum(bounds[sensor].values()), sum(meta["counts"][sensor].values())
+            found.append(f"{count} of {total} detections out of bounds ({reasons(bounds[sensor])})")
+        if sensor in unread:
+            found.append(f"{sum(unread[sensor].values())} left out when read ({reasons(unread[sensor])})")
+        yield f"{sensor}: {'; '.join(found)}"
+
+
+def _advise(run: Run, options: str = "") -> str:
+    """The command that examines the settings of `run`."""
+    source = str((run.meta.get("input") or {}).get("path") or "")
+    named = f" {source} -c {run.path / 'config.yaml'}" if run.path is not None and source else ""
+    return f"fgtrack advise{named}{options}"
+
+
+def _changed(run: Run) -> Iterator[Caution]:
+    """Files of a finished run that differ from those that it has written."""
+    if run.path is not None and run.meta.get("complete") and digest(run.path) != run.meta.get("digest"):
+        yield Caution("tracks.csv or updates.csv", "changed since the run: the digest is another; repeat the run")
+
+
+def _clocks(run: Run) -> Iterator[Caution]:
+    updates = run.tables["updates"]
+    for sensor, mine in _by_sensor(updates):
+        if (updates["stamp_ns"][mine] == 0).all():
+            text = (
+                "all stamps are 0: its driver does not set them, so its delay is unknown; "
+                f"`stamp_from: receipt` on its topic, or sensors.{sensor}.stamp_from, takes the receipt for the stamp"
+            )
+            yield Caution(sensor, text, {f"sensors.{sensor}.stamp_from": "receipt"})
+        receipts_ns = np.unique(updates["receipt_ns"][mine])
+        if unit := wrong_unit(len(receipts_ns), int(receipts_ns[0]), int(receipts_ns[-1])):
+            yield Caution(sensor, unit)
+
+
+def _angles(run: Run) -> Iterator[Caution]:
+    """Angles that were recorded in degrees and read as radians."""
+    ego, detections = run.tables["ego"], run.tables["detections"]
+    by_sensor = ((sensor, detections, mine) for sensor, mine in _by_sensor(detections))
+    for about, table, mine in [(EGO, ego, slice(None)), *by_sensor]:
+        for name in ANGULAR:
+            values = table[name][mine] if name in table else np.empty(0)
+            finite = values[np.isfinite(values)]
+            found = in_degrees(about, name, float(finite.min(initial=0.0)), float(finite.max(initial=0.0)))
+            yield from () if found is None else (found,)
+
+
+def _ego(run: Run) -> Iterator[Caution]:
+    """No ego where it is needed, or reasons for which more than half of its states were refused."""
+    failed = [f"{count} of {total} of {sensor}" for sensor, name, count, total in _mostly(run) if name == "failed"]
+    num_states = run.tables["ego"].num_rows
+    if num_states:
+        if jumps := run.meta.get("ego_jumps"):
+            times = "once" if jumps == 1 else f"{jumps} times"
+            text = (
+                f"its position jumps {times}, as where a clock is set or a localisation is reinitialised: what is seen "
+                "from it is misplaced there, cut the recording in parts"
+            )
+            yield Caution(EGO, text)
+        for reason, count in dict(run.meta.get("ego_refused") or {}).items():
+            if 2 * count > num_states:
+                text = f"{count} of {num_states} states not used, {reason}: look at the clock of its driver"
+                yield Caution(EGO, text)
+    elif failed:
+        text = f"no state was received, so nothing in its frame can be placed ({', '.join(failed)} failed)"
+        yield Caution(EGO, f"{text}: {_NAME_EGO}")
+    elif _ego_speeds_births(run):
+        text = (
+            "no state was received, so new objects are assumed to stand still, and what the sensors could see is not "
+            f"known: {_NAME_EGO}, or set birth.ego_speed_factor to 0"
+        )
+        yield Caution(EGO, text, _STANDING)
+
+
+def _map(run: Run) -> Iterator[Caution]:
+    """No map where new objects are as fast as the ego, in its direction."""
+    if not _ego_speeds_births(run) or _section(run, "map").get("track") not in (None, OPEN_SPACE):
+        return
+    detections = run.tables["detections"]
+    blind = [name for name, mine in _by_sensor(detections) if not np.isfinite(detections["yaw_rad"][mine]).any()]
+    if blind:
+        text = (
+            f"there is none, and no heading from {', '.join(blind)}: new objects may drive in any direction; name the "
+            "map with --map (`oval` for the simulated races), or set birth.ego_speed_factor to 0 for open space"
+        )
+        yield Caution("map", text, _STANDING)
+
+
+def _ego_speeds_births(run: Run) -> bool:
+    """True if new objects are assumed to be as fast as the ego, or nearly."""
+    return bool(run.tables["updates"].num_rows and _section(run, "birth").get("ego_speed_factor"))
+
+
+def _mostly(run: Run) -> Iterator[tuple[str, str, int, int]]:
+    """Sensors of which more than half of the detections were not used for one reason: it, the count, and the total."""
+    updates = run.tables["updates"]
+    for sensor, mine in _by_sensor(updates):
+        for name, count in zip(*np.unique(updates["disposition"][mine], return_counts=True), strict=True):
+            if name not in USED and 2 * count > mine.sum():
+                yield sensor, str(name), int(count), int(mine.sum())
+
+
+def _unused(run: Run) -> Iterator[Caution]:
+    """Dispositions of more than half of the detections of a sensor, where no other diagnostic has them."""
+    updates = run.tables["updates"]
+    for sensor, name, count, total in _mostly(run):
+        unset = name == "too_old" and not updates["stamp_ns"][updates["sensor"] == sensor].any()
+        if unset or (name == "failed" and not run.tables["ego"].num_rows):
+            continue
+        by = reasons((run.meta.get("out_of_bounds") or {}).get(sensor, {}))
+        cure = _too_old(run, sensor) if name == "too_old" else _CURES[name].format(sensor=sensor, reasons=by)
+        yield Caution(sensor, f"{count} of {total} {name}: {cure}")
+
+
+def _too_old(run: Run, sensor: str) -> str:
+    updates = run.tables["updates"].where(run.tables["updates"]["sensor"] == sensor)
+    delay_s = float(np.median(updates["receipt_ns"] - updates["stamp_ns"])) / NS_PER_S
+    limit_s = (_section(run, "sensors").get(sensor) or {}).get("max_delay_s")
+    if limit_s is not None and delay_s > limit_s:
+        cure = f"raise sensors.{sensor}.max_delay_s or correct its clock"
+        return f"median delay {delay_s:.3g} s, allowed {limit_s:g} s: {cure}"
+    window, lag_s = _reported_window(run)
+    if delay_s > lag_s:
+        return f"median delay {delay_s:.3g} s, older than {window}: raise it, or correct the clock"
+    if run.meta.get("estimator") == "drop":
+        return (
+            f"median delay {delay_s:.3g} s, and `drop` ignores by design what is older than the newest detection that "
+            "a track has fused, whatever the window: use an estimator that fuses it, such as ekf-replay"
+        )
+    return (
+        f"median delay {delay_s:.3g} s, within {window}: no track is as old as these detections, check births, gate "
+        "and clock"
+    )
+
+
+def _window(run: Run) -> Iterator[Caution]:
+    """A window that holds less than two lists of a sensor."""
+    window, lag_s = _reported_window(run)
+    updates = run.tables["updates"]
+    for sensor, mine in _by_sensor(updates):
+        stamps_ns = np.unique(updates["stamp_ns"][mine])
+        period_s = float(np.median(np.diff(stamps_ns))) / NS_PER_S if len(stamps_ns) >= FEWEST else 0.0
+        if lag_s < period_s:
+            yield Caution(sensor, f"one list every {period_s:.3g} s, longer than {window}: raise it")
+
+
+def _failures(run: Run) -> Iterator[Caution]:
+    """Failures inside the estimator."""
+    counts = {kind: n for kind, n in dict(run.meta.get("failures") or {}).items() if n and kind != _NO_FAILURE}
+    if counts:
+        first = run.meta.get("first_failure")
+        cure = "these tracks are less accurate; look at the noise and the starts, or take another estimator"
+        if set(counts) == {"diverged"}:
+            cure = "measurements in a row contradicted a track: look at NIS by sensor, clocks and noise"
+        text = f"failures: {', '.join(f'{n} {kind}' for kind, n in counts.items())}"
+        yield Caution("estimator", f"{text}{f' (the first one: {first})' if first else ''}: {cure}")
+
+
+def _fragmentation(run: Run) -> Iterator[Caution]:
+    """Tracks that break off and begin again, and births that die unconfirmed: bad tracking that needs no truth."""
+    found, now_ns = Fragmentation.of(run), run.tables["timing"]["now_ns"]
+    total, recorded_s = len(found.lifetimes_s), float(np.ptp(now_ns)) / NS_PER_S if len(now_ns) else 0.0
+    enough = found.breaks >= max(_FEWEST_BREAKS, _BREAKS_SHARE * total)
+    if enough and found.breaks_per_minute > MOST_BREAKS_PER_MINUTE:
+        text = (
+            f"{found.breaks} of {total} confirmed tracks begin where another one has just ended: "
+            f"{found.breaks_per_minute:.2g} breaks per object and minute, median life {found.median_s:.2g} of "
+            f"{recorded_s:.3g} s; likely causes: a field of view or range larger than what a sensor covers, "
+            f"detection_probability, lifecycle.lifetime_s, noise; `{_advise(run)}` looks for them"
+        )
+        yield Caution("tracks", text)
+    dispositions = run.tables["updates"]["disposition"]
+    used = int(np.isin(dispositions, USED).sum())
+    dead = int(np.count_nonzero(dispositions == "birth")) - total
+    if used >= FEWEST and dead > _DEAD_SHARE * used:
+        text = (
+            f"{dead} of {used} detections used began a track that was never confirmed; likely causes: clutter, errors "
+            f"or motion larger than configured, a wrong ego or clock; `{_advise(run)}` looks for them"
+        )
+        yield Caution("tracks", text)
+
+
+def _reported_window(run: Run) -> tuple[str, float]:
+    """The window with the key that sets its length, and its length; runs of older versions do not report them."""
+    found = run.meta.get("effective") or {}
+    if "lag_key" not in found:
+        return "the window", np.inf
+    return f"the window ({found['lag_key']} {found['lag_s']:g} s)", float(found["lag_s"])
+
+
+def _section(run: Run, name: str) -> Mapping[str, Any]:
+    return run.config.get(name) or {}
+
+
+def _by_sensor(table: Table) -> Iterator[tuple[str, Any]]:
+    for sensor in np.unique(table["sensor"]).tolist():
+        yield sensor, table["sensor"] == sensor

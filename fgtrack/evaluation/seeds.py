@@ -1,0 +1,329 @@
+"""The table of a sweep over its seeds: means at every point of the grid, and paired differences of the estimators."""
+
+import csv
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from fgtrack.core.errors import CallError, DataError, did_you_mean
+from fgtrack.core.files import open_text
+from fgtrack.evaluation.comparison import Entry, entry_columns, entry_record, ranked
+from fgtrack.evaluation.intervals import paired
+from fgtrack.evaluation.tables import PERCENT, Column, Record, Table, csv_text
+
+SWEEP_FILE = "sweep.csv"
+
+#: Metrics that have a better and a worse, in order of preference; the first is shown.
+_BETTER: Mapping[str, Literal["less", "more", "nearer"]] = {
+    "truth.overall.errors.*.rmse": "less",
+    "multi_object.gospa.in_sight_rms_m": "less",
+    "multi_object.gospa.rms_m": "less",
+    "consistency.position_nees.mean": "nearer",
+    "consistency.state_nees.mean": "nearer",
+    "consistency.nis.*.mean": "nearer",
+    "lagged.*.errors.*.rmse": "less",
+    "truth.overall.tracked_share_in_sight": "more",
+    "truth.overall.tracked_share": "more",
+    "truth.overall.breaks": "less",
+    "truth.overall.id_switches": "less",
+    "truth.overall.time_to_confirm_s.mean": "less",
+    "truth.false_tracks": "less",
+    "multi_object.clear.mota": "more",
+    "multi_object.identity.idf1": "more",
+    "multi_object.hota.hota": "more",
+    "predictions.*.mean": "less",
+}
+#: Metrics that a summary shows first, and their headings.
+_MAIN: Mapping[str, str] = {
+    "truth.overall.errors.position_m.rmse": "pos.\n[m]",
+    "consistency.position_nees.mean": "NEES\npos.",
+    "multi_object.gospa.in_sight_rms_m": "GOSPA\n[m]",
+    "truth.overall.tracked_share_in_sight": "tracked\n[%]",
+}
+_SHARES = ("truth.overall.tracked_share_in_sight",)
+_INTERVALS = "t intervals of paired differences over seeds; tie with the best: 0 is inside"
+_MOST_ROWS = 40
+
+
+@dataclass(frozen=True)
+class PointMean:
+    """A metric of one estimator at one point of the grid.
+
+    Attributes
+    ----------
+    point
+        Cells of the axes.
+    estimator
+        Name.
+    mean, standard_error
+        Over the seeds; the error of one seed is NaN.
+    seeds
+        Seeds with a value.
+    """
+
+    point: tuple[str, ...]
+    estimator: str
+    mean: float
+    standard_error: float
+    seeds: int
+
+
+@dataclass(frozen=True)
+class SweepTable:
+    """The rows of sweep.csv.
+
+    Attributes
+    ----------
+    axes, metrics
+        Columns that make a point of the grid, and those of the metrics.
+    rows
+        Cells by column.
+    """
+
+    axes: tuple[str, ...]
+    metrics: tuple[str, ...]
+    rows: Sequence[Mapping[str, str]]
+
+    @property
+    def shown_axes(self) -> tuple[str, ...]:
+        """Axes that vary and distinguish the points, without those of whole mappings where labels do it."""
+        varying = [axis for axis in self.axes if len({row[axis] for row in self.rows}) > 1]
+        points = [tuple(row[axis] for axis in varying) for row in self.rows]
+        return tuple(varying[k] for k in distinguishing(points, len(varying)))
+
+    def means(self, metric: str, axes: Sequence[str] | None = None) -> list[PointMean]:
+        """Mean and standard error of `metric` at every point and of every estimator, in the order of the table.
+
+        `axes` are those that make a point, by default `shown_axes`. Cells that are empty or not finite are ignored; a
+        point without any number is left out.
+
+        Raises
+        ------
+        CallError
+            There is no such metric.
+        """
+        if metric not in self.metrics:
+            hint = did_you_mean(metric, self.metrics) or f", there are {', '.join(self.metrics[:5])} ..."
+            raise CallError(f"{metric}: the sweep has no such metric{hint}")
+        axes = self.shown_axes if axes is None else axes
+        values: dict[tuple[tuple[str, ...], str], list[float]] = {}
+        for row in self.rows:
+            value = number(row[metric])
+            if math.isfinite(value):
+                values.setdefault((tuple(row[axis] for axis in axes), row["estimator"]), []).append(value)
+        return [
+            PointMean(*key, float(np.mean(of)), float(np.std(of, ddof=1)) / math.sqrt(n) if n > 1 else math.nan, n)
+            for key, of in values.items()
+            for n in [len(of)]
+        ]
+
+
+@dataclass(frozen=True)
+class SeedComparison:
+    """The estimators in one metric at one point of the grid.
+
+    Attributes
+    ----------
+    point
+        Cells of the axes.
+    metric
+        Column.
+    seeds
+        Seeds that all estimators have a value of.
+    entries
+        From the best estimator to the worst; the values are means over the seeds.
+    """
+
+    point: tuple[str, ...]
+    metric: str
+    seeds: int
+    entries: tuple[Entry, ...]
+
+
+def read_sweep(folder: Path | str) -> SweepTable:
+    """The table of the sweep in `folder`.
+
+    Raises
+    ------
+    CallError
+        There is no table.
+    DataError
+        It is not the table of a sweep, or has no rows.
+    """
+    path = Path(folder) / SWEEP_FILE
+    try:
+        with open_text(path, newline="") as file:
+            rows = list(csv.DictReader(file))
+    except OSError as error:
+        raise CallError(f"{path}: cannot be read ({error.strerror}), make one with `fgtrack sweep`") from error
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: is not a table ({error}), repeat the sweep") from error
+    columns = list(rows[0]) if rows else []
+    if "seed" not in columns or "estimator" not in columns or any(None in row.values() for row in rows):
+        raise DataError(f"{path}: holds no rows of a sweep, repeat it")
+    seed = columns.index("seed")
+    return SweepTable(tuple(columns[:seed]), tuple(columns[seed + 2 :]), rows)
+
+
+def is_sweep(folder: Path) -> bool:
+    """True if `folder` holds the table of a sweep."""
+    return (folder / SWEEP_FILE).is_file()
+
+
+def distinguishing(points: Iterable[tuple[str, ...]], num_axes: int) -> list[int]:
+    """Axes that distinguish `points`, without those of whole mappings where labels do it."""
+    distinct = set(points)
+    plain = [k for k in range(num_axes) if not any(point[k].startswith(("{", "[")) for point in distinct)]
+    return plain if len({tuple(point[k] for k in plain) for point in distinct}) == len(distinct) else [*range(num_axes)]
+
+
+def number(cell: str) -> float:
+    """The number in a cell; NaN where there is none."""
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan
+
+
+def seed_comparisons(rows: Sequence[Mapping[str, str]], axes: Sequence[str]) -> list[SeedComparison]:
+    """A comparison for every metric with a better and a worse, and every point with several estimators.
+
+    Parameters
+    ----------
+    rows
+        Those of sweep.csv, by column.
+    axes
+        Columns that make a point.
+    """
+    points: dict[tuple[str, ...], list[Mapping[str, str]]] = {}
+    for row in rows:
+        points.setdefault(tuple(row[axis] for axis in axes), []).append(row)
+    metrics = [name for pattern in _BETTER for name in (rows[0] if rows else ()) if fnmatchcase(name, pattern)]
+    found = (_compared(point, metric, mine) for metric in metrics for point, mine in points.items())
+    return [one for one in found if one is not None]
+
+
+def to_csv(compared: Sequence[SeedComparison], axes: Sequence[str]) -> str:
+    """A row for every comparison and estimator; floats with all digits, an empty cell for NaN."""
+    rows: list[list[Any]] = [
+        [*axes, "metric", "estimator", "seeds", "mean", "worse_by", "low", "high", "standing"],
+    ]
+    for one in compared:
+        for entry in one.entries:
+            record = entry_record(entry)
+            numbers = [record[name] for name in ("value", "worse_by", "low", "high")]
+            rows.append([*one.point, one.metric, entry.name, one.seeds, *numbers, entry.standing])
+    return csv_text(rows)
+
+
+def shown_tables(compared: Sequence[SeedComparison], axes: Sequence[str]) -> list[Table]:
+    """The first metric of `compared` for people: every point of a few, else the number of points at which each is best.
+
+    Empty where no point has several seeds.
+    """
+    mine = [one for one in compared if one.metric == compared[0].metric]
+    if not any(one.seeds > 1 for one in mine):
+        return []
+    metric, shown = mine[0].metric, distinguishing((one.point for one in mine), len(axes))
+    records = [
+        {"point": ", ".join(one.point[k] for k in shown), "seeds": one.seeds, **entry_record(entry, "mean")}
+        for one in mine
+        for entry in one.entries
+    ]
+    estimator = Column("estimator", "run", left=True)
+    if len(records) <= _MOST_ROWS:
+        columns = [Column(_axis_names(shown, axes), "point", left=True), estimator, *entry_columns("mean", "mean")]
+        columns.append(Column("seeds"))
+        return [Table(metric, records, columns, ("point", "run"), [_INTERVALS, "+: best; =: ties with the best"])]
+    counts = Counter((record["run"], record["standing"]) for record in records)
+    names = dict.fromkeys(record["run"] for record in records)
+    standings = ("best", "tie", "worse")
+    records = [{"run": name, **{standing: counts[name, standing] for standing in standings}} for name in names]
+    title = f"{metric}: points at which each estimator is best, of {len(mine)}"
+    return [Table(title, records, [estimator, *map(Column, standings)], notes=[_INTERVALS])]
+
+
+def summary_table(sweep: SweepTable, compared: Sequence[SeedComparison]) -> Table:
+    """Mean and standard error over the seeds of every metric, a row for each point and estimator; few metrics first.
+
+    The best value at a point is bold where `compared`, those of the sweep, have no tie.
+    """
+    means = {metric: found for metric in sweep.metrics if (found := sweep.means(metric, sweep.axes))}
+    values = {(one.point, one.estimator, metric): one for metric, found in means.items() for one in found}
+    best = {
+        (one.point, entry.name, one.metric) for one in compared for entry in one.entries if entry.standing == "best"
+    }
+    rows = list(dict.fromkeys((tuple(row[axis] for axis in sweep.axes), row["estimator"]) for row in sweep.rows))
+    shown = distinguishing((point for point, _ in rows), len(sweep.axes))
+    main = [name for name in _MAIN if name in means] or list(means)[: len(_MAIN)]
+    metrics = [*main, *(name for name in means if name not in main)]
+    records = []
+    for point, estimator in rows:
+        record: dict[str, Any] = {**dict(zip(sweep.axes, point, strict=True)), "estimator": estimator}
+        mine = {metric: values[point, estimator, metric] for metric in metrics if (point, estimator, metric) in values}
+        for metric in metrics:
+            one = mine.get(metric)
+            record[metric], record[f"{metric}.standard_error"] = (one.mean, one.standard_error) if one else (None, None)
+        records.append(record | {"seeds": max((one.seeds for one in mine.values()), default=0)})
+
+    def point_text(record: Record) -> str:
+        return ", ".join(record[sweep.axes[k]] for k in shown)
+
+    def is_best(metric: str) -> Callable[[Record], bool]:
+        return lambda record: (tuple(record[axis] for axis in sweep.axes), record["estimator"], metric) in best
+
+    columns = [Column(_axis_names(shown, sweep.axes), cell_of=point_text, left=True), Column("estimator", left=True)]
+    for name in metrics:
+        columns.append(
+            Column(
+                _MAIN.get(name) or re.sub(r"\.(?!\d)", "\n", name),
+                f"{name} {name}.standard_error",
+                "{} ± {}",
+                PERCENT if name in _SHARES else 1.0,
+                bold=is_best(name),
+                when="always" if name in main else "full",
+            )
+        )
+    notes = ["± standard error of the mean over the seeds"]
+    if any((*row, metric) in best for row in rows for metric in main):
+        notes.append("bold: the best estimator of its point in this, with 95 % confidence")
+    return Table("Summary", records, [*columns, Column("seeds")], (*sweep.axes, "estimator"), notes)
+
+
+def _axis_names(shown: Sequence[int], axes: Sequence[str]) -> str:
+    """The last parts of the names of the axes shown."""
+    return ",\n".join(axes[k].rpartition(".")[2] for k in shown) or "point"
+
+
+def _compared(point: tuple[str, ...], metric: str, rows: Sequence[Mapping[str, str]]) -> SeedComparison | None:
+    """The estimators over the seeds that all of them have; None of fewer than two, or without such a seed."""
+    cost_of = _cost_of(metric)
+    values: dict[str, dict[str, tuple[float, float]]] = {}
+    for row in rows:
+        value, cost = number(row[metric]), cost_of(row)
+        if math.isfinite(cost):
+            values.setdefault(row["estimator"], {})[row["seed"]] = (value, cost)
+    seeds = sorted(set.intersection(*map(set, values.values())), key=int) if len(values) > 1 else []
+    if not seeds:
+        return None
+    found = np.array([[of[seed] for seed in seeds] for of in values.values()])
+    means, costs = found[..., 0].mean(axis=1), found[..., 1]
+    entries = ranked(list(values), means, costs.mean(axis=1), lambda one, best: paired(costs[one], costs[best]))
+    return SeedComparison(point, metric, len(seeds), entries)
+
+
+def _cost_of(metric: str) -> Callable[[Mapping[str, str]], float]:
+    """The number that should be small in a row: the metric, its negative, or its distance from the expected value."""
+    better = next(better for pattern, better in _BETTER.items() if fnmatchcase(metric, pattern))
+    if better == "nearer":
+        dof, default = metric.removesuffix("mean") + "dof", "2" if "position_nees" in metric else ""
+        return lambda row: abs(number(row[metric]) - number(row.get(dof, default)))
+    sign = 1.0 if better == "less" else -1.0
+    return lambda row: sign * number(row[metric])
