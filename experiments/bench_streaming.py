@@ -58,13 +58,13 @@ def typical(runs: Sequence[fgtrack.Run]) -> fgtrack.Run:
 
 def table(title: str, tables: Tables) -> str:
     """The rows of one stream as Markdown: what is judged, by method, and the times."""
-    streaming, load = tables["streaming"], tables["load"]
+    streaming, load = tables.tables["streaming"], tables.tables["load"]
     lines = [
         f"| {title} | {' [m] | '.join(_TITLES.values())} [m] | ready after p50 / p99 [ms] | late ticks | load [%] |",
         f"|{'---|' * 7}",
     ]
-    for record in load.records():
-        mine = [row for row in streaming.records() if row["run"] == record["run"]]
+    for record in load.plain():
+        mine = [row for row in streaming.plain() if row["run"] == record["run"]]
         cells = {row["judged"]: f"{short(row['position_rmse_m'])}{_MARKS[str(row['standing'])]}" for row in mine}
         times = " / ".join(f"{1e3 * float(record[f'ready_after_{q}_s'] or 0.0):.3g}" for q in ("p50", "p99"))
         late = f"{record['deadline_misses']} of {record['ticks']}"
@@ -89,9 +89,9 @@ def main(
         said = [
             line
             for line in tables.verdict
-            if any(part in line for part in ("judged when", "users also", "falls behind"))
+            if any(part in line for part in ("evaluated when", "users also", "falls behind"))
         ]
-        few = [note for note in tables["streaming"].notes if "samples" in note]
+        few = [note for note in tables.tables["streaming"].notes if "samples" in note]
         parts += [table(title, tables), *said, *few]
     text = "\n\n".join(parts) + "\n"
     (out / "streaming.md").write_text(text, encoding="utf-8")

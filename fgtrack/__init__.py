@@ -31,6 +31,7 @@ _HOMES = {
     "ObjectList": "fgtrack.io.adapters.common",
     "RobustLoss": "fgtrack.models.sensors",
     "Run": "fgtrack.io.run",
+    "ScheduledMeasurement": "fgtrack.evaluation.bounds",
     "SensorModel": "fgtrack.models.sensors",
     "SensorPose": "fgtrack.models.measurement",
     "SmoothedReport": "fgtrack.core.types",
@@ -53,9 +54,12 @@ _HOMES = {
     "UpdateStatus": "fgtrack.estimation.base",
     "advise": "fgtrack.advice.advise",
     "config": "fgtrack.pipeline",
+    "bounds": "fgtrack.evaluation.bounds",
+    "bounds_along": "fgtrack.evaluation.bounds",
     "close_ups": "fgtrack.plotting.late_detection",
     "compare": "fgtrack.evaluation.compare",
     "estimator": "fgtrack.estimation.registry",
+    "evaluate": "fgtrack.evaluation.metrics",
     "initial_state": "fgtrack.estimation.birth",
     "list_estimators": "fgtrack.estimation.registry",
     "load_run": "fgtrack.io.run",
@@ -104,7 +108,11 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.estimation.filters.ekf import robust_weight as robust_weight
     from fgtrack.estimation.registry import estimator as estimator
     from fgtrack.estimation.registry import list_estimators as list_estimators
+    from fgtrack.evaluation.bounds import ScheduledMeasurement as ScheduledMeasurement
+    from fgtrack.evaluation.bounds import bounds as bounds
+    from fgtrack.evaluation.bounds import bounds_along as bounds_along
     from fgtrack.evaluation.compare import compare as compare
+    from fgtrack.evaluation.metrics import evaluate as evaluate
     from fgtrack.evaluation.tables import Tables as Tables
     from fgtrack.io.adapters.common import ObjectList as ObjectList
     from fgtrack.io.run import Run as Run

@@ -25,21 +25,21 @@ runs = [
 # The present states. Backward-forward is not replay: a late LiDAR update wipes the RADAR updates fused since. The
 # replaying EKF and the smoother keep them and nearly tie.
 tables = fgtrack.compare(*runs)
-print(tables["tracking"])
+print(tables[["tracking"]])
 
 # %%
 # The past. The smoother's states 0.1 to 0.5 s ago contain what has arrived since; a filter has no such output.
-print(tables["lag"])
+print(tables[["lag"]])
 fgtrack.plot.lag(runs)
 
 # %%
-# Errors over time, and what became of every detection.
+# Errors over time, and the outcome of every detection.
 fgtrack.plot.errors(runs)
 
 # %%
-print(tables["dispositions"])
+print(tables[["dispositions"]])
 
 # %%
-# Every table of a run is a pandas DataFrame.
-smoother = runs[0]
-print(smoother.smoothed.dtypes)
+# Every table is a pandas DataFrame, those of a comparison and those of a run.
+print(tables["tracking"][["run", "position_rmse_m"]])
+print(runs[0].smoothed.dtypes)

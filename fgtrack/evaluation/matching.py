@@ -143,7 +143,7 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
         tracks = tracks.where(~_ignored(run, tracks, paths, options.gate_m))
     candidates, distances_m = _distances(tracks, paths)
     tick_index = np.searchsorted(timing["tick"], tracks["tick"])
-    object_index = _nearest_pairs(distances_m, tracks["track_id"], tick_index, timing.num_rows, options.gate_m)
+    object_index = nearest_pairs(distances_m, tracks["track_id"], tick_index, timing.num_rows, options.gate_m)
     paired = np.flatnonzero(object_index != NO_OBJECT)
     track_ids = np.full((timing.num_rows, len(paths)), NO_TRACK)
     track_ids[tick_index[paired], object_index[paired]] = tracks["track_id"][paired]
@@ -276,7 +276,7 @@ def _ignored(run: Run, tracks: Table, paths: list[TruePath], gate_m: float) -> B
     _, distances_m = _distances(tracks, [*paths, *ignored_paths(run.tables["ignored"])])
     timing, stamps_ns = run.tables["timing"], tracks["stamp_ns"]
     tick_index = np.searchsorted(timing["tick"], tracks["tick"])
-    index = _nearest_pairs(distances_m, tracks["track_id"], tick_index, timing.num_rows, gate_m)
+    index = nearest_pairs(distances_m, tracks["track_id"], tick_index, timing.num_rows, gate_m)
     in_regions = in_ignored_regions(run, stamps_ns, np.stack([tracks["x_m"], tracks["y_m"]], axis=-1))
     return np.asarray((index >= len(paths)) | ((index == NO_OBJECT) & in_regions))
 
@@ -291,7 +291,7 @@ def _distances(tracks: Table, paths: list[TruePath]) -> tuple[FloatArray, FloatA
     return candidates, np.linalg.norm(candidates[..., :2] - xy[:, None], axis=-1)
 
 
-def _nearest_pairs(
+def nearest_pairs(
     distances_m: FloatArray, ids: IntArray, tick_index: IntArray, num_ticks: int, gate_m: float
 ) -> IntArray:
     """Object of every row: as many pairs as possible, then the least sum of distances, none beyond the gate."""

@@ -11,11 +11,11 @@ from fgtrack.advice.clocks import clock_findings, clock_verdicts, stamp_findings
 from fgtrack.advice.noise import NoiseFit
 from fgtrack.advice.outcome import Outcome, harm
 from fgtrack.evaluation.intervals import Estimate
-from fgtrack.evaluation.metrics import NOTHING_TRACKED
+from fgtrack.evaluation.metrics import ObjectMetrics
 from fgtrack.pipeline.clock_offsets import OffsetReport, SensorOffset
 
 SECOND_NS = 1_000_000_000
-TRUTH = replace(NOTHING_TRACKED, ticks_present=6000, ticks_in_sight=6000, ticks_tracked_in_sight=5900)
+TRUTH = replace(ObjectMetrics.total(()), ticks_present=6000, ticks_in_sight=6000, ticks_tracked_in_sight=5900)
 GOOD = Outcome(births=20, confirmed=3, life_s=30.0, used={"radar": 0.9}, noise=(), truth=TRUTH, tick_s=0.02)
 
 

@@ -1,6 +1,5 @@
 """NEES and NIS with their bands, over one run and over many, and the whiteness of innovations."""
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from evaluation_runs import ROUND, START_NS, TICK_NS, WEST, update, write_run
 from scipy.stats import chi2
 
 from fgtrack.core.types import MEASURABLE, Disposition, UpdateRecord
-from fgtrack.evaluation.consistency import Nees, nees_over_runs, normalised_squares, position_nees, state_nees
+from fgtrack.evaluation.consistency import Nees, nees_over_runs, normalised_squares, state_nees
 from fgtrack.evaluation.innovations import FEWEST, LAGS, Autocorrelation, autocorrelations
 from fgtrack.evaluation.matching import Matching, match
 from fgtrack.evaluation.metrics import evaluate
@@ -53,14 +52,8 @@ def test_without_a_positive_definite_covariance_there_is_no_square() -> None:
     assert np.isnan(squares).tolist() == [False, True, True, True, False]
     assert np.isnan(normalised_squares(table_of(covariances), np.ones((5, 5))))[4]
     assert np.isnan(normalised_squares(table_of(covariances[:1]), np.array([[1.0, np.nan]])))[0]
-
-
-def test_entries_that_no_covariance_has_give_no_square() -> None:
-    """Out of 1e60 beside a variance of 1e-300 comes more than a number holds."""
-    covariances = np.tile(np.eye(5), (2, 1, 1))
-    covariances[0, 0, 0] = 1e-300
-    covariances[0, 0, 1] = covariances[0, 1, 0] = 1e60
-    assert np.isnan(normalised_squares(table_of(covariances), np.full((2, 2), 1e3))).tolist() == [True, False]
+    covariances[0, 0, :2], covariances[0, 1, 0] = (1e-300, 1e60), 1e60  # out of these comes more than a number holds
+    assert np.isnan(normalised_squares(table_of(covariances[:1]), np.full((1, 2), 1e3)))[0]
 
 
 # --- one run
@@ -88,13 +81,6 @@ def test_the_yaw_rate_counts_where_truth_and_model_have_one(tmp_path: Path) -> N
     assert nees.values == pytest.approx([0.0625] * 3 + [0.0], abs=1e-9)
 
 
-def test_truth_without_yaw_gives_the_nees_of_the_position_only(tmp_path: Path) -> None:
-    tracks = [[WEST.track(k, 1, along_m=2.0)] for k in range(3)]
-    found = evaluate(write_run(tmp_path / "run", tracks, truth=WEST.truth(range(3), pose=False))).consistency
-    assert (found.position_nees.count, found.position_nees.mean) == (3, pytest.approx(4.0))
-    assert found.state_nees.count == 0
-
-
 def test_nis_has_the_degrees_of_freedom_of_what_was_measured(tmp_path: Path) -> None:
     updates = {
         0: [update(disposition=Disposition.BIRTH)],
@@ -113,15 +99,6 @@ def test_the_band_is_that_of_a_sum_of_independent_squares() -> None:
     low, high = ChiSquareMean(40, 2.0, 2.5).band
     assert (low, high) == pytest.approx(tuple(chi2.ppf([0.025, 0.975], 100) / 40))
     assert all(map(math.isnan, ChiSquareMean().band))
-
-
-def test_means_of_two_samples_add_up() -> None:
-    rng = np.random.default_rng(1)
-    values, dof = rng.chisquare(3, 30), rng.integers(1, 6, 30)
-    values[4] = np.nan
-    both = ChiSquareMean.of(values, dof)
-    added = ChiSquareMean.of(values[:10], dof[:10]) + ChiSquareMean.of(values[10:], dof[10:]) + ChiSquareMean()
-    assert (added.count, added.mean, added.dof) == (29, pytest.approx(both.mean), pytest.approx(both.dof))
 
 
 def test_the_band_holds_the_mean_of_19_in_20_samples() -> None:
@@ -186,19 +163,6 @@ def test_values_of_different_runs_meet_at_the_same_object_and_stamp() -> None:
     assert found.run_means.tolist() == [3.0, pytest.approx(19 / 3), 6.0]
 
 
-def test_nees_of_runs_comes_from_their_matchings(tmp_path: Path) -> None:
-    runs = []
-    for seed, along_m in enumerate((1.0, 3.0)):
-        tracks = [[WEST.track(k, 1 + seed, along_m=along_m), ROUND.track(k, 5)] for k in range(4)]
-        truth = [*WEST.truth(range(4)), *ROUND.truth(range(4))]
-        runs.append(write_run(tmp_path / str(seed), tracks, truth=truth))
-    found = nees_over_runs([position_nees(matching_of(run)) for run in runs])
-    assert found.mean[found.object_ids == 7] == pytest.approx([5.0] * 4)
-    assert found.mean[found.object_ids == 8] == pytest.approx([0.0] * 4, abs=1e-9)
-    with pytest.raises(ValueError, match="at least one"):
-        nees_over_runs([])
-
-
 # --- whiteness
 
 
@@ -233,12 +197,6 @@ def test_tracks_do_not_run_into_each_other(tmp_path: Path) -> None:
     found = whiteness(run)
     assert (found.tracks, found.count) == (2, 70)
     assert found.lag1 == pytest.approx(-(39 * 2 + 29 * 18) / (40 * 2 + 30 * 18))
-
-
-@pytest.mark.parametrize("track_id", [-7, 10**18])
-def test_a_track_may_have_any_number(tmp_path: Path, track_id: int) -> None:
-    flips = (-1.0) ** np.arange(FEWEST)[:, None] * np.ones(2)
-    assert whiteness(innovations_run(tmp_path / "run", {track_id: flips})).count == FEWEST
 
 
 def test_white_innovations_stay_inside_their_bands_whatever_their_covariance() -> None:
@@ -291,26 +249,3 @@ def test_too_few_innovations_tell_nothing(tmp_path: Path) -> None:
     assert evaluate(run).consistency.autocorrelation["lidar"] == {}
     zeros = innovations_run(tmp_path / "zeros", {1: np.zeros((FEWEST, 2))})
     assert evaluate(zeros).consistency.autocorrelation["lidar"] == {}
-
-
-def test_consistency_is_strict_json(tmp_path: Path) -> None:
-    tracks = [[WEST.track(k, 1, along_m=2.0)] for k in range(3)]
-    updates = {k: [update(tick=k, nis=2.0, x_m=1.0, y_m=float(k))] for k in range(FEWEST)}
-    plain = evaluate(write_run(tmp_path / "run", tracks, truth=WEST.truth(range(3)), updates=updates)).as_dict()
-    again = json.loads(json.dumps(plain, allow_nan=False))
-    assert again == plain
-    nees = again["consistency"]["position_nees"]
-    low, high = chi2.ppf([0.025, 0.975], 6) / 3
-    assert nees == {
-        "count": 3,
-        "mean": 4.0,
-        "dof": 2.0,
-        "band_low": pytest.approx(low),
-        "band_high": pytest.approx(high),
-    }
-    assert again["consistency"]["nis"]["lidar"]["mean"] == 2.0
-    assert again["consistency"]["autocorrelation"]["lidar"]["position_m"]["tracks"] == 1
-    assert again["multi_object"]["gospa"]["localisation_m2"] == pytest.approx(4.0)
-    assert again["multi_object"]["clear"]["pairs"] == 3
-    assert set(again["multi_object"]["identity"]) == {"idf1", "idp", "idr"}
-    assert set(again["multi_object"]["hota"]) == {"hota", "deta", "assa"}

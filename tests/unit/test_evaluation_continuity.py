@@ -4,7 +4,6 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from evaluation_runs import ROUND, WEST, update, write_run
 
@@ -139,13 +138,6 @@ def test_a_detection_belongs_to_the_nearest_object(tmp_path: Path) -> None:
     assert confirm_of(run) == [pytest.approx(2 * 0.02), pytest.approx(4 * 0.02)]
 
 
-def test_an_object_that_is_never_confirmed_has_no_time(tmp_path: Path) -> None:
-    tracks = [[WEST.track(k, 1, num_measured=2)] for k in range(4)]
-    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(4)), updates={0: [update()]})
-    assert np.isnan(confirm_of(run)).all()
-    assert np.isnan(confirm_of(write_run(tmp_path / "empty", truth=WEST.truth(range(4))))).all()
-
-
 def test_overall_is_the_mean_of_the_objects(tmp_path: Path) -> None:
     tracks = [[WEST.track(k, 1, num_measured=k + 1), ROUND.track(k, 2, num_measured=k - 2)] for k in range(6)]
     updates = {0: [update(track_id=1)], 2: [update(tick=2, track_id=2)]}
@@ -156,9 +148,3 @@ def test_overall_is_the_mean_of_the_objects(tmp_path: Path) -> None:
     assert (overall.time_to_confirm_s.count, overall.time_to_confirm_s.mean) == (2, pytest.approx(0.05))
     times_s = [one.time_to_confirm_s.mean for one in truth.objects.values()]
     assert times_s == [pytest.approx(0.04), pytest.approx(0.06)]
-
-
-def test_the_time_per_detection_is_that_of_the_ticks_with_detections(tmp_path: Path) -> None:
-    run = write_run(tmp_path / "run", process_ns=[1_000, 4_000, 9_000, 6_000], num_detections=[0, 2, 0, 3])
-    assert evaluate(run).time_per_detection_s == pytest.approx(2e-6)
-    assert math.isnan(evaluate(write_run(tmp_path / "none", process_ns=[5])).time_per_detection_s)

@@ -1,6 +1,5 @@
 """Lagged and final states against truth: metrics and figure."""
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -138,19 +137,6 @@ def test_a_filter_has_its_present_states_alone(tmp_path: Path) -> None:
     assert present.position_nees.mean == pytest.approx(9.0)
 
 
-def test_lag_zero_is_that_of_the_present_states_and_stands_there_once(tmp_path: Path) -> None:
-    smoothed = {k: [WEST.later(k, 1, 0.0, along_m=9.0)] for k in TICKS}
-    tracks = [[WEST.track(k, 1, along_m=1.0)] for k in TICKS]
-    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS), smoothed=smoothed)
-    (present,) = lag_metrics(run, match(run))
-    assert present.errors["position_m"].rmse == pytest.approx(1.0)
-
-
-def test_without_truth_there_is_nothing_to_judge(tmp_path: Path) -> None:
-    run = write_run(tmp_path / "run", [[WEST.track(0, 1)]], smoothed={0: [WEST.later(0, 1, 0.1)]})
-    assert evaluate(run).lagged == ()
-
-
 def test_a_gain_over_nothing_is_no_number(tmp_path: Path) -> None:
     smoothed = {k: [WEST.later(k - 5, 1, 0.1)] for k in range(5, 20)}
     far = [[WEST.track(k, 1, across_m=60.0)] for k in TICKS]
@@ -159,16 +145,6 @@ def test_a_gain_over_nothing_is_no_number(tmp_path: Path) -> None:
     assert not entry.is_lagged
     exact = {"position_m": Moments(3, 0.0, 0.0)}
     assert math.isnan(LagMetrics(0.1, exact, Moments(), exact).gain("position_m"))
-
-
-def test_lags_are_strict_json(tmp_path: Path) -> None:
-    plain = evaluate(smoothed_run(tmp_path / "run")).as_dict()
-    again = json.loads(json.dumps(plain, allow_nan=False))
-    assert again == plain
-    assert [entry["lag_s"] for entry in again["lagged"]] == [0.0, 0.1, 0.2, "window"]
-    assert again["lagged"][1]["errors"]["position_m"]["rmse"] == pytest.approx(1.25)
-    assert again["lagged"][1]["present_errors"]["position_m"]["count"] == 30
-    assert again["lagged"][2]["position_nees"]["mean"] == pytest.approx(6.25 / 16)
 
 
 # --- figure

@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import TruthState
-from fgtrack.evaluation.matching import NO_OBJECT, _assign, _pair, contested, match, track_errors
+from fgtrack.evaluation.matching import NO_OBJECT, ambiguous, match, nearest_pairs, track_errors
 from fgtrack.evaluation.truth import TruePath, true_paths
 from fgtrack.io.run import NO_TRACK, EvaluationConfig
 
@@ -31,13 +31,6 @@ def test_truth_between_two_stamps_is_a_curve_that_a_turning_car_drives() -> None
     assert between[:2] == pytest.approx((x_m, y_m), abs=1e-4)
     assert straight_m > 0.05
     assert between[2:] == pytest.approx((yaw_rad, speed_mps))
-
-
-def test_truth_without_heading_is_linear() -> None:
-    nan = math.nan
-    at = path_of((0.0, 0.0, nan, nan), (4.0, 2.0, nan, nan)).at(np.array([START_NS + S_NS // 4]))
-    assert at[0, :2] == pytest.approx((1.0, 0.5))
-    assert np.isnan(at[0, 2:]).all()
 
 
 def test_yaw_is_interpolated_the_shorter_way_round() -> None:
@@ -64,11 +57,6 @@ def test_there_is_no_truth_while_an_object_is_away() -> None:
     path = TruePath(1, START_NS + (stamps_s * S_NS).astype(np.int64), states)
     known = np.isfinite(path.at(START_NS + np.array([S_NS, S_NS + 1, 5 * S_NS, 9 * S_NS]))[:, 0])
     assert known.tolist() == [True, False, False, True]
-
-
-def test_a_single_truth_stamp_is_truth_there_only() -> None:
-    path = path_of((1.0, 2.0, 0.0, 3.0))
-    assert np.isfinite(path.at(START_NS + np.array([-1, 0, 1]))[:, 0]).tolist() == [False, True, False]
 
 
 def test_the_ego_and_rows_without_position_are_no_true_objects(tmp_path: Path) -> None:
@@ -172,6 +160,13 @@ def test_a_run_without_truth_has_no_matching(tmp_path: Path) -> None:
     assert match(write_run(tmp_path / "run", [[WEST.track(0, 1)]])) is None
 
 
+def assigned(distances_m: np.ndarray) -> list[tuple[int, int]]:
+    """Pairs of the rows of one tick; infinite distances lie outside the gate."""
+    rows = np.arange(len(distances_m))
+    columns = nearest_pairs(distances_m, rows, np.zeros(len(rows), np.int64), 1, 10.0).tolist()
+    return [(row, column) for row, column in enumerate(columns) if column != NO_OBJECT]
+
+
 distances = hnp.arrays(
     np.float64,
     hnp.array_shapes(min_dims=2, max_dims=2, max_side=5),
@@ -182,18 +177,16 @@ distances = hnp.arrays(
 def test_three_far_pairs_are_more_than_two_near_ones() -> None:
     """However much cheaper: 27 m against 2 m."""
     distances_m = np.array([[1.0, 9.0, np.inf], [np.inf, 1.0, 9.0], [9.0, np.inf, np.inf]])
-    assert sorted(_assign(distances_m, np.arange(3), np.full(3, NO_TRACK))) == [(0, 1), (1, 2), (2, 0)]
+    assert assigned(distances_m) == [(0, 1), (1, 2), (2, 0)]
 
 
 @settings(deadline=None)
 @given(distances)
 def test_the_assignment_is_the_largest_and_then_the_cheapest(distances_m: np.ndarray) -> None:
-    rows, columns = distances_m.shape
-    pairs = _assign(distances_m, np.arange(rows), np.full(columns, NO_TRACK))
-    assert len({row for row, _ in pairs}) == len({column for _, column in pairs}) == len(pairs)
+    pairs = assigned(distances_m)
+    assert len({column for _, column in pairs}) == len(pairs)
     inside = np.isfinite(distances_m)
-    largest = linear_sum_assignment(inside, maximize=True)
-    assert len(pairs) == inside[largest].sum()
+    assert len(pairs) == inside[linear_sum_assignment(inside, maximize=True)].sum()
     cheapest = linear_sum_assignment(np.where(inside, distances_m, 1e4))
     assert sum(distances_m[pair] for pair in pairs) == pytest.approx(
         distances_m[cheapest][inside[cheapest]].sum(), abs=1e-6
@@ -202,7 +195,7 @@ def test_the_assignment_is_the_largest_and_then_the_cheapest(distances_m: np.nda
 
 @settings(deadline=None)
 @given(st.integers(0, 10_000), st.sampled_from([0.1, 0.3, 0.6]))
-def test_where_there_is_no_choice_the_pairs_are_those_of_the_assignment(seed: int, density: float) -> None:
+def test_pairs_inside_the_gate_stay_and_the_rest_is_assigned(seed: int, density: float) -> None:
     """Rows of the ticks stand in any order; few, some or most of the distances lie inside the gate."""
     rng = np.random.default_rng(seed)
     ticks, columns = 8, int(rng.integers(1, 4))
@@ -212,21 +205,24 @@ def test_where_there_is_no_choice_the_pairs_are_those_of_the_assignment(seed: in
         ids[tick_index == tick] = rng.permutation(4)[: (tick_index == tick).sum()]
     distances_m = rng.uniform(0.0, 5.0, (len(ids), columns))
     distances_m[rng.random(distances_m.shape) > density] = np.inf
-    expected = np.full(len(ids), NO_OBJECT)
-    previous = np.full(columns, NO_TRACK)
+    expected, last = np.full(len(ids), NO_OBJECT), {}
     for tick in range(ticks):
         rows = np.flatnonzero(tick_index == tick)
-        pairs = _assign(distances_m[rows], ids[rows], previous)
-        previous = np.full(columns, NO_TRACK)
-        for row, column in pairs:
-            expected[rows[row]], previous[column] = column, ids[rows[row]]
-    assert _pair(distances_m, ids, tick_index, ticks).tolist() == expected.tolist()
+        kept = {r: last[ids[r]] for r in rows if ids[r] in last and np.isfinite(distances_m[r, last[ids[r]]])}
+        free = [r for r in rows if r not in kept]
+        open_columns = [column for column in range(columns) if column not in kept.values()]
+        for row, column in assigned(distances_m[np.ix_(free, open_columns)]) if free and open_columns else ():
+            kept[free[row]] = open_columns[column]
+        for row, column in kept.items():
+            expected[row] = column
+        last = {ids[row]: column for row, column in kept.items()}
+    assert nearest_pairs(distances_m, ids, tick_index, ticks, 10.0).tolist() == expected.tolist()
 
 
-def test_a_tick_is_contested_where_a_row_or_an_object_has_a_choice() -> None:
+def test_a_tick_is_ambiguous_where_a_row_or_an_object_has_a_choice() -> None:
     inside = np.array([[1, 0], [0, 1], [1, 1], [1, 0], [1, 0], [0, 0]], dtype=bool)
     tick_index = np.array([0, 0, 1, 2, 2, 3])
-    assert contested(inside, tick_index, 5).tolist() == [False, True, True, False, False]
+    assert ambiguous(inside, tick_index, 5).tolist() == [False, True, True, False, False]
 
 
 @pytest.mark.parametrize(
@@ -238,9 +234,7 @@ def test_a_tick_is_contested_where_a_row_or_an_object_has_a_choice() -> None:
         ),
         ("evaluation: {gate_m: wide}", r"run.config\.yaml: evaluation.gate_m is not"),
         ("evaluation: {gate_m: .inf}", r"run.config\.yaml: evaluation: gate_m: must be positive"),
-        ("evaluation: {gate_m: .nan}", r"run.config\.yaml: evaluation: gate_m: must be positive"),
         ("evaluation: {confirmed_only: [1]}", r"run.config\.yaml: evaluation.confirmed_only is not"),
-        ("evaluation: {multi_object: maybe}", r"run.config\.yaml: evaluation.multi_object is not"),
         ("evaluation: [1]", r"run.config\.yaml: evaluation is not"),
         ("evaluation: {", r"run.config\.yaml: is not YAML"),
     ],

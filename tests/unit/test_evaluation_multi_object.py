@@ -14,17 +14,17 @@ from evaluation_scenes import Positions, random_scenes
 from fgtrack.core.types import TrackReport
 from fgtrack.evaluation.matching import Scenes, match, scenes
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.multi_object import Clear, Frames, Gospa, Hota, Identity, MultiObjectMetrics, gospa
+from fgtrack.evaluation.multi_object import Clear, MultiObjectMetrics, gospa
 from fgtrack.io.run import EvaluationConfig, Run, Table
 
 C_M, GATE_M = 5.0, 4.0
 
 #: Many, some and hardly any pairs to choose from.
-SCENES = [(seed, side_m) for seed in range(5) for side_m in (3.0, 15.0, 200.0)]
+SCENES = [(seed, side_m) for seed in range(3) for side_m in (3.0, 15.0, 200.0)]
 
 
 def multi_object(run: Run, options: EvaluationConfig | None = None) -> MultiObjectMetrics:
-    found = evaluate(run, options).multi_object
+    found = evaluate(run, options=options).multi_object
     assert found is not None
     return found
 
@@ -52,13 +52,6 @@ def test_gospa_and_its_parts_are_those_of_stone_soup(seed: int, side_m: float) -
         assert found.total_m[tick] == pytest.approx(expected["distance"], abs=1e-9)
         for name in ("localisation", "missed", "false"):
             assert getattr(found, f"{name}_m2")[tick] == pytest.approx(expected[name], abs=1e-9)
-
-
-def test_the_parts_of_gospa_add_up_over_the_run() -> None:
-    for seed, side_m in SCENES:
-        one = Gospa.of(gospa(random_scenes(seed, side_m)[2], C_M), C_M)
-        assert one.rms_m**2 == pytest.approx(one.localisation_m2 + one.missed_m2 + one.false_m2)
-        assert one.mean_m <= one.rms_m
 
 
 @pytest.fixture
@@ -99,11 +92,6 @@ def test_a_pair_at_the_cut_off_is_a_miss_and_a_false_track() -> None:
     assert (inside.localisation_m2[0], inside.missed_m2[0], inside.false_m2[0]) == (4.0, 0.0, 0.0)
 
 
-def test_without_a_tick_gospa_is_no_number() -> None:
-    empty = Scenes(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 1)), *[np.zeros((0, 1), bool)] * 2)
-    assert math.isnan(Gospa.of(gospa(empty, C_M), C_M).rms_m)
-
-
 # --- CLEAR, IDF1, HOTA
 
 
@@ -127,10 +115,10 @@ def test_clear_identity_and_hota_are_those_of_trackeval(seed: int, side_m: float
     objects, tracks, there = random_scenes(seed, side_m)
     data = trackeval_data(trackeval, objects, tracks)
     quiet = {"PRINT_CONFIG": False}
-    frames = Frames.of(there, GATE_M)
+    found = MultiObjectMetrics.of(there, EvaluationConfig(gate_m=GATE_M))
 
     expected = trackeval.metrics.CLEAR(quiet).eval_sequence(data)
-    clear = Clear.of(there, GATE_M)
+    clear = found.clear
     counts = (clear.pairs, clear.misses, clear.false_positives, clear.id_switches)
     assert counts == tuple(expected[name] for name in ("CLR_TP", "CLR_FN", "CLR_FP", "IDSW"))
     assert clear.mota == pytest.approx(expected["MOTA"], abs=1e-6)
@@ -138,19 +126,17 @@ def test_clear_identity_and_hota_are_those_of_trackeval(seed: int, side_m: float
         assert clear.motp_m == pytest.approx((1.0 - expected["MOTP"]) * 2.0 * GATE_M, abs=1e-6)
 
     expected = trackeval.metrics.Identity(quiet).eval_sequence(data)
-    identity = Identity.of(frames)
     for name in ("IDF1", "IDP", "IDR"):
-        assert getattr(identity, name.lower()) == pytest.approx(expected[name], abs=1e-6)
+        assert getattr(found.identity, name.lower()) == pytest.approx(expected[name], abs=1e-6)
 
     expected = trackeval.metrics.HOTA().eval_sequence(data)
-    hota = Hota.of(frames)
     for name in ("HOTA", "DetA", "AssA"):
-        assert getattr(hota, name.lower()) == pytest.approx(np.mean(expected[name]), abs=1e-6)
+        assert getattr(found.hota, name.lower()) == pytest.approx(np.mean(expected[name]), abs=1e-6)
 
 
 def test_the_random_scenes_have_switches_to_find() -> None:
     clear = [Clear.of(random_scenes(seed, side_m)[2], GATE_M) for seed, side_m in SCENES]
-    assert sum(one.id_switches for one in clear) > 50
+    assert sum(one.id_switches for one in clear) > 30
     assert min(one.mota for one in clear) < 0.3
     assert max(one.mota for one in clear) > 0.35
 
@@ -176,21 +162,17 @@ def test_identity_and_hota_of_a_run_are_what_can_be_counted(story: Run) -> None:
 def test_a_pair_at_the_gate_counts_and_one_beyond_it_does_not() -> None:
     for distance_m, pairs in ((GATE_M, 1), (GATE_M + 1e-6, 0)):
         there = Scenes(np.array([0]), np.array([1]), np.array([[distance_m]]), np.array([[True]]), np.array([[True]]))
-        assert Clear.of(there, GATE_M).pairs == pairs
-        assert Identity.of(Frames.of(there, GATE_M)).idf1 == pairs
+        found = MultiObjectMetrics.of(there, EvaluationConfig(gate_m=GATE_M))
+        assert (found.clear.pairs, found.identity.idf1) == (pairs, pairs)
 
 
-def test_without_any_object_scores_are_no_numbers() -> None:
+def test_without_any_object_or_tick_scores_are_nan() -> None:
     there = Scenes(np.array([0]), np.array([1]), np.array([[np.inf]]), np.array([[False]]), np.array([[False]]))
-    frames = Frames.of(there, GATE_M)
-    scores = [
-        Clear.of(there, GATE_M).mota,
-        Clear.of(there, GATE_M).motp_m,
-        Identity.of(frames).idf1,
-        Hota.of(frames).hota,
-    ]
-    assert all(map(math.isnan, scores))
-    assert Clear.of(there, GATE_M).false_positives == 1
+    found = MultiObjectMetrics.of(there, EvaluationConfig())
+    assert all(map(math.isnan, (found.clear.mota, found.clear.motp_m, found.identity.idf1, found.hota.hota)))
+    assert found.clear.false_positives == 1
+    empty = Scenes(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 1)), *[np.zeros((0, 1), bool)] * 2)
+    assert math.isnan(MultiObjectMetrics.of(empty, EvaluationConfig()).gospa.rms_m)
 
 
 # --- what is judged
@@ -203,12 +185,6 @@ def test_ticks_without_recorded_truth_are_not_judged(story: Run) -> None:
     assert (story.tables["timing"].num_rows, there.num_ticks) == (12, 10)
     assert there.present.sum(axis=0).tolist() == [10, 8]
     assert np.isinf(there.distances_m[there.tick_index >= 8, 1]).all()
-
-
-def test_ticks_before_the_truth_are_not_judged(tmp_path: Path) -> None:
-    run = write_run(tmp_path / "run", [[WEST.track(k, 1)] for k in range(6)], truth=WEST.truth(range(2, 5)))
-    assert multi_object(run).gospa.ticks == 3
-    assert multi_object(run).clear.pairs == 3
 
 
 def test_an_object_that_has_left_has_no_pair_though_a_row_has_an_earlier_stamp(tmp_path: Path) -> None:
@@ -226,20 +202,6 @@ def test_the_order_of_the_rows_does_not_matter(story: Run) -> None:
     assert multi_object(story.with_tables(tracks=tracks)) == multi_object(story)
 
 
-def test_a_late_stamped_row_is_as_far_as_it_is_at_its_own_stamp(tmp_path: Path) -> None:
-    tracks = [[], [], [WEST.track(1, 1)]]
-    found = multi_object(write_run(tmp_path / "run", tracks, truth=WEST.truth(range(3))))
-    assert (found.clear.pairs, found.clear.misses) == (1, 2)
-    assert found.clear.motp_m == pytest.approx(0.0, abs=1e-9)
-
-
-def test_tracks_count_when_they_are_confirmed(tmp_path: Path) -> None:
-    tracks = [[WEST.track(k, 1, num_measured=k + 1)] for k in range(4)]
-    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(4)))
-    assert multi_object(run).clear.pairs == 2
-    assert multi_object(run, EvaluationConfig(confirmed_only=False)).clear.pairs == 4
-
-
 def test_the_configuration_of_the_run_says_how_it_is_judged(story: Run) -> None:
     without = replace(story, config_text="evaluation: {multi_object: false}")
     assert evaluate(without).multi_object is None
@@ -250,7 +212,3 @@ def test_the_configuration_of_the_run_says_how_it_is_judged(story: Run) -> None:
     assert one.multi_object is not None
     assert one.multi_object.gospa.c_m == 3.0
     assert evaluate(story).options == EvaluationConfig()
-
-
-def test_without_truth_there_is_nothing_to_score(tmp_path: Path) -> None:
-    assert evaluate(write_run(tmp_path / "run", [[WEST.track(0, 1)]])).multi_object is None

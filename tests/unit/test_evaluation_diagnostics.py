@@ -152,7 +152,7 @@ def test_jumps_of_the_ego_are_told(jumps: int, told: str | None, tmp_path: Path)
     run = run_of(tmp_path / "run", lists(Disposition.IN_SEQUENCE))
     ego = Table({name: column(name, [0, 1]) for name in run.tables["ego"]})
     found = list(map(str, diagnostics(replace(run.with_tables(ego=ego), meta={**run.meta, "ego_jumps": jumps}))))
-    assert [f"ego: its place {told}" in each for each in found] == ([] if told is None else [True])
+    assert [f"ego: its position {told}" in each for each in found] == ([] if told is None else [True])
 
 
 def test_seconds_in_place_of_nanoseconds_are_told(tmp_path: Path) -> None:

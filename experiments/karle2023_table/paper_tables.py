@@ -1,6 +1,6 @@
 """The evaluation of Karle et al. 2023 as tables: residuals, precision, delays, computing time.
 
-    python experiments/karle2023_table/evaluation.py out/race
+    python experiments/karle2023_table/paper_tables.py out/race
 
 Prints what sections III-H and IV of the paper show of one drive, for every run given.
 """

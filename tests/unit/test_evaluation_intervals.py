@@ -9,7 +9,7 @@ from scipy.special import stdtrit
 from scipy.stats import ttest_rel
 
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.intervals import Estimate, average, block_length, by_stamp, mean_square, paired, within_run
+from fgtrack.evaluation.intervals import Estimate, block_length, by_stamp, mean_square, paired, within_run
 
 
 def mean(sums: FloatArray) -> FloatArray:
@@ -38,17 +38,6 @@ def test_over_seeds_it_is_the_paired_t_interval() -> None:
 
 def test_pairs_with_a_missing_value_are_left_out() -> None:
     assert paired([1.0, math.nan, 3.0, 5.0], [0.0, 2.0, 1.0, math.nan]) == paired([1.0, 3.0], [0.0, 1.0])
-
-
-def test_an_average_is_the_difference_to_nothing_and_shows_its_interval() -> None:
-    found = average([0.3, math.nan, 0.5, 0.4])
-    assert found == paired([0.3, 0.5, 0.4], [0.0, 0.0, 0.0])
-    assert f"{found:.2f}" == "0.40 (0.15 to 0.65)"
-
-
-def test_the_same_values_differ_by_nothing_and_not_significantly() -> None:
-    same = paired([0.3, 0.4], [0.3, 0.4])
-    assert (same.mean, same.low, same.high, same.is_significant) == (0.0, 0.0, 0.0, False)
 
 
 def test_one_pair_has_no_interval_and_none_no_mean() -> None:
@@ -144,10 +133,6 @@ def test_anticorrelation_gives_a_block_length_too() -> None:
     lengths = [block_length(np.diff(rng.standard_normal(200))) for _ in range(30)]  # sums of R near 0, some negative
     assert 1 in lengths
     assert all(1 <= length <= 66 for length in lengths)
-
-
-def test_what_never_varies_has_an_interval_of_no_width() -> None:
-    assert within_run(np.ones((100, 2)), mean, np.random.default_rng(9)) == Estimate(1.0, 1.0, 1.0, 100)
 
 
 def test_a_sum_of_zeros_and_a_short_run_do_no_harm() -> None:
