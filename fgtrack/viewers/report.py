@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import fgtrack
+from fgtrack.core.errors import printable
 from fgtrack.evaluation.diagnostics import diagnostics, noise_diagnostics
 from fgtrack.evaluation.runs import JudgedRun, recordings_warning
 from fgtrack.evaluation.tables import Table, Tables, grid
@@ -156,7 +157,7 @@ def _table(table: Table) -> str:
     for row in list(grid(shown, lambda text, bold: (text, bold)))[1:]:
         cells = (_cell("td", text, column.left, bold) for column, (text, bold) in zip(shown, row, strict=True))
         rows.append(f"<tr>{''.join(cells)}</tr>\n")
-    return _wide(table.title, head, "".join(rows)) + _list(table.shown_notes(), "soft")
+    return _wide(printable(table.title), head, "".join(rows)) + _list(table.shown_notes(), "soft")
 
 
 def _grid(title: str, names: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -97,8 +97,9 @@ def test_it_has_every_part_and_every_run(page: str, folder: Path) -> None:
     assert opened.count("<figure ") == 3
     assert "<table" not in opened
     assert {"figure-close_up", "figure-map_smoother", "figure-error_against_lag"} <= set(ids)
-    for table in fgtrack.compare(folder / "runs").values():
-        assert not table.num_rows or f"<h3>{table.title}</h3>" in page
+    tables = fgtrack.compare(folder / "runs")
+    for table in tables.tables.values():
+        assert not table.records or f"<h3>{table.title}</h3>" in page
     for name in NAMES:
         assert fgtrack.load_run(folder / "runs" / name).meta["digest"] in page
         assert f"{name}: config.yaml" in page

@@ -171,7 +171,7 @@ def check_told(run: Run) -> Counter[str]:
     for kind, count in failed.items():
         assert f"{count} {kind}" in line or kind == Failure.STEP_DAMPED
         assert tables["failures"][kind.replace(" ", "_")].tolist() == [count]
-    assert not tables["failures"].is_detail
+    assert not tables.tables["failures"].is_detail
     assert "Failures inside the estimator" in str(tables)
     ended = run.meta["ended_by_failure"]
     assert len(ended) == min(failed[Failure.TRACK_ENDED], 100)
