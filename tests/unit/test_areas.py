@@ -57,15 +57,6 @@ def test_a_csv_file_has_a_corner_a_row_and_may_name_its_polygons(tmp_path: Path,
     assert ExclusionAreas.read([alone]).contain(np.array([[9.0, 1.0], [1.0, 9.0]])).tolist() == [True, False]
 
 
-def test_many_points_are_judged_in_portions_as_few_are(monkeypatch, tmp_path: Path) -> None:
-    areas = ExclusionAreas.read([written(tmp_path, polygon(SQUARE, HOLE))])
-    points = np.random.default_rng(3).uniform(-2.0, 12.0, (500, 2))
-    whole = areas.contain(points)
-    monkeypatch.setattr("fgtrack.models.areas._PORTION", 50)
-    assert np.array_equal(areas.contain(points), whole)
-    assert 0 < whole.sum() < 500
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -11,7 +11,6 @@ from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.filters.initiation import Fix, Search
-from fgtrack.estimation.filters.replay import ReplayBank, ReplayEkf
 from fgtrack.estimation.registry import ESTIMATORS, estimator
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRV, CV
@@ -54,20 +53,6 @@ def test_equal_values_of_one_stamp_count_the_same_whichever_came_first(name: str
 def test_a_smoother_that_has_converged_counts_them_the_same_too(name: str, what: str) -> None:
     first, *others = (fed(name, order) for order in permutations((*ALIKE[what], POSITION)))
     assert max(max(difference(other, first, CTRV())) for other in others) < 1e-5
-
-
-@pytest.mark.parametrize("what", ALIKE)
-def test_they_do_in_the_bank_of_many_objects_as_well(what: str) -> None:
-    states = set()
-    for order in permutations((*ALIKE[what], POSITION)):
-        bank = ReplayBank(CTRV(), lambda start: ReplayEkf(CTRV(), start, 1.0), 1.0)
-        for track_id in range(5):
-            bank.birth(track_id, START)
-        for measurement in order:
-            bank.update(measurement.stamp_ns, range(5), [measurement] * 5)
-        found = bank.states_at(60 * MS)
-        states.add(found.means.tobytes() + found.covariances.tobytes())
-    assert len(states) == 1
 
 
 def test_of_two_fixes_in_one_place_at_one_time_the_line_takes_the_same_first() -> None:

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
 from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
 from fgtrack.estimation.filters.ekf import correct
-from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator, Propagator
+from fgtrack.estimation.filters.propagation import EulerCtrv, Propagator
 from fgtrack.estimation.filters.published import LeadingClock, StalePresent
 from fgtrack.models.measurement import SensorPose, measurement_model
-from fgtrack.models.motion import CTRV, CV
+from fgtrack.models.motion import CTRV
 
 STEP_NS = 10_000_000
 START_NS = 1_600_000_000_000_000_000
@@ -71,49 +71,7 @@ def test_the_nearest_stored_state_is_used_and_of_two_the_newer(late_ms: float, b
     assert bank().steps_back(START_NS - ms(late_ms)) == back
 
 
-@settings(deadline=None)
-@given(late_ns=st.integers(-(10**8), 10**9), step_ns=st.integers(1, 10**8))
-def test_the_steps_back_are_those_of_a_search_over_all_slots(late_ns: int, step_ns: int) -> None:
-    made = BackwardForwardBank(euler(), step_ns, 10)
-    made.advance(START_NS // step_ns * step_ns)
-    stamp_ns = made.present_ns - late_ns
-    near = max(late_ns // step_ns, 0)
-    assert made.steps_back(stamp_ns) == min(range(near, near + 2), key=lambda k: abs(late_ns - k * step_ns))
-
-
 # --- an update in the past
-
-
-def test_an_update_in_the_past_is_rewind_correct_and_predict() -> None:
-    made = bank()
-    made.birth(7, prior(START_NS))
-    for tick in range(1, 16):
-        made.advance(START_NS + 2 * tick * STEP_NS)
-    present_ns = made.present_ns
-    stamp_ns = present_ns - ms(123)
-    before = made.states_at(stamp_ns)
-    same(before.means, made.states_at(present_ns - ms(120)).means)
-    measurement = position(stamp_ns, float(before.means[0, 0]) + 0.7, float(before.means[0, 1]) - 0.4)
-    [result] = made.update(stamp_ns, [7], [measurement])
-    by_hand = correct(
-        before.means, before.covariances, measurement.z[None], measurement.R[None], POSITION, SensorPose()
-    )
-    assert result.status is UpdateStatus.IN_SEQUENCE
-    same(result.innovation, [0.7, -0.4])
-    assert result.nis == pytest.approx(by_hand.nis[0])
-    for back in range(12):  # every state on the way is the new one
-        steps = np.array([12 - back])
-        mean, covariance = euler().propagate(by_hand.mean, by_hand.covariance, steps, 0.01)
-        stored = made.states_at(present_ns - back * STEP_NS)
-        same(stored.means, mean)
-        same(stored.covariances, covariance)
-    [present] = made.present()
-    assert present.stamp_ns == present_ns
-    same(present.mean, made.states_at(present_ns).means[0])
-    same(present.covariance, made.states_at(present_ns).covariances[0])
-    same(made.states_at(stamp_ns).means, by_hand.mean)
-    older = made.states_at(present_ns - ms(130))
-    assert not np.allclose(older.means, by_hand.mean)  # what is older stays as it was
 
 
 def test_what_was_fused_after_a_late_stamp_is_forgotten() -> None:
@@ -130,34 +88,6 @@ def test_what_was_fused_after_a_late_stamp_is_forgotten() -> None:
     assert (late.status, only.status) == (UpdateStatus.OUT_OF_SEQUENCE, UpdateStatus.IN_SEQUENCE)
     same(with_newer.present()[0].mean, without_newer.present()[0].mean)
     same(with_newer.present()[0].covariance, without_newer.present()[0].covariance)
-
-
-def test_equal_stamps_are_in_sequence_and_older_than_birth_is_not() -> None:
-    made = bank()
-    made.advance(START_NS + 10 * STEP_NS)
-    made.birth(0, prior(START_NS + ms(52)))
-    for stamp_ms, status in [
-        (52, "in_sequence"),
-        (48, "out_of_sequence"),
-        (60, "in_sequence"),
-        (59, "out_of_sequence"),
-    ]:
-        stamp_ns = START_NS + ms(stamp_ms)
-        [result] = made.update(stamp_ns, [0], [position(stamp_ns, 0.0)])
-        assert result.status == status
-
-
-def test_a_measurement_of_the_future_is_fused_at_present() -> None:
-    made = bank()
-    made.birth(0, prior(START_NS))
-    stamp_ns = START_NS + ms(300)
-    before = made.states_at(stamp_ns)
-    made.update(stamp_ns, [0], [position(stamp_ns, 1.0)])
-    after = made.states_at(START_NS)
-    by_hand = correct(
-        before.means, before.covariances, np.array([[1.0, 0.0]]), 0.09 * np.eye(2)[None], POSITION, SensorPose()
-    )
-    same(after.means, by_hand.mean)
 
 
 # --- births
@@ -180,50 +110,7 @@ def test_a_track_born_late_starts_at_its_stamp_and_is_not_offered_at_older_ones(
     assert made.states_at(START_NS + ms(200)).track_ids == (1, 2)
 
 
-def test_a_birth_between_two_grid_stamps_goes_to_the_nearer_and_of_the_future_to_the_present() -> None:
-    made = bank()
-    made.advance(START_NS + 20 * STEP_NS)
-    for track_id, stamp_ms, oldest_ms in [(0, 104.9, 100), (1, 105.1, 110), (2, 900.0, 200)]:
-        made.birth(track_id, prior(START_NS + ms(stamp_ms)))
-        assert track_id in made.states_at(START_NS + ms(oldest_ms)).track_ids
-        assert track_id not in made.states_at(START_NS + ms(oldest_ms - 10)).track_ids
-
-
-def test_a_birth_of_unknown_heading_starts_at_yaw_zero_or_with_a_wide_velocity() -> None:
-    made = bank()
-    made.birth(0, prior(START_NS, yaw_rad=None))
-    assert made.present()[0].mean.tolist() == [0.0, 0.0, 0.0, 40.0, 0.1]
-    cartesian = BackwardForwardBank(ExactPropagator(CV()), STEP_NS, 10)
-    cartesian.advance(START_NS)
-    cartesian.birth(0, prior(START_NS, 3.0, 4.0, yaw_rad=None))
-    state = cartesian.states_at(START_NS)
-    assert state.means.tolist() == [[3.0, 4.0, 0.0, 0.0]]
-    same(state.covariances[0], np.diag([0.1, 0.1, 1604.0, 1604.0]))
-
-
 # --- storage
-
-
-def test_the_storage_ends_at_its_length() -> None:
-    made = bank(storage_steps=20)
-    made.birth(0, prior(START_NS))
-    for tick in range(1, 31):
-        made.advance(START_NS + tick * STEP_NS)
-    oldest_ns = START_NS + 11 * STEP_NS
-    assert made.window_start_ns == oldest_ns - STEP_NS // 2
-    assert made.states_at(oldest_ns).track_ids == (0,)
-    assert made.states_at(made.window_start_ns).track_ids == (0,)
-    assert made.states_at(made.window_start_ns - 1).track_ids == ()
-
-
-@pytest.mark.parametrize("length", [19, 20])
-def test_a_birth_at_the_very_start_of_the_window_is_integrated_to_the_present(length: int) -> None:
-    made = bank(storage_steps=length)
-    made.advance(START_NS + 100 * STEP_NS)
-    made.birth(0, prior(made.window_start_ns))
-    [state] = made.present()
-    assert state.mean[0] == pytest.approx(40.0 * 0.01 * (length - 0.5) * math.cos(0.2), abs=0.3)
-    assert made.states_at(made.window_start_ns).track_ids == (0,)
 
 
 def test_a_clock_that_jumps_far_ahead_predicts_all_the_way() -> None:
@@ -238,24 +125,6 @@ def test_a_clock_that_jumps_far_ahead_predicts_all_the_way() -> None:
     for back in (0, 7, 19):
         stamp_ns = made.present_ns - back * STEP_NS
         np.testing.assert_allclose(made.states_at(stamp_ns).means, slow.states_at(stamp_ns).means, atol=1e-7)
-
-
-def test_a_gap_of_decades_without_tracks_costs_nothing() -> None:
-    made = BackwardForwardBank(euler(), STEP_NS, 350)
-    made.advance(0)
-    made.advance(START_NS)
-    made.birth(0, prior(START_NS - ms(50)))
-    assert made.states_at(START_NS - ms(50)).track_ids == (0,)
-    assert made.states_at(START_NS - ms(60)).track_ids == ()
-
-
-def test_a_clock_that_stands_still_or_goes_back_changes_no_state() -> None:
-    made = bank()
-    made.birth(0, prior(START_NS))
-    made.advance(START_NS + 5 * STEP_NS)
-    before = made.states_at(START_NS + 5 * STEP_NS).means
-    made.advance(START_NS + 5 * STEP_NS)
-    assert np.array_equal(made.states_at(START_NS + 5 * STEP_NS).means, before)
 
 
 def test_the_present_lies_between_grid_stamps_and_its_yaw_is_wrapped() -> None:
@@ -311,25 +180,6 @@ def test_a_measurement_that_cannot_be_fused_fails_alone_and_changes_nothing() ->
     assert np.array_equal(before[1].mean, after[1].mean)
     assert not np.array_equal(before[0].mean, after[0].mean)
     assert not np.array_equal(before[2].mean, after[2].mean)
-
-
-def test_a_singular_innovation_covariance_is_a_failure_and_no_crash() -> None:
-    made = BackwardForwardBank(EulerCtrv(CTRV(), np.zeros(5)), STEP_NS, 5)
-    made.advance(START_NS)
-    certain = Start(
-        stamp_ns=START_NS,
-        position_std_m=0.0,
-        yaw_rad=0.0,
-        yaw_std_rad=0.1,
-        speed_mps=0.0,
-        speed_std_mps=0.1,
-        yaw_rate_std_radps=0.1,
-        accel_std_mps2=0.1,
-    )
-    made.birth(0, certain)
-    exact = Measurement(START_NS, POSITION, np.ones(2), np.zeros((2, 2)))
-    assert [result.status for result in made.update(START_NS, [0], [exact])] == ["failed"]
-    assert made.present()[0].mean.tolist() == [0.0] * 5
 
 
 # --- against the simplest bank there is
@@ -468,18 +318,3 @@ def test_a_stale_storage_keeps_the_prior_of_an_update_without_delay() -> None:
     assert stored.means[0, 0] == 0.0
     made.update(START_NS, [0], [position(START_NS, 1.0)])  # delayed now: reaches the storage
     assert made.states_at(START_NS).means[0, 0] == pytest.approx(present)
-
-
-def test_present_states_are_in_order_of_birth_and_kinematic() -> None:
-    made = BackwardForwardBank(ExactPropagator(CV()), STEP_NS, 10)
-    made.advance(START_NS)
-    assert made.present() == []
-    for track_id in (5, 3, 9):
-        made.birth(track_id, prior(START_NS, x_m=float(track_id)))
-    made.remove(3)
-    made.birth(4, prior(START_NS, x_m=4.0))
-    assert made.track_ids == (5, 9, 4)
-    states: list[TrackState] = made.present()
-    assert [state.mean[0] for state in states] == [5.0, 9.0, 4.0]
-    assert [state.mean.shape for state in states] == [(5,)] * 3
-    same(states[0].mean[2:], [0.2, 40.0, 0.0])

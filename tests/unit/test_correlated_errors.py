@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgtrack.core.errors import CallError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
@@ -22,9 +21,6 @@ from fgtrack.models.measurement import SensorPose, measured_position, measuremen
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.road import OpenSpace
 from fgtrack.models.sensors import Correlation, SensorModel
-from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.config import Config, MotionConfig
-from fgtrack.pipeline.load import load
 from fgtrack.testing import check_motion_model
 from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
 from fgtrack.tracking.preprocess import Candidate
@@ -47,11 +43,6 @@ def test_there_is_a_state_for_every_component_of_a_sensor_whose_errors_last() ->
     assert (motion.dim, motion.linear) == (9, False)
     assert with_correlated_errors(CV(), SENSORS).linear
     assert with_correlated_errors(CTRV(), {"white": WHITE}) == CTRV()
-
-
-def test_a_sensor_that_is_ignored_adds_no_state() -> None:
-    config = Config(sensors=SENSORS, ignore_sensors=("lidar",), motion=MotionConfig("ctrv"))
-    assert config.motion_model().state_names == (*CTRV.state_names, "camera.bearing_rad")
 
 
 def test_an_error_is_stationary_and_falls_to_its_e_th_part_after_its_time() -> None:
@@ -81,34 +72,10 @@ def test_one_detection_is_as_uncertain_as_its_covariance_says(name: str) -> None
     assert model.linear == (name == "lidar")
 
 
-def test_a_yaw_from_the_map_stays_as_it_is() -> None:
-    sensor = replace(LIDAR, std={"x_m": 0.5, "y_m": 0.5}, yaw_from_map_std_rad=0.3)
-    motion = with_correlated_errors(CTRV(), {"lidar": sensor})
-    plain = measurement_model(("x_m", "y_m", "yaw_rad"), motion)
-    model, white = split_error("lidar", sensor, plain, np.diag([1.0, 1.0, 0.09]), motion.state_names)
-    assert np.diag(white) == pytest.approx([0.5, 0.5, 0.09])
-    assert not model.jacobian(np.zeros(7))[2, 5:].any()
-
-
-def test_a_sensor_without_it_measures_as_before() -> None:
-    plain, R = measurement_model(("x_m", "y_m"), CTRV()), np.eye(2)
-    assert split_error("white", WHITE, plain, R, CTRV.state_names) == (plain, R)
-    assert whole_error(plain, R) is R
-
-
 @pytest.mark.parametrize(("share", "time_s"), [(0.0, 1.0), (1.0, 1.0), (0.5, 0.0), (0.5, np.inf)])
 def test_a_correlation_that_makes_no_sense_is_refused(share: float, time_s: float) -> None:
     with pytest.raises(ValueError, match="must"):
         Correlation(share, time_s)
-
-
-def test_the_steps_of_the_paper_have_no_such_state(tmp_path) -> None:
-    config = load(Config, None, ["motion.kind=ctrv"])
-    erring = replace(config, sensors={"radar": replace(WHITE, correlation=Correlation())})
-    build_tracker(erring)
-    build_tracker(replace(erring, estimator="ekf-backward-forward"))
-    with pytest.raises(ValueError, match=r"sensors.radar.correlation: needs motion.kind ctrv, ctra or cv"):
-        replace(erring, motion=MotionConfig(kind="ctrv_euler"))
 
 
 def nees(name: str, modelled: bool, lag_s: float, num_runs: int = 40) -> float:
@@ -155,11 +122,6 @@ def test_without_it_a_smoother_believes_its_past_too_much() -> None:
 
 def test_both_estimators_agree_where_all_is_linear() -> None:
     assert nees("ekf-replay", True, 0.0, 3) == pytest.approx(nees("smoother", True, 0.0, 3), rel=1e-6)
-
-
-def test_a_bad_share_in_a_configuration_is_one_line() -> None:
-    with pytest.raises(CallError, match=r"sensors\.a\.correlation.*share"):
-        load(Config, None, ["sensors={a: {std: {x_m: 1.0, y_m: 1.0}, correlation: {share: 2.0}}}"])
 
 
 @pytest.mark.parametrize("seen", ["x_m", "range_m"])
@@ -210,13 +172,6 @@ def test_the_tracker_gives_a_new_track_the_error_of_its_detection() -> None:
     fixed = FixedBirth().prior(candidate, OpenSpace(), None, ego_in_pit=False)
     assert fixed is not None
     assert fixed.position_cross == {}
-
-
-def test_an_entry_that_the_state_lacks_is_refused() -> None:
-    with pytest.raises(CallError, match=r"position_cross: the state has no radar\.x_m"):
-        initial_state(CV(), Start(position_cross={"radar.x_m": (1.0, 0.0)}))
-    with pytest.raises(CallError, match="position_cross of a: must be two finite numbers"):
-        Start(position_cross={"a": (float("nan"), 0.0)})
 
 
 def test_errors_that_last_for_less_than_a_moment_stay_numbers_when_moved_back() -> None:

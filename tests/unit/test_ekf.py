@@ -89,23 +89,6 @@ def test_a_filter_over_linear_motion_is_the_batch_solution_of_the_whole_chain() 
     np.testing.assert_allclose(covariance[0], np.linalg.inv(information)[-n:, -n:], atol=1e-9)
 
 
-def test_the_innovation_of_a_yaw_takes_the_short_way_round() -> None:
-    model = measurement_model(("x_m", "y_m", "yaw_rad"), CTRV())
-    x, P = np.array([[0.0, 0.0, 3.1, 0.0, 0.0]]), np.eye(5)[None]
-    done = correct(x, P, np.array([[0.0, 0.0, -3.1]]), np.eye(3)[None], model, SensorPose())
-    assert done.innovation[0, 2] == pytest.approx(2 * np.pi - 6.2)
-    assert done.mean[0, 2] == pytest.approx(np.pi, abs=1e-12)
-
-
-def test_a_bearing_is_seen_from_the_sensor_pose() -> None:
-    model = measurement_model(("bearing_rad",), CTRV())
-    x, P = np.array([[10.0, 10.0, 0.0, 0.0, 0.0]]), np.eye(5)[None]
-    pose = SensorPose(10.0, 0.0, np.pi / 2)
-    done = correct(x, P, np.array([[0.1]]), np.array([[[1e-6]]]), model, pose)
-    assert done.innovation[0, 0] == pytest.approx(0.1)
-    assert done.mean[0, :2] == pytest.approx([9.0, 10.0], abs=0.02)  # to the left of the line of sight
-
-
 @settings(deadline=None, max_examples=30)
 @given(seed=seeds, scale=st.sampled_from([1e-12, 1e-6, 1.0, 1e6]))
 def test_the_posterior_stays_symmetric_and_positive_however_good_the_measurement(seed: int, scale: float) -> None:
@@ -141,17 +124,6 @@ def test_a_prediction_is_the_motion_model_with_its_noise_and_changes_no_input(mo
     assert np.array_equal(P, before[1])
 
 
-@settings(deadline=None, max_examples=20)
-@given(seed=seeds, share=st.floats(0.05, 0.95))
-def test_a_split_prediction_of_linear_motion_is_the_whole_one(seed: int, share: float) -> None:
-    rng = np.random.default_rng(seed)
-    x, P = rng.normal(size=(2, 4)), positive_definite(rng, 2, 4)
-    whole = predict(x, P, CV(), 2.0)
-    parts = predict(*predict(x, P, CV(), 2.0 * share), CV(), 2.0 * (1.0 - share))
-    for a, b in zip(parts, whole, strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-11)
-
-
 @settings(deadline=None, max_examples=60)
 @given(
     seed=seeds,
@@ -176,12 +148,6 @@ def test_the_correction_of_one_state_is_that_of_a_stack(
     np.testing.assert_array_equal(one.covariance, one.covariance.T)
     for array, before in zip((x, P, z, R), inputs, strict=True):
         np.testing.assert_array_equal(array, before)
-
-
-def test_a_singular_innovation_covariance_of_one_state_is_an_error() -> None:
-    model = measurement_model(("x_m", "y_m"), CTRV())
-    with pytest.raises(np.linalg.LinAlgError):
-        correct_one(np.zeros(5), np.zeros((5, 5)), Measurement(0, model, np.ones(2), np.zeros((2, 2))))
 
 
 def test_the_replaying_filter_keeps_the_yaw_in_its_range_through_full_turns() -> None:

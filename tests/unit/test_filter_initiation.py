@@ -11,10 +11,9 @@ import fgtrack
 from fgtrack.core.geometry import polar, polar_gradient, rotation, wrap_angle
 from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.track_initiation import LONGEST_S, MOST_MEASUREMENTS, TrackInitiation
 from fgtrack.models.measurement import SensorPose
-from fgtrack.models.motion import CTRA, CTRV, CV
+from fgtrack.models.motion import CTRV
 from fgtrack.sim.draw import drawn
 
 STD_M, PERIOD_NS = 0.3, 50_000_000
@@ -89,18 +88,6 @@ def test_the_order_of_arrival_does_not_matter(method: str, speed_mps: float) -> 
         np.testing.assert_array_equal(states(fed(method, order), 4), expected)
 
 
-def test_one_point_starts_at_yaw_0_and_never_turns() -> None:
-    measurements = positions(2.0, 1)
-    found = fed("one-point", measurements).state_at(PERIOD_NS)
-    x, P = initial_state(CTRV(), START)
-    H = np.eye(2, 5)
-    F, Q = CTRV().jacobian(x, 0.05), CTRV().process_noise(x, 0.05)
-    P = F @ P @ F.T + Q
-    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + STD_M**2 * np.eye(2))
-    np.testing.assert_allclose(found.mean, x + K @ (measurements[0].z - x[:2]), atol=1e-12)
-    np.testing.assert_allclose(found.covariance, (np.eye(5) - K @ H) @ P, atol=1e-9)
-
-
 def test_what_is_no_position_does_not_count() -> None:
     """A bearing alone and a range alone are fused, and give no line."""
     partial = [
@@ -128,14 +115,6 @@ def test_range_and_bearing_together_are_a_position() -> None:
     found = fed("regression", measurements).state_at(6 * PERIOD_NS).mean
     assert abs(wrap_angle(found[YAW] - 2.0)) < 0.15
     assert abs(found[3] - 30.0) < 4.0
-
-
-def test_a_known_direction_is_not_sought() -> None:
-    start = Start(yaw_rad=0.3, speed_mps=20.0)
-    expected = states(fed("one-point", positions(2.0, 5), start), 5)
-    for method in METHODS:
-        np.testing.assert_array_equal(states(fed(method, positions(2.0, 5), start), 5), expected)
-        assert TrackInitiation.of(CV(), START, method) is None  # a linear model needs none
 
 
 def test_two_points_end_it_and_a_regression_ends_where_the_direction_is_certain() -> None:
@@ -210,22 +189,6 @@ def test_what_is_known_of_the_speed_is_used_once() -> None:
     state = fed("regression", positions(2.0, 2, speed_mps=20.0), start).state_at(2 * PERIOD_NS)
     assert abs(state.mean[3] - 20.0) < 1.5
     assert 0.9 < np.sqrt(state.covariance[3, 3]) < 1.05
-
-
-def test_other_models_start_along_the_line_as_well() -> None:
-    estimator = fgtrack.estimator("ekf-replay", CTRA(), START, initiation="regression")
-    for measurement in positions(2.0, 8):
-        estimator.update(measurement)
-    mean = estimator.state_at(8 * PERIOD_NS).mean
-    assert mean.shape == (6,)
-    assert abs(wrap_angle(mean[YAW] - 2.0)) < 0.2
-
-
-def test_a_start_without_uncertainty_falls_back_to_one_point() -> None:
-    """No line can be weighted there; nothing fails."""
-    start = Start(position_std_m=0.0, speed_std_mps=40.0)
-    expected = states(fed("one-point", positions(2.0, 3), start), 3)
-    np.testing.assert_array_equal(states(fed("regression", positions(2.0, 3), start), 3), expected)
 
 
 def test_an_unknown_method_is_refused_with_the_known_ones() -> None:

@@ -124,13 +124,6 @@ def test_the_contract_holds_with_several_hypotheses(name: str) -> None:
         check()
 
 
-def test_one_hypothesis_is_the_estimator_itself() -> None:
-    assert not isinstance(fgtrack.estimator("ekf-replay", CTRV(), START, hypotheses=1), Hypotheses)
-    assert not isinstance(fgtrack.estimator("ekf-replay", CV(), START, hypotheses=8), Hypotheses)
-    known = replace(START, yaw_rad=0.3)
-    assert not isinstance(fgtrack.estimator("ekf-replay", CTRV(), known, hypotheses=8), Hypotheses)
-
-
 @pytest.mark.parametrize(
     ("wanted", "text"),
     [(0, "at least 1, is 0"), ([replace(START, stamp_ns=5)], "one and the same stamp"), ([], "at least one start")],
@@ -138,14 +131,6 @@ def test_one_hypothesis_is_the_estimator_itself() -> None:
 def test_what_makes_no_sense_is_refused(wanted: Any, text: str) -> None:
     with pytest.raises(fgtrack.CallError, match=text):
         fgtrack.estimator("ekf-replay", CTRV(), START, hypotheses=wanted)
-
-
-def test_two_that_have_become_the_same_are_one() -> None:
-    given = [replace(START, yaw_rad=0.0), replace(START, yaw_rad=0.001)]
-    estimator = fgtrack.estimator("ekf-replay", CTRV(), START, hypotheses=given)
-    estimator.update(at(100, 1.5, 0.0))
-    assert isinstance(estimator, Hypotheses)
-    assert len(estimator.estimators) == 1
 
 
 def test_two_that_have_become_the_same_are_as_probable_as_both(monkeypatch: pytest.MonkeyPatch) -> None:

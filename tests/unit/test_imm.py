@@ -1,7 +1,5 @@
 """The interacting multiple model filter: what it is made of, and that late measurements change nothing."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -125,24 +123,6 @@ def test_an_outlier_under_a_loss_does_not_decide_between_the_models() -> None:
     before = imm.probabilities
     fed(imm, [far])
     assert_allclose(imm.probabilities, before, atol=0.1)
-
-
-def test_an_unknown_direction_is_found_along_the_first_positions() -> None:
-    start = Start(speed_std_mps=30.0)
-    imm, ekf = ImmReplay(CTRV(), start, 2.0), ReplayEkf(CTRV(), start, 2.0)
-    measurements = positions(np.full(20, 20.0))
-    for estimator in (imm, ekf):
-        fed(estimator, measurements)
-    assert_allclose(imm.state_at(1000 * MS).mean[:4], ekf.state_at(1000 * MS).mean[:4], atol=0.5)
-
-
-def test_stamps_a_microsecond_apart_and_equal_ones_are_fused() -> None:
-    first, *_ = positions(np.full(1, 20.0))
-    imm = ImmReplay(CTRV(), START, 1.0)
-    stamps_ns = [50 * MS, 50 * MS, 50 * MS + 1000, 50 * MS + 2000]
-    fed(imm, [Measurement(at, first.model, first.z, first.R) for at in stamps_ns])
-    shrinking = [float(np.trace(step.covariance[:2, :2])) for step in imm.steps[1:]]
-    assert all(later < earlier for earlier, later in pairwise(shrinking))
 
 
 @pytest.mark.parametrize(

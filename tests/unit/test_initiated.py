@@ -19,7 +19,6 @@ from fgtrack.testing import estimator_checks
 
 PERIOD_NS, STD = 50_000_000, {"x_m": 0.3, "y_m": 0.3}
 START = Start(position_std_m=0.3, speed_std_mps=40.0)
-UNAWARE = [name for name in ESTIMATORS if not Claims.of(ESTIMATORS.load(name)).initiates]
 #: One measurement in ten is late by two steps.
 CTRV_FILTERS = [name for name in ESTIMATORS if name not in ("smoother-batch", "as-current", "drop")]
 

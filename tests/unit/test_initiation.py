@@ -5,11 +5,11 @@ import pytest
 
 from fgtrack.core.geometry import rotation
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.filters.initiation import Fix, Line, Search, along, fixes_of, over, straight_line
+from fgtrack.estimation.filters.initiation import Fix, Line, Search, fixes_of, over
 from fgtrack.estimation.smoothing.bank import FixedLagSmoother
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.windows import Windows
-from fgtrack.models.motion import CTRV, CV
+from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import RobustLoss
 
 STD_M = 0.5
@@ -81,28 +81,12 @@ def test_a_certain_direction_is_not_sought_again(monkeypatch: pytest.MonkeyPatch
     assert not restarts
 
 
-def test_two_positions_give_their_difference_over_their_time() -> None:
-    R = np.diag([0.04, 0.09])
-    line = straight_line([Fix(0.5, np.array([1.0, 2.0]), R), Fix(1.0, np.array([4.0, 0.0]), 2.0 * R)])
-    np.testing.assert_allclose(line.velocity_mps, [6.0, -4.0], atol=1e-9)
-    np.testing.assert_allclose(line.position_m, [-2.0, 4.0], atol=1e-9)
-    np.testing.assert_allclose(line.covariance, 3.0 * R / 0.25, atol=1e-9)
-    with pytest.raises(np.linalg.LinAlgError):
-        straight_line([Fix(1.0, np.zeros(2), R), Fix(1.0, np.ones(2), R)])
-
-
 def test_certainty_counts_standard_deviations_of_the_velocity() -> None:
     assert Line(np.zeros(2), np.array([0.0, 5.8]), np.diag([1.0, 4.0])).certainty == pytest.approx(2.9)
     line = Line(np.zeros(2), np.array([0.0, 6.2]), np.diag([1.0, 4.0]))
     assert over(line, "regression", 3.0)
     assert not over(line, "regression", 3.2)
     assert over(line, "two-point", 3.2)
-
-
-def test_states_lie_along_the_line() -> None:
-    line = Line(np.array([1.0, 2.0]), np.array([0.0, -4.0]), np.eye(2))
-    np.testing.assert_allclose(along(line, 0.5, CTRV.state_names), [1.0, 0.0, -np.pi / 2.0, 4.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(along(line, -1.0, CV.state_names), [1.0, 6.0, 0.0, -4.0], atol=1e-12)
 
 
 def test_a_line_that_is_certain_stays_unless_something_older_than_its_last_position_comes() -> None:

@@ -59,14 +59,6 @@ def test_it_is_exact_in_any_order_of_arrival(name: str) -> None:
             assert max(difference(found.state_at(at_ns), in_time.state_at(at_ns))) < tolerance
 
 
-def test_the_smoothers_agree() -> None:
-    measurements = on_the_circle(1.0 / RADIUS_M)
-    first, *others = (fed(name, measurements) for name in ("smoother", "smoother-banded", "smoother-batch"))
-    for other in others:
-        for at_ns in (100 * MS, 400 * MS, 800 * MS):
-            assert max(difference(other.state_at(at_ns), first.state_at(at_ns))) < 1e-5
-
-
 @pytest.mark.parametrize("name", ["ekf-replay", "smoother", "ekf-backward-forward"])
 def test_it_gives_the_yaw_rate_that_positions_do_not_show(name: str) -> None:
     """To the standard deviation of the curvature times the speed, from the first measurement on."""

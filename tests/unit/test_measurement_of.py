@@ -12,7 +12,6 @@ from fgtrack.estimation.oosm import AccumulatedStateDensity, Al1, ReorderBuffer
 from fgtrack.estimation.smoothing.bank import FixedLagSmoother
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.measurement import SensorPose, measurement_model
-from fgtrack.models.motion import CTRA, CTRV, CV
 from fgtrack.models.sensors import RobustLoss
 
 STD = {"x_m": 0.3, "y_m": 0.4}
@@ -58,15 +57,6 @@ def test_what_makes_no_sense_is_one_line(given: dict, message: str) -> None:
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("stamp_ns", [None, "x", np.nan, 1.5, np.array([1]), 2**63, -(2**62)], ids=repr)
-def test_a_stamp_is_an_integer(stamp_ns: object) -> None:
-    with pytest.raises(CallError, match=r"^measurement: stamp_ns: must be an integer"):
-        Measurement.of(stamp_ns, x_m=1.0, std={"x_m": 1.0})
-    with pytest.raises(CallError, match=r"^Start: stamp_ns: must be an integer"):
-        Start(stamp_ns=stamp_ns)
-    assert Measurement.of(np.int64(5), x_m=np.float32(1.0), std={"x_m": 1}).z.tolist() == [1.0]
-
-
 @pytest.mark.parametrize("motion", MODELS, ids=lambda motion: type(motion).__name__)
 def test_every_kind_of_estimator_sees_it_in_its_own_state(motion) -> None:
     start, settings = Start(yaw_rad=0.5, speed_mps=20.0), SmootherSettings()
@@ -87,10 +77,3 @@ def test_every_kind_of_estimator_sees_it_in_its_own_state(motion) -> None:
         state = found.state_at(stamp_ns)
         assert isinstance(state, TrackState)
         assert state.mean.tolist() == expected.state_at(stamp_ns).mean.tolist()
-
-
-def test_a_measurement_that_fits_is_used_itself() -> None:
-    one = Measurement.of(0, x_m=1.0, y_m=2.0, std=STD)
-    assert one.seen_by(CTRV()) is one
-    assert one.seen_by(CTRA()) is one
-    assert one.seen_by(CV()).seen_by(CV()).model is measurement_model(("x_m", "y_m"), CV())

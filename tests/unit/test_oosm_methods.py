@@ -39,7 +39,6 @@ from fgtrack.estimation.oosm import (
     determinant,
     trace,
 )
-from fgtrack.estimation.oosm.crossing import Past, fuse_across
 from fgtrack.estimation.registry import estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
@@ -96,16 +95,6 @@ def test_the_accumulated_density_knows_the_smoothed_past() -> None:
         assert_same(estimator.state_at(stamp_ns), expected)
 
 
-def test_what_leaves_the_window_of_the_accumulated_density_stays_in_the_present() -> None:
-    rng = np.random.default_rng(4)
-    estimator, measurements = started("asd", lag_s=0.45), in_sequence(rng)
-    fed(estimator, measurements)
-    assert estimator.window_ns == (stamp(1.55), stamp(2.0))
-    more = [late(rng, 2), late(rng, 3)]
-    fed(estimator, more)
-    assert_same(last(estimator), last(replayed([*measurements, *more])))
-
-
 @pytest.mark.parametrize("name", ["c", "rts", "zlz"])
 def test_without_process_noise_nothing_is_lost_by_any_number_of_late_measurements(name: str) -> None:
     motion, rng = CV(velocity_density_m2ps3=0.0), np.random.default_rng(5)
@@ -123,20 +112,6 @@ def test_al1_and_fpfd_are_the_same_also_for_a_second_late_measurement(lag: int) 
         assert_same(last(fed(started("al1"), arrived)), last(fed(started("fpfd"), arrived)))
 
 
-def test_at_one_lag_several_lags_in_one_step_are_the_algorithms_for_one() -> None:
-    rng = np.random.default_rng(1)
-    measurements = [*in_sequence(rng), late(rng, 1)]
-    assert_same(last(fed(started("a1"), measurements)), last(fed(started("al1"), measurements)))
-    assert_same(last(fed(started("b1"), measurements)), last(fed(started("bl1"), measurements)))
-
-
-@pytest.mark.parametrize("name", ["a1", "al1", "fpfd"])
-def test_two_measurements_of_the_newest_stamp_are_one_lag(name: str) -> None:
-    rng = np.random.default_rng(6)
-    measurements = [*in_sequence(rng), measured(rng, NUM_STEPS * STEP_S, std=0.5), late(rng, 1)]
-    assert_same(last(fed(started(name), measurements)), last(replayed(measurements)))
-
-
 def test_a1_fails_rather_than_give_a_covariance_that_is_none() -> None:
     rng = np.random.default_rng(10)
     estimator = A1(LINEAR, prior(), LAG_S)
@@ -144,12 +119,6 @@ def test_a1_fails_rather_than_give_a_covariance_that_is_none() -> None:
     assert estimator.update(late(rng, 10)).status is UpdateStatus.FAILED
     np.testing.assert_array_equal(last(estimator).mean, before.mean)
     np.testing.assert_array_equal(last(estimator).covariance, before.covariance)
-
-
-def test_a_past_that_is_no_covariance_is_refused() -> None:
-    past = Past(np.zeros(4), -5.0 * np.eye(4), 0.1 * np.eye(4))
-    with pytest.raises(np.linalg.LinAlgError):
-        fuse_across(np.zeros(4), np.eye(4), past, measured(np.random.default_rng(0), 1.0))
 
 
 @pytest.mark.parametrize("lag", [1, 3, 10])
@@ -183,23 +152,6 @@ def test_larsen_carries_the_late_correction_through_the_gains_of_the_steps_since
     expected = last(filtered)
     found = last(fed(started("larsen"), [*steps, more]))
     assert_same(found, TrackState(found.stamp_ns, expected.mean + shift, expected.covariance - lost))
-
-
-def test_drop_ignores_what_is_late() -> None:
-    rng = np.random.default_rng(7)
-    steps = in_sequence(rng)
-    estimator = fed(started("drop"), steps)
-    assert estimator.update(late(rng, 2)).status is UpdateStatus.TOO_OLD
-    assert_same(last(estimator), last(replayed(steps)))
-
-
-def test_as_current_takes_a_late_measurement_at_the_newest_stamp() -> None:
-    rng = np.random.default_rng(8)
-    steps, more = in_sequence(rng), late(rng, 2)
-    estimator = fed(started("as-current"), steps)
-    assert estimator.update(more).status is UpdateStatus.OUT_OF_SEQUENCE
-    moved = Measurement(stamp(2.0), more.model, more.z, more.R)
-    assert_same(last(estimator), last(replayed([*steps, moved])))
 
 
 def test_the_delayed_horizon_is_the_replay_up_to_the_horizon_and_prediction_after() -> None:

@@ -15,7 +15,7 @@ from fgtrack.estimation.filters.published import (
     SaturatedEulerCtrv,
     published_yaw,
 )
-from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
+from fgtrack.models.motion import CTRA, CTRV, MotionModel
 
 ISOTROPIC = np.array([4e-4, 4e-4, 9e-4, 1e-2, 2.5e-3])
 ANISOTROPIC = np.array([4e-3, 1e-5, 9e-4, 1e-2, 2.5e-3])
@@ -101,16 +101,6 @@ def test_exact_steps_at_once_are_the_exact_steps_one_by_one(motion: MotionModel,
         assert np.abs((covariances[i] - covariance[0]) / np.outer(deviations, deviations)).max() < 1e-9
 
 
-def test_short_euler_steps_approach_the_exact_arc() -> None:
-    x, P = np.array([[0.0, 0.0, 0.3, 50.0, 0.2]]), np.eye(5)[None] * 0.01
-    exact = CTRV().predict(x, 1.0)[0]
-    errors = []
-    for steps in (100, 1000):
-        means, _ = EulerCtrv(CTRV(), ISOTROPIC).propagate(x, P, np.array([steps]), 1.0 / steps)
-        errors.append(float(np.abs(means[0] - exact).max()))
-    assert errors[1] == pytest.approx(errors[0] / 10, rel=0.05)
-
-
 def test_an_acceleration_is_carried_along_where_it_does_not_drive() -> None:
     x, P = np.array([[0.0, 0.0, 0.0, 10.0, 0.0, 3.0]]), np.eye(6)[None]
     means, _ = EulerCtrv(CTRA(), np.append(ISOTROPIC, 0.1)).propagate(x, P, np.array([50]), 0.01)
@@ -130,11 +120,6 @@ def test_settling_wraps_a_copy_to_the_propagators_own_range(wrap, wrapped: float
     mean = np.array([[1.0, 2.0, math.pi + 0.5, 4.0, 5.0]])
     assert wrap(mean)[0] == pytest.approx([1.0, 2.0, wrapped, 4.0, 5.0])
     assert mean[0, 2] == math.pi + 0.5
-
-
-def test_settling_leaves_a_state_without_yaw_alone() -> None:
-    mean = np.array([[1.0, 2.0, 30.0, 40.0]])
-    assert np.array_equal(ExactPropagator(CV()).wrap(mean), mean)
 
 
 def test_the_published_yaw_range_ends_where_the_published_yaw_is_pi() -> None:

@@ -3,19 +3,17 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fgtrack.core.time import nanoseconds
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
 from fgtrack.estimation.filters.replay import ReplayBank, ReplayEkf
-from fgtrack.estimation.object_bank import ObjectBank, OneObject
+from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.registry import estimator_bank
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
-from fgtrack.testing import check_estimator
 from fgtrack.testing.streams import MS, START
 
 LAG_S = 0.6
@@ -140,14 +138,6 @@ def test_what_cannot_be_fused_fails_alone_and_changes_nothing() -> None:
         statuses = banks.update(START.stamp_ns + offset_ms * MS, [0, 1, 2], measurements)
         assert statuses[1] is UpdateStatus.FAILED
         assert UpdateStatus.FAILED not in (statuses[0], statuses[2])
-
-
-@pytest.mark.parametrize("motion", [CTRV(), CV()])
-def test_the_bank_keeps_the_contract_of_an_estimator(motion: MotionModel) -> None:
-    def one(motion: MotionModel, start: Start, lag_s: float) -> OneObject:
-        return OneObject(motion, ReplayBank(motion, lambda start: ReplayEkf(motion, start, lag_s), lag_s), start)
-
-    check_estimator(one, num_streams=5)
 
 
 def test_the_tracker_gets_the_bank_and_other_filters_are_one_for_each_object() -> None:

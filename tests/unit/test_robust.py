@@ -10,8 +10,8 @@ from gtsam.noiseModel import mEstimator
 from scipy.optimize import minimize
 
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.filters.ekf import correct, correct_one, robust_weight
+from fgtrack.estimation.base import Estimator, Measurement
+from fgtrack.estimation.filters.ekf import correct, correct_one
 from fgtrack.estimation.registry import ESTIMATORS, Claims, estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
@@ -103,13 +103,6 @@ def test_a_stack_of_states_is_weighted_one_by_one() -> None:
         assert stacked.nis[row] == pytest.approx(one.nis, rel=1e-12)
 
 
-def test_the_weight_is_a_fixed_point() -> None:
-    loss, y, spread = RobustLoss("huber", 1.5), np.array([4.0, -3.0]), P[:2, :2]
-    w = robust_weight(loss, y, spread, R)
-    rest = R / w @ np.linalg.solve(spread + R / w, y)
-    assert w == pytest.approx(weight(loss, float(np.sqrt(rest @ np.linalg.solve(R, rest)))), rel=1e-8)
-
-
 def fed(name: str, loss: RobustLoss | None) -> Estimator:
     """Forty positions in sequence, then some late ones; each tenth is 8 m off."""
     rng, found = np.random.default_rng(5), estimator(name, LINEAR, replace(START, speed_mps=20.0), lag_s=3.0)
@@ -130,10 +123,3 @@ def test_every_estimator_is_pulled_less_by_outliers_with_a_loss(name: str) -> No
     truth = np.array([3.0, -2.0]) + 40.0 * np.array([np.cos(0.4), np.sin(0.4)])
     plain, robust = (fed(name, loss).state_at(at_ns).mean[:2] for loss in (None, RobustLoss("huber", 1.0)))
     assert np.linalg.norm(robust - truth) < 0.6 * np.linalg.norm(plain - truth)
-
-
-def test_a_start_is_enough() -> None:
-    found = estimator("ekf-replay", MOTION, Start())
-    for k in range(1, 5):
-        found.update(replace(seen(0.1, RobustLoss("cauchy", 1.0)), stamp_ns=k * 10**8))
-    assert np.isfinite(found.state_at(4 * 10**8).mean).all()

@@ -1,4 +1,3 @@
-from dataclasses import FrozenInstanceError
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from fgtrack.models.track_map import COLUMNS, TrackMap
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED_MAPS = ROOT / "../shared/data/maps"
-SHARED = ("lvms_track", "lvms_pitlane", "ims_track", "ims_pitlane")
 HEADING, CURVATURE = COLUMNS.index("psi_ref_rad"), COLUMNS.index("kappa_ref_radpm")
 
 OVAL = TrackMap.read(ROOT / "configs/maps/oval_track.csv")
@@ -29,13 +27,6 @@ def circle_table(num: int = 200, radius_m: float = 100.0, direction: float = 1.0
     table[:, HEADING] = angle + direction * np.pi / 2.0
     table[:, CURVATURE] = direction / radius_m
     return table
-
-
-def shared_map(name: str) -> TrackMap:
-    path = SHARED_MAPS / f"{name}.csv"
-    if not path.exists():
-        pytest.skip(f"the shared map {name}.csv is not there")
-    return TrackMap.read(path)
 
 
 def circular_difference(a: FloatArray, b: FloatArray, length: float) -> FloatArray:
@@ -58,14 +49,6 @@ def assert_round_trip(track: TrackMap, s: FloatArray, lateral: FloatArray) -> No
 )
 def test_a_place_goes_to_the_map_and_back(places: list[tuple[float, float]], track: TrackMap) -> None:
     s, lateral = np.array(places).T
-    assert_round_trip(track, s, lateral)
-
-
-@pytest.mark.parametrize("name", SHARED)
-def test_places_all_around_a_real_map_go_to_the_map_and_back(name: str) -> None:
-    track = shared_map(name)
-    s = np.linspace(-1.0, track.length_m + 1.0, 20_001)
-    lateral = np.tile([-12.0, -3.0, 0.0, 3.0, 12.0], 4001)[: len(s)]
     assert_round_trip(track, s, lateral)
 
 
@@ -103,15 +86,6 @@ def test_points_beyond_the_centre_of_curvature_and_far_away_give_finite_answers(
     assert np.isfinite(track.heading(points)).all()
 
 
-def test_the_centre_of_curvature_itself_gives_a_finite_answer() -> None:
-    table = circle_table(num=4)
-    table[:, :2] = [[0.0, -100.0], [100.0, 0.0], [0.0, 100.0], [-100.0, 0.0]]
-    table[:, HEADING] = [0.0, np.pi / 2.0, np.pi, -np.pi / 2.0]
-    s, lateral = TrackMap(table).frenet(np.array([[0.0, 0.0], [0.0, -1e-9]]))
-    np.testing.assert_allclose(lateral, 100.0)  # the point lies on the normals of a whole segment
-    assert (s <= np.hypot(100.0, 100.0)).all()
-
-
 def test_no_points_give_no_answers() -> None:
     none = np.empty((0, 2))
     assert [len(part) for part in OVAL.frenet(none)] == [0, 0]
@@ -134,19 +108,6 @@ def heading_error(track: TrackMap, lateral: float) -> FloatArray:
 def test_the_heading_is_the_numeric_tangent_everywhere(lateral: float) -> None:
     assert heading_error(OVAL, lateral).max() < 1e-3
     assert heading_error(TrackMap(circle_table(num=400)), lateral).max() < 1e-3
-
-
-@pytest.mark.parametrize("name", SHARED)
-def test_the_heading_of_a_real_map_is_the_numeric_tangent_everywhere(name: str) -> None:
-    assert heading_error(shared_map(name), 0.0).max() < 0.02
-
-
-def test_the_heading_in_the_cell_where_the_published_look_up_fails_is_right() -> None:
-    track = shared_map("lvms_track")
-    rows = track.table[308:312]  # the file's heading jumps from -pi to pi between its rows 309 and 310
-    midpoints = (rows[:-1, :2] + rows[1:, :2]) / 2.0
-    chord = np.arctan2(*np.diff(rows[:, :2], axis=0).T[::-1])
-    assert np.abs(wrap_angles(track.heading(midpoints) - chord)).max() < 1e-3
 
 
 def test_heading_and_curvature_at_a_row_are_the_row() -> None:
@@ -187,13 +148,6 @@ def test_the_inner_bound_is_the_one_that_the_lap_encloses() -> None:
         assert track.outside(points, inner_buffer_m=0.0, outer_buffer_m=-1.0).tolist() == [False, True]
 
 
-def test_a_view_is_heading_and_outside_at_once() -> None:
-    points = np.random.default_rng(1).uniform(-700.0, 700.0, (300, 2))
-    heading, _, outside = OVAL.view(points, -0.5, -1.5)
-    np.testing.assert_array_equal(heading, OVAL.heading(points))
-    np.testing.assert_array_equal(outside, OVAL.outside(points, -0.5, -1.5))
-
-
 # Files
 
 
@@ -207,28 +161,6 @@ def lines_of(table: FloatArray) -> list[str]:
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     OVAL.write(tmp_path / "map.csv")
     np.testing.assert_allclose(TrackMap.read(tmp_path / "map.csv").table, OVAL.table, atol=1e-9)
-
-
-def test_a_written_map_names_its_columns_and_has_nine_decimals(tmp_path: Path) -> None:
-    table = circle_table(num=4)
-    table[1, COLUMNS.index("alpha_m")] = -1e-10
-    TrackMap(table).write(tmp_path / "map.csv")
-    first, *rows = (tmp_path / "map.csv").read_text().splitlines()
-    assert first == "# " + "; ".join(COLUMNS)
-    cells = [cell for row in rows for cell in row.split("; ")]
-    assert len(cells) == 5 * len(COLUMNS)
-    assert all(cell == f"{float(cell):.9f}" for cell in cells)
-    assert "-0.000000000" not in cells
-
-
-def test_comments_blanks_and_whole_numbers_are_read(tmp_path: Path) -> None:
-    table = circle_table()
-    lines = [line.replace(";", " ; ") if index % 2 else line for index, line in enumerate(lines_of(table))]
-    lines.insert(50, "  # another comment")
-    (tmp_path / "map.csv").write_text("\n".join(lines))
-    track = TrackMap.read(tmp_path / "map.csv")
-    np.testing.assert_allclose(track.table[:-1, :2], table[:, :2], atol=1e-6)
-    assert np.abs(wrap_angles(track.table[:-1, HEADING] - table[:, HEADING])).max() < 1e-7
 
 
 def test_a_heading_in_the_file_counts_from_the_y_axis(tmp_path: Path) -> None:
@@ -288,26 +220,3 @@ def test_headings_that_count_from_the_x_axis_are_noticed() -> None:
     table[:, HEADING] -= np.pi / 2.0
     with pytest.raises(DataError, match=r"row 1: psi_ref_rad is 1\.59 rad off"):
         TrackMap(table)
-
-
-def test_a_map_cannot_be_changed() -> None:
-    table = circle_table()
-    track = TrackMap(table)
-    table[:] = 0.0
-    assert track.table[0, 0] == 100.0
-    with pytest.raises(ValueError, match="read-only"):
-        track.table[0, 0] = 1.0
-    with pytest.raises(FrozenInstanceError):
-        track.length_m = 1.0  # type: ignore[misc]
-
-
-def test_few_points_are_looked_up_as_many_are() -> None:
-    rng = np.random.default_rng(0)
-    points = OVAL.position(rng.uniform(0.0, OVAL.length_m, 60), rng.normal(0.0, 8.0, 60))
-    points[0] = OVAL.position(np.array([0.0]), np.array([2.0]))[0]  # its foot is where the line closes
-    many = OVAL.view(points, 1.0, 2.0)
-    assert 0 < many.outside.sum() < 60
-    for size in (1, 2, 3):
-        parts = [OVAL.view(points[k : k + size], 1.0, 2.0) for k in range(0, 60, size)]
-        for few, all_of_them in zip(zip(*parts, strict=True), many, strict=True):
-            np.testing.assert_allclose(np.concatenate(few), all_of_them, rtol=0.0, atol=1e-13)

@@ -38,19 +38,6 @@ def test_the_noise_is_that_of_the_cubature_points() -> None:
     assert found.noise[0, 0] > 0.01
 
 
-def test_the_regression_is_that_of_many_samples() -> None:
-    def g(x: np.ndarray) -> np.ndarray:
-        return np.stack([np.hypot(x[..., 0], x[..., 1]), x[..., 0] * x[..., 2]], axis=-1)
-
-    mean = np.array([6.0, -4.0, 0.5])
-    samples = mean + np.random.default_rng(0).standard_normal((400_000, 3)) @ ROOT.T
-    centred, values = samples - samples.mean(axis=0), g(samples)
-    A = np.linalg.lstsq(centred, values - values.mean(axis=0), rcond=None)[0].T
-    found = regression(g, mean, P)
-    np.testing.assert_allclose(found.mean, values.mean(axis=0), atol=5e-3)
-    np.testing.assert_allclose(found.A, A, atol=6e-3)
-
-
 def test_a_narrow_spread_gives_the_derivative() -> None:
     motion, x = CTRV(), np.array([3.0, 1.0, 0.4, 20.0, 0.3])
     found = regression(lambda each: motion.predict(each, 0.2), x, 1e-8 * np.eye(5))
