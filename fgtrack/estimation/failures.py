@@ -1,11 +1,11 @@
 """What went wrong inside estimators, and what was done about it: the counters that all of them share."""
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from traceback import format_exception
-
-from fgtrack.estimation.base import UpdateResult
+from typing import Any
 
 __all__ = ["EndedTrack", "EstimatorError", "Failure", "Failures"]
 
@@ -46,13 +46,13 @@ class EstimatorError(Exception):
     ----------
     causes
         Exceptions by track.
-    results
-        Of an update, of all tracks.
+    answers
+        What the others returned, by track.
     """
 
-    def __init__(self, causes: dict[int, Exception], results: list[UpdateResult]) -> None:
+    def __init__(self, causes: dict[int, Exception], answers: Mapping[int, Any]) -> None:  # Any: depends on the call
         super().__init__(f"estimators of the tracks {', '.join(map(str, causes))} raised")
-        self.causes, self.results = causes, results
+        self.causes, self.answers = causes, answers
 
 
 @dataclass(frozen=True)

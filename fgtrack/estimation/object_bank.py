@@ -67,17 +67,14 @@ class ObjectBank(Generic[_E]):
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
         self._now_ns = now_ns
-        self._ask(lambda estimator: estimator.advance(now_ns))
+        self._ask(lambda _, estimator: estimator.advance(now_ns))
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`."""
-        states = self._ask(lambda one: self._state(one, stamp_ns) if one.window_ns[0] <= stamp_ns else None)
+        states = self._ask(lambda _, one: self._state(one, stamp_ns) if one.window_ns[0] <= stamp_ns else None)
         known = {track_id: state for track_id, state in states.items() if state is not None}
         if not known:
             return no_states(self._motion.dim)
-        if len(known) == 1:
-            [(track_id, state)] = known.items()
-            return StatesAt((track_id,), state.mean[None], state.covariance[None])
         means = np.array([state.mean for state in known.values()])
         return StatesAt(tuple(known), means, np.array([state.covariance for state in known.values()]))
 
@@ -85,17 +82,9 @@ class ObjectBank(Generic[_E]):
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
-        results, causes = [_FAILED] * len(track_ids), dict[int, Exception]()
-        for row, (track_id, measurement) in enumerate(zip(track_ids, measurements, strict=True)):
-            try:
-                results[row] = _checked(self._estimators[track_id].update(measurement))
-            except DataError:
-                raise
-            except Exception as error:
-                causes[track_id] = error
-        if causes:
-            raise EstimatorError(causes, results)
-        return results
+        seen = dict(zip(track_ids, measurements, strict=True))
+        found = self._ask(lambda track_id, estimator: _checked(estimator.update(seen[track_id])), track_ids)
+        return [found[track_id] for track_id in track_ids]
 
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
@@ -109,7 +98,7 @@ class ObjectBank(Generic[_E]):
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
         if not self._estimators:
             return []
-        states = self._ask(lambda one: self._state(one, max(self._now_ns, one.window_ns[0]))).values()
+        states = self._ask(lambda _, one: self._state(one, max(self._now_ns, one.window_ns[0]))).values()
         means, covariances = zip(*((state.mean, state.covariance) for state in states), strict=True)
         return PresentStates(self._motion, self._now_ns, np.array(means), np.array(covariances))
 
@@ -117,18 +106,18 @@ class ObjectBank(Generic[_E]):
         """See `TrackBank.smoothed`: none."""
         return []
 
-    def _ask(self, question: Callable[[_E], _T], track_ids: Sequence[int] | None = None) -> dict[int, _T]:
+    def _ask(self, question: Callable[[int, _E], _T], track_ids: Sequence[int] | None = None) -> dict[int, _T]:
         """Return the answers of all estimators, or of some, by track. Raises `EstimatorError` if some raise."""
         answers, causes = dict[int, _T](), dict[int, Exception]()
         for track_id in self._estimators if track_ids is None else track_ids:
             try:
-                answers[track_id] = question(self._estimators[track_id])
+                answers[track_id] = question(track_id, self._estimators[track_id])
             except DataError:
                 raise
             except Exception as error:
                 causes[track_id] = error
         if causes:
-            raise EstimatorError(causes, [])
+            raise EstimatorError(causes, answers)
         return answers
 
     def _state(self, estimator: _E, stamp_ns: int) -> TrackState:

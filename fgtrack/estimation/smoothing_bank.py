@@ -36,14 +36,14 @@ class SmoothingBank(ObjectBank[_S]):
     def remove(self, track_id: int) -> None:
         """See `TrackBank.remove`; what was still inside the window becomes final."""
         try:
-            rest = self._ask(lambda one: one.take_rest(), [track_id])[track_id]
+            rest = self._ask(lambda _, one: one.take_rest(), [track_id])[track_id]
             self._ended += self._reports([(track_id, state) for state in rest])
         finally:
             super().remove(track_id)
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`."""
-        final = self._ask(lambda one: one.take_final())
+        final = self._ask(lambda _, one: one.take_final())
         reports, self._ended = self._ended, []
         reports += self._reports([(track_id, state) for track_id, states in final.items() for state in states])
         for lag_s in self._lagged_s:

@@ -10,7 +10,7 @@ from fgtrack.core.time import period_ns, seconds
 from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.failures import Failures
 from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
-from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator, Propagator
+from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator
 from fgtrack.estimation.filters.published import (
     AcceleratedEulerCtrv,
     LeadingClock,
@@ -175,7 +175,7 @@ def build_bank(config: Config, failures: Failures | None = None) -> TrackBank:
     return build(config, failures or Failures())
 
 
-def build_propagator(config: Config, step_s: float) -> Propagator:
+def build_propagator(config: Config, step_s: float) -> ExactPropagator:
     """The motion model in steps of `step_s`."""
     motion, noise = config.motion_model(), config.motion
     if noise.kind != "ctrv_euler":

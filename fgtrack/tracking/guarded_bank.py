@@ -80,7 +80,7 @@ class GuardedBank:
         except DataError:
             raise
         except EstimatorError as error:
-            results = error.results
+            results = [error.answers.get(track_id, results[0]) for track_id in track_ids]
             self._end_all(error.causes, Failure.UPDATE_FAILED)
         except Exception as error:
             self._end_all(dict.fromkeys(track_ids, error), Failure.UPDATE_FAILED)

@@ -11,7 +11,7 @@ from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
 from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
 from fgtrack.estimation.filters.ekf import correct
-from fgtrack.estimation.filters.propagation import EulerCtrv, Propagator
+from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator
 from fgtrack.estimation.filters.published import LeadingClock, StalePresent
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV
@@ -198,7 +198,7 @@ class NaiveTrack:
 class NaiveBank:
     """The method for one track at a time, on lists, one step after the other."""
 
-    propagator: Propagator
+    propagator: ExactPropagator
     length: int
     grid_ns: int
     tracks: dict[int, NaiveTrack] = field(default_factory=dict)

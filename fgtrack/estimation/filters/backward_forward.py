@@ -18,11 +18,9 @@ from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import correct
-from fgtrack.estimation.filters.propagation import ExactPropagator, Propagator
+from fgtrack.estimation.filters.propagation import ExactPropagator
 from fgtrack.estimation.present import PresentStates
 from fgtrack.models.motion import MotionModel
-
-_LONGEST_STRETCH = 64  # steps of pure prediction after which a state is stored, so that predictions stay short
 
 
 class Anchor(NamedTuple):
@@ -81,7 +79,7 @@ class BackwardForwardBank:
         Number of grid states that the storage reaches back.
     """
 
-    def __init__(self, propagator: Propagator, step_ns: int, storage_steps: int) -> None:
+    def __init__(self, propagator: ExactPropagator, step_ns: int, storage_steps: int) -> None:
         self._propagator = propagator
         self._step_ns = step_ns
         self._step_s = seconds(step_ns)
@@ -116,24 +114,13 @@ class BackwardForwardBank:
         self._advance_steps((grid_ns - self._grid_ns) // self._step_ns)
 
     def _advance_steps(self, steps: int) -> None:
-        """Move the present by `steps`, through stored states wherever the prediction would become long."""
-        while steps > 0:
-            part = min(steps, _LONGEST_STRETCH) if self._objects else steps
-            steps -= part
-            self._grid += part
-            self._grid_ns += part * self._step_ns
+        """Move the present by `steps`."""
+        if steps > 0:
+            self._grid += steps
+            self._grid_ns += steps * self._step_ns
             self._cached.clear()
-            self._store_present()
         for storage in self._objects.values():
             storage.trim(self._grid - self._length + 1)
-
-    def _store_present(self) -> None:
-        """Store the present state of objects that have been predicted for long."""
-        due = [i for i, storage in self._objects.items() if self._grid - storage.anchors[-1].grid >= _LONGEST_STRETCH]
-        if due:
-            states = self._predicted(due, self._grid)
-            for track_id, mean, covariance in zip(due, states.means, states.covariances, strict=True):
-                self._objects[track_id].put(Anchor(self._grid, self._grid, mean, covariance))
 
     def _predicted(self, track_ids: Sequence[int], grid: int) -> StatesAt:
         """States at `grid`; at the present they are the filters' own."""

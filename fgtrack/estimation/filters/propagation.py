@@ -2,7 +2,6 @@
 
 import math
 from importlib import import_module
-from typing import Protocol
 
 import numpy as np
 
@@ -13,26 +12,14 @@ from fgtrack.models.measurement import MeasurementModel
 from fgtrack.models.motion import MotionModel
 
 
-class Propagator(Protocol):
-    """Predicts m objects at once."""
-
-    motion: MotionModel
-    """Names and conversions of the state; its equations too, where the propagator has none of its own."""
-
-    def propagate(
-        self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """States (m, n) and (m, n, n), each after its own number of `steps` (m,) of `dt_s`; yaw is not wrapped."""
-
-    def wrap(self, mean: FloatArray) -> FloatArray:
-        """Means, shape (..., n), with the angles brought back to their range after a correction."""
-
-    def residual(self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
-        """Measured minus predicted, shape (..., k), in the angles' range."""
-
-
 class ExactPropagator:
-    """All steps in one: exact, because flow and process noise of a motion model compose."""
+    """Predicts m objects at once, all steps in one: exact, because flow and process noise of a motion model compose.
+
+    Parameters
+    ----------
+    motion
+        Names and conversions of the state, and its equations.
+    """
 
     def __init__(self, motion: MotionModel) -> None:
         self.motion = motion
@@ -40,15 +27,15 @@ class ExactPropagator:
     def propagate(
         self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
     ) -> tuple[FloatArray, FloatArray]:
-        """See `Propagator.propagate`."""
+        """States (m, n) and (m, n, n), each after its own number of `steps` (m,) of `dt_s`; yaw is not wrapped."""
         return predict(mean, covariance, self.motion, steps * np.float64(dt_s))
 
     def wrap(self, mean: FloatArray) -> FloatArray:
-        """See `Propagator.wrap`."""
+        """Means, shape (..., n), with the angles brought back to their range after a correction."""
         return wrapped(self.motion, mean)
 
     def residual(self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
-        """See `Propagator.residual`: the model's own."""
+        """Measured minus predicted, shape (..., k), in the angles' range: the model's own."""
         return model.residual(z, z_predicted)
 
 
@@ -71,7 +58,7 @@ class EulerCtrv(ExactPropagator):
     def propagate(
         self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
     ) -> tuple[FloatArray, FloatArray]:
-        """See `Propagator.propagate`."""
+        """See `ExactPropagator.propagate`."""
         euler = import_module("fgtrack.estimation.kernels.euler")
         x, P = (np.array(each, dtype=np.float64, order="C") for each in (mean, covariance))
         after: tuple[FloatArray, FloatArray] = euler.propagate(
