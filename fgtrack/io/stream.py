@@ -22,7 +22,7 @@ from fgtrack.core.types import (
     TruthState,
 )
 from fgtrack.io.config import InputConfig
-from fgtrack.io.errors import LARGEST_BYTES, MOST_OBJECTS, TruncatedInput, UntilBreak, refuse_larger
+from fgtrack.io.errors import LARGEST_BYTES, TruncatedInput, UntilBreak, refuse_larger
 from fgtrack.io.gate import WrongError, checked_message
 from fgtrack.io.output import new_file
 from fgtrack.io.source import FileFormat
@@ -34,17 +34,13 @@ GZIP_MAGIC = b"\x1f\x8b"
 _TAIL = 1 << 16
 
 _logger = logging.getLogger(__name__)
-_INT64_LIMIT = 1 << 63
-_VALUES_PER_OBJECT = 100
 _KINDS: dict[str, type[Message]] = {"ego": EgoState, "detections": DetectionList, "truth": TruthState}
 
 # A parsed JSON object: its values are checked one by one below.
 Record = dict[str, Any]
 
 
-def read_stream(
-    path: Path | str, largest_bytes: int = LARGEST_BYTES, most_objects: int = MOST_OBJECTS
-) -> Iterator[Message]:
+def read_stream(path: Path | str, largest_bytes: int = LARGEST_BYTES) -> Iterator[Message]:
     """Messages of the stream `path` in the order of the file, which is receipt order.
 
     Gzip is recognised by its magic number. Unknown keys are ignored; one warning is logged with their names
@@ -54,8 +50,6 @@ def read_stream(
     ----------
     largest_bytes
         A line that is longer, unpacked, is refused.
-    most_objects
-        A list with more is refused.
 
     Raises
     ------
@@ -67,7 +61,7 @@ def read_stream(
     path = Path(path)
     unknown: Counter[str] = Counter()
     newest_ns: int | None = None
-    with closing(_records(path, largest_bytes, most_objects)) as records:
+    with closing(_records(path, largest_bytes)) as records:
         _check_header(path, next(records, None))
         for line, record in records:
             try:
@@ -96,7 +90,7 @@ def _recognises(path: Path) -> bool:
 
 
 def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
-    return partial(read_stream, path, config.largest_bytes, config.most_objects)
+    return partial(read_stream, path, config.largest_bytes)
 
 
 def _settings(path: Path) -> Mapping[str, object]:
@@ -195,9 +189,7 @@ def _given(value: EgoState | TruthState | Detection) -> Record:
     return given
 
 
-def _records(
-    path: Path, largest_bytes: int = LARGEST_BYTES, most_objects: int = MOST_OBJECTS
-) -> Generator[tuple[int, Record], None, None]:
+def _records(path: Path, largest_bytes: int = LARGEST_BYTES) -> Generator[tuple[int, Record], None, None]:
     """Line number and JSON object of every line that is not blank."""
     line, num_records = 0, 0
     try:
@@ -209,7 +201,6 @@ def _records(
                 refuse_larger(len(text), f"{path}:{line}", largest_bytes)
                 if not text.strip():
                     continue
-                _refuse_crowd(text, f"{path}:{line}", most_objects)
                 try:
                     record = json.loads(text.decode())
                 except (ValueError, RecursionError) as error:
@@ -226,17 +217,6 @@ def _records(
         raise TruncatedInput(f"{path}:{line + 1}: breaks off after record {num_records} ({error})") from error
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-
-
-def _refuse_crowd(text: bytes, where: str, most_objects: int) -> None:
-    """Raise `DataError` before a line is parsed that would fill the memory with more than its objects may hold."""
-    if len(text) < most_objects:
-        return
-    for sign, most in ((b"{", 2 * most_objects), (b"[", 2 * most_objects), (b",", _VALUES_PER_OBJECT * most_objects)):
-        if text.count(sign) > most:
-            raise DataError(
-                f"{where}: holds more than {most_objects} objects: raise input.most_objects, if that is right"
-            )
 
 
 def _check_header(path: Path, first: tuple[int, Record] | None) -> Record:

@@ -14,7 +14,7 @@ from functools import partial
 from itertools import chain, groupby
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO
+from typing import Any, NamedTuple
 
 from fgtrack.core.checks import is_stamp
 from fgtrack.core.errors import CallError, DataError
@@ -46,8 +46,7 @@ _OBJECT = frozenset({*_TIMES, "object_id", *MEASURABLE, *DESCRIBING})
 _TRUTH = frozenset({*_TIMES, "object_id", *STATE_NAMES})
 _SHORTEST_NS = 100_000  # between two times of a table: 10 kHz
 _FEWEST = 10  # rows whose times have a period
-_LONGEST_LINE = 1_000_000
-_MOST_ROWS = 1_000_000
+_LONGEST_HEADER = 1_000_000
 _LONGEST_TIME = 25  # digits of a time before and behind the point
 
 
@@ -145,23 +144,19 @@ def rows(file: Path, delimiter: str | None = None) -> Iterator[Cells]:
     Raises
     ------
     DataError
-        The file is not a table, or has too many rows.
+        The file is not a table.
     """
     try:
         with open_text(file, "utf-8-sig", newline="") as text:
-            first = text.readline(_LONGEST_LINE)
+            first = text.readline(_LONGEST_HEADER)
             text.seek(0)
-            reader = csv.reader(
-                _lines(file, text), delimiter=delimiter or max(",;\t", key=first.count), skipinitialspace=True
-            )
+            reader = csv.reader(text, delimiter=delimiter or max(",;\t", key=first.count), skipinitialspace=True)
             header = [name.strip() for name in next(reader, [])]
             twice = next((name for name in header if header.count(name) > 1), None)
             if twice is not None:
                 raise DataError(f"{file}:1: has the column {twice!r} twice")
             yield Cells(f"{file}:1", dict(zip(header, header, strict=True)))
-            for count, cells in enumerate(reader):
-                if count >= _MOST_ROWS:
-                    raise DataError(f"{file}: has more than {_MOST_ROWS} rows, give it in parts")
+            for cells in reader:
                 if not any(cells):
                     continue
                 if len(cells) != len(header):
@@ -173,13 +168,6 @@ def rows(file: Path, delimiter: str | None = None) -> Iterator[Cells]:
         raise DataError(f"{file}: is no UTF-8 text ({error.reason})") from error
     except csv.Error as error:
         raise DataError(f"{file}:{reader.line_num}: is no CSV ({error})") from error
-
-
-def _lines(file: Path, text: TextIO) -> Iterator[str]:
-    for number, line in enumerate(iter(partial(text.readline, _LONGEST_LINE), ""), start=1):
-        if len(line) == _LONGEST_LINE:
-            raise DataError(f"{file}:{number}: is longer than {_LONGEST_LINE} characters")
-        yield line
 
 
 def _check_columns(file: Path, table: CsvTable, header: list[str]) -> None:
