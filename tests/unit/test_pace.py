@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fgtrack.core.types import Message
-from fgtrack.io.run import COLUMNS, Node, RunWriter, Table, load_run, ready_times
+from fgtrack.io.run import COLUMNS, Node, RunWriter, load_run
 from fgtrack.pipeline import replay as pipeline
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import ClockConfig, Config, MapConfig
@@ -72,16 +72,6 @@ def test_a_tick_begins_when_the_one_before_is_done(
         done * MS for done in done_ms
     ]
     assert node.misses == misses
-
-
-def test_times_beyond_what_a_stamp_holds_end_there() -> None:
-    longest = 2**63 - 1
-    timing = Table({"now_ns": np.array([0, 10, 20]), "process_ns": np.array([5, longest, longest])})
-    assert ready_times(timing, Node(20 * MS)).tolist() == [5, longest, longest]
-
-
-def test_the_time_of_a_tick_is_that_of_the_clock(driven: Driven) -> None:
-    assert set(driven(FakeClock(step_ns=3 * MS), realtime=False)[0]) == {3 * MS}
 
 
 def test_missed_deadlines_are_counted(driven: Driven) -> None:

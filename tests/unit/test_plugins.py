@@ -14,14 +14,13 @@ from fgtrack.estimation.base import Measurement, Start, UpdateStatus
 from fgtrack.estimation.registry import (
     ESTIMATORS,
     MOTION_MODELS,
-    Claims,
     estimator,
     estimator_bank,
     motion_model,
     summary,
 )
 from fgtrack.models.measurement import measurement_model
-from fgtrack.models.motion import CTRV, CV
+from fgtrack.models.motion import CV
 from fgtrack.pipeline.sweep import run_job
 
 GROUP = "fgtrack.tests"
@@ -106,22 +105,6 @@ def test_every_estimator_is_made_by_name_and_says_what_it_is(name: str) -> None:
     assert 0 < len(summary(ESTIMATORS.load(name))) < 300
 
 
-def test_the_paper_s_bank_is_an_estimator_of_one_object() -> None:
-    motion = CTRV()
-    one = estimator("ekf-backward-forward", motion, Start(yaw_rad=0.0, speed_mps=10.0), lag_s=0.5, frequency_hz=100.0)
-    model = measurement_model(("x_m", "y_m"), motion)
-    for ms in (100, 200, 300, 250):
-        z = one.state_at(ms * 10**6).mean[:2] + 0.01
-        status = one.update(Measurement(ms * 10**6, model, z, np.eye(2))).status
-        assert status is (UpdateStatus.OUT_OF_SEQUENCE if ms == 250 else UpdateStatus.IN_SEQUENCE)
-    assert one.window_ns == (0, 300 * 10**6)
-    ahead = one.state_at(1000 * 10**6)
-    assert 9.0 < ahead.mean[0] < 11.0
-    one.advance(1000 * 10**6)
-    assert one.window_ns[0] > 400 * 10**6
-    assert one.update(Measurement(10**8, model, z, np.eye(2))).status is UpdateStatus.TOO_OLD
-
-
 def test_options_that_an_estimator_does_not_take_are_refused() -> None:
     start = Start()
     with pytest.raises(CallError, match=r"^ekf-replay: .*'hold_s'; its options are initiation$"):
@@ -132,11 +115,6 @@ def test_options_that_an_estimator_does_not_take_are_refused() -> None:
         estimator("smoother", CV(), start, max_iterations=0)
     with pytest.raises(CallError, match=r"cv: .*'drag'; its options are velocity_density_m2ps3"):
         motion_model("cv", {"drag": 0.1})
-
-
-def test_what_an_estimator_does_not_say_of_itself_is_the_default() -> None:
-    assert Claims.of(ESTIMATORS.load("drop")) == Claims()
-    assert Claims.of(ESTIMATORS.load("asd")) == Claims("any lag, any number", "never", smooths=True, tolerance=1e-7)
 
 
 def test_a_plug_in_that_ends_the_program_is_named(registry: Registry) -> None:
