@@ -226,7 +226,10 @@ def works_together(factory: Factory) -> bool:
 
 
 def _replays(factory: Factory) -> bool:
-    return isinstance(factory, type) and issubclass(factory, ReplayingFilter)
+    """True if a bank may call what a class is made of, for it overrides none of the methods of an estimator."""
+    if not isinstance(factory, type) or not issubclass(factory, ReplayingFilter):
+        return False
+    return all(getattr(factory, name) is getattr(ReplayingFilter, name) for name in _members(Estimator))
 
 
 def _made_bank(name: str, factory: Factory, motion: MotionModel, lag_s: float, options: Mapping[str, Any]) -> TrackBank:
