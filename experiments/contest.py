@@ -16,9 +16,9 @@ from typing import Annotated
 import typer
 
 import fgtrack
-from fgtrack.evaluation.consistency import Consistency
 from fgtrack.evaluation.intervals import average
 from fgtrack.evaluation.metrics import evaluate
+from fgtrack.evaluation.scores.consistency import Consistency
 from fgtrack.pipeline.load import validate
 from fgtrack.sim.scenario import Scenario
 

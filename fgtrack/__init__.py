@@ -57,7 +57,7 @@ _HOMES = {
     "bounds": "fgtrack.evaluation.bounds",
     "bounds_along": "fgtrack.evaluation.bounds",
     "close_ups": "fgtrack.plotting.late_detection",
-    "compare": "fgtrack.evaluation.compare",
+    "compare": "fgtrack.evaluation.tables.compare",
     "estimator": "fgtrack.estimation.registry",
     "evaluate": "fgtrack.evaluation.metrics",
     "initial_state": "fgtrack.estimation.birth",
@@ -111,9 +111,9 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.evaluation.bounds import ScheduledMeasurement as ScheduledMeasurement
     from fgtrack.evaluation.bounds import bounds as bounds
     from fgtrack.evaluation.bounds import bounds_along as bounds_along
-    from fgtrack.evaluation.compare import compare as compare
     from fgtrack.evaluation.metrics import evaluate as evaluate
     from fgtrack.evaluation.tables import Tables as Tables
+    from fgtrack.evaluation.tables.compare import compare as compare
     from fgtrack.io.adapters.common import ObjectList as ObjectList
     from fgtrack.io.run import Run as Run
     from fgtrack.io.run import load_run as load_run

@@ -22,8 +22,8 @@ from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.evaluation.intervals import average, paired
-from fgtrack.evaluation.lagged import lag_metrics
 from fgtrack.evaluation.matching import match
+from fgtrack.evaluation.scores.lagged import lag_metrics
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import Correlation, Mount, SensorModel
 from fgtrack.pipeline.config import Config

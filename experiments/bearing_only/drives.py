@@ -25,8 +25,8 @@ from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray, T
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.registry import estimator
 from fgtrack.evaluation.intervals import by_stamp, within_run
-from fgtrack.evaluation.lagged import lag_metrics
 from fgtrack.evaluation.matching import Matching, match
+from fgtrack.evaluation.scores.lagged import lag_metrics
 from fgtrack.io.source import open_input
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV

@@ -18,9 +18,9 @@ import typer
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.evaluation.innovations import LOCAL_NAMES, local_innovations, message_delays, moments_of
 from fgtrack.evaluation.runs import JudgedRun, judged
-from fgtrack.evaluation.statistics import Distribution, Moments
+from fgtrack.evaluation.scores.innovations import LOCAL_NAMES, local_innovations, message_delays, moments_of
+from fgtrack.evaluation.scores.statistics import Distribution, Moments
 from fgtrack.evaluation.tables import MS, RUN, Column, Table, Tables, named
 from fgtrack.evaluation.truth import ego_states
 from fgtrack.io.run import Run

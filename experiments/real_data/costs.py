@@ -8,8 +8,8 @@ import numpy as np
 from fgtrack.core.types import FloatArray, Message
 from fgtrack.evaluation.comparison import paired_sums
 from fgtrack.evaluation.intervals import Estimate, by_stamp, within_run
-from fgtrack.evaluation.prediction import displacements
 from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.scores.prediction import displacements
 from fgtrack.sim.delays import ConstantDelay
 from fgtrack.sim.redelay import SensorDelays, redelay
 

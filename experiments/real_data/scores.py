@@ -11,8 +11,8 @@ import numpy as np
 from fgtrack.core.geometry import rotation
 from fgtrack.core.types import DetectionList, EgoState, FloatArray, Message, TrackStatus
 from fgtrack.evaluation.matching import match, scenes
-from fgtrack.evaluation.multi_object import Clear
 from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.scores.multi_object import Clear
 from fgtrack.io.run import Run, Table
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config

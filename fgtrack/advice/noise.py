@@ -8,8 +8,8 @@ import numpy as np
 
 from fgtrack.advice.finding import Finding
 from fgtrack.evaluation.diagnostics import CORRELATED, FAR_OFF, FEWEST, innovation_lag1, misfits
-from fgtrack.evaluation.innovations import num_measured
 from fgtrack.evaluation.intervals import Estimate, by_stamp, mean_square
+from fgtrack.evaluation.scores.innovations import num_measured
 from fgtrack.io.run import Run
 
 __all__ = ["NoiseFit", "noise_findings", "noise_fits"]

@@ -13,9 +13,9 @@ from fgtrack.advice.page import Advice
 from fgtrack.advice.summary import summary
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Message
-from fgtrack.evaluation.compare import compare
 from fgtrack.evaluation.runs import JudgedRun, judged
 from fgtrack.evaluation.tables import Tables
+from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.output import check_apart, check_output, claimed, new_file, new_files
 from fgtrack.io.run import Run, check_run, load_run, write_metrics

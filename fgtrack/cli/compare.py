@@ -7,11 +7,11 @@ import typer
 from fgtrack.cli.arguments import All, FormOption, Json, Runs
 from fgtrack.cli.show import chosen_form, say, show, warn
 from fgtrack.core.errors import FgtrackError
-from fgtrack.evaluation.compare import compare as tables_of
 from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.evaluation.runs import Runs as AnyRuns
 from fgtrack.evaluation.runs import judged, recordings_warning
 from fgtrack.evaluation.tables import Tables
+from fgtrack.evaluation.tables.compare import compare as tables_of
 from fgtrack.io.run import write_metrics
 
 

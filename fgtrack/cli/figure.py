@@ -14,7 +14,7 @@ from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.evaluation.runs import judged, run_folders, start_ns
-from fgtrack.evaluation.seeds import is_sweep, read_sweep
+from fgtrack.evaluation.tables.seeds import is_sweep, read_sweep
 from fgtrack.io.output import check_apart, new_file, new_files
 from fgtrack.plotting.late_detection import drawn_close_up
 from fgtrack.plotting.paper import Paper, settings

@@ -10,8 +10,8 @@ from fgtrack.advice.study import opening_at
 from fgtrack.cli.arguments import Overwrite, Runs
 from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError
-from fgtrack.evaluation.compare import compare
 from fgtrack.evaluation.runs import judged, run_folders
+from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.output import check_apart, check_output
 from fgtrack.plotting.late_detection import drawn_close_up
 from fgtrack.plotting.plot import drawn, planned

@@ -14,7 +14,14 @@ from fgtrack.cli.completion import sweeps
 from fgtrack.cli.show import progress, say, show
 from fgtrack.core.errors import CallError, one_line
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.seeds import SweepTable, read_sweep, seed_comparisons, shown_tables, summary_table, to_csv
+from fgtrack.evaluation.tables.seeds import (
+    SweepTable,
+    read_sweep,
+    seed_comparisons,
+    shown_tables,
+    summary_table,
+    to_csv,
+)
 from fgtrack.io.output import check_apart, write_file
 from fgtrack.io.run import Run
 from fgtrack.pipeline.shipped import find_file

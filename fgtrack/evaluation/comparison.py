@@ -12,11 +12,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.consistency import position_nees
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, within_run
 from fgtrack.evaluation.matching import scenes, track_errors
-from fgtrack.evaluation.multi_object import gospa
 from fgtrack.evaluation.runs import JudgedRun, by_recording
+from fgtrack.evaluation.scores.consistency import position_nees
+from fgtrack.evaluation.scores.multi_object import gospa
 from fgtrack.evaluation.tables import Column, Value, short, two_digits
 from fgtrack.io.run import EvaluationConfig
 

@@ -11,9 +11,9 @@ from scipy.special import chdtri
 from fgtrack.core.caution import EGO, Caution, in_degrees
 from fgtrack.core.time import NS_PER_S, wrong_unit
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.innovations import autocorrelations, num_measured
 from fgtrack.evaluation.matching import confirmed
-from fgtrack.evaluation.statistics import ChiSquareMean
+from fgtrack.evaluation.scores.innovations import autocorrelations, num_measured
+from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.io.run import Run, Table, digest
 from fgtrack.models.measurement import ANGULAR
 from fgtrack.models.road import OPEN_SPACE

@@ -9,11 +9,12 @@ import numpy as np
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Disposition
-from fgtrack.evaluation.consistency import Consistency, consistency
-from fgtrack.evaluation.continuity import breaks, late_switches, switches, times_to_confirm, tracked_visits
-from fgtrack.evaluation.deadlines import Deadlines
 from fgtrack.evaluation.diagnostics import excluded_lines
-from fgtrack.evaluation.innovations import (
+from fgtrack.evaluation.matching import ERROR_NAMES, Matching, confirmed, match, track_errors
+from fgtrack.evaluation.scores.consistency import Consistency, consistency
+from fgtrack.evaluation.scores.continuity import breaks, late_switches, switches, times_to_confirm, tracked_visits
+from fgtrack.evaluation.scores.deadlines import Deadlines
+from fgtrack.evaluation.scores.innovations import (
     RESIDUAL_NAMES,
     local_innovations,
     message_delays,
@@ -21,11 +22,10 @@ from fgtrack.evaluation.innovations import (
     num_measured,
     residuals,
 )
-from fgtrack.evaluation.lagged import LagMetrics, lag_metrics
-from fgtrack.evaluation.matching import ERROR_NAMES, Matching, confirmed, match, track_errors
-from fgtrack.evaluation.multi_object import MultiObjectMetrics, multi_object_metrics
-from fgtrack.evaluation.prediction import PredictionErrors, prediction_errors
-from fgtrack.evaluation.statistics import ChiSquareMean, Distribution, Moments
+from fgtrack.evaluation.scores.lagged import LagMetrics, lag_metrics
+from fgtrack.evaluation.scores.multi_object import MultiObjectMetrics, multi_object_metrics
+from fgtrack.evaluation.scores.prediction import PredictionErrors, prediction_errors
+from fgtrack.evaluation.scores.statistics import ChiSquareMean, Distribution, Moments
 from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, Table
 
 FALSE_TRACK_SHARE = 0.5

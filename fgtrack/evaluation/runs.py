@@ -12,9 +12,9 @@ import numpy as np
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import MEASURABLE, IntArray
-from fgtrack.evaluation.lagged import LagMetrics
 from fgtrack.evaluation.matching import Matching, match, recorded
 from fgtrack.evaluation.metrics import Metrics, evaluate_matched
+from fgtrack.evaluation.scores.lagged import LagMetrics
 from fgtrack.io.run import EvaluationConfig, Run, Table, is_run_folder, load_run
 
 

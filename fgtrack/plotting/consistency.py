@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.consistency import position_nees
-from fgtrack.evaluation.innovations import num_measured
 from fgtrack.evaluation.runs import JudgedRun, OneRun, one_judged, start_ns
-from fgtrack.evaluation.statistics import chi_square_band
+from fgtrack.evaluation.scores.consistency import position_nees
+from fgtrack.evaluation.scores.innovations import num_measured
+from fgtrack.evaluation.scores.statistics import chi_square_band
 from fgtrack.plotting.paper import Paper, Sheet, styled
 from fgtrack.plotting.style import (
     GREY,

@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.lagged import final_errors
 from fgtrack.evaluation.matching import TrackErrors, track_errors
 from fgtrack.evaluation.palette import Look
 from fgtrack.evaluation.runs import JudgedRun, Runs, judged, starts_ns
-from fgtrack.evaluation.statistics import Moments
+from fgtrack.evaluation.scores.lagged import final_errors
+from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.plotting.paper import Paper, Sheet, styled
 from fgtrack.plotting.style import broken_line, legend_above, run_looks, usual_step_ns
 

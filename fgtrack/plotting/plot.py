@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 
 from fgtrack.evaluation.matching import track_errors
 from fgtrack.evaluation.runs import JudgedRun
-from fgtrack.evaluation.seeds import SweepTable
-from fgtrack.evaluation.statistics import Moments
+from fgtrack.evaluation.scores.statistics import Moments
+from fgtrack.evaluation.tables.seeds import SweepTable
 from fgtrack.plotting.arrivals import arrivals
 from fgtrack.plotting.close_up import close_up
 from fgtrack.plotting.consistency import consistency, has_squares

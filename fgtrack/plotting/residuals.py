@@ -7,10 +7,10 @@ from matplotlib.figure import Figure
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
-from fgtrack.evaluation import innovations
-from fgtrack.evaluation.innovations import RESIDUAL_NAMES
 from fgtrack.evaluation.runs import JudgedRun, OneRun, one_judged, start_ns
-from fgtrack.evaluation.statistics import Moments
+from fgtrack.evaluation.scores import innovations
+from fgtrack.evaluation.scores.innovations import RESIDUAL_NAMES
+from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.models.measurement import ANGULAR
 from fgtrack.plotting.paper import Paper, Sheet, styled
 from fgtrack.plotting.ranges import bulk

@@ -15,7 +15,7 @@ from scipy.special import stdtrit
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.palette import Look, look, looks
-from fgtrack.evaluation.seeds import PointMean, SweepTable, number, read_sweep
+from fgtrack.evaluation.tables.seeds import PointMean, SweepTable, number, read_sweep
 from fgtrack.plotting.paper import Paper, Sheet, styled
 from fgtrack.plotting.style import legend_above, log_axis
 

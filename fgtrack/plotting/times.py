@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.innovations import message_delays
 from fgtrack.evaluation.runs import OneRun, Runs, judged, one_judged
-from fgtrack.evaluation.statistics import Distribution
+from fgtrack.evaluation.scores.innovations import message_delays
+from fgtrack.evaluation.scores.statistics import Distribution
 from fgtrack.io.run import Run
 from fgtrack.plotting.paper import Paper, Sheet, styled
 from fgtrack.plotting.style import legend_above, log_axis, run_looks, sensor_colour, titled

@@ -19,8 +19,8 @@ from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.registry import ESTIMATORS
-from fgtrack.evaluation.compare import compare
 from fgtrack.evaluation.diagnostics import diagnostics
+from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.run import Run, Table, load_run
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.pipeline.config import Config

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgtrack.evaluation.consistency import consistency
 from fgtrack.evaluation.matching import match
+from fgtrack.evaluation.scores.consistency import consistency
 from fgtrack.models.sensors import Mount, SensorModel
 from fgtrack.pipeline.config import Config, MotionConfig
 from fgtrack.pipeline.public import replay

@@ -7,7 +7,7 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import MEASURABLE, FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.filters.replay import ReplayEkf
-from fgtrack.evaluation.innovations import Autocorrelation, autocorrelations
+from fgtrack.evaluation.scores.innovations import Autocorrelation, autocorrelations
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.sim.draw import drawn

@@ -9,9 +9,9 @@ import pytest
 from evaluation_runs import ROUND, WEST, update, write_run
 
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.compare import compare
 from fgtrack.evaluation.comparison import Comparison, Quantity, comparisons
 from fgtrack.evaluation.runs import JudgedRun, same_recording
+from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.run import Run
 
 TICKS = 200

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluation_runs import ROUND, START_NS, TICK_NS, WEST, update, write_run
+from evaluation_runs import ROUND, WEST, update, write_run
 from scipy.stats import chi2
 
 from fgtrack.core.types import MEASURABLE, Disposition, UpdateRecord
-from fgtrack.evaluation.consistency import Nees, nees_over_runs, normalised_squares, state_nees
-from fgtrack.evaluation.innovations import FEWEST, LAGS, Autocorrelation, autocorrelations
 from fgtrack.evaluation.matching import Matching, match
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.statistics import ChiSquareMean
+from fgtrack.evaluation.scores.consistency import normalised_squares, state_nees
+from fgtrack.evaluation.scores.innovations import FEWEST, LAGS, Autocorrelation, autocorrelations
+from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.io.run import COVARIANCE_COLUMNS, Run, Table
 
 
@@ -111,14 +111,7 @@ def test_the_band_holds_the_mean_of_19_in_20_samples() -> None:
     assert above == pytest.approx(0.025, abs=spread)
 
 
-# --- many runs
-
-
-def runs_of(errors: np.ndarray, scale: float = 1.0) -> list[Nees]:
-    """NEES of correlated `errors`, shape (runs, stamps, 2), whose covariance is told as `scale` times the truth."""
-    stamps_ns = START_NS + TICK_NS * np.arange(errors.shape[1])
-    ids, dof = np.full(len(stamps_ns), 7), np.full(len(stamps_ns), 2)
-    return [Nees(stamps_ns, ids, np.square(one).sum(axis=-1) / scale, dof) for one in errors]
+# --- whiteness
 
 
 def correlated_errors(num_runs: int, num_stamps: int, memory: float) -> np.ndarray:
@@ -128,42 +121,6 @@ def correlated_errors(num_runs: int, num_stamps: int, memory: float) -> np.ndarr
     for k in range(1, num_stamps):
         errors[:, k] = memory * errors[:, k - 1] + math.sqrt(1.0 - memory**2) * errors[:, k]
     return errors
-
-
-def test_many_runs_tell_a_consistent_estimator_where_one_run_cannot() -> None:
-    samples = runs_of(correlated_errors(60, 2000, 0.95))
-    single = [ChiSquareMean.of(one.values, one.dof) for one in samples]
-    assert np.mean([one.band[0] <= one.mean <= one.band[1] for one in single]) < 0.6  # bands as if independent
-    found = nees_over_runs(samples)
-    assert found.share_inside == pytest.approx(0.95, abs=0.03)
-    assert found.num_runs.tolist() == [60] * 2000
-    assert found.low[0] == pytest.approx(chi2.ppf(0.025, 120) / 60)
-    assert found.high[0] == pytest.approx(chi2.ppf(0.975, 120) / 60)
-    overall = found.overall
-    assert overall.count == 60
-    assert abs(overall.mean - 2.0) < 4.0 * overall.std / math.sqrt(overall.count - 1)
-
-
-@pytest.mark.parametrize("scale", [0.7, 1.4])
-def test_many_runs_tell_a_covariance_that_is_too_small_or_too_large(scale: float) -> None:
-    assert nees_over_runs(runs_of(correlated_errors(60, 2000, 0.95), scale)).share_inside < 0.6
-
-
-def test_values_of_different_runs_meet_at_the_same_object_and_stamp() -> None:
-    two = np.full(3, 2)
-    first = Nees(np.array([10, 20, 30]), np.array([1, 1, 1]), np.array([1.0, np.nan, 5.0]), two)
-    second = Nees(np.array([10, 10, 20]), np.array([1, 2, 1]), np.array([3.0, 7.0, 9.0]), np.array([2, 2, 5]))
-    third = Nees(np.array([30, 30]), np.array([1, 1]), np.array([100.0, 6.0]), two[:2])
-    found = nees_over_runs([first, second, third])
-    places = list(zip(found.object_ids.tolist(), found.stamps_ns.tolist(), strict=True))
-    assert places == [(1, 10), (1, 20), (1, 30), (2, 10)]
-    assert found.num_runs.tolist() == [2, 1, 2, 1]
-    assert found.mean.tolist() == [2.0, 9.0, 5.5, 7.0]  # of two values of a run at one stamp the last
-    assert found.high[1] == pytest.approx(chi2.ppf(0.975, 5))
-    assert found.run_means.tolist() == [3.0, pytest.approx(19 / 3), 6.0]
-
-
-# --- whiteness
 
 
 def innovations_run(folder: Path, series: dict[int, np.ndarray], names: tuple[str, ...] = ("x_m", "y_m")) -> Run:

@@ -8,9 +8,9 @@ import pytest
 from evaluation_runs import ROUND, WEST, update, write_run
 
 from fgtrack.core.types import Disposition, UpdateRecord
-from fgtrack.evaluation.continuity import late_switches, times_to_confirm
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.metrics import evaluate
+from fgtrack.evaluation.scores.continuity import late_switches, times_to_confirm
 from fgtrack.io.run import EvaluationConfig, Run
 
 LATE = Disposition.OUT_OF_SEQUENCE

@@ -10,10 +10,10 @@ from evaluation_runs import START_NS, TICK_NS, WEST, Car, run_beside, update, wr
 from support.scripts import load
 
 from fgtrack.core.types import Disposition, EgoState, TickReport
-from fgtrack.evaluation.compare import compare
-from fgtrack.evaluation.innovations import local_innovations
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.runs import judged
+from fgtrack.evaluation.scores.innovations import local_innovations
+from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.run import Run, RunWriter, load_run
 from fgtrack.models.oval import make_oval
 

@@ -9,10 +9,10 @@ import pytest
 from evaluation_runs import ROUND, WEST, write_run
 
 from fgtrack.core.types import SmoothedReport
-from fgtrack.evaluation.lagged import WINDOW, LagMetrics, lag_metrics
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.statistics import Moments
+from fgtrack.evaluation.scores.lagged import WINDOW, LagMetrics, lag_metrics
+from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.io.run import Run
 from fgtrack.plotting.plot import lag
 

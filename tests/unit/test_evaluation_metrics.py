@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 
 from fgtrack.core.types import Disposition, TrackReport
 from fgtrack.evaluation.metrics import Metrics, ObjectMetrics, evaluate
-from fgtrack.evaluation.statistics import Moments
+from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.io.run import EvaluationConfig, Run
 
 samples = hnp.arrays(np.float64, st.integers(0, 20), elements=st.floats(-1e3, 1e3))

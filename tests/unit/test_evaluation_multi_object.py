@@ -14,7 +14,7 @@ from evaluation_scenes import Positions, random_scenes
 from fgtrack.core.types import TrackReport
 from fgtrack.evaluation.matching import Scenes, match, scenes
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.multi_object import Clear, MultiObjectMetrics, gospa
+from fgtrack.evaluation.scores.multi_object import Clear, MultiObjectMetrics, gospa
 from fgtrack.io.run import EvaluationConfig, Run, Table
 
 C_M, GATE_M = 5.0, 4.0

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from fgtrack.evaluation.intervals import paired
-from fgtrack.evaluation.seeds import SeedComparison, SweepTable, seed_comparisons, shown_tables, summary_table, to_csv
+from fgtrack.evaluation.tables.seeds import (
+    SeedComparison,
+    SweepTable,
+    seed_comparisons,
+    shown_tables,
+    summary_table,
+    to_csv,
+)
 
 RMSE = "truth.overall.errors.position_m.rmse"
 SEEDS = 6

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from evaluation_runs import ROUND, WEST, write_run
 
-from fgtrack.evaluation.compare import compare
-from fgtrack.evaluation.deadlines import Deadlines
 from fgtrack.evaluation.runs import JudgedRun
-from fgtrack.evaluation.streaming import ASKED, PREDICTED, READY, streamed
+from fgtrack.evaluation.scores.deadlines import Deadlines
 from fgtrack.evaluation.tables import Tables
+from fgtrack.evaluation.tables.compare import compare
+from fgtrack.evaluation.tables.streaming import ASKED, PREDICTED, READY, streamed
 from fgtrack.io.run import Run
 
 MS = 1_000_000

@@ -15,11 +15,11 @@ from unit.evaluation_runs import ROUND, WEST, update, write_run
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Disposition
-from fgtrack.evaluation.compare import BACKWARD_FORWARD_NOTE, compare
 from fgtrack.evaluation.metrics import Metrics, evaluate
 from fgtrack.evaluation.runs import JudgedRun, labelled
-from fgtrack.evaluation.statistics import Distribution
+from fgtrack.evaluation.scores.statistics import Distribution
 from fgtrack.evaluation.tables import Column, Table, Tables, short, two_digits
+from fgtrack.evaluation.tables.compare import BACKWARD_FORWARD_NOTE, compare
 from fgtrack.io.run import Run
 
 ESTIMATORS = ("ekf-backward-forward", "ekf-replay", "smoother")

@@ -10,11 +10,11 @@ import pytest
 from evaluation_runs import WEST, update, write_run
 
 from fgtrack.evaluation.comparison import Comparison, Entry, Quantity
-from fgtrack.evaluation.consistency import Consistency
 from fgtrack.evaluation.intervals import Estimate
 from fgtrack.evaluation.metrics import Metrics, evaluate
-from fgtrack.evaluation.statistics import ChiSquareMean, Moments
-from fgtrack.evaluation.verdict import verdict
+from fgtrack.evaluation.scores.consistency import Consistency
+from fgtrack.evaluation.scores.statistics import ChiSquareMean, Moments
+from fgtrack.evaluation.tables.verdict import verdict
 
 FITS = Consistency(
     position_nees=ChiSquareMean(1000, 2.1, 2.0),

@@ -11,9 +11,9 @@ from evaluation_runs import START_NS, TICK_NS, update
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import EgoState, TickReport, TrackReport, TrackState, TrackStatus, TruthState
-from fgtrack.evaluation.compare import compare
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.metrics import evaluate
+from fgtrack.evaluation.tables.compare import compare
 from fgtrack.evaluation.truth import ego_poses, true_paths, visible
 from fgtrack.io.run import Run, RunWriter, load_run
 from fgtrack.pipeline.replay import replay_in_memory

@@ -8,7 +8,7 @@ from evaluation_runs import WEST, run_beside, write_run
 from fgtrack.core.types import TrackReport
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.prediction import prediction_errors
+from fgtrack.evaluation.scores.prediction import prediction_errors
 from fgtrack.io.run import Run
 
 

@@ -10,7 +10,7 @@ from support.pictures import faults
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.evaluation.palette import look
-from fgtrack.evaluation.seeds import SWEEP_FILE, is_sweep, read_sweep
+from fgtrack.evaluation.tables.seeds import SWEEP_FILE, is_sweep, read_sweep
 from fgtrack.pipeline.sweep import SWEEP_TABLE
 from fgtrack.plotting import plot
 from fgtrack.plotting.sweep import metric_words

@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.consistency import normalised_squares
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, within_run
 from fgtrack.evaluation.matching import Matching, TrackErrors, state_errors
-from fgtrack.evaluation.statistics import Moments
+from fgtrack.evaluation.scores.consistency import normalised_squares
+from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.evaluation.truth import TRUE_STATE, true_paths
 from fgtrack.io.run import Run, Table
 

@@ -26,13 +26,13 @@ from fgtrack.evaluation.comparison import (
     entry_record,
     quantity,
 )
-from fgtrack.evaluation.deadlines import ready
 from fgtrack.evaluation.intervals import UNKNOWN, by_stamp
 from fgtrack.evaluation.runs import JudgedRun
-from fgtrack.evaluation.statistics import Distribution
+from fgtrack.evaluation.scores.deadlines import ready
+from fgtrack.evaluation.scores.statistics import Distribution
 from fgtrack.evaluation.tables import MS, PERCENT, RUN, Column, Table
+from fgtrack.evaluation.tables.verdict import who_is_best
 from fgtrack.evaluation.truth import true_paths
-from fgtrack.evaluation.verdict import who_is_best
 
 #: A state is evaluated at its own stamp, as everywhere else; as published, at the moment when it was ready; the same
 #: after its user has moved it to that moment.

@@ -9,7 +9,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.matching import Matching, confirmed
 from fgtrack.evaluation.roads import roads
-from fgtrack.evaluation.statistics import Moments
+from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.evaluation.truth import TRUE_STATE, true_paths
 from fgtrack.io.run import Run
 from fgtrack.models.predictor import ArcPredictor, Predictor, RailPredictor

@@ -6,9 +6,9 @@ from typing import NamedTuple
 from fgtrack.evaluation.comparison import Comparison, Entry
 from fgtrack.evaluation.diagnostics import FEWEST, is_far_off
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate
-from fgtrack.evaluation.lagged import WINDOW
 from fgtrack.evaluation.metrics import Metrics
-from fgtrack.evaluation.statistics import ChiSquareMean
+from fgtrack.evaluation.scores.lagged import WINDOW
+from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.evaluation.tables import PERCENT, short, two_digits
 
 _MOST_NAMED = 3

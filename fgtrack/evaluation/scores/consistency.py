@@ -1,15 +1,15 @@
 """Consistency of the covariances: NEES and NIS with their chi-square bands."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fgtrack.core.types import YAW, FloatArray, IntArray
-from fgtrack.evaluation.innovations import Autocorrelation, autocorrelations, num_measured
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, mean_square
 from fgtrack.evaluation.matching import Matching, state_errors
-from fgtrack.evaluation.statistics import ChiSquareMean, Moments, chi_square_band
+from fgtrack.evaluation.scores.innovations import Autocorrelation, autocorrelations, num_measured
+from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.evaluation.truth import TRUE_STATE
 from fgtrack.io.run import Run, Table
 
@@ -26,7 +26,7 @@ class Consistency:
     """Normalised squared errors and innovations of one run, and the whiteness of the innovations.
 
     The bands are those of independent samples. Innovations of a consistent estimator are independent, errors along a
-    run are not: a single run may leave the band of its NEES, see `nees_over_runs`.
+    run are not: a single run may leave the band of its NEES, see `position_nees_interval`.
 
     Attributes
     ----------
@@ -65,41 +65,6 @@ class Nees:
     object_ids: IntArray
     values: FloatArray
     dof: IntArray
-
-
-@dataclass(frozen=True)
-class NeesOverRuns:
-    """NEES averaged over Monte-Carlo runs: at m objects and stamps, each with at most one value of a run.
-
-    Attributes
-    ----------
-    object_ids, stamps_ns
-        Shape (m,).
-    num_runs
-        Runs with a value there, shape (m,).
-    mean, low, high
-        Mean over them and its 95 % band, shape (m,).
-    run_means
-        Average of every run's own values, shape (runs,); these are independent. NaN for a run without any.
-    """
-
-    object_ids: IntArray
-    stamps_ns: IntArray
-    num_runs: IntArray
-    mean: FloatArray
-    low: FloatArray
-    high: FloatArray
-    run_means: FloatArray = field(repr=False)
-
-    @property
-    def share_inside(self) -> float:
-        """Share of the objects and stamps inside the band; 0.95 on average for a consistent estimator."""
-        return float(((self.mean >= self.low) & (self.mean <= self.high)).mean()) if len(self.mean) else np.nan
-
-    @property
-    def overall(self) -> Moments:
-        """Moments of `run_means`: std / sqrt(count - 1) is the standard error of the mean, without any assumption."""
-        return Moments.of(self.run_means)
 
 
 def consistency(run: Run, matching: Matching | None) -> Consistency:
@@ -142,32 +107,6 @@ def state_nees(matching: Matching) -> Nees:
     return replace(without, values=values, dof=np.where(full, with_yaw_rate.dof, without.dof))
 
 
-def nees_over_runs(samples: Sequence[Nees]) -> NeesOverRuns:
-    """NEES averaged over runs that differ in their seeds, an entry of `samples` for each: `position_nees(match(run))`.
-
-    Errors along one run are correlated, those of different runs are not. So at every object and stamp the values of
-    N runs are averaged, and N times this mean is chi-square with N times the degrees of freedom. Runs must have the
-    same ticks (`clock.node_hz`); where some have no value, N is the number of the others. Of several values of a
-    run at one stamp the last counts. The objects and stamps themselves remain correlated, so `share_inside` scatters
-    more than the share of as many independent draws.
-
-    Raises
-    ------
-    ValueError
-        There is no run.
-    """
-    if not samples:
-        raise ValueError("at least one run is needed")
-    kept = [_one_each(sample) for sample in samples]
-    keys = np.concatenate([np.stack([one.object_ids, one.stamps_ns], axis=-1) for one in kept])
-    distinct, inverse, num_runs = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    values, dof = (np.concatenate([getattr(one, name) for one in kept]) for name in ("values", "dof"))
-    total, total_dof = (np.bincount(inverse, part, len(distinct)).astype(np.float64) for part in (values, dof))
-    run_means = np.array([Moments.of(one.values).mean for one in kept])
-    band = chi_square_band(total_dof, num_runs)
-    return NeesOverRuns(distinct[:, 0], distinct[:, 1], num_runs, total / num_runs, *band, run_means)
-
-
 def normalised_squares(states: Table, errors: FloatArray) -> FloatArray:
     """Normalised error squared e' P^-1 e of the leading components of `states`, shape (n,).
 
@@ -203,11 +142,3 @@ def _nees(matching: Matching, size: int) -> Nees:
         values=normalised_squares(tracks, errors[:, :size]),
         dof=np.full(tracks.num_rows, size),
     )
-
-
-def _one_each(nees: Nees) -> Nees:
-    """The finite values, the last one of each object and stamp."""
-    rows = np.flatnonzero(np.isfinite(nees.values))[::-1]
-    keys = np.stack([nees.object_ids[rows], nees.stamps_ns[rows]], axis=-1)
-    rows = rows[np.unique(keys, axis=0, return_index=True)[1]]
-    return Nees(nees.stamps_ns[rows], nees.object_ids[rows], nees.values[rows], nees.dof[rows])

@@ -16,16 +16,16 @@ from fgtrack.evaluation.comparison import (
     is_best,
 )
 from fgtrack.evaluation.diagnostics import USED
-from fgtrack.evaluation.innovations import FEWEST, LAGS, RESIDUAL_NAMES, Autocorrelation
 from fgtrack.evaluation.intervals import UNKNOWN
-from fgtrack.evaluation.lagged import WINDOW, LagMetrics
 from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics
-from fgtrack.evaluation.prediction import HORIZONS_S
 from fgtrack.evaluation.runs import OneRun, judged
-from fgtrack.evaluation.statistics import ChiSquareMean
-from fgtrack.evaluation.streaming import streaming_tables
+from fgtrack.evaluation.scores.innovations import FEWEST, LAGS, RESIDUAL_NAMES, Autocorrelation
+from fgtrack.evaluation.scores.lagged import WINDOW, LagMetrics
+from fgtrack.evaluation.scores.prediction import HORIZONS_S
+from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.evaluation.tables import MS, NO_VALUE, PERCENT, RUN, Column, Table, Tables, Value, named
-from fgtrack.evaluation.verdict import verdict
+from fgtrack.evaluation.tables.streaming import streaming_tables
+from fgtrack.evaluation.tables.verdict import verdict
 
 BACKWARD_FORWARD = "ekf-backward-forward"
 BACKWARD_FORWARD_NOTE = "backward-forward forgets what was fused after the stamp of a late detection"
