@@ -5,7 +5,7 @@ x_m, y_m and yaw_rad are in the map frame and speed_mps is over ground along the
 turn positive, is that of the way of the object: its yaw rate over its speed. No sensor measures it, a map tells it.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import NamedTuple
@@ -29,7 +29,6 @@ COMPONENTS = (*MEASURABLE, "curvature_radpm")
 ANGULAR = ("yaw_rad", "bearing_rad")
 #: Components that are relative to the sensor.
 RELATIVE = ("range_m", "bearing_rad", "range_rate_mps")
-_NONE = np.zeros(2)
 
 
 class SensorPose(NamedTuple):
@@ -90,8 +89,7 @@ class MeasurementModel:
         """Measurement expected of the states `x`, shape (..., n) -> (..., k). Angles are not wrapped."""
         if self.linear:
             return x.take(self._selected, axis=-1)
-        scene = _Scene(x, pose, self._cartesian)
-        return np.stack([_COMPONENTS[name].value(scene) for name in self.components], axis=-1)
+        return _observed(self.components, x, pose, self._cartesian)[0]
 
     def jacobian(self, x: FloatArray, pose: SensorPose = _AT_ORIGIN) -> FloatArray:
         """Derivative H of `predict` by `x`, shape (..., k, n); read-only where the model is linear.
@@ -99,16 +97,12 @@ class MeasurementModel:
         Finite everywhere: the gradient of an angle grows up to `MIN_RANGE_M` and `MIN_SPEED_MPS` and no
         further.
         """
-        shape = (*x.shape[:-1], len(self.components), x.shape[-1])
+        n = x.shape[-1]
+        shape = (*x.shape[:-1], len(self.components), n)
         if self.linear:
-            return np.broadcast_to(self.selection(x.shape[-1]), shape)
-        scene = _Scene(x, pose, self._cartesian)
+            return np.broadcast_to(self.selection(n), shape)
         H = np.zeros(shape)
-        for row, name in enumerate(self.components):
-            component = _COMPONENTS[name]
-            H[..., row, :2], H[..., row, 2:4] = component.gradient(scene)
-            if component.by_yaw_rate is not None:
-                H[..., row, YAW_RATE] = component.by_yaw_rate(scene)
+        H[..., :5] = _observed(self.components, x, pose, self._cartesian)[1][..., :n]
         return H
 
     def pose_jacobian(self, x: FloatArray, pose: SensorPose) -> FloatArray:
@@ -116,14 +110,13 @@ class MeasurementModel:
         D = np.zeros((*x.shape[:-1], len(self.components), len(pose)))
         if not self.relative:
             return D
-        scene = _Scene(x, pose, self._cartesian)
+        _, G = _observed((*self.components, "range_m"), x, pose, self._cartesian)
         for row in self.relative:
-            name = self.components[row]
-            D[..., row, :2] = -_COMPONENTS[name].gradient(scene)[0]  # the offset alone counts
-            if name == "bearing_rad":
+            D[..., row, :2] = -G[..., row, :2]  # the offset alone counts
+            if self.components[row] == "bearing_rad":
                 D[..., row, 2] = -1.0
-            elif name == "range_rate_mps":
-                D[..., row, 3:] = -scene.line_of_sight
+            elif self.components[row] == "range_rate_mps":
+                D[..., row, 3:] = -G[..., -1, :2]
         return D
 
     def selection(self, n: int) -> FloatArray:
@@ -200,101 +193,42 @@ def _polar_rows(components: tuple[str, ...]) -> list[int]:
     return [components.index("bearing_rad"), components.index("range_m")]
 
 
-class _Scene:
-    """States and a sensor pose, and what several components derive from them.
+def _observed(
+    names: Sequence[str], x: FloatArray, pose: SensorPose, cartesian_state: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Values (..., k) of the components `names`, and their derivatives (..., k, 5) by the state as far as a yaw rate.
 
-    `motion` is the third and fourth entry of the state: (yaw, speed), or (vx, vy) where `cartesian_motion` is
-    set. `turn`, shape (..., 1), is the yaw rate of a state that has one.
+    A moved object turns the line of sight towards its normal; its velocity counts along it. A curvature is the yaw rate
+    over the speed, times v^2 / (v^2 + v0^2) with v0 = `SLOW_MPS`, which falls to 0 at rest.
     """
-
-    def __init__(self, x: FloatArray, pose: SensorPose, cartesian_motion: bool) -> None:
-        self.position: FloatArray = x[..., :2]
-        self.motion: FloatArray = x[..., 2:4]
-        self.turn: FloatArray = x[..., YAW_RATE : YAW_RATE + 1]
-        self.pose = pose
-        self.cartesian_motion = cartesian_motion
-
-    @cached_property
-    def offset(self) -> FloatArray:
-        """From the sensor to the object in the map, shape (..., 2)."""
-        return np.asarray(self.position - np.array([self.pose.x_m, self.pose.y_m]))
-
-    @cached_property
-    def offset_gradient(self) -> FloatArray:
-        """Derivative of direction and range by the position, shape (..., 2, 2)."""
-        return polar_gradient(self.offset, MIN_RANGE_M)
-
-    @property
-    def line_of_sight(self) -> FloatArray:
-        """Unit vector from the sensor to the object in the map, shape (..., 2)."""
-        return np.asarray(self.offset_gradient[..., 1, :])
-
-    @property
-    def yaw_speed(self) -> FloatArray:
-        """Heading and speed along it, shape (..., 2)."""
-        return polar(self.motion) if self.cartesian_motion else self.motion
-
-    @property
-    def yaw_speed_gradient(self) -> FloatArray:
-        """Derivative of heading and speed by `motion`, shape (..., 2, 2)."""
-        return polar_gradient(self.motion, MIN_SPEED_MPS) if self.cartesian_motion else np.eye(2)
-
-    @property
-    def relative_velocity(self) -> FloatArray:
-        """Velocity of the object minus that of the sensor in the map, shape (..., 2)."""
-        velocity = self.motion if self.cartesian_motion else cartesian(self.motion)
-        return np.asarray(velocity - np.array([self.pose.vx_mps, self.pose.vy_mps]))
-
-    @property
-    def velocity_gradient(self) -> FloatArray:
-        """Derivative of the velocity by `motion`, shape (..., 2, 2)."""
-        return np.eye(2) if self.cartesian_motion else cartesian_gradient(self.motion)
-
-
-class _Component(NamedTuple):
-    """One quantity: its value and its gradients by position and `motion`, shape (..., 2) each."""
-
-    value: Callable[[_Scene], FloatArray]
-    gradient: Callable[[_Scene], tuple[FloatArray, FloatArray]]
-    by_yaw_rate: Callable[[_Scene], FloatArray] | None = None
-    """Derivative by the yaw rate, shape (...); None where it is 0."""
-
-
-def _range_rate(scene: _Scene) -> FloatArray:
-    """Relative velocity along the line of sight."""
-    return np.asarray(np.sum(scene.relative_velocity * scene.line_of_sight, axis=-1))
-
-
-def _range_rate_gradient(scene: _Scene) -> tuple[FloatArray, FloatArray]:
-    """A moved object turns the line of sight towards its normal; the velocity counts along it."""
-    along = scene.line_of_sight
-    normal = np.stack([-along[..., 1], along[..., 0]], axis=-1)
-    across_mps = np.sum(scene.relative_velocity * normal, axis=-1, keepdims=True)
-    by_motion = (along[..., None, :] @ scene.velocity_gradient)[..., 0, :]
-    return across_mps * scene.offset_gradient[..., 0, :], by_motion
-
-
-def _pace(scene: _Scene) -> FloatArray:
-    """1 / v, which falls to 0 at rest: v / (v^2 + v0^2) with v0 = `SLOW_MPS`."""
-    speed_mps = scene.motion[..., 1]
-    return np.asarray(speed_mps / (speed_mps**2 + SLOW_MPS**2))
-
-
-def _curvature_gradient(scene: _Scene) -> tuple[FloatArray, FloatArray]:
-    """By the speed alone: the derivative of `_pace` is 1 / (v^2 + v0^2) - 2 pace^2."""
-    by_speed = scene.turn[..., 0] * (1.0 / (scene.motion[..., 1] ** 2 + SLOW_MPS**2) - 2.0 * _pace(scene) ** 2)
-    return _NONE, np.stack([np.zeros_like(by_speed), by_speed], axis=-1)
-
-
-_COMPONENTS = {
-    "x_m": _Component(lambda s: s.position[..., 0], lambda s: (np.array([1.0, 0.0]), _NONE)),
-    "y_m": _Component(lambda s: s.position[..., 1], lambda s: (np.array([0.0, 1.0]), _NONE)),
-    "yaw_rad": _Component(lambda s: s.yaw_speed[..., 0], lambda s: (_NONE, s.yaw_speed_gradient[..., 0, :])),
-    "speed_mps": _Component(lambda s: s.yaw_speed[..., 1], lambda s: (_NONE, s.yaw_speed_gradient[..., 1, :])),
-    "range_m": _Component(lambda s: polar(s.offset)[..., 1], lambda s: (s.line_of_sight, _NONE)),
-    "bearing_rad": _Component(
-        lambda s: polar(s.offset)[..., 0] - s.pose.yaw_rad, lambda s: (s.offset_gradient[..., 0, :], _NONE)
-    ),
-    "range_rate_mps": _Component(_range_rate, _range_rate_gradient),
-    "curvature_radpm": _Component(lambda s: s.turn[..., 0] * _pace(s), _curvature_gradient, _pace),
-}
+    shape = *x.shape[:-1], len(names)
+    z, G = np.empty(shape), np.zeros((*shape, 5))
+    offset, motion = x[..., :2] - np.array(pose[:2]), x[..., 2:4]
+    yaw_speed, velocity, by_yaw_speed, by_velocity = motion, motion, np.eye(2), np.eye(2)
+    if cartesian_state:
+        yaw_speed, by_yaw_speed = polar(motion), polar_gradient(motion, MIN_SPEED_MPS)
+    else:
+        velocity, by_velocity = cartesian(motion), cartesian_gradient(motion)
+    bearing_range, gradient = polar(offset), polar_gradient(offset, MIN_RANGE_M)
+    sight, relative = gradient[..., 1, :], velocity - np.array(pose[3:])
+    for row, name in enumerate(names):
+        if name in POLAR[:2]:
+            column = POLAR.index(name)
+            z[..., row], G[..., row, column] = x[..., column], 1.0
+        elif name in POLAR:
+            column = POLAR.index(name) - 2
+            z[..., row], G[..., row, 2:4] = yaw_speed[..., column], by_yaw_speed[..., column, :]
+        elif name == "bearing_rad":
+            z[..., row], G[..., row, :2] = bearing_range[..., 0] - pose.yaw_rad, gradient[..., 0, :]
+        elif name == "range_m":
+            z[..., row], G[..., row, :2] = bearing_range[..., 1], sight
+        elif name == "range_rate_mps":
+            across = np.vecdot(relative, np.stack([-sight[..., 1], sight[..., 0]], axis=-1))
+            z[..., row], G[..., row, :2] = np.vecdot(relative, sight), across[..., None] * gradient[..., 0, :]
+            G[..., row, 2:4] = (sight[..., None, :] @ by_velocity)[..., 0, :]
+        else:
+            speed, turn = x[..., 3], x[..., YAW_RATE]
+            least = 1.0 / (speed**2 + SLOW_MPS**2)
+            z[..., row], G[..., row, YAW_RATE] = turn * speed * least, speed * least
+            G[..., row, 3] = turn * (least - 2.0 * (speed * least) ** 2)
+    return z, G

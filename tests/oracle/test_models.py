@@ -1,6 +1,6 @@
 """A wrong equation of any motion or measurement model is found by the oracle, also one that is no number."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,20 +16,17 @@ from fgtrack.testing.references import Difference
 Break = Callable[[pytest.MonkeyPatch], None]
 
 
-def component(name: str, cartesian: bool, **changed: Callable[[Any, Any], Any]) -> Break:
-    """Break parts of what is measured as `name`, of Cartesian states or of the others."""
-    known = measurement._COMPONENTS[name]
+def component(name: str, cartesian: bool, part: int) -> Break:
+    """Let the value (part 0) or the derivative (1) of `name` be no number, of Cartesian states or of the others."""
+    right = measurement._observed
 
-    def broken(part: str, change: Callable[[Any, Any], Any]) -> Callable[[Any], Any]:
-        right = getattr(known, part)
-        return lambda scene: change(right(scene), 1.0) if scene.cartesian_motion is cartesian else right(scene)
+    def wrong(names: Sequence[str], x: FloatArray, pose: Any, cartesian_state: bool) -> tuple[FloatArray, FloatArray]:
+        found = right(names, x, pose, cartesian_state)
+        if name in names and cartesian_state is cartesian:
+            (found[0][..., None], found[1])[part][..., list(names).index(name), :] = np.nan
+        return found
 
-    wrong = known._replace(**{part: broken(part, change) for part, change in changed.items()})
-    return lambda patch: patch.setitem(measurement._COMPONENTS, name, wrong)
-
-
-def no_number(value: Any, _: float) -> Any:
-    return tuple(each * np.nan for each in value) if isinstance(value, tuple) else value * np.nan
+    return lambda patch: patch.setattr(measurement, "_observed", wrong)
 
 
 def method(kind: type, name: str, change: Callable[..., Any]) -> Break:
@@ -63,10 +60,10 @@ def shown_too_sure(given: tuple[FloatArray, FloatArray], model: MotionModel, *_:
 
 
 BROKEN: dict[str, Break] = {
-    "Jacobian of a Cartesian range rate is no number": component("range_rate_mps", True, gradient=no_number),
-    "value of a curvature is no number": component("curvature_radpm", False, value=no_number),
-    "Jacobian of a curvature is no number": component("curvature_radpm", False, by_yaw_rate=no_number),
-    "Cartesian yaw is no number": component("yaw_rad", True, value=no_number),
+    "Jacobian of a Cartesian range rate is no number": component("range_rate_mps", True, 1),
+    "value of a curvature is no number": component("curvature_radpm", False, 0),
+    "Jacobian of a curvature is no number": component("curvature_radpm", False, 1),
+    "Cartesian yaw is no number": component("yaw_rad", True, 0),
     "densities of yaw that are set are not used": densities_of_yaw_as_they_ever_were,
     "published covariance of a Cartesian state": method(MotionModel, "kinematic", shown_too_sure),
     "covariance of a birth": method(MotionModel, "from_kinematic", lambda found, *_: (found[0], 2.0 * found[1])),
