@@ -6,7 +6,6 @@ Cramer-Rao bounds for discrete-time nonlinear filtering", IEEE Transactions on S
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -20,33 +19,42 @@ from fgtrack.models.motion import MotionModel
 
 @dataclass(frozen=True)
 class ScheduledMeasurement:
-    """A measurement that will be made: its value does not matter for a bound."""
+    """A measurement that will be made: its value does not matter for a bound.
+
+    Attributes
+    ----------
+    stamp_ns, receipt_ns
+        Times of sensing and of arrival.
+    model, R, pose
+        Measurement model, covariance, shape (k, k), and pose of the sensor.
+    """
 
     stamp_ns: int
     receipt_ns: int
     model: MeasurementModel
     R: FloatArray
-    """Covariance, shape (k, k)."""
     pose: SensorPose = field(default_factory=SensorPose)
 
 
 class Bounds(NamedTuple):
-    """Lower bounds of the covariance of the present state at m times, shape (m, n, n) each."""
+    """Lower bounds of the covariance of the present state at m times, shape (m, n, n) each.
+
+    Attributes
+    ----------
+    in_time
+        If everything arrived when it was sensed.
+    arrived
+        From what has arrived, each at its own stamp.
+    dropped
+        From what has arrived, without what came later than something sensed after it.
+    """
 
     in_time: FloatArray
-    """If everything arrived when it was sensed."""
     arrived: FloatArray
-    """From what has arrived, each at its own stamp."""
     dropped: FloatArray
-    """From what has arrived, without what came later than something sensed after it."""
 
 
-class _Segment(NamedTuple):
-    """Expected information of one step of the chain: the blocks of the recursion."""
-
-    D11: FloatArray
-    D12: FloatArray
-    D22: FloatArray
+_NEVER_NS = np.iinfo(np.int64).max
 
 
 def bounds(
@@ -129,88 +137,53 @@ def _bounds(
 ) -> Bounds:
     """`bounds` from the true `states` (trajectories, s, n) at `stamps_ns` (s,)."""
     ordered = sorted(measurements, key=lambda item: item.stamp_ns)
-    chain = _Chain(motion, stamps_ns, states, psd_solve(prior_covariance, np.eye(motion.dim)), ordered)
-    kept = _in_sequence(ordered)
     receipts_ns = np.array([item.receipt_ns for item in ordered], dtype=np.int64)
     own_ns = np.array([item.stamp_ns for item in ordered], dtype=np.int64)
-    never_ns = np.iinfo(np.int64).max
-    return Bounds(
-        chain.covariances(now_ns, own_ns),
-        chain.covariances(now_ns, receipts_ns),
-        chain.covariances(now_ns, np.where(kept, receipts_ns, never_ns)),
-    )
+    later_ns = np.minimum.accumulate(receipts_ns[::-1])[::-1]
+    kept = np.append(receipts_ns[:-1] <= later_ns[1:], True)[: len(ordered)]  # before everything sensed after them
+    index = np.searchsorted(stamps_ns, own_ns)
+    gained = [_information(item, states[:, k]) for item, k in zip(ordered, index, strict=True)]
+    steps = [_step(motion, states[:, k], seconds(int(ns))) for k, ns in enumerate(np.diff(stamps_ns))]
+    start = psd_solve(prior_covariance, np.eye(motion.dim))
 
-
-class _Chain:
-    """The information recursion over all stamps, with the expected information of every measurement."""
-
-    def __init__(
-        self,
-        motion: MotionModel,
-        stamps_ns: IntArray,
-        states: FloatArray,
-        information: FloatArray,
-        measurements: Sequence[ScheduledMeasurement],
-    ) -> None:
-        self._stamps_ns = stamps_ns
-        self._start = information
-        self._places = np.searchsorted(stamps_ns, [item.stamp_ns for item in measurements])
-        self._gained = [
-            _information(item, states[:, place]) for item, place in zip(measurements, self._places, strict=True)
-        ]
-        durations_s = [seconds(int(after - before)) for before, after in pairwise(stamps_ns)]
-        self._segments = [_segment(motion, states[:, i], dt_s) for i, dt_s in enumerate(durations_s)]
-
-    def covariances(self, now_ns: Sequence[int], from_ns: IntArray) -> FloatArray:
-        """Bounds at `now_ns` where measurement i counts from `from_ns[i]` on, shape (m, n, n).
+    def covariances(from_ns: IntArray) -> FloatArray:
+        """Bounds where measurement i counts from `from_ns[i]` on, shape (m, n, n).
 
         What lies before the oldest measurement that is still to come does not change any more and is kept.
         """
-        found = []
-        settled, J = 0, self._start
+        found, settled, J = [], 0, start
         for time_ns in now_ns:
-            here = int(np.searchsorted(self._stamps_ns, time_ns))
-            counts = from_ns <= time_ns
-            waiting = self._places[~counts & (from_ns != np.iinfo(np.int64).max)]
-            final = min(here, int(waiting.min()) if len(waiting) else here)
-            J = self._advanced(J, settled, final, counts)
-            settled = final
-            at_now = self._with_measurements(self._advanced(J, settled, here, counts), here, counts)
-            found.append(symmetrise(psd_solve(at_now, np.eye(len(J)))))
+            here, counts = int(np.searchsorted(stamps_ns, time_ns)), from_ns <= time_ns
+            waiting = index[~counts & (from_ns != _NEVER_NS)]
+            final = min([here, *waiting.tolist()])
+            J, settled = advanced(J, settled, final, counts), final
+            at_now = measured(advanced(J, settled, here, counts), here, counts)
+            found.append(symmetrise(psd_solve(at_now, np.eye(motion.dim))))
         return np.array(found)
 
-    def _advanced(self, J: FloatArray, first: int, last: int, counts: BoolArray) -> FloatArray:
+    def advanced(J: FloatArray, first: int, last: int, counts: BoolArray) -> FloatArray:
         """Information of stamp `last`, before its own measurements, from that of `first`, before its own."""
-        for i in range(first, last):
-            D11, D12, D22 = self._segments[i]
-            J = symmetrise(D22 - D12.T @ psd_solve(self._with_measurements(J, i, counts) + D11, D12))
+        for k in range(first, last):
+            D11, D12, D22 = steps[k]
+            J = symmetrise(D22 - D12.T @ psd_solve(measured(J, k, counts) + D11, D12))
         return J
 
-    def _with_measurements(self, J: FloatArray, place: int, counts: BoolArray) -> FloatArray:
-        first, last = np.searchsorted(self._places, [place, place + 1])
-        for i in range(first, last):
-            if counts[i]:
-                J = J + self._gained[i]
-        return J
+    def measured(J: FloatArray, k: int, counts: BoolArray) -> FloatArray:
+        first, last = np.searchsorted(index, [k, k + 1])
+        return sum((gained[i] for i in range(first, last) if counts[i]), start=J)
+
+    return Bounds(covariances(own_ns), covariances(receipts_ns), covariances(np.where(kept, receipts_ns, _NEVER_NS)))
 
 
-def _segment(motion: MotionModel, states: FloatArray, dt_s: float) -> _Segment:
+def _step(motion: MotionModel, states: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Expected information of one step of the chain: D11, D12 and D22 of the recursion."""
     F, Q = motion.jacobian(states, dt_s), motion.process_noise(states, dt_s)
     weight = np.linalg.solve(Q, np.broadcast_to(np.eye(motion.dim), Q.shape))
     weighted = F.mT @ weight
-    return _Segment((weighted @ F).mean(axis=0), -weighted.mean(axis=0), weight.mean(axis=0))
+    return (weighted @ F).mean(axis=0), -weighted.mean(axis=0), weight.mean(axis=0)
 
 
 def _information(item: ScheduledMeasurement, states: FloatArray) -> FloatArray:
     """E[H' R^-1 H] over states (trajectories, n)."""
     H = item.model.jacobian(states, item.pose)
     return np.asarray((H.mT @ psd_solve(item.R, np.eye(len(item.R))) @ H).mean(axis=0))
-
-
-def _in_sequence(ordered: Sequence[ScheduledMeasurement]) -> BoolArray:
-    """Which of the measurements, in order of stamps, arrive before everything that is sensed after them."""
-    receipts_ns = np.array([item.receipt_ns for item in ordered], dtype=np.int64)
-    later_ns = np.minimum.accumulate(receipts_ns[::-1])[::-1]
-    kept = np.ones(len(ordered), dtype=np.bool_)
-    kept[:-1] = receipts_ns[:-1] <= later_ns[1:]
-    return kept

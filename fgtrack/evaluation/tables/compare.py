@@ -17,10 +17,11 @@ from fgtrack.evaluation.comparison import (
 )
 from fgtrack.evaluation.diagnostics import USED
 from fgtrack.evaluation.intervals import UNKNOWN
-from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics
+from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics, ObjectMetrics, TruthMetrics
 from fgtrack.evaluation.runs import OneRun, judged
 from fgtrack.evaluation.scores.innovations import FEWEST, LAGS, RESIDUAL_NAMES, Autocorrelation
 from fgtrack.evaluation.scores.lagged import WINDOW, LagMetrics
+from fgtrack.evaluation.scores.multi_object import MultiObjectMetrics
 from fgtrack.evaluation.scores.prediction import HORIZONS_S
 from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.evaluation.tables import MS, NO_VALUE, PERCENT, RUN, Column, Table, Tables, Value, named
@@ -118,19 +119,14 @@ def _differences(compared: Sequence[Comparison]) -> Table:
 
 def _tracking(metrics: Mapping[str, Metrics], compared: Sequence[Comparison], notes: Sequence[str]) -> Table:
     """A row for each run: errors against truth, continuity, number of tracks, time."""
-    records, with_truth = [], any(one.truth for one in metrics.values())
-    for label, one in metrics.items():
-        record: dict[str, Any] = {"run": label, "estimator": one.estimator}
-        if one.truth is not None:
-            overall = one.truth.overall
-            record |= {named(name, "rmse"): overall.errors[name].rmse for name in _ERRORS}
-            record |= {"position_nees": one.consistency.position_nees.mean, "tracked_share": overall.tracked_share}
-            record |= {"tracked_share_in_sight": overall.tracked_share_in_sight, "breaks": overall.breaks}
-            record |= {"id_switches": overall.id_switches, "false_tracks": one.truth.false_tracks}
-            record["precision"] = one.precision
-        record |= {"num_tracks": one.num_tracks, "num_confirmed": one.num_confirmed}
-        record["time_per_tick_p50_s"], record["time_per_tick_p99_s"] = one.time_per_tick_s.p50, one.time_per_tick_s.p99
-        records.append(record)
+    with_truth = any(one.truth for one in metrics.values())
+    records = [
+        {"run": label, "estimator": one.estimator}
+        | ({} if one.truth is None else _truth_numbers(one, one.truth))
+        | {"num_tracks": one.num_tracks, "num_confirmed": one.num_confirmed}
+        | {"time_per_tick_p50_s": one.time_per_tick_s.p50, "time_per_tick_p99_s": one.time_per_tick_s.p99}
+        for label, one in metrics.items()
+    ]
     best = _best_of(compared)
     nees_note = "NEES: mean of the position's; 2 if the covariances fit"
     seen_note = "tracked: share of the ticks at which some sensor could see the object"
@@ -174,29 +170,27 @@ def _tracking(metrics: Mapping[str, Metrics], compared: Sequence[Comparison], no
     return Table(title, records, columns, notes=[*own, *notes])
 
 
+def _truth_numbers(one: Metrics, truth: TruthMetrics) -> dict[str, float]:
+    overall = truth.overall
+    return {
+        **{named(name, "rmse"): overall.errors[name].rmse for name in _ERRORS},
+        "position_nees": one.consistency.position_nees.mean,
+        "tracked_share": overall.tracked_share,
+        "tracked_share_in_sight": overall.tracked_share_in_sight,
+        "breaks": overall.breaks,
+        "id_switches": overall.id_switches,
+        "false_tracks": truth.false_tracks,
+        "precision": one.precision,
+    }
+
+
 def _multi_object(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]) -> Table:
     """A row for each run with truth: GOSPA and its parts, CLEAR, IDF1, HOTA, switches, time to confirm."""
-    records = []
-    for label, one in metrics.items():
-        record: dict[str, Any] = {"run": label}
-        if one.multi_object is not None and one.truth is not None:
-            gospa, overall, hota = one.multi_object.gospa, one.truth.overall, one.multi_object.hota
-            record |= {
-                _GOSPA: gospa.in_sight_rms_m,
-                "gospa_localisation_m": math.sqrt(gospa.localisation_m2),
-                "gospa_missed_in_sight_m": math.sqrt(max(gospa.missed_m2 - gospa.out_of_sight_m2, 0.0)),
-                "gospa_false_m": math.sqrt(gospa.false_m2),
-                "gospa_out_of_sight_m": math.sqrt(gospa.out_of_sight_m2),
-                "gospa_rms_m": gospa.rms_m,
-                "gospa_missed_m": math.sqrt(gospa.missed_m2),
-            }
-            record |= {"mota": one.multi_object.clear.mota, "idf1": one.multi_object.identity.idf1, "hota": hota.hota}
-            record |= {"deta": hota.deta, "assa": hota.assa, "id_switches": overall.id_switches}
-            record |= {
-                "late_id_switches": overall.late_id_switches,
-                "time_to_confirm_s": overall.time_to_confirm_s.mean,
-            }
-        records.append(record)
+    records = [
+        {"run": label}
+        | ({} if one.multi_object is None or one.truth is None else _scores(one.multi_object, one.truth.overall))
+        for label, one in metrics.items()
+    ]
     columns = [
         RUN,
         Column("GOSPA\n[m]", _GOSPA, bold=_best_of(compared)(_GOSPA)),
@@ -221,6 +215,27 @@ def _multi_object(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]
     return Table("Multi-object metrics", records, columns, notes=notes, is_detail=True)
 
 
+def _scores(of: MultiObjectMetrics, overall: ObjectMetrics) -> dict[str, float]:
+    gospa = of.gospa
+    return {
+        _GOSPA: gospa.in_sight_rms_m,
+        "gospa_localisation_m": math.sqrt(gospa.localisation_m2),
+        "gospa_missed_in_sight_m": math.sqrt(max(gospa.missed_m2 - gospa.out_of_sight_m2, 0.0)),
+        "gospa_false_m": math.sqrt(gospa.false_m2),
+        "gospa_out_of_sight_m": math.sqrt(gospa.out_of_sight_m2),
+        "gospa_rms_m": gospa.rms_m,
+        "gospa_missed_m": math.sqrt(gospa.missed_m2),
+        "mota": of.clear.mota,
+        "idf1": of.identity.idf1,
+        "hota": of.hota.hota,
+        "deta": of.hota.deta,
+        "assa": of.hota.assa,
+        "id_switches": overall.id_switches,
+        "late_id_switches": overall.late_id_switches,
+        "time_to_confirm_s": overall.time_to_confirm_s.mean,
+    }
+
+
 def _lag(metrics: Mapping[str, Metrics]) -> Table:
     """A row for each run and lag, where any run has lagged or final states: errors, and how waiting lowers them."""
     records = []
@@ -228,14 +243,14 @@ def _lag(metrics: Mapping[str, Metrics]) -> Table:
         few = _some_lags(one.lagged, _FEW_LAGS)
         for lag in _some_lags(one.lagged, _MOST_LAGS):
             is_window, is_present = lag.lag_s == WINDOW, lag.lag_s == 0.0
-            record: dict[str, Any] = {"run": label, "lag": lag.lag_s if is_window else f"{lag.lag_s:g}"}
-            record |= {"lag_s": None if is_window else lag.lag_s, "num_states": lag.errors["position_m"].count}
+            numbers: dict[str, Any] = {"lag": lag.lag_s if is_window else f"{lag.lag_s:g}"}
+            numbers |= {"lag_s": None if is_window else lag.lag_s, "num_states": lag.errors["position_m"].count}
             for name in ("position_m", "speed_mps", "yaw_rad"):
-                record[named(name, "rmse")] = lag.errors[name].rmse
-                record[f"{name.rpartition('_')[0]}_reduction"] = math.nan if is_present else lag.gain(name)
-            record["position_reduction_low"] = lag.position_reduction.low
-            record["position_reduction_high"] = lag.position_reduction.high
-            record["position_nees"] = lag.position_nees.mean
+                gain = math.nan if is_present else lag.gain(name)
+                numbers |= {named(name, "rmse"): lag.errors[name].rmse, f"{name.rpartition('_')[0]}_reduction": gain}
+            ends = {"low": lag.position_reduction.low, "high": lag.position_reduction.high}
+            numbers |= {f"position_reduction_{end}": value for end, value in ends.items()}
+            record = {"run": label, **numbers, "position_nees": lag.position_nees.mean}
             records.append((record, lag in few))
     main = [record for record, is_main in records if is_main]
     interval = "position_reduction_low position_reduction_high"
