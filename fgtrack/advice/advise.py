@@ -33,7 +33,7 @@ from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.trial import TRIAL_S, beginning, suspicions
 from fgtrack.pipeline.tune import tuned
-from fgtrack.pipeline.tune_rules import TuneRules
+from fgtrack.pipeline.tune_space import TuneRules
 from fgtrack.tracking.ego import MAX_EXTRAPOLATION_S
 
 __all__ = ["advice_on", "advise"]

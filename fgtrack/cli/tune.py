@@ -21,7 +21,7 @@ from fgtrack.pipeline.assumed import Assumed
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.tune import tuned
 from fgtrack.pipeline.tune_report import HeldOut, TunedParameter, TuneReport
-from fgtrack.pipeline.tune_rules import TuneRules
+from fgtrack.pipeline.tune_space import TuneRules
 
 _KNOWN = {"yes": "yes", "roughly": "roughly", "limit": "a limit", "no": "not identifiable"}
 _WIDTH = 78

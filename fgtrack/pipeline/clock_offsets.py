@@ -236,8 +236,12 @@ def estimate_offsets(
         rows, tracks = [], set[int]()
         for sensor in sensors:
             found = {} if sensor == name else dict(_paired(seen.get(sensor, {}), paths))
+            is_swapped = name != TRUTH and counts[sensor] > counts[name]  # the path of the better sensor is smoother
+            if is_swapped:
+                found = dict(_paired(seen.get(name, {}), _paths(seen, sensor)))
+            row = _row(sensor, list(found.values()), name, len(sensors))
+            rows.append(replace(row, offset_s=-row.offset_s) if is_swapped and row.offset_s is not None else row)
             tracks |= found.keys()
-            rows.append(_row(sensor, list(found.values()), name, len(sensors)))
         return OffsetReport(name, tuple(rows), len(tracks), sum(one.num_detections for one in rows), broken, least_s)
 
     paths = true_paths(messages) if reference is None else []

@@ -24,8 +24,7 @@ from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.pipeline.tune_measurements import recorded
 from fgtrack.pipeline.tune_report import HeldOut, InnovationFit, Known, SensorNoise, TunedParameter, TuneReport
-from fgtrack.pipeline.tune_rules import TuneRules, for_tuning, widened
-from fgtrack.pipeline.tune_space import ConfigNoise
+from fgtrack.pipeline.tune_space import ConfigNoise, TuneRules, for_tuning, widened
 
 _LASTING = "an error that lasts looks like motion: only the part that does not is fitted, by the share"
 _ENDLESS = "no maximum: the likelihood still rises 10^4 times away, as where all errors are 0"
