@@ -1,4 +1,4 @@
-"""What a person must know before believing a recording or a run."""
+"""Warnings about a recording or a run."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,7 +8,7 @@ from fgtrack.core.geometry import may_be_radians
 __all__ = ["EGO", "Caution", "in_degrees"]
 
 EGO = "ego"
-"""What a caution of the ego is about."""
+"""Subject of a caution about the ego."""
 
 
 @dataclass(frozen=True)
@@ -18,11 +18,11 @@ class Caution:
     about: str
     """Sensor, `ego`, or what else it concerns."""
     text: str
-    """What is wrong, its cause and its cure, without the full stop."""
+    """Problem, cause and cure, without the full stop."""
     settings: Mapping[str, object] = field(default_factory=dict)
-    """Values of keys of the configuration that mend it; empty where none does for certain."""
+    """Values of keys of the configuration that correct it; empty where none does for certain."""
     spoils: bool = False
-    """Whether nothing can be judged before it is mended."""
+    """True if nothing can be judged before it is corrected."""
 
     def __str__(self) -> str:
         return f"{self.about}: {self.text}"

@@ -23,7 +23,7 @@ __all__ = [
 ]
 
 LARGEST = 1e9
-"""What is measured, mapped or configured is no larger, in any unit: its square is still far from the largest float."""
+"""Largest magnitude of a measured, mapped or configured value, in any unit: its square stays finite."""
 
 
 LARGEST_NS = 4 * 10**18
@@ -31,12 +31,12 @@ LARGEST_NS = 4 * 10**18
 
 
 def is_number(value: object, least: float = -LARGEST, most: float = LARGEST) -> bool:
-    """Whether it is a real number between `least` and `most`."""
+    """True if it is a real number between `least` and `most`."""
     return isinstance(value, (float, int, np.floating, np.integer)) and bool(least <= value <= most)
 
 
 def is_stamp(value: object) -> bool:
-    """Whether it is an integer of at most `LARGEST_NS`."""
+    """True if it is an integer of at most `LARGEST_NS`."""
     return isinstance(value, (int, np.integer)) and bool(-LARGEST_NS <= value <= LARGEST_NS)
 
 

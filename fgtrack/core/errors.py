@@ -22,7 +22,7 @@ class CallError(FgtrackError, ValueError):
 
 
 def did_you_mean(name: object, known: Iterable[object]) -> str:
-    """What to append to a message on a `name` that is not among the `known` ones; empty where none is alike."""
+    """Suffix of a message on a `name` that is not among the `known` ones; empty where none is similar."""
     near = difflib.get_close_matches(str(name), [str(each) for each in known], n=1)
     return f", did you mean {near[0]!r}?" if near else ""
 

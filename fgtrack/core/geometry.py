@@ -50,7 +50,7 @@ def rotations(yaws_rad: FloatArray) -> FloatArray:
 
 
 def in_polygon(points: FloatArray, corners: FloatArray) -> BoolArray:
-    """Whether each of `points`, shape (n, 2), lies inside a polygon with `corners`, shape (m, 2); shape (n,).
+    """True where each of `points`, shape (n, 2), lies inside a polygon with `corners`, shape (m, 2); shape (n,).
 
     By the parity of the edges that a ray along +x crosses, so outlines that cross themselves have holes.
     """

@@ -1,4 +1,4 @@
-"""What is alike can be calculated at once: positions of equal items."""
+"""Indices of equal items, which are calculated at once."""
 
 from collections.abc import Hashable, Sequence
 

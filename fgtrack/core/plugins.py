@@ -79,7 +79,7 @@ class Registry:
         return name
 
     def load(self, name: str) -> Any:  # Any: what an entry point names is only known to its user
-        """What `name` stands for. Raises `CallError` for an unknown name and for a plug-in that cannot be loaded."""
+        """Return the part `name`. Raises `CallError` for an unknown name and a plug-in that cannot be loaded."""
         entry = self._entries[self.resolve(name)]
         with self.blamed(name, "cannot be loaded"):
             return entry.load()

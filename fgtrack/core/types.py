@@ -71,9 +71,9 @@ class Detection:
     width_m: float | None = None
     height_m: float | None = None
     score: float | None = None
-    """How sure the detector is, on a scale of its own."""
+    """Confidence of the detector, on a scale of its own."""
     class_name: str | None = None
-    """What it is: `car`, `truck` ..., in the words of the detector."""
+    """Class: `car`, `truck` ..., in the words of the detector."""
 
     @property
     def measured(self) -> tuple[str, ...]:
@@ -125,7 +125,7 @@ class TruthState:
     yaw_rate_radps: float | None = None
     accel_mps2: float | None = None
     ignored: bool = False
-    """Whether a track of this object, or in this region, is neither right nor false when a run is judged."""
+    """True if a track of this object, or in this region, is neither right nor false when a run is judged."""
     outline_m: tuple[float, ...] | None = None
     """Corners x, y, x, y ... of the region that is ignored at this stamp, `x_m` and `y_m` in it; None for an object."""
 
@@ -134,7 +134,7 @@ Message = EgoState | DetectionList | TruthState
 
 
 class Disposition(StrEnum):
-    """What became of a detection: exactly one for each detection received."""
+    """Outcome of a detection: exactly one for each detection received."""
 
     BIRTH = "birth"
     IN_SEQUENCE = "in_sequence"
@@ -167,7 +167,7 @@ class TrackState:
 
 
 class TrackStatus(StrEnum):
-    """How far a track can be trusted."""
+    """Confidence in a track."""
 
     TENTATIVE = "tentative"
     """Not yet believed: measured too seldom, or too improbable, as the lifecycle says."""
@@ -178,7 +178,7 @@ class TrackStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ObjectReport:
-    """What the detections of a track say of its object besides its state; None of what none of them says."""
+    """Class and size of the object of a track; None where no detection gives it."""
 
     class_name: str | None = None
     """That of most detections."""
@@ -204,7 +204,7 @@ class TrackReport:
 
     @property
     def stamp_ns(self) -> int:
-        """When the object is there."""
+        """Stamp of the state."""
         return self.state.stamp_ns
 
     @property
@@ -263,7 +263,7 @@ class SmoothedReport:
     track_id: int
     state: TrackState
     lag_s: float | None = None
-    """How long before the tick the state is; None of a final one."""
+    """Time from the state to the tick; None of a final one."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -92,7 +92,7 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
 
 
 def build_lifecycle(config: Config) -> Lifecycle:
-    """What says which tracks are believed, and which end."""
+    """Rules that confirm and end tracks."""
     rules = config.lifecycle
     if isinstance(rules, ExistenceRules):
         return ExistenceLifecycle(rules, config.sensors, config.ego.detection_origin_m)

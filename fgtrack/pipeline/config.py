@@ -35,7 +35,7 @@ _Weight = Annotated[float, Field(gt=0.0, le=1.0)]
 
 @settings
 class ClockConfig:
-    """When the tracker ticks."""
+    """Times of the ticks."""
 
     node_hz: Annotated[float, Field(ge=0.1, le=10_000.0)] | None = 50.0
     """Ticks lie on multiples of the node period; null ticks at every message instead."""
@@ -51,7 +51,7 @@ class MapConfig:
     pit: str | None = None
     """CSV file of the pit lane, `oval` for the built-in one, or null."""
     inner_buffer_m: float = 0.0
-    """How far beyond the inner bound an object may be."""
+    """Distance beyond the inner bound at which an object may be."""
     outer_buffer_m: float = 0.0
     """The same for the outer bound."""
     pit_buffer_m: float = 0.0
@@ -67,7 +67,7 @@ class MapConfig:
 
 @settings
 class EgoConfig:
-    """What is done to the ego state, and where detections in the ego frame have their origin."""
+    """Low-pass of the ego state, its uncertainty, and the origin of detections in the ego frame."""
 
     yaw_weight: _Weight = 1.0
     """Weight of the new yaw in the low-pass; 1 leaves it as it is."""
@@ -115,12 +115,12 @@ an ego low-pass that filters its own output again at every tick (Q13); a trackin
 
 @dataclass(frozen=True)
 class CountingConfig(LifecycleRules):
-    """When a track starts and ends, by counts of matches and misses."""
+    """Start and end of tracks by counts of matches and misses."""
 
     kind: Literal["counting", "published"] = "counting"
     """`published`: which sensor ages which track, and when, as published (Q9, Q15, Q22)."""
     suppress_births_near_newer_tracks: bool = False
-    """Whether a track claims a detection that the newer one which started it has overtaken. As in the paper it does
+    """True if a track claims a detection that the newer one which started it has overtaken. As in the paper it does
     not, and the detection starts a second track: with a fast and a slow sensor nearly every new object gets two."""
 
 
@@ -143,7 +143,7 @@ class FilterConfig:
     frequency_hz: Annotated[float, Field(ge=1.0, le=10_000.0)] = 100.0
     """Frequency of the grid."""
     storage_s: float = 3.0
-    """How far back states are kept."""
+    """Time for which states are kept."""
 
     def __post_init__(self) -> None:
         if not 1.0 / self.frequency_hz <= self.storage_s <= 60.0:
@@ -152,7 +152,7 @@ class FilterConfig:
 
 @settings
 class InitiationConfig:
-    """How a track starts whose direction of travel neither the map nor the sensor gives."""
+    """Start of a track whose direction of travel neither the map nor the sensor gives."""
 
     method: Initiation = DEFAULT
     """`one-point`: at the first position, heading along x; `two-point`: along the first two; `regression`: along a line
@@ -196,7 +196,7 @@ class MotionConfig:
 
     @property
     def is_plug_in(self) -> bool:
-        """Whether the model takes `parameters` and no `std_per_s`."""
+        """True if the model takes `parameters` and no `std_per_s`."""
         return self.kind not in _BUILT_IN_MOTION
 
     def model(self) -> MotionModel:
@@ -224,7 +224,7 @@ class Effective:
     lag_s: float
     """Length of the window."""
     reach_s: float
-    """How far back a detection still changes a track."""
+    """Largest age at which a detection changes a track."""
 
     def __str__(self) -> str:
         x_m, y_m = self.detection_origin_m

@@ -18,7 +18,7 @@ NEWEST = 1000
 
 @dataclass(frozen=True, slots=True)
 class Lateness:
-    """How late the messages of one sensor, or of the ego, come. Delays are receipt minus the stamp of the message."""
+    """Delays of the messages of one sensor, or of the ego: receipt minus stamp of the message."""
 
     messages: int
     """Received."""
@@ -27,7 +27,7 @@ class Lateness:
     too_late: int
     """Detections that ended as `too_old`."""
     delay_median_s: float | None
-    """Of the newest 1,000 messages; None before the first."""
+    """Median of the newest 1,000 messages; None before the first."""
     delay_p99_s: float | None
     """99th percentile of the same."""
     delay_worst_s: float | None
@@ -40,11 +40,11 @@ class Lateness:
 
 @dataclass(frozen=True, slots=True)
 class TickTiming:
-    """How long ticks take, and whether they keep up."""
+    """Durations and missed deadlines of ticks."""
 
     ticks: int
     median_s: float | None
-    """Of the newest 1,000 ticks; None before the first."""
+    """Median of the newest 1,000 ticks; None before the first."""
     p99_s: float | None
     """99th percentile of the same."""
     worst_s: float | None

@@ -42,7 +42,7 @@ class Tracker:
 
     `receive` takes messages in the order of their arrival, `tick` processes what came since the last one. What cannot
     be used never raises: it is counted in `refused`, and every detection ends in exactly one disposition of `counts`.
-    What an estimator raises does not end the tracker: the track begins anew or ends, counted in `failures`.
+    What an estimator raises does not end the tracker: the track is reinitialised or ends, counted in `failures`.
 
     `receive` may be called by any thread, also while a tick runs, and never waits. Everything else may be called by any
     thread, too, and takes turns.
@@ -113,7 +113,7 @@ class Tracker:
 
     @property
     def failures(self) -> Mapping[str, int]:
-        """How often what failed inside, and what was done about it; see `Failure` for the kinds."""
+        """Number of failures inside, and of their consequences; see `Failure` for the kinds."""
         with self._turn:
             return {failure.value: count for failure, count in self._tracker.failures.counts.items()}
 
@@ -124,7 +124,7 @@ class Tracker:
 
     @property
     def lateness(self) -> Mapping[str, Lateness]:
-        """How late messages come, by sensor, and under `ego` for the ego, as of the last tick."""
+        """Delays of messages by sensor, and under `ego` for the ego, as of the last tick."""
         with self._turn:
             self._take_arrivals()
             first_ns, now_ns = self._first_tick_ns, self._last.now_ns
@@ -136,7 +136,7 @@ class Tracker:
 
     @property
     def timing(self) -> TickTiming:
-        """How long ticks take, and which deadlines they have missed."""
+        """Durations and missed deadlines of ticks."""
         with self._turn:
             return self._times.timing
 

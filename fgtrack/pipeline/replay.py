@@ -74,7 +74,7 @@ class _Feed:
             self.broken = "holds neither ego states nor detections"
 
     def _until_break(self) -> Iterator[Message]:
-        """What the input holds up to its break; what is raised where a message goes to breaks off no input."""
+        """Yield the input up to its break; an error of a receiver of messages is no break."""
         try:
             for message in self.messages:
                 self.num_messages += 1
@@ -93,7 +93,7 @@ class _Feed:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing came out before the end or the break."""
+        """True if nothing came out before the end or the break."""
         return self.last_receipt_ns is None
 
     def _check_time(self, message: Delivered) -> None:
@@ -246,7 +246,7 @@ def _drive(
 def _opening(
     config: Config, origin: str, kind: str, folder: Path | None = None
 ) -> tuple[str, dict[str, object], float | None]:
-    """What a run in `folder` begins with: text of its configuration, meta data, lag of its smoothed states."""
+    """Return the beginning of a run in `folder`: text of its configuration, meta data, lag of its smoothed states."""
     source = {"path": origin, "kind": kind}
     if folder is not None and (place := path_from_run(origin, folder)) is not None:
         source["path_from_run"] = place

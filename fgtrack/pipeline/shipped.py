@@ -19,7 +19,7 @@ _WANTED = {"estimator": "a name", "set": "a mapping of keys to values"}
 
 
 def shipped_folder() -> Path:
-    """Where the shipped files are: inside an installed package, beside it in a checkout."""
+    """Folder of the shipped files: inside an installed package, beside it in a checkout."""
     inside = _PACKAGE / "configs"
     return inside if inside.is_dir() else _PACKAGE.parent / "configs"
 
@@ -50,7 +50,7 @@ def find_file(kind: Kind, name: str | Path, folder: Path | None = None) -> Path:
 
 
 def summary(path: Path) -> str:
-    """What a shipped file is for: its first line, a comment."""
+    """Purpose of a shipped file: its first line, a comment."""
     return path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
 
 

@@ -1,4 +1,4 @@
-"""What is wrong with the stamps that a sensor reports: error = reported stamp - the time at which it sensed.
+"""Errors of the stamps that a sensor reports: error = reported stamp - the time at which it sensed.
 
 A sensor has a list of clock models; each reads what the one before it reported. A model reads all messages of one
 sensor at once, in the order in which it sensed, and is an immutable value.

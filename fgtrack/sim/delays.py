@@ -1,4 +1,4 @@
-"""How late the messages of a sensor arrive: delay = receipt - stamp.
+"""Delays of the messages of a sensor: delay = receipt - stamp.
 
 A model draws the delays of all messages of one sensor at once, given their stamps in order, so that a model
 may have a memory (bursts) and still be an immutable value.
@@ -208,7 +208,7 @@ def _relative_q90(log_shape: float) -> float:
 
 
 def _two_states(rng: np.random.Generator, share: float, to_bad: FloatArray, to_good: FloatArray) -> BoolArray:
-    """Whether the chain is bad at each of n messages: at the first one with probability `share`.
+    """True where the chain is bad, at each of n messages: at the first one with probability `share`.
 
     Entry k of `to_bad` and `to_good`, shape (n,), is the probability to move from message k - 1 to k; the first
     is not used.

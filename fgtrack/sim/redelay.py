@@ -21,12 +21,12 @@ OTHERS = "*"
 
 @settings
 class SensorDelays:
-    """How the lists of one sensor arrive."""
+    """Delays, losses and clock errors of the lists of one sensor."""
 
     delay: AnyDelay | None = None
     """Delay behind the recorded stamp; null keeps the recorded receipt. Kind `none`: the stamp is the arrival."""
     clock: tuple[AnyClock, ...] = ()
-    """What is wrong with the stamps that it reports; the delay is still that behind the recorded one."""
+    """Errors of the stamps that it reports; the delay is still that behind the recorded one."""
     loss_probability: Probability = 0.0
     """That a list never arrives, each by itself."""
 

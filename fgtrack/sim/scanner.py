@@ -146,7 +146,7 @@ class Scanner:
         return measurement_model(POLAR, CV()).predict(relative)
 
     def _carried(self, scan: IntArray, mount: Mount) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of a frame mounted in the detection frame, in the map: origin, its velocity, (m, 2), and yaw, (m,)."""
+        """Origin, its velocity, (m, 2), and yaw, (m,), in the map, of a frame mounted in the detection frame."""
         x, y, yaw, speed, yaw_rate = self.ego[scan, : YAW_RATE + 1].T
         ahead_m = self.detection_origin_x_m + mount.x_m
         x, y, vx, vy = body_point(x, y, yaw, speed, yaw_rate, ahead_m, mount.y_m)

@@ -14,11 +14,11 @@ from fgtrack.sim.vehicles import AnyVehicle, TrackVehicle
 
 @settings
 class EgoMessages:
-    """What the localisation of the ego vehicle reports."""
+    """Messages of the localisation of the ego vehicle."""
 
     rate_hz: Rate = 100.0
     position_std_m: NonNegativeFloat = 0.02
-    """Of x and of y."""
+    """Standard deviation of x and of y."""
     yaw_std_rad: NonNegativeFloat = 0.001
     speed_std_mps: NonNegativeFloat = 0.05
     yaw_rate_std_radps: NonNegativeFloat = 0.002

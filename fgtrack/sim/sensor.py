@@ -66,7 +66,7 @@ class SimulatedSensor:
     split_distance_m: tuple[NonNegativeFloat, NonNegativeFloat] = (2.0, 4.0)
     outlier_probability: Probability = 0.0
     outlier_factor: Annotated[float, Field(ge=1.0)] = 10.0
-    """How many times larger the standard deviations of an outlier are."""
+    """Factor on the standard deviations of an outlier."""
     drop_outs: tuple[tuple[float, float], ...] = ()
     """Intervals [start, end) in seconds in which the sensor is silent."""
 

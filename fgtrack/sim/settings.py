@@ -1,4 +1,4 @@
-"""What the settings of a scenario have in common: frozen, finite, in their range, checked wherever they are made."""
+"""Settings of a scenario: frozen, finite, in their range, checked wherever they are made."""
 
 from dataclasses import field
 from typing import Annotated, TypeVar, dataclass_transform

@@ -1,4 +1,4 @@
-"""Where the vehicles are: driving along a track as given, or drawn from the motion model itself."""
+"""Motion of the vehicles: driving along a track as given, or drawn from the motion model itself."""
 
 import math
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""What an estimator makes of several objects at once, and of what it has smoothed."""
+"""Promises of an estimator about several objects at once, and about smoothed states."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -70,7 +70,7 @@ def hands_out_sound_smoothed_states(subject: Subject, stream: Stream) -> None:
 
 
 def _is_between(state: TrackState, stream: Stream, tolerance: float) -> None:
-    """Whether `state` knows what was measured up to its stamp at least, and all at most."""
+    """Require that `state` contains the measurements up to its stamp at least, and all at most."""
     motion, at_ns = stream.motion, state.stamp_ns
     before = [m for m in stream.measurements if m.stamp_ns <= at_ns]
     filtered = dense_joint(motion, stream.start, before, [at_ns])[at_ns]
@@ -132,7 +132,7 @@ def _same(found: TrackState, expected: TrackState, number: int, motion: MotionMo
 
 
 def _sound_of(shown: TrackState, motion: MotionModel, what: str) -> None:
-    """Whether a kinematic state is sound in the entries that `motion` has; the others are 0."""
+    """Require that a kinematic state is sound in the entries that `motion` has; the others are 0."""
     known = [k for k, name in enumerate(STATE_NAMES[: len(shown.mean)]) if k < YAW_RATE or name in motion.state_names]
     require(np.isfinite(shown.mean).all() and np.isfinite(shown.covariance).all(), f"{what} is not finite")
     sound(shown.mean[known], shown.covariance[np.ix_(known, known)], what)

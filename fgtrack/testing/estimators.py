@@ -1,4 +1,4 @@
-"""What every estimator must do, in whatever order measurements arrive."""
+"""Promises of every estimator, in any order of arrival."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What every motion model must do: predict, and publish a state."""
+"""Promises of every motion model: predict, and publish a state."""
 
 import math
 from collections.abc import Callable
@@ -13,9 +13,9 @@ from fgtrack.models.motion import CARTESIAN, POLAR, MotionModel
 from fgtrack.testing.promise import BrokenPromiseError, run_all
 
 ModelCheck = Callable[[MotionModel, FloatArray, float], str | None]
-"""What is wrong of a model at a state (n,) and a duration, or None."""
+"""Return the fault of a model at a state (n,) and a duration, or None."""
 
-#: Of the covariance from which a covariance of first order is told from one with higher terms.
+#: Of the covariance from which a covariance of first order is distinguished from one with higher terms.
 _SMALL = 1e-6
 _STEP = 1e-6
 
@@ -53,7 +53,7 @@ def _run(check: ModelCheck, model: MotionModel, seed: int) -> None:
 
 
 def apart(found: FloatArray, expected: FloatArray, tolerance: float, what: str) -> str | None:
-    """What is wrong where `found` is not `expected`; None where it is. A NaN is wrong."""
+    """Return the fault where `found` is not `expected`; None where it is. A NaN is one."""
     found = np.asarray(found)
     if found.shape != expected.shape:
         return f"{what} has shape {found.shape}, expected {expected.shape}"
@@ -75,7 +75,7 @@ def _is_hashable_and_equal_to_itself(model: MotionModel, x: FloatArray, dt_s: fl
 def _flows_on_where_it_stopped(model: MotionModel, x: FloatArray, dt_s: float) -> str | None:
     after = model.predict(model.predict(x, 0.3 * dt_s), 0.7 * dt_s)
     return apart(after, model.predict(x, dt_s), 1e-9, "predict over two parts") or apart(
-        model.predict(model.predict(x, dt_s), -dt_s), x, 1e-9, "predict forth and back"
+        model.predict(model.predict(x, dt_s), -dt_s), x, 1e-9, "predict in a round trip"
     )
 
 
@@ -123,7 +123,7 @@ def _refuses_noise_of_a_negative_duration(model: MotionModel, x: FloatArray, dt_
 
 
 def _has_the_transition_of_its_functions(model: MotionModel, x: FloatArray, dt_s: float) -> str | None:
-    """Of one state and of several numbers of states, each with another duration."""
+    """Check one state and several numbers of states, each with another duration."""
     counts = 1, 2, 3, 24
     cases: list[tuple[FloatArray, float | FloatArray]] = [(x, dt_s)]
     cases += [(x + 0.05 * np.linspace(0.0, 1.0, m)[:, None], np.linspace(0.1, 1.0, m) * dt_s) for m in counts]

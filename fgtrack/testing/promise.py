@@ -33,7 +33,7 @@ def run_all(what: str, checks: Mapping[str, Callable[[], None]]) -> None:
 
 
 class WrongError(Exception):
-    """What is wrong; the runner adds with which measurements."""
+    """Fault of an estimator; the runner adds the measurements."""
 
 
 def require(condition: object, text: str) -> None:
@@ -81,14 +81,14 @@ Draw = Callable[[np.random.Generator], Stream]
 
 @dataclass(frozen=True)
 class Promise:
-    """What an estimator promises on streams of one kind."""
+    """Promise of an estimator on streams of one kind."""
 
     check: Check
     draws: tuple[Draw, ...]
     applies: Callable[[Claims], bool] = lambda claims: True
-    """Whether an estimator with these claims promises it."""
+    """True if an estimator with these claims promises it."""
     repeats: bool = False
-    """Whether it is checked on many streams."""
+    """True if it is checked on many streams."""
 
     def run(self, subject: Subject, seed: int, num_streams: int) -> None:
         """Raise `BrokenPromiseError` with the smallest part of a stream that still breaks it."""
@@ -112,7 +112,7 @@ class Promise:
         return self.check.__name__.removeprefix("_").replace("_", " ")
 
     def _wrong(self, subject: Subject, stream: Stream) -> str:
-        """What is wrong, or nothing."""
+        """Return the fault, or an empty text."""
         try:
             self.check(subject, stream)
         except WrongError as error:

@@ -112,7 +112,7 @@ def _slope(one: Measurement, x: FloatArray) -> FloatArray:
 
 
 def _weight(one: Measurement, y: FloatArray) -> float:
-    """What the robust loss of a measurement leaves of its weight at the residual `y` (k,)."""
+    """Weight of a measurement under its robust loss at the residual `y` (k,)."""
     if one.loss is None:
         return 1.0
     far = float(np.sqrt(y @ np.linalg.solve(one.R, y))) / one.loss.width
@@ -124,7 +124,7 @@ def _weight(one: Measurement, y: FloatArray) -> float:
 
 
 class Difference(NamedTuple):
-    """How far one Gaussian is from another."""
+    """Distance of one Gaussian from another."""
 
     mean_sigma: float
     """Largest difference of the means, in standard deviations."""
@@ -133,7 +133,7 @@ class Difference(NamedTuple):
 
 
 def difference(found: TrackState, expected: TrackState, motion: MotionModel | None = None) -> Difference:
-    """How far `found` is from `expected`; a NaN stays one. The yaw of a state of `motion` goes the short way round."""
+    """Distance of `found` from `expected`; a NaN stays one. The yaw of a state of `motion` goes the short way round."""
     sigma, off = np.sqrt(np.diag(expected.covariance)), found.mean - expected.mean
     off = off if motion is None else wrapped(motion, off)
     mean = np.abs(off) / sigma
@@ -142,7 +142,7 @@ def difference(found: TrackState, expected: TrackState, motion: MotionModel | No
 
 
 def innovation_difference(result: UpdateResult, measurement: Measurement, before: TrackState) -> Difference:
-    """How far the innovation of `result` is from that of the state `before` the measurement, and its NIS, over 1 + NIS.
+    """Distance of the innovation of `result` from that of the state `before` the measurement; of the NIS over 1 + NIS.
 
     Infinite where there is none.
     """
@@ -158,7 +158,7 @@ def innovation_difference(result: UpdateResult, measurement: Measurement, before
 
 
 def rounding_bound(motion: MotionModel, stamps_ns: Iterable[int], sigma_m: float = 0.5) -> float:
-    """What rounding may cost a solver that divides by the process noise of a linear model, in standard deviations.
+    """Bound of the rounding errors, in standard deviations, of a solver that divides by a linear model's process noise.
 
     Given its end, the start of a segment is known to 1 / W = sqrt(Q_xx) / 2, 3e-11 m for 1 us of CV; beside a row that
     weighs W an orthogonal factorisation keeps one of a measurement of `sigma_m` to eps W sigma only. Ten times that,
