@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.evaluation.runs import JudgedRun, OneRun, one_judged, start_ns
 from fgtrack.evaluation.scores.consistency import position_nees
 from fgtrack.evaluation.scores.innovations import num_measured
@@ -51,15 +51,33 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     rows = sheet.plots(len(panels), sharex=True)[:, 0]
     sensors = np.unique(one.run.tables["updates"]["sensor"]).tolist()
     first_ns = start_ns([one])
-    for place, (axes, (name, (stamps_ns, values, dof))) in enumerate(zip(rows, panels.items(), strict=True)):
+    for axes, (name, (stamps_ns, values, dof)) in zip(rows, panels.items(), strict=True):
         time_s = (stamps_ns - first_ns) / NS_PER_S
         if name == _NEES:
-            _draw_nees(axes, stamps_ns, time_s, values, dof, run_looks([one])[one.label].colour)
+            distinct_ns, index, count = np.unique(stamps_ns, return_inverse=True, return_counts=True)
+            mean, mean_dof = (np.bincount(index, each) / count for each in (values, dof))
+            low, high = chi_square_band(mean_dof * count, count)
+            text = _summary("position", values, dof, (mean >= low) & (mean <= high), "ticks")
+            _draw(axes, distinct_ns, first_ns, mean, (low, high), mean_dof, run_looks([one])[one.label].colour, text)
         else:
-            color = sensor_colour(sensors.index(name.removeprefix("NIS of ")))
-            _draw_nis(axes, time_s, values, dof, color, name)
+            sensor = name.removeprefix("NIS of ")
+            colour = sensor_colour(sensors.index(sensor))
+            low, high = chi_square_band(dof.astype(np.float64), np.ones(len(dof), dtype=np.int64))
+            text = _summary(sensor, values, dof, (values >= low) & (values <= high), "detections")
+            length = min(max(_SHORTEST, min(_LONGEST, len(values) // _WINDOWS)), len(values))
+            order = np.argsort(stamps_ns, kind="stable")
+            since_ns = stamps_ns[order] - first_ns
+            middle_ns, mean, mean_dof = (_means(each, length) for each in (since_ns, values[order], dof[order]))
+            band = chi_square_band(mean_dof * length, np.full(len(mean), length))
+            axes.plot(time_s, values, ".", ms=3.0, mew=0, color=colour, alpha=0.5, rasterized=True)
+            text += f"; line: mean of {length}"
+            _draw(axes, first_ns + middle_ns.astype(np.int64), first_ns, mean, band, mean_dof, colour, text)
+            bottom, top = axes.get_ylim()
+            shown = values[values > 0.0]  # the axis is logarithmic
+            if len(shown):
+                axes.set_ylim(min(bottom, np.quantile(shown, 0.05)), max(top, np.quantile(shown, 0.99)))
         axes.set_ylabel(name.replace(" of ", " of\n").replace("_", " "))
-        if not place:
+        if axes is rows[0]:
             axes.fill_between([], [], color=GREY, alpha=0.25, lw=0, label="95 % band")
             axes.plot([], color="black", lw=0.9, ls="--", label="expected")
         legend_above(axes)
@@ -94,69 +112,35 @@ def has_squares(one: JudgedRun) -> bool:
     return bool(_panels(one))
 
 
-def _draw_nees(
-    axes: Axes, stamps_ns: IntArray, time_s: FloatArray, values: FloatArray, dof: IntArray, color: str
-) -> None:
-    """The mean over the objects of each stamp."""
-    distinct_ns, first, index, count = np.unique(stamps_ns, return_index=True, return_inverse=True, return_counts=True)
-    mean = np.bincount(index, values) / count
-    total_dof = np.bincount(index, dof).astype(np.float64)
-    low, high = chi_square_band(total_dof, count)
-    text = _said("position", values, dof, float(((mean >= low) & (mean <= high)).mean()), "ticks")
-    _draw(axes, distinct_ns, time_s[first], mean, (low, high), total_dof / count, color, text, 0.9)
-
-
-def _draw_nis(axes: Axes, time_s: FloatArray, values: FloatArray, dof: IntArray, color: str, name: str) -> None:
-    """Every value, and the mean of several in a row."""
-    sensor = name.removeprefix("NIS of ")
-    low, high = chi_square_band(dof.astype(np.float64), np.ones(len(dof), dtype=np.int64))
-    inside = float(((values >= low) & (values <= high)).mean())
-    length = min(max(_SHORTEST, min(_LONGEST, len(values) // _WINDOWS)), len(values))
-    order = np.argsort(time_s, kind="stable")
-    total, total_dof, late_s = (_sums(of[order].astype(np.float64), length) for of in (values, dof, time_s))
-    middle_s, count = late_s / length, np.full(len(total), length)
-    axes.plot(time_s, values, ".", ms=3.0, mew=0, color=color, alpha=0.5, rasterized=True)
-    band = chi_square_band(total_dof, count)
-    text = _said(sensor, values, dof, inside, "detections") + f"; line: mean of {length}"
-    middle_ns = (NS_PER_S * middle_s).astype(np.int64)
-    _draw(axes, middle_ns, middle_s, total / length, band, total_dof / length, color, text, 1.3)
-    bottom, top = axes.get_ylim()
-    shown = values[values > 0.0]  # the axis is logarithmic
-    if len(shown):
-        axes.set_ylim(min(bottom, float(np.quantile(shown, 0.05))), max(top, float(np.quantile(shown, 0.99))))
-
-
 def _draw(
     axes: Axes,
     stamps_ns: IntArray,
-    time_s: FloatArray,
+    first_ns: int,
     mean: FloatArray,
     band: tuple[FloatArray, FloatArray],
     expected: FloatArray,
-    color: str,
+    colour: str,
     text: str,
-    width: float,
 ) -> None:
-    step_ns = usual_step_ns(stamps_ns)
-    low, high = (broken_line(stamps_ns, time_s, edge, step_ns)[1] for edge in band)
+    step_ns, time_s = usual_step_ns(stamps_ns), (stamps_ns - first_ns) / NS_PER_S
     x_s, y = broken_line(stamps_ns, time_s, mean, step_ns)
+    low, high, middle = (broken_line(stamps_ns, time_s, each, step_ns)[1] for each in (*band, expected))
     axes.fill_between(x_s, low, high, color=GREY, alpha=0.25, lw=0)
-    axes.plot(x_s, y, color=color, lw=width, label=text)
-    axes.plot(*broken_line(stamps_ns, time_s, expected, step_ns), color="black", lw=0.9, ls="--")
+    axes.plot(x_s, y, color=colour, lw=1.1, label=text)
+    axes.plot(x_s, middle, color="black", lw=0.9, ls="--")
     axes.set_yscale("log")
     shown = np.concatenate([mean[mean > 0.0], *band])
-    middle = float(np.median(expected))
-    axes.set_ylim(max(_LOWEST * middle, 0.8 * float(shown.min())), 1.25 * float(shown.max()))
+    lowest = max(_LOWEST * float(np.median(expected)), 0.8 * float(shown.min()))
+    axes.set_ylim(lowest, 1.25 * float(shown.max()))
     log_axis(axes.yaxis)
 
 
-def _sums(values: FloatArray, length: int) -> FloatArray:
-    """Sums of `length` values in a row, shape (n - length + 1,)."""
-    total = np.concatenate([[0.0], np.cumsum(values)])
-    return np.asarray(total[length:] - total[:-length])
+def _means(values: FloatArray | IntArray, length: int) -> FloatArray:
+    """Means of `length` values in a row, shape (n - length + 1,)."""
+    total = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
+    return np.asarray((total[length:] - total[:-length]) / length)
 
 
-def _said(what: str, values: FloatArray, dof: IntArray, inside: float, of: str) -> str:
-    return (
-        f"{what}: mean {values.mean():.3g}, expected {dof.mean():.3g}; {100.0 * inside:.0f} % of the {of} in their band"
-    )
+def _summary(name: str, values: FloatArray, dof: IntArray, inside: BoolArray, of: str) -> str:
+    share = 100.0 * float(inside.mean())
+    return f"{name}: mean {values.mean():.3g}, expected {dof.mean():.3g}; {share:.0f} % of the {of} in their band"

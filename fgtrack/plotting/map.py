@@ -60,7 +60,9 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     )
     detections_m, ego_m = placed(one.run).position_m, _positions(one.run.tables["ego"])
     held = [*bounds_m, ego_m, *(path.states[:, :2] for path in true_paths(one.run.tables["truth"]))]
-    lows_m, highs_m = _limits([_positions(tracks), detections_m], held)
+    samples_m = [_positions(tracks), detections_m]
+    edges = [bulk([each[:, k] for each in samples_m], [each[:, k] for each in held]) for k in range(2)]
+    lows_m, highs_m = np.transpose(edges)
     window = _window(one.run)
     has_window = window is not None and (highs_m - lows_m).max() > _WORTHWHILE * 2.0 * window.half_m
     sheet = Sheet(11.0 if has_window else 8.0, 6.0, paper)
@@ -71,14 +73,14 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         for k, ring in enumerate(rings):
             axes.plot(*ring.T, color=GREY, lw=1.2, ls=":", zorder=3, label="" if k else "excluded")
         near = window if is_close else None
-        ego, seen = _near(one.run.tables["ego"], near), _near(one.run.tables["detections"], near)
+        ego, seen = (_near(one.run.tables[name]["stamp_ns"], near) for name in ("ego", "detections"))
         if np.isfinite(ego_m).any():
             axes.plot(*ego_m[ego].T, color="black", lw=0.8, ls="--", label="ego", zorder=3.5)
         if np.isfinite(detections_m).any():
             label = f"detections ({int(np.isfinite(detections_m[:, 0]).sum())})"
             size, above = (5.0, 4.5) if is_close else (1.5, 2.2)
             axes.plot(*detections_m[seen].T, "x", ms=size, mew=0.2 * size, color=_DETECTIONS, label=label, zorder=above)
-        _draw_objects(axes, one, tracks.where(_near(tracks, near)), near)
+        _draw_objects(axes, one, tracks.where(_near(tracks["stamp_ns"], near)), near)
         axes.set_aspect("equal", adjustable="datalim")
         axes.set(xlabel="x, east [m]", ylabel="y, north [m]")
     overview = panels[0]
@@ -93,7 +95,6 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         text.append("the map file is not there any more")
     if one.matching is None:
         text.append(f"{len(np.unique(tracks['track_id']))} confirmed tracks, no truth")
-    samples_m = (_positions(tracks), detections_m)
     outside = sum(int(((each < lows_m) | (each > highs_m)).any(axis=-1).sum()) for each in samples_m)
     if outside:
         text.append(f"{outside} rows of tracks and detections are outside of the picture")
@@ -133,11 +134,10 @@ def _window(run: Run) -> _Window | None:
     return _Window(middle_ns, (low_m + high_m) / 2.0, max(_LEAST_M, 0.6 * float((high_m - low_m).max())))
 
 
-def _near(table: Table, window: _Window | None) -> BoolArray:
-    """Rows of the time of `window`, all where it is None."""
-    if window is None:
-        return np.ones(table.num_rows, dtype=bool)
-    return np.asarray(np.abs(table["stamp_ns"] - window.middle_ns) <= 2 * nanoseconds(_AROUND_S))
+def _near(stamps_ns: IntArray, window: _Window | None) -> BoolArray:
+    """True for stamps of the time of `window`, for all where it is None."""
+    middle_ns, reach_ns = (0, np.inf) if window is None else (window.middle_ns, 2 * nanoseconds(_AROUND_S))
+    return np.asarray(np.abs(stamps_ns - middle_ns) <= reach_ns)
 
 
 def _show(axes: Axes, lows_m: FloatArray, highs_m: FloatArray) -> None:
@@ -150,13 +150,6 @@ def _positions(table: Table) -> FloatArray:
     return np.stack([table["x_m"], table["y_m"]], axis=-1)
 
 
-def _limits(samples_m: list[FloatArray], held_m: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Lowest and highest x and y of the bulk of `samples_m` and all of `held_m`, shape (n, 2) each."""
-    edges = [bulk([one[:, k] for one in samples_m], [one[:, k] for one in held_m]) for k in range(2)]
-    lows_m, highs_m = np.transpose(edges)
-    return lows_m, highs_m
-
-
 def _draw_objects(axes: Axes, one: JudgedRun, tracks: Table, window: _Window | None) -> None:
     """Truth and tracks, in their colours."""
     step_ns = usual_step_ns(one.run.tables["tracks"]["now_ns"])
@@ -166,12 +159,10 @@ def _draw_objects(axes: Axes, one: JudgedRun, tracks: Table, window: _Window | N
             _draw_tracks(axes, tracks.where(tracks["track_id"] == track_id), step_ns, colour(k), "")
         return
     paths = true_paths(one.run.tables["truth"])
-    few, index_of = len(paths) <= _NAMED_OBJECTS, matching.object_index[_near(matching.tracks, window)]
+    few, index_of = len(paths) <= _NAMED_OBJECTS, matching.object_index[_near(matching.tracks["stamp_ns"], window)]
     for index, path in enumerate(paths):
         name = f"object {path.object_id}" if few else "objects"
-        rows = (
-            slice(None) if window is None else np.abs(path.stamps_ns - window.middle_ns) <= 2 * nanoseconds(_AROUND_S)
-        )
+        rows = _near(path.stamps_ns, window)
         x_m, y_m = path.states[rows, :2].T
         stamps_ns: IntArray = path.stamps_ns[rows]
         line = broken_line(stamps_ns, x_m, y_m, usual_step_ns(path.stamps_ns))

@@ -87,15 +87,6 @@ def test_without_truth_it_moves_the_present_by_the_median(folder: Path) -> None:
     assert "afterwards" in figure.axes[1].get_ylabel()
 
 
-def test_after_it_the_present_is_that_of_the_run(folder: Path, found: list[CloseUp]) -> None:
-    for name, one in zip(NAMES, found, strict=True):
-        tracks = fgtrack.load_run(folder / "runs" / name).tables["tracks"]
-        row = tracks.where((tracks["now_ns"] == one.now_ns) & (tracks["track_id"] == one.track_id))
-        np.testing.assert_allclose(one.after.means[-1, :2], [row["x_m"][0], row["y_m"][0]], atol=1e-6)
-        assert one.after.stamps_ns[-1] == one.now_ns
-        assert one.arrival.stamp_ns in one.after.stamps_ns
-
-
 def test_it_draws_the_past_towards_the_detection_and_is_fused_once(folder: Path, found: list[CloseUp]) -> None:
     for name, one in zip(NAMES, found, strict=True):
         run = fgtrack.load_run(folder / "runs" / name)
@@ -165,20 +156,6 @@ def test_in_a_column_the_errors_of_all_methods_are_one_readable_plot(folder: Pat
     assert faults(figure) == []
     assert axes.get_window_extent().height > 0.5 * figure.bbox.height
     assert {line.get_color() for line in axes.lines} == {"black", *(look(name).colour for name in NAMES)}
-
-
-@pytest.mark.slow
-def test_all_figures_can_be_the_pages_of_one_pdf(folder: Path, tmp_path: Path) -> None:
-    call = ["figure", str(folder / "runs" / NAMES[0]), "-o"]
-    assert command([*call, str(tmp_path / "a.pdf")]) == 0
-    assert command([*call, str(tmp_path / "b.pdf")]) == 0
-    content = (tmp_path / "a.pdf").read_bytes()
-    assert content == (tmp_path / "b.pdf").read_bytes()
-    assert content.startswith(b"%PDF")
-    assert content.count(b"/Type /Page ") >= 6
-    assert command([*call, str(tmp_path / "a.pdf")]) == 2
-    assert command([*call, str(tmp_path / "a.pdf"), "--overwrite"]) == 0
-    assert command([*call, str(tmp_path / "a.svg")]) == 2
 
 
 def test_the_command_draws_it_and_goes_on_without_a_recording(

@@ -6,9 +6,7 @@ import shutil
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +14,6 @@ from mcap.reader import make_reader
 from rosbags.interfaces import ConnectionExtRosbag2, QosDurability
 from rosbags.rosbag2 import Reader
 
-import fgtrack
 from fgtrack.cli.main import run as command
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import (
@@ -31,12 +28,9 @@ from fgtrack.core.types import (
     TrackStatus,
     UpdateRecord,
 )
-from fgtrack.evaluation.placement import placed
 from fgtrack.io.ros.bag import Bag, BagMessage
 from fgtrack.io.run import Run, RunWriter, Table, load_run
-from fgtrack.pipeline.replay import replay_in_memory
-from fgtrack.pipeline.shipped import read_config, shipped_folder
-from fgtrack.tracking.preprocess import Candidate, Preprocess
+from fgtrack.pipeline.shipped import shipped_folder
 from fgtrack.viewers.export import export, viewer_messages
 from fgtrack.viewers.foxglove import values, write_foxglove
 from fgtrack.viewers.ros2 import write_ros2
@@ -348,45 +342,6 @@ def test_what_is_sent_once_reaches_those_who_listen_later(bag: dict[str, list[Ba
                 lasting.add(connection.topic)
     assert lasting == {"/map/markers", "/ego/markers"}
     assert all(len(bag[topic]) == 1 for topic in lasting)
-
-
-# Placement
-
-
-def test_detections_are_where_the_tracker_places_them(runs: Path) -> None:
-    """The path of the ego is linear between its stamps; the tracker extrapolates where it does not know it yet."""
-    places: dict[tuple[str, int, int], tuple[float, float]] = {}
-
-    class Watched(Preprocess):
-        def __init__(self, inner: Preprocess) -> None:
-            self.inner = inner
-
-        def __call__(self, batch: Any, sensor: Any, ego: Any) -> Any:
-            candidates, records = self.inner(batch, sensor, ego)
-            for one in candidates:
-                assert isinstance(one, Candidate)
-                if one.position_m is not None and not one.merged:
-                    places[batch.sensor, batch.stamp_ns, one.index] = tuple(one.position_m.tolist())
-            return candidates, records
-
-    config = read_config("smoother", [], track_map="oval", estimator="ekf-replay")
-    messages = fgtrack.simulate("default", seed=3, duration_s=3.0)
-    run, _ = replay_in_memory(
-        messages, config, observed=lambda parts: replace(parts, preprocess=Watched(parts.preprocess))
-    )
-    table, found = run.tables["detections"], placed(run)
-    keys = zip(table["sensor"].tolist(), table["stamp_ns"].tolist(), table["index"].tolist(), strict=True)
-    off_m = [
-        math.dist(places[key], position_m)
-        for key, position_m in zip(keys, found.position_m.tolist(), strict=True)
-        if key in places
-    ]
-    assert len(off_m) > 50
-    assert max(off_m) < 0.2
-    assert np.median(off_m) < 0.02
-
-
-# Files
 
 
 def test_the_same_run_gives_the_same_bytes(file: Path, runs: Path, tmp_path: Path) -> None:

@@ -246,32 +246,11 @@ def test_exclusion_areas_are_shown_on_the_map_and_in_the_viewer(tmp_path: Path, 
     assert notes[0] == "map.excluded: lost.csv is not there any more, so it is not shown"
 
 
-def test_a_map_that_is_gone_is_said_and_one_that_is_none_is_refused(tmp_path: Path, runs: list[Run]) -> None:
-    gone = replace(runs[0], config_text="map: {track: nowhere.csv}")
-    assert "not there any more" in plot.map(gone).get_suptitle()
-    (tmp_path / "bad.csv").write_text("no map\n")
-    for text, message in ((f"map: {{track: {tmp_path / 'bad.csv'}}}", "no map"), ("map: {", "not YAML")):
-        with pytest.raises(DataError, match=message):
-            plot.map(replace(runs[0], config_text=text))
-
-
-def test_the_built_in_oval_is_drawn_and_open_space_has_no_bounds(runs: list[Run]) -> None:
-    oval, space = (replace(runs[0], config_text=f"map: {{track: {name}}}") for name in ("oval", "null"))
-    assert len(plot.map(oval).axes[0].lines) == len(plot.map(space).axes[0].lines) + 2
-
-
 def test_without_truth_the_map_shows_the_tracks_with_enough_measurements(runs: list[Run]) -> None:
     plain = runs[0].with_tables(
         truth=runs[0].tables["truth"].where(np.zeros(len(runs[0].tables["truth"]["stamp_ns"]), dtype=bool))
     )
     assert "3 confirmed tracks, no truth" in plot.map(plain).get_suptitle()
-
-
-def test_two_rows_that_are_far_apart_are_no_line(tmp_path: Path) -> None:
-    tracks = [[WEST.track(k, 1), *([WEST.track(k, 2, across_m=9.0)] if k in (0, 59) else [])] for k in TICKS]
-    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS))
-    wrong = plot.map(run).axes[0].lines[-1]
-    assert np.isnan(np.asarray(wrong.get_xdata(), dtype=float)).tolist() == [False, True, False]
 
 
 def test_outliers_do_not_widen_the_residual_figure_but_are_counted(tmp_path: Path) -> None:
@@ -284,13 +263,6 @@ def test_outliers_do_not_widen_the_residual_figure_but_are_counted(tmp_path: Pat
     assert legend(axes)[0].endswith("n 60 (1 outside)")
 
 
-def test_the_error_figure_is_broken_where_the_object_was_not_tracked(runs: list[Run]) -> None:
-    (line, *_) = plot.errors(runs, 8).axes[0].lines
-    assert np.isnan(np.asarray(line.get_ydata(), dtype=float)).sum() == 1
-    x = np.asarray(line.get_xdata(), dtype=float)
-    assert (np.nanmin(x), np.nanmax(x)) == pytest.approx((5 * 0.02, 59 * 0.02))  # from the start of the run
-
-
 def test_errors_of_several_objects_are_their_root_mean_square(runs: list[Run]) -> None:
     axes = plot.errors(runs[0]).axes[0]
     y = np.asarray(axes.lines[0].get_ydata(), dtype=float)
@@ -298,12 +270,6 @@ def test_errors_of_several_objects_are_their_root_mean_square(runs: list[Run]) -
     assert legend(axes) == [f"smoother: RMSE {0.3 * np.sqrt(60 / 74):.3g} m"]
     with pytest.raises(DataError, match="object 9: no run has truth of it, there are 7, 8"):
         plot.errors(runs, 9)
-
-
-def test_a_folder_of_several_runs_is_not_one_run(runs: list[Run]) -> None:
-    assert runs[0].path is not None
-    with pytest.raises(CallError, match="holds 2 runs"):
-        plot.map(runs[0].path.parent)
 
 
 def test_the_time_figure_leaves_out_ticks_without_detections(tmp_path: Path) -> None:

@@ -66,13 +66,9 @@ def many_runs(folder: Path) -> list[Run]:
 
 
 SCENES = {
-    "two objects": lambda folder: [a_run(folder / name) for name in ("smoother", "ekf-replay")],
     "fifty objects": lambda folder: [a_run(folder / "smoother", objects=50)],
-    "one object": lambda folder: [a_run(folder / "smoother", objects=1, sensors=1)],
     "no truth": lambda folder: [a_run(folder / "smoother", truth=False)],
     "large numbers": lambda folder: [a_run(folder / name, scale=1e7) for name in ("smoother", "ekf-replay")],
-    "small numbers": lambda folder: [a_run(folder / name, scale=1e-7) for name in ("smoother", "ekf-replay")],
-    "many sensors": lambda folder: [a_run(folder / "smoother", sensors=7)],
     "many runs with long names": many_runs,
 }
 

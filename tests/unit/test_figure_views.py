@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluation_runs import ROUND, START_NS, TICK_NS, WEST, Car, update, write_run
+from evaluation_runs import START_NS, TICK_NS, WEST, Car, update, write_run
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
@@ -88,15 +88,6 @@ def test_consistent_values_are_inside_their_bands_and_others_outside(tmp_path: P
     assert "expected 2; 9" in said["lidar"]
     assert "mean of 10" in said["lidar"]
     assert "expected 1; " in said["radar"]
-
-
-def test_the_nees_of_a_tick_is_the_mean_over_its_objects(tmp_path: Path) -> None:
-    tracks = [[WEST.track(k, 1, along_m=2.0), ROUND.track(k, 2)] for k in TICKS]
-    axes = plot.consistency(write_run(tmp_path / "run", tracks, truth=[*WEST.truth(TICKS), *ROUND.truth(TICKS)])).axes[
-        0
-    ]
-    np.testing.assert_allclose(y_of(labelled(axes, "position")), 2.0, rtol=1e-4)  # (4 + 0) / 2
-    assert "mean 2, expected 2; 100 % of the ticks" in str(labelled(axes, "position").get_label())
 
 
 # --- differences

@@ -9,7 +9,6 @@ import pytest
 from support.pictures import faults
 
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.evaluation.palette import look
 from fgtrack.evaluation.tables.seeds import SWEEP_FILE, is_sweep, read_sweep
 from fgtrack.pipeline.sweep import SWEEP_TABLE
 from fgtrack.plotting import plot
@@ -78,11 +77,6 @@ def test_texts_and_single_seeds_and_many_estimators_are_drawn_as_well(tmp_path: 
     assert faults(figure) == []
 
 
-def test_few_metrics_are_drawn_and_the_rest_on_request(tmp_path: Path) -> None:
-    plans = plot.planned_sweep(read_sweep(a_sweep(tmp_path / "sweep")))
-    assert [(plan.name, plan.is_extra) for plan in plans] == [(f"sweep_{POSITION}", False), (f"sweep_{NEES}", False)]
-
-
 def test_what_is_no_sweep_is_one_clear_error(tmp_path: Path) -> None:
     with pytest.raises(CallError, match="cannot be read"):
         plot.sweep(tmp_path)
@@ -94,15 +88,6 @@ def test_what_is_no_sweep_is_one_clear_error(tmp_path: Path) -> None:
     assert is_sweep(tmp_path / "sweep")
     assert not is_sweep(tmp_path / "nowhere")
     assert SWEEP_FILE == SWEEP_TABLE
-
-
-def test_an_estimator_has_the_colour_of_its_name_in_sweeps_and_in_runs(tmp_path: Path) -> None:
-    folder = a_sweep(tmp_path / "sweep")
-    text = (folder / SWEEP_FILE).read_text().replace("estimator-0", "ekf-replay").replace("estimator-1", "smoother")
-    (folder / SWEEP_FILE).write_text(text)
-    (axes,) = plot.sweep(folder).axes
-    colours = {each.get_label(): each.lines[0].get_color() for each in axes.containers}
-    assert colours == {name: look(name).colour for name in ("ekf-replay", "smoother")}
 
 
 @pytest.mark.parametrize(
