@@ -163,7 +163,7 @@ def test_what_is_embedded_is_what_the_run_folders_hold(page: str, folder: Path) 
     late_case = fgtrack.close_ups([folder / "runs" / name for name in NAMES])[0]
     assert shown["moment"]["t"] == pytest.approx((late_case.now_ns - start_ns) / 1e9)
     place_m = np.array([shown["moment"]["x"], shown["moment"]["y"]]) + origin_m
-    np.testing.assert_allclose(place_m, late_case.position_m, atol=1e-9)
+    np.testing.assert_allclose(place_m, late_case.after.means[-1, :2], atol=1e-9)
 
 
 def test_the_same_runs_give_the_same_bytes_and_replace_nothing(
