@@ -391,7 +391,7 @@ def test_a_table_that_a_kill_left_without_its_header_has_no_rows(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "change", [{"versions": "x"}, {"counts": {"radar": {"birth": "x"}}}, {"complete": 1}, {"effective": {"lag_s": 1}}]
+    "change", [{"versions": "x"}, {"counts": {"radar": {"birth": "x"}}}, {"complete": 1}, {"effective": {"lag_s": "x"}}]
 )
 def test_a_meta_file_with_another_type_is_one_line(tmp_path, change):
     write(tmp_path / "run", report())

@@ -2,11 +2,11 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, ValidationError, create_model
 
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import DataError
@@ -35,80 +35,41 @@ class EvaluationConfig:
             raise ValueError(f"gate_m: must be positive and at most {LARGEST:g}, is {self.gate_m}")
 
 
-@dataclass(frozen=True)
-class _Input:
-    path: str = ""
-    kind: str = ""
+def _model(**kinds: Any) -> type[BaseModel]:  # Any: types, also generic ones
+    """Model of a mapping that may hold these keys with values of these types, and any others."""
+    fields: dict[str, Any] = {key: (kind, None) for key, kind in kinds.items()}
+    return create_model("Mapping", **fields)
 
 
-@dataclass(frozen=True)
-class _Effective:
-    lag_key: str
-    lag_s: _Number
-
-
-@dataclass(frozen=True)
-class _Meta:
-    input: _Input = field(default_factory=_Input)
-    effective: _Effective | None = None
-    estimator: str = ""
-    versions: Mapping[str, str] = field(default_factory=dict)
-    complete: bool = False
-    digest: str = ""
-    detections_received: int = 0
-    messages_received: int = 0
-    counts: _Counts = field(default_factory=dict)
-    out_of_bounds: _Counts = field(default_factory=dict)
-    left_out: _Counts = field(default_factory=dict)
-    ego_refused: Mapping[str, int] = field(default_factory=dict)
-    ego_jumps: int = 0
-    failures: Mapping[str, int] = field(default_factory=dict)
-    first_failure: str | None = None
-    broken_off: str | None = None
-
-
-@dataclass(frozen=True)
-class _Sensor:
-    mount: Mapping[str, _Number] | None = None
-    max_delay_s: _Number | None = None
-
-
-@dataclass(frozen=True)
-class _Ego:
-    detection_origin_x_m: _Number = 0.0
-    detection_origin_y_m: _Number = 0.0
-
-
-@dataclass(frozen=True)
-class _Map:
-    track: str | None = None
-    pit: str | None = None
-    excluded: Sequence[str] | None = None
-
-
-@dataclass(frozen=True)
-class _Clock:
-    node_hz: Annotated[float, Field(gt=0.0, le=LARGEST)] | None = None
-
-
-@dataclass(frozen=True)
-class _Smoother:
-    lag_s: Annotated[float, Field(ge=0.0, le=LARGEST)] = 0.0
-
-
-@dataclass(frozen=True)
-class _Config:
-    sensors: Mapping[str, _Sensor | None] | None = None
-    ego: _Ego | None = None
-    map: _Map | None = None
-    birth: Mapping[str, Any] | None = None
-    clock: _Clock | None = None
-    smoother: _Smoother | None = None
-    input: Mapping[str, Any] | None = None
-    evaluation: EvaluationConfig | None = None
-
-
-_META, _CONFIG = TypeAdapter(_Meta), TypeAdapter(_Config)
+_META = _model(
+    input=_model(path=str, kind=str),
+    effective=_model(lag_key=str, lag_s=_Number) | None,
+    estimator=str,
+    versions=Mapping[str, str],
+    complete=bool,
+    digest=str,
+    detections_received=int,
+    messages_received=int,
+    counts=_Counts,
+    out_of_bounds=_Counts,
+    left_out=_Counts,
+    ego_refused=Mapping[str, int],
+    ego_jumps=int,
+    failures=Mapping[str, int],
+    first_failure=str | None,
+    broken_off=str | None,
+)
+_OF_SENSORS: Any = Mapping  # the type checker takes no model that is made by a call
+_CONFIG = _model(
+    sensors=_OF_SENSORS[str, _model(mount=Mapping[str, _Number] | None, max_delay_s=_Number | None) | None] | None,
+    ego=_model(detection_origin_x_m=_Number, detection_origin_y_m=_Number) | None,
+    map=_model(track=str | None, pit=str | None, excluded=Sequence[str] | None) | None,
+    birth=_model(ego_speed_factor=_Number | None) | None,
+    clock=_model(node_hz=Annotated[float, Field(gt=0.0, le=LARGEST)] | None) | None,
+    smoother=_model(lag_s=Annotated[float, Field(ge=0.0, le=LARGEST)]) | None,
+    input=Mapping[str, Any] | None,
+    evaluation=EvaluationConfig | None,
+)
 
 
 def check_meta(meta: Any, path: Path) -> None:
@@ -121,10 +82,10 @@ def check_config(config: Any, path: Path) -> None:
     _check(_CONFIG, config, path)
 
 
-def _check(kind: TypeAdapter[Any], value: Any, path: Path) -> None:
+def _check(model: type[BaseModel], value: Any, path: Path) -> None:
     try:
         text = json.dumps(value, default=str, skipkeys=True, ensure_ascii=False)
-        kind.validate_json(text.encode("utf-8", "replace"), strict=True)  # names of files need not be UTF-8
+        model.model_validate_json(text.encode("utf-8", "replace"), strict=True)  # names of files need not be UTF-8
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
