@@ -116,7 +116,10 @@ class RunWriter(RunSink):
             self._folder = self.path / _STAGE if any(self.path.iterdir()) else self.path
             if self._folder != self.path:
                 shutil.rmtree(self._folder, ignore_errors=True)  # of a killed command
-                self._folder.mkdir()
+                try:
+                    self._folder.mkdir()
+                except OSError as error:
+                    raise write_error(self.path, error) from error
             self._write_meta(self._folder)  # the first, so that a folder with a table is known as a run
             write_file(self._folder / "config.yaml", self._config_text)
             for table in COLUMNS:
