@@ -1,7 +1,6 @@
 """`fgtrack verify`: the contract suite over the estimators and motion models that are installed."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Annotated
 
 import typer
@@ -15,18 +14,12 @@ from fgtrack.testing import BrokenPromiseError, estimator_checks, motion_model_c
 
 _NUM_STREAMS = 2
 _BAD = 1
-
-
-@dataclass(frozen=True)
-class _Row:
-    """The outcome of one suite."""
-
-    name: str
-    claim: str
-    """For which late measurements it is exact; `motion model` of one."""
-    num_promises: int
-    broken: Mapping[str, str]
-    """What is wrong, by promise."""
+_COLUMNS = (
+    Column("name", left=True),
+    Column("exact for late measurements", "exact", left=True),
+    Column("promises"),
+    Column("broken"),
+)
 
 
 def verify(
@@ -43,22 +36,23 @@ def verify(
     """
     form = chosen_form(as_json, form)
     names = list(ESTIMATORS.loaded()) if name is None else [ESTIMATORS.resolve(name)]
-    rows = []
     with progress("verify"):
-        for each in names:
-            rows.append(
-                _row(each, Claims.of(ESTIMATORS.load(each)).exact, estimator_checks(each, num_streams=_NUM_STREAMS))
-            )
+        suites = {
+            each: (Claims.of(ESTIMATORS.load(each)).exact, estimator_checks(each, num_streams=_NUM_STREAMS))
+            for each in names
+        }
         if name is None:
             models = MOTION_MODELS.loaded().items()
-            rows += [_row(each, "motion model", motion_model_checks(model())) for each, model in models]
-    broken = {row.name: dict(row.broken) for row in rows if row.broken}
-    promises = sum(row.num_promises for row in rows)
-    show(
-        _table(rows),
-        form,
-        {"met": not broken, "promises": promises, "checked": [row.name for row in rows], "broken": broken},
-    )
+            suites |= {each: ("motion model", motion_model_checks(model())) for each, model in models}
+        found_broken = {each: _broken(checks) for each, (_, checks) in suites.items()}
+    records = [
+        {"name": each, "exact": claim or "-", "promises": len(checks), "broken": len(found_broken[each])}
+        for each, (claim, checks) in suites.items()
+    ]
+    broken = {each: found for each, found in found_broken.items() if found}
+    promises = sum(len(checks) for _, checks in suites.values())
+    values = {"met": not broken, "promises": promises, "checked": list(suites), "broken": broken}
+    show(Table("Contract of estimators and motion models", records, _COLUMNS, ("name",)), form, values)
     if form is None:
         for each, found in broken.items():
             for promise, what in found.items():
@@ -68,25 +62,12 @@ def verify(
     return _BAD if broken else 0
 
 
-def _row(name: str, claim: str, checks: Mapping[str, Callable[[], None]]) -> _Row:
+def _broken(checks: Mapping[str, Callable[[], None]]) -> dict[str, str]:
+    """Return what is wrong, by promise."""
     broken: dict[str, str] = {}
     for check in checks.values():
         try:
             check()
         except BrokenPromiseError as error:
             broken.update(error.promises)
-    return _Row(name, claim, len(checks), broken)
-
-
-def _table(rows: list[_Row]) -> Table:
-    records = [
-        {"name": row.name, "exact": row.claim or "-", "promises": row.num_promises, "broken": len(row.broken)}
-        for row in rows
-    ]
-    columns = [
-        Column("name", left=True),
-        Column("exact for late measurements", "exact", left=True),
-        Column("promises"),
-        Column("broken"),
-    ]
-    return Table("Contract of estimators and motion models", records, columns, ("name",))
+    return broken
