@@ -8,10 +8,12 @@ sees it, cut at the borders.
 """
 
 import math
-import re
+from bisect import bisect_right
 from collections import Counter, defaultdict
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,41 +29,34 @@ from fgtrack.io.run import NO_TRACK, Run
 
 __all__ = ["KittiResult", "write_kitti_result"]
 
-#: As `_line` writes it: frame, track, type, not told how truncated and occluded, thirteen numbers.
-_LINE = re.compile(rb"\d+ \d+ .+ -1 -1( -?\d+\.\d{6}){13}")
-_LONGEST_LINE = 1000
+_SIZE = ("height_m", "width_m", "length_m", "z_m")
 
 
 @dataclass(frozen=True)
 class KittiResult:
-    """What was written."""
+    """Counts of a written file.
+
+    Attributes
+    ----------
+    lines
+        Boxes, one of each track at each frame.
+    tracks, without_box
+        Tracks in it, and those that are not, because no detection of theirs has a size.
+    """
 
     lines: int
-    """Boxes, one of each track at each frame."""
     tracks: int
     without_box: int
-    """Tracks that are not in it, because no detection of theirs says how large the object is."""
 
 
-@dataclass
-class _Seen:
-    """What the detections of a track say of its object so far."""
+@dataclass(frozen=True)
+class _Description:
+    """What the detections of a track have in common up to a tick: the middle is that of the last one, above ground."""
 
-    middle_m: float = math.nan
-    sizes_m: list[tuple[float, float, float]] = field(default_factory=list)
-    """Height, width and length of each."""
-    scores: list[float] = field(default_factory=list)
-    classes: Counter[str] = field(default_factory=Counter)
-
-    def take(self, size_m: tuple[float, float, float], middle_m: float, score: float, name: str) -> None:
-        if name:
-            self.classes[name] += 1
-        if not math.isfinite(sum(size_m) + middle_m):
-            return
-        self.sizes_m.append(size_m)
-        self.middle_m = middle_m
-        if math.isfinite(score):
-            self.scores.append(score)
+    size_m: tuple[float, float, float]
+    middle_m: float
+    score: float
+    kind: str
 
 
 def write_kitti_result(run: Run, sequence: Path, out: Path, *, overwrite: bool = False) -> KittiResult:
@@ -72,17 +67,17 @@ def write_kitti_result(run: Run, sequence: Path, out: Path, *, overwrite: bool =
     Parameters
     ----------
     sequence
-        The file of the sequence in `oxts/`, or a folder with one sequence: it says where the camera is.
+        The file of the sequence in `oxts/`, or a folder with one sequence: it has the pose of the camera.
 
     Raises
     ------
     CallError
-        `sequence` is none, something is at `out`, or it lies in an input.
+        `sequence` is not one, something is at `out`, or it lies in an input.
     DataError
-        A file of the sequence is damaged, or no detection of the run says how large its object is.
+        A file of the sequence is damaged, or no detection of the run has a size.
     """
     if not is_sequence(sequence):
-        raise CallError(f"{sequence}: is no sequence of the KITTI data set, name its oxts/NNNN.txt")
+        raise CallError(f"{sequence}: is not a sequence of the KITTI data set, name its oxts/NNNN.txt")
     check_apart(out, [sequence, *(() if run.path is None else (run.path,))])
     views = view_of_sequence(sequence)
     lines, tracks, without = _lines(run, views)
@@ -98,55 +93,53 @@ def write_kitti_result(run: Run, sequence: Path, out: Path, *, overwrite: bool =
 
 def _lines(run: Run, views: list[View]) -> tuple[list[str], set[int], set[int]]:
     """Lines, the tracks that are in them, and those that are not for want of a box at some frame."""
-    tracks = (
-        run.tables["tracks"].where(confirmed(run.tables["tracks"]))
-        if run.evaluation.confirmed_only
-        else run.tables["tracks"]
-    )
+    tracks = run.tables["tracks"]
+    tracks = tracks.where(confirmed(tracks)) if run.evaluation.confirmed_only else tracks
     of_tick = defaultdict(list)
     for row, tick in enumerate(tracks["tick"].tolist()):
         of_tick[tick].append(row)
     names = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
     states = np.nan_to_num(np.column_stack([tracks[name] for name in names]))
-    ids = tracks["track_id"].tolist()
-    told = _Told(run)
+    ids, fused = tracks["track_id"].tolist(), _fused(run)
     lines, written, without = [], set(), set()
     for frame, (now_ns, tick) in _ticks(run, len(views)).items():
-        told.until(tick)
         ahead_s = seconds(frame * PERIOD_NS - now_ns)
         for row in of_tick[tick]:
-            seen = told.of[ids[row]]
-            if not seen.sizes_m:
+            description = _described(fused[ids[row]], tick)
+            if description is None:
                 without.add(ids[row])
                 continue
-            line = _line(frame, ids[row], views[frame], _moved(states[row], ahead_s), seen)
+            line = _line(frame, ids[row], views[frame], _moved(states[row], ahead_s), description)
             if line is not None:
                 lines.append(line)
                 written.add(ids[row])
     return lines, written, without
 
 
-class _Told:
-    """Goes through the detections as they were fused, and keeps what they say of each track."""
+def _fused(run: Run) -> dict[int, list[tuple[Any, ...]]]:
+    """By track the tick, size, height above ground, score and class of the detections that it fused, by tick."""
+    detections, updates, rows = run.tables["detections"], run.tables["updates"], update_rows(run)
+    fused = np.flatnonzero(rows >= 0)
+    fused = fused[updates["track_id"][rows[fused]] != NO_TRACK]
+    columns = (detections[name][fused].tolist() for name in (*_SIZE, "score", "class_name"))
+    found: dict[int, list[tuple[Any, ...]]] = defaultdict(list)
+    ticks, ids = (updates[name][rows[fused]].tolist() for name in ("tick", "track_id"))
+    for track_id, *entry in sorted(zip(ids, ticks, *columns, strict=True), key=itemgetter(1)):
+        found[track_id].append(tuple(entry))
+    return found
 
-    def __init__(self, run: Run) -> None:
-        self.of: dict[int, _Seen] = defaultdict(_Seen)
-        detections, updates, rows = run.tables["detections"], run.tables["updates"], update_rows(run)
-        fused = np.flatnonzero(rows >= 0)
-        fused = fused[updates["track_id"][rows[fused]] != NO_TRACK]
-        ticks = updates["tick"][rows[fused]]
-        order = np.argsort(ticks, kind="stable")
-        self._ticks, self._next = ticks[order].tolist(), 0
-        self._ids = updates["track_id"][rows[fused]][order].tolist()
-        columns = ("height_m", "width_m", "length_m", "z_m", "score", "class_name")
-        self._values = list(zip(*(detections[name][fused][order].tolist() for name in columns), strict=True))
 
-    def until(self, tick: int) -> None:
-        """Take in what was fused up to `tick`."""
-        while self._next < len(self._ticks) and self._ticks[self._next] <= tick:
-            *size_m, middle_m, score, name = self._values[self._next]
-            self.of[self._ids[self._next]].take(tuple(size_m), middle_m, score, name)
-            self._next += 1
+def _described(entries: list[tuple[Any, ...]], tick: int) -> _Description | None:
+    """Mean size and score, most frequent class and last height of the detections up to `tick`; None without a size."""
+    until = entries[: bisect_right(entries, tick, key=itemgetter(0))]
+    boxes = [entry for entry in until if math.isfinite(sum(entry[1:5]))]
+    if not boxes:
+        return None
+    height_m, width_m, length_m = np.mean([entry[1:4] for entry in boxes], axis=0).tolist()
+    scores = [entry[5] for entry in boxes if math.isfinite(entry[5])]
+    kinds = Counter(entry[6] for entry in until if entry[6]).most_common(1)
+    score, kind = float(np.mean(scores)) if scores else 1.0, kinds[0][0] if kinds else "car"
+    return _Description((height_m, width_m, length_m), boxes[-1][4], score, kind)
 
 
 def _ticks(run: Run, num_frames: int) -> dict[int, tuple[int, int]]:
@@ -170,21 +163,22 @@ def _moved(state: np.ndarray, ahead_s: float) -> tuple[float, float, float]:
     return x_m, y_m, wrap_angle(yaw_rad + ahead_s * yaw_rate_radps)
 
 
-def _line(frame: int, track_id: int, view: View, pose: tuple[float, float, float], seen: _Seen) -> str | None:
+def _line(
+    frame: int, track_id: int, view: View, pose: tuple[float, float, float], described: _Description
+) -> str | None:
     """The line of a track; None where camera 2 does not see it."""
     x_m, y_m, yaw_rad = pose
-    height_m, width_m, length_m = np.mean(seen.sizes_m, axis=0).tolist()
+    height_m, width_m, length_m = described.size_m
     ego = view.ego
     ahead_m, aside_m = (np.array([x_m - ego.x_m, y_m - ego.y_m]) @ rotation(ego.yaw_rad)).tolist()
-    bottom = np.array([ahead_m, aside_m, seen.middle_m - 0.5 * height_m])
+    bottom = np.array([ahead_m, aside_m, described.middle_m - 0.5 * height_m])
     place, turned_rad = view.rectified(bottom, yaw_rad - ego.yaw_rad)
     right_m, down_m, forward_m = place.tolist()
     box = Box(height_m, width_m, length_m, right_m, down_m, forward_m, turned_rad)
     image = box.image_px(view.calibration)
     if image is None:
         return None
-    kind = seen.classes.most_common(1)[0][0] if seen.classes else "car"
     alpha_rad = wrap_angle(turned_rad - math.atan2(box.x_m, box.z_m))
-    score = float(np.mean(seen.scores)) if seen.scores else 1.0
-    numbers = (alpha_rad, *image, *box, score)
-    return f"{frame} {track_id} {CLASS_NAMES.get(kind, kind)} -1 -1 {' '.join(f'{value:.6f}' for value in numbers)}\n"
+    numbers = (alpha_rad, *image, *box, described.score)
+    name = CLASS_NAMES.get(described.kind, described.kind)
+    return f"{frame} {track_id} {name} -1 -1 {' '.join(f'{value:.6f}' for value in numbers)}\n"
