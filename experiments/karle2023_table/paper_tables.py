@@ -18,7 +18,7 @@ import typer
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.evaluation.runs import JudgedRun, judged
+from fgtrack.evaluation.runs import EvaluatedRun, evaluated
 from fgtrack.evaluation.scores.innovations import LOCAL_NAMES, local_innovations, message_delays, moments_of
 from fgtrack.evaluation.scores.statistics import Distribution, Moments
 from fgtrack.evaluation.tables import MS, RUN, Column, Table, Tables, named
@@ -100,10 +100,10 @@ class ResidualSamples:
 
 def main(runs: Annotated[list[Path], typer.Argument(help="Run folders, or folders of runs.")]) -> None:
     """Print the tables."""
-    print(evaluation(judged(runs)))
+    print(evaluation(evaluated(runs)))
 
 
-def evaluation(runs: Sequence[JudgedRun]) -> Tables:
+def evaluation(runs: Sequence[EvaluatedRun]) -> Tables:
     """`residuals`, `residuals_by`, `sensors` and `latency` of `runs`.
 
     Raises `DataError` where the map that a run names is not a map.
@@ -112,7 +112,7 @@ def evaluation(runs: Sequence[JudgedRun]) -> Tables:
     return Tables({name: make(runs) for name, make in makers.items()})
 
 
-def _residuals(runs: Sequence[JudgedRun]) -> Table:
+def _residuals(runs: Sequence[EvaluatedRun]) -> Table:
     """A row for each run: residuals of all sensors together, and the precision (table I)."""
     records = [
         {"run": one.label, **_moments(one.metrics.residuals)}
@@ -129,7 +129,7 @@ def _residuals(runs: Sequence[JudgedRun]) -> Table:
     return Table(title, records, columns, notes=notes)
 
 
-def _residuals_by(runs: Sequence[JudgedRun]) -> Table:
+def _residuals_by(runs: Sequence[EvaluatedRun]) -> Table:
     """A row for each run, group of samples and sensor."""
     records = []
     for one in runs:
@@ -163,7 +163,7 @@ def _groups(samples: ResidualSamples) -> Iterator[tuple[str, BoolArray]]:
             yield f"{name} {text} {unit}", np.isfinite(values) & (numbers == k)
 
 
-def _sensors(runs: Sequence[JudgedRun]) -> Table:
+def _sensors(runs: Sequence[EvaluatedRun]) -> Table:
     """A row for each run and sensor: delays, way of the ego in them, and the detections that were fused."""
     records = [record for one in runs for record in _sensor_records(one)]
     columns = [
@@ -184,7 +184,7 @@ def _sensors(runs: Sequence[JudgedRun]) -> Table:
     return Table(title, records, columns, ("run", "sensor"), notes)
 
 
-def _sensor_records(one: JudgedRun) -> Iterator[dict[str, Any]]:
+def _sensor_records(one: EvaluatedRun) -> Iterator[dict[str, Any]]:
     updates, samples = one.run.tables["updates"], ResidualSamples.of(one.run)
     for sensor in np.unique(updates["sensor"]).tolist():
         receipts_ns, delay_s = message_delays(updates.where(updates["sensor"] == sensor))
@@ -209,7 +209,7 @@ def _ends(name: str, unit: str = "") -> list[str]:
     return [f"{name}_{moment}{unit}" for moment in ("min", "median", "max")]
 
 
-def _latency(runs: Sequence[JudgedRun]) -> Table:
+def _latency(runs: Sequence[EvaluatedRun]) -> Table:
     """A row for each run: computing time of the ticks with detections."""
     records = []
     for one in runs:

@@ -26,7 +26,7 @@ from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import FloatArray, IntArray, Message
 from fgtrack.evaluation.comparison import paired_sums
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, within_run
-from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.truth import ego_poses, true_paths
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
@@ -133,7 +133,7 @@ def measured(source: Path, config: Config, seconds: float) -> tuple[list[list[st
     """Rows of both tables of one recording."""
     messages = beginning(source, seconds)
     runs = {
-        errors: JudgedRun(errors, fgtrack.replay(messages, with_cameras(config, errors)))
+        errors: EvaluatedRun(errors, fgtrack.replay(messages, with_cameras(config, errors)))
         for errors in ("none", *ERRORS)
     }
     rows = []
@@ -159,7 +159,7 @@ def bounds(one: Estimate) -> tuple[float, float, float]:
     return one.mean, one.low, one.high
 
 
-def change(without: JudgedRun, run: JudgedRun, quantity: str) -> Estimate:
+def change(without: EvaluatedRun, run: EvaluatedRun, quantity: str) -> Estimate:
     """What the cameras change, less is better."""
     ticks = paired_sums([without, run]).sums[quantity]
     return within_run(ticks, lambda S: np.sqrt(S[1] / S[2]) - np.sqrt(S[0] / S[2]), np.random.default_rng(SEED))

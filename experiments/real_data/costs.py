@@ -8,7 +8,7 @@ import numpy as np
 from fgtrack.core.types import FloatArray, Message
 from fgtrack.evaluation.comparison import paired_sums
 from fgtrack.evaluation.intervals import Estimate, by_stamp, within_run
-from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.scores.prediction import displacements
 from fgtrack.sim.delays import ConstantDelay
 from fgtrack.sim.redelay import SensorDelays, redelay
@@ -28,7 +28,7 @@ def late(messages: Sequence[Message], sensor: str, delay_s: float) -> list[Messa
     return list(redelay(lambda: iter(messages), delays, np.random.default_rng(0)))
 
 
-def sums(prompt: Sequence[JudgedRun], after: Sequence[JudgedRun], horizons_s: Sequence[float] = ()) -> Sums:
+def sums(prompt: Sequence[EvaluatedRun], after: Sequence[EvaluatedRun], horizons_s: Sequence[float] = ()) -> Sums:
     """What runs of one recording, of the same estimators in the same order, are compared by.
 
     Positions where all runs track the same object at the same stamp, now and `horizons_s` ahead; GOSPA at all ticks.
@@ -39,7 +39,7 @@ def sums(prompt: Sequence[JudgedRun], after: Sequence[JudgedRun], horizons_s: Se
     return {**{name: found[name] for name in QUANTITIES if name in found}, **ahead}
 
 
-def _ahead(runs: Sequence[JudgedRun], horizon_s: float) -> FloatArray:
+def _ahead(runs: Sequence[EvaluatedRun], horizon_s: float) -> FloatArray:
     """Squared errors of what the states predict, where all runs predict the same object from the same stamp."""
     found = [displacements(one.run, one.matching) for one in runs if one.matching is not None]
     squares = [

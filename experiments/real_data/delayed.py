@@ -30,7 +30,7 @@ from scores import SEQUENCES, kitti_sources, write
 
 import fgtrack
 from fgtrack.core.types import DetectionList, Message
-from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import ClockConfig, Config
 from fgtrack.pipeline.shipped import read_config
@@ -78,7 +78,7 @@ def judged(arrangement: str, source: Path, config: Config, delay_s: float) -> Fo
     if arrangement == "halves":
         messages = list(halves(messages))
     prompt, late = (
-        [JudgedRun(each, fgtrack.replay(received, replace(config, estimator=each))) for each in ESTIMATORS]
+        [EvaluatedRun(each, fgtrack.replay(received, replace(config, estimator=each))) for each in ESTIMATORS]
         for received in (messages, costs.late(messages, LATE[arrangement], delay_s))
     )
     scores = []

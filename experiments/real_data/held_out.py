@@ -22,7 +22,7 @@ from scores import HEADER, Found, autoferry_sources, scored, write, write_scores
 
 import fgtrack
 from fgtrack.evaluation.intervals import paired
-from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
@@ -32,12 +32,12 @@ def judged(
     source: Path, config: Config, estimators: Sequence[str], sensor: str, delays_s: Sequence[float]
 ) -> tuple[list[list[Found]], list[costs.Sums]]:
     """Scores of one recording by delay and estimator, and what each delay but the first, which is 0, is compared by."""
-    found, compared, prompt = [], [], list[JudgedRun]()
+    found, compared, prompt = [], [], list[EvaluatedRun]()
     recording = list(open_input(source, config.input).messages())
     for delay_s in delays_s:
         messages = costs.late(recording, sensor, delay_s) if delay_s else recording
         configs = [replace(config, estimator=each) for each in estimators]
-        runs = [JudgedRun(one.estimator, fgtrack.replay(messages, one)) for one in configs]
+        runs = [EvaluatedRun(one.estimator, fgtrack.replay(messages, one)) for one in configs]
         found.append([scored(source.name, source, *each) for each in zip(configs, runs, strict=True)])
         if delay_s:
             compared.append(costs.sums(prompt, runs))

@@ -15,14 +15,14 @@ from joblib import Parallel, delayed
 from scores import SEQUENCES, Found, autoferry_sources, kitti_sources, scored, write_scores
 
 import fgtrack
-from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
 
 
 def judged(name: str, source: Path, config: Config) -> Found:
     """Scores of one recording, `name`."""
-    return scored(name, source, config, JudgedRun(name, fgtrack.replay(source, config)))
+    return scored(name, source, config, EvaluatedRun(name, fgtrack.replay(source, config)))
 
 
 def main(

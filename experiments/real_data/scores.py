@@ -11,7 +11,7 @@ import numpy as np
 from fgtrack.core.geometry import rotation
 from fgtrack.core.types import DetectionList, EgoState, FloatArray, Message, TrackStatus
 from fgtrack.evaluation.matching import match, scenes
-from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.scores.multi_object import Clear
 from fgtrack.io.run import Run, Table
 from fgtrack.io.source import open_input
@@ -96,13 +96,13 @@ def raw_mota(source: Path, config: Config, run: Run) -> float:
     return 1.0 - (clear.misses + clear.false_positives) / (clear.pairs + clear.misses)
 
 
-def nis_ratios(run: JudgedRun) -> dict[str, float]:
+def nis_ratios(run: EvaluatedRun) -> dict[str, float]:
     """Mean NIS over its expectation, by sensor."""
     nis = run.metrics.consistency.nis
     return {sensor: found.mean / found.dof for sensor, found in nis.items() if found.count}
 
 
-def scored(name: str, source: Path, config: Config, run: JudgedRun) -> Found:
+def scored(name: str, source: Path, config: Config, run: EvaluatedRun) -> Found:
     """Scores of `run`, of the recording `name` at `source` with `config`."""
     truth, scores = run.metrics.truth, run.metrics.multi_object
     assert truth is not None

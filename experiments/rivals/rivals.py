@@ -21,7 +21,7 @@ import typer
 import fgtrack
 from fgtrack.core.types import Detection, DetectionList, Message
 from fgtrack.evaluation.intervals import average, paired
-from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.models.oval import OVAL, make_oval
 from fgtrack.models.track_map import COLUMNS, TrackMap
 from fgtrack.pipeline.shipped import read_scenario
@@ -166,7 +166,7 @@ def straightened(share: float, folder: Path) -> str:
 
 def judged(scene: str, contestant: str, recording: str, run: fgtrack.Run) -> Result:
     """The numbers of a run."""
-    one = JudgedRun(contestant, run)
+    one = EvaluatedRun(contestant, run)
     found = one.metrics
     assert found.truth is not None
     errors = found.truth.overall.errors

@@ -17,7 +17,7 @@ from fgtrack.advice.noise import noise_findings
 from fgtrack.advice.outcome import Outcome, harm, objection
 from fgtrack.advice.page import Advice
 from fgtrack.advice.windows import beyond_lags, window_findings
-from fgtrack.core.caution import EGO
+from fgtrack.core.diagnostic import EGO
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Message

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from fgtrack.core.caution import EGO
+from fgtrack.core.diagnostic import EGO
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DetectionList, EgoState, FloatArray, IntArray, Message
 

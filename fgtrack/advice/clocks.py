@@ -8,7 +8,7 @@ import numpy as np
 
 from fgtrack.advice.arrivals import FEWEST, Arrivals
 from fgtrack.advice.finding import Finding, milliseconds, percent
-from fgtrack.core.caution import EGO
+from fgtrack.core.diagnostic import EGO
 from fgtrack.pipeline.clock_offsets import RECEIPT_S, TRUTH, Bias, OffsetReport, SensorOffset
 from fgtrack.pipeline.config import EgoConfig
 

@@ -12,7 +12,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.comparison import POSITION_NEES, comparisons
 from fgtrack.evaluation.diagnostics import FAR_OFF, MOST_BREAKS_PER_MINUTE, USED, Fragmentation, misfits
 from fgtrack.evaluation.metrics import ObjectMetrics, evaluate
-from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.io.run import Run
 
 __all__ = ["Outcome", "harm", "objection"]
@@ -135,7 +135,7 @@ def objection(before: Run, after: Run) -> str | None:
         return f"mean NIS of {sensor} is {nis.mean:.3g} then, expected {nis.dof:.3g}"
     if (worse := harm(Outcome.of(before), Outcome.of(after))) is not None:
         return f"{worse}: tracks break at errors that the noise does not expect"
-    runs = [JudgedRun("before", before), JudgedRun("after", after)]
+    runs = [EvaluatedRun("before", before), EvaluatedRun("after", after)]
     for quantity in (each for contest in comparisons(runs) for each in contest.quantities):
         found = {entry.name: entry for entry in quantity.entries}
         was, now = found["before"].value, found["after"].value

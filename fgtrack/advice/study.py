@@ -13,7 +13,7 @@ from fgtrack.advice.page import Advice
 from fgtrack.advice.summary import summary
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Message
-from fgtrack.evaluation.runs import JudgedRun, judged
+from fgtrack.evaluation.runs import EvaluatedRun, evaluated
 from fgtrack.evaluation.tables import Tables
 from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.errors import UntilBreak
@@ -160,7 +160,7 @@ def study(
         source = replace(source, messages=repeated)
         results = _replayed(source, times_ns, known.config, folders, overwrite, on_step)
         on_step("compare", _COMPARE)
-        every = judged([load_run(result.path) for result in results])
+        every = evaluated([load_run(result.path) for result in results])
         tables = compare(*every)
         for one in every:
             if one.run.path is not None:
@@ -234,7 +234,7 @@ def _replayed(
 
 
 def _pictured(
-    runs: list[JudgedRun],
+    runs: list[EvaluatedRun],
     tables: Tables,
     opening: Opening,
     more: Mapping[str, Figure],

@@ -9,19 +9,19 @@ import numpy as np
 from fgtrack.advice.page import Advice
 from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.diagnostics import USED, diagnostics
-from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.tables import Tables, short
 
 _PERCENT, _MS = 100.0, 1e3
 _IMPORTANT = 60.0  # weight of a finding without a setting that has to be dealt with first
 
 
-def summary(runs: Sequence[JudgedRun], tables: Tables, advice: Advice | None) -> tuple[str, ...]:
+def summary(runs: Sequence[EvaluatedRun], tables: Tables, advice: Advice | None) -> tuple[str, ...]:
     """Return sentences: the recording, its tracks, the verdict of the comparison, and what to do."""
     return (_recording(runs[0]), _tracks(runs[0]), *tables.verdict, _to_do(runs, tables, advice))
 
 
-def _recording(one: JudgedRun) -> str:
+def _recording(one: EvaluatedRun) -> str:
     updates, now_ns = one.run.tables["updates"], one.run.tables["timing"]["now_ns"]
     length_s = (int(now_ns[-1]) - int(now_ns[0])) / NS_PER_S if len(now_ns) else 0.0
     sensors = []
@@ -36,7 +36,7 @@ def _recording(one: JudgedRun) -> str:
     return f"In {length_s:.0f} s detections came from {' and '.join(sensors) or 'no sensor'}{many}."
 
 
-def _tracks(one: JudgedRun) -> str:
+def _tracks(one: EvaluatedRun) -> str:
     truth = one.metrics.truth
     if truth is not None:
         of, share = truth.overall, _PERCENT * truth.overall.tracked_share_in_sight
@@ -56,7 +56,7 @@ def _tracks(one: JudgedRun) -> str:
     return f"{one.label} confirms {_several(len(ids), 'track')}, half of them for {np.median(lives_s):.1f} s or longer."
 
 
-def _to_do(runs: Sequence[JudgedRun], tables: Tables, advice: Advice | None) -> str:
+def _to_do(runs: Sequence[EvaluatedRun], tables: Tables, advice: Advice | None) -> str:
     """What comes first: a defect of the recording or its settings, else the choice of a method."""
     open_findings = [] if advice is None else [one for one in advice.findings if not one.settings]
     found = [str(one) for one in open_findings if one.weight >= _IMPORTANT] or [

@@ -9,7 +9,7 @@ from fgtrack.cli.show import chosen_form, say, show, warn
 from fgtrack.core.errors import FgtrackError
 from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.evaluation.runs import Runs as AnyRuns
-from fgtrack.evaluation.runs import judged, recordings_warning
+from fgtrack.evaluation.runs import evaluated, recordings_warning
 from fgtrack.evaluation.tables import Tables
 from fgtrack.evaluation.tables.compare import compare as tables_of
 from fgtrack.io.run import write_metrics
@@ -26,7 +26,7 @@ def compare(
 ) -> None:
     """Compare runs in tables, and write metrics.json into each."""
     form = chosen_form(as_json, form)
-    every = judged(runs)
+    every = evaluated(runs)
     of_each = dict.fromkeys(f"{one.label}: {line}" for one in every for line in diagnostics(one.run))
     for line in (*recordings_warning(every), *of_each):
         warn(line)
@@ -38,7 +38,7 @@ def compare(
 
 def written_tables(runs: AnyRuns, streaming: bool = False) -> Tables:
     """The tables of `runs`; the metrics of each are written into its folder, with a warning where they cannot be."""
-    every = judged(runs)
+    every = evaluated(runs)
     tables = tables_of(*every, streaming=streaming)
     for one in every:
         if one.run.path is not None:

@@ -13,7 +13,7 @@ from fgtrack.cli.show import progress, say
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
-from fgtrack.evaluation.runs import judged, run_folders, start_ns
+from fgtrack.evaluation.runs import evaluated, run_folders, start_ns
 from fgtrack.evaluation.tables.seeds import is_sweep, read_sweep
 from fgtrack.io.output import check_apart, new_file, new_files
 from fgtrack.plotting.late_detection import drawn_close_up
@@ -99,7 +99,7 @@ def _of_sweep(folders: Sequence[Path], track: int | None, stamp: float | None) -
 
 
 def _of_runs(folders: Sequence[Path], out: Path, track: int | None, stamp: float | None, paper: Paper) -> _Figures:
-    found = judged(folders)
+    found = evaluated(folders)
     check_apart(out, run_folders(found))
     if stamp is not None and not abs(stamp) <= LARGEST:
         raise CallError(f"--stamp {stamp}: is no time after the first tick, up to {LARGEST:g} s")

@@ -10,7 +10,7 @@ from fgtrack.advice.study import opening_at
 from fgtrack.cli.arguments import Overwrite, Runs
 from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError
-from fgtrack.evaluation.runs import judged, run_folders
+from fgtrack.evaluation.runs import evaluated, run_folders
 from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.output import check_apart, check_output
 from fgtrack.plotting.late_detection import drawn_close_up
@@ -36,7 +36,7 @@ def report(
     if out.suffix.lower() not in _SUFFIXES:
         raise CallError(f"{out}: a report is one HTML file, end the name with .html")
     check_output(out, overwrite)
-    every = judged(runs)
+    every = evaluated(runs)
     check_apart(out, run_folders(every))
     with progress("report"):
         close_up, late = drawn_close_up(every)

@@ -14,7 +14,7 @@ import numpy as np
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, within_run
 from fgtrack.evaluation.matching import scenes, track_errors
-from fgtrack.evaluation.runs import JudgedRun, by_recording
+from fgtrack.evaluation.runs import EvaluatedRun, by_recording
 from fgtrack.evaluation.scores.consistency import position_nees
 from fgtrack.evaluation.scores.multi_object import gospa
 from fgtrack.evaluation.tables import Column, Value, short, two_digits
@@ -88,14 +88,14 @@ class Comparison:
         return next((one.entries for one in self.quantities if one.name == name), ())
 
 
-def comparisons(runs: Sequence[JudgedRun]) -> list[Comparison]:
+def comparisons(runs: Sequence[EvaluatedRun]) -> list[Comparison]:
     """A comparison for every recording of which there are several runs with truth."""
     return [_comparison(group) for group in comparable(runs) if len(group) > 1]
 
 
-def comparable(runs: Sequence[JudgedRun]) -> list[list[JudgedRun]]:
+def comparable(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
     """The runs with truth, those of the same recording and evaluated by the same settings together."""
-    groups: dict[tuple[int, EvaluationConfig], list[JudgedRun]] = {}
+    groups: dict[tuple[int, EvaluationConfig], list[EvaluatedRun]] = {}
     for number, group in enumerate(by_recording([one for one in runs if one.matching is not None])):
         for one in group:
             groups.setdefault((number, one.options), []).append(one)
@@ -162,7 +162,7 @@ class Paired(NamedTuple):
     sums: Mapping[str, FloatArray]
 
 
-def paired_sums(group: Sequence[JudgedRun]) -> Paired:
+def paired_sums(group: Sequence[EvaluatedRun]) -> Paired:
     """The errors of `group`, runs of one recording, at the same objects and stamps, stamp by stamp."""
     matchings = [one.matching for one in group if one.matching is not None]
     errors, squares = [track_errors(one) for one in matchings], [position_nees(one).values for one in matchings]
@@ -223,13 +223,13 @@ def quantity(name: str, labels: Sequence[str], ticks: FloatArray) -> Quantity:
     return Quantity(name, ranked(labels, means if is_nees else np.sqrt(means), cost(means), worse_by))
 
 
-def _comparison(group: Sequence[JudgedRun]) -> Comparison:
+def _comparison(group: Sequence[EvaluatedRun]) -> Comparison:
     paired, labels = paired_sums(group), tuple(one.label for one in group)
     quantities = [quantity(name, labels, ticks) for name, ticks in paired.sums.items() if ticks[:, -1].any()]
     return Comparison(labels, paired.samples, paired.most_samples, tuple(quantities))
 
 
-def _gospa_sums(group: Sequence[JudgedRun]) -> FloatArray:
+def _gospa_sums(group: Sequence[EvaluatedRun]) -> FloatArray:
     """Squared GOSPA of the visible objects of every run, and 1, at the ticks that all have.
 
     Visible is what a sensor of any run could see, so that all are measured alike; runs without a known field of view

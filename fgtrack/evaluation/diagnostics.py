@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from fgtrack.core.caution import EGO, Caution, in_degrees
+from fgtrack.core.diagnostic import EGO, Diagnostic, in_degrees
 from fgtrack.core.time import NS_PER_S, wrong_unit
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.matching import confirmed
@@ -109,13 +109,13 @@ class Fragmentation:
         return self.breaks / minutes if minutes else math.nan
 
 
-def diagnostics(run: Run) -> list[Caution]:
+def diagnostics(run: Run) -> list[Diagnostic]:
     """Defects of `run`, as far as its files show them."""
     found = (_changed, _clocks, _angles, _ego, _map, _unused, _window, _failures, _fragmentation)
     return [one for of_kind in found for one in of_kind(run)]
 
 
-def noise_diagnostics(run: Run) -> list[Caution]:
+def noise_diagnostics(run: Run) -> list[Diagnostic]:
     """Sensors whose innovations are inconsistent with the noise; see also the verdict of `compare`."""
     found = []
     for sensor, nis in misfits(run):
@@ -129,7 +129,7 @@ def noise_diagnostics(run: Run) -> list[Caution]:
         if lag1 is not None and lag1 > CORRELATED:
             text += f", and errors are correlated in time ({lag1:.2f}), which fitted white noise cannot express"
         fit = _advise(run, " --tune -o advised.yaml")
-        found.append(Caution(sensor, f"{text}; `{fit}` fits it, or reports what has to be done first"))
+        found.append(Diagnostic(sensor, f"{text}; `{fit}` fits it, or reports what has to be done first"))
     return found
 
 
@@ -198,13 +198,13 @@ def _advise(run: Run, options: str = "") -> str:
     return f"fgtrack advise{named}{options}"
 
 
-def _changed(run: Run) -> Iterator[Caution]:
+def _changed(run: Run) -> Iterator[Diagnostic]:
     """Files of a finished run that differ from those that it has written."""
     if run.path is not None and run.meta.get("complete") and digest(run.path) != run.meta.get("digest"):
-        yield Caution("tracks.csv or updates.csv", "changed since the run: the digest is another; repeat the run")
+        yield Diagnostic("tracks.csv or updates.csv", "changed since the run: the digest is another; repeat the run")
 
 
-def _clocks(run: Run) -> Iterator[Caution]:
+def _clocks(run: Run) -> Iterator[Diagnostic]:
     updates = run.tables["updates"]
     for sensor, mine in _by_sensor(updates):
         if (updates["stamp_ns"][mine] == 0).all():
@@ -212,13 +212,13 @@ def _clocks(run: Run) -> Iterator[Caution]:
                 "all stamps are 0: its driver does not set them, so its delay is unknown; "
                 f"`stamp_from: receipt` on its topic, or sensors.{sensor}.stamp_from, takes the receipt for the stamp"
             )
-            yield Caution(sensor, text, {f"sensors.{sensor}.stamp_from": "receipt"})
+            yield Diagnostic(sensor, text, {f"sensors.{sensor}.stamp_from": "receipt"})
         receipts_ns = np.unique(updates["receipt_ns"][mine])
         if unit := wrong_unit(len(receipts_ns), int(receipts_ns[0]), int(receipts_ns[-1])):
-            yield Caution(sensor, unit)
+            yield Diagnostic(sensor, unit)
 
 
-def _angles(run: Run) -> Iterator[Caution]:
+def _angles(run: Run) -> Iterator[Diagnostic]:
     """Angles that were recorded in degrees and read as radians."""
     ego, detections = run.tables["ego"], run.tables["detections"]
     by_sensor = ((sensor, detections, mine) for sensor, mine in _by_sensor(detections))
@@ -230,7 +230,7 @@ def _angles(run: Run) -> Iterator[Caution]:
             yield from () if found is None else (found,)
 
 
-def _ego(run: Run) -> Iterator[Caution]:
+def _ego(run: Run) -> Iterator[Diagnostic]:
     """No ego where it is needed, or reasons for which more than half of its states were refused."""
     failed = [f"{count} of {total} of {sensor}" for sensor, name, count, total in _mostly(run) if name == "failed"]
     num_states = run.tables["ego"].num_rows
@@ -241,23 +241,23 @@ def _ego(run: Run) -> Iterator[Caution]:
                 f"its position jumps {times}, as where a clock is set or a localisation is reinitialised: what is seen "
                 "from it is misplaced there, cut the recording in parts"
             )
-            yield Caution(EGO, text)
+            yield Diagnostic(EGO, text)
         for reason, count in dict(run.meta.get("ego_refused") or {}).items():
             if 2 * count > num_states:
                 text = f"{count} of {num_states} states not used, {reason}: look at the clock of its driver"
-                yield Caution(EGO, text)
+                yield Diagnostic(EGO, text)
     elif failed:
         text = f"no state was received, so nothing in its frame can be placed ({', '.join(failed)} failed)"
-        yield Caution(EGO, f"{text}: {_NAME_EGO}")
+        yield Diagnostic(EGO, f"{text}: {_NAME_EGO}")
     elif _ego_speeds_births(run):
         text = (
             "no state was received, so new objects are assumed to stand still, and what the sensors could see is not "
             f"known: {_NAME_EGO}, or set birth.ego_speed_factor to 0"
         )
-        yield Caution(EGO, text, _STANDING)
+        yield Diagnostic(EGO, text, _STANDING)
 
 
-def _map(run: Run) -> Iterator[Caution]:
+def _map(run: Run) -> Iterator[Diagnostic]:
     """No map where new objects are as fast as the ego, in its direction."""
     if not _ego_speeds_births(run) or _section(run, "map").get("track") not in (None, OPEN_SPACE):
         return
@@ -268,7 +268,7 @@ def _map(run: Run) -> Iterator[Caution]:
             f"there is none, and no heading from {', '.join(blind)}: new objects may drive in any direction; name the "
             "map with --map (`oval` for the simulated races), or set birth.ego_speed_factor to 0 for open space"
         )
-        yield Caution("map", text, _STANDING)
+        yield Diagnostic("map", text, _STANDING)
 
 
 def _ego_speeds_births(run: Run) -> bool:
@@ -285,7 +285,7 @@ def _mostly(run: Run) -> Iterator[tuple[str, str, int, int]]:
                 yield sensor, str(name), int(count), int(mine.sum())
 
 
-def _unused(run: Run) -> Iterator[Caution]:
+def _unused(run: Run) -> Iterator[Diagnostic]:
     """Dispositions of more than half of the detections of a sensor, where no other diagnostic has them."""
     updates = run.tables["updates"]
     for sensor, name, count, total in _mostly(run):
@@ -294,7 +294,7 @@ def _unused(run: Run) -> Iterator[Caution]:
             continue
         by = reasons((run.meta.get("out_of_bounds") or {}).get(sensor, {}))
         cure = _too_old(run, sensor) if name == "too_old" else _CURES[name].format(sensor=sensor, reasons=by)
-        yield Caution(sensor, f"{count} of {total} {name}: {cure}")
+        yield Diagnostic(sensor, f"{count} of {total} {name}: {cure}")
 
 
 def _too_old(run: Run, sensor: str) -> str:
@@ -318,7 +318,7 @@ def _too_old(run: Run, sensor: str) -> str:
     )
 
 
-def _window(run: Run) -> Iterator[Caution]:
+def _window(run: Run) -> Iterator[Diagnostic]:
     """A window that holds less than two lists of a sensor."""
     window, lag_s = _reported_window(run)
     updates = run.tables["updates"]
@@ -326,10 +326,10 @@ def _window(run: Run) -> Iterator[Caution]:
         stamps_ns = np.unique(updates["stamp_ns"][mine])
         period_s = float(np.median(np.diff(stamps_ns))) / NS_PER_S if len(stamps_ns) >= FEWEST else 0.0
         if lag_s < period_s:
-            yield Caution(sensor, f"one list every {period_s:.3g} s, longer than {window}: raise it")
+            yield Diagnostic(sensor, f"one list every {period_s:.3g} s, longer than {window}: raise it")
 
 
-def _failures(run: Run) -> Iterator[Caution]:
+def _failures(run: Run) -> Iterator[Diagnostic]:
     """Failures inside the estimator."""
     counts = {kind: n for kind, n in dict(run.meta.get("failures") or {}).items() if n and kind != _NO_FAILURE}
     if counts:
@@ -338,10 +338,10 @@ def _failures(run: Run) -> Iterator[Caution]:
         if set(counts) == {"diverged"}:
             cure = "measurements in a row contradicted a track: look at NIS by sensor, clocks and noise"
         text = f"failures: {', '.join(f'{n} {kind}' for kind, n in counts.items())}"
-        yield Caution("estimator", f"{text}{f' (the first one: {first})' if first else ''}: {cure}")
+        yield Diagnostic("estimator", f"{text}{f' (the first one: {first})' if first else ''}: {cure}")
 
 
-def _fragmentation(run: Run) -> Iterator[Caution]:
+def _fragmentation(run: Run) -> Iterator[Diagnostic]:
     """Tracks that break off and begin again, and births that die unconfirmed: bad tracking that needs no truth."""
     found, now_ns = Fragmentation.of(run), run.tables["timing"]["now_ns"]
     total, recorded_s = len(found.lifetimes_s), float(np.ptp(now_ns)) / NS_PER_S if len(now_ns) else 0.0
@@ -353,7 +353,7 @@ def _fragmentation(run: Run) -> Iterator[Caution]:
             f"{recorded_s:.3g} s; likely causes: a field of view or range larger than what a sensor covers, "
             f"detection_probability, lifecycle.lifetime_s, noise; `{_advise(run)}` looks for them"
         )
-        yield Caution("tracks", text)
+        yield Diagnostic("tracks", text)
     dispositions = run.tables["updates"]["disposition"]
     used = int(np.isin(dispositions, USED).sum())
     dead = int(np.count_nonzero(dispositions == "birth")) - total
@@ -362,7 +362,7 @@ def _fragmentation(run: Run) -> Iterator[Caution]:
             f"{dead} of {used} detections used began a track that was never confirmed; likely causes: clutter, errors "
             f"or motion larger than configured, a wrong ego or clock; `{_advise(run)}` looks for them"
         )
-        yield Caution("tracks", text)
+        yield Diagnostic("tracks", text)
 
 
 def _reported_window(run: Run) -> tuple[str, float]:

@@ -19,7 +19,7 @@ from fgtrack.io.run import EvaluationConfig, Run, Table, is_run_folder, load_run
 
 
 @dataclass(frozen=True, eq=False)
-class JudgedRun:
+class EvaluatedRun:
     """A run and its evaluation, computed when it is first used.
 
     Attributes
@@ -61,11 +61,11 @@ class JudgedRun:
         return evaluate_matched(self.run, self.matching, self.options)
 
 
-OneRun = Run | JudgedRun | Path | str
+OneRun = Run | EvaluatedRun | Path | str
 Runs = OneRun | Mapping[str, OneRun] | Iterable[OneRun | Iterable[OneRun] | Mapping[str, OneRun]]
 
 
-def judged(runs: Runs) -> list[JudgedRun]:
+def evaluated(runs: Runs) -> list[EvaluatedRun]:
     """Runs under labels of their own; a path is a run folder, or a folder that holds some; a mapping gives labels.
 
     Runs of a folder come by name; they may be one folder deeper, as in that of `fgtrack demo`.
@@ -81,14 +81,14 @@ def judged(runs: Runs) -> list[JudgedRun]:
     for one in every:
         if not isinstance(one, OneRun):
             raise CallError(f"runs: must be runs or paths of run folders, there is a {type(one).__name__}")
-    if all(isinstance(one, JudgedRun) for one in every):
+    if all(isinstance(one, EvaluatedRun) for one in every):
         return every
-    plain = [one.run if isinstance(one, JudgedRun) else one for one in every]
+    plain = [one.run if isinstance(one, EvaluatedRun) else one for one in every]
     read = [found for one in plain for found in ([one] if isinstance(one, Run) else _read(Path(one)))]
-    return [JudgedRun(label, run) for label, run in labelled(read).items()]
+    return [EvaluatedRun(label, run) for label, run in labelled(read).items()]
 
 
-def one_judged(run: OneRun) -> JudgedRun:
+def one_evaluated(run: OneRun) -> EvaluatedRun:
     """The one run that `run` stands for.
 
     Raises
@@ -98,23 +98,23 @@ def one_judged(run: OneRun) -> JudgedRun:
     DataError
         A run folder is damaged.
     """
-    every = judged(run)
+    every = evaluated(run)
     if len(every) > 1:
         raise CallError(f"{run}: holds {len(every)} runs, name one of them")
     return every[0]
 
 
-def run_folders(runs: Iterable[JudgedRun]) -> list[Path]:
+def run_folders(runs: Iterable[EvaluatedRun]) -> list[Path]:
     """The folders of `runs`, of those that have one."""
     return [one.run.path for one in runs if one.run.path is not None]
 
 
-def start_ns(runs: Sequence[JudgedRun]) -> int:
+def start_ns(runs: Sequence[EvaluatedRun]) -> int:
     """Time of the first tick of `runs`; 0 without one."""
     return min((int(ns[0]) for ns in map(_ticks_ns, runs) if len(ns)), default=0)
 
 
-def starts_ns(runs: Sequence[JudgedRun]) -> dict[str, int]:
+def starts_ns(runs: Sequence[EvaluatedRun]) -> dict[str, int]:
     """Start of the recording of each run, by label: the first tick of it and of those that ran at the same time."""
     ends = {one.label: (int(ns[0]), int(ns[-1])) if len(ns) else (0, 0) for one in runs for ns in [_ticks_ns(one)]}
     return {
@@ -167,9 +167,9 @@ def same_recording(one: Run, other: Run) -> bool:
     return one.recording is not None and one.recording == other.recording
 
 
-def by_recording(runs: Sequence[JudgedRun]) -> list[list[JudgedRun]]:
+def by_recording(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
     """`runs` in groups, those of the same recording together."""
-    groups: list[list[JudgedRun]] = []
+    groups: list[list[EvaluatedRun]] = []
     for one in runs:
         group = next((group for group in groups if same_recording(group[0].run, one.run)), None)
         if group is None:
@@ -179,7 +179,7 @@ def by_recording(runs: Sequence[JudgedRun]) -> list[list[JudgedRun]]:
     return groups
 
 
-def recordings_warning(runs: Sequence[JudgedRun]) -> list[str]:
+def recordings_warning(runs: Sequence[EvaluatedRun]) -> list[str]:
     """A line where `runs` are of different recordings, with their names; empty otherwise."""
     groups = by_recording(runs)
     texts = [f"{', '.join(one.label for one in group)} ({_source(group[0].run)})" for group in groups]
@@ -189,7 +189,7 @@ def recordings_warning(runs: Sequence[JudgedRun]) -> list[str]:
 
 def _several(given: Any) -> list[Any]:  # Any: what a user gives
     if isinstance(given, Mapping):
-        return [JudgedRun(str(label), one_judged(run).run) for label, run in given.items()]
+        return [EvaluatedRun(str(label), one_evaluated(run).run) for label, run in given.items()]
     return [given] if isinstance(given, OneRun) or not isinstance(given, Iterable) else list(given)
 
 
@@ -203,7 +203,7 @@ def _read(path: Path) -> list[Run]:
     raise CallError(f"{path}: no run folder, make one with `fgtrack replay`")
 
 
-def _ticks_ns(one: JudgedRun) -> IntArray:
+def _ticks_ns(one: EvaluatedRun) -> IntArray:
     return one.run.tables["timing"]["now_ns"]
 
 

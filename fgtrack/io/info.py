@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgtrack.core.caution import Caution, in_degrees
+from fgtrack.core.diagnostic import Diagnostic, in_degrees
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import seconds, wrong_unit
 from fgtrack.core.types import Detection, DetectionList, EgoState, TruthState
@@ -66,7 +66,7 @@ class InputInfo:
     topics: tuple[TopicInfo, ...]
     problem: str | None
     """Where the input breaks off, or why a replay with the configuration would refuse it."""
-    cautions: tuple[Caution, ...] = ()
+    cautions: tuple[Diagnostic, ...] = ()
     """Times and angles that are probably in another unit."""
 
 
@@ -98,7 +98,7 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
     duration_s = 0.0 if start_ns is None else seconds(end_ns - start_ns)
     found = [one for (name, _), item in sorted(times.items()) for one in item.cautions(name)]
     if start_ns is not None and not found and (text := wrong_unit(2, start_ns, end_ns)):
-        found = [Caution(str(path), text)]
+        found = [Diagnostic(str(path), text)]
     return InputInfo(path, kind, start_ns, duration_s, topics, problem, tuple(found))
 
 
@@ -150,10 +150,10 @@ class _Times:
         intervals = self.count - len(spans_s)
         return intervals / sum(spans_s) if sum(spans_s) > 0.0 else None
 
-    def cautions(self, name: str) -> Iterator[Caution]:
+    def cautions(self, name: str) -> Iterator[Diagnostic]:
         for found in self.receipts_ns.values():
             if (text := wrong_unit(len(found), min(found), max(found))) is not None:
-                yield Caution(name, text)
+                yield Diagnostic(name, text)
                 break
         for angle, (least, most) in self._angles.items():
             if (caution := in_degrees(name, angle, least, most)) is not None:

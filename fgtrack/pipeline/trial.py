@@ -7,7 +7,7 @@ from itertools import takewhile
 
 import numpy as np
 
-from fgtrack.core.caution import EGO, Caution, in_degrees
+from fgtrack.core.diagnostic import EGO, Diagnostic, in_degrees
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DESCRIBING, MEASURABLE, Detection, DetectionList, EgoState, Message, TruthState
@@ -32,7 +32,7 @@ class Trial:
     """How much of the input was tried."""
     samples: Mapping[str, str]
     """What the first message of everything was read as, by `ego`, `truth` and the names of sensors."""
-    suspicions: tuple[Caution, ...]
+    suspicions: tuple[Diagnostic, ...]
     """What is probably wrong with the configuration, each with its cure."""
     run: Run | None
     """The dry run; None where nothing could be tracked."""
@@ -66,7 +66,7 @@ def beginning(messages: Iterable[Message], duration_ns: int) -> Iterator[Message
         yield from takewhile(lambda message: message.receipt_ns - first.receipt_ns <= duration_ns, iterator)
 
 
-def suspicions(messages: Sequence[Message], config: Config) -> Iterator[Caution]:
+def suspicions(messages: Sequence[Message], config: Config) -> Iterator[Diagnostic]:
     """What is probably wrong with how `messages` are read, with what to do."""
     egos = [message for message in messages if isinstance(message, EgoState)]
     truth = [message for message in messages if isinstance(message, TruthState)]
@@ -77,27 +77,27 @@ def suspicions(messages: Sequence[Message], config: Config) -> Iterator[Caution]
     relative = sorted(name for name, found in lists.items() if any(each.frame != "map" for each in found))
     if relative and not egos:
         text = f"no state is read, but {relative[0]} is relative to it: name its topic (input.ego)"
-        yield Caution(EGO, text, spoils=True)
+        yield Diagnostic(EGO, text, spoils=True)
     if egos and not any(ego.stamp_ns for ego in egos):
-        yield Caution(EGO, "all stamps are 0: set `stamp_from: receipt` on its topic", spoils=True)
+        yield Diagnostic(EGO, "all stamps are 0: set `stamp_from: receipt` on its topic", spoils=True)
     yield from _degrees(EGO, egos)
     yield from _degrees("truth", truth)
     for name in sorted(set(config.sensors) - set(lists)):
         if name in (config.input.detections or config.input.csv.detections):
-            yield Caution(name, "sends nothing in the first seconds")
+            yield Diagnostic(name, "sends nothing in the first seconds")
     for name, found in sorted(lists.items()):
         sensor, objects = config.sensors.get(name), [item for each in found for item in each.objects]
         if not any(each.stamp_ns for each in found) and (sensor is None or sensor.stamp_from != "receipt"):
             key = f"sensors.{name}.stamp_from"
             text = f"all stamps are 0: set `stamp_from: receipt` on its topic, or {key}; nothing is known of its delay"
-            yield Caution(name, text, {key: "receipt"}, spoils=True)
+            yield Diagnostic(name, text, {key: "receipt"}, spoils=True)
         yield from _degrees(name, objects)
         yield from _frames(name, found, egos)
         if sensor is not None and objects:
             yield from _measured(name, objects, sensor)
 
 
-def _degrees(name: str, states: Sequence[EgoState | TruthState | Detection]) -> Iterator[Caution]:
+def _degrees(name: str, states: Sequence[EgoState | TruthState | Detection]) -> Iterator[Diagnostic]:
     for angle in ANGULAR:
         values = [value for state in states if (value := getattr(state, angle, None)) is not None]
         finite = [value for value in values if math.isfinite(value)]
@@ -105,7 +105,7 @@ def _degrees(name: str, states: Sequence[EgoState | TruthState | Detection]) -> 
             yield found
 
 
-def _frames(name: str, lists: Sequence[DetectionList], egos: Sequence[EgoState]) -> Iterator[Caution]:
+def _frames(name: str, lists: Sequence[DetectionList], egos: Sequence[EgoState]) -> Iterator[Diagnostic]:
     """Whether positions are far from where their frame puts them, and near in the other one."""
     points = [
         (each.stamp_ns, item.x_m, item.y_m)
@@ -126,22 +126,22 @@ def _frames(name: str, lists: Sequence[DetectionList], egos: Sequence[EgoState])
             f"is read as in the map, {from_ego_m:.0f} m from the ego, but its numbers are small ({bare_m:.0f} m): "
             "set `frame: ego` (or sensor)"
         )
-        yield Caution(name, text, spoils=True)
+        yield Diagnostic(name, text, spoils=True)
     if frame != "map" and bare_m > _FAR_M and from_ego_m < _NEARER * bare_m:
         text = (
             f"is read as relative to the {frame}, {bare_m:.0f} m away, but its numbers lie {from_ego_m:.0f} m from "
             "where the ego is in the map: set `frame: map`"
         )
-        yield Caution(name, text, spoils=True)
+        yield Diagnostic(name, text, spoils=True)
 
 
-def _measured(name: str, objects: Sequence[Detection], sensor: SensorModel) -> Iterator[Caution]:
+def _measured(name: str, objects: Sequence[Detection], sensor: SensorModel) -> Iterator[Diagnostic]:
     given = {component for item in objects for component in item.measured}
     missing = [component for component in sensor.std if component not in given]
     if missing:
         has = ", ".join(component for component in MEASURABLE if component in given) or "nothing"
         what = f"{', '.join(missing)} of its std, but {has}"
-        yield Caution(name, f"never measures {what}: change sensors.{name}.std or the fields")
+        yield Diagnostic(name, f"never measures {what}: change sensors.{name}.std or the fields")
 
 
 def _samples(messages: Sequence[Message]) -> dict[str, str]:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, IntArray
-from fgtrack.evaluation.runs import OneRun, one_judged, start_ns
+from fgtrack.evaluation.runs import OneRun, one_evaluated, start_ns
 from fgtrack.io.run import Table
 from fgtrack.io.run.schema import Column
 from fgtrack.plotting.paper import Paper, Sheet, styled
@@ -51,7 +51,7 @@ def arrivals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     DataError
         The run has no detections.
     """
-    one = one_judged(run)
+    one = one_evaluated(run)
     updates = one.run.tables["updates"]
     if not updates.num_rows:
         raise DataError(f"{one.label}: has no detections, so there are no arrivals to draw")

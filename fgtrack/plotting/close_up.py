@@ -15,7 +15,7 @@ from fgtrack.core.geometry import rotation
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import YAW, FloatArray, IntArray
 from fgtrack.evaluation.palette import Look
-from fgtrack.evaluation.runs import JudgedRun, Runs, judged
+from fgtrack.evaluation.runs import EvaluatedRun, Runs, evaluated
 from fgtrack.evaluation.truth import TruePath, true_paths
 from fgtrack.plotting.paper import Paper, Sheet, is_column, styled
 from fgtrack.plotting.style import GREY, legend_above, run_looks
@@ -90,7 +90,7 @@ def close_up(runs: Runs, close_ups: Sequence[CloseUp], **paper: Unpack[Paper]) -
     CallError
         They are not as many, or of different detections.
     """
-    every = judged(runs)
+    every = evaluated(runs)
     if len(every) != len(close_ups) or len({one.arrival for one in close_ups}) != 1:
         raise CallError(f"{len(every)} runs need as many close-ups of one detection")
     first = close_ups[0]
@@ -125,7 +125,7 @@ def close_up(runs: Runs, close_ups: Sequence[CloseUp], **paper: Unpack[Paper]) -
     return sheet.figure
 
 
-def _true_path(run: JudgedRun, one: CloseUp) -> TruePath | None:
+def _true_path(run: EvaluatedRun, one: CloseUp) -> TruePath | None:
     """Path of the true object nearest to the present; None where none is known."""
     now_ns, at_m = np.array([one.now_ns]), one.after.means[-1, :2]
     paths = [path for path in true_paths(run.run.tables["truth"]) if np.isfinite(path.at(now_ns)[0, 0])]
@@ -135,7 +135,7 @@ def _true_path(run: JudgedRun, one: CloseUp) -> TruePath | None:
 class _Panel:
     """Errors of one run before and after, ahead and to the left of the reference."""
 
-    def __init__(self, run: JudgedRun, one: CloseUp, look: Look, first: CloseUp, truth: TruePath | None) -> None:
+    def __init__(self, run: EvaluatedRun, one: CloseUp, look: Look, first: CloseUp, truth: TruePath | None) -> None:
         self._label, self._look, self._one = run.label, look, one
         self._forgets = run.run.meta.get("estimator") in _FORGET
         turn, now_ns = rotation(-float(first.after.means[-1, YAW])), one.now_ns

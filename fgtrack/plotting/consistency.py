@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.evaluation.runs import JudgedRun, OneRun, one_judged, start_ns
+from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
 from fgtrack.evaluation.scores.consistency import position_nees
 from fgtrack.evaluation.scores.innovations import num_measured
 from fgtrack.evaluation.scores.statistics import chi_square_band
@@ -43,7 +43,7 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     DataError
         The run has neither truth of its tracks nor innovations.
     """
-    one = one_judged(run)
+    one = one_evaluated(run)
     panels = _panels(one)
     if not panels:
         raise DataError(f"{one.label}: has no errors and no innovations, so there is no consistency to draw")
@@ -90,7 +90,7 @@ _NEES = "NEES of the position"
 _Squares = tuple[IntArray, FloatArray, IntArray]  # stamps, values, degrees of freedom; of shape (n,) each
 
 
-def _panels(one: JudgedRun) -> dict[str, _Squares]:
+def _panels(one: EvaluatedRun) -> dict[str, _Squares]:
     """What there is to show, by name."""
     found: dict[str, _Squares] = {}
     if one.matching is not None:
@@ -107,7 +107,7 @@ def _panels(one: JudgedRun) -> dict[str, _Squares]:
     return found
 
 
-def has_squares(one: JudgedRun) -> bool:
+def has_squares(one: EvaluatedRun) -> bool:
     """Whether `consistency` has anything to show."""
     return bool(_panels(one))
 

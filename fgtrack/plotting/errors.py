@@ -14,7 +14,7 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.matching import TrackErrors, track_errors
 from fgtrack.evaluation.palette import Look
-from fgtrack.evaluation.runs import JudgedRun, Runs, judged, starts_ns
+from fgtrack.evaluation.runs import EvaluatedRun, Runs, evaluated, starts_ns
 from fgtrack.evaluation.scores.lagged import final_errors
 from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.plotting.paper import Paper, Sheet, styled
@@ -66,7 +66,7 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
     DataError
         No run has truth, or none of this object.
     """
-    every = [one for one in judged(runs) if one.matching is not None]
+    every = [one for one in evaluated(runs) if one.matching is not None]
     known = sorted({k for one in every if one.matching for k in one.matching.object_ids})
     if not known:
         raise DataError("no run has truth, so there are no errors to draw")
@@ -94,7 +94,7 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
     return sheet.figure
 
 
-def _curves(runs: Sequence[JudgedRun], object_id: int | None) -> list[_Curve]:
+def _curves(runs: Sequence[EvaluatedRun], object_id: int | None) -> list[_Curve]:
     """Errors of the present states of every run, then of the final ones of those that have them."""
     first_ns, styles = starts_ns(runs), run_looks(runs)
     present: list[_Curve] = []
@@ -163,7 +163,7 @@ def lag(runs: Runs, quantity: str = "position_m", **paper: Unpack[Paper]) -> Fig
     DataError
         No run has truth of this quantity.
     """
-    every = judged(runs)
+    every = evaluated(runs)
     if quantity not in _QUANTITIES or not any(entry.errors[quantity].count for one in every for entry in one.lagged):
         raise DataError(f"no run has tracks with truth of {quantity}, so there are no errors to draw")
     what, unit, factor = _QUANTITIES[quantity]

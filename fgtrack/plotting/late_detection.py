@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FUSED, DetectionList, Disposition, FloatArray, Message
-from fgtrack.evaluation.runs import JudgedRun, by_recording
+from fgtrack.evaluation.runs import EvaluatedRun, by_recording
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import Run, load_run
 from fgtrack.io.source import open_input
@@ -64,7 +64,7 @@ def close_ups(
 
 
 def drawn_close_up(
-    runs: Sequence[JudgedRun], track_id: int | None = None, stamp_ns: int | None = None, **paper: Unpack[Paper]
+    runs: Sequence[EvaluatedRun], track_id: int | None = None, stamp_ns: int | None = None, **paper: Unpack[Paper]
 ) -> tuple[list[tuple[str, Figure]], CloseUp | DataError]:
     """Return the named figure of `close_ups` and the first of these; no figure and the error where there is none.
 

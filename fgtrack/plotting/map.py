@@ -11,7 +11,7 @@ from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.placement import placed
 from fgtrack.evaluation.roads import excluded_lines, road_lines, roads
-from fgtrack.evaluation.runs import JudgedRun, OneRun, one_judged, start_ns
+from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import Run, Table
 from fgtrack.plotting.paper import Paper, Sheet, styled
@@ -49,7 +49,7 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     DataError
         `config.yaml` is not YAML, or the map that it names is no map.
     """
-    one = one_judged(run)
+    one = one_evaluated(run)
     maps, notes = roads(one.run)
     bounds_m = [line for road in maps.values() for line in road_lines(road)[:2]]
     rings = excluded_lines(one.run)
@@ -150,7 +150,7 @@ def _positions(table: Table) -> FloatArray:
     return np.stack([table["x_m"], table["y_m"]], axis=-1)
 
 
-def _draw_objects(axes: Axes, one: JudgedRun, tracks: Table, window: _Window | None) -> None:
+def _draw_objects(axes: Axes, one: EvaluatedRun, tracks: Table, window: _Window | None) -> None:
     """Truth and tracks, in their colours."""
     step_ns = usual_step_ns(one.run.tables["tracks"]["now_ns"])
     matching = one.matching

@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fgtrack.evaluation.matching import track_errors
-from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.evaluation.tables.seeds import SweepTable
 from fgtrack.plotting.arrivals import arrivals
@@ -64,7 +64,7 @@ class Planned:
     """True if it is one of many, and drawn on request only."""
 
 
-def planned(runs: Sequence[JudgedRun]) -> list[Planned]:
+def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
     """Return every figure that `runs` have data for; of many objects and runs but the worst few are extras.
 
     Raises
@@ -98,9 +98,9 @@ def planned(runs: Sequence[JudgedRun]) -> list[Planned]:
     return plans
 
 
-def _alike(runs: Sequence[JudgedRun], *names: str) -> list[list[JudgedRun]]:
+def _alike(runs: Sequence[EvaluatedRun], *names: str) -> list[list[EvaluatedRun]]:
     """Runs with detections, together those whose columns `names` of updates.csv are the same."""
-    groups: dict[bytes, list[JudgedRun]] = {}
+    groups: dict[bytes, list[EvaluatedRun]] = {}
     for one in runs:
         if (updates := one.run.tables["updates"]).num_rows:
             order = np.lexsort([updates[name] for name in _DETECTION])  # estimators may take them in another order
@@ -109,7 +109,7 @@ def _alike(runs: Sequence[JudgedRun], *names: str) -> list[list[JudgedRun]]:
     return list(groups.values())
 
 
-def _of_groups(groups: Sequence[Sequence[JudgedRun]], name: str, draw: Callable[..., Figure]) -> Iterator[Planned]:
+def _of_groups(groups: Sequence[Sequence[EvaluatedRun]], name: str, draw: Callable[..., Figure]) -> Iterator[Planned]:
     """One figure for each of `groups`; of many the first are no extras."""
     for k, group in enumerate(groups):
         label = "" if len(groups) == 1 else ", ".join(one.label for one in group)
@@ -117,14 +117,14 @@ def _of_groups(groups: Sequence[Sequence[JudgedRun]], name: str, draw: Callable[
         yield Planned(file, partial(draw, replace(group[0], label=label)), len(groups) > _MOST_RUNS and k >= _FEW)
 
 
-def _worst(runs: Sequence[JudgedRun]) -> list[JudgedRun]:
+def _worst(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
     """`runs` from the largest position RMSE to the smallest; those that tracked no true object come first."""
     lost = [one.matching is not None and not one.matching.paired.any() for one in runs]
     order = sorted(range(len(runs)), key=lambda k: np.inf if lost[k] else _rmse_m(runs[k]), reverse=True)
     return [runs[k] for k in order]
 
 
-def _rmse_m(one: JudgedRun, object_id: int | None = None) -> float:
+def _rmse_m(one: EvaluatedRun, object_id: int | None = None) -> float:
     """Position RMSE of a run, of one object or over all; -1 where there is none."""
     if one.matching is None or (object_id is not None and object_id not in one.matching.object_ids):
         return -1.0

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
-from fgtrack.evaluation.runs import JudgedRun, OneRun, one_judged, start_ns
+from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
 from fgtrack.evaluation.scores import innovations
 from fgtrack.evaluation.scores.innovations import RESIDUAL_NAMES
 from fgtrack.evaluation.scores.statistics import Moments
@@ -41,7 +41,7 @@ def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     DataError
         The run has no innovations.
     """
-    one = one_judged(run)
+    one = one_evaluated(run)
     values, updates = innovations.residuals(one.run), one.run.tables["updates"]
     time_s = (updates["stamp_ns"] - start_ns([one])) / NS_PER_S
     sensors = np.unique(updates["sensor"]).tolist()
@@ -81,6 +81,6 @@ def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     return sheet.figure
 
 
-def has_residuals(one: JudgedRun) -> bool:
+def has_residuals(one: EvaluatedRun) -> bool:
     """True if `residuals` has anything to show."""
     return any(np.isfinite(values).any() for values in innovations.residuals(one.run).values())

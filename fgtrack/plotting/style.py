@@ -24,7 +24,7 @@ from PIL.PngImagePlugin import PngInfo
 from fgtrack.core.errors import CallError, printable_lines
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.palette import PALETTE, SENSORS, Look, looks
-from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.runs import EvaluatedRun
 
 _RC: Any = mpl.rcParams  # Any: its keys are a Literal of all names
 WRONG = "#000000"
@@ -83,7 +83,7 @@ def sensor_colour(index: int) -> str:
     return SENSORS[index % len(SENSORS)]
 
 
-def run_looks(runs: Sequence[JudgedRun]) -> dict[str, Look]:
+def run_looks(runs: Sequence[EvaluatedRun]) -> dict[str, Look]:
     """Return how the curves of each run look, by label: colours are those of the estimators."""
     found = looks([str(one.run.meta.get("estimator") or one.label) for one in runs])
     return {one.label: each for one, each in zip(runs, found, strict=True)}

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.runs import OneRun, Runs, judged, one_judged
+from fgtrack.evaluation.runs import OneRun, Runs, evaluated, one_evaluated
 from fgtrack.evaluation.scores.innovations import message_delays
 from fgtrack.evaluation.scores.statistics import Distribution
 from fgtrack.io.run import Run
@@ -27,7 +27,7 @@ def delays(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     DataError
         The run has no detections.
     """
-    one = one_judged(run)
+    one = one_evaluated(run)
     if not one.run.tables["updates"].num_rows:
         raise DataError(f"{one.label}: has no detections, so there are no delays to draw")
     sheet = Sheet(7.0, 3.8, paper)
@@ -59,7 +59,7 @@ def timing(runs: Runs, **paper: Unpack[Paper]) -> Figure:
     DataError
         No run has a tick with detections.
     """
-    every = judged(runs)
+    every = evaluated(runs)
     if not any((one.run.tables["timing"]["num_detections"] > 0).any() for one in every):
         raise DataError("no run has detections, so there are no processing times to draw")
     sheet = Sheet(7.0, 3.8, paper)

@@ -8,7 +8,7 @@ from pathlib import Path
 from fgtrack.core.errors import CallError, printable
 from fgtrack.evaluation.palette import distinct_colours
 from fgtrack.evaluation.roads import excluded_lines, roads
-from fgtrack.evaluation.runs import Runs, judged, run_folders, same_recording
+from fgtrack.evaluation.runs import Runs, evaluated, run_folders, same_recording
 from fgtrack.io.output import check_apart
 from fgtrack.io.ros.bag_writer import token
 from fgtrack.io.run import Run
@@ -44,7 +44,7 @@ def export(runs: Runs, out: Path, *, ros2: bool = False, overwrite: bool = False
     """
     check, write = (check_ros2, write_ros2) if ros2 else _foxglove()
     check(out, overwrite)
-    every = judged(runs)
+    every = evaluated(runs)
     check_apart(out, run_folders(every))
     named = {one.label: one.run for one in every}
     messages, notes = viewer_messages(named)

@@ -14,7 +14,7 @@ from fgtrack.evaluation.diagnostics import USED
 from fgtrack.evaluation.palette import SENSORS, distinct_colours
 from fgtrack.evaluation.placement import placed, update_rows
 from fgtrack.evaluation.roads import excluded_lines, road_lines, roads
-from fgtrack.evaluation.runs import JudgedRun, by_recording
+from fgtrack.evaluation.runs import EvaluatedRun, by_recording
 from fgtrack.io.run import Run, Table
 from fgtrack.viewers.states import AROUND_95, NOMINAL_SIZE_M, ellipses, final_ns, located, start_ns, track_positions
 
@@ -29,7 +29,7 @@ _TIME_DIGITS, _DIGITS = 4, 3  # of seconds; of metres and radians
 _LONGEST_S = 1e7  # times farther from the start are of another clock, and left out
 
 
-def playback(runs: Sequence[JudgedRun], moment: Moment | None = None) -> tuple[Json, list[str]]:
+def playback(runs: Sequence[EvaluatedRun], moment: Moment | None = None) -> tuple[Json, list[str]]:
     """Return what the viewer shows of `runs`, first `moment`, and a line for whatever it does not show.
 
     Times are seconds from the start of a recording, positions relative to its origin, and missing values null.
@@ -60,12 +60,12 @@ def playback(runs: Sequence[JudgedRun], moment: Moment | None = None) -> tuple[J
 class _Recording:
     """Runs of one recording, and the time and place that theirs are relative to."""
 
-    runs: Sequence[JudgedRun]
+    runs: Sequence[EvaluatedRun]
     start_ns: int
     origin_m: FloatArray
 
     @classmethod
-    def of(cls, runs: Sequence[JudgedRun]) -> "_Recording":
+    def of(cls, runs: Sequence[EvaluatedRun]) -> "_Recording":
         """Return the recording of `runs`; its origin is near the middle of all that is drawn, in whole metres."""
         origin_m = np.zeros(2)
         for table in (
@@ -126,7 +126,7 @@ class _Recording:
             "truth": {"object": _column(truth["object_id"]), **self.columns(truth, "stamp_ns")},
         }
 
-    def run(self, one: JudgedRun, notes: dict[str, None], most: int) -> Json:
+    def run(self, one: EvaluatedRun, notes: dict[str, None], most: int) -> Json:
         """Ticks, tracks, their past at every tick, final states and detections."""
         tables, lagged, smoothed = one.run.tables, one.run.tables["lagged"], one.run.tables["smoothed"]
         past = self.rows(lagged.where(lagged["lag_s"] > 0.0), "now_ns", "track_id", "stamp_ns")

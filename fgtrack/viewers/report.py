@@ -14,7 +14,7 @@ from typing import Any
 import fgtrack
 from fgtrack.core.errors import printable
 from fgtrack.evaluation.diagnostics import diagnostics, noise_diagnostics
-from fgtrack.evaluation.runs import JudgedRun, recordings_warning
+from fgtrack.evaluation.runs import EvaluatedRun, recordings_warning
 from fgtrack.evaluation.tables import Table, Tables, grid
 from fgtrack.io.output import new_file
 from fgtrack.viewers.playback import Moment, playback
@@ -44,7 +44,7 @@ class Opening:
 
 
 def write_report(
-    runs: Sequence[JudgedRun],
+    runs: Sequence[EvaluatedRun],
     tables: Tables,
     pictures: Iterable[tuple[str, bytes]],
     out: Path,
@@ -84,7 +84,7 @@ def write_report(
     return len(text)
 
 
-def _page(runs: Sequence[JudgedRun], tables: Tables, pictures: Iterable[tuple[str, bytes]], opening: Opening) -> str:
+def _page(runs: Sequence[EvaluatedRun], tables: Tables, pictures: Iterable[tuple[str, bytes]], opening: Opening) -> str:
     scene, notes = playback(runs, opening.moment)
     warnings = recordings_warning(runs)
     warnings += [f"{one.label}: {line}" for one in runs for line in diagnostics(one.run)]
@@ -197,7 +197,7 @@ def _figure(name: str, picture: bytes) -> str:
     )
 
 
-def _configuration(runs: Sequence[JudgedRun]) -> str:
+def _configuration(runs: Sequence[EvaluatedRun]) -> str:
     """The keys whose values differ between runs, then everything of each run."""
     settings = {one.label: flattened(one.run.config) for one in runs}
     keys = dict.fromkeys(key for one in settings.values() for key in one)
@@ -226,7 +226,7 @@ def flattened(config: Mapping[str, Any], above: str = "") -> dict[str, str]:
 _FACTS = ("run", "estimator", "recording", "detections", "time [s]", "versions", "digest")
 
 
-def _facts(one: JudgedRun) -> list[str]:
+def _facts(one: EvaluatedRun) -> list[str]:
     """What a run was made of, by whom and how long it took, in the order of `_FACTS`."""
     meta = one.run.meta
     versions: Mapping[str, Any] = meta.get("versions") or {}

@@ -17,7 +17,7 @@ import fgtrack
 from fgtrack.cli.main import run as command
 from fgtrack.evaluation.palette import look
 from fgtrack.evaluation.placement import placed
-from fgtrack.evaluation.runs import judged
+from fgtrack.evaluation.runs import evaluated
 from fgtrack.io.run import Table
 from fgtrack.viewers.playback import playback
 from fgtrack.viewers.report import flattened
@@ -178,14 +178,14 @@ def test_the_same_runs_give_the_same_bytes_and_replace_nothing(
 def test_runs_of_different_recordings_have_each_their_own_map_and_time(folder: Path) -> None:
     fgtrack.simulate("default", seed=4, duration_s=1.0, out=folder / "other.jsonl", overwrite=True)
     other = fgtrack.replay(folder / "other.jsonl", "tuned", map="oval", pit_map="oval", estimator="ekf-replay")
-    shown, _ = playback(judged([folder / "runs" / NAMES[0], other]))
+    shown, _ = playback(evaluated([folder / "runs" / NAMES[0], other]))
     assert [one["recording"] for one in shown["runs"]] == [0, 1]
 
 
 def test_old_runs_without_detections_and_ego_are_shown_and_noted(folder: Path, tmp_path: Path) -> None:
     for name in ("config.yaml", "meta.json", "tracks.csv", "updates.csv", "timing.csv"):
         (tmp_path / name).write_bytes((folder / "runs" / NAMES[0] / name).read_bytes())
-    shown, notes = playback(judged(tmp_path))
+    shown, notes = playback(evaluated(tmp_path))
     assert any("no detections.csv" in note for note in notes)
     assert len(shown["runs"][0]["tracks"]["t"]) > 100
 
@@ -194,14 +194,14 @@ def test_a_sensor_whose_clock_is_years_off_has_no_stamps(folder: Path) -> None:
     run = fgtrack.load_run(folder / "runs" / NAMES[0])
     off = {"stamp_ns": run.tables["detections"]["stamp_ns"] - 10**18}
     detections, updates = Table({**run.tables["detections"], **off}), Table({**run.tables["updates"], **off})
-    found = playback(judged(run.with_tables(detections=detections, updates=updates)))[0]["runs"][0]["detections"]
+    found = playback(evaluated(run.with_tables(detections=detections, updates=updates)))[0]["runs"][0]["detections"]
     assert set(found["stamp"]) == {None}
     assert None not in found["receipt"]
 
 
 def test_long_runs_are_thinned_and_it_is_reported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fgtrack.viewers.playback.MOST_ROWS", 200)
-    shown, notes = playback(judged(folder / "runs" / NAMES[0]))
+    shown, notes = playback(evaluated(folder / "runs" / NAMES[0]))
     run = fgtrack.load_run(folder / "runs" / NAMES[0])
     step = -(-run.tables["tracks"].num_rows // 200)
     assert step > 1

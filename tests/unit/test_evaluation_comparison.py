@@ -10,7 +10,7 @@ from evaluation_runs import ROUND, WEST, update, write_run
 
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.comparison import Comparison, Quantity, comparisons
-from fgtrack.evaluation.runs import JudgedRun, same_recording
+from fgtrack.evaluation.runs import EvaluatedRun, same_recording
 from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.run import Run
 
@@ -26,8 +26,8 @@ def a_run(folder: Path, across_m: FloatArray, *, first: int = 0, config_text: st
     return write_run(folder, tracks, truth=truth, updates=updates, config_text=config_text)
 
 
-def judged(runs: Sequence[Run]) -> list[JudgedRun]:
-    return [JudgedRun(str(number), run) for number, run in enumerate(runs)]
+def judged(runs: Sequence[Run]) -> list[EvaluatedRun]:
+    return [EvaluatedRun(str(number), run) for number, run in enumerate(runs)]
 
 
 def comparison_of(runs: Sequence[Run]) -> Comparison:
@@ -127,23 +127,23 @@ def test_nothing_in_common_is_said(tmp_path: Path) -> None:
 
 
 def test_runs_of_other_recordings_or_judged_otherwise_are_not_paired(tmp_path: Path, trio: list[Run]) -> None:
-    one = JudgedRun("one", trio[0])
+    one = EvaluatedRun("one", trio[0])
     other_truth = write_run(tmp_path / "truth", [[WEST.track(0, 1)]], truth=WEST.truth(range(9)))
     other_gate = a_run(tmp_path / "gate", NOISE_M, config_text="evaluation: {gate_m: 3.0}")
     more_detections = trio[1].with_tables(
         updates=write_run(tmp_path / "more", updates={0: [update(), update()]}).tables["updates"]
     )
     for other in (other_truth, other_gate, more_detections):
-        assert comparisons([one, JudgedRun("other", other)]) == []
+        assert comparisons([one, EvaluatedRun("other", other)]) == []
 
 
 def test_the_same_detections_with_other_delays_or_other_stamps_are_paired(tmp_path: Path, trio: list[Run]) -> None:
-    one = JudgedRun("one", trio[0])
+    one = EvaluatedRun("one", trio[0])
     later = write_run(tmp_path / "later", updates={k: [update(tick=k, delay_ns=7)] for k in range(0, TICKS, 5)})
     restamped = a_run(tmp_path / "restamped", NOISE_M, stamps_late=1)
     for other in (trio[1].with_tables(updates=later.tables["updates"]), restamped):
         assert same_recording(one.run, other)
-        assert len(comparisons([one, JudgedRun("other", other)])) == 1
+        assert len(comparisons([one, EvaluatedRun("other", other)])) == 1
 
 
 def test_each_recording_has_a_comparison_of_its_own(tmp_path: Path, trio: list[Run]) -> None:

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Disposition
-from fgtrack.evaluation.runs import judged
+from fgtrack.evaluation.runs import evaluated
 from fgtrack.io.run import Run
 from fgtrack.models.track_map import COLUMNS, TrackMap
 from fgtrack.plotting import plot
@@ -113,7 +113,7 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Callable[[Sequence[Run]], list[str
     """Gives the names of the figures that runs have data for; none is drawn."""
     for name in EXPECTED:
         monkeypatch.setattr(plot, name, lambda *_: Figure())
-    return lambda runs: [plan.name for plan in plot.planned(judged(runs))]
+    return lambda runs: [plan.name for plan in plot.planned(evaluated(runs))]
 
 
 def legend(axes: Axes) -> list[str]:
@@ -200,7 +200,7 @@ def test_arrivals_show_the_part_with_the_most_late_detections(tmp_path: Path) ->
 def test_a_file_is_named_after_its_figure_and_run(tmp_path: Path) -> None:
     run = write_run(tmp_path / "a run", updates={0: [update(x_m=1.0, y_m=1.0, delay_ns=1)]})
     (tmp_path / "out").mkdir()
-    files = plot.save_named(plot.drawn(plot.planned(judged(run))), tmp_path / "out", "svg")
+    files = plot.save_named(plot.drawn(plot.planned(evaluated(run))), tmp_path / "out", "svg")
     assert [file.name for file in files] == [
         *("residuals_a_run_smoother.svg", "arrivals.svg", "delays.svg", "timing.svg")
     ]
@@ -301,7 +301,7 @@ def short_run(tmp_path: Path) -> Run:
 def test_files_hold_no_date_and_no_version(
     form: str, start: bytes, varying: bytes, short_run: Run, tmp_path: Path
 ) -> None:
-    (file,) = plot.save_named(plot.drawn(plot.planned(judged(short_run))), tmp_path, form)
+    (file,) = plot.save_named(plot.drawn(plot.planned(evaluated(short_run))), tmp_path, form)
     assert file.name == f"timing.{form}"
     content = file.read_bytes()
     assert content.startswith(start)

@@ -11,7 +11,7 @@ from support.scripts import load
 
 from fgtrack.core.types import Disposition, EgoState, TickReport
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.runs import judged
+from fgtrack.evaluation.runs import evaluated
 from fgtrack.evaluation.scores.innovations import local_innovations
 from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.run import Run, RunWriter, load_run
@@ -75,7 +75,7 @@ def test_an_object_is_ahead_and_left_of_the_ego_and_slower(on_the_oval: Run) -> 
 
 def test_the_tables_of_the_paper(tmp_path: Path) -> None:
     run = run_beside(tmp_path / "run")
-    tables = paper.evaluation(judged(run))
+    tables = paper.evaluation(evaluated(run))
     (row,) = tables.tables["residuals"].plain()
     assert row["along_mean_m"] == pytest.approx((149 * -0.3 + 2 * 1.0) / 151)
     assert (row["speed_mean_mps"], row["speed_std_mps"], row["yaw_mean_rad"]) == (2.0, 0.0, None)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from evaluation_runs import ROUND, WEST, write_run
 
-from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.scores.deadlines import Deadlines
 from fgtrack.evaluation.tables import Tables
 from fgtrack.evaluation.tables.compare import compare
@@ -34,32 +34,32 @@ def rmse(tables: Tables, judged: str) -> dict[str, float]:
 
 
 def test_what_took_30_ms_is_judged_30_ms_later(tmp_path: Path) -> None:
-    found = streamed(JudgedRun("a", made(tmp_path / "run", [30, 0])))
+    found = streamed(EvaluatedRun("a", made(tmp_path / "run", [30, 0])))
     assert found.errors_m[ASKED] == pytest.approx(0.0, abs=1e-6)
     assert found.errors_m[READY][:3].tolist() == pytest.approx([20.0 * 0.03, 20.0 * 0.01, 0.0], abs=1e-6)
 
 
 def test_a_tick_that_takes_longer_than_the_period_makes_the_next_ones_late(tmp_path: Path) -> None:
-    found = streamed(JudgedRun("a", made(tmp_path / "run", [50, 10, 10, 0])))
+    found = streamed(EvaluatedRun("a", made(tmp_path / "run", [50, 10, 10, 0])))
     later_s = np.array([0.05, 0.04, 0.03, 0.01, 0.0])
     assert found.errors_m[READY][:5].tolist() == pytest.approx((20.0 * later_s).tolist(), abs=1e-6)
 
 
 def test_a_user_who_predicts_pays_for_what_its_speed_does_not_tell(tmp_path: Path) -> None:
-    straight = streamed(JudgedRun("a", made(tmp_path / "run", [10], speed_mps=3.0)))
+    straight = streamed(EvaluatedRun("a", made(tmp_path / "run", [10], speed_mps=3.0)))
     assert straight.errors_m[READY] == pytest.approx(0.2, abs=1e-6)
     assert straight.errors_m[PREDICTED] == pytest.approx(0.03, abs=1e-6)
     truth = ROUND.truth(range(-1, 100))
     tracks = [[ROUND.track(tick, 1)] for tick in TICKS]
     run = write_run(tmp_path / "round", tracks, truth=truth, process_ns=[19 * MS] * len(TICKS))
-    turning = streamed(JudgedRun("b", run))
+    turning = streamed(EvaluatedRun("b", run))
     expected_m = 0.5 * 30.0 * 0.5 * 0.019**2  # half of v omega t^2
     assert turning.errors_m[PREDICTED] == pytest.approx(expected_m, rel=0.05)
 
 
 def test_a_track_without_yaw_and_speed_stays_where_it_was_published(tmp_path: Path) -> None:
     run = made(tmp_path / "run", [10], yaw_rad=np.nan, speed_mps=np.nan)
-    found = streamed(JudgedRun("a", run))
+    found = streamed(EvaluatedRun("a", run))
     np.testing.assert_array_equal(found.errors_m[PREDICTED], found.errors_m[READY])
 
 

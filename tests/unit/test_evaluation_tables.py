@@ -16,7 +16,7 @@ from unit.evaluation_runs import ROUND, WEST, update, write_run
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Disposition
 from fgtrack.evaluation.metrics import Metrics, evaluate
-from fgtrack.evaluation.runs import JudgedRun, labelled
+from fgtrack.evaluation.runs import EvaluatedRun, labelled
 from fgtrack.evaluation.scores.statistics import Distribution
 from fgtrack.evaluation.tables import Column, Table, Tables, short, two_digits
 from fgtrack.evaluation.tables.compare import BACKWARD_FORWARD_NOTE, compare
@@ -72,9 +72,9 @@ def rows_of(tables: Tables, name: str) -> list[str]:
     ]
 
 
-def evaluated(label: str, run: Run, metrics: Metrics) -> JudgedRun:
+def evaluated(label: str, run: Run, metrics: Metrics) -> EvaluatedRun:
     """A run with these metrics."""
-    one = JudgedRun(label, run)
+    one = EvaluatedRun(label, run)
     one.__dict__["metrics"] = metrics
     return one
 

@@ -9,19 +9,19 @@ from support.pictures import faults
 from test_figure_texts import a_run
 
 from fgtrack.core.errors import CallError
-from fgtrack.evaluation.runs import JudgedRun, judged
+from fgtrack.evaluation.runs import EvaluatedRun, evaluated
 from fgtrack.plotting import plot
 from fgtrack.plotting.paper import inches
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> list[JudgedRun]:
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[EvaluatedRun]:
     folder = tmp_path_factory.mktemp("paper")
-    return judged([a_run(folder / name) for name in ("smoother", "ekf-replay", "ekf-backward-forward")])
+    return evaluated([a_run(folder / name) for name in ("smoother", "ekf-replay", "ekf-backward-forward")])
 
 
 @pytest.mark.parametrize("name", ["errors", "lag", "timing", "delays"])
-def test_a_figure_in_a_column_is_readable(name: str, runs: list[JudgedRun]) -> None:
+def test_a_figure_in_a_column_is_readable(name: str, runs: list[EvaluatedRun]) -> None:
     figure = getattr(plot, name)(runs if name != "delays" else runs[0], width="3.4in")
     assert figure.get_figwidth() == pytest.approx(3.4)
     assert figure.get_suptitle() == ""  # a paper has captions
@@ -30,7 +30,7 @@ def test_a_figure_in_a_column_is_readable(name: str, runs: list[JudgedRun]) -> N
         assert axes.get_window_extent().width > 0.7 * figure.bbox.width
 
 
-def test_settings_of_the_user_are_kept_and_a_font_is_that_of_every_text(runs: list[JudgedRun]) -> None:
+def test_settings_of_the_user_are_kept_and_a_font_is_that_of_every_text(runs: list[EvaluatedRun]) -> None:
     with mpl.rc_context({"font.family": "DejaVu Serif", "axes.grid": False}):
         figure = plot.timing(runs)
     assert figure.axes[0].xaxis.label.get_fontfamily() == ["DejaVu Serif"]
@@ -38,13 +38,13 @@ def test_settings_of_the_user_are_kept_and_a_font_is_that_of_every_text(runs: li
     assert mpl.rcParams["font.family"] == ["sans-serif"]
 
 
-def test_a_style_is_a_file_or_a_name(runs: list[JudgedRun], tmp_path: Path) -> None:
+def test_a_style_is_a_file_or_a_name(runs: list[EvaluatedRun], tmp_path: Path) -> None:
     (tmp_path / "mine.mplstyle").write_text("axes.facecolor: black\n")
     assert plot.timing(runs, style=tmp_path / "mine.mplstyle").axes[0].get_facecolor() == (0.0, 0.0, 0.0, 1.0)
     assert plot.timing(runs, style="dark_background").axes[0].get_facecolor() == (0.0, 0.0, 0.0, 1.0)
 
 
-def test_axes_of_ones_own_are_drawn_into(runs: list[JudgedRun]) -> None:
+def test_axes_of_ones_own_are_drawn_into(runs: list[EvaluatedRun]) -> None:
     figure, (left, right) = plt.subplots(1, 2)
     assert plot.lag(runs, ax=left) is figure
     assert left.get_xlabel() == "lag of the output [s]"
@@ -74,6 +74,6 @@ def test_a_width_has_a_unit_or_is_in_inches(text: str | float, expected: float) 
         ({"style": "nowhere.mplstyle"}, "cannot be used"),
     ],
 )
-def test_what_is_not_usable_is_one_clear_error(paper: dict[str, str], message: str, runs: list[JudgedRun]) -> None:
+def test_what_is_not_usable_is_one_clear_error(paper: dict[str, str], message: str, runs: list[EvaluatedRun]) -> None:
     with pytest.raises(CallError, match=message):
         plot.timing(runs, **paper)

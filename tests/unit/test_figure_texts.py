@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from support.pictures import faults
 
 from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState
-from fgtrack.evaluation.runs import judged
+from fgtrack.evaluation.runs import evaluated
 from fgtrack.io.run import Run
 from fgtrack.plotting import plot
 from fgtrack.plotting.paper import styled
@@ -75,7 +75,7 @@ SCENES = {
 
 def figures(runs: list[Run]) -> Iterator[tuple[str, Figure]]:
     """One of each kind."""
-    plans = {plan.draw.func: plan for plan in reversed(plot.planned(judged(runs)))}
+    plans = {plan.draw.func: plan for plan in reversed(plot.planned(evaluated(runs)))}
     return plot.drawn(plans.values())
 
 

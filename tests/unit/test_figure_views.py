@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray
 from fgtrack.evaluation.palette import look
-from fgtrack.evaluation.runs import judged
+from fgtrack.evaluation.runs import evaluated
 from fgtrack.io.run import Table
 from fgtrack.plotting import plot
 from fgtrack.plotting.errors import moving_rms
@@ -132,14 +132,14 @@ def test_of_many_objects_the_worst_are_drawn_and_the_rest_on_request(tmp_path: P
     cars = [Car(k, 100.0, 30.0 * k, 0.0, 20.0) for k in range(6)]
     tracks = [[car.track(k, car.object_id, along_m=0.1 * car.object_id) for car in cars] for k in TICKS]
     run = write_run(tmp_path / "run", tracks, truth=[row for car in cars for row in car.truth(TICKS)])
-    plans = [plan for plan in plot.planned(judged(run)) if plan.name.startswith("errors")]
+    plans = [plan for plan in plot.planned(evaluated(run)) if plan.name.startswith("errors")]
     assert [plan.name for plan in plans if not plan.is_extra] == [
         *("errors_all_objects", "errors_object_3", "errors_object_4", "errors_object_5")
     ]
     assert len(plans) == 7
     few, every = ([name for name, _ in plot.drawn(plans, each)] for each in (False, True))
     assert len(every) == len(few) + 3
-    many = judged(
+    many = evaluated(
         [replace(run, path=None)] * 1 + [write_run(tmp_path / f"r{k}", [[cars[0].track(0, 1)]]) for k in range(7)]
     )
     maps = [plan for plan in plot.planned(many) if plan.name.startswith("map")]

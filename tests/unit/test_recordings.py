@@ -9,7 +9,7 @@ import pytest
 from unit.evaluation_runs import ROUND, WEST, update, write_run
 
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
-from fgtrack.evaluation.runs import by_recording, judged, recordings_warning, same_recording
+from fgtrack.evaluation.runs import by_recording, evaluated, recordings_warning, same_recording
 from fgtrack.io.run import Run, load_run
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.config import Config
@@ -62,7 +62,7 @@ def test_runs_of_different_recordings_are_told_by_name(tmp_path: Path) -> None:
         meta = {"estimator": "smoother", "input": {"path": f"{name}.mcap"}, "messages_received": 7}
         return write_run(tmp_path / name, updates={0: [update()]}, truth=rows, meta=meta).path or tmp_path
 
-    runs = judged([write("a", WEST), write("b", ROUND), write("c", WEST)])
+    runs = evaluated([write("a", WEST), write("b", ROUND), write("c", WEST)])
     assert [[one.label[:1] for one in group] for group in by_recording(runs)] == [["a", "c"], ["b"]]
     (line,) = recordings_warning(runs)
     assert line.startswith("the runs are of 2 recordings")

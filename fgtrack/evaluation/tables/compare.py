@@ -18,7 +18,7 @@ from fgtrack.evaluation.comparison import (
 from fgtrack.evaluation.diagnostics import USED
 from fgtrack.evaluation.intervals import UNKNOWN
 from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics, ObjectMetrics, TruthMetrics
-from fgtrack.evaluation.runs import OneRun, judged
+from fgtrack.evaluation.runs import OneRun, evaluated
 from fgtrack.evaluation.scores.innovations import FEWEST, LAGS, RESIDUAL_NAMES, Autocorrelation
 from fgtrack.evaluation.scores.lagged import WINDOW, LagMetrics
 from fgtrack.evaluation.scores.multi_object import MultiObjectMetrics
@@ -68,7 +68,7 @@ def compare(*runs: OneRun | Iterable[OneRun] | Mapping[str, OneRun], streaming: 
     DataError
         A run folder is damaged.
     """
-    every = judged(runs)
+    every = evaluated(runs)
     if not every:
         raise CallError("compare: no run is given, name at least one")
     metrics, compared = {one.label: one.metrics for one in every}, comparisons(every)

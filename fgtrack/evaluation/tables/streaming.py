@@ -27,7 +27,7 @@ from fgtrack.evaluation.comparison import (
     quantity,
 )
 from fgtrack.evaluation.intervals import UNKNOWN, by_stamp
-from fgtrack.evaluation.runs import JudgedRun
+from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.scores.deadlines import ready
 from fgtrack.evaluation.scores.statistics import Distribution
 from fgtrack.evaluation.tables import MS, PERCENT, RUN, Column, Table
@@ -59,7 +59,7 @@ class Streamed:
     errors_m: Mapping[str, FloatArray]
 
 
-def streamed(one: JudgedRun) -> Streamed:
+def streamed(one: EvaluatedRun) -> Streamed:
     """Errors of `one`, a run with truth, when it is ready. Pairs are those of its `matching`.
 
     A user predicts straight on: the published position, moved along the published yaw at the published speed. A state
@@ -85,7 +85,7 @@ def streamed(one: JudgedRun) -> Streamed:
     return Streamed(object_index, matching.now_ns[ticks], errors_m)
 
 
-def streaming_tables(runs: Sequence[JudgedRun]) -> tuple[dict[str, Table], list[str]]:
+def streaming_tables(runs: Sequence[EvaluatedRun]) -> tuple[dict[str, Table], list[str]]:
     """Tables `streaming` and `load` of `runs`, and sentences on the best run when each pays for its time.
 
     Runs that fall behind for good are not ranked beside others that keep up: their loss has no bound, and the few
@@ -127,7 +127,7 @@ def streaming_tables(runs: Sequence[JudgedRun]) -> tuple[dict[str, Table], list[
     return {"streaming": streaming, "load": _load(runs)}, sentences
 
 
-def _compared(group: Sequence[JudgedRun]) -> tuple[dict[str, tuple[Entry, ...]], float]:
+def _compared(group: Sequence[EvaluatedRun]) -> tuple[dict[str, tuple[Entry, ...]], float]:
     """Runs of one recording by when they are evaluated, and the least share of a run's samples that counts.
 
     They are compared at the objects and ticks that all of them have, with truth when they are ready, so that the same
@@ -147,7 +147,7 @@ def _compared(group: Sequence[JudgedRun]) -> tuple[dict[str, tuple[Entry, ...]],
     return entries, len(at_ns) / max(len(one.now_ns) for one in every)
 
 
-def _load(runs: Sequence[JudgedRun]) -> Table:
+def _load(runs: Sequence[EvaluatedRun]) -> Table:
     """A row for each run: time from its tick until an output was ready, late ticks, load."""
     records = []
     for one in runs:

@@ -5,14 +5,14 @@ from dataclasses import dataclass, field
 
 from fgtrack.core.geometry import may_be_radians
 
-__all__ = ["EGO", "Caution", "in_degrees"]
+__all__ = ["EGO", "Diagnostic", "in_degrees"]
 
 EGO = "ego"
-"""Subject of a caution about the ego."""
+"""Subject of a diagnostic about the ego."""
 
 
 @dataclass(frozen=True)
-class Caution:
+class Diagnostic:
     """Something that is wrong; `str` is a line of it."""
 
     about: str
@@ -28,9 +28,9 @@ class Caution:
         return f"{self.about}: {self.text}"
 
 
-def in_degrees(about: str, name: str, least: float, most: float) -> Caution | None:
-    """Caution that the angle `name` between `least` and `most` is in degrees; None where it may be in radians."""
+def in_degrees(about: str, name: str, least: float, most: float) -> Diagnostic | None:
+    """Diagnostic that the angle `name` between `least` and `most` is in degrees; None where it may be in radians."""
     if may_be_radians(least, most):
         return None
     text = f"{name} goes up to {max(-least, most):.4g}: degrees? Convert it by `{{path: ..., degrees: true}}`"
-    return Caution(about, text, spoils=True)
+    return Diagnostic(about, text, spoils=True)
