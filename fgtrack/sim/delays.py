@@ -142,8 +142,8 @@ class MarkovDelay:
 
     After a message in the good state the next one is in the bad state with probability `to_bad`, and back with
     `to_good` (E. N. Gilbert, Capacity of a burst-noise channel, Bell System Technical Journal 39(5), 1960). A
-    share `bad_share` of the messages is in the bad state, in bursts of 1 / `to_good` messages on average. The
-    first message finds the chain as it is in the long run.
+    share to_bad / (to_bad + to_good) of the messages is in the bad state, in bursts of 1 / `to_good` messages on
+    average. The first message finds the chain as it is in the long run.
     """
 
     good: "AnyDelay"
@@ -152,15 +152,10 @@ class MarkovDelay:
     to_good: Annotated[float, Field(gt=0.0, le=1.0)]
     kind: Literal["markov"] = "markov"
 
-    @property
-    def bad_share(self) -> float:
-        """Share of the messages that are in the bad state."""
-        return self.to_bad / (self.to_bad + self.to_good)
-
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
         """See `DelayModel`."""
-        moves = np.ones(len(stamps_s))
-        bad = _two_states(rng, self.bad_share, self.to_bad * moves, self.to_good * moves)
+        moves, share = np.ones(len(stamps_s)), self.to_bad / (self.to_bad + self.to_good)
+        bad = _two_states(rng, share, self.to_bad * moves, self.to_good * moves)
         good_s = self.good.draw(rng, stamps_s)  # both are drawn for all messages
         return np.where(bad, self.bad.draw(rng, stamps_s), good_s)
 
@@ -179,15 +174,14 @@ class MarkovTimeDelay:
     to_good_per_s: PositiveFloat
     kind: Literal["markov_time"] = "markov_time"
 
-    @property
-    def bad_share(self) -> float:
-        """Share of the time that the link is bad."""
-        return self.to_bad_per_s / (self.to_bad_per_s + self.to_good_per_s)
-
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
         """See `DelayModel`."""
-        forgotten = -np.expm1(-(self.to_bad_per_s + self.to_good_per_s) * np.diff(stamps_s, prepend=stamps_s[:1]))
-        bad = _two_states(rng, self.bad_share, self.bad_share * forgotten, (1.0 - self.bad_share) * forgotten)
+        rate_per_s = self.to_bad_per_s + self.to_good_per_s
+        forgotten, share = (
+            -np.expm1(-rate_per_s * np.diff(stamps_s, prepend=stamps_s[:1])),
+            self.to_bad_per_s / rate_per_s,
+        )
+        bad = _two_states(rng, share, share * forgotten, (1.0 - share) * forgotten)
         good_s = self.good.draw(rng, stamps_s)  # both are drawn for all messages
         return np.where(bad, self.bad.draw(rng, stamps_s), good_s)
 

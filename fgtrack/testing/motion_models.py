@@ -10,7 +10,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import ACCEL, STATE_NAMES, YAW, FloatArray
 from fgtrack.models.motion import CARTESIAN, POLAR, MotionModel
-from fgtrack.testing.promise import BrokenPromiseError, run_all
+from fgtrack.testing.promise import BrokenPromiseError, run_all, sound
 
 ModelCheck = Callable[[MotionModel, FloatArray, float], str | None]
 """Return the fault of a model at a state (n,) and a duration, or None."""
@@ -108,9 +108,7 @@ def _has_noise_that_is_symmetric_and_positive_definite(model: MotionModel, x: Fl
     Q = model.process_noise(x, dt_s)
     if not dt_s:
         return apart(Q, np.zeros_like(Q), 1e-15, "process_noise over 0 s")
-    scale = np.sqrt(np.abs(np.diag(Q)))
-    if (Q != Q.T).any() or not scale.all() or np.linalg.eigvalsh(Q / np.outer(scale, scale)).min() <= 0.0:
-        return f"process_noise is not symmetric and positive definite:\n{Q}"
+    sound(x, Q, "process_noise")
     return None
 
 
@@ -224,10 +222,7 @@ def _begins_with_a_sound_covariance(model: MotionModel, x: FloatArray, dt_s: flo
             wrong = wrong or apart(covariance[k], expected, 1e-9, f"the covariance of {name} of a birth")
             if wrong:
                 return wrong
-    scale = np.sqrt(np.abs(np.diag(covariance)))
-    sound = np.isfinite(covariance).all() and (covariance == covariance.T).all() and (scale > 0.0).all()
-    if not sound or not np.linalg.eigvalsh(covariance / np.outer(scale, scale)).min() > 0.0:
-        return f"the covariance of from_kinematic is not symmetric and positive definite:\n{covariance}"
+    sound(begun, covariance, "from_kinematic")
     return None
 
 
