@@ -22,6 +22,7 @@ from fgtrack.pipeline.list_statistics import ListStatistics
 from fgtrack.pipeline.load import plain
 from fgtrack.pipeline.recorded import RecordedSensor, recorded
 from fgtrack.pipeline.revisits import for_slow_revisits
+from fgtrack.tracking.association import GatedMahalanobis
 from fgtrack.tracking.existence import ExistenceRules
 
 __all__ = ["ASSUMED_STD", "Assumed", "Assumption", "assumed", "is_open", "source_of"]
@@ -46,6 +47,7 @@ _LEAST_CLUTTER = 0.05
 
 RECORDED, USUAL = "recorded", "usual of a detector of cars by LiDAR or RADAR"
 USUAL_BOX = "usual of boxes that a detector fits to cars"
+_UNPLACED = "gives no position, and bearings from an unknown mount err by more than the tracks"
 """Reasons."""
 
 
@@ -83,10 +85,16 @@ class Assumption:
                 return "reports objects one by one"
             case "out_of_view_s":
                 return f"tracks out of view end after {value:g} s"
+            case "claim_m":
+                return f"nothing begins within {value:g} m of a track"
+            case "ignore_sensors":
+                return f"{', '.join(value)} left out"
             case "field_of_view_rad":
                 return "sees all around" if value >= math.tau else f"sees {math.degrees(value):.0f} degrees"
             case "view_range_m":
                 return f"up to {value:g} m"
+            case "max_range_m":
+                return f"used up to {value:g} m, beyond which clutter outweighs objects"
             case "max_range_behind_m":
                 return f"behind it up to {value:g} m"
             case "mount":
@@ -153,7 +161,8 @@ def assumed(config: Config, source: InputSource) -> Assumed:
       view and range of those of which neither the configuration nor the recording gives any of both. A position counts
       once: a detection of x and y is not taken as range and bearing as well.
     - How often they come back: motion and clock of objects that are measured every few seconds (`for_slow_revisits`).
-    - Usual values: standard deviations, and a sensor that looks all around from the origin.
+    - Usual values: standard deviations, and a sensor that looks all around from the origin. Sensors that give bearings
+      alone are left out where others give positions, unless the recording carries their mount.
     """
     carried = recorded(source)
     found: list[Assumption] = []
@@ -174,7 +183,8 @@ def assumed(config: Config, source: InputSource) -> Assumed:
     if is_open(replace(config, sensors=sensors)):
         mounts = {name: one.mount for name, one in (sensors or carried.sensors).items() if one.mount is not None}
         covered, lists = _seen(source, config, mounts)
-        if not sensors:
+        named = bool(sensors)
+        if not named:
             config, more = _for_revisits(config, lists)
             found += more
             for name, one in covered.items():
@@ -183,9 +193,15 @@ def assumed(config: Config, source: InputSource) -> Assumed:
                 sensor, more = _with_lists(name, SensorModel(std=std), one, lists.get(name, ListStatistics()))
                 found += more
                 sensors[name] = _with_recorded(name, sensor, carried.sensors.get(name, RecordedSensor()), found)
+            config = _with_claim(config, covered, found)
+            unplaced = [name for name, one in sensors.items() if not one.gives_position and one.mount is None]
+            if unplaced and any(one.gives_position for one in sensors.values()):
+                config = replace(config, ignore_sensors=(*config.ignore_sensors, *unplaced))
+                found.append(Assumption("ignore_sensors", list(config.ignore_sensors), _UNPLACED))
         for name, sensor in sensors.items():
             if sensor.scan and not sensor.is_view_given and name in covered:
-                sensors[name] = _with_coverage(name, sensor, covered[name], found)
+                seen = replace(covered[name], persistence=None) if named else covered[name]
+                sensors[name] = _with_coverage(name, sensor, seen, found)
         gap_s, reason = _out_of_view_s(replace(config, sensors=sensors), covered)
         default_s = ExistenceRules.out_of_view_s
         if isinstance(lifecycle, ExistenceRules) and lifecycle.out_of_view_s == default_s != gap_s:
@@ -214,6 +230,18 @@ def _with_recorded(name: str, sensor: SensorModel, carried: RecordedSensor, foun
     return replace(sensor, **given)
 
 
+def _with_claim(config: Config, seen: Mapping[str, Coverage], found: list[Assumption]) -> Config:
+    """`config` in which a track claims what is as near to it as sensors disagree, where that is more than they err."""
+    apart_m = max((one.disagreement_m for one in seen.values() if one.disagreement_m is not None), default=0.0)
+    rules = config.association
+    if apart_m <= ASSUMED_STD["x_m"] or rules != GatedMahalanobis():
+        return config
+    claim_m = float(round(3.0 * apart_m))
+    reason = f"sensors disagree by {apart_m:.2g} m on each axis, as on large hulls"
+    found.append(Assumption("association.claim_m", claim_m, reason))
+    return replace(config, association=replace(rules, claim_m=claim_m))
+
+
 def _out_of_view_s(config: Config, seen: Mapping[str, Coverage]) -> tuple[float, str]:
     """How long a track lives that no sensor can see, and why.
 
@@ -237,6 +265,8 @@ def _with_coverage(name: str, sensor: SensorModel, seen: Coverage, found: list[A
         given["field_of_view_rad"] = seen.field_of_view_rad
     if seen.range_m is not None:
         given["view_range_m"] = seen.range_m
+    if sensor.score is None and seen.persistence is not None and seen.persistence.max_range_m is not None:
+        given["max_range_m"] = float(round(seen.persistence.max_range_m))
     reason = f"where it detects, of {seen}"
     found += [Assumption(f"sensors.{name}.{key}", plain(value), reason) for key, value in given.items()]
     return replace(sensor, **given)

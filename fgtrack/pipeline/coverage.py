@@ -11,7 +11,7 @@ from fgtrack.core.geometry import wrap_angle, wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, Detection, DetectionList, EgoState, FloatArray, IntArray, Message
 from fgtrack.models.sensors import Mount
-from fgtrack.pipeline.persistence import Persistence, persistence
+from fgtrack.pipeline.persistence import Persistence, disagreement_m, persistence
 
 __all__ = ["Coverage", "coverages"]
 
@@ -45,6 +45,8 @@ class Coverage:
     """Up to where it detects; None where it measures no range, or too seldom."""
     persistence: Persistence | None = None
     """How its detections persist from list to list; None where too few do."""
+    disagreement_m: float | None = None
+    """Least standard deviation of its positions against those of another sensor; None where none sees the same."""
     boxes: bool = False
     """Whether its detections have a length and a width."""
     area_m2: float | None = None
@@ -86,7 +88,13 @@ def coverages(messages: Iterable[Message], mounts: Mapping[str, Mount] | None = 
     path = path[np.isfinite(path).all(axis=1)]
     path = path[np.argsort(path[:, 0], kind="stable")]
     path[:, 3] = np.unwrap(path[:, 3])
-    return {name: one.coverage(path, (mounts or {}).get(name)) for name, one in sorted(found.items())}
+    seen = {name: one.coverage(path, (mounts or {}).get(name)) for name, one in sorted(found.items())}
+    lists = {name: found[name].lists(path) for name, one in seen.items() if one.persistence is not None}
+    for name, (stamps_s, (points_m,)) in lists.items():
+        known = [one.persistence for other, one in seen.items() if other != name and one.persistence is not None]
+        apart_m = [m for one in known if (m := disagreement_m(one, stamps_s, points_m)) is not None]
+        seen[name] = replace(seen[name], disagreement_m=min(apart_m, default=None))
+    return seen
 
 
 @dataclass
@@ -136,7 +144,8 @@ class _Detections:
         if has_range.any():
             extent_m = np.quantile(offsets_m, 1.0 - _OUTSIDE, axis=0) - np.quantile(offsets_m, _OUTSIDE, axis=0)
             area_m2 = max(float(np.prod(extent_m)), _narrowest_m2(offsets_m))  # one object may keep its place
-            found = replace(found, persistence=self._persistence(rows, path), area_m2=area_m2)
+            stamps_s, columns = self.lists(path, rows[:, 5], np.hypot(*offsets_m.T))
+            found = replace(found, persistence=persistence(stamps_s, *columns), area_m2=area_m2)
         period_s = float(np.median(np.diff(receipts_s))) if len(receipts_s) > 1 else 0.0
         span_s = max(_CELL_S, _CELL_PERIODS * period_s)
         reach = _CELL_M + _CELL_MPS * span_s if has_range.any() else _CELL_BEARING
@@ -150,16 +159,21 @@ class _Detections:
         limit_m = None if range_m is None else float(round(_RANGE_FACTOR * range_m))
         return replace(found, axis_rad=axis_rad, field_of_view_rad=full_rad, range_m=limit_m)
 
-    def _persistence(self, rows: FloatArray, path: FloatArray) -> Persistence | None:
-        """Persistence of positions, in the map where the ego's `path` is known."""
+    def lists(self, path: FloatArray, *columns: FloatArray) -> tuple[FloatArray, list[list[FloatArray]]]:
+        """Stamps of the lists, rising, and of each list its positions and its part of `columns`.
+
+        Positions are in the map where the ego's `path` is known. Detections without a range are left out.
+        """
+        rows = np.array(self.rows).reshape(-1, 6)
+        rows = rows[rows[:, 4] > 0.0]
         points_m = rows[:, 2:4]
         if "map" not in self.frames and len(path):
             x_m, y_m, yaw_rad = (np.interp(rows[:, 1], path[:, 0], column) for column in path[:, 1:].T)
             points_m = _turned(points_m, yaw_rad) + np.column_stack([x_m, y_m])
         stamps_s = np.array(self.stamps_s)
         begins = np.searchsorted(rows[:, 0], np.arange(len(stamps_s) + 1))  # rows stand list by list
-        lists = [slice(begins[k], begins[k + 1]) for k in np.argsort(stamps_s, kind="stable")]
-        return persistence(np.sort(stamps_s), [points_m[one] for one in lists], [rows[one, 5] for one in lists])
+        parts = [slice(begins[k], begins[k + 1]) for k in np.argsort(stamps_s, kind="stable")]
+        return np.sort(stamps_s), [[column[one] for one in parts] for column in (points_m, *columns)]
 
     def _offsets_m(self, rows: FloatArray, path: FloatArray, mount: Mount | None) -> FloatArray:
         """Positions seen from the sensor or, where its mount is not known, from the ego, shape (n, 2)."""

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import compress, pairwise
 
 import numpy as np
 from scipy.optimize import minimize
@@ -13,7 +13,7 @@ from scipy.special import expit, log_expit
 from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.models.sensors import Score
 
-__all__ = ["Persistence", "persistence"]
+__all__ = ["Persistence", "disagreement_m", "persistence"]
 
 _FASTEST_MPS = 90.0
 _LARGEST_ERROR_M = 3.0
@@ -21,6 +21,9 @@ _LARGEST_ERROR_M = 3.0
 _MOST_CENTRES = 3_000
 """Detections whose neighbours are looked for; of longer recordings every n-th list is a centre."""
 _FEWEST = 30
+_FEWEST_FAR = 5
+_BESIDE_M = np.array([20.0, 20.0])
+"""Farther than the hull of any object but large ships."""
 _CORE = 3.5
 """Second differences up to so many times their scale belong to one object: all but 0.2 % of a Rayleigh distribution."""
 _Line = tuple[FloatArray, FloatArray]
@@ -47,11 +50,41 @@ class Persistence:
     """Clutter of the next list around clutter; None without `score`."""
     score: Score | None
     """Model of the scores; None if they are absent, or higher ones are not more often of an object."""
-    num_triples: int
+    max_range_m: float | None
+    """Range beyond which most triples do not go on, so that clutter outweighs objects; None where they do at any."""
+    lines: FloatArray
+    """Stamp, position and velocity at the end of each triple, shape (n, 5)."""
+
+    @property
+    def num_triples(self) -> int:
+        """Number of triples."""
+        return len(self.lines)
+
+
+def disagreement_m(one: Persistence, stamps_s: FloatArray, points_m: Sequence[FloatArray]) -> float | None:
+    """Standard deviation, per axis, of where another sensor sees the objects of `one`, in its lists; None if unknown.
+
+    It shows what a sensor alone does not: errors that last, as on an object that is larger than what it sees of it.
+    Both see the same objects only if detections are nearer to where these are than to places beside them.
+    """
+    distances_m, beside_m = [], []
+    for stamp_s, *state in one.lines.tolist():
+        k = int(np.argmin(np.abs(stamps_s - stamp_s)))
+        if len(points_m[k]):
+            at_m = np.array(state[:2]) + (stamps_s[k] - stamp_s) * np.array(state[2:])
+            distances_m.append(np.hypot(*(points_m[k] - at_m).T).min())
+            beside_m.append(np.hypot(*(points_m[k] - at_m - _BESIDE_M).T).min())
+    if len(distances_m) < _FEWEST:
+        return None
+    scale_m = _scale(np.array(distances_m))
+    return scale_m if scale_m < 0.5 * _scale(np.array(beside_m)) else None
 
 
 def persistence(
-    stamps_s: FloatArray, points_m: Sequence[FloatArray], scores: Sequence[FloatArray]
+    stamps_s: FloatArray,
+    points_m: Sequence[FloatArray],
+    scores: Sequence[FloatArray],
+    ranges_m: Sequence[FloatArray],
 ) -> Persistence | None:
     """Persistence of detections; None where too few detections follow one another.
 
@@ -63,14 +96,17 @@ def persistence(
         Positions of each list in a frame that does not turn, shape (m, 2) each.
     scores
         Scores of each list, NaN where absent, shape (m,) each.
+    ranges_m
+        Ranges of each list from the sensor, NaN where unknown, shape (m,) each.
     """
     trees = [cKDTree(points) if len(points) else None for points in points_m]
     every = max(1, math.ceil(sum(map(len, points_m)) / _MOST_CENTRES))
-    misfits, lines, found_scores = [], [], []
+    misfits, lines, found_scores, found_ranges_m = [], [], [], []
     for k in range(1, len(stamps_s) - 3, every):
         before_s, after_s = float(stamps_s[k] - stamps_s[k - 1]), float(stamps_s[k + 1] - stamps_s[k])
         if min(before_s, after_s) <= 0.0:
             continue
+        found_ranges_m += ranges_m[k].tolist()
         for centre_m, score in zip(points_m[k], scores[k], strict=True):
             best = _best(centre_m, trees[k - 1], trees[k + 1], before_s, after_s)
             misfits.append(math.inf if best is None else best[0])
@@ -98,7 +134,18 @@ def persistence(
     if score_model is not None:
         odds = len(misfit) / max(of_objects, 1.0) - 1.0
         near = _near_clutter_per_m2(trees, [_of_clutter(one, score_model, odds) for one in scores])
-    return Persistence(probability, clutter, near, score_model, num_triples)
+    max_range_m = _max_range_m(np.array(found_ranges_m)[in_triple], of_object[in_triple] / probability**2)
+    ends = [(stamps_s[k + 1], *line[0], *line[1]) for k, line in compress(lines, in_triple) if line is not None]
+    return Persistence(probability, clutter, near, score_model, max_range_m, np.array(ends))
+
+
+def _max_range_m(ranges_m: FloatArray, objects: FloatArray) -> float | None:
+    """Range beyond which, however far, most triples go on by chance, given how many `objects` each stands for."""
+    known = np.isfinite(ranges_m)
+    order = np.argsort(ranges_m[known])
+    surplus = np.cumsum(objects[known][order] - 0.5)
+    best = int(np.argmax(surplus)) if len(surplus) else 0
+    return float(ranges_m[known][order][best]) if len(surplus) - best > _FEWEST_FAR else None
 
 
 def _of_clutter(scores: FloatArray, model: Score, odds: float) -> FloatArray:

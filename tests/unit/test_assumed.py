@@ -213,6 +213,32 @@ def test_what_leaves_the_view_of_the_only_sensor_that_gives_positions_ends_at_on
     assert assumed(own, source_of(forward)).config.lifecycle == own.lifecycle
 
 
+def test_bearings_alone_are_left_out_beside_positions_unless_their_mount_is_recorded() -> None:
+    bearing = message(Detection(bearing_rad=0.1), sensor="camera")
+    source = source_of(lambda: [message(POINT, sensor="lidar"), bearing])
+    found = assumed(Config(), source)
+    assert set(found.config.used_sensors) == {"lidar"}
+    assert "camera left out" in found.lines()[-1]
+    assert found.to_yaml().count("# assumed: gives no position") == 1
+    assert set(assumed(Config(), source_of(lambda: [bearing])).config.used_sensors) == {"camera"}
+    mounted = replace(source, settings=lambda: {"sensors": {"camera": {"mount": {"x_m": 1.0}}}})
+    assert set(assumed(Config(), mounted).config.used_sensors) == {"lidar", "camera"}
+
+
+def test_where_sensors_disagree_about_a_hull_a_track_claims_what_is_near() -> None:
+    def hull():
+        for one in forward():
+            yield one
+            if getattr(one, "objects", ()):
+                x_m, y_m = one.objects[0].x_m + 8.0, one.objects[0].y_m
+                yield replace(one, sensor="lidar", objects=[Detection(x_m=x_m, y_m=y_m)])
+
+    found = assumed(Config(), source_of(hull))
+    assert found.config.association.claim_m == pytest.approx(3.0 * 8.0 / 1.18, abs=1.5)
+    assert "nothing begins within" in found.lines()[-1]
+    assert assumed(Config(), source_of(forward)).config.association.claim_m == 0.0
+
+
 def test_boxes_are_taken_to_be_more_exact_than_points() -> None:
     box = replace(POINT, length_m=4.0, width_m=1.8)
     found = assumed(Config(), source_of(lambda: [message(box, sensor="lidar")]))

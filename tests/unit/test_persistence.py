@@ -1,28 +1,30 @@
 import numpy as np
 import pytest
 
-from fgtrack.pipeline.persistence import Persistence, persistence
+from fgtrack.pipeline.persistence import Persistence, disagreement_m, persistence
 
 
 def cars(
-    detection_probability: float, clutter: float, seed: int = 1, count: int = 4, num_places: int = 0
+    detection_probability: float, clutter: float, count: int = 4, num_places: int = 0, flashes: bool = False
 ) -> Persistence | None:
     """Persistence of `count` cars at up to 30 m/s in 600 lists at 10 Hz; scores 4 above those of clutter.
 
-    Every second list shows clutter at each of `num_places` as well.
+    Every second list shows clutter at each of `num_places` as well; `flashes` are three lists of clutter each, far off.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     at_m, speed_mps = rng.uniform(-300.0, 300.0, (count, 2)), rng.uniform(-30.0, 30.0, (count, 2))
     stamps_s, places_m = 0.1 * np.arange(600), rng.uniform(-2000.0, 2000.0, (num_places, 2))
     points_m, scores = [], []
-    for t_s in stamps_s.tolist():
+    for k, t_s in enumerate(stamps_s.tolist()):
         true_m = at_m + speed_mps * t_s + rng.normal(0.0, 0.3, (count, 2))
         true_m = true_m[rng.random(count) < detection_probability]
         false_m = rng.uniform(-2000.0, 2000.0, (rng.poisson(clutter), 2))
         false_m = np.concatenate([false_m, places_m[rng.random(num_places) < 0.5]])
+        if flashes and k % 10 < 3:
+            false_m = np.concatenate([false_m, np.array([[5000.0, 100.0 * (k // 10)]])])
         points_m.append(np.concatenate([true_m, false_m]))
         scores.append(np.concatenate([rng.normal(4.0, 1.0, len(true_m)), rng.normal(0.0, 1.0, len(false_m))]))
-    return persistence(stamps_s, points_m, scores)
+    return persistence(stamps_s, points_m, scores, [np.hypot(*one.T) for one in points_m])
 
 
 @pytest.mark.parametrize("clutter", [0.0, 2.0])
@@ -58,3 +60,22 @@ def test_clutter_that_comes_back_is_dense_around_itself() -> None:
 def test_few_detections_and_clutter_alone_show_nothing() -> None:
     assert cars(0.05, 0.0) is None
     assert cars(0.0, 1.0) is None
+
+
+def test_beyond_some_range_what_comes_back_twice_does_not_go_on() -> None:
+    near, far = cars(0.9, 0.0), cars(0.9, 0.0, flashes=True)
+    assert near is not None
+    assert far is not None
+    assert near.max_range_m is None
+    assert far.max_range_m is not None
+    assert far.max_range_m < 3000.0
+
+
+@pytest.mark.parametrize(("aside_m", "expected_m"), [(0.5, 0.4), (6.0, 5.1), (300.0, None)])
+def test_sensors_disagree_by_how_far_they_see_an_object_apart(aside_m: float, expected_m: float | None) -> None:
+    found = cars(0.9, 0.0)
+    assert found is not None
+    stamps_s, state = found.lines[:, 0], found.lines[:, 1:3]
+    points_m = [state[stamps_s == one] + aside_m for one in stamps_s]
+    seen_m = disagreement_m(found, stamps_s, points_m)
+    assert seen_m == (None if expected_m is None else pytest.approx(1.41 * aside_m / 1.18, rel=0.1))
