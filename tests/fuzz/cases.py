@@ -178,14 +178,14 @@ def _problem_of_run(path: Path) -> str | None:
     if not found.meta.get("complete"):
         return "leaves an incomplete run"
     counted = sum(sum(counts.values()) for counts in found.meta["counts"].values())
-    if not found.updates.num_rows == counted == found.meta["detections_received"]:
-        return f"{found.meta['detections_received']} detections, {counted} counted, {found.updates.num_rows} rows"
+    if not len(found.updates) == counted == found.meta["detections_received"]:
+        return f"{found.meta['detections_received']} detections, {counted} counted, {len(found.updates)} rows"
     raised = [
         kind for kind in (Failure.LIST_FAILED, Failure.ESTIMATOR_RAISED) if found.meta.get("failures", {}).get(kind)
     ]
     if raised:  # what the guards hide is a defect all the same
         return f"{', '.join(raised)}: {found.meta['first_failure']}"
-    for table in (found.tracks, found.smoothed):
+    for table in (found.tables["tracks"], found.tables["smoothed"]):
         if not table.num_rows:
             continue
         for name in ("x_m", "y_m", "yaw_rad", "speed_mps", *(name for name in table if name.startswith("p_"))):

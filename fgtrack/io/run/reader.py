@@ -202,7 +202,8 @@ def load_run(path: Path | str) -> Run:
     tables = {name: _read_table(path / f"{name}.csv", name, complete) for name in COLUMNS}
     if (np.diff(tables["timing"]["tick"]) <= 0).any():
         raise DataError(f"{path / 'timing.csv'}: its ticks do not increase, repeat the run")
-    return Run(path, meta, _read_text(path / "config.yaml"), tables)
+    config = path / "config.yaml"
+    return Run(path, meta, _read_text(config) if complete or config.exists() else "", tables)
 
 
 def _read_text(path: Path) -> str:
@@ -229,7 +230,8 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
 
     names = COLUMNS[table]
     empty = Table({name: column(name, ()) for name in names})
-    if table in OPTIONAL_TABLES and not path.exists():
+    may_miss = table in OPTIONAL_TABLES or not complete  # killed while it was begun
+    if may_miss and not path.exists():
         return empty
     types = {
         name: "Int64" if name == "track_id" else {str: object, int: "int64"}.get(column_type(name)) for name in names
@@ -248,7 +250,7 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}), is this a run folder?") from error
     except pandas.errors.EmptyDataError as error:
-        if table in OPTIONAL_TABLES and not complete:  # killed while it was begun
+        if not complete:
             return empty
         raise DataError(f"{path}: is empty, repeat the run") from error
     except (ValueError, OverflowError) as error:
