@@ -94,15 +94,7 @@ def test_the_demo_goes_from_scenario_to_report(demo: Path) -> None:
     assert "report.html" in shown
 
 
-@pytest.mark.slow
-def test_the_demo_shows_every_name_in_100_columns(tmp_path: Path) -> None:
-    lines = lines_in_terminal(100, "demo", "-o", tmp_path, program=("-c", SHORT_DEMO))
-    check([line for line in lines if str(tmp_path) not in line], 100)
-
-
-@pytest.mark.parametrize(
-    ("width", "options"), [(60, ()), (80, ()), (80, ("--all", "--streaming")), (100, ()), (100, ("--all",))]
-)
+@pytest.mark.parametrize(("width", "options"), [(60, ()), (80, ("--all", "--streaming")), (100, ("--all",))])
 def test_a_comparison_shows_every_name_in_a_narrow_terminal(demo: Path, width: int, options: Sequence[str]) -> None:
     lines = lines_in_terminal(width, "compare", demo, *options)
     check(lines, width)
