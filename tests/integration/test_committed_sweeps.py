@@ -30,12 +30,6 @@ def by_label(plan: Plan, column: str, of: str) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_no_two_jobs_are_the_same(path: Path) -> None:
-    jobs = load_plan(path).jobs
-    assert len({job.key for job in jobs}) == len(jobs)
-
-
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_the_first_job_runs_and_has_every_metric_that_is_asked_for(path: Path, tmp_path: Path) -> None:
     plan = load_plan(path)
     result = Sweep.open(replace(plan, jobs=(shortened(plan.jobs[0]),)), tmp_path / "out").run(score, jobs=1)

@@ -112,17 +112,6 @@ def test_the_commands_of_the_page_run_and_workers_load_the_package(folder: Path)
     assert (folder / "sweep/errors.csv").read_text().count("refilter") == 0
 
 
-@pytest.mark.slow
-def test_the_workers_of_a_cluster_load_the_package(folder: Path) -> None:
-    followed(
-        folder, ["-m", "fgtrack", "simulate", "single_opponent", "-o", "drive.jsonl", "--duration", "2", "--overwrite"]
-    )
-    (folder / "on_cluster.py").write_text(ON_CLUSTER)
-    followed(folder, ["on_cluster.py"])
-    assert (folder / "cluster/sweep.csv").read_text().count("refilter") == 2
-    assert (folder / "cluster/errors.csv").read_text().count("refilter") == 0
-
-
 def last_x_m(tracks: str) -> float:
     header, *rows = tracks.splitlines()
     return float(rows[-1].split(",")[header.split(",").index("x_m")])

@@ -98,7 +98,6 @@ def confirmed(
 
 #: Every meeting, each heading elsewhere and drawn anew.
 SCENES = [(name, (60.0, 150.0, -100.0)[seed % 3], seed) for seed, name in enumerate(MEETINGS)]
-MORE = [(name, (150.0, -20.0, 110.0)[seed % 3], seed) for seed in range(10, 12) for name in MEETINGS]
 
 MERGE = {"merge": {"kind": "connected", "distance_m": 5.1}}
 NO_MERGE = {"merge": {"kind": "none"}}
@@ -136,14 +135,6 @@ def test_two_cars_that_meet_are_as_many_tracks_with_every_estimator(
     name: str, towards_deg: float, seed: int, settings: str
 ) -> None:
     counts(name, towards_deg, seed, settings, FEW, apart=1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "towards_deg", "seed"), MORE)
-@pytest.mark.parametrize("settings", SETTINGS)
-def test_they_are_with_other_noise_in_other_directions(name: str, towards_deg: float, seed: int, settings: str) -> None:
-    """Few meetings without counters are two tracks apart, all with backward-forward."""
-    counts(name, towards_deg, seed, settings, ("smoother", *FEW), apart=1 if settings.startswith("counters") else 2)
 
 
 @pytest.mark.parametrize("estimator", ["ekf-replay", "ekf-backward-forward"])

@@ -76,13 +76,6 @@ def test_scenario_lists_are_addressed_by_name_or_index(plan: Any) -> None:
     assert scenario["opponents"][1:] == base["opponents"][1:]
 
 
-def test_what_is_set_holds_for_every_point_and_has_no_column(plan: Any) -> None:
-    made = plan("set: {map.track: oval}\nvary: {scenario.sensors.radar.rate_hz: [10.0, 20.0]}\nduration_s: 3.0")
-    assert made.columns == ("scenario.sensors.radar.rate_hz",)
-    assert all(job.recipe.config["map"]["track"] == "oval" for job in made.jobs)
-    assert all(job.recipe.scenario["duration_s"] == 3.0 for job in made.jobs)
-
-
 def test_a_changed_value_leaves_the_original_alone() -> None:
     items = {"sensors": [{"name": "a", "rate": 1}, {"name": "b", "rate": 2}]}
     changed = with_value(items, ["sensors", "b", "rate"], 3)
@@ -114,17 +107,6 @@ one_at_a_time:
         config = job.recipe.config
         found = (config["association"]["gate_m"], config["clock"]["node_hz"], config["ignore_sensors"])
         assert found == row[2:]
-
-
-def test_every_point_of_a_grid_has_one_setting_at_a_time(plan: Any) -> None:
-    made = plan("vary: {clock.node_hz: [20.0, 50.0]}\none_at_a_time: {association.gate_m: [1.0]}")
-    assert made.columns == ("changed", "to", "clock.node_hz")
-    assert [job.cells for job in made.jobs] == [
-        ("base", None, 20.0),
-        ("base", None, 50.0),
-        ("association.gate_m", 1.0, 20.0),
-        ("association.gate_m", 1.0, 50.0),
-    ]
 
 
 # --- errors name the key
@@ -287,20 +269,6 @@ def test_the_files_beside_the_one_that_is_named_change_the_key(plan: Any, tmp_pa
     assert keys(plan("", head)) != before
 
 
-# --- the committed ones
-
-
-@pytest.mark.parametrize("path", sorted((CONFIGS / "sweeps").glob("*.yaml")), ids=lambda path: path.stem)
-def test_every_committed_sweep_can_be_run(path: Path) -> None:
-    assert all(job.problem is None for job in load_plan(path).jobs)
-
-
-def test_the_delay_sweep_is_seven_delays_by_five_rates_by_twenty_seeds_by_six_estimators() -> None:
-    made = load_plan(CONFIGS / "sweeps/delay.yaml")
-    assert len(made.jobs) == len({job.key for job in made.jobs}) == 7 * 5 * 20
-    assert len(made.estimators) == 6
-
-
 # --- on another recording
 
 
@@ -371,12 +339,6 @@ def test_tables_are_in_the_order_of_the_grid_with_all_digits(tmp_path: Path) -> 
     ]
     assert (result.num_cells, result.num_good, result.num_bad) == (6, 3, 3)
     assert result.first_error == "it, broke"
-
-
-def test_jobs_that_are_not_finished_have_no_row(tmp_path: Path) -> None:
-    result = write_tables(tmp_path, TABLES, {"k0": DONE["k0"]})
-    assert len(lines(tmp_path / "sweep.csv")) == 3
-    assert (result.num_good, result.num_bad) == (2, 2)
 
 
 def test_metrics_are_chosen_by_name_or_pattern_and_unknown_ones_reported(tmp_path: Path) -> None:
