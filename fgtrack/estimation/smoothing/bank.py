@@ -25,31 +25,15 @@ from fgtrack.models.motion import MotionModel
 MakeSolver = Callable[[MotionModel, SmootherSettings], Solver]
 
 _TOO_OLD, _FAILED = UpdateResult(UpdateStatus.TOO_OLD), UpdateResult(UpdateStatus.FAILED)
-
-
-class _Times(NamedTuple):
-    """Stamps of m tracks, each of shape (m,)."""
-
-    newest: IntArray
-    """Of the newest nodes."""
-    start: IntArray
-    """Where the windows start, by the clock and the newest stamps."""
-    reach: IntArray
-    """The oldest that may be fused."""
-    oldest: IntArray
-    """The oldest that can be fused or asked for."""
-
-    def at(self, tracks: IntArray) -> "_Times":
-        """Return those of some tracks."""
-        return _Times(*(values[tracks] for values in self))
+_STATUSES = UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE, UpdateStatus.BEYOND_WINDOW
 
 
 class _Known(NamedTuple):
     """Tracks that are known at a stamp."""
 
     track_ids: tuple[int, ...]
-    tracks: IntArray
-    """Rows of the arrays."""
+    positions: dict[int, int]
+    """Positions of the track ids."""
     states: States
 
 
@@ -93,8 +77,8 @@ class SmootherBank:
         """Of the tracks whose direction is sought, by row."""
         self._known: dict[int, _Known] = {}
         """By stamp, until something changes."""
-        self._known_times: _Times | None = None
-        """Of all rows, until something changes."""
+        self._known_times: IntArray | None = None
+        """See `_times`, until something changes."""
         self._final: dict[int, list[TrackState]] = {}
         """States of nodes that have left, by row."""
         self._ended: list[SmoothedReport] = []
@@ -137,25 +121,24 @@ class SmootherBank:
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
         tracks = np.array([self._tracks[track_id] for track_id in track_ids], dtype=np.int64)
-        times = self._times().at(tracks)
-        self._settings.refuse_older(stamp_ns, int(times.start.max(initial=stamp_ns)))
+        newest_ns, start_ns, reach_ns, oldest_ns = self._times()[:, tracks]
+        self._settings.refuse_older(stamp_ns, int(start_ns.max(initial=stamp_ns)))
         results = [_TOO_OLD] * len(tracks)
-        rows = (times.oldest <= stamp_ns).nonzero()[0]
+        rows = (oldest_ns <= stamp_ns).nonzero()[0]
         if not rows.size:
             return results
         chosen = [measurements[row].seen_by(self._motion) for row in rows.tolist()]
         known = self._known_at(stamp_ns)
-        position = np.zeros(len(self._clock_ns), dtype=np.int64)
-        position[known.tracks] = np.arange(len(known.tracks))
-        means, covariances = (values[position[tracks[rows]]] for values in known.states)
-        innovations = Innovations.of(chosen, means, covariances)
+        positions = [known.positions[track_ids[row]] for row in rows.tolist()]
+        states = States(known.states.means[positions], known.states.covariances[positions])
+        innovations = Innovations.of(chosen, *states)
         is_fused = np.isfinite(innovations.nis)
-        self._fuse(stamp_ns, tracks[rows], chosen, innovations, means, times.at(rows), is_fused)
-        given = zip(
-            *(values.tolist() for values in (rows, is_fused, times.start[rows], times.newest[rows])), strict=True
-        )
-        for k, (row, fused, start_ns, newest_ns) in enumerate(given):
-            results[row] = innovations.result(k, _status(stamp_ns, start_ns, newest_ns)) if fused else _FAILED
+        self._fuse(stamp_ns, tracks[rows], chosen, innovations, states.means, start_ns[rows], reach_ns[rows], is_fused)
+        late = [
+            2 if stamp_ns < a else int(stamp_ns < b) for a, b in zip(start_ns.tolist(), newest_ns.tolist(), strict=True)
+        ]
+        for k, (row, fused) in enumerate(zip(rows.tolist(), is_fused.tolist(), strict=True)):
+            results[row] = innovations.result(k, _STATUSES[late[row]]) if fused else _FAILED
         return results
 
     def birth(self, track_id: int, prior: Start) -> None:
@@ -184,7 +167,7 @@ class SmootherBank:
         if not self._tracks:
             return []
         tracks = self._all_tracks()
-        states = self.windows.states_at(tracks, np.maximum(self._now_ns, self._times().oldest[tracks]))
+        states = self.windows.states_at(tracks, np.maximum(self._now_ns, self._times()[3, tracks]))
         return PresentStates(self._motion, self._now_ns, *states)
 
     def smoothed(self) -> list[SmoothedReport]:
@@ -214,8 +197,8 @@ class SmootherBank:
 
     def window_ns(self, track_id: int) -> tuple[int, int]:
         """See `Estimator.window_ns`."""
-        times, track = self._times(), self._tracks[track_id]
-        return int(times.oldest[track]), int(times.newest[track])
+        newest_ns, _, _, oldest_ns = self._times()[:, self._tracks[track_id]].tolist()
+        return oldest_ns, newest_ns
 
     def state_at(self, track_id: int, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`."""
@@ -247,7 +230,8 @@ class SmootherBank:
         measurements: Sequence[Measurement],
         innovations: Innovations,
         guesses: FloatArray,
-        times: _Times,
+        start_ns: IntArray,
+        reach_ns: IntArray,
         is_fused: BoolArray,
     ) -> None:
         """Fuse those of `measurements` that `is_fused` marks; unmark those that cannot be."""
@@ -256,9 +240,9 @@ class SmootherBank:
             return
         self._changed()
         chosen = [measurements[row] for row in rows.tolist()]
-        of, reach = tracks[rows], (times.start[rows], times.reach[rows])
+        of, window_ns = tracks[rows], (start_ns[rows], reach_ns[rows])
         try:
-            left = self.windows.fuse(of, stamp_ns, chosen, innovations.at(is_fused), guesses[rows], *reach)
+            left = self.windows.fuse(of, stamp_ns, chosen, innovations.at(is_fused), guesses[rows], *window_ns)
         except np.linalg.LinAlgError:
             if len(rows) == 1:
                 self.windows.failures.add(Failure.GRAPH_REBUILT)
@@ -266,7 +250,7 @@ class SmootherBank:
                 return
             for row in rows.tolist():
                 alone = np.arange(len(tracks)) == row
-                self._fuse(stamp_ns, tracks, measurements, innovations, guesses, times, alone)
+                self._fuse(stamp_ns, tracks, measurements, innovations, guesses, start_ns, reach_ns, alone)
                 is_fused[row] = alone[row]
             return
         for track, left_ns, mean, covariance in zip(
@@ -297,14 +281,17 @@ class SmootherBank:
     def _all_tracks(self) -> IntArray:
         return np.fromiter(self._tracks.values(), dtype=np.int64, count=len(self._tracks))
 
-    def _times(self) -> _Times:
-        """Return the times of all rows."""
+    def _times(self) -> IntArray:
+        """Return four stamps of each row, shape (4, rows).
+
+        Those of the newest nodes, where the windows start, the oldest that may be fused, and the oldest that can be.
+        """
         if self._known_times is None:
-            rows = np.arange(len(self._clock_ns))
-            newest, first = self.windows.newest_ns(rows), self._first_ns
+            nodes, first = self.windows.nodes, self._first_ns
+            newest = nodes.stamps_ns[np.arange(len(first)), nodes.count[: len(first)] - 1]
             start = np.maximum(np.maximum(self._clock_ns, newest) - self._lag_ns, first)
             reach = np.maximum(start - self._behind_ns, first)
-            self._known_times = _Times(newest, start, reach, np.maximum(reach, self.windows.oldest_ns(rows)))
+            self._known_times = np.array([newest, start, reach, np.maximum(reach, nodes.stamps_ns[: len(first), 0])])
         return self._known_times
 
     def _known_at(self, stamp_ns: int) -> _Known:
@@ -312,19 +299,14 @@ class SmootherBank:
         known = self._known.get(stamp_ns)
         if known is None:
             tracks = self._all_tracks()
-            is_known = self._times().oldest[tracks] <= stamp_ns
+            is_known = self._times()[3, tracks] <= stamp_ns
             track_ids = tuple(compress(self._tracks, is_known.tolist()))
             tracks = tracks[is_known]
             states = self.windows.states_at(tracks, np.full(len(tracks), stamp_ns))
-            known = self._known[stamp_ns] = _Known(track_ids, tracks, states)
+            known = self._known[stamp_ns] = _Known(
+                track_ids, dict(zip(track_ids, range(len(tracks)), strict=True)), states
+            )
         return known
-
-
-def _status(stamp_ns: int, start_ns: int, newest_ns: int) -> UpdateStatus:
-    """Status of a measurement that is fused in a window that begins and ends there."""
-    if stamp_ns < start_ns:
-        return UpdateStatus.BEYOND_WINDOW
-    return UpdateStatus.OUT_OF_SEQUENCE if stamp_ns < newest_ns else UpdateStatus.IN_SEQUENCE
 
 
 class FixedLagSmoother:

@@ -324,7 +324,7 @@ def interpolate(
                 E[i, j] = (1.0 if i == j else 0.0) - E[i, j]
                 mean[t, i] += Psi[i, j] * (right[t, j] - ahead[t, j])
         product(E, F1[t], Lambda)
-        product(Lambda, A[t], by_right)
+        product(Lambda, A[t][:, :n], by_right)
         by_right += Psi
         product(by_right, P[t], work)
         P[t] = 0.0

@@ -2,17 +2,68 @@
 
 import numpy as np
 
-from fgtrack.core.compiled import njit
+from fgtrack.core.compiled import inlined, njit
+from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.smoothing.kernels import MATRICES, ORDER, TRACKS, VECTORS, cholesky, regularise
 
 
-@njit(f"void(int64[:], int64[:], {ORDER}, {TRACKS}, {TRACKS})")
-def place_before(tracks: IntArray, stamps_ns: IntArray, all_ns: IntArray, count: IntArray, indices: IntArray) -> None:
-    """Write the indices of the newest nodes at or before `stamps_ns`; -1 if there is none."""
+@inlined
+def _before(stamp_ns: int, all_ns: IntArray, count: int) -> int:
+    """Return the index of the newest of `count` nodes at or before `stamp_ns`; -1 if there is none."""
+    return int(np.searchsorted(all_ns[:count], stamp_ns, side="right")) - 1
+
+
+@njit(f"int64(int64[:], int64[:], {ORDER}, {TRACKS}, {ORDER}, int64[:], int64[:], float64[:], float64[:])")
+def locate(
+    tracks: IntArray,
+    stamps_ns: IntArray,
+    all_ns: IntArray,
+    count: IntArray,
+    numbers: IntArray,
+    indices: IntArray,
+    at: IntArray,
+    until_s: FloatArray,
+    after_s: FloatArray,
+) -> int:
+    """Write index and number of the nodes after `stamps_ns`, or of the last ones, and the times around the stamps.
+
+    Return how many are after them.
+    """
+    num_between = 0
     for t in range(len(tracks)):
-        track = tracks[t]
-        indices[t] = np.searchsorted(all_ns[track, : count[track]], stamps_ns[t], side="right") - 1
+        track, stamp_ns = tracks[t], stamps_ns[t]
+        index = _before(stamp_ns, all_ns[track], count[track])
+        until_s[t], after_s[t] = (stamp_ns - all_ns[track, index]) / NS_PER_S, 0.0
+        if until_s[t] > 0.0 and index < count[track] - 1:
+            index += 1
+            after_s[t] = (all_ns[track, index] - stamp_ns) / NS_PER_S
+            num_between += 1
+        indices[t], at[t] = index, numbers[track, index]
+    return num_between
+
+
+@njit(f"void(int64[:], int64, int64, {ORDER}, {TRACKS}, int64[:], int64[:])")
+def nearest(
+    tracks: IntArray,
+    stamp_ns: int,
+    near_ns: int,
+    all_ns: IntArray,
+    count: IntArray,
+    indices: IntArray,
+    at_ns: IntArray,
+) -> None:
+    """Write the stamps of the nodes at most `near_ns` from `stamp_ns`, or else this, and the nodes there or before."""
+    for t in range(len(tracks)):
+        stamps_ns, num = all_ns[tracks[t]], count[tracks[t]]
+        index = _before(stamp_ns, stamps_ns, num)
+        before_ns = stamp_ns - stamps_ns[index]
+        after_ns = stamps_ns[index + 1] - stamp_ns if index + 1 < num else near_ns + 1
+        at_ns[t] = stamp_ns
+        if min(before_ns, after_ns) <= near_ns:
+            index += after_ns < before_ns
+            at_ns[t] = stamps_ns[index]
+        indices[t] = index
 
 
 @njit(f"void(int64[:], int64[:], int64[:], {ORDER}, {TRACKS}, {TRACKS})")
@@ -166,3 +217,15 @@ def changed_factors(
             owners[num, 0], owners[num, 1], owners[num, 2] = t, left, right
             num += 1
     return num
+
+
+@njit(f"b1(int64[:], float64[:], {VECTORS}, {VECTORS}, {VECTORS})")
+def write_steps(
+    numbers: IntArray, delta: FloatArray, reference: FloatArray, origin: FloatArray, step: FloatArray
+) -> bool:
+    """Write `step` of nodes whose states are `reference` + `delta`, one after the other; True if all are finite."""
+    n = origin.shape[1]
+    for k in range(len(numbers)):
+        for i in range(n):
+            step[numbers[k], i] = reference[numbers[k], i] - origin[numbers[k], i] + delta[k * n + i]
+    return bool(np.isfinite(delta).all())

@@ -84,19 +84,29 @@ class Nodes:
         """True if the motion to the next node, and the measurements, were linearised since a factor graph read them."""
         self.terms: dict[int, list[MeasurementTerm]] = {}
         """Measurements of each node."""
+        self.order = self.first, self.count, self.numbers
+        """What all loops over the windows need."""
 
-    def at(self, tracks: IntArray, indices: IntArray) -> IntArray:
-        """Return the numbers of the nodes at `indices`; both of one shape."""
-        return self.numbers[tracks, indices]
+    def located(self, tracks: IntArray, stamps_ns: IntArray) -> tuple[IntArray, IntArray, FloatArray, FloatArray, int]:
+        """Return index and number of the node after each of `stamps_ns`, or of the last one, with the times around it.
 
-    def place_before(self, tracks: IntArray, stamps_ns: IntArray) -> IntArray:
-        """Return the index of the newest node at or before `stamps_ns`, of each track; -1 where all are after it."""
-        indices = np.empty(len(tracks), dtype=np.int64)
-        node_kernels.place_before(tracks, stamps_ns, self.stamps_ns, self.count, indices)
-        return indices
+        These are until the stamp, from the node before it, and from there to the node, 0 if it is not after the stamp;
+        then how many of the nodes are.
+        """
+        m = len(tracks)
+        (indices, numbers), (until_s, after_s) = np.empty((2, m), dtype=np.int64), np.empty((2, m))
+        given = self.stamps_ns, self.count, self.numbers
+        num_between = node_kernels.locate(tracks, stamps_ns, *given, indices, numbers, until_s, after_s)
+        return indices, numbers, until_s, after_s, num_between
+
+    def nearest(self, tracks: IntArray, stamp_ns: int, near_ns: int) -> tuple[IntArray, IntArray]:
+        """Return the indices of the nodes at most `near_ns` from `stamp_ns`, or else before it, and their stamps."""
+        indices, at_ns = np.empty((2, len(tracks)), dtype=np.int64)
+        node_kernels.nearest(tracks, stamp_ns, near_ns, self.stamps_ns, self.count, indices, at_ns)
+        return indices, at_ns
 
     def last_before(self, tracks: IntArray, indices: IntArray, stamps_ns: IntArray) -> IntArray:
-        """Return `place_before`, or `indices` if these are later."""
+        """Return the indices of the newest nodes at or before `stamps_ns`, or `indices` if these are later."""
         last = np.empty(len(tracks), dtype=np.int64)
         node_kernels.last_before(tracks, indices, stamps_ns, self.stamps_ns, self.count, last)
         return last
@@ -199,6 +209,7 @@ class Nodes:
         self._grow(axis=0)
         for name in ("count", "first", "anchored", "known", "any_far"):
             setattr(self, name, grown(getattr(self, name), len(self.numbers)))
+        self.order = self.first, self.count, self.numbers
 
     def _grow(self, axis: int) -> None:
         """Double the tracks, or the nodes of each; a node keeps its number and, if it is of a track, its values."""
@@ -211,6 +222,7 @@ class Nodes:
             larger = np.zeros((self.numbers.size, *values.shape[1:]), values.dtype)  # only pages of used ones are made
             larger[used] = values[used]
             setattr(self, name, larger)
+        self.order = self.first, self.count, self.numbers
 
     def _fit_rows(self, most: int) -> None:
         while most > self.rows.shape[1]:
@@ -226,8 +238,8 @@ class Undo:
         self._order = [getattr(nodes, name).take(tracks, axis=0) for name in nodes._ORDER]
         self.first = nodes.first[tracks]
         self._saved: list[tuple[str, IntArray, FloatArray]] = []
-        self._keep("predicted", nodes.at(tracks, self.first))
-        self._keep("back", nodes.at(tracks, np.maximum(self.first - 1, 0)))
+        self._keep("predicted", nodes.numbers[tracks, self.first])
+        self._keep("back", nodes.numbers[tracks, np.maximum(self.first - 1, 0)])
         self._keep("origin", nodes.numbers[tracks])
         self.added: list[int] = []
         """Nodes to which a measurement was added."""

@@ -87,13 +87,13 @@ class Solver:
         given = nodes.origin, nodes.segment, nodes.rows, nodes.num_rows
         result = nodes.predicted, nodes.filtered, nodes.back, nodes.C
         ends = nodes.count[tracks] if ends is None else ends
-        if not kernels.eliminate(tracks, starts, ends, *self._order, *given, *result):
+        if not kernels.eliminate(tracks, starts, ends, *self.nodes.order, *given, *result):
             raise np.linalg.LinAlgError("a state is not finite")
 
     def back_substitute(self, tracks: IntArray) -> None:
         """Find how far the states of `tracks` are from their linearisation points."""
         nodes = self.nodes
-        kernels.back_substitute(tracks, *self._order, nodes.filtered, nodes.back, nodes.step)
+        kernels.back_substitute(tracks, *self.nodes.order, nodes.filtered, nodes.back, nodes.step)
         self._mark_far(tracks)
         nodes.known[tracks] = nodes.count[tracks]
 
@@ -102,16 +102,12 @@ class Solver:
         nodes, n = self.nodes, self.motion.dim
         steps, covariances = np.empty((len(tracks), n)), np.empty((len(tracks), n, n))
         given = nodes.filtered, nodes.back, nodes.C, nodes.step, nodes.P
-        kernels.smoothed(tracks, indices, nodes.known, *self._order, *given, steps, covariances)
+        kernels.smoothed(tracks, indices, nodes.known, *self.nodes.order, *given, steps, covariances)
         return steps, covariances
-
-    @property
-    def _order(self) -> tuple[IntArray, IntArray, IntArray]:
-        return self.nodes.first, self.nodes.count, self.nodes.numbers
 
     def _mark_far(self, tracks: IntArray) -> None:
         nodes, limits = self.nodes, (self._thresholds, self.nodes.anchored)
-        kernels.mark_far(tracks, *self._order, *limits, nodes.step, nodes.far, nodes.any_far)
+        kernels.mark_far(tracks, *self.nodes.order, *limits, nodes.step, nodes.far, nodes.any_far)
 
     # --- linearisation
 
@@ -119,7 +115,7 @@ class Solver:
         """Nodes that are too far from their linearisation points: rows of `tracks`, and indices."""
         nodes = self.nodes
         rows, indices = np.empty((2, int((nodes.count - nodes.first)[tracks].sum())), dtype=np.int64)
-        num = kernels.find_far(tracks, *self._order, nodes.anchored, nodes.far, nodes.any_far, rows, indices)
+        num = kernels.find_far(tracks, *self.nodes.order, nodes.anchored, nodes.far, nodes.any_far, rows, indices)
         return rows[:num], indices[:num]
 
     def move_far(self, tracks: IntArray) -> Moved:
@@ -129,7 +125,7 @@ class Solver:
         rows, indices = self.far(tracks)
         of = tracks[rows]
         if rows.size:
-            numbers = nodes.at(of, indices)
+            numbers = nodes.numbers[of, indices]
             nodes.move(of, numbers, nodes.step[numbers])
             np.minimum.at(starts, rows, indices)
         return Moved(starts, of, indices)
@@ -142,7 +138,7 @@ class Solver:
             tracks, indices = tracks[inner], indices[inner]
         if tracks.size:
             dt_s = (nodes.stamps_ns[tracks, indices + 1] - nodes.stamps_ns[tracks, indices]) / NS_PER_S
-            numbers = nodes.at(tracks, indices)
+            numbers = nodes.numbers[tracks, indices]
             ahead, F, Q = self.motion.transition(nodes.origin[numbers], dt_s)
             nodes.segment[numbers] = np.concatenate([F, Q, ahead[..., None]], axis=-1)
             nodes.changed[numbers, 0] = True

@@ -10,8 +10,8 @@ from fgtrack.core.time import NS_PER_S, seconds
 from fgtrack.core.types import YAW, BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.failures import Failure, Failures
-from fgtrack.estimation.filters.ekf import predict
 from fgtrack.estimation.filters.initiation import Fix, Line, along, fixes_of
+from fgtrack.estimation.kernels import kalman
 from fgtrack.estimation.smoothing import kernels
 from fgtrack.estimation.smoothing.damping import DampedWindow
 from fgtrack.estimation.smoothing.nodes import Undo
@@ -66,58 +66,42 @@ class Windows:
 
     # --- states
 
-    def oldest_ns(self, tracks: IntArray) -> IntArray:
-        """Oldest stamps at which a state is known, behind the windows too."""
-        return np.asarray(self.nodes.stamps_ns[tracks, 0])
-
-    def newest_ns(self, tracks: IntArray) -> IntArray:
-        """Stamps of the newest nodes."""
-        return np.asarray(self.nodes.stamps_ns[tracks, self.nodes.count[tracks] - 1])
-
     def states_at(self, tracks: IntArray, stamps_ns: IntArray) -> States:
-        """States of `tracks` at `stamps_ns`, not older than `oldest_ns`: interpolated, or predicted ahead."""
+        """States of `tracks` at `stamps_ns`, not older than the oldest node: interpolated, or predicted ahead."""
         nodes = self.nodes
-        indices = nodes.place_before(tracks, stamps_ns)
-        until_ns = stamps_ns - nodes.stamps_ns[tracks, indices]
-        is_between = (until_ns > 0) & (indices < nodes.count[tracks] - 1)
-        indices = indices + is_between
-        self.solver.look_up(tracks, indices, is_between)
-        steps, covariances = self.solver.smoothed(tracks, indices)
-        means = nodes.origin[nodes.at(tracks, indices)] + steps
-        is_ahead = (until_ns > 0) & ~is_between
-        if is_ahead.any():
-            until_s = until_ns[is_ahead] / NS_PER_S
-            means[is_ahead], covariances[is_ahead] = predict(
-                means[is_ahead], covariances[is_ahead], self._motion, until_s
+        indices, numbers, until_s, after_s, num_between = nodes.located(tracks, stamps_ns)
+        self.solver.look_up(tracks, indices, after_s > 0.0)
+        means, covariances = self.solver.smoothed(tracks, indices)
+        means += nodes.origin[numbers]
+        if num_between < len(tracks):  # of no time, or between two nodes, are states ahead what they are
+            ahead, F, Q = self._motion.transition(
+                means, until_s if num_between == 0 else np.where(after_s > 0.0, 0.0, until_s)
             )
-        if is_between.any():
-            chosen = slice(None) if is_between.all() else is_between
-            means[chosen], covariances[chosen] = self._between(
-                tracks[chosen], indices[chosen], stamps_ns[chosen], steps[chosen], means[chosen], covariances[chosen]
-            )
+            covariances, means = kalman.predict(F, covariances, Q)[0], ahead
+        if num_between:
+            k = slice(None) if num_between == len(tracks) else after_s > 0.0
+            left = nodes.numbers[tracks[k], indices[k] - 1]
+            means[k], covariances[k] = self._between(left, numbers[k], until_s[k], after_s[k], means[k], covariances[k])
         return States(means, covariances)
 
     def _between(
         self,
-        tracks: IntArray,
-        indices: IntArray,
-        stamps_ns: IntArray,
-        steps: FloatArray,
-        right: FloatArray,
-        P: FloatArray,
+        left: IntArray,
+        right: IntArray,
+        until_s: FloatArray,
+        after_s: FloatArray,
+        means: FloatArray,
+        covariances: FloatArray,
     ) -> States:
-        """States between the nodes at `indices`, with these steps, means and covariances, and those before them."""
+        """States so long after the nodes `left` and before the nodes `right`, which have the means and covariances."""
         nodes, n = self.nodes, self._motion.dim
-        at = nodes.at(tracks, indices - 1)
-        A, b = nodes.back[at, :, :n].copy(), nodes.back[at, :, n]
-        left = nodes.origin[at] + np.matvec(A, steps) + b
-        until_s = (stamps_ns - nodes.stamps_ns[tracks, indices - 1]) / NS_PER_S
-        after_s = (nodes.stamps_ns[tracks, indices] - stamps_ns) / NS_PER_S
-        first = self._motion.transition(left, until_s)
+        back, C = nodes.back[left], nodes.C[left]
+        mean = nodes.origin[left] + np.matvec(back[:, :, :n], means - nodes.origin[right]) + back[:, :, n]
+        first = self._motion.transition(mean, until_s)
         second = self._motion.transition(first.mean, after_s)
-        if not kernels.interpolate(*first, *second, right, A, nodes.C[at], P):
+        if not kernels.interpolate(*first, *second, means, back, C, covariances):
             raise np.linalg.LinAlgError("process noise is not positive definite")
-        return States(first.mean, P)
+        return States(first.mean, covariances)
 
     # --- updates
 
@@ -141,8 +125,8 @@ class Windows:
         guesses = self._relinearised(tracks, stamp_ns, measurements, guesses)
         anchors = nodes.last_before(tracks, nodes.first[tracks], start_ns)
         left = self._leaving(tracks, anchors)
-        stamps_ns, measurements = self._at_nodes(tracks, stamp_ns, measurements)
-        indices = nodes.place_before(tracks, stamps_ns)
+        indices, stamps_ns = nodes.nearest(tracks, stamp_ns, solver.near_ns)
+        measurements = self._at_nodes(stamps_ns, measurements)
         is_old = indices < anchors
         undo = Undo(nodes, tracks)
         try:
@@ -180,7 +164,7 @@ class Windows:
         if not tracks.size or solver.is_damped:
             return
         rows, indices = solver.far(tracks)
-        moved = nodes.at(tracks[rows], indices)
+        moved = nodes.numbers[tracks[rows], indices]
         far = zip(rows.tolist(), moved.tolist(), nodes.origin[moved], nodes.step[moved], strict=True)
         for row in sorted({row for row, number, x, step in far if overshot(nodes.terms[number], x, x + step)}):
             track = int(tracks[row])
@@ -211,29 +195,15 @@ class Windows:
         rows, columns = np.nonzero(np.arange(int(num.max())) < num[:, None])
         tracks, indices = tracks[rows], nodes.first[tracks[rows]] + columns
         steps, covariances = self.solver.smoothed(tracks, indices)
-        means = nodes.origin[nodes.at(tracks, indices)] + steps
+        means = nodes.origin[nodes.numbers[tracks, indices]] + steps
         return Leaving(tracks, nodes.stamps_ns[tracks, indices], States(means, covariances))
 
-    def _at_nodes(
-        self, tracks: IntArray, stamp_ns: int, measurements: Sequence[Measurement]
-    ) -> tuple[IntArray, Sequence[Measurement]]:
-        """Stamps (m,) and measurements, moved to the nearest node where it is closer than the solver can tell apart."""
-        nodes, stamps_ns = self.nodes, np.full(len(tracks), stamp_ns)
-        if not self.solver.near_ns:
-            return stamps_ns, measurements
-        indices = nodes.place_before(tracks, stamps_ns)
-        around = np.stack([indices, np.minimum(indices + 1, nodes.count[tracks] - 1)])
-        around_ns = nodes.stamps_ns[tracks, around]
-        apart_ns = np.abs(around_ns - stamp_ns)
-        nearest_ns = np.where(apart_ns[0] <= apart_ns[1], *around_ns)
-        is_near = (apart_ns.min(axis=0) <= self.solver.near_ns) & (nearest_ns != stamp_ns)
-        if not is_near.any():
-            return stamps_ns, measurements
-        measurements = list(measurements)
-        for row in is_near.nonzero()[0].tolist():
-            stamps_ns[row] = nearest_ns[row]
-            measurements[row] = NearMeasurement.at(measurements[row], int(nearest_ns[row]), self._motion)
-        return stamps_ns, measurements
+    def _at_nodes(self, stamps_ns: IntArray, measurements: Sequence[Measurement]) -> Sequence[Measurement]:
+        """Measurements of the nodes at `stamps_ns`, which may be closer to theirs than the solver can tell apart."""
+        return [
+            each if each.stamp_ns == node_ns else NearMeasurement.at(each, node_ns, self._motion)
+            for each, node_ns in zip(measurements, stamps_ns.tolist(), strict=True)
+        ]
 
     def _insert(
         self,
@@ -265,7 +235,7 @@ class Windows:
         if of.size:
             self.solver.linearise_motion(of, at)
         np.minimum(moved.starts, indices, out=moved.starts, where=is_live)
-        return nodes.at(tracks, indices)
+        return nodes.numbers[tracks, indices]
 
     def _measure(
         self,
@@ -295,7 +265,7 @@ class Windows:
         most = nodes.first[tracks] - 1
         if not ((most >= _MANY) & (nodes.stamps_ns[tracks, _MANY - 1] <= stamps_ns)).any():
             return
-        num = np.minimum(nodes.place_before(tracks, stamps_ns), most)
+        num = np.minimum(nodes.last_before(tracks, np.zeros_like(tracks), stamps_ns), most)
         many = num >= _MANY
         if many.any():
             nodes.drop(tracks[many], num[many])

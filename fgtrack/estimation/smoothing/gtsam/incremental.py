@@ -110,9 +110,8 @@ class IncrementalSolver(GraphSolver):
             num_leaving = int(nodes.first[track]) - start
             inside = window[num_leaving:]
             graph.solve(new, window[:num_leaving].tolist(), n)
-            delta = graph.smoother.getDelta().vector(inside.tolist()).reshape(len(inside), n)
-            nodes.step[inside] = self._reference[inside] - nodes.origin[inside] + delta
-            if not np.isfinite(delta).all():
+            delta = graph.smoother.getDelta().vector(inside.tolist())
+            if not node_kernels.write_steps(inside, delta, self._reference, nodes.origin, nodes.step):
                 raise ValueError("a state is not finite")
 
     def _graph(self, track: int, window: IntArray) -> _Graph:
