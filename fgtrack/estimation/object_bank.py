@@ -200,6 +200,6 @@ def state_of(bank: TrackBank, motion: MotionModel, track_id: int, stamp_ns: int)
     """
     states = states_of(bank, motion, stamp_ns)
     if track_id not in states.track_ids:
-        raise CallError(f"track {track_id} is not known at {stamp_ns} ns: that is before its window")
+        raise CallError(f"track {track_id} has no state at {stamp_ns} ns: before its window, or not finite")
     row = states.track_ids.index(track_id)
     return track_state(motion, stamp_ns, states.means[row], states.covariances[row])

@@ -316,7 +316,8 @@ def _row(name: str, pairs: Sequence[_Pair], reference: str, num_sensors: int) ->
         offset_s += move_s
         if abs(move_s) < 1e-4:
             break
-    speed_mps = math.sqrt(float(np.nanmean(np.square(g).sum(axis=1))))
+    squared = np.square(g).sum(axis=1)
+    speed_mps = math.sqrt(float(np.mean(squared[np.isfinite(squared)]))) if np.isfinite(squared).any() else 0.0
     why = f"objects move {speed_mps:.2g} m/s (rms) in its frame, against {reference}"
     if not abs(move_s) <= max(0.2 * fit.std[0], 1e-3) or abs(offset_s) > _REACH_S or math.isinf(fit.std[0]):
         return SensorOffset(name, None, None, len(stamps_ns), why)
@@ -376,4 +377,6 @@ def _solved(r: FloatArray, A: FloatArray, stamps_ns: IntArray) -> _Fit:
     std = np.sqrt((1.0 - 1.0 / len(names)) * np.square(without).sum(axis=0)).tolist()
     column = psd_solve(H, np.eye(size)[0])
     shares = np.einsum("j,njk,k->n", column, parts, column) / column[0]  # of what is known of the offset
+    if not shares.any():  # nothing moves
+        return _Fit(tuple(x.tolist()), (math.inf,) * size, 0.0, cost)
     return _Fit(tuple(x.tolist()), tuple(std), 1.0 / float(shares @ shares) - 1.0, cost)

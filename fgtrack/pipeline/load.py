@@ -191,7 +191,7 @@ def _first_problem(error: ValidationError, kind: type[Any], text: str) -> str:
     if first["type"] == _UNKNOWN:
         known = _known_keys(kind, text, names[:-1])
         hint = did_you_mean(names[-1], known).removesuffix("?")
-        message, given = f"unknown key{hint}, known here: {', '.join(known)}", ""
+        message, given = f"unknown key{hint}" + (f", known here: {', '.join(known)}" if known else ""), ""
     elif first["type"] == "union_tag_not_found":
         message = "needs the key `kind`, which says which of its forms is meant"
     elif first["type"] == "union_tag_invalid":

@@ -96,7 +96,7 @@ def test_a_chunk_of_an_mcap_file(tmp_path: Path, compression: str) -> None:
 def test_a_packed_message(tmp_path: Path) -> None:
     file = drive_as(tmp_path, "sqlite3")
     with sqlite3.connect(file) as base:
-        base.execute("update messages set data = ? where id = 20", (zstd.compress(BOMB),))
+        base.execute("update messages set data = ? where id = 17", (zstd.compress(BOMB),))
     base.close()
     refused(tmp_path / "bag", r"the message on \S+ at \d+ ns: is larger than 1 MB")
 

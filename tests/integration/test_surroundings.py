@@ -75,13 +75,6 @@ def test_what_is_to_be_written_is_written_though_the_reader_has_left(folder: Pat
     assert (folder / made).exists()
 
 
-def test_a_variable_that_keeps_processes_from_starting_is_a_line(folder: Path) -> None:
-    done = shell(folder, "fgtrack sweep sweep.yaml -o odd", LOKY_MAX_CPU_COUNT="nonsense")
-    assert done.returncode == 2
-    assert done.stderr.startswith("fgtrack: error: processes cannot be started (ValueError")
-    assert done.stderr.count("\n") == 1
-
-
 def test_figures_need_nothing_of_the_environment(folder: Path) -> None:
     done = shell(folder, "fgtrack figure run -o figures", MPLBACKEND="nonsense", MPLCONFIGDIR="/proc/none")
     assert (done.returncode, done.stderr) == (0, "")
