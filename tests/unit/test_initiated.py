@@ -123,8 +123,9 @@ def test_the_configuration_says_it_for_all_tracks(name: str, method: str) -> Non
         bank.advance(measurement.stamp_ns)
         bank.update(measurement.stamp_ns, [1], [measurement])
         one.update(measurement)
-    states = bank.states_at(4 * PERIOD_NS)
-    np.testing.assert_allclose(states.means[0], one.state_at(4 * PERIOD_NS).mean, atol=1e-9)
+    mean = bank.states_at(4 * PERIOD_NS).means[0]
+    mean[2] = wrap_angle(float(mean[2]))  # a state may have turned more than once
+    np.testing.assert_allclose(mean, one.state_at(4 * PERIOD_NS).mean, atol=1e-9)
 
 
 def test_on_a_map_backward_forward_stays_one_bank_for_all_objects() -> None:

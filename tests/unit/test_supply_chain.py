@@ -32,7 +32,6 @@ BOUND_ABOVE = {
     "motrics",
     "matplotlib",
     "pandas",
-    "ijson",
 }
 
 
