@@ -147,7 +147,7 @@ def entry_columns(heading: str, name: str = "value") -> list[Column]:
 
 
 class Paired(NamedTuple):
-    """What runs of one recording are compared by.
+    """Sums by which runs of one recording are compared.
 
     Attributes
     ----------

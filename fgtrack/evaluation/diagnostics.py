@@ -1,4 +1,4 @@
-"""What must be known before a run is trusted: unused detections and why, inconsistent noise, broken tracks."""
+"""Diagnostics to read before a run is trusted: unused detections and why, inconsistent noise, broken tracks."""
 
 import math
 from collections.abc import Iterator, Mapping

@@ -51,7 +51,7 @@ class KittiResult:
 
 @dataclass(frozen=True)
 class _Description:
-    """What the detections of a track have in common up to a tick: the middle is that of the last one, above ground."""
+    """Mean size and score, last height of the middle above ground and most frequent class of a track up to a tick."""
 
     size_m: tuple[float, float, float]
     middle_m: float

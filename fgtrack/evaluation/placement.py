@@ -1,4 +1,4 @@
-"""Where the detections of a run are in the map, and what became of each."""
+"""Positions of the detections of a run in the map, and the outcome of each."""
 
 from collections import defaultdict, deque
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class Placed:
     yaw_rad: FloatArray
     """Shape (n,); NaN where it was not measured."""
     sensor_m: FloatArray
-    """Where the sensor was, shape (n, 2); NaN where no pose of the ego is known."""
+    """Position of the sensor, shape (n, 2); NaN where no pose of the ego is known."""
     bearing_rad: FloatArray
     """Direction from the sensor, shape (n,); NaN where it was not measured."""
 

@@ -108,7 +108,7 @@ def _draw_flow(axes: Axes, updates: Table, fates: Column, first_ns: int) -> None
 
 
 def _shown_ns(updates: Table) -> int:
-    """How long the part shown is."""
+    """Length of the part shown, in nanoseconds."""
     sensors = updates["sensor"]
     steps_ns = [usual_step_ns(updates["stamp_ns"][sensors == name]) for name in np.unique(sensors).tolist()]
     shortest_ns = min(steps_ns)
@@ -123,5 +123,5 @@ def _busiest_ns(receipts_ns: IntArray, late: BoolArray, length_ns: int) -> int:
 
 
 def _fates(updates: Table) -> Column:
-    """What became of each detection, as in the legend."""
+    """Outcome of each detection, as in the legend, shape (n,)."""
     return np.array([_FATES.get(name, "not used") for name in updates["disposition"].tolist()])

@@ -91,7 +91,7 @@ _Squares = tuple[IntArray, FloatArray, IntArray]  # stamps, values, degrees of f
 
 
 def _panels(one: EvaluatedRun) -> dict[str, _Squares]:
-    """What there is to show, by name."""
+    """Stamps, normalised squares and degrees of freedom to show, by name of the panel."""
     found: dict[str, _Squares] = {}
     if one.matching is not None:
         nees = position_nees(one.matching)
@@ -108,7 +108,7 @@ def _panels(one: EvaluatedRun) -> dict[str, _Squares]:
 
 
 def has_squares(one: EvaluatedRun) -> bool:
-    """Whether `consistency` has anything to show."""
+    """True if `consistency` has anything to show."""
     return bool(_panels(one))
 
 

@@ -37,7 +37,7 @@ class _Curve:
     label: str
     look: Look
     first_ns: int
-    """Where its time begins."""
+    """Start of its time axis."""
     step_ns: float
     """Usual step between its ticks."""
     stamps_ns: IntArray

@@ -104,7 +104,7 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
 
 
 class _Window(NamedTuple):
-    """Where and when the close-up is."""
+    """Time and region of the close-up."""
 
     middle_ns: int
     middle_m: FloatArray

@@ -150,7 +150,7 @@ def _families(font: str) -> list[str]:
 
 
 class Sheet:
-    """What a figure is drawn on: a figure of its own, or the axes that the caller gave."""
+    """Canvas of a figure: a figure of its own, or the axes that the caller gave."""
 
     def __init__(self, width_in: float, height_in: float, paper: Paper) -> None:
         """Make a figure of this usual size, in the width that `paper` wants."""

@@ -1,4 +1,4 @@
-"""What part of its data an axis shows: the bulk, whatever single values are far away."""
+"""Range of its data that an axis shows: the bulk, whatever single values are far away."""
 
 from collections.abc import Iterable
 

@@ -1,4 +1,4 @@
-"""How figures look, and how they are saved: equal figures, equal bytes."""
+"""Style of figures, and their files: equal figures, equal bytes."""
 
 import base64
 import io

@@ -28,7 +28,7 @@ class SensorDelays:
     clock: tuple[AnyClock, ...] = ()
     """Errors of the stamps that it reports; the delay is still that behind the recorded one."""
     loss_probability: Probability = 0.0
-    """That a list never arrives, each by itself."""
+    """Probability that a list never arrives, each by itself."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -121,7 +121,7 @@ class Scanner:
         return np.stack([values[name] for name in self.sensor.components], axis=1)
 
     def _visible(self, scan: IntArray, states: FloatArray) -> BoolArray:
-        """Which of `states` lie in the field of view, shape (m,)."""
+        """True for those of `states` that lie in the field of view, shape (m,)."""
         sensor = self.sensor
         distance, bearing, _ = self._relative(scan, states).T
         return in_view(

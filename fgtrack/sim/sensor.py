@@ -62,7 +62,7 @@ class SimulatedSensor:
     detection_probability: Probability = 1.0
     clutter: Clutter = field(default_factory=Clutter)
     split_probability: Probability = 0.0
-    """That a detected object gives two detections, one behind the other."""
+    """Probability that a detected object gives two detections, one behind the other."""
     split_distance_m: tuple[NonNegativeFloat, NonNegativeFloat] = (2.0, 4.0)
     outlier_probability: Probability = 0.0
     outlier_factor: Annotated[float, Field(ge=1.0)] = 10.0
@@ -102,6 +102,6 @@ class SimulatedSensor:
         return times[times <= duration_s]
 
     def silent(self, times_s: FloatArray) -> BoolArray:
-        """Which of `times_s` lie in a drop-out."""
+        """True for those of `times_s` that lie in a drop-out, shape (n,)."""
         starts_s, ends_s = np.reshape(self.drop_outs, (-1, 2)).T[:, :, None]
         return np.asarray(((times_s >= starts_s) & (times_s < ends_s)).any(axis=0))

@@ -16,7 +16,7 @@ __all__ = ["IN_A_ROW", "RARE", "Divergence", "are_finite", "check_real", "faults
 _MOST = np.array([1e9, 1e9, 1e3, 1e5, 1e4, 1e6])
 """Largest x, y, yaw, speed, yaw rate and acceleration, in SI units: far beyond any vehicle on Earth."""
 _ROUNDING = 1e-9
-"""So much less than 0 an eigenvalue of a correlation matrix may be: rounding, where an entry is known for certain."""
+"""Tolerance of an eigenvalue of a correlation matrix below 0: rounding, where an entry is known for certain."""
 _TINY = 1e-300
 
 IN_A_ROW, RARE = 8, 1e-4

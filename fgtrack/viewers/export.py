@@ -20,12 +20,12 @@ from fgtrack.viewers.states import start_ns
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written."""
+    """Number of messages written, and notes on contents that could not be shown."""
 
     counts: Mapping[str, int]
     """Messages by topic."""
     notes: tuple[str, ...]
-    """What could not be shown, a line each."""
+    """Contents that could not be shown, a line each."""
 
 
 def export(runs: Runs, out: Path, *, ros2: bool = False, overwrite: bool = False) -> Exported:

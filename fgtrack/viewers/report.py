@@ -30,7 +30,7 @@ _PNG_SIZE = slice(16, 24)  # of its header
 
 @dataclass(frozen=True)
 class Opening:
-    """How a report begins."""
+    """First part of a report: verdict, assumptions, advice, and the moment that the viewer shows first."""
 
     sentences: Sequence[str] = ()
     """Its verdict; empty for that of the comparison."""
@@ -38,9 +38,9 @@ class Opening:
     """Settings that the user has not given."""
     advice: Sequence[str] = ()
     moment: Moment | None = None
-    """What the viewer shows first; None for an early late detection."""
+    """Time [ns], x and y [m] that the viewer shows first; None for an early late detection."""
     missing: Sequence[str] = ()
-    """What the report leaves out, a line each."""
+    """Contents that the report leaves out, a line each."""
 
 
 def write_report(
@@ -227,7 +227,7 @@ _FACTS = ("run", "estimator", "recording", "detections", "time [s]", "versions",
 
 
 def _facts(one: EvaluatedRun) -> list[str]:
-    """What a run was made of, by whom and how long it took, in the order of `_FACTS`."""
+    """Label, estimator, recording, detections, time [s], versions and digest of a run, in the order of `_FACTS`."""
     meta = one.run.meta
     versions: Mapping[str, Any] = meta.get("versions") or {}
     wall_s = meta.get("wall_s")

@@ -99,7 +99,7 @@ def truth_messages(truth: Table) -> Iterator[Messages]:
 
 
 def run_messages(run: Run, look: Look) -> Iterator[Messages]:
-    """What shows a run alone, each in the order of log times."""
+    """Streams of the messages that show a run alone, each in the order of log times."""
     yield from _track_messages(run, look)
     yield _past_messages(run, look)
     yield from _final_messages(run, look)

@@ -24,10 +24,10 @@ class Shape:
     at_m: Point = (0.0, 0.0)
     """Its centre; of an arrow its tail."""
     height_m: float = 0.0
-    """Of the centre above the ground."""
+    """Height of the centre above the ground."""
     yaw_rad: float = 0.0
     points_m: Sequence[Point] = ()
-    """Of a line."""
+    """Points of a line."""
     text: str = ""
 
 
@@ -38,7 +38,7 @@ class Entity:
     name: str
     shapes: tuple[Shape, ...]
     lifetime_s: float | None = None
-    """How long it is shown from its log time on; None until it is replaced or removed."""
+    """Time in seconds for which it is shown from its log time on; None until it is replaced or removed."""
     facts: Mapping[str, str] = field(default_factory=dict)
     """Texts that a viewer shows of a selected entity."""
     frame: Literal["map", "ego"] = "map"

@@ -251,7 +251,7 @@ def similarities(distances_m: FloatArray, gate_m: float) -> FloatArray:
 
 
 def motrics_frames(scenes: Scenes, gate_m: float) -> tuple[list[Any], list[Any], list[Any]]:
-    """What motrics takes: lists of the objects, the tracks and their similarities, with an entry for every tick."""
+    """Lists of the objects, the tracks and their similarities for motrics, with an entry for every tick."""
     scores = similarities(scenes.distances_m, gate_m)
     ids = scenes.track_ids.tolist()
     rows_of = list(zip(scenes, scenes.present, strict=True))

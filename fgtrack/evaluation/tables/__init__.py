@@ -191,7 +191,7 @@ class Table:
         return csv_text([self.names, *(record.values() for record in self.plain())])
 
     def to_markdown(self) -> str:
-        """What is shown as a table of GitHub Markdown under a heading, the notes below."""
+        """Shown columns and records as a table of GitHub Markdown under a heading, the notes below."""
         shown = self.shown()
         head, *rows = grid(shown, lambda cell, bold: f"**{_markdown(cell.strip())}**" if bold else _markdown(cell))
         rule = [":---" if column.left else "---:" for column in shown]
@@ -206,7 +206,7 @@ class Table:
         )
 
     def to_latex(self) -> str:
-        """What is shown as a table environment with the rules of the package booktabs; notes as comments."""
+        """Shown columns and records as a table environment with the rules of package booktabs; notes as comments."""
         shown = self.shown()
         head, *rows = grid(shown, lambda cell, bold: f"\\textbf{{{_latex(cell)}}}" if bold else _latex(cell))
         body = [f"{'{}' if row[0][:1] in ('[', '*') else ''}{' & '.join(row)} \\\\" for row in rows]  # no option of \\

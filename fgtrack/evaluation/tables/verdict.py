@@ -77,7 +77,7 @@ def who_is_best(entries: Sequence[Entry], when: str) -> str:
 
 
 def _metres(entry: Entry, what: str = "") -> str:
-    """How much worse `entry` is, with the interval and `what` behind the unit."""
+    """Amount by which `entry` is worse, with the interval and `what` behind the unit."""
     worse = entry.worse_by or UNKNOWN
     scale, unit = (1e3, "mm") if abs(worse.mean) < 0.01 else (1.0, "m")
     mean, low, high = (two_digits(scale * value) for value in (worse.mean, worse.low, worse.high))
