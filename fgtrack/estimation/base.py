@@ -215,7 +215,7 @@ def _check(name: str, value: object, rule: str, holds: bool) -> None:
 
 
 def _is_array(value: object, shape: tuple[int, ...], largest: float) -> bool:
-    """Whether it has this shape, and numbers of a magnitude up to `largest`."""
+    """True if it has this shape, and numbers of a magnitude up to `largest`."""
     try:
         array = np.asarray(value)
     except ValueError:  # rows of several lengths

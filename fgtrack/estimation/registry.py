@@ -81,33 +81,33 @@ class Claims:
     """When, in a nonlinear model, estimates do not depend on the order of arrival: by themselves, after the estimator's
     own method `converge()`, or never, where an estimate keeps its linearisation."""
     smooths: bool = False
-    """Whether states of the past contain later measurements; a filter's do not."""
+    """True if states of the past contain later measurements; a filter's do not."""
     tolerance: float = 1e-9
     """Largest difference to the dense joint posterior, in standard deviations."""
     rounding: float = 0.0
     """Where stamps nearly coincide, the tolerance grows to this many times `rounding_bound` of the suite."""
     retrodicts: bool = False
-    """Whether a filter predicts the innovation of a late measurement from everything that has been fused, also what was
+    """True if a filter predicts the innovation of a late measurement from everything that has been fused, also what was
     sensed after it. One that smooths does so anyway."""
     spreads: bool = False
-    """Whether predictions of a nonlinear model are averages over the spread of the state, not values at its mean."""
+    """True if predictions of a nonlinear model are averages over the spread of the state, not values at its mean."""
     mixes: bool = False
-    """Whether it weighs other motion models beside the one that it is given: what it predicts, and what it estimates in
+    """True if it weighs other motion models beside the one that it is given: what it predicts, and what it estimates in
     sequence, is then not what that model alone would give."""
     held_s: float = 0.0
     """How long a measurement waits before it counts."""
     initiates: bool = False
-    """Whether it finds an unknown direction of travel by itself, and takes `initiation` as an option. Another one is
+    """True if it finds an unknown direction of travel by itself, and takes `initiation` as an option. Another one is
     made again, along its first positions, until their direction is certain (see `Initiated`)."""
     reports: bool = False
-    """Whether it hands out what it has smoothed, by `take_final` and `take_rest` of `Smoother`;
+    """True if it hands out what it has smoothed, by `take_final` and `take_rest` of `Smoother`;
     one that does has to initiate, too."""
     bank: bool = False
-    """Whether the entry makes the estimators of all objects together."""
+    """True if the entry makes the estimators of all objects together."""
 
     @property
     def is_exact(self) -> bool:
-        """Whether nothing late, in whatever number, changes what it gives in a linear model."""
+        """True if nothing late, in whatever number, changes what it gives in a linear model."""
         return self.exact == EXACT
 
     @classmethod
@@ -221,7 +221,7 @@ def motion_model(name: str, parameters: Mapping[str, Any]) -> MotionModel:
 
 
 def works_together(factory: Factory) -> bool:
-    """Whether the estimators of several objects are made as one, by other code than those of a single object."""
+    """True if the estimators of several objects are made as one, by other code than those of a single object."""
     return Claims.of(factory).bank or _replays(factory)
 
 

@@ -82,7 +82,7 @@ class MeasurementModel:
 
     @cached_property
     def linear(self) -> bool:
-        """Whether the measurement selects entries of the state, whatever the sensor pose."""
+        """True if the measurement selects entries of the state, whatever the sensor pose."""
         return set(self.components) <= set(self.state_names)
 
     def predict(self, x: FloatArray, pose: SensorPose = _AT_ORIGIN) -> FloatArray:

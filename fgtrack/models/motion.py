@@ -49,7 +49,7 @@ class MotionModel(ABC):
     state_names: ClassVar[tuple[str, ...]]
     """Names of the n entries of the state: those of `POLAR` or of `CARTESIAN`, then any others."""
     linear: ClassVar[bool] = False
-    """Whether the Jacobian is the same at every state."""
+    """True if the Jacobian is the same at every state."""
 
     @property
     def dim(self) -> int:
@@ -58,7 +58,7 @@ class MotionModel(ABC):
 
     @property
     def cartesian(self) -> bool:
-        """Whether the state holds the velocity as vx and vy, and not as yaw and speed."""
+        """True if the state holds the velocity as vx and vy, and not as yaw and speed."""
         return self.state_names[:4] == CARTESIAN
 
     @abstractmethod
@@ -137,7 +137,7 @@ class MotionModel(ABC):
 
     @cached_property
     def _leads(self) -> bool:
-        """Whether the state is a kinematic state."""
+        """True if the state is a kinematic state."""
         return self.dim >= ACCEL and self.state_names == STATE_NAMES[: self.dim]
 
     @cached_property

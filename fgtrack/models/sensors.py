@@ -46,7 +46,7 @@ class Filter:
             raise ValueError(f"min: must not be more than max = {self.max}, is {self.min}")
 
     def passes(self, value: object) -> bool:
-        """Whether `value` passes; what is not there or not a number does not pass a bound."""
+        """True if `value` passes; what is not there or not a number does not pass a bound."""
         if (self.one_of is not None and value not in self.one_of) or value in self.none_of:
             return False
         if self.min is None and self.max is None:
@@ -151,10 +151,10 @@ class SensorModel:
     """Full angle that it sees, centred on its axis; for existence and evaluation, as these ranges. null: in a replay
     that of the recording, or where it detects in it, if no range is given either; else all around."""
     scan: bool = True
-    """Whether a list shows all objects in view, so that it misses those that it lacks. False where objects are reported
+    """True if a list shows all objects in view, so that it misses those that it lacks. False where objects are reported
     one by one, as by ADS-B, AIS or V2X; without a configuration a replay finds it in the recording."""
     births: bool = True
-    """Whether an unmatched detection of this sensor starts a track."""
+    """True if an unmatched detection of this sensor starts a track."""
     loss: RobustLoss | None = None
     """Robust loss of its measurements; null is the Gaussian. A smoother weighs them anew while they are in its
     window, a filter once, at the state that the update gives."""
@@ -214,7 +214,7 @@ class SensorModel:
 
     @property
     def gives_position(self) -> bool:
-        """Whether its detections say where an object is: x and y, or range and bearing."""
+        """True if its detections say where an object is: x and y, or range and bearing."""
         return "x_m" in self.std or {"range_m", "bearing_rad"} <= self.std.keys()
 
     @property
@@ -229,7 +229,7 @@ class SensorModel:
         return any(limit is not None for limit in limits)
 
     def sees(self, positions_m: FloatArray, ego_poses: FloatArray, origin_m: tuple[float, float]) -> BoolArray:
-        """Whether an object there is in range and in the field of view, shape (...); nothing hides it.
+        """True if an object there is in range and in the field of view, shape (...); nothing hides it.
 
         `positions_m` (..., 2) are in the map, `ego_poses` (..., 3) are x, y and yaw of the ego there at the same times,
         `origin_m` is the origin of the detection frame seen from the ego (`ego.detection_origin_*`).
@@ -258,7 +258,7 @@ class SensorModel:
 
     @property
     def round(self) -> bool:
-        """Whether its error of the position is the same along and across the line of sight."""
+        """True if its error of the position is the same along and across the line of sight."""
         growth = self.std_growth
         return self.std["x_m"] == self.std["y_m"] and growth.get("x_m", 0.0) == growth.get("y_m", 0.0)
 

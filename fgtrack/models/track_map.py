@@ -84,7 +84,7 @@ class TrackMap:
     length_m: float = field(init=False)
     """Length of one lap."""
     counter_clockwise: bool = field(init=False)
-    """Whether the line is driven counter-clockwise, so that the inner bound is the left one."""
+    """True if the line is driven counter-clockwise, so that the inner bound is the left one."""
     _points: FloatArray = field(init=False, repr=False)
     _arc: FloatArray = field(init=False, repr=False)
     _segments: FloatArray = field(init=False, repr=False)

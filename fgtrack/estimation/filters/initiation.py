@@ -165,10 +165,10 @@ def along(line: Line, time_s: float, state_names: Sequence[str]) -> FloatArray:
 
 
 def sought(motion: MotionModel, start: Start, method: Initiation) -> bool:
-    """Whether the direction of travel is to be sought at all: it is unknown, and `motion` has to be linearised."""
+    """True if the direction of travel is to be sought at all: it is unknown, and `motion` has to be linearised."""
     return method != "one-point" and start.yaw_rad is None and not motion.linear
 
 
 def over(line: Line, method: Initiation, certain: float) -> bool:
-    """Whether `line`, through two fixes or more, is the last one that `method` asks for."""
+    """True if `line`, through two fixes or more, is the last one that `method` asks for."""
     return method == "two-point" or line.certainty > certain

@@ -46,7 +46,7 @@ class EulerCtrv(ExactPropagator):
     """
 
     accelerates = False
-    """Whether an acceleration drives the speed."""
+    """True if an acceleration drives the speed."""
     yaw_limit_rad = math.inf
     """Largest yaw that a step gives."""
 

@@ -34,7 +34,7 @@ class Step:
 
     @property
     def along(self) -> bool:
-        """Whether the state comes from all that had been measured, along a line, and not from the step before."""
+        """True if the state comes from all that had been measured, along a line, and not from the step before."""
         return self.search is not None and self.search.line is not None
 
 
@@ -50,7 +50,7 @@ class EkfRecursion:
     """
 
     linearises_at_prediction = True
-    """Whether a nonlinear measurement is fused by its derivative at the prediction, else by `correct_one`."""
+    """True if a nonlinear measurement is fused by its derivative at the prediction, else by `correct_one`."""
 
     def __init__(self, motion: MotionModel) -> None:
         self.motion = motion

@@ -87,7 +87,7 @@ class TrackInitiation:
 
     @property
     def over(self) -> bool:
-        """Whether the direction is known: what comes next is fused by the filter itself."""
+        """True if the direction is known: what comes next is fused by the filter itself."""
         return self.line is not None and over(self.line, self.method, CERTAIN)
 
     def state(self) -> tuple[FloatArray, FloatArray]:

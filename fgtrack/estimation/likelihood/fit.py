@@ -47,7 +47,7 @@ class FitSettings:
     """Linearised again until no parameter changes by more than this share of its standard error."""
 
     def counts(self, series: Series, place: int) -> bool:
-        """Whether the observation at `place` has a part in the likelihood.
+        """True if the observation at `place` has a part in the likelihood.
 
         It does where it is late enough in its track, within the limits of its series, and of one object.
         """

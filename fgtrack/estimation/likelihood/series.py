@@ -38,7 +38,7 @@ class Observation:
 
     @property
     def tuned(self) -> bool:
-        """Whether the standard deviations of the sensor hold for it."""
+        """True if the standard deviations of the sensor hold for it."""
         return not self.own.any()
 
 

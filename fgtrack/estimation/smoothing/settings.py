@@ -37,7 +37,7 @@ class SmootherSettings:
     lagged_s: tuple[float, ...] = (0.3,)
     """Lags of the lagged output; the first one goes to smoothed.csv."""
     final: bool = True
-    """Whether the smoothed state of a node is given when it leaves the window."""
+    """True if the smoothed state of a node is given when it leaves the window."""
 
     def __post_init__(self) -> None:
         not_negative(lag_s=self.lag_s, ring_s=self.ring_s)
