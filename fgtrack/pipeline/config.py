@@ -27,6 +27,16 @@ from fgtrack.tracking.merge import ConnectedMerge, NoMerge
 from fgtrack.tracking.objects import ObjectRules
 from fgtrack.tracking.published import NeighbourhoodMerge, UngatedEuclidean
 
+__all__ = [
+    "ClockConfig",
+    "CountingConfig",
+    "EgoConfig",
+    "FilterConfig",
+    "InitiationConfig",
+    "MapConfig",
+    "MotionConfig",
+]
+
 MergeConfig = Annotated[ConnectedMerge | NoMerge | NeighbourhoodMerge, Discriminator("kind")]
 AssociationConfig = Annotated[GatedEuclidean | GatedMahalanobis | UngatedEuclidean, Discriminator("kind")]
 BirthConfig = Annotated[MeasuredBirth | FixedBirth, Discriminator("kind")]
