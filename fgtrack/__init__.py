@@ -10,7 +10,7 @@ __version__ = "0.2.0.dev0"
 
 #: Module (or package, of a module) that each public name is loaded from on first use.
 _HOMES = {
-    "Advice": "fgtrack.advice.page",
+    "Advice": "fgtrack.calibration.page",
     "CTRA": "fgtrack.models.motion",
     "CTRV": "fgtrack.models.motion",
     "CV": "fgtrack.models.motion",
@@ -37,7 +37,7 @@ _HOMES = {
     "SmoothedReport": "fgtrack.core.types",
     "Start": "fgtrack.estimation.base",
     "StatesAt": "fgtrack.estimation.base",
-    "Study": "fgtrack.advice.study",
+    "Study": "fgtrack.calibration.study",
     "Tables": "fgtrack.evaluation.tables",
     "TickReport": "fgtrack.core.types",
     "TickTiming": "fgtrack.pipeline.latencies",
@@ -48,11 +48,11 @@ _HOMES = {
     "Tracker": "fgtrack.pipeline.live",
     "TracksAt": "fgtrack.pipeline.live",
     "TruthState": "fgtrack.core.types",
-    "TuneReport": "fgtrack.pipeline.tune_report",
+    "TuneReport": "fgtrack.calibration.tune_report",
     "UpdateRecord": "fgtrack.core.types",
     "UpdateResult": "fgtrack.estimation.base",
     "UpdateStatus": "fgtrack.estimation.base",
-    "advise": "fgtrack.advice.advise",
+    "advise": "fgtrack.calibration.advise",
     "config": "fgtrack.pipeline",
     "bounds": "fgtrack.evaluation.bounds",
     "bounds_along": "fgtrack.evaluation.bounds",
@@ -69,19 +69,21 @@ _HOMES = {
     "robust_weight": "fgtrack.estimation.filters.ekf",
     "simulate": "fgtrack.pipeline.public",
     "starts": "fgtrack.estimation",
-    "study": "fgtrack.advice.study",
+    "study": "fgtrack.calibration.study",
     "testing": "fgtrack",
-    "tune": "fgtrack.pipeline.tune",
+    "tune": "fgtrack.calibration.tune",
 }
 
 __all__ = sorted(_HOMES)
 
 if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two lists equal
     from fgtrack import testing as testing
-    from fgtrack.advice.advise import advise as advise
-    from fgtrack.advice.page import Advice as Advice
-    from fgtrack.advice.study import Study as Study
-    from fgtrack.advice.study import study as study
+    from fgtrack.calibration.advise import advise as advise
+    from fgtrack.calibration.page import Advice as Advice
+    from fgtrack.calibration.study import Study as Study
+    from fgtrack.calibration.study import study as study
+    from fgtrack.calibration.tune import tune as tune
+    from fgtrack.calibration.tune_report import TuneReport as TuneReport
     from fgtrack.core.errors import CallError as CallError
     from fgtrack.core.errors import DataError as DataError
     from fgtrack.core.errors import FgtrackError as FgtrackError
@@ -135,8 +137,6 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.pipeline.live import TracksAt as TracksAt
     from fgtrack.pipeline.public import replay as replay
     from fgtrack.pipeline.public import simulate as simulate
-    from fgtrack.pipeline.tune import tune as tune
-    from fgtrack.pipeline.tune_report import TuneReport as TuneReport
     from fgtrack.plotting import plot as plot
     from fgtrack.plotting.late_detection import close_ups as close_ups
 

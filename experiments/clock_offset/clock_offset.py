@@ -17,8 +17,8 @@ import numpy as np
 import typer
 from joblib import Parallel, delayed
 
+from fgtrack.calibration.clock_offsets import estimate_offsets
 from fgtrack.core.time import nanoseconds
-from fgtrack.pipeline.clock_offsets import estimate_offsets
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
 from fgtrack.pipeline.shipped import read_scenario

@@ -5,12 +5,12 @@ from typing import Annotated
 
 import typer
 
-from fgtrack.advice.advise import advise as advised
+from fgtrack.calibration.advise import advise as advised
 from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, Overwrite, PitMap, Reference, Settings, TrackMap
 from fgtrack.cli.show import chosen_form, command_line, progress, say, show
 from fgtrack.core.errors import DataError
 from fgtrack.io.output import check_apart, check_output, new_file
-from fgtrack.pipeline.assumed import Assumed
+from fgtrack.pipeline.assumptions.assumed import Assumed
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
 

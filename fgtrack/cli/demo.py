@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from fgtrack.advice.study import study
+from fgtrack.calibration.study import study
 from fgtrack.cli.arguments import Overwrite
 from fgtrack.cli.show import progress, say, told
 from fgtrack.cli.study import show_study

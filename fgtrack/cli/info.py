@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from fgtrack.calibration.starting import write_starting
+from fgtrack.calibration.trial import Trial, try_out
 from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, Overwrite
 from fgtrack.cli.show import chosen_form, progress, say, sentences, show, warn
 from fgtrack.core.errors import CallError, DataError, FgtrackError
@@ -16,11 +18,9 @@ from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value
 from fgtrack.io.info import OTHER_CLOCK_S, InputInfo, describe
 from fgtrack.io.output import check_apart, check_output
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.assumed import assumed
+from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
-from fgtrack.pipeline.starting import write_starting
-from fgtrack.pipeline.trial import Trial, try_out
 
 _DELAYS = ("delay_mean_s", "delay_p50_s", "delay_p90_s", "delay_max_s")
 

@@ -2,15 +2,15 @@
 
 from dataclasses import asdict, replace
 
-from fgtrack.advice.clocks import clock_verdicts
+from fgtrack.calibration.clock_offsets import OffsetReport, SensorOffset, estimate_offsets
+from fgtrack.calibration.clocks import clock_verdicts
 from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, PitMap, Reference, Settings, TrackMap
 from fgtrack.cli.show import chosen_form, progress, say, sentences, show
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.tables import Column, Table, Value
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.assumed import assumed
-from fgtrack.pipeline.clock_offsets import OffsetReport, SensorOffset, estimate_offsets
+from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
 

@@ -15,7 +15,7 @@ from fgtrack.evaluation.diagnostics import diagnostics, excluded_lines, noise_di
 from fgtrack.io.output import check_apart
 from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.assumed import assumed
+from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.replay import located, replay_each
 from fgtrack.pipeline.shipped import read_config
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from fgtrack.advice.study import opening_at
+from fgtrack.calibration.study import opening_at
 from fgtrack.cli.arguments import Overwrite, Runs
 from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from fgtrack.advice.study import Study, outputs
-from fgtrack.advice.study import study as studied
+from fgtrack.calibration.study import Study, outputs
+from fgtrack.calibration.study import study as studied
 from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Settings, TrackMap
 from fgtrack.cli.show import command_line, progress, say, sentences, show, warn
 from fgtrack.core.errors import DataError

@@ -10,18 +10,18 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from fgtrack.advice.noise import noise_fits
+from fgtrack.calibration.noise import noise_fits
+from fgtrack.calibration.tune import tuned
+from fgtrack.calibration.tune_report import HeldOut, TunedParameter, TuneReport
+from fgtrack.calibration.tune_space import TuneRules
 from fgtrack.cli.arguments import ConfigFile, FormOption, Json, Overwrite, PitMap, Settings, TrackMap
 from fgtrack.cli.show import chosen_form, progress, say, show
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
 from fgtrack.io.output import check_apart, check_output, new_file
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.assumed import Assumed
+from fgtrack.pipeline.assumptions.assumed import Assumed
 from fgtrack.pipeline.shipped import read_config
-from fgtrack.pipeline.tune import tuned
-from fgtrack.pipeline.tune_report import HeldOut, TunedParameter, TuneReport
-from fgtrack.pipeline.tune_space import TuneRules
 
 _KNOWN = {"yes": "yes", "roughly": "roughly", "limit": "a limit", "no": "not identifiable"}
 _WIDTH = 78

@@ -14,7 +14,7 @@ from fgtrack.io.recording import Storage, check_recording, write_recording
 from fgtrack.io.run import Run, load_run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline import replay as pipeline
-from fgtrack.pipeline.assumed import assumed
+from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.recorded import recorded_of
 from fgtrack.pipeline.shipped import read_config, read_scenario

@@ -14,7 +14,7 @@ from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import MemoryRun, Node, Run, RunWriter, path_from_run
 from fgtrack.models.sensors import SensorModel
-from fgtrack.pipeline.assumed import assumed, is_open, source_of
+from fgtrack.pipeline.assumptions.assumed import assumed, is_open, source_of
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, Tick, WallClock, corrected, message_ticks, node_ticks
 from fgtrack.pipeline.config import ClockConfig, Config

@@ -26,7 +26,7 @@ from fgtrack.core.types import Message
 from fgtrack.io.output import check_output, claimed, write_file
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.assumed import assumed
+from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import validate
 from fgtrack.pipeline.replay import replay_in_memory

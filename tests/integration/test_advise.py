@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 import fgtrack
-from fgtrack.advice import advise as advise_module
-from fgtrack.advice.arrivals import Arrivals
-from fgtrack.advice.windows import window_findings
+from fgtrack.calibration import advise as advise_module
+from fgtrack.calibration.arrivals import Arrivals
+from fgtrack.calibration.windows import window_findings
 from fgtrack.cli.main import run as run_command
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.io.run import Run, load_run
 from fgtrack.io.source import open_input
 from fgtrack.io.stream import write_stream
-from fgtrack.pipeline.assumed import assumed
+from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.sim.redelay import restamped

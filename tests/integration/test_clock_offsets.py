@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fgtrack.calibration.clock_offsets import OffsetReport, SensorOffset, estimate_offsets
 from fgtrack.cli.main import run
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Detection, DetectionList, EgoState, Frame, Message, TruthState
 from fgtrack.io.stream import write_stream
 from fgtrack.models.sensors import SensorModel
-from fgtrack.pipeline.clock_offsets import OffsetReport, SensorOffset, estimate_offsets
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
 from fgtrack.pipeline.shipped import read_scenario

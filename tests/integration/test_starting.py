@@ -10,6 +10,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from support.messages import START_NS, drive, shared
 
 import fgtrack
+from fgtrack.calibration.starting import starting_config
 from fgtrack.cli.main import run
 from fgtrack.core.types import DetectionList, EgoState, TruthState
 from fgtrack.io.config import Field
@@ -17,7 +18,6 @@ from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.source import open_input
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.shipped import read_config
-from fgtrack.pipeline.starting import starting_config
 
 RADAR = """std_msgs/Header header
 Target[] targets

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import fgtrack
-from fgtrack.advice.study import ESTIMATORS, Study
+from fgtrack.calibration.study import ESTIMATORS, Study
 from fgtrack.cli.main import run as command
 
 

@@ -8,13 +8,13 @@ import pytest
 from support.messages import drive, shared
 from typer.testing import CliRunner
 
+from fgtrack.calibration.trial import suspicions, try_out
 from fgtrack.cli.main import app
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
 from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import dump, validate
-from fgtrack.pipeline.trial import suspicions, try_out
 
 CONFIG = validate(
     Config,

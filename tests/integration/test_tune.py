@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fgtrack.calibration.tune_measurements import recorded
+from fgtrack.calibration.tune_space import ConfigNoise
 from fgtrack.cli.main import run
 from fgtrack.core.types import EgoState
 from fgtrack.io.run import load_run
 from fgtrack.io.stream import write_stream
-from fgtrack.pipeline.assumed import Assumed
+from fgtrack.pipeline.assumptions.assumed import Assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
 from fgtrack.pipeline.shipped import read_config, read_scenario
-from fgtrack.pipeline.tune_measurements import recorded
-from fgtrack.pipeline.tune_space import ConfigNoise
 from fgtrack.sim.simulate import simulate
 
 Capture = pytest.CaptureFixture[str]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fgtrack
-from fgtrack.advice.outcome import Outcome
+from fgtrack.calibration.outcome import Outcome
 from fgtrack.core.types import DetectionList, Message, TruthState
 from fgtrack.io.run import Run
 from fgtrack.pipeline.shipped import read_scenario

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fgtrack.calibration.tune import tuned
+from fgtrack.calibration.tune_report import TuneReport
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
 from fgtrack.models.motion import CTRV, CV
-from fgtrack.pipeline.assumed import source_of
+from fgtrack.pipeline.assumptions.assumed import source_of
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config, read_scenario
-from fgtrack.pipeline.tune import tuned
-from fgtrack.pipeline.tune_report import TuneReport
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.sensor import Clutter
 from fgtrack.sim.simulate import simulate

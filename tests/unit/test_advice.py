@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgtrack.advice.arrivals import Arrivals
-from fgtrack.advice.clocks import clock_findings, clock_verdicts, stamp_findings
-from fgtrack.advice.noise import NoiseFit
-from fgtrack.advice.outcome import Outcome, harm
+from fgtrack.calibration.arrivals import Arrivals
+from fgtrack.calibration.clock_offsets import OffsetReport, SensorOffset
+from fgtrack.calibration.clocks import clock_findings, clock_verdicts, stamp_findings
+from fgtrack.calibration.noise import NoiseFit
+from fgtrack.calibration.outcome import Outcome, harm
 from fgtrack.evaluation.intervals import Estimate
 from fgtrack.evaluation.metrics import ObjectMetrics
-from fgtrack.pipeline.clock_offsets import OffsetReport, SensorOffset
 
 SECOND_NS = 1_000_000_000
 TRUTH = replace(ObjectMetrics.total(()), ticks_present=6000, ticks_in_sight=6000, ticks_tracked_in_sight=5900)

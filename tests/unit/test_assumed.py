@@ -12,7 +12,7 @@ from fgtrack.io.recording import write_recording
 from fgtrack.io.source import open_input
 from fgtrack.models.road import OpenSpace
 from fgtrack.models.sensors import Mount, SensorModel
-from fgtrack.pipeline.assumed import ASSUMED_STD, assumed, source_of
+from fgtrack.pipeline.assumptions.assumed import ASSUMED_STD, assumed, source_of
 from fgtrack.pipeline.build import build_road
 from fgtrack.pipeline.config import Config, Effective
 from fgtrack.pipeline.public import replay, simulate

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.special import stdtrit
 
+from fgtrack.calibration.clock_offsets import _Fit, _solved
+from fgtrack.calibration.paths import EgoPath
 from fgtrack.core.geometry import rotations
 from fgtrack.core.types import EgoState, FloatArray, IntArray
-from fgtrack.pipeline.clock_offsets import _Fit, _solved
-from fgtrack.pipeline.paths import EgoPath
 
 PERIOD_NS = 50_000_000
 STRETCH = 100

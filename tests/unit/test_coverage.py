@@ -5,7 +5,7 @@ import pytest
 
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray, Message
 from fgtrack.models.sensors import Mount
-from fgtrack.pipeline.coverage import Coverage, coverages
+from fgtrack.pipeline.assumptions.coverage import Coverage, coverages
 
 MS = 1_000_000
 

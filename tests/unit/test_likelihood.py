@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from fgtrack.calibration.tune_measurements import observation
+from fgtrack.calibration.tune_space import ConfigNoise
 from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray
@@ -24,8 +26,6 @@ from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, CV
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.shipped import read_config
-from fgtrack.pipeline.tune_measurements import observation
-from fgtrack.pipeline.tune_space import ConfigNoise
 
 START = Start(position_m=(3.0, -2.0), yaw_rad=0.3, yaw_std_rad=0.2, speed_mps=8.0, speed_std_mps=2.0)
 SPACE = NoiseSpace(

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from fgtrack.pipeline.persistence import Persistence, disagreement_m, persistence
+from fgtrack.pipeline.assumptions.persistence import Persistence, disagreement_m, persistence
 
 
 def cars(

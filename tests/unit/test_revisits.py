@@ -12,7 +12,7 @@ import pytest
 
 import fgtrack
 from fgtrack.core.types import Detection, DetectionList
-from fgtrack.pipeline.assumed import assumed, source_of
+from fgtrack.pipeline.assumptions.assumed import assumed, source_of
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
 

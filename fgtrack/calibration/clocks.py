@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgtrack.advice.arrivals import FEWEST, Arrivals
-from fgtrack.advice.finding import Finding, milliseconds, percent
+from fgtrack.calibration.arrivals import FEWEST, Arrivals
+from fgtrack.calibration.clock_offsets import RECEIPT_S, TRUTH, Bias, OffsetReport, SensorOffset
+from fgtrack.calibration.finding import Finding, milliseconds, percent
 from fgtrack.core.diagnostic import EGO
-from fgtrack.pipeline.clock_offsets import RECEIPT_S, TRUTH, Bias, OffsetReport, SensorOffset
 from fgtrack.pipeline.config import EgoConfig
 
 __all__ = [

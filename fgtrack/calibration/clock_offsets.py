@@ -27,6 +27,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
+from fgtrack.calibration.paths import EgoPath, ObjectPath, Sightings, sightings_of, true_paths
 from fgtrack.core.errors import CallError, DataError, did_you_mean
 from fgtrack.core.geometry import rotations
 from fgtrack.core.linalg import psd_solve
@@ -35,7 +36,6 @@ from fgtrack.core.types import DetectionList, EgoState, FloatArray, IntArray, Me
 from fgtrack.io.run import Run
 from fgtrack.pipeline.clock import corrected
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.paths import EgoPath, ObjectPath, Sightings, sightings_of, true_paths
 from fgtrack.pipeline.replay import replay_in_memory
 
 __all__ = ["RECEIPT_S", "TRUTH", "Bias", "OffsetReport", "SensorOffset", "estimate_offsets"]

@@ -4,19 +4,23 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from fgtrack.advice.arrivals import FEWEST, Arrivals, arrivals_of, overtaken
-from fgtrack.advice.clocks import (
+from fgtrack.calibration.arrivals import FEWEST, Arrivals, arrivals_of, overtaken
+from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
+from fgtrack.calibration.clocks import (
     bias_findings,
     clock_findings,
     clock_verdicts,
     receipt_findings,
     stamp_findings,
 )
-from fgtrack.advice.finding import Finding, milliseconds, percent
-from fgtrack.advice.noise import noise_findings
-from fgtrack.advice.outcome import Outcome, harm, objection
-from fgtrack.advice.page import Advice
-from fgtrack.advice.windows import beyond_lags, window_findings
+from fgtrack.calibration.finding import Finding, milliseconds, percent
+from fgtrack.calibration.noise import noise_findings
+from fgtrack.calibration.outcome import Outcome, harm, objection
+from fgtrack.calibration.page import Advice
+from fgtrack.calibration.trial import TRIAL_S, beginning, suspicions
+from fgtrack.calibration.tune import tuned
+from fgtrack.calibration.tune_space import TuneRules
+from fgtrack.calibration.windows import beyond_lags, window_findings
 from fgtrack.core.diagnostic import EGO
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
@@ -25,15 +29,11 @@ from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.assumed import Assumed, assumed, source_of
+from fgtrack.pipeline.assumptions.assumed import Assumed, assumed, source_of
 from fgtrack.pipeline.clock import corrected
-from fgtrack.pipeline.clock_offsets import OffsetReport, estimate_offsets
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.shipped import read_config
-from fgtrack.pipeline.trial import TRIAL_S, beginning, suspicions
-from fgtrack.pipeline.tune import tuned
-from fgtrack.pipeline.tune_space import TuneRules
 from fgtrack.tracking.ego import MAX_EXTRAPOLATION_S
 
 __all__ = ["advice_on", "advise"]

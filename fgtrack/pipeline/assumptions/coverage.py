@@ -11,7 +11,7 @@ from fgtrack.core.geometry import wrap_angle, wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, Detection, DetectionList, EgoState, FloatArray, IntArray, Message
 from fgtrack.models.sensors import Mount
-from fgtrack.pipeline.persistence import Persistence, disagreement_m, persistence
+from fgtrack.pipeline.assumptions.persistence import Persistence, disagreement_m, persistence
 
 __all__ = ["Coverage", "coverages"]
 

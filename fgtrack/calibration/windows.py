@@ -4,8 +4,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from fgtrack.advice.arrivals import Arrivals
-from fgtrack.advice.finding import Finding, milliseconds, nice_above, percent
+from fgtrack.calibration.arrivals import Arrivals
+from fgtrack.calibration.finding import Finding, milliseconds, nice_above, percent
 from fgtrack.pipeline.config import Config
 from fgtrack.tracking.existence import ExistenceRules
 

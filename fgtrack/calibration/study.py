@@ -8,9 +8,9 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from fgtrack.advice.advise import advice_on
-from fgtrack.advice.page import Advice
-from fgtrack.advice.summary import summary
+from fgtrack.calibration.advise import advice_on
+from fgtrack.calibration.page import Advice
+from fgtrack.calibration.summary import summary
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Message
 from fgtrack.evaluation.runs import EvaluatedRun, evaluated
@@ -20,7 +20,7 @@ from fgtrack.io.errors import UntilBreak
 from fgtrack.io.output import check_apart, check_output, claimed, new_file, new_files
 from fgtrack.io.run import Run, check_run, load_run, write_metrics
 from fgtrack.io.source import InputSource, open_input
-from fgtrack.pipeline.assumed import Assumed, assumed
+from fgtrack.pipeline.assumptions.assumed import Assumed, assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import ReplayResult, replay_each
 from fgtrack.pipeline.shipped import read_config

@@ -9,6 +9,8 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 
+from fgtrack.calibration.parts import Part, table_parts, topic_parts
+from fgtrack.calibration.trial import beginning, suspicions
 from fgtrack.core.errors import CallError, FgtrackError, printable
 from fgtrack.io.adapters.native import NATIVE_ADAPTERS
 from fgtrack.io.config import CsvInput, CsvTable, Field, InputConfig, TopicInput
@@ -16,11 +18,9 @@ from fgtrack.io.info import InputInfo, describe
 from fgtrack.io.output import new_file
 from fgtrack.io.ros.bag import Bag
 from fgtrack.io.source import input_kind, open_input
-from fgtrack.pipeline.assumed import Assumed, assumed
+from fgtrack.pipeline.assumptions.assumed import Assumed, assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import plain, validate
-from fgtrack.pipeline.parts import Part, table_parts, topic_parts
-from fgtrack.pipeline.trial import beginning, suspicions
 
 __all__ = ["starting_config", "write_starting"]
 

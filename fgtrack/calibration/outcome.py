@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgtrack.advice.finding import percent
-from fgtrack.advice.noise import NoiseFit, noise_fits
+from fgtrack.calibration.finding import percent
+from fgtrack.calibration.noise import NoiseFit, noise_fits
 from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.comparison import POSITION_NEES, comparisons
 from fgtrack.evaluation.diagnostics import FAR_OFF, MOST_BREAKS_PER_MINUTE, USED, Fragmentation, misfits

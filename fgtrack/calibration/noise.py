@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgtrack.advice.finding import Finding
+from fgtrack.calibration.finding import Finding
 from fgtrack.evaluation.diagnostics import CORRELATED, FAR_OFF, FEWEST, innovation_lag1, misfits
 from fgtrack.evaluation.intervals import Estimate, by_stamp, mean_square
 from fgtrack.evaluation.scores.innovations import num_measured

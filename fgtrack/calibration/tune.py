@@ -8,6 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from fgtrack.calibration.tune_measurements import recorded
+from fgtrack.calibration.tune_report import HeldOut, InnovationFit, Known, SensorNoise, TunedParameter, TuneReport
+from fgtrack.calibration.tune_space import ConfigNoise, TuneRules, for_tuning, widened
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import BoolArray, FloatArray, Message
 from fgtrack.estimation.likelihood.contaminated import outlier_share
@@ -18,13 +21,10 @@ from fgtrack.estimation.likelihood.series import Series
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import Run
 from fgtrack.io.source import InputSource, open_input
-from fgtrack.pipeline.assumed import assumed
+from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
-from fgtrack.pipeline.tune_measurements import recorded
-from fgtrack.pipeline.tune_report import HeldOut, InnovationFit, Known, SensorNoise, TunedParameter, TuneReport
-from fgtrack.pipeline.tune_space import ConfigNoise, TuneRules, for_tuning, widened
 
 _LASTING = "an error that lasts looks like motion: only the part that does not is fitted, by the share"
 _ENDLESS = "no maximum: the likelihood still rises 10^4 times away, as where all errors are 0"

@@ -5,7 +5,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from fgtrack.core.types import DetectionList
-from fgtrack.pipeline.revisits import Revisits
+from fgtrack.pipeline.assumptions.revisits import Revisits
 
 REPORTS_SHARE = 0.75
 """Share of lists with one object from which on a sensor reports objects one by one, if none of its lists is empty."""

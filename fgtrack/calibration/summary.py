@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fgtrack.advice.page import Advice
+from fgtrack.calibration.page import Advice
 from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.diagnostics import USED, diagnostics
 from fgtrack.evaluation.runs import EvaluatedRun

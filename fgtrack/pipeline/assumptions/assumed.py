@@ -16,12 +16,12 @@ from fgtrack.core.types import MEASURABLE, DetectionList, Message
 from fgtrack.io.errors import MOST_SENSORS
 from fgtrack.io.source import InputSource
 from fgtrack.models.sensors import Mount, Score, SensorModel
+from fgtrack.pipeline.assumptions.coverage import Coverage, coverages
+from fgtrack.pipeline.assumptions.list_statistics import ListStatistics
+from fgtrack.pipeline.assumptions.revisits import for_slow_revisits
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.coverage import Coverage, coverages
-from fgtrack.pipeline.list_statistics import ListStatistics
 from fgtrack.pipeline.load import plain
 from fgtrack.pipeline.recorded import RecordedSensor, recorded
-from fgtrack.pipeline.revisits import for_slow_revisits
 from fgtrack.tracking.association import GatedMahalanobis
 from fgtrack.tracking.existence import ExistenceRules
 

@@ -5,10 +5,10 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from textwrap import wrap
 
-from fgtrack.advice.arrivals import Arrivals
-from fgtrack.advice.finding import Finding
-from fgtrack.advice.outcome import Outcome
-from fgtrack.advice.windows import BeyondLag
+from fgtrack.calibration.arrivals import Arrivals
+from fgtrack.calibration.finding import Finding
+from fgtrack.calibration.outcome import Outcome
+from fgtrack.calibration.windows import BeyondLag
 from fgtrack.evaluation.tables import NO_VALUE, Column, Record, Table, Tables, Value, short
 from fgtrack.pipeline.config import Config
 

@@ -1,0 +1,1 @@
+"""Assumptions about a recording that comes without a configuration: what its own lists show."""
