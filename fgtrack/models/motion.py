@@ -6,10 +6,11 @@ backwards. `predict` does not wrap the yaw; `MeasurementModel.residual` does.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from importlib import import_module
+from types import ModuleType
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -146,15 +147,10 @@ class MotionModel(ABC):
         return np.array([[float(row == column) for column in self.state_names] for row in STATE_NAMES])
 
 
-Kernel = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
-"""Mean, F and Q of states (m, n) after durations (m,), with spectral densities (n,)."""
-
-
 @cache
-def _kernel(name: str) -> Kernel:
-    """Return a function of `fgtrack.models.transitions`, which is not imported before it is needed: numba is large."""
-    kernel: Kernel = getattr(import_module("fgtrack.models.transitions"), name)
-    return kernel
+def _compiled() -> ModuleType:
+    """Return `fgtrack.models.transitions`, which is not imported before it is needed: numba is large."""
+    return import_module("fgtrack.models.transitions")
 
 
 @dataclass(frozen=True)
@@ -164,8 +160,8 @@ class WhiteNoise(MotionModel):
     The noise parameters are spectral densities, in fields `<what>_density_<unit>` in the order of the state.
     """
 
-    kernel: ClassVar[str]
-    """Name of its transition in `fgtrack.models.transitions`."""
+    kind: ClassVar[int] = 0
+    """Kind of its transition in `fgtrack.models.transitions`."""
 
     def __post_init__(self) -> None:
         not_negative(**{field.name: getattr(self, field.name) for field in fields(self)})
@@ -212,13 +208,13 @@ class WhiteNoise(MotionModel):
             shape = np.broadcast_shapes(shape, t.shape)
             x, t = np.broadcast_to(x, (*shape, n)), np.broadcast_to(t, shape)
         states = np.array(x, dtype=np.float64, order="C").reshape(-1, n)
-        mean, F, Q = _kernel(self.kernel)(states, np.array(t, order="C").reshape(-1), self._density)
+        mean, F, Q = _compiled().transitions(self.kind, states, np.array(t, order="C").reshape(-1), self.density)
         if len(shape) == 1:
             return Transition(mean, F, Q)
         return Transition(mean.reshape(*shape, n), F.reshape(*shape, n, n), Q.reshape(*shape, n, n))
 
     @cached_property
-    def _density(self) -> FloatArray:
+    def density(self) -> FloatArray:
         """Spectral densities of the entries of the state, shape (n,); x and y have the same."""
         first, *others = (getattr(self, name) for name in self.density_names())
         return np.array([first, first, *others])
@@ -239,7 +235,6 @@ class CTRV(WhiteNoise):
     yaw_rate_density_rad2ps3: float = 0.5**2 / 100.0
 
     state_names: ClassVar[tuple[str, ...]] = STATE_NAMES[:ACCEL]
-    kernel: ClassVar[str] = "arcs"
 
 
 @dataclass(frozen=True)
@@ -273,9 +268,9 @@ class CV(WhiteNoise):
 
     state_names: ClassVar[tuple[str, ...]] = CARTESIAN
     linear: ClassVar[bool] = True
-    kernel: ClassVar[str] = "lines"
+    kind: ClassVar[int] = 1
 
     @cached_property
-    def _density(self) -> FloatArray:
+    def density(self) -> FloatArray:
         """See `WhiteNoise`: that of the velocity."""
         return np.array([0.0, 0.0, self.velocity_density_m2ps3, self.velocity_density_m2ps3])

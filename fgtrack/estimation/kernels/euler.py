@@ -4,9 +4,8 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import njit
+from fgtrack.core.compiled import add_product_transposed, njit, product
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.kernels.kalman import add_product_transposed, product
 
 
 @njit("(float64[:, ::1], float64[:, :, ::1], int64[::1], float64, float64[::1], b1, float64)")
@@ -35,13 +34,15 @@ def propagate(
             c, s, way = math.cos(x[2]), math.sin(x[2]), x[3] * dt_s
             F[0, 2], F[0, 3], F[1, 2], F[1, 3] = -way * s, c * dt_s, way * c, s * dt_s
             product(F, covariance[i], FP)
-            more[:] = 0.0
-            for j in range(2, n):
-                more[j, j] = density[j] * dt_s
+            for j in range(n):
+                for k in range(n):
+                    more[j, k] = density[j] * dt_s if j == k else 0.0
             more[0, 0], more[1, 1] = along * c * c + across * s * s, along * s * s + across * c * c
             more[0, 1] = more[1, 0] = (along - across) * c * s
             add_product_transposed(FP, F, more)
-            covariance[i] = more
+            for j in range(n):
+                for k in range(n):
+                    covariance[i, j, k] = more[j, k]
             x[0] += way * c
             x[1] += way * s
             x[2] = min(x[2] + x[4] * dt_s, yaw_limit_rad)

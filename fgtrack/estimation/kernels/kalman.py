@@ -2,59 +2,71 @@
 
 import numpy as np
 
-from fgtrack.core.compiled import inlined, njit
+from fgtrack.core.compiled import add_product_transposed, inlined, njit, product, solve
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
 _VECTORS, _MATRICES = "float64[:, ::1]", "float64[:, :, ::1]"
 
 
 @inlined
-def product(A: FloatArray, B: FloatArray, found: FloatArray) -> None:
-    """Write A B."""
-    for i in range(A.shape[0]):
-        for j in range(B.shape[1]):
-            value = 0.0
-            for k in range(A.shape[1]):
-                value += A[i, k] * B[k, j]
-            found[i, j] = value
+def predict_one(F: FloatArray, P: FloatArray, found: FloatArray, cross: FloatArray) -> None:
+    """Let Q in `found` be F P F' + Q, and write the cross-covariance F P."""
+    product(F, P, cross)
+    add_product_transposed(cross, F, found)
 
 
 @inlined
-def add_product_transposed(A: FloatArray, B: FloatArray, found: FloatArray) -> None:
-    """Add A B', which is symmetric, to `found`: its lower triangle, and the mirror of that."""
-    for i in range(A.shape[0]):
-        for j in range(i + 1):
-            value = found[i, j]
-            for k in range(A.shape[1]):
-                value += A[i, k] * B[j, k]
-            found[i, j] = found[j, i] = value
+def innovate(
+    P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray, measured: IntArray, S: FloatArray, HP: FloatArray
+) -> float:
+    """Write S = H P H' + R and S^-1 H P, and return the NIS of the entries `measured`; NaN where S has no root."""
+    k, d = len(y), len(measured)
+    factor, part, own = np.empty((k, k)), np.empty((d, d)), np.empty((d, 1))
+    for a in range(k):
+        for b in range(k):
+            S[a, b] = R[a, b]
+    product(H, P, HP)
+    add_product_transposed(HP, H, S)
+    for a in range(k):
+        for b in range(k):
+            factor[a, b] = S[a, b]
+    for a in range(d):
+        own[a, 0] = y[measured[a]]
+        for b in range(d):
+            part[a, b] = S[measured[a], measured[b]]
+    if not (solve(factor, HP) and solve(part, own)):
+        return np.nan
+    nis = 0.0
+    for a in range(d):
+        nis += y[measured[a]] * own[a, 0]
+    return nis
 
 
 @inlined
-def solve(S: FloatArray, columns: FloatArray) -> bool:
-    """Overwrite columns by S^-1 columns and S by its Cholesky factor; False unless S is positive definite."""
-    n = S.shape[0]
-    for i in range(n):
-        for j in range(i + 1):
-            value = S[i, j]
-            for k in range(j):
-                value -= S[i, k] * S[j, k]
-            if j < i:
-                S[i, j] = value / S[j, j]
-            elif value > 0.0:
-                S[i, i] = np.sqrt(value)
-            else:
-                return False
-    for c in range(columns.shape[1]):
-        for i in range(n):
-            for k in range(i):
-                columns[i, c] -= S[i, k] * columns[k, c]
-            columns[i, c] /= S[i, i]
-        for i in range(n - 1, -1, -1):
-            for k in range(i + 1, n):
-                columns[i, c] -= S[k, i] * columns[k, c]
-            columns[i, c] /= S[i, i]
-    return True
+def correct_one(mean: FloatArray, P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray, K: FloatArray) -> bool:
+    """Overwrite mean and P by x + K y and (I - K H) P (I - K H)' + K R K', of K transposed; True if all is finite."""
+    n, k = len(mean), len(y)
+    A, AP, KR, found = np.empty((n, n)), np.empty((n, n)), np.empty((n, k)), np.zeros((n, n))
+    gain = np.empty((n, k))
+    total = 0.0
+    for a in range(n):
+        for b in range(k):
+            gain[a, b] = K[b, a]
+            mean[a] += K[b, a] * y[b]
+        total += abs(mean[a])
+    product(gain, H, A)
+    for a in range(n):
+        for b in range(n):
+            A[a, b] = (1.0 if a == b else 0.0) - A[a, b]
+    product(A, P, AP)
+    product(gain, R, KR)
+    add_product_transposed(AP, A, found)
+    add_product_transposed(KR, gain, found)
+    for a in range(n):
+        for b in range(n):
+            P[a, b] = found[a, b]
+            total += abs(found[a, b])
+    return total < np.inf
 
 
 @njit(f"({_MATRICES}, {_MATRICES}, {_MATRICES})")
@@ -62,8 +74,7 @@ def predict(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, Fl
     """Covariances F P F' + Q and cross-covariances F P, shapes (m, n, n)."""
     cross, found = np.empty(P.shape), Q.copy()
     for i in range(len(P)):
-        product(F[i], P[i], cross[i])
-        add_product_transposed(cross[i], F[i], found[i])
+        predict_one(F[i], P[i], found[i], cross[i])
     return found, cross
 
 
@@ -76,37 +87,12 @@ def correct(
     Then the NIS of the entries `measured` of y, S, and where S was positive definite and all is finite. Shapes (m, n),
     (m, n, n), (m, k), (1, k, n) or (m, k, n), (m, k, k).
     """
-    (m, n), k, d = mean.shape, y.shape[1], len(measured)
-    after, covariance, nis, Ss = mean.copy(), np.zeros((m, n, n)), np.zeros(m), R.copy()
-    fused = np.zeros(m, np.bool_)
-    HP, factor, part, own = np.empty((k, n)), np.empty((k, k)), np.empty((d, d)), np.empty((d, 1))
-    A, AP, K, KR = np.empty((n, n)), np.empty((n, n)), np.empty((n, k)), np.empty((n, k))
+    m, k = y.shape
+    after, covariance, nis, S = mean.copy(), P.copy(), np.empty(m), np.empty(R.shape)
+    fused, K = np.zeros(m, np.bool_), np.empty((k, mean.shape[1]))
     for i in range(m):
-        h, S = H[min(i, len(H) - 1)], Ss[i]
-        product(h, P[i], HP)
-        add_product_transposed(HP, h, S)
-        factor[:] = S
-        for a in range(d):
-            own[a, 0] = y[i, measured[a]]
-            for b in range(d):
-                part[a, b] = S[measured[a], measured[b]]
-        if not (solve(factor, HP) and solve(part, own)):
-            continue
-        for a in range(d):
-            nis[i] += y[i, measured[a]] * own[a, 0]
-        total = 0.0
-        for a in range(n):
-            for b in range(k):
-                K[a, b] = HP[b, a]
-                after[i, a] += K[a, b] * y[i, b]
-            total += abs(after[i, a])
-        product(K, h, A)
-        for a in range(n):
-            for b in range(n):
-                A[a, b] = (1.0 if a == b else 0.0) - A[a, b]
-        product(A, P[i], AP)
-        product(K, R[i], KR)
-        add_product_transposed(AP, A, covariance[i])
-        add_product_transposed(KR, K, covariance[i])
-        fused[i] = np.isfinite(total + np.abs(covariance[i]).sum())
-    return after, covariance, nis, Ss, fused
+        h = H[min(i, len(H) - 1)]
+        nis[i] = innovate(P[i], y[i], h, R[i], measured, S[i], K)
+        if nis[i] == nis[i]:
+            fused[i] = correct_one(after[i], covariance[i], y[i], h, R[i], K)
+    return after, covariance, nis, S, fused

@@ -7,9 +7,8 @@ stamps 1 us apart. Arguments are those arrays of `Nodes` that have their names.
 
 import numpy as np
 
-from fgtrack.core.compiled import inlined, njit
+from fgtrack.core.compiled import add_product_transposed, inlined, njit, product, solve
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation.kernels.kalman import add_product_transposed, product, solve
 
 #: Where a measurement leaves less than this of a variance, the short form of its update keeps too few digits.
 _LEAST_SHARE = 1e-6
