@@ -30,6 +30,7 @@ from fgtrack.tracking.tracker import Tracker
 _BACK_S = 0.15  # before the detection the estimates begin
 _STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
 _SETTLED = 20  # measurements of a track before which it moves for want of a good start
+_EARLY_S = 20.0  # what the choice is restricted to: the recording is replayed up to the detection for every run
 
 
 def close_ups(
@@ -167,9 +168,9 @@ def chosen(runs: Sequence[Run], track_id: int | None = None, stamp_ns: int | Non
     """Return a typical out-of-sequence detection that every run fused, and a sentence with the rule of the choice.
 
     Of those that lower the error of the first run's present, it is the one with errors nearest to their root mean
-    squares: before it in the first run, after it in all of them; nearest is the largest of the ratios. Without truth
-    it is the one that moves the present by the median. Ticks at which a track fused several detections, and tracks
-    with fewer than twenty, are left out.
+    squares: before it in the first run, after it in all of them; nearest is the largest of the ratios. It is one of
+    the first 20 s where there is any. Without truth it is the one that moves the present by the median. Ticks at which
+    a track fused several detections, and tracks with fewer than twenty, are left out.
 
     Parameters
     ----------
@@ -211,12 +212,15 @@ def chosen(runs: Sequence[Run], track_id: int | None = None, stamp_ns: int | Non
     rms_m = np.sqrt(np.nanmean(errors_m[lowered] ** 2, axis=0))
     with np.errstate(divide="ignore"):
         apart = np.abs(np.log(errors_m / rms_m)).max(axis=1)
-    row = int(np.where(lowered & np.isfinite(apart), apart, np.inf).argmin())
+    candidates = lowered & np.isfinite(apart)
+    receipts_ns = np.array([one.receipt_ns for one in common])
+    early = candidates & (receipts_ns - receipts_ns.min() <= nanoseconds(_EARLY_S))
+    row = int(np.where(early if early.any() else candidates, apart, np.inf).argmin())
     rms_all_m = np.sqrt(np.nanmean(errors_m[:, :2] ** 2, axis=0))
     return common[row], (
         f"{100.0 * float(lowered.mean()):.0f} % of {len(common)} late detections lower the error of the present; this "
-        f"one is nearest to their root mean square ({rms_m[0]:.2f} to {rms_m[1]:.2f} m; of all {rms_all_m[0]:.2f} to "
-        f"{rms_all_m[1]:.2f} m)."
+        f"one, of the first {_EARLY_S:g} s, is nearest to their root mean square ({rms_m[0]:.2f} to {rms_m[1]:.2f} m; "
+        f"of all {rms_all_m[0]:.2f} to {rms_all_m[1]:.2f} m)."
     )
 
 
