@@ -31,9 +31,9 @@ test-slow: $(TEST)
 fuzz: $(TEST)
 	$(BIN)/python -m pytest tests/fuzz -n auto -m slow --fuzz-seconds $(or $(SECONDS),1800) --fuzz-seed $(or $(SEED),0)
 
-# Some 20 minutes: 400 kills, full disks, folders of others, workers and schedulers that die. KILLS=1000 SEED=1 for others.
+# Some 15 minutes: 400 kills, full disks, folders of others. KILLS=1000 SEED=1 for others.
 faults: $(TEST)
-	$(BIN)/python -m pytest tests/faults -n auto -m 'slow or not slow' --kills $(or $(KILLS),100) --fuzz-seed $(or $(SEED),0)
+	$(BIN)/python -m pytest tests/faults -n auto -m slow --kills $(or $(KILLS),100) --fuzz-seed $(or $(SEED),0)
 
 coverage: $(DEV)
 	$(BIN)/python -m pytest -n auto $(BY_FILE) --cov --cov-report=term-missing:skip-covered

@@ -20,9 +20,9 @@ _NIGHTLY = ("_experiment", "_benchmark")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """How long `tests/fuzz` goes on, how often `tests/faults` kills, and with which random numbers."""
-    parser.addoption("--fuzz-seconds", type=float, default=60.0, help="time for each target of the slow fuzzing tests")
-    parser.addoption("--fuzz-seed", type=int, default=0, help="seed of the slow fuzzing tests")
-    parser.addoption("--kills", type=int, default=100, help="kills of each command in tests/faults")
+    parser.addoption("--fuzz-seconds", type=float, default=10.0, help="time for each target of the fuzzing tests")
+    parser.addoption("--fuzz-seed", type=int, default=0, help="seed of the fuzzing tests")
+    parser.addoption("--kills", type=int, default=3, help="kills of each command in tests/faults")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -9,9 +9,13 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
+from support import kitti
 
 import fgtrack
+from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.stream import write_stream
 from fgtrack.models.oval import make_oval
 from fgtrack.pipeline.shipped import shipped_folder
@@ -79,37 +83,15 @@ def log_folder() -> Files:
     return {"in/data_logs.csv": "\n".join(rows).encode()}
 
 
-def kitti() -> Files:
-    eye = "1 0 0 0 0 1 0 0 0 0 1 0"
-    camera = "700 0 600 0 0 700 180 0 0 0 1 0"
-    calib = "\n".join(
-        [*(f"P{k}: {camera}" for k in range(4)), "R_rect 1 0 0 0 1 0 0 0 1", "Tr_velo_cam 0 -1 0 0 0 0 -1 0 1 0 0 0"]
-    )
-    oxts, labels, poses = [], [], []
-    for k in range(20):
-        values = np.zeros(30)
-        values[:6] = 49.0 + 1e-5 * k, 8.0, 110.0, 0.0, 0.0, 0.1
-        values[8] = 10.0
-        oxts.append(" ".join(map(repr, values.tolist())))
-        labels.append(f"{k} 1 Car 0 0 0.0 1 2 3 4 1.5 1.6 4.0 2.0 1.5 {20.0 + 0.1 * k} {-0.5 * math.pi}")
-        poses.append(f"{k},2,1,2,3,4,9.0,1.5,1.6,4.0,2.0,1.5,{20.0 + 0.1 * k},{-0.5 * math.pi},0.0")
-    texts = {"oxts": oxts, "label_02": labels, "pointrcnn_car": poses, "calib": [f"{calib}\nTr_imu_velo {eye}", ""]}
-    return {f"in/{name}/0001.txt": "\n".join(lines).encode() for name, lines in texts.items()}
-
-
-def kitti_forms() -> list[Files]:
-    """The forms in which detectors and trackers publish, beside that of `kitti`."""
-    files = kitti()
-    other = {name: content for name, content in files.items() if "pointrcnn" not in name}
-    place = "1 2 3 4 1.5 1.6 4.0 2.0 1.5 20.0"
-    tracking = "\n".join(f"{k} 5 Car -1 -1 0.1 {place} -1.57 9.{k}" for k in range(20)).encode()
-    image = "\n".join(f"{k},100.5,150,180.25,200,0.9" for k in range(20)).encode()
-    frames = {f"in/pointrcnn_car/0001/{k:06d}.txt": f"Car 0 0 0.1 {place} -1.57 9.{k}\n".encode() for k in range(20)}
-    return [
-        {**other, "in/pointrcnn_car/0001.txt": tracking},
-        {**files, "in/rrc_car/0001.txt": image},
-        {**other, **frames},
-    ]
+def kitti_sequence() -> Files:
+    with tempfile.TemporaryDirectory() as at:
+        kitti.folder(
+            Path(at) / "in",
+            oxts=[kitti.oxts(1e-5 * k, yaw_rad=0.1, speed_mps=10.0) for k in range(20)],
+            label_02=[kitti.label(k, 1, "Car", 20.0 + 0.1 * k, 2.0, 0.0) for k in range(20)],
+            pointrcnn_car=[kitti.pose(k, 20.0 + 0.1 * k, 2.0, 0.0) for k in range(20)],
+        )
+        return {str(file.relative_to(at)): file.read_bytes() for file in Path(at).rglob("*.txt")}
 
 
 def tables() -> Files:
@@ -125,44 +107,57 @@ def tables() -> Files:
 
 
 def nuscenes() -> Files:
-    north = [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
     boxes: dict[str, object] = {}
-    tables: dict[str, list[dict[str, object]]] = {
-        "scene": [{"token": "a", "name": "scene-0001"}],
-        "category": [{"token": "c", "name": "vehicle.car"}],
-        "instance": [{"token": "i", "category_token": "c"}],
-    }
+    tables: dict[str, list[dict[str, object]]] = {"scene": [{"token": "a", "name": "scene-0001"}]}
     for k in range(10):
-        stamp_us, token, at = 10**15 + 500_000 * k, f"s{k}", [110.0, 2.0 + k, 1.0]
+        stamp_us, token, turned = 10**15 + 500_000 * k, f"s{k}", [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
+        box = {"sample_token": token, "translation": [110.0, 2.0 + k, 1.0], "size": [1.9, 4.5, 1.6], "rotation": turned}
         boxes[token] = [
-            {
-                "sample_token": token,
-                "translation": at,
-                "size": [1.9, 4.5, 1.6],
-                "rotation": north,
-                "velocity": [0.0, 2.0],
-                "tracking_name": "car",
-                "tracking_id": "7",
-                "tracking_score": 0.8,
-            }
+            {**box, "velocity": [0.0, 2.0], "tracking_name": "car", "tracking_id": "7", "tracking_score": 1}
         ]
-        seen = {"num_lidar_pts": 5, "num_radar_pts": 0}
-        place = {"translation": [100.0, 1.0 * k, 0.0], "rotation": north}
         for name, entry in {
             "sample": {"token": token, "timestamp": stamp_us, "scene_token": "a"},
             "sample_data": {"sample_token": token, "ego_pose_token": f"p{k}"},
-            "ego_pose": {"token": f"p{k}", "timestamp": stamp_us, **place},
-            "sample_annotation": {
-                "sample_token": token,
-                "instance_token": "i",
-                "translation": at,
-                "rotation": north,
-                **seen,
-            },
+            "ego_pose": {"token": f"p{k}", "timestamp": stamp_us, "translation": [100.0, k, 0.0], "rotation": turned},
         }.items():
             tables.setdefault(name, []).append(entry)
     files = {f"in/v1.0-mini/{name}.json": json.dumps(entries).encode() for name, entries in tables.items()}
     return {"in/results.json": json.dumps({"meta": {}, "results": boxes}).encode(), **files}
+
+
+def bag(storage: str) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        write_bag(Path(folder) / "bag", drive(), storage)
+        (file,) = (file for file in (Path(folder) / "bag").iterdir() if file.suffix != ".yaml")
+        return file.read_bytes()
+
+
+def ros1() -> bytes:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    types = store.types
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "drive.bag"
+        with Rosbag1Writer(path) as writer:
+            topic = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=store)
+            for k in range(40):
+                time = types["builtin_interfaces/msg/Time"](1000 + k // 20, (k % 20) * 50_000_000)
+                header = types["std_msgs/msg/Header"](k, time, "map")
+                pose = types["geometry_msgs/msg/Pose"](
+                    types["geometry_msgs/msg/Point"](1.0 * k, 0.0, 0.0),
+                    types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+                )
+                zero = types["geometry_msgs/msg/Vector3"](20.0, 0.0, 0.0)
+                message = types["nav_msgs/msg/Odometry"](
+                    header,
+                    "base",
+                    types["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36)),
+                    types["geometry_msgs/msg/TwistWithCovariance"](
+                        types["geometry_msgs/msg/Twist"](zero, zero), np.zeros(36)
+                    ),
+                )
+                receipt_ns = 1_000_000_000_000 + k * 50_000_000
+                writer.write(topic, receipt_ns, store.serialize_ros1(message, "nav_msgs/msg/Odometry"))
+        return path.read_bytes()
 
 
 def track_map() -> bytes:
@@ -296,7 +291,6 @@ sensors:
 EXCLUDED = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {}, "geometry":
 {"type": "MultiPolygon", "coordinates":
 [[[[0.0, 0.0], [90.0, 0.0], [90.0, 90.5], [0.0, 0.0]]], [[[5, 5], [9, 5], [9, 9], [5, 5]]]]}}]}"""
-CORNERS = b"area,x_m,y_m\nshore,0.0,0.0\nshore,90.0,0.5\nshore,90.0,90.0\npier,5,5\npier,9,5\npier,9,9\n"
 DELAYS = b"""radar:
   delay: {kind: gamma, min_s: 0.01, mean_s: 0.1, q90_s: 0.15}
   clock: [{kind: offset, offset_s: -0.06}, {kind: drift, drift_ppm: 40.0}, {kind: quantised, step_s: 0.001}]

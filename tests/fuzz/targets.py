@@ -5,8 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fgtrack.cli import main
-from fuzz import bags, inputs
+from fuzz import inputs
 from fuzz.inputs import LINE, Files
 
 RUN = "run"
@@ -17,183 +16,108 @@ RUN = "run"
 class Target:
     """A kind of input."""
 
-    name: str
     healthy: Callable[[], Sequence[Files]]
     """Inputs that are right, as contents by name."""
-    spoilt: Callable[[str], bool]
-    """Which files are spoilt."""
     commands: Sequence[Sequence[str]]
     """Words of the commands, called in the folder of the files; `LINE` for those in that file."""
+    corrupted: str | None = None
+    """The file that is corrupted, else any."""
 
 
-def run(words: Sequence[str]) -> int:
-    """Exit code of the command of these words."""
-    return main.run(inputs.words(Path(LINE).read_bytes()) if words == (LINE,) else words)
+def words_of(command: Sequence[str], folder: Path) -> Sequence[str]:
+    """Words of a command, those of the file where it is `LINE`."""
+    return inputs.words((folder / LINE).read_bytes()) if command == (LINE,) else command
 
 
 _REPLAY = ("--overwrite", "-o", RUN, "-e")
-_EKF = (*_REPLAY, "ekf-replay")
+_OPEN = ("-c", "open_space", *_REPLAY, "ekf-replay")
 _CV = ("--set", "motion={kind: cv, std_per_s: {velocity: 3.0}}", "--set", "clock.node_hz=10")
-_TOPICS = "input={ego: {topic: /ego}, detections: {radar: {topic: /seen}}}"
 _MERGE = "merge={kind: connected, distance_m: 5.1}"
 
 
-def _all(name: str) -> bool:
-    return True
+def _recording(file: str, content: Callable[[], bytes], *options: str) -> Target:
+    return Target(lambda: [{file: content()}], [("info", file), ("replay", file, *_OPEN, *options)])
 
 
-def _only(name: str) -> Callable[[str], bool]:
-    return lambda file: file == name
+def _beside(file: str, contents: Callable[[], Sequence[bytes]], *commands: Sequence[str]) -> Target:
+    """A file, beside a stream that is right."""
+    return Target(lambda: [{file: one, "x.jsonl": inputs.stream()} for one in contents()], commands, file)
 
 
-TARGETS = (
-    Target(
-        "stream",
+TARGETS = {
+    "stream": _recording("x.jsonl", inputs.stream),
+    "gzip": _recording("x.jsonl.gz", lambda: gzip.compress(inputs.stream(), mtime=0)),
+    "mcap": _recording("x.mcap", lambda: inputs.bag("mcap")),
+    "sqlite3": _recording("x.db3", lambda: inputs.bag("sqlite3")),
+    "ros1": _recording("x.bag", inputs.ros1, "--set", "input.ego.topic=/odom"),
+    "smoother": Target(
         lambda: [{"x.jsonl": inputs.stream()}],
-        _all,
-        [("info", "x.jsonl"), ("replay", "x.jsonl", "-c", "open_space", *_EKF)],
-    ),
-    Target(
-        "stream-smoother",
-        lambda: [{"x.jsonl": inputs.stream()}],
-        _all,
         [("replay", "x.jsonl", "-c", "open_space", "--set", _MERGE, *_REPLAY, "smoother")],
     ),
-    Target(
-        "gzip",
-        lambda: [{"x.jsonl.gz": gzip.compress(inputs.stream(), mtime=0)}],
-        _all,
-        [("info", "x.jsonl.gz"), ("replay", "x.jsonl.gz", "-c", "open_space", *_EKF)],
-    ),
-    Target(
-        "mcap",
-        lambda: [{"x.mcap": bags.bag("mcap")}],
-        _all,
-        [("info", "x.mcap"), ("replay", "x.mcap", "-c", "open_space", *_EKF)],
-    ),
-    Target(
-        "sqlite3",
-        lambda: [{"x.db3": bags.bag("sqlite3")}],
-        _all,
-        [("info", "x.db3"), ("replay", "x.db3", "-c", "open_space", *_EKF)],
-    ),
-    Target(
-        "ros1",
-        lambda: [{"x.bag": bags.ros1()}],
-        _all,
-        [("info", "x.bag"), ("replay", "x.bag", "-c", "open_space", "--set", "input.ego.topic=/odom", *_EKF)],
-    ),
-    Target(
-        "foreign",
-        lambda: [bags.foreign()],
-        _all,
-        [("info", "x.mcap", "-c", "x.yaml"), ("replay", "x.mcap", "-c", "x.yaml", "--overwrite", "-o", RUN)],
-    ),
-    Target(
-        "bag-folder",
-        bags.folders,
-        _all,
-        [("info", "in"), ("replay", "in", "-c", "open_space", "--set", _TOPICS, *_EKF)],
-    ),
-    Target(
-        "autoferry",
+    "autoferry": Target(
         lambda: [inputs.autoferry()],
-        _all,
-        [("info", "in"), ("replay", "in", "-c", "autoferry", *_EKF), ("compare", RUN)],
+        [("info", "in"), ("replay", "in", "-c", "autoferry", *_REPLAY, "ekf-replay"), ("compare", RUN)],
     ),
-    Target(
-        "log-folder",
+    "log-folder": Target(
         lambda: [inputs.log_folder()],
-        _all,
         [
             ("info", "in"),
             ("replay", "in", "-c", "karle2023", "--set", "map.track=null", *_REPLAY, "ekf-backward-forward"),
         ],
     ),
-    Target("kitti", lambda: [inputs.kitti()], _all, [("info", "in"), ("replay", "in", "-c", "kitti", *_EKF)]),
-    Target(
-        "kitti-forms",
-        inputs.kitti_forms,
-        lambda name: "_car" in name,
-        [("info", "in"), ("replay", "in", "-c", "kitti", *_EKF)],
+    "kitti": Target(
+        lambda: [inputs.kitti_sequence()], [("info", "in"), ("replay", "in", "-c", "kitti", *_REPLAY, "ekf-replay")]
     ),
-    Target(
-        "tables",
+    "tables": Target(
         lambda: [inputs.tables()],
-        _all,
         [("info", "in", "-c", "x.yaml"), ("replay", "in", "-c", "x.yaml", "--overwrite", "-o", RUN)],
     ),
-    Target(
-        "nuscenes",
+    "nuscenes": Target(
         lambda: [inputs.nuscenes()],
-        _all,
-        [
-            ("info", "in/results.json"),
-            ("replay", "in/results.json", "-c", "open_space", "--set", inputs.NUSCENES, *_EKF),
-        ],
+        [("info", "in/results.json"), ("replay", "in/results.json", "--set", inputs.NUSCENES, *_OPEN)],
     ),
-    Target(
-        "excluded",
-        lambda: [
-            {"x.json": inputs.EXCLUDED, "x.jsonl": inputs.stream()},
-            {"x.json": inputs.CORNERS, "x.jsonl": inputs.stream()},
-        ],
-        _only("x.json"),
-        [("replay", "x.jsonl", "-c", "open_space", "--set", 'map.excluded=["x.json"]', *_EKF)],
+    "excluded": _beside(
+        "x.json", lambda: [inputs.EXCLUDED], ("replay", "x.jsonl", "--set", 'map.excluded=["x.json"]', *_OPEN)
     ),
-    Target(
-        "configuration",
+    "configuration": Target(
         inputs.configurations,
-        _only("x.yaml"),
-        [("config", "-c", "x.yaml"), ("replay", "x.jsonl", "-c", "x.yaml", *_EKF)],
+        [("config", "-c", "x.yaml"), ("replay", "x.jsonl", "-c", "x.yaml", *_REPLAY, "ekf-replay")],
+        "x.yaml",
     ),
-    Target(
-        "scenario",
+    "scenario": Target(
         lambda: [{"x.yaml": content} for content in inputs.shipped("scenarios")],
-        _only("x.yaml"),
         [("simulate", "x.yaml", "-o", "out.jsonl", "--overwrite", "--duration", "0.5")],
     ),
-    Target(
-        "sweep",
-        lambda: [{"x.yaml": content, **inputs.named()} for content in (inputs.SWEEP, inputs.RESWEEP)],
-        _only("x.yaml"),
+    "sweep": Target(
+        lambda: [{**inputs.named(), "x.yaml": content} for content in (inputs.SWEEP, inputs.RESWEEP)],
         [("sweep", "x.yaml", "-o", "swept", "--jobs", "1")],
+        "x.yaml",
     ),
-    Target(
-        "map",
-        lambda: [{"x.csv": inputs.track_map(), "x.jsonl": inputs.stream()}],
-        _only("x.csv"),
+    "map": _beside(
+        "x.csv",
+        lambda: [inputs.track_map()],
+        ("replay", "x.jsonl", "-c", "smoother", "--map", "x.csv", *_REPLAY, "ekf-replay"),
+        ("replay", "x.jsonl", "-c", "karle2023_reference", "--map", "x.csv", "-o", RUN, "--overwrite"),
+    ),
+    "delays": _beside(
+        "x.yaml", lambda: [inputs.DELAYS], ("convert", "x.jsonl", "out.jsonl", "--delays", "x.yaml", "--overwrite")
+    ),
+    "calibration": Target(
+        lambda: [{"x.jsonl": inputs.straight()}],
         [
-            ("replay", "x.jsonl", "-c", "smoother", "--map", "x.csv", *_EKF),
-            ("replay", "x.jsonl", "-c", "karle2023_reference", "--map", "x.csv", "-o", RUN, "--overwrite"),
+            ("tune", "x.jsonl", *_CV, "-o", "x.yaml", "--overwrite"),
+            ("advise", "x.jsonl", *_CV, "--tune"),
+            ("offsets", "x.jsonl", *_CV),
         ],
     ),
-    Target(
-        "delays",
-        lambda: [{"x.yaml": inputs.DELAYS, "x.jsonl": inputs.stream()}],
-        _only("x.yaml"),
-        [("convert", "x.jsonl", "out.jsonl", "--delays", "x.yaml", "--overwrite")],
-    ),
-    Target(
-        "tune",
-        lambda: [{"x.jsonl": inputs.straight()}],
-        _all,
-        [("tune", "x.jsonl", *_CV, "-o", "x.yaml", "--overwrite")],
-    ),
-    Target(
-        "advise",
-        lambda: [{"x.jsonl": inputs.straight()}],
-        _all,
-        [("advise", "x.jsonl", *_CV, "--tune"), ("offsets", "x.jsonl", *_CV)],
-    ),
-    Target(
-        "run", lambda: [inputs.run_folder()], _all, [("compare", "in"), ("export", "in", "-o", "x.mcap", "--overwrite")]
-    ),
-    Target(
-        "pictures",
+    "run": Target(
         lambda: [inputs.run_folder()],
-        _all,
-        [("report", "in", "-o", "x.html", "--overwrite"), ("export", "in", "-o", "bag", "--ros2", "--overwrite")],
+        [
+            ("compare", "in"),
+            ("report", "in", "-o", "x.html", "--overwrite"),
+            ("export", "in", "-o", "x.mcap", "--overwrite"),
+            ("export", "in", "-o", "bag", "--ros2", "--overwrite"),
+        ],
     ),
-    Target("line", inputs.lines, _only(LINE), [("replay", "x.jsonl", "-c", "open_space", "-o", "in"), (LINE,)]),
-)
+    "line": Target(inputs.lines, [("replay", "x.jsonl", "-c", "open_space", "-o", "in"), (LINE,)], LINE),
+}

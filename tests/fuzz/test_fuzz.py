@@ -1,78 +1,146 @@
 """Whatever is in a file: no internal error, no warning, no hang, no flood of memory, and every detection counted.
 
-Each case is a healthy input with a few things spoilt, always the same for its seed and number. `make fuzz` takes half
-an hour for each kind and keeps what it finds in `out/fuzz`.
+Each case is a healthy input with a few things corrupted, always the same for its seed and number. `make fuzz` takes
+half an hour for each kind and keeps what it finds in `out/fuzz`.
 """
 
-import sys
+import shutil
+import time
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
+from support.server import Outcome, Server
 
-from fuzz.cases import files_of, fuzz, healthy, problem_of, write
-from fuzz.targets import TARGETS, Target
+from fgtrack.estimation.failures import Failure
+from fgtrack.io.run import load_run
+from fuzz.inputs import Files
+from fuzz.mutation import mutated
+from fuzz.targets import RUN, TARGETS, Target, words_of
 
-each_target = pytest.mark.parametrize("target", TARGETS, ids=[target.name for target in TARGETS])
-_A_FEW = 4
-_SEED = 20_261
-
-
-@each_target
-def test_a_few_spoilt_inputs_of_every_kind(target: Target, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    for files in healthy(target):
-        assert problem_of(target, files, right=True) is None
-    problems = {case: problem_of(target, files_of(target, _SEED, case)) for case in range(_A_FEW)}
-    assert not {case: problem for case, problem in problems.items() if problem is not None}
+MOST_MB, LONGEST_S, LONGEST_LINE = 2000.0, 20.0, 2000
+_A_FEW, _SEED = 4, 20_261
 
 
-@pytest.mark.slow
-@each_target
-def test_a_minute_of_spoilt_inputs(target: Target, request: pytest.FixtureRequest) -> None:
-    seconds, seed = request.config.getoption("--fuzz-seconds"), request.config.getoption("--fuzz-seed")
-    count, findings = fuzz(target.name, seed, seconds, most=10**9, keep=Path("out/fuzz").absolute())
-    assert count > 0
-    assert not findings, f"{len(findings)} of {count} cases"
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    made = Server()
+    yield made
+    made.close()
 
 
-@each_target
-def test_a_case_is_always_the_same_and_another_one_another(target: Target) -> None:
-    assert files_of(target, 1, 2) == files_of(target, 1, 2)
-    assert len({str(files_of(target, 1, case)) for case in range(8)}) > 4
+@cache
+def healthy(name: str) -> list[Files]:
+    """The inputs of a target that are right."""
+    return list(TARGETS[name].healthy())
 
 
-def test_a_process_of_its_own_says_how_far_it_came() -> None:
-    count, findings = fuzz("delays", _SEED, seconds=300.0, most=3)
-    assert (count, findings) == (3, [])
+def files_of(name: str, seed: int, case: int) -> dict[str, bytes]:
+    """The files of a case: always the same ones."""
+    rng, right = np.random.default_rng([seed, case]), healthy(name)
+    files = dict(right[rng.integers(len(right))])
+    corrupted = TARGETS[name].corrupted
+    names = sorted(one for one in files if corrupted is None or one == corrupted)
+    for one in rng.choice(names, size=1 if rng.integers(4) else min(2, len(names)), replace=False).tolist():
+        files[one] = mutated(rng, one, files[one])
+    return files
 
 
-def test_what_is_looked_for_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The judge itself: an internal error, a silent failure, an endless line, an escape, a strange exit code."""
-    target = next(target for target in TARGETS if target.name == "delays")
-    said = iter([(1, "fgtrack: error: internal error: Boom"), (1, ""), (2, "x" * 10_000), (0, "\x1b[31m"), (7, "what")])
-
-    def fake(words: object) -> int:
-        code, text = next(said)
-        (sys.stderr if code else sys.stdout).write(f"{text}\n")
-        return code
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("fuzz.cases.run", fake)
-    for expected in ("internal error", "without a word", "prints", "prints", "exit code 7"):
-        problem = problem_of(target, healthy(target)[0])
-        assert problem is not None
-        assert expected in problem
+def problem_of(server: Server, target: Target, files: Files, folder: Path, right: bool = False) -> str | None:
+    """What is wrong with what the commands make of `files` in a new `folder`; `right` ones end with 0."""
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+    for command in target.commands:
+        done = server(words_of(command, folder), folder, kill_after_s=10.0 * LONGEST_S)
+        problem = _problem(done) or _problem_of_run(folder / RUN)
+        if problem is None and right and done.code:
+            problem = f"exit code {done.code} for an input that is right: {done.said.strip()}"
+        if problem is not None:
+            return f"{command[0]}: {problem}"
+    shutil.rmtree(folder)
+    return None
 
 
-def test_an_input_that_is_right_must_be_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _problem(done: Outcome) -> str | None:
+    if "internal error" in done.said or "Traceback" in done.said or "RuntimeWarning" in done.said:
+        return done.said.strip()[-600:]
+    if done.code not in (0, 1, 2) or (done.code and not done.said.strip()):
+        return f"exit code {done.code}, said {done.said!r}"
+    for line in done.said.splitlines():
+        if not line.isprintable() or (line.startswith("fgtrack: ") and len(line) > LONGEST_LINE):
+            return f"prints {line[:200]!r}"
+    if done.cpu_s > LONGEST_S or done.peak_mb > MOST_MB:
+        return f"takes {done.cpu_s:.0f} s and {done.peak_mb:.0f} MB"
+    return None
+
+
+def _problem_of_run(path: Path) -> str | None:
+    """Dispositions that do not add up, states that are not finite."""
+    if not (path / "meta.json").is_file():
+        return None
+    found = load_run(path)
+    if not found.meta.get("complete"):
+        return "leaves an incomplete run"
+    counted = sum(sum(counts.values()) for counts in found.meta["counts"].values())
+    if not len(found.updates) == counted == found.meta["detections_received"]:
+        return f"{found.meta['detections_received']} detections, {counted} counted, {len(found.updates)} rows"
+    hidden = (Failure.LIST_FAILED, Failure.ESTIMATOR_RAISED)  # what the guards hide is a defect all the same
+    if raised := [kind for kind in hidden if found.meta.get("failures", {}).get(kind)]:
+        return f"{', '.join(raised)}: {found.meta['first_failure']}"
+    for table in (found.tables["tracks"], found.tables["smoothed"]):
+        for name in ("x_m", "y_m", "yaw_rad", "speed_mps", *(name for name in table if name.startswith("p_"))):
+            if not np.isfinite(table[name]).all():
+                return f"{name} is not finite"
+            if name in ("p_x_x", "p_y_y", "p_yaw_yaw", "p_speed_speed") and not (table[name] > 0.0).all():
+                return f"{name} is not positive"
+    return None
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_a_few_corrupted_inputs_of_every_kind(server: Server, name: str, tmp_path: Path) -> None:
+    for k, files in enumerate(healthy(name)):
+        assert problem_of(server, TARGETS[name], files, tmp_path / f"right-{k}", right=True) is None
+    cases = [files_of(name, _SEED, case) for case in range(_A_FEW)]
+    assert cases == [files_of(name, _SEED, case) for case in range(_A_FEW)]
+    assert len({str(files) for files in cases}) > 1
+    found = {case: problem_of(server, TARGETS[name], files, tmp_path / str(case)) for case, files in enumerate(cases)}
+    assert not {case: problem for case, problem in found.items() if problem is not None}
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_a_minute_of_corrupted_inputs(server: Server, name: str, request: pytest.FixtureRequest) -> None:
+    ends, seed = time.monotonic() + request.config.getoption("--fuzz-seconds"), request.config.getoption("--fuzz-seed")
+    case, findings, keep = 0, dict[int, str](), Path("out/fuzz").absolute() / name
+    while time.monotonic() < ends:
+        problem = problem_of(server, TARGETS[name], files_of(name, seed, case), keep / str(case))
+        if problem is not None:  # its folder stays
+            findings[case] = problem
+        case += 1
+    assert case > 0
+    assert not findings, f"{len(findings)} of {case} cases"
+
+
+@pytest.mark.parametrize(
+    ("code", "said", "expected"),
+    [
+        (1, "fgtrack: error: internal error: Boom", "internal error"),
+        (1, "", "said ''"),
+        (2, f"fgtrack: error: {'x' * 10_000}", "prints"),
+        (0, "\x1b[31m", "prints"),
+        (7, "what", "exit code 7"),
+        (0, "fine", None),
+    ],
+)
+def test_what_is_looked_for_is_found(code: int, said: str, expected: str | None) -> None:
+    problem = _problem(Outcome(code, 0.1, said, None))
+    assert (problem is None) if expected is None else (expected in str(problem))
+
+
+def test_an_input_that_is_right_must_be_taken(server: Server, tmp_path: Path) -> None:
     """Else nothing but its refusal is fuzzed."""
-    target = next(target for target in TARGETS if target.name == "delays")
-    wrong = {**healthy(target)[0], "x.yaml": b"radar: {delay: {kind: gamma}}\n"}
-    monkeypatch.chdir(tmp_path)
-    assert problem_of(target, wrong) is None
-    assert "for an input that is right" in str(problem_of(target, wrong, right=True))
-
-
-def test_a_kept_case_is_written_whole(tmp_path: Path) -> None:
-    write(tmp_path / "case", {"in/a.txt": b"1", "b": b""})
-    assert (tmp_path / "case/in/a.txt").read_bytes() == b"1"
+    wrong = {**healthy("delays")[0], "x.yaml": b"radar: {delay: {kind: gamma}}\n"}
+    assert problem_of(server, TARGETS["delays"], wrong, tmp_path / "a") is None
+    assert "for an input that is right" in str(problem_of(server, TARGETS["delays"], wrong, tmp_path / "b", right=True))

@@ -5,13 +5,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from faults.cases import Server
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from support.mcap import CDR, END, HEADER, SEPARATOR, channel, chunk, mcap_of_type, message, poses, schema
 from support.messages import drive
+from support.server import Server
 
 from fgtrack.io.ros.bag_writer import write_bag
+
+pytestmark = pytest.mark.slow
 
 MOST_MB, LONGEST_S = 4096.0, 20.0
 _SENSOR = ("--set", "sensors={s: {std: {x_m: 1.0, y_m: 1.0}}}", "-o", "run")

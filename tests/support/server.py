@@ -1,6 +1,6 @@
-"""Runs commands in forks of itself, so that each costs what it does and not what it imports; a script of its own.
+"""A process that runs commands in forks of itself, so that each costs what it does and not what it imports.
 
-Every line of stdin is an `Order` as JSON, answered by a line with its `Outcome`.
+As a script it answers every line of stdin, an `Order` as JSON, by a line with its `Outcome`.
 """
 
 import json
@@ -8,15 +8,13 @@ import os
 import resource
 import select
 import signal
+import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-
-import fgtrack.cli.sweep  # noqa: F401  # as what it imports
-from fgtrack.cli.main import run
 
 #: What a process does to files, as Python's audit events; writing into an open file is none.
 _CHANGES = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.truncate", "sqlite3.connect")
@@ -56,6 +54,33 @@ class Outcome:
     """Of the processor, however busy it is with other things."""
 
 
+class Server:
+    """The process, as seen by a test."""
+
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        assert self._read() == "ready"
+
+    def __call__(self, words: Sequence[str], folder: Path, **disturbed: object) -> Outcome:
+        """Run a command in `folder`; `disturbed` are fields of `Order`."""
+        assert self._process.stdin is not None
+        order = Order(list(words), str(folder), **disturbed)  # type: ignore[arg-type]  # as the caller names them
+        self._process.stdin.write(json.dumps(asdict(order)) + "\n")
+        self._process.stdin.flush()
+        return Outcome(**json.loads(self._read()))
+
+    def _read(self) -> str:
+        assert self._process.stdout is not None
+        return self._process.stdout.readline().strip()
+
+    def close(self) -> None:
+        """End it."""
+        with self._process:  # closes its pipes, which ends it
+            pass
+
+
 def serve() -> None:
     """Answer every line of stdin until its end."""
     _warm_up()
@@ -71,6 +96,9 @@ def _answer(line: str) -> None:
 
 def _warm_up() -> None:
     """Import what the commands import."""
+    import fgtrack.cli.sweep  # noqa: F401
+    from fgtrack.cli.main import run
+
     with tempfile.TemporaryDirectory() as folder, open(os.devnull, "w") as nowhere:
         standard, sys.stdout = sys.stdout, nowhere
         stream = f"{folder}/x.jsonl"
@@ -106,6 +134,8 @@ def _outcome(order: Order) -> Outcome:
 
 
 def _child(order: Order, said: int, counted: int) -> None:
+    from fgtrack.cli.main import run
+
     code = 70
     try:
         os.chdir(order.folder)
@@ -150,5 +180,5 @@ def _writes(arguments: tuple[object, ...]) -> bool:
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parents[1]))
+    sys.path[0] = str(Path(__file__).parents[1])  # beside this file lies a module `mcap`
     serve()
