@@ -16,12 +16,12 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.plugins import Registry
 from fgtrack.estimation.base import Estimator, Smoother, Start, TrackBank
 from fgtrack.estimation.filters.initiation import DEFAULT
-from fgtrack.estimation.filters.replay import ReplayBank, ReplayingFilter
+from fgtrack.estimation.filters.replay import ReplayBank, ReplayEkf
 from fgtrack.estimation.filters.track_initiation import initiated
 from fgtrack.estimation.hypotheses import hypotheses
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.smoothing_bank import SmoothingBank
-from fgtrack.models.motion import MotionModel
+from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel, WhiteNoise
 
 OOSM_GROUP = "fgtrack.oosm"
 EXACT = "any lag, any number"
@@ -207,7 +207,7 @@ def start_bank(
             return smoother
 
         return SmoothingBank(motion, one, lag_s, lagged_s)
-    if _replays(factory):
+    if factory is ReplayEkf and isinstance(motion, WhiteNoise) and type(motion) in (CTRV, CTRA, CV):
         return ReplayBank(motion, lambda start: _made(ESTIMATORS, name, factory, motion, start, lag_s, **own), lag_s)
     return ObjectBank(motion, lambda start: start_estimator(name, factory, motion, start, lag_s, options), lag_s)
 
@@ -222,14 +222,7 @@ def motion_model(name: str, parameters: Mapping[str, Any]) -> MotionModel:
 
 def works_together(factory: Factory) -> bool:
     """True if the estimators of several objects are made as one, by other code than those of a single object."""
-    return Claims.of(factory).bank or _replays(factory)
-
-
-def _replays(factory: Factory) -> bool:
-    """True if a bank may call what a class is made of, for it overrides none of the methods of an estimator."""
-    if not isinstance(factory, type) or not issubclass(factory, ReplayingFilter):
-        return False
-    return all(getattr(factory, name) is getattr(ReplayingFilter, name) for name in _members(Estimator))
+    return Claims.of(factory).bank or factory is ReplayEkf
 
 
 def _made_bank(name: str, factory: Factory, motion: MotionModel, lag_s: float, options: Mapping[str, Any]) -> TrackBank:

@@ -88,7 +88,7 @@ class MeasurementModel:
     def predict(self, x: FloatArray, pose: SensorPose = _AT_ORIGIN) -> FloatArray:
         """Measurement expected of the states `x`, shape (..., n) -> (..., k). Angles are not wrapped."""
         if self.linear:
-            return x.take(self._selected, axis=-1)
+            return x.take(self.selected, axis=-1)
         return _observed(self.components, x, pose, self._cartesian)[0]
 
     def jacobian(self, x: FloatArray, pose: SensorPose = _AT_ORIGIN) -> FloatArray:
@@ -122,7 +122,7 @@ class MeasurementModel:
     def selection(self, n: int) -> FloatArray:
         """`jacobian` of a linear model at any state of `n` entries, shape (k, n), read-only."""
         if n not in self._selections:
-            H = np.eye(n)[self._selected]
+            H = np.eye(n)[self.selected]
             H.flags.writeable = False
             self._selections[n] = H
         return self._selections[n]
@@ -146,7 +146,8 @@ class MeasurementModel:
         return {}
 
     @cached_property
-    def _selected(self) -> IntArray:
+    def selected(self) -> IntArray:
+        """Where the components of a linear model are in the state, shape (k,)."""
         return np.array([self.state_names.index(name) for name in self.components])
 
 

@@ -40,10 +40,10 @@ class IekfRecursion(EkfRecursion):
         check_iteration(max_iterations, tolerance)
         self._max_iterations, self._tolerance = max_iterations, tolerance
 
-    linearises_at_prediction = False
-
     def correct_one(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
         """See `EkfRecursion.correct_one`."""
+        if measurement.model.linear:
+            return super().correct_one(mean, covariance, measurement)
 
         def cost(x: FloatArray) -> float:
             y = measurement.model.residual(measurement.z, measurement.model.predict(x, measurement.pose))

@@ -98,26 +98,14 @@ class ImmRecursion(EkfRecursion):
         means, covariances = zip(*states, strict=True)
         return _with(super().first(prior, initiation), Mixture(means, covariances, self._sojourns.share))
 
-    def ahead(self, before: Sequence[Step], stamps_ns: Sequence[int]) -> Prediction:
+    def ahead(self, before: Step, stamp_ns: int) -> Prediction:
         """See `EkfRecursion.ahead`; the cross-covariance, of which nothing is asked, is the covariance."""
-        mixtures = [self._mixed(*each) for each in zip(before, stamps_ns, strict=True)]
-        states = [self._moments(mixture, mixture.probabilities, self.motion) for mixture in mixtures]
-        mean, covariance = (np.array(part) for part in zip(*states, strict=True))
+        mixture = self._mixed(before, stamp_ns)
+        mean, covariance = self._moments(mixture, mixture.probabilities, self.motion)
         return Prediction(mean, covariance, covariance)
 
-    def fused(
-        self, before: Sequence[Step], measurements: Sequence[Measurement]
-    ) -> list[tuple[Step, OneCorrection] | None]:
+    def fused(self, before: Step, measurement: Measurement) -> tuple[Step, OneCorrection]:
         """See `EkfRecursion.fused`."""
-        found: list[tuple[Step, OneCorrection] | None] = []
-        for step, measurement in zip(before, measurements, strict=True):
-            try:
-                found.append(self._fused(step, measurement))
-            except np.linalg.LinAlgError:
-                found.append(None)
-        return found
-
-    def _fused(self, before: Step, measurement: Measurement) -> tuple[Step, OneCorrection] | None:
         prior = self._mixed(before, measurement.stamp_ns)
         predicted = self._moments(prior, prior.probabilities, self.motion)
         corrected = [
@@ -133,10 +121,7 @@ class ImmRecursion(EkfRecursion):
         weight = float(posterior.probabilities @ [each.weight for each in corrected])
         whole = self._moments(posterior, posterior.probabilities, self.motion)
         corrected_whole = OneCorrection(*whole, found.innovation, found.nis, weight, found.S)
-        concluded = self._concluded(before, measurement, Prediction(*predicted, predicted[1]), corrected_whole)
-        if concluded is None:
-            return None
-        step, correction = concluded
+        step, correction = self._concluded(before, measurement, Prediction(*predicted, predicted[1]), corrected_whole)
         if step.along:  # the state comes from all that was measured, along a line, by `motion`
             alike = [self._own(self.motion, model, step.mean, step.covariance) for model in self._models]
             means, covariances = zip(*alike, strict=True)

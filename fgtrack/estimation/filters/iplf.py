@@ -38,6 +38,8 @@ class IplfRecursion(UkfRecursion):
 
     def correct_one(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
         """See `EkfRecursion.correct_one`."""
+        if measurement.model.linear:
+            return super().correct_one(mean, covariance, measurement)
         x, P = mean, covariance
         for _ in range(self._max_iterations):
             last, spread = x, P

@@ -1,18 +1,13 @@
-"""What a recursive filter does with stacks of states: predict them, and correct each by a measurement."""
+"""What a recursive filter does with a state: predict it, and correct it by a measurement."""
 
-from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 
-import numpy as np
-
 from fgtrack.core.geometry import wrap_angle
-from fgtrack.core.grouping import equal_ones
-from fgtrack.core.time import NS_PER_S
+from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, correct, correct_one, predict_across
+from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, correct_one, predict_across
 from fgtrack.estimation.filters.initiation import Initiation
 from fgtrack.estimation.filters.track_initiation import TrackInitiation
 from fgtrack.models.motion import MotionModel
@@ -49,14 +44,11 @@ class EkfRecursion:
         Motion model.
     """
 
-    linearises_at_prediction = True
-    """True if a nonlinear measurement is fused by its derivative at the prediction, else by `correct_one`."""
-
     def __init__(self, motion: MotionModel) -> None:
         self.motion = motion
 
-    def predict(self, mean: FloatArray, covariance: FloatArray, dt_s: FloatArray) -> Prediction:
-        """States `mean` (m, n), `covariance` (m, n, n) after `dt_s` (m,) >= 0."""
+    def predict(self, mean: FloatArray, covariance: FloatArray, dt_s: float) -> Prediction:
+        """State `mean` (n,), `covariance` (n, n) after `dt_s` >= 0."""
         return predict_across(mean, covariance, self.motion, dt_s)
 
     def correct_one(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
@@ -67,27 +59,6 @@ class EkfRecursion:
         """
         return correct_one(mean, covariance, measurement)
 
-    def correct(
-        self, mean: FloatArray, covariance: FloatArray, measurements: Sequence[Measurement]
-    ) -> list[OneCorrection | None]:
-        """`correct_one` of m states; None where a measurement cannot be fused."""
-        found: list[OneCorrection | None] = [None] * len(measurements)
-        kinds = [(id(one.model), 0 if one.model.linear else id(one.pose), one.assumed) for one in measurements]
-        for rows in equal_ones(kinds):
-            chosen = [measurements[row] for row in rows]
-            one = chosen[0]
-            if one.model.linear or self.linearises_at_prediction:
-                z, R = np.array([each.z for each in chosen]), np.array([each.R for each in chosen])
-                losses = [each.loss for each in chosen]
-                args = mean[rows], covariance[rows], z, R, one.model, one.pose, None, one.measured, losses
-                for row, each in zip(rows, correct(*args).rows(), strict=True):
-                    found[row] = each
-                continue
-            for row in rows:
-                with suppress(np.linalg.LinAlgError):
-                    found[row] = self.correct_one(mean[row], covariance[row], measurements[row])
-        return found
-
     # --- steps of filters
 
     def first(self, prior: Start, initiation: Initiation) -> Step:
@@ -96,36 +67,26 @@ class EkfRecursion:
         search, predicted = TrackInitiation.of(self.motion, prior, initiation), Prediction(mean, covariance, covariance)
         return Step(prior.stamp_ns, None, mean, covariance, predicted, search)
 
-    def ahead(self, before: Sequence[Step], stamps_ns: Sequence[int]) -> Prediction:
-        """States at `stamps_ns`, each predicted from its step."""
-        mean, covariance = np.array([step.mean for step in before]), np.array([step.covariance for step in before])
-        late_ns = np.array([stamp_ns - step.stamp_ns for step, stamp_ns in zip(before, stamps_ns, strict=True)])
-        return (
-            self.predict(mean, covariance, late_ns / NS_PER_S)
-            if late_ns.any()
-            else Prediction(mean, covariance, covariance)
-        )
+    def ahead(self, before: Step, stamp_ns: int) -> Prediction:
+        """State at `stamp_ns`, predicted from a step."""
+        if stamp_ns == before.stamp_ns:
+            return Prediction(before.mean, before.covariance, before.covariance)
+        return self.predict(before.mean, before.covariance, seconds(stamp_ns - before.stamp_ns))
 
-    def fused(
-        self, before: Sequence[Step], measurements: Sequence[Measurement]
-    ) -> list[tuple[Step, OneCorrection] | None]:
-        """The steps of `measurements`, each after the step before it; None where one cannot be fused."""
-        predicted = self.ahead(before, [one.stamp_ns for one in measurements])
-        corrected = self.correct(predicted.mean, predicted.covariance, measurements)
-        parts = zip(before, measurements, map(Prediction, *predicted), corrected, strict=True)
-        return [None if own is None else self._concluded(step, one, at, own) for step, one, at, own in parts]
+    def fused(self, before: Step, measurement: Measurement) -> tuple[Step, OneCorrection]:
+        """The step of `measurement` after the step before it. Raises as `correct_one`."""
+        predicted = self.ahead(before, measurement.stamp_ns)
+        corrected = self.correct_one(predicted.mean, predicted.covariance, measurement)
+        return self._concluded(before, measurement, predicted, corrected)
 
     def _concluded(
         self, before: Step, measurement: Measurement, predicted: Prediction, corrected: OneCorrection
-    ) -> tuple[Step, OneCorrection] | None:
+    ) -> tuple[Step, OneCorrection]:
         """The step of a corrected state; while the direction of travel is sought, that along the line instead."""
         mean, covariance = corrected.mean, corrected.covariance
         search = None if before.search is None else before.search.with_measurement(measurement)
         if search is not None and search.line is not None:
-            try:
-                mean, covariance = search.state()
-            except np.linalg.LinAlgError:
-                return None
+            mean, covariance = search.state()
         if not self.motion.cartesian:
             mean[YAW] = wrap_angle(mean[YAW])
         return Step(measurement.stamp_ns, measurement, mean, covariance, predicted, search), corrected

@@ -1,21 +1,16 @@
 """Filters that roll back to a late measurement and filter the later ones again, for one object or many together."""
 
 import bisect
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 
+from fgtrack.core.checks import LARGEST_NS
 from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.base import (
-    NOTHING,
-    Content,
-    Measurement,
-    Start,
-    StatesAt,
-    UpdateResult,
-    UpdateStatus,
-    no_states,
-)
+from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus
 from fgtrack.estimation.filters.ekf import OneCorrection, Prediction
 from fgtrack.estimation.filters.initiation import DEFAULT, checked_initiation
 from fgtrack.estimation.filters.propagation import track_state, wrapped
@@ -24,7 +19,8 @@ from fgtrack.estimation.filters.windowed import WindowedFilter
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.present import PresentStates
 from fgtrack.estimation.rts import rts_step
-from fgtrack.models.motion import MotionModel
+from fgtrack.models.measurement import MeasurementModel
+from fgtrack.models.motion import MotionModel, WhiteNoise
 
 
 class ReplayingFilter(WindowedFilter):
@@ -56,101 +52,49 @@ class ReplayingFilter(WindowedFilter):
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: the filter's state, from the measurements up to that stamp."""
-        mean, covariance, _ = self.recursion.ahead([self.step_before(stamp_ns)], [stamp_ns])
-        return track_state(self._motion, stamp_ns, mean[0], covariance[0])
+        mean, covariance, _ = self.recursion.ahead(self.step_before(stamp_ns), stamp_ns)
+        return track_state(self._motion, stamp_ns, mean, covariance)
 
     def step_before(self, stamp_ns: int) -> Step:
         """The newest step at or before `stamp_ns`; the first one where there is none."""
         return self.steps[max(bisect.bisect_right(self.steps, stamp_ns, key=_stamp) - 1, 0)]
-
-    def place_of(self, measurement: Measurement) -> int:
-        """Index of `measurement` among the steps: by stamp, and at one stamp by content; never before the first."""
-        place = max(bisect.bisect_right(self.steps, measurement.stamp_ns, key=_stamp), 1)
-        while place > 1 and self.steps[place - 1].stamp_ns == measurement.stamp_ns:
-            if _content(self.steps[place - 1]) <= measurement.content:
-                break
-            place -= 1
-        return place
 
     def _forget_before(self, stamp_ns: int) -> None:
         # what is measured at that very stamp may still come, and belongs behind the first step
         del self.steps[: max(bisect.bisect_left(self.steps, stamp_ns, key=_stamp) - 1, 0)]
 
     def _fuse(self, measurement: Measurement) -> OneCorrection:
-        [found] = fuse([self], [measurement])
-        if found is None:
-            raise np.linalg.LinAlgError("the measurement cannot be fused")
+        stamps_ns = [each.stamp_ns for each in self.steps]
+        place = _place(stamps_ns, [each.measurement for each in self.steps], measurement)
+        later, (step, found) = self.steps[place:], self.recursion.fused(self.steps[place - 1], measurement)
+        if later and self.retrodicts:
+            state = _retrodicted(self.recursion, step, later)
+            expected = self.recursion.correct_one(*state, measurement)
+            found = found._replace(innovation=expected.innovation, nis=expected.nis, S=expected.S)
+        chain = [step]
+        for each in later:
+            if each.measurement is not None:
+                chain.append(self.recursion.fused(chain[-1], each.measurement)[0])
+        self.steps[place:] = chain
         return found
 
 
-def fuse(filters: Sequence[ReplayingFilter], measurements: Sequence[Measurement]) -> list[OneCorrection | None]:
-    """Give each filter of one kind a measurement; None, and all as it was, where it cannot be fused.
-
-    All filters roll back, correct and filter later measurements again side by side, step by step.
-    """
-    recursion, retrodicts = filters[0].recursion, filters[0].retrodicts
-    places = [each.place_of(one) for each, one in zip(filters, measurements, strict=True)]
-    later = [each.steps[place:] for each, place in zip(filters, places, strict=True)]
-    begun = recursion.fused([each.steps[k - 1] for each, k in zip(filters, places, strict=True)], measurements)
-    found = [None if each is None else each[1] for each in begun]
-    chains = [[] if each is None else [each[0]] for each in begun]
-    rows = [row for row, steps in enumerate(later) if steps and found[row] is not None]
-    if rows and retrodicts:
-        states = _retrodicted(recursion, [chains[row][0] for row in rows], [later[row] for row in rows])
-        innovations = recursion.correct(*states, [measurements[row] for row in rows])
-        for row, expected in zip(rows, innovations, strict=True):
-            own = found[row]
-            if own is None or expected is None:
-                found[row] = None
-            else:
-                found[row] = own._replace(innovation=expected.innovation, nis=expected.nis, S=expected.S)
-    depth = 0
-    while rows := [row for row in rows if found[row] is not None and len(later[row]) > depth]:
-        again = [(row, one) for row in rows if (one := later[row][depth].measurement) is not None]
-        replayed = recursion.fused([chains[row][-1] for row, _ in again], [one for _, one in again])
-        for (row, _), each in zip(again, replayed, strict=True):
-            if each is None:
-                found[row] = None
-            else:
-                chains[row].append(each[0])
-        depth += 1
-    for row, correction in enumerate(found):
-        if correction is not None:
-            filters[row].steps[places[row] :] = chains[row]
-    return found
-
-
-def _retrodicted(
-    recursion: EkfRecursion, new: Sequence[Step], later: Sequence[Sequence[Step]]
-) -> tuple[FloatArray, FloatArray]:
-    """States (m, n), (m, n, n) that the `new` measurements find, given all that was fused, also the `later` steps.
+def _retrodicted(recursion: EkfRecursion, new: Step, later: Sequence[Step]) -> tuple[FloatArray, FloatArray]:
+    """State (n,), (n, n) that the `new` measurement finds, given all that was fused, also the `later` steps.
 
     From the newest step back (see `rts_step`), each as it was when the new measurement was unknown.
     """
-    without = [Step(step.stamp_ns, None, *step.predicted[:2], step.predicted) for step in new]
-    first = recursion.ahead(without, [steps[0].stamp_ns for steps in later])
-    mean, covariance = (np.array([getattr(steps[-1], name) for steps in later]) for name in ("mean", "covariance"))
-    sought = list(range(len(new)))  # those whose state does not come from a line through all that was measured
-    for place in range(max(map(len, later)) - 1, -1, -1):
-        chosen = list[int]()
-        for row in [row for row in sought if len(later[row]) > place]:
-            after, before = later[row][place], later[row][place - 1] if place else without[row]
-            if after.along and after.search is not None:
-                mean[row], covariance[row] = after.search.retrodicted(new[row].stamp_ns, mean[row], covariance[row])
-                sought.remove(row)
-            elif before.stamp_ns != after.stamp_ns:  # else it is the same state
-                chosen.append(row)
-        if not chosen:
+    without = Step(new.stamp_ns, None, *new.predicted[:2], new.predicted)
+    mean, covariance = later[-1].mean, later[-1].covariance
+    for place in range(len(later) - 1, -1, -1):
+        after, before = later[place], later[place - 1] if place else without
+        if after.along and after.search is not None:
+            return after.search.retrodicted(new.stamp_ns, mean, covariance)
+        if before.stamp_ns == after.stamp_ns:  # the same state
             continue
-        befores = [later[row][place - 1] if place else without[row] for row in chosen]
-        predicted = (
-            Prediction(*(part[chosen] for part in first))
-            if not place
-            else Prediction(*map(np.array, zip(*(later[row][place].predicted for row in chosen), strict=True)))
-        )
-        shift = wrapped(recursion.motion, mean[chosen] - predicted.mean)
-        x, P = np.array([step.mean for step in befores]), np.array([step.covariance for step in befores])
-        mean[chosen], covariance[chosen], _ = rts_step(x, P, predicted, shift, covariance[chosen])
+        predicted = after.predicted if place else recursion.ahead(without, after.stamp_ns)
+        shift = wrapped(recursion.motion, mean - predicted.mean)
+        mean, covariance, _ = rts_step(before.mean, before.covariance, predicted, shift, covariance)
     return mean, covariance
 
 
@@ -171,52 +115,222 @@ class ReplayEkf(ReplayingFilter):
         super().__init__(motion, prior, lag_s, EkfRecursion(motion), initiation)
 
 
-class ReplayBank(ObjectBank[ReplayingFilter]):
-    """Replaying filters of all objects, of one kind: their states are calculated together. See `ObjectBank`."""
+@dataclass(slots=True)
+class _Chain:
+    """The steps of a filter in the arrays of `ReplayBank`, whose row they are in."""
+
+    row: int
+    stamps_ns: list[int]
+    measurements: list[Measurement | None]
+    filter: ReplayEkf
+
+
+class ReplayBank(ObjectBank[ReplayEkf]):
+    """`ReplayEkf` of all objects, whose steps lie in arrays: a compiled loop replays all that a list concerns.
+
+    Filters of their own remain where a direction of travel is sought, and where a window has a measurement with a
+    robust loss or of what is not an entry of the state. See `ObjectBank` and `fgtrack.estimation.kernels.replay`.
+
+    Parameters
+    ----------
+    motion
+        A shipped motion model.
+    start, lag_s
+        See `ObjectBank`.
+    """
+
+    def __init__(self, motion: WhiteNoise, start: Callable[[Start], ReplayEkf], lag_s: float) -> None:
+        super().__init__(motion, start, lag_s)
+        self._kernels = import_module("fgtrack.estimation.kernels.replay")
+        self._kind, self._density = motion.kind, motion.density
+        self._start_ns = -int(LARGEST_NS)  # of all windows, by the clock
+        self._chains: dict[int, _Chain] = {}
+        self._free: list[int] = []
+        self._order, self._steps = np.empty((0, 0), dtype=np.int64), list[Any]()
+        self._allocate(8, 64, 4)
+
+    def _allocate(self, rows: int, slots: int, k: int) -> None:
+        """Make arrays for so many tracks, steps and components; what is there is kept."""
+        n = self._motion.dim
+        shapes = ((), np.int64), ((n,), float), ((n, n), float), ((n,), float), ((n, n), float), ((n, n), float)
+        measured = ((k,), float), ((k, k), float), ((k,), np.int64), ((), np.int64)
+        order, old = np.tile(np.arange(slots), (rows, 1)), self._order.shape
+        order[: old[0], : old[1]] = self._order
+        steps = [np.zeros((rows, slots, *shape), dtype) for shape, dtype in (*shapes, *measured)]
+        for new, present in zip(steps, self._steps, strict=bool(self._steps)):
+            new[tuple(map(slice, present.shape))] = present
+        self._free += range(old[0], rows)
+        self._order, self._steps = order, steps
+
+    def advance(self, now_ns: int) -> None:
+        """See `TrackBank.advance`."""
+        self._now_ns = now_ns
+        self._start_ns = max(self._start_ns, now_ns - self._lag_ns)
+        if len(self._chains) < len(self._estimators):
+            self._ask(lambda _, one: one.advance(now_ns), [i for i in self._estimators if i not in self._chains])
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`."""
-        inside = {i: each for i, each in self._estimators.items() if each.window_ns[0] <= stamp_ns}
-        if not inside:
-            return no_states(self._motion.dim)
-        mean, covariance = self._ahead(list(inside.values()), [stamp_ns] * len(inside))
-        return StatesAt(tuple(inside), mean, covariance)
+        inside = [i for i, one in self._estimators.items() if self._window_start_ns(i, one) <= stamp_ns]
+        return StatesAt(tuple(inside), *self._ahead(inside, [stamp_ns] * len(inside)))
 
     def present(self) -> list[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
-        filters = list(self._estimators.values())
-        if not filters:
-            return []
-        stamps_ns = [max(self._now_ns, each.window_ns[0]) for each in filters]
-        return PresentStates(self._motion, self._now_ns, *self._ahead(filters, stamps_ns))
+        stamps_ns = [max(self._now_ns, one.window_ns[0]) for one in self._estimators.values()]
+        return PresentStates(self._motion, self._now_ns, *self._ahead(list(self._estimators), stamps_ns))
 
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
-        results = [UpdateResult(UpdateStatus.TOO_OLD)] * len(track_ids)
-        filters = [self._estimators[track_id] for track_id in track_ids]
-        rows = [row for row, each in enumerate(filters) if each.window_ns[0] <= stamp_ns]
-        if rows:
-            chosen, seen = [filters[row] for row in rows], [measurements[row].seen_by(self._motion) for row in rows]
-            try:
-                found = fuse(chosen, seen)
-            except np.linalg.LinAlgError:  # of one of them
-                outcomes = [each.update(one) for each, one in zip(chosen, seen, strict=True)]
+        seen = [one.seen_by(self._motion) for one in measurements]
+        found = dict[int, UpdateResult]()
+        alike: dict[tuple[int, tuple[str, ...]], list[int]] = {}
+        for place, track_id in enumerate(track_ids):
+            if stamp_ns < self._window_start_ns(track_id, self._estimators[track_id]):
+                found[track_id] = UpdateResult(UpdateStatus.TOO_OLD)
+            elif track_id in self._chains and _is_plain(seen[place]):
+                alike.setdefault((id(seen[place].model), seen[place].assumed), []).append(place)
+        for places in alike.values():
+            found |= self._fused(stamp_ns, [track_ids[place] for place in places], [seen[place] for place in places])
+        rest = [place for place, track_id in enumerate(track_ids) if track_id not in found]
+        for place in rest:
+            self._take_out(track_ids[place])
+        if rest:
+            ids = [track_ids[place] for place in rest]
+            found |= zip(ids, super().update(stamp_ns, ids, [seen[place] for place in rest]), strict=True)
+            for track_id in ids:
+                self._put_in(track_id)
+        return [found[track_id] for track_id in track_ids]
+
+    def birth(self, track_id: int, prior: Start) -> None:
+        """See `TrackBank.birth`."""
+        super().birth(track_id, prior)
+        self._put_in(track_id)
+
+    def remove(self, track_id: int) -> None:
+        """See `TrackBank.remove`."""
+        if track_id in self._chains:
+            self._free.append(self._chains.pop(track_id).row)
+        super().remove(track_id)
+
+    def _window_start_ns(self, track_id: int, one: ReplayEkf) -> int:
+        start_ns = one.window_ns[0]
+        return max(start_ns, self._start_ns) if track_id in self._chains else start_ns
+
+    def _fused(self, stamp_ns: int, track_ids: Sequence[int], seen: Sequence[Measurement]) -> dict[int, UpdateResult]:
+        """Outcomes, by track, of measurements of the same that could be fused."""
+        chains, one = [self._chains[track_id] for track_id in track_ids], seen[0]
+        k = len(one.model.selected)
+        for chain in chains:
+            self._make_room(chain, k)
+        places = [_place(chain.stamps_ns, chain.measurements, each) for chain, each in zip(chains, seen, strict=True)]
+        rows = np.array([chain.row for chain in chains])
+        counts = np.array([len(chain.stamps_ns) for chain in chains])
+        slots, y, S = self._order[rows, counts], np.empty((len(seen), k)), np.empty((len(seen), k, k))
+        *_, z, R, columns, sizes = self._steps
+        self._steps[0][rows, slots], columns[rows, slots, :k], sizes[rows, slots] = stamp_ns, one.model.selected, k
+        z[rows, slots, :k], R[rows, slots, :k, :k] = [each.z for each in seen], [each.R for each in seen]
+        own = np.arange(k) if one.measured is None else np.array(one.measured)
+        nis, fused = self._kernels.fuse(
+            self._kind, self._density, self._order, *self._steps, rows, np.array(places), counts, y, S, own
+        )
+        found, numbers = dict[int, UpdateResult](), nis.tolist()
+        for i in fused.nonzero()[0].tolist():
+            chain = chains[i]
+            chain.stamps_ns.insert(places[i], stamp_ns)
+            chain.measurements.insert(places[i], seen[i])
+            found[track_ids[i]] = UpdateResult(chain.filter.moved_on(stamp_ns), y[i], numbers[i], S[i])
+        return found
+
+    def _make_room(self, chain: _Chain, k: int) -> None:
+        """Let there be a free slot for a measurement of `k` components."""
+        rows, slots = self._order.shape
+        if len(chain.stamps_ns) == slots:
+            start_ns = max(self._start_ns, chain.filter.window_ns[0])
+            gone = max(bisect.bisect_left(chain.stamps_ns, start_ns) - 1, 0)
+            del chain.stamps_ns[:gone], chain.measurements[:gone]
+            self._order[chain.row] = np.roll(self._order[chain.row], -gone)
+        largest, is_full = self._steps[6].shape[-1], len(chain.stamps_ns) == slots
+        if k > largest or is_full:
+            self._allocate(rows, slots * (1 + is_full), max(k, largest))
+
+    def _ahead(self, track_ids: Sequence[int], stamps_ns: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Means (m, n) and covariances (m, n, n) of tracks, each at its stamp, with the yaw in (-pi, pi]."""
+        chosen, others = list[tuple[int, int, int]](), dict[int, TrackState]()
+        for i, (track_id, stamp_ns) in enumerate(zip(track_ids, stamps_ns, strict=True)):
+            chain = self._chains.get(track_id)
+            if chain is None:
+                others[i] = self._estimators[track_id].state_at(stamp_ns)
             else:
-                outcomes = [each.outcome(stamp_ns, one) for each, one in zip(chosen, found, strict=True)]
-            for row, outcome in zip(rows, outcomes, strict=True):
-                results[row] = outcome
-        return results
+                place = max(bisect.bisect_right(chain.stamps_ns, stamp_ns) - 1, 0)
+                chosen.append((chain.row, place, stamp_ns))
+        rows, places, at_ns = np.array(chosen, dtype=np.int64).reshape(-1, 3).T.copy()
+        found: tuple[FloatArray, FloatArray] = self._kernels.ahead(
+            self._kind, self._density, self._order, *self._steps[:6], rows, places, at_ns
+        )
+        if not others:
+            return found
+        states = iter(zip(*found, strict=True))
+        rest = [(others[i].mean, others[i].covariance) if i in others else next(states) for i in range(len(track_ids))]
+        mean, covariance = zip(*rest, strict=True)
+        return np.array(mean), np.array(covariance)
 
-    def _ahead(self, filters: Sequence[ReplayingFilter], stamps_ns: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        steps = [each.step_before(stamp_ns) for each, stamp_ns in zip(filters, stamps_ns, strict=True)]
-        mean, covariance, _ = filters[0].recursion.ahead(steps, stamps_ns)
-        return wrapped(self._motion, mean), covariance
+    def _put_in(self, track_id: int) -> None:
+        """Move the steps of a filter into the arrays, where these can hold them."""
+        one = self._estimators[track_id]
+        if not all(each.search is None and _is_plain(each.measurement) for each in one.steps):
+            return
+        k = max((len(each.measurement.z) for each in one.steps if each.measurement is not None), default=0)
+        if not self._free:
+            self._allocate(2 * len(self._order), *self._steps[7].shape[1:3])
+        chain = _Chain(self._free.pop(), [], [], one)
+        for each in one.steps:
+            self._make_room(chain, k)
+            slot = self._order[chain.row, len(chain.stamps_ns)]
+            known = each.stamp_ns, each.mean, each.covariance, *each.predicted
+            for array, value in zip(self._steps, known, strict=False):
+                array[chain.row, slot] = value
+            if each.measurement is not None:
+                own, d = each.measurement, len(each.measurement.z)
+                z, R, columns, sizes = self._steps[6:]
+                z[chain.row, slot, :d], R[chain.row, slot, :d, :d] = own.z, own.R
+                columns[chain.row, slot, :d], sizes[chain.row, slot] = own.model.selected, d
+            chain.stamps_ns.append(each.stamp_ns)
+            chain.measurements.append(each.measurement)
+        one.steps = []
+        self._chains[track_id] = chain
+
+    def _take_out(self, track_id: int) -> None:
+        """Move the steps of a filter out of the arrays, if they are there."""
+        chain = self._chains.pop(track_id, None)
+        if chain is None:
+            return
+        self._free.append(chain.row)
+        for slot, stamp_ns, measurement in zip(
+            self._order[chain.row], chain.stamps_ns, chain.measurements, strict=False
+        ):
+            mean, covariance, *before = (array[chain.row, slot].copy() for array in self._steps[1:6])
+            chain.filter.steps.append(Step(stamp_ns, measurement, mean, covariance, Prediction(*before)))
+        chain.filter.advance(self._start_ns + self._lag_ns)
 
 
-def _content(step: Step) -> Content:
-    return NOTHING if step.measurement is None else step.measurement.content
+def _is_plain(measurement: Measurement | None) -> bool:
+    """True if a measurement, or what is none, is of entries of the state, without a loss."""
+    if measurement is None:
+        return True
+    return measurement.loss is None and type(measurement.model) is MeasurementModel and measurement.model.linear
+
+
+def _place(stamps_ns: Sequence[int], measurements: Sequence[Measurement | None], new: Measurement) -> int:
+    """Index of `new` among measurements: by stamp, and at one stamp by content; never before the first."""
+    place = max(bisect.bisect_right(stamps_ns, new.stamp_ns), 1)
+    while place > 1 and stamps_ns[place - 1] == new.stamp_ns:
+        last = measurements[place - 1]
+        if last is None or last.content <= new.content:
+            break
+        place -= 1
+    return place
 
 
 def _stamp(step: Step) -> int:

@@ -96,18 +96,18 @@ class UkfRecursion(EkfRecursion):
     is linear it does as the extended Kalman filter.
     """
 
-    linearises_at_prediction = False
-
-    def predict(self, mean: FloatArray, covariance: FloatArray, dt_s: FloatArray) -> Prediction:
+    def predict(self, mean: FloatArray, covariance: FloatArray, dt_s: float) -> Prediction:
         """See `EkfRecursion.predict`."""
         if self.motion.linear:
             return super().predict(mean, covariance, dt_s)
-        after, A, noise = regression(lambda x: self.motion.predict(x, dt_s[:, None]), mean, covariance)
+        after, A, noise = regression(lambda x: self.motion.predict(x, dt_s), mean, covariance)
         AP, Q = A @ covariance, self.motion.process_noise(mean, dt_s)
         return Prediction(after, symmetrise(AP @ A.mT + noise + Q), AP)
 
     def correct_one(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
         """See `EkfRecursion.correct_one`."""
+        if measurement.model.linear:
+            return super().correct_one(mean, covariance, measurement)
         z, A, noise = measurement_regression(measurement, mean, covariance)
         y, R = measurement.model.residual(measurement.z, z), measurement.R + noise
         return updated_one(mean, covariance, y, A, R, measurement.loss, measurement.measured)

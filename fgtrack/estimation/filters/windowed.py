@@ -49,16 +49,16 @@ class WindowedFilter(ABC):
             result = self._fuse(measurement.seen_by(self._motion))
         except np.linalg.LinAlgError:
             return UpdateResult(UpdateStatus.FAILED)
-        return UpdateResult(UpdateStatus.TOO_OLD) if result is None else self.outcome(measurement.stamp_ns, result)
+        if result is None:
+            return UpdateResult(UpdateStatus.TOO_OLD)
+        return UpdateResult(self.moved_on(measurement.stamp_ns), result.innovation, result.nis, result.S)
 
-    def outcome(self, stamp_ns: int, found: OneCorrection | None) -> UpdateResult:
-        """Outcome of a measurement that was fused; None of one that could not be. The window moves on."""
-        if found is None:
-            return UpdateResult(UpdateStatus.FAILED)
+    def moved_on(self, stamp_ns: int) -> UpdateStatus:
+        """Status of a measurement that was fused; the window moves on."""
         status = UpdateStatus.OUT_OF_SEQUENCE if stamp_ns < self._newest_ns else UpdateStatus.IN_SEQUENCE
         self._newest_ns = max(self._newest_ns, stamp_ns)
         self.advance(self._newest_ns)
-        return UpdateResult(status, found.innovation, found.nis, found.S)
+        return status
 
     @abstractmethod
     def _fuse(self, measurement: Measurement) -> OneCorrection | None:

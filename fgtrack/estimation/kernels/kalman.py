@@ -93,6 +93,6 @@ def correct(
     for i in range(m):
         h = H[min(i, len(H) - 1)]
         nis[i] = innovate(P[i], y[i], h, R[i], measured, S[i], K)
-        if nis[i] == nis[i]:
+        if not np.isnan(nis[i]):
             fused[i] = correct_one(after[i], covariance[i], y[i], h, R[i], K)
     return after, covariance, nis, S, fused

@@ -1,0 +1,250 @@
+"""The extended Kalman filter with replay, of many tracks: arrays (tracks, slots, ...) hold the steps of their windows.
+
+`order[track]` has the slots of a track's steps, oldest first, and then the free ones. A step is what was measured, the
+state predicted for it (`before`, with the cross-covariance to the step before), and the state after it. Measurements
+are entries of the state: component a of a slot is entry `columns[a]`.
+"""
+
+import math
+
+import numpy as np
+
+from fgtrack.core.compiled import add_product_transposed, inlined, njit, product, solve
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.estimation.kernels.kalman import correct_one, innovate, predict_one
+from fgtrack.models.transitions import ARC, transition
+
+_YAW = 2
+
+
+@inlined
+def _wrapped(angle_rad: float) -> float:
+    """Return the angle in (-pi, pi], unchanged where it lies there."""
+    if -math.pi < angle_rad <= math.pi:
+        return angle_rad
+    wrapped = math.pi - np.mod(math.pi - angle_rad, 2.0 * math.pi)
+    return math.pi if wrapped <= -math.pi else wrapped
+
+
+@inlined
+def _copy(source: FloatArray, found: FloatArray) -> None:
+    """Fill the matrix `found` from `source`, which may be larger."""
+    for i in range(found.shape[0]):
+        for j in range(found.shape[1]):
+            found[i, j] = source[i, j]
+
+
+@inlined
+def _ahead(
+    motion: int,
+    density: FloatArray,
+    x: FloatArray,
+    P: FloatArray,
+    late_ns: int,
+    mean: FloatArray,
+    covariance: FloatArray,
+    cross: FloatArray,
+) -> None:
+    """Write mean, covariance and cross-covariance after a time: f(x), F P F' + Q and F P."""
+    F = np.empty(P.shape)
+    transition(motion, x, late_ns / NS_PER_S, density, mean, F, covariance)
+    predict_one(F, P, covariance, cross)
+
+
+@inlined
+def _innovation(x: FloatArray, z: FloatArray, columns: IntArray, wraps: bool, y: FloatArray, H: FloatArray) -> None:
+    """Write y = z - H x, and H, which selects `columns`."""
+    for a in range(len(y)):
+        y[a] = z[a] - x[columns[a]]
+        if wraps and columns[a] == _YAW:
+            y[a] = _wrapped(y[a])
+        for b in range(len(x)):
+            H[a, b] = 1.0 if b == columns[a] else 0.0
+
+
+@inlined
+def _retrodict(
+    motion: int,
+    density: FloatArray,
+    slots: IntArray,
+    new: int,
+    stamps_ns: IntArray,
+    mean: FloatArray,
+    covariance: FloatArray,
+    before: FloatArray,
+    before_P: FloatArray,
+    cross: FloatArray,
+    x: FloatArray,
+    P: FloatArray,
+) -> bool:
+    """Smooth x, P, the state after the last of the later steps in `slots`, back to the prediction of the step `new`.
+
+    From step to step (Rauch, Tung and Striebel), x_j + C s and P_j + C (P - P_-) C' with the prediction x_-, P_- of the
+    step after, the shift s = x - x_- and C = (P_-^-1 F P_j)'. False where some P_- has no root.
+    """
+    n, wraps = len(x), motion == ARC
+    ahead, ahead_P, gain, root = np.empty((1, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    shift, C, CD = np.empty(n), np.empty((n, n)), np.empty((n, n))
+    for j in range(len(slots) - 1, -1, -1):
+        after, left = slots[j], slots[j - 1] if j else new
+        late_ns = stamps_ns[after] - stamps_ns[left]
+        if late_ns == 0:  # the same state
+            continue
+        if j:
+            _copy(before[after : after + 1], ahead)
+            _copy(before_P[after], ahead_P)
+            _copy(cross[after], gain)
+        else:
+            _ahead(motion, density, before[new], before_P[new], late_ns, ahead[0], ahead_P, gain)
+        _copy(ahead_P, root)
+        if not solve(root, gain):
+            return False
+        for a in range(n):
+            shift[a] = x[a] - ahead[0, a]
+            for b in range(n):
+                C[a, b] = gain[b, a]
+                root[a, b] = P[a, b] - ahead_P[a, b]
+        if wraps:
+            shift[_YAW] = _wrapped(shift[_YAW])
+        product(C, root, CD)
+        _copy(covariance[left] if j else before_P[new], P)
+        add_product_transposed(CD, C, P)
+        for a in range(n):
+            x[a] = mean[left, a] if j else before[new, a]
+            for b in range(n):
+                x[a] += C[a, b] * shift[b]
+    return True
+
+
+@inlined
+def _step(
+    motion: int,
+    density: FloatArray,
+    left: int,
+    slot: int,
+    stamps_ns: IntArray,
+    mean: FloatArray,
+    covariance: FloatArray,
+    before: FloatArray,
+    before_P: FloatArray,
+    cross: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    columns: IntArray,
+) -> bool:
+    """Predict from the step in `left`, and fuse the measurement of `slot`; False where it cannot be fused."""
+    late_ns = stamps_ns[slot] - stamps_ns[left]
+    _ahead(motion, density, mean[left], covariance[left], late_ns, before[slot], before_P[slot], cross[slot])
+    k, n = len(z), mean.shape[1]
+    for a in range(n):
+        mean[slot, a] = before[slot, a]
+    _copy(before_P[slot], covariance[slot])
+    y, H, S, own, K = np.empty(k), np.empty((k, n)), np.empty((k, k)), np.empty((k, k)), np.empty((k, n))
+    _copy(R, own)
+    _innovation(before[slot], z, columns, motion == ARC, y, H)
+    nis = innovate(before_P[slot], y, H, own, columns[:0], S, K)
+    if np.isnan(nis) or not correct_one(mean[slot], covariance[slot], y, H, own, K):
+        return False
+    if motion == ARC:
+        mean[slot, _YAW] = _wrapped(mean[slot, _YAW])
+    return True
+
+
+_STEPS = (
+    "int64, float64[::1], int64[:, ::1], int64[:, ::1], float64[:, :, ::1], float64[:, :, :, ::1], float64[:, :, ::1], "
+    "float64[:, :, :, ::1], float64[:, :, :, ::1]"
+)
+
+
+@njit(
+    f"({_STEPS}, float64[:, :, ::1], float64[:, :, :, ::1], int64[:, :, ::1], int64[:, ::1], int64[::1], int64[::1], "
+    "int64[::1], float64[:, ::1], float64[:, :, ::1], int64[::1])"
+)
+def fuse(
+    motion: int,
+    density: FloatArray,
+    order: IntArray,
+    stamps_ns: IntArray,
+    mean: FloatArray,
+    covariance: FloatArray,
+    before: FloatArray,
+    before_P: FloatArray,
+    cross: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    columns: IntArray,
+    sizes: IntArray,
+    rows: IntArray,
+    places: IntArray,
+    counts: IntArray,
+    y: FloatArray,
+    S: FloatArray,
+    measured: IntArray,
+) -> tuple[FloatArray, BoolArray]:
+    """Put the measurement in the first free slot of each of `rows` at its place, and filter the later ones again.
+
+    `counts` are the numbers of steps. Writes innovations y (m, k) and their covariances S (m, k, k) given all that was
+    fused; returns the NIS of the entries `measured`, and False where one cannot be fused: there all is as it was.
+    """
+    (m, k), n = y.shape, mean.shape[2]
+    nis, fused = np.empty(m), np.zeros(m, np.bool_)
+    x, P, H, K, own = np.empty(n), np.empty((n, n)), np.empty((k, n)), np.empty((k, n)), np.empty((k, k))
+    for i in range(m):
+        t, place, count = rows[i], places[i], counts[i]
+        slots, at_ns = order[t], stamps_ns[t]
+        new = slots[count]
+        steps = at_ns, mean[t], covariance[t], before[t], before_P[t], cross[t]
+        ok = _step(motion, density, slots[place - 1], new, *steps, z[t, new, :k], R[t, new], columns[t, new, :k])
+        last = slots[count - 1]
+        for a in range(n):
+            x[a] = before[t, new, a] if place == count else mean[t, last, a]
+        _copy(before_P[t, new] if place == count else covariance[t, last], P)
+        if not (ok and (place == count or _retrodict(motion, density, slots[place:count], new, *steps, x, P))):
+            continue
+        _innovation(x, z[t, new, :k], columns[t, new, :k], motion == ARC, y[i], H)
+        _copy(R[t, new], own)
+        nis[i] = innovate(P, y[i], H, own, measured, S[i], K)
+        if np.isnan(nis[i]):
+            continue
+        for j in range(count, place, -1):
+            slots[j] = slots[j - 1]
+        slots[place] = new
+        for j in range(place + 1, count + 1):
+            s, d = slots[j], sizes[t, slots[j]]
+            ok = ok and _step(motion, density, slots[j - 1], s, *steps, z[t, s, :d], R[t, s], columns[t, s, :d])
+        fused[i] = ok
+        if not ok:
+            for j in range(place, count):
+                slots[j] = slots[j + 1]
+            slots[count] = new
+            for j in range(place, count):
+                s, d = slots[j], sizes[t, slots[j]]
+                _step(motion, density, slots[j - 1], s, *steps, z[t, s, :d], R[t, s], columns[t, s, :d])
+    return nis, fused
+
+
+@njit(f"({_STEPS}, int64[::1], int64[::1], int64[::1])")
+def ahead(
+    motion: int,
+    density: FloatArray,
+    order: IntArray,
+    stamps_ns: IntArray,
+    mean: FloatArray,
+    covariance: FloatArray,
+    before: FloatArray,
+    before_P: FloatArray,
+    cross: FloatArray,
+    rows: IntArray,
+    places: IntArray,
+    at_ns: IntArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Means (m, n) and covariances (m, n, n) of tracks at `at_ns`, each predicted from the step at its place."""
+    m, n = len(rows), mean.shape[2]
+    found, P, FP = np.empty((m, n)), np.empty((m, n, n)), np.empty((n, n))
+    for i in range(m):
+        t, s = rows[i], order[rows[i], places[i]]
+        _ahead(motion, density, mean[t, s], covariance[t, s], at_ns[i] - stamps_ns[t, s], found[i], P[i], FP)
+        if motion == ARC:
+            found[i, _YAW] = _wrapped(found[i, _YAW])
+    return found, P
