@@ -79,7 +79,7 @@ def scores(run: Run) -> tuple[float, float, int]:
     assert found.truth is not None
     assert found.multi_object is not None
     overall = found.truth.overall
-    return overall.errors["position_m"].rmse, found.multi_object.gospa.rms_m, overall.id_switches
+    return overall.errors["position_m"].rmse, found.multi_object.gospa["rms_m"], overall.id_switches
 
 
 def followed(recording: Path, config: str | None, track_map: str | None, tune: bool) -> Followed:

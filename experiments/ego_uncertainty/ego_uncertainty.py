@@ -114,7 +114,7 @@ def result(messages: Sequence[Message], mode: str, estimator: str) -> Result:
     tracks, truth = matching.tracks.where(matching.paired), matching.true_states[matching.paired]
     settled = tracks["stamp_ns"] >= matching.tracks["stamp_ns"].min() + nanoseconds(SETTLED_S)
     squared_m2 = (tracks["x_m"] - truth[:, 0]) ** 2 + (tracks["y_m"] - truth[:, 1]) ** 2
-    return Result(float(squared_m2[settled].mean()), float(position_nees(matching).values[settled].mean()))
+    return Result(float(squared_m2[settled].mean()), float(position_nees(matching)[settled].mean()))
 
 
 def drive(count: int, time_s: float, seed: int, duration_s: float, estimator: str) -> dict[str, Result]:

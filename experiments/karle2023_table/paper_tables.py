@@ -78,7 +78,6 @@ class ResidualSamples:
         rows, states = rows[order], states[order]
         track_ids, stamps_ns = updates["track_id"][rows], updates["stamp_ns"][rows]
         ego = ego_states(run.tables["ego"], stamps_ns)
-        ego = np.full((len(rows), 4), np.nan) if ego is None else ego
         dx_m, dy_m = (states[:, :2] - ego[:, :2]).T
         c, s = np.cos(ego[:, 2]), np.sin(ego[:, 2])
         return cls(
@@ -190,7 +189,7 @@ def _sensor_records(one: EvaluatedRun) -> Iterator[dict[str, Any]]:
         receipts_ns, delay_s = message_delays(updates.where(updates["sensor"] == sensor))
         ego = ego_states(one.run.ego, receipts_ns - np.round(delay_s * NS_PER_S).astype(np.int64))
         delay = Distribution.of(delay_s)
-        moved_m = np.empty(0) if ego is None else delay_s * ego[:, 3]
+        moved_m = delay_s * ego[:, 3]
         moved = Distribution.of(moved_m[np.isfinite(moved_m)])
         mine = samples.sensors == sensor
         detections = np.unique(samples.track_ids[mine], return_counts=True)[1].astype(np.float64)

@@ -27,7 +27,7 @@ from fgtrack.core.types import FloatArray, IntArray, Message
 from fgtrack.evaluation.comparison import paired_sums
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, within_run
 from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.evaluation.truth import ego_poses, true_paths
+from fgtrack.evaluation.truth import ego_states, true_paths
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
 from fgtrack.models.sensors import Correlation, Filter, SensorModel
@@ -77,8 +77,7 @@ def errors_of(run: Run, camera: str) -> list[Series]:
     """Of every vessel the bearings next to it, while no other vessel is near the line of sight."""
     seen = run.tables["detections"].where(run.tables["detections"]["sensor"] == camera)
     stamps_ns = seen["stamp_ns"]
-    poses = ego_poses(run.tables["ego"], stamps_ns)
-    assert poses is not None
+    poses = ego_states(run.tables["ego"], stamps_ns)
     places_m = np.stack([path.at(stamps_ns)[:, :2] for path in true_paths(run.tables["truth"])]) - poses[:, :2]
     true_rad = np.arctan2(places_m[..., 1], places_m[..., 0]) - poses[:, 2]
     found = []
@@ -144,9 +143,9 @@ def measured(source: Path, config: Config, seconds: float) -> tuple[list[list[st
         assert metrics.multi_object is not None
         nis = nis_ratios(run)
         values = (
-            *(metrics.multi_object.gospa.in_sight_rms_m, *bounds(changes[0])),
+            *(metrics.multi_object.gospa["in_sight_rms_m"], *bounds(changes[0])),
             *(metrics.truth.overall.errors["position_m"].rmse, *bounds(changes[1])),
-            *(100.0 * metrics.multi_object.clear.mota, 100.0 * metrics.multi_object.identity.idf1),
+            *(100.0 * metrics.multi_object.clear["mota"], 100.0 * metrics.multi_object.identity["idf1"]),
             *(metrics.truth.overall.breaks, metrics.truth.false_tracks),
             *(nis.get(camera, math.nan) for camera in CAMERAS),
         )

@@ -84,7 +84,7 @@ def judged(arrangement: str, source: Path, config: Config, delay_s: float) -> Fo
     scores = []
     for pair in zip(prompt, late, strict=True):
         clear = [one.metrics.multi_object.clear for one in pair if one.metrics.multi_object is not None]
-        scores.append([*(100.0 * one.mota for one in clear), *(float(one.id_switches) for one in clear)])
+        scores.append([*(100.0 * one["mota"] for one in clear), *(float(one["id_switches"]) for one in clear)])
     return Found(costs.sums(prompt, late, HORIZONS_S), scores)
 
 

@@ -12,7 +12,7 @@ from fgtrack.core.geometry import rotation
 from fgtrack.core.types import DetectionList, EgoState, FloatArray, Message, TrackStatus
 from fgtrack.evaluation.matching import match, scenes
 from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.evaluation.scores.multi_object import Clear
+from fgtrack.evaluation.scores.multi_object import clear
 from fgtrack.io.run import Run, Table
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
@@ -92,8 +92,8 @@ def raw_mota(source: Path, config: Config, run: Run) -> float:
     found = raw(run, list(scans(open_input(source, config.input).messages(), config)))
     matching = match(found, config.evaluation)
     assert matching is not None
-    clear = Clear.of(scenes(found, matching), config.evaluation.gate_m)
-    return 1.0 - (clear.misses + clear.false_positives) / (clear.pairs + clear.misses)
+    counts = clear(scenes(found, matching), config.evaluation.gate_m)
+    return 1.0 - (counts["misses"] + counts["false_positives"]) / (counts["pairs"] + counts["misses"])
 
 
 def nis_ratios(run: EvaluatedRun) -> dict[str, float]:
@@ -109,10 +109,10 @@ def scored(name: str, source: Path, config: Config, run: EvaluatedRun) -> Found:
     assert scores is not None
     values = (
         100.0 * raw_mota(source, config, run.run),
-        100.0 * scores.clear.mota,
-        100.0 * scores.identity.idf1,
-        100.0 * scores.hota.hota,
-        scores.gospa.rms_m,
+        100.0 * scores.clear["mota"],
+        100.0 * scores.identity["idf1"],
+        100.0 * scores.hota["hota"],
+        scores.gospa["rms_m"],
         truth.overall.errors["position_m"].rmse,
         truth.false_tracks / len(truth.objects),
     )

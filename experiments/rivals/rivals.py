@@ -179,7 +179,7 @@ def judged(scene: str, contestant: str, recording: str, run: fgtrack.Run) -> Res
         errors["speed_mps"].rmse,
         found.consistency.position_nees.mean,
         found.predictions["arc"]["1s"].final_m.mean,
-        100.0 * found.multi_object.clear.mota if found.multi_object else np.nan,
+        100.0 * found.multi_object.clear["mota"] if found.multi_object else np.nan,
     )
 
 

@@ -136,10 +136,10 @@ def objection(before: Run, after: Run) -> str | None:
     if (worse := harm(Outcome.of(before), Outcome.of(after))) is not None:
         return f"{worse}: tracks break at errors that the noise does not expect"
     runs = [EvaluatedRun("before", before), EvaluatedRun("after", after)]
-    for quantity in (each for contest in comparisons(runs) for each in contest.quantities):
-        found = {entry.name: entry for entry in quantity.entries}
+    for name, entries in (each for one in comparisons(runs) for each in one.quantities.items()):
+        found = {entry.name: entry for entry in entries}
         was, now = found["before"].value, found["after"].value
-        fits = quantity.name == POSITION_NEES and 1.0 / FAR_OFF <= now / _POSITION_DOF <= FAR_OFF
+        fits = name == POSITION_NEES and 1.0 / FAR_OFF <= now / _POSITION_DOF <= FAR_OFF
         if found["after"].standing == "worse" and not fits:
-            return f"{quantity.name} against the truth of the recording goes from {was:.3g} to {now:.3g}"
+            return f"{name} against the truth of the recording goes from {was:.3g} to {now:.3g}"
     return None

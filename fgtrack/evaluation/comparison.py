@@ -13,7 +13,7 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, within_run
-from fgtrack.evaluation.matching import scenes, track_errors
+from fgtrack.evaluation.matching import recorded, scenes, track_errors
 from fgtrack.evaluation.runs import EvaluatedRun, by_recording
 from fgtrack.evaluation.scores.consistency import position_nees
 from fgtrack.evaluation.scores.multi_object import gospa
@@ -54,15 +54,6 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Quantity:
-    """A quantity with its unit in the name, and its entries from the best to the worst. Less is better, but for the
-    NEES."""
-
-    name: str
-    entries: tuple[Entry, ...]
-
-
-@dataclass(frozen=True)
 class Comparison:
     """Runs of one recording.
 
@@ -75,17 +66,13 @@ class Comparison:
     most_samples
         Those of the run with most of them.
     quantities
-        Those that all runs have.
+        By name, with the unit in it, the entries from the best to the worst; those that all runs have.
     """
 
     runs: tuple[str, ...]
     samples: int
     most_samples: int
-    quantities: tuple[Quantity, ...]
-
-    def __getitem__(self, name: str) -> tuple[Entry, ...]:
-        """Entries of a quantity from the best to the worst; empty where not all runs have it."""
-        return next((one.entries for one in self.quantities if one.name == name), ())
+    quantities: Mapping[str, tuple[Entry, ...]]
 
 
 def comparisons(runs: Sequence[EvaluatedRun]) -> list[Comparison]:
@@ -100,12 +87,6 @@ def comparable(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
         for one in group:
             groups.setdefault((number, one.options), []).append(one)
     return list(groups.values())
-
-
-def is_best(compared: Sequence[Comparison], quantity: str, run: str) -> bool:
-    """True if `run` is better than all other runs of its recording, none of which ties with it."""
-    first = (entries[0] for one in compared if (entries := one[quantity]))
-    return any(entry.name == run and entry.standing == "best" for entry in first)
 
 
 def ranked(
@@ -135,7 +116,7 @@ def entry_columns(heading: str, name: str = "value") -> list[Column]:
     """The value of an entry with its standing, the best one bold, and how much worse it is."""
     return [
         Column(
-            f"{heading}  ",
+            heading,
             f"{name} standing",
             "{} {}",
             text=lambda value: _MARKS.get(value, "") or short(value),
@@ -165,7 +146,7 @@ class Paired(NamedTuple):
 def paired_sums(group: Sequence[EvaluatedRun]) -> Paired:
     """The errors of `group`, runs of one recording, at the same objects and stamps, stamp by stamp."""
     matchings = [one.matching for one in group if one.matching is not None]
-    errors, squares = [track_errors(one) for one in matchings], [position_nees(one).values for one in matchings]
+    errors, squares = [track_errors(one) for one in matchings], [position_nees(one) for one in matchings]
     codes, at_ns, rows = common_samples([one.object_index for one in errors], [one.stamps_ns for one in errors])
     sums: dict[str, FloatArray] = {}
     if len(at_ns):
@@ -203,7 +184,7 @@ def common_samples(
     return [len(codes) for codes, _ in found], every_ns[common % max(len(every_ns), 1)], rows
 
 
-def quantity(name: str, labels: Sequence[str], ticks: FloatArray) -> Quantity:
+def compared(name: str, labels: Sequence[str], ticks: FloatArray) -> tuple[Entry, ...]:
     """The runs by rising cost, and how much worse than the best they are.
 
     `ticks` has a column of sums for each run and one of counts, shape (n, runs + 1). The cost is the root of the mean,
@@ -220,13 +201,13 @@ def quantity(name: str, labels: Sequence[str], ticks: FloatArray) -> Quantity:
 
     *numerators, count = ticks.sum(axis=0).tolist()
     means = np.array(numerators) / count
-    return Quantity(name, ranked(labels, means if is_nees else np.sqrt(means), cost(means), worse_by))
+    return ranked(labels, means if is_nees else np.sqrt(means), cost(means), worse_by)
 
 
 def _comparison(group: Sequence[EvaluatedRun]) -> Comparison:
     paired, labels = paired_sums(group), tuple(one.label for one in group)
-    quantities = [quantity(name, labels, ticks) for name, ticks in paired.sums.items() if ticks[:, -1].any()]
-    return Comparison(labels, paired.samples, paired.most_samples, tuple(quantities))
+    quantities = {name: compared(name, labels, ticks) for name, ticks in paired.sums.items() if ticks[:, -1].any()}
+    return Comparison(labels, paired.samples, paired.most_samples, quantities)
 
 
 def _gospa_sums(group: Sequence[EvaluatedRun]) -> FloatArray:
@@ -235,9 +216,10 @@ def _gospa_sums(group: Sequence[EvaluatedRun]) -> FloatArray:
     Visible is what a sensor of any run could see, so that all are measured alike; runs without a known field of view
     are left out of that, unless none has one.
     """
-    common_ns = functools.reduce(np.intersect1d, [one.scored_ticks_ns for one in group])
-    rows = [np.searchsorted(one.scored_ticks_ns, common_ns) for one in group]
     matchings = [one.matching for one in group if one.matching is not None]
+    ticks_ns = [one.now_ns[recorded(each.run, one.now_ns)] for each, one in zip(group, matchings, strict=True)]
+    common_ns = functools.reduce(np.intersect1d, ticks_ns)
+    rows = [np.searchsorted(one, common_ns) for one in ticks_ns]
     there = [scenes(one.run, matching) for one, matching in zip(group, matchings, strict=True)]
     asked = [k for k, matching in enumerate(matchings) if matching.is_sight_known] or list(range(len(group)))
     seen = np.any([there[k].in_sight[rows[k]] for k in asked], axis=0)
@@ -246,5 +228,5 @@ def _gospa_sums(group: Sequence[EvaluatedRun]) -> FloatArray:
         in_sight = scene.in_sight.copy()
         in_sight[mine] = seen
         parts = gospa(replace(scene, in_sight=in_sight), one.options.gate_m)
-        columns.append(np.square(parts.in_sight_m[mine]))
+        columns.append((parts.total_m2 - parts.out_of_sight_m2)[mine])
     return np.stack([*columns, np.ones(len(common_ns))], axis=-1)

@@ -102,12 +102,6 @@ class Fragmentation:
         """Median lifetime; NaN without tracks."""
         return float(np.median(self.lifetimes_s)) if len(self.lifetimes_s) else math.nan
 
-    @property
-    def breaks_per_minute(self) -> float:
-        """Breaks per minute of all lifetimes together; NaN without tracks."""
-        minutes = float(self.lifetimes_s.sum()) / 60.0
-        return self.breaks / minutes if minutes else math.nan
-
 
 def diagnostics(run: Run) -> list[Diagnostic]:
     """Defects of `run`, as far as its files show them."""
@@ -345,11 +339,12 @@ def _fragmentation(run: Run) -> Iterator[Diagnostic]:
     """Tracks that break off and begin again, and births that die unconfirmed: bad tracking that needs no truth."""
     found, now_ns = Fragmentation.of(run), run.tables["timing"]["now_ns"]
     total, recorded_s = len(found.lifetimes_s), float(np.ptp(now_ns)) / NS_PER_S if len(now_ns) else 0.0
+    minutes = float(found.lifetimes_s.sum()) / 60.0
     enough = found.breaks >= max(_FEWEST_BREAKS, _BREAKS_SHARE * total)
-    if enough and found.breaks_per_minute > MOST_BREAKS_PER_MINUTE:
+    if enough and found.breaks > MOST_BREAKS_PER_MINUTE * minutes:
         text = (
             f"{found.breaks} of {total} confirmed tracks begin where another one has just ended: "
-            f"{found.breaks_per_minute:.2g} breaks per object and minute, median life {found.median_s:.2g} of "
+            f"{found.breaks / minutes:.2g} breaks per object and minute, median life {found.median_s:.2g} of "
             f"{recorded_s:.3g} s; likely causes: a field of view or range larger than what a sensor covers, "
             f"detection_probability, lifecycle.lifetime_s, noise; `{_advise(run)}` looks for them"
         )

@@ -65,15 +65,8 @@ def paired(values_a: Sequence[float] | FloatArray, values_b: Sequence[float] | F
     """Mean of `values_a` minus `values_b` and its 95 % interval; entry k of both is of the same seed.
 
     `average` of the differences. A relative difference comes from logarithms: `exp(paired(log(a), log(b)).mean) - 1`.
-
-    Raises
-    ------
-    ValueError
-        The two have different lengths.
     """
     a, b = np.asarray(values_a, dtype=np.float64), np.asarray(values_b, dtype=np.float64)
-    if a.ndim != 1 or a.shape != b.shape:
-        raise ValueError(f"paired values must be two lists of one length, are of shape {a.shape} and {b.shape}")
     return average((a - b)[np.isfinite(a) & np.isfinite(b)])
 
 

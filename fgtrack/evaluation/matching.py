@@ -237,7 +237,7 @@ def scenes(run: Run, matching: Matching) -> Scenes:
 
     An object is present where its truth is known at the tick. A row is as far from it as at the row's own stamp.
     """
-    scored = recorded(run, matching)
+    scored = recorded(run, matching.now_ns)
     rows = np.flatnonzero(scored[matching.tick_index])
     rows = rows[np.argsort(matching.tick_index[rows], kind="stable")]
     tick_index, present = (np.cumsum(scored) - 1)[matching.tick_index[rows]], matching.present[scored]
@@ -246,17 +246,13 @@ def scenes(run: Run, matching: Matching) -> Scenes:
     return Scenes(tick_index, matching.tracks["track_id"][rows], distances_m, present, matching.in_sight[scored])
 
 
-def recorded(run: Run, matching: Matching) -> BoolArray:
-    """True for the ticks of `matching` between the first and the last stamp of the truth, shape (ticks,)."""
-    return _while_recorded(run, matching.now_ns)
-
-
 def confirmed(tracks: Table) -> BoolArray:
     """True for the rows of tracks.csv that are not tentative, shape (rows,)."""
     return np.asarray(tracks["status"] != TrackStatus.TENTATIVE.value)
 
 
-def _while_recorded(run: Run, stamps_ns: IntArray) -> BoolArray:
+def recorded(run: Run, stamps_ns: IntArray) -> BoolArray:
+    """True for those of `stamps_ns` between the first and the last stamp of the truth, shape (n,)."""
     truth_ns = run.tables["truth"]["stamp_ns"]
     return np.asarray((stamps_ns >= truth_ns.min()) & (stamps_ns <= truth_ns.max()))
 
@@ -267,7 +263,7 @@ def _evaluated(run: Run, options: EvaluationConfig) -> BoolArray:
     Only a run that was killed has rows of a tick that is missing in timing.csv.
     """
     tracks = run.tables["tracks"]
-    kept = _while_recorded(run, tracks["stamp_ns"]) & np.isin(tracks["tick"], run.tables["timing"]["tick"])
+    kept = recorded(run, tracks["stamp_ns"]) & np.isin(tracks["tick"], run.tables["timing"]["tick"])
     return kept & confirmed(tracks) if options.confirmed_only else kept
 
 

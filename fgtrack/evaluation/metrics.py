@@ -10,7 +10,7 @@ import numpy as np
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Disposition
 from fgtrack.evaluation.diagnostics import excluded_lines
-from fgtrack.evaluation.matching import ERROR_NAMES, Matching, confirmed, match, track_errors
+from fgtrack.evaluation.matching import ERROR_NAMES, Matching, confirmed, match, scenes, track_errors
 from fgtrack.evaluation.scores.consistency import Consistency, consistency
 from fgtrack.evaluation.scores.continuity import breaks, late_switches, switches, times_to_confirm, tracked_visits
 from fgtrack.evaluation.scores.deadlines import Deadlines
@@ -247,6 +247,7 @@ def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationCon
     """Metrics of `run`, whose `match` by these `options` is known."""
     tracks, timing = run.tables["tracks"], run.tables["timing"]
     busy = timing["num_detections"] > 0
+    scored = scenes(run, matching) if matching is not None and options.multi_object else None
     time_s, detections = timing["process_ns"][busy] / NS_PER_S, timing["num_detections"][busy]
     return Metrics(
         name="" if run.path is None else run.path.resolve().name,
@@ -262,7 +263,7 @@ def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationCon
         deadlines=Deadlines.of(run),
         truth=None if matching is None else _truth_metrics(run, matching, options),
         lagged=lag_metrics(run, matching),
-        multi_object=multi_object_metrics(run, matching, options),
+        multi_object=None if scored is None else multi_object_metrics(scored, options.gate_m),
         predictions=prediction_errors(run, matching),
         failures=dict(run.meta.get("failures") or {}),
         left_out=tuple(excluded_lines(run.meta)),

@@ -7,7 +7,7 @@ import numpy as np
 
 from fgtrack.core.geometry import cartesian, rotations, wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.evaluation.truth import ego_poses
+from fgtrack.evaluation.truth import ego_states
 from fgtrack.io.run import Run
 from fgtrack.io.run.schema import Column
 
@@ -36,9 +36,7 @@ def placed(run: Run) -> Placed:
     """
     table = run.tables["detections"]
     frame, stamps_ns = table["frame"], table["stamp_ns"]
-    poses = ego_poses(run.tables["ego"], stamps_ns)
-    if poses is None:
-        poses = np.full((len(stamps_ns), 3), np.nan)
+    poses = ego_states(run.tables["ego"], stamps_ns)
     mounts = _mounts(run, table["sensor"], frame == "sensor")
     sensor_m, sensor_rad = _moved(poses[:, :2], poses[:, 2], mounts[:, :2]), poses[:, 2] + mounts[:, 2]
     in_map = frame == "map"

@@ -12,9 +12,8 @@ import numpy as np
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import MEASURABLE, IntArray
-from fgtrack.evaluation.matching import Matching, match, recorded
+from fgtrack.evaluation.matching import Matching, match
 from fgtrack.evaluation.metrics import Metrics, evaluate_matched
-from fgtrack.evaluation.scores.lagged import LagMetrics
 from fgtrack.io.run import EvaluationConfig, Run, Table, is_run_folder, load_run
 
 
@@ -42,18 +41,6 @@ class EvaluatedRun:
     def options(self) -> EvaluationConfig:
         """Settings of the evaluation."""
         return self.run.evaluation
-
-    @cached_property
-    def scored_ticks_ns(self) -> IntArray:
-        """Times of the ticks that scores over all objects are made of, shape (t,); empty without truth."""
-        if self.matching is None:
-            return np.zeros(0, dtype=np.int64)
-        return self.matching.now_ns[recorded(self.run, self.matching)]
-
-    @property
-    def lagged(self) -> tuple[LagMetrics, ...]:
-        """Errors of present, lagged and final states; empty for a run without truth."""
-        return self.metrics.lagged
 
     @cached_property
     def metrics(self) -> Metrics:

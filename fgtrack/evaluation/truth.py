@@ -135,8 +135,8 @@ def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> tuple[Bool
     """
     positions_m = np.stack([path.at(now_ns)[:, :2] for path in paths], axis=1)
     present = np.asarray(np.isfinite(positions_m).all(axis=-1))
-    sensors, poses = _sensors(run), ego_poses(run.tables["ego"], now_ns)
-    if poses is None or not sensors:
+    sensors, poses = _sensors(run), ego_states(run.tables["ego"], now_ns)[:, :3]
+    if np.isnan(poses).all() or not sensors:
         return present, False
     ego = run.config.get("ego") or {}
     origin_m = (float(ego.get("detection_origin_x_m", 0.0)), float(ego.get("detection_origin_y_m", 0.0)))
@@ -146,18 +146,15 @@ def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> tuple[Bool
     return present & seen, all(map(_is_limited, sensors))
 
 
-def ego_poses(ego: Table, stamps_ns: IntArray) -> FloatArray | None:
-    """x, y and yaw (not wrapped) of the ego at `stamps_ns`, shape (n, 3), constant beyond the ends; None if unknown."""
-    states = ego_states(ego, stamps_ns)
-    return None if states is None else states[:, :3]
+def ego_states(ego: Table, stamps_ns: IntArray) -> FloatArray:
+    """x, y, yaw (not wrapped) and speed of the ego at `stamps_ns`, shape (n, 4), constant beyond the ends.
 
-
-def ego_states(ego: Table, stamps_ns: IntArray) -> FloatArray | None:
-    """As `ego_poses`, with the speed, shape (n, 4)."""
+    NaN where no state of it is known.
+    """
     rows = np.stack([ego[name] for name in ("x_m", "y_m", "yaw_rad", "speed_mps")], axis=-1)
     known = np.flatnonzero(np.isfinite(rows[:, :3]).all(axis=1))
     if not len(known):
-        return None
+        return np.full((len(stamps_ns), 4), np.nan)
     at_ns, first = np.unique(ego["stamp_ns"][known], return_index=True)
     rows = rows[known[first]]
     rows[:, 2] = np.unwrap(rows[:, 2])

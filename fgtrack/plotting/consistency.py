@@ -94,10 +94,10 @@ def _panels(one: EvaluatedRun) -> dict[str, _Squares]:
     """Stamps, normalised squares and degrees of freedom to show, by name of the panel."""
     found: dict[str, _Squares] = {}
     if one.matching is not None:
-        nees = position_nees(one.matching)
-        known = np.isfinite(nees.values)
+        values, stamps_ns = position_nees(one.matching), one.matching.tracks["stamp_ns"][one.matching.paired]
+        known = np.isfinite(values)
         if known.any():
-            found[_NEES] = nees.stamps_ns[known], nees.values[known], nees.dof[known]
+            found[_NEES] = stamps_ns[known], values[known], np.full(known.sum(), 2)
     updates = one.run.tables["updates"]
     measured = num_measured(updates)
     for sensor in np.unique(updates["sensor"]).tolist():

@@ -164,13 +164,16 @@ def lag(runs: Runs, quantity: str = "position_m", **paper: Unpack[Paper]) -> Fig
         No run has truth of this quantity.
     """
     every = evaluated(runs)
-    if quantity not in _QUANTITIES or not any(entry.errors[quantity].count for one in every for entry in one.lagged):
+    if quantity not in _QUANTITIES or not any(
+        entry.errors[quantity].count for one in every for entry in one.metrics.lagged
+    ):
         raise DataError(f"no run has tracks with truth of {quantity}, so there are no errors to draw")
     what, unit, factor = _QUANTITIES[quantity]
     sheet = Sheet(7.0, 4.2, paper)
     axes: Axes = sheet.plots()[0, 0]
     for one, its in zip(every, run_looks(every).values(), strict=True):
-        curve = [one.lagged[0], *(entry for entry in one.lagged if entry.is_lagged)] if one.lagged else []
+        lagged = one.metrics.lagged
+        curve = [*lagged[:1], *(entry for entry in lagged if entry.is_lagged)]
         rmse = [factor * entry.errors[quantity].rmse for entry in curve]
         given: dict[str, Any] = {"color": its.colour, "ls": its.line, "lw": 1.6}
         if len(curve) > 1:

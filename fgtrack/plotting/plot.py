@@ -91,7 +91,7 @@ def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
         by_error = sorted(ids, key=lambda object_id: max(_rmse_m(one, object_id) for one in runs), reverse=True)
     for k in ids:
         plans.append(Planned(f"errors_object_{k}", partial(errors, runs, k), many and k not in by_error[:_FEW]))
-    if any(entry.is_lagged for one in runs for entry in one.lagged):
+    if any(entry.is_lagged for one in runs for entry in one.metrics.lagged):
         plans.append(Planned("error_against_lag", partial(lag, runs)))
     if any((one.run.tables["timing"]["num_detections"] > 0).any() for one in runs):
         plans.append(Planned("timing", partial(timing, runs)))

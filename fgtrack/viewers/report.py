@@ -15,7 +15,7 @@ import fgtrack
 from fgtrack.core.errors import printable
 from fgtrack.evaluation.diagnostics import diagnostics, noise_diagnostics
 from fgtrack.evaluation.runs import EvaluatedRun, recordings_warning
-from fgtrack.evaluation.tables import Table, Tables, grid
+from fgtrack.evaluation.tables import Tables, html_cell
 from fgtrack.io.output import new_file
 from fgtrack.viewers.playback import Moment, playback
 
@@ -24,7 +24,6 @@ _FIRST = ("close_up", "errors", "error_against_delay", "error_against_lag", "map
 _CAPTIONS = {"error_against_delay": "error against delay: a sweep over ten races that comes with fgtrack"}
 _MOST_OPEN, _MOST_WARNINGS = 3, 3
 _NONE = "–"
-_LONG = 40  # characters of a cell that may be broken
 _PNG_SIZE = slice(16, 24)  # of its header
 
 
@@ -104,7 +103,11 @@ def _page(runs: Sequence[EvaluatedRun], tables: Tables, pictures: Iterable[tuple
     folded_parts = {
         "Assumptions": _list(opening.assumptions),
         "Advice": _list(opening.advice),
-        "Tables": "".join(_table(table) for table in tables.in_full().tables.values() if table.records),
+        "Tables": "".join(
+            _wide(printable(table.title), table.to_html()) + _list(table.shown_notes(), "soft")
+            for table in tables.in_full().tables.values()
+            if table.records
+        ),
         "More figures": _figures(text for name, text in figures.items() if name not in first),
         "Configuration": _configuration(runs),
         "Runs": _grid("What they were made of", _FACTS, [_facts(one) for one in runs]),
@@ -149,37 +152,20 @@ def _list(lines: Iterable[str], kind: str = "") -> str:
     return f"<ul{name}>\n{items}</ul>\n" if items else ""
 
 
-def _table(table: Table) -> str:
-    """A table as people read it; the name of a run is in its first row only."""
-    shown = table.shown()
-    head = "".join(_cell("th", column.heading, column.left) for column in shown)
-    rows = []
-    for row in list(grid(shown, lambda text, bold: (text, bold)))[1:]:
-        cells = (_cell("td", text, column.left, bold) for column, (text, bold) in zip(shown, row, strict=True))
-        rows.append(f"<tr>{''.join(cells)}</tr>\n")
-    return _wide(printable(table.title), head, "".join(rows)) + _list(table.shown_notes(), "soft")
-
-
 def _grid(title: str, names: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A table of texts."""
-    lines = (f"<tr>{''.join(_cell('td', text, True) for text in row)}</tr>\n" for row in rows)
-    return _wide(title, "".join(_cell("th", name, True) for name in names), "".join(lines))
+    lines = (f"<tr>{''.join(html_cell('td', text, True) for text in row)}</tr>\n" for row in rows)
+    head = "".join(html_cell("th", name, True) for name in names)
+    return _wide(title, f"<thead><tr>{head}</tr></thead>\n<tbody>\n{''.join(lines)}</tbody>\n")
 
 
-def _wide(title: str, head: str, rows: str) -> str:
+def _wide(title: str, content: str) -> str:
     """A table that scrolls sideways where the page is narrower."""
     name = escape(title)
     return (
-        f'<h3>{name}</h3>\n<div class="wide" tabindex="0" role="region" aria-label="{name}"><table>\n'
-        f"<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}</tbody>\n</table></div>\n"
+        f'<h3>{name}</h3>\n<div class="wide" tabindex="0" role="region" aria-label="{name}">'
+        f"<table>\n{content}</table></div>\n"
     )
-
-
-def _cell(tag: str, text: str, is_left: bool, is_bold: bool = False) -> str:
-    content = escape(text).replace("\n", "<br>")
-    kinds = [name for name, has in (("left", is_left), ("long", len(text) > _LONG)) if has]
-    kind = f' class="{" ".join(kinds)}"' if kinds else ""
-    return f"<{tag}{kind}>{f'<b>{content}</b>' if is_bold else content}</{tag}>"
 
 
 def _figures(texts: Iterable[str]) -> str:

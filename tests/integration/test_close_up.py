@@ -177,10 +177,3 @@ def test_the_command_draws_it_and_goes_on_without_a_recording(
         assert "recording of the run is not there" in capsys.readouterr().err
     finally:
         (tmp_path / "drive.jsonl").rename(folder / "drive.jsonl")
-
-
-def test_a_configuration_of_a_run_that_is_none_is_bad_data(folder: Path, found: list[CloseUp]) -> None:
-    run = fgtrack.load_run(folder / "runs" / NAMES[0])
-    spoilt = replace(run, config_text="estimator: [1]")
-    with pytest.raises(fgtrack.DataError, match=r"config\.yaml: estimator: .*, so no close-up$"):
-        close_up_of(spoilt, found[0].arrival)

@@ -34,7 +34,6 @@ from fgtrack.pipeline.shipped import shipped_folder
 from fgtrack.viewers.export import export, viewer_messages
 from fgtrack.viewers.foxglove import values, write_foxglove
 from fgtrack.viewers.ros2 import write_ros2
-from fgtrack.viewers.run_messages import truth_messages
 from fgtrack.viewers.shapes import Scene, Shape, ViewerMessage
 
 Times = Counter[tuple[int, int]]
@@ -108,16 +107,6 @@ def bag(runs: Path) -> dict[str, list[BagMessage]]:
     out = runs.parent / "rosbag"
     assert command(["export", str(runs / "smoother"), "-o", str(out), "--ros2"]) == 0
     return read_bag(out)
-
-
-def test_truth_of_a_negative_id_is_shown_and_the_ego_is_not() -> None:
-    columns = {"stamp_ns": 1, "object_id": 1, "x_m": 2.0, "y_m": 3.0, "yaw_rad": 0.1}
-    truth = Table(
-        {name: np.array([value] * 3) for name, value in columns.items()} | {"object_id": np.array([-1, -5, 0])}
-    )
-    _, poses = truth_messages(truth)
-    [message] = poses
-    assert [one.object_id for one in message.content] == [-5, 0]
 
 
 def test_every_topic_has_the_messages_and_both_times_of_the_run(
@@ -265,29 +254,6 @@ def described(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_box_has_the_size_that_detections_told_and_its_label_the_class(described: Path, tmp_path: Path) -> None:
-    [message] = messages_of(described)["/tracks"]
-    car, unknown = message.content.entities
-    assert car.shapes[0].size_m == (4.2, 1.7, 1.2)  # the height of a racing car
-    assert unknown.shapes[0].size_m == (4.8, 2.0, 1.2)
-    assert [one.shapes[1].text for one in (car, unknown)] == ["1 car", "2"]
-    assert (car.facts["class"], unknown.facts.get("class")) == ("car", None)
-    export([described], tmp_path / "bag", ros2=True)
-    car, unknown = read_bag(tmp_path / "bag")["/tracks"][0].data.detections
-    assert [(one.bbox.size.x, one.bbox.size.y, one.bbox.size.z) for one in (car, unknown)] == [(4.2, 1.7, 0), (0, 0, 0)]
-    assert [one.results[0].hypothesis.class_id for one in (car, unknown)] == ["car", ""]
-
-
-def test_an_ellipse_reaches_two_standard_deviations_along_its_axes(by_hand: Path) -> None:
-    first, second = messages_of(by_hand)["/ellipses"]
-    straight, turned = shapes(first)
-    assert straight.size_m[:2] == pytest.approx((8.0, 4.0))  # 2 sigma to both sides: 4 times 2, 4 times 1
-    assert (straight.at_m, straight.height_m, straight.yaw_rad) == ((98.0, 68.0), 1.25, 0.0)  # on its box
-    assert turned.size_m[:2] == pytest.approx((12.0, 2.0))  # 4 times 3, 4 times 0.5
-    assert turned.yaw_rad == pytest.approx(0.5 + math.pi / 2)
-    assert second.content.removed == ("track 4",)
-
-
 def test_a_bag_shows_a_run_made_by_hand(by_hand: Path, tmp_path: Path) -> None:
     export([by_hand], tmp_path / "bag", ros2=True)
     found = read_bag(tmp_path / "bag")
@@ -342,14 +308,6 @@ def test_what_is_sent_once_reaches_those_who_listen_later(bag: dict[str, list[Ba
                 lasting.add(connection.topic)
     assert lasting == {"/map/markers", "/ego/markers"}
     assert all(len(bag[topic]) == 1 for topic in lasting)
-
-
-def test_the_same_run_gives_the_same_bytes(file: Path, runs: Path, tmp_path: Path) -> None:
-    export([runs / "smoother"], tmp_path / "again.mcap")
-    assert (tmp_path / "again.mcap").read_bytes() == file.read_bytes()
-    for folder in ("a", "b"):
-        export([runs / "smoother"], tmp_path / folder / "a.mcap", ros2=True)
-    assert (tmp_path / "a/a.mcap").read_bytes() == (tmp_path / "b/a.mcap").read_bytes()
 
 
 @pytest.mark.parametrize("options", [["x.mcap"], ["x.mcap", "--ros2"], ["bag", "--ros2"]])
@@ -419,21 +377,6 @@ def test_without_the_sdk_of_foxglove_one_line_says_what_to_install(
     [line] = capsys.readouterr().err.splitlines()
     assert "pip install foxglove-sdk" in line
     assert command(["export", str(runs / "ekf-replay"), "-o", str(tmp_path / "bag"), "--ros2"]) == 0
-
-
-def test_a_run_that_was_killed_is_exported_up_to_there(runs: Path, tmp_path: Path) -> None:
-    (tmp_path / "run").mkdir()
-    for path in (runs / "smoother").iterdir():
-        content = path.read_bytes()
-        (tmp_path / "run" / path.name).write_bytes(content[: len(content) // 2] if path.suffix == ".csv" else content)
-    meta = json.loads((tmp_path / "run/meta.json").read_text())
-    (tmp_path / "run/meta.json").write_text(json.dumps({"format": meta["format"], "complete": False}))
-    export([tmp_path / "run"], tmp_path / "x.mcap")
-    updates = load_run(tmp_path / "run").updates
-    assert read(tmp_path / "x.mcap")["/outcomes"].total() == len(updates) > 0
-    (tmp_path / "run/updates.csv").write_text((tmp_path / "run/updates.csv").read_text().splitlines()[0] + "\n")
-    export([tmp_path / "run"], tmp_path / "y.mcap")
-    assert {"/outcomes", "/arrivals"} & set(read(tmp_path / "y.mcap")) == set()
 
 
 # Several runs, and runs of which something is missing

@@ -20,7 +20,6 @@ from fgtrack.evaluation.placement import placed
 from fgtrack.evaluation.runs import evaluated
 from fgtrack.io.run import Table
 from fgtrack.viewers.playback import playback
-from fgtrack.viewers.report import flattened
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = ("ekf-replay", "smoother")
@@ -182,14 +181,6 @@ def test_runs_of_different_recordings_have_each_their_own_map_and_time(folder: P
     assert [one["recording"] for one in shown["runs"]] == [0, 1]
 
 
-def test_old_runs_without_detections_and_ego_are_shown_and_noted(folder: Path, tmp_path: Path) -> None:
-    for name in ("config.yaml", "meta.json", "tracks.csv", "updates.csv", "timing.csv"):
-        (tmp_path / name).write_bytes((folder / "runs" / NAMES[0] / name).read_bytes())
-    shown, notes = playback(evaluated(tmp_path))
-    assert any("no detections.csv" in note for note in notes)
-    assert len(shown["runs"][0]["tracks"]["t"]) > 100
-
-
 def test_a_sensor_whose_clock_is_years_off_has_no_stamps(folder: Path) -> None:
     run = fgtrack.load_run(folder / "runs" / NAMES[0])
     off = {"stamp_ns": run.tables["detections"]["stamp_ns"] - 10**18}
@@ -235,11 +226,6 @@ def test_a_bad_call_is_one_line(
     assert command(["report", str(folder / first), *(word.format(tmp=tmp_path) for word in rest)]) == 2
     (told,) = capsys.readouterr().err.splitlines()
     assert line in told
-
-
-def test_settings_are_flattened_by_their_path() -> None:
-    flat = flattened({"a": {"b": 1, "c": [1, 2]}, "d": None, "e": {}})
-    assert flat == {"a.b": "1", "a.c": "[1, 2]", "d": "null", "e": "{}"}
 
 
 def test_the_wheel_holds_the_templates(tmp_path: Path) -> None:

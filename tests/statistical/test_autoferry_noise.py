@@ -18,7 +18,7 @@ def test_vessels_are_tracked_with_noise_that_fits() -> None:
         metrics = evaluate(fgtrack.replay(shared(f"data/autoferry/scenario{number}"), "autoferry"))
         assert metrics.multi_object is not None
         assert metrics.truth is not None
-        motas.append(metrics.multi_object.clear.mota)
+        motas.append(metrics.multi_object.clear["mota"])
         false.append(metrics.truth.false_tracks / len(metrics.truth.objects))
         for sensor in ("lidar", "radar"):
             found = metrics.consistency.nis[sensor]

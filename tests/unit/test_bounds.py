@@ -100,14 +100,6 @@ def test_the_bounds_along_trajectories_are_the_mean_of_those_of_each() -> None:
         np.testing.assert_allclose(mean, np.mean(single, axis=0), rtol=1e-12)
 
 
-def test_in_a_linear_model_trajectories_do_not_matter() -> None:
-    motion = CV(5.0)
-    x, P = initial_state(motion, PRIOR)
-    about = motion, START_NS, P, planned(motion), straight(motion, x, trajectories=2), NOW_NS
-    for along, posterior in zip(bounds_along(*about), bounds(*about), strict=True):
-        np.testing.assert_allclose(along, posterior, rtol=1e-12)
-
-
 @pytest.mark.parametrize("function", [bounds, bounds_along])
 def test_a_measurement_before_the_start_is_refused(function: Callable[..., Bounds]) -> None:
     motion = CV(5.0)

@@ -9,7 +9,7 @@ import pytest
 from evaluation_runs import ROUND, WEST, update, write_run
 
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.comparison import Comparison, Quantity, comparisons
+from fgtrack.evaluation.comparison import Comparison, comparisons
 from fgtrack.evaluation.runs import EvaluatedRun, same_recording
 from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.run import Run
@@ -35,10 +35,6 @@ def comparison_of(runs: Sequence[Run]) -> Comparison:
     return found
 
 
-def quantities_of(contest: Comparison) -> dict[str, Quantity]:
-    return {one.name: one for one in contest.quantities}
-
-
 def rms(values: FloatArray) -> float:
     return math.sqrt(float(np.square(values).mean()))
 
@@ -52,39 +48,34 @@ def trio(tmp_path_factory: pytest.TempPathFactory) -> list[Run]:
 
 
 def test_the_best_run_and_those_that_tie_with_it_and_how_much_worse_the_others_are(trio: list[Run]) -> None:
-    found = quantities_of(comparison_of(trio))["position_rmse_m"]
-    assert [(entry.name, entry.standing) for entry in found.entries] in (
+    found = comparison_of(trio).quantities["position_rmse_m"]
+    assert [(entry.name, entry.standing) for entry in found] in (
         [("1", "tie"), ("2", "tie"), ("0", "worse")],
         [("2", "tie"), ("1", "tie"), ("0", "worse")],
     )
-    values = {entry.name: entry.value for entry in found.entries}
+    values = {entry.name: entry.value for entry in found}
     assert values["1"] == pytest.approx(rms(NOISE_M), rel=1e-9)
-    worse = found.entries[2].worse_by
+    worse = found[2].worse_by
     assert worse is not None
-    assert worse.mean == pytest.approx(values["0"] - found.entries[0].value)
+    assert worse.mean == pytest.approx(values["0"] - found[0].value)
     assert worse.low < rms(NOISE_M) < worse.high
-    assert found.entries[0].worse_by is None
-    assert {entry.name for entry in found.entries if entry.standing == "tie"} == {"1", "2"}
-
-
-def test_without_the_tie_the_best_is_best(trio: list[Run]) -> None:
-    found = quantities_of(comparison_of(trio[:2]))["position_rmse_m"]
-    assert [(entry.name, entry.standing) for entry in found.entries] == [("1", "best"), ("0", "worse")]
+    assert found[0].worse_by is None
+    assert {entry.name for entry in found if entry.standing == "tie"} == {"1", "2"}
 
 
 def test_gospa_is_that_of_the_metrics(trio: list[Run]) -> None:
-    found = quantities_of(comparison_of(trio))["gospa_in_sight_rms_m"]
+    found = comparison_of(trio).quantities["gospa_in_sight_rms_m"]
     expected = {
-        one.label: one.metrics.multi_object.gospa.in_sight_rms_m for one in judged(trio) if one.metrics.multi_object
+        one.label: one.metrics.multi_object.gospa["in_sight_rms_m"] for one in judged(trio) if one.metrics.multi_object
     }
-    assert {entry.name: entry.value for entry in found.entries} == pytest.approx(expected)
-    assert found.entries[-1].name == "0"
+    assert {entry.name: entry.value for entry in found} == pytest.approx(expected)
+    assert found[-1].name == "0"
 
 
 def test_gospa_is_left_out_where_the_scores_of_all_tracks_are_not_asked_for(tmp_path: Path) -> None:
     plain = "evaluation: {multi_object: false}"
     runs = [a_run(tmp_path / name, NOISE_M, config_text=plain) for name in "ab"]
-    assert set(quantities_of(comparison_of(runs))) == {
+    assert set(comparison_of(runs).quantities) == {
         *("position_rmse_m", "speed_rmse_mps", "yaw_rmse_rad", "position_nees")
     }
 
@@ -93,14 +84,14 @@ def test_of_the_nees_the_nearest_to_two_is_best(tmp_path: Path) -> None:
     """The covariance of a track is the identity, so its NEES is its squared error."""
     noise = np.random.default_rng(2).normal(0.0, 0.2, TICKS)
     near, cautious = a_run(tmp_path / "a", math.sqrt(1.8) + noise), a_run(tmp_path / "b", 0.2 + noise)
-    found = quantities_of(comparison_of([cautious, near]))
-    assert [entry.name for entry in found["position_nees"].entries] == ["1", "0"]
-    assert found["position_nees"].entries[0].standing == "best"
-    best, other = found["position_nees"].entries
+    found = comparison_of([cautious, near]).quantities
+    assert [entry.name for entry in found["position_nees"]] == ["1", "0"]
+    assert found["position_nees"][0].standing == "best"
+    best, other = found["position_nees"]
     assert best.value == pytest.approx(1.8, rel=0.1)
     assert other.worse_by is not None
     assert other.worse_by.mean == pytest.approx(abs(other.value - 2.0) - abs(best.value - 2.0))
-    assert [entry.name for entry in found["position_rmse_m"].entries] == ["0", "1"]
+    assert [entry.name for entry in found["position_rmse_m"]] == ["0", "1"]
 
 
 def test_only_samples_that_all_runs_have_are_compared(tmp_path: Path) -> None:
@@ -111,7 +102,7 @@ def test_only_samples_that_all_runs_have_are_compared(tmp_path: Path) -> None:
     runs[1] = runs[1].with_tables(updates=runs[0].tables["updates"])
     found = comparison_of(runs)
     assert (found.samples, found.most_samples) == (150, 200)
-    entries = quantities_of(found)["position_rmse_m"].entries
+    entries = found.quantities["position_rmse_m"]
     assert [entry.value for entry in entries] == pytest.approx([rms(NOISE_M[50:])] * 2)
     assert {entry.standing for entry in entries} == {"tie"}
     assert "150 samples in common, of up to 200" in str(compare(runs))

@@ -76,9 +76,9 @@ def test_the_yaw_rate_counts_where_truth_and_model_have_one(tmp_path: Path) -> N
     straight[4, 4] = 0.0
     state = tracks[3][0].state
     tracks[3] = [replace(tracks[3][0], state=replace(state, covariance=straight))]
-    nees = state_nees(matching_of(write_run(tmp_path / "run", tracks, truth=truth)))
-    assert nees.dof.tolist() == [5, 5, 5, 4]
-    assert nees.values == pytest.approx([0.0625] * 3 + [0.0], abs=1e-9)
+    values, dof = state_nees(matching_of(write_run(tmp_path / "run", tracks, truth=truth)))
+    assert dof.tolist() == [5, 5, 5, 4]
+    assert values == pytest.approx([0.0625] * 3 + [0.0], abs=1e-9)
 
 
 def test_nis_has_the_degrees_of_freedom_of_what_was_measured(tmp_path: Path) -> None:
@@ -99,16 +99,6 @@ def test_the_band_is_that_of_a_sum_of_independent_squares() -> None:
     low, high = ChiSquareMean(40, 2.0, 2.5).band
     assert (low, high) == pytest.approx(tuple(chi2.ppf([0.025, 0.975], 100) / 40))
     assert all(map(math.isnan, ChiSquareMean().band))
-
-
-def test_the_band_holds_the_mean_of_19_in_20_samples() -> None:
-    rng = np.random.default_rng(2)
-    samples = [ChiSquareMean.of(rng.chisquare(2, 15), np.full(15, 2)) for _ in range(2000)]
-    below = np.mean([one.mean < one.band[0] for one in samples])
-    above = np.mean([one.mean > one.band[1] for one in samples])
-    spread = 4.0 * math.sqrt(0.025 * 0.975 / 2000)  # 4 standard deviations of each share
-    assert below == pytest.approx(0.025, abs=spread)
-    assert above == pytest.approx(0.025, abs=spread)
 
 
 # --- whiteness
@@ -190,19 +180,3 @@ def test_correlated_and_biased_innovations_leave_their_bands(tmp_path: Path) -> 
     biased = whiteness(innovations_run(tmp_path / "biased", {0: 1.0 + correlated_errors(1, 400, 0.0)[0]}))
     assert biased.lag1 == pytest.approx(0.5, abs=0.1)
     assert biased.share_outside == 1.0
-
-
-def test_every_innovation_of_a_sensor_is_looked_at(tmp_path: Path) -> None:
-    values = np.random.default_rng(0).normal(size=(FEWEST, 4))
-    run = innovations_run(tmp_path / "run", {1: values}, ("x_m", "y_m", "yaw_rad", "speed_mps"))
-    found = evaluate(run).consistency.autocorrelation["lidar"]
-    assert list(found) == ["position_m", "yaw_rad", "speed_mps"]
-    bearings = innovations_run(tmp_path / "bearings", {1: values[:, :1]}, ("bearing_rad",))
-    assert list(evaluate(bearings).consistency.autocorrelation["lidar"]) == ["bearing_rad"]
-
-
-def test_too_few_innovations_tell_nothing(tmp_path: Path) -> None:
-    run = innovations_run(tmp_path / "run", {1: np.ones((FEWEST - 1, 2)), 2: np.zeros((0, 2))})
-    assert evaluate(run).consistency.autocorrelation["lidar"] == {}
-    zeros = innovations_run(tmp_path / "zeros", {1: np.zeros((FEWEST, 2))})
-    assert evaluate(zeros).consistency.autocorrelation["lidar"] == {}

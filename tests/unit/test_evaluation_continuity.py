@@ -9,9 +9,8 @@ from evaluation_runs import ROUND, WEST, update, write_run
 
 from fgtrack.core.types import Disposition, UpdateRecord
 from fgtrack.evaluation.matching import match
-from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.scores.continuity import late_switches, times_to_confirm
-from fgtrack.io.run import EvaluationConfig, Run
+from fgtrack.io.run import Run
 
 LATE = Disposition.OUT_OF_SEQUENCE
 GATE_M = 5.0
@@ -54,15 +53,6 @@ def test_a_switch_is_late_soon_after_an_out_of_sequence_update_of_one_of_the_two
     assert late_of(switching_run(tmp_path / "run", updates), 0.1) == [late, 0]
 
 
-def test_several_late_updates_make_one_late_switch(tmp_path: Path) -> None:
-    updates = {k: [update(tick=k, disposition=LATE, track_id=1)] for k in range(8, 10)}
-    run = switching_run(tmp_path / "run", updates)
-    overall = evaluate(run).truth
-    assert overall is not None
-    assert (overall.overall.id_switches, overall.overall.late_id_switches) == (1, 1)
-    assert late_of(run, 0.0) == [0, 0]
-
-
 def test_an_update_of_a_tick_that_was_never_finished_does_not_count(tmp_path: Path) -> None:
     run = switching_run(tmp_path / "run", {12: [update(disposition=LATE, track_id=2)], 19: [update(disposition=LATE)]})
     finished = run.tables["timing"]["tick"] < 15
@@ -91,16 +81,6 @@ def test_the_time_to_confirm_is_from_the_first_stamp_to_the_tick_of_the_first_co
     west, round_ = confirm_of(run)
     assert west == pytest.approx((8 - 2) * 0.02)
     assert math.isnan(round_)
-
-
-def test_a_row_counts_at_its_tick_and_when_it_is_confirmed_whatever_is_judged(tmp_path: Path) -> None:
-    """Rows are stamped a tick before the one that publishes them."""
-    tracks = [[], *[[WEST.track(k - 1, 1, num_measured=k)] for k in range(1, 6)]]
-    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(6)), updates={1: [update(tick=0)]})
-    for options in (EvaluationConfig(), EvaluationConfig(confirmed_only=False)):
-        matching = match(run, options)
-        assert matching is not None
-        assert times_to_confirm(run, matching, GATE_M).tolist() == [pytest.approx(3 * 0.02)]
 
 
 def test_a_track_that_died_unconfirmed_counts_as_the_first_detection(tmp_path: Path) -> None:
@@ -136,15 +116,3 @@ def test_a_detection_belongs_to_the_nearest_object(tmp_path: Path) -> None:
     updates = {3: [update(tick=1, track_id=2)], 4: [update(tick=3, track_id=1)]}
     run = write_run(tmp_path / "run", tracks, truth=[*WEST.truth(range(6)), *twin.truth(range(6))], updates=updates)
     assert confirm_of(run) == [pytest.approx(2 * 0.02), pytest.approx(4 * 0.02)]
-
-
-def test_overall_is_the_mean_of_the_objects(tmp_path: Path) -> None:
-    tracks = [[WEST.track(k, 1, num_measured=k + 1), ROUND.track(k, 2, num_measured=k - 2)] for k in range(6)]
-    updates = {0: [update(track_id=1)], 2: [update(tick=2, track_id=2)]}
-    run = write_run(tmp_path / "run", tracks, truth=[*WEST.truth(range(6)), *ROUND.truth(range(6))], updates=updates)
-    truth = evaluate(run).truth
-    assert truth is not None
-    overall = truth.overall
-    assert (overall.time_to_confirm_s.count, overall.time_to_confirm_s.mean) == (2, pytest.approx(0.05))
-    times_s = [one.time_to_confirm_s.mean for one in truth.objects.values()]
-    assert times_s == [pytest.approx(0.04), pytest.approx(0.06)]

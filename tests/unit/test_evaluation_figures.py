@@ -196,16 +196,6 @@ def test_arrivals_show_the_part_with_the_most_late_detections(tmp_path: Path) ->
         assert {y for line in axes.lines for y in line.get_ydata()} == {delay_ms}
 
 
-@pytest.mark.usefixtures("names")
-def test_a_file_is_named_after_its_figure_and_run(tmp_path: Path) -> None:
-    run = write_run(tmp_path / "a run", updates={0: [update(x_m=1.0, y_m=1.0, delay_ns=1)]})
-    (tmp_path / "out").mkdir()
-    files = plot.save_named(plot.drawn(plot.planned(evaluated(run))), tmp_path / "out", "svg")
-    assert [file.name for file in files] == [
-        *("residuals_a_run_smoother.svg", "arrivals.svg", "delays.svg", "timing.svg")
-    ]
-
-
 @pytest.mark.parametrize("name", [name for name in EXPECTED if name != "map"])
 def test_without_data_there_is_one_clear_error(name: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="to draw"):
@@ -244,39 +234,6 @@ def test_exclusion_areas_are_shown_on_the_map_and_in_the_viewer(tmp_path: Path, 
     scene = next(message.content for message in messages if message.topic == "/map")
     assert [len(line.points_m) for line in scene.entities[0].shapes] == [4, 5]
     assert notes[0] == "map.excluded: lost.csv is not there any more, so it is not shown"
-
-
-def test_without_truth_the_map_shows_the_tracks_with_enough_measurements(runs: list[Run]) -> None:
-    plain = runs[0].with_tables(
-        truth=runs[0].tables["truth"].where(np.zeros(len(runs[0].tables["truth"]["stamp_ns"]), dtype=bool))
-    )
-    assert "3 confirmed tracks, no truth" in plot.map(plain).get_suptitle()
-
-
-def test_outliers_do_not_widen_the_residual_figure_but_are_counted(tmp_path: Path) -> None:
-    values = [0.1 * (k % 11) - 0.5 for k in TICKS]
-    values[7] = 99.0
-    updates = {k: [update(tick=k, speed_mps=value)] for k, value in enumerate(values)}
-    axes = plot.residuals(write_run(tmp_path / "run", updates=updates)).axes[0]
-    assert axes.get_ylim()[1] < 5.0
-    assert np.asarray(axes.lines[0].get_xdata())[[0, -1]].tolist() == [0.0, 59 * 0.02]
-    assert legend(axes)[0].endswith("n 60 (1 outside)")
-
-
-def test_errors_of_several_objects_are_their_root_mean_square(runs: list[Run]) -> None:
-    axes = plot.errors(runs[0]).axes[0]
-    y = np.asarray(axes.lines[0].get_ydata(), dtype=float)
-    assert y[[30, -1]] == pytest.approx([0.3, 0.3 / np.sqrt(2.0)])  # WEST alone is tracked, then both
-    assert legend(axes) == [f"smoother: RMSE {0.3 * np.sqrt(60 / 74):.3g} m"]
-    with pytest.raises(DataError, match="object 9: no run has truth of it, there are 7, 8"):
-        plot.errors(runs, 9)
-
-
-def test_the_time_figure_leaves_out_ticks_without_detections(tmp_path: Path) -> None:
-    run = write_run(tmp_path / "run", process_ns=[1_000_000, 2_000_000, 4_000_000], num_detections=[0, 1, 1])
-    (axes,) = plot.timing(run).axes
-    x_ms = np.asarray(axes.lines[0].get_xdata(), dtype=float)
-    assert set(x_ms[np.isfinite(x_ms)]) == {2.0, 4.0}
 
 
 def test_a_line_is_not_drawn_across_a_pause() -> None:

@@ -28,7 +28,7 @@ def region(tick: int, x_m: float, y_m: float, half_m: float = 10.0) -> TruthStat
 def false_positives(run: Run) -> int:
     found = evaluate(run).multi_object
     assert found is not None
-    return found.clear.false_positives
+    return int(found.clear["false_positives"])
 
 
 def test_a_track_of_an_ignored_object_is_not_false_and_none_is_not_a_miss(tmp_path: Path) -> None:
@@ -38,12 +38,12 @@ def test_a_track_of_an_ignored_object_is_not_false_and_none_is_not_a_miss(tmp_pa
     assert false_positives(write_run(tmp_path / "without", tracks, truth=truth)) == 10
     judged = evaluate(write_run(tmp_path / "with", tracks, truth=[*truth, *van])).multi_object
     assert judged is not None
-    assert (judged.clear.false_positives, judged.clear.misses, judged.clear.mota) == (0, 0, 1.0)
+    assert (judged.clear["false_positives"], judged.clear["misses"], judged.clear["mota"]) == (0, 0, 1.0)
     assert judged.gospa.false_m2 == judged.gospa.missed_m2 == 0.0
     alone = [[WEST.track(tick, 1)] for tick in TICKS]
     judged = evaluate(write_run(tmp_path / "alone", alone, truth=[*truth, *van])).multi_object
     assert judged is not None
-    assert (judged.clear.misses, judged.clear.mota) == (0, 1.0)
+    assert (judged.clear["misses"], judged.clear["mota"]) == (0, 1.0)
 
 
 def test_a_true_object_beside_an_ignored_one_keeps_its_track(tmp_path: Path) -> None:

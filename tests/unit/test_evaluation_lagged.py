@@ -1,6 +1,5 @@
 """Lagged and final states against truth: metrics and figure."""
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +9,7 @@ from evaluation_runs import ROUND, WEST, write_run
 
 from fgtrack.core.types import SmoothedReport
 from fgtrack.evaluation.matching import match
-from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.scores.lagged import WINDOW, LagMetrics, lag_metrics
-from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.io.run import Run
 from fgtrack.plotting.plot import lag
 
@@ -97,13 +94,6 @@ def test_a_state_belongs_to_the_object_that_its_track_followed_at_its_stamp(tmp_
     assert entry.errors["position_m"].rmse == pytest.approx(0.5)
 
 
-def test_a_state_outside_of_the_life_of_its_track_is_not_judged(tmp_path: Path) -> None:
-    tracks = [[WEST.track(k, 1)] if 5 <= k < 15 else [] for k in TICKS]
-    final = [WEST.later(tick, 1) for tick in (3, 4.9, 5, 7.7, 14, 14.1, 17)] + [WEST.later(7, 2)]
-    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS), smoothed={19: final})
-    assert lagged_of(run)[WINDOW].errors["position_m"].count == 3
-
-
 def test_where_truth_has_ended_neither_the_state_nor_its_present_one_counts(tmp_path: Path) -> None:
     """Truth of WEST ends at tick 10, which is nearest to the state at tick 10.4."""
     tracks = [[WEST.track(k, 1)] for k in TICKS]
@@ -125,26 +115,6 @@ def test_nees_weighs_the_error_with_the_covariance(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS), smoothed={10: states})
     nees = lagged_of(run)[0.1].position_nees
     assert (nees.count, nees.mean) == (2, pytest.approx(18.0))
-
-
-def test_a_filter_has_its_present_states_alone(tmp_path: Path) -> None:
-    metrics = evaluate(filter_run(tmp_path / "run"))
-    assert metrics.truth is not None
-    (present,) = metrics.lagged
-    assert present.lag_s == 0.0
-    assert present.errors == present.present_errors == metrics.truth.overall.errors
-    assert not present.is_lagged
-    assert present.position_nees.mean == pytest.approx(9.0)
-
-
-def test_a_gain_over_nothing_is_no_number(tmp_path: Path) -> None:
-    smoothed = {k: [WEST.later(k - 5, 1, 0.1)] for k in range(5, 20)}
-    far = [[WEST.track(k, 1, across_m=60.0)] for k in TICKS]
-    entry = lagged_of(write_run(tmp_path / "run", far, truth=WEST.truth(TICKS), smoothed=smoothed))[0.1]
-    assert math.isnan(entry.gain("position_m"))
-    assert not entry.is_lagged
-    exact = {"position_m": Moments(3, 0.0, 0.0)}
-    assert math.isnan(LagMetrics(0.1, exact, Moments(), exact).gain("position_m"))
 
 
 # --- figure
@@ -175,10 +145,3 @@ def test_the_figure_has_a_line_per_run_and_a_level_one_for_a_filter(tmp_path: Pa
         low, high = axes.get_ylim()
         assert low == 0.0
         assert high > max(float(np.max(np.asarray(line.get_ydata()))) for line in axes.lines if len(line.get_xdata()))
-
-
-def test_truth_without_speed_leaves_the_speed_out(tmp_path: Path) -> None:
-    tracks = [[WEST.track(k, 1, along_m=1.0)] for k in TICKS]
-    smoothed = {k: [WEST.later(k - 5, 1, 0.1, along_m=0.5)] for k in range(5, 20)}
-    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS, pose=False), smoothed=smoothed)
-    assert [axes.get_ylabel() for axes in lag(run).axes] == ["position RMSE [m]"]

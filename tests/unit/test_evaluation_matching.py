@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import TruthState
-from fgtrack.evaluation.matching import NO_OBJECT, ambiguous, match, nearest_pairs, track_errors
+from fgtrack.evaluation.matching import NO_OBJECT, match, nearest_pairs, track_errors
 from fgtrack.evaluation.truth import TruePath, true_paths
 from fgtrack.io.run import NO_TRACK, EvaluationConfig
 
@@ -43,12 +43,6 @@ def test_truth_at_its_own_stamps_is_the_recorded_state_to_the_bit() -> None:
     states = [(0.1, 0.7, 0.3, 9.1), (1e3 / 3, 2.0, math.nan, 9.3), (7.7, 3.1, -3.1, math.nan)]
     path = path_of(*states)
     np.testing.assert_array_equal(path.at(path.stamps_ns), np.array(states))
-
-
-def test_there_is_no_truth_outside_its_time_span() -> None:
-    path = path_of((0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 1.0))
-    around = path.at(START_NS + np.array([-1, 0, S_NS, S_NS + 1]))
-    assert np.isfinite(around).all(axis=1).tolist() == [False, True, True, False]
 
 
 def test_there_is_no_truth_while_an_object_is_away() -> None:
@@ -102,27 +96,6 @@ def test_errors_are_along_and_across_the_true_heading(tmp_path: Path) -> None:
     assert matching.track_ids.tolist() == [[1, 2]] * 5
 
 
-def test_a_pair_inside_the_gate_stays_though_another_track_is_nearer(tmp_path: Path) -> None:
-    tracks = [
-        [WEST.track(0, 1, along_m=0.1), WEST.track(0, 2, along_m=3.0)],
-        [WEST.track(1, 1, along_m=4.0), WEST.track(1, 2, along_m=0.0)],
-        [WEST.track(2, 1, along_m=5.1), WEST.track(2, 2, along_m=1.0)],
-    ]
-    matching = match(write_run(tmp_path / "run", tracks, truth=WEST.truth(range(3))))
-    assert matching is not None
-    assert matching.track_ids[:, 0].tolist() == [1, 1, 2]
-
-
-def test_nothing_is_paired_outside_the_gate(tmp_path: Path) -> None:
-    tracks = [[WEST.track(0, 1, across_m=2.1)], [WEST.track(1, 1, across_m=2.0 - 1e-9)], []]
-    run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(3)))
-    matching = match(run, EvaluationConfig(gate_m=2.0))
-    assert matching is not None
-    assert matching.track_ids[:, 0].tolist() == [NO_TRACK, 1, NO_TRACK]
-    assert matching.present.all()
-    assert matching.object_index.tolist() == [NO_OBJECT, 0]
-
-
 def test_tentative_tracks_are_judged_only_if_asked(tmp_path: Path) -> None:
     tracks = [[WEST.track(k, 1, num_measured=k + 1)] for k in range(4)]
     run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(4)))
@@ -156,10 +129,6 @@ def test_a_track_with_an_infinite_state_is_paired_to_nothing(tmp_path: Path) -> 
     assert matching.object_index.tolist() == [NO_OBJECT, 0]
 
 
-def test_a_run_without_truth_has_no_matching(tmp_path: Path) -> None:
-    assert match(write_run(tmp_path / "run", [[WEST.track(0, 1)]])) is None
-
-
 def assigned(distances_m: np.ndarray) -> list[tuple[int, int]]:
     """Pairs of the rows of one tick; infinite distances lie outside the gate."""
     rows = np.arange(len(distances_m))
@@ -172,12 +141,6 @@ distances = hnp.arrays(
     hnp.array_shapes(min_dims=2, max_dims=2, max_side=5),
     elements=st.one_of(st.floats(0.0, 10.0), st.just(np.inf)),
 )
-
-
-def test_three_far_pairs_are_more_than_two_near_ones() -> None:
-    """However much cheaper: 27 m against 2 m."""
-    distances_m = np.array([[1.0, 9.0, np.inf], [np.inf, 1.0, 9.0], [9.0, np.inf, np.inf]])
-    assert assigned(distances_m) == [(0, 1), (1, 2), (2, 0)]
 
 
 @settings(deadline=None)
@@ -219,12 +182,6 @@ def test_pairs_inside_the_gate_stay_and_the_rest_is_assigned(seed: int, density:
     assert nearest_pairs(distances_m, ids, tick_index, ticks, 10.0).tolist() == expected.tolist()
 
 
-def test_a_tick_is_ambiguous_where_a_row_or_an_object_has_a_choice() -> None:
-    inside = np.array([[1, 0], [0, 1], [1, 1], [1, 0], [1, 0], [0, 0]], dtype=bool)
-    tick_index = np.array([0, 0, 1, 2, 2, 3])
-    assert ambiguous(inside, tick_index, 5).tolist() == [False, True, True, False, False]
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -243,9 +200,3 @@ def test_a_configuration_that_cannot_be_used_is_one_clear_error(tmp_path: Path, 
     run = write_run(tmp_path / "run", config_text=text)
     with pytest.raises(DataError, match=message):
         _ = run.evaluation
-
-
-def test_what_the_configuration_does_not_say_has_its_default(tmp_path: Path) -> None:
-    run = write_run(tmp_path / "run", config_text="evaluation: {confirmed_only: false, of_a_later_version: 1}")
-    assert run.evaluation == EvaluationConfig(confirmed_only=False)
-    assert dataclasses.replace(run, config_text="").evaluation == EvaluationConfig()

@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 from fgtrack.core.types import Disposition, TrackReport
 from fgtrack.evaluation.metrics import Metrics, ObjectMetrics, evaluate
 from fgtrack.evaluation.scores.statistics import Moments
-from fgtrack.io.run import EvaluationConfig, Run
+from fgtrack.io.run import Run
 
 samples = hnp.arrays(np.float64, st.integers(0, 20), elements=st.floats(-1e3, 1e3))
 
@@ -71,28 +71,6 @@ def test_time_tracked_breaks_and_switches_are_counted(story: Run) -> None:
     assert west.tracked_share == pytest.approx(0.8)
 
 
-def test_errors_have_their_known_moments(story: Run) -> None:
-    errors = objects_of(evaluate(story))[7].errors
-    assert errors["position_m"].rmse == pytest.approx(2.5)
-    assert errors["position_m"].std == pytest.approx(0.0, abs=1e-9)
-    assert errors["across_m"].mean == pytest.approx(2.0)
-    # 5 of 8 rows at +1.5 m, 3 at -1.5 m; yaw and speed the other way round
-    assert errors["along_m"].mean == pytest.approx(1.5 / 4.0)
-    assert errors["along_m"].std == pytest.approx(1.5 * math.sqrt(1 - 1 / 16))
-    assert errors["along_m"].rmse == pytest.approx(1.5)
-    assert errors["yaw_rad"].mean == pytest.approx(-0.05)
-    assert errors["yaw_rad"].rmse == pytest.approx(0.2)
-    assert errors["speed_mps"].mean == pytest.approx(-0.25)
-
-
-def test_overall_is_all_objects_together(story: Run) -> None:
-    metrics = evaluate(story)
-    assert metrics.truth is not None
-    overall = metrics.truth.overall
-    assert (overall.ticks_present, overall.ticks_tracked, overall.breaks) == (19, 16, 2)
-    assert overall.errors["position_m"].rmse == pytest.approx(math.sqrt((8 * 6.25 + 8 * 1.0) / 16))
-
-
 def test_false_tracks_and_precision(story: Run) -> None:
     metrics = evaluate(story)
     assert metrics.truth is not None
@@ -115,29 +93,6 @@ def test_precision_counts_every_visit_of_an_object(tmp_path: Path) -> None:
     assert metrics.truth is not None
     assert (metrics.truth.tracked_objects, metrics.truth.tracked_visits) == (1, 2)
     assert metrics.precision == 2.0  # one track for both
-
-
-def test_precision_counts_confirmed_tracks_whatever_is_judged(story: Run) -> None:
-    metrics = evaluate(story, options=EvaluationConfig(confirmed_only=False))
-    assert metrics.truth is not None
-    assert metrics.truth.judged_tracks == 5
-    assert metrics.precision == pytest.approx(2 / 4)
-
-
-@pytest.mark.parametrize(("paired", "false"), [(4, 1), (5, 0)])
-def test_a_track_is_false_when_paired_for_less_than_half_of_its_life(tmp_path: Path, paired: int, false: int) -> None:
-    tracks = [[WEST.track(k, 1, across_m=0.0 if k < paired else 20.0)] for k in range(10)]
-    metrics = evaluate(write_run(tmp_path / "run", tracks, truth=WEST.truth(range(10))))
-    assert metrics.truth is not None
-    assert metrics.truth.false_tracks == false
-
-
-def test_an_object_that_was_never_tracked_has_no_errors(tmp_path: Path) -> None:
-    metrics = evaluate(write_run(tmp_path / "run", [[], []], truth=WEST.truth(range(2))))
-    west = objects_of(metrics)[7]
-    assert (west.ticks_present, west.ticks_tracked, west.breaks, west.id_switches) == (2, 0, 0, 0)
-    assert math.isnan(west.errors["position_m"].rmse)
-    assert math.isnan(metrics.precision)
 
 
 def test_truth_without_heading_gives_position_errors_only(tmp_path: Path) -> None:
@@ -201,21 +156,6 @@ def test_the_delay_of_a_message_counts_once(tmp_path: Path) -> None:
     assert (delay_s.count, delay_s.max) == (2, 0.2)
     assert delay_s.mean == pytest.approx(0.15)
     assert delay_s.p90 == pytest.approx(0.19)
-
-
-def test_time_is_that_of_ticks_with_detections(tmp_path: Path) -> None:
-    run = write_run(tmp_path / "run", process_ns=[1_000, 4_000, 9_000, 6_000], num_detections=[0, 2, 0, 1])
-    time_s = evaluate(run).time_per_tick_s
-    assert (time_s.count, time_s.max) == (2, 6e-6)
-    assert time_s.p50 == pytest.approx(5e-6)
-
-
-def test_a_run_without_truth_has_the_rest(tmp_path: Path) -> None:
-    metrics = evaluate(write_run(tmp_path / "run", [[WEST.track(0, 1)]], updates={0: [update(nis=2.0)]}))
-    assert metrics.truth is None
-    assert metrics.num_tracks == 1
-    assert metrics.sensors["lidar"].nis.mean == 2.0
-    assert math.isnan(metrics.precision)
 
 
 def test_metrics_are_strict_json(story: Run) -> None:

@@ -122,11 +122,6 @@ def test_of_many_points_it_is_shown_how_often_who_is_best() -> None:
     assert table.data.to_numpy().tolist() == [["a", 20, 10, 0], ["b", 0, 10, 20]]
 
 
-def test_a_single_seed_shows_nothing() -> None:
-    assert shown_tables(seed_comparisons(rows_of({"a": [1.0], "b": [2.0]}), ()), ()) == []
-    assert shown_tables([], ()) == []
-
-
 def test_a_summary_has_mean_and_standard_error_of_each_point_and_estimator() -> None:
     values = {"a": [0.4, 0.5, 0.6, 0.5], "b": [0.9, 1.0, 1.1, 1.0]}
     cells = {"late": "much", "delay": '{"kind": "none"}'}
@@ -146,11 +141,3 @@ def test_a_summary_has_mean_and_standard_error_of_each_point_and_estimator() -> 
     assert "**0.500 ± 0.041**" in shown.to_markdown()
     assert "**1.00" not in shown.to_markdown()
     assert next(csv.DictReader(io.StringIO(shown.to_csv())))["delay"] == cells["delay"]
-
-
-def test_a_summary_of_few_metrics_shows_those_that_there_are() -> None:
-    rows = rows_of({"a": [1.0, 2.0], "b": [1.0, 2.0]}, "lagged.0.3.errors.yaw_rad.rmse")
-    text = str(summary_table(SweepTable((), ("lagged.0.3.errors.yaw_rad.rmse",), rows), []))
-    assert "lagged.0.3" in text
-    assert "1.50 ± 0.500" in text
-    assert "bold" not in text

@@ -11,7 +11,6 @@ from test_figure_texts import a_run
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.runs import EvaluatedRun, evaluated
 from fgtrack.plotting import plot
-from fgtrack.plotting.paper import inches
 
 
 @pytest.fixture(scope="module")
@@ -55,13 +54,6 @@ def test_axes_of_ones_own_are_drawn_into(runs: list[EvaluatedRun]) -> None:
     with pytest.raises(CallError, match="needs axes made by"):
         plot.errors(runs, ax=figure.add_axes((0.0, 0.0, 1.0, 1.0)))
     plt.close(figure)
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"), [("3.4in", 3.4), ("86mm", 86 / 25.4), ("8.6 cm", 8.6 / 2.54), (3.4, 3.4)]
-)
-def test_a_width_has_a_unit_or_is_in_inches(text: str | float, expected: float) -> None:
-    assert inches(text) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

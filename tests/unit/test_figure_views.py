@@ -12,10 +12,7 @@ from matplotlib.lines import Line2D
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray
 from fgtrack.evaluation.palette import look
 from fgtrack.evaluation.runs import evaluated
-from fgtrack.io.run import Table
 from fgtrack.plotting import plot
-from fgtrack.plotting.errors import moving_rms
-from fgtrack.plotting.ranges import bulk
 
 TICKS = range(60)
 
@@ -58,15 +55,6 @@ def test_ego_and_detections_are_on_the_map(tmp_path: Path) -> None:
     assert (x_of(found)[0], y_of(found)[0]) == pytest.approx((10.0, 25.0))
 
 
-def test_the_bulk_of_a_sample_leaves_out_what_is_far_away() -> None:
-    low, high = bulk([np.array([*np.linspace(0.0, 1.0, 101), 1e6, np.nan])])
-    assert -0.2 < low < 0.0 < 1.0 < high < 3.0
-    assert bulk([np.zeros(0)]) == (0.0, 1.0)
-    assert bulk([np.zeros(3)], [np.array([-10.0, 10.0])]) == (-11.0, 11.0)
-    for value in (1e9, -1e18, 1e300):
-        assert (np.diff(np.linspace(*bulk([np.full(3, value)]), 41)) > 0.0).all()
-
-
 # --- NEES and NIS
 
 
@@ -106,23 +94,6 @@ def test_curves_that_coincide_are_both_seen_for_one_is_dashed(tmp_path: Path) ->
     assert (smoother.get_linestyle(), replay.get_linestyle()) == ("-", "--")
     assert final.get_color() == smoother.get_color() == look("smoother").colour != replay.get_color()
     assert str(final.get_label()).startswith("smoother, final state: RMSE 0.1")
-
-
-def test_an_error_is_the_root_mean_square_of_those_around_it() -> None:
-    stamps_ns = np.array([0, 0, 10, 20, 30, 1000])
-    found_ns, rms = moving_rms(stamps_ns, np.array([3.0, 4.0, 1.0, np.nan, 2.0, 7.0]), 20)
-    assert found_ns.tolist() == [0, 10, 30, 1000]
-    np.testing.assert_allclose(rms, [np.sqrt(26 / 3), np.sqrt(26 / 3), 2.0, 7.0])
-
-
-def test_runs_of_another_day_begin_at_zero_as_well(tmp_path: Path) -> None:
-    runs = [write_run(tmp_path / name, [[WEST.track(k, 1)] for k in TICKS], truth=WEST.truth(TICKS)) for name in "ab"]
-    day_ns = 86_400 * 1_000_000_000
-    for table, names in (("tracks", ("now_ns", "stamp_ns")), ("timing", ("now_ns",)), ("truth", ("stamp_ns",))):
-        moved = Table({name: of + day_ns if name in names else of for name, of in runs[1].tables[table].items()})
-        runs[1] = runs[1].with_tables(**{table: moved})
-    first, second = plot.errors(runs).axes[0].lines
-    np.testing.assert_allclose(x_of(first), x_of(second))
 
 
 # --- few

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.kitti import RECTIFIED_FROM_IMU, folder, oxts
-from support.messages import shared
 from typer.testing import CliRunner
 
 from fgtrack.cli.main import app
@@ -183,16 +182,3 @@ def test_the_evaluation_of_the_field_takes_the_result(tmp_path, replayed):
     assert found["CLR_FP"] == found["IDSW"] == 0
     assert found["CLR_FN"] <= 2 * 2  # until a track is confirmed
     assert found["MOTA"] > 0.9
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_the_evaluation_of_the_field_takes_the_result_of_a_real_sequence(tmp_path):
-    root = shared("data/kitti")
-    oxts_file = root / "oxts/0006.txt"
-    run = replay(oxts_file, "kitti", estimator="ekf-replay")
-    (tmp_path / "gt").mkdir()
-    (tmp_path / "gt/label_02").symlink_to(root / "label_02")
-    write_kitti_result(run, oxts_file, tmp_path / "trackers/fgtrack/data/0006.txt")
-    found = judged(tmp_path, "0006", 270)
-    assert found["MOTA"] > 0.8
-    assert found["MOTP"] > 0.75

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import fgtrack
 from fgtrack.cli.main import app
 from fgtrack.core.types import Detection, DetectionList, Disposition
-from fgtrack.evaluation.diagnostics import excluded_lines, reasons
+from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.io.adapters.scans import grouped
 from fgtrack.io.stream import write_stream
 from fgtrack.models.sensors import Filter, SensorModel
@@ -58,11 +58,6 @@ def test_score_class_and_speed_decide_what_is_used_and_the_rest_is_out_of_bounds
     }
 
 
-def test_a_filter_goes_by_what_detections_have() -> None:
-    with pytest.raises(ValueError, match=r"unknown 'snr', known are x_m, .*score"):
-        replace(RADAR, filters={"snr": Filter(min=1.0)})
-
-
 def test_a_run_counts_what_was_left_out_by_sensor_and_setting_and_compare_shows_it(tmp_path: Path) -> None:
     config = tmp_path / "config.yaml"
     config.write_text(
@@ -106,7 +101,3 @@ def test_a_recording_that_is_converted_says_what_it_holds_no_more(tmp_path: Path
     )
     said = CliRunner().invoke(app, ["convert", str(table), str(out), "-c", str(config)])
     assert "radar: 2 left out when read (2 by filters.snr)" in said.output.replace("\n", " "), said.output
-
-
-def test_the_most_frequent_reason_comes_first() -> None:
-    assert reasons({"b": 1, "a": 3}) == "3 by a, 1 by b"

@@ -21,14 +21,6 @@ def test_every_colour_is_visible_on_white_and_on_dark(page: str) -> None:
         assert (high + 0.05) / (low + 0.05) >= 3.0, colour
 
 
-def test_an_estimator_has_its_colour_whatever_the_order() -> None:
-    names = [*COMMON, "an-estimator-of-a-plug-in"]
-    one, other = (dict(zip(order, looks(order), strict=True)) for order in (names, names[::-1]))
-    assert one == other == {name: look(name) for name in names}
-    assert len({look(name).colour for name in COMMON}) == len(COMMON)
-    assert not {look(name).colour for name in COMMON} & set(SENSORS)
-
-
 def test_runs_of_one_estimator_share_the_colour_and_differ_by_the_line() -> None:
     found = looks(["smoother"] * 4)
     assert {one.colour for one in found} == {look("smoother").colour}

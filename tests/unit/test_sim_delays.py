@@ -121,13 +121,6 @@ def test_a_chain_in_time_forgets_over_a_gap_and_stays_at_equal_stamps() -> None:
     assert stats.binomtest(int((pairs[:, 1] == pairs[:, 2]).sum()), 400, 0.5).pvalue > 1e-4
 
 
-@pytest.mark.parametrize("make", [MarkovDelay, MarkovTimeDelay])
-def test_the_first_message_finds_a_chain_as_it_is_in_the_long_run(make: type[MarkovDelay | MarkovTimeDelay]) -> None:
-    model = make(GOOD, BAD, 0.1, 0.3)
-    first = [model.draw(np.random.default_rng(seed), np.zeros(1))[0] for seed in range(1000)]
-    assert stats.binomtest(first.count(0.5), 1000, 0.25).pvalue > 1e-4
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -18,10 +18,3 @@ def test_draws_have_the_mean_and_the_covariance_of_the_model() -> None:
     whitened = np.linalg.solve(np.linalg.cholesky(Q), found.T)
     np.testing.assert_allclose(whitened.mean(axis=1), 0.0, atol=5.0 / np.sqrt(num))
     np.testing.assert_allclose(np.cov(whitened), np.eye(5), atol=5.0 * np.sqrt(2.0 / num))
-
-
-def test_one_state_and_a_stack_are_drawn_alike() -> None:
-    states = np.array([[0.0, 0.0, 0.1, 20.0, 0.1], [5.0, 1.0, 1.0, 8.0, 0.0]])
-    both = drawn(MOTION, states, 0.05, np.random.default_rng(2))
-    rng = np.random.default_rng(2)
-    np.testing.assert_allclose([drawn(MOTION, state, 0.05, rng) for state in states], both, rtol=1e-13)

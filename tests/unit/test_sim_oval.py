@@ -42,35 +42,6 @@ def test_the_oval_has_the_proportions_of_a_speedway(oval: TrackMap) -> None:
     np.testing.assert_allclose(left + right, 15.0)
 
 
-@pytest.mark.parametrize("lane", ["oval", "pit_lane"])
-def test_the_columns_of_a_made_map_agree_with_each_other(request: pytest.FixtureRequest, lane: str) -> None:
-    track: TrackMap = request.getfixturevalue(lane)
-    table = track.table
-    s, heading, curvature = (table[:, COLUMN[n]] for n in ("s_ref_m", "psi_ref_rad", "kappa_ref_radpm"))
-    chord = np.arctan2(*np.diff(table[:, :2], axis=0).T[::-1])
-    middle = heading[:-1] + wrap_angles(np.diff(heading)) / 2.0
-    assert np.abs(wrap_angles(chord - middle)).max() < 1e-4
-    # Where the pit lane leaves its straights, the curvature has kinks: differences are off there.
-    for of, rate in ((np.unwrap(heading), curvature), (curvature, table[:, COLUMN["dkappa_ref_radpm2"]])):
-        assert np.quantile(np.abs(np.gradient(of, s) - rate)[1:-1], 0.99) < 2e-5
-    normal = table[:, [COLUMN["x_normvec_m"], COLUMN["y_normvec_m"]]]
-    np.testing.assert_allclose(normal, np.stack([np.sin(heading), -np.cos(heading)], axis=1), atol=1e-12)
-    np.testing.assert_allclose(table[0, :2], table[-1, :2], atol=1e-9)
-
-
-def test_the_curvature_of_the_oval_has_no_jump(oval: TrackMap) -> None:
-    curvature = oval.table[:, COLUMN["kappa_ref_radpm"]]
-    assert np.abs(np.diff(curvature)).max() < 2.0 * 7e-5  # rows are 2 m apart
-    assert curvature[0] == pytest.approx(curvature[-1], abs=1e-9)
-
-
-def test_the_pit_road_lies_left_of_the_front_straight_and_beside_the_track(oval: TrackMap, pit_lane: TrackMap) -> None:
-    s = np.linspace(-200.0, 200.0, 101)
-    points = oval.position(s, np.full(101, 24.0))
-    assert not pit_lane.outside(points, 0.0, 0.0).any()
-    assert oval.outside(points, 0.0, 0.0).all()
-
-
 ANGLES = np.array([0.0, 0.4, 1.0, 1.3, 2.2, 3.0, 3.3, 4.4, 5.0, 5.8])
 COARSE = np.stack([300.0 * np.cos(ANGLES), 200.0 * np.sin(ANGLES)], axis=1)
 

@@ -12,8 +12,7 @@ from support.messages import START_NS, drive, exact, message_lists
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.io.errors import TruncatedInput
-from fgtrack.pipeline.load import load
-from fgtrack.sim.clocks import JitterClock, OffsetClock
+from fgtrack.sim.clocks import OffsetClock
 from fgtrack.sim.delays import (
     ConstantDelay,
     GammaDelay,
@@ -23,8 +22,6 @@ from fgtrack.sim.delays import (
     UniformDelay,
 )
 from fgtrack.sim.redelay import OTHERS, SensorDelays, redelay
-from fgtrack.sim.scenario import Scenario
-from fgtrack.sim.simulate import simulate
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "configs/scenarios"
 MS = 1_000_000
@@ -66,29 +63,6 @@ def test_messages_come_in_order_of_the_new_receipt_and_none_is_lost_or_changed(
 def test_without_any_sensor_named_everything_stays_to_the_bit(messages: list[Message]) -> None:
     assert exact(redelayed(messages)) == exact(messages)
     assert exact(list(redelay(lambda: messages, {OTHERS: SensorDelays()}, np.random.default_rng(0)))) == exact(messages)
-
-
-def test_a_sensor_that_is_not_named_keeps_its_receipts() -> None:
-    found = redelayed(DRIVE, radar=LATE)
-    assert lists(found, "lidar") == lists(DRIVE, "lidar")
-    assert delays_s(found, "radar") != delays_s(DRIVE, "radar")
-
-
-def test_the_same_generator_gives_the_same_messages_and_another_one_others() -> None:
-    result = redelay(lambda: DRIVE, {"radar": LATE}, np.random.default_rng(5))
-    first = list(result)
-    assert list(result) == first == redelayed(DRIVE, 5, radar=LATE)
-    assert redelayed(DRIVE, 6, radar=LATE) != first
-
-
-def test_another_sensor_loss_or_clock_leaves_the_delays_of_the_first() -> None:
-    alone = lists(redelayed(DRIVE, lidar=LATE), "lidar")
-    assert lists(redelayed(DRIVE, lidar=LATE, radar=LATE), "lidar") == alone
-    some = lists(redelayed(DRIVE, lidar=replace(LATE, loss_probability=0.5)), "lidar")
-    assert 5 < len(some) < 35
-    assert all(m in alone for m in some)
-    jittered = lists(redelayed(DRIVE, lidar=replace(LATE, clock=(JitterClock(0.001),))), "lidar")
-    assert [m.receipt_ns for m in jittered] == [m.receipt_ns for m in alone]
 
 
 def test_drawn_delays_follow_their_model_in_the_order_of_the_stamps() -> None:
@@ -134,18 +108,6 @@ def test_detections_with_stamps_of_their_own_follow_their_list() -> None:
 
 
 # Round trips
-
-
-def test_constant_delays_restore_what_other_delays_have_shuffled() -> None:
-    scenario = replace(load(Scenario, SCENARIOS / "single_opponent.yaml"), duration_s=5.0)
-    constant = [replace(s, delay=ConstantDelay(d)) for s, d in zip(scenario.sensors, (0.15, 0.06), strict=True)]
-    original = simulate(replace(scenario, sensors=tuple(constant)), np.random.default_rng(0))
-    shuffled = redelayed(original, lidar_cluster=LATE, radar=LATE)
-    stamps = [m.stamp_ns for m in shuffled if isinstance(m, DetectionList)]
-    assert shuffled != original
-    assert np.count_nonzero(np.diff(stamps) < 0) > 50
-    back = {"lidar_cluster": SensorDelays(ConstantDelay(0.15)), "radar": SensorDelays(ConstantDelay(0.06))}
-    assert redelayed(shuffled, **back) == original
 
 
 def test_at_the_same_receipt_what_keeps_it_comes_first_then_sensor_by_sensor() -> None:

@@ -57,12 +57,6 @@ def test_positions_count_from_the_rear_axle() -> None:
     )
 
 
-def test_yaw_is_relative_to_the_ego_and_speed_over_ground() -> None:
-    sensor = SimulatedSensor("lidar", {**NO_NOISE, "yaw_rad": 0.0, "speed_mps": 0.0})
-    _, z = scan(sensor, seen_from(30.0, 0.0, yaw_rad=4.0, speed_mps=70.0), num_scans=1)
-    np.testing.assert_allclose(z[0, 2:], [4.0 - 2.0 * math.pi, 70.0], atol=1e-9)
-
-
 def test_range_and_bearing_are_relative_to_the_mounted_sensor() -> None:
     sensor = SimulatedSensor("radar", {"range_m": 0.0, "bearing_rad": 0.0}, mount=Mount(x_m=3.0, y_m=1.0, yaw_rad=0.2))
     assert sensor.frame == "sensor"
@@ -109,20 +103,6 @@ def test_a_sensor_sees_between_its_ranges_and_inside_its_field_of_view_only() ->
         assert scan(sensor, seen_from(x, y), num_scans=1)[0].tolist() == [int(seen)]
 
 
-def test_a_sensor_may_see_less_far_behind_than_ahead() -> None:
-    sensor = SimulatedSensor("lidar", NO_NOISE, max_range_m=98.0, max_range_behind_m=57.0)
-    for x, y, seen in (
-        (97.9, 0.0, True),
-        (-56.9, 0.0, True),
-        (-57.1, 0.0, False),
-        (1.0, 90.0, True),  # just ahead of the line across the sensor
-        (-1.0, 90.0, False),
-        (-1.0, -90.0, False),
-        (-1.0, 56.0, True),
-    ):
-        assert scan(sensor, seen_from(x, y), num_scans=1)[0].tolist() == [int(seen)]
-
-
 # Statistics
 
 
@@ -139,15 +119,6 @@ def test_position_noise_lies_along_and_across_the_line_of_sight() -> None:
     assert_variance(across, 0.5)
     assert_variance(z[:, 2] - 65.0, 0.2)
     assert abs(np.corrcoef(along, across)[0, 1]) < 5.0 / math.sqrt(N)
-
-
-def test_outliers_are_as_many_and_as_wild_as_told() -> None:
-    sensor = SimulatedSensor("lidar", {"x_m": 0.3, "y_m": 0.3}, outlier_probability=0.2, outlier_factor=10.0)
-    _, z = scan(sensor, seen_from(20.0, 0.0))
-    squared = np.sum((z - (20.0, 0.0)) ** 2, axis=1) / 0.3**2  # chi-square of 2 degrees, or 100 times it
-    wild = squared > 200.0
-    expected = 0.8 * math.exp(-100.0) + 0.2 * math.exp(-1.0)
-    assert stats.binomtest(int(wild.sum()), N, expected).pvalue > ALPHA
 
 
 def test_a_split_gives_two_detections_a_few_metres_apart_along_the_object() -> None:
@@ -198,19 +169,6 @@ def test_clutter_on_the_track_lies_on_the_track_and_seems_to_drive() -> None:
     assert not oval.outside(points, 1e-6, 1e-6).any()
     np.testing.assert_allclose(z[:, 2] + 0.5, oval.heading(points), atol=1e-9)
     assert stats.kstest(z[:, 3], stats.uniform(10.0, 70.0).cdf).pvalue > ALPHA
-
-
-def test_the_order_in_a_scan_tells_nothing_about_the_objects() -> None:
-    counts, z = scan(SimulatedSensor("lidar", NO_NOISE), seen_from(20.0, 5.0), seen_from(20.0, -5.0))
-    assert (counts == 2).all()
-    assert stats.binomtest(int(np.count_nonzero(z[::2, 1] > 0.0)), N, 0.5).pvalue > ALPHA
-
-
-def test_another_object_leaves_the_detections_of_the_first_as_they_were() -> None:
-    sensor = SimulatedSensor("lidar", {"x_m": 0.3, "y_m": 0.3}, detection_probability=0.7)
-    alone = scan(sensor, seen_from(20.0, 5.0))[1]
-    both = scan(sensor, seen_from(20.0, 5.0), seen_from(20.0, -50.0))[1]
-    np.testing.assert_array_equal(both[both[:, 1] > -20.0], alone)
 
 
 # Times and settings

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.errors import CallError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.pipeline.shipped import read_scenario
@@ -50,11 +50,6 @@ def test_settings_of_a_scenario_that_make_no_sense_are_named() -> None:
 
 
 # Messages
-
-
-def test_the_same_seed_gives_the_same_messages_and_another_seed_others() -> None:
-    assert run(SHORT) == run(SHORT)
-    assert run(SHORT) != run(SHORT, seed=1)
 
 
 def test_messages_come_in_order_of_receipt_and_scans_overtake_each_other() -> None:
@@ -115,14 +110,6 @@ def test_a_scan_that_saw_nothing_is_sent_and_a_silent_sensor_sends_nothing() -> 
     assert times == [k / 10 for k in range(51) if not 10 <= k < 20]
 
 
-def test_another_sensor_leaves_everything_else_as_it_was() -> None:
-    extra = SimulatedSensor("extra", {"x_m": 1.0, "y_m": 1.0}, clutter=Clutter(2.0))
-    messages = run(replace(SHORT, sensors=(*SHORT.sensors, extra)))
-    assert scans_of(messages, "extra")
-    others = [m for m in messages if not (isinstance(m, DetectionList) and m.sensor == "extra")]
-    assert others == run(SHORT)
-
-
 def test_another_delay_leaves_stamps_and_detections_as_they_were() -> None:
     def without_receipts(scenario: Scenario) -> list[tuple[object, ...]]:
         messages = [m for m in run(scenario) if isinstance(m, DetectionList)]
@@ -152,16 +139,6 @@ def test_equal_receipts_are_ordered_truth_ego_sensors() -> None:
         "radar",
         "lidar",
     ]
-
-
-def test_a_map_file_may_stand_for_the_oval() -> None:
-    path = str(ROOT / "configs/maps/oval_track.csv")
-    from_file = [m for m in run(replace(SHORT, map=path)) if isinstance(m, TruthState)]
-    built_in = [m for m in run(SHORT) if isinstance(m, TruthState)]
-    for a, b in zip(from_file[::50], built_in[::50], strict=True):
-        assert (a.x_m, a.y_m) == pytest.approx((b.x_m, b.y_m), abs=1e-5)
-    with pytest.raises(DataError, match=r"cannot (be read|read the map)"):
-        run(replace(SHORT, map="missing.csv"))
 
 
 @pytest.mark.parametrize(

@@ -67,16 +67,6 @@ def test_the_axis_with_the_most_numbers_is_horizontal_and_the_others_have_panels
     assert faults(figure) == []
 
 
-def test_texts_and_single_seeds_and_many_estimators_are_drawn_as_well(tmp_path: Path) -> None:
-    folder = a_sweep(tmp_path / "sweep", seeds=1, estimators=9)
-    text = (folder / SWEEP_FILE).read_text().replace("\n0.05,", "\nshort-and-sweet,").replace("\n0.1,", "\nlonger,")
-    (folder / SWEEP_FILE).write_text(text)
-    figure = plot.sweep(folder)
-    assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["short-and-sweet", "longer", "0.2"]
-    assert "one seed" in figure.get_suptitle()
-    assert faults(figure) == []
-
-
 def test_what_is_no_sweep_is_one_clear_error(tmp_path: Path) -> None:
     with pytest.raises(CallError, match="cannot be read"):
         plot.sweep(tmp_path)

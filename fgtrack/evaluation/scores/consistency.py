@@ -49,24 +49,6 @@ class Consistency:
     position_nees_interval: Estimate = UNKNOWN
 
 
-@dataclass(frozen=True)
-class Nees:
-    """NEES of n present states.
-
-    Attributes
-    ----------
-    stamps_ns, object_ids, values
-        Of each state, shape (n,).
-    dof
-        Degrees of freedom of each value: what a consistent estimator has on average.
-    """
-
-    stamps_ns: IntArray
-    object_ids: IntArray
-    values: FloatArray
-    dof: IntArray
-
-
 def consistency(run: Run, matching: Matching | None) -> Consistency:
     """NEES of the evaluated rows of `run`, NIS and whiteness of its innovations."""
     updates = run.tables["updates"]
@@ -80,31 +62,30 @@ def consistency(run: Run, matching: Matching | None) -> Consistency:
     )
     if matching is None or not matching.paired.any():
         return found
-    position, state = position_nees(matching), state_nees(matching)
-    ticks = by_stamp(position.stamps_ns, position.values[:, None])
+    position, (state, dof) = position_nees(matching), state_nees(matching)
+    ticks = by_stamp(matching.tracks["stamp_ns"][matching.paired], position[:, None])
     return replace(
         found,
-        position_nees=ChiSquareMean.of(position.values, position.dof),
-        state_nees=ChiSquareMean.of(state.values, state.dof),
+        position_nees=ChiSquareMean.of(position, np.full(len(position), _POSITION)),
+        state_nees=ChiSquareMean.of(state, dof),
         position_nees_interval=mean_square(ticks, np.random.default_rng(_SEED)),
     )
 
 
-def position_nees(matching: Matching) -> Nees:
-    """NEES of the position of every paired row."""
+def position_nees(matching: Matching) -> FloatArray:
+    """NEES of the position of every paired row, shape (p,); NaN where there is none."""
     return _nees(matching, _POSITION)
 
 
-def state_nees(matching: Matching) -> Nees:
-    """NEES of x, y, yaw, speed and yaw rate of every paired row with known true yaw and speed.
+def state_nees(matching: Matching) -> tuple[FloatArray, IntArray]:
+    """NEES of x, y, yaw, speed and yaw rate of every paired row with known true yaw and speed, and its dof, shape (p,).
 
     The yaw rate is left out where the truth or the model has none (its variance is 0).
     """
-    with_yaw_rate, without = _nees(matching, _WITH_YAW_RATE), _nees(matching, _POSE_AND_SPEED)
     variance = matching.tracks["p_yaw_rate_yaw_rate"][matching.paired]
     full = np.isfinite(matching.true_states[matching.paired, _WITH_YAW_RATE - 1]) & (variance > 0.0)
-    values = np.where(full, with_yaw_rate.values, without.values)
-    return replace(without, values=values, dof=np.where(full, with_yaw_rate.dof, without.dof))
+    values = np.where(full, _nees(matching, _WITH_YAW_RATE), _nees(matching, _POSE_AND_SPEED))
+    return values, np.where(full, _WITH_YAW_RATE, _POSE_AND_SPEED)
 
 
 def normalised_squares(states: Table, errors: FloatArray) -> FloatArray:
@@ -131,14 +112,9 @@ def normalised_squares(states: Table, errors: FloatArray) -> FloatArray:
     return np.where(np.isfinite(total), total, np.nan)
 
 
-def _nees(matching: Matching, size: int) -> Nees:
+def _nees(matching: Matching, size: int) -> FloatArray:
     """NEES of the first `size` components of every paired row; NaN where there is none."""
     tracks, truth = matching.tracks.where(matching.paired), matching.true_states[matching.paired]
     errors = np.stack([tracks[name] for name in TRUE_STATE], axis=-1) - truth
     errors[:, YAW] = state_errors(tracks, truth)["yaw_rad"]
-    return Nees(
-        stamps_ns=tracks["stamp_ns"],
-        object_ids=np.array(matching.object_ids)[matching.object_index[matching.paired]],
-        values=normalised_squares(tracks, errors[:, :size]),
-        dof=np.full(tracks.num_rows, size),
-    )
+    return normalised_squares(tracks, errors[:, :size])

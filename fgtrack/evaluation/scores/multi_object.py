@@ -18,23 +18,24 @@ a zero distance of twice the gate: the similarity of 0.5, from which on IDF1 cou
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from motrics import compute_hota_from_similarity, compute_identity_from_similarity
 from scipy.optimize import linear_sum_assignment
 
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.matching import NO_OBJECT, Matching, Scenes, ambiguous, pair, scenes
-from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run
+from fgtrack.evaluation.matching import NO_OBJECT, Scenes, ambiguous, pair
+from fgtrack.evaluation.scores.continuity import switches
+from fgtrack.io.run import NO_TRACK
 
 AT_GATE = 0.5
 """Similarity of a pair that is as far apart as the gate, from which on it counts."""
 
 
-@dataclass(frozen=True)
-class GospaParts:
+class GospaParts(NamedTuple):
     """Squared parts at every tick, shape (t,) each; they add up to the square of GOSPA.
 
     Attributes
@@ -51,173 +52,83 @@ class GospaParts:
     out_of_sight_m2: FloatArray
 
     @property
-    def total_m(self) -> FloatArray:
-        """GOSPA at every tick, shape (t,)."""
-        return np.sqrt(self.localisation_m2 + self.missed_m2 + self.false_m2)
-
-    @property
-    def in_sight_m(self) -> FloatArray:
-        """GOSPA at every tick without the missed objects out of sight, shape (t,)."""
-        return np.sqrt(self.localisation_m2 + (self.missed_m2 - self.out_of_sight_m2) + self.false_m2)
-
-
-@dataclass(frozen=True)
-class Gospa:
-    """GOSPA of a run; NaN without a tick.
-
-    Attributes
-    ----------
-    c_m
-        Cut-off distance: a missed object or a false track costs c^2 / 2.
-    ticks
-        Number of ticks.
-    mean_m, rms_m
-        Mean over the ticks, and root of the mean square, whose square is the sum of the three parts.
-    localisation_m2, missed_m2, false_m2
-        Mean squared parts of the pairs, the missed objects and the false tracks.
-    in_sight_rms_m
-        As `rms_m`, without the missed objects that no sensor could see.
-    out_of_sight_m2
-        Mean squared part of these objects, a part of `missed_m2`.
-    """
-
-    c_m: float
-    ticks: int
-    mean_m: float
-    rms_m: float
-    localisation_m2: float
-    missed_m2: float
-    false_m2: float
-    in_sight_rms_m: float
-    out_of_sight_m2: float
-
-    @classmethod
-    def of(cls, parts: GospaParts, c_m: float) -> "Gospa":
-        """Averages of `parts` over the ticks."""
-        ticks = len(parts.total_m)
-        squares = (parts.total_m**2, parts.localisation_m2, parts.missed_m2, parts.false_m2)
-        values = (parts.total_m, *squares, parts.in_sight_m**2, parts.out_of_sight_m2)
-        mean_m, total, localisation, missed, false, in_sight, out = (
-            float(value.mean()) if ticks else math.nan for value in values
-        )
-        return cls(c_m, ticks, mean_m, math.sqrt(total), localisation, missed, false, math.sqrt(in_sight), out)
-
-
-@dataclass(frozen=True)
-class Clear:
-    """CLEAR scores; counts are sums over the ticks.
-
-    Attributes
-    ----------
-    mota
-        1 - (misses + false positives + switches) / number of objects; NaN without any object.
-    motp_m
-        Mean distance of the pairs; NaN without a pair.
-    pairs
-        Objects with a track (TP).
-    misses
-        Objects without one (FN).
-    false_positives
-        Tracks without an object (FP).
-    id_switches
-        Pairs with another track than the object's last one (IDSW).
-    """
-
-    mota: float
-    motp_m: float
-    pairs: int
-    misses: int
-    false_positives: int
-    id_switches: int
-
-    @classmethod
-    def of(cls, scenes: Scenes, gate_m: float) -> "Clear":
-        """CLEAR of `scenes`; a pair is not farther apart than `gate_m`.
-
-        Pairs of the last tick with objects and tracks stay, the others have the largest sum of similarities.
-        """
-        similarity = similarities(scenes.distances_m, gate_m)
-        scores = np.where(similarity >= AT_GATE - np.finfo(np.float64).eps, similarity, 0.0)
-        used = scenes.present.any(axis=1) & (scenes.per_tick(np.ones(len(scores))) > 0)
-        last = np.maximum.accumulate(np.where(used, np.arange(scenes.num_ticks), 0))
-        columns = pair(scores, scenes.track_ids, scenes.tick_index, np.concatenate([[-1], last])[:-1])
-        paired = np.flatnonzero(columns != NO_OBJECT)
-        track_ids = np.full(scenes.present.shape, NO_TRACK)
-        track_ids[scenes.tick_index[paired], columns[paired]] = scenes.track_ids[paired]
-        sequences = (column[column != NO_TRACK] for column in track_ids.T)
-        switches = sum(int((sequence[1:] != sequence[:-1]).sum()) for sequence in sequences)
-        pairs, objects = len(paired), int(scenes.present.sum())
-        misses, false_positives = objects - pairs, len(columns) - pairs
-        mota = 1.0 - (misses + false_positives + switches) / objects if objects else math.nan
-        motp_m = float(scenes.distances_m[paired, columns[paired]].mean()) if pairs else math.nan
-        return cls(mota, motp_m, pairs, misses, false_positives, switches)
-
-
-@dataclass(frozen=True)
-class Identity:
-    """Every object is given one track for the whole run, so that most of the pairs are right.
-
-    Attributes
-    ----------
-    idf1
-        Harmonic mean of the two others.
-    idp
-        Share of the track rows that are at the object of their track.
-    idr
-        Share of the objects, at all ticks, that are at their track.
-    """
-
-    idf1: float
-    idp: float
-    idr: float
-
-
-@dataclass(frozen=True)
-class Hota:
-    """Means over the bounds 0.05, 0.1, ..., 0.95 of the similarity.
-
-    Attributes
-    ----------
-    hota
-        Mean of sqrt(DetA AssA).
-    deta
-        Detection: pairs / (pairs + misses + false positives).
-    assa
-        Association: the same, for the track and the object of a pair, averaged over the pairs.
-    """
-
-    hota: float
-    deta: float
-    assa: float
+    def total_m2(self) -> FloatArray:
+        """Squared GOSPA at every tick, shape (t,)."""
+        return self.localisation_m2 + self.missed_m2 + self.false_m2
 
 
 @dataclass(frozen=True)
 class MultiObjectMetrics:
-    """Scores over the ticks at which truth is recorded."""
+    """Scores over the ticks at which truth is recorded; NaN where there is nothing to score.
 
-    gospa: Gospa
-    clear: Clear
-    identity: Identity
-    hota: Hota
+    Attributes
+    ----------
+    gospa
+        Cut-off distance `c_m`, number of `ticks`, mean `mean_m` and root mean square `rms_m` over them, mean squared
+        parts `localisation_m2`, `missed_m2` and `false_m2`, the root mean square `in_sight_rms_m` without the missed
+        objects that no sensor could see, and the mean squared part `out_of_sight_m2` of these.
+    clear
+        `mota`, the mean distance `motp_m` of the pairs, and sums over the ticks: `pairs` (TP), `misses` (FN),
+        `false_positives` (FP) and `id_switches` (pairs with another track than the object's last one, IDSW).
+    identity
+        Every object is given one track for the whole run, so that most of the pairs are right: the share `idp` of the
+        track rows that are at their object, the share `idr` of the objects at their track, the harmonic mean `idf1`.
+    hota
+        Means over the bounds 0.05, 0.1, ..., 0.95 of the similarity: `deta` = pairs / (pairs + misses + false
+        positives), `assa` the same for the track and the object of a pair, averaged over the pairs, and `hota`, the
+        mean of sqrt(DetA AssA).
+    """
 
-    @classmethod
-    def of(cls, scenes: Scenes, options: EvaluationConfig) -> "MultiObjectMetrics":
-        """Scores of `scenes`."""
-        frames = motrics_frames(scenes, options.gate_m)
-        identity = compute_identity_from_similarity(*frames, AT_GATE)
-        hota = compute_hota_from_similarity(*frames)
-        return cls(
-            Gospa.of(gospa(scenes, options.gate_m), options.gate_m),
-            Clear.of(scenes, options.gate_m),
-            Identity(*(getattr(identity, k) if identity.num_gt else math.nan for k in ("idf1", "idp", "idr"))),
-            Hota(*(getattr(hota, k) if hota.num_gt else math.nan for k in ("hota", "deta", "assa"))),
-        )
+    gospa: Mapping[str, float]
+    clear: Mapping[str, float]
+    identity: Mapping[str, float]
+    hota: Mapping[str, float]
 
 
-def multi_object_metrics(run: Run, matching: Matching | None, options: EvaluationConfig) -> MultiObjectMetrics | None:
-    """Scores of the evaluated rows of `run`; None without truth, and where `options` exclude them."""
-    wanted = matching is not None and options.multi_object
-    return MultiObjectMetrics.of(scenes(run, matching), options) if wanted and matching is not None else None
+def multi_object_metrics(scenes: Scenes, gate_m: float) -> MultiObjectMetrics:
+    """Scores of `scenes`; a pair is not farther apart than `gate_m`."""
+    parts = gospa(scenes, gate_m)
+    in_sight_m2 = parts.total_m2 - parts.out_of_sight_m2
+    total_m2, sight_m2, *means_m2 = (_mean(values) for values in (parts.total_m2, in_sight_m2, *parts))
+    roots = {"mean_m": _mean(np.sqrt(parts.total_m2)), "rms_m": math.sqrt(total_m2)}
+    own = dict(zip(parts._fields, means_m2, strict=True)) | {"in_sight_rms_m": math.sqrt(sight_m2)}
+    similarity = similarities(scenes.distances_m, gate_m)
+    ids, rows_of = scenes.track_ids.tolist(), list(zip(scenes, scenes.present, strict=True))
+    objects = [np.flatnonzero(present).tolist() for _, present in rows_of]
+    frames = objects, [ids[k] for k, _ in rows_of], [similarity[k].T[here].tolist() for k, here in rows_of]
+    identity, hota = compute_identity_from_similarity(*frames, AT_GATE), compute_hota_from_similarity(*frames)
+    return MultiObjectMetrics(
+        {"c_m": gate_m, "ticks": scenes.num_ticks, **roots, **own},
+        clear(scenes, gate_m),
+        {name: getattr(identity, name) if identity.num_gt else math.nan for name in ("idf1", "idp", "idr")},
+        {name: getattr(hota, name) if hota.num_gt else math.nan for name in ("hota", "deta", "assa")},
+    )
+
+
+def clear(scenes: Scenes, gate_m: float) -> dict[str, float]:
+    """CLEAR of `scenes`; a pair is not farther apart than `gate_m`.
+
+    Pairs of the last tick with objects and tracks stay, the others have the largest sum of similarities.
+    """
+    similarity = similarities(scenes.distances_m, gate_m)
+    scores = np.where(similarity >= AT_GATE - np.finfo(np.float64).eps, similarity, 0.0)
+    used = scenes.present.any(axis=1) & (scenes.per_tick(np.ones(len(scores))) > 0)
+    last = np.maximum.accumulate(np.where(used, np.arange(scenes.num_ticks), 0))
+    columns = pair(scores, scenes.track_ids, scenes.tick_index, np.concatenate([[-1], last])[:-1])
+    paired = np.flatnonzero(columns != NO_OBJECT)
+    track_ids = np.full(scenes.present.shape, NO_TRACK)
+    track_ids[scenes.tick_index[paired], columns[paired]] = scenes.track_ids[paired]
+    switched = sum(len(switches(column)) for column in track_ids.T)
+    pairs, objects = len(paired), int(scenes.present.sum())
+    misses, false_positives = objects - pairs, len(columns) - pairs
+    return {
+        "mota": 1.0 - (misses + false_positives + switched) / objects if objects else math.nan,
+        "motp_m": _mean(scenes.distances_m[paired, columns[paired]]),
+        "pairs": pairs,
+        "misses": misses,
+        "false_positives": false_positives,
+        "id_switches": switched,
+    }
 
 
 def gospa(scenes: Scenes, c_m: float) -> GospaParts:
@@ -250,10 +161,5 @@ def similarities(distances_m: FloatArray, gate_m: float) -> FloatArray:
     return np.maximum(0.0, 1.0 - distances_m / (2.0 * gate_m))
 
 
-def motrics_frames(scenes: Scenes, gate_m: float) -> tuple[list[Any], list[Any], list[Any]]:
-    """Lists of the objects, the tracks and their similarities for motrics, with an entry for every tick."""
-    scores = similarities(scenes.distances_m, gate_m)
-    ids = scenes.track_ids.tolist()
-    rows_of = list(zip(scenes, scenes.present, strict=True))
-    objects = [np.flatnonzero(present).tolist() for _, present in rows_of]
-    return objects, [ids[rows] for rows, _ in rows_of], [scores[rows].T[here].tolist() for rows, here in rows_of]
+def _mean(values: FloatArray) -> float:
+    return float(values.mean()) if len(values) else math.nan

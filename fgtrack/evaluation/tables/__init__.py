@@ -8,11 +8,12 @@ import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
-from itertools import takewhile
 from typing import Any, Literal, TypeVar, overload
 
+from rich.box import SIMPLE_HEAD
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table as Grid
 from rich.text import Text
 
 from fgtrack.core.errors import printable, printable_lines
@@ -27,6 +28,7 @@ PERCENT = 100.0
 MS = 1e3
 
 _WIDTH = 120  # of a table as text
+_LONG = 40  # characters of a cell that may be broken
 _MOST_SENTENCES = 10  # of the verdict in a repr
 _MARKDOWN = {"\\": r"\\", "|": r"\|", "<": r"\<"}
 _LATEX = {char: f"\\{char}" for char in "&%$#_{}"} | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
@@ -121,11 +123,6 @@ class Shown:
     bold: Sequence[bool]
     left: bool
 
-    @property
-    def width(self) -> int:
-        """Width in a terminal, without the space beside it."""
-        return max(map(cell_len, (*self.heading.split("\n"), *self.cells)), default=0)
-
 
 @dataclass(frozen=True)
 class Table:
@@ -193,7 +190,8 @@ class Table:
     def to_markdown(self) -> str:
         """Shown columns and records as a table of GitHub Markdown under a heading, the notes below."""
         shown = self.shown()
-        head, *rows = grid(shown, lambda cell, bold: f"**{_markdown(cell.strip())}**" if bold else _markdown(cell))
+        head = [_markdown(_one_line(column.heading)) for column in shown]
+        rows = _rows(shown, lambda cell, bold: f"**{_markdown(cell.strip())}**" if bold else _markdown(cell))
         rule = [":---" if column.left else "---:" for column in shown]
         lines = [
             f"### {_markdown(printable(self.title))}",
@@ -208,7 +206,8 @@ class Table:
     def to_latex(self) -> str:
         """Shown columns and records as a table environment with the rules of package booktabs; notes as comments."""
         shown = self.shown()
-        head, *rows = grid(shown, lambda cell, bold: f"\\textbf{{{_latex(cell)}}}" if bold else _latex(cell))
+        head = [_latex(_one_line(column.heading)) for column in shown]
+        rows = _rows(shown, lambda cell, bold: f"\\textbf{{{_latex(cell)}}}" if bold else _latex(cell))
         body = [f"{'{}' if row[0][:1] in ('[', '*') else ''}{' & '.join(row)} \\\\" for row in rows]  # no option of \\
         spec = "".join("l" if column.left else "r" for column in shown)
         begin = [r"\begin{table}", r"\centering", f"\\caption{{{_latex(printable(self.title))}}}"]
@@ -217,20 +216,26 @@ class Table:
         return "\n".join([*begin, *body, *end])
 
     def _repr_html_(self) -> str:
-        head, *rows = grid(self.shown(), lambda cell, bold: f"<b>{escape(cell)}</b>" if bold else escape(cell))
-        lines = [f"<tr><th>{'</th><th>'.join(head)}</th></tr>"]
-        lines += [f"<tr><td>{'</td><td>'.join(row)}</td></tr>" for row in rows]
         notes = "".join(f"<li>{escape(note)}</li>" for note in self.shown_notes())
         caption = f"<caption>{escape(printable(self.title))}</caption>"
-        return f"<table>{caption}{''.join(lines)}</table>" + f"<ul>{notes}</ul>" * bool(notes)
+        return f"<table>{caption}{self.to_html()}</table>" + f"<ul>{notes}</ul>" * bool(notes)
+
+    def to_html(self) -> str:
+        """Head and body of an HTML table of the shown columns and records."""
+        shown = self.shown()
+        head = [html_cell("th", column.heading, column.left) for column in shown]
+        lines = []
+        for row in _rows(shown, lambda cell, bold: (cell, bold)):
+            cells = (html_cell("td", cell, one.left, bold) for one, (cell, bold) in zip(shown, row, strict=True))
+            lines.append(f"<tr>{''.join(cells)}</tr>\n")
+        return f"<thead><tr>{''.join(head)}</tr></thead>\n<tbody>\n{''.join(lines)}</tbody>\n"
 
     def __str__(self) -> str:
         return _text(self)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield Text(f"\n{printable(self.title)}")
-        for line in _arranged(self.shown(), options.max_width):
-            yield from line.divide(range(options.max_width, line.cell_len, options.max_width))
+        yield from _grids(self.shown(), options.max_width)
         yield from map(Text, self.shown_notes())
 
     def _visible(self) -> list[Column]:
@@ -357,7 +362,7 @@ def bulleted(sentences: Iterable[str], width: int) -> Iterator[Text]:
     for sentence in sentences:
         kept = _QUANTITY.sub("\\1\u00a0\\2", printable(sentence))
         for line in textwrap.wrap(kept, width, initial_indent="- ", subsequent_indent="  ", break_on_hyphens=False):
-            yield _line(line.replace("\u00a0", " "))
+            yield Text(line.replace("\u00a0", " "))
 
 
 def _text(shown: Table | Tables) -> str:
@@ -367,68 +372,50 @@ def _text(shown: Table | Tables) -> str:
     return capture.get().removesuffix("\n")
 
 
-def grid(shown: Sequence[Shown], form: Callable[[str, bool], Cell]) -> Iterator[list[Cell]]:
-    """Headings and rows in a `form` of text and whether it is bold; the first cell only where it changes."""
-    headings = (column.heading.replace("-\n", "").replace("/\n", "/").replace("\n", " ") for column in shown)
-    yield [form(heading, False) for heading in headings]
+def html_cell(tag: str, text: str, is_left: bool, is_bold: bool = False) -> str:
+    """A cell of an HTML table; of class `long` where it may be broken."""
+    content = escape(text).replace("\n", "<br>")
+    kinds = " ".join(name for name, has in (("left", is_left), ("long", len(text) > _LONG)) if has)
+    kind = f' class="{kinds}"' if kinds else ""
+    return f"<{tag}{kind}>{f'<b>{content}</b>' if is_bold else content}</{tag}>"
+
+
+def _rows(shown: Sequence[Shown], form: Callable[[str, bool], Cell]) -> Iterator[list[Cell]]:
+    """Rows in a `form` of text and whether it is bold; the first cell only where it changes."""
     for k, first in enumerate(shown[0].cells):
         repeated = k > 0 and shown[0].cells[k - 1] == first
         yield [form("" if repeated and column is shown[0] else column.cells[k], column.bold[k]) for column in shown]
 
 
-def _arranged(shown: Sequence[Shown], width: int) -> list[Text]:
-    """Lines of a terminal, no longer than `width` where possible, and as few as possible.
+def _one_line(heading: str) -> str:
+    return heading.replace("-\n", "").replace("/\n", "/").replace("\n", " ")
 
-    What does not fit beside the names of the rows stands in further parts below, each with the names; the first name
-    stands beside its rows, or on a line above them.
+
+def _grids(shown: Sequence[Shown], width: int) -> Iterator[Grid | Text]:
+    """Tables of at most `width`: columns without room beside the names stand in further ones below, with the names.
+
+    Names that take more than half of the width are broken.
     """
-    layouts = [list(_layout(shown, width, above)) for above in ([False, True] if shown[0].left else [False])]
-    return min(layouts, key=lambda lines: (any(line.cell_len > width for line in lines), len(lines)))
-
-
-def _layout(shown: Sequence[Shown], width: int, above: bool) -> Iterator[Text]:
-    title, indent = (shown[0], "  ") if above else (None, "")
-    names = [*takewhile(lambda column: column.left, shown)]
-    parts = [names[above:]]
-    for column in shown[len(names) :]:
-        if len(parts[-1]) > len(names[above:]) and _width(indent, [*parts[-1], column]) > width:
-            parts.append(names[above:])
-        parts[-1].append(column)
-    for number, part in enumerate(parts):
-        if number:
-            yield _line("continued:")
-        if title is not None and title.heading:
-            yield _line(f" {title.heading}")
-        headings = [column.heading.split("\n") for column in part]
-        for k in range(max(map(len, headings), default=0), 0, -1):
-            yield _row(part, [lines[-k] if k <= len(lines) else "" for lines in headings], None, indent)
-        yield _line("─" * max(_width(indent, part), 1))
-        for k, first in enumerate(shown[0].cells):
-            repeated = k > 0 and shown[0].cells[k - 1] == first
-            if title is not None and not repeated:
-                yield _line(f" {first}")
-            cells = ["" if repeated and column is shown[0] and column.left else column.cells[k] for column in part]
-            yield _row(part, cells, k, indent)
-
-
-def _width(indent: str, columns: Sequence[Shown]) -> int:
-    return len(indent) + sum(column.width + 2 for column in columns) - 1
-
-
-def _row(columns: Sequence[Shown], cells: Sequence[str], k: int | None, indent: str) -> Text:
-    text = _line(indent)
-    for column, cell in zip(columns, cells, strict=True):
-        space = " " * (column.width - cell_len(cell))
-        text.append((" " if len(text) == len(indent) else "  ") + ("" if column.left else space))
-        text.append(cell, "bold" if k is not None and column.bold[k] else "")
-        text.append(space if column.left else "")
-    text.rstrip()
-    return text
-
-
-def _line(text: str) -> Text:
-    """Text that no terminal wraps or cuts before its edge."""
-    return Text(text, no_wrap=True, overflow="ignore")
+    widths = [2 + max(map(cell_len, (*one.heading.split("\n"), *one.cells))) for one in shown]
+    num_names = next((k for k, one in enumerate(shown) if not one.left), len(shown))
+    parts, free = [list(range(num_names))], width + 1 - min(sum(widths[:num_names]), width // 2)
+    for k in range(num_names, len(shown)):
+        used = sum(widths[each] for each in parts[-1][num_names:])
+        if used and used + widths[k] > free:
+            parts.append(list(range(num_names)))
+        parts[-1].append(k)
+    rows = list(_rows(shown, lambda cell, bold: Text(cell, "bold" if bold else "")))
+    for part in parts:
+        if part is not parts[0]:
+            yield Text("continued:")
+        grid = Grid(box=SIMPLE_HEAD, show_edge=False, padding=(0, 0, 0, 1), header_style="")
+        for k in part:
+            justify: Literal["left", "right"] = "left" if shown[k].left else "right"
+            heading = Text(shown[k].heading)
+            grid.add_column(heading, justify=justify, vertical="bottom", no_wrap=not shown[k].left, overflow="fold")
+        for row in rows:
+            grid.add_row(*(row[k] for k in part))
+        yield grid
 
 
 def _markdown(text: str) -> str:

@@ -1,7 +1,7 @@
 """Runs in comparison: their tables and the sentences that summarise them."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from fgtrack.core.errors import CallError
@@ -13,7 +13,6 @@ from fgtrack.evaluation.comparison import (
     comparisons,
     entry_columns,
     entry_record,
-    is_best,
 )
 from fgtrack.evaluation.diagnostics import USED
 from fgtrack.evaluation.intervals import UNKNOWN
@@ -24,7 +23,7 @@ from fgtrack.evaluation.scores.lagged import WINDOW, LagMetrics
 from fgtrack.evaluation.scores.multi_object import MultiObjectMetrics
 from fgtrack.evaluation.scores.prediction import HORIZONS_S
 from fgtrack.evaluation.scores.statistics import ChiSquareMean
-from fgtrack.evaluation.tables import MS, NO_VALUE, PERCENT, RUN, Column, Table, Tables, Value, named
+from fgtrack.evaluation.tables import MS, NO_VALUE, PERCENT, RUN, Column, Record, Table, Tables, Value, named
 from fgtrack.evaluation.tables.streaming import streaming_tables
 from fgtrack.evaluation.tables.verdict import verdict
 
@@ -95,10 +94,10 @@ def compare(*runs: OneRun | Iterable[OneRun] | Mapping[str, OneRun], streaming: 
 def _differences(compared: Sequence[Comparison]) -> Table:
     """A row for each recording, quantity and run: its value, and how much worse than the best it is."""
     records = [
-        {"quantity": q.name, **entry_record(entry), "blocks": (entry.worse_by or UNKNOWN).count}
+        {"quantity": name, **entry_record(entry), "blocks": (entry.worse_by or UNKNOWN).count}
         for one in compared
-        for q in one.quantities
-        for entry in q.entries
+        for name, entries in one.quantities.items()
+        for entry in entries
     ]
     quantity = Column("quantity", text=lambda name: _QUANTITIES[str(name)], left=True)
     notes = ["RMSE where all runs track the object; NEES: worse is farther from 2", STANDING_NOTE]
@@ -127,23 +126,43 @@ def _tracking(metrics: Mapping[str, Metrics], compared: Sequence[Comparison], no
         | {"time_per_tick_p50_s": one.time_per_tick_s.p50, "time_per_tick_p99_s": one.time_per_tick_s.p99}
         for label, one in metrics.items()
     ]
-    best = _best_of(compared)
-    nees_note = "NEES: mean of the position's; 2 if the covariances fit"
-    seen_note = "tracked: share of the ticks at which some sensor could see the object"
-    break_note = "breaks: resumed after a loss or with another track; switches: the latter"
-    false_note = f"false: paired with a true object in less than {FALSE_TRACK_SHARE:.0%} of its life"
-    precision_note = "precision: true objects tracked / tracks that were confirmed"
     truth = [
         *(
-            Column(heading, rmse, bold=best(rmse), when="always" if name == "position_m" else "full")
+            Column(heading, rmse, bold=_is_best(compared, rmse), when="always" if name == "position_m" else "full")
             for name, heading in _ERRORS.items()
             for rmse in [named(name, "rmse")]
         ),
-        Column("NEES\npos.", "position_nees", when="few", bold=best(POSITION_NEES), note=nees_note),
-        Column("tracked\n[%]", "tracked_share_in_sight", scale=PERCENT, note=seen_note),
-        Column("breaks/\nswitches", "breaks id_switches", "{}/{}", note=break_note),
-        Column("false\ntracks", "false_tracks", note=false_note),
-        Column("preci-\nsion", "precision", text=_two_decimals, when="full", note=precision_note),
+        Column(
+            "NEES\npos.",
+            "position_nees",
+            when="few",
+            bold=_is_best(compared, POSITION_NEES),
+            note="NEES: mean of the position's; 2 if the covariances fit",
+        ),
+        Column(
+            "tracked\n[%]",
+            "tracked_share_in_sight",
+            scale=PERCENT,
+            note="tracked: share of the ticks at which some sensor could see the object",
+        ),
+        Column(
+            "breaks/\nswitches",
+            "breaks id_switches",
+            "{}/{}",
+            note="breaks: resumed after a loss or with another track; switches: the latter",
+        ),
+        Column(
+            "false\ntracks",
+            "false_tracks",
+            note=f"false: paired with a true object in less than {FALSE_TRACK_SHARE:.0%} of its life",
+        ),
+        Column(
+            "preci-\nsion",
+            "precision",
+            text=_two_decimals,
+            when="full",
+            note="precision: true objects tracked / tracks that were confirmed",
+        ),
     ]
     columns = [
         RUN,
@@ -157,8 +176,7 @@ def _tracking(metrics: Mapping[str, Metrics], compared: Sequence[Comparison], no
         ),
         Column("ms/tick\np50/p99", "time_per_tick_p50_s time_per_tick_p99_s", "{}/{}", MS),
     ]
-    names = [*(column.names for column in truth[: len(_ERRORS)]), POSITION_NEES]
-    own = [BEST_NOTE] if any(is_best(compared, name, run) for run in metrics for name in names) else []
+    own = [BEST_NOTE] if any(column.bold(record) for column in truth for record in records) else []
     late = [
         f"{label} {one.deadlines.misses}/{one.deadlines.ticks}"
         for label, one in metrics.items()
@@ -193,7 +211,7 @@ def _multi_object(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]
     ]
     columns = [
         RUN,
-        Column("GOSPA\n[m]", _GOSPA, bold=_best_of(compared)(_GOSPA)),
+        Column("GOSPA\n[m]", _GOSPA, bold=_is_best(compared, _GOSPA)),
         Column("local.\n[m]", "gospa_localisation_m"),
         Column("missed\n[m]", "gospa_missed_in_sight_m"),
         Column("false\n[m]", "gospa_false_m"),
@@ -209,27 +227,25 @@ def _multi_object(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]
         "scores: 100 is perfect; defined in docs/metrics.md",
         "late: switches soon after an out-of-sequence update of one of the two tracks",
         "confirm: from an object's first detection to its first confirmed track",
-        *([BEST_NOTE] if any(is_best(compared, _GOSPA, run) for run in metrics) else []),
+        *([BEST_NOTE] if any(map(_is_best(compared, _GOSPA), records)) else []),
     ]
     records = records if any(len(record) > 1 for record in records) else []
     return Table("Multi-object metrics", records, columns, notes=notes, is_detail=True)
 
 
 def _scores(of: MultiObjectMetrics, overall: ObjectMetrics) -> dict[str, float]:
-    gospa = of.gospa
+    m2 = of.gospa
     return {
-        _GOSPA: gospa.in_sight_rms_m,
-        "gospa_localisation_m": math.sqrt(gospa.localisation_m2),
-        "gospa_missed_in_sight_m": math.sqrt(max(gospa.missed_m2 - gospa.out_of_sight_m2, 0.0)),
-        "gospa_false_m": math.sqrt(gospa.false_m2),
-        "gospa_out_of_sight_m": math.sqrt(gospa.out_of_sight_m2),
-        "gospa_rms_m": gospa.rms_m,
-        "gospa_missed_m": math.sqrt(gospa.missed_m2),
-        "mota": of.clear.mota,
-        "idf1": of.identity.idf1,
-        "hota": of.hota.hota,
-        "deta": of.hota.deta,
-        "assa": of.hota.assa,
+        _GOSPA: of.gospa["in_sight_rms_m"],
+        "gospa_localisation_m": math.sqrt(m2["localisation_m2"]),
+        "gospa_missed_in_sight_m": math.sqrt(max(m2["missed_m2"] - m2["out_of_sight_m2"], 0.0)),
+        "gospa_false_m": math.sqrt(m2["false_m2"]),
+        "gospa_out_of_sight_m": math.sqrt(m2["out_of_sight_m2"]),
+        "gospa_rms_m": of.gospa["rms_m"],
+        "gospa_missed_m": math.sqrt(m2["missed_m2"]),
+        "mota": of.clear["mota"],
+        "idf1": of.identity["idf1"],
+        **of.hota,
         "id_switches": overall.id_switches,
         "late_id_switches": overall.late_id_switches,
         "time_to_confirm_s": overall.time_to_confirm_s.mean,
@@ -418,9 +434,11 @@ def _predictions(metrics: Mapping[str, Metrics]) -> Table:
     return Table("Predictions from the published states", records, columns, ("run", "predictor"), notes, is_detail=True)
 
 
-def _best_of(compared: Sequence[Comparison]) -> Any:
-    """Function of a quantity: True for the records whose run is best in it."""
-    return lambda quantity: lambda record: is_best(compared, quantity, str(record["run"]))
+def _is_best(compared: Sequence[Comparison], quantity: str) -> Callable[[Record], bool]:
+    """Function of a record: True if its run is better than all others of its recording, none of which ties with it."""
+    first = [entries[0] for one in compared if (entries := one.quantities.get(quantity))]
+    best = {entry.name for entry in first if entry.standing == "best"}
+    return lambda record: record["run"] in best
 
 
 def _two_decimals(value: Value) -> str:

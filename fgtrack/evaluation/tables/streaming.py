@@ -8,23 +8,22 @@ acts on it then. A user who knows the stamp may predict it to then; the remainin
 Times come from timing.csv, so nothing here depends on the machine that compares.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from fgtrack.core.geometry import cartesian
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.comparison import (
     STANDING_NOTE,
     Entry,
     common_samples,
     comparable,
+    compared,
     entry_columns,
     entry_record,
-    quantity,
 )
 from fgtrack.evaluation.intervals import UNKNOWN, by_stamp
 from fgtrack.evaluation.runs import EvaluatedRun
@@ -42,28 +41,11 @@ _TITLES = {ASKED: "at its stamp", READY: "when ready", PREDICTED: "predicted to 
 _LARGE_SHARE = 0.9
 
 
-@dataclass(frozen=True)
-class Streamed:
-    """The paired rows of a run, each array of shape (p,).
-
-    Attributes
-    ----------
-    object_index, now_ns
-        Object of the row, and the tick that published it.
-    errors_m
-        Distance to the truth, by when it is evaluated; NaN where there is no truth then.
-    """
-
-    object_index: IntArray
-    now_ns: IntArray
-    errors_m: Mapping[str, FloatArray]
-
-
-def streamed(one: EvaluatedRun) -> Streamed:
-    """Errors of `one`, a run with truth, when it is ready. Pairs are those of its `matching`.
+def streamed(one: EvaluatedRun) -> dict[str, FloatArray]:
+    """Distances to the truth of the paired rows of `one`, by when they are evaluated, shape (p,) each.
 
     A user predicts straight on: the published position, moved along the published yaw at the published speed. A state
-    without yaw or speed stays where it is.
+    without yaw or speed stays where it is. NaN where there is no truth then.
     """
     matching = one.matching
     assert matching is not None
@@ -77,12 +59,11 @@ def streamed(one: EvaluatedRun) -> Streamed:
     published = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
     way_m = tracks["speed_mps"] * (ready_ns - tracks["stamp_ns"]) / NS_PER_S
     moved = published + np.nan_to_num(cartesian(np.stack([tracks["yaw_rad"], way_m], axis=-1)))
-    errors_m = {
+    return {
         ASKED: matching.distances_m[rows, object_index],
         READY: np.linalg.norm(published - truth, axis=-1),
         PREDICTED: np.linalg.norm(moved - truth, axis=-1),
     }
-    return Streamed(object_index, matching.now_ns[ticks], errors_m)
 
 
 def streaming_tables(runs: Sequence[EvaluatedRun]) -> tuple[dict[str, Table], list[str]]:
@@ -133,18 +114,23 @@ def _compared(group: Sequence[EvaluatedRun]) -> tuple[dict[str, tuple[Entry, ...
     They are compared at the objects and ticks that all of them have, with truth when they are ready, so that the same
     samples stand behind all numbers.
     """
-    every = [streamed(one) for one in group]
-    known = [np.flatnonzero(np.isfinite(one.errors_m[READY])) for one in every]
-    objects = [one.object_index[mine] for one, mine in zip(every, known, strict=True)]
-    _, at_ns, rows = common_samples(objects, [one.now_ns[mine] for one, mine in zip(every, known, strict=True)])
+    every, objects, ticks_ns = [], [], []
+    for one in group:
+        errors_m, matching = streamed(one), one.matching
+        assert matching is not None
+        known = np.isfinite(errors_m[READY])
+        every.append({name: values[known] for name, values in errors_m.items()})
+        objects.append(matching.object_index[matching.paired][known])
+        ticks_ns.append(matching.now_ns[matching.tick_index[matching.paired][known]])
+    _, at_ns, rows = common_samples(objects, ticks_ns)
     if not len(at_ns):
         return {}, 0.0
     entries = {}
     for name in (ASKED, READY, PREDICTED):
-        errors_m = [one.errors_m[name][mine][row] for one, mine, row in zip(every, known, rows, strict=True)]
-        sums = by_stamp(at_ns, np.square(np.stack(errors_m, axis=-1)))
-        entries[name] = quantity(name, [one.label for one in group], sums).entries
-    return entries, len(at_ns) / max(len(one.now_ns) for one in every)
+        squares_m2 = [np.square(one[name][row]) for one, row in zip(every, rows, strict=True)]
+        sums = by_stamp(at_ns, np.stack(squares_m2, axis=-1))
+        entries[name] = compared(name, [one.label for one in group], sums)
+    return entries, len(at_ns) / max(np.count_nonzero(one.matching.paired) for one in group if one.matching)
 
 
 def _load(runs: Sequence[EvaluatedRun]) -> Table:

@@ -35,8 +35,8 @@ class _Square(NamedTuple):
 def verdict(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]) -> tuple[str, ...]:
     """Sentences on the runs of `metrics`, by label; none for runs without errors and innovations."""
     sentences = [
-        who_is_best(one[_POSITION], "at the newest stamp")
-        if one[_POSITION]
+        who_is_best(one.quantities[_POSITION], "at the newest stamp")
+        if _POSITION in one.quantities
         else f"{_listed(one.runs)} never track the same object at the same stamp: there is nothing to pair."
         for one in compared
     ]
@@ -48,7 +48,7 @@ def verdict(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]) -> t
             else "Not all runs are of the same recording with truth (or they are evaluated by different settings): "
             "only those that are can be ranked by their differences."
         )
-    groups = [[entry.name for entry in one[_POSITION]] or list(one.runs) for one in compared]
+    groups = [[entry.name for entry in one.quantities.get(_POSITION, ())] or list(one.runs) for one in compared]
     for labels in (*groups, *([label] for label in alone)):
         sentences += _noise({label: metrics[label] for label in labels})
     for label, one in metrics.items():
