@@ -2,11 +2,19 @@
 
 from collections.abc import Sequence
 from functools import cache
+from importlib import import_module
+from types import ModuleType
 
 import numpy as np
 from scipy.linalg.lapack import dgesv, dpotrf, dtrtri
 
 from fgtrack.core.types import FloatArray
+
+
+@cache
+def kernels(name: str) -> ModuleType:
+    """Return the module `name` of compiled loops, which is not imported before it is needed: numba is large."""
+    return import_module(name)
 
 
 @cache

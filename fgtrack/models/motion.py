@@ -8,9 +8,7 @@ backwards. `predict` does not wrap the yaw; `MeasurementModel.residual` does.
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import cache, cached_property
-from importlib import import_module
-from types import ModuleType
+from functools import cached_property
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -18,7 +16,7 @@ import numpy as np
 from fgtrack.core.checks import not_negative, positive
 from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import cartesian, cartesian_gradient, polar, polar_gradient
-from fgtrack.core.linalg import congruence, symmetrise
+from fgtrack.core.linalg import congruence, kernels, symmetrise
 from fgtrack.core.types import ACCEL, SPEED, STATE_NAMES, YAW, YAW_RATE, FloatArray
 
 #: The first entries of every model's state are either of these.
@@ -147,12 +145,6 @@ class MotionModel(ABC):
         return np.array([[float(row == column) for column in self.state_names] for row in STATE_NAMES])
 
 
-@cache
-def _compiled() -> ModuleType:
-    """Return `fgtrack.models.transitions`, which is not imported before it is needed: numba is large."""
-    return import_module("fgtrack.models.transitions")
-
-
 @dataclass(frozen=True)
 class WhiteNoise(MotionModel):
     """A motion model with a compiled transition, driven by white noise in each entry of the state.
@@ -208,7 +200,8 @@ class WhiteNoise(MotionModel):
             shape = np.broadcast_shapes(shape, t.shape)
             x, t = np.broadcast_to(x, (*shape, n)), np.broadcast_to(t, shape)
         states = np.array(x, dtype=np.float64, order="C").reshape(-1, n)
-        mean, F, Q = _compiled().transitions(self.kind, states, np.array(t, order="C").reshape(-1), self.density)
+        compiled = kernels("fgtrack.models.transitions")
+        mean, F, Q = compiled.transitions(self.kind, states, np.array(t, order="C").reshape(-1), self.density)
         if len(shape) == 1:
             return Transition(mean, F, Q)
         return Transition(mean.reshape(*shape, n), F.reshape(*shape, n, n), Q.reshape(*shape, n, n))

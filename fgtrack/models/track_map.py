@@ -13,6 +13,7 @@ from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import wrap_angles
+from fgtrack.core.linalg import kernels
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
 #: Columns of a map file, in order. The normal points to the right of the driving direction.
@@ -224,35 +225,15 @@ class TrackMap:
 
     def _locate(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Quantities at the feet of `points_m` on the line, shape (n, 10), and lateral offsets, shape (n,)."""
+        points_m = np.array(points_m, order="C")
         nearest = np.asarray(self._tree.query(points_m)[1])
-        points = _complex(points_m)
-        plane = self._segments.take(nearest, axis=0).view(np.complex128)
-        behind = ((points - plane[:, 0]) * plane[:, 1]).real < 0.0
-        at = self._segments.take(nearest - behind, axis=0, mode="wrap")
-        part, lateral_m = _projected(points, at.view(np.complex128).T, at[:, _ALONG::_QUANTITIES].T)
-        return _interpolated(at, part), lateral_m
+        found: tuple[FloatArray, FloatArray] = kernels("fgtrack.models.feet").feet(points_m, nearest, self._segments)
+        return found
 
 
 def _complex(vectors: FloatArray) -> ComplexArray:
     """x + i y of `vectors`, shape (n, 2)."""
     return np.ascontiguousarray(vectors).view(np.complex128)[:, 0]
-
-
-def _projected(points: ComplexArray, plane: ComplexArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Parts t of segments at which the feet of `points` are, and their lateral offsets, shapes (n,).
-
-    The foot has the point on its normal: Re((q - t e) (B + t dB)) = 0 with q from the start of the segment to the
-    point, e the segment, B and dB `_BACK` and its change. `plane` (10, n) are the segment rows in complex numbers,
-    `along` (2, n) are `_ALONG` and its change.
-    """
-    offset, back, segment, turn = points - plane[0], plane[1], plane[5], plane[6]  # values, then changes
-    c = (offset * back).real
-    # Positive as far as the centre of curvature; beyond it the nearer end of the segment is the foot.
-    b = np.maximum(0.5 * (along[0] - (offset * turn).real), 1e-12)
-    root = np.sqrt(np.maximum(b * b + along[1] * c, 0.0))
-    part = np.clip(c / (root + b), 0.0, 1.0)
-    back = back + part * turn
-    return part, ((offset - part * segment) * back).imag / np.abs(back)
 
 
 def _interpolated(at: FloatArray, part: FloatArray) -> FloatArray:

@@ -76,8 +76,8 @@ class GatedEuclidean:
         if self.max_nis is not None and len(pairs.rows):
             suspects.update(pairs.rows.tolist())
             nis = np.empty(len(pairs.rows))
-            for batch in innovations(pairs, grouped(candidates), len(candidates), states):
-                nis[batch.pairs] = batch.nis
+            for chosen, found, _, _ in innovations(pairs, grouped(candidates), len(candidates), states):
+                nis[chosen] = found
             pairs = pairs.at(nis <= self.max_nis)
         return _refusing(suspects, assigned(pairs, len(candidates), len(states.means)))
 
@@ -110,9 +110,9 @@ class GatedMahalanobis:
         reach_m = reaches_m(groups, states, quantiles, self.max_distance_m)
         pairs = _near(candidates, states, reach_m, apart)
         cost, inside = np.empty(len(pairs.rows)), np.empty(len(pairs.rows), dtype=bool)
-        for batch in innovations(pairs, groups, len(candidates), states) if len(cost) else ():
-            cost[batch.pairs] = batch.nis + np.linalg.slogdet(batch.S)[1]
-            inside[batch.pairs] = batch.nis <= chi_square_quantile(self.gate_probability, batch.S.shape[-1])
+        for chosen, nis, logdet, k in innovations(pairs, groups, len(candidates), states) if len(cost) else ():
+            cost[chosen] = nis + logdet
+            inside[chosen] = nis <= chi_square_quantile(self.gate_probability, k)
         result = assigned(pairs._replace(values=cost).at(inside), len(candidates), len(states.means))
         if not (self.claim_m and result.new):
             return result
@@ -143,15 +143,16 @@ def chi_square_quantile(probability: float, freedom: int) -> float:
 
 def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:
     """Assignment of as many of `pairs` as possible at least total cost, which are their values."""
-    if len(pairs.rows) < 2:
-        rows, columns = pairs.rows, pairs.columns
-    elif num_candidates * num_tracks <= _DENSE:
+    one, other = pairs.rows.tolist(), pairs.columns.tolist()
+    if len(set(one)) == len(one) and len(set(other)) == len(other):  # nothing competes, as nearly always
+        return _outcome(pairs.rows, pairs.columns, num_candidates, num_tracks)
+    if num_candidates * num_tracks <= _DENSE:
         cost = np.full((num_candidates, num_tracks), _OUTSIDE)
         cost[pairs.rows, pairs.columns] = pairs.values
         inside = np.zeros(cost.shape, dtype=bool)
         inside[pairs.rows, pairs.columns] = True
         return assigned_densely(cost, inside)
-    elif num_candidates > num_tracks:
+    if num_candidates > num_tracks:
         columns, rows = _least_cost(pairs.columns, pairs.rows, pairs.values, (num_tracks, num_candidates))
     else:
         rows, columns = _least_cost(pairs.rows, pairs.columns, pairs.values, (num_candidates, num_tracks))

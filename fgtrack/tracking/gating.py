@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fgtrack.core.grouping import equal_ones
-from fgtrack.core.linalg import congruence, mahalanobis_squared, symmetrise
+from fgtrack.core.linalg import kernels, symmetrise
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, StatesAt
 from fgtrack.estimation.filters.ekf import linearised
@@ -134,31 +134,22 @@ def _distances_to_ray(candidate: Candidate, means: FloatArray) -> FloatArray:
     return np.asarray(np.where(np.cos(angle) > 0.0, across, ranges))
 
 
-class InnovationBatch(NamedTuple):
-    """Innovations of pairs of candidates and tracks that measure the same, assumed components included."""
-
-    pairs: IntArray | slice
-    """Indices of the pairs, shape (p,)."""
-    nis: FloatArray
-    """Shape (p,)."""
-    S: FloatArray
-    """Covariances of the innovations, shape (p, k, k)."""
-
-
 def innovations(
     pairs: Pairs, groups: Sequence[Group], num_candidates: int, states: StatesAt
-) -> Iterator[InnovationBatch]:
-    """Yield the innovations of `pairs` of candidates, which are in `groups`, and tracks with these states."""
+) -> Iterator[tuple[IntArray | slice, FloatArray, FloatArray, int]]:
+    """Yield the innovations of `pairs` of candidates, which are in `groups`, and tracks with these states.
+
+    Indices of pairs that measure the same, assumed components included, with NIS and log det S, shapes (p,), and the
+    number k of components. NaN where S has no root.
+    """
+    P = np.array(states.covariances, dtype=np.float64, order="C")
     for chosen, members, group in _by_group(pairs.rows, groups, num_candidates):
         columns = pairs.columns[chosen]
         x = states.means[columns]
         y, H = linearised(group.z[members], x, group.example.model, group.example.pose)
-        if H.ndim == 2:
-            predicted = congruence(H, states.covariances)[columns]
-        else:
-            predicted = congruence(H, states.covariances[columns])
-        S = predicted + group.noise(members, x)
-        yield InnovationBatch(chosen, mahalanobis_squared(y, S), S)
+        R = group.noise(members, x)
+        H = np.array(H, ndmin=3, order="C")
+        yield chosen, *kernels("fgtrack.tracking.kernels").innovations(y, H, P, columns, R), y.shape[-1]
 
 
 def _by_group(

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 from scipy.special import chdtri
 
+from fgtrack.core.linalg import kernels
 from fgtrack.core.types import BoolArray, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, UpdateResult
 from fgtrack.estimation.failures import Failure
@@ -17,7 +18,8 @@ _MOST = np.array([1e9, 1e9, 1e3, 1e5, 1e4, 1e6])
 """Largest x, y, yaw, speed, yaw rate and acceleration, in SI units: far beyond any vehicle on Earth."""
 _ROUNDING = 1e-9
 """Tolerance of an eigenvalue of a correlation matrix below 0: rounding, where an entry is known for certain."""
-_TINY = 1e-300
+_FAULTS = Failure.NOT_FINITE, Failure.OUT_OF_BOUNDS, Failure.NOT_DEFINITE
+"""By the codes of the compiled loop."""
 
 IN_A_ROW, RARE = 8, 1e-4
 """A track has diverged when so many measurements in a row have a NIS that is rarer than this."""
@@ -54,35 +56,9 @@ def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
     n = means.shape[1]
     if not 5 <= n <= len(_MOST) or covariances.shape[1:] != (n, n):
         raise ValueError(f"states have the shapes {means.shape} and {covariances.shape}")
-    finite, small = are_finite(means, covariances), np.asarray((np.abs(means) <= _MOST[:n]).all(axis=1))
-    if finite.all() and small.all() and _are_covariances(covariances):
-        return {}
-    found = {}
-    for row in range(len(means)):
-        if not finite[row]:
-            found[row] = Failure.NOT_FINITE
-        elif not small[row]:
-            found[row] = Failure.OUT_OF_BOUNDS
-        elif not _are_covariances(covariances[row : row + 1]):
-            found[row] = Failure.NOT_DEFINITE
-    return found
-
-
-def _are_covariances(covariances: FloatArray) -> bool:
-    """True if all, shape (m, n, n), are symmetric and positive semidefinite up to rounding."""
-    variances = np.diagonal(covariances, axis1=-2, axis2=-1)
-    std = np.sqrt(np.maximum(variances, _TINY))
-    with np.errstate(over="ignore"):
-        correlations = np.asarray(covariances / std[:, :, None] / std[:, None, :])
-    if not ((variances >= 0.0).all() and (np.abs(correlations - correlations.mT) <= _ROUNDING).all()):
-        return False
-    n = covariances.shape[-1]
-    correlations[:, range(n), range(n)] = 1.0 + _ROUNDING
-    try:
-        np.linalg.cholesky(correlations)
-    except np.linalg.LinAlgError:
-        return False
-    return True
+    arrays = (np.array(array, dtype=np.float64, order="C") for array in (means, covariances))
+    codes = kernels("fgtrack.tracking.kernels").faults(*arrays, _MOST, _ROUNDING).tolist()
+    return {row: _FAULTS[code - 1] for row, code in enumerate(codes) if code} if any(codes) else {}
 
 
 @cache

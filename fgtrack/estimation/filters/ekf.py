@@ -2,9 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from functools import cache
-from importlib import import_module
-from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +9,7 @@ import numpy as np
 from fgtrack.core.linalg import (
     congruence,
     identity,
+    kernels,
     product,
     psd_solve,
     symmetrise,
@@ -24,6 +22,7 @@ from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import weight
 from fgtrack.models.sensors import RobustLoss
 
+_KALMAN = "fgtrack.estimation.kernels.kalman"
 _MAX_REWEIGHTINGS = 50
 _REWEIGHTING_TOLERANCE = 1e-9
 
@@ -157,7 +156,7 @@ def predict_across(
     after, F, Q = motion.transition(mean, dt_s)
     shape, n = after.shape[:-1], after.shape[-1]
     P = np.broadcast_to(covariance, (*shape, n, n))
-    found, cross = _kernels().predict(
+    found, cross = kernels(_KALMAN).predict(
         *(np.array(each, dtype=np.float64, order="C").reshape(-1, n, n) for each in (F, P, Q))
     )
     return Prediction(after, found.reshape(*shape, n, n), cross.reshape(*shape, n, n))
@@ -197,13 +196,13 @@ def correct_with_innovation(
     rows = np.arange(y.shape[-1]) if measured is None else np.array(measured, dtype=np.int64)
     x, P, y, R = (np.array(each, dtype=np.float64, order="C") for each in (mean, covariance, y, R))
     H = np.array(H, dtype=np.float64, order="C", ndmin=3)
-    after, covariance, nis, S, fused = _kernels().correct(x, P, y, H, R, rows)
+    after, covariance, nis, S, fused = kernels(_KALMAN).correct(x, P, y, H, R, rows)
     w = np.ones(len(x))
     if any(losses):
         spread = congruence(H, P)
         for row, loss in enumerate(losses):
             w[row] = robust_weight(loss, y[row], spread[row], R[row]) if fused[row] else 1.0
-        after, covariance, _, _, fused = _kernels().correct(x, P, y, H, R / w[:, None, None], rows)
+        after, covariance, _, _, fused = kernels(_KALMAN).correct(x, P, y, H, R / w[:, None, None], rows)
     return Correction(after, covariance, y, nis, w, S, fused)
 
 
@@ -230,9 +229,3 @@ def correct_one(mean: FloatArray, covariance: FloatArray, measurement: Measureme
     """`correct` of one state, shapes (n,) and (n, n). Raises as `updated_one`."""
     y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
     return updated_one(mean, covariance, y, H, measurement.R, measurement.loss, measurement.measured)
-
-
-@cache
-def _kernels() -> ModuleType:
-    """Return the compiled loops, which are not imported before they are needed: numba is large."""
-    return import_module("fgtrack.estimation.kernels.kalman")

@@ -1,11 +1,11 @@
 """Propagators: many objects through equal time steps, each through its own number of them."""
 
 import math
-from importlib import import_module
 
 import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
+from fgtrack.core.linalg import kernels
 from fgtrack.core.types import YAW, FloatArray, IntArray, TrackState
 from fgtrack.estimation.filters.ekf import predict
 from fgtrack.models.measurement import MeasurementModel
@@ -59,7 +59,7 @@ class EulerCtrv(ExactPropagator):
         self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
     ) -> tuple[FloatArray, FloatArray]:
         """See `ExactPropagator.propagate`."""
-        euler = import_module("fgtrack.estimation.kernels.euler")
+        euler = kernels("fgtrack.estimation.kernels.euler")
         x, P = (np.array(each, dtype=np.float64, order="C") for each in (mean, covariance))
         after: tuple[FloatArray, FloatArray] = euler.propagate(
             x, P, np.array(steps, dtype=np.int64), dt_s, self._density, self.accelerates, self.yaw_limit_rad

@@ -3,12 +3,12 @@
 import bisect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from fgtrack.core.checks import LARGEST_NS
+from fgtrack.core.linalg import kernels
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus
 from fgtrack.estimation.filters.ekf import OneCorrection, Prediction
@@ -141,7 +141,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
 
     def __init__(self, motion: WhiteNoise, start: Callable[[Start], ReplayEkf], lag_s: float) -> None:
         super().__init__(motion, start, lag_s)
-        self._kernels = import_module("fgtrack.estimation.kernels.replay")
+        self._kernels = kernels("fgtrack.estimation.kernels.replay")
         self._kind, self._density = motion.kind, motion.density
         self._start_ns = -int(LARGEST_NS)  # of all windows, by the clock
         self._chains: dict[int, _Chain] = {}

@@ -1,0 +1,37 @@
+"""Feet of points on the line of a map, compiled."""
+
+import math
+
+import numpy as np
+
+from fgtrack.core.compiled import njit
+from fgtrack.core.types import FloatArray, IntArray
+
+_ALONG, _QUANTITIES = 9, 10  # see `fgtrack.models.track_map`
+
+
+@njit("(float64[:, ::1], int64[:], Array(float64, 2, 'C', readonly=True))")
+def feet(points_m: FloatArray, nearest: IntArray, segments: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Quantities (m, 10) at the feet of points (m, 2) on the line, and lateral offsets (m,), left positive.
+
+    `segments` (n, 20) are the rows of `TrackMap`, and the foot is on the one that begins or ends at the `nearest` point
+    of the line. It has the point on its normal: Re((q - t e) (B + t dB)) = 0 with q from the start of the segment to
+    the point, e the segment, and B, dB the inverse of the heading and its change, as complex numbers.
+    """
+    found, lateral = np.empty((len(points_m), _QUANTITIES)), np.empty(len(points_m))
+    for i in range(len(points_m)):
+        x, y = points_m[i, 0], points_m[i, 1]
+        at = segments[nearest[i]]
+        if (x - at[0]) * at[2] - (y - at[1]) * at[3] < 0.0:
+            at = segments[(nearest[i] - 1) % len(segments)]
+        right, up = x - at[0], y - at[1]
+        c = right * at[2] - up * at[3]
+        # Positive as far as the centre of curvature; beyond it the nearer end of the segment is the foot.
+        b = max(0.5 * (at[_ALONG] - (right * at[12] - up * at[13])), 1e-12)
+        part = c / (math.sqrt(max(b * b + at[_ALONG + _QUANTITIES] * c, 0.0)) + b)
+        part = min(max(part, 0.0), 1.0)
+        for j in range(_QUANTITIES):
+            found[i, j] = at[j] + part * at[_QUANTITIES + j]
+        right, up = right - part * at[10], up - part * at[11]
+        lateral[i] = (right * found[i, 3] + up * found[i, 2]) / math.hypot(found[i, 2], found[i, 3])
+    return found, lateral

@@ -1,0 +1,55 @@
+"""Compiled loops over pairs of detections and tracks, and over the states that a tick publishes."""
+
+import math
+
+import numpy as np
+
+from fgtrack.core.compiled import njit, solve
+from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.estimation.kernels.kalman import innovate
+
+SOUND, NOT_FINITE, OUT_OF_BOUNDS, NOT_DEFINITE = range(4)
+
+
+@njit("(float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1], int64[:], float64[:, :, ::1])")
+def innovations(
+    y: FloatArray, H: FloatArray, P: FloatArray, tracks: IntArray, R: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """NIS y' S^-1 y and log det S with S = H P H' + R of pairs, shapes (m,); NaN where S has no root.
+
+    Innovations y (m, k), Jacobians H (m, k, n) or (1, k, n), covariances P (tracks, n, n), R (m, k, k).
+    """
+    m, k = y.shape
+    nis, logdet, every = np.empty(m), np.zeros(m), np.arange(k)
+    S, HP, none = np.empty((k, k)), np.empty((k, P.shape[1])), np.empty((k, 0))
+    for i in range(m):
+        nis[i] = innovate(P[tracks[i]], y[i], H[min(i, len(H) - 1)], R[i], every, S, HP)
+        solve(S, none)
+        for a in range(k):
+            logdet[i] += 2.0 * math.log(S[a, a])
+    return nis, logdet
+
+
+@njit("int64[::1](float64[:, ::1], float64[:, :, ::1], float64[::1], float64)")
+def faults(means: FloatArray, covariances: FloatArray, most: FloatArray, rounding: float) -> IntArray:
+    """What is wrong with states (m, n) and (m, n, n), shape (m,): not finite, larger than `most`, no covariance."""
+    m, n = means.shape
+    found, C, none = np.zeros(m, np.int64), np.empty((n, n)), np.empty((n, 0))
+    for i in range(m):
+        P, total, small, sound = covariances[i], 0.0, True, True
+        for a in range(n):
+            total += abs(means[i, a])
+            small = small and abs(means[i, a]) <= most[a]
+            for b in range(n):
+                total += abs(P[a, b])
+                root = math.sqrt(max(P[a, a], 1e-300)) * math.sqrt(max(P[b, b], 1e-300))
+                C[a, b] = 1.0 + rounding if a == b else P[a, b] / root
+                sound = sound and abs(P[a, b] - P[b, a]) / root <= rounding
+            sound = sound and P[a, a] >= 0.0
+        if not total < np.inf:
+            found[i] = NOT_FINITE
+        elif not small:
+            found[i] = OUT_OF_BOUNDS
+        elif not (sound and solve(C, none)):
+            found[i] = NOT_DEFINITE
+    return found
