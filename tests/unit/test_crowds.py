@@ -104,8 +104,8 @@ def test_an_association_by_a_tree_is_that_of_all_pairs(
         cost, inside = np.empty(len(pairs.rows)), np.empty(len(pairs.rows), dtype=bool)
         for chosen, nis, logdet, k in innovations(pairs, grouped(candidates), len(candidates), tracks):
             cost[chosen] = nis + logdet
-            limit = {1: 10.8275661707, 2: 13.8155105580}[batch.S.shape[-1]]  # chi-square quantiles of 0.999
-            inside[batch.pairs] = (batch.nis <= limit) & (pairs.values[batch.pairs] <= 9.0)
+            limit = {1: 10.8275661707, 2: 13.8155105580}[k]  # chi-square quantiles of 0.999
+            inside[chosen] = (nis <= limit) & (pairs.values[chosen] <= 9.0)
         assert whole == assigned_densely(cost.reshape(distances.shape), inside.reshape(distances.shape))
 
 
