@@ -39,7 +39,7 @@ def test_a_track_of_an_ignored_object_is_not_false_and_none_is_not_a_miss(tmp_pa
     judged = evaluate(write_run(tmp_path / "with", tracks, truth=[*truth, *van])).multi_object
     assert judged is not None
     assert (judged.clear["false_positives"], judged.clear["misses"], judged.clear["mota"]) == (0, 0, 1.0)
-    assert judged.gospa.false_m2 == judged.gospa.missed_m2 == 0.0
+    assert judged.gospa["false_m2"] == judged.gospa["missed_m2"] == 0.0
     alone = [[WEST.track(tick, 1)] for tick in TICKS]
     judged = evaluate(write_run(tmp_path / "alone", alone, truth=[*truth, *van])).multi_object
     assert judged is not None
