@@ -60,7 +60,7 @@ def arrivals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     sheet = Sheet(9.0, sum(heights) + 1.5, paper)
     flow, *rows = sheet.plots(len(heights), heights=heights)[:, 0]
     first_ns = start_ns([one])
-    fates = _fates(updates)
+    fates = np.array([_FATES.get(name, "not used") for name in updates["disposition"].tolist()])
     _draw_flow(flow, updates, fates, first_ns)
     for name, color in _COLOURS.items():
         count = int((fates == name).sum())
@@ -86,7 +86,9 @@ def arrivals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
 
 def _draw_flow(axes: Axes, updates: Table, fates: Column, first_ns: int) -> None:
     """A line for each detection of the busiest part, a pair of levels for each sensor."""
-    length_ns = _shown_ns(updates)
+    own = (updates["stamp_ns"][updates["sensor"] == name] for name in np.unique(updates["sensor"]).tolist())
+    shortest_ns = min(map(usual_step_ns, own))
+    length_ns = round(_SHOWN_LISTS * shortest_ns) if np.isfinite(shortest_ns) else NS_PER_S
     start_ns = _busiest_ns(updates["receipt_ns"], fates == "fused out of sequence", length_ns)
     inside = (updates["receipt_ns"] >= start_ns) & (updates["stamp_ns"] <= start_ns + length_ns)
     sensors = np.unique(updates["sensor"][inside]).tolist()
@@ -107,21 +109,8 @@ def _draw_flow(axes: Axes, updates: Table, fates: Column, first_ns: int) -> None
     axes.set(xlim=(from_s, from_s + length_ns / NS_PER_S), ylim=(0.0, len(sensors)), xlabel="time [s]")
 
 
-def _shown_ns(updates: Table) -> int:
-    """Length of the part shown, in nanoseconds."""
-    sensors = updates["sensor"]
-    steps_ns = [usual_step_ns(updates["stamp_ns"][sensors == name]) for name in np.unique(sensors).tolist()]
-    shortest_ns = min(steps_ns)
-    return round(_SHOWN_LISTS * shortest_ns) if np.isfinite(shortest_ns) else NS_PER_S
-
-
 def _busiest_ns(receipts_ns: IntArray, late: BoolArray, length_ns: int) -> int:
     """When the part begins in which the most of the `late` were received, or of all where there are none."""
     receipts_ns = np.sort(receipts_ns[late] if late.any() else receipts_ns)
     counts = np.searchsorted(receipts_ns, receipts_ns + length_ns, side="right") - np.arange(len(receipts_ns))
     return int(receipts_ns[counts.argmax()])
-
-
-def _fates(updates: Table) -> Column:
-    """Outcome of each detection, as in the legend, shape (n,)."""
-    return np.array([_FATES.get(name, "not used") for name in updates["disposition"].tolist()])

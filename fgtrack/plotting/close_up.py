@@ -47,8 +47,6 @@ class Estimates:
     """Rising, shape (m,); the last one is the present."""
     means: FloatArray
     """x, y, yaw, speed, yaw rate[, acceleration], shape (m, n)."""
-    covariances: FloatArray
-    """Shape (m, n, n)."""
 
 
 @dataclass(frozen=True)

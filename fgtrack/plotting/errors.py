@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Unpack
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,7 +11,7 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.matching import TrackErrors, track_errors
+from fgtrack.evaluation.matching import track_errors
 from fgtrack.evaluation.palette import Look
 from fgtrack.evaluation.runs import EvaluatedRun, Runs, evaluated, starts_ns
 from fgtrack.evaluation.scores.lagged import final_errors
@@ -30,16 +29,13 @@ _WINDOWS = 60  # moving means in the time that is shown
 _SHORTEST_S = 0.2  # of these
 
 
-@dataclass(frozen=True)
-class _Curve:
-    """The errors of one run over time."""
+class _Curve(NamedTuple):
+    """The errors of one run by rising stamp; its time axis starts at `first_ns`, ticks are `step_ns` apart."""
 
     label: str
     look: Look
     first_ns: int
-    """Start of its time axis."""
     step_ns: float
-    """Usual step between its ticks."""
     stamps_ns: IntArray
     values: Mapping[str, FloatArray]
 
@@ -75,13 +71,12 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
     wanted = known[0] if len(known) == 1 else object_id
     curves = _curves(every, wanted)
     names = [name for name in _QUANTITIES if any(np.isfinite(one.values[name]).any() for one in curves)]
-    window_s = max(
-        max((float(np.ptp(one.stamps_ns)) for one in curves if len(one.stamps_ns)), default=0.0) / NS_PER_S / _WINDOWS,
-        _SHORTEST_S,
-    )
-    sheet = Sheet(9.0, 1.5 + 2.0 * len(names or ["position_m"]), paper)
-    rows = sheet.plots(len(names or ["position_m"]), sharex=True)[:, 0]
-    for axes, name in zip(rows, names or ["position_m"], strict=True):
+    names = names or ["position_m"]
+    longest_ns = max((float(np.ptp(one.stamps_ns)) for one in curves if len(one.stamps_ns)), default=0.0)
+    window_s = max(longest_ns / NS_PER_S / _WINDOWS, _SHORTEST_S)
+    sheet = Sheet(9.0, 1.5 + 2.0 * len(names), paper)
+    rows = sheet.plots(len(names), sharex=True)[:, 0]
+    for axes, name in zip(rows, names, strict=True):
         what, unit, factor = _QUANTITIES[name]
         for one in curves:
             _draw_moving(axes, one, factor * one.values[name], unit, nanoseconds(window_s), has_label=axes is rows[0])
@@ -103,23 +98,18 @@ def _curves(runs: Sequence[EvaluatedRun], object_id: int | None) -> list[_Curve]
         matching = one.matching
         if matching is None or (object_id is not None and object_id not in matching.object_ids):
             continue
-        index = None if object_id is None else matching.object_ids.index(object_id)
-        step_ns = usual_step_ns(matching.tracks["now_ns"])
-        for found, label, its, group in (
-            (track_errors(matching), one.label, styles[one.label], present),
-            (final_errors(one.run, matching), f"{one.label}, final state", styles[one.label]._replace(line=":"), final),
+        step_ns, its = usual_step_ns(matching.tracks["now_ns"]), styles[one.label]
+        for found, label, look, curves in (
+            (track_errors(matching), one.label, its, present),
+            (final_errors(one.run, matching), f"{one.label}, final state", its._replace(line=":"), final),
         ):
-            stamps_ns, values = _of_object(found, index)
-            if group is present or len(stamps_ns):
-                group.append(_Curve(label, its, first_ns[one.label], step_ns, stamps_ns, values))
+            rows = np.argsort(found.stamps_ns, kind="stable")
+            if object_id is not None:
+                rows = rows[found.object_index[rows] == matching.object_ids.index(object_id)]
+            values = {name: each[rows] for name, each in found.values.items()}
+            if curves is present or len(rows):
+                curves.append(_Curve(label, look, first_ns[one.label], step_ns, found.stamps_ns[rows], values))
     return [*present, *final]
-
-
-def _of_object(found: TrackErrors, index: int | None) -> tuple[IntArray, Mapping[str, FloatArray]]:
-    """Stamps and errors by name of the object `index`, or of all, by rising stamp."""
-    mine = np.flatnonzero(np.ones(len(found.stamps_ns), dtype=bool) if index is None else found.object_index == index)
-    mine = mine[np.argsort(found.stamps_ns[mine], kind="stable")]
-    return found.stamps_ns[mine], {name: values[mine] for name, values in found.values.items()}
 
 
 def _draw_moving(axes: Axes, one: _Curve, values: FloatArray, unit: str, window_ns: int, has_label: bool) -> None:

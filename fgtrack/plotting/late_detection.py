@@ -149,8 +149,7 @@ def _estimates(tracker: Tracker, track_id: int, stamps_ns: Iterable[int]) -> Est
         except CallError:  # before its window
             break
     found.reverse()
-    columns = ([state.stamp_ns for state in found], [state.mean for state in found], [s.covariance for s in found])
-    return Estimates(*map(np.array, columns))
+    return Estimates(np.array([state.stamp_ns for state in found]), np.array([state.mean for state in found]))
 
 
 class _Late(NamedTuple):

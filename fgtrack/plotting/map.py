@@ -53,11 +53,8 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     maps, notes = roads(one.run)
     bounds_m = [line for road in maps.values() for line in road_lines(road)[:2]]
     rings = excluded_lines(one.run)
-    tracks = (
-        one.run.tables["tracks"].where(confirmed(one.run.tables["tracks"]))
-        if one.matching is None
-        else one.matching.tracks
-    )
+    every = one.run.tables["tracks"]
+    tracks = every.where(confirmed(every)) if one.matching is None else one.matching.tracks
     detections_m, ego_m = placed(one.run).position_m, _positions(one.run.tables["ego"])
     held = [*bounds_m, ego_m, *(path.states[:, :2] for path in true_paths(one.run.tables["truth"]))]
     samples_m = [_positions(tracks), detections_m]
@@ -123,11 +120,9 @@ def _window(run: Run) -> _Window | None:
         row = int(counts.argmax())
         best = max(best, (int(counts[row]), -int(stamps_ns[row]), track_id))
     middle_ns = -best[1]
-    rows = run.tables["tracks"].where(
-        (run.tables["tracks"]["track_id"] == best[2])
-        & (np.abs(run.tables["tracks"]["stamp_ns"] - middle_ns) <= around_ns)
-    )
-    positions_m = _positions(rows)
+    tracks = run.tables["tracks"]
+    is_near = np.abs(tracks["stamp_ns"] - middle_ns) <= around_ns
+    positions_m = _positions(tracks.where((tracks["track_id"] == best[2]) & is_near))
     if not best[0] or not len(positions_m):
         return None
     low_m, high_m = positions_m.min(axis=0), positions_m.max(axis=0)

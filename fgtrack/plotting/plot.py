@@ -72,7 +72,8 @@ def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
     DataError
         The map that a run names is not a map.
     """
-    extra = {one.label for one in _worst(runs)[_FEW:]} if len(runs) > _MOST_RUNS else set()
+    best = sorted(runs, key=_rmse_m)[:-_FEW] if len(runs) > _MOST_RUNS else []
+    extra = {one.label for one in best}
     plans = []
     for name, draw, has_data in (
         ("map", map, lambda one: one.run.tables["tracks"].num_rows),
@@ -117,23 +118,15 @@ def _of_groups(groups: Sequence[Sequence[EvaluatedRun]], name: str, draw: Callab
         yield Planned(file, partial(draw, replace(group[0], label=label)), len(groups) > _MOST_RUNS and k >= _FEW)
 
 
-def _worst(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
-    """`runs` from the largest position RMSE to the smallest; those that tracked no true object come first."""
-    lost = [one.matching is not None and not one.matching.paired.any() for one in runs]
-    order = sorted(range(len(runs)), key=lambda k: np.inf if lost[k] else _rmse_m(runs[k]), reverse=True)
-    return [runs[k] for k in order]
-
-
 def _rmse_m(one: EvaluatedRun, object_id: int | None = None) -> float:
-    """Position RMSE of a run, of one object or over all; -1 where there is none."""
+    """Position RMSE of a run, of one object or over all; infinite where nothing is tracked, -1 without truth of it."""
     if one.matching is None or (object_id is not None and object_id not in one.matching.object_ids):
         return -1.0
     found = track_errors(one.matching)
-    values = found.values["position_m"]
+    mine = np.ones(len(found.object_index), dtype=np.bool_)
     if object_id is not None:
-        values = values[found.object_index == one.matching.object_ids.index(object_id)]
-    moments = Moments.of(values)
-    return moments.rmse if moments.count else -1.0
+        mine = found.object_index == one.matching.object_ids.index(object_id)
+    return Moments.of(found.values["position_m"][mine]).rmse if mine.any() else np.inf
 
 
 def planned_sweep(table: SweepTable) -> list[Planned]:

@@ -15,17 +15,13 @@ def bulk(samples: Iterable[FloatArray], held: Iterable[FloatArray] = ()) -> tupl
     for nothing. Of no values it is (0, 1).
     """
     lows, highs = [], []
-    for sample in samples:
-        known = sample[np.isfinite(sample)]
-        if len(known):
-            first, third = np.quantile(known, (0.25, 0.75)).tolist()
-            lows.append(max(float(known.min()), first - _BEYOND * (third - first)))
-            highs.append(min(float(known.max()), third + _BEYOND * (third - first)))
-    for values in held:
+    for values, is_held in (*((each, False) for each in samples), *((each, True) for each in held)):
         known = values[np.isfinite(values)]
         if len(known):
-            lows.append(float(known.min()))
-            highs.append(float(known.max()))
+            first, third = np.quantile(known, (0.25, 0.75)).tolist()
+            reach = np.inf if is_held else _BEYOND * (third - first)
+            lows.append(max(float(known.min()), first - reach))
+            highs.append(min(float(known.max()), third + reach))
     if not lows:
         return 0.0, 1.0
     low, high = min(lows), max(highs)

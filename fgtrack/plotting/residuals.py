@@ -10,8 +10,6 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
 from fgtrack.evaluation.scores import innovations
 from fgtrack.evaluation.scores.innovations import RESIDUAL_NAMES
-from fgtrack.evaluation.scores.statistics import Moments
-from fgtrack.models.measurement import ANGULAR
 from fgtrack.plotting.paper import Paper, Sheet, styled
 from fgtrack.plotting.ranges import bulk
 from fgtrack.plotting.style import legend_above, sensor_colour, titled
@@ -60,7 +58,7 @@ def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
             sample = values[name][mine]
             if not len(sample):
                 continue
-            moments = (Moments.of_angles if name in ANGULAR else Moments.of)(sample)
+            moments = innovations.moments_of(name, sample)
             outside = int(((sample < low) | (sample > high)).sum())
             mean = round(moments.mean, 3) + 0.0  # no negative zero
             label = f"{sensor}: mean {mean:.3f}, std {moments.std:.3f}, n {moments.count}"

@@ -14,7 +14,7 @@ from scipy.special import stdtrit
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.palette import Look, look, looks
+from fgtrack.evaluation.palette import look, looks
 from fgtrack.evaluation.tables.seeds import PointMean, SweepTable, number, read_sweep
 from fgtrack.plotting.paper import Paper, Sheet, styled
 from fgtrack.plotting.style import legend_above, log_axis
@@ -52,7 +52,6 @@ _REST = (
 _WIDE = 3  # panels side by side
 _LOG_FROM = 20.0  # largest over smallest value
 _DODGE = 0.012  # of the axis, between the error bars of two estimators
-_CAP = 3.0
 _NAMED_STEPS = 8  # more values of the horizontal axis than these have no tick each
 
 
@@ -94,7 +93,12 @@ def sweep(
     means = table.means(metric, names)
     if not means:
         raise DataError(f"{metric}: no cell of the sweep has a value, so there is nothing to draw")
-    across = _horizontal(table, names)
+    cells = [list(dict.fromkeys(row[name] for row in table.rows)) for name in names] or [[""]]
+    are_numbers = [all(math.isfinite(number(cell)) for cell in each) for each in cells]
+    across = max(range(len(cells)), key=lambda k: (are_numbers[k], len(cells[k])))
+    places = map(number, cells[across]) if are_numbers[across] else range(len(cells[across]))
+    ticks = dict(zip(cells[across], map(float, places), strict=True))
+    width = max(ticks.values()) - min(ticks.values()) or 1.0
     rest = [k for k in range(len(names)) if k != across]
     panels = {tuple(one.point[k] for k in rest): None for one in means}
     columns = min(_WIDE, len(panels))
@@ -102,12 +106,23 @@ def sweep(
     sheet = Sheet(max(7.0, 1.2 + 3.8 * columns), 1.5 + 3.0 * rows, paper)
     grid = sheet.plots(rows, columns, sharex=True, sharey=True)
     estimators = list(dict.fromkeys(one.estimator for one in means))
-    ticks = _ticks([row[names[across]] for row in table.rows] if names else [""])
     for axes, point in zip(grid.flat, panels, strict=False):
         for k, (estimator, its) in enumerate(zip(estimators, looks(estimators), strict=True)):
             mine = [one for one in means if one.estimator == estimator and tuple(one.point[k] for k in rest) == point]
-            at = [ticks[one.point[across] if names else ""] for one in mine]
-            _draw(axes, at, mine, k - (len(estimators) - 1) / 2.0, its, ticks)
+            at = np.array([ticks[one.point[across] if names else ""] for one in mine])
+            order = np.argsort(at, kind="stable")
+            axes.errorbar(
+                at[order] + _DODGE * width * (k - (len(estimators) - 1) / 2.0),  # so that bars do not hide each other
+                np.array([one.mean for one in mine])[order],
+                half_widths(mine)[order],
+                color=its.colour,
+                ls=its.line if are_numbers[across] else "none",
+                marker=its.marker,
+                ms=4,
+                lw=1.2,
+                capsize=3.0,
+                label=estimator if mine else "",
+            )
         axes.set_title("\n".join(f"{words(names[k])}: {c}" for k, c in zip(rest, point, strict=True)), loc="left")
         if metric in _EXPECTED:
             axes.axhline(_EXPECTED[metric], color="black", lw=0.9, ls="--", label="expected")
@@ -116,7 +131,15 @@ def sweep(
         if len(panels) - columns <= k < len(panels):
             axes.set_xlabel(words(names[across]) if names else "")
             axes.tick_params(labelbottom=True)
-    _scale(grid[0, 0], means, ticks)
+    values = np.array([one.mean for one in means])
+    if (values > 0.0).all() and values.max() > _LOG_FROM * values.min():
+        grid[0, 0].set_yscale("log")
+        log_axis(grid[0, 0].yaxis)
+    elif (values >= 0.0).all():
+        grid[0, 0].set_ylim(0.0, None if values.any() else 1.0)
+    if len(ticks) <= _NAMED_STEPS or not are_numbers[across]:
+        grid[0, 0].set_xticks(list(ticks.values()), list(ticks))
+    grid[0, 0].set_xlim(min(ticks.values()) - 0.08 * width, max(ticks.values()) + 0.08 * width)
     for axes in grid[:, 0]:
         axes.set_ylabel(metric_words(metric))
     if len(panels) == 1:
@@ -216,56 +239,3 @@ def words(name: str) -> str:
     text, end = (stem, f" [{_UNITS[unit]}]") if stem and unit in _UNITS else (plain, "")
     proper = {each.lower(): each for each in ("LiDAR", "RADAR", "NEES", "NIS")}
     return " ".join(proper.get(word, word) for word in text.replace("_", " ").split(" ")) + end
-
-
-def _ticks(cells: Sequence[str]) -> dict[str, float]:
-    """Position of each value of the horizontal axis: its own where all are numbers, else side by side."""
-    names = list(dict.fromkeys(cells))
-    numbers = [number(name) for name in names]
-    return dict(zip(names, numbers if all(map(math.isfinite, numbers)) else map(float, range(len(names))), strict=True))
-
-
-def _draw(
-    panel: Axes, at: Sequence[float], means: Sequence[PointMean], aside: float, its: Look, ticks: Mapping[str, float]
-) -> None:
-    x = np.array(at) + _DODGE * _width(ticks) * aside  # so that bars do not hide each other
-    order = np.argsort(x, kind="stable")
-    panel.errorbar(
-        x[order],
-        np.array([one.mean for one in means])[order],
-        half_widths(means)[order],
-        color=its.colour,
-        ls=its.line if all(number(name) == x for name, x in ticks.items()) else "none",
-        marker=its.marker,
-        ms=4,
-        lw=1.2,
-        capsize=_CAP,
-        label=means[0].estimator if means else "",
-    )
-
-
-def _width(ticks: Mapping[str, float]) -> float:
-    return max(ticks.values()) - min(ticks.values()) or 1.0
-
-
-def _scale(panel: Axes, means: Sequence[PointMean], ticks: Mapping[str, float]) -> None:
-    values = np.array([one.mean for one in means])
-    if (values > 0.0).all() and values.max() > _LOG_FROM * values.min():
-        panel.set_yscale("log")
-        log_axis(panel.yaxis)
-    elif (values >= 0.0).all():
-        panel.set_ylim(0.0, None if values.any() else 1.0)
-    if len(ticks) <= _NAMED_STEPS or any(number(name) != x for name, x in ticks.items()):
-        panel.set_xticks(list(ticks.values()), list(ticks))
-    margin = 0.08 * _width(ticks)
-    panel.set_xlim(min(ticks.values()) - margin, max(ticks.values()) + margin)
-
-
-def _horizontal(table: SweepTable, axes: Sequence[str]) -> int:
-    """Index of the axis with the most different numbers, else with the most different texts."""
-
-    def rank(k: int) -> tuple[bool, int]:
-        cells = {row[axes[k]] for row in table.rows}
-        return all(math.isfinite(number(cell)) for cell in cells), len(cells)
-
-    return max(range(len(axes)), key=rank, default=0)
