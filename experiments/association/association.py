@@ -45,7 +45,7 @@ from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.plotting.paper import styled
 from fgtrack.plotting.style import colour, log_axis, save
-from fgtrack.sim.draw import drawn
+from fgtrack.sim.vehicles import drawn
 from fgtrack.tracking.association import Association, GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.preprocess import Candidate
 

@@ -26,7 +26,7 @@ from fgtrack.evaluation.intervals import Estimate, average, paired
 from fgtrack.models.measurement import SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import RobustLoss
-from fgtrack.sim.draw import drawn
+from fgtrack.sim.vehicles import drawn
 
 START_NS = 1_790_000_000 * NS_PER_S
 HUBER = RobustLoss("huber", 1.5)

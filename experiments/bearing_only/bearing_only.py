@@ -28,7 +28,7 @@ from fgtrack.estimation.starts import distances
 from fgtrack.evaluation.intervals import average, paired
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CV
-from fgtrack.sim.draw import drawn
+from fgtrack.sim.vehicles import drawn
 
 START_NS = 1_790_000_000 * NS_PER_S
 FIRST_BEARING_RAD = np.deg2rad(10.0)

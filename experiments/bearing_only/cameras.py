@@ -28,7 +28,7 @@ from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import Correlation, Mount, SensorModel
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
-from fgtrack.sim.draw import drawn
+from fgtrack.sim.vehicles import drawn
 
 MOTION = CTRV(0.01, 0.001, 0.5, 0.01)
 STARTS = np.array(

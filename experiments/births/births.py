@@ -22,7 +22,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.evaluation.intervals import Estimate
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
-from fgtrack.sim.draw import drawn
+from fgtrack.sim.vehicles import drawn
 
 START_NS = 1_790_000_000 * NS_PER_S
 STEP_S = 0.05

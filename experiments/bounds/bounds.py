@@ -36,7 +36,7 @@ from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
 from fgtrack.plotting.paper import styled
 from fgtrack.plotting.style import GREY, WRONG, save
-from fgtrack.sim.draw import drawn
+from fgtrack.sim.vehicles import drawn
 
 START_NS = 1_790_000_000 * NS_PER_S
 POOR_PERIOD_S, GOOD_PERIOD_S, GOOD_PHASE_S = 0.05, 0.1, 0.025

@@ -22,7 +22,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.evaluation.intervals import Estimate, paired
 from fgtrack.models.measurement import SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import CTRV
-from fgtrack.sim.draw import drawn
+from fgtrack.sim.vehicles import drawn
 
 MOTION = CTRV()
 STEP_S, DURATION_S, SETTLED_S = 0.1, 5.0, 1.0

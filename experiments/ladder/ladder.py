@@ -40,7 +40,7 @@ from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
 from fgtrack.plotting.paper import styled
 from fgtrack.plotting.style import WRONG, log_axis, save
-from fgtrack.sim.draw import drawn
+from fgtrack.sim.vehicles import drawn
 
 MOTION = CV(velocity_density_m2ps3=5.0)
 POSITION = measurement_model(("x_m", "y_m"), MOTION)

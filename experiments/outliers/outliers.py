@@ -23,7 +23,7 @@ from fgtrack.evaluation.intervals import paired
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import RobustLoss
-from fgtrack.sim.draw import drawn
+from fgtrack.sim.vehicles import drawn
 
 START_NS = 1_790_000_000 * NS_PER_S
 STEP_S = 0.05

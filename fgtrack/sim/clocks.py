@@ -5,23 +5,16 @@ sensor at once, in the order in which it sensed, and is an immutable value.
 """
 
 from collections.abc import Sequence
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Discriminator, Field
 
 from fgtrack.core.time import NS_PER_S, nanoseconds
-from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.core.types import IntArray
 from fgtrack.sim.settings import settings
 
 _LARGEST_ERROR_S = 86_400.0  # a day
-
-
-class ClockModel(Protocol):
-    """A way in which stamps are wrong."""
-
-    def read(self, rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray) -> IntArray:
-        """Stamps reported for `stamps_ns` of messages received at `receipts_ns`; all shapes (n,)."""
 
 
 @settings
@@ -33,7 +26,7 @@ class OffsetClock:
     kind: Literal["offset"] = "offset"
 
     def read(self, rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray) -> IntArray:
-        """See `ClockModel`."""
+        """Reported stamps, see `AnyClock`."""
         return stamps_ns + nanoseconds(self.offset_s)
 
 
@@ -46,9 +39,9 @@ class DriftClock:
     kind: Literal["drift"] = "drift"
 
     def read(self, rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray) -> IntArray:
-        """See `ClockModel`."""
+        """Reported stamps, see `AnyClock`."""
         elapsed_ns = (stamps_ns - stamps_ns[:1]).astype(np.float64)
-        return stamps_ns + _whole(elapsed_ns * (self.drift_ppm * 1e-6))
+        return stamps_ns + np.rint(elapsed_ns * (self.drift_ppm * 1e-6)).astype(np.int64)
 
 
 @settings
@@ -59,8 +52,9 @@ class JitterClock:
     kind: Literal["jitter"] = "jitter"
 
     def read(self, rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray) -> IntArray:
-        """See `ClockModel`."""
-        return stamps_ns + _whole(rng.standard_normal(len(stamps_ns)) * (self.std_s * NS_PER_S))
+        """Reported stamps, see `AnyClock`."""
+        errors_ns = rng.standard_normal(len(stamps_ns)) * (self.std_s * NS_PER_S)
+        return stamps_ns + np.rint(errors_ns).astype(np.int64)
 
 
 @settings
@@ -71,7 +65,7 @@ class QuantisedClock:
     kind: Literal["quantised"] = "quantised"
 
     def read(self, rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray) -> IntArray:
-        """See `ClockModel`."""
+        """Reported stamps, see `AnyClock`."""
         return stamps_ns - stamps_ns % nanoseconds(self.step_s)
 
 
@@ -82,11 +76,12 @@ class ArrivalClock:
     kind: Literal["arrival"] = "arrival"
 
     def read(self, rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray) -> IntArray:
-        """See `ClockModel`."""
+        """Reported stamps, see `AnyClock`."""
         return receipts_ns.copy()
 
 
-#: Every clock model, chosen by `kind`.
+#: Every clock model, chosen by `kind`; `read` gives the stamps reported for `stamps_ns` of messages received at
+#: `receipts_ns`, shape (n,) each.
 AnyClock = Annotated[
     OffsetClock | DriftClock | JitterClock | QuantisedClock | ArrivalClock,
     Discriminator("kind"),
@@ -94,7 +89,7 @@ AnyClock = Annotated[
 
 
 def reported_stamps(
-    clocks: Sequence[ClockModel], rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray
+    clocks: Sequence[AnyClock], rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray
 ) -> IntArray:
     """Stamps that a sensor with `clocks` reports; all shapes (n,).
 
@@ -103,7 +98,3 @@ def reported_stamps(
     for clock, child in zip(clocks, rng.spawn(len(clocks)), strict=True):
         stamps_ns = clock.read(child, stamps_ns, receipts_ns)
     return stamps_ns
-
-
-def _whole(errors_ns: FloatArray) -> IntArray:
-    return np.rint(errors_ns).astype(np.int64)

@@ -7,7 +7,7 @@ may have a memory (bursts) and still be an immutable value.
 import math
 from dataclasses import field
 from functools import cached_property
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat
@@ -17,13 +17,6 @@ from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.sim.settings import Probability, require, settings
 
 
-class DelayModel(Protocol):
-    """A distribution of delays."""
-
-    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """Delays in seconds of the messages stamped `stamps_s` (ascending), shape (n,); NaN is a lost one."""
-
-
 @settings
 class NoDelay:
     """Everything arrives at once."""
@@ -31,7 +24,7 @@ class NoDelay:
     kind: Literal["none"] = "none"
 
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """See `DelayModel`."""
+        """Delays, see `AnyDelay`."""
         return np.zeros(len(stamps_s))
 
 
@@ -43,7 +36,7 @@ class ConstantDelay:
     kind: Literal["constant"] = "constant"
 
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """See `DelayModel`."""
+        """Delays, see `AnyDelay`."""
         return np.full(len(stamps_s), self.delay_s)
 
 
@@ -59,7 +52,7 @@ class UniformDelay:
         require(self.max_s >= self.min_s, "max_s", "must not be below min_s", self.max_s)
 
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """See `DelayModel`."""
+        """Delays, see `AnyDelay`."""
         return rng.uniform(self.min_s, self.max_s, len(stamps_s))
 
 
@@ -72,7 +65,7 @@ class NormalDelay:
     kind: Literal["normal"] = "normal"
 
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """See `DelayModel`. Inverts the distribution function."""
+        """Delays, see `AnyDelay`: inverts the distribution function."""
         # 1 - u is uniform on (ndtr(-mean / std), 1]; the upper tail keeps its digits that way.
         tail = rng.uniform(0.0, special.ndtr(self.mean_s / self.std_s), len(stamps_s))
         return np.maximum(self.mean_s - self.std_s * special.ndtri(tail), 0.0)
@@ -117,7 +110,7 @@ class GammaDelay:
         return (self.mean_s - self.min_s) / self.shape
 
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """See `DelayModel`."""
+        """Delays, see `AnyDelay`."""
         return self.min_s + rng.gamma(self.shape, self.scale_s, len(stamps_s))
 
 
@@ -130,7 +123,7 @@ class LossyDelay:
     kind: Literal["loss"] = "loss"
 
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """See `DelayModel`."""
+        """Delays, see `AnyDelay`."""
         delays = self.base.draw(rng, stamps_s)
         delays[rng.random(len(stamps_s)) < self.probability] = math.nan
         return delays
@@ -153,7 +146,7 @@ class MarkovDelay:
     kind: Literal["markov"] = "markov"
 
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """See `DelayModel`."""
+        """Delays, see `AnyDelay`."""
         moves, share = np.ones(len(stamps_s)), self.to_bad / (self.to_bad + self.to_good)
         bad = _two_states(rng, share, self.to_bad * moves, self.to_good * moves)
         good_s = self.good.draw(rng, stamps_s)  # both are drawn for all messages
@@ -175,7 +168,7 @@ class MarkovTimeDelay:
     kind: Literal["markov_time"] = "markov_time"
 
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """See `DelayModel`."""
+        """Delays, see `AnyDelay`."""
         rate_per_s = self.to_bad_per_s + self.to_good_per_s
         forgotten, share = (
             -np.expm1(-rate_per_s * np.diff(stamps_s, prepend=stamps_s[:1])),
@@ -186,7 +179,8 @@ class MarkovTimeDelay:
         return np.where(bad, self.bad.draw(rng, stamps_s), good_s)
 
 
-#: Every delay model, chosen by `kind`.
+#: Every delay model, chosen by `kind`; `draw` gives the delays in s of the messages stamped `stamps_s` (ascending),
+#: shape (n,), NaN for a lost one.
 AnyDelay = Annotated[
     NoDelay | ConstantDelay | UniformDelay | NormalDelay | GammaDelay | LossyDelay | MarkovDelay | MarkovTimeDelay,
     Discriminator("kind"),
@@ -207,12 +201,10 @@ def _two_states(rng: np.random.Generator, share: float, to_bad: FloatArray, to_g
     Entry k of `to_bad` and `to_good`, shape (n,), is the probability to move from message k - 1 to k; the first
     is not used.
     """
-    bad = np.zeros(len(to_bad), dtype=bool)
-    for k, draw in enumerate(rng.random(len(bad))):
-        if k == 0:
-            bad[k] = draw < share
-        else:
-            bad[k] = draw >= to_good[k] if bad[k - 1] else draw < to_bad[k]
+    draws, bad = rng.random(len(to_bad)), np.zeros(len(to_bad), dtype=bool)
+    bad[:1] = draws[:1] < share
+    for k in range(1, len(bad)):
+        bad[k] = draws[k] >= to_good[k] if bad[k - 1] else draws[k] < to_bad[k]
     return bad
 
 

@@ -24,7 +24,7 @@ from fgtrack.models.oval import OVAL, make_oval
 from fgtrack.models.path import Path
 from fgtrack.models.track_map import TrackMap
 from fgtrack.sim.clocks import reported_stamps
-from fgtrack.sim.delays import DelayModel
+from fgtrack.sim.delays import AnyDelay
 from fgtrack.sim.scanner import Scanner
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.sensor import SimulatedSensor
@@ -153,7 +153,7 @@ def _stamps(scenario: Scenario, times_s: FloatArray) -> tuple[IntArray, FloatArr
 
 
 def _receipts(
-    delay: DelayModel, rng: np.random.Generator, stamps_ns: IntArray, times_s: FloatArray
+    delay: AnyDelay, rng: np.random.Generator, stamps_ns: IntArray, times_s: FloatArray
 ) -> tuple[IntArray, BoolArray]:
     """Receipt of each stamp, and True where the message is lost."""
     delays_s = delay.draw(rng, times_s)

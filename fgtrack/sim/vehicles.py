@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat
@@ -11,16 +11,9 @@ from scipy.interpolate import CubicHermiteSpline
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import STATE_NAMES, YAW, FloatArray
-from fgtrack.models.motion import CTRV
+from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.path import Path
 from fgtrack.sim.settings import require, settings
-
-
-class Trajectory(Protocol):
-    """The true motion of one vehicle."""
-
-    def states(self, times_s: FloatArray) -> FloatArray:
-        """States at `times_s`, shape (n,), from the start of the scenario: shape (n, 6), `STATE_NAMES`."""
 
 
 @settings
@@ -74,7 +67,10 @@ class TrackTrajectory:
     path: Path
 
     def states(self, times_s: FloatArray) -> FloatArray:
-        """See `Trajectory`. The acceleration is that along the heading."""
+        """States at `times_s`, shape (n,), from the start of the scenario: shape (n, 6), `STATE_NAMES`.
+
+        The acceleration is that along the heading.
+        """
         u, u1, u2 = self._along(times_s)
         d, d1, d2 = self._across(times_s)
         frame = self.path.frame(u)
@@ -169,7 +165,7 @@ class DrawnTrajectory:
     """Independent noise of the same covariance, shape (m, 5)."""
 
     def states(self, times_s: FloatArray) -> FloatArray:
-        """See `Trajectory`. The acceleration is 0, as the model has none."""
+        """As `TrackTrajectory.states`; the acceleration is 0, as the model has none."""
         step_s, motion = self.vehicle.step_s, self.vehicle.motion
         k = np.clip((times_s / step_s).astype(np.int64), 0, len(self.noise) - 1)
         within_s = times_s - k * step_s
@@ -183,3 +179,15 @@ class DrawnTrajectory:
 
 #: Every kind of vehicle, chosen by `kind`.
 AnyVehicle = Annotated[TrackVehicle | DrawnVehicle, Discriminator("kind")]
+#: The true motion of one vehicle.
+Trajectory = TrackTrajectory | DrawnTrajectory
+
+
+def drawn(motion: MotionModel, x: FloatArray, dt_s: float, rng: np.random.Generator) -> FloatArray:
+    """A draw of the states `dt_s` after `x`, both shape (..., n): the prediction plus N(0, Q(x, dt_s)).
+
+    Raises `numpy.linalg.LinAlgError` where Q is singular, as with a density of zero.
+    """
+    roots = np.linalg.cholesky(motion.process_noise(x, dt_s))
+    noise = rng.standard_normal((*x.shape[:-1], 1, x.shape[-1]))
+    return np.asarray(motion.predict(x, dt_s) + np.vecdot(roots, noise))

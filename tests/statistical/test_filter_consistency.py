@@ -13,7 +13,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.registry import estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
-from fgtrack.sim.draw import drawn
+from fgtrack.sim.vehicles import drawn
 
 MOTION = CTRV(
     position_density_m2ps=0.001, yaw_density_rad2ps=0.002, speed_density_m2ps3=0.2, yaw_rate_density_rad2ps3=0.01

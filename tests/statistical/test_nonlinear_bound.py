@@ -16,7 +16,7 @@ from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.evaluation.bounds import Bounds, ScheduledMeasurement, bounds, bounds_along
 from fgtrack.models.motion import CTRV, MotionModel
-from fgtrack.sim.draw import drawn
+from fgtrack.sim.vehicles import drawn
 
 START_NS = 1_790_000_000 * NS_PER_S
 PRIOR = Start(

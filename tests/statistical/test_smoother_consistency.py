@@ -16,7 +16,7 @@ from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.sensors import RobustLoss
-from fgtrack.sim.draw import drawn
+from fgtrack.sim.vehicles import drawn
 
 START_NS = 1_790_000_000_000_000_000
 MOTION = CTRV(yaw_density_rad2ps=0.002, yaw_rate_density_rad2ps3=0.02, speed_density_m2ps3=0.5)

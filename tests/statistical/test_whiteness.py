@@ -10,7 +10,7 @@ from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.evaluation.scores.innovations import Autocorrelation, autocorrelations
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
-from fgtrack.sim.draw import drawn
+from fgtrack.sim.vehicles import drawn
 
 MOTION = CTRV()
 SENSORS = {"lidar": ({"x_m": 0.3, "y_m": 0.3}, 0.151), "radar": ({"x_m": 1.0, "y_m": 1.0, "speed_mps": 0.2}, 0.062)}

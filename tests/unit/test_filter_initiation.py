@@ -14,7 +14,7 @@ from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.filters.track_initiation import LONGEST_S, MOST_MEASUREMENTS, TrackInitiation
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRV
-from fgtrack.sim.draw import drawn
+from fgtrack.sim.vehicles import drawn
 
 STD_M, PERIOD_NS = 0.3, 50_000_000
 STD = {"x_m": STD_M, "y_m": STD_M}

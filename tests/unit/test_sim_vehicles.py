@@ -9,7 +9,7 @@ from fgtrack.core.types import ACCEL, SPEED, YAW, YAW_RATE
 from fgtrack.models.motion import CTRV
 from fgtrack.models.oval import make_oval
 from fgtrack.models.path import Path
-from fgtrack.sim.vehicles import DrawnVehicle, LaneChange, TrackTrajectory, TrackVehicle
+from fgtrack.sim.vehicles import DrawnVehicle, LaneChange, TrackTrajectory, TrackVehicle, drawn
 
 OVAL = make_oval()
 PATH = Path.through(OVAL.table[:, :2])
@@ -106,3 +106,13 @@ def test_a_drawn_vehicle_moves_as_its_motion_model_says(start_s: float, step_s: 
 def test_a_setting_that_makes_no_sense_is_named(make: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()  # type: ignore[operator]
+
+
+def test_draws_have_the_mean_and_the_covariance_of_the_model() -> None:
+    x, dt_s, num = np.array([3.0, -2.0, 3.1, 20.0, 0.2]), 0.1, 20_000
+    found = drawn(CTRV(), np.tile(x, (num, 1)), dt_s, np.random.default_rng(1)) - CTRV().predict(x, dt_s)
+    found[:, YAW] = wrap_angles(found[:, YAW])
+    Q = CTRV().process_noise(x, dt_s)
+    whitened = np.linalg.solve(np.linalg.cholesky(Q), found.T)
+    np.testing.assert_allclose(whitened.mean(axis=1), 0.0, atol=5.0 / np.sqrt(num))
+    np.testing.assert_allclose(np.cov(whitened), np.eye(5), atol=5.0 * np.sqrt(2.0 / num))
