@@ -1,7 +1,6 @@
 """Which method is best when it pays for its time: streaming accuracy on the demo and with 50 objects.
 
     python experiments/bench_streaming.py
-    python experiments/bench_streaming.py --page docs/speed.md    # as the page has it
 
 Both streams are replayed by every method in turn; what was published is judged when it was ready, with the times that
 this machine took (of each tick the median over the rounds). The demo is the default scenario with its seed and fitted
