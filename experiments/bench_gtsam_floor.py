@@ -25,7 +25,7 @@ from fgtrack.pipeline.load import load
 
 CONFIG = Path(__file__).parent.parent / "configs" / "smoother.yaml"
 PARTS = {
-    "making the factors": [(incremental.IncrementalSolver, "_add_factors")],
+    "making the factors": [(incremental.IncrementalSolver, "_changed_factors")],
     "iSAM2's update and the means": [(incremental._Graph, "solve")],
     "covariances": [(incremental.IncrementalSolver, "_covariance")],
 }

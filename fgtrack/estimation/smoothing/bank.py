@@ -121,7 +121,7 @@ class SmootherBank:
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
         tracks = np.array([self._tracks[track_id] for track_id in track_ids], dtype=np.int64)
-        newest_ns, start_ns, reach_ns, oldest_ns = self._times()[:, tracks]
+        newest_ns, start_ns, reach_ns, oldest_ns = self._times().take(tracks, axis=1)
         self._settings.refuse_older(stamp_ns, int(start_ns.max(initial=stamp_ns)))
         results = [_TOO_OLD] * len(tracks)
         rows = (oldest_ns <= stamp_ns).nonzero()[0]

@@ -3,17 +3,53 @@
 The windows are block-tridiagonal. Elimination is the Kalman filter; what it leaves of each node, given the next one, is
 the gain and the covariance of the Rauch-Tung-Striebel smoother. No process noise is divided by, which vanishes between
 stamps 1 us apart. Arguments are those arrays of `Nodes` that have their names.
+
+All arrays are contiguous, and blocks are copied entry by entry: numba compiles that in a fraction of the time.
 """
 
 import numpy as np
 
-from fgtrack.core.compiled import add_product_transposed, inlined, njit, product, solve
-from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.core.compiled import inlined, njit, solve
+from fgtrack.core.types import FloatArray, IntArray
 
 #: Where a measurement leaves less than this of a variance, the short form of its update keeps too few digits.
 _LEAST_SHARE = 1e-6
+#: A node that leaves the window is relinearised where it has moved by more than this share of the thresholds.
+LEAVING_SHARE = 0.5
 TRACKS, ORDER, VECTORS, MATRICES = "int64[::1]", "int64[:, ::1]", "float64[:, ::1]", "float64[:, :, ::1]"
 _WINDOWS = f"{TRACKS}, {TRACKS}, {ORDER}"  # first, count, numbers
+
+
+@inlined
+def multiply(A: FloatArray, B: FloatArray, column: int, result: FloatArray) -> None:
+    """Write A B to `result`, where B is n columns wide and begins at `column`, A and `result` at the first one."""
+    n = A.shape[0]
+    for i in range(n):
+        for j in range(n):
+            value = 0.0
+            for k in range(n):
+                value += A[i, k] * B[k, column + j]
+            result[i, j] = value
+
+
+@inlined
+def add_multiplied(A: FloatArray, B: FloatArray, result: FloatArray) -> None:
+    """Add A B', which is symmetric, to the first n columns of `result`: the lower triangle, and the mirror of that."""
+    n = A.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            value = result[i, j]
+            for k in range(n):
+                value += A[i, k] * B[j, k]
+            result[i, j] = result[j, i] = value
+
+
+@inlined
+def copy(source: FloatArray, column: int, result: FloatArray) -> None:
+    """Copy columns of `source`, from `column` on, to `result`."""
+    for i in range(result.shape[0]):
+        for j in range(result.shape[1]):
+            result[i, j] = source[i, column + j]
 
 
 @inlined
@@ -51,8 +87,8 @@ def _predict(left: FloatArray, segment: FloatArray, origin: FloatArray, moved: F
         ahead[i, n] = mean
         for j in range(i + 1):
             ahead[i, j] = 0.5 * (segment[i, n + j] + segment[j, n + i])
-    product(segment[:, :n], left[:, :n], moved)
-    add_product_transposed(moved, segment[:, :n], ahead[:, :n])
+    multiply(segment, left, 0, moved)
+    add_multiplied(moved, segment, ahead)
 
 
 @inlined
@@ -68,7 +104,7 @@ def _condition(
 ) -> bool:
     """A = P F' (F P F' + Q)^-1, b, C = E P E' + A Q A', E = I - A F; `gain` holds F P. False if there is no A."""
     n = gain.shape[0]
-    E[:] = ahead[:, :n]
+    copy(ahead, 0, E)
     if not solve(E, gain):
         return False
     for i in range(n):
@@ -80,31 +116,31 @@ def _condition(
             for k in range(n):
                 value -= gain[k, i] * segment[k, j]
             E[i, j] = value
+            C[i, j] = 0.0
         back[i, n] = mean
-    C[:] = 0.0
-    product(E, left[:, :n], work)
-    add_product_transposed(work, E, C)
-    product(back[:, :n], segment[:, n : 2 * n], work)
-    add_product_transposed(work, back[:, :n], C)
+    multiply(E, left, 0, work)
+    add_multiplied(work, E, C)
+    multiply(back, segment, n, work)
+    add_multiplied(work, back, C)
     return True
 
 
 @inlined
 def _correct(
-    state: FloatArray, row: FloatArray, gain: FloatArray, E: FloatArray, P: FloatArray, work: FloatArray
+    state: FloatArray, rows: FloatArray, k: int, gain: FloatArray, E: FloatArray, P: FloatArray, work: FloatArray
 ) -> None:
-    """Fuse y = G x + N(0, 1), `row` being [G | y], into `state` [P | x]; precise ones in Joseph's form."""
+    """Fuse y = G x + N(0, 1), [G | y] being row k, into `state` [P | x]; precise ones in Joseph's form."""
     n = len(gain)
-    S, y = 1.0, row[n]
+    S, y = 1.0, rows[k, n]
     for i in range(n):
         gain[i] = 0.0
         for j in range(n):
-            gain[i] += state[i, j] * row[j]
-        S += row[i] * gain[i]
-        y -= row[i] * state[i, n]
+            gain[i] += state[i, j] * rows[k, j]
+        S += rows[k, i] * gain[i]
+        y -= rows[k, i] * state[i, n]
     precise = S > 1.0 / _LEAST_SHARE
     if precise:
-        P[:] = state[:, :n]
+        copy(state, 0, P)
     for i in range(n):
         gain[i] /= S
         state[i, n] += gain[i] * y
@@ -113,14 +149,14 @@ def _correct(
     if precise:
         for i in range(n):
             for j in range(n):
-                E[i, j] = (1.0 if i == j else 0.0) - gain[i] * row[j]
+                E[i, j] = (1.0 if i == j else 0.0) - gain[i] * rows[k, j]
                 state[i, j] = gain[i] * gain[j]
-        product(E, P, work)
-        add_product_transposed(work, E, state[:, :n])
+        multiply(E, P, 0, work)
+        add_multiplied(work, E, state)
 
 
 @njit(
-    f"b1(int64[:], int64[:], int64[:], {_WINDOWS}, {VECTORS}, {MATRICES}, {MATRICES}, {TRACKS},"
+    f"b1({TRACKS}, {TRACKS}, {TRACKS}, {_WINDOWS}, {VECTORS}, {MATRICES}, {MATRICES}, {TRACKS},"
     f" {', '.join([MATRICES] * 4)})"
 )
 def eliminate(
@@ -153,16 +189,19 @@ def eliminate(
                     filtered[before], segment[before], predicted[at], A, E, work, back[before], C[before]
                 ):
                     return False
-            state = filtered[at]
-            state[:] = predicted[at]
+            state, total = filtered[at], 0.0
+            copy(predicted[at], 0, state)
             for k in range(num_rows[at]):
-                _correct(state, rows[at, k], gain, E, P, work)
-            if not np.isfinite(state).all():
+                _correct(state, rows[at], k, gain, E, P, work)
+            for i in range(n):
+                for j in range(n + 1):
+                    total += abs(state[i, j])
+            if not np.isfinite(total):
                 return False
     return True
 
 
-@njit(f"void(int64[:], {_WINDOWS}, {MATRICES}, {MATRICES}, {VECTORS})")
+@njit(f"void({TRACKS}, {_WINDOWS}, {MATRICES}, {MATRICES}, {VECTORS})")
 def back_substitute(
     tracks: IntArray,
     first: IntArray,
@@ -187,59 +226,36 @@ def back_substitute(
             later = at
 
 
-@njit(f"void(int64[:], {_WINDOWS}, {VECTORS}, {TRACKS}, {VECTORS}, b1[::1], b1[::1])")
-def mark_far(
+@njit(f"int64({TRACKS}, {TRACKS}, {_WINDOWS}, {VECTORS}, {VECTORS}, {TRACKS}, {TRACKS})")
+def find_far(
     tracks: IntArray,
+    anchors: IntArray,
     first: IntArray,
     count: IntArray,
     numbers: IntArray,
     thresholds: FloatArray,
-    anchored: IntArray,
     step: FloatArray,
-    far: BoolArray,
-    any_far: BoolArray,
-) -> None:
-    """Mark with `far` the nodes in the windows with a `step` longer than `thresholds` (tracks, n).
-
-    The first `anchored` nodes of each window are never marked.
-    """
-    for track in tracks:
-        any_far[track] = False
-        for index in range(first[track], count[track]):
-            at = numbers[track, index]
-            too_long = False
-            for i in range(step.shape[1]):
-                too_long |= abs(step[at, i]) > thresholds[track, i]
-            far[at] = too_long and index >= first[track] + anchored[track]
-            any_far[track] |= far[at]
-
-
-@njit(f"int64(int64[:], {_WINDOWS}, {TRACKS}, b1[::1], b1[::1], {TRACKS}, {TRACKS})")
-def find_far(
-    tracks: IntArray,
-    first: IntArray,
-    count: IntArray,
-    numbers: IntArray,
-    anchored: IntArray,
-    far: BoolArray,
-    any_far: BoolArray,
     rows: IntArray,
     indices: IntArray,
 ) -> int:
-    """Write the marked nodes as rows of `tracks` and `indices`; return their number."""
+    """Write the nodes with a `step` longer than `thresholds` as rows of `tracks` and indices; return their number.
+
+    Nodes before `anchors` are about to leave: a `LEAVING_SHARE` of the thresholds holds for them.
+    """
     num = 0
     for t in range(len(tracks)):
-        track = tracks[t]
-        if any_far[track]:
-            for index in range(first[track] + anchored[track], count[track]):
-                if far[numbers[track, index]]:
-                    rows[num], indices[num] = t, index
-                    num += 1
+        for index in range(first[tracks[t]], count[tracks[t]]):
+            at, share, too_long = numbers[tracks[t], index], LEAVING_SHARE if index < anchors[t] else 1.0, False
+            for i in range(step.shape[1]):
+                too_long |= abs(step[at, i]) > share * thresholds[tracks[t], i]
+            if too_long:
+                rows[num], indices[num] = t, index
+                num += 1
     return num
 
 
 @njit(
-    f"void(int64[:], int64[:], {TRACKS}, {_WINDOWS}, {MATRICES}, {MATRICES}, {MATRICES}, {VECTORS}, {MATRICES},"
+    f"void({TRACKS}, {TRACKS}, {TRACKS}, {_WINDOWS}, {MATRICES}, {MATRICES}, {MATRICES}, {VECTORS}, {MATRICES},"
     f" {VECTORS}, {MATRICES})"
 )
 def smoothed(
@@ -268,12 +284,12 @@ def smoothed(
         for index in range(known[track] - 1, indices[t] - 1, -1):
             at = numbers[track, index]
             if index == count[track] - 1:
-                P[at] = filtered[at, :, :n]
+                copy(filtered[at], 0, P[at])
                 continue
             later = numbers[track, index + 1]
-            P[at] = C[at]
-            product(back[at, :, :n], P[later], work)
-            add_product_transposed(work, back[at, :, :n], P[at])
+            copy(C[at], 0, P[at])
+            multiply(back[at], P[later], 0, work)
+            add_multiplied(work, back[at], P[at])
             if index < first[track]:  # behind the window
                 for i in range(n):
                     value = back[at, i, n]
@@ -282,7 +298,9 @@ def smoothed(
                     step[at, i] = value
         known[track] = min(known[track], indices[t])
         at = numbers[track, indices[t]]
-        steps[t], covariances[t] = step[at], P[at]
+        copy(P[at], 0, covariances[t])
+        for i in range(n):
+            steps[t, i] = step[at, i]
 
 
 @njit(f"b1({', '.join([VECTORS, MATRICES, MATRICES] * 2)}, {VECTORS}, {MATRICES}, {MATRICES}, {MATRICES})")
@@ -304,31 +322,38 @@ def interpolate(
     on the left A and C given it. See `interpolation.between` for Psi, Lambda and Sigma, which is E Q1 E' + Psi Q2 Psi'.
     """
     n = mean.shape[1]
-    S, gain, Psi, E, Lambda, by_right, work = np.empty((7, n, n))
+    S, gain, Psi, E = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    Lambda, by_right, work = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     for t in range(len(mean)):
         for attempt in range(2):
-            product(F2[t], Q1[t], gain)
-            S[:] = Q2[t]
-            add_product_transposed(gain, F2[t], S)
+            multiply(F2[t], Q1[t], 0, gain)
+            copy(Q2[t], 0, S)
+            add_multiplied(gain, F2[t], S)
             if solve(S, gain):
                 break
             if attempt == 1:
                 return False
             regularise(Q1[t])
             regularise(Q2[t])
-        Psi[:] = gain.T
-        product(Psi, F2[t], E)
+        for i in range(n):
+            for j in range(n):
+                Psi[i, j] = gain[j, i]
+        multiply(Psi, F2[t], 0, E)
         for i in range(n):
             for j in range(n):
                 E[i, j] = (1.0 if i == j else 0.0) - E[i, j]
                 mean[t, i] += Psi[i, j] * (right[t, j] - ahead[t, j])
-        product(E, F1[t], Lambda)
-        product(Lambda, A[t][:, :n], by_right)
-        by_right += Psi
-        product(by_right, P[t], work)
-        P[t] = 0.0
-        add_product_transposed(work, by_right, P[t])
+        multiply(E, F1[t], 0, Lambda)
+        multiply(Lambda, A[t], 0, by_right)
+        for i in range(n):
+            for j in range(n):
+                by_right[i, j] += Psi[i, j]
+        multiply(by_right, P[t], 0, work)
+        for i in range(n):
+            for j in range(n):
+                P[t, i, j] = 0.0
+        add_multiplied(work, by_right, P[t])
         for weights, noise in ((Lambda, C[t]), (E, Q1[t]), (Psi, Q2[t])):
-            product(weights, noise, work)
-            add_product_transposed(work, weights, P[t])
+            multiply(weights, noise, 0, work)
+            add_multiplied(work, weights, P[t])
     return True

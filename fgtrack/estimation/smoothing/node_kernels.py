@@ -5,16 +5,23 @@ import numpy as np
 from fgtrack.core.compiled import inlined, njit
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation.smoothing.kernels import MATRICES, ORDER, TRACKS, VECTORS, cholesky, regularise
+from fgtrack.estimation.smoothing.kernels import MATRICES, ORDER, TRACKS, VECTORS, cholesky, copy, regularise
 
 
 @inlined
 def _before(stamp_ns: int, all_ns: IntArray, count: int) -> int:
     """Return the index of the newest of `count` nodes at or before `stamp_ns`; -1 if there is none."""
-    return int(np.searchsorted(all_ns[:count], stamp_ns, side="right")) - 1
+    low, high = -1, count
+    while high - low > 1:
+        middle = (low + high) // 2
+        if all_ns[middle] <= stamp_ns:
+            low = middle
+        else:
+            high = middle
+    return low
 
 
-@njit(f"int64(int64[:], int64[:], {ORDER}, {TRACKS}, {ORDER}, int64[:], int64[:], float64[:], float64[:])")
+@njit(f"int64({TRACKS}, {TRACKS}, {ORDER}, {TRACKS}, {ORDER}, {TRACKS}, {TRACKS}, float64[::1], float64[::1])")
 def locate(
     tracks: IntArray,
     stamps_ns: IntArray,
@@ -43,7 +50,7 @@ def locate(
     return num_between
 
 
-@njit(f"void(int64[:], int64, int64, {ORDER}, {TRACKS}, int64[:], int64[:])")
+@njit(f"void({TRACKS}, int64, int64, {ORDER}, {TRACKS}, {TRACKS}, {TRACKS})")
 def nearest(
     tracks: IntArray,
     stamp_ns: int,
@@ -66,7 +73,7 @@ def nearest(
         indices[t] = index
 
 
-@njit(f"void(int64[:], int64[:], int64[:], {ORDER}, {TRACKS}, {TRACKS})")
+@njit(f"void({TRACKS}, {TRACKS}, {TRACKS}, {ORDER}, {TRACKS}, {TRACKS})")
 def last_before(
     tracks: IntArray, indices: IntArray, stamps_ns: IntArray, all_ns: IntArray, count: IntArray, last: IntArray
 ) -> None:
@@ -78,7 +85,7 @@ def last_before(
         last[t] = index
 
 
-@njit(f"void(int64[:], int64[:], int64, {ORDER}, {ORDER}, {TRACKS}, {TRACKS})")
+@njit(f"void({TRACKS}, {TRACKS}, int64, {ORDER}, {ORDER}, {TRACKS}, {TRACKS})")
 def insert(
     tracks: IntArray,
     indices: IntArray,
@@ -98,7 +105,7 @@ def insert(
         count[track] += 1
 
 
-@njit(f"void(int64[:], int64[:], float64[:, :], {TRACKS}, {ORDER}, {VECTORS}, {VECTORS}, {', '.join([MATRICES] * 3)})")
+@njit(f"void({TRACKS}, {TRACKS}, {VECTORS}, {TRACKS}, {ORDER}, {VECTORS}, {VECTORS}, {', '.join([MATRICES] * 3)})")
 def shift(
     tracks: IntArray,
     shifted: IntArray,
@@ -129,7 +136,7 @@ def shift(
                     back[behind, i, n] += back[behind, i, j] * steps[t, j]
 
 
-@njit(f"b1(int64[:], int64[:], float64[:, :], {MATRICES}, float64[:, :, :], float64[:, :], {MATRICES}, {TRACKS})")
+@njit(f"b1({TRACKS}, {TRACKS}, {VECTORS}, {MATRICES}, {MATRICES}, {VECTORS}, {MATRICES}, {TRACKS})")
 def observe(
     numbers: IntArray,
     size: IntArray,
@@ -162,8 +169,8 @@ def observe(
 
 
 @njit(
-    f"int64(int64[:], int64[:], {TRACKS}, {ORDER}, {VECTORS}, {VECTORS}, {MATRICES},"
-    f" {TRACKS}, b1[:, ::1], {ORDER}, {MATRICES})"
+    f"int64({TRACKS}, {TRACKS}, {TRACKS}, {ORDER}, {VECTORS}, {VECTORS}, {MATRICES}, {MATRICES},"
+    f" {TRACKS}, b1[::1], {ORDER}, {MATRICES})"
 )
 def changed_factors(
     tracks: IntArray,
@@ -173,6 +180,7 @@ def changed_factors(
     origin: FloatArray,
     reference: FloatArray,
     segment: FloatArray,
+    rows: FloatArray,
     num_rows: IntArray,
     changed: BoolArray,
     owners: IntArray,
@@ -180,52 +188,59 @@ def changed_factors(
 ) -> int:
     """Write the factors from `starts` on that have `changed`; return their number, or -1 if a Q is not definite.
 
-    Row of `tracks`, number and next number in `owners`; the latter is -1 for measurements. Motion is W (F d_left -
-    d_right) = W e + N(0, I), d relative to `reference`, W' W = Q^-1 and e = r_right - f(x0) - F (r_left - x0):
-    [(W F)'; -W'; (W e)'] in `factors`.
+    A factor is that of the measurements of a node, in its first rows, and of its motion to the next one, if there is
+    one. Row of `tracks`, index, number and next number, or -1, and the number of rows are in `owners`. Motion is
+    W (F d_left - d_right) = W e + N(0, I), d relative to `reference`, W' W = Q^-1 and e = r_right - f(x0) - F (r_left -
+    x0): [(W F)'; -W'; (W e)'] in `factors`; measurements are [G'; 0; (y + G (x0 - r))'].
     """
     n = origin.shape[1]
     L, Q, rhs = np.empty((n, n)), np.empty((n, n)), np.empty((n, 2 * n + 1))
     num = 0
     for t in range(len(tracks)):
         for index in range(starts[t], count[tracks[t]]):
-            left = numbers[tracks[t], index]
-            if changed[left, 1] and num_rows[left] > 0:
-                owners[num, 0], owners[num, 1], owners[num, 2] = t, left, -1
-                num += 1
-            is_moved = changed[left, 0] and index < count[tracks[t]] - 1
-            changed[left] = False
-            if not is_moved:
+            left, has_next = numbers[tracks[t], index], index < count[tracks[t]] - 1
+            used = num_rows[left]
+            if not changed[left] or not (has_next or used):
                 continue
-            right = numbers[tracks[t], index + 1]
-            Q[:] = segment[left, :, n : 2 * n]
-            if not cholesky(Q, n, L):
-                regularise(Q)
-                if not cholesky(Q, n, L):
-                    return -1
-            for i in range(n):
-                rhs[i, 2 * n] = reference[right, i] - segment[left, i, 2 * n]
+            changed[left] = False
+            for k in range(used):
+                factors[num, 2 * n, k] = rows[left, k, n]
                 for j in range(n):
-                    rhs[i, j], rhs[i, n + j] = segment[left, i, j], -1.0 if i == j else 0.0
-                    rhs[i, 2 * n] -= segment[left, i, j] * (reference[left, j] - origin[left, j])
-            for j in range(2 * n + 1):
+                    factors[num, j, k], factors[num, n + j, k] = rows[left, k, j], 0.0
+                    factors[num, 2 * n, k] += rows[left, k, j] * (origin[left, j] - reference[left, j])
+            owners[num, 0], owners[num, 1], owners[num, 2] = t, index, left
+            owners[num, 3], owners[num, 4] = -1, used
+            if has_next:
+                right = numbers[tracks[t], index + 1]
+                owners[num, 3], owners[num, 4] = right, used + n
+                copy(segment[left], n, Q)
+                if not cholesky(Q, n, L):
+                    regularise(Q)
+                    if not cholesky(Q, n, L):
+                        return -1
                 for i in range(n):
-                    value = rhs[i, j]
-                    for m in range(i):
-                        value -= L[i, m] * factors[num, j, m]
-                    factors[num, j, i] = value / L[i, i]
-            owners[num, 0], owners[num, 1], owners[num, 2] = t, left, right
+                    rhs[i, 2 * n] = reference[right, i] - segment[left, i, 2 * n]
+                    for j in range(n):
+                        rhs[i, j], rhs[i, n + j] = segment[left, i, j], -1.0 if i == j else 0.0
+                        rhs[i, 2 * n] -= segment[left, i, j] * (reference[left, j] - origin[left, j])
+                for j in range(2 * n + 1):
+                    for i in range(n):
+                        value = rhs[i, j]
+                        for m in range(i):
+                            value -= L[i, m] * factors[num, j, used + m]
+                        factors[num, j, used + i] = value / L[i, i]
             num += 1
     return num
 
 
-@njit(f"b1(int64[:], float64[:], {VECTORS}, {VECTORS}, {VECTORS})")
+@njit(f"b1({TRACKS}, float64[::1], {VECTORS}, {VECTORS}, {VECTORS})")
 def write_steps(
     numbers: IntArray, delta: FloatArray, reference: FloatArray, origin: FloatArray, step: FloatArray
 ) -> bool:
     """Write `step` of nodes whose states are `reference` + `delta`, one after the other; True if all are finite."""
-    n = origin.shape[1]
+    n, total = origin.shape[1], 0.0
     for k in range(len(numbers)):
         for i in range(n):
             step[numbers[k], i] = reference[numbers[k], i] - origin[numbers[k], i] + delta[k * n + i]
-    return bool(np.isfinite(delta).all())
+            total += abs(delta[k * n + i])
+    return bool(np.isfinite(total))

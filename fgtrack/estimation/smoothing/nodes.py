@@ -41,10 +41,10 @@ class Nodes:
         Length of a state.
     """
 
-    _ORDER = ("stamps_ns", "numbers", "first", "count", "anchored")
+    _ORDER = ("stamps_ns", "numbers", "first", "count")
     _VALUES = (
         *("origin", "segment", "rows", "num_rows", "predicted", "filtered", "back", "C"),
-        *("step", "P", "far", "changed"),
+        *("step", "P", "changed"),
     )
 
     def __init__(self, n: int) -> None:
@@ -58,12 +58,8 @@ class Nodes:
         """Number of nodes of each track."""
         self.first: IntArray = np.zeros_like(self.count)
         """Index of the oldest node of the window."""
-        self.anchored: IntArray = np.zeros_like(self.count)
-        """1 if the oldest node of the window keeps its linearisation, because it has a marginalised past."""
         self.known: IntArray = np.zeros_like(self.count)
         """From this index on `P` is known."""
-        self.any_far: BoolArray = np.zeros(len(self.count), dtype=bool)
-        """True if a node of the track is marked as `far`."""
         self.origin = np.zeros((size, n))
         """Linearisation points x0."""
         self.segment = np.zeros((size, n, 2 * n + 1))
@@ -78,10 +74,8 @@ class Nodes:
         """The node given the next one: x - x0 = A (next - its x0) + b + N(0, C); A and b."""
         self.step, self.P = np.zeros((size, n)), np.zeros((size, n, n))
         """Mean relative to x0, and covariance, given everything."""
-        self.far = np.zeros(size, dtype=bool)
-        """True if `step` is longer than it may be."""
-        self.changed: BoolArray = np.zeros((size, 2), dtype=bool)
-        """True if the motion to the next node, and the measurements, were linearised since a factor graph read them."""
+        self.changed: BoolArray = np.zeros(size, dtype=bool)
+        """True if the motion to the next node, or a measurement, was linearised since a factor graph read them."""
         self.terms: dict[int, list[MeasurementTerm]] = {}
         """Measurements of each node."""
         self.order = self.first, self.count, self.numbers
@@ -127,8 +121,7 @@ class Nodes:
         self.stamps_ns[track, 0] = stamp_ns
         self.count[track] = 1
         number = int(self.numbers[track, 0])
-        self.first[track] = self.known[track] = self.anchored[track] = 0
-        self.any_far[track] = False
+        self.first[track] = self.known[track] = 0
         self._empty(np.array([number]))
         self.origin[number] = mean
         for values in (self.predicted, self.filtered):
@@ -149,7 +142,6 @@ class Nodes:
         """
         order = self.first, self.numbers
         node_kernels.shift(tracks, numbers, steps, *order, self.origin, self.step, self.predicted, self.back, self.rows)
-        self.far[numbers] = False
         for number in numbers.tolist():
             if any(map(is_nonlinear, self.terms[number])):
                 self.linearise_terms(number)
@@ -179,7 +171,7 @@ class Nodes:
         self._fit_rows(int(used.max(initial=0)) + k)
         self.rows[numbers[:, None], used[:, None] + np.arange(k)] = rows
         self.num_rows[numbers] = used + k
-        self.changed[numbers, 1] = True
+        self.changed[numbers] = True
 
     def observe(self, numbers: IntArray, measured: Innovations, offsets: FloatArray) -> None:
         """Add measurements y = H (x - guess) + N(0, R); guess - x0 is `offsets`, (m, n).
@@ -190,13 +182,12 @@ class Nodes:
         given = measured.size, measured.y, measured.H, measured.R
         if not node_kernels.observe(numbers, *given, offsets, self.rows, self.num_rows):
             raise np.linalg.LinAlgError("a covariance is not positive definite")
-        self.changed[numbers, 1] = True
+        self.changed[numbers] = True
 
     def _empty(self, numbers: IntArray) -> None:
         self.num_rows[numbers] = 0
         self.rows[numbers] = 0.0
         self.predicted[numbers, :, -1] = 0.0
-        self.far[numbers] = False
         for number in numbers.tolist():
             self.terms[number] = []
 
@@ -207,7 +198,7 @@ class Nodes:
 
     def _grow_tracks(self) -> None:
         self._grow(axis=0)
-        for name in ("count", "first", "anchored", "known", "any_far"):
+        for name in ("count", "first", "known"):
             setattr(self, name, grown(getattr(self, name), len(self.numbers)))
         self.order = self.first, self.count, self.numbers
 

@@ -94,7 +94,6 @@ class Solver:
         """Find how far the states of `tracks` are from their linearisation points."""
         nodes = self.nodes
         kernels.back_substitute(tracks, *self.nodes.order, nodes.filtered, nodes.back, nodes.step)
-        self._mark_far(tracks)
         nodes.known[tracks] = nodes.count[tracks]
 
     def smoothed(self, tracks: IntArray, indices: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -105,24 +104,23 @@ class Solver:
         kernels.smoothed(tracks, indices, nodes.known, *self.nodes.order, *given, steps, covariances)
         return steps, covariances
 
-    def _mark_far(self, tracks: IntArray) -> None:
-        nodes, limits = self.nodes, (self._thresholds, self.nodes.anchored)
-        kernels.mark_far(tracks, *self.nodes.order, *limits, nodes.step, nodes.far, nodes.any_far)
-
     # --- linearisation
 
-    def far(self, tracks: IntArray) -> tuple[IntArray, IntArray]:
-        """Nodes that are too far from their linearisation points: rows of `tracks`, and indices."""
+    def far(self, tracks: IntArray, anchors: IntArray) -> tuple[IntArray, IntArray]:
+        """Nodes that are too far from their linearisation points: rows of `tracks`, and indices.
+
+        For those before `anchors`, which are about to leave, the tolerance is smaller.
+        """
         nodes = self.nodes
         rows, indices = np.empty((2, int((nodes.count - nodes.first)[tracks].sum())), dtype=np.int64)
-        num = kernels.find_far(tracks, *self.nodes.order, nodes.anchored, nodes.far, nodes.any_far, rows, indices)
+        num = kernels.find_far(tracks, anchors, *nodes.order, self._thresholds, nodes.step, rows, indices)
         return rows[:num], indices[:num]
 
-    def move_far(self, tracks: IntArray) -> Moved:
+    def move_far(self, tracks: IntArray, anchors: IntArray) -> Moved:
         """Move the linearisation points that are too far from their states, not yet the motion from there."""
         nodes = self.nodes
         starts = nodes.count[tracks]
-        rows, indices = self.far(tracks)
+        rows, indices = self.far(tracks, anchors)
         of = tracks[rows]
         if rows.size:
             numbers = nodes.numbers[of, indices]
@@ -141,12 +139,12 @@ class Solver:
             numbers = nodes.numbers[tracks, indices]
             ahead, F, Q = self.motion.transition(nodes.origin[numbers], dt_s)
             nodes.segment[numbers] = np.concatenate([F, Q, ahead[..., None]], axis=-1)
-            nodes.changed[numbers, 0] = True
+            nodes.changed[numbers] = True
 
     def iterate(self, tracks: IntArray, max_iterations: int) -> None:
         """Take Gauss-Newton steps while a state is further than a threshold from its linearisation point."""
         for _ in range(max_iterations):
-            moved = self.move_far(tracks)
+            moved = self.move_far(tracks, self.nodes.first[tracks])
             if not moved.tracks.size:
                 return
             self.linearise_motion(moved.tracks, moved.indices)
@@ -160,7 +158,7 @@ class Solver:
         """Relinearise a window before its first measurement that is not linear, with other thresholds from now on."""
         self.is_nonlinear[track] = True
         self._thresholds[track] = self._settings.thresholds(self.motion, nonlinear=True)
-        self.solve_anew(track, self.estimates(track))
+        self.solve_at(track, self.estimates(track))
 
     def estimates(self, track: int) -> FloatArray:
         """Means of all nodes in the window, shape (m, n)."""
@@ -171,11 +169,6 @@ class Solver:
         """Linearise the whole window at `means`, shape (m, n), and solve it."""
         self.move_to(track, means)
         self.rebuild(np.array([track]))
-
-    def solve_anew(self, track: int, means: FloatArray) -> None:
-        """Do as `solve_at`, and let the oldest node be relinearised, too, until the next one leaves."""
-        self.nodes.anchored[track] = 0
-        self.solve_at(track, means)
 
     def move_to(self, track: int, means: FloatArray) -> None:
         """Move all linearisation points of the window."""

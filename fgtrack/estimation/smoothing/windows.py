@@ -130,12 +130,11 @@ class Windows:
         is_old = indices < anchors
         undo = Undo(nodes, tracks)
         try:
-            moved = solver.move_far(tracks)
+            moved = solver.move_far(tracks, anchors)
             starts = moved.starts
             if is_old.any():
                 solver.linearise_motion(moved.tracks, moved.indices)
                 moved = Moved(starts, tracks[:0], tracks[:0])
-                nodes.anchored[tracks] |= anchors > undo.first
                 solver.solve(tracks[is_old], starts[is_old], anchors[is_old])
                 for row in is_old.nonzero()[0].tolist():
                     track = int(tracks[row])
@@ -148,7 +147,6 @@ class Windows:
                     nodes.linearise_terms(number)
             numbers = self._insert(tracks, stamp_ns, stamps_ns, indices, ~is_old, guesses, moved)
             self._measure(numbers, measurements, innovations, guesses, ~is_old, undo)
-            nodes.anchored[tracks] |= anchors > undo.first
             solver.solve(tracks, starts, anchors)
         except np.linalg.LinAlgError:
             undo()
@@ -163,7 +161,7 @@ class Windows:
         tracks = tracks[solver.is_nonlinear[tracks]]
         if not tracks.size or solver.is_damped:
             return
-        rows, indices = solver.far(tracks)
+        rows, indices = solver.far(tracks, nodes.first[tracks])
         moved = nodes.numbers[tracks[rows], indices]
         far = zip(rows.tolist(), moved.tolist(), nodes.origin[moved], nodes.step[moved], strict=True)
         for row in sorted({row for row, number, x, step in far if overshot(nodes.terms[number], x, x + step)}):
@@ -171,7 +169,7 @@ class Windows:
             means = nodes.origin[nodes.window(track)]
             with suppress(np.linalg.LinAlgError):  # then the linearisation points remain
                 means = DampedWindow(solver, track).solved()
-            solver.solve_anew(track, means)
+            solver.solve_at(track, means)
             self.failures.add(Failure.STEP_DAMPED)
 
     def _relinearised(

@@ -77,7 +77,6 @@ class GraphSolver(Solver):
         except (RuntimeError, ValueError, IndexError) as error:
             raise np.linalg.LinAlgError(f"the graph cannot be solved ({error})") from error
         self._known.update((track, {}) for track in tracks.tolist())
-        self._mark_far(tracks)
         nodes.known[tracks] = anchors
 
     def rebuild(self, tracks: IntArray) -> None:

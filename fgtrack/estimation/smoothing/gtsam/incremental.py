@@ -1,8 +1,7 @@
-"""The default solver: gtsam's incremental fixed-lag smoother on iSAM2."""
+"""The default solver: gtsam's iSAM2."""
 
 from collections.abc import Sequence
 from functools import cache
-from typing import SupportsFloat, SupportsIndex, SupportsInt
 
 import gtsam
 import numpy as np
@@ -15,18 +14,16 @@ from fgtrack.estimation.smoothing.nodes import grown
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
 
-_Key = SupportsInt | SupportsIndex
-_Stamp = SupportsFloat | SupportsIndex
-
-#: gtsam marginalises what is older than its lag: only nodes that leave are given such a stamp.
-_INSIDE, _LEFT, _LAG = 1.0, 0.0, 0.5
+_Changed = tuple[int, gtsam.JacobianFactor]
+"""Node and its factor."""
 
 
 class _Graph:
     """The factor graph of a window; its variables have the numbers of the nodes, and the values 0.
 
     iSAM2 with QR, because Cholesky fails for stamps close together. It is given linear factors only, so it never calls
-    back into Python: what has to be linearised elsewhere is replaced.
+    back into Python: what has to be linearised elsewhere is replaced. It eliminates in the order of the stamps: a late
+    measurement leaves alone what is older, and nodes that have left the window are leaves of the Bayes tree.
     """
 
     def __init__(self, prior: gtsam.JacobianFactor) -> None:
@@ -37,41 +34,43 @@ class _Graph:
         gauss_newton = gtsam.ISAM2GaussNewtonParams()
         gauss_newton.setWildfireThreshold(0.0)
         params.setOptimizationParams(gauss_newton)
-        self.smoother = gtsam.IncrementalFixedLagSmoother(_LAG, params)
-        self.slots: dict[int, list[int | None]] = {}
-        """Slots of the motion factor to the next node and of the measurements, by node."""
-        self._factors = gtsam.GaussianFactorGraph()
-        self._owners: list[tuple[int, int]] = []
-        self._removed: list[int] = []
+        self.isam = gtsam.ISAM2(params)
         self._prior: gtsam.JacobianFactor | None = prior
+        self.slots: dict[int, int | None] = {}
+        """Slot of the factor of each node, of its measurements and its motion to the next one, if it has any."""
+        self._newest = -1
 
-    def replace(self, number: int, kind: int, factor: gtsam.JacobianFactor) -> None:
-        """Add a factor instead of that of this `kind` of a node, 0 for motion and 1 for measurements."""
-        self._factors.push_back(factor)
-        self._owners.append((number, kind))
-        slot = self.slots[number][kind]
-        if slot is not None:
-            self._removed.append(slot)
+    def solve(
+        self, numbers: Sequence[int], num_leaving: int, values: gtsam.Values, first: int, changed: Sequence[_Changed]
+    ) -> FloatArray:
+        """Return the states of the nodes `numbers`, one after the other, without the first ones, which are leaving.
 
-    def solve(self, new: Sequence[int], leaving: Sequence[int], size: int) -> None:
-        """Solve with `new` nodes of n = `size` entries and the new factors, without those that are `leaving`."""
-        values, stamps = gtsam.Values(), dict[_Key, _Stamp]()
-        for number in new:
-            values.insert(number, np.zeros(size))
-            stamps[number] = _INSIDE
-        for number in leaving:
-            stamps[number] = _LEFT
+        The factors that have `changed` replace those of the same nodes, from index `first` on; `values` are those of
+        new nodes.
+        """
+        factors, order = gtsam.GaussianFactorGraph(), gtsam.KeyGroupMap()
+        for _, factor in changed:
+            factors.push_back(factor)
         if self._prior is not None:
-            self._factors.push_back(self._prior)
+            factors.push_back(self._prior)
             self._prior = None
-        graph = gtsam.LinearContainerFactor.ConvertLinearGraph(self._factors)  # in half the time of one by one
-        self.smoother.update(graph, values, stamps, self._removed)
-        slots = self.smoother.getISAM2Result().getNewFactorsIndices()
-        for (number, kind), slot in zip(self._owners, slots, strict=False):
-            self.slots[number][kind] = slot
-        for number in leaving:
-            del self.slots[number]
-        self._factors, self._owners, self._removed = gtsam.GaussianFactorGraph(), [], []
+        if first and numbers[first] == self._newest:  # in one clique with the node before it
+            first -= 1
+        for group, number in enumerate(numbers[first:]):
+            order.insert2(number, group)
+        slots = [self.slots[number] for number, _ in changed]
+        removed = [slot for slot in slots if slot is not None]
+        graph = gtsam.LinearContainerFactor.ConvertLinearGraph(factors)  # in half the time of one by one
+        added = self.isam.update(graph, values, removed, order).getNewFactorsIndices()
+        self.slots.update(zip((number for number, _ in changed), added, strict=False))
+        self._newest = numbers[-1]
+        if num_leaving:
+            leaves = gtsam.KeyList()
+            for number in numbers[:num_leaving]:
+                leaves.push_back(number)
+                del self.slots[number]
+            self.isam.marginalizeLeaves(leaves)
+        return self.isam.getDelta().vector(numbers[num_leaving:])
 
 
 class IncrementalSolver(GraphSolver):
@@ -87,31 +86,32 @@ class IncrementalSolver(GraphSolver):
         self._graphs.pop(track, None)
 
     def _covariance(self, track: int, *numbers: int) -> FloatArray:
-        smoother = self._graphs[track].smoother
+        isam = self._graphs[track].isam
         if len(numbers) == 1:
-            return smoother.marginalCovariance(numbers[0])
-        return smoother.getISAM2().jointMarginalCovariance(list(numbers)).fullMatrix()
+            return isam.marginalCovariance(numbers[0])
+        return isam.jointMarginalCovariance(list(numbers)).fullMatrix()
 
     def _update(self, tracks: IntArray, starts: IntArray) -> None:
-        nodes, n = self.nodes, self.motion.dim
+        nodes, zero = self.nodes, np.zeros(self.motion.dim)
         if nodes.numbers.size > len(self._reference):
             self._reference = grown(self._reference, nodes.numbers.size)
-        rows = list(zip(tracks.tolist(), starts.tolist(), strict=True))
-        windows = [nodes.numbers[track, start : nodes.count[track]] for track, start in rows]
-        graphs = [self._graph(track, window) for (track, _), window in zip(rows, windows, strict=True)]
-        added = [
-            [number for number in w.tolist() if number not in g.slots] for w, g in zip(windows, graphs, strict=True)
-        ]
-        for new, graph in zip(added, graphs, strict=True):
-            self._reference[new] = nodes.origin[new]
-            graph.slots.update((number, [None, None]) for number in new)
-        self._add_factors(tracks, starts, graphs, 2 * sum(map(len, windows)))
-        for (track, start), window, graph, new in zip(rows, windows, graphs, added, strict=True):
-            num_leaving = int(nodes.first[track]) - start
-            inside = window[num_leaving:]
-            graph.solve(new, window[:num_leaving].tolist(), n)
-            delta = graph.smoother.getDelta().vector(inside.tolist())
-            if not node_kernels.write_steps(inside, delta, self._reference, nodes.origin, nodes.step):
+        leaving = (nodes.first[tracks] - starts).tolist()
+        windows, graphs, values = [], [], []
+        for track, start in zip(tracks.tolist(), starts.tolist(), strict=True):
+            window = nodes.numbers[track, start : nodes.count[track]].copy()
+            graph = self._graph(track, window)
+            values.append(gtsam.Values())
+            for number in window.tolist():
+                if number not in graph.slots:
+                    graph.slots[number] = None
+                    values[-1].insert(number, zero)
+                    self._reference[number] = nodes.origin[number]
+            windows.append(window)
+            graphs.append(graph)
+        changed = self._changed_factors(tracks, starts, sum(map(len, windows)))
+        for graph, window, num_leaving, new, factors in zip(graphs, windows, leaving, values, changed, strict=True):
+            delta = graph.solve(window.tolist(), num_leaving, new, *factors)
+            if not node_kernels.write_steps(window[num_leaving:], delta, self._reference, nodes.origin, nodes.step):
                 raise ValueError("a state is not finite")
 
     def _graph(self, track: int, window: IntArray) -> _Graph:
@@ -125,22 +125,25 @@ class IncrementalSolver(GraphSolver):
             nodes.changed[window] = True
         return graph
 
-    def _add_factors(self, tracks: IntArray, starts: IntArray, graphs: Sequence[_Graph], most: int) -> None:
-        """Add the factors that have changed, at most so many, of all tracks."""
+    def _changed_factors(self, tracks: IntArray, starts: IntArray, most: int) -> list[tuple[int, list[_Changed]]]:
+        """Return the factors that have changed, at most so many, of each track, and the first index from `starts`."""
         nodes, n = self.nodes, self.motion.dim
-        owners, factors = np.empty((most, 3), dtype=np.int64), np.empty((most, 2 * n + 1, n))
-        given = nodes.origin, self._reference, nodes.segment, nodes.num_rows, nodes.changed
+        owners, factors = np.empty((most, 5), dtype=np.int64), np.empty((most, 2 * n + 1, n + nodes.rows.shape[1]))
+        given = nodes.origin, self._reference, nodes.segment, nodes.rows, nodes.num_rows, nodes.changed
         num = node_kernels.changed_factors(tracks, starts, nodes.count, nodes.numbers, *given, owners, factors)
         if num < 0:
             raise ValueError("process noise is not positive definite")
-        for (row, number, right), motion in zip(owners[:num].tolist(), factors, strict=False):
-            if right >= 0:
-                factor = gtsam.JacobianFactor(number, motion[:n].T, right, motion[n:-1].T, motion[-1], _unit(n))
+        changed: list[tuple[int, list[_Changed]]] = [(0, []) for _ in tracks]
+        for (row, index, number, right, size), each in zip(owners[:num].tolist(), factors, strict=False):
+            A, b, unit = each[:n, :size].T, each[-1, :size], _unit(size)
+            if right < 0:
+                factor = gtsam.JacobianFactor(number, A, b, unit)
             else:
-                rows = nodes.rows[number, : nodes.num_rows[number]]
-                b = rows[:, -1] + rows[:, :-1].dot(nodes.origin[number] - self._reference[number])
-                factor = gtsam.JacobianFactor(number, rows[:, :-1], b, _unit(len(rows)))
-            graphs[row].replace(number, right < 0, factor)
+                factor = gtsam.JacobianFactor(number, A, right, each[n:-1, :size].T, b, unit)
+            if not changed[row][1]:
+                changed[row] = index - int(starts[row]), changed[row][1]
+            changed[row][1].append((number, factor))
+        return changed
 
 
 @cache
