@@ -173,6 +173,12 @@ def test_pages_named_in_the_code_exist() -> None:
             assert (ROOT / name).is_file(), f"{file}: {name} does not exist"
 
 
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/architecture.md"])
+def test_files_named_on_the_pages_for_developers_exist(page: str) -> None:
+    for name in re.findall(r"`((?:fgtrack|tests|docs|\.ci)/[\w/.]*|CHANGELOG\.md)`", prose(Path(page))):
+        assert (ROOT / name).exists(), f"{page}: {name} does not exist"
+
+
 # Commands
 
 
