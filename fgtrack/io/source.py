@@ -12,7 +12,7 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Message
 from fgtrack.io.adapters import ADAPTERS
 from fgtrack.io.config import InputConfig
-from fgtrack.io.gate import checked
+from fgtrack.io.validation import validated
 
 _logger = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ class InputSource:
     kind: str
     """Name of its format."""
     messages: Callable[[], Iterator[Message]]
-    """Gives the messages in receipt order, as `fgtrack.io.gate` lets them pass.
+    """Gives the messages in receipt order, as `fgtrack.io.validation` lets them pass.
 
     Raises `TruncatedInput` behind the last message before a break, `DataError` for all else that is wrong.
     """
@@ -52,6 +52,8 @@ class FileFormat:
     """What the input at a path carries of a configuration, as `InputSource.settings`."""
     end_ns: Callable[[Path], int | None] = lambda path: None
     """About the receipt of the last message, as `InputSource.end_ns`; errors of any kind mean None."""
+    validates: bool = False
+    """True if the reader validates every message by itself, with `validated_message`."""
 
 
 def open_input(path: Path | str, config: InputConfig | None = None) -> InputSource:
@@ -72,9 +74,8 @@ def open_input(path: Path | str, config: InputConfig | None = None) -> InputSour
         form = file_format(name)
         messages = form.open(path, config)
     end_ns = partial(_end_ns, form, path)
-    return InputSource(
-        path, name, partial(checked, path, messages, config.most_objects), partial(form.settings, path), end_ns
-    )
+    read = partial(validated, path, messages, config.most_objects, form.validates)
+    return InputSource(path, name, read, partial(form.settings, path), end_ns)
 
 
 def _end_ns(form: FileFormat, path: Path) -> int | None:

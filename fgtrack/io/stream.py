@@ -23,9 +23,9 @@ from fgtrack.core.types import (
 )
 from fgtrack.io.config import InputConfig
 from fgtrack.io.errors import LARGEST_BYTES, TruncatedInput, UntilBreak, refuse_larger
-from fgtrack.io.gate import WrongError, checked_message
 from fgtrack.io.output import new_file
 from fgtrack.io.source import FileFormat
+from fgtrack.io.validation import InvalidMessageError, validated_message
 
 STREAM_FORMAT = "fgtrack-stream/1"
 SETTINGS = "settings"
@@ -66,7 +66,7 @@ def read_stream(path: Path | str, largest_bytes: int = LARGEST_BYTES) -> Iterato
         for line, record in records:
             try:
                 message = _message(record, unknown)
-            except WrongError as error:
+            except InvalidMessageError as error:
                 raise DataError(f"{path}:{line}: {error}") from error
             if not isinstance(message, TruthState):
                 if newest_ns is not None and message.receipt_ns < newest_ns:
@@ -107,7 +107,7 @@ def _end_ns(path: Path) -> int | None:
     return max((json.loads(line)["receipt_ns"] for line in lines[1:] if b"receipt_ns" in line), default=None)
 
 
-FORMAT = FileFormat("an fgtrack stream (.jsonl, .jsonl.gz)", _recognises, _open, _settings, _end_ns)
+FORMAT = FileFormat("an fgtrack stream (.jsonl, .jsonl.gz)", _recognises, _open, _settings, _end_ns, validates=True)
 
 
 def read_header(path: Path | str) -> Mapping[str, Any]:
@@ -234,16 +234,16 @@ def _message(record: Record, unknown: Counter[str]) -> Message:
     name = record.get("type")
     kind = _KINDS.get(name) if isinstance(name, str) else None
     if kind is None:
-        raise WrongError(f"unknown record type {name!r}, known are {', '.join(_KINDS)}")
+        raise InvalidMessageError(f"unknown record type {name!r}, known are {', '.join(_KINDS)}")
     values = _values(str(name), kind, record, unknown)
     if kind is DetectionList:
         values["objects"] = [_detection(index, item, unknown) for index, item in enumerate(values["objects"])]
-    return checked_message(kind(**values))
+    return validated_message(kind(**values))
 
 
 def _detection(index: int, item: object, unknown: Counter[str]) -> Detection:
     if not isinstance(item, dict):
-        raise WrongError(f"objects[{index}]: a JSON object expected, not {item!r}")
+        raise InvalidMessageError(f"objects[{index}]: a JSON object expected, not {item!r}")
     return Detection(**_values("objects", Detection, item, unknown))
 
 
@@ -259,12 +259,14 @@ def _values(name: str, kind: type, record: Record, unknown: Counter[str]) -> Rec
             value = given[key]
             is_list = isinstance(value, list)
             if is_list != (key in _LISTS):
-                raise WrongError(f"{key}: {'no list' if is_list else 'a list'} expected, not {str(value)[:60]}")
+                raise InvalidMessageError(
+                    f"{key}: {'no list' if is_list else 'a list'} expected, not {str(value)[:60]}"
+                )
             values[key] = tuple(map(_plain_number, value)) if is_list else value
             if key not in _INTEGERS:
                 values[key] = _plain_number(values[key])
         elif is_needed:
-            raise WrongError(f"{key}: is missing")
+            raise InvalidMessageError(f"{key}: is missing")
     return values
 
 

@@ -23,7 +23,7 @@ from fgtrack.core.types import (
     TrackReport,
     UpdateRecord,
 )
-from fgtrack.io.gate import WrongError, checked_detection
+from fgtrack.io.validation import InvalidMessageError, validated_detection
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import WallClock, corrected
 from fgtrack.pipeline.config import Config
@@ -189,8 +189,8 @@ class Tracker:
         try:
             if isinstance(item, Detection) and isinstance(item.covariance, list | np.ndarray):
                 item = replace(item, covariance=tuple(np.ravel(item.covariance).tolist()))
-            return checked_detection(item)
-        except (WrongError, ValueError) as error:
+            return validated_detection(item)
+        except (InvalidMessageError, ValueError) as error:
             self._refused[f"detection: {str(error).partition(', not ')[0]}"] += 1
             return Detection()
 

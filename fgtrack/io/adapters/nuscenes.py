@@ -11,6 +11,7 @@ stand in a folder of the version, `v1.0-...`, beside it. Choices that the data l
 - Truth that no sensor has a point of is ignored, as in the data set's own evaluation.
 """
 
+import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -21,18 +22,21 @@ from pathlib import Path
 from typing import Any
 
 from fgtrack.core.errors import CallError, DataError, FgtrackError
+from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import seconds
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.io.adapters.common import signed_speed_mps, split
 from fgtrack.io.adapters.ids import object_id
-from fgtrack.io.adapters.json_entries import list_entries, object_entries
 from fgtrack.io.config import InputConfig, NuscenesInput
 from fgtrack.io.source import FileFormat
 
 __all__ = ["FORMAT", "read_scene"]
 
 _RESULTS = re.compile(rb'\s*\{\s*"(meta|results)"\s*:')
+_A_LIST, _OF_RESULTS = re.compile(r"\s*\["), re.compile(r'.*?"results"\s*:\s*\{', re.DOTALL)
+_BETWEEN = re.compile(r"[\s,:]*")
+_LARGEST_MB = 1500.0
 _NS_PER_US = 1000
 _CATEGORIES = {
     "movable_object.barrier": "barrier",
@@ -64,7 +68,7 @@ def read_scene(file: Path, settings: NuscenesInput) -> Iterator[Message]:
     tables = _tables(file, settings)
     try:
         samples = _samples(tables, file, settings)
-        boxes = {token: of for token, of in object_entries(file, "results") if token in samples}
+        boxes = {token: of for token, of in _entries(file, _OF_RESULTS) if token in samples}
         egos = _egos(tables, samples)
         truth = _truth(tables, samples, settings)
         lists = [
@@ -82,6 +86,35 @@ def read_scene(file: Path, settings: NuscenesInput) -> Iterator[Message]:
     yield from sorted(messages, key=attrgetter("receipt_ns"))
 
 
+def _entries(file: Path, begin: re.Pattern[str] = _A_LIST) -> Iterator[Json]:
+    """Values of the list or object that follows `begin` in the JSON `file`; those of an object with their keys.
+
+    One after the other: the text of such a table has up to a gigabyte, and its values take five times as much.
+    """
+    decode = json.JSONDecoder().raw_decode
+    try:
+        text = read_whole(file, _LARGEST_MB).decode()
+        start = begin.match(text)
+        if start is None:
+            raise ValueError("does not begin so")
+        at = _next(text, start.end())
+        while text[at] not in "]}":
+            value, at = decode(text, at)
+            at = _next(text, at)
+            if begin is _OF_RESULTS:
+                inner, at = decode(text, at)
+                value, at = (value, inner), _next(text, at)
+            yield value
+    except (IndexError, ValueError, RecursionError) as error:
+        raise DataError(f"{file}: is not JSON of the expected form ({error}), fetch it again") from error
+
+
+def _next(text: str, at: int) -> int:
+    """Return where the next value begins, from `at` on."""
+    found = _BETWEEN.match(text, at)
+    return found.end() if found else at
+
+
 def _tables(file: Path, settings: NuscenesInput) -> Path:
     if settings.tables is not None:
         folder = file.parent / settings.tables
@@ -95,9 +128,9 @@ def _tables(file: Path, settings: NuscenesInput) -> Path:
 
 def _samples(tables: Path, file: Path, settings: NuscenesInput) -> dict[str, int]:
     """Stamps of the samples of the scene, by token, in the order of time."""
-    names = {each["token"]: each["name"] for each in list_entries(tables / "scene.json")}
-    judged = {token for token, _ in object_entries(file, "results")}
-    scenes = {each["scene_token"] for each in list_entries(tables / "sample.json") if each["token"] in judged}
+    names = {each["token"]: each["name"] for each in _entries(tables / "scene.json")}
+    judged = {token for token, _ in _entries(file, _OF_RESULTS)}
+    scenes = {each["scene_token"] for each in _entries(tables / "sample.json") if each["token"] in judged}
     if settings.scene is not None:
         scenes = {token for token, name in names.items() if settings.scene in (token, name)}
         if not scenes:
@@ -105,7 +138,7 @@ def _samples(tables: Path, file: Path, settings: NuscenesInput) -> dict[str, int
     if len(scenes) != 1:
         has = _some(names[token] for token in scenes) if scenes else "none of these tables"
         raise CallError(f"{file}: the results are of {len(scenes)} scenes ({has}), name one as input.nuscenes.scene")
-    entries = list_entries(tables / "sample.json")
+    entries = _entries(tables / "sample.json")
     chosen = sorted((each["timestamp"], each["token"]) for each in entries if each["scene_token"] in scenes)
     return {token: int(time_us) * _NS_PER_US for time_us, token in chosen}
 
@@ -118,10 +151,10 @@ def _some(names: Any) -> str:
 def _egos(tables: Path, samples: Mapping[str, int]) -> list[EgoState]:
     """The poses at the data of the samples, with the motion between them."""
     wanted = {
-        each["ego_pose_token"] for each in list_entries(tables / "sample_data.json") if each["sample_token"] in samples
+        each["ego_pose_token"] for each in _entries(tables / "sample_data.json") if each["sample_token"] in samples
     }
     poses = {}
-    for each in list_entries(tables / "ego_pose.json"):
+    for each in _entries(tables / "ego_pose.json"):
         if each["token"] in wanted:
             x_m, y_m, _ = map(float, each["translation"])
             poses[int(each["timestamp"]) * _NS_PER_US] = (x_m, y_m, _yaw_rad(each["rotation"]))
@@ -172,10 +205,10 @@ def _boxes(boxes: list[Json], settings: NuscenesInput) -> Iterator[Detection | s
 def _truth(tables: Path, samples: Mapping[str, int], settings: NuscenesInput) -> list[TruthState]:
     if not (tables / "sample_annotation.json").is_file():
         return []
-    categories = {each["token"]: _class(each["name"]) for each in list_entries(tables / "category.json")}
-    kinds = {each["token"]: categories[each["category_token"]] for each in list_entries(tables / "instance.json")}
+    categories = {each["token"]: _class(each["name"]) for each in _entries(tables / "category.json")}
+    kinds = {each["token"]: categories[each["category_token"]] for each in _entries(tables / "instance.json")}
     states = []
-    for each in list_entries(tables / "sample_annotation.json"):
+    for each in _entries(tables / "sample_annotation.json"):
         stamp_ns = samples.get(each["sample_token"])
         kind = kinds[each["instance_token"]]
         if stamp_ns is None or kind is None or (settings.classes and kind not in settings.classes):

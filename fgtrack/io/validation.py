@@ -1,0 +1,181 @@
+"""Validation behind every reader: all that comes out of an input has the types and ranges that the rest relies on.
+
+What is wrong with an input is a `DataError` with its position, whatever the reader raised; everything before has been
+given, so a run is complete up to there. Measured numbers that are not finite pass: the tracker counts them. Describing
+ones (size, score) become None. Detections of a running system pass the same check, see `validated_detection`.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import fields, replace
+from math import isfinite
+from operator import is_
+from pathlib import Path
+
+import numpy as np
+
+from fgtrack.core.checks import LARGEST_NS, is_stamp
+from fgtrack.core.errors import DataError, FgtrackError
+from fgtrack.core.types import (
+    DESCRIBING,
+    EGO_COVARIANCE_STATES,
+    FRAMES,
+    Detection,
+    DetectionList,
+    EgoState,
+    Message,
+    TruthState,
+)
+from fgtrack.io.errors import MOST_OBJECTS, MOST_SENSORS, one_line
+
+__all__ = ["InvalidMessageError", "validated", "validated_detection", "validated_message"]
+
+_LONGEST_NAME = 200
+_FAR_M = 1e9
+_INT64 = range(-(1 << 63), 1 << 63)
+
+
+class InvalidMessageError(Exception):
+    """Problem of a message; the reader adds where it is."""
+
+
+def validated(
+    path: Path, messages: Callable[[], Iterator[Message]], most_objects: int = MOST_OBJECTS, done: bool = False
+) -> Iterator[Message]:
+    """Messages of the input at `path`; those of a reader that has validated them are `done`.
+
+    A list with more than `most_objects` is refused, and one of a sensor beyond `MOST_SENSORS`.
+
+    Raises
+    ------
+    DataError
+        The reader failed, or gave an invalid message; raised after everything before that.
+    """
+    count, sensors = 0, set[str]()
+    try:
+        for message in messages():
+            message = message if done else validated_message(message)
+            if isinstance(message, DetectionList):
+                sensors.add(message.sensor)
+                if len(sensors) > MOST_SENSORS:
+                    raise InvalidMessageError(
+                        f"{message.sensor}: the lists before it are of {MOST_SENSORS} other sensors"
+                    )
+                if len(message.objects) > most_objects:
+                    many = f"a list of {len(message.objects)} objects"
+                    raise InvalidMessageError(f"{message.sensor}: {many}, more than input.most_objects allows")
+            yield message
+            count += 1
+    except InvalidMessageError as error:
+        raise DataError(f"{path}: message {count + 1}: {error}") from error
+    except (FgtrackError, MemoryError):
+        raise
+    except Exception as error:  # whatever a foreign input makes a reader raise
+        what = f"{type(error).__name__}: {one_line(error)}"
+        raise DataError(f"{path}: cannot be read beyond message {count} ({what}): repair or convert it") from error
+
+
+def validated_message(message: Message) -> Message:
+    """Return `message`, its detections as of `validated_detection`. Raises `InvalidMessageError`."""
+    if not isinstance(message, DetectionList | EgoState | TruthState):
+        raise InvalidMessageError(f"a {type(message).__name__} is no message")
+    _check_fields(message)
+    if not is_stamp(message.receipt_ns):  # all windows are counted from it
+        raise _invalid("receipt_ns", f"at most {LARGEST_NS:.0g} ns from 0", message.receipt_ns)
+    if isinstance(message, DetectionList):
+        objects = []
+        for index, item in enumerate(message.objects):
+            try:
+                objects.append(validated_detection(item))
+            except InvalidMessageError as error:
+                raise InvalidMessageError(f"{message.sensor}: objects[{index}]: {error}") from error
+        return message if all(map(is_, objects, message.objects)) else replace(message, objects=tuple(objects))
+    if isinstance(message, EgoState):
+        size = len(EGO_COVARIANCE_STATES)
+        if message.covariance is not None and len(message.covariance) != size**2:
+            raise InvalidMessageError(f"covariance: a list of {size} x {size} numbers expected")
+    elif message.outline_m is not None and not _is_ring(message.outline_m):
+        raise _invalid("outline_m", "x and y of at least three corners", message.outline_m)
+    return message
+
+
+def _is_ring(corners: tuple[float, ...]) -> bool:
+    return len(corners) >= 6 and len(corners) % 2 == 0 and all(abs(each) <= _FAR_M for each in corners)
+
+
+def validated_detection(item: Detection) -> Detection:
+    """Return `item` with None for describing numbers that are not finite and for class names that are too long.
+
+    Raises `InvalidMessageError` for a value of a wrong type.
+    """
+    if not isinstance(item, Detection):
+        raise InvalidMessageError(f"a {type(item).__name__} is no detection")
+    lost = []
+    for name in DESCRIBING:
+        value = getattr(item, name)
+        is_long = isinstance(value, str) and len(value) > _LONGEST_NAME
+        if is_long or (isinstance(value, (float, np.floating)) and not isfinite(value)):
+            lost.append(name)
+    item = replace(item, **dict.fromkeys(lost)) if lost else item
+    _check_fields(item)
+    return item
+
+
+def _check_fields(item: Message | Detection) -> None:
+    for name, (holds, expected), is_optional in _FIELDS[type(item)]:
+        value = getattr(item, name)
+        if not (holds(value) or (value is None and is_optional)):
+            raise _invalid(name, expected, value)
+
+
+def _is_integer(value: object) -> bool:
+    return value in _INT64 if type(value) is int else isinstance(value, np.integer)
+
+
+def _is_flag(value: object) -> bool:
+    return isinstance(value, bool | np.bool_)
+
+
+def _is_number(value: object) -> bool:
+    if type(value) is int:
+        return value.bit_length() <= 1000
+    return isinstance(value, (float, np.floating, np.integer))
+
+
+def _is_name(value: object) -> bool:
+    is_short = isinstance(value, str) and 0 < len(value) <= _LONGEST_NAME
+    return is_short and str(value).encode(errors="replace").decode() == value
+
+
+def _are_numbers(value: object) -> bool:
+    return isinstance(value, tuple) and all(each is None or _is_number(each) for each in value)
+
+
+_INTEGER, _FLAG = (_is_integer, "a 64 bit integer"), (_is_flag, "true or false")
+_NAME = (_is_name, f"a name of up to {_LONGEST_NAME} characters")
+_NUMBERS = (_are_numbers, "a list of numbers")
+#: By field its rule and what it expects; all others are numbers.
+_RULES: dict[str, tuple[Callable[[object], bool], str]] = {
+    **dict.fromkeys(("stamp_ns", "receipt_ns", "object_id"), _INTEGER),
+    **dict.fromkeys(("in_pit", "ignored"), _FLAG),
+    "sensor": _NAME,
+    "class_name": (lambda value: value == "" or _is_name(value), _NAME[1]),
+    **dict.fromkeys(("covariance", "outline_m"), _NUMBERS),
+    "frame": (lambda value: value in FRAMES, f"one of {', '.join(sorted(FRAMES))}"),
+}
+_FIELDS = {
+    kind: [
+        (each.name, _RULES.get(each.name, (_is_number, "a number")), each.default is None)
+        for each in fields(kind)
+        if each.name not in ("objects", "left_out")
+    ]
+    for kind in (EgoState, DetectionList, TruthState, Detection)
+}
+
+
+def _invalid(name: str, expected: str, value: object) -> InvalidMessageError:
+    try:
+        text = ascii(value)
+    except ValueError:  # an integer of more digits than Python writes
+        text = f"an integer of {getattr(value, 'bit_length', int)()} bits"
+    text = text if len(text) <= 60 else f"{text[:57]}..."
+    return InvalidMessageError(f"{name}: {expected} expected, not {text}")
