@@ -28,7 +28,7 @@ from fgtrack.plotting.close_up import CloseUp
 from fgtrack.plotting.late_detection import drawn_close_up
 from fgtrack.plotting.plot import drawn, planned
 from fgtrack.plotting.style import png
-from fgtrack.viewers.report import Opening, write_report
+from fgtrack.viewers.report import ReportHead, write_report
 
 __all__ = ["ESTIMATORS", "Study", "study"]
 
@@ -167,12 +167,12 @@ def study(
                 write_metrics(one.run.path, one.metrics.as_dict())
         lines = summary(every, tables, advised)
         on_step("draw", _DRAW)
-        opening = Opening(
+        report_head = ReportHead(
             sentences=lines,
             assumptions=known.lines(),
             advice=() if advised is None else advised.sentences,
         )
-        _pictured(every, tables, opening, figures or {}, pictures, page, overwrite)
+        _pictured(every, tables, report_head, figures or {}, pictures, page, overwrite)
         on_step("done", _DONE)
     return Study(out, lines, tuple(known.lines()), advised, tuple(o.run for o in every), tables, results[0].broken)
 
@@ -236,7 +236,7 @@ def _replayed(
 def _pictured(
     runs: list[EvaluatedRun],
     tables: Tables,
-    opening: Opening,
+    head: ReportHead,
     more: Mapping[str, Figure],
     figures: Path,
     page: Path,
@@ -249,14 +249,14 @@ def _pictured(
     with new_files(figures, overwrite) as folder:
         for name, picture in pictures:
             (folder / f"{name}.png").write_bytes(picture)
-    at = opening_at(late)
-    opening = replace(opening, moment=at.moment, missing=at.missing)
-    write_report(runs, tables, pictures, page, opening, overwrite)
+    at = head_at(late)
+    head = replace(head, moment=at.moment, missing=at.missing)
+    write_report(runs, tables, pictures, page, head, overwrite)
 
 
-def opening_at(late: CloseUp | DataError) -> Opening:
+def head_at(late: CloseUp | DataError) -> ReportHead:
     """Return how a report opens at a late detection; without one it says why."""
     if isinstance(late, DataError):
-        return Opening(missing=(f"no close-up: {late}",))
+        return ReportHead(missing=(f"no close-up: {late}",))
     x_m, y_m = late.after.means[-1, :2].tolist()
-    return Opening(moment=(late.now_ns, x_m, y_m))
+    return ReportHead(moment=(late.now_ns, x_m, y_m))

@@ -45,8 +45,8 @@ def export(
 def _export_kitti(runs: list[Path], sequence: Path, out: Path, overwrite: bool) -> None:
     if len(runs) != 1:
         raise CallError(f"--kitti: writes one run, these are {len(runs)}")
-    written = write_kitti_result(load_run(runs[0]), sequence, out, overwrite=overwrite)
-    if written.without_box:
+    boxes, tracks, without_size = write_kitti_result(load_run(runs[0]), sequence, out, overwrite=overwrite)
+    if without_size:
         log = logging.getLogger(__name__)
-        log.warning(f"{written.without_box} tracks are left out: none of their detections has a size")
-    say(f"{out}: {written.lines} boxes of {written.tracks} tracks")
+        log.warning(f"{without_size} tracks are left out: none of their detections has a size")
+    say(f"{out}: {boxes} boxes of {tracks} tracks")

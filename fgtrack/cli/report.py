@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from fgtrack.calibration.study import opening_at
+from fgtrack.calibration.study import head_at
 from fgtrack.cli.arguments import Overwrite, Runs
 from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError
@@ -41,5 +41,5 @@ def report(
     with progress("report"):
         close_up, late = drawn_close_up(every)
         pictures = ((name, png(figure)) for name, figure in chain(close_up, drawn(planned(every))))
-        size = write_report(every, compare(*every), pictures, out, opening_at(late), overwrite)
+        size = write_report(every, compare(*every), pictures, out, head_at(late), overwrite)
     say(f"{out}: {size / _MEGABYTE:.1f} MB, open it in a browser")

@@ -1,1 +1,1 @@
-"""Judges runs: truth matching, metrics, tables and figures. Reads run folders, never a tracker."""
+"""Evaluation of runs: truth matching, metrics, tables and figures. Reads run folders, never a tracker."""

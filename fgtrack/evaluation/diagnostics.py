@@ -36,7 +36,7 @@ _DEAD_SHARE = 0.5
 _GAP_S, _OVERLAP_S = 5.0, 2.0
 #: It begins within this distance of the prediction of the other one: noise, and a turn of 0.3 rad or 30 % of its speed.
 _NEAR_M, _DEPARTURE = 3.0, 0.3
-_NO_FAILURE = "step damped"  # a failure that is none: with bearings damped steps are usual
+_NO_FAILURE = "step damped"  # not a failure: with bearings damped steps are usual
 
 #: Cause and cure of dispositions that most detections of a sensor may have.
 _CURES = {

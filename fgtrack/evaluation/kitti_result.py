@@ -1,8 +1,8 @@
 """A run of a KITTI sequence as a result file of the data set, for its own evaluation and for that of AB3DMOT.
 
 A line per track and frame: `frame track type truncated occluded alpha left top right bottom h w l x y z rotation_y
-score` (Geiger, Lenz, Urtasun 2012, development kit of the tracking benchmark). The tracker knows where an object is in
-the plane and which way it heads. The rest is what the detections of boxes say that its track has fused by then: mean
+score` (Geiger, Lenz, Urtasun 2012, development kit of the tracking benchmark). Tracks have position and
+heading in the plane. The rest comes from the detections of boxes that the track has fused by then: mean
 size and score, most frequent class, last height above the ground. The box in the image is the box in space as camera 2
 sees it, cut at the borders.
 """
@@ -10,7 +10,6 @@ sees it, cut at the borders.
 import math
 from bisect import bisect_right
 from collections import Counter, defaultdict
-from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -27,42 +26,20 @@ from fgtrack.io.adapters.kitti_view import PERIOD_NS, Box, View
 from fgtrack.io.output import check_apart, new_file
 from fgtrack.io.run import NO_TRACK, Run
 
-__all__ = ["KittiResult", "write_kitti_result"]
-
 _SIZE = ("height_m", "width_m", "length_m", "z_m")
 
 
-@dataclass(frozen=True)
-class KittiResult:
-    """Counts of a written file.
-
-    Attributes
-    ----------
-    lines
-        Boxes, one of each track at each frame.
-    tracks, without_box
-        Tracks in it, and those that are not, because no detection of theirs has a size.
-    """
-
-    lines: int
-    tracks: int
-    without_box: int
+#: Mean height, width and length of a track, last height of its middle above ground, mean score, most frequent class.
+_Description = tuple[list[float], float, float, str]
 
 
-@dataclass(frozen=True)
-class _Description:
-    """Mean size and score, last height of the middle above ground and most frequent class of a track up to a tick."""
-
-    size_m: tuple[float, float, float]
-    middle_m: float
-    score: float
-    kind: str
-
-
-def write_kitti_result(run: Run, sequence: Path, out: Path, *, overwrite: bool = False) -> KittiResult:
+def write_kitti_result(run: Run, sequence: Path, out: Path, *, overwrite: bool = False) -> tuple[int, int, int]:
     """Write the tracks of `run` at the frames of `sequence` to the text file `out`.
 
-    A track is in it where it is `confirmed`, unless the run is judged by all (`evaluation.confirmed_only`).
+    Returns the boxes, one of each track at each frame, the tracks that have one, and those that have none, because no
+    detection of theirs has a size.
+
+    A track is in it where it is `confirmed`, unless all are evaluated (`evaluation.confirmed_only`).
 
     Parameters
     ----------
@@ -88,7 +65,7 @@ def write_kitti_result(run: Run, sequence: Path, out: Path, *, overwrite: bool =
         )
     with new_file(out, overwrite) as file:
         file.write("".join(lines).encode())
-    return KittiResult(len(lines), len(tracks), len(without - tracks))
+    return len(lines), len(tracks), len(without - tracks)
 
 
 def _lines(run: Run, views: list[View]) -> tuple[list[str], set[int], set[int]]:
@@ -135,11 +112,11 @@ def _described(entries: list[tuple[Any, ...]], tick: int) -> _Description | None
     boxes = [entry for entry in until if math.isfinite(sum(entry[1:5]))]
     if not boxes:
         return None
-    height_m, width_m, length_m = np.mean([entry[1:4] for entry in boxes], axis=0).tolist()
+    size_m = np.mean([entry[1:4] for entry in boxes], axis=0).tolist()
     scores = [entry[5] for entry in boxes if math.isfinite(entry[5])]
     kinds = Counter(entry[6] for entry in until if entry[6]).most_common(1)
     score, kind = float(np.mean(scores)) if scores else 1.0, kinds[0][0] if kinds else "car"
-    return _Description((height_m, width_m, length_m), boxes[-1][4], score, kind)
+    return size_m, boxes[-1][4], score, kind
 
 
 def _ticks(run: Run, num_frames: int) -> dict[int, tuple[int, int]]:
@@ -167,11 +144,10 @@ def _line(
     frame: int, track_id: int, view: View, pose: tuple[float, float, float], described: _Description
 ) -> str | None:
     """The line of a track; None where camera 2 does not see it."""
-    x_m, y_m, yaw_rad = pose
-    height_m, width_m, length_m = described.size_m
-    ego = view.ego
+    (x_m, y_m, yaw_rad), ego = pose, view.ego
+    (height_m, width_m, length_m), middle_m, score, kind = described
     ahead_m, aside_m = (np.array([x_m - ego.x_m, y_m - ego.y_m]) @ rotation(ego.yaw_rad)).tolist()
-    bottom = np.array([ahead_m, aside_m, described.middle_m - 0.5 * height_m])
+    bottom = np.array([ahead_m, aside_m, middle_m - 0.5 * height_m])
     place, turned_rad = view.rectified(bottom, yaw_rad - ego.yaw_rad)
     right_m, down_m, forward_m = place.tolist()
     box = Box(height_m, width_m, length_m, right_m, down_m, forward_m, turned_rad)
@@ -179,6 +155,5 @@ def _line(
     if image is None:
         return None
     alpha_rad = wrap_angle(turned_rad - math.atan2(box.x_m, box.z_m))
-    numbers = (alpha_rad, *image, *box, described.score)
-    name = CLASS_NAMES.get(described.kind, described.kind)
-    return f"{frame} {track_id} {name} -1 -1 {' '.join(f'{value:.6f}' for value in numbers)}\n"
+    numbers = (alpha_rad, *image, *box, score)
+    return f"{frame} {track_id} {CLASS_NAMES.get(kind, kind)} -1 -1 {' '.join(f'{value:.6f}' for value in numbers)}\n"

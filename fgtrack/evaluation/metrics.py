@@ -85,11 +85,10 @@ class ObjectMetrics:
         """All `objects` together."""
         every = list(objects)
         errors = {name: sum((one.errors[name] for one in every), Moments()) for name in ERROR_NAMES}
-        empty = cls(errors)
-        names = [entry.name for entry in fields(cls) if entry.name != "errors"]
-        return replace(
-            empty, **{name: sum((getattr(one, name) for one in every), getattr(empty, name)) for name in names}
-        )
+        confirm_s = sum((one.time_to_confirm_s for one in every), Moments())
+        counts = [entry.name for entry in fields(cls) if entry.name not in ("errors", "time_to_confirm_s")]
+        sums = {name: sum(getattr(one, name) for one in every) for name in counts}
+        return cls(errors, time_to_confirm_s=confirm_s, **sums)
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ def placed(run: Run) -> Placed:
 
 
 def update_rows(run: Run) -> IntArray:
-    """The row of `Run.updates` that says what became of each of `Run.detections`, shape (n,); -1 where none does."""
+    """Row of `Run.updates` with the outcome of each of `Run.detections`, shape (n,); -1 without one."""
     waiting: defaultdict[tuple[object, ...], deque[int]] = defaultdict(deque)
     for row, key in enumerate(zip(*(run.tables["updates"][name].tolist() for name in _KEY), strict=True)):
         waiting[key].append(row)
@@ -67,7 +67,7 @@ def _moved(origins_m: FloatArray, yaws_rad: FloatArray, points_m: FloatArray) ->
 def _mounts(run: Run, sensors: Column, mounted: BoolArray) -> FloatArray:
     """Places (ahead, left) and yaw, shape (n, 3), of the frames of detections on the ego.
 
-    `mounted` says which are given in the frame of their sensor; the others are in the ego's detection frame.
+    `mounted` is True for those given in the frame of their sensor; the others are in the ego's detection frame.
     """
     config = run.config
     ego, known = config.get("ego") or {}, config.get("sensors") or {}

@@ -158,11 +158,9 @@ def by_recording(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
     """`runs` in groups, those of the same recording together."""
     groups: list[list[EvaluatedRun]] = []
     for one in runs:
-        group = next((group for group in groups if same_recording(group[0].run, one.run)), None)
-        if group is None:
-            groups.append([one])
-        else:
-            group.append(one)
+        group = next((group for group in groups if same_recording(group[0].run, one.run)), [])
+        groups += [] if group else [group]
+        group.append(one)
     return groups
 
 
@@ -200,9 +198,8 @@ def _same_detections(one: Run, other: Run, sensor: str) -> bool:
     updates = [run.tables["updates"].where(run.tables["updates"]["sensor"] == sensor) for run in runs]
     tables = [run.tables["detections"].where(run.tables["detections"]["sensor"] == sensor) for run in runs]
     same = [k for k in ("stamp_ns", "receipt_ns") if np.array_equal(np.sort(updates[0][k]), np.sort(updates[1][k]))]
-    if not all(table.num_rows for table in tables):  # of fgtrack 0.1
-        return bool(same)
-    return any(_same_values(tables, time) for time in same)
+    known = all(table.num_rows for table in tables)
+    return any(not known or _same_values(tables, time) for time in same)
 
 
 def _same_values(tables: Sequence[Table], time: str) -> bool:
@@ -212,8 +209,7 @@ def _same_values(tables: Sequence[Table], time: str) -> bool:
     orders = [np.lexsort((table["index"], table[time])) for table in tables]
     for name in MEASURABLE:
         a, b = (table[name][order] for table, order in zip(tables, orders, strict=True))
-        known = np.isfinite(a) & np.isfinite(b)
-        if not np.array_equal(a[known], b[known]):
+        if (np.isfinite(a) & np.isfinite(b) & (a != b)).any():
             return False
     return True
 

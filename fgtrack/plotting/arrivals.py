@@ -1,4 +1,4 @@
-"""The figure of arrivals: what was sensed when, received when, and what became of it."""
+"""The figure of arrivals: stamps, receipts and outcomes of detections."""
 
 from collections.abc import Mapping
 from typing import Unpack
@@ -43,8 +43,8 @@ def arrivals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     """Above a part of the run, a line for each detection from stamp to receipt; below the delays, sensor by sensor.
 
     A line that crosses another was overtaken: it is out of sequence. The part shown is that in which the most
-    detections were fused out of sequence; the fastest sensor sends twenty lists in it. Colours say what became of a
-    detection.
+    detections were fused out of sequence; the fastest sensor sends twenty lists in it. Colours are the outcomes of the
+    detections.
 
     Raises
     ------

@@ -21,7 +21,7 @@ from fgtrack.plotting.paper import Paper, Sheet, is_column, styled
 from fgtrack.plotting.style import GREY, legend_above, run_looks
 
 STEP_S = 0.01
-"""Between estimates; that of the grid of the backward-forward EKF, whose states are held in between."""
+"""Between estimates; that of the grid of the backward-forward EKF, whose states are constant in between."""
 
 _FORGET = ("ekf-backward-forward", "rewind-forget", "backward-forward")
 _RING_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)

@@ -56,9 +56,9 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     every = one.run.tables["tracks"]
     tracks = every.where(confirmed(every)) if one.matching is None else one.matching.tracks
     detections_m, ego_m = placed(one.run).position_m, _positions(one.run.tables["ego"])
-    held = [*bounds_m, ego_m, *(path.states[:, :2] for path in true_paths(one.run.tables["truth"]))]
+    required = [*bounds_m, ego_m, *(path.states[:, :2] for path in true_paths(one.run.tables["truth"]))]
     samples_m = [_positions(tracks), detections_m]
-    edges = [bulk([each[:, k] for each in samples_m], [each[:, k] for each in held]) for k in range(2)]
+    edges = [bulk([each[:, k] for each in samples_m], [each[:, k] for each in required]) for k in range(2)]
     lows_m, highs_m = np.transpose(edges)
     window = _window(one.run)
     has_window = window is not None and (highs_m - lows_m).max() > _WORTHWHILE * 2.0 * window.half_m

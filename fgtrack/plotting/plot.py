@@ -21,7 +21,7 @@ from fgtrack.plotting.arrivals import arrivals
 from fgtrack.plotting.close_up import close_up
 from fgtrack.plotting.consistency import consistency, has_squares
 from fgtrack.plotting.errors import errors, lag
-from fgtrack.plotting.map import tracks_on_map as map  # noqa: A004  # the name that users know
+from fgtrack.plotting.map import tracks_on_map as map  # noqa: A004  # the public name
 from fgtrack.plotting.paper import Paper
 from fgtrack.plotting.residuals import has_residuals, residuals
 from fgtrack.plotting.style import save

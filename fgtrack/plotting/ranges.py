@@ -10,16 +10,14 @@ _BEYOND = 3.0  # interquartile ranges beyond the quartiles that still belong to 
 _MARGIN = 0.05
 
 
-def bulk(samples: Iterable[FloatArray], held: Iterable[FloatArray] = ()) -> tuple[float, float]:
-    """Range with the bulk of every one of `samples` and all of `held`, with a margin; values that are not finite count
-    for nothing. Of no values it is (0, 1).
-    """
+def bulk(samples: Iterable[FloatArray], required: Iterable[FloatArray] = ()) -> tuple[float, float]:
+    """Range with the bulk of each of `samples` and all of `required`, and a margin; (0, 1) without finite values."""
     lows, highs = [], []
-    for values, is_held in (*((each, False) for each in samples), *((each, True) for each in held)):
+    for values, is_required in (*((each, False) for each in samples), *((each, True) for each in required)):
         known = values[np.isfinite(values)]
         if len(known):
             first, third = np.quantile(known, (0.25, 0.75)).tolist()
-            reach = np.inf if is_held else _BEYOND * (third - first)
+            reach = np.inf if is_required else _BEYOND * (third - first)
             lows.append(max(float(known.min()), first - reach))
             highs.append(min(float(known.max()), third + reach))
     if not lows:

@@ -32,7 +32,7 @@ _DENSITIES = {"m": "1/m", "rad": "1/rad", "mps": "s/m"}
 def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     """Residuals (innovations) per sensor, a row per component: over time, and how they are distributed.
 
-    Bins and axes cover the bulk of every sensor's residuals; the legend says how many lie outside.
+    Bins and axes cover the bulk of every sensor's residuals; the legend counts those outside.
 
     Raises
     ------

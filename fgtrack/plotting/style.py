@@ -191,7 +191,7 @@ def png(figure: Figure, dpi: float = 150.0) -> bytes:
 
 
 def save(figure: Figure, path: Path | str) -> Path:
-    """Write `figure` as PNG, SVG or PDF, as the suffix says, without date and version: equal figures, equal files.
+    """Write `figure` as PNG, SVG or PDF, by the suffix, without date and version: equal figures, equal files.
 
     Raises
     ------

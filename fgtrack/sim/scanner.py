@@ -1,4 +1,4 @@
-"""Scans: what a simulated sensor sees of the objects, and what it only believes to see."""
+"""Scans: detections of the objects by a simulated sensor, and its clutter."""
 
 import math
 from collections.abc import Sequence

@@ -31,17 +31,17 @@ def gives_each_of_several_objects_what_it_gives_one_alone(subject: Subject, stre
     later = [{new if number == _GONE else number: m for number, m in one.items()} for one in lists[half:]]
     bank = subject.start_bank(stream)
     _born(bank, [one.start for one in objects])
-    said = _fed(bank, lists[:half])
+    reported = _fed(bank, lists[:half])
     bank.remove(_GONE)
     bank.birth(new, objects[_GONE].start)
-    said += _fed(bank, later)
+    reported += _fed(bank, later)
     expected_ids = [number for number in range(new + 1) if number != _GONE]
     require(sorted(bank.track_ids) == expected_ids, f"its objects are {bank.track_ids}, not {expected_ids}")
     for number in expected_ids:
         own = objects[_GONE if number == new else number]
         begun = half if number == new else 0
         estimator, results = _alone(subject, own, number, [*lists[:half], *later], begun)
-        _same_said(number, [one[number] for one in said if number in one], results)
+        _same_results(number, [one[number] for one in reported if number in one], results)
         for at_ns in (bank.present_ns - 120 * MS, bank.present_ns):
             _same(state_of(bank, stream.motion, number, at_ns), estimator.state_at(at_ns), number, stream.motion)
     _publishes_the_present(bank, stream.motion)
@@ -113,7 +113,7 @@ def _alone(
     return estimator, results
 
 
-def _same_said(number: int, found: Sequence[UpdateResult], expected: Sequence[UpdateResult]) -> None:
+def _same_results(number: int, found: Sequence[UpdateResult], expected: Sequence[UpdateResult]) -> None:
     for one, other in zip(found, expected, strict=True):
         require(one.status is other.status, f"of object {number} an update is {one.status}, alone it is {other.status}")
         if other.innovation is not None and other.nis is not None:
@@ -164,14 +164,14 @@ def _born(bank: TrackBank, starts: Sequence[Start]) -> None:
 
 
 def _fed(bank: TrackBank, lists: Sequence[List]) -> list[dict[int, UpdateResult]]:
-    """Give `lists` to a bank as the tracker does; what it said of each object."""
-    said = []
+    """Give `lists` to a bank as the tracker does, and return its results by object."""
+    reported = []
     for one in lists:
         stamp_ns = next(iter(one.values())).stamp_ns
         bank.advance(max(bank.present_ns, stamp_ns))
         bank.states_at(stamp_ns)
-        said.append(dict(zip(one, bank.update(stamp_ns, list(one), list(one.values())), strict=True)))
-    return said
+        reported.append(dict(zip(one, bank.update(stamp_ns, list(one), list(one.values())), strict=True)))
+    return reported
 
 
 def _lists_of(objects: Sequence[Sequence[Measurement]]) -> list[List]:

@@ -131,7 +131,7 @@ def _fuses_a_late_measurement_exactly(subject: Subject, stream: Stream) -> None:
 
 
 def _reports_the_innovation_against_all_that_it_has_fused(subject: Subject, stream: Stream) -> None:
-    """From later stamps too, where it says so; of a nonlinear filter it is known for what comes in sequence."""
+    """From later stamps too, where it claims so; of a nonlinear filter it is known for what comes in sequence."""
     estimator, claims = subject.start(stream), subject.claims
     fused: list[Measurement] = []
     for measurement in stream.measurements:
@@ -290,7 +290,7 @@ def _comes_near_the_posterior_of_a_nonlinear_model(subject: Subject, stream: Str
         )
 
 
-def _converged(subject: Subject, *estimators: Any) -> bool:  # Any: the claim says that they have `converge`
+def _converged(subject: Subject, *estimators: Any) -> bool:  # Any: the claim promises `converge`
     """True if the estimators have to converge first, which they do."""
     needed = subject.claims.nonlinear == "at convergence"
     for estimator in estimators if needed else ():
@@ -359,7 +359,7 @@ def check_estimator(
         `(motion, lag_s, **options) -> TrackBank`; or the name of a registered one.
     exact
         True holds it to the dense joint posterior of a linear model in any order of arrival, False does not; text as
-        in `Claims.exact`. None takes what the factory says of itself.
+        in `Claims.exact`. None takes the claims of the factory.
     seed
         Seed of the random streams.
     num_streams

@@ -190,7 +190,7 @@ def _publishes_the_entries_of_its_state(model: MotionModel, x: FloatArray, dt_s:
 
 
 def _is_as_it_was_after_a_kinematic_state(model: MotionModel, x: FloatArray, dt_s: float) -> str | None:
-    """The mean; and, because the errors are small, the covariance of what both know."""
+    """The mean; and, because the errors are small, the covariance of the components of both."""
     P = _covariance(model.dim)
     shown, published = model.kinematic(x, P)
     back, covariance = model.from_kinematic(shown, published)

@@ -70,7 +70,7 @@ class Subject:
         return start_bank(self.name, self.factory, stream.motion, LAG_S, self.options)
 
     def fed(self, stream: Stream) -> tuple[Estimator, list[UpdateResult]]:
-        """A new one that has taken all of `stream`, and what it said."""
+        """A new one that has taken all of `stream`, and the results."""
         estimator = self.start(stream)
         return estimator, [estimator.update(measurement) for measurement in stream.measurements]
 

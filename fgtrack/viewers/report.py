@@ -28,7 +28,7 @@ _PNG_SIZE = slice(16, 24)  # of its header
 
 
 @dataclass(frozen=True)
-class Opening:
+class ReportHead:
     """First part of a report: verdict, assumptions, advice, and the moment that the viewer shows first."""
 
     sentences: Sequence[str] = ()
@@ -47,7 +47,7 @@ def write_report(
     tables: Tables,
     pictures: Iterable[tuple[str, bytes]],
     out: Path,
-    opening: Opening,
+    head: ReportHead,
     overwrite: bool,
 ) -> int:
     """Write the report of `runs` into the file `out`, and return its size in bytes.
@@ -65,7 +65,7 @@ def write_report(
         Figures as PNG by name, in the order in which they are shown.
     out
         HTML file.
-    opening
+    head
         How the page begins.
     overwrite
         True to replace a file.
@@ -77,32 +77,32 @@ def write_report(
     DataError
         A run or its map is damaged, or the disk is full.
     """
-    text = _page(runs, tables, pictures, opening).encode("utf-8", "backslashreplace")  # names need not be UTF-8
+    text = _page(runs, tables, pictures, head).encode("utf-8", "backslashreplace")  # names need not be UTF-8
     with new_file(out, overwrite) as file:
         file.write(text)
     return len(text)
 
 
-def _page(runs: Sequence[EvaluatedRun], tables: Tables, pictures: Iterable[tuple[str, bytes]], opening: Opening) -> str:
-    scene, notes = playback(runs, opening.moment)
+def _page(runs: Sequence[EvaluatedRun], tables: Tables, pictures: Iterable[tuple[str, bytes]], head: ReportHead) -> str:
+    scene, notes = playback(runs, head.moment)
     warnings = recordings_warning(runs)
     warnings += [f"{one.label}: {line}" for one in runs for line in diagnostics(one.run)]
     warnings += map(str, noise_diagnostics(runs[0].run))  # of the sensors, as `replay` prints them
-    warnings = list(dict.fromkeys((*warnings, *notes, *opening.missing)))
+    warnings = list(dict.fromkeys((*warnings, *notes, *head.missing)))
     figures = {name: _figure(name, picture) for name, picture in pictures}
     first = [next((name for name in figures if name.startswith(kind)), "") for kind in _FIRST]
     first = list(dict.fromkeys(name for name in (*first, *figures) if name))[:_MOST_OPEN]
     open_parts = {
-        "Verdict": _list(opening.sentences or tables.verdict)
-        or "<p>Nothing to judge: no errors and no innovations.</p>",
+        "Verdict": _list(head.sentences or tables.verdict)
+        or "<p>Nothing to evaluate: no errors and no innovations.</p>",
         "Warnings": _list(warnings[:_MOST_WARNINGS], "warnings")
         + _folded("More warnings", _list(warnings[_MOST_WARNINGS:])),
         "Viewer": _template("viewer.html"),
         "Figures": _figures(text for name, text in figures.items() if name in first),
     }
     folded_parts = {
-        "Assumptions": _list(opening.assumptions),
-        "Advice": _list(opening.advice),
+        "Assumptions": _list(head.assumptions),
+        "Advice": _list(head.advice),
         "Tables": "".join(
             _wide(printable(table.title), table.to_html()) + _list(table.shown_notes(), "soft")
             for table in tables.in_full().tables.values()

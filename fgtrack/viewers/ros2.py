@@ -85,17 +85,17 @@ def _write(
                 raise DataError(f"the time {message.log_ns} ns lies outside what a recording holds")
             for topic, made in factory.messages(message):
                 if topic not in connections:
-                    lasting = isinstance(message.content, Scene) and message.content.lasting
+                    latched = isinstance(message.content, Scene) and message.content.latched
                     connections[topic] = bag.add_connection(
-                        topic, made.__msgtype__, typestore=factory.typestore, offered_qos_profiles=[_quality(lasting)]
+                        topic, made.__msgtype__, typestore=factory.typestore, offered_qos_profiles=[_quality(latched)]
                     )
                 bag.write(connections[topic], message.log_ns, factory.serialize(made))
                 counts[topic] += 1
     return dict(counts)
 
 
-def _quality(lasting: bool) -> Qos:
-    durability = QosDurability.TRANSIENT_LOCAL if lasting else QosDurability.VOLATILE
+def _quality(latched: bool) -> Qos:
+    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
     reliable, liveliness = QosReliability.RELIABLE, QosLiveliness.SYSTEM_DEFAULT
     return Qos(QosHistory.KEEP_LAST, 10, reliable, durability, _FOREVER, _FOREVER, liveliness, _FOREVER, False)
 

@@ -65,7 +65,7 @@ def map_messages(maps: dict[str, TrackMap], excluded: Sequence[FloatArray], at_n
         rings = tuple(_line(points.tolist(), _MAP_LINE_M, (*_GREY[:3], 0.6)) for points in excluded)
         entities.append(Entity("excluded", rings))
     if entities:
-        yield ViewerMessage(at_ns, at_ns, "/map", Scene(tuple(entities), lasting=True))
+        yield ViewerMessage(at_ns, at_ns, "/map", Scene(tuple(entities), latched=True))
 
 
 def ego_messages(ego: Table, at_ns: int) -> Messages:
@@ -74,7 +74,7 @@ def ego_messages(ego: Table, at_ns: int) -> Messages:
     rows = rows[np.argsort(ego["receipt_ns"][rows], kind="stable")]
     if len(rows):
         box = Entity("ego", (_box((0.0, 0.0), 0.0, NOMINAL_SIZE_M, _WHITE),), frame="ego")
-        yield ViewerMessage(at_ns, at_ns, "/ego", Scene((box,), lasting=True))
+        yield ViewerMessage(at_ns, at_ns, "/ego", Scene((box,), latched=True))
     states = np.nan_to_num(np.stack([ego[name][rows] for name in STATE_NAMES], axis=-1)).tolist()
     times = zip(ego["stamp_ns"][rows].tolist(), ego["receipt_ns"][rows].tolist(), strict=True)
     for (stamp_ns, receipt_ns), state in zip(times, states, strict=True):
@@ -132,9 +132,9 @@ def _track_messages(run: Run, look: Look) -> Iterator[Messages]:
         if math.isfinite(speed_mps) and speed_mps:
             turned_rad = yaw_rad if speed_mps > 0.0 else yaw_rad + math.pi
             shapes.append(_arrow(at_m, turned_rad, abs(speed_mps) * _SPEED_ARROW_S, 0.25, look.of_track(track_id)))
-        told = {"status": status, "speed": f"{speed_mps:.2f} m/s", "measured": str(num_measured)}
-        told |= {"class": state.class_name} if state.class_name else {}
-        return Entity(f"track {track_id}", tuple(shapes), facts=told)
+        details = {"status": status, "speed": f"{speed_mps:.2f} m/s", "measured": str(num_measured)}
+        details |= {"class": state.class_name} if state.class_name else {}
+        return Entity(f"track {track_id}", tuple(shapes), facts=details)
 
     def patch(row: int) -> Entity | None:
         long_m, short_m, yaw_rad = axes[row]

@@ -50,7 +50,7 @@ class Scene:
 
     entities: tuple[Entity, ...] = ()
     removed: tuple[str, ...] = ()
-    lasting: bool = False
+    latched: bool = False
     """True if it is sent once, so that late subscribers must get it too."""
 
 

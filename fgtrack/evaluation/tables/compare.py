@@ -48,7 +48,7 @@ _QUANTITIES = {
 _MAIN_QUANTITIES = ("position_rmse_m", "gospa_in_sight_rms_m")
 _GOSPA = "gospa_in_sight_rms_m"
 _UNITS = {"m": "m", "rad": "rad", "mps": "m/s"}
-_COMMON_SHARE = 0.9  # of the samples that all runs have in common; below it a note says how many
+_COMMON_SHARE = 0.9  # of the samples that all runs have in common; below it a note counts them
 _MOST_LAGS, _FEW_LAGS = 8, 3
 
 

@@ -3,7 +3,7 @@
 Li, Wang, Ramanan: Towards streaming perception, ECCV 2020, for object detection; Wang et al.: Are we ready for
 vision-centric driving streaming perception? The ASAP benchmark, CVPR 2023, for tracking. As there, ticks are done one
 after the other by one thread, and what took 30 ms is compared with the truth 30 ms later, as it was published: its user
-acts on it then. A user who knows the stamp may predict it to then; the remaining error is given beside.
+acts on it then. With the stamp a user may predict it to then; the remaining error is given beside.
 
 Times come from timing.csv, so nothing here depends on the machine that compares.
 """
