@@ -23,9 +23,10 @@ VARIANTS: tuple[tuple[str, dict[str, Any]], ...] = (
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_every_estimator_keeps_the_contract(name: str) -> None:
-    check_estimator(name, num_streams=4 if name == "smoother-batch" else 10)
+    check_estimator(name, num_streams=3 if name.startswith("smoother") else 6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "options"), VARIANTS, ids=str)
 def test_so_it_does_with_other_options(name: str, options: dict[str, Any]) -> None:
     check_estimator(name, seed=1, num_streams=5, **options)

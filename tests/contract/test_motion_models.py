@@ -5,7 +5,7 @@ import pytest
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.registry import MOTION_MODELS
-from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel, Transition
+from fgtrack.models.motion import CTRV, CV, MotionModel, Transition
 from fgtrack.testing import BrokenPromiseError, check_motion_model, motion_model_checks
 
 
@@ -24,19 +24,10 @@ class _WrongJacobian(CV):
         return super().jacobian(x, 1.01 * np.asarray(dt_s))
 
 
-class _OneStateOnly(CV):
-    def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
-        return super().predict(x.reshape(-1, 4)[0], float(np.ravel(dt_s)[0]))
-
-
 class _InPlace(CV):
     def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         x += 0.0 if np.ndim(dt_s) else 1e-3 * float(dt_s)
         return super().predict(x, dt_s)
-
-
-class _SaysLinear(CTRV):
-    linear = True
 
 
 class _Forwards(CV):
@@ -44,27 +35,8 @@ class _Forwards(CV):
         return super().process_noise(x, np.abs(dt_s))
 
 
-class _Lopsided(CV):
-    def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
-        Q = super().process_noise(x, dt_s)
-        Q[..., 0, 3] += 1e-12
-        return Q
-
-
-class _Jumps(CV):
-    def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
-        after = super().predict(x, dt_s)
-        after[..., 0] += np.asarray(dt_s) ** 2
-        return after
-
-
 class _Polar(CV):
     state_names = ("x_m", "y_m", "speed_mps", "yaw_rad")
-
-
-class _Offset(CTRV):
-    def kinematic(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return x + 1.0, P
 
 
 class _TooSure(CV):
@@ -79,21 +51,10 @@ class _Whirls(CV):
         return mean + 5.0 * (np.arange(mean.shape[-1]) >= 4), covariance
 
 
-class _NoNumber(CV):
-    def kinematic(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-        mean, covariance = super().kinematic(x, P)
-        return mean, np.nan * covariance
-
-
 class _NegativeBirth(CV):
     def from_kinematic(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         x, P = super().from_kinematic(mean, covariance)
         return x, -P
-
-
-class _NegativeStart(CTRA):
-    def start_variance(self, name: str) -> float:
-        return -3.0
 
 
 class _OtherTransitionOfMany(CTRV):
@@ -102,33 +63,19 @@ class _OtherTransitionOfMany(CTRV):
         return found._replace(Q=found.Q * (2.0 if len(x) > 3 else 1.0))
 
 
-class _NegativeBeyondHalfASecond(CTRV):
-    def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
-        Q = super().process_noise(x, dt_s)
-        return Q * np.where(np.asarray(dt_s) > 0.5, -1.0, 1.0)[..., None, None]
-
-
 @pytest.mark.parametrize(
     ("model", "promise"),
     [
         (_EulerNoise(), "has noise that composes"),
         (_WrongJacobian(), "has the jacobian of its prediction"),
-        (_OneStateOnly(), "takes arrays of states and durations"),
         (_InPlace(), "keeps its inputs"),
-        (_SaysLinear(), "has the same jacobian everywhere if linear"),
         (_Forwards(), "refuses noise of a negative duration"),
-        (_Lopsided(), "has noise that is symmetric and positive definite"),
-        (_Jumps(), "flows on where it stopped"),
         (_Polar(), "has a state that measurements know"),
-        (_Offset(), "is as it was after a kinematic state"),
         (_TooSure(), "publishes the entries of its state"),
         (_Whirls(), "publishes the entries of its state"),
-        (_NoNumber(), "publishes the entries of its state"),
         (_NegativeBirth(), "is as it was after a kinematic state"),
         (_NegativeBirth(), "begins with a sound covariance"),
-        (_NegativeStart(), "begins with a sound covariance"),
         (_OtherTransitionOfMany(), "has the transition of its functions"),
-        (_NegativeBeyondHalfASecond(), "has noise that is symmetric and positive definite"),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, MotionModel) else "",
 )

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.errors import DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
@@ -22,7 +22,7 @@ from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
 from fgtrack.testing.references import Difference, dense_joint, difference
-from fgtrack.testing.streams import COMPONENTS, MS, START, US, measured, shuffled
+from fgtrack.testing.streams import COMPONENTS, MS, START, measured, shuffled
 
 START_NS = START.stamp_ns
 LINEAR = (("x_m", "y_m"), ("x_m", "y_m", "speed_mps"), ("x_m", "y_m", "yaw_rad"))
@@ -228,17 +228,6 @@ def test_of_several_tracks_the_one_that_cannot_be_updated_fails_alone(make: type
             assert max(difference(after, before)) < 1e-6
 
 
-def test_after_a_rebuild_a_nonlinear_model_stands_where_it_stood() -> None:
-    motion, rng = CTRV(), np.random.default_rng(9)
-    hit, spared = smoother(motion, "incremental"), smoother(motion, "incremental")
-    fill(motion, rng, hit, spared)
-    Fuse(hit.bank, "after")
-    assert hit.update(measured(rng, motion, 345 * MS)).status is UpdateStatus.FAILED
-    hit.converge()
-    spared.converge()
-    assert apart(hit, spared) < 1e-2
-
-
 # --- outputs
 
 
@@ -277,39 +266,6 @@ def test_final_states_of_a_nonlinear_model_are_near_the_optimum_of_what_had_arri
     assert np.median(differences) < 0.008
 
 
-def test_a_prior_that_says_nothing_costs_few_digits() -> None:
-    motion = CV()
-    start = replace(START, position_std_m=1e5, speed_std_mps=1e5)
-    one = estimator("smoother-banded", motion, start, lag_s=9.0)
-    measurements = arriving(motion, 6, LINEAR[:1], num=20)
-    for measurement in measurements:
-        one.update(measurement)
-    for state in one.take_rest():  # type: ignore[attr-defined]  # smoothers have it
-        joint = dense_joint(motion, start, measurements, [state.stamp_ns])
-        assert max(difference(state, joint[state.stamp_ns])) < 1e-5
-
-
-def test_an_option_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(CallError, match="unknown option 'lagg_s'; its options are"):
-        estimator("smoother", CV(), START, lagg_s=1)
-
-
-@every_solver
-def test_states_between_which_gauss_newton_oscillates_converge(name: str) -> None:
-    """Two clusters of positions: the noise of the motion between them follows the state before it, and so on."""
-    motion, rng = CTRV(), np.random.default_rng(295)
-    offsets_ns = (1422 * MS, 1422 * MS + US, 2 * MS, 2 * MS + US)
-    measurements = [measured(rng, motion, ns, COMPONENTS[rng.integers(4)]) for ns in offsets_ns]
-    shuffled_one, in_order = (smoother(motion, name, 2.0) for _ in range(2))
-    for index in range(4):
-        shuffled_one.update(measurements[index])
-        in_order.update(measurements[3 - index])
-    for each in (shuffled_one, in_order):
-        each.converge(20)
-    for ns in (0, 2 * MS, 700 * MS, 1422 * MS):
-        assert max(difference(shuffled_one.state_at(START_NS + ns), in_order.state_at(START_NS + ns))) < 1e-5
-
-
 # --- late measurements
 
 
@@ -334,24 +290,6 @@ def test_late_data_may_be_an_error_and_the_estimator_stays_as_it_was(name: str) 
         one.update(measured(rng, motion, start_ns - START_NS - 10 * MS))
     assert [repr(one.state_at(stamp_ns)) for stamp_ns in (start_ns, newest_ns)] == before
     assert one.update(measured(rng, motion, start_ns - START_NS)).status is UpdateStatus.OUT_OF_SEQUENCE
-
-
-@every_solver
-def test_in_a_nonlinear_model_late_data_beyond_the_window_costs_little(name: str) -> None:
-    """Marginalised nodes keep their linearisation: most of what the detection says arrives, not all."""
-    motion, rng = CTRV(), np.random.default_rng(7)
-    measurements = [measured(rng, motion, k * 50 * MS) for k in range(1, 30)]
-    late = measurements[10]
-    in_order, beyond = smoother(motion, name), smoother(motion, name)
-    for measurement in measurements:
-        in_order.update(measurement)
-        if measurement is not late:
-            beyond.update(measurement)
-    newest_ns = START_NS + 1450 * MS
-    without, expected = beyond.state_at(newest_ns), in_order.state_at(newest_ns)
-    assert beyond.update(late).status is UpdateStatus.BEYOND_WINDOW
-    remaining = difference(beyond.state_at(newest_ns), expected).mean_sigma
-    assert remaining < 0.2 * difference(without, expected).mean_sigma
 
 
 # --- many tracks

@@ -42,7 +42,7 @@ def counted(lives: Mapping[int, Life]) -> dict[int, tuple[int, int, int]]:
     return {track_id: (life.counter, life.num_measured, life.last_seen_ns) for track_id, life in lives.items()}
 
 
-@pytest.fixture(scope="module", params=RUNS)
+@pytest.fixture(scope="module", params=[*RUNS[:3], pytest.param(RUNS[3], marks=pytest.mark.slow)])
 def golden(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Golden:
     expected_file = shared(f"reference/{request.param}/expected.jsonl.gz")
     maps = [

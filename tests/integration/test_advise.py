@@ -169,6 +169,7 @@ def test_stamps_of_zero(call: Call) -> None:
     assert sum(fates.get(fate, 0) for fate in ("birth", "in_sequence", "out_of_sequence")) > 40
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", ["lidar", "radar"])
 def test_a_wrong_clock_is_found_by_the_truth_and_mended(call: Call, sensor: str) -> None:
     off = changed(lambda item: restamped(item, item.stamp_ns + 80 * MS) if item.sensor == sensor else item, drive(600))
@@ -214,17 +215,6 @@ def test_without_truth_only_the_difference_of_two_clocks_is_known(call: Call) ->
     assert advice.config.sensors["lidar"].clock_offset_s == pytest.approx(0.08, abs=0.02)
 
 
-@pytest.mark.slow
-def test_what_an_advised_clock_leaves_is_nothing(call: Call) -> None:
-    off = changed(lambda item: restamped(item, item.stamp_ns + 80 * MS) if item.sensor == "lidar" else item, drive(600))
-    write(off)
-    advised(call, "drive.jsonl", "-o", "a.yaml")
-    code, text = call("advise", "drive.jsonl", "-c", "a.yaml", "-o", "b.yaml")
-    assert code == 0
-    assert "clock_offset_s" not in text
-    assert "Nothing is changed" in Path("b.yaml").read_text()
-
-
 def test_a_limit_that_refuses_bursts(call: Call) -> None:
     def late_ms(k: int) -> float:
         return 600.0 + 5.0 * (k % 7) if k % 100 in range(40, 60) else 100.0 + 3.0 * (k % 7)
@@ -245,6 +235,7 @@ def test_a_limit_that_refuses_bursts(call: Call) -> None:
     assert "20 % of its detections come later than max_delay_s 0.3 s allows" in " ".join(advice.sentences)
 
 
+@pytest.mark.slow
 def test_a_window_shorter_than_the_delays_and_than_a_period(call: Call) -> None:
     write(drive(300))
     Path("c.yaml").write_text(CONFIG + "filter: {storage_s: 0.05}\n")
@@ -287,12 +278,6 @@ def test_negative_delays_a_jump_and_a_drift(call: Call) -> None:
 def told() -> tuple[str, ...]:
     Path("c.yaml").write_text(CONFIG)
     return fgtrack.advise("drive.jsonl", "c.yaml").sentences
-
-
-@pytest.mark.slow
-def test_receipts_for_stamps(call: Call) -> None:
-    write(changed(lambda item: replace(item, stamp_ns=item.receipt_ns), drive(truth=False)))
-    assert any("every stamp is the receipt" in line for line in told())
 
 
 def test_a_sensor_without_a_model_is_left_out(call: Call) -> None:
@@ -356,26 +341,7 @@ def test_white_noise_is_not_fitted_to_errors_that_last(call: Call) -> None:
     assert "white noise is too small for them" in text
 
 
-def test_noise_that_cannot_be_fitted_leaves_the_other_advice(call: Call) -> None:
-    write(drive(10))
-    code, text = call("advise", "drive.jsonl", "--tune")
-    assert code == 0
-    assert "- tune: no noise is changed: " in text
-    assert "- sensors: not configured: assumed, " in text
-    assert "--tune" not in text
-
-
-def test_the_forms_of_the_page(call: Call, capsys: pytest.CaptureFixture[str]) -> None:
-    write(drive())
-    assert run_command(["advise", "drive.jsonl", "-c", "c.yaml", "--json"]) == 0
-    values = json.loads(capsys.readouterr().out)
-    assert values["recording"] == "drive.jsonl"
-    assert {row["sensor"] for row in values["tables"]["lateness"]} == {"lidar", "radar"}
-    for form, expected in (("md", "|"), ("csv", "lateness,lidar,,lists,150"), ("latex", "tabular")):
-        assert run_command(["advise", "drive.jsonl", "-c", "c.yaml", "--format", form]) == 0
-        assert expected in capsys.readouterr().out
-
-
+@pytest.mark.slow
 def test_an_origin_that_is_wrong_is_found_by_the_truth(call: Call) -> None:
     def moved(item: DetectionList) -> DetectionList:
         return replace(item, objects=[replace(of, x_m=of.x_m + 1.5) for of in item.objects if of.x_m is not None])

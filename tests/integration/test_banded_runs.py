@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.examples import slow
 from support.messages import shared
 
 import fgtrack
@@ -22,7 +23,8 @@ def recording(name: str) -> dict[str, object]:
 
 
 @pytest.mark.parametrize(
-    "name", ["default", "short10", "lidar3_10", "jitter10", pytest.param("full60", marks=pytest.mark.slow)]
+    "name",
+    ["default", *slow("short10", "lidar3_10", "jitter10", "full60")],
 )
 def test_whole_runs_are_those_of_the_smoother(name: str) -> None:
     given = recording(name)

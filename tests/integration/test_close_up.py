@@ -1,6 +1,5 @@
 """A late detection in close-up: which one, what the tracks were before and after, and the picture of it."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from fgtrack.evaluation.palette import look
 from fgtrack.evaluation.placement import placed
 from fgtrack.models.motion import CTRV
 from fgtrack.plotting.close_up import Arrival, CloseUp
-from fgtrack.plotting.late_detection import chosen, close_up_of
+from fgtrack.plotting.late_detection import close_up_of
 
 NAMES = ("ekf-replay", "ekf-backward-forward")
 
@@ -77,16 +76,6 @@ def test_it_is_typical_of_the_late_detections_that_lower_the_error(folder: Path,
     assert f"{rms_m[0]:.2f} to {rms_m[1]:.2f} m" in found[0].rule
 
 
-def test_without_truth_it_moves_the_present_by_the_median(folder: Path) -> None:
-    run = fgtrack.load_run(folder / "runs" / NAMES[0])
-    blind = run.with_tables(truth=run.tables["truth"].where(np.zeros(run.tables["truth"].num_rows, dtype=bool)))
-    arrival, rule = chosen([blind])
-    assert rule.endswith("the one that moves the present by the median.")
-    figure = fgtrack.plot.close_up([blind], [replace(close_up_of(blind, arrival), rule=rule)])
-    assert faults(figure) == []
-    assert "afterwards" in figure.axes[1].get_ylabel()
-
-
 def test_it_draws_the_past_towards_the_detection_and_is_fused_once(folder: Path, found: list[CloseUp]) -> None:
     for name, one in zip(NAMES, found, strict=True):
         run = fgtrack.load_run(folder / "runs" / name)
@@ -100,20 +89,6 @@ def test_it_draws_the_past_towards_the_detection_and_is_fused_once(folder: Path,
         assert off_m[1] < off_m[0]
         assert stamp_ns not in one.fused_ns
         assert one.fused_ns.max() > stamp_ns
-
-
-def test_a_track_and_a_stamp_can_be_asked_for(folder: Path) -> None:
-    run = fgtrack.load_run(folder / "runs" / NAMES[0])
-    stamp_ns = int(run.tables["timing"]["now_ns"][0]) + 4 * NS_PER_S
-    tracks = sorted(
-        set(run.tables["updates"]["track_id"][run.tables["updates"]["disposition"] == "out_of_sequence"].tolist())
-    )
-    for track in tracks:
-        arrival, _ = chosen([run], track, stamp_ns)
-        assert abs(arrival.stamp_ns - stamp_ns) < 0.2 * NS_PER_S
-        assert close_up_of(run, arrival).track_id == track
-    with pytest.raises(fgtrack.DataError, match="has no track 99"):
-        chosen([run], 99)
 
 
 def test_what_is_not_there_is_said(folder: Path) -> None:
@@ -146,14 +121,6 @@ def test_the_picture_shows_errors_before_and_after_and_what_was_forgotten(folder
         assert one.after.stamps_ns[-1] == one.now_ns
     with pytest.raises(fgtrack.CallError, match="of one detection"):
         fgtrack.plot.close_up(runs[:1], found)
-
-
-def test_in_a_column_the_errors_of_all_methods_are_one_readable_plot(folder: Path, found: list[CloseUp]) -> None:
-    figure = fgtrack.plot.close_up([folder / "runs" / name for name in NAMES], found, width="3.4in")
-    (axes,) = figure.axes
-    assert faults(figure) == []
-    assert axes.get_window_extent().height > 0.5 * figure.bbox.height
-    assert {line.get_color() for line in axes.lines} == {"black", *(look(name).colour for name in NAMES)}
 
 
 def test_the_command_draws_it_and_goes_on_without_a_recording(

@@ -40,13 +40,8 @@ def test_python_m_runs_the_command_line() -> None:
 @pytest.mark.parametrize(
     ("words", "offered"),
     [
-        ("rep", {"replay", "report"}),
-        ("replay --over", {"--overwrite"}),
-        ("replay drive.jsonl -e ekf-rep", {"ekf-replay"}),
         ("replay drive.jsonl -e ekf-replay,smoother-b", {"ekf-replay,smoother-batch", "ekf-replay,smoother-banded"}),
         ("replay drive.jsonl -c karle", {"karle2023", "karle2023_reference"}),
-        ("simulate no_", {"no_delay"}),
-        ("sweep smo", {"smoke"}),
     ],
 )
 def test_the_shell_completes_commands_options_and_names(words: str, offered: set[str]) -> None:

@@ -9,6 +9,8 @@ from fgtrack.cli.sweep import score
 from fgtrack.pipeline.sweep import Sweep
 from fgtrack.pipeline.sweep_plan import Job, load_plan
 
+pytestmark = pytest.mark.slow
+
 FOLDER = Path(__file__).parents[2] / "configs/sweeps"
 FILES = sorted(FOLDER.glob("*.yaml"))
 DURATION_S = 1.5

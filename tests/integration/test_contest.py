@@ -6,6 +6,8 @@ from support.scripts import EXPERIMENTS
 sys.path.insert(0, str(EXPERIMENTS))
 import contest
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_lever_arm_costs_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     rows = [line.split("|")[2:5] for line in contest.lever_arm(1, 8.0).splitlines()[2:]]

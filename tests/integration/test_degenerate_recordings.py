@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.examples import slow
 
 from fgtrack.cli.main import run
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
@@ -76,7 +77,8 @@ KINDS = {
     "two stamps": (lambda: drive(stamps=2), FEW),
     "one stamp": (lambda: drive(stamps=1), FEW),
 }
-each_kind = pytest.mark.parametrize("kind", KINDS)
+_FAST = ("constant yaw", "one detection")
+each_kind = pytest.mark.parametrize("kind", [*_FAST, *slow(*(kind for kind in KINDS if kind not in _FAST))])
 
 
 def called(words: Sequence[str], capsys: Capture) -> tuple[int, str, str]:
@@ -117,6 +119,7 @@ def test_offsets_and_advice_say_what_can_be_known(kind: str, command: str, tmp_p
     assert "nan" not in out
 
 
+@pytest.mark.slow
 def test_advice_on_noise_that_has_no_maximum_leaves_it(tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "drive.jsonl"
     write_stream(path, [one for one in KINDS["all alike"][0]() if getattr(one, "sensor", "lidar") == "lidar"])

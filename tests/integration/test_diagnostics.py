@@ -75,12 +75,7 @@ def test_no_ego(call: Call) -> None:
     assert replayed(call, drive(ego=False, frame="map"), "birth.ego_speed_factor=0.0")[1] == []
 
 
-def test_no_map_where_it_says_where_objects_head(call: Call) -> None:
-    code, (line,), _ = replayed(call, drive(yaw=False))
-    assert (code, line.startswith("map: there is none, and no heading from lidar: ")) == (0, True)
-    assert replayed(call, drive(yaw=False), "birth.ego_speed_factor=0.0")[1] == []
-
-
+@pytest.mark.slow
 def test_noise_that_does_not_fit_names_the_command_that_fits_it(call: Call) -> None:
     _, warned, _ = replayed(call, drive(160), "sensors.lidar.std={x_m: 0.1, y_m: 0.1, yaw_rad: 0.1}")
     (line,) = [line for line in warned if "the configured noise is too small, as if errors were" in line]

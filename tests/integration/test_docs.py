@@ -1,7 +1,6 @@
 """The README, the pages and the experiments' READMEs against the code: everything that they show is tried."""
 
 import ast
-import json
 import re
 import shlex
 import shutil
@@ -20,6 +19,7 @@ import pytest
 import typer
 from matplotlib import pyplot
 from ruamel.yaml import YAML
+from support.examples import slow
 
 import fgtrack
 from fgtrack.cli.main import COMMANDS, app
@@ -128,7 +128,11 @@ def test_the_first_tutorial_has_at_most_twelve_lines() -> None:
     assert len({node.lineno for node in ast.walk(code) if isinstance(node, ast.stmt)} - {1}) <= 12
 
 
-@pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "tutorial",
+    [TUTORIALS[0], *slow(*TUTORIALS[1:])],
+    ids=lambda path: path.stem,
+)
 def test_tutorials_run(tutorial: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     matplotlib.use("agg")
@@ -279,11 +283,6 @@ def test_yaml_blocks_are_valid_files(block: Block) -> None:
     elif set(raw) <= {field.name for field in fields(Config)}:
         kind = Config
     validate(kind, raw, f"{block.page}:{block.line}")
-
-
-@pytest.mark.parametrize("block", all_blocks("json"), ids=lambda block: f"{block.page}:{block.line}")
-def test_json_blocks_are_json_lines(block: Block) -> None:
-    assert all(json.loads(line) for line in block.text.splitlines())
 
 
 @pytest.mark.parametrize("model", [*get_args(get_args(AnyDelay)[0]), *get_args(get_args(AnyClock)[0])])

@@ -3,7 +3,6 @@
 import json
 import math
 import shutil
-import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,13 +14,12 @@ from rosbags.interfaces import ConnectionExtRosbag2, QosDurability
 from rosbags.rosbag2 import Reader
 
 from fgtrack.cli.main import run as command
-from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.errors import DataError
 from fgtrack.core.types import (
     Detection,
     DetectionList,
     Disposition,
     EgoState,
-    ObjectReport,
     TickReport,
     TrackReport,
     TrackState,
@@ -241,19 +239,6 @@ def test_foxglove_gets_what_the_shapes_say(by_hand: Path) -> None:
     assert {"track_id", "nis"} & set(next(values(topics["/outcomes"][1]))[1]) == set()
 
 
-@pytest.fixture(scope="module")
-def described(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two tracks: a car whose height nobody tells, and one of which nothing is told."""
-    path = tmp_path_factory.mktemp("described") / "run"
-    state = TrackState(TICK_NS, np.array([98.0, 68.0, 0.0, 20.0, 0.0]), np.eye(5))
-    car = ObjectReport("car", 1.0, 4.2, 1.7)
-    reports = tuple(TrackReport(k, TrackStatus.CONFIRMED, state, 4, object=told) for k, told in ((1, car), (2, None)))
-    with RunWriter(path, "{}") as writer:
-        writer.write_tick(TickReport(0, TICK_NS, reports, ()), 1, 0)
-        writer.finish({"estimator": "smoother"})
-    return path
-
-
 def test_a_bag_shows_a_run_made_by_hand(by_hand: Path, tmp_path: Path) -> None:
     export([by_hand], tmp_path / "bag", ros2=True)
     found = read_bag(tmp_path / "bag")
@@ -310,23 +295,6 @@ def test_what_is_sent_once_reaches_those_who_listen_later(bag: dict[str, list[Ba
     assert all(len(bag[topic]) == 1 for topic in lasting)
 
 
-@pytest.mark.parametrize("options", [["x.mcap"], ["x.mcap", "--ros2"], ["bag", "--ros2"]])
-def test_what_is_there_is_replaced_only_on_request(
-    runs: Path, tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["export", str(runs / "ekf-replay"), "-o", str(tmp_path / options[0]), *options[1:]]
-    assert command(arguments) == 0
-    assert command(arguments) == 2
-    assert "--overwrite" in capsys.readouterr().err
-    assert command([*arguments, "--overwrite"]) == 0
-    assert [path.name for path in tmp_path.iterdir()] == options[:1]
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine/thesis.tex").write_text("years")
-    arguments[3] = str(tmp_path / "mine")
-    assert command([*arguments, "--overwrite"]) == 2
-    assert (tmp_path / "mine/thesis.tex").read_text() == "years"
-
-
 @pytest.mark.parametrize(("name", "write"), [("x.mcap", write_foxglove), ("x.mcap", write_ros2), ("bag", write_ros2)])
 def test_an_export_that_fails_leaves_nothing(
     smoothed: Run, tmp_path: Path, name: str, write: Callable[..., object]
@@ -342,41 +310,6 @@ def test_an_export_that_fails_leaves_nothing(
     with pytest.raises(DataError, match=r"-5 ns lies"):
         write(tmp_path / name, [ViewerMessage(-5, 5, "/tracks", Scene())], {})
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (["missing", "-o", "x.mcap"], "missing: no run folder"),
-        (["RUN", "-o", "x"], "x: viewers recognise such a file by its name, let it end in .mcap"),
-        (["RUN", "RUN", "-o", "x.mcap"], "is given twice"),
-        (["RUN"], "Missing option '-o'"),
-    ],
-)
-def test_a_call_that_cannot_be_done_is_one_line(
-    runs: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    line: str,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert command(["export", *(str(runs / "smoother") if word == "RUN" else word for word in arguments)]) == 2
-    [told] = capsys.readouterr().err.strip().splitlines()
-    assert line in told
-    assert not list(tmp_path.iterdir())
-
-
-def test_without_the_sdk_of_foxglove_one_line_says_what_to_install(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.delitem(sys.modules, "fgtrack.viewers.foxglove")
-    monkeypatch.setitem(sys.modules, "foxglove", None)
-    assert command(["export", str(runs / "ekf-replay"), "-o", str(tmp_path / "x.mcap")]) == 2
-    [line] = capsys.readouterr().err.splitlines()
-    assert "pip install foxglove-sdk" in line
-    assert command(["export", str(runs / "ekf-replay"), "-o", str(tmp_path / "bag"), "--ros2"]) == 0
 
 
 # Several runs, and runs of which something is missing
@@ -397,16 +330,6 @@ def test_several_runs_stand_side_by_side(runs: Path, tmp_path: Path) -> None:
         if shape.kind == "cube"
     }
     assert len(boxes) == len({colour for _, colour in boxes}) == 2
-
-
-def test_runs_of_different_recordings_are_refused(runs: Path, by_hand: Path, tmp_path: Path) -> None:
-    shutil.copytree(by_hand, tmp_path / "other")
-    ego = tmp_path / "other/ego.csv"
-    ego.write_text(ego.read_text().replace(",100,", ",101,"))
-    for one, other in ((runs / "smoother", by_hand), (by_hand, tmp_path / "other")):
-        with pytest.raises(CallError, match="are of different recordings"):
-            export([one, other], tmp_path / "x.mcap")
-    assert [path.name for path in tmp_path.iterdir()] == ["other"]
 
 
 def test_a_run_of_an_older_version_and_a_map_that_is_gone_are_told(

@@ -12,6 +12,8 @@ import pytest
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
@@ -44,18 +46,6 @@ for line in sys.stdin:
     code = run(shlex.split(line)[1:])
     if code:
         sys.exit(f"{line}: exit code {code}")
-"""
-
-
-#: A sweep on a cluster whose workers are other processes.
-ON_CLUSTER = """
-import sys
-from distributed import LocalCluster
-from fgtrack.cli.main import run
-
-if __name__ == "__main__":
-    with LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster:
-        sys.exit(run(["sweep", "sweep.yaml", "-o", "cluster", "--dask", cluster.scheduler_address]))
 """
 
 
@@ -120,35 +110,6 @@ def last_x_m(tracks: str) -> float:
 def test_the_tests_of_the_page_pass(folder: Path) -> None:
     said = followed(folder, ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", "/dev/null", "--rootdir", ".", "."])
     assert re.search(r"\d\d passed", said)
-
-
-def test_a_copy_that_drops_late_data_breaks_the_contract(folder: Path) -> None:
-    script = """
-from fgtrack import UpdateResult
-from fgtrack.testing import check_estimator
-from fgtrack_example.refilter import Refilter
-
-class Drops(Refilter):
-    def update(self, measurement):
-        newest_ns, kept = self.window_ns[1], list(self.measurements)
-        result = super().update(measurement)
-        if measurement.stamp_ns < newest_ns:
-            self.measurements = kept
-        return result
-
-check_estimator(Drops, num_streams=2)
-"""
-    said = followed(folder, ["-c", script], code=1)
-    assert "BrokenPromiseError: Drops: broken promise: it gives the dense joint posterior in any order" in said
-    assert "measurements in the order of arrival" in said
-
-
-def test_the_ladder_has_the_method(folder: Path) -> None:
-    ladder = str(ROOT / "experiments/ladder/ladder.py")
-    said = followed(folder, [ladder, "-o", "ladder", "--runs", "2", "--lags", "3"])
-    rows = {line.split("|")[1].strip(): line.split("|")[2:] for line in said.splitlines() if line.startswith("| ")}
-    assert rows["refilter"][0].strip().startswith(rows["ekf-replay"][0].strip().partition(" (")[0])
-    assert rows["refilter"][1].strip() == "any lag, any number"
 
 
 def test_a_recording_with_the_message_type_is_replayed(folder: Path) -> None:

@@ -1,7 +1,4 @@
-from shutil import copyfile
-
 import pytest
-from mcap.writer import Writer as McapWriter
 from support.messages import START_NS, drive, shared
 
 from fgtrack.cli.main import run
@@ -77,16 +74,6 @@ def test_times_and_angles_in_another_unit_are_pointed_out(tmp_path):
     assert "years long: its times are of several units or clocks (`time_unit` of CSV tables)" in str(one)
 
 
-def test_a_copy_of_a_file_beside_it_is_refused(tmp_path):
-    write_bag(tmp_path / "bag", drive())
-    (file,) = (tmp_path / "bag").glob("*.mcap")
-    (tmp_path / "two").mkdir()
-    for name in ("a.mcap", "b.mcap"):
-        copyfile(file, tmp_path / "two" / name)
-    with pytest.raises(DataError, match=r"two: a\.mcap and b\.mcap are copies of one recording: remove or name one"):
-        describe(tmp_path / "two")
-
-
 def test_every_shared_recording_is_described_or_refused_in_one_line():
     root = shared("data/bags")
     paths = [*root.rglob("*.mcap"), *root.rglob("*.db3"), *(file.parent for file in root.rglob("metadata.yaml"))]
@@ -107,29 +94,10 @@ def test_every_shared_recording_is_described_or_refused_in_one_line():
     assert all("wrong_format" in line and "\n" not in line for line in refused)
 
 
-def test_a_type_without_definition_is_listed_with_the_reason():
-    topics = by_name(describe(shared("data/bags/rosbag2_py_resources/sqlite3/convert_a")))
-    assert topics["b_basictypes"].count == 50
-    assert "test_msgs/msg/BasicTypes" in topics["b_basictypes"].note
-
-
 def test_stamps_of_another_clock_are_pointed_out():
     topic = by_name(describe(shared("data/bags/nav2_turtlebot.mcap")))["/odom"]
     assert topic.count == 2639
     assert "another clock" in topic.note
-
-
-def test_a_channel_without_a_type_is_listed_with_its_problem(tmp_path):
-    """As MCAP allows it, for JSON or bytes."""
-    with (tmp_path / "x.mcap").open("wb") as file:
-        writer = McapWriter(file)
-        writer.start(profile="ros2", library="")
-        channel = writer.register_channel("/plain", "cdr", 0)
-        writer.add_message(channel, 5, b"\0\1\0\0", 5)
-        writer.finish()
-    (topic,) = describe(tmp_path / "x.mcap", InputConfig()).topics
-    assert topic.name == "/plain"
-    assert "a type without a name is neither in the recording nor known" in topic.note
 
 
 def test_a_pipe_is_as_wide_as_columns_says(tmp_path, monkeypatch, capsys):

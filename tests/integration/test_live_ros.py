@@ -95,21 +95,6 @@ def test_a_standing_car_is_tracked_from_a_turning_ego_with_late_lists_and_late_p
     assert node.tracker.lateness["lidar_cluster"].delay_median_s == pytest.approx(0.109)
 
 
-def test_the_pose_is_that_at_the_stamp_of_the_list(script: ModuleType) -> None:
-    node = made(script)
-    received: list[Any] = []
-    node.tracker.receive = received.append
-    stamp_ns = NOW_NS + 33 * MS
-    for at_ns in (NOW_NS + 20 * MS, NOW_NS + 40 * MS):
-        node.buffer.known[at_ns] = pose(at_ns)
-    send(node, "radar/detections", detections(stamp_ns), NOW_NS + 45 * MS)
-    tick(node, NOW_NS + 60 * MS)
-    newest, exact, message = received
-    assert [newest.stamp_ns, exact.stamp_ns, message.stamp_ns] == [NOW_NS + 40 * MS, stamp_ns, stamp_ns]
-    assert (exact.x_m, exact.y_m, exact.yaw_rad) == pytest.approx(pose(stamp_ns))
-    assert (message.receipt_ns, message.frame) == (NOW_NS + 45 * MS, "ego")
-
-
 def test_a_list_waits_for_its_pose_and_keeps_its_receipt(script: ModuleType) -> None:
     node = made(script)
     node.buffer.known[NOW_NS] = pose(NOW_NS)
@@ -125,36 +110,6 @@ def test_a_list_waits_for_its_pose_and_keeps_its_receipt(script: ModuleType) -> 
     assert node.without_pose == 0
 
 
-def test_a_list_does_not_wait_for_ever(script: ModuleType) -> None:
-    node = made(script, tf_wait_s=0.1)
-    send(node, "radar/detections", detections(NOW_NS + 30 * MS), NOW_NS + 40 * MS)
-    for now_ms in (50, 139):
-        tick(node, NOW_NS + now_ms * MS)
-        assert counts(node) == {}
-    tick(node, NOW_NS + 140 * MS)
-    assert counts(node) == {"radar": {"failed": 1}}  # no pose at all was ever known
-    assert node.without_pose == 1
-
-
-def test_lists_in_the_map_wait_for_nothing_and_others_are_of_the_sensor(script: ModuleType) -> None:
-    node = made(script)
-    received: list[Any] = []
-    node.tracker.receive = received.append
-    send(node, "radar/detections", detections(NOW_NS, "map"), NOW_NS + 10 * MS)
-    tick(node, NOW_NS + 20 * MS)
-    assert [message.frame for message in received] == ["map"]
-    node.buffer.known = {NOW_NS + k * MS: pose(NOW_NS + k * MS) for k in (0, 50)}
-    send(node, "radar/detections", detections(NOW_NS + 20 * MS, "radar_front"), NOW_NS + 30 * MS)
-    tick(node, NOW_NS + 40 * MS)
-    assert received[-1].frame == "sensor"
-
-
-def test_a_simulated_time_that_has_not_begun_makes_no_tick(script: ModuleType) -> None:
-    node = made(script)
-    assert tick(node, 0) is None
-    assert node.tracker.timing.ticks == 0
-
-
 def test_where_time_begins_again_the_tracker_does(script: ModuleType) -> None:
     node = made(script)
     node.buffer.known = {NOW_NS + k * MS: pose(NOW_NS + k * MS) for k in (0, 500)}
@@ -168,24 +123,3 @@ def test_where_time_begins_again_the_tracker_does(script: ModuleType) -> None:
     published = tick(node, NOW_NS - 5_000 * MS)
     assert (published.detections, Time.from_msg(published.header.stamp).nanoseconds) == ([], NOW_NS - 5_000 * MS)
     assert (counts(node), node.tracker.refused, node.buffer.known) == ({}, {}, {})
-
-
-def test_lists_and_odometry_are_taken_best_effort_and_the_timer_has_the_rate_of_the_node(script: ModuleType) -> None:
-    node = made(script)
-    assert set(node.subscriptions) == {"odometry", "lidar_cluster/detections", "radar/detections"}
-    assert {qos.reliability for _, _, qos in node.subscriptions.values()} == {"best_effort"}
-    assert node.timers[0][0] == 0.02
-
-
-def test_the_log_says_who_is_silent_and_what_was_not_used(script: ModuleType) -> None:
-    node = made(script, tf_wait_s=0.0)
-    node.timers[1][1]()
-    assert node.logger.lines == []
-    tick(node, NOW_NS)
-    send(node, "radar/detections", detections(NOW_NS), NOW_NS + 10 * MS)
-    tick(node, NOW_NS + 1_500 * MS)
-    node.timers[1][1]()
-    said = "\n".join(node.logger.lines)
-    assert "lidar_cluster: silent for 1.5 s" in said
-    assert "radar: silent for 1.5 s" in said
-    assert "without pose: 1" in said

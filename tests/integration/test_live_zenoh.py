@@ -182,6 +182,7 @@ def test_of_ten_thousand_late_messages_none_is_lost_without_a_word() -> None:
     assert vehicle["tracks"] > 100
 
 
+@pytest.mark.slow
 def test_messages_that_are_lost_on_the_way_are_noticed() -> None:
     vehicle, tracker = driven("--duration-s", "300", "--max-lists", "400", "--lose-every", "20")
     assert tracker["lost"] == {topic: count // 20 for topic, count in vehicle["sent"].items()}

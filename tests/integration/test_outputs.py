@@ -4,8 +4,6 @@ import json
 import math
 import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -18,9 +16,8 @@ from fgtrack.cli import demo
 from fgtrack.cli.main import COMMANDS, _command, run
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
-from fgtrack.io.output import claimed, new_file
 from fgtrack.io.ros.bag_writer import write_bag
-from fgtrack.io.run import RunWriter, digest, load_run
+from fgtrack.io.run import RunWriter, load_run
 from fgtrack.io.source import open_input
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.replay import replay_each
@@ -235,12 +232,6 @@ def test_a_replay_that_is_under_way_holds_all_its_folders(here: Path) -> None:
     assert len(replay_each(messages, paper(), folders)) == 2
 
 
-def test_a_sweep_does_not_share_its_folder(here: Path, call: Call) -> None:
-    Path("sweep.yaml").write_text(SWEEP)
-    with claimed(Path("swept")):
-        assert "another command is writing there" in call("sweep", "sweep.yaml", "-o", "swept")[1]
-
-
 #: Commands whose output is an input, holds one or lies in one, and which.
 TANGLED = [
     (("convert", "drive.jsonl", "./drive.jsonl"), "drive.jsonl"),
@@ -315,14 +306,6 @@ def test_what_appears_while_a_recording_is_written_is_not_replaced(here: Path) -
     assert not list(here.glob("*.part"))
 
 
-@pytest.mark.parametrize(("write", "out"), [(write_stream, "other.jsonl"), (write_bag, "bag")])
-def test_no_message_is_read_for_an_output_that_is_refused(here: Path, write: Callable[..., int], out: str) -> None:
-    messages = iter(drive(5))
-    with pytest.raises(CallError, match=f"{out}: already exists"):
-        write(out, messages)
-    assert len(list(messages)) == 10
-
-
 def test_figures_are_replaced_all_or_none(here: Path, call: Call) -> None:
     figures = sorted(Path("figures").iterdir())
     assert call("figure", "run", "-o", "figures")[0] == 0  # they would be the same
@@ -361,20 +344,6 @@ def test_an_output_that_cannot_be_written_is_a_bad_call_everywhere(here: Path, c
         assert "file/x" in error
 
 
-def test_two_replays_at_once_into_one_folder_are_one_run_and_one_refusal(here: Path) -> None:
-    write_stream("long.jsonl", drive(1500))
-    words = [sys.executable, "-m", "fgtrack", "replay", "long.jsonl", "-o", "both", "--overwrite"]
-    both = [subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) for _ in range(2)]
-    errors = [one.communicate(timeout=120)[1] for one in both]
-    refused = [error for one, error in zip(both, errors, strict=True) if one.returncode == 2]
-    assert all("another command is writing there" in error for error in refused)
-    assert sorted(one.returncode for one in both) in ([0, 2], [0, 0])  # where the second began after the first
-    run = load_run("both")
-    assert run.meta["complete"] is True
-    assert digest(Path("both")) == run.meta["digest"]
-    assert run.tables["updates"].num_rows == 1500
-
-
 def test_a_run_that_cannot_be_written_to_is_compared_with_a_warning(
     here: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -389,12 +358,6 @@ def test_a_run_that_cannot_be_written_to_is_compared_with_a_warning(
     [line] = [line for line in said.err.splitlines() if "metrics.json" in line]
     assert line.startswith("fgtrack: warning: run/metrics.json: cannot be written")
     assert content(here) == before
-
-
-def test_a_full_disk_is_no_fault_of_the_call(here: Path) -> None:
-    with pytest.raises(DataError, match="free some space"), new_file(Path("new.jsonl"), False):
-        raise OSError(28, "No space left on device")
-    assert not list(here.glob("new*"))
 
 
 @pytest.mark.parametrize(("write", "out"), [(write_stream, "other.jsonl"), (write_bag, "bag")])
@@ -414,18 +377,3 @@ def test_what_fails_while_it_is_written_keeps_the_old_recording(
     with pytest.raises(DataError, match=r"broken$"):
         write(new, failing(DataError("broken"), 5))
     assert list(open_input(here / new).messages()) == drive(5)
-
-
-def test_a_replay_that_gives_nothing_leaves_the_old_run(here: Path, call: Call) -> None:
-    write_stream("sonar.jsonl", [DetectionList("sonar", START_NS, START_NS, (Detection(x_m=1.0, y_m=2.0),))])
-    before = content(here / "run")
-    assert call("replay", "sonar.jsonl", "-c", "smoother", "-o", "run", "--overwrite")[0] == 1
-    assert content(here / "run") == before
-
-
-@pytest.mark.parametrize("words", [("info", "pipe.jsonl"), ("replay", "drive.jsonl", "-c", "pipe.jsonl", "-o", "new")])
-def test_a_pipe_as_a_file_is_one_line(here: Path, call: Call, words: tuple[str, ...]) -> None:
-    os.mkfifo("pipe.jsonl")
-    code, error = call(*words)
-    assert code in (1, 2)
-    assert "pipe.jsonl" in error

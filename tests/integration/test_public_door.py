@@ -1,7 +1,6 @@
 """The public names of `import fgtrack`: what the commands do, in a few lines, without importing more than is used."""
 
 import ast
-import inspect
 import pydoc
 import shutil
 import subprocess
@@ -11,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 import fgtrack
 
@@ -69,12 +67,6 @@ def test_a_star_import_and_the_help_show_the_public_names_alone() -> None:
     assert [name for name in fgtrack.__all__ if name not in page] == []
     assert "_HOMES" not in page
     assert "import_module" not in page
-
-
-def test_plot_completes_to_figures_only() -> None:
-    assert {"errors", "map", "timing"} <= set(dir(fgtrack.plot))
-    for name in dir(fgtrack.plot):
-        assert inspect.signature(getattr(fgtrack.plot, name)).return_annotation is Figure, name
 
 
 def test_a_run_in_memory_a_run_folder_and_the_command_give_the_same_run(drive: Path, tmp_path: Path) -> None:
@@ -160,14 +152,6 @@ def test_an_argument_of_another_type_is_named(wrong: object) -> None:
     for name, call in calls.items():
         with pytest.raises(fgtrack.CallError, match=f"^{name}: "):
             call()
-
-
-def test_numbers_of_numpy_are_numbers() -> None:
-    for value in (np.float32(4.0), np.float64(4.0), np.int64(4), np.array(4.0)):
-        tracker = fgtrack.Tracker.from_config("smoother", set={"association.gate_m": value})
-        assert tracker.config.association.gate_m == 4.0
-    with pytest.raises(fgtrack.CallError, match=r"only plain YAML values"):
-        fgtrack.Tracker.from_config("smoother", set={"association.gate_m": object()})
 
 
 def test_a_run_and_a_comparison_show_themselves_in_a_few_lines(drive: Path, tmp_path: Path) -> None:

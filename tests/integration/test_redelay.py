@@ -92,15 +92,6 @@ def test_what_is_lost_is_said(fgtrack: Command) -> None:
     assert {(m.sensor, m.receipt_ns - m.stamp_ns) for m in lists} == {("lidar_cluster", 0), ("radar", 50_000_000)}
 
 
-def test_a_stream_that_breaks_off_is_converted_up_to_the_break(fgtrack: Command) -> None:
-    whole = Path("original.jsonl").read_bytes()
-    Path("cut.jsonl").write_bytes(whole[: len(whole) // 2])
-    code, _, err = fgtrack("convert", "cut.jsonl", "out.jsonl", "--delays", "bursts.yaml")
-    assert code == 1
-    assert "breaks off" in err
-    assert len(read("out.jsonl")) == whole[: len(whole) // 2].count(b"\n") - 1
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -129,8 +120,3 @@ def test_a_bad_file_of_delays_is_one_line_that_names_the_key(fgtrack: Command, t
     assert message in err
     assert len(err.splitlines()) == 1
     assert not Path("out.jsonl").exists()
-
-
-def test_a_seed_without_delays_is_a_bad_call(fgtrack: Command) -> None:
-    code, _, err = fgtrack("convert", "original.jsonl", "out.jsonl", "--seed", 3)
-    assert (code, err) == (2, "fgtrack: error: --seed: only --delays draws random numbers, name its file\n")

@@ -165,6 +165,7 @@ def test_what_is_embedded_is_what_the_run_folders_hold(page: str, folder: Path) 
     np.testing.assert_allclose(place_m, late_case.after.means[-1, :2], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_same_runs_give_the_same_bytes_and_replace_nothing(
     page: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -172,13 +173,6 @@ def test_the_same_runs_give_the_same_bytes_and_replace_nothing(
     assert (folder / "again.html").read_text(encoding="utf-8") == page
     assert command(["report", str(folder / "runs"), "-o", str(folder / "again.html")]) == 2
     assert "--overwrite" in capsys.readouterr().err
-
-
-def test_runs_of_different_recordings_have_each_their_own_map_and_time(folder: Path) -> None:
-    fgtrack.simulate("default", seed=4, duration_s=1.0, out=folder / "other.jsonl", overwrite=True)
-    other = fgtrack.replay(folder / "other.jsonl", "tuned", map="oval", pit_map="oval", estimator="ekf-replay")
-    shown, _ = playback(evaluated([folder / "runs" / NAMES[0], other]))
-    assert [one["recording"] for one in shown["runs"]] == [0, 1]
 
 
 def test_a_sensor_whose_clock_is_years_off_has_no_stamps(folder: Path) -> None:
@@ -190,6 +184,7 @@ def test_a_sensor_whose_clock_is_years_off_has_no_stamps(folder: Path) -> None:
     assert None not in found["receipt"]
 
 
+@pytest.mark.slow
 def test_long_runs_are_thinned_and_it_is_reported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fgtrack.viewers.playback.MOST_ROWS", 200)
     shown, notes = playback(evaluated(folder / "runs" / NAMES[0]))
@@ -215,19 +210,7 @@ def test_names_from_outside_are_text(folder: Path, tmp_path: Path) -> None:
     assert embedded(text)["runs"][0]["label"].startswith(strange.name)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [(("runs", "-o", "{tmp}/report"), "a report is one HTML file"), (("drive.jsonl", "-o", "{tmp}/a.html"), "no run")],
-)
-def test_a_bad_call_is_one_line(
-    arguments: tuple[str, ...], line: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    first, *rest = arguments
-    assert command(["report", str(folder / first), *(word.format(tmp=tmp_path) for word in rest)]) == 2
-    (told,) = capsys.readouterr().err.splitlines()
-    assert line in told
-
-
+@pytest.mark.slow
 def test_the_wheel_holds_the_templates(tmp_path: Path) -> None:
     subprocess.run(
         [sys.executable, "-c", f"from hatchling.build import build_wheel; build_wheel({str(tmp_path)!r})"],

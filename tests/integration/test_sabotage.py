@@ -11,20 +11,17 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import Failure
 from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.replay import ReplayEkf
-from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.run import Run, Table, load_run
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.live import Tracker
 from fgtrack.pipeline.replay import replay
 from fgtrack.pipeline.shipped import read_config
 
@@ -218,18 +215,6 @@ def test_a_healthy_estimator_fails_nowhere_and_compare_says_so_in_full(
     assert "Failures inside the estimator" in str(tables.in_full())
 
 
-@pytest.mark.parametrize("wrong", list(KINDS)[::4])
-def test_a_running_tracker_shares_the_guards(sabotaged: Callable[[str], Config], wrong: str) -> None:
-    tracker = Tracker(sabotaged(wrong))
-    for message in messages():
-        tracker.receive(message)
-        for track in tracker.tick(message.receipt_ns).tracks:
-            assert np.isfinite(track.state.mean).all()
-            np.linalg.cholesky(track.covariance)
-    assert tracker.failures[KINDS[wrong]] > 0
-    assert sum(map(sum, (counts.values() for counts in tracker.counts.values()))) == 2 * LISTS
-
-
 class Rotten(CTRV):
     """Beyond 45 m something is wrong, from some time on."""
 
@@ -283,46 +268,3 @@ def test_what_a_motion_model_does_wrong_is_not_published_and_counted(
     check_published(run)
     if wrong != "has endless noise":  # of which nothing is known, is sound
         check_told(run)
-
-
-def test_a_state_that_a_model_spoils_on_the_way_to_another_time_is_not_given(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Config, "motion_model", lambda self: Rotten())
-    tracker = Tracker(read_config("smoother", SETTINGS, estimator="ekf-replay"))
-    for message in messages():
-        tracker.receive(message)
-        tracks = tracker.tick(message.receipt_ns).tracks
-    assert len(tracks) == 2
-    ahead_ns = tracks[0].stamp_ns + 100 * MS
-    assert len(tracker.tracks_at(ahead_ns)) == 2
-    monkeypatch.setattr(Rotten, "wrong", "steps to nowhere")
-    monkeypatch.setattr(Rotten, "asked", 1000)
-    [near] = tracker.tracks_at(ahead_ns)
-    assert near.x_m < BETWEEN_M
-    [far_id] = {track.track_id for track in tracks} - {near.track_id}
-    with pytest.raises(CallError, match=f"track {far_id} has no state at {ahead_ns} ns"):
-        tracker.state_at(far_id, ahead_ns)
-
-
-class NeverBank(ObjectBank):
-    """Fails with and without tracks."""
-
-    def advance(self, now_ns: int) -> None:
-        raise RuntimeError("never")
-
-
-def test_an_estimator_that_fails_even_without_a_track_is_one_line(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    motion = CTRV()
-    monkeypatch.setattr(
-        "fgtrack.pipeline.build.build_bank",
-        lambda config, failures: NeverBank(motion, lambda start: ReplayEkf(motion, start, 1.0), 1.0),
-    )
-    with pytest.raises(DataError, match=r"fails even without tracks \(RuntimeError: never\)"):
-        run_of(read_config("smoother", SETTINGS), tmp_path)
-
-
-def test_meta_json_has_a_count_of_every_kind_for_every_estimator(tmp_path: Path) -> None:
-    for estimator in (*BUILT_IN, "ukf-replay", "larsen"):
-        run = run_of(read_config("smoother", SETTINGS, estimator=estimator), tmp_path / estimator)
-        assert run.meta["failures"] == dict.fromkeys(Failure, 0), estimator

@@ -6,7 +6,6 @@ import pytest
 from support.scripts import EXPERIMENTS
 
 sys.path.insert(0, str(EXPERIMENTS))
-import bench_memory
 import bench_report
 import bench_speed
 import bench_streaming
@@ -38,15 +37,6 @@ def test_the_table_has_a_row_for_every_cell_and_every_promise(folder: Path) -> N
     assert found["machine"]["python"] in text
 
 
-def test_stone_soup_stands_beside_the_estimators_of_one_object(folder: Path) -> None:
-    found = json.loads((folder / "speed.json").read_text())
-    names = [one["name"] for one in found["per_detection"]]
-    assert {"smoother", "smoother-banded", "ekf-replay", "ekf-backward-forward"} < set(names)
-    assert sum("Stone Soup" in name for name in names) == 2
-    assert found["stone_soup_us"] > 0.0
-    assert max(one["error_m"] for one in found["per_detection"]) < 5.0
-
-
 def test_the_tables_replace_those_of_the_page(folder: Path) -> None:
     page, text = (folder / "page.md").read_text(), (folder / "speed.md").read_text()
     assert page == f"# Speed\n<!-- begin speed -->\n\n{text}\n<!-- end speed -->\nMore.\n"
@@ -72,12 +62,3 @@ def test_the_streaming_table_has_both_streams_and_every_method(
         asked_m, ready_m = ([float(row.split("|")[k].split()[0]) for row in rows] for k in (2, 3))
         assert max(asked_m) < 2.0
         assert asked_m != ready_m
-
-
-def test_the_memory_table_follows_one_run_over_its_laps(tmp_path: Path) -> None:
-    bench_memory.main(tmp_path, duration_s=4.0, objects=1, estimator="ekf-replay", parts=4)
-    text = (tmp_path / "memory.md").read_text()
-    rows = [line.split("|") for line in text.splitlines() if line.startswith("| ")][1:]
-    assert [float(row[1]) for row in rows] == pytest.approx([1 / 60, 2 / 60, 3 / 60, 4 / 60], abs=2e-3)
-    assert all(float(row[2]) > 10.0 and int(row[4]) == 1 for row in rows)
-    assert [path.name for path in tmp_path.iterdir()] == ["memory.md"]

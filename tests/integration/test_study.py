@@ -56,6 +56,7 @@ def test_a_study_is_replaced_only_when_told(found: Study, recording: Path, capsy
     assert "--overwrite" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_without_truth_it_says_so(recording: Path, tmp_path: Path) -> None:
     lines = [line for line in recording.read_text().splitlines(keepends=True) if '"truth"' not in line[:60]]
     (tmp_path / "drive.jsonl").write_text("".join(lines))

@@ -10,6 +10,8 @@ import pytest
 from fgtrack.cli.main import run
 from fgtrack.io.output import write_file
 
+pytestmark = pytest.mark.slow
+
 SWEEP = """
 format: fgtrack-sweep/1
 scenario: single_opponent

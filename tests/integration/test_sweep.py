@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -18,11 +17,9 @@ import pytest
 
 from fgtrack.cli.main import run
 from fgtrack.cli.sweep import score, swept
-from fgtrack.core.types import TruthState
 from fgtrack.io.run import Run
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.load import load
-from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.pipeline.sweep import Scores, Sweep
 from fgtrack.pipeline.sweep_plan import load_plan
 from fgtrack.sim.scenario import Scenario
@@ -201,6 +198,7 @@ def test_a_killed_sweep_goes_on_where_it_was_and_gives_the_same_bytes(
     assert [path.name for path in parts(out)] == [path.name for path in parts(done)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_ctrl_c_is_one_line_and_what_is_done_stays(smoke: Path, tmp_path: Path, jobs: int) -> None:
     out = tmp_path / "interrupted"
@@ -243,6 +241,7 @@ def surroundings(run: Run) -> Scores:
     return Scores({"threads": os.environ.get("OMP_NUM_THREADS"), "deaf": int(deaf)}, {"pid": os.getpid()})
 
 
+@pytest.mark.slow
 def test_processes_have_one_thread_each_and_leave_ctrl_c_to_the_first(tmp_path: Path) -> None:
     text = "duration_s: 0.5\nestimators: [ekf-replay]\nseeds: 4\n"
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
@@ -309,6 +308,7 @@ def deadly(run: Run) -> Scores:
     return scores
 
 
+@pytest.mark.slow
 def test_a_cell_that_kills_its_process_is_bad_and_the_rest_is_done(tmp_path: Path) -> None:
     sweep = write_sweep(
         tmp_path,
@@ -325,33 +325,10 @@ vary: {evaluation.gate_m: [5.0, 3.0, 4.0]}
     assert "the process that ran it died" in bad[0]["error"]
 
 
-@pytest.mark.parametrize(
-    ("extra", "said"),
-    [
-        (["--jobs", "0"], "--jobs 0: at least one process is needed"),
-        (["--jobs", "2", "--dask", "tcp://127.0.0.1:1"], "give one of them"),
-    ],
-)
-def test_a_bad_call_is_reported(
-    smoke: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], extra: Sequence[str], said: str
-) -> None:
-    assert run(["sweep", str(smoke), "-o", str(tmp_path / "out"), *extra]) == 2
-    assert said in capsys.readouterr().err
-
-
 def test_metrics_that_do_not_exist_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = "duration_s: 0.5\nestimators: [ekf-replay]\nmetrics: [num_tracks, truth.positon]\n"
     assert run(["sweep", str(write_sweep(tmp_path, text)), "-o", str(tmp_path / "out"), "--jobs", "1"]) == 1
     assert "metrics: no column fits truth.positon" in capsys.readouterr().err
-    assert list(rows(tmp_path / "out/sweep.csv")[0]) == ["seed", "estimator", "num_tracks"]
-
-
-def test_another_recording_may_lack_what_the_metrics_need(tmp_path: Path) -> None:
-    messages = simulate(read_scenario("single_opponent", duration_s=0.5), np.random.default_rng(0))
-    write_stream(tmp_path / "drive.jsonl", [message for message in messages if not isinstance(message, TruthState)])
-    text = "duration_s: 0.5\nestimators: [ekf-replay]\nmetrics: [num_tracks, truth.false_tracks]\n"
-    call = ["sweep", str(write_sweep(tmp_path, text)), "--input", str(tmp_path / "drive.jsonl")]
-    assert run([*call, "-o", str(tmp_path / "out"), "--jobs", "1", "--set", "association.gate_m=4.0"]) == 0
     assert list(rows(tmp_path / "out/sweep.csv")[0]) == ["seed", "estimator", "num_tracks"]
 
 

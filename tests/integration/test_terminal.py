@@ -15,6 +15,8 @@ import pytest
 
 from fgtrack.io.run import load_run
 
+pytestmark = pytest.mark.slow
+
 ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
 SHORT_DEMO = """
 from dataclasses import replace
@@ -92,20 +94,3 @@ def test_the_demo_goes_from_scenario_to_report(demo: Path) -> None:
     assert "final" in found["smoother"].tables["smoothed"]["kind"]
     assert {path.name for path in (demo / "figures").iterdir()} >= {"error_against_lag.png", "timing.png"}
     assert "report.html" in shown
-
-
-@pytest.mark.parametrize(("width", "options"), [(60, ()), (80, ("--all", "--streaming")), (100, ("--all",))])
-def test_a_comparison_shows_every_name_in_a_narrow_terminal(demo: Path, width: int, options: Sequence[str]) -> None:
-    lines = lines_in_terminal(width, "compare", demo, *options)
-    check(lines, width)
-    assert any("every table and column: --all" in line for line in lines) == ("--all" not in options)
-
-
-def test_other_tables_fit_too(demo: Path) -> None:
-    width = 60
-    topics = lines_in_terminal(width, "info", demo / "recording")
-    assert max(map(len, [line for line in topics if str(demo) not in line])) <= width
-    for topic in ("/fgtrack/detections/lidar_cluster", "/detections/radar"):
-        assert sum(topic in line.split() for line in topics) >= 1
-    listed = lines_in_terminal(width, "config", "--list")
-    assert max(map(len, listed)) <= width

@@ -4,8 +4,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
-from support.messages import drive, shared
+from support.messages import drive
 from typer.testing import CliRunner
 
 from fgtrack.calibration.trial import suspicions, try_out
@@ -136,12 +135,3 @@ def test_a_typo_in_a_field_path_is_one_line_with_the_names_there(tmp_path):
     assert "bbox.pose.x: leads nowhere, there is no 'pose', but center" in text
     assert "/detections/lidar" in text
     assert "ignored" in text
-
-
-@pytest.mark.parametrize("sequence", ["0006"])
-def test_a_shipped_configuration_fits_its_data(sequence):
-    recording = shared(f"data/kitti/oxts/{sequence}.txt")
-    done = CliRunner().invoke(app, ["info", str(recording), "-c", "kitti"])
-    assert done.exit_code == 0
-    assert "first of pointrcnn_car (in the frame ego): x_m" in done.output
-    assert "class_name car" in done.output

@@ -13,7 +13,6 @@ from fgtrack.cli.main import run
 from fgtrack.core.types import EgoState
 from fgtrack.io.run import load_run
 from fgtrack.io.stream import write_stream
-from fgtrack.pipeline.assumptions.assumed import Assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
 from fgtrack.pipeline.shipped import read_config, read_scenario
@@ -131,13 +130,6 @@ def test_a_recording_of_nothing_is_one_line(tmp_path: Path, capsys: Capture) -> 
     [line] = capsys.readouterr().err.splitlines()
     assert "nothing to fit noise to" in line
     assert not (tmp_path / "tuned.yaml").exists()
-
-
-@pytest.mark.parametrize("end", ["\n", "\r", "\x85", "\u2028", "\x0b"])
-def test_no_name_in_a_comment_becomes_a_setting(end: str, tmp_path: Path) -> None:
-    config = read_config(None, ["estimator=ekf-replay"])
-    (tmp_path / "out.yaml").write_text(Assumed(config, ()).to_yaml([f"x{end}ignore_sensors: [radar] #"]))
-    assert load(Config, tmp_path / "out.yaml") == config
 
 
 def test_sensors_that_are_ignored_are_not_tuned_and_stay_as_they_are() -> None:

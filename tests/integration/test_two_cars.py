@@ -126,7 +126,7 @@ def counts(name: str, towards_deg: float, seed: int, settings: str, estimators: 
 @pytest.mark.parametrize(
     ("name", "towards_deg", "seed", "settings"),
     [
-        pytest.param(*scene, settings, marks=[] if (k + n) % 3 == 0 else pytest.mark.slow)
+        pytest.param(*scene, settings, marks=[] if k == n else pytest.mark.slow)
         for k, scene in enumerate(SCENES)
         for n, settings in enumerate(SETTINGS)
     ],

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.examples import slow
 
 import fgtrack
 from fgtrack.calibration.outcome import Outcome
@@ -50,16 +51,20 @@ def check_tracked(run: Run) -> None:
     assert found.breaks_per_minute <= 2.0
 
 
-@pytest.mark.parametrize("speed_mps", [10.0, 30.0, 65.0])
-@pytest.mark.parametrize("num_opponents", [1, 2, 8])
+@pytest.mark.parametrize(
+    ("num_opponents", "speed_mps"),
+    [(2, 30.0), *slow((1, 10.0), (1, 65.0), (8, 10.0), (8, 65.0))],
+)
 def test_cars_around_a_driving_ego(num_opponents: int, speed_mps: float) -> None:
     check_tracked(fgtrack.replay(scene(num_opponents, speed_mps)))
 
 
+@pytest.mark.slow
 def test_traffic_around_an_ego_that_stands() -> None:
     check_tracked(fgtrack.replay(scene(2, 5.0, ego_mps=0.01, ahead_m=(-40.0, -20.0))))
 
 
+@pytest.mark.slow
 def test_a_forward_sensor_misses_no_car_behind() -> None:
     messages = scene(2, 30.0, ahead_m=(30.0, -25.0))
     run = fgtrack.replay(messages)
@@ -68,6 +73,7 @@ def test_a_forward_sensor_misses_no_car_behind() -> None:
     check_tracked(run)
 
 
+@pytest.mark.slow
 def test_lists_of_one_object_miss_nobody() -> None:
     messages: list[Message] = []
     for message in scene(4, 30.0):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from published_reception import SENSORS, PublishedReception
+from support.examples import slow
 from support.messages import shared
 
 from fgtrack.core.geometry import wrap_angles
@@ -58,7 +59,7 @@ def keys(sensor: str) -> list[str]:
     return ["x", "y", "yaw", "v"] if SENSORS[sensor].measures_speed else ["x", "y", "yaw"]
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", [RUNS[0], *slow(*RUNS[1:])])
 def test_a_log_folder_replays_to_the_tracks_of_the_stream(name: str, tmp_path: Path) -> None:
     with gzip.open(shared(f"reference/{name}/expected.jsonl.gz")) as file:
         expected = [json.loads(line) for line in file]

@@ -178,9 +178,7 @@ def key(record: UpdateRecord) -> tuple[str, int, int, int]:
 FUSED = (Disposition.IN_SEQUENCE, Disposition.OUT_OF_SEQUENCE, Disposition.BEYOND_WINDOW)
 
 
-@pytest.mark.parametrize("name", CONFIGS)
-@few
-@given(messages=streams())
+@given(messages=streams(), name=st.sampled_from(list(CONFIGS)))
 def test_every_detection_ends_in_exactly_one_row_and_every_state_is_sound(name: str, messages: list[Delivered]) -> None:
     config = CONFIGS[name]
     messages = [m for m in messages if isinstance(m, EgoState) or m.sensor in config.sensors]

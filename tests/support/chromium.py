@@ -1,6 +1,5 @@
 """A headless Chromium that tests speak to by its DevTools protocol, over two pipes: no port, no further package."""
 
-import base64
 import fcntl
 import json
 import os
@@ -79,11 +78,6 @@ class Browser:
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self("Emulation.setEmulatedMedia", features=[scheme])
 
-    def picture(self, path: Path, *, whole: bool = False) -> None:
-        """Write what is seen, or the whole page, as PNG."""
-        data = self("Page.captureScreenshot", captureBeyondViewport=whole, **({"clip": self._page()} if whole else {}))
-        path.write_bytes(base64.b64decode(data["data"]))
-
     def key(self, key: str, code: int, text: str = "") -> None:
         """Press and release a key."""
         common = {"key": key, "windowsVirtualKeyCode": code}
@@ -94,24 +88,6 @@ class Browser:
         """Press and release the mouse."""
         for kind in ("mousePressed", "mouseReleased"):
             self("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-
-    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        """Press the mouse, move it, release it."""
-        for kind, (x, y) in (("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end)):
-            self("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-
-    def touch(self, *places: tuple[float, float]) -> None:
-        """Lay a finger down at the first place, move it over the others, lift it."""
-        for k, (x, y) in enumerate(places):
-            self("Input.dispatchTouchEvent", type="touchMove" if k else "touchStart", touchPoints=[{"x": x, "y": y}])
-        self("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
-
-    def pinch(self, x: float, y: float, before: float, after: float) -> None:
-        """Lay two fingers down `before` apart, move them until they are `after` apart, lift them."""
-        for kind, apart in (("touchStart", before), ("touchMove", (before + after) / 2), ("touchMove", after)):
-            points = [{"x": x + side * apart / 2, "y": y, "id": k} for k, side in enumerate((-1, 1))]
-            self("Input.dispatchTouchEvent", type=kind, touchPoints=points)
-        self("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
     def box(self, selector: str) -> dict[str, float]:
         """Place and size of an element on the screen, after it is scrolled to."""
@@ -145,10 +121,6 @@ class Browser:
             event["params"]["request"]["url"] for event in self.events if event["method"] == "Network.requestWillBeSent"
         )
         return [address for address in sent if not address.startswith("data:")]
-
-    def _page(self) -> dict[str, float]:
-        size = self("Page.getLayoutMetrics")["cssContentSize"]
-        return {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1}
 
     def _next(self) -> dict[str, Any]:
         while b"\0" not in self._rest:

@@ -96,11 +96,7 @@ class Stream:
     @cached_property
     def problem(self) -> Problem:
         """The same, for the oracle."""
-        return self.problem_of(self.motion)
-
-    def problem_of(self, motion: MotionModel) -> Problem:
-        """The same under another motion model, for the oracle."""
-        return problem_of(motion, self.prior, self.sightings)
+        return problem_of(self.motion, self.prior, self.sightings)
 
     @cached_property
     def solution(self) -> Solution:

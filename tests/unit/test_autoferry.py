@@ -109,6 +109,7 @@ def test_a_file_of_a_scenario_points_to_its_folder(tmp_path):
         open_input(tmp_path / "scenario9_detections.json")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", SCENARIOS)
 def test_every_record_of_the_data_set_is_read_in_receipt_order(number):
     folder = shared(f"data/autoferry/scenario{number}")
@@ -124,6 +125,7 @@ def test_every_record_of_the_data_set_is_read_in_receipt_order(number):
     assert sum(isinstance(m, TruthState) for m in messages) == len(distinct)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", SCENARIOS)
 def test_lidar_points_and_bearings_lie_at_the_true_vessels(number):
     messages = list(open_input(shared(f"data/autoferry/scenario{number}")).messages())

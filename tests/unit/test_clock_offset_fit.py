@@ -31,6 +31,7 @@ def recording(rng: np.random.Generator, offset_s: float = 0.0) -> tuple[float, f
     return found.x[0], found.std[0], found.dof
 
 
+@pytest.mark.slow
 def test_an_interval_of_the_offset_holds_it_as_often_as_it_says() -> None:
     rng = np.random.default_rng(1)
     found = np.array([recording(rng) for _ in range(400)])

@@ -109,6 +109,7 @@ def nees(name: str, modelled: bool, lag_s: float, num_runs: int = 40) -> float:
     return float(np.mean(found))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ekf-replay", "smoother", "smoother-banded"])
 @pytest.mark.parametrize("lag_s", [0.0, 0.5])
 def test_estimators_are_consistent_where_the_errors_have_a_state(name: str, lag_s: float) -> None:
@@ -116,6 +117,7 @@ def test_estimators_are_consistent_where_the_errors_have_a_state(name: str, lag_
     assert abs(nees(name, True, lag_s) - 2.0) < 0.95
 
 
+@pytest.mark.slow
 def test_without_it_a_smoother_believes_its_past_too_much() -> None:
     assert nees("smoother", False, 0.5) > 5.0
 

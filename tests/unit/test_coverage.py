@@ -41,9 +41,10 @@ def coverage(messages: list[Message], **mounts: Mount) -> Coverage:
     return coverages(messages, mounts)["one"]
 
 
-@pytest.mark.parametrize("clutter", [0.0, 0.2])
-@pytest.mark.parametrize("field_of_view_rad", [0.6, 1.57, 2.5])
-@pytest.mark.parametrize("axis_rad", [0.0, math.pi, -math.pi / 2, 0.5])
+@pytest.mark.parametrize(
+    ("axis_rad", "field_of_view_rad", "clutter"),
+    [(0.0, 0.6, 0.2), (math.pi, 1.57, 0.0), (-math.pi / 2, 2.5, 0.2), (0.5, 1.57, 0.2)],
+)
 def test_the_sector_of_a_sensor_is_found_wherever_it_looks(axis_rad, field_of_view_rad, clutter) -> None:
     found = coverage(lists(seen(axis_rad, field_of_view_rad, clutter=clutter)))
     assert found.field_of_view_rad == pytest.approx(field_of_view_rad, abs=0.25)

@@ -70,6 +70,7 @@ def test_bearings_alone_lead_where_levenberg_marquardt_does() -> None:
             assert d @ np.linalg.solve(state.covariance, d) < 23.5  # one in ten thousand
 
 
+@pytest.mark.slow
 def test_without_damping_some_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     found = [heard(np.random.default_rng(seed)) for seed in range(4)]
     streams = [measurements for measurements, _ in found]

@@ -9,7 +9,6 @@ from fgtrack.tracking.ego import CONTRADICTS, Continuity, EgoTrajectory
 
 MS = 1_000_000
 SPEED_MPS = 60.0
-UNSURE = (25.0, *[0.0] * 5, 25.0, *[0.0] * 18)
 
 
 def driven(count: int = 40, step_ms: int = 10, speed_mps: float = SPEED_MPS) -> list[EgoState]:

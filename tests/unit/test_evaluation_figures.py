@@ -173,9 +173,6 @@ def test_there_is_a_figure_of_what_runs_have_data_for(
     assert [name for name in names([at_once]) if "delays" in name] == []
 
 
-LATE = Disposition.OUT_OF_SEQUENCE
-
-
 def test_arrivals_show_the_part_with_the_most_late_detections(tmp_path: Path) -> None:
     late = {
         k: [update("lidar", tick=k, delay_ns=150_000_000, disposition=Disposition.OUT_OF_SEQUENCE)]

@@ -49,6 +49,7 @@ def test_one_pair_has_no_interval_and_none_no_mean() -> None:
     assert none.count == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
 def test_the_interval_within_a_run_covers_the_truth_as_often_as_it_says(correlation: float) -> None:
     rng = np.random.default_rng(2)

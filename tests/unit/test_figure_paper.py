@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import matplotlib as mpl
-import matplotlib.pyplot as plt
 import pytest
 from support.pictures import faults
 from test_figure_texts import a_run
@@ -29,31 +27,10 @@ def test_a_figure_in_a_column_is_readable(name: str, runs: list[EvaluatedRun]) -
         assert axes.get_window_extent().width > 0.7 * figure.bbox.width
 
 
-def test_settings_of_the_user_are_kept_and_a_font_is_that_of_every_text(runs: list[EvaluatedRun]) -> None:
-    with mpl.rc_context({"font.family": "DejaVu Serif", "axes.grid": False}):
-        figure = plot.timing(runs)
-    assert figure.axes[0].xaxis.label.get_fontfamily() == ["DejaVu Serif"]
-    assert plot.timing(runs, font="DejaVu Sans Mono").axes[0].xaxis.label.get_fontfamily() == ["DejaVu Sans Mono"]
-    assert mpl.rcParams["font.family"] == ["sans-serif"]
-
-
 def test_a_style_is_a_file_or_a_name(runs: list[EvaluatedRun], tmp_path: Path) -> None:
     (tmp_path / "mine.mplstyle").write_text("axes.facecolor: black\n")
     assert plot.timing(runs, style=tmp_path / "mine.mplstyle").axes[0].get_facecolor() == (0.0, 0.0, 0.0, 1.0)
     assert plot.timing(runs, style="dark_background").axes[0].get_facecolor() == (0.0, 0.0, 0.0, 1.0)
-
-
-def test_axes_of_ones_own_are_drawn_into(runs: list[EvaluatedRun]) -> None:
-    figure, (left, right) = plt.subplots(1, 2)
-    assert plot.lag(runs, ax=left) is figure
-    assert left.get_xlabel() == "lag of the output [s]"
-    plot.errors(runs, ax=right)
-    assert [axes.get_ylabel() for axes in figure.axes[2:]] == [
-        *("position error [m]", "speed error [m/s]", "yaw error [deg]"),
-    ]
-    with pytest.raises(CallError, match="needs axes made by"):
-        plot.errors(runs, ax=figure.add_axes((0.0, 0.0, 1.0, 1.0)))
-    plt.close(figure)
 
 
 @pytest.mark.parametrize(

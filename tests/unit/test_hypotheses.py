@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
+from support.examples import slow
 
 import fgtrack
 from fgtrack.core.geometry import wrap_angle
@@ -107,7 +108,7 @@ def test_both_places_of_two_ranges_live_until_the_sensor_turns(name: str, side: 
     assert np.hypot(*(estimator.state_at(4000 * MS).mean[:2] - truth)) < 1.0
 
 
-@pytest.mark.parametrize("name", ["ekf-replay", "smoother", "rts"])
+@pytest.mark.parametrize("name", ["ekf-replay", *slow("smoother", "rts")])
 def test_the_contract_holds_with_several_hypotheses(name: str) -> None:
     """A second one beside the true start, that is not dropped at once."""
     made = ESTIMATORS.load(name)

@@ -14,7 +14,6 @@ from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.models.correlated_errors import CorrelatedErrors
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
-from fgtrack.testing.streams import NONLINEAR, shuffled
 
 START = Start(yaw_rad=0.3, speed_mps=20.0, speed_std_mps=2.0)
 MS = 1_000_000
@@ -67,22 +66,6 @@ def test_of_two_models_that_are_the_same_it_is_the_replaying_filter(motion: Moti
         assert_allclose(found.mean, expected.mean, rtol=1e-10)
         assert_allclose(found.covariance, expected.covariance, rtol=1e-8, atol=1e-12)
     assert_allclose(imm.probabilities, [0.5, 0.5])
-
-
-@pytest.mark.parametrize(("motion", "other"), [(CTRV(), ""), (CTRA(), ""), (CV(), "ctrv"), (CTRV(), CV())], ids=str)
-def test_the_order_of_arrival_changes_neither_states_nor_probabilities(
-    motion: MotionModel, other: str | MotionModel
-) -> None:
-    for seed in range(5):
-        stream = shuffled(NONLINEAR, np.random.default_rng(seed))
-        late, in_time = (ImmReplay(motion, stream.start, 1.0, other=other) for _ in range(2))
-        fed(late, list(stream.measurements))
-        fed(in_time, list(stream.in_order.measurements))
-        assert_allclose(late.probabilities, in_time.probabilities, rtol=1e-12)
-        for at_ns in (stream.start.stamp_ns, stream.newest_ns, stream.newest_ns + 100 * MS):
-            found, expected = late.state_at(at_ns), in_time.state_at(at_ns)
-            assert_allclose(found.mean, expected.mean, rtol=1e-12)
-            assert_allclose(found.covariance, expected.covariance, rtol=1e-12, atol=1e-14)
 
 
 def test_braking_makes_acceleration_probable_and_steady_driving_does_not() -> None:

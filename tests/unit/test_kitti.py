@@ -261,6 +261,7 @@ def test_a_sequence_without_a_calibration_is_one_line(tmp_path):
         messages(drive)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sequence", SEQUENCES)
 def test_every_line_of_the_data_set_is_read_and_lies_at_the_labelled_cars(sequence):
     root = shared("data/kitti")

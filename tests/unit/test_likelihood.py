@@ -137,7 +137,7 @@ def test_the_contaminated_update_has_the_moments_of_the_exact_posterior() -> Non
     assert 0.0 < found.outlier < 1.0
 
 
-@pytest.mark.parametrize("outliers", [0.0, 0.03])
+@pytest.mark.parametrize("outliers", [0.03, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_the_maximum_is_near_the_truth_whatever_the_outliers(outliers: float) -> None:
     rng = np.random.default_rng(2)
     tracks = [drawn(rng, VALUES, 120, outliers) for _ in range(8)]

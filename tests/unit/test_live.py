@@ -69,13 +69,6 @@ def test_an_unknown_sensor_is_counted_and_its_detections_are_invalid() -> None:
     assert tracker.counts["sonar"] == {"invalid": 1}
 
 
-def test_an_ignored_sensor_is_ignored() -> None:
-    tracker = Tracker.from_config("smoother", set={"ignore_sensors": ["sonar"]})
-    tracker.receive(seen(NOW_NS, NOW_NS, sensor="sonar"))
-    assert tracker.tick(NOW_NS).updates == ()
-    assert tracker.refused == {}
-
-
 def test_a_clock_that_runs_backwards_is_refused_and_counted_and_loses_nothing() -> None:
     tracker, report = started()
     later_ns = report.now_ns + 20 * MS

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.examples import slow
 
 import fgtrack
 from fgtrack.core.types import YAW_RATE, FloatArray
@@ -47,7 +48,8 @@ def fed(name: str, measurements: list[Measurement], order: FloatArray | None = N
 
 
 @pytest.mark.parametrize(
-    "name", ["ekf-replay", "imm-replay", "ukf-replay", "smoother", "smoother-banded", "smoother-batch"]
+    "name",
+    ["ekf-replay", "smoother-banded", *slow("imm-replay", "ukf-replay", "smoother", "smoother-batch")],
 )
 def test_it_is_exact_in_any_order_of_arrival(name: str) -> None:
     measurements = on_the_circle(1.0 / RADIUS_M)

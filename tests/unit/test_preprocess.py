@@ -102,11 +102,6 @@ def test_the_sensor_pose_has_lever_arm_mount_and_the_velocity_of_the_ego() -> No
     assert (ego_frame.x_m, ego_frame.y_m, ego_frame.yaw_rad) == pytest.approx((100.0, 48.26, math.pi / 2))
 
 
-def test_map_detections_need_no_ego() -> None:
-    [found] = candidates(Detection(x_m=10.0, y_m=3.0, yaw_rad=0.1), frame="map", ego=None)
-    assert found.values == {"x_m": 10.0, "y_m": 3.0, "yaw_rad": 0.1}
-
-
 @given(x=st.floats(-80, 80), y=st.floats(-80, 80), ego_yaw=st.floats(-3.1, 3.1), mount_yaw=st.floats(-3.1, 3.1))
 def test_a_polar_and_a_cartesian_detection_of_one_place_agree(
     x: float, y: float, ego_yaw: float, mount_yaw: float
@@ -233,18 +228,6 @@ def test_every_detection_leads_or_is_merged_into_exactly_one_candidate(merge: Me
     found = candidates(*items, merge=merge, frame="map")
     indices = [i for item in found for i in (item.index, *item.merged)]
     assert sorted(indices) == list(range(count))
-
-
-@given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 12))
-def test_connected_groups_are_those_of_a_search_by_hand(seed: int, count: int) -> None:
-    points = np.random.default_rng(seed).uniform(0.0, 20.0, size=(count, 2))
-    groups = {frozenset([i]) for i in range(count)}
-    for i in range(count):
-        for j in range(i):
-            if math.dist(points[i], points[j]) <= 5.1:
-                a, b = (next(group for group in groups if k in group) for k in (i, j))
-                groups = groups - {a, b} | {a | b}
-    assert {frozenset(members) for members in ConnectedMerge(5.1).groups(points).values()} == groups
 
 
 def test_a_merged_yaw_is_the_mean_direction_and_the_published_one_is_not() -> None:

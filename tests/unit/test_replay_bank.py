@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from support.examples import few
 
 from fgtrack.core.time import nanoseconds
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
@@ -83,6 +84,7 @@ def drawn(rng: np.random.Generator, motion: MotionModel, offset_ns: int) -> Meas
     return Measurement(START.stamp_ns + offset_ns, model, z, np.diag(std**2), pose, loss, assumed)
 
 
+@few
 @given(seed=st.integers(0, 2**32 - 1), motion=st.sampled_from([CTRV(), CTRA(), CV()]), sought=st.booleans())
 def test_any_history_is_that_of_one_estimator_for_each_object(seed: int, motion: MotionModel, sought: bool) -> None:
     rng = np.random.default_rng(seed)

@@ -92,6 +92,7 @@ def _reports(duration_s: float) -> tuple[list[DetectionList], list[str]]:
     return [messages[k] for k in order], [names[k] for k in order]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not OPENSKY.is_file(), reason="needs ../shared/data/opensky")
 def test_aircraft_of_opensky_keep_one_track_each_without_a_configuration() -> None:
     messages, names = _reports(300.0)

@@ -55,7 +55,7 @@ def objective(x: FloatArray, measurement: Measurement) -> float:
     return float(0.5 * (x - MEAN) @ np.linalg.solve(P, x - MEAN) + penalty(measurement.loss, distance))
 
 
-@pytest.mark.parametrize("off", [0.3, 1.5, 3.0, 8.0])
+@pytest.mark.parametrize("off", [0.3, 8.0])
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_update_is_a_minimum_of_prior_plus_loss(kind: str, off: float) -> None:
     measurement = seen(off, RobustLoss(kind, 1.5))

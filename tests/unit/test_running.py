@@ -185,13 +185,6 @@ def test_what_an_estimator_raises_ends_its_tracks_which_are_born_again(
     assert failing.counts == {"lidar_cluster": dispositions}
 
 
-def test_a_birth_that_fails_is_no_birth(failing: Tracker) -> None:
-    FailingBank.fails = {"birth"}
-    run(failing, 3)
-    assert failing.failures == {"birth failed": 1}
-    assert failing.counts == {"lidar_cluster": {"failed": 1, "birth": 2, "in_sequence": 3}}
-
-
 def test_a_list_whose_processing_raises_ends_as_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     tracker = tracker_of()
     run(tracker)
@@ -357,10 +350,3 @@ def test_it_counts_missed_deadlines_and_skipped_ticks(
     assert (timing.ticks, timing.deadline_misses, timing.skipped) == (4, misses, skipped)
     assert timing.worst_s == max(durations_ms) / 1e3
     assert timing.median_s == pytest.approx(np.median(durations_ms) / 1e3)
-
-
-def test_without_a_node_there_are_no_deadlines() -> None:
-    tracker = Tracker("smoother", set={"clock.node_hz": None}, clock=Clock([5, 5000]))
-    tracker.tick(NOW_NS)
-    tracker.tick(NOW_NS + 9_000 * MS)
-    assert (tracker.timing.deadline_misses, tracker.timing.skipped) == (0, 0)

@@ -10,7 +10,7 @@ from fgtrack.models.sensors import Mount
 from fgtrack.sim.scanner import Scanner
 from fgtrack.sim.sensor import Clutter, SimulatedSensor
 
-N = 20_000
+N = 4_000
 ALPHA = 1e-4  # of every statistical test here
 NO_NOISE = {"x_m": 0.0, "y_m": 0.0}
 EGO = np.array([100.0, -50.0, 2.0, 60.0, 0.3, 0.0])

@@ -97,6 +97,7 @@ def test_tracks_diverge_by_themselves_and_begin_anew_with_nothing_against_them()
     assert outcomes(divergence, [30.0], 1, x_m=0.0) == [1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "times"), [(1.0, range(1)), (3.0, range(20, 60))])
 def test_chance_makes_no_track_diverge_and_errors_three_times_too_large_some_once_in_5000(
     size: float, times: range

@@ -18,8 +18,6 @@ from fgtrack.pipeline.sweep import PART_FORMAT, Cell, Sweep, write_tables
 from fgtrack.pipeline.sweep_plan import Job, Plan, Recipe, load_plan
 from fgtrack.sim.simulate import simulate
 
-CONFIGS = Path(__file__).parents[2] / "configs"
-
 HEAD = """
 format: fgtrack-sweep/1
 scenario: default

@@ -105,8 +105,3 @@ def test_error_against_delay_needs_no_sweep_and_rises_for_every_method() -> None
         assert y[-1] > y[1]
     assert (lines["ekf-backward-forward"][1:] > lines["smoother"][1:]).all()
     assert faults(figure) == []
-
-
-def test_what_is_not_over_delays_is_not_drawn_against_them(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="not over one axis of delays"):
-        plot.error_against_delay(a_sweep(tmp_path / "sweep", gates=("5.0", "3.0")))

@@ -11,7 +11,6 @@ from fgtrack.core.types import FloatArray
 from fgtrack.models.track_map import COLUMNS, TrackMap
 
 ROOT = Path(__file__).resolve().parents[2]
-SHARED_MAPS = ROOT / "../shared/data/maps"
 HEADING, CURVATURE = COLUMNS.index("psi_ref_rad"), COLUMNS.index("kappa_ref_radpm")
 
 OVAL = TrackMap.read(ROOT / "configs/maps/oval_track.csv")

