@@ -14,16 +14,25 @@ _ALONG, _QUANTITIES = 9, 10  # see `fgtrack.models.track_map`
 def feet(points_m: FloatArray, nearest: IntArray, segments: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Quantities (m, 10) at the feet of points (m, 2) on the line, and lateral offsets (m,), left positive.
 
-    `segments` (n, 20) are the rows of `TrackMap`, and the foot is on the one that begins or ends at the `nearest` point
-    of the line. It has the point on its normal: Re((q - t e) (B + t dB)) = 0 with q from the start of the segment to
-    the point, e the segment, and B, dB the inverse of the heading and its change, as complex numbers.
+    `segments` (n, 20) are the rows of `TrackMap`. The foot is on the one that begins or ends at the `nearest` point of
+    the line, which is sought where it is not given (0,). It has the point on its normal: Re((q - t e) (B + t dB)) = 0
+    with q from the start of the segment to the point, e the segment, and B, dB the inverse of the heading and its
+    change, as complex numbers.
     """
     found, lateral = np.empty((len(points_m), _QUANTITIES)), np.empty(len(points_m))
     for i in range(len(points_m)):
-        x, y = points_m[i, 0], points_m[i, 1]
-        at = segments[nearest[i]]
+        x, y, first = points_m[i, 0], points_m[i, 1], 0
+        if len(nearest):
+            first = nearest[i]
+        else:
+            least = np.inf
+            for j in range(len(segments)):
+                squared_m2 = (segments[j, 0] - x) ** 2 + (segments[j, 1] - y) ** 2
+                if squared_m2 < least:
+                    least, first = squared_m2, j
+        at = segments[first]
         if (x - at[0]) * at[2] - (y - at[1]) * at[3] < 0.0:
-            at = segments[(nearest[i] - 1) % len(segments)]
+            at = segments[(first - 1) % len(segments)]
         right, up = x - at[0], y - at[1]
         c = right * at[2] - up * at[3]
         # Positive as far as the centre of curvature; beyond it the nearer end of the segment is the foot.

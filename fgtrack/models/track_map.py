@@ -43,6 +43,8 @@ _ARCS = (_COLUMN["s_racetraj_m"], _COLUMN["s_ref_m"])
 _FILE_HEADING_OFFSET_RAD = math.pi / 2  # a file's heading is 0 along +y, REP-103 is 0 along +x
 _SAME_POINT_M = 1e-3
 _LARGEST_MB = 20.0  # some 100,000 rows
+_DENSE = 1 << 16  # so many distances are faster than a tree
+_UNKNOWN = np.empty(0, dtype=np.int64)
 _MAX_GAP = 10.0  # closing segment, in lengths of the longest other segment
 _MAX_HEADING_ERROR_RAD = 1.0  # coarse maps turn much in a row; a wrong convention is off by pi / 2
 
@@ -226,7 +228,9 @@ class TrackMap:
     def _locate(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Quantities at the feet of `points_m` on the line, shape (n, 10), and lateral offsets, shape (n,)."""
         points_m = np.array(points_m, order="C")
-        nearest = np.asarray(self._tree.query(points_m)[1])
+        nearest = _UNKNOWN
+        if len(points_m) * len(self._segments) > _DENSE:
+            nearest = np.asarray(self._tree.query(points_m)[1])
         found: tuple[FloatArray, FloatArray] = kernels("fgtrack.models.feet").feet(points_m, nearest, self._segments)
         return found
 

@@ -61,8 +61,8 @@ def _short_arc(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F
     c, s = math.cos(heading), math.sin(heading)
     gradient, cross = np.empty((4, 2)), np.zeros((4, 2))  # cross: integral of g D Phi' for each entry from the yaw on
     square = real = imag = 0.0  # integrals of |g|^2 D and of g^2 D
-    for node in range(7):
-        R, weight = t * _NODES[node], t * _WEIGHTS[node]
+    for node in range(8):
+        R, weight = (t * _NODES[node], t * _WEIGHTS[node]) if node < 7 else (t, 0.0)  # the last one is the start
         _position_gradient(R, x[4], speed, accel, gradient)
         for j in range(n - 2):
             along, left, q = gradient[j, 0], gradient[j, 1], density[j + 2] * weight
@@ -75,7 +75,6 @@ def _short_arc(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F
             cross[0, i] += density[4] * weight * R * gradient[2, i]
             cross[1, i] += q_accel * weight * R * gradient[3, i]
     real, imag = real * (c * c - s * s) - imag * 2.0 * c * s, imag * (c * c - s * s) + real * 2.0 * c * s
-    _position_gradient(t, x[4], speed, accel, gradient)
     for i in range(n):
         mean[i] = x[i]
         for k in range(n):
@@ -130,26 +129,24 @@ def transition(
             return
         parts = math.ceil(turn / MAX_TURN_RAD)
         t /= parts
-    if kind == ARC:
-        _short_arc(x, t, density, mean, F, Q)
-    else:
+    if kind != ARC:
         _line(x, t, density, mean, F, Q)
-    if parts == 1:
         return
     n = len(x)
     before, G, old, GM = np.empty(n), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    for _ in range(1, parts):
+    for part in range(parts):
         for i in range(n):
-            before[i] = mean[i]
+            before[i] = mean[i] if part else x[i]
             for k in range(n):
                 old[i, k] = Q[i, k]
         _short_arc(before, t, density, mean, G, Q)
-        product(G, old, GM)
-        add_product_transposed(GM, G, Q)
-        product(G, F, GM)
+        if part:
+            product(G, old, GM)
+            add_product_transposed(GM, G, Q)
+            product(G, F, GM)
         for i in range(n):
             for k in range(n):
-                F[i, k] = GM[i, k]
+                F[i, k] = GM[i, k] if part else G[i, k]
 
 
 @njit("(int64, float64[:, ::1], float64[::1], float64[::1])")

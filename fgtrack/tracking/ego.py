@@ -16,7 +16,7 @@ from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.linalg import congruence, symmetrise
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import EgoState, FloatArray
-from fgtrack.tracking.inbox import ASYMMETRY, is_bounded
+from fgtrack.tracking.inbox import ASYMMETRY
 
 #: A detection whose stamp is further than this from any ego state cannot be placed, in a gap neither.
 MAX_EXTRAPOLATION_S = 1.0
@@ -45,8 +45,8 @@ class EgoPose(NamedTuple):
 
 
 def is_finite(ego: EgoState) -> bool:
-    """True if every number of `ego` is finite and bounded (see `is_bounded`)."""
-    return all(map(is_bounded, (ego.x_m, ego.y_m, ego.yaw_rad, ego.speed_mps, ego.yaw_rate_radps, ego.accel_mps2)))
+    """True if every number of `ego` is finite and bounded (by `LARGEST`)."""
+    return all(abs(value) <= LARGEST for value in _VALUES(ego)[2:8])
 
 
 def extrapolated(ego: EgoState, stamp_ns: int, covariance: FloatArray | None = None, straight: bool = False) -> EgoPose:

@@ -225,16 +225,11 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         for chain in chains:
             self._make_room(chain, k)
         places = [_place(chain.stamps_ns, chain.measurements, each) for chain, each in zip(chains, seen, strict=True)]
-        rows = np.array([chain.row for chain in chains])
-        counts = np.array([len(chain.stamps_ns) for chain in chains])
-        slots, y, S = self._order[rows, counts], np.empty((len(seen), k)), np.empty((len(seen), k, k))
-        *_, z, R, columns, sizes = self._steps
-        self._steps[0][rows, slots], columns[rows, slots, :k], sizes[rows, slots] = stamp_ns, one.model.selected, k
-        z[rows, slots, :k], R[rows, slots, :k, :k] = [each.z for each in seen], [each.R for each in seen]
+        at = [(chain.row, place, len(chain.stamps_ns)) for chain, place in zip(chains, places, strict=True)]
         own = np.arange(k) if one.measured is None else np.array(one.measured)
-        nis, fused = self._kernels.fuse(
-            self._kind, self._density, self._order, *self._steps, rows, np.array(places), counts, y, S, own
-        )
+        z, R = np.array([each.z for each in seen]), np.array([each.R for each in seen])
+        steps, selected = (self._kind, self._density, self._order, *self._steps), one.model.selected
+        y, nis, S, fused = self._kernels.fuse(*steps, np.array(at), stamp_ns, z, R, selected, own)
         found, numbers = dict[int, UpdateResult](), nis.tolist()
         for i in fused.nonzero()[0].tolist():
             chain = chains[i]
@@ -265,9 +260,9 @@ class ReplayBank(ObjectBank[ReplayEkf]):
             else:
                 place = max(bisect.bisect_right(chain.stamps_ns, stamp_ns) - 1, 0)
                 chosen.append((chain.row, place, stamp_ns))
-        rows, places, at_ns = np.array(chosen, dtype=np.int64).reshape(-1, 3).T.copy()
+        at = np.array(chosen, dtype=np.int64).reshape(-1, 3)
         found: tuple[FloatArray, FloatArray] = self._kernels.ahead(
-            self._kind, self._density, self._order, *self._steps[:6], rows, places, at_ns
+            self._kind, self._density, self._order, *self._steps[:6], at
         )
         if not others:
             return found

@@ -20,25 +20,29 @@ def innovate(
     P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray, measured: IntArray, S: FloatArray, HP: FloatArray
 ) -> float:
     """Write S = H P H' + R and S^-1 H P, and return the NIS of the entries `measured`; NaN where S has no root."""
-    k, d = len(y), len(measured)
-    factor, part, own = np.empty((k, k)), np.empty((d, d)), np.empty((d, 1))
+    k, nis = len(y), 0.0
     for a in range(k):
         for b in range(k):
             S[a, b] = R[a, b]
     product(H, P, HP)
     add_product_transposed(HP, H, S)
-    for a in range(k):
-        for b in range(k):
-            factor[a, b] = S[a, b]
-    for a in range(d):
-        own[a, 0] = y[measured[a]]
-        for b in range(d):
-            part[a, b] = S[measured[a], measured[b]]
-    if not (solve(factor, HP) and solve(part, own)):
-        return np.nan
-    nis = 0.0
-    for a in range(d):
-        nis += y[measured[a]] * own[a, 0]
+    for whole in range(2):
+        d, n = (k, len(P)) if whole else (len(measured), 1)
+        factor, columns = np.empty((d, d)), np.empty((d, n))
+        for a in range(d):
+            row = a if whole else measured[a]
+            for b in range(d):
+                factor[a, b] = S[row, b if whole else measured[b]]
+            for b in range(n):
+                columns[a, b] = HP[a, b] if whole else y[row]
+        if not solve(factor, columns):
+            return np.nan
+        for a in range(d):
+            if not whole:
+                nis += y[measured[a]] * columns[a, 0]
+            else:
+                for b in range(n):
+                    HP[a, b] = columns[a, b]
     return nis
 
 

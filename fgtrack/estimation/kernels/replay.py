@@ -158,8 +158,8 @@ _STEPS = (
 
 
 @njit(
-    f"({_STEPS}, float64[:, :, ::1], float64[:, :, :, ::1], int64[:, :, ::1], int64[:, ::1], int64[::1], int64[::1], "
-    "int64[::1], float64[:, ::1], float64[:, :, ::1], int64[::1])"
+    f"({_STEPS}, float64[:, :, ::1], float64[:, :, :, ::1], int64[:, :, ::1], int64[:, ::1], int64[:, ::1], int64, "
+    "float64[:, ::1], float64[:, :, ::1], int64[::1], int64[::1])"
 )
 def fuse(
     motion: int,
@@ -175,56 +175,59 @@ def fuse(
     R: FloatArray,
     columns: IntArray,
     sizes: IntArray,
-    rows: IntArray,
-    places: IntArray,
-    counts: IntArray,
-    y: FloatArray,
-    S: FloatArray,
+    at: IntArray,
+    stamp_ns: int,
+    new_z: FloatArray,
+    new_R: FloatArray,
+    new_columns: IntArray,
     measured: IntArray,
-) -> tuple[FloatArray, BoolArray]:
-    """Put the measurement in the first free slot of each of `rows` at its place, and filter the later ones again.
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Put a measurement of `stamp_ns` into each chain of steps, and filter the later ones again.
 
-    `counts` are the numbers of steps. Writes innovations y (m, k) and their covariances S (m, k, k) given all that was
-    fused; returns the NIS of the entries `measured`, and False where one cannot be fused: there all is as it was.
+    Rows of `at` (m, 3) are a track, the place of its measurement, and the number of its steps, fewer than its slots.
+    Returns innovations y (m, k), the NIS of their entries `measured`, and S (m, k, k), given all that was fused; and
+    False where a measurement cannot be fused: there all is as it was.
     """
-    (m, k), n = y.shape, mean.shape[2]
-    nis, fused = np.empty(m), np.zeros(m, np.bool_)
+    (m, k), n = new_z.shape, mean.shape[2]
+    y, S, nis, fused = np.empty((m, k)), np.empty((m, k, k)), np.empty(m), np.zeros(m, np.bool_)
     x, P, H, K, own = np.empty(n), np.empty((n, n)), np.empty((k, n)), np.empty((k, n)), np.empty((k, k))
     for i in range(m):
-        t, place, count = rows[i], places[i], counts[i]
-        slots, at_ns = order[t], stamps_ns[t]
+        t, place, count = at[i, 0], at[i, 1], at[i, 2]
+        slots = order[t]
         new = slots[count]
-        steps = at_ns, mean[t], covariance[t], before[t], before_P[t], cross[t]
-        ok = _step(motion, density, slots[place - 1], new, *steps, z[t, new, :k], R[t, new], columns[t, new, :k])
-        last = slots[count - 1]
-        for a in range(n):
-            x[a] = before[t, new, a] if place == count else mean[t, last, a]
-        _copy(before_P[t, new] if place == count else covariance[t, last], P)
-        if not (ok and (place == count or _retrodict(motion, density, slots[place:count], new, *steps, x, P))):
-            continue
-        _innovation(x, z[t, new, :k], columns[t, new, :k], motion == ARC, y[i], H)
-        _copy(R[t, new], own)
-        nis[i] = innovate(P, y[i], H, own, measured, S[i], K)
-        if np.isnan(nis[i]):
-            continue
+        stamps_ns[t, new], sizes[t, new] = stamp_ns, k
+        for a in range(k):
+            z[t, new, a], columns[t, new, a] = new_z[i, a], new_columns[a]
+            for b in range(k):
+                R[t, new, a, b] = new_R[i, a, b]
         for j in range(count, place, -1):
             slots[j] = slots[j - 1]
         slots[place] = new
-        for j in range(place + 1, count + 1):
+        steps = stamps_ns[t], mean[t], covariance[t], before[t], before_P[t], cross[t]
+        j, last, fused[i] = place, count, True
+        while j <= last:
             s, d = slots[j], sizes[t, slots[j]]
-            ok = ok and _step(motion, density, slots[j - 1], s, *steps, z[t, s, :d], R[t, s], columns[t, s, :d])
-        fused[i] = ok
-        if not ok:
-            for j in range(place, count):
-                slots[j] = slots[j + 1]
-            slots[count] = new
-            for j in range(place, count):
-                s, d = slots[j], sizes[t, slots[j]]
-                _step(motion, density, slots[j - 1], s, *steps, z[t, s, :d], R[t, s], columns[t, s, :d])
-    return nis, fused
+            ok = _step(motion, density, slots[j - 1], s, *steps, z[t, s, :d], R[t, s], columns[t, s, :d])
+            if ok and s == new:
+                newest = slots[count]
+                for a in range(n):
+                    x[a] = before[t, new, a] if place == count else mean[t, newest, a]
+                _copy(before_P[t, new] if place == count else covariance[t, newest], P)
+                ok = _retrodict(motion, density, slots[place + 1 : count + 1], new, *steps, x, P)
+                _copy(new_R[i], own)
+                _innovation(x, new_z[i], new_columns, motion == ARC, y[i], H)
+                nis[i] = innovate(P, y[i], H, own, measured, S[i], K)
+                ok = ok and not np.isnan(nis[i])
+            j += 1
+            if not ok and fused[i]:  # take it out, and filter the later ones again without it
+                for j in range(place, count):
+                    slots[j] = slots[j + 1]
+                slots[count] = new
+                j, last, fused[i] = place, count - 1, False
+    return y, nis, S, fused
 
 
-@njit(f"({_STEPS}, int64[::1], int64[::1], int64[::1])")
+@njit(f"({_STEPS}, int64[:, ::1])")
 def ahead(
     motion: int,
     density: FloatArray,
@@ -235,16 +238,15 @@ def ahead(
     before: FloatArray,
     before_P: FloatArray,
     cross: FloatArray,
-    rows: IntArray,
-    places: IntArray,
-    at_ns: IntArray,
+    at: IntArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Means (m, n) and covariances (m, n, n) of tracks at `at_ns`, each predicted from the step at its place."""
-    m, n = len(rows), mean.shape[2]
+    """Means (m, n) and covariances (m, n, n), each predicted; rows of `at` are track, place of the step, and stamp."""
+    m, n = len(at), mean.shape[2]
     found, P, FP = np.empty((m, n)), np.empty((m, n, n)), np.empty((n, n))
     for i in range(m):
-        t, s = rows[i], order[rows[i], places[i]]
-        _ahead(motion, density, mean[t, s], covariance[t, s], at_ns[i] - stamps_ns[t, s], found[i], P[i], FP)
+        t, place, at_ns = at[i, 0], at[i, 1], at[i, 2]
+        s = order[t, place]
+        _ahead(motion, density, mean[t, s], covariance[t, s], at_ns - stamps_ns[t, s], found[i], P[i], FP)
         if motion == ARC:
             found[i, _YAW] = _wrapped(found[i, _YAW])
     return found, P
