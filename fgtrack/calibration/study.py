@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import chain, count
+from itertools import chain
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -19,10 +19,10 @@ from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.output import check_apart, check_output, claimed, new_file, new_files
 from fgtrack.io.run import Run, check_run, load_run, write_metrics
-from fgtrack.io.source import InputSource, open_input
+from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumptions.assumed import Assumed, assumed
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.replay import ReplayResult, replay_each
+from fgtrack.pipeline.replay import replay_each, tick_progress
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.plotting.close_up import CloseUp
 from fgtrack.plotting.late_detection import drawn_close_up
@@ -37,7 +37,6 @@ ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
 _MARK = "(fgtrack study)"
 #: Share of the work that is done when a step begins.
 _ADVICE, _REPLAY, _COMPARE, _DRAW, _DONE = 0.02, 0.3, 0.85, 0.9, 1.0
-_TICKS = 50  # between two signs of progress
 
 OnStep = Callable[[str, float], None]
 
@@ -156,9 +155,19 @@ def study(
             yield from messages
             readable.raise_error()
 
-        times_ns = (messages[0].receipt_ns, messages[-1].receipt_ns) if messages else (0, 0)
-        source = replace(source, messages=repeated)
-        results = _replayed(source, times_ns, known.config, folders, overwrite, on_step)
+        def replayed(text: str, share: float | None) -> None:
+            on_step(f"replay, {text}", _REPLAY + (_COMPARE - _REPLAY) * (share or 0.0))
+
+        end_ns = messages[-1].receipt_ns if messages else 0
+        results = replay_each(
+            repeated,
+            known.config,
+            folders,
+            origin=str(source.path),
+            kind=source.kind,
+            on_tick=tick_progress(replayed, end_ns, len(folders)),
+            overwrite=overwrite,
+        )
         on_step("compare", _COMPARE)
         every = evaluated([load_run(result.path) for result in results])
         tables = compare(*every)
@@ -201,36 +210,6 @@ def _following(known: Assumed, advice: Advice) -> Assumed:
     """Return `known` with the advice followed; what the advice changes is not assumed any more."""
     changed = {one.key for one in advice.changes}
     return Assumed(advice.config, tuple(one for one in known.assumptions if one.key not in changed))
-
-
-def _replayed(
-    source: InputSource,
-    times_ns: tuple[int, int],
-    config: Config,
-    folders: Mapping[str, Path],
-    overwrite: bool,
-    on_step: OnStep,
-) -> list[ReplayResult]:
-    share, (start_ns, end_ns) = (_COMPARE - _REPLAY) / len(folders), times_ns
-    results: list[ReplayResult] = []
-    ticks = count()
-
-    def on_tick(now_ns: int, num_tracks: int) -> None:
-        if next(ticks) % _TICKS == 0:
-            done = len(results) + min(max(now_ns - start_ns, 0) / max(end_ns - start_ns, 1), 1.0)
-            on_step(f"replay, {list(folders)[len(results)]}, {num_tracks} tracks", _REPLAY + share * done)
-
-    for name, folder in folders.items():
-        results += replay_each(
-            source.messages,
-            config,
-            {name: folder},
-            origin=str(source.path),
-            kind=source.kind,
-            on_tick=on_tick,
-            overwrite=overwrite,
-        )
-    return results
 
 
 def _pictured(

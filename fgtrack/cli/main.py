@@ -17,7 +17,7 @@ import typer
 from typer.core import TyperGroup
 
 import fgtrack
-from fgtrack.cli.interrupts import INTERRUPTED, interrupted
+from fgtrack.cli.entry import INTERRUPTED, interrupted
 from fgtrack.cli.streams import standard_streams
 from fgtrack.core.errors import CallError, DataError, FgtrackError, one_line
 from fgtrack.io.output import FULL
@@ -26,11 +26,25 @@ _logger = logging.getLogger(__name__)
 
 DONE, BAD_DATA, BAD_CALL = 0, 1, 2
 
-#: Commands in the order of the help; each is a function in the module of its name.
-COMMANDS = (
-    *("demo", "study", "simulate", "replay", "compare", "figure", "report", "export", "sweep"),
-    *("tune", "advise", "verify", "info", "convert", "offsets", "config"),
-)
+#: Commands in the order of the help, functions of that name, and the modules that hold them.
+COMMANDS = {
+    "demo": "study",
+    "study": "study",
+    "simulate": "recordings",
+    "replay": "replay",
+    "compare": "runs",
+    "figure": "pictures",
+    "report": "pictures",
+    "export": "runs",
+    "sweep": "sweep",
+    "tune": "tune",
+    "advise": "calibrate",
+    "verify": "verify",
+    "info": "calibrate",
+    "convert": "recordings",
+    "offsets": "calibrate",
+    "config": "recordings",
+}
 _STYLE: dict[str, Any] = {"add_completion": False, "rich_markup_mode": None, "pretty_exceptions_enable": False}
 
 
@@ -38,34 +52,19 @@ class _LazyCommands(TyperGroup):
     """Imports a command's module when the command is called; the help needs none of them."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command; what Typer would end the program by, without a word, is an error."""
+        """Run the command; Typer would end the program at a closed pipe without a message."""
         try:
             return super().invoke(ctx)
         except BrokenPipeError as error:
             raise DataError(f"{error.filename or 'an output'}: output pipe closed") from error
-        except SystemExit as error:
-            what = f"SystemExit: {error.code}"
-            raise CallError(
-                f"a plug-in, or what it loads, ends the program ({what}): repair or uninstall it"
-            ) from error
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        name, _, rest = super().resolve_command(ctx, args)
-        return name, None if name is None else _command(name), rest
-
-
-def _command(name: str) -> Any:  # Any: Typer does not export the type of its commands
-    module = import_module(f"fgtrack.cli.{name}")
-    single = typer.Typer(**_STYLE)
-    single.command(name)(getattr(module, name))
-    return typer.main.get_command(single)
-
-
-def _help(name: str) -> str:
-    """Docstring of a command, read from its source."""
-    module = ast.parse(Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8"))
-    functions = [item for item in module.body if isinstance(item, ast.FunctionDef) and item.name == name]
-    return ast.get_docstring(functions[0]) or ""
+        name, command, rest = super().resolve_command(ctx, args)
+        if name is not None:
+            single = typer.Typer(**_STYLE)
+            single.command(name)(getattr(import_module(f"fgtrack.cli.{COMMANDS[name]}"), name))
+            command = typer.main.get_command(single)
+        return name, command, rest
 
 
 app = typer.Typer(
@@ -74,6 +73,15 @@ app = typer.Typer(
     help="Track objects from delayed object lists, and compare how delays are dealt with.",
     **{**_STYLE, "add_completion": True},
 )
+
+
+def _help(name: str) -> str:
+    """Docstring of a command, read from its source."""
+    module = ast.parse(Path(__file__).with_name(f"{COMMANDS[name]}.py").read_text(encoding="utf-8"))
+    (function,) = (item for item in module.body if isinstance(item, ast.FunctionDef) and item.name == name)
+    return ast.get_docstring(function) or ""
+
+
 for _name in COMMANDS:
     app.command(_name, help=_help(_name))(lambda: None)
 
@@ -117,14 +125,14 @@ def run(arguments: Sequence[str]) -> int:
     memory = resource.getrlimit(resource.RLIMIT_AS)
     try:
         with standard_streams(), warnings.catch_warnings():
-            warnings.showwarning = _told  # type: ignore[assignment]  # the rest is of no use here
+            warnings.showwarning = _log  # type: ignore[assignment]  # the rest is of no use here
             return _run(words, debug)
     finally:
         resource.setrlimit(resource.RLIMIT_AS, memory)  # of whoever calls this from Python
 
 
-def _told(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: object) -> None:
-    """A warning of a library or a plug-in, as a line."""
+def _log(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: object) -> None:
+    """Log a warning of a library or a plug-in as a line."""
     _logger.warning("%s:%d: %s: %s", filename, lineno, category.__name__, message)
 
 
@@ -137,40 +145,22 @@ def _run(words: Sequence[str], debug: bool) -> int:
         outcome = typer.main.get_command(app).main([*words] or ["--help"], prog_name="fgtrack", standalone_mode=False)
         if outcome == INTERRUPTED:  # typer turns the exception into this code
             return _failed("interrupted; what was computed so far is in the output folder", INTERRUPTED, debug)
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
         return BAD_CALL if not words else outcome if isinstance(outcome, int) else DONE
     except typer.TyperException as error:
-        return _failed(_wrong_call(error), BAD_CALL, debug)
-    except CallError as error:
-        return _failed(str(error), BAD_CALL, debug)
+        return _failed(error.format_message(), BAD_CALL, debug)
     except FgtrackError as error:
-        return _failed(str(error), BAD_DATA, debug)
+        return _failed(str(error), BAD_CALL if isinstance(error, CallError) else BAD_DATA, debug)
     except MemoryError:
         return _failed("more memory needed than --max-memory allows: raise it, or split the input", BAD_DATA, debug)
-    except OSError as error:  # of files, the library makes its own errors
-        if error.errno in FULL:
-            what = f"what was to be printed cannot be written ({error.strerror}), free some space"
-            return _failed(what, BAD_DATA, debug)
-        if error.filename is not None:  # of a path that was given, there or in a file
-            return _failed(f"{error.filename}: cannot be used, the system says: {error.strerror}", BAD_CALL, debug)
-        return _bug(error, debug)
     except Exception as error:  # the last line of defence: a bug must not look like bad data
-        return _bug(error, debug)
-
-
-def _wrong_call(error: typer.TyperException) -> str:
-    """Message of `error`; of arguments that are too many, what the command takes."""
-    text, context = error.format_message(), getattr(error, "ctx", None)
-    _, is_extra, extra = text.partition("unexpected extra argument(s) ")
-    if not is_extra or context is None:
-        return text
-    arguments = [each for each in context.command.params if each.param_type_name == "argument"]
-    takes = " and ".join(f"one {each.metavar or each.name.upper()}" for each in arguments) or "no argument"
-    return f"{context.info_name}: takes {takes}, {extra.strip('()')} is too many"
-
-
-def _bug(error: Exception, debug: bool) -> int:
-    return _failed(f"internal error: {type(error).__name__}: {error} (run with --debug)", BAD_DATA, debug)
+        message, code = f"internal error: {type(error).__name__}: {error} (run with --debug)", BAD_DATA
+        if isinstance(error, OSError) and error.errno in FULL:  # of files, the library makes its own errors
+            message = f"what was to be printed cannot be written ({error.strerror}), free some space"
+        elif isinstance(error, OSError) and error.filename is not None:  # of a path that was given, there or in a file
+            message, code = f"{error.filename}: cannot be used, the system says: {error.strerror}", BAD_CALL
+        return _failed(message, code, debug)
 
 
 def _failed(message: str, code: int, debug: bool) -> int:

@@ -6,9 +6,8 @@ from typing import Annotated
 
 import typer
 
-from fgtrack.cli import completion
-from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Settings, TrackMap
-from fgtrack.cli.show import progress, say, tick_progress, warn
+from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Settings, TrackMap, estimators
+from fgtrack.cli.show import progress, say, warn
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.evaluation.diagnostics import diagnostics, excluded_lines, noise_diagnostics, unused
@@ -16,7 +15,7 @@ from fgtrack.io.output import check_apart
 from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumptions.assumed import assumed
-from fgtrack.pipeline.replay import located, replay_each
+from fgtrack.pipeline.replay import located, replay_each, tick_progress
 from fgtrack.pipeline.shipped import read_config
 
 
@@ -30,7 +29,7 @@ def replay(
             "-e",
             "--estimator",
             help="Estimator, or several with commas between them.",
-            autocompletion=completion.estimators,
+            autocompletion=estimators,
         ),
     ] = None,
     track_map: TrackMap = None,
@@ -45,9 +44,8 @@ def replay(
     config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
     given = (config.estimator if estimators is None else estimators).split(",")
     names = tuple(ESTIMATORS.resolve(name.strip()) for name in given)
-    for name in names:
-        if names.count(name) > 1:
-            raise CallError(f"estimator {name!r} is named twice")
+    if len(set(names)) < len(names):
+        raise CallError(f"estimator {max(names, key=names.count)!r} is named twice")
     folders = {name: out / name for name in names} if len(names) > 1 else {names[0]: out}
     for folder in folders.values():
         check_apart(folder, [recording, config_file])

@@ -2,12 +2,10 @@
 
 import json
 import os
-import shlex
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import count
 from typing import Any, Protocol
 
 from rich.console import Console
@@ -20,19 +18,16 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.progress import Progress as RichProgress
-from rich.table import Table as Grid
-from rich.text import Text
 
 from fgtrack.cli.arguments import Form
 from fgtrack.core.errors import CallError, one_line, printable_lines
-from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Message
 from fgtrack.evaluation.tables import Table, Tables, bulleted
 
 _WIDTH_WITHOUT_TERMINAL = 120
 LINE_PERIOD_S = 10.0
 """Between two lines of progress off a terminal."""
-_TICKS, _MESSAGES = 50, 1000  # between two signs of progress
+_MESSAGES = 1000  # between two signs of progress
 _SPEED_PERIOD_S = 600.0  # over which the time of the rest is estimated: jobs differ
 
 
@@ -47,22 +42,9 @@ def say(line: object) -> None:
     console().print(printable_lines(str(line)), highlight=False, soft_wrap=True, markup=False)
 
 
-def command_line(*words: object) -> str:
-    """A command as a shell takes it, whatever is in the names of files."""
-    return shlex.join(map(str, words))
-
-
 def warn(line: str) -> None:
     """Print a warning as one line on stderr."""
     Console(stderr=True).print(f"fgtrack: warning: {one_line(line)}", highlight=False, soft_wrap=True, markup=False)
-
-
-def entries(names: Mapping[str, str]) -> None:
-    """Print names and what they are, in two columns."""
-    grid = Grid.grid(padding=(0, 0, 0, 2))
-    for name, what in names.items():
-        grid.add_row(Text(name, no_wrap=True), Text(what))
-    console().print(grid)
 
 
 def sentences(lines: Iterable[str]) -> None:
@@ -107,23 +89,14 @@ def progress(what: str, total: int | None = None) -> Iterator[Progress]:
     if not stderr.is_terminal:
         yield _Lines(what, total)
         return
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeElapsedColumn(),
-    )
-    left = (TextColumn("left"), TimeRemainingColumn())
+    columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
+    left = TextColumn("left"), TimeRemainingColumn()
     with RichProgress(*columns, *left, console=stderr, transient=True, speed_estimate_period=_SPEED_PERIOD_S) as bar:
         task = bar.add_task(what, total=total)
 
         def moved(text: str = "", share: float | None = None) -> None:
-            words = f"{what} {text}".rstrip()
-            if share is None:
-                bar.update(task, advance=1, description=words)
-            else:
-                bar.update(task, completed=share, total=1.0, description=words)
+            at: dict[str, Any] = {"advance": 1} if share is None else {"completed": share, "total": 1.0}
+            bar.update(task, description=f"{what} {text}".rstrip(), **at)
 
         yield moved
 
@@ -146,31 +119,9 @@ class _Lines:
         print(f"fgtrack: {', '.join(parts)}", file=sys.stderr, flush=True)
 
 
-def tick_progress(tell: Progress, end_ns: int | None, passes: int) -> Callable[[int, int], None]:
-    """Return what to call after each tick of `passes` replays: it reports now and then how far they have come.
-
-    `end_ns` is when the recording ends, where that is known.
-    """
-    ticks = count()
-    first_ns, last_ns, passed = 0, 0, -1
-
-    def moved(now_ns: int, num_tracks: int) -> None:
-        nonlocal first_ns, last_ns, passed
-        if passed < 0 or now_ns < last_ns:  # the next estimator begins
-            first_ns, passed = now_ns, passed + 1
-        last_ns = now_ns
-        if next(ticks) % _TICKS == 0:
-            done_ns = now_ns - first_ns
-            done = None if end_ns is None else min(done_ns / max(end_ns - first_ns, 1), 1.0)
-            share = None if done is None else (passed + done) / passes
-            tell(f"{done_ns / NS_PER_S:.1f} s of data, {num_tracks} tracks", share)
-
-    return moved
-
-
-def told(messages: Sequence[Message], tell: Progress) -> Iterator[Message]:
-    """`messages`, telling how many have been taken."""
+def counted(messages: Sequence[Message], moved: Progress) -> Iterator[Message]:
+    """Yield `messages`; `moved` gets the share of those that have been taken."""
     for number, message in enumerate(messages):
         if number % _MESSAGES == 0:
-            tell("", number / len(messages))
+            moved("", number / len(messages))
         yield message

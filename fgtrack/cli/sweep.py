@@ -1,16 +1,15 @@
 """`fgtrack sweep`: settings x seeds x estimators into one table."""
 
-import csv
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
+import pandas as pd
 import typer
 
-from fgtrack.cli.arguments import All, Form, FormOption, Overwrite
-from fgtrack.cli.completion import sweeps
+from fgtrack.cli.arguments import All, Form, FormOption, Overwrite, sweeps
 from fgtrack.cli.show import progress, say, show
 from fgtrack.core.errors import CallError, one_line
 from fgtrack.evaluation.metrics import evaluate
@@ -35,7 +34,6 @@ from fgtrack.pipeline.sweep import (
     Scalar,
     Scores,
     Sweep,
-    SweepResult,
 )
 from fgtrack.pipeline.sweep_plan import load_plan
 
@@ -74,7 +72,7 @@ def sweep(
 
     Ends with mean and standard error at each point of the grid, and who is better.
     """
-    tell = say if form is None else _silent
+    tell = say if form is None else lambda line: None
     if jobs is not None and jobs < 1:
         raise CallError(f"--jobs {jobs}: at least one process is needed")
     if jobs is not None and dask is not None:
@@ -101,7 +99,15 @@ def sweep(
         _summarise(read_sweep(out), out, form, everything)
     if recording is not None:  # the metrics were chosen for another input: of this one, all that it has are taken
         result = replace(result, unknown_metrics=())
-    return _complain(result, sweep_file, out)
+    problems = []
+    if result.num_bad:
+        problems.append(f"{out / ERROR_TABLE}: {result.num_bad} bad cells, the first: {result.first_error}")
+    if result.unknown_metrics:
+        names = ", ".join(result.unknown_metrics)
+        problems.append(f"{sweep_file}: metrics: no column fits {names}; without `metrics` {SWEEP_TABLE} has all")
+    for problem in problems:
+        print(f"fgtrack: error: {one_line(problem)}", file=sys.stderr)
+    return 1 if problems else 0
 
 
 def swept(sweep_file: Path, out: Path, num_seeds: int | None = None) -> list[dict[str, str]]:
@@ -114,12 +120,8 @@ def swept(sweep_file: Path, out: Path, num_seeds: int | None = None) -> list[dic
         plan = load_plan(sweep_file)
         jobs = tuple(job for job in plan.jobs if num_seeds is None or job.seed < num_seeds)
         Sweep.open(replace(plan, jobs=jobs), out).run(score)
-    return _read(out / SWEEP_TABLE)
-
-
-def _read(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    rows: list[dict[str, str]] = pd.read_csv(out / SWEEP_TABLE, dtype=str, keep_default_na=False).to_dict("records")
+    return rows
 
 
 def _summarise(table: SweepTable, out: Path, form: Form | None, everything: bool) -> None:
@@ -135,10 +137,6 @@ def _summarise(table: SweepTable, out: Path, form: Form | None, everything: bool
     show(summary.in_full() if everything else summary, form)
     if form is None and summary.has_more and not everything:
         say(f"\nevery metric: --all, or {out / SUMMARY_TABLE}")
-
-
-def _silent(line: str) -> None:
-    """Of a table for another program nothing else is said."""
 
 
 def score(run: Run) -> Scores:
@@ -159,16 +157,3 @@ def _scalars(value: object, path: str) -> Iterator[tuple[str, Scalar]]:
             yield from _scalars(entry, f"{path}.{name}")
     elif value is None or isinstance(value, (str, int, float)):
         yield path, value
-
-
-def _complain(result: SweepResult, sweep_file: Path, out: Path) -> int:
-    """A line on stderr for what is bad; gives the exit code."""
-    problems = []
-    if result.num_bad:
-        problems.append(f"{out / ERROR_TABLE}: {result.num_bad} bad cells, the first: {result.first_error}")
-    if result.unknown_metrics:
-        names = ", ".join(result.unknown_metrics)
-        problems.append(f"{sweep_file}: metrics: no column fits {names}; without `metrics` {SWEEP_TABLE} has all")
-    for problem in problems:
-        print(f"fgtrack: error: {one_line(problem)}", file=sys.stderr)
-    return 1 if problems else 0

@@ -3,12 +3,10 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from io import StringIO
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from fgtrack.calibration.noise import noise_fits
 from fgtrack.calibration.tune import tuned
@@ -24,7 +22,6 @@ from fgtrack.pipeline.assumptions.assumed import Assumed
 from fgtrack.pipeline.shipped import read_config
 
 _KNOWN = {"yes": "yes", "roughly": "roughly", "limit": "a limit", "no": "not identifiable"}
-_WIDTH = 78
 
 
 def tune(
@@ -52,11 +49,13 @@ def tune(
     sources = {str(path): open_input(path, config.input) for path in recordings}
     with progress("tune") as tell:
         report = tuned(sources, config, TuneRules(keep=tuple(keep or ())), tell)
-    tables, found = Tables(_tables(report)), _sensors(report)
-    lines = [*_text(tables), "", *found]
+    shown = {"parameters": _parameters(report.parameters)}
+    if report.held_out is not None:
+        shown["held_out"] = _judged(report.held_out)
+    tables, found = Tables(shown), _sensors(report)
     of_recordings = replace(report.config, map=read_config(config_file).map)  # the maps belong to these
     title = f"The noise of {config_file or 'the defaults'}, fitted to {', '.join(sources)} (fgtrack tune)."
-    head = [title, "", *lines, ""]
+    head = [title, "", *str(tables).splitlines(), "", *found, ""]
     with new_file(out, overwrite) as file:
         file.write(Assumed(of_recordings, ()).to_yaml(head).encode())
     show(tables, form, report.as_dict())
@@ -64,13 +63,6 @@ def tune(
         say("\n".join(["", *found, f"{out}: written"]))
     if report.broken:
         raise DataError(f"{next(iter(report.broken.values()))}; used up to there")
-
-
-def _tables(report: TuneReport) -> dict[str, Table]:
-    tables = {"parameters": _parameters(report.parameters)}
-    if report.held_out is not None:
-        tables["held_out"] = _judged(report.held_out)
-    return tables
 
 
 def _parameters(parameters: Sequence[TunedParameter]) -> Table:
@@ -141,10 +133,3 @@ def _judged(held_out: HeldOut) -> Table:
     title = f"Held out: {share}, {held_out.count} innovations, by the noise fitted to the rest"
     notes = [f"log-likelihood per innovation: {held_out.before:.4g} before, {held_out.after:.4g} after"]
     return Table(title, records, columns, ("of",), notes)
-
-
-def _text(tables: Tables) -> list[str]:
-    """The tables as lines of text."""
-    file = StringIO()
-    Console(file=file, width=_WIDTH, color_system=None).print(tables)
-    return [line.rstrip() for line in file.getvalue().splitlines()]

@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from fgtrack.cli.arguments import FormOption, Json
-from fgtrack.cli.completion import estimators
+from fgtrack.cli.arguments import FormOption, Json, estimators
 from fgtrack.cli.show import chosen_form, progress, say, show
 from fgtrack.estimation.registry import ESTIMATORS, MOTION_MODELS, Claims
 from fgtrack.evaluation.tables import Column, Table

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import count
 from pathlib import Path
 
 from fgtrack.core.errors import DataError
@@ -24,6 +25,7 @@ from fgtrack.tracking.tracker import Tracker, TrackerParts, check_sensor
 
 #: Ticks go on while nothing is received: a few messages must not make a recording of days.
 _GAP_S, _LONGEST_SILENCE_S = 10.0, 3600.0
+_TICKS = 50  # between two signs of progress
 _PACKAGES = ("fgtrack", "gtsam", "numpy", "scipy", "rosbags")
 
 
@@ -283,6 +285,29 @@ def replay_each(
             finished = _drive(tracker, messages(), chosen, writer, on_tick, origin, realtime=realtime)
             results.append(ReplayResult(writer.path, *finished))
     return results
+
+
+def tick_progress(
+    tell: Callable[[str, float | None], None], end_ns: int | None, passes: int
+) -> Callable[[int, int], None]:
+    """Return the `on_tick` of `passes` replays, which now and then tells `tell` the share that is done.
+
+    `end_ns` is when the recording ends, where that is known.
+    """
+    ticks = count()
+    first_ns, last_ns, passed = 0, 0, -1
+
+    def moved(now_ns: int, num_tracks: int) -> None:
+        nonlocal first_ns, last_ns, passed
+        if passed < 0 or now_ns < last_ns:  # the next estimator begins
+            first_ns, passed = now_ns, passed + 1
+        last_ns = now_ns
+        if next(ticks) % _TICKS == 0:
+            done_ns = now_ns - first_ns
+            share = None if end_ns is None else (passed + min(done_ns / max(end_ns - first_ns, 1), 1.0)) / passes
+            tell(f"{done_ns / NS_PER_S:.1f} s of data, {num_tracks} tracks", share)
+
+    return moved
 
 
 def located(problem: str, origin: str) -> str:

@@ -12,7 +12,7 @@ import pytest
 from support import kitti
 from support.paper import paper
 
-from fgtrack.cli import demo
+from fgtrack.cli import study
 from fgtrack.cli.main import COMMANDS, _command, run
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
@@ -64,7 +64,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(demo, "simulate", lambda scenario, rng: drive())
+        patch.setattr(study, "simulate", lambda scenario, rng: drive())
         write_stream("drive.jsonl", drive())
         write_stream("noisy.jsonl", noisy())
         write_stream("other.jsonl", drive(10))
@@ -87,14 +87,14 @@ def here(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The current folder, a copy of that one; figures are copied, not drawn."""
     folder = shutil.copytree(made, tmp_path / "here")
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(demo, "simulate", lambda scenario, rng: drive())
+    monkeypatch.setattr(study, "simulate", lambda scenario, rng: drive())
 
     def redraw(named: object, folder: Path, form: str) -> list[Path]:
         return [Path(shutil.copy(picture, folder)) for picture in sorted((made / "figures").iterdir())]
 
-    monkeypatch.setattr("fgtrack.cli.figure.save_named", redraw)
+    monkeypatch.setattr("fgtrack.cli.pictures.save_named", redraw)
     monkeypatch.setattr(
-        "fgtrack.cli.figure.save_pages", lambda figures, file: file.write((made / "figures.pdf").read_bytes())
+        "fgtrack.cli.pictures.save_pages", lambda figures, file: file.write((made / "figures.pdf").read_bytes())
     )
     return folder
 

@@ -20,9 +20,9 @@ pytestmark = pytest.mark.slow
 ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
 SHORT_DEMO = """
 from dataclasses import replace
-from fgtrack.cli import demo, main
-read = demo.read_scenario
-demo.read_scenario = lambda name: replace(read(name), duration_s=3.0)
+from fgtrack.cli import main, study
+read = study.read_scenario
+study.read_scenario = lambda name: replace(read(name), duration_s=3.0)
 raise SystemExit(main.main())
 """
 

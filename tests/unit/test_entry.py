@@ -58,7 +58,7 @@ def run(program: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize("error", ["error", "ImportError('initialization failed') from None"])
 @pytest.mark.parametrize(
-    ("module", "words"), [("fgtrack.cli.main", []), ("fgtrack.cli.info", ["info", "x"]), ("numpy", ["info", "x"])]
+    ("module", "words"), [("fgtrack.cli.main", []), ("fgtrack.cli.calibrate", ["info", "x"]), ("numpy", ["info", "x"])]
 )
 def test_an_interrupt_while_something_loads_is_one_line(module: str, words: list[str], error: str) -> None:
     done = run(INTERRUPTED.format(module=module, words=words, error=error))

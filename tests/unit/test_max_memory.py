@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-import fgtrack.cli.config
+import fgtrack.cli.recordings
 from fgtrack.cli.main import run
 
 
@@ -15,7 +15,9 @@ def test_a_command_runs_within_the_limit_and_the_caller_keeps_its_own(
     words: tuple[str, ...], gib: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = []
-    monkeypatch.setattr(fgtrack.cli.config, "config", lambda: seen.append(resource.getrlimit(resource.RLIMIT_AS)[0]))
+    monkeypatch.setattr(
+        fgtrack.cli.recordings, "config", lambda: seen.append(resource.getrlimit(resource.RLIMIT_AS)[0])
+    )
     before = resource.getrlimit(resource.RLIMIT_AS)
     assert run([*words, "config"]) == 0
     assert seen == [int(gib * 2**30)]
@@ -26,7 +28,7 @@ def test_too_little_memory_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: 
     def exhausted() -> None:
         raise MemoryError
 
-    monkeypatch.setattr(fgtrack.cli.config, "config", exhausted)
+    monkeypatch.setattr(fgtrack.cli.recordings, "config", exhausted)
     assert run(["config"]) == 1
     assert capsys.readouterr().err == (
         "fgtrack: error: more memory needed than --max-memory allows: raise it, or split the input\n"

@@ -1,25 +1,28 @@
-"""`fgtrack figure`: pictures of runs and sweeps."""
+"""`fgtrack figure` and `report`: pictures of runs and sweeps, and one page of runs to look at."""
 
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import typer
 from matplotlib.figure import Figure
 
-from fgtrack.cli.arguments import Overwrite
+from fgtrack.calibration.study import head_at
+from fgtrack.cli.arguments import Overwrite, Runs
 from fgtrack.cli.show import progress, say
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.evaluation.runs import evaluated, run_folders, start_ns
+from fgtrack.evaluation.tables.compare import compare
 from fgtrack.evaluation.tables.seeds import is_sweep, read_sweep
-from fgtrack.io.output import check_apart, new_file, new_files
+from fgtrack.io.output import check_apart, check_output, new_file, new_files
 from fgtrack.plotting.late_detection import drawn_close_up
 from fgtrack.plotting.paper import Paper, settings
 from fgtrack.plotting.plot import Planned, drawn, planned, planned_sweep, save_named
-from fgtrack.plotting.style import save_pages
+from fgtrack.plotting.style import png, save_pages
+from fgtrack.viewers.report import write_report
 
 
 def figure(
@@ -72,13 +75,8 @@ def figure(
 
 def _paper(width: str | None, font: str | None, style: str | None) -> Paper:
     """Return the options as keywords of the figures. Raises `CallError` where one is not usable."""
-    paper: Paper = {}
-    if width is not None:
-        paper["width"] = width
-    if font is not None:
-        paper["font"] = font
-    if style is not None:
-        paper["style"] = style
+    given = {"width": width, "font": font, "style": style}
+    paper = cast(Paper, {name: value for name, value in given.items() if value is not None})
     settings(paper)
     return paper
 
@@ -109,3 +107,30 @@ def _of_runs(folders: Sequence[Path], out: Path, track: int | None, stamp: float
     if missing is not None and (track is not None or stamp is not None):
         raise missing
     return first, planned(found), missing
+
+
+_SUFFIXES = (".html", ".htm")
+_MEGABYTE = 1e6
+
+
+def report(
+    runs: Runs,
+    out: Annotated[Path, typer.Option("-o", "--out", help="HTML file.")],
+    overwrite: Overwrite = False,
+) -> None:
+    """Write one HTML file: verdict, viewer, figures, tables.
+
+    It opens with the verdict, a viewer that plays the runs, and three figures; all tables and figures and the
+    configuration are folded below. The file needs no network and no other file. Its close-up replays the recording;
+    where that is not there any more it is left out.
+    """
+    if out.suffix.lower() not in _SUFFIXES:
+        raise CallError(f"{out}: a report is one HTML file, end the name with .html")
+    check_output(out, overwrite)
+    every = evaluated(runs)
+    check_apart(out, run_folders(every))
+    with progress("report"):
+        close_up, late = drawn_close_up(every)
+        pictures = ((name, png(figure)) for name, figure in chain(close_up, drawn(planned(every))))
+        size = write_report(every, compare(*every), pictures, out, head_at(late), overwrite)
+    say(f"{out}: {size / _MEGABYTE:.1f} MB, open it in a browser")

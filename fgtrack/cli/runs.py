@@ -1,4 +1,4 @@
-"""`fgtrack export`: runs for Foxglove, Lichtblick, RViz."""
+"""`fgtrack compare` and `export`: tables of runs, and runs for other programs."""
 
 import logging
 from pathlib import Path
@@ -6,13 +6,43 @@ from typing import Annotated
 
 import typer
 
-from fgtrack.cli.arguments import Overwrite, Runs
-from fgtrack.cli.show import progress, say
-from fgtrack.core.errors import CallError
+from fgtrack.cli.arguments import All, FormOption, Json, Overwrite, Runs
+from fgtrack.cli.show import chosen_form, progress, say, show, warn
+from fgtrack.core.errors import CallError, FgtrackError
+from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.evaluation.kitti_result import write_kitti_result
-from fgtrack.io.run import load_run
+from fgtrack.evaluation.runs import evaluated, recordings_warning
+from fgtrack.evaluation.tables.compare import compare as tables_of
+from fgtrack.io.run import load_run, write_metrics
 from fgtrack.pipeline.shipped import shipped_folder
 from fgtrack.viewers.export import export as written
+
+
+def compare(
+    runs: Runs,
+    as_json: Json = False,
+    form: FormOption = None,
+    everything: All = False,
+    streaming: Annotated[
+        bool, typer.Option("--streaming", help="Judge what was published when it was ready, too.")
+    ] = False,
+) -> None:
+    """Compare runs in tables, and write metrics.json into each."""
+    form = chosen_form(as_json, form)
+    every = evaluated(runs)
+    of_each = dict.fromkeys(f"{one.label}: {line}" for one in every for line in diagnostics(one.run))
+    for line in (*recordings_warning(every), *of_each):
+        warn(line)
+    tables = tables_of(*every, streaming=streaming)
+    for one in every:
+        if one.run.path is not None:
+            try:
+                write_metrics(one.run.path, one.metrics.as_dict())
+            except FgtrackError as error:
+                warn(f"{error}; the tables are complete without it")
+    show(tables.in_full() if everything else tables, form)
+    if form is None and tables.has_more and not everything:
+        say("\nevery table and column: --all")
 
 
 def export(

@@ -1,0 +1,230 @@
+"""`fgtrack info`, `advise` and `offsets`: contents of a recording, its problems, and the clocks of its sensors."""
+
+import shlex
+from collections.abc import Set
+from contextlib import suppress
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fgtrack.calibration.advise import advise as advised
+from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
+from fgtrack.calibration.clocks import clock_verdicts
+from fgtrack.calibration.starting import write_starting
+from fgtrack.calibration.trial import Trial, try_out
+from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, Overwrite, PitMap, Reference, Settings, TrackMap
+from fgtrack.cli.show import chosen_form, progress, say, sentences, show, warn
+from fgtrack.core.errors import CallError, DataError, FgtrackError
+from fgtrack.evaluation.diagnostics import excluded_lines
+from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value
+from fgtrack.io.errors import UntilBreak
+from fgtrack.io.info import OTHER_CLOCK_S, InputInfo, describe
+from fgtrack.io.output import check_apart, check_output, new_file
+from fgtrack.io.source import open_input
+from fgtrack.pipeline.assumptions.assumed import Assumed, assumed
+from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.replay import located
+from fgtrack.pipeline.shipped import read_config
+
+_DELAYS = ("mean_s", "p50_s", "p90_s", "max_s")
+
+
+def info(
+    recording: Input,
+    config_file: ConfigFile = None,
+    write: Annotated[
+        Path | None,
+        typer.Option("--write", metavar="MY.yaml", help="Write a commented starting configuration for the recording."),
+    ] = None,
+    overwrite: Overwrite = False,
+    as_json: Json = False,
+    form: FormOption = None,
+) -> None:
+    """Show topics, rates and delays of a recording.
+
+    With a configuration (or with the one of --write, which guesses what topics, fields and columns are) also what it
+    would take from them, what a message of each is read as, and what a replay of the first seconds makes of them.
+    """
+    form = chosen_form(as_json, form)
+    if write is not None:
+        if config_file is not None:
+            raise CallError("--write, -c: a starting configuration is made from the recording alone, give one of them")
+        check_output(write, overwrite)
+        check_apart(write, [recording])
+        write_starting(write, recording, overwrite)
+        if form is None:
+            say(f"{write}: written; check its guesses, they are applied below")
+        config_file = str(write)
+    config = None if config_file is None else read_config(config_file)
+    found = describe(recording, None if config is None else config.input)
+    topics = _topics(found, NO_VALUE if config is None else "ignored")
+    comes_to = (config or Config()).effective
+    values: dict[str, object] = {
+        "path": str(found.path),
+        "kind": found.kind,
+        "start_ns": found.start_ns,
+        "duration_s": found.duration_s,
+    }
+    values |= {"problem": found.problem, "cautions": list(map(str, found.cautions)), "topics": topics.plain()}
+    show(topics, form, {**values, "effective": comes_to.values()})
+    if form is None:
+        sentences([f"{config_file or 'without a configuration'}: {comes_to}"])
+    for one in found.cautions:
+        warn(str(one))
+    trial = None
+    if config is not None and found.problem is None and form is None:
+        trial = _try_out(recording, config, {(one.about, one.text.split()[0]) for one in found.cautions})
+    elif form is None:
+        with suppress(FgtrackError), progress("detections"):  # whose topics and columns nothing names
+            sentences(assumed(Config(), open_input(recording)).lines())
+    problem = found.problem if trial is None else trial.problem
+    if problem is not None:
+        raise DataError(problem)
+
+
+def _try_out(recording: Path, config: Config, warned: Set[tuple[str, str]]) -> Trial:
+    with progress("first seconds"):
+        source = open_input(recording, config.input)
+        open_settings = assumed(config, source)
+        trial = try_out(source.messages(), open_settings.config)
+    sentences(open_settings.lines())
+    for name, text in trial.samples.items():
+        say(f"first of {name}: {text}")
+    if trial.run is not None:
+        for sensor, counts in trial.run.meta["counts"].items():
+            became = ", ".join(f"{count} {fate.replace('_', ' ')}" for fate, count in counts.items() if count)
+            say(f"first {trial.duration_s:g} s of {sensor}: {became or 'no detection'}")
+        for line in excluded_lines(trial.run.meta):
+            say(f"first {trial.duration_s:g} s of {line}")
+        say(f"first {trial.duration_s:g} s: {len(set(trial.run.tables['tracks']['track_id'].tolist()))} tracks")
+    for found in trial.suspicions:
+        if (found.about, found.text.split()[0]) not in warned:
+            warn(str(found))
+    return trial
+
+
+def _topics(found: InputInfo, unused: str) -> Table:
+    records = []
+    for one in found.topics:
+        record: dict[str, object] = {"topic": one.name, "messages": one.count, "rate_hz": one.rate_hz}
+        record |= {f"delay_{name}": None if one.delay is None else getattr(one.delay, name) for name in _DELAYS}
+        records.append(record | {"taken_as": one.used_as or unused, "type": one.type})
+    columns = [
+        Column("topic", left=True),
+        Column("messages"),
+        Column("rate\n[Hz]", "rate_hz"),
+        Column(
+            "delay [ms]\nmean/p50/p90/max",
+            " ".join(f"delay_{name}" for name in _DELAYS),
+            "{}/{}/{}/{}",
+            1e3,
+            text=_whole,
+        ),
+        Column("taken as", "taken_as", left=True),
+        Column("type", left=True),
+    ]
+    notes = [
+        f"{topic.name}: {topic.note}" for topic in found.topics if topic.note is not None and topic.used_as is None
+    ]
+    extent = "empty"
+    if found.start_ns is not None:
+        start = datetime.fromtimestamp(found.start_ns // 1_000_000_000, UTC)
+        extent = f"{found.duration_s:.3f} s from {start:%Y-%m-%d %H:%M:%S} UTC ({found.start_ns} ns)"
+    return Table(f"{found.path}: {found.kind}, {extent}", records, columns, ("topic",), notes)
+
+
+def _whole(value: Value) -> str:
+    """Whole milliseconds; of a recorder with another clock than the sensor nothing."""
+    return f"{value:.0f}" if abs(float(value)) < 1e3 * OTHER_CLOCK_S else NO_VALUE
+
+
+def advise(
+    recording: Input,
+    config_file: ConfigFile = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Configuration to write that follows the advice (YAML).")
+    ] = None,
+    tune: Annotated[bool, typer.Option("--tune", help="Fit noise that does not fit, too.")] = False,
+    reference: Reference = None,
+    track_map: TrackMap = None,
+    pit_map: PitMap = None,
+    settings: Settings = None,
+    overwrite: Overwrite = False,
+    as_json: Json = False,
+    form: FormOption = None,
+) -> None:
+    """Say what is late or wrong, and which settings mend it.
+
+    Sentences in order of importance, and what windows of several lengths would lose.
+    """
+    form = chosen_form(as_json, form)
+    if out is not None:
+        check_output(out, overwrite)
+    config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
+    if out is not None:
+        check_apart(out, [recording, config_file])
+    with progress("advise") as tell:
+        advice = advised(recording, config, reference=reference, tune=tune, on_step=tell)
+    if out is not None:
+        head = [f"Settings for {recording} (fgtrack advise).", "", *advice.comments(), ""]
+        with new_file(out, overwrite) as file:
+            file.write(Assumed(advice.config, ()).to_yaml(head).encode())
+    show(advice.tables, form, advice.as_dict())
+    if out is not None and form is None:
+        again = shlex.join(["fgtrack", "replay", str(recording), "-c", str(out), "-o", "RUN"])
+        say(f"{out}: written; follow it by `{again}`")
+    if advice.broken is not None:
+        raise DataError(f"{located(advice.broken, str(recording))}; used up to there")
+
+
+def offsets(
+    recording: Input,
+    config_file: ConfigFile = None,
+    reference: Reference = None,
+    track_map: TrackMap = None,
+    pit_map: PitMap = None,
+    settings: Settings = None,
+    as_json: Json = False,
+    form: FormOption = None,
+) -> None:
+    """Estimate constant clock offsets of sensors.
+
+    Says which ones are not identifiable.
+    """
+    form = chosen_form(as_json, form)
+    config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
+    source = open_input(recording, config.input)
+    with progress("offsets"):
+        found = assumed(config, source)
+        readable = UntilBreak(source.messages())
+        report = estimate_offsets(list(readable), found.config, reference)
+        report = report if readable.error is None else replace(report, broken=str(readable.error))
+    for line in found.lines() if form is None else ():
+        say(line)
+    verdicts = clock_verdicts(report)
+    show(_offsets(report), form, report.as_dict() | {"verdicts": [asdict(one) for one in verdicts]})
+    if form is None:
+        sentences(f"{one.sensor}: {one}" for one in verdicts)
+    if report.broken is not None:
+        raise DataError(f"{located(report.broken, str(recording))}; used up to there")
+
+
+def _offsets(report: OffsetReport) -> Table:
+    records = [
+        {"sensor": one.sensor, "offset_s": one.offset_s, "std_s": one.std_s, "num_detections": one.num_detections}
+        | {"known": "reference" if one.sensor == report.reference else "yes" if one.is_known else "no"}
+        for one in report.sensors
+    ]
+    columns = [
+        Column("sensor", left=True),
+        Column("offset\n[ms]", "offset_s", scale=1e3, text="{:.1f}".format),
+        Column("std\n[ms]", "std_s", scale=1e3, text="{:.1f}".format),
+        Column("detections", "num_detections"),
+        Column("known", left=True),
+    ]
+    notes = [f"{one.sensor}: {one.why}" for one in report.sensors]
+    title = f"Offsets of {report.num_detections} detections of {report.num_tracks} tracks (reported stamp - true time)"
+    return Table(title, records, columns, ("sensor",), notes)

@@ -1,0 +1,120 @@
+"""`fgtrack simulate`, `convert` and `config`: recordings that are made, and the configuration of a replay."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Annotated, get_args
+
+import numpy as np
+import typer
+from rich.table import Table as Grid
+from rich.text import Text
+
+from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, Settings, StorageOption, scenarios
+from fgtrack.cli.show import console, counted, progress, say
+from fgtrack.core.errors import CallError
+from fgtrack.core.types import DetectionList, Message
+from fgtrack.evaluation.diagnostics import excluded_lines
+from fgtrack.io.output import check_apart
+from fgtrack.io.recording import check_recording, write_recording
+from fgtrack.io.source import open_input
+from fgtrack.pipeline.load import dump, load
+from fgtrack.pipeline.recorded import recorded_of
+from fgtrack.pipeline.shipped import Kind, read_config, read_scenario, shipped, summary
+from fgtrack.sim.redelay import Redelayed, SensorDelays, redelay
+from fgtrack.sim.simulate import simulate as simulated
+
+
+def simulate(
+    scenario_file: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENARIO",
+            help="Scenario: a file (YAML) or a shipped name, as `default`.",
+            autocompletion=scenarios,
+        ),
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder.")],
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random generator.")] = 0,
+    duration_s: Annotated[
+        float | None, typer.Option("--duration", help="Length in seconds, instead of the scenario's.")
+    ] = None,
+    storage: StorageOption = "mcap",
+    overwrite: Overwrite = False,
+) -> None:
+    """Simulate a scenario into a stream or a rosbag2 folder."""
+    scenario = read_scenario(scenario_file, duration_s=duration_s)
+    check_apart(out, [scenario_file, scenario.map])
+    check_recording(out, overwrite)
+    with progress("simulate") as tell:
+        messages = counted(simulated(scenario, np.random.default_rng(seed)), tell)
+        count = write_recording(out, messages, storage, settings=recorded_of(scenario), overwrite=overwrite)
+    say(f"{out}: {count} messages")
+
+
+def convert(
+    recording: Input,
+    out: Annotated[Path, typer.Argument(help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder.")],
+    config_file: ConfigFile = None,
+    delays_file: Annotated[
+        Path | None,
+        typer.Option("--delays", help="Give detections other delays, losses and clock errors by sensor (YAML)."),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, help="Seed of the random generator of --delays.", show_default="0")
+    ] = None,
+    storage: StorageOption = "mcap",
+    overwrite: Overwrite = False,
+) -> None:
+    """Convert a recording into a stream or a rosbag2 folder."""
+    if seed is not None and delays_file is None:
+        raise CallError("--seed: only --delays draws random numbers, name its file")
+    config = read_config(config_file)
+    check_apart(out, [recording, config_file, delays_file])
+    check_recording(out, overwrite)
+    source = open_input(recording, config.input)
+    unread: dict[str, Counter[str]] = {}
+    with progress("convert"):
+        messages = source.messages() if delays_file is None else _redelayed(source.messages, delays_file, seed or 0)
+        kept = _with_unread(messages, unread)
+        count = write_recording(out, kept, storage, settings=source.settings(), overwrite=overwrite)
+    lost = messages.num_lost if isinstance(messages, Redelayed) else {}
+    losses = ", ".join(f"{number} of {sensor}" for sensor, number in lost.items() if number)
+    say(f"{out}: {count} messages{losses and f', lost {losses}'}")
+    for line in excluded_lines({"left_out": unread}):
+        say(line)
+
+
+def _with_unread(messages: Iterable[Message], unread: dict[str, Counter[str]]) -> Iterator[Message]:
+    """Yield `messages`; counts of excluded detections are added to `unread`, by sensor and setting."""
+    for message in messages:
+        if isinstance(message, DetectionList) and message.left_out:
+            unread.setdefault(message.sensor, Counter()).update(message.left_out)
+        yield message
+
+
+def _redelayed(read: Callable[[], Iterator[Message]], delays_file: Path, seed: int) -> Redelayed:
+    delays = load(dict[str, SensorDelays], delays_file)
+    try:
+        return redelay(read, delays, np.random.default_rng(seed))
+    except CallError as error:
+        raise CallError(f"{delays_file}: {error}") from error
+
+
+def config(
+    config_file: ConfigFile = None,
+    settings: Settings = None,
+    listed: Annotated[
+        bool, typer.Option("--list", help="List the shipped configurations, scenarios and sweeps.")
+    ] = False,
+) -> None:
+    """Print the resolved configuration, or list the shipped ones."""
+    if not listed:
+        print(dump(read_config(config_file, settings or [])), end="")
+        return
+    for kind in get_args(Kind):
+        say(f"{kind}s")
+        grid = Grid.grid(padding=(0, 0, 0, 2))
+        for name, path in shipped(kind).items():
+            grid.add_row(Text(name, no_wrap=True), Text(summary(path)))
+        console().print(grid)
