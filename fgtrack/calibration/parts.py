@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any
@@ -43,9 +43,8 @@ class Part:
     item: TopicInput | CsvTable
     reasons: Mapping[str, str]
     """By component."""
-    unused: tuple[str, ...] = ()
-    """Fields that nothing is taken from."""
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
+    """Fields that nothing is taken from, and settings to look at."""
 
     @property
     def label(self) -> str:
@@ -107,7 +106,9 @@ def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> tuple[Pa
         if path or is_ego:
             return part, ""
         if "range_m" in own:
-            return replace(part, notes=("one object per message: set scan_s to put those of a scan together",)), ""
+            return replace(
+                part, notes=(*part.notes, "one object per message: set scan_s to put those of a scan together")
+            ), ""
         mapping = ", ".join(f"{key}: {one.path}" for key, one in used.items())
         return None, f"one pose per message: the ego, truth or one object; fields: {{{mapping}}}"
     return None, f"no position among {_spreads(_columns(lists[''])) or 'its fields'}"
@@ -198,9 +199,11 @@ def _number(text: str) -> float:
 
 
 def _unused(values: Mapping[str, Sequence[float]], used: Mapping[str, Guess]) -> tuple[str, ...]:
+    """Return a note on the fields or columns that are not `used`; none without any."""
     paths = [one.path.path if isinstance(one.path, Field) else one.path for one in used.values()]
     names = {name for path in paths for name in ([path] if isinstance(path, str) else path)}
-    return tuple(_spreads({name: found}) for name, found in values.items() if name not in names)
+    rest = {name: found for name, found in values.items() if name not in names}
+    return (f"not used: {_spreads(rest)}",) if rest else ()
 
 
 def _spreads(values: Mapping[str, Sequence[float]]) -> str:

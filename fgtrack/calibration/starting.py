@@ -1,26 +1,24 @@
 """A starting configuration for a recording that nobody has configured: what its parts probably are, and why."""
 
+import json
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from io import StringIO
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 from ruamel.yaml import YAML
-from ruamel.yaml.comments import CommentedMap
 
 from fgtrack.calibration.parts import Part, table_parts, topic_parts
 from fgtrack.calibration.trial import beginning, suspicions
-from fgtrack.core.errors import CallError, FgtrackError, printable
+from fgtrack.core.errors import CallError, FgtrackError
 from fgtrack.io.adapters.native import NATIVE_ADAPTERS
-from fgtrack.io.config import CsvInput, CsvTable, Field, InputConfig, TopicInput
+from fgtrack.io.config import CsvInput, CsvTable, InputConfig, TopicInput
 from fgtrack.io.info import InputInfo, describe
 from fgtrack.io.output import new_file
 from fgtrack.io.ros.bag import Bag
 from fgtrack.io.source import input_kind, open_input
-from fgtrack.pipeline.assumptions.assumed import Assumed, assumed
+from fgtrack.pipeline.assumptions.assumed import Assumed, assumed, departures
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import plain, validate
+from fgtrack.pipeline.load import validate
 
 __all__ = ["starting_config", "write_starting"]
 
@@ -53,21 +51,17 @@ def starting_config(recording: Path) -> str:
         with_sensors = assumed(config, source)
         checks = [str(one) for one in suspicions(list(beginning(source.messages(), _TRIAL_NS)), with_sensors.config)]
     except FgtrackError as error:  # of a recording in which nothing can be taken
-        with_sensors, checks = Assumed(Config(), ()), [str(error)] if taken else []
-    lines = [
-        f"# Starting configuration for {recording.name} {_MARK}",
-        "# Guesses from names and values: check units, frames and noise, then",
-        f"#   fgtrack info {recording} -c THIS.yaml; fgtrack replay {recording} -c THIS.yaml -o RUN",
-        *(f"# {line}" for line in _contents(found)),
-        *(
-            f"# Check: {line}"
-            for line in [*map(str, found.cautions), *checks, *([found.problem] if found.problem else [])]
-        ),
-        *(f"# Not taken: {line}" for line in [*left, *refused]),
+        with_sensors, checks = Assumed(config, ()), [str(error)] if taken else []
+    head = [
+        f"Starting configuration for {recording.name} {_MARK}",
+        "Guesses from names and values: check units, frames and noise, then",
+        f"  fgtrack info {recording} -c THIS.yaml; fgtrack replay {recording} -c THIS.yaml -o RUN",
+        *_contents(found),
+        *(f"Check: {line}" for line in [*map(str, found.cautions), *checks, *filter(None, [found.problem])]),
+        *(f"Not taken: {line}" for line in [*left, *refused]),
+        *(f"{part.label}: {note}" for part in taken for note in part.notes),
     ]
-    head = "".join(f"{printable(line)}\n" for line in lines)
-    rest = Assumed(replace(with_sensors.config, input=InputConfig()), with_sensors.assumptions).to_yaml()
-    text = head + (_dumped(_document(taken)) if taken else "") + rest
+    text = with_sensors.to_yaml(head, [one for part in taken for one in _comments(part)])
     validate(Config, YAML(typ="safe", pure=True).load(text) or {}, "the starting configuration")
     return text
 
@@ -104,7 +98,7 @@ def _readable(recording: Path, parts: Sequence[Part]) -> tuple[list[Part], list[
     for part in parts:
         what = f"{part.label} as {part.role}"
         if any(part.role == other.role for other in taken):
-            refused.append(f"{what}: there is another one, {_dumped(_document([part]), flow=True)}")
+            refused.append(f"{what}: there is another one, {json.dumps(departures(part.item))}")
             continue
         try:
             next(iter(open_input(recording, _input([part])).messages()), None)
@@ -126,55 +120,10 @@ def _input(parts: Sequence[Part]) -> InputConfig:
     )
 
 
-def _document(parts: Sequence[Part]) -> CommentedMap:
-    """The section `input` with a comment for each guess."""
-    document, csv = CommentedMap(), CommentedMap()
-    for part in sorted(parts, key=lambda one: ("ego", "truth").index(one.role) if one.role in ("ego", "truth") else 2):
-        place = csv if isinstance(part.item, CsvTable) else document
-        if part.role not in ("ego", "truth"):
-            place = place.setdefault("detections", CommentedMap())
-        place[part.role] = _item(part)
-    if csv:
-        document["csv"] = csv
-    return CommentedMap(input=document)
-
-
-def _item(part: Part) -> CommentedMap:
-    """A topic or table, of which only what is set is written."""
-    default = plain(TopicInput("") if isinstance(part.item, TopicInput) else CsvTable({}))
-    item = CommentedMap((key, value) for key, value in plain(part.item).items() if value != default.get(key))
-    if isinstance(part.item, CsvTable):
-        item["time_unit"] = part.item.time_unit
-    for key in ("fields", "columns"):
-        if key in item:
-            item[key] = inner = CommentedMap((name, _field(path)) for name, path in item[key].items())
-            for name in inner:
-                if reason := part.reasons.get(name):
-                    inner.yaml_add_eol_comment(printable(reason), name)
-    for name in item.keys() & part.reasons.keys():
-        item.yaml_add_eol_comment(printable(part.reasons[name]), name)
-    lines = [*part.notes, *([f"not used: {', '.join(part.unused)}"] if part.unused else [])]
-    if lines:
-        indent = 4 + 2 * isinstance(part.item, CsvTable) + 2 * (part.role not in ("ego", "truth"))
-        item.yaml_set_comment_before_after_key(next(iter(item)), before=printable("; ".join(lines)), indent=indent)
-    return item
-
-
-def _field(path: Any) -> Any:  # Any: plain values
-    """A path with what converts it, on one line."""
-    if not isinstance(path, dict):
-        return path
-    default = plain(Field(""))
-    found = CommentedMap((key, value) for key, value in path.items() if key == "path" or value != default[key])
-    found.fa.set_flow_style()
-    return found
-
-
-def _dumped(document: CommentedMap, flow: bool = False) -> str:
-    yaml, text = YAML(), StringIO()
-    yaml.width = 4096
-    if flow:
-        yaml = YAML(typ="safe", pure=True)
-        yaml.width, yaml.default_flow_style = 4096, True
-    yaml.dump(plain(document) if flow else document, text)
-    return text.getvalue().strip() if flow else text.getvalue()
+def _comments(part: Part) -> Iterator[tuple[Sequence[str], str]]:
+    """Yield paths of keys, and the reasons of their guesses."""
+    is_table = isinstance(part.item, CsvTable)
+    of = [*(["csv"] if is_table else []), *(["detections"] if part.role not in ("ego", "truth") else []), part.role]
+    own = {one.name for one in fields(part.item)}
+    for name, reason in part.reasons.items():
+        yield ["input", *of, *([] if name in own else ["columns" if is_table else "fields"]), name], reason

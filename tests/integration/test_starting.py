@@ -75,7 +75,7 @@ def test_tables_of_another_program_are_written_read_and_replayed(foreign, tmp_pa
     assert config.input.csv.detections["radar"].columns["bearing_rad"] == Field("azimuth", degrees=True)
     text = (tmp_path / "my.yaml").read_text()
     assert "degrees; a compass, clockwise from north, as it agrees with the direction of travel" in text
-    assert "# not used: temp (21 to 21)" in text
+    assert "# ego.csv: not used: temp (21 to 21)" in text
     assert run(["replay", "drive", "-c", "my.yaml", "-o", "run"]) == 0
     assert "warning" not in capsys.readouterr().err.replace("map: there is none", "")
 

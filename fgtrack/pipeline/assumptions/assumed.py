@@ -1,9 +1,9 @@
 """What a replay assumes where the configuration leaves it open: what a recording carries, and what it shows."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from fgtrack.pipeline.recorded import RecordedSensor, recorded
 from fgtrack.tracking.association import GatedMahalanobis
 from fgtrack.tracking.existence import ExistenceRules
 
-__all__ = ["ASSUMED_STD", "Assumed", "Assumption", "assumed", "is_open", "source_of"]
+__all__ = ["ASSUMED_STD", "Assumed", "Assumption", "assumed", "departures", "is_open", "source_of"]
 
 #: Standard deviations of a sensor of which nothing is known: a detector of cars by LiDAR or RADAR.
 ASSUMED_STD = {
@@ -51,6 +51,29 @@ _UNPLACED = "gives no position, and bearings from an unknown mount err by more t
 """Reasons."""
 
 
+def _mounted(value: Mapping[str, float]) -> str:
+    axis = f", axis {math.degrees(value['yaw_rad']):.0f} degrees" if value["yaw_rad"] else ""
+    return f"mounted at {value['x_m']:g} m, {value['y_m']:g} m{axis}"
+
+
+#: Settings in words, by the last name of their keys.
+_WORDS: Mapping[str, Callable[[Any], str]] = {  # Any: of the key
+    "std": lambda std: f"standard deviations {', '.join(f'{name} {one:g}' for name, one in std.items())}",
+    "detection_probability": "detection probability {:g}".format,
+    "clutter_per_m2": "clutter {:g} per m2".format,
+    "score": "score {0[even]:g} as often of objects as of clutter, e times per {0[scale]:g}".format,
+    "scan": lambda _: "reports objects one by one",
+    "out_of_view_s": "tracks out of view end after {:g} s".format,
+    "claim_m": "nothing begins within {:g} m of a track".format,
+    "ignore_sensors": lambda names: f"{', '.join(names)} left out",
+    "field_of_view_rad": lambda rad: "sees all around" if rad >= math.tau else f"sees {math.degrees(rad):.0f} degrees",
+    "view_range_m": "up to {:g} m".format,
+    "max_range_m": "used up to {:g} m, beyond which clutter outweighs objects".format,
+    "max_range_behind_m": "behind it up to {:g} m".format,
+    "mount": _mounted,
+}
+
+
 @dataclass(frozen=True)
 class Assumption:
     """A setting that the user has not given."""
@@ -71,36 +94,8 @@ class Assumption:
     @property
     def text(self) -> str:
         """The setting in words, without its sensor and its reason."""
-        value: Any = self.value  # Any: of its key
-        match self.key.rpartition(".")[2]:
-            case "std":
-                return f"standard deviations {', '.join(f'{name} {one:g}' for name, one in value.items())}"
-            case "detection_probability":
-                return f"detection probability {value:g}"
-            case "clutter_per_m2":
-                return f"clutter {value:g} per m2"
-            case "score":
-                return f"score {value['even']:g} as often of objects as of clutter, e times per {value['scale']:g}"
-            case "scan":
-                return "reports objects one by one"
-            case "out_of_view_s":
-                return f"tracks out of view end after {value:g} s"
-            case "claim_m":
-                return f"nothing begins within {value:g} m of a track"
-            case "ignore_sensors":
-                return f"{', '.join(value)} left out"
-            case "field_of_view_rad":
-                return "sees all around" if value >= math.tau else f"sees {math.degrees(value):.0f} degrees"
-            case "view_range_m":
-                return f"up to {value:g} m"
-            case "max_range_m":
-                return f"used up to {value:g} m, beyond which clutter outweighs objects"
-            case "max_range_behind_m":
-                return f"behind it up to {value:g} m"
-            case "mount":
-                axis = f", axis {math.degrees(value['yaw_rad']):.0f} degrees" if value["yaw_rad"] else ""
-                return f"mounted at {value['x_m']:g} m, {value['y_m']:g} m{axis}"
-        return f"{self.key} {value}"
+        words = _WORDS.get(self.key.rpartition(".")[2])
+        return f"{self.key} {self.value}" if words is None else words(self.value)
 
 
 @dataclass(frozen=True)
@@ -110,19 +105,20 @@ class Assumed:
     config: Config
     assumptions: tuple[Assumption, ...]
 
-    def to_yaml(self, head: Iterable[str] = ()) -> str:
-        """Return YAML of all settings that differ from the defaults; a comment says why one was assumed.
+    def to_yaml(self, head: Iterable[str] = (), comments: Iterable[tuple[Sequence[str], str]] = ()) -> str:
+        """Return YAML of all settings that differ from the defaults; a comment gives the reason of an assumed one.
 
-        As `-c` it gives the run of this configuration without assuming anything. The lines of `head` are comments.
+        As `-c` it gives the run of this configuration without assuming anything. The lines of `head` are comments, and
+        `comments` are those of further keys, by path.
         """
-        sensors = {name: _of_sensor(sensor) for name, sensor in self.config.sensors.items()}
-        tree = _commented({**_departures(self.config, Config()), "sensors": sensors})
-        for one in self.assumptions:
-            inner, names = tree, self._path(one.key)
-            for name in names[:-1]:
-                inner = inner[name]
-            if names[-1] in inner:
-                inner.yaml_add_eol_comment(f"assumed: {one.reason}", names[-1])
+        tree = _commented(departures(self.config))
+        reasons = [(self._path(one.key), f"assumed: {one.reason}") for one in self.assumptions]
+        for path, reason in [*reasons, *comments]:
+            inner = tree
+            for name in path[:-1]:
+                inner = inner.get(name, {})
+            if path[-1] in inner:
+                inner.yaml_add_eol_comment(printable(reason), path[-1])
         text = StringIO()
         yaml = YAML()
         yaml.width = 4096
@@ -330,7 +326,7 @@ def _with_lists(
 def _for_revisits(config: Config, lists: Mapping[str, ListStatistics]) -> tuple[Config, list[Assumption]]:
     """`config` with what suits objects that are seldom measured, see `for_slow_revisits`."""
     sections, reason = for_slow_revisits(config, [one.revisits for one in lists.values()])
-    given = {name: _departures(section, getattr(config, name)) for name, section in sections.items()}
+    given = {name: departures(section) for name, section in sections.items()}
     found = [Assumption(f"{name}.{key}", value, reason) for name, one in given.items() for key, value in one.items()]
     return replace(config, **sections), found
 
@@ -342,17 +338,16 @@ def _std(seen: Coverage) -> dict[str, float]:
     return {name: usual[name] for name in MEASURABLE if name in left}
 
 
-def _departures(value: object, default: object) -> Any:  # Any: plain values
-    """What of a dataclass differs from `default`, with its form (`kind`) where it has one; all of any other value."""
-    if not is_dataclass(value) or type(value) is not type(default):
+def departures(value: object) -> Any:  # Any: plain values
+    """Return plain values; of dataclasses those that are not the defaults, and their forms (`kind`)."""
+    if isinstance(value, Mapping):
+        return {name: departures(item) for name, item in value.items()}
+    if not is_dataclass(value):
         return plain(value)
-    names = [field.name for field in fields(value) if getattr(value, field.name) != getattr(default, field.name)]
-    form = ["kind"] if names and hasattr(value, "kind") and "kind" not in names else []
-    return {name: _departures(getattr(value, name), getattr(default, name)) for name in [*form, *names]}
-
-
-def _of_sensor(sensor: SensorModel) -> dict[str, Any]:  # Any: plain values
-    return {"std": plain(sensor.std), **_departures(sensor, SensorModel(std=sensor.std))}
+    given = {one.name: getattr(value, one.name) for one in fields(value)}
+    defaults = {one.name: one.default for one in fields(value)}
+    defaults |= {one.name: one.default_factory() for one in fields(value) if one.default_factory is not MISSING}
+    return {name: departures(item) for name, item in given.items() if name == "kind" or item != defaults[name]}
 
 
 def _commented(value: Any) -> Any:  # Any: plain values
