@@ -165,7 +165,7 @@ def study(
             folders,
             origin=str(source.path),
             kind=source.kind,
-            on_tick=tick_progress(replayed, end_ns, len(folders)),
+            on_tick=tick_progress(replayed, end_ns, ESTIMATORS),
             overwrite=overwrite,
         )
         on_step("compare", _COMPARE)

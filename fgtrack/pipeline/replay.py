@@ -2,7 +2,7 @@
 
 import importlib.metadata
 import platform
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -288,9 +288,9 @@ def replay_each(
 
 
 def tick_progress(
-    tell: Callable[[str, float | None], None], end_ns: int | None, passes: int
+    tell: Callable[[str, float | None], None], end_ns: int | None, names: Sequence[str]
 ) -> Callable[[int, int], None]:
-    """Return the `on_tick` of `passes` replays, which now and then tells `tell` the share that is done.
+    """Return the `on_tick` of replays by the estimators `names`: it gives `tell` the share that is done now and then.
 
     `end_ns` is when the recording ends, where that is known.
     """
@@ -304,8 +304,8 @@ def tick_progress(
         last_ns = now_ns
         if next(ticks) % _TICKS == 0:
             done_ns = now_ns - first_ns
-            share = None if end_ns is None else (passed + min(done_ns / max(end_ns - first_ns, 1), 1.0)) / passes
-            tell(f"{done_ns / NS_PER_S:.1f} s of data, {num_tracks} tracks", share)
+            share = None if end_ns is None else (passed + min(done_ns / max(end_ns - first_ns, 1), 1.0)) / len(names)
+            tell(f"{names[passed]}, {done_ns / NS_PER_S:.1f} s of data, {num_tracks} tracks", share)
 
     return moved
 

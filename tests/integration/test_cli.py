@@ -273,7 +273,7 @@ def foreign_folder(path: Path) -> None:
             ("simulate", "default", "-o", "drive.mcap"),
             "drive.mcap: is written as .jsonl, as .jsonl.gz, or as a rosbag2",
         ),
-        (("replay", "drive.jsonl", "b", "-o", "run"), "unexpected extra argument (b)"),
+        (("replay", "drive.jsonl", "b", "-o", "run"), "unexpected extra argument"),
         (("replay", "drive.jsonl"), "--out"),
         (("replay", "-o", "run"), "ecording"),
         (("fly",), "fly"),
