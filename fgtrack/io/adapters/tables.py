@@ -12,7 +12,7 @@ from dataclasses import replace
 from decimal import Decimal, InvalidOperation
 from functools import partial
 from itertools import chain, groupby
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,6 +41,7 @@ __all__ = ["FORMAT", "headers", "read_tables", "rows"]
 _ENDINGS = (".csv", ".tsv")
 _TIMES = ("stamp", "receipt")
 _TEXTS = frozenset({"class_name", "object_id"})
+_NO_NUMBERS = _TEXTS | set(_TIMES)
 _EGO = frozenset({*_TIMES, *STATE_NAMES})
 _OBJECT = frozenset({*_TIMES, "object_id", *MEASURABLE, *DESCRIBING})
 _TRUTH = frozenset({*_TIMES, "object_id", *STATE_NAMES})
@@ -58,15 +59,6 @@ class Cells(NamedTuple):
     values: dict[str, str]
 
 
-class _Times(NamedTuple):
-    stamp_ns: int
-    receipt_ns: int
-
-
-Make = Callable[[Cells, _Times], Any]
-"""An `EgoState`, a `TruthState`, or a `Detection` (None of a row without one)."""
-
-
 def read_tables(tables: Sequence[tuple[Path, CsvTable, str]]) -> Iterator[Message]:
     """Messages of the tables, each with its file and what it holds: `ego`, `truth` or `detections SENSOR`.
 
@@ -77,59 +69,54 @@ def read_tables(tables: Sequence[tuple[Path, CsvTable, str]]) -> Iterator[Messag
     DataError
         A row is not what the mapping says; raised after all messages up to the last receipt before that row.
     """
-    found: list[Message] = []
-    breaks: list[tuple[float, DataError]] = []
-    for file, table, role in tables:
+    found: list[tuple[tuple[int, int, int], Message]] = []
+    until_ns, broken = math.inf, None
+    for number, (file, table, role) in enumerate(tables):
         messages, error = _read(file, table, role)
-        found += messages
-        if error is not None:
-            breaks.append((max((one.receipt_ns for one in messages), default=-math.inf), error))
-    until_ns, broken = min(breaks, key=lambda one: one[0], default=(math.inf, None))
-    for message in sorted(found, key=attrgetter("receipt_ns")):
-        if message.receipt_ns > until_ns:
+        for one in messages:
+            found.append(((one.receipt_ns, number, one.stamp_ns if isinstance(one, DetectionList) else 0), one))
+        last_ns = max((one.receipt_ns for one in messages), default=-math.inf)
+        if error is not None and last_ns < until_ns:
+            until_ns, broken = last_ns, error
+    found.sort(key=itemgetter(0))
+    for (receipt_ns, _, _), group in groupby(found, key=itemgetter(0)):
+        if receipt_ns > until_ns:
             break
-        yield message
+        rows = [one for _, one in group]
+        lists = [one for one in rows if isinstance(one, DetectionList)]
+        objects, left_out = (
+            tuple(chain.from_iterable(map(attrgetter(name), lists))) for name in ("objects", "left_out")
+        )
+        yield from [replace(lists[0], objects=objects, left_out=left_out)] if lists else rows
     if broken is not None:
         raise broken
 
 
 def _read(file: Path, table: CsvTable, role: str) -> tuple[list[Message], DataError | None]:
-    """All messages of a table, up to its end or to what is wrong with it."""
-    read: list[tuple[_Times, Any]] = []
+    """A message of every row of a table, and the error that ends it."""
+    messages: list[Message] = []
     left_out: list[str] = []
-    first: Cells | None = None  # of those left out
-    sample: Cells | None = None  # of those read
+    skipped: Cells | None = None
+    sample: Cells | None = None
     error = None
-    make: Make = partial(_state, table, role) if role in ("ego", "truth") else partial(_detection, table)
     try:
         for cells in _rows(file, table):
             refused = (name for name, each in table.filters.items() if not each.passes(_typed(cells.values[name])))
             if (name := next(refused, None)) is not None:
                 left_out.append(f"filters.{name}")
-                first = first or cells
+                skipped = skipped or cells
                 continue
-            times = _times(cells, table)
+            messages.append(_message(cells, table, role))
             sample = sample or cells
-            read.append((times, make(cells, times)))
-        if not read and first is not None and role not in ("ego", "truth"):
-            read.append((_times(first, table), None))  # an empty list, to say what was left out
+        if not messages and skipped is not None and role not in ("ego", "truth"):  # to report what was left out
+            messages.append(_message(skipped, replace(table, columns=_times_of(table)), role))
     except DataError as found:
         error = found
-    if sample is not None and (wrong := _wrong_unit([times for times, _ in read], sample, table, role)):
+    if sample is not None and (wrong := _wrong_unit([one.stamp_ns for one in messages], sample, table, role)):
         return [], DataError(wrong)
-    if role in ("ego", "truth"):
-        return [state for _, state in read], error
-    lists = list(_lists(read, role.removeprefix("detections "), table))
-    if lists:
-        lists[0] = replace(lists[0], left_out=tuple(left_out))  # their own times are not read
-    return [*lists], error
-
-
-def _lists(rows: list[tuple[_Times, Detection | None]], sensor: str, table: CsvTable) -> Iterator[DetectionList]:
-    rows.sort(key=lambda row: (row[0].receipt_ns, row[0].stamp_ns))
-    for times, group in groupby(rows, key=lambda row: row[0]):
-        objects = [item for _, item in group if item is not None]
-        yield DetectionList(sensor, times.stamp_ns, times.receipt_ns, objects, table.frame or "ego")
+    if messages and isinstance(messages[0], DetectionList):
+        messages[0] = replace(messages[0], left_out=tuple(left_out))  # their own times are not read
+    return messages, error
 
 
 def _rows(file: Path, table: CsvTable) -> Iterator[Cells]:
@@ -181,15 +168,13 @@ def _names(path: FieldPath) -> Sequence[str]:
     return [path] if isinstance(path, str) else path
 
 
-def _times(cells: Cells, table: CsvTable) -> _Times:
-    stamp_ns = _time(cells, table, "stamp")
-    receipt_ns = _time(cells, table, "receipt") if "receipt" in table.columns else stamp_ns
-    return _Times(receipt_ns if table.stamp_from == "receipt" else stamp_ns, receipt_ns)
+def _times_of(table: CsvTable) -> dict[str, FieldPath]:
+    return {name: path for name, path in table.columns.items() if name in _TIMES}
 
 
 def _time(cells: Cells, table: CsvTable, name: str) -> int:
     """Integer nanoseconds of the decimal text; a float would lose the last hundred of them."""
-    (column,) = _names(table.columns[name])
+    column = str(table.columns[name])
     text = cells.values[column]
     try:
         value = Decimal(text)
@@ -207,54 +192,44 @@ def _time(cells: Cells, table: CsvTable, name: str) -> int:
     return time_ns
 
 
-def _wrong_unit(times: Sequence[_Times], sample: Cells, table: CsvTable, role: str) -> str | None:
-    """Sentence about the unit of `times`, where rows follow each other faster than any sensor sends.
+def _wrong_unit(times_ns: Sequence[int], sample: Cells, table: CsvTable, role: str) -> str | None:
+    """Sentence about the unit of `times_ns`, where rows follow each other faster than any sensor sends.
 
     `sample` is the first of the rows.
     """
-    stamps_ns = {one.stamp_ns for one in times}
-    span_ns = max(stamps_ns) - min(stamps_ns)
-    (column,) = _names(table.columns["stamp"])
+    num_times, span_ns = len(set(times_ns)), max(times_ns) - min(times_ns)
+    column = str(table.columns["stamp"])
     unit = epoch_unit(float(sample.values[column]))
     is_other = unit not in (None, table.time_unit)
-    if len(times) < _FEWEST or span_ns >= _SHORTEST_NS * len(stamps_ns) or not (is_other or len(stamps_ns) > 2):
+    if len(times_ns) < _FEWEST or span_ns >= _SHORTEST_NS * num_times or not (is_other or num_times > 2):
         return None
     return (
         f"{sample.place}: {column}: {sample.values[column][:40]} and the times after it in {table.time_unit} are "
-        f"{span_ns * 1e-9:.3g} s long, {len(times)} rows that no sensor sends so fast: "
+        f"{span_ns * 1e-9:.3g} s long, {len(times_ns)} rows that no sensor sends so fast: "
         f"{f'set `time_unit: {unit}`' if is_other else 'change `time_unit`'} (input.csv.{role.replace(' ', '.')})"
     )
 
 
-def _state(table: CsvTable, role: str, cells: Cells, times: _Times) -> EgoState | TruthState:
-    named = [name for name in STATE_NAMES if name in table.columns]
-    values: dict[str, Any] = {name: _number(cells, table.columns[name], name) for name in named}
-    if role == "ego":
+def _message(cells: Cells, table: CsvTable, role: str) -> Message:
+    """The state in a row, or a list of its detection; empty where nothing is measured."""
+    receipt_ns = stamp_ns = _time(cells, table, "stamp")
+    if "receipt" in table.columns:
+        receipt_ns = _time(cells, table, "receipt")
+    times = (receipt_ns if table.stamp_from == "receipt" else stamp_ns, receipt_ns)
+    columns = table.columns
+    values: dict[str, Any] = {name: _number(cells, columns[name], name) for name in columns.keys() - _NO_NUMBERS}
+    number = object_id(cells.values[str(columns["object_id"])]) if "object_id" in columns else None
+    if role == "ego":  # an empty cell is not a number: the tracker counts a state without it as refused
         given = {name: value for name, value in values.items() if value is not None}
-        for name in ("x_m", "y_m", "yaw_rad", "speed_mps"):
-            given.setdefault(name, math.nan)  # an empty cell; the tracker counts a state without it as refused
-        return EgoState(times.stamp_ns, times.receipt_ns, **given)
-    x_m, y_m = (math.nan if values[name] is None else values[name] for name in ("x_m", "y_m"))
-    values |= {"x_m": x_m, "y_m": y_m}
-    return TruthState(times.stamp_ns, times.receipt_ns, _id(cells, table) or 0, **values)
-
-
-def _detection(table: CsvTable, cells: Cells, times: _Times) -> Detection | None:
-    numbers = [name for name in (*MEASURABLE, *DESCRIBING) if name in table.columns and name not in _TEXTS]
-    values: dict[str, Any] = {name: _number(cells, table.columns[name], name) for name in numbers}
-    if all(values[name] is None for name in numbers if name in MEASURABLE):
-        return None
-    if "class_name" in table.columns:
-        (column,) = _names(table.columns["class_name"])
-        values["class_name"] = cells.values[column] or None
-    return Detection(**values, object_id=_id(cells, table))
-
-
-def _id(cells: Cells, table: CsvTable) -> int | None:
-    if "object_id" not in table.columns:
-        return None
-    (column,) = _names(table.columns["object_id"])
-    return object_id(cells.values[column])
+        return EgoState(*times, **dict.fromkeys(("x_m", "y_m", "yaw_rad", "speed_mps"), math.nan) | given)
+    if role == "truth":
+        values |= {name: math.nan for name in ("x_m", "y_m") if values[name] is None}
+        return TruthState(*times, number or 0, **values)
+    if "class_name" in columns:
+        values["class_name"] = cells.values[str(columns["class_name"])] or None
+    is_measured = any(values.get(name) is not None for name in MEASURABLE)
+    objects = (Detection(**values, object_id=number),) if is_measured else ()
+    return DetectionList(role.removeprefix("detections "), *times, objects, table.frame or "ego")
 
 
 def _number(cells: Cells, path: FieldPath, name: str) -> float | None:
@@ -317,7 +292,7 @@ def _tables(path: Path, config: CsvInput) -> Iterator[tuple[Path, CsvTable, str]
         if known is _OBJECT and set(table.columns).isdisjoint(MEASURABLE):
             raise CallError(f"{where}: must name what is measured, one of {', '.join(MEASURABLE)}")
         for name in (*_TIMES, *_TEXTS):
-            if len(_names(table.columns.get(name, ""))) != 1 or isinstance(table.columns.get(name), Field):
+            if not isinstance(table.columns.get(name, ""), str):
                 raise CallError(f"{where}.{name}: the name of one column is needed")
         yield _file(path, table, role), table, role
 
