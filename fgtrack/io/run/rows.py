@@ -11,7 +11,6 @@ from fgtrack.core.types import (
     STATE_NAMES,
     DetectionList,
     EgoState,
-    ObjectReport,
     SmoothedReport,
     TickReport,
     TrackReport,
@@ -79,25 +78,10 @@ def smoothed_rows(reports: Iterable[SmoothedReport]) -> list[Row]:
     return found
 
 
-def truth_row(truth: TruthState) -> Row:
-    """A row of `truth`."""
-    return (truth.stamp_ns, truth.object_id, *_truth_state(truth))
-
-
 def ignored_row(truth: TruthState) -> Row:
     """A row of `ignored`; corners as `x y x y ...`."""
     outline = None if truth.outline_m is None else " ".join(map(repr, map(float, truth.outline_m)))
     return (truth.stamp_ns, truth.object_id, float(truth.x_m), float(truth.y_m), outline)
-
-
-def object_row(track_id: int, found: ObjectReport) -> Row:
-    """The row of `objects` of one track."""
-    return (track_id, found.class_name, found.class_share, found.length_m, found.width_m, found.height_m)
-
-
-def ego_row(ego: EgoState) -> Row:
-    """A row of `ego`."""
-    return (ego.stamp_ns, ego.receipt_ns, *_ego_state(ego))
 
 
 def detection_rows(message: DetectionList) -> list[Row]:
@@ -105,9 +89,8 @@ def detection_rows(message: DetectionList) -> list[Row]:
     found: list[Row] = []
     for index, one in enumerate(message.objects):
         stamp_ns = message.stamp_ns if one.stamp_ns is None else one.stamp_ns
-        said = (None if value is None else float(value) for value in _measured(one))
-        of_object = (_float_or_text(value) for value in _describing(one))
-        found.append((message.sensor, stamp_ns, message.receipt_ns, index, message.frame, *said, *of_object))
+        values = (value if value is None or isinstance(value, str) else float(value) for value in _values(one))
+        found.append((message.sensor, stamp_ns, message.receipt_ns, index, message.frame, *values))
     return found
 
 
@@ -122,10 +105,6 @@ def text(table: str, found: Sequence[Row]) -> str:
 def text_header(table: str) -> bytes:
     """First line of the CSV file of `table`."""
     return (",".join(COLUMNS[table]) + "\n").encode()
-
-
-def _float_or_text(value: float | str | None) -> Cell:
-    return value if value is None or isinstance(value, str) else float(value)
 
 
 @lru_cache
@@ -164,7 +143,6 @@ def _upper_triangle(size: int) -> Callable[[list[Cell]], Row]:
     return picked
 
 
-_truth_state = attrgetter(*STATE_NAMES)
-_ego_state = attrgetter(*STATE_NAMES)
-_measured = attrgetter(*MEASURABLE)
-_describing = attrgetter(*DESCRIBING)
+state_cells: Callable[[EgoState | TruthState], Row] = attrgetter(*STATE_NAMES)
+"""Cells of the states of the ego or of truth."""
+_values = attrgetter(*MEASURABLE, *DESCRIBING)

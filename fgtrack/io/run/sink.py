@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence, Set
+from dataclasses import astuple
 
 from fgtrack.core.types import (
     DetectionList,
@@ -13,7 +14,7 @@ from fgtrack.core.types import (
     TickReport,
     TruthState,
 )
-from fgtrack.io.run.rows import Row, detection_rows, ego_row, ignored_row, object_row, rows, smoothed_rows, truth_row
+from fgtrack.io.run.rows import Row, detection_rows, ignored_row, rows, smoothed_rows, state_cells
 from fgtrack.io.run.schema import RUN_FORMAT
 
 
@@ -38,7 +39,7 @@ class RunSink(ABC):
         self._out_of_bounds: dict[str, Counter[str]] = {}  # by setting
         self._left_out: dict[str, Counter[str]] = {}  # by the reader and its settings
         self._objects: dict[int, ObjectReport] = {}  # the last word on tracks that have not ended
-        self._received: dict[str, list[Row]] = {"ego": [], "detections": []}  # since the last tick
+        self._received: dict[str, list[Row]] = {name: [] for name in ("truth", "ignored", "ego", "detections")}
 
     def write_tick(self, report: TickReport, process_ns: int, num_detections: int) -> None:
         """Take all rows of one tick, see `rows`, and what was received before it."""
@@ -54,23 +55,23 @@ class RunSink(ABC):
                 self._append(table, found)
 
     def write_smoothed(self, reports: Sequence[SmoothedReport]) -> None:
-        """Take rows of `smoothed`."""
+        """Take rows of `smoothed`; the end of a run may have none."""
         if reports:
             self._append("smoothed", smoothed_rows(reports))
 
     def write_truth(self, truth: TruthState) -> None:
-        """Take a row of `truth`, or of `ignored`."""
+        """Take a row of `truth`, or of `ignored`; the next tick puts it behind the others, as all that is received."""
         if truth.ignored:
-            self._append("ignored", [ignored_row(truth)])
+            self._received["ignored"].append(ignored_row(truth))
         else:
-            self._append("truth", [truth_row(truth)])
+            self._received["truth"].append((truth.stamp_ns, truth.object_id, *state_cells(truth)))
 
     def write_ego(self, ego: EgoState) -> None:
-        """Take a row of `ego`; the next tick puts it behind the others."""
-        self._received["ego"].append(ego_row(ego))
+        """Take a row of `ego`."""
+        self._received["ego"].append((ego.stamp_ns, ego.receipt_ns, *state_cells(ego)))
 
     def write_detections(self, message: DetectionList) -> None:
-        """Take the rows of `detections`; the next tick puts them behind the others."""
+        """Take the rows of `detections`."""
         self._received["detections"] += detection_rows(message)
         if message.left_out:
             self._left_out.setdefault(message.sensor, Counter()).update(message.left_out)
@@ -95,7 +96,7 @@ class RunSink(ABC):
         """Append rows of `objects` of tracks that are not `alive` any more."""
         ended = sorted(self._objects.keys() - alive)
         if ended:
-            self._append("objects", [object_row(track_id, self._objects.pop(track_id)) for track_id in ended])
+            self._append("objects", [(track_id, *astuple(self._objects.pop(track_id))) for track_id in ended])
 
     def _append_received(self) -> None:
         for table, found in self._received.items():

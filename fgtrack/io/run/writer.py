@@ -57,7 +57,6 @@ class RunWriter(RunSink):
         super().__init__(config_text, meta, smoothed_lag_s)
         self.path = Path(path)
         self._folder: Path | None = None  # where the files are, once there are any
-        self._truth: dict[str, list[Row]] = {"truth": [], "ignored": []}  # of the time before the first tick
         self._files: dict[str, FileIO] = {}
         with ExitStack() as claim:
             claim.enter_context(claimed(self.path))
@@ -104,11 +103,8 @@ class RunWriter(RunSink):
         (self.path / _OLD_META).unlink(missing_ok=True)
 
     def _append(self, table: str, rows: Sequence[Row]) -> None:
-        if table in self._truth and self._folder is None:
-            self._truth[table] += rows
-        else:
-            self._begin()
-            self._write(table, text(table, rows))
+        self._begin()
+        self._write(table, text(table, rows))
 
     def _begin(self) -> Path:
         """Make the files, with the first tick: a run that fails before leaves nothing."""
@@ -122,10 +118,8 @@ class RunWriter(RunSink):
                     raise write_error(self.path, error) from error
             self._write_meta(self._folder)  # the first, so that a folder with a table is known as a run
             write_file(self._folder / "config.yaml", self._config_text)
-            for table in COLUMNS:
-                rows = self._truth.get(table)
-                if rows or table not in OPTIONAL_TABLES:
-                    self._write(table, text(table, rows or ()))
+            for table in COLUMNS.keys() - OPTIONAL_TABLES:
+                self._write(table, "")
         return self._folder
 
     def _write(self, table: str, lines: str) -> None:
