@@ -145,7 +145,8 @@ def test_a_covariance_that_does_not_cover_the_speed_is_not_given():
 
 
 def vision(size=1.0, results=True, **identity):
-    covariance = Message(pose=Message(pose=pose(5.0, 6.0, -1.0), covariance=POSE_COVARIANCE))
+    kind = Message(class_id="car", score=0.7)
+    covariance = Message(hypothesis=kind, pose=Message(pose=pose(5.0, 6.0, -1.0), covariance=POSE_COVARIANCE))
     box = Message(center=pose(1.0, 2.0, 0.5), size=xyz(size, size, size))
     item = Message(header=header(0), results=[covariance] if results else [], bbox=box, **identity)
     return Message(header=header(frame_id="/map"), detections=[item])
@@ -160,6 +161,7 @@ def test_vision_detections_of_every_version_give_pose_covariance_and_id(identity
     (item,) = found.objects
     assert found.frame == "map"
     assert (item.x_m, item.y_m, item.object_id, item.stamp_ns) == (1.0, 2.0, object_id, None)
+    assert (item.class_name, item.score) == ("car", 0.7)
     assert item.covariance == XY_YAW
 
 

@@ -35,14 +35,9 @@ class ObjectList:
 
 def split(found: Iterable[Detection | str]) -> tuple[tuple[Detection, ...], tuple[str, ...]]:
     """The detections among `found`, and what says of each other object by which setting it is left out."""
-    objects: list[Detection] = []
-    left_out: list[str] = []
-    for one in found:
-        if isinstance(one, str):
-            left_out.append(one)
-        else:
-            objects.append(one)
-    return tuple(objects), tuple(left_out)
+    every = tuple(found)
+    left_out = tuple(one for one in every if isinstance(one, str))
+    return tuple(one for one in every if not isinstance(one, str)), left_out
 
 
 def stamp_ns(time: RosMessage) -> int:
@@ -60,7 +55,7 @@ def frame_of(header: RosMessage) -> Frame:
     return "map" if header.frame_id.lstrip("/") in MAP_FRAMES else "ego"
 
 
-def object_list(header: RosMessage, objects: Sequence[Detection]) -> ObjectList:
+def object_list(header: RosMessage, objects: Iterable[Detection]) -> ObjectList:
     """An object list with the stamp and the frame of `header`."""
     return ObjectList(stamp_ns(header.stamp), frame_of(header), tuple(objects))
 

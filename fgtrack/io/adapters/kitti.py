@@ -28,6 +28,7 @@ Choices that the data leave open:
 import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -142,12 +143,8 @@ FORMAT = FileFormat(
 def _detection_places(folder: Path, sequence: str) -> list[Path]:
     """Files, or folders with a file per frame, of what detected something in `sequence`."""
     places = [*folder.glob(f"*/{sequence}.txt"), *(each for each in folder.glob(f"*/{sequence}") if each.is_dir())]
-    kept = {place.parent.name: place for place in sorted(places) if place.name == f"{sequence}.txt" or _holds(place)}
+    kept = {place.parent.name: place for place in sorted(places) if place.is_file() or any(place.glob("[0-9]*.txt"))}
     return [place for name, place in sorted(kept.items()) if name not in (_OXTS, _CALIB, _LABELS)]
-
-
-def _holds(folder: Path) -> bool:
-    return any(file.stem.isdigit() for file in folder.glob("*.txt"))
 
 
 def _truth(view: View, settings: KittiInput, fields: list[str]) -> TruthState | None:
@@ -165,8 +162,8 @@ def _truth(view: View, settings: KittiInput, fields: list[str]) -> TruthState | 
 
 def _regions(view: View, rows: list[Row]) -> Iterator[TruthState]:
     """The regions of a frame; their ids count down from -2."""
-    boxes = [row for row in rows if len(row.fields) > 2 and row.fields[2] == _DONT_CARE]
-    yield from _read(boxes, partial(_region, view, iter(range(-2, -2 - len(boxes), -1))))
+    boxes = [row for row in rows if row.fields[2:3] == [_DONT_CARE]]
+    yield from _read(boxes, partial(_region, view, count(-2, -1)))
 
 
 def _region(view: View, ids: Iterator[int], fields: list[str]) -> TruthState:
@@ -266,7 +263,7 @@ def _read(rows: list[Row], parse: Callable[[list[str]], _Parsed | None]) -> Iter
 def _rows(place: Path, num_frames: int) -> Rows:
     """Lines of a file of the sequence, or of the files of its frames in a folder, as if they were one."""
     rows: dict[int, list[Row]] = {}
-    for where, fields in _of_frames(place) if place.is_dir() else _of_file(place):
+    for where, fields in _split(place):
         try:
             frame = int(fields[0])
         except ValueError as error:
@@ -277,12 +274,9 @@ def _rows(place: Path, num_frames: int) -> Rows:
     return rows
 
 
-def _of_file(file: Path) -> Iterator[tuple[str, list[str]]]:
-    for number, line in enumerate(lines(file), 1):
-        yield f"{file}:{number}", line.split(",") if "," in line else line.split()
-
-
-def _of_frames(folder: Path) -> Iterator[tuple[str, list[str]]]:
-    for file in sorted(folder.glob("*.txt")):
+def _split(place: Path) -> Iterator[tuple[str, list[str]]]:
+    """File and line, and fields, of a file, or of the files of a folder, whose names are frames."""
+    for file in sorted(place.glob("*.txt")) if place.is_dir() else [place]:
+        first = [file.stem, "-1"] if place.is_dir() else []
         for number, line in enumerate(lines(file), 1):
-            yield f"{file}:{number}", [file.stem, "-1", *line.split()]
+            yield f"{file}:{number}", [*first, *(line.split(",") if "," in line else line.split())]

@@ -4,7 +4,6 @@ Which of it a tracker uses is the sensor model's choice. A speed is negative whe
 No object is left out: what is not a number stays so and is counted by the tracker.
 """
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,14 +34,17 @@ def detection3d_array(message: RosMessage) -> ObjectList:
     The pose is that of the box, or where the box has no size that of the first hypothesis; the covariance is
     that of the first hypothesis.
     """
-    return object_list(message.header, [_detection3d(item) for item in message.detections])
+    return object_list(message.header, map(_detection3d, message.detections))
 
 
 def _detection3d(item: RosMessage) -> Detection:
     pose, size = item.bbox.center, item.bbox.size
-    hypothesis = item.results[0].pose if len(item.results) else None
+    first = item.results[0] if len(item.results) else None
+    hypothesis = getattr(first, "pose", None)
     if hypothesis is not None and size.x == size.y == size.z == 0.0:
         pose = hypothesis.pose
+    kind = getattr(first, "hypothesis", first)  # it holds class and score, whose names differ by version
+    name = getattr(kind, "class_id", getattr(kind, "id", None))
     identity = getattr(item, "id", "") or getattr(item, "tracking_id", "")
     values = {"x_m": pose.position.x, "y_m": pose.position.y, "yaw_rad": yaw_rad(pose.orientation)}
     return Detection(
@@ -50,27 +52,15 @@ def _detection3d(item: RosMessage) -> Detection:
         covariance=None if hypothesis is None else covariance(measured(values), planar(hypothesis.covariance)),
         stamp_ns=object_stamp_ns(item.header),
         object_id=object_id(identity),
-        **_vision_description(item, pose),
+        **_size(size, pose.position.z),
+        score=getattr(kind, "score", None),
+        class_name=None if name in (None, "") else str(name),
     )
 
 
-def _vision_description(item: RosMessage, pose: RosMessage) -> dict[str, Any]:
-    """Size, height, and class and score of the first hypothesis, whose place differs between the versions."""
-    first = item.results[0] if len(item.results) else None
-    hypothesis = getattr(first, "hypothesis", first)
-    name = getattr(hypothesis, "class_id", getattr(hypothesis, "id", None))
-    return {
-        **_size(item.bbox.size, pose),
-        "score": getattr(hypothesis, "score", None),
-        "class_name": None if name in (None, "") else str(name),
-    }
-
-
-def _size(size: RosMessage, pose: RosMessage) -> dict[str, float | None]:
+def _size(size: RosMessage, z_m: float | None = None) -> dict[str, Any]:
     """Length, width and height, where there is a length, and the height of the middle."""
-    if not size.x > 0.0:
-        return {}
-    return {"z_m": pose.position.z, "length_m": size.x, "width_m": size.y, "height_m": size.z}
+    return {"z_m": z_m, "length_m": size.x, "width_m": size.y, "height_m": size.z} if size.x > 0.0 else {}
 
 
 def detected_objects(message: RosMessage) -> ObjectList:
@@ -79,29 +69,18 @@ def detected_objects(message: RosMessage) -> ObjectList:
     Position, yaw where the orientation is available without a doubt about its sign, speed where there is a
     twist, which is in the object's own frame.
     """
-    return object_list(message.header, [_detected_object(item) for item in message.objects])
+    return object_list(message.header, map(_autoware_object, message.objects))
 
 
 def tracked_objects(message: RosMessage) -> ObjectList:
     """`TrackedObjects` of the same packages, as `DetectedObjects`; twist and covariances are always there."""
-    return object_list(message.header, [_tracked_object(item) for item in message.objects])
+    return object_list(message.header, map(_autoware_object, message.objects))
 
 
-def _tracked_object(item: RosMessage) -> Detection:
+def _autoware_object(item: RosMessage) -> Detection:
+    """A detected object, which may lack twist and covariances, or a tracked one, which has an id."""
     kinematics = item.kinematics
-    found = _autoware_object(item, kinematics, has_twist=True, has_pose_covariance=True, has_twist_covariance=True)
-    return replace(found, object_id=_uuid(item.object_id))
-
-
-def _detected_object(item: RosMessage) -> Detection:
-    kinematics = item.kinematics
-    has_covariances = kinematics.has_position_covariance, kinematics.has_twist_covariance
-    return _autoware_object(item, kinematics, kinematics.has_twist, *has_covariances)
-
-
-def _autoware_object(
-    item: RosMessage, kinematics: RosMessage, has_twist: bool, has_pose_covariance: bool, has_twist_covariance: bool
-) -> Detection:
+    has_twist = getattr(kinematics, "has_twist", True)
     pose = kinematics.pose_with_covariance.pose
     twist = kinematics.twist_with_covariance
     velocity = twist.twist.linear
@@ -113,35 +92,28 @@ def _autoware_object(
         "speed_mps": signed_speed_mps(velocity.x, velocity.y, 0.0 if available else None) if has_twist else None,
     }
     variance = None
-    if has_twist_covariance:
+    if getattr(kinematics, "has_twist_covariance", True):
         planar_twist = np.asarray(twist.covariance, dtype=float).reshape(6, 6)[:2, :2]
         variance = speed_variance(velocity.x, velocity.y, planar_twist)
     pose_covariance = kinematics.pose_with_covariance.covariance
+    label = max(item.classification, key=lambda each: each.probability).label if len(item.classification) else 0
     return Detection(
         **values,
         covariance=covariance(
             measured(values),
-            planar(pose_covariance) if has_pose_covariance else None,
+            planar(pose_covariance) if getattr(kinematics, "has_position_covariance", True) else None,
             variance,
         ),
-        **_autoware_description(item, pose),
+        object_id=_uuid(item.object_id) if hasattr(item, "object_id") else None,
+        **_size(item.shape.dimensions, pose.position.z),
+        score=float(item.existence_probability),
+        class_name=_AUTOWARE_CLASSES[label] if 0 < label < len(_AUTOWARE_CLASSES) else None,
     )
-
-
-def _autoware_description(item: RosMessage, pose: RosMessage) -> dict[str, Any]:
-    """Size of a box or a cylinder, existence probability and the most likely class."""
-    likely = max(item.classification, key=lambda each: each.probability, default=None)
-    label = 0 if likely is None else likely.label
-    return {
-        **_size(item.shape.dimensions, pose),
-        "score": float(item.existence_probability),
-        "class_name": _AUTOWARE_CLASSES[label] if 0 < label < len(_AUTOWARE_CLASSES) else None,
-    }
 
 
 def object_array(message: RosMessage) -> ObjectList:
     """`derived_object_msgs/ObjectArray`: position, yaw, speed; the twist is in the frame of the header."""
-    return object_list(message.header, [_derived_object(item) for item in message.objects])
+    return object_list(message.header, map(_derived_object, message.objects))
 
 
 def _derived_object(item: RosMessage) -> Detection:
@@ -158,7 +130,7 @@ def _derived_object(item: RosMessage) -> Detection:
 
 def radar_tracks(message: RosMessage) -> ObjectList:
     """`radar_msgs/RadarTracks`: position and speed; the radar does not say where an object heads."""
-    return object_list(message.header, [_radar_track(item) for item in message.tracks])
+    return object_list(message.header, map(_radar_track, message.tracks))
 
 
 def _radar_track(item: RosMessage) -> Detection:
@@ -172,11 +144,7 @@ def _radar_track(item: RosMessage) -> Detection:
     }
     variance = speed_variance(velocity.x, velocity.y, _planar_triangle(item.velocity_covariance))
     own = covariance(measured(values), pose, variance)
-    return Detection(**values, covariance=own, object_id=_uuid(item.uuid), **_radar_size(item.size))
-
-
-def _radar_size(size: RosMessage) -> dict[str, Any]:
-    return {"length_m": size.x, "width_m": size.y, "height_m": size.z} if size.x > 0.0 else {}
+    return Detection(**values, covariance=own, object_id=_uuid(item.uuid), **_size(item.size))
 
 
 def _uuid(identity: RosMessage) -> int | None:
@@ -191,8 +159,9 @@ def _planar_triangle(triangle: RosMessage) -> np.ndarray:
 
 def pose_array(message: RosMessage) -> ObjectList:
     """`geometry_msgs/PoseArray`: position and yaw."""
-    poses = message.poses
-    objects = [Detection(x_m=pose.position.x, y_m=pose.position.y, yaw_rad=yaw_rad(pose.orientation)) for pose in poses]
+    objects = [
+        Detection(x_m=pose.position.x, y_m=pose.position.y, yaw_rad=yaw_rad(pose.orientation)) for pose in message.poses
+    ]
     return object_list(message.header, objects)
 
 

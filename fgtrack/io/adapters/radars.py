@@ -21,8 +21,7 @@ _NO_TARGET = 0  # status of an ESR track
 
 def conti_radar(message: RosMessage) -> ObjectList:
     """`conti_radar/Measurement`, clusters of a Continental ARS 408: x ahead and y to the left, relative velocities."""
-    points = [point for point in message.points if getattr(point, "invalid_state", 0) == 0]
-    return _listed(message, [_conti(point) for point in points])
+    return _listed(message, [_conti(point) for point in message.points if getattr(point, "invalid_state", 0) == 0])
 
 
 def _conti(point: RosMessage) -> Detection:

@@ -85,7 +85,7 @@ class Bag:
                     check_serialization(self.path, item.topic, item.ext.serialization_format)
             self._ros1 = any(isinstance(file, Rosbag1File) for file in files)
             self._types = MessageTypes(map(_key, connections), self._ros1, message_definitions, most_objects)
-            self._stamped = {key for key in set(map(_key, connections)) if self._starts_with_header(key)}
+            self._stamped = set(filter(self._types.begins_with_header, map(_key, connections)))
             self.break_off = self._break_off(files)
         self.topics = _topics(connections, self._types.problems)
         """Topics by name; a topic with two types is listed twice."""
@@ -131,17 +131,6 @@ class Bag:
         sec, nanosec = struct.unpack_from(">iI" if not self._ros1 and data[1] == 0 else "<iI", data, offset)
         return int(sec * NS_PER_S + nanosec)
 
-    def _starts_with_header(self, key: Key) -> bool:
-        if key in self._types.problems:
-            return False
-        fields = self._types.fields(key)
-        return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
-
-    def _decompressed(self, data: bytes, what: str) -> bytes:
-        """Message that a recorder has compressed; its name in errors is `what`."""
-        refuse_larger(zstandard.frame_content_size(data), what, self._largest_bytes)
-        return zstandard.ZstdDecompressor().decompress(data, max_output_size=self._largest_bytes)
-
     @contextmanager
     def _files(self) -> Iterator[list[BagFile]]:
         with _as_data_error(self.path), ExitStack() as stack:
@@ -166,13 +155,16 @@ class Bag:
         return next(iter(broken + empty), None)
 
     def _records(self, topics: Collection[str]) -> Iterator[tuple[Connection, int, bytes]]:
-        count = 0
+        count, decompress = 0, zstandard.ZstdDecompressor().decompress
         with self._files() as files:
             try:
-                for connection, log_ns, data in _merged(files, topics):
+                wanted = [(file, [item for item in file.connections if item.topic in topics]) for file in files]
+                records = [iter(file.messages(connections)) for file, connections in wanted if connections]
+                for connection, log_ns, data in heapq.merge(*records, key=itemgetter(1)):
                     if data[:4] == _ZSTD_MAGIC and not self._ros1:
                         what = f"{self.path}: the message on {connection.topic} at {log_ns} ns"
-                        data = self._decompressed(data, what)
+                        refuse_larger(zstandard.frame_content_size(data), what, self._largest_bytes)
+                        data = decompress(data, max_output_size=self._largest_bytes)
                     yield connection, log_ns, data
                     count += 1
             except (FgtrackError, MemoryError):
@@ -202,16 +194,6 @@ def _topics(connections: list[Connection], problems: Mapping[Key, str]) -> tuple
         if _key(item) in problems:
             found.setdefault((item.topic, item.msgtype), problems[_key(item)])
     return tuple(BagTopic(*topic, count, found.get(topic)) for topic, count in sorted(counts.items()))
-
-
-def _merged(files: list[BagFile], wanted: Collection[str]) -> Iterator[tuple[Connection, int, bytes]]:
-    """Records on the `wanted` topics of all files in log-time order; equal times keep the files' order."""
-
-    def records(file: BagFile) -> Iterator[tuple[Connection, int, bytes]]:
-        connections = [item for item in file.connections if item.topic in wanted]
-        return iter(file.messages(connections)) if connections else iter(())
-
-    return heapq.merge(*map(records, files), key=itemgetter(1))
 
 
 @contextmanager

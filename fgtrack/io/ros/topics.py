@@ -163,13 +163,6 @@ def _check_keys(role: str, item: TopicInput) -> None:
             )
 
 
-def _check_filters(item: TopicInput) -> None:
-    for name in item.filters if item.fields is None else ():
-        if name not in DETECTION_FIELDS:
-            known = ", ".join(sorted(DETECTION_FIELDS))
-            raise CallError(f"topic {item.topic}: without fields, filters go by {known}, not by {name!r}")
-
-
 def _check_fields(item: TopicInput, known: frozenset[str], needed: tuple[str, ...] = ()) -> None:
     fields = item.fields or {}
     for name in sorted(set(fields) - known):
@@ -197,10 +190,13 @@ def _ego(topic: BagTopic, item: TopicInput) -> Convert:
 
 
 def _objects(
-    topic: BagTopic, item: TopicInput, messages: Callable[[ObjectList, int, int], Iterator[Message]]
+    topic: BagTopic, item: TopicInput, messages: Callable[[ObjectList | DetectionList, int, int], Iterator[Message]]
 ) -> Convert:
     """Makes `messages` of an object list, its stamp (without one the receipt) and its receipt."""
-    _check_filters(item)
+    for name in item.filters if item.fields is None else ():
+        if name not in DETECTION_FIELDS:
+            known = ", ".join(sorted(DETECTION_FIELDS))
+            raise CallError(f"topic {item.topic}: without fields, filters go by {known}, not by {name!r}")
     read = _object_list(topic, item)
 
     def convert(message: RosMessage, receipt_ns: int) -> Iterator[Message]:
@@ -210,13 +206,13 @@ def _objects(
     return convert
 
 
-def _object_list(topic: BagTopic, item: TopicInput) -> Callable[[RosMessage], ObjectList]:
-    read: Callable[[RosMessage], ObjectList]
+def _object_list(topic: BagTopic, item: TopicInput) -> Callable[[RosMessage], ObjectList | DetectionList]:
+    read: Callable[[RosMessage], ObjectList | DetectionList]
     if item.fields is not None:
         _check_fields(item, OBJECT_FIELDS)
         read = partial(objects_by_fields, fields=item.fields)
     elif topic.type == DETECTIONS:
-        read = _own_objects
+        read = partial(detections, receipt_ns=0)  # a list of fgtrack's own has what an object list has
     elif topic.type not in ADAPTERS:
         known = ", ".join(message_types())
         raise CallError(f"topic {topic.name}: objects of type {topic.type} need fields, known are {known}")
@@ -225,13 +221,9 @@ def _object_list(topic: BagTopic, item: TopicInput) -> Callable[[RosMessage], Ob
     return partial(_passing, read, item) if item.filters else read
 
 
-def _own_objects(message: RosMessage) -> ObjectList:
-    """The objects of a list that fgtrack has written."""
-    found = detections(message, 0)
-    return ObjectList(found.stamp_ns, found.frame, tuple(found.objects))
-
-
-def _passing(read: Callable[[RosMessage], ObjectList], item: TopicInput, message: RosMessage) -> ObjectList:
+def _passing(
+    read: Callable[[RosMessage], ObjectList | DetectionList], item: TopicInput, message: RosMessage
+) -> ObjectList | DetectionList:
     """The objects of `message` that all filters let pass."""
     found = read(message)
     own = found.objects if item.fields is None else items_by_fields(message, item.fields)
@@ -248,7 +240,7 @@ def _judged(item: TopicInput, detection: Detection, source: RosMessage) -> Detec
 
 
 def _detections(topic: BagTopic, item: TopicInput, sensor: str) -> Convert:
-    def messages(objects: ObjectList, stamp_ns: int, receipt_ns: int) -> Iterator[Message]:
+    def messages(objects: ObjectList | DetectionList, stamp_ns: int, receipt_ns: int) -> Iterator[Message]:
         frame = item.frame or objects.frame or "ego"
         yield DetectionList(sensor, stamp_ns, receipt_ns, objects.objects, frame, objects.left_out)
 
@@ -263,7 +255,7 @@ def _truths(topic: BagTopic, item: TopicInput, number: int, topics: int) -> Conv
         return _objects(topic, item, _truth)
     own = object_id(number if item.object_id is None else item.object_id)
 
-    def messages(objects: ObjectList, stamp_ns: int, receipt_ns: int) -> Iterator[Message]:
+    def messages(objects: ObjectList | DetectionList, stamp_ns: int, receipt_ns: int) -> Iterator[Message]:
         if len(objects.objects) > 1:
             raise FieldError("truth of one object expected, give no object_id and name one topic of truth alone")
         named = tuple(replace(state, object_id=own) for state in objects.objects)
@@ -285,7 +277,7 @@ def _at_receipt(message: Message) -> Message:
     return replace(message, stamp_ns=message.receipt_ns)
 
 
-def _truth(objects: ObjectList, stamp_ns: int, receipt_ns: int) -> Iterator[Message]:
+def _truth(objects: ObjectList | DetectionList, stamp_ns: int, receipt_ns: int) -> Iterator[Message]:
     """One state per object; an object without an id is known by its place in the list."""
     for index, state in enumerate(objects.objects):
         if state.x_m is None or state.y_m is None:

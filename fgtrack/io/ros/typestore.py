@@ -108,9 +108,10 @@ class MessageTypes:
             except (ValueError, RecursionError) as error:
                 self.problems[key] = str(error)
 
-    def fields(self, key: Key) -> Fielddefs:
-        """The members of a type that has no problem."""
-        return self._types[key][key[0]][1]
+    def begins_with_header(self, key: Key) -> bool:
+        """True if the first member of a type that can be decoded is a header."""
+        members = [] if key in self.problems else self._types[key][key[0]][1]
+        return bool(members) and members[0][1][1] == "std_msgs/msg/Header"
 
     def types(self, key: Key) -> Typesdict:
         """A type that has no problem, with all its parts."""
