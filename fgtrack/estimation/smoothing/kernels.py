@@ -21,14 +21,14 @@ _WINDOWS = f"{TRACKS}, {TRACKS}, {ORDER}"  # first, count, numbers
 
 
 @inlined
-def multiply(A: FloatArray, B: FloatArray, column: int, result: FloatArray) -> None:
-    """Write A B to `result`, where B is n columns wide and begins at `column`, A and `result` at the first one."""
+def multiply(A: FloatArray, B: FloatArray, result: FloatArray) -> None:
+    """Write A B, of the first n columns of each."""
     n = A.shape[0]
     for i in range(n):
         for j in range(n):
             value = 0.0
             for k in range(n):
-                value += A[i, k] * B[k, column + j]
+                value += A[i, k] * B[k, j]
             result[i, j] = value
 
 
@@ -45,11 +45,11 @@ def add_multiplied(A: FloatArray, B: FloatArray, result: FloatArray) -> None:
 
 
 @inlined
-def copy(source: FloatArray, column: int, result: FloatArray) -> None:
-    """Copy columns of `source`, from `column` on, to `result`."""
+def copy(source: FloatArray, result: FloatArray) -> None:
+    """Copy the first columns of `source` to `result`."""
     for i in range(result.shape[0]):
         for j in range(result.shape[1]):
-            result[i, j] = source[i, column + j]
+            result[i, j] = source[i, j]
 
 
 @inlined
@@ -87,7 +87,7 @@ def _predict(left: FloatArray, segment: FloatArray, origin: FloatArray, moved: F
         ahead[i, n] = mean
         for j in range(i + 1):
             ahead[i, j] = 0.5 * (segment[i, n + j] + segment[j, n + i])
-    multiply(segment, left, 0, moved)
+    multiply(segment, left, moved)
     add_multiplied(moved, segment, ahead)
 
 
@@ -98,19 +98,20 @@ def _condition(
     ahead: FloatArray,
     gain: FloatArray,
     E: FloatArray,
+    Q: FloatArray,
     work: FloatArray,
     back: FloatArray,
     C: FloatArray,
 ) -> bool:
     """A = P F' (F P F' + Q)^-1, b, C = E P E' + A Q A', E = I - A F; `gain` holds F P. False if there is no A."""
     n = gain.shape[0]
-    copy(ahead, 0, E)
+    copy(ahead, E)
     if not solve(E, gain):
         return False
     for i in range(n):
         mean = left[i, n]
         for j in range(n):
-            back[i, j] = gain[j, i]
+            back[i, j], Q[i, j] = gain[j, i], segment[i, n + j]
             mean -= gain[j, i] * ahead[j, n]
             value = 1.0 if i == j else 0.0
             for k in range(n):
@@ -118,9 +119,9 @@ def _condition(
             E[i, j] = value
             C[i, j] = 0.0
         back[i, n] = mean
-    multiply(E, left, 0, work)
+    multiply(E, left, work)
     add_multiplied(work, E, C)
-    multiply(back, segment, n, work)
+    multiply(back, Q, work)
     add_multiplied(work, back, C)
     return True
 
@@ -140,7 +141,7 @@ def _correct(
         y -= rows[k, i] * state[i, n]
     precise = S > 1.0 / _LEAST_SHARE
     if precise:
-        copy(state, 0, P)
+        copy(state, P)
     for i in range(n):
         gain[i] /= S
         state[i, n] += gain[i] * y
@@ -151,7 +152,7 @@ def _correct(
             for j in range(n):
                 E[i, j] = (1.0 if i == j else 0.0) - gain[i] * rows[k, j]
                 state[i, j] = gain[i] * gain[j]
-        multiply(E, P, 0, work)
+        multiply(E, P, work)
         add_multiplied(work, E, state)
 
 
@@ -186,11 +187,11 @@ def eliminate(
                 before = numbers[track, index - 1]
                 _predict(filtered[before], segment[before], origin[at], A, predicted[at])
                 if not _condition(
-                    filtered[before], segment[before], predicted[at], A, E, work, back[before], C[before]
+                    filtered[before], segment[before], predicted[at], A, E, P, work, back[before], C[before]
                 ):
                     return False
             state, total = filtered[at], 0.0
-            copy(predicted[at], 0, state)
+            copy(predicted[at], state)
             for k in range(num_rows[at]):
                 _correct(state, rows[at], k, gain, E, P, work)
             for i in range(n):
@@ -284,11 +285,11 @@ def smoothed(
         for index in range(known[track] - 1, indices[t] - 1, -1):
             at = numbers[track, index]
             if index == count[track] - 1:
-                copy(filtered[at], 0, P[at])
+                copy(filtered[at], P[at])
                 continue
             later = numbers[track, index + 1]
-            copy(C[at], 0, P[at])
-            multiply(back[at], P[later], 0, work)
+            copy(C[at], P[at])
+            multiply(back[at], P[later], work)
             add_multiplied(work, back[at], P[at])
             if index < first[track]:  # behind the window
                 for i in range(n):
@@ -298,7 +299,7 @@ def smoothed(
                     step[at, i] = value
         known[track] = min(known[track], indices[t])
         at = numbers[track, indices[t]]
-        copy(P[at], 0, covariances[t])
+        copy(P[at], covariances[t])
         for i in range(n):
             steps[t, i] = step[at, i]
 
@@ -326,8 +327,8 @@ def interpolate(
     Lambda, by_right, work = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     for t in range(len(mean)):
         for attempt in range(2):
-            multiply(F2[t], Q1[t], 0, gain)
-            copy(Q2[t], 0, S)
+            multiply(F2[t], Q1[t], gain)
+            copy(Q2[t], S)
             add_multiplied(gain, F2[t], S)
             if solve(S, gain):
                 break
@@ -338,22 +339,22 @@ def interpolate(
         for i in range(n):
             for j in range(n):
                 Psi[i, j] = gain[j, i]
-        multiply(Psi, F2[t], 0, E)
+        multiply(Psi, F2[t], E)
         for i in range(n):
             for j in range(n):
                 E[i, j] = (1.0 if i == j else 0.0) - E[i, j]
                 mean[t, i] += Psi[i, j] * (right[t, j] - ahead[t, j])
-        multiply(E, F1[t], 0, Lambda)
-        multiply(Lambda, A[t], 0, by_right)
+        multiply(E, F1[t], Lambda)
+        multiply(Lambda, A[t], by_right)
         for i in range(n):
             for j in range(n):
                 by_right[i, j] += Psi[i, j]
-        multiply(by_right, P[t], 0, work)
+        multiply(by_right, P[t], work)
         for i in range(n):
             for j in range(n):
                 P[t, i, j] = 0.0
         add_multiplied(work, by_right, P[t])
         for weights, noise in ((Lambda, C[t]), (E, Q1[t]), (Psi, Q2[t])):
-            multiply(weights, noise, 0, work)
+            multiply(weights, noise, work)
             add_multiplied(work, weights, P[t])
     return True

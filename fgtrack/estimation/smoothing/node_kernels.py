@@ -5,7 +5,7 @@ import numpy as np
 from fgtrack.core.compiled import inlined, njit
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation.smoothing.kernels import MATRICES, ORDER, TRACKS, VECTORS, cholesky, copy, regularise
+from fgtrack.estimation.smoothing.kernels import MATRICES, ORDER, TRACKS, VECTORS, cholesky, regularise
 
 
 @inlined
@@ -213,7 +213,9 @@ def changed_factors(
             if has_next:
                 right = numbers[tracks[t], index + 1]
                 owners[num, 3], owners[num, 4] = right, used + n
-                copy(segment[left], n, Q)
+                for i in range(n):
+                    for j in range(n):
+                        Q[i, j] = segment[left, i, n + j]
                 if not cholesky(Q, n, L):
                     regularise(Q)
                     if not cholesky(Q, n, L):
