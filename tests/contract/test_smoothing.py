@@ -252,7 +252,7 @@ def test_final_states_are_the_dense_joint_of_what_had_arrived_when_the_node_left
 
 
 def test_final_states_of_a_nonlinear_model_are_near_the_optimum_of_what_had_arrived() -> None:
-    """Nodes that leave are relinearised earlier than others: without that the median is 0.010."""
+    """Nodes that leave, or are solved again anyway, are relinearised earlier: without that the median is 0.010."""
     motion, differences = CTRV(), list[float]()
     for seed in (1, 3):
         rng = np.random.default_rng(seed)

@@ -14,8 +14,10 @@ from fgtrack.core.types import FloatArray, IntArray
 
 #: Where a measurement leaves less than this of a variance, the short form of its update keeps too few digits.
 _LEAST_SHARE = 1e-6
-#: A node that leaves the window is relinearised where it has moved by more than this share of the thresholds.
+#: Nodes that are about to leave the window are relinearised where they have moved by this share of the thresholds.
 LEAVING_SHARE = 0.5
+#: Nodes that are solved again, because an older one has changed, by this one.
+SOLVED_SHARE = 0.25
 TRACKS, ORDER, VECTORS, MATRICES = "int64[::1]", "int64[:, ::1]", "float64[:, ::1]", "float64[:, :, ::1]"
 _WINDOWS = f"{TRACKS}, {TRACKS}, {ORDER}"  # first, count, numbers
 
@@ -227,10 +229,11 @@ def back_substitute(
             later = at
 
 
-@njit(f"int64({TRACKS}, {TRACKS}, {_WINDOWS}, {VECTORS}, {VECTORS}, {TRACKS}, {TRACKS})")
+@njit(f"int64({TRACKS}, {TRACKS}, {TRACKS}, {_WINDOWS}, {VECTORS}, {VECTORS}, {TRACKS}, {TRACKS})")
 def find_far(
     tracks: IntArray,
     anchors: IntArray,
+    starts: IntArray,
     first: IntArray,
     count: IntArray,
     numbers: IntArray,
@@ -241,15 +244,21 @@ def find_far(
 ) -> int:
     """Write the nodes with a `step` longer than `thresholds` as rows of `tracks` and indices; return their number.
 
-    Nodes before `anchors` are about to leave: a `LEAVING_SHARE` of the thresholds holds for them.
+    A `LEAVING_SHARE` of the thresholds holds for nodes before `anchors`, a `SOLVED_SHARE` from `starts` on and after
+    the first node that is too far.
     """
     num = 0
     for t in range(len(tracks)):
+        is_solved = False
         for index in range(first[tracks[t]], count[tracks[t]]):
-            at, share, too_long = numbers[tracks[t], index], LEAVING_SHARE if index < anchors[t] else 1.0, False
+            at, too_long = numbers[tracks[t], index], False
+            share = LEAVING_SHARE if index < anchors[t] else 1.0
+            if is_solved or index >= starts[t]:
+                share = SOLVED_SHARE
             for i in range(step.shape[1]):
                 too_long |= abs(step[at, i]) > share * thresholds[tracks[t], i]
             if too_long:
+                is_solved = True
                 rows[num], indices[num] = t, index
                 num += 1
     return num

@@ -30,8 +30,9 @@ class SmootherSettings:
     ring_s: float = 2.0
     """How far behind the window `fuse` reaches; older detections are `too_old`."""
     relinearise: Mapping[str, float] = field(default_factory=_RELINEARISE.copy)
-    """An entry of the state that moved further than this from its linearisation point is relinearised (iSAM2), or than
-    half of it when it is about to leave the window; see `thresholds` for entries that are not named."""
+    """An entry of the state that moved further than this from its linearisation point is relinearised: at half of it
+    when it is about to leave the window, at a quarter when it is solved again anyway; see `thresholds` for entries that
+    are not named."""
     max_iterations: int = 1
     """Gauss-Newton steps per update; further ones are taken only while a state moves."""
     lagged_s: tuple[float, ...] = (0.3,)

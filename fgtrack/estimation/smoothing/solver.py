@@ -106,26 +106,27 @@ class Solver:
 
     # --- linearisation
 
-    def far(self, tracks: IntArray, anchors: IntArray) -> tuple[IntArray, IntArray]:
+    def far(self, tracks: IntArray, anchors: IntArray, starts: IntArray) -> tuple[IntArray, IntArray]:
         """Nodes that are too far from their linearisation points: rows of `tracks`, and indices.
 
-        For those before `anchors`, which are about to leave, the tolerance is smaller.
+        The tolerance is smaller for those before `anchors`, which are about to leave, and for those that are solved
+        again anyway, from `starts` on.
         """
         nodes = self.nodes
         rows, indices = np.empty((2, int((nodes.count - nodes.first)[tracks].sum())), dtype=np.int64)
-        num = kernels.find_far(tracks, anchors, *nodes.order, self._thresholds, nodes.step, rows, indices)
+        num = kernels.find_far(tracks, anchors, starts, *nodes.order, self._thresholds, nodes.step, rows, indices)
         return rows[:num], indices[:num]
 
-    def move_far(self, tracks: IntArray, anchors: IntArray) -> Moved:
+    def move_far(self, tracks: IntArray, anchors: IntArray, starts: IntArray) -> Moved:
         """Move the linearisation points that are too far from their states, not yet the motion from there."""
         nodes = self.nodes
-        starts = nodes.count[tracks]
-        rows, indices = self.far(tracks, anchors)
+        rows, indices = self.far(tracks, anchors, starts)
         of = tracks[rows]
         if rows.size:
             numbers = nodes.numbers[of, indices]
             nodes.move(of, numbers, nodes.step[numbers])
-            np.minimum.at(starts, rows, indices)
+        starts = nodes.count[tracks]
+        np.minimum.at(starts, rows, indices)
         return Moved(starts, of, indices)
 
     def linearise_motion(self, tracks: IntArray, indices: IntArray) -> None:
@@ -144,7 +145,7 @@ class Solver:
     def iterate(self, tracks: IntArray, max_iterations: int) -> None:
         """Take Gauss-Newton steps while a state is further than a threshold from its linearisation point."""
         for _ in range(max_iterations):
-            moved = self.move_far(tracks, self.nodes.first[tracks])
+            moved = self.move_far(tracks, self.nodes.first[tracks], self.nodes.count[tracks])
             if not moved.tracks.size:
                 return
             self.linearise_motion(moved.tracks, moved.indices)

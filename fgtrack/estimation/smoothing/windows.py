@@ -130,7 +130,7 @@ class Windows:
         is_old = indices < anchors
         undo = Undo(nodes, tracks)
         try:
-            moved = solver.move_far(tracks, anchors)
+            moved = solver.move_far(tracks, anchors, indices)
             starts = moved.starts
             if is_old.any():
                 solver.linearise_motion(moved.tracks, moved.indices)
@@ -161,7 +161,7 @@ class Windows:
         tracks = tracks[solver.is_nonlinear[tracks]]
         if not tracks.size or solver.is_damped:
             return
-        rows, indices = solver.far(tracks, nodes.first[tracks])
+        rows, indices = solver.far(tracks, nodes.first[tracks], nodes.count[tracks])
         moved = nodes.numbers[tracks[rows], indices]
         far = zip(rows.tolist(), moved.tolist(), nodes.origin[moved], nodes.step[moved], strict=True)
         for row in sorted({row for row, number, x, step in far if overshot(nodes.terms[number], x, x + step)}):
